@@ -23,6 +23,7 @@ from impact_posture.controller_export.manifest import SCHEMA, build_controller
 from impact_posture.controller_export.parameters import Field, parameters
 from impact_posture.controller_export.render import render
 from impact_posture.controller_export.structure import Structure, structure_of
+from impact_posture.dynamics.model_parameters import ModelParameters
 from impact_posture.errors import InputError
 from impact_posture.impact.objective import ImpactObjective
 from impact_posture.libraries import library_path
@@ -76,6 +77,7 @@ def export_controller(
     build: bool = False,
     force: bool = False,
     generated: Sequence[str] = (),
+    shared: bool = False,
 ) -> ControllerExport:
     """Write the controller of a formulation as C99 into a folder, whole or not at all.
 
@@ -93,6 +95,8 @@ def export_controller(
         build: Leave ``lib<prefix>.so`` in the folder.
         force: Replace an earlier export.
         generated: Further flags of the compiler for what is generated from the model.
+        shared: Make the armature and the places of the joints a parameter, ``numbers``, so that robots which differ
+            in them have the same code.  Its gradient is no export of its own.
 
     Raises:
         InputError: A task or joint has no C code, the gradient is missing, or there are no sources of DAQP.
@@ -107,6 +111,9 @@ def export_controller(
         raise InputError(what, where="controller export", hint=hint)
     sources = daqp_sources(daqp)
     fields = tuple(parameters(structure, period))
+    if shared:
+        numbers = ModelParameters(robot.model).values
+        fields = (*fields, Field("numbers", "finite", "armature and places of the joints", numbers))
     manifest = _manifest(structure, fields, prefix)
     metric = f"{prefix}_metric" if objective is not None else None
     own = [
@@ -114,9 +121,11 @@ def export_controller(
         *([] if metric is None else [f"{metric}.c"]),
     ]
     manifest["sources"] = [*own, f"{prefix}_daqp.c"]
-    texts = render(structure, fields, prefix, identity(manifest), metric) | renamed(sources, prefix)
+    lean = objective if shared else None
+    texts = render(structure, fields, prefix, identity(manifest), metric, lean, shared=shared)
+    texts |= renamed(sources, prefix)
     texts[f"{prefix}.json"] = json.dumps(manifest, indent=2, allow_nan=False) + "\n"
-    texts |= {} if objective is None or metric is None else _metric(objective, metric)
+    texts |= {} if objective is None or metric is None or shared else _metric(objective, metric)
     texts["Makefile"], texts["CMakeLists.txt"] = _makefile(manifest), _cmake(manifest)
     out = Path(f"{prefix}-c") if out is None else out
     library = library_path(out, prefix)

@@ -22,8 +22,11 @@ from impact_posture.codegen.sums import rebuilt
 from impact_posture.controller_export.parameters import RULES, Field
 from impact_posture.controller_export.rigid_body import MovingTree
 from impact_posture.controller_export.structure import Structure
+from impact_posture.dynamics.model_parameters import ModelParameters
 from impact_posture.escape import c_comment
 from impact_posture.impact.contact import point_on
+from impact_posture.impact.kernel import ImpactKernel
+from impact_posture.impact.objective import ImpactObjective
 from impact_posture.robot.robot import Robot
 from impact_posture.settings import Vector3
 from impact_posture.version import __version__
@@ -45,8 +48,8 @@ _FRAMES = 4096
 
 
 @dataclass(frozen=True)
-class DynamicsCode:
-    """C of the quantities in ``ip_model``.
+class GeneratedCode:
+    """C of quantities of the robot: those in ``ip_model``, or its objective.
 
     Attributes:
         constants: Tables of numbers.
@@ -68,10 +71,16 @@ class DynamicsCode:
 
 
 @lru_cache(maxsize=2)
-def dynamics_code(robot: Robot, points: tuple[tuple[str, Vector3, bool], ...]) -> DynamicsCode:
-    """Generate the dynamics of points of a robot: frame, offset, and whether a rotation is needed."""
+def dynamics_code(
+    robot: Robot, points: tuple[tuple[str, Vector3, bool], ...], *, shared: bool = False
+) -> GeneratedCode:
+    """Generate the dynamics of points of a robot: frame, offset, and whether a rotation is needed.
+
+    ``shared`` code reads the numbers of :class:`~impact_posture.dynamics.model_parameters.ModelParameters`.
+    """
     q, v = ca.SX.sym("q", robot.nq), ca.SX.sym("v", robot.nv)
-    tree = MovingTree(robot.model, q, v)
+    numbers = ModelParameters(robot.model) if shared else None
+    tree = MovingTree(robot.model, q, v, numbers)
     found: dict[str, ca.SX] = {"M": tree.mass_matrix(), "h": tree.bias()}
     if robot.floating:
         found["base"] = tree.rotations[1]
@@ -85,8 +94,23 @@ def dynamics_code(robot: Robot, points: tuple[tuple[str, Vector3, bool], ...]) -
         if rows == 6:
             found[f"rotation[{k}]"], found[f"spatial[{k}]"] = tree.rotation(on), spatial
     # C has matrices row by row, and CasADi column by column.
+    targets = {f"d->{name}[{{}}]": x.T for name, x in found.items()}
+    return _generated({"q": q, "v": v} | ({} if numbers is None else {"numbers": numbers.symbol}), targets)
+
+
+@lru_cache(maxsize=2)
+def objective_code(objective: ImpactObjective) -> GeneratedCode:
+    """Generate an objective and its gradient, of numbers as in shared :func:`dynamics_code`."""
+    q, numbers = ca.SX.sym("q", objective.robot.nq), ModelParameters(objective.robot.model)
+    kernel = ImpactKernel(objective.case, q, ca.SX(ca.DM(objective.contact.normal)), numbers)
+    targets = dict(zip(("value[{}]", "gradient[{}]"), objective.worst_case.expressions(kernel), strict=True))
+    return _generated({"q": q, "numbers": numbers.symbol}, targets)
+
+
+def _generated(inputs: dict[str, ca.SX], found: dict[str, ca.SX]) -> GeneratedCode:
+    """Generate C for the entries of outputs, by their targets in C."""
     names = [f"o{k}" for k in range(len(found))]
-    function = ca.Function("dynamics", [q, v], [x.T for x in found.values()], ["q", "v"], names, {"cse": True})
+    function = ca.Function("code", [*inputs.values()], [*found.values()], [*inputs], names, {"cse": True})
     graph = rebuilt(graph_of(function))
     layout = lay_out(graph, [names])
     constants = Constants("ip", DOUBLE)
@@ -96,16 +120,25 @@ def dynamics_code(robot: Robot, points: tuple[tuple[str, Vector3, bool], ...]) -
     for name, target in zip(names, found, strict=True):
         for k, node in enumerate(graph.outputs[name]):
             known = graph.nodes[node].op == "const"
-            (fixed if known else outputs).append((f"d->{target}[{k}]", emitter.output(node)))
+            (fixed if known else outputs).append((target.format(k), emitter.output(node)))
     angles = tuple(graph.nodes[k].args[1] for k in layout.angles)
     work = layout.sizes.get(1, 1)
     largest = max((block.local_bytes for block in emitter.blocks), default=0)
     stack = 8 * (work + 2 * len(angles)) + largest
     text = constants.text({1: "double"})
-    return DynamicsCode(text, emitter.blocks, angles or (0,), work, outputs, fixed, stack)
+    return GeneratedCode(text, emitter.blocks, angles or (0,), work, outputs, fixed, stack)
 
 
-def render(s: Structure, fields: Sequence[Field], prefix: str, identity: str, metric: str | None) -> dict[str, str]:
+def render(
+    s: Structure,
+    fields: Sequence[Field],
+    prefix: str,
+    identity: str,
+    metric: str | None,
+    objective: ImpactObjective | None = None,
+    *,
+    shared: bool = False,
+) -> dict[str, str]:
     """Return file name → text of the header and the source.
 
     Args:
@@ -114,8 +147,11 @@ def render(s: Structure, fields: Sequence[Field], prefix: str, identity: str, me
         prefix: Beginning of the C names.
         identity: Words of the library about its manifest.
         metric: Prefix of the export of the gradient, if the controller has one.
+        objective: The objective, where its code is :func:`objective_code` and not an export of its own.
+        shared: Whether the last parameter is ``numbers``, which models with the same code do not share.
     """
-    code, robot = dynamics_code(s.robot, tuple((p.frame, p.offset, p in s.turning) for p in s.points)), s.robot
+    points, robot = tuple((p.frame, p.offset, p in s.turning) for p in s.points), s.robot
+    code = dynamics_code(robot, points, shared=shared)
     sizes = s.sizes
     bounds = sizes["SIMPLE"] + sizes["GENERAL"]
     nv, equations = sizes["NV"], sizes["EQUATIONS"]
@@ -140,23 +176,26 @@ def render(s: Structure, fields: Sequence[Field], prefix: str, identity: str, me
         "robot": robot.name, "version": __version__, "prefix": prefix, "sizes": sizes, "room": room, "fields": fields,
         "q_names": configuration_names(robot), "v_names": robot.tangent_names, "u_names": s.actuators.names,
         "convention": robot.convention, "tasks": [t.name for t in s.tasks] or ["none"], "metric": metric,
+        "shared": fields[-1].value.size if shared else 0,
         "stack_bytes": -(-max(code.stack_bytes, solver + 16 * nv * 8) // 64) * 64 + _FRAMES,
         "identity": identity, "tables": tables, "named": named_fields, "literals": _initializer,
         "rules": _braced(str(x) for f in fields for x in (f.value.size, RULES[f.rule])),
-        "code": code, "places": _braced(map(str, code.angles)),
         "core": "\n".join(_own(name) for name in _files(sizes)),
     }  # fmt: skip
     templates = environment("impact_posture.controller_export", c_comment)
-    texts = {
-        name: templates.get_template(template).render(context)
-        for name, template in (
-            (f"{prefix}.h", "controller.h.jinja"),
-            (f"{prefix}.c", "controller.c.jinja"),
-            (f"{prefix}_defaults.c", "defaults.c.jinja"),
-            (f"{prefix}_dynamics.h", "dynamics.h.jinja"),
-            (f"{prefix}_dynamics.c", "dynamics.c.jinja"),
-        )
-    }
+    files = [
+        (f"{prefix}.h", "controller.h", None),
+        (f"{prefix}.c", "controller.c", None),
+        (f"{prefix}_defaults.c", "defaults.c", None),
+        (f"{prefix}_dynamics.h", "dynamics.h", None),
+        (f"{prefix}_dynamics.c", "dynamics.c", code),
+        *([] if objective is None else [(f"{metric}.c", "dynamics.c", objective_code(objective))]),
+    ]
+    texts = {}
+    for name, template, own in files:
+        more: dict[str, Any] = {"objective": own is not code}
+        more |= {} if own is None else {"code": own, "places": _braced(map(str, own.angles))}
+        texts[name] = templates.get_template(f"{template}.jinja").render(context | more)
     return {name: named(text, prefix) for name, text in texts.items()} | _relaxation(prefix)
 
 

@@ -8,6 +8,7 @@ import casadi as ca
 import numpy as np
 
 from impact_posture.dynamics.kinematics import ByJoint, PointOnLink
+from impact_posture.dynamics.model_parameters import ModelParameters
 from impact_posture.dynamics.spatial import (
     cross,
     force_to_parent,
@@ -26,10 +27,11 @@ class MovingTree(Tree):
         model: The model, a ``pin.Model``.
         q: Configuration, shape (nq, 1).
         v: ν, shape (nv, 1).
+        numbers: Numbers of the model that are parameters.
     """
 
-    def __init__(self, model: object, q: ca.SX, v: ca.SX) -> None:
-        super().__init__(model, q)
+    def __init__(self, model: object, q: ca.SX, v: ca.SX, numbers: ModelParameters | None = None) -> None:
+        super().__init__(model, q, limbs=numbers)
         self._v, self._moving = v, self.velocities(v)
         self._gravity = ca.SX(np.array(self.model.gravity.linear, dtype=float))
 

@@ -60,6 +60,6 @@ int ip_init(ip_context *c, const ip_params *p)
     c->excess = isfinite(p->control_upper[i]) ? fmax(c->excess, fabs(p->control_upper[i])) : c->excess;
   }
   c->excess *= 1e-6;
-  ip_dynamics_constants(&c->m);
+  IP_CONSTANTS(c, &c->m);
   return 0;
 }

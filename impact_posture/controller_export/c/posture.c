@@ -24,7 +24,7 @@ static void ip_evaluate(ip_context *c)
   double term[IP_NV], value, square;
   const double bound = c->p.robust_gain[0] * c->p.robust_reach[0];
   int i, s;
-  if (IP_GRADIENT(c->q, &value, term) != 0) {
+  if (IP_GRADIENT(&c->m, c->q, &value, term) != 0) {
     return;
   }
   ip_scaled(term, -c->p.robust_gain[0] / c->scale, term, IP_NV);
@@ -109,7 +109,7 @@ static int ip_normalize(ip_context *c)
     z[k] = 1.0;
     for (j = 0; j < 2; ++j) {
       ip_integrate(c->q, z, j ? -1e-5 : 1e-5, q);
-      if (IP_GRADIENT(q, &value, g[j]) != 0) {
+      if (IP_GRADIENT(&c->m, q, &value, g[j]) != 0) {
         return 0;
       }
     }
@@ -125,7 +125,7 @@ static int ip_normalize(ip_context *c)
     ip_combine(P + i * N, N, V + i, N, V, N, N);
   }
   largest = sqrt(ip_eigen(P, V, N));
-  if (IP_GRADIENT(c->q, &value, g[0]) != 0) {
+  if (IP_GRADIENT(&c->m, c->q, &value, g[0]) != 0) {
     return 0;
   }
   c->scale = fmax(largest, 1e-3 * fabs(value));
@@ -148,7 +148,7 @@ static void ip_reset_posture(ip_context *c)
 #if IP_ROBUST
   {
     double gradient[IP_NV];
-    if (IP_GRADIENT(c->q, &c->value, gradient) != 0) {
+    if (IP_GRADIENT(&c->m, c->q, &c->value, gradient) != 0) {
       c->value = NAN;
     }
   }

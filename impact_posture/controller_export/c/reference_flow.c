@@ -58,7 +58,7 @@ static void ip_flow_evaluate(ip_flow *f, const double *q, double *slope)
 {
   double value;
   int i;
-  f->failed = IP_GRADIENT(q, &value, slope) != 0 || !isfinite(value + ip_dot(slope, slope, IP_NV));
+  f->failed = IP_GRADIENT(&f->m, q, &value, slope) != 0 || !isfinite(value + ip_dot(slope, slope, IP_NV));
   f->found = f->failed ? NAN : value;
   for (i = 0; i < IP_NV; ++i) {
     slope[i] = f->failed ? 0.0 : slope[i] / f->start;

@@ -159,8 +159,8 @@ static int ip_flow_begin(ip_context *c)
   memcpy(f->first, c->q, sizeof f->first);
   memcpy(f->here, c->q, sizeof f->here);
   f->deadline = INFINITY;
-  ip_dynamics_constants(&f->m);
-  ip_dynamics_constants(&f->ahead);
+  IP_CONSTANTS(c, &f->m);
+  IP_CONSTANTS(c, &f->ahead);
   for (k = 0; k < IP_TASKS; ++k) {
     if (!ip_flow_led[k]) {
       ip_constant_rows(k, f->J[row]);
