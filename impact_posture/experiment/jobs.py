@@ -4,12 +4,12 @@ from __future__ import annotations
 
 from dataclasses import asdict, dataclass
 from functools import lru_cache
-from importlib import metadata
 from typing import Any
 
 import numpy as np
 from pydantic_core import to_jsonable_python
 
+from impact_posture.dynamics.mjcf import import_mujoco
 from impact_posture.errors import InputError
 from impact_posture.escape import file_name
 from impact_posture.posture.compiled import CompileMode
@@ -141,7 +141,7 @@ def execute(job: Job, factory: ControllerFactory | None = None) -> tuple[tuple[R
         "path": factory.path.to_dict() if job.controller.removesuffix("-stiff") == "path" else None,
         "warnings": factory.warnings,
         "model_sha256": factory.setup.robot.model_sha256,
-        "versions": versions() | {"mujoco": metadata.version("mujoco")},
+        "versions": versions() | {"mujoco": str(import_mujoco().__version__)},
     }
     return found, jsonable(document)
 

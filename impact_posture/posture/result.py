@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import platform
+from functools import cache
 from importlib import metadata
 from typing import Any
 
@@ -100,11 +101,17 @@ def versions() -> dict[str, str]:
     """Return the versions of all software that a result depends on."""
     found = {"impact-posture": __version__, "python": platform.python_version()}
     found |= {"casadi": ca.CasadiMeta.version(), "pinocchio": pin.__version__, "numpy": np.__version__}
+    data = _version_of("example-robot-data")
+    return found | ({} if data is None else {"example-robot-data": data})
+
+
+@cache
+def _version_of(package: str) -> str | None:
+    """Return the version of an installed package, which takes milliseconds to find."""
     try:
-        found["example-robot-data"] = metadata.version("example-robot-data")
+        return metadata.version(package)
     except metadata.PackageNotFoundError:
-        pass
-    return found
+        return None
 
 
 def result_arrays(

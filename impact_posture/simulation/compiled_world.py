@@ -6,7 +6,7 @@ import ctypes
 import re
 from collections.abc import Callable
 from functools import cache
-from importlib import metadata, resources
+from importlib import resources
 from pathlib import Path
 from typing import Any, NamedTuple
 
@@ -126,6 +126,7 @@ def _members() -> dict[str, str]:
     return found
 
 
+@cache
 def _source() -> str:
     return (resources.files(__package__) / "c" / f"{_NAME}.c").read_text(encoding="utf-8")
 
@@ -143,7 +144,7 @@ def _library() -> ctypes.CDLL | None:
     headers = Path(import_mujoco().__file__).parent / "include"
     if not (headers / "mujoco" / "mujoco.h").is_file():
         return None
-    folder = cache_folder("worlds", source_key([metadata.version("mujoco"), _source()]))
+    folder = cache_folder("worlds", source_key([str(import_mujoco().__version__), _source()]))
     library = library_path(folder, _NAME)
     with locked(folder.with_suffix(".lock")):
         if not is_cached(library):

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import shutil
 from dataclasses import replace
+from pathlib import Path
 from typing import Any
 
 import numpy as np
@@ -15,6 +16,10 @@ from impact_posture.libraries import cache_path
 from impact_posture.simulation.compiled_tick import CompiledTick
 from impact_posture.simulation.controller_factory import ControllerFactory
 from impact_posture.simulation.metrics import measure
+from impact_posture.simulation.scenario import set_up
+from impact_posture.simulation.scenario_file import read_scenario
+from impact_posture.simulation.scenario_objective import interpreted
+from impact_posture.simulation.sensor_noise import Reading
 from tests.daqp import sources_or_skip
 from tests.simulation.factories import driven, factory, needs_mujoco
 
@@ -56,6 +61,35 @@ def test_a_run_in_c_is_that_of_python(name: str, controller: str, mode: Any) -> 
     calm = slice(0, 300)
     np.testing.assert_allclose(theirs.series.q[calm], ours.series.q[calm], rtol=0, atol=1e-9)
     np.testing.assert_allclose(theirs.series.torque[calm], ours.series.torque[calm], rtol=0, atol=1e-7)
+
+
+def test_robots_that_differ_in_armature_and_mounting_share_the_library() -> None:
+    scenario = read_scenario("aerial-vertical")
+    x, y, z = scenario.mounting["shoulder_roll"]
+    other = replace(
+        scenario,
+        armature={"shoulder_pitch": 0.01, "elbow_pitch": 0.02},
+        mounting={"shoulder_roll": (x + 0.01, y, z + 0.02)},
+    )
+    made = [in_c("aerial-vertical"), ControllerFactory(set_up(other), compile="always", gradient_of=interpreted)]
+    there: list[set[Path]] = []
+    values: list[float] = []
+    for each in made:
+        driver = each.driver("robust")
+        assert driver.compiled is not None
+        there.append(set((cache_path() / "controllers").iterdir()))
+        q, v = each.setup.q, np.full(each.setup.robot.nv, 0.01)
+        driver.reset(q)
+        driver.brace()
+        driver.posture.brace()
+        for t in 0.001 * np.arange(6):
+            wanted, found = driver.controller.tick(t, q, v), driver.compiled.tick(Reading(t, q, v, None))
+            np.testing.assert_allclose(found.u, wanted.u, rtol=1e-9, atol=1e-9)
+            np.testing.assert_allclose(found.acceleration, wanted.acceleration, rtol=1e-9, atol=1e-9)
+        values.append(driver.compiled.library.report().objective)
+        assert values[-1] == pytest.approx(driver.posture.value, rel=1e-12)
+    assert values[0] != pytest.approx(values[1], rel=0.1)
+    assert there[0] == there[1]
 
 
 def test_auto_builds_where_it_can_and_a_job_says_so_where_its_runs_pay_for_it() -> None:

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import json
+import math
 from collections.abc import Callable, Mapping
 from dataclasses import asdict, dataclass, field, replace
 
@@ -107,7 +108,7 @@ def point(scenario: str, number: int, seed: int, known: Record | None = None, pl
         NotAdmissible: No draw was.
     """
     if known is not None and (known.documents or known.draw.name):
-        return _complete(known, ControllerFactory(prepare(known.draw), gradient_of=interpreted), play)
+        return _complete(known, _factory(prepare(known.draw)), play)
     rejected: list[str] = []
     for attempt in range(ATTEMPTS):
         chosen = draw(scenario, number, attempt, seed)
@@ -142,13 +143,21 @@ def is_held(setup: Setup, objective: ImpactObjective) -> bool:
     return holding is None or holding.feasible
 
 
+def _factory(setup: Setup) -> ControllerFactory:
+    """Return controllers for runs that no one draws."""
+    # What Python still evaluates is less than compiling the gradient anew for every armature and mounting.
+    factory = ControllerFactory(setup, gradient_of=interpreted)
+    # The metric over time is only drawn.
+    factory.metric = lambda q: math.nan
+    return factory
+
+
 def _admit(chosen: Draw, play: _Play) -> tuple[ControllerFactory, Document]:
     try:
         setup = prepare(chosen)
     except ImpactPostureError as error:
         raise NotAdmissible(f"no start ({type(error).__name__})") from None
-    # What Python still evaluates is less than compiling the gradient anew for every armature and mounting.
-    factory = ControllerFactory(setup, gradient_of=interpreted)
+    factory = _factory(setup)
     if not is_held(setup, factory.objective()):
         raise NotAdmissible(f"the motors do not hold the start with {100 * SHARE:.0f} % of their limits")
     nominal = _document(factory, chosen, NOMINAL, play)
