@@ -193,9 +193,9 @@ def render(
     ]
     texts = {}
     for name, template, own in files:
-        more: dict[str, Any] = {"objective": own is not code}
-        more |= {} if own is None else {"code": own, "places": _braced(map(str, own.angles))}
-        texts[name] = templates.get_template(f"{template}.jinja").render(context | more)
+        generated: dict[str, Any] = {"objective": own is not code}
+        generated |= {} if own is None else {"code": own, "places": _braced(map(str, own.angles))}
+        texts[name] = templates.get_template(f"{template}.jinja").render(context | generated)
     return {name: named(text, prefix) for name, text in texts.items()} | _relaxation(prefix)
 
 

@@ -140,6 +140,7 @@ def _key(structure: Structure, objective: ImpactObjective | None) -> str:
         robot.model_sha256,
         repr(structure.sizes),
         repr({name: table.tolist() for name, table in structure.tables.items()}),
+        repr((structure.actuators.G.tolist(), robot.model.gravity.vector.tolist())),
         repr([(task.name, type(task).__name__) for task in structure.formulation.tasks]),
         *[
             repr((f.parentJoint, f.placement.homogeneous.tolist(), p))

@@ -90,6 +90,7 @@ class ControllerFactory:
         setup: The experiment.
         free: Whether gradients and the offline optimum ignore the feet.
         gradient_of: Makes the gradient of an objective, compiled or interpreted.
+        offline_of: Finds the offline posture, as :func:`~impact_posture.simulation.offline.offline_posture` does.
         compile: Whether controllers run as machine code: ``auto`` where they can, always, or never.
         starts: Number of starts of the optimizer for offline postures.
         in_c: Whether the last driver does.
@@ -99,6 +100,7 @@ class ControllerFactory:
     setup: Setup
     free: bool = False
     gradient_of: Callable[[ImpactObjective], Gradient] = compiled
+    offline_of: Callable[..., OfflinePosture] = offline_posture
     compile: CompileMode = "never"
     starts: int = 8
     in_c: bool = False
@@ -143,7 +145,7 @@ class ControllerFactory:
         # A path begins where the robot starts, so its end holds the end effector there.
         kind, at_contact = _KINDS.get(name, "impulse"), name != "path"
         if (kind, at_contact) not in self._offline:
-            self._offline[kind, at_contact] = offline_posture(
+            self._offline[kind, at_contact] = self.offline_of(
                 self.setup, self.objective(kind), starts=self.starts, at_contact=at_contact
             )
         return self._offline[kind, at_contact]

@@ -6,6 +6,7 @@ import json
 import math
 from collections.abc import Callable, Mapping
 from dataclasses import asdict, dataclass, field, replace
+from typing import Any
 
 import numpy as np
 import pinocchio as pin
@@ -21,7 +22,7 @@ from impact_posture.impact.objective import ImpactObjective
 from impact_posture.posture.load_cases import load_cases
 from impact_posture.simulation.controller_factory import ControllerFactory
 from impact_posture.simulation.metrics import before
-from impact_posture.simulation.offline import SHARE, scenario_requirements
+from impact_posture.simulation.offline import SHARE, OfflinePosture, offline_posture, scenario_requirements
 from impact_posture.simulation.run import Run
 from impact_posture.simulation.scenario import Setup
 from impact_posture.simulation.scenario_objective import interpreted
@@ -38,6 +39,9 @@ SATURATED = 0.05
 ATTEMPTS = 40
 # What a record does not keep of a document.
 _LEFT_OUT = ("windows", "versions", "runs")
+# Offline postures that this process has found last, and how many it keeps: those of some points of each scenario.
+_KEPT = 16
+_FOUND: dict[str, OfflinePosture] = {}
 _Play = Callable[[Job, ControllerFactory], tuple[tuple[Run, ...], Document]]
 
 
@@ -146,10 +150,21 @@ def is_held(setup: Setup, objective: ImpactObjective) -> bool:
 def _factory(setup: Setup) -> ControllerFactory:
     """Return controllers for runs that no one draws."""
     # What Python still evaluates is less than compiling the gradient anew for every armature and mounting.
-    factory = ControllerFactory(setup, gradient_of=interpreted)
+    factory = ControllerFactory(setup, gradient_of=interpreted, offline_of=_offline)
     # The metric over time is only drawn.
     factory.metric = lambda q: math.nan
     return factory
+
+
+def _offline(setup: Setup, objective: ImpactObjective, **options: Any) -> OfflinePosture:
+    """Optimize each problem once: gains, pushes and laws of contact leave it as it is."""
+    demands = scenario_requirements(setup, objective, at_contact=options["at_contact"])
+    impact = objective.contact, objective.metric, objective.kind, objective.supports, objective.compliance
+    key = repr((setup.robot.source, setup.robot.data_sha256, setup.q.tobytes(), impact, demands, options))
+    found = _FOUND[key] = _FOUND.pop(key, None) or offline_posture(setup, objective, **options)
+    if len(_FOUND) > _KEPT:
+        del _FOUND[next(iter(_FOUND))]
+    return found
 
 
 def _admit(chosen: Draw, play: _Play) -> tuple[ControllerFactory, Document]:
