@@ -24,7 +24,7 @@ help:
 	@echo "make study-feasible  what it costs to be clear of collisions, held by the motors and reached at speed"
 	@echo "make study-flow     where the reference flow of robust-flow rests, from 1,000 random starts (ten minutes)"
 	@echo "make study-real-impacts  balls, strikes, taps: what the rigid model predicts, and what MuJoCo finds (some minutes)"
-	@echo "make study-robustness  where each controller helps, and which targets it keeps: variations of each experiment (some hours; goes on where it was)"
+	@echo "make study-robustness  where each controller helps, and which targets it keeps: variations of each experiment (about ten minutes; goes on where it was)"
 	@echo "make study-scan     what decides along the redundancy of an arm and of a humanoid, as a picture"
 	@echo "make study-controller  the controller in C against the one in Python: equal answers, growth, times of a tick (an hour; PART=equality, growth or times: times alone need a quiet machine, 4 minutes)"
 	@echo "make study-sweep    what sweeps survive (killed workers and parents, MPI, Slurm jobs), and what they cost"

@@ -25,8 +25,8 @@ from impact_posture.simulation.throw import FLIGHT, Throw
 
 # Time when controllers begin to prepare, after the first reaction of sensors and motors, s.
 BRACE = 0.1
-# Ticks from one message about the progress to the next.
-_TELL = 100
+# Ticks from one message about the progress to the next, in Python and in C, where a call takes as long as ten ticks.
+_TELL, _TELL_IN_C = 100, 1000
 # Times that differ by less are equal, because sums of periods are not exact, s.
 _SAME = 1e-9
 
@@ -111,10 +111,10 @@ class _Loop:
 
     def ticks(self, n: int, reference: Reference | None = None) -> Array:
         """Take ticks, fewer if the state runs away (:attr:`away`).  Return ``‖ν‖`` after each."""
-        take = self._in_python if self.compiled is None else self._in_c
+        take, most = (self._in_python, _TELL) if self.compiled is None else (self._in_c, _TELL_IN_C)
         speeds = np.zeros(0)
         while speeds.size < n:
-            asked = min(_TELL, n - speeds.size)
+            asked = min(most, n - speeds.size)
             found = take(asked, reference)
             speeds = np.concatenate([speeds, found])
             if found.size < asked:
@@ -147,17 +147,19 @@ class _Loop:
         assert self.compiled is not None  # noqa: S101 (the caller has asked)
         distances: list[float] = []
         levels: list[float] = []
+        # A driver with a level of its own knows it before the tick.
+        own = type(self.driver).level is not Driver.level
 
         def lead(t: float) -> None:
             point = None if reference is None else reference.at(t)
             self.driver.lead(t, point)
             distances.append(0.0 if point is None else point.distance)
-            levels.append(self.driver.level)
+            if own:
+                levels.append(self.driver.level)
 
         found = self.compiled.take(n, lead)
         done = found.level.size
-        # A driver with a level of its own knows it before the tick.
-        level = found.level if type(self.driver).level is Driver.level else np.array(levels[:done])
+        level = np.array(levels[:done]) if own else found.level
         self.recorder.take_all(found.trace, found.rotor_speed, level, found.status, np.array(distances[:done]))
         return np.asarray(np.linalg.norm(found.trace.v, axis=1))
 
