@@ -16,7 +16,6 @@ from numpy.typing import ArrayLike, NDArray
 
 from impact_posture.dynamics.chart import Chart
 from impact_posture.dynamics.joints import joint_quaternion, joint_spin, joint_transform
-from impact_posture.dynamics.model_parameters import ModelParameters
 from impact_posture.dynamics.repeated_limbs import RepeatedLimbs
 from impact_posture.dynamics.spatial import constant, quaternion_product, transposed_times
 from impact_posture.robot.model_joints import finite_armature
@@ -67,7 +66,7 @@ class Kinematics:
         q: ca.SX,
         chart_x: ca.SX | None = None,
         extra_inertia: Mapping[int, NDArray[np.float64]] | None = None,
-        limbs: RepeatedLimbs | ModelParameters | None = None,
+        limbs: RepeatedLimbs | None = None,
     ) -> None:
         self.model, self.q = model, q
         self.chart = Chart(model)

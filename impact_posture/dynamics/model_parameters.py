@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable, Mapping
+from collections.abc import Callable
 from dataclasses import replace
 
 import casadi as ca
@@ -11,28 +11,22 @@ import pinocchio as pin
 from numpy.typing import ArrayLike
 
 from impact_posture.arrays import Array
-from impact_posture.dynamics.repeated_limbs import Place
+from impact_posture.dynamics.repeated_limbs import RepeatedLimbs
 from impact_posture.dynamics.spatial import constant, rounded
 from impact_posture.robot.model_joints import finite_armature
 from impact_posture.robot.robot import Robot
 
 
-class ModelParameters:
-    """The armature and the places of the joints on their links, as far as they are not zero.
-
-    It takes the place of :class:`~impact_posture.dynamics.repeated_limbs.RepeatedLimbs`, without limbs.
+class ModelParameters(RepeatedLimbs):
+    """The armature and the places of the joints on their links, as far as they are not zero, without repeated limbs.
 
     Attributes:
         symbol: The parameters, shape (n, 1) with n of at least one.
         values: Their values, shape (n,).
-        places: Places in repeated limbs, of which there are none.
-
-    Args:
-        model: The model.
     """
 
     def __init__(self, model: pin.Model) -> None:
-        self.places: Mapping[int, Place] = {}
+        self.groups, self.places, self.parameters = (), {}, {}
         numbers = _numbers(model)
         entries = np.concatenate([*numbers.values(), np.zeros(0)])
         self.values: Array = entries[entries != 0.0] if entries.any() else np.ones(1)
@@ -50,28 +44,15 @@ class ModelParameters:
         found = self._found.get((joint, tag))
         return constant(of(joint)) if found is None else found
 
-    def counterparts(self, joint: int) -> list[int]:
-        """Return the joint alone."""
-        return [joint]
-
-    def indicator(self, joint: int, of: int) -> ca.SX:
-        """Return one for the joint itself, else zero."""
-        return ca.SX(float(joint == of))
-
 
 def without_parameters(robot: Robot) -> Robot:
     """Return the robot with ones for the numbers that are parameters: robots with the same code are equal there."""
-    model = robot.model.copy()
-    for (joint, tag), values in _numbers(model).items():
-        ones = np.where(values == 0.0, 0.0, 1.0)
-        if tag == "translation":
-            model.jointPlacements[joint].translation = ones
-        else:
-            locked = np.isinf(robot.model.armature)
-            at = slice(model.idx_vs[joint], model.idx_vs[joint] + model.nvs[joint])
-            armature = np.array(model.armature)
-            armature[at] = np.where(locked[at], np.inf, ones)
-            model.armature = armature
+    model, armature = robot.model.copy(), np.array(robot.model.armature)
+    finite = np.isfinite(armature)
+    armature[finite] = rounded(armature[finite]) != 0.0
+    model.armature = armature
+    for placement in model.jointPlacements:
+        placement.translation = (rounded(placement.translation) != 0.0).astype(float)
     return replace(robot, model=model, stated_armature=None)
 
 

@@ -14,7 +14,6 @@ import numpy as np
 import pinocchio as pin
 
 from impact_posture.arrays import Array, null_space
-from impact_posture.dynamics.model_parameters import ModelParameters
 from impact_posture.dynamics.numeric import Numeric
 from impact_posture.dynamics.repeated_limbs import RepeatedLimbs
 from impact_posture.dynamics.tree import ByJoint, PointOnLink, Response, Tree, Wrench
@@ -38,9 +37,7 @@ class ImpactKernel:
             (:class:`~impact_posture.dynamics.repeated_limbs.RepeatedLimbs`).
     """
 
-    def __init__(
-        self, case: ImpactCase, q: ca.SX, n: ca.SX, limbs: RepeatedLimbs | ModelParameters | None = None
-    ) -> None:
+    def __init__(self, case: ImpactCase, q: ca.SX, n: ca.SX, limbs: RepeatedLimbs | None = None) -> None:
         self.case, self.metric, self.q, self.n = case, case.metric, q, n
         extra = support_inertia(case.robot, case.supports, case.compliance)
         self.tree = Tree(case.robot.model, q, extra_inertia=extra, limbs=limbs)
