@@ -103,6 +103,9 @@ class Equilibrium:
             (weight * self.load.lower[self._free], weight * self.load.upper[self._free]),
         ]
         self.lower, self.upper = (np.concatenate(parts) for parts in zip(*ends, strict=True))
+        # What was found last, because one posture is looked at several times.
+        self._even: tuple[bytes, float] | None = None
+        self._found: tuple[bytes, Distribution] | None = None
 
     def _affine(self, load: Array, by_force: Array) -> tuple[Array, Array, Array, Array]:
         """``A, b, S, c`` of the balance ``A z + b`` and the shares ``S z + c``, from the load at ``z = 0``."""
@@ -122,6 +125,13 @@ class Equilibrium:
 
         This proves without a linear program that the posture can be held.  It says nothing if they do not.
         """
+        key = q.tobytes()
+        if self._even is None or self._even[0] != key:
+            self._even = key, self._even_share(q)
+        return self._even[1] <= 1 - room
+
+    def _even_share(self, q: Array) -> float:
+        """Return the largest share of a limit at forces near even ones; infinite if they do not balance the base."""
         still = self.load.torque(q, np.zeros(self.load.count), by_posture=False)
         A, b, S, c = self._affine(still.value, still.by_force)
         lower, upper = self.load.lower, self.load.upper
@@ -130,10 +140,16 @@ class Equilibrium:
         even[self._free] = (lower + upper)[self._free] / 2
         z = even - np.linalg.pinv(A) @ (A @ even + b) if len(A) else even
         balanced = np.abs(A @ z + b).max(initial=0.0) < _TIED and (z[pushing] >= 0).all()
-        return bool(balanced and np.abs(S @ z + c).max(initial=0.0) <= 1 - room)
+        return float(np.abs(S @ z + c).max(initial=0.0)) if balanced else np.inf
 
     def distribute(self, q: Array) -> Distribution:
         """Return the forces that balance the base with the least largest share, or with the least imbalance."""
+        key = q.tobytes()
+        if self._found is None or self._found[0] != key:
+            self._found = key, self._distribute(q)
+        return self._found[1]
+
+    def _distribute(self, q: Array) -> Distribution:
         count = self.load.count
         still = self.load.torque(q, np.zeros(count))
         A, b, S, c = self._affine(still.value, still.by_force)

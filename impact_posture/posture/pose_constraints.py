@@ -78,6 +78,8 @@ class HeldOrientation(ExpressionConstraint):
         right = np.eye(3) if axis is None else _rotation_to(axis)
         left = target @ right
         self.parameters = np.concatenate([_coefficients(left.T), _coefficients(right)])
+        self._left, self._right = pin.Quaternion(self.parameters[:4]), pin.Quaternion(self.parameters[4:8])
+        self._axes = self._right.matrix()
         self.lower = self.upper = np.zeros(width)
 
     def describe(self) -> str:
@@ -91,12 +93,15 @@ class HeldOrientation(ExpressionConstraint):
 
     def evaluate(self, model: Numeric) -> tuple[Array, Array]:
         """See :class:`Constraint`."""
-        right, rotation = pin.Quaternion(self.parameters[4:8]), model.placement(self.point).rotation
-        error = (pin.Quaternion(self.parameters[:4]) * pin.Quaternion(rotation) * right).coeffs()
-        x, y, z, w = error if error[3] >= 0 else -error
+        return self.error(model.placement(self.point).rotation, model.jacobian(self.point)[3:])
+
+    def error(self, rotation: Array, jacobian: Array) -> tuple[Array, Array]:
+        """Return the rows and their tangent Jacobian for a frame with an angular Jacobian, shape (3, nv)."""
+        error = (self._left * pin.Quaternion(rotation) * self._right).coeffs()
+        x, y, z, w = (error if error[3] >= 0 else -error).tolist()
         # d(2 vec(Q)) = (w I + [v]×) ω in the axes that Q turns: those of the frame times `right`.
-        turn = np.array([[w, -z, y], [z, w, -x], [-y, x, w]])[: self.rows] @ (rotation @ right.matrix()).T
-        return 2 * np.array([x, y, z])[: self.rows], turn @ model.jacobian(self.point)[3:]
+        turn = np.array([[w, -z, y], [z, w, -x], [-y, x, w]])[: self.rows] @ (rotation @ self._axes).T
+        return 2 * np.array([x, y, z])[: self.rows], turn @ jacobian
 
     def pose_error(self, value: Array) -> tuple[float, float]:
         """See :class:`Constraint`; the rows are ``2 sin(θ/2)`` along the axis of a rotation by θ, or of a tilt."""
@@ -108,7 +113,7 @@ class HeldPose(ExpressionConstraint):
 
     def __init__(self, name: str, point: PointOnLink, target: pin.SE3, axis: Array | None = None) -> None:
         self.name = name
-        self._parts: tuple[ExpressionConstraint, ...] = (
+        self._parts = (
             HeldPosition(name, point, target.translation),
             HeldOrientation(name, point, target.rotation, axis),
         )
@@ -126,8 +131,13 @@ class HeldPose(ExpressionConstraint):
 
     def evaluate(self, model: Numeric) -> tuple[Array, Array]:
         """See :class:`Constraint`."""
-        values, jacobians = zip(*(p.evaluate(model) for p in self._parts), strict=True)
-        return np.concatenate(values), np.vstack(jacobians)
+        position, orientation = self._parts
+        at, jacobian = model.placement(position.point), model.jacobian(position.point)
+        turned, turning = orientation.error(at.rotation, jacobian[3:])
+        return (
+            np.concatenate([at.translation - position.parameters, turned]),
+            np.concatenate([jacobian[:3], turning]),
+        )
 
     def pose_error(self, value: Array) -> tuple[float, float]:
         """See :class:`Constraint`."""

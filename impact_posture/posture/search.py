@@ -19,7 +19,7 @@ from impact_posture.posture.nlp import SLACK_PRICE, PostureNLP, SolveRecord, bui
 from impact_posture.posture.posture_distance import distance
 from impact_posture.posture.problem import PostureProblem
 from impact_posture.posture.program_rows import ProgramRows
-from impact_posture.posture.starts import ATTEMPTS, CANDIDATES, FEASIBLE, feasible_start
+from impact_posture.posture.starts import ATTEMPTS, CANDIDATES, FEASIBLE, Projector, feasible_start
 from impact_posture.processes import fork_map
 
 Progress = Callable[[int, int], None]
@@ -124,6 +124,8 @@ class Search:
     ) -> None:
         self.problem, self._known, self._scale, self._seed, self._compile = problem, known, scale, seed, compile
         self.nlp = build_nlp(problem, compile=compile, starts=starts, rows=rows)
+        # The constraints that starts are pulled onto do not grow.
+        self._projector = Projector(problem)
         self._starts, self._finish_all = starts, finish_all or starts * self._unknowns <= _SMALL
         self.build_time_s = self.nlp.build_time_s
         # A run goes on from where it ended without what the program lacked.
@@ -216,6 +218,7 @@ class Search:
     def _run(self, index: int, *, last: bool) -> Run:
         """Run one start; an end that the program lacks parts for is certified in its last round only."""
         nlp, scale, problem = self.nlp, self._scale, self.problem
+        numeric = nlp.program.numeric
         trapped, start = self._trapped[index], self._ends.get(index)
         if start is None and index < len(self._known) and trapped <= 1:
             start = self._known[index]
@@ -224,13 +227,13 @@ class Search:
             other = index + max(trapped - 1, 0) * self._starts
             count = ATTEMPTS if trapped else CANDIDATES
             # Near the first start, because the given posture may be far from all that satisfies the constraints.
-            start = feasible_start(problem, other, self._seed, count, self._known[0])
+            start = feasible_start(problem, other, self._seed, count, self._known[0], self._projector)
         if start is None:
             return Run()
         price = HIGH_PRICE if trapped else SLACK_PRICE
         try:
             record, certificate = nlp.solve(start, scale=scale, price=price), None
-            lacks = record.converged and problem.grown([record.q]) is not problem
+            lacks = record.converged and problem.grown([record.q], numeric) is not problem
             if last or not lacks:
                 record, certificate = run_start(nlp, start, scale, price, record)
             objective = problem.objective.value(record.q)
@@ -240,7 +243,7 @@ class Search:
         minimized = objective / scale
         if problem.requirements.regularization:
             minimized += problem.requirements.regularization * distance(nlp.chart, record.q, problem.given) ** 2
-        anew = record.converged and not lacks and trapped < _ANEW and not feasible(problem, record.q)
+        anew = record.converged and not lacks and trapped < _ANEW and not feasible(problem, record.q, numeric)
         return Run(start, record, objective, minimized, certificate, lacks, trapped=anew)
 
 
@@ -248,7 +251,13 @@ def _near(one: Array, other: Array) -> bool:
     return bool(np.abs(one - other).max() < _SAME)
 
 
-def feasible(problem: PostureProblem, q: Array) -> bool:
-    """Return whether ``q`` satisfies all constraints, those of the program and others."""
-    violations = problem.violations(Numeric(problem.robot.model).at(q))
+def feasible(problem: PostureProblem, q: Array, numeric: Numeric | None = None) -> bool:
+    """Return whether ``q`` satisfies all constraints, those of the program and others.
+
+    Args:
+        problem: The posture problem.
+        q: The posture, shape (nq,).
+        numeric: The model, if the caller has it; it is moved.
+    """
+    violations = problem.violations((numeric or Numeric(problem.robot.model)).at(q))
     return all(float(np.abs(excess).max(initial=0.0)) <= FEASIBLE for excess in violations)

@@ -121,6 +121,8 @@ class Separator:
         self._x, self._y = a.hull.vertices, np.zeros((0, 3)) if b.hull is None else b.hull.vertices
         self.gap = a.hull.radius + (0.0 if b.hull is None else b.hull.radius) + margin
         self.margin = margin
+        # The last distance, because one posture is looked at several times, and the placements that it is for.
+        self._latest: tuple[pin.SE3, pin.SE3, tuple[float, Array, Array]] | None = None
 
     @property
     def count(self) -> int:
@@ -199,6 +201,11 @@ class Separator:
     def distance(self, model: Numeric) -> tuple[float, Array, Array]:
         """Return the distance less the clearance, the normal from b to a, the closest points (2, 3), in the world."""
         at_a, at_b = self.a.placement(model), self.b.placement(model)
+        if self._latest is None or self._latest[0] != at_a or self._latest[1] != at_b:
+            self._latest = at_a, at_b, self._distance(at_a, at_b)
+        return self._latest[2]
+
+    def _distance(self, at_a: pin.SE3, at_b: pin.SE3) -> tuple[float, Array, Array]:
         if self.b.hull is not None:
             assert self.a.hull is not None  # noqa: S101 (narrows a type)
             found = separation(self.a.hull, at_a, self.b.hull, at_b)

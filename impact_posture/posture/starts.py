@@ -51,42 +51,43 @@ class Projector:
         self.numeric = Numeric(problem.robot.model)
         self.chart = Chart.of(problem.robot.model)
         self._held = held_rows(problem.robot, problem.requirements.hold).sum(axis=0) > 0
-        self._in_v, self._in_x = self.chart.bounded
+        self._in_v, self._in_x = (np.array(places, dtype=int) for places in self.chart.bounded)
+        self._low, self._high = problem.lower[self._in_x], problem.upper[self._in_x]
+        self._projected = [(c, c.equality) for c in problem.constraints if c.projected]
+        self._free = [c for c in problem.constraints if not c.projected]
 
     def clip(self, q: Array) -> Array:
         """Clamp ``q`` to the bounds."""
-        x = np.clip(self.chart.to_x(q), self.problem.lower, self.problem.upper)
-        return self.chart.to_q(x)
+        x = np.maximum(self.chart.to_x(q), self.problem.lower)
+        return self.chart.to_q(np.minimum(x, self.problem.upper))
 
     def residual(self, q: Array) -> tuple[Array, Array]:
         """Return the violations of all rows at ``q``, zero where an inequality holds, and their Jacobian."""
         self.numeric.at(q)
         values, jacobians = [np.zeros(0)], [np.zeros((0, self.problem.robot.nv))]
-        for constraint in self.problem.constraints:
-            if not constraint.projected:
-                continue
+        for constraint, equality in self._projected:
             value, jacobian = constraint.evaluate(self.numeric)
-            violation = constraint.excess(value)
+            violation = value - constraint.lower if equality else constraint.excess(value)
             values.append(violation)
-            if not constraint.equality:
+            if not equality:
                 jacobian = np.where((violation != 0)[:, None], jacobian, 0.0)
             jacobians.append(jacobian)
-        return np.concatenate(values), np.vstack(jacobians)
+        return np.concatenate(values), np.concatenate(jacobians)
 
     def outside(self, q: Array) -> float:
         """Return the violation of the constraints that are not projected, summed."""
         self.numeric.at(q)
-        free = [c for c in self.problem.constraints if not c.projected]
-        return float(sum(np.abs(c.excess(c.value(self.numeric))).sum() for c in free))
+        return float(sum(np.abs(c.excess(c.value(self.numeric))).sum() for c in self._free))
 
     def project(self, q: Array, tolerance: float = 1e-9) -> Projection:
         """Pull ``q`` onto the constraints.  The result may still violate them."""
         q = self.clip(q)
         value, jacobian = self.residual(q)
-        damping, norms = 1e-3, list[float]()
+        damping, norms, one = 1e-3, list[float](), np.eye(len(value))
         for _ in range(_STEPS):
             size = float(np.abs(value).max(initial=0.0))
-            norms.append(float(np.linalg.norm(value)))
+            squared = float(value @ value)
+            norms.append(squared**0.5)
             stuck = len(norms) > _PATIENCE and norms[-1] > 0.8 * norms[-1 - _PATIENCE]
             if size < tolerance or damping > 1e6 or stuck:
                 break
@@ -95,11 +96,11 @@ class Projector:
             gram = free @ free.T
             # Rows may repeat others (two frames on one link), so the damping must not fall below rounding.
             damped = damping * min(1.0, size) + _ROUNDING * max(1.0, float(np.trace(gram)))
-            step = -free.T @ np.linalg.solve(gram + damped * np.eye(len(gram)), value)
-            step *= min(1.0, 1.0 / max(np.abs(step).max(), 1e-12))
+            step = -free.T @ np.linalg.solve(gram + damped * one, value)
+            step *= min(1.0, 1.0 / max(float(np.abs(step).max()), 1e-12))
             candidate = self.clip(pin.integrate(self.problem.robot.model, q, step))
             new_value, new_jacobian = self.residual(candidate)
-            if new_value @ new_value < value @ value:
+            if new_value @ new_value < squared:
                 q, value, jacobian, damping = candidate, new_value, new_jacobian, max(damping / 5, 1e-9)
             else:
                 damping = max(damping * 10, 1e-6)
@@ -108,15 +109,20 @@ class Projector:
     def _blocked(self, q: Array, direction: Array) -> NDArray[np.bool_]:
         """Joints on a limit that the descent direction would violate."""
         x, along = self.chart.to_x(q)[self._in_x], direction[self._in_v]
-        at_low = (x <= self.problem.lower[self._in_x] + 1e-12) & (along < 0)
-        at_high = (x >= self.problem.upper[self._in_x] - 1e-12) & (along > 0)
+        at_low = (x <= self._low + 1e-12) & (along < 0)
+        at_high = (x >= self._high - 1e-12) & (along > 0)
         blocked = np.zeros(self.problem.robot.nv, dtype=bool)
         blocked[self._in_v] = at_low | at_high
         return blocked
 
 
 def feasible_start(
-    problem: PostureProblem, index: int, seed: int, candidates: int = CANDIDATES, around: Array | None = None
+    problem: PostureProblem,
+    index: int,
+    seed: int,
+    candidates: int = CANDIDATES,
+    around: Array | None = None,
+    projector: Projector | None = None,
 ) -> Array | None:
     """Return the ``index``-th feasible start of a seed; ``None`` if no attempt reached the constraints.
 
@@ -124,8 +130,16 @@ def feasible_start(
     posture, and even starts anywhere within the limits.  Near starts reach the constraints more often, far starts
     find other optima.  Of ``candidates`` postures that reach them, the first counts that satisfies the constraints
     without projection too, else the one that violates them least.
+
+    Args:
+        problem: The posture problem.
+        index: Index of the start.
+        seed: Seed of all starts.
+        candidates: Most postures on the projected constraints to choose from.
+        around: Posture that odd starts are near, shape (nq,).
+        projector: That of the problem, or of one that grew into it, if the caller has it.
     """
-    projector, around = Projector(problem), problem.given if around is None else around
+    projector, around = projector or Projector(problem), problem.given if around is None else around
     if index == 0:
         found = projector.project(problem.given)
         return found.q if found.violation <= FEASIBLE else None
