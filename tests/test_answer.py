@@ -180,7 +180,7 @@ def test_an_answer_of_a_small_robot_imports_no_part_of_scipy() -> None:
     assert (done.stdout, done.stderr) == ("[]\n", "")
 
 
-@pytest.mark.parametrize(("robot", "normal"), [("borinot", (0, 0, 1)), ("tiago", (-1, 0, 0))])
+@pytest.mark.parametrize(("robot", "normal"), [("bolt", (0, 0, 1)), ("tiago", (-1, 0, 0))])
 def test_starts_that_share_a_run_end_where_their_own_runs_would(
     robot: str, normal: tuple[float, float, float], monkeypatch: pytest.MonkeyPatch
 ) -> None:

@@ -126,10 +126,13 @@ class Search:
         self.nlp = build_nlp(problem, compile=compile, starts=starts, rows=rows)
         # The constraints that starts are pulled onto do not grow.
         self._projector = Projector(problem)
-        self._starts, self._finish_all = starts, finish_all or starts * self._unknowns <= _SMALL
+        self._small = starts * self._unknowns <= _SMALL
+        self._starts, self._finish_all = starts, finish_all or self._small
         self.build_time_s = self.nlp.build_time_s
         # A run goes on from where it ended without what the program lacked.
         self._ends: dict[int, Array] = {}
+        # Price of a meter of slack for starts that did not end in a trap.
+        self._price = SLACK_PRICE
         # Times that each start ended in a trap.
         self._trapped: Counter[int] = Counter()
 
@@ -159,6 +162,9 @@ class Search:
             # A run without all rows goes through bodies and may end between them.  With the rows and a higher price
             # it keeps what its start satisfies.
             trapped = {k for k in batch if runs[k].trapped and k not in last}
+            if len(runs) < starts and trapped == {*range(_FIRST)}:
+                # Passing through something is worth more than the price to each of the first starts.
+                self._price = HIGH_PRICE
             self._trapped.update(trapped)
             self._ends = {k: q for k, q in (self._ends | lacking).items() if k not in trapped}
             waiting = sorted({*waiting} - {*batch} | {*lacking, *trapped})
@@ -182,6 +188,9 @@ class Search:
         if not runs and self.problem.grows:
             # What the first starts lack is what most others will.
             return waiting[:_FIRST]
+        if self._small and len(runs) == _FIRST and waiting[0] < _FIRST:
+            # A little more in a small program costs the others less than another run.
+            return [k for k in waiting if k < _FIRST]
         if self._finish_all or not all(k in runs for k in waiting):
             return waiting
         count = max(_BATCH // self._unknowns, 1)
@@ -230,7 +239,7 @@ class Search:
             start = feasible_start(problem, other, self._seed, count, self._known[0], self._projector)
         if start is None:
             return Run()
-        price = HIGH_PRICE if trapped else SLACK_PRICE
+        price = HIGH_PRICE if trapped else self._price
         try:
             record, certificate = nlp.solve(start, scale=scale, price=price), None
             lacks = record.converged and problem.grown([record.q], numeric) is not problem
