@@ -74,10 +74,15 @@ class Projector:
             jacobians.append(jacobian)
         return np.concatenate(values), np.concatenate(jacobians)
 
-    def outside(self, q: Array) -> float:
-        """Return the violation of the constraints that are not projected, summed."""
+    def outside(self, q: Array, most: float = np.inf) -> float:
+        """Return the violation of the constraints that are not projected, summed until it reaches ``most``."""
         self.numeric.at(q)
-        return float(sum(np.abs(c.excess(c.value(self.numeric))).sum() for c in self._free))
+        total = 0.0
+        for constraint in self._free:
+            if total >= most:
+                break
+            total += float(np.abs(constraint.excess(constraint.value(self.numeric))).sum())
+        return total
 
     def project(self, q: Array, tolerance: float = 1e-9) -> Projection:
         """Pull ``q`` onto the constraints.  The result may still violate them."""
@@ -149,7 +154,7 @@ def feasible_start(
         near = around if (index + attempt) % 2 else None
         found = projector.project(random_posture(problem, projector.chart, rng, near))
         if found.violation <= FEASIBLE:
-            outside, tried = projector.outside(found.q), tried + 1
+            outside, tried = projector.outside(found.q, least), tried + 1
             if outside < least:
                 best, least = found.q, outside
             if least <= FEASIBLE or tried == candidates:
