@@ -16,7 +16,7 @@ from impact_posture.arrays import Array
 from impact_posture.dynamics.mjcf import import_mujoco
 from impact_posture.errors import CompilerError
 from impact_posture.libraries import build_library, cache_folder, is_cached, library_path, load_library, source_key
-from impact_posture.simulation.actuator_command import Trace
+from impact_posture.simulation.actuator_command import ActuatorCommand, Trace
 from impact_posture.simulation.compiled_tick import CompiledTick
 from impact_posture.simulation.scenario_objective import locked
 from impact_posture.simulation.world import World, unwarned
@@ -58,6 +58,15 @@ class CompiledWorld:
         self._struct = type("World", (ctypes.Structure,), {"_fields_": fields})()
         self._give(**_functions(), **tick.library.addresses(), **contents)
 
+    def _command(self) -> ActuatorCommand:
+        """Return the last command of the controller."""
+        own = self._struct
+        u, speed = (
+            np.array((ctypes.c_double * size).from_address(at))
+            for at, size in ((own.u, own.rotors + own.joints), (own.rotor_speed, own.rotors))
+        )
+        return ActuatorCommand(u[own.rotors :], speed)
+
     def _give(self, **values: Any) -> None:
         for name, value in values.items():
             if isinstance(value, int | float):
@@ -73,6 +82,9 @@ class CompiledWorld:
         Args:
             n: Number of ticks.
             lead: Moves the targets of the controller before a tick at a time, s.
+
+        Raises:
+            InputError: A command is not finite, or has a torque without end.
         """
         world, own = self._world, self._struct
         led, leads = self._tick.plan([(own.steps + k * own.count) * own.timestep for k in range(n)], lead)
@@ -85,6 +97,8 @@ class CompiledWorld:
         with unwarned():
             done = int(self._run(ctypes.byref(own), n))
         world.go_to(own.steps)
+        if own.refused:
+            world.checked(self._command())
         row: dict[str, Any] = {name: self._arrays[f"row_{name}"][:done] for name in shapes}
         row["stopped"], row["touching"] = world.stopped(row["qpos"]), row["touching"] > 0
         row["began"] = np.where(np.isinf(row["began"]), np.nan, row["began"])

@@ -183,7 +183,7 @@ class World:
             SimulationDiverged: The state ran away.
         """
         self._check_ready()
-        speed, self._torques = self._checked(command)
+        speed, self._torques = self.checked(command)
         self._data.ctrl[self._count :] = self._torques
         if not count:
             return
@@ -293,7 +293,7 @@ class World:
                  "nq": q.size, "nv": v.size, "nqpos": self._data.qpos.size, "floating": int(floating),
                  "q_at": places[0], "v_at": places[1], "true_q": q, "true_v": v, "joints": self._effort.size,
                  "effort": self._effort, "torque": self._torques, "steps": self._steps, "count": count,
-                 "timestep": self.timestep, "rotors": 0, "vibrates": 0,
+                 "timestep": self.timestep, "rotors": 0, "vibrates": 0, "refused": 0,
                  "felt": -1 if self._felt is None else self._felt}  # fmt: skip
         parts = [self._filter.in_c(), self._noise.in_c(), self._log.in_c()]
         parts += [] if self._rotors is None else [self._rotors.in_c(count)]
@@ -308,7 +308,12 @@ class World:
         """Take note that C has gone to a number of steps since the reset."""
         self._steps = steps
 
-    def _checked(self, command: Command | ActuatorCommand) -> tuple[Array, Array]:
+    def checked(self, command: Command | ActuatorCommand) -> tuple[Array, Array]:
+        """Return rotor speeds, shape (rotors,), and joint torques, shape (joints,), within their limits.
+
+        Raises:
+            InputError: The command has other sizes, is not finite, or has a torque without end.
+        """
         speed, torque = np.asarray(command.rotor_speed, dtype=float), np.asarray(command.torque, dtype=float)
         if speed.shape != (self._count,) or torque.shape != self._effort.shape:
             sizes = f"give {self._count} and {self._effort.size}"

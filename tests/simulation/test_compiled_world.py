@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import ctypes
 from collections.abc import Iterator
 from dataclasses import replace
 from pathlib import Path
@@ -10,7 +11,9 @@ from typing import Any
 import numpy as np
 import pytest
 
+from impact_posture.errors import InputError
 from impact_posture.simulation import compiled_world, run
+from impact_posture.simulation.actuator_command import ActuatorCommand
 from impact_posture.simulation.controller_factory import ControllerFactory
 from impact_posture.simulation.metrics import measure
 from impact_posture.simulation.outcome import judge
@@ -103,6 +106,38 @@ def test_a_state_that_runs_away_ends_the_run_in_c() -> None:
     assert found.away is not None and found.waited < found.away < found.waited + 0.1
     assert found.series.t[-1] < found.away
     assert ("control lost", found.away) in [(e.status, e.time) for e in judge(made.setup, found)]
+
+
+@pytest.mark.parametrize("name", ["solo8-push", "aerial-vertical"])
+@pytest.mark.parametrize("wrong", [np.nan, np.inf, 1e300, 1e7])
+def test_a_command_is_refused_or_cut_as_in_python(name: str, wrong: float) -> None:
+    made = in_c(factory(name))
+    driver, world = made.driver("nominal"), made.setup.world
+    answer = driver.reset(made.setup.q)
+    assert driver.compiled is not None
+    out, rotors = driver.compiled.library._out, answer.rotor_speed.size
+    for where in ("u", "rotor_speed") if rotors else ("u",):
+        world.reset(made.setup.q, rotor_speed=answer.rotor_speed)
+        loop = compiled_world.compiled_world(world, driver.compiled, 1)
+        assert loop is not None
+
+        @ctypes.CFUNCTYPE(ctypes.c_int, *6 * (ctypes.c_void_p,))
+        def tick(*_: object, where: str = where) -> int:
+            out["u"][:], out["rotor_speed"][:rotors] = answer.u, answer.rotor_speed
+            out[where][-1] = wrong
+            return 0
+
+        loop._struct.tick = ctypes.cast(tick, ctypes.c_void_p)
+        tick(*6 * [None])
+        command = ActuatorCommand(out["u"][rotors:], out["rotor_speed"][:rotors])
+        if np.isfinite(wrong):
+            world.checked(command)
+            assert loop.take(1, lambda t: None).level.size == 1
+            continue
+        with pytest.raises(InputError, match="command: is not finite"):
+            world.checked(command)
+        with pytest.raises(InputError, match="command: is not finite"):
+            loop.take(1, lambda t: None)
 
 
 def test_python_takes_the_ticks_where_c_cannot(monkeypatch: pytest.MonkeyPatch, tmp_path: Path) -> None:

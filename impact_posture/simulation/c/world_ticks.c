@@ -30,6 +30,8 @@ typedef struct {
   /* The robot: places of q and v in qpos and qvel, the true state. */
   int nq, nv, nqpos, floating, joints, *q_at, *v_at;
   double *true_q, *true_v, *effort, *torque, runaway;
+  /* Whether the last command was refused, as World.checked does. */
+  int refused;
 
   /* Time: physics steps in all and in a tick, s. */
   int steps, count;
@@ -316,7 +318,28 @@ static void advance(world *w)
   }
 }
 
-/* Take ticks.  Return how many were taken before the state ran away or a command had no end. */
+/* Whether the command is not finite, or has an endless torque within the effort limits. */
+static int refuses(const world *w)
+{
+  int k;
+  if (dot(w->u, w->u, w->rotors + w->joints) + dot(w->rotor_speed, w->rotor_speed, w->rotors) < w->runaway) {
+    return 0;
+  }
+  for (k = 0; k < w->rotors; ++k) {
+    if (!isfinite(w->rotor_speed[k])) {
+      return 1;
+    }
+  }
+  for (k = 0; k < w->joints; ++k) {
+    const double u = w->u[w->rotors + k], torque = fmin(fabs(u), w->effort[k]);
+    if (!isfinite(u) || !(torque * torque < w->runaway)) {
+      return 1;
+    }
+  }
+  return 0;
+}
+
+/* Take ticks.  Return how many were taken before the state ran away or a command was refused. */
 int world_ticks(world *w, int ticks)
 {
   const int targets = w->targets;
@@ -329,7 +352,7 @@ int world_ticks(world *w, int ticks)
     }
     measure(w, w->noise + tick * w->noises);
     w->tick(w->context, w->steps * w->timestep, w->q, w->v, w->felt >= 0 ? w->force : NULL, w->command);
-    if (!(dot(w->u, w->u, w->rotors + w->joints) + dot(w->rotor_speed, w->rotor_speed, w->rotors) < w->runaway)) {
+    if ((w->refused = refuses(w))) {
       break;
     }
     for (k = 0; k < w->shapes; ++k) {
