@@ -22,6 +22,7 @@ from impact_posture.libraries import library_path, load_library
 from impact_posture.toolchain import find_compiler
 from impact_posture.tsid.controller import Controller, Status
 from impact_posture.tsid.impact_robust import gradient_of
+from impact_posture.tsid.reference_flow import PHASES
 from impact_posture.tsid.reference_flow_posture import ReferenceFlowPosture
 from impact_posture.tsid.task_formulation import arm_formulation
 from tests.exported_controller import KINDS, exported, impact_of
@@ -104,10 +105,27 @@ def test_a_step_that_is_not_found_leaves_the_reference_at_rest_and_is_counted() 
     theirs.parameters["flow_path"][:] = 1e300
     theirs.reset(r.posture(), np.zeros(r.nv))
     theirs.brace()
-    for k in range(25):
+    for k in range(5 * len(PHASES)):
         assert theirs.tick(k * DT, r.posture(), np.zeros(r.nv)).status is Status.SOLVED
     assert theirs.flow_failures == 5
     np.testing.assert_allclose(theirs.target, r.posture(), atol=1e-6)
+
+
+def test_a_flow_that_moves_ends_a_fade_of_the_posture() -> None:
+    r = robot("panda")
+    ours, posture, theirs = both("panda", ELBOW)
+    at_rest, other = np.zeros(r.nv), np.array(r.posture())
+    other[0] += 0.3
+    posture.brace()
+    theirs.brace()
+    for k in range(60):
+        if k == 30:
+            posture.move_to(other, 0.1)
+            theirs.move_to(other, 0.1)
+        answers = [controller.tick(k * DT, r.posture(), at_rest) for controller in (ours, theirs)]
+        np.testing.assert_allclose(theirs.target, posture.target, rtol=0, atol=1e-9)
+        np.testing.assert_allclose(answers[1].u, answers[0].u, rtol=0, atol=1e-7)
+    assert 1e-4 < np.abs(theirs.target - r.posture()).max() < 0.1
 
 
 def test_a_clock_that_stands_still_moves_nothing() -> None:

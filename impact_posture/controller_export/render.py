@@ -163,7 +163,7 @@ def render(
         "RELAXATION": _relaxation_room(n, m, 1 + sizes["LEVELS"]),
     }
     held, rows = sizes["HELD"], sizes["FLOW_ROWS"]
-    more["FLOW_WORK"] = max(2 * held * held + held * nv, 2 * nv * nv, rows * nv)
+    more["FLOW_WORK"] = max(3 * held * held + held * nv, 2 * nv * nv, rows * nv)
     room = {name: max(1, value) for name, value in (sizes | more).items()}
     n += 1
     solver = 8 * (n * (n + 1) // 2 + 12 * n + 2 * max(bounds, 2 * rows)) + 2048

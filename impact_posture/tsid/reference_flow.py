@@ -44,8 +44,9 @@ class ReferenceFlow:
     """Saddle-free Newton flow of a reference posture ``q_r`` in the null space of contacts and tasks.
 
     ``H`` and ``∇H`` are evaluated at ``q_r`` and not at the measured posture, so that noise, tracking errors and the
-    impact itself do not enter.  An update takes as many ticks as :data:`PHASES` has parts.  All memory is in arrays
-    whose sizes do not change, except for the basis of the redundancy.
+    impact itself do not enter.  An update takes as many ticks as :data:`PHASES` has parts.  The controller in C
+    spreads the work of a part over the empty ticks beside it.  All memory is in arrays whose sizes do not change,
+    except for the basis of the redundancy.
 
     Contacts stay at their places, and tasks of the strict levels and weighted tasks at their targets.  Only the
     ``led`` tasks (center of mass, base orientation) follow the flow.  Joints that ``robot.toml`` holds do not move.
@@ -156,14 +157,20 @@ class ReferenceFlow:
     # ---- the parts of an update, one a tick -----------------------------------------------------------------------
 
     def _look(self) -> None:
-        """Evaluate objective, constraints and limits at ``q_r``, and learn from the way since the last look."""
+        """Evaluate objective, constraints and limits, and learn from the way since the last look.
+
+        The motion changes in a later tick.  The look is at where ``q_r`` will be then.
+        """
         state, direction = self._state, self.direction
-        way, slope, shares = pin.difference(self._model, self.q, self._here), self._slope, self.shares
-        self._place(self.q)
-        self._here[:] = self.q
+        dt = self._elapsed / _SINCE
+        way = _UNTIL * dt * (self.velocity + (_UNTIL + 1) / 2 * dt * self.acceleration)
+        ahead = pin.integrate(self._model, self.q, way)
+        way, slope, shares = pin.difference(self._model, ahead, self._here), self._slope, self.shares
+        self._place(ahead)
+        self._here[:] = ahead
         for task, rows in zip(self._held, self._places, strict=True):
             self.error[rows] = task.error(state)
-        self.value, self._slope = self._evaluate(self.q)
+        self.value, self._slope = self._evaluate(ahead)
         self._space = space = Redundancy.of(self._J)
         self._multipliers = space.inverse.T @ self._slope
         self._reduced = self._slope - self._J.T @ self._multipliers
@@ -216,7 +223,7 @@ class ReferenceFlow:
             self._wanted[:] = self.direction.towards(self._space.basis, way)
             self._visited += int(self.direction.failures == before and np.abs(self._wanted).max() < _REACHED)
             return
-        offset = pin.difference(self._model, self._first, self.q)
+        offset = pin.difference(self._model, self._first, self._here)
         self._wanted[:] = self.direction.newton(self._space, self._slope, self.value / self.start, offset, self.error)
         gain, least = self.direction.gain, self.options.epsilon
         self.resting = gain < (4 * least if self.resting else least)
@@ -233,7 +240,8 @@ class ReferenceFlow:
             return
         error = np.abs(pin.difference(self._model, self._measured, self.q)[self._base :]).max(initial=0.0)
         fastest = options.speed * max(1.0 - error / options.tracking, 0.0)
-        fastest = min(fastest, options.acceleration * max(self._deadline - self._clock, 0.0))
+        # The speed is that at the next change, and rest comes with the one after.
+        fastest = min(fastest, options.acceleration * max(self._deadline - self._clock - 2 * period, 0.0))
         # Half of the acceleration stops a flow of speed √(a δ) on its step δ.  Below v/2, the speed is 2 a/v δ.
         least = options.speed**2 / (4 * options.acceleration)
         wanted = self._wanted * math.sqrt(options.acceleration / max(np.abs(self._wanted).max(), least))
@@ -277,7 +285,7 @@ class ReferenceFlow:
         return limited(-flow, most)
 
     def _coast(self) -> None:
-        """Do nothing, so that a tick of the flow takes less than twice a nominal one in the mean."""
+        """Do nothing, because the controller in C spreads the parts over these ticks, so that none takes long."""
 
     def _place(self, q: Array) -> None:
         """Evaluate the Jacobian of the constraints at a posture."""
@@ -308,8 +316,14 @@ def mixed_directions(nv: int) -> Array:
 
 PHASES: tuple[Callable[[ReferenceFlow], None], ...] = (
     ReferenceFlow._look,
+    *3 * (ReferenceFlow._coast,),
+    ReferenceFlow._govern,
     ReferenceFlow._probe,
-    ReferenceFlow._direct,
+    *5 * (ReferenceFlow._coast,),
     ReferenceFlow._govern,
     ReferenceFlow._coast,
+    ReferenceFlow._direct,
 )
+# Ticks from a look to the change of the motion, and those since the last change that the flow has counted at a look.
+_UNTIL = PHASES.index(ReferenceFlow._govern)
+_SINCE = PHASES[::-1].index(ReferenceFlow._govern) + 1

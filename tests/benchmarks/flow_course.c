@@ -36,13 +36,13 @@ int course_begin(course_context *c, const course_params *p, const double *q, int
   return refused;
 }
 
-/* Let the flow go for at most so many updates of five ticks of dt, s, a row of out each, or until it rests.  Return the
+/* Let the flow go for at most so many updates, each of ticks of dt, s, a row of out each, or until it rests.  Return the
  * updates. */
 int course_run(course_context *c, double dt, int updates, double *out)
 {
   int k, i;
   for (k = 0; k < updates; ++k) {
-    for (i = 0; i < 5; ++i) {
+    for (i = 0; i < COURSE_FLOW_PHASES; ++i) {
       memcpy(c->q, c->flow.q, sizeof c->q);
       course_flow_lead(c, dt);
     }

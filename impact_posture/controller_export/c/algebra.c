@@ -204,7 +204,7 @@ static void ip_integrate(const double *q, const double *v, double step, double *
 /* Upper R with A = R'R in place of the upper triangle of the n x n matrix A; 0 where A is not positive definite. */
 static int ip_cholesky(double *A, int n)
 {
-  int i, j, k;
+  int i, k;
   for (i = 0; i < n; ++i) {
     double *row = A + i * n, s;
     /* Not "<=", which is false for a NaN. */
@@ -214,11 +214,7 @@ static int ip_cholesky(double *A, int n)
     s = 1.0 / sqrt(row[i]);
     ip_scaled(row + i, s, row + i, n - i);
     for (k = i + 1; k < n; ++k) {
-      const double c = row[k];
-      double *below = A + k * n;
-      for (j = k; j < n; ++j) {
-        below[j] -= c * row[j];
-      }
+      ip_add(A + k * (n + 1), -row[k], row + k, n - k);
     }
   }
   return 1;

@@ -1,27 +1,42 @@
 /* Eigenvalues of a symmetric matrix: Householder's tridiagonal form, then QR steps with Wilkinson's shift (Golub and Van
  * Loan, Matrix Computations, sections 8.3.1 and 8.3.3). */
 
-/* Take the reflection I - beta v v' of the entries from k + 1 on out of A, and put it into the rows of V. */
-static void ip_reflect(double *A, double *V, int n, int k, const double *v, double beta)
+/* Bring the symmetric n x n matrix A to V A V', tridiagonal on and above its diagonal. */
+static void ip_tridiagonal(double *A, double *V, int n)
 {
-  double p[IP_LARGEST], half = 0.0;
-  int i, j;
-  for (i = k + 1; i < n; ++i) {
-    p[i] = beta * ip_dot(A + i * n + k + 1, v + k + 1, n - k - 1);
-    half += 0.5 * beta * p[i] * v[i];
-  }
-  ip_add(p + k + 1, -half, v + k + 1, n - k - 1);
-  for (i = k + 1; i < n; ++i) {
-    for (j = k + 1; j < n; ++j) {
-      A[i * n + j] -= v[i] * p[j] + p[i] * v[j];
+  double p[IP_LARGEST], beta[IP_LARGEST], e[IP_LARGEST];
+  int i, k;
+  for (k = 0; k + 1 < n; ++k) {
+    /* The reflection I - beta v v' of the entries from k + 1 on. */
+    double *v = A + k * n, size = sqrt(ip_dot(v + k + 1, v + k + 1, n - k - 1)), half = 0.0;
+    beta[k] = 0.0;
+    e[k] = v[k + 1];
+    if (k + 2 == n || !(size > 0.0)) {
+      continue;
+    }
+    e[k] = v[k + 1] < 0.0 ? size : -size;
+    v[k + 1] -= e[k];
+    beta[k] = 1.0 / (size * fabs(v[k + 1]));
+    for (i = k + 1; i < n; ++i) {
+      p[i] = beta[k] * ip_dot(A + i * n + k + 1, v + k + 1, n - k - 1);
+      half += 0.5 * beta[k] * p[i] * v[i];
+    }
+    ip_add(p + k + 1, -half, v + k + 1, n - k - 1);
+    for (i = k + 1; i < n; ++i) {
+      ip_add(A + i * n + k + 1, -v[i], p + k + 1, n - k - 1);
+      ip_add(A + i * n + k + 1, -p[i], v + k + 1, n - k - 1);
     }
   }
-  memset(p, 0, sizeof p);
-  for (i = k + 1; i < n; ++i) {
-    ip_add(p, beta * v[i], V + i * n, n);
+  for (i = 0; i < n * n; ++i) {
+    V[i] = i % (n + 1) == 0 ? 1.0 : 0.0;
   }
-  for (i = k + 1; i < n; ++i) {
-    ip_add(V + i * n, -v[i], p, n);
+  for (k = n - 2; k >= 0; --k) {
+    const double *v = A + k * n + k + 1;
+    for (i = k + 1; i < n; ++i) {
+      double *row = V + i * n + k + 1;
+      ip_add(row, -beta[k] * ip_dot(row, v, n - k - 1), v, n - k - 1);
+    }
+    A[k * n + k + 1] = e[k];
   }
 }
 
@@ -33,7 +48,7 @@ static void ip_qr_step(double *d, double *e, double *V, int n, int low, int high
   double x = d[low] - shift, z = e[low];
   int k;
   for (k = low; k < high; ++k) {
-    const double r = hypot(x, z), c = r > 0.0 ? x / r : 1.0, s = r > 0.0 ? z / r : 0.0;
+    const double r = sqrt(x * x + z * z), c = r > 0.0 ? x / r : 1.0, s = r > 0.0 ? z / r : 0.0;
     const double a = d[k], b = e[k], g = d[k + 1];
     if (k > low) {
       e[k - 1] = r;
@@ -50,35 +65,17 @@ static void ip_qr_step(double *d, double *e, double *V, int n, int low, int high
   }
 }
 
-/* Eigenvalues of the symmetric n x n matrix A on its diagonal, and eigenvectors in the rows of V.  Return the largest
- * eigenvalue, or 0 if all are negative. */
-static double ip_eigen(double *A, double *V, int n)
+/* Bring a tridiagonal matrix nearer to its eigenvalues on the diagonal, by about so many rotations, or there. */
+static void ip_diagonalize(double *A, double *V, int n, int rotations)
 {
-  double v[IP_LARGEST], e[IP_LARGEST], d[IP_LARGEST], most = 0.0;
-  int i, k, high, step;
-  for (i = 0; i < n * n; ++i) {
-    V[i] = i % (n + 1) == 0 ? 1.0 : 0.0;
+  double e[IP_LARGEST], d[IP_LARGEST];
+  int k, high, low;
+  for (k = 0; k < n; ++k) {
+    d[k] = A[k * (n + 1)];
+    e[k] = k + 1 < n ? A[k * n + k + 1] : 0.0;
   }
-  for (k = 0; k + 1 < n; ++k) {
-    double size = 0.0;
-    for (i = k + 1; i < n; ++i) {
-      v[i] = A[i * n + k];
-      size += v[i] * v[i];
-    }
-    size = sqrt(size);
-    e[k] = v[k + 1] < 0.0 ? size : -size;
-    v[k + 1] -= e[k];
-    if (k + 2 < n && size > 0.0) {
-      ip_reflect(A, V, n, k, v, 1.0 / (size * fabs(v[k + 1])));
-    } else {
-      e[k] = A[(k + 1) * n + k];
-    }
-  }
-  for (i = 0; i < n; ++i) {
-    d[i] = A[i * (n + 1)];
-  }
-  for (high = n - 1, step = 0; high > 0 && step < 30 * n; ++step) {
-    int low = high;
+  for (high = n - 1; high > 0 && rotations > 0;) {
+    low = high;
     while (low > 0 && fabs(e[low - 1]) > 1e-16 * (fabs(d[low - 1]) + fabs(d[low]))) {
       --low;
     }
@@ -86,11 +83,27 @@ static double ip_eigen(double *A, double *V, int n)
       --high;
     } else {
       ip_qr_step(d, e, V, n, low, high);
+      rotations -= high - low;
     }
   }
-  for (i = 0; i < n; ++i) {
-    A[i * (n + 1)] = d[i];
-    most = fmax(most, d[i]);
+  for (k = 0; k < n; ++k) {
+    A[k * (n + 1)] = d[k];
+    if (k + 1 < n) {
+      A[k * n + k + 1] = e[k];
+    }
+  }
+}
+
+/* Eigenvalues of the symmetric n x n matrix A on its diagonal, and eigenvectors in the rows of V.  Return the largest
+ * eigenvalue, or 0 if all are negative. */
+static double ip_eigen(double *A, double *V, int n)
+{
+  double most = 0.0;
+  int k;
+  ip_tridiagonal(A, V, n);
+  ip_diagonalize(A, V, n, 30 * n * n);
+  for (k = 0; k < n; ++k) {
+    most = fmax(most, A[k * (n + 1)]);
   }
   return most;
 }

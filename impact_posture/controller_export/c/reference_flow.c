@@ -1,6 +1,11 @@
 /* The reference flow: a posture q_r that goes down the gradient on contacts and tasks, limited in speed and acceleration,
- * before the posture task follows it.  An update takes five ticks, the last of them empty.  The formulas are in
- * impact_posture/tsid/reference_flow.py. */
+ * before the posture task follows it.  An update takes IP_FLOW_PHASES ticks, so that none takes much longer than without it.
+ * The formulas are in impact_posture/tsid/reference_flow.py. */
+
+/* Ticks of an update, from its look to the change of the motion, and from the last change to the look. */
+#define IP_FLOW_PHASES 14
+#define IP_FLOW_UNTIL 4
+#define IP_FLOW_SINCE 3
 
 /* Step of the differences, rad; step below which a posture on the way is reached, rad (m). */
 #define IP_PROBE 1e-4
@@ -74,20 +79,31 @@ static void ip_flow_reduce(const ip_flow *f, double (*J)[IP_NV], double *slope)
   }
 }
 
-/* Evaluate objective, constraints and limits at q_r, and learn from the way since the last look. */
+/* Evaluate objective and constraints where q_r is when the governor changes its motion. */
 static void ip_flow_look(ip_context *c)
 {
   ip_flow *f = &c->flow;
-  double way[IP_NV], slope[IP_NV], shares[IP_CONTROLS], length;
-  int i;
-  ip_difference(f->q, f->here, way);
-  length = sqrt(ip_dot(way, way, IP_NV));
-  memcpy(slope, f->slope, sizeof slope);
-  memcpy(shares, f->shares, sizeof shares);
-  memcpy(f->here, f->q, sizeof f->here);
-  ip_flow_place(c, f->q, f->error);
-  ip_flow_evaluate(f, f->q, f->slope);
+  double ahead[IP_NQ], way[IP_NV];
+  const double dt = f->elapsed / IP_FLOW_SINCE;
+  memcpy(way, f->velocity, sizeof way);
+  ip_add(way, (IP_FLOW_UNTIL + 1) / 2.0 * dt, f->acceleration, IP_NV);
+  ip_integrate(f->q, way, IP_FLOW_UNTIL * dt, ahead);
+  ip_difference(ahead, f->here, f->z);
+  f->length = sqrt(ip_dot(f->z, f->z, IP_NV));
+  memcpy(f->here, ahead, sizeof f->here);
+  memcpy(f->there, f->slope, sizeof f->there);
+  ip_flow_place(c, f->here, f->error);
+  ip_flow_evaluate(f, f->here, f->slope);
   f->value = f->found;
+  memcpy(f->shared, f->shares, sizeof f->shared);
+  ip_flow_shares(c, f->shares);
+}
+
+/* Find the redundancy, and the gradient on it. */
+static void ip_flow_split(ip_context *c)
+{
+  ip_flow *f = &c->flow;
+  int i;
   ip_flow_space(f);
   memset(f->multiplier, 0, sizeof f->multiplier);
   for (i = 0; i < IP_NV; ++i) {
@@ -95,15 +111,21 @@ static void ip_flow_look(ip_context *c)
   }
   memcpy(f->reduced, f->slope, sizeof f->reduced);
   ip_flow_reduce(f, f->J, f->reduced);
-  ip_flow_shares(c, f->shares);
+}
+
+/* Learn from the way since the last look, find the limits, and prepare the return. */
+static void ip_flow_limit(ip_context *c)
+{
+  ip_flow *f = &c->flow;
   /* A look that failed has no slope. */
-  if (length > IP_MOVED && !f->failed && ip_dot(slope, slope, IP_NV) > 0.0) {
-    ip_flow_reduce(f, f->before, slope);
-    ip_scaled(way, 1.0 / length, way, IP_NV);
-    ip_flow_learn(f, way, length, slope, shares);
+  if (f->length > IP_MOVED && !f->failed && ip_dot(f->there, f->there, IP_NV) > 0.0) {
+    ip_flow_reduce(f, f->before, f->there);
+    ip_scaled(f->z, 1.0 / f->length, f->z, IP_NV);
+    ip_flow_learn(f, f->there, f->shared);
   }
   memcpy(f->before, f->J, sizeof f->before);
   ip_flow_limits(c);
+  ip_flow_still(f);
 }
 
 /* A direction of the redundancy that does not depend on its basis: what is new of a fixed one. */
@@ -127,24 +149,72 @@ static void ip_flow_aim(ip_flow *f)
   }
 }
 
-/* Evaluate the reduced gradient and the static controls beside the posture of the last look, and learn. */
+/* Evaluate the gradient beside the posture of the last look. */
 static void ip_flow_probe(ip_context *c)
 {
   ip_flow *f = &c->flow;
-  double q[IP_NQ], slope[IP_NV], shares[IP_CONTROLS];
+  double q[IP_NQ];
+  f->length = 0.0;
   if (f->failed || !f->left) {
     return;
   }
   f->probed = f->next % f->left;
+  f->length = IP_PROBE;
   ip_flow_aim(f);
-  ip_integrate(f->here, f->seen[f->probed], IP_PROBE, q);
-  ip_flow_evaluate(f, q, slope);
+  memcpy(f->z, f->seen[f->probed], sizeof f->z);
+  ip_integrate(f->here, f->z, f->length, q);
+  ip_flow_evaluate(f, q, f->there);
   ip_flow_place(c, q, NULL);
-  ip_flow_reduce(f, f->J, slope);
+}
+
+/* Learn from it, by the gradient on the constraints and the static controls there. */
+static void ip_flow_compare(ip_context *c)
+{
+  ip_flow *f = &c->flow;
+  double shares[IP_CONTROLS];
+  if (f->failed || !(f->length > 0.0)) {
+    return;
+  }
+  ip_flow_reduce(f, f->J, f->there);
   ip_flow_shares(c, shares);
   if (!f->failed) {
-    ip_flow_learn(f, f->seen[f->probed], IP_PROBE, slope, shares);
+    ip_flow_learn(f, f->there, shares);
     ++f->next;
+  }
+}
+
+/* The parts of finding the eigenvalues of the curvature. */
+static void ip_flow_curve(ip_context *c)
+{
+  ip_flow *f = &c->flow;
+  if (ip_flow_descends(f)) {
+    ip_flow_bend(c);
+  }
+}
+
+static void ip_flow_tridiagonal(ip_context *c)
+{
+  ip_flow *f = &c->flow;
+  if (ip_flow_descends(f)) {
+    ip_tridiagonal(f->work, f->work + IP_NV * IP_NV, f->left);
+  }
+}
+
+static void ip_flow_diagonalize(ip_context *c)
+{
+  ip_flow *f = &c->flow;
+  if (ip_flow_descends(f)) {
+    ip_diagonalize(f->work, f->work + IP_NV * IP_NV, f->left, f->left * f->left / 2);
+  }
+}
+
+static void ip_flow_variables(ip_context *c)
+{
+  ip_flow *f = &c->flow;
+  if (ip_flow_descends(f)) {
+    ip_diagonalize(f->work, f->work + IP_NV * IP_NV, f->left, 30 * f->left * f->left);
+    ip_flow_turn(c);
+    ip_flow_rows(f);
   }
 }
 
@@ -159,18 +229,23 @@ static void ip_flow_direct(ip_context *c)
 #if IP_PATH
   if (f->visited < IP_PATH) {
     const int before = f->failures;
-    double way[IP_NV], slope[IP_NV];
-    int k;
+    double way[IP_NV];
+    int i, k;
     ip_difference(f->q, c->p.flow_path + f->visited * IP_NQ, way);
     for (k = 0; k < f->left; ++k) {
-      slope[k] = -ip_dot(f->Z[k], way, IP_NV);
+      f->steep[k] = -ip_dot(f->Z[k], way, IP_NV);
+      for (i = 0; i < IP_NV; ++i) {
+        f->way[i * f->left + k] = f->Z[k][i];
+      }
     }
-    ip_flow_solve(f, f->Z, slope, f->wanted);
+    ip_flow_rows(f);
+    ip_flow_solve(f);
     f->visited += f->failures == before && ip_largest(f->wanted, 0) < IP_REACHED;
     return;
   }
 #endif
-  ip_flow_newton(c);
+  ip_flow_solve(f);
+  f->gain *= ip_flow_root(f);
   f->resting = f->gain < (f->resting ? 4.0 : 1.0) * c->p.flow_epsilon[0];
   if (f->resting) {
     /* It brakes as it turns, downhill. */

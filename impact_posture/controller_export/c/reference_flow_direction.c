@@ -40,12 +40,12 @@ static void ip_flow_limits(ip_context *c)
   double position[3], J[3 * IP_NV], drift[3], coasting[IP_NV];
   int j, k, r;
   ip_scaled(f->flow, p->flow_speed[0] / p->flow_acceleration[0] / 2.0, coasting, IP_NV);
-  ip_center_of_mass(&f->m, f->q, position, J, drift);
+  ip_center_of_mass(&f->m, f->here, position, J, drift);
   for (r = 0; r < IP_FLOW_ROWS; ++r) {
     double high = INFINITY, low = -INFINITY, ahead = 0.0;
     if (r < IP_JOINTS_V) {
       const double upper = p->joint_upper[IP_BASE + r], lower = p->joint_lower[IP_BASE + r];
-      const double at = f->q[ip_limit_q[IP_BASE + r]], margin = fmin(p->flow_joint_margin[0], (upper - lower) / 8.0);
+      const double at = f->here[ip_limit_q[IP_BASE + r]], margin = fmin(p->flow_joint_margin[0], (upper - lower) / 8.0);
       ahead = coasting[IP_BASE + r];
       if (isfinite(upper) && isfinite(lower)) {
         high = upper - at - margin;
@@ -81,50 +81,64 @@ static void ip_flow_limits(ip_context *c)
   }
 }
 
-/* The step with the least |y|^2/2 + slope y, step = sum of y[k] way[k] over the redundancy; zero if the solver fails.
- * With u = y + slope this is the least |u|^2. */
-APART static void ip_flow_solve(ip_flow *f, double (*way)[IP_NV], const double *slope, double *step)
+/* The rows of a step along f->way, which has NV rows, in f->work, and their bounds. */
+static void ip_flow_rows(ip_flow *f)
+{
+  enum { N = IP_NV };
+  const double *way = f->way;
+  const int n = f->left;
+  int r;
+  for (r = 0; r < IP_FLOW_ROWS; ++r) {
+    const int k = r - IP_JOINTS_V;
+    double *row = f->work + r * n, length, shift;
+    if (k < 0) {
+      memcpy(row, way + (IP_BASE + r) * n, sizeof(double) * (size_t)n);
+    } else {
+      ip_combine(row, n, k < IP_PLACED ? f->row[k] : f->T[k - IP_PLACED], 1, way, n, N);
+    }
+    length = ip_dot(row, row, n);
+    shift = ip_dot(row, f->steep, n);
+    f->scaling[r] = length >= IP_NOTHING ? 1.0 / sqrt(length) : 1.0;
+    ip_scaled(row, f->scaling[r], row, n);
+    f->upper[r] = (f->high[r] + shift) * f->scaling[r];
+    f->lower[r] = (f->low[r] + shift) * f->scaling[r];
+    /* A row of zeros bounds nothing. */
+    f->sense[r] = length >= IP_NOTHING ? 0 : DAQP_IMMUTABLE;
+  }
+}
+
+/* The step with the least |y|^2/2 + f->steep y, f->wanted = f->way y, within the rows; zero if the solver fails.  With
+ * u = y + f->steep this is the least |u|^2. */
+APART static void ip_flow_solve(ip_flow *f)
 {
   enum { N = IP_NV, M = IP_FLOW_ROWS };
-  double u[N], upper[M], lower[M], scaling[M], *rows = f->work;
-  int sense[M], k, r;
+  const double *slope = f->steep;
+  double u[N], *step = f->wanted;
   const int n = f->left;
+  int k;
   ip_memory memory;
   DAQPWorkspace w;
-  memset(step, 0, sizeof(double) * IP_NV);
   f->gain = 0.0;
   if (n == 0) {
     return;
   }
-  for (r = 0; r < M; ++r) {
-    double *row = rows + r * n, length, shift;
-    for (k = 0; k < n; ++k) {
-      row[k] = ip_flow_along(f, r, way[k]);
-    }
-    length = ip_dot(row, row, n);
-    shift = ip_dot(row, slope, n);
-    scaling[r] = length >= IP_NOTHING ? 1.0 / sqrt(length) : 1.0;
-    ip_scaled(row, scaling[r], row, n);
-    upper[r] = (f->high[r] + shift) * scaling[r];
-    lower[r] = (f->low[r] + shift) * scaling[r];
-    /* A row of zeros bounds nothing. */
-    sense[r] = length >= IP_NOTHING ? 0 : DAQP_IMMUTABLE;
-  }
   ip_prepare(&memory, n, 0, M, u, &w);
-  w.M = rows;
-  w.dupper = upper;
-  w.dlower = lower;
-  w.scaling = scaling;
-  w.sense = sense;
+  w.M = f->work;
+  w.dupper = f->upper;
+  w.dlower = f->lower;
+  w.scaling = f->scaling;
+  w.sense = f->sense;
   if (daqp_reactivate_constraints(&w) < 0 || daqp_ldp(&w) <= 0 || w.state & DAQP_STATE_NOISE_FLOOR) {
     /* The last is an answer that violates bounds after circles. */
     ++f->failures;
     return;
   }
   for (k = 0; k < n; ++k) {
-    const double y = u[k] - slope[k];
-    f->gain -= slope[k] * y + y * y / 2.0;
-    ip_add(step, y, way[k], N);
+    u[k] -= slope[k];
+    f->gain -= slope[k] * u[k] + u[k] * u[k] / 2.0;
+  }
+  for (k = 0; k < N; ++k) {
+    step[k] = ip_dot(f->way + k * n, u, n);
   }
   if (!isfinite(ip_dot(step, step, N))) {
     ++f->failures;
@@ -133,24 +147,36 @@ APART static void ip_flow_solve(ip_flow *f, double (*way)[IP_NV], const double *
   }
 }
 
-/* The Newton step of 2 sqrt(H/H0) + rho/2 |q - q0|^2 into f->wanted, and the decrease that it predicts into f->gain. */
-static void ip_flow_newton(ip_context *c)
+/* Whether the flow takes Newton steps at this update. */
+static int ip_flow_descends(const ip_flow *f)
+{
+  return !f->failed && f->visited == IP_PATH;
+}
+
+/* The root of H/H0, or the least that counts. */
+static double ip_flow_root(const ip_flow *f)
+{
+  return sqrt(fmax(fabs(f->value / f->start), IP_LEAST_VALUE));
+}
+
+/* Curvature and slope of 2 sqrt(H/H0) + rho/2 |q - q0|^2 on the redundancy, into f->work and f->steep. */
+static void ip_flow_bend(ip_context *c)
 {
   enum { N = IP_NV };
   ip_flow *f = &c->flow;
-  double *C = f->work, *V = C + N * N, offset[N], full[N], slope[N], turned[N];
-  const double root = sqrt(fmax(fabs(f->value / f->start), IP_LEAST_VALUE)), rho = c->p.flow_rho[0];
+  double *C = f->work, offset[N], full[N];
+  const double root = ip_flow_root(f), rho = c->p.flow_rho[0];
   const int n = f->left;
   int i, j, k;
-  ip_difference(f->first, f->q, offset);
+  ip_difference(f->first, f->here, offset);
   for (i = 0; i < N; ++i) {
     full[i] = f->slope[i] / root + (i < IP_BASE ? 0.0 : rho * offset[i]);
   }
   for (k = 0; k < n; ++k) {
-    slope[k] = ip_dot(f->Z[k], full, N);
-    for (i = 0; i < N; ++i) {
-      offset[i] = ip_dot(f->B + i * N, f->Z[k], N) / root + (i < IP_BASE ? 0.0 : rho * f->Z[k][i]);
-    }
+    f->steep[k] = ip_dot(f->Z[k], full, N);
+    ip_combine(offset, N, f->Z[k], 1, f->B, N, N);
+    ip_scaled(offset, 1.0 / root, offset, N);
+    ip_add(offset + IP_BASE, rho, f->Z[k] + IP_BASE, N - IP_BASE);
     for (j = 0; j <= k; ++j) {
       C[k * n + j] = C[j * n + k] = ip_dot(f->Z[j], offset, N);
     }
@@ -158,27 +184,43 @@ static void ip_flow_newton(ip_context *c)
   for (i = 0; f->soft && i < IP_HELD; ++i) {
     /* Nearly dependent constraints are springs. */
     for (k = 0; k < n; ++k) {
-      slope[k] -= IP_SPRING * f->spring[i][k] * f->error[i];
+      f->steep[k] -= IP_SPRING * f->spring[i][k] * f->error[i];
       ip_add(C + k * n, IP_SPRING * f->spring[i][k], f->spring[i], n);
     }
   }
-  ip_eigen(C, V, n);
-  for (k = 0; k < n; ++k) {
-    const double ease = 1.0 / sqrt(fmax(fabs(C[k * (n + 1)]), c->p.flow_mu[0]));
-    memset(f->way[k], 0, sizeof f->way[k]);
-    for (j = 0; j < n; ++j) {
-      ip_add(f->way[k], ease * V[k * n + j], f->Z[j], N);
-    }
-    turned[k] = ease * ip_dot(V + k * n, slope, n);
-  }
-  ip_flow_solve(f, f->way, turned, f->wanted);
-  f->gain *= root;
 }
 
-/* Learn the curvature and the slope of the static controls along a unit vector z, from the reduced gradient and the static
- * controls at the end of a way, z times its length, that begins at the last look. */
-static void ip_flow_learn(ip_flow *f, const double *z, double length, const double *slope, const double *shares)
+/* The variables of the Newton step by the eigenvalues of the curvature: their ways, and the slope along them in place of
+ * f->steep. */
+static void ip_flow_turn(ip_context *c)
 {
+  enum { N = IP_NV };
+  ip_flow *f = &c->flow;
+  double *C = f->work, *V = C + N * N, slope[N];
+  const int n = f->left;
+  int i, k;
+  memcpy(slope, f->steep, sizeof slope);
+  for (k = 0; k < n; ++k) {
+    const double ease = 1.0 / sqrt(fmax(fabs(C[k * (n + 1)]), c->p.flow_mu[0]));
+    ip_scaled(V + k * n, ease, V + k * n, n);
+    f->steep[k] = ip_dot(V + k * n, slope, n);
+  }
+  /* V' in place of C. */
+  for (i = 0; i < n; ++i) {
+    for (k = 0; k < n; ++k) {
+      C[i * n + k] = V[k * n + i];
+    }
+  }
+  for (i = 0; i < N; ++i) {
+    ip_combine(f->way + i * n, n, f->Z[0] + i, N, C, n, n);
+  }
+}
+
+/* Learn the curvature and the slope of the static controls along f->z, from the reduced gradient and the static controls
+ * at the end of a way, f->z times its length, that begins at the last look. */
+static void ip_flow_learn(ip_flow *f, const double *slope, const double *shares)
+{
+  const double *z = f->z, length = f->length;
   double missing[IP_NV], along;
   int i;
   for (i = 0; i < IP_NV; ++i) {

@@ -5,8 +5,6 @@
 #define IP_STILL 1e-5
 /* What a limit may be missed by where the flow brakes, rad (m), or as a share. */
 #define IP_NEAR 1e-3
-/* Pull to zero of the base's share in a motion that the joints do not determine. */
-#define IP_IDLE 1e-9
 
 /* Shorten x so that no entry exceeds a number. */
 static void ip_shorten(double *x, double most)
@@ -17,7 +15,8 @@ static void ip_shorten(double *x, double most)
   }
 }
 
-/* The velocity that brings q_r back to contacts and tasks; of all such motions that of the base and not of the joints. */
+/* The velocity that brings q_r back to contacts and tasks; of all such motions that of the base and not of the joints, by
+ * ip_flow_still. */
 static void ip_flow_back(ip_context *c, double *back)
 {
   ip_flow *f = &c->flow;
@@ -33,20 +32,14 @@ static void ip_flow_back(ip_context *c, double *back)
     back[i] = ip_dot(f->inverse + i * IP_HELD, rate, IP_HELD);
   }
 #if IP_BASE
-  {
-    double *square = f->work, x[IP_NV];
-    const int n = f->left;
-    for (k = 0; k < n; ++k) {
-      for (i = 0; i <= k; ++i) {
-        square[i * n + k] = ip_dot(f->Z[i] + IP_BASE, f->Z[k] + IP_BASE, IP_JOINTS_V) + (i == k ? IP_IDLE : 0.0);
-      }
+  if (f->stills) {
+    double x[IP_NV];
+    for (k = 0; k < f->left; ++k) {
       x[k] = ip_dot(f->Z[k] + IP_BASE, back + IP_BASE, IP_JOINTS_V);
     }
-    if (n && ip_cholesky(square, n)) {
-      ip_solve_factor(square, n, x);
-      for (k = 0; k < n; ++k) {
-        ip_add(back, -x[k], f->Z[k], IP_NV);
-      }
+    ip_solve_factor(f->joints, f->left, x);
+    for (k = 0; k < f->left; ++k) {
+      ip_add(back, -x[k], f->Z[k], IP_NV);
     }
   }
 #endif
@@ -121,7 +114,8 @@ static void ip_flow_govern(ip_context *c)
   }
   ip_difference(c->q, f->q, e);
   fastest = p->flow_speed[0] * fmax(1.0 - ip_largest(e, IP_BASE) / p->flow_tracking[0], 0.0);
-  fastest = fmin(fastest, p->flow_acceleration[0] * fmax(f->deadline - f->clock, 0.0));
+  /* The speed is that at the next change, and rest comes with the one after. */
+  fastest = fmin(fastest, p->flow_acceleration[0] * fmax(f->deadline - f->clock - 2.0 * period, 0.0));
   fastest = f->on ? fastest : 0.0;
   ip_flow_back(c, back);
   ip_flow_project(f, f->flow);
@@ -180,8 +174,12 @@ static int ip_flow_begin(ip_context *c)
   }
   f->start = fabs(f->found);
   ip_flow_look(c);
+  ip_flow_decompose(c);
+  ip_flow_split(c);
+  ip_flow_limit(c);
   for (k = 0; k < f->left; ++k) {
     ip_flow_probe(c);
+    ip_flow_compare(c);
   }
   f->next = 0;
   c->value = f->value;
@@ -191,7 +189,12 @@ static int ip_flow_begin(ip_context *c)
 /* Advance the flow by dt seconds, and move the targets of the posture task and of the tasks that it leads. */
 static void ip_flow_lead(ip_context *c, double dt)
 {
-  static void (*const phases[])(ip_context *) = {ip_flow_look, ip_flow_probe, ip_flow_direct, ip_flow_govern};
+  /* The look, the governor (twice), the probe and the direction are in the ticks in which Python has them. */
+  static void (*const phases[IP_FLOW_PHASES])(ip_context *) = {
+    ip_flow_look,    ip_flow_decompose, ip_flow_split,       ip_flow_limit,       ip_flow_govern,      ip_flow_probe,
+    ip_flow_compare, ip_flow_curve,     ip_flow_tridiagonal, ip_flow_diagonalize, ip_flow_diagonalize, ip_flow_govern,
+    ip_flow_variables, ip_flow_direct,
+  };
   ip_flow *f = &c->flow;
   double position[3], J[3 * IP_NV], drift[3];
   int i, k;
@@ -200,16 +203,13 @@ static void ip_flow_lead(ip_context *c, double dt)
   }
   f->clock += dt;
   f->elapsed += dt;
-  k = f->phase;
-  f->phase = (f->phase + 1) % 5;
-  /* The last phase does nothing, as in Python. */
-  if (k < 4) {
-    phases[k](c);
-  }
+  phases[f->phase](c);
+  f->phase = (f->phase + 1) % IP_FLOW_PHASES;
   ip_add(f->velocity, dt, f->acceleration, IP_NV);
   ip_integrate(f->q, f->velocity, dt, f->q);
   c->value = f->value;
   memcpy(c->posture, f->q, sizeof c->posture);
+  c->blend = 1.0;
   memcpy(c->posture_velocity, f->velocity, sizeof c->posture_velocity);
   memcpy(c->posture_acceleration, f->acceleration, sizeof c->posture_acceleration);
   for (k = 0; k < IP_TASKS; ++k) {

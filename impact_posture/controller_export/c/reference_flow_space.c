@@ -10,6 +10,8 @@
 #define IP_TINY 1e-12
 /* Points nearer to a line than this lie on it, m. */
 #define IP_ON_LINE 1e-9
+/* Pull to zero of the base's share in a motion that the joints do not determine. */
+#define IP_IDLE 1e-9
 /* Least share of the half range of a control that counts as left. */
 #define IP_LEFT 0.1
 
@@ -33,62 +35,91 @@ static void ip_solve_factor(const double *R, int n, double *b)
 }
 #endif
 
-/* Decompose J = U S V': the inverse of the directions that it holds, and an orthonormal basis of the others, by the rows
- * of Z.  A Gram matrix is exact enough, because what counts has singular values above 2 %. */
-static void ip_flow_space(ip_flow *f)
+/* Eigenvectors of JJ' and its eigenvalues into f->work.  A Gram matrix is exact enough, because what counts has singular
+ * values above 2 %. */
+static void ip_flow_decompose(ip_context *c)
 {
   enum { N = IP_NV, M = IP_HELD };
-  double *G = f->work, *U = G + M * M, *held = U + M * M, beta[IP_LARGEST], most;
-  int i, j, k, rank = 0;
+  ip_flow *f = &c->flow;
+  double *G = f->work;
+  int i, j;
   for (i = 0; i < M; ++i) {
     for (j = 0; j <= i; ++j) {
       G[i * M + j] = G[j * M + i] = ip_dot(f->J[i], f->J[j], N);
     }
   }
-  most = ip_eigen(G, U, M);
-  memset(f->inverse, 0, sizeof f->inverse);
+  f->most = ip_eigen(G, G + M * M, M);
+}
+
+/* With J = U S V' of these: the inverse of the directions that J holds, and an orthonormal basis of the others, by the rows
+ * of Z. */
+static void ip_flow_space(ip_flow *f)
+{
+  enum { N = IP_NV, M = IP_HELD };
+  double *G = f->work, *U = G + M * M, *held = U + M * M, *T = held + M * N, beta, w[IP_LARGEST];
+  int i, k, rank = 0;
   for (k = 0; k < M && rank < N; ++k) {
     const double value = G[k * (M + 1)];
-    double *row = held + rank * N;
-    if (!(value > IP_SLACK * IP_SLACK * most)) {
-      continue;
+    if (value > IP_SLACK * IP_SLACK * f->most) {
+      ip_scaled(U + k * M, 1.0 / sqrt(value), U + rank * M, M);
+      ip_combine(held + rank * N, N, U + rank * M, 1, f->J[0], N, M);
+      ++rank;
     }
-    memset(row, 0, sizeof(double) * N);
-    for (j = 0; j < M; ++j) {
-      ip_add(row, U[k * M + j], f->J[j], N);
-    }
-    for (i = 0; i < N; ++i) {
-      ip_add(f->inverse + i * M, row[i] / value, U + k * M, M);
-      row[i] /= sqrt(value);
-    }
-    ++rank;
   }
-  /* Reflections that take these rows to the first entries take the other entries to Z. */
+  for (i = 0; i < N; ++i) {
+    ip_combine(f->inverse + i * M, M, held + i, N, U, M, rank);
+  }
+  /* Reflections that take these rows to the first entries take the other entries to Z.  Their product is I - V'RV, with
+   * their vectors in the rows of V and R upper triangular (Golub and Van Loan, section 5.1.7).  T is R'. */
   for (k = 0; k < rank; ++k) {
     double *v = held + k * N, size = sqrt(ip_dot(v + k, v + k, N - k));
     v[k] += v[k] < 0.0 ? -size : size;
-    beta[k] = 1.0 / (size * fabs(v[k]));
+    beta = 1.0 / (size * fabs(v[k]));
+    memset(v, 0, sizeof(double) * (size_t)k);
     for (i = k + 1; i < rank; ++i) {
       double *row = held + i * N + k;
-      ip_add(row, -beta[k] * ip_dot(v + k, row, N - k), v + k, N - k);
+      ip_add(row, -beta * ip_dot(v + k, row, N - k), v + k, N - k);
     }
+    for (i = 0; i < k; ++i) {
+      w[i] = -beta * ip_dot(held + i * N + k, v + k, N - k);
+    }
+    memset(T + k * M, 0, sizeof(double) * M);
+    for (i = 0; i < k; ++i) {
+      ip_add(T + k * M, w[i], T + i * M, k);
+    }
+    T[k * (M + 1)] = beta;
   }
   f->left = N - rank;
   f->soft = rank < (M < N ? M : N);
   for (i = 0; i < f->left; ++i) {
-    double *z = f->Z[i];
-    memset(z, 0, sizeof f->Z[i]);
-    z[rank + i] = 1.0;
-    for (k = rank - 1; k >= 0; --k) {
-      const double *v = held + k * N + k;
-      ip_add(z + k, -beta[k] * ip_dot(v, z + k, N - k), v, N - k);
-    }
+    ip_combine(w, rank, held + rank + i, N, T, M, rank);
+    ip_combine(f->Z[i], N, w, 1, held, N, rank);
+    ip_scaled(f->Z[i], -1.0, f->Z[i], N);
+    f->Z[i][rank + i] += 1.0;
   }
   for (i = 0; f->soft && i < M; ++i) {
     for (k = 0; k < f->left; ++k) {
       f->spring[i][k] = ip_dot(f->J[i], f->Z[k], N);
     }
   }
+}
+
+/* Factor of what the joints have of Z, by which the return does without them. */
+static void ip_flow_still(ip_flow *f)
+{
+#if IP_BASE
+  double *square = f->joints;
+  const int n = f->left;
+  int i, k;
+  for (k = 0; k < n; ++k) {
+    for (i = 0; i <= k; ++i) {
+      square[i * n + k] = ip_dot(f->Z[i] + IP_BASE, f->Z[k] + IP_BASE, IP_JOINTS_V) + (i == k ? IP_IDLE : 0.0);
+    }
+  }
+  f->stills = n && ip_cholesky(square, n);
+#else
+  (void)f;
+#endif
 }
 
 /* x = Z Z' x. */
