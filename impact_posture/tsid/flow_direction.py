@@ -36,7 +36,7 @@ class FlowOptions:
 
     Attributes:
         speed: Largest speed ``v`` of an entry of ``q_r``, rad/s (m/s).
-        acceleration: Largest acceleration ``a``, rad/s² (m/s²); half of it stops the flow on its step.
+        acceleration: Largest acceleration ``a``, rad/s² (m/s²); a third of it stops the flow on its step.
         rho: ρ, pull of the joints towards the start per rad², relative to ``H₀``.
         mu: μ, least curvature per rad², relative to ``H₀``.
         epsilon: ε, predicted decrease relative to ``H₀`` below which the flow rests; it resumes above 4 ε.
@@ -116,7 +116,7 @@ class FlowDirection:
     Attributes:
         B: Curvature of ``H/H₀`` on the constraints, shape (nv, nv).
         T: Slope of the static controls (:class:`StaticControls`), shape (controls, nv).
-        gain: Decrease of ``H/H₀`` that the last step predicts.
+        gain: Decrease of ``H/H₀`` that the last step predicts, at most that to first order.
         failures: Number of steps that the solver did not find.  They are zero.
     """
 
@@ -206,7 +206,8 @@ class FlowDirection:
         values, vectors = np.linalg.eigh(curvature)
         way = Z @ (vectors / np.sqrt(np.maximum(np.abs(values), self._mu)))
         step = self._solve(way, way.T @ (Z @ slope))
-        self.gain *= root
+        # The flow does not climb for what the pull or the springs win.
+        self.gain = min(self.gain * root, -float(gradient @ step))
         return step
 
     def towards(self, Z: Array, way: Array) -> Array:

@@ -242,9 +242,9 @@ class ReferenceFlow:
         fastest = options.speed * max(1.0 - error / options.tracking, 0.0)
         # The speed is that at the next change, and rest comes with the one after.
         fastest = min(fastest, options.acceleration * max(self._deadline - self._clock - 2 * period, 0.0))
-        # Half of the acceleration stops a flow of speed √(a δ) on its step δ.  Below v/2, the speed is 2 a/v δ.
-        least = options.speed**2 / (4 * options.acceleration)
-        wanted = self._wanted * math.sqrt(options.acceleration / max(np.abs(self._wanted).max(), least))
+        # A third of the acceleration stops a speed of √(2/3 a δ) on the step δ.  Below v/2, it is 4/3 a/v δ.
+        least = 3 * options.speed**2 / (8 * options.acceleration)
+        wanted = self._wanted * math.sqrt(2 * options.acceleration / 3 / max(np.abs(self._wanted).max(), least))
         if not self.on:
             fastest = 0.0
         rate = self.error / _RETURN

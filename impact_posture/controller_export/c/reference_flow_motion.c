@@ -69,9 +69,9 @@ static void ip_flow_change(const ip_flow *f, const ip_params *p, double period, 
 {
   enum { N = IP_NV, FAST = 0, BRAKE = 2 };
   const double a = p->flow_acceleration[0], most = a * period, time = ip_largest(f->flow, 0) / a;
-  /* Half of the acceleration stops a flow of speed sqrt(a d) on its step d.  Below v/2, the speed is 2 a/v d. */
-  const double least = p->flow_speed[0] * p->flow_speed[0] / (4.0 * a);
-  const double pace = sqrt(a / fmax(ip_largest(f->wanted, 0), least));
+  /* A third of the acceleration stops a speed of sqrt(2/3 a d) on the step d.  Below v/2, it is 4/3 a/v d. */
+  const double least = 3.0 * p->flow_speed[0] * p->flow_speed[0] / (8.0 * a);
+  const double pace = sqrt(2.0 * a / 3.0 / fmax(ip_largest(f->wanted, 0), least));
   double wanted[N], stop[N];
   int i, k;
   for (i = 0; i < N; ++i) {
