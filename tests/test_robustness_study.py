@@ -304,8 +304,8 @@ def test_what_goes_with_success_by_hand() -> None:
     # H fell in three; in the first of them the jump rose.
     assert wrong is records[0]
     text = "\n".join(page({AERIAL: records}, 0))
-    assert f"Worst motion: `{AERIAL}` number {first + 3}" in text
-    assert f"H fell most and the jump rose: `{AERIAL}` number {first}" in text
+    assert f"`robust` moves the robot most, compared with nominal, in `{AERIAL}` number {first + 3}" in text
+    assert f"The jump rises although H falls most in `{AERIAL}` number {first}" in text
     assert "motion −55 %, jump +25 %, √H 2 → 1, v√S 4 → 5" in text
 
 
@@ -313,15 +313,19 @@ def test_the_advice_follows_the_numbers() -> None:
     good = [made(AERIAL, k, {"robust": (0.9, 1.0), "posture": (0.4, 0.5)}) for k in range(4)]
     poor = [made(AERIAL, k, {"robust": (1.1, 1.0), "posture": "fell"}) for k in range(4)]
     advice = "\n".join(page({AERIAL: good}, 0)).partition(MARK)[0]
-    assert "take `posture`" in advice and "It keeps every target at 4 of 4 points" in advice
+    assert "Take `posture`" in advice and "It keeps every target at 4 of 4 points" in advice
     assert "−60 % at the median" in advice
     advice = "\n".join(page({AERIAL: poor}, 0)).partition(MARK)[0]
-    assert "nothing keeps its targets reliably" in advice and "take" not in advice
-    assert f"**What failed:** `posture` in `{AERIAL}` (fell at 4 of 4)." in advice
+    assert "No controller keeps its targets reliably" in advice and "Take" not in advice
+    assert f"**What failed:** in `{AERIAL}`, `posture` fell at 4 of 4 points." in advice
     live = [made(STANDING, k, {"robust": (0.7, 1.0), "stiff": (0.6, 1.0), "posture": (1.0, 1.0)}) for k in range(4)]
-    assert f"`{STANDING}` `stiff` −40 %, `posture` +0 %: stiffness" in "\n".join(page({STANDING: live}, 0))
+    text = "\n".join(page({STANDING: live}, 0))
+    assert (
+        f"In `{STANDING}` the median motion changes by −40 % with `stiff` and by +0 % with `posture`: the stiffness"
+        in text
+    )
     kept, missed = ("\n".join(envelope.page({AERIAL: records})) for records in (good, poor))
-    assert "take `posture`" in kept and "failed 4" in missed
+    assert "Take `posture`" in kept and "failed 4" in missed
     assert "0 variations one at a time and 4 random draws" in kept and "Its effect is not known" in kept
 
 

@@ -72,17 +72,22 @@ def choice(name: str, own: Sequence[Record]) -> str:
     found = [summarize(own, c) for c in COMPARED if c != NOMINAL]
     best = min(found, key=lambda s: (-s.kept, s.motion[1]))
     if best.kept < _OFTEN * best.count:
-        lead = f"nothing keeps its targets reliably. At best `{best.controller}` ({MEANING[best.controller]}) does"
+        lead = (
+            f"No controller keeps its targets reliably. The best is `{best.controller}` "
+            f"({MEANING[best.controller]}), which does"
+        )
     else:
-        lead = f"take `{best.controller}` ({MEANING[best.controller]}). It keeps every target"
+        lead = f"Take `{best.controller}` ({MEANING[best.controller]}). It keeps every target"
     words = (
         f"- **{name}**: {lead} at {best.kept} of {best.count} points. It changes the motion by "
         f"{percent(best.motion[1])} at the median (quartiles {percent(best.motion[0])} and {percent(best.motion[2])})"
     )
     if name.startswith("aerial"):
         words += f", with {best.force[0]:.1f} times the peak force"
-    others = "; ".join(f"`{s.controller}` {s.kept} ({percent(s.motion[1])})" for s in found if s is not best)
-    return f"{words}. The others keep every target at: {others}."
+    others = ", ".join(
+        f"`{s.controller}` at {s.kept} (motion {percent(s.motion[1])})" for s in found if s is not best
+    )
+    return f"{words}. Of the others, every target is kept by {others}."
 
 
 def _tuned(name: str, own: Sequence[Record]) -> str:
@@ -92,8 +97,8 @@ def _tuned(name: str, own: Sequence[Record]) -> str:
         named = [(r.draw.name, change(r, controller)) for r in tried(own) if r.draw.name]
         (_, shipped), *others = named
         # The variations of most interest come first; the table has all.
-        found = ", ".join(f"{words} {percent(value)}" for words, value in others[:_TOLD])
-        parts.append(f"`{controller}` changes the motion by {percent(shipped)} as shipped; {found}")
+        found = ", ".join(f"{percent(value)} ({words})" for words, value in others[:_TOLD])
+        parts.append(f"`{controller}` changes the motion by {percent(shipped)} as shipped, and otherwise by {found}")
     return f"- **How far {name} is tuned:** {'. '.join(parts)}."
 
 
@@ -101,13 +106,13 @@ def _counts(records: Records) -> Iterator[str]:
     counts = []
     for name, own in records.items():
         draws, lacking = sum(not r.draw.name for r in own), [r for r in own if not r.documents]
-        words = f"`{name}` {len(own) - draws} variations one at a time and {draws} random draws"
+        words = f"of `{name}` {len(own) - draws} variations one at a time and {draws} random draws"
         if lacking:
             reasons = ", ".join(f"{r.draw.name} ({r.rejected[-1]})" for r in lacking)
-            words += f", without what nominal itself does not get through: {reasons}"
+            words += f", without those that nominal itself does not get through: {reasons}"
         counts.append(words)
     planned = sum(len(VARIATIONS[name]) for name in records)
-    yield f"The points: {'; '.join(counts)}."
+    yield f"The points are {'; '.join(counts)}."
     yield f"Planned are {planned} variations in all, and 40 random draws of each scenario."
     yield (
         f"Shortened against the shipped scenarios: one seed of noise, {COUNT} contacts instead of 5, {DWELL:g} s "

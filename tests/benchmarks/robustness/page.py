@@ -70,10 +70,17 @@ def _stiffness(records: Records) -> list[str]:
     parts = []
     for name, own in records.items():
         term, stiff, posture = (summarize(own, c).motion[1] for c in ("robust", "stiff", "posture"))
-        what = "stiffness" if stiff < min(term, posture) else "posture" if posture < stiff / 2 else "both"
-        parts.append(f"`{name}` `stiff` {percent(stiff)}, `posture` {percent(posture)}: {what}")
-    lead = "**Posture or stiffness?** `stiff` has the spring of the term and no posture, `posture` has no spring"
-    return [f"- {lead} (median motion): {'; '.join(parts)}."] if parts else []
+        what = "the stiffness helps" if stiff < min(term, posture) else "both help"
+        what = "the posture helps" if posture < stiff / 2 else what
+        parts.append(
+            f"In `{name}` the median motion changes by {percent(stiff)} with `stiff` and by {percent(posture)} with "
+            f"`posture`: {what}."
+        )
+    lead = (
+        "**Posture or stiffness?** `stiff` keeps the start posture, as stiffly as the term; `posture` takes the "
+        "offline optimum, without that stiffness."
+    )
+    return [f"- {lead} {' '.join(parts)}"] if parts else []
 
 
 def _failed(records: Records) -> list[str]:
@@ -81,8 +88,8 @@ def _failed(records: Records) -> list[str]:
     for name, own in records.items():
         for controller in COMPARED:
             summary = summarize(own, controller)
-            words = ", ".join(f"{kind} at {n}" for kind, n in sorted(summary.failures.items()))
-            found += [f"`{controller}` in `{name}` ({words} of {summary.count})"] if words else []
+            words = " and ".join(f"{kind} at {n}" for kind, n in sorted(summary.failures.items()))
+            found += [f"in `{name}`, `{controller}` {words} of {summary.count} points"] if words else []
     return [f"- **What failed:** {'; '.join(found) or 'nothing'}."]
 
 
@@ -94,8 +101,9 @@ def _predictors(records: Records) -> list[str]:
     ranks = {name: ranks_of_jumps(own, tuple(PREDICTORS)) for name, own in aerial.items()}
     least = {key: min(found[key] for found in ranks.values()) for key in PREDICTORS}
     best = max(PREDICTORS, key=lambda key: -math.inf if math.isnan(least[key]) else least[key])
-    parts = "; ".join(
-        f"`{name}` {', '.join(f'{key} {_signed(found[key])}' for key in PREDICTORS)}" for name, found in ranks.items()
+    parts = " and ".join(
+        f"in `{name}` {', '.join(f'{_signed(found[key])} with {key}' for key in PREDICTORS)}"
+        for name, found in ranks.items()
     )
     every = [r for own in aerial.values() for r in tried(own)]
     names = [c for c in COMPARED if c != NOMINAL]
@@ -104,10 +112,11 @@ def _predictors(records: Records) -> list[str]:
         key: [agreement(every, names, key, metric)[0] for metric in ("peak_jump", "q_total_impact")]
         for key in PREDICTORS
     }
-    ways = ", ".join(f"{key} in {jump} and {motion}" for key, (jump, motion) in same.items())
+    ways = ", ".join(f"{key} for {jump} jumps and {motion} motions" for key, (jump, motion) in same.items())
     return [
-        f"- **{best} tells the jump of a contact best.** Rank correlation of the measured jump, over all points and "
-        f"controllers: {parts}. Against nominal, the jump and the motion of {count} runs went the way of: {ways}."
+        f"- **{best} predicts the jump of a contact best.** Over all points and controllers, the measured jump has "
+        f"the rank correlations {parts}. Whether a controller does better or worse than nominal, in {count} runs, "
+        f"is told rightly by {ways}."
     ]
 
 
@@ -180,27 +189,27 @@ def _splits(records: Records) -> Iterator[str]:
                 about = words.get(key, f"shoulder less than {_UNDER:g} m from under the center")
                 body.append([f"`{name}`", about, f"`{controller}`", _part(so), _part(otherwise)])
     if any(not r.draw.name for own in records.values() for r in own):
-        yield from ("Less motion in how many random draws, and the median change:", "")
+        yield from ("In how many random draws the motion is less, and its median change:", "")
         yield from table(["scenario", "split", "controller", "so", "otherwise"], body)
 
 
 def _counterexamples(records: Records) -> Iterator[str]:
     """By name, with what it takes to see them again."""
-    yield "Of `robust` against `nominal`; each can be run again with `python -m tests.benchmarks points"
-    yield from ("--only NAME --number NUMBER`.", "")
+    yield "These compare `robust` with `nominal`. `python -m tests.benchmarks points --only NAME --number NUMBER`"
+    yield from ("runs one of them again.", "")
     for name, every in records.items():
         own = tried(every)
         bad, wrong = worst(own, "robust"), misled(own, "robust")
         if bad is not None and change(bad, "robust") > 0:
-            yield "- Worst motion: " + _case(bad)
+            yield "- `robust` moves the robot most, compared with nominal, in " + _case(bad)
         else:
-            yield f"- `{name}`: `robust` moved the robot more than nominal in none."
+            yield f"- In `{name}`, `robust` moves the robot more than nominal at no point."
         if wrong is not None:
-            yield "- H fell most and the jump rose: " + _case(wrong)
+            yield "- The jump rises although H falls most in " + _case(wrong)
         else:
-            yield f"- `{name}`: in none did H fall and the jump rise."
+            yield f"- In `{name}`, the jump rises at no point where H falls."
         for record in [r for r in own if r.failure("robust")][:2]:
-            yield f"- Failed, {record.failure('robust')}: {_where(record)}."
+            yield f"- `robust` {record.failure('robust')} in {_where(record)}."
 
 
 def _where(record: Record) -> str:
@@ -219,19 +228,24 @@ def _case(record: Record) -> str:
         if before is not None and after is not None:
             label = "√H" if key == "H" else "v√S"
             numbers.append(f"{label} {before:.3g} → {after:.3g}")
-    return f"{_where(record)}: motion {motion}, {', '.join(numbers)}; `posture` {record.failure('posture') or other}."
+    return (
+        f"{_where(record)}: motion {motion}, {', '.join(numbers)}. With `posture`: "
+        f"{record.failure('posture') or f'motion {other}'}."
+    )
 
 
 def _drawn(records: Records, seed: int) -> Iterator[str]:
     """Ranges, what is fixed, what was drawn again."""
-    yield from (f"Seed {seed}; uniform, unless it says otherwise.", "", *range_table(list(records)), "")
-    yield "The pushes have no mounting to vary: where a push acts is the frame. The variations one at a time are"
-    yield "those of [the reproduction](reproduction.md)."
-    yield f"A robot that does not come to rest is pushed {PATIENCE:g} s late. Noise of seed 0; else as in the files."
+    yield f"The seed is {seed}. Distributions are uniform where the table does not say otherwise."
+    yield from ("", *range_table(list(records)), "")
+    yield "Pushes have no mounting to vary, because a push acts at the frame. The variations one at a time are"
+    yield "those of [the reproduction](reproduction.md). A robot that does not come to rest is pushed"
+    yield f"{PATIENCE:g} s late. All runs have the noise of seed 0. Everything else is as the scenarios' files say."
     yield ""
     yield f"A draw is taken if the motors hold its start with {100 * SHARE:.0f} % of their limits and the nominal"
     yield "controller gets through: it makes all contacts, or comes to rest before the push, does not fall, and is at"
-    yield f"a limit for at most {100 * SATURATED:.0f} % of the time outside the impact windows. Else, another draw:"
+    yield f"a limit for at most {100 * SATURATED:.0f} % of the time outside the impact windows. Otherwise another"
+    yield "draw takes its place."
     yield ""
     for name, own in records.items():
         drawn = [record for record in own if not record.draw.name]

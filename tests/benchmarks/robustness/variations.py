@@ -37,17 +37,17 @@ _COMMON = (
     Range("contact", 0.25, 4.0, "stiffness of the surface, times the scenario's", "log"),
 )
 _TOOL = (
-    Range("tilt", -5.0, 5.0, "tool off the normal, in the arm's plane, degrees"),
-    Range("roll", -3.0, 3.0, "tool off the normal, across, degrees"),
+    Range("tilt", -5.0, 5.0, "angle between tool and normal in the plane of the arm, degrees"),
+    Range("roll", -3.0, 3.0, "angle between tool and normal across that plane, degrees"),
 )
 _SLIP = Range("friction", 0.15, 0.6, "friction of the surface")
 
 
 def _pushed(stir: float) -> tuple[Range, ...]:
-    words = "start: size of random changes of the joints, rad, pulled back onto the feet's places"
+    words = "size of the random changes of the joints at the start, rad; the feet stay in place"
     return (
         Range("stir", 0.02, stir, words),
-        Range("force", 0.6, 1.4, "push, times the scenario's"),
+        Range("force", 0.6, 1.4, "force of the push, times the scenario's"),
         Range("stiffness", 0.5, 2.0, "gains of center of mass, base and posture, times the scenario's", "log"),
         Range("friction", 0.5, 1.0, "friction of the ground"),
         *_COMMON,
@@ -56,21 +56,23 @@ def _pushed(stir: float) -> tuple[Range, ...]:
 
 RANGES: dict[str, tuple[Range, ...]] = {
     "aerial-vertical": (
-        Range("elbow", 0.4, 1.2, "start: elbow's bend, rad; shoulder so that the tool looks at the floor"),
-        Range("fold", -1.0, 1.0, "start: which way the elbow bends", "sign"),
+        Range("elbow", 0.4, 1.2, "bend of the elbow at the start, rad; the shoulder turns the tool to the floor"),
+        Range("fold", -1.0, 1.0, "way in which the elbow bends at the start", "sign"),
         *_TOOL,
-        Range("speed", 0.25, 0.6, "approach, m/s"),
-        Range("x", -0.04, 0.10, "shoulder's pitch axis ahead of the base's center, m"),
-        Range("z", -0.10, -0.02, "shoulder's height over the base's center, m"),
+        Range("speed", 0.25, 0.6, "speed of approach, m/s"),
+        Range("x", -0.04, 0.10, "distance of the shoulder's pitch axis ahead of the base's center, m"),
+        Range("z", -0.10, -0.02, "height of the shoulder over the base's center, m"),
         _SLIP,
         *_COMMON,
     ),
     "aerial-lateral": (
-        Range("shoulder", -1.9, -0.6, "start: shoulder's pitch, rad; elbow so that the tool looks at the wall"),
+        Range(
+            "shoulder", -1.9, -0.6, "pitch of the shoulder at the start, rad; the elbow turns the tool to the wall"
+        ),
         *_TOOL,
-        Range("speed", 0.2, 0.45, "approach, m/s"),
-        Range("x", 0.0, 0.13, "shoulder's pitch axis ahead of the base's center, m"),
-        Range("z", -0.10, 0.0, "shoulder's height over the base's center, m"),
+        Range("speed", 0.2, 0.45, "speed of approach, m/s"),
+        Range("x", 0.0, 0.13, "distance of the shoulder's pitch axis ahead of the base's center, m"),
+        Range("z", -0.10, 0.0, "height of the shoulder over the base's center, m"),
         _SLIP,
         *_COMMON,
     ),
