@@ -319,7 +319,8 @@ class World:
             sizes = f"give {self._count} and {self._effort.size}"
             raise InputError(f"{speed.size} rotor speeds and {torque.size} torques", where="command", hint=sizes)
         # A sum of squares that is not absurd settles it.
-        usual = speed.dot(speed) + torque.dot(torque) < RUNAWAY**2
+        with np.errstate(over="ignore"):
+            usual = speed.dot(speed) + torque.dot(torque) < RUNAWAY**2
         if not usual and not (np.isfinite(speed).all() and np.isfinite(torque).all()):
             raise InputError("is not finite", where="command", hint="hold the last one instead")
         torque = np.minimum(np.maximum(torque, -self._effort), self._effort)
