@@ -196,7 +196,7 @@ def test_what_goes_wrong_is_an_outcome(monkeypatch: pytest.MonkeyPatch) -> None:
     text = "\n".join(page({AERIAL: [record]}, 0))
     assert "control lost 1" in text
     assert "nominal control lost: 1" in text
-    assert f"- Failed, control lost: `{AERIAL}` number {number}" in text
+    assert f"- `robust` fails in `{AERIAL}` number {number}" in text
     # A record that lacks a controller runs that one alone.
     tried.clear()
     known = replace(record, documents={c: d for c, d in record.documents.items() if c != "stiff"})
@@ -317,7 +317,7 @@ def test_the_advice_follows_the_numbers() -> None:
     assert "−60 % at the median" in advice
     advice = "\n".join(page({AERIAL: poor}, 0)).partition(MARK)[0]
     assert "No controller keeps its targets reliably" in advice and "Take" not in advice
-    assert f"**What failed:** in `{AERIAL}`, `posture` fell at 4 of 4 points." in advice
+    assert f"**What failed:** `posture` in `{AERIAL}` at 4 of 4 points (fell 4)." in advice
     live = [made(STANDING, k, {"robust": (0.7, 1.0), "stiff": (0.6, 1.0), "posture": (1.0, 1.0)}) for k in range(4)]
     text = "\n".join(page({STANDING: live}, 0))
     assert (

@@ -88,8 +88,9 @@ def _failed(records: Records) -> list[str]:
     for name, own in records.items():
         for controller in COMPARED:
             summary = summarize(own, controller)
-            words = " and ".join(f"{kind} at {n}" for kind, n in sorted(summary.failures.items()))
-            found += [f"in `{name}`, `{controller}` {words} of {summary.count} points"] if words else []
+            words = ", ".join(f"{kind} {n}" for kind, n in sorted(summary.failures.items()))
+            failed = sum(summary.failures.values())
+            found += [f"`{controller}` in `{name}` at {failed} of {summary.count} points ({words})"] if words else []
     return [f"- **What failed:** {'; '.join(found) or 'nothing'}."]
 
 
@@ -209,7 +210,7 @@ def _counterexamples(records: Records) -> Iterator[str]:
         else:
             yield f"- In `{name}`, the jump rises at no point where H falls."
         for record in [r for r in own if r.failure("robust")][:2]:
-            yield f"- `robust` {record.failure('robust')} in {_where(record)}."
+            yield f"- `robust` fails in {_where(record)}: {record.failure('robust')}."
 
 
 def _where(record: Record) -> str:
