@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import gc
 from collections import Counter
 from pathlib import Path
 from typing import TYPE_CHECKING, Annotated, Any
@@ -20,6 +21,8 @@ if TYPE_CHECKING:
     from impact_posture.posture.solve import PostureSolution
     from impact_posture.result_folder import Written
 
+# Thresholds of the garbage collector.
+_RARELY = 200_000, 50, 100
 # Actuators in the table of what holding a posture takes.
 _TIGHTEST = 3
 
@@ -47,6 +50,8 @@ def optimize(
     quiet: options.Quiet = False,
 ) -> None:
     """Run ``impact-posture optimize``."""
+    # Most of what is made here lives until the answer is printed, so that to look for garbage only takes time.
+    gc.set_threshold(*_RARELY)
     settings = _settings(robot, given)
     _refuse_idle(given, settings)
     from impact_posture.early_writer import early_writer

@@ -166,12 +166,14 @@ class Kinematics:
 
     def center_of_mass(self) -> ca.SX:
         """Return the world position of the center of mass, shape (3,)."""
-        total, weighted = 0.0, ca.SX.zeros(3)
-        for i in self._R:
-            body = self.model.inertias[i]
-            total += body.mass
-            weighted += body.mass * (self.origins[i] + self.rotations[i] @ ca.SX(np.array(body.lever)))
-        return weighted / total
+        masses = {i: float(self.model.inertias[i].mass) for i in self._R} | {0: 0.0}
+        moments = {i: masses[i] * constant(np.array(self.model.inertias[i].lever)) for i in self._R} | {
+            0: ca.SX(3, 1)
+        }
+        for _, i, parent in reversed(self._joints):
+            masses[parent] += masses[i]
+            moments[parent] = moments[parent] + masses[i] * self._p[i] + self._R[i] @ moments[i]
+        return ca.densify(moments[0] / masses[0])
 
     def to_link(self, joint: int, direction: ca.SX) -> ca.SX:
         """Rotate a world direction into link coordinates, down the chain from the root."""

@@ -12,6 +12,7 @@ from dataclasses import dataclass
 from functools import cached_property
 
 import casadi as ca
+import numpy as np
 
 from impact_posture.dynamics import tree_steps as step
 from impact_posture.dynamics.kinematics import ByJoint, Kinematics, PointOnLink
@@ -92,18 +93,28 @@ class Tree(Kinematics):
                 total[parent] = total[parent] + force_to_parent(self._R[i], self._p[i], total[i])
         return total
 
-    def mass_times(self, v: ca.SX, velocities: ByJoint | None = None, *, extra: bool = True) -> ca.SX:
-        """Return ``M(q) v`` in O(n), armature included, shape (nv,).
+    def mass_times(
+        self,
+        v: ca.SX,
+        velocities: ByJoint | None = None,
+        *,
+        extra: bool = True,
+        less: Sequence[Wrench] = (),
+    ) -> ca.SX:
+        """Return ``M(q) v − Σ Jᵀ w`` in O(n), armature included, shape (nv,).
 
         Args:
             v: Generalized velocity, shape (nv,).
             velocities: Spatial velocity of every link under ``v``, if it is known already.
             extra: Include the extra inertias.
+            less: The wrenches.
         """
         velocities = self.velocities(v) if velocities is None else velocities
         inertia = self._inertia if extra else self._own_inertia
-        momenta = self._accumulate({i: inertia[i] @ velocity for i, velocity in velocities.items()})
-        return self._project(momenta) + self.armature * v
+        momenta = {i: inertia[i] @ velocity for i, velocity in velocities.items()}
+        for wrench in less:
+            momenta[wrench.point.joint] = momenta[wrench.point.joint] - self.link_force(wrench)
+        return self._project(self._accumulate(momenta)) + self.armature * v
 
     def _project(self, forces: ByJoint) -> ca.SX:
         return ca.densify(ca.vertcat(*[transposed_times(S, forces[i]) for i, S in self._S.items()]))
@@ -118,9 +129,21 @@ class Tree(Kinematics):
             force, moment = self.to_link(joint, wrench.force), self.to_link(joint, wrench.moment)
         return ca.vertcat(force, moment + cross(position, force))
 
-    def generalized_force(self, wrenches: Sequence[Wrench]) -> ca.SX:
-        """Return ``Σ Jᵀ [force; moment]`` of the wrenches, shape (nv,)."""
+    def generalized_force(self, wrenches: Sequence[Wrench], gravity: ca.SX | None = None) -> ca.SX:
+        """Return ``Σ Jᵀ [force; moment]`` of the wrenches, and of the weights of the links, shape (nv,).
+
+        Args:
+            wrenches: The wrenches.
+            gravity: Acceleration of gravity in world axes, shape (3,).
+        """
         forces: ByJoint = dict.fromkeys(self._R, _ZERO)
+        if gravity is not None:
+            along = {0: gravity}
+            for _, i, parent in self._joints:
+                along[i] = transposed_times(self._R[i], along[parent])
+                body = self.model.inertias[i]
+                weight = body.mass * along[i]
+                forces[i] = ca.vertcat(weight, cross(constant(np.array(body.lever)), weight))
         for wrench in wrenches:
             forces[wrench.point.joint] = forces[wrench.point.joint] + self.link_force(wrench)
         return self._project(self._accumulate(forces))

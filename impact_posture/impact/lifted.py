@@ -106,8 +106,7 @@ class UnknownJump:
         rest: What :attr:`derivatives` leave of the residual: the impact, and the rows of locked joints.
         derivatives: Derivatives of the equations.
         compliance: ε, 1/kg.
-        locked: Velocity entries of locked joints, whose equation is ``a_k = 0``.
-        mass_a: ``M a``.
+        tree: The tree, whose locked joints have the equations ``a_k = 0``.
         contact_velocity: ``J a``, world, shape (3,).
     """
 
@@ -118,9 +117,13 @@ class UnknownJump:
     rest: ca.SX
     derivatives: JumpDerivatives
     compliance: float
-    locked: tuple[int, ...]
-    mass_a: ca.SX
+    tree: Tree
     contact_velocity: ca.SX
+
+    @property
+    def mass_a(self) -> ca.SX:
+        """``M a``."""
+        return self.tree.mass_times(self.a)
 
     def with_impulse(self, impulse: ca.SX, fixing: ca.SX) -> UnknownJump:
         """Return the same jump with the impulse of the impact as an unknown, and the equations that fix it."""
@@ -129,12 +132,12 @@ class UnknownJump:
 
     def known_derivatives(self, multipliers: ca.SX) -> tuple[ca.SX, ca.SX]:
         """Return Jacobian and Hessian of the residual less :attr:`rest`, over chart coordinates, ``a`` and ``f``."""
-        count = self.a.numel()
+        count, locked = self.a.numel(), list(self.tree.locked)
         moving = ca.SX.ones(count)
-        moving[list(self.locked)] = 0
+        moving[locked] = 0
         b, of_feet = moving * multipliers[:count], multipliers[count : count + self.f.numel()]
         jacobian, hessian = self.derivatives.of(self.a, self.f, b, of_feet, self.compliance)
-        jacobian[list(self.locked), :] = 0
+        jacobian[locked, :] = 0
         return ca.sparsify(jacobian), hessian
 
 
@@ -158,8 +161,8 @@ def unknown_jump(case: ImpactCase, tree: Tree, impact: Wrench, label: str = "") 
         wrenches.append(Wrench(foot.point, full[:3], full[3:], in_frame=True))
         held.append(tree.own_velocity(foot.point, velocities)[: foot.rows] + case.compliance * f_k)
         f = ca.vertcat(f, f_k)
-    mass_a, pushed = tree.mass_times(a), -tree.generalized_force([impact])
-    momentum = mass_a + pushed - tree.generalized_force(wrenches)
+    pushed = -tree.generalized_force([impact])
+    momentum = tree.mass_times(a, velocities, less=wrenches) + pushed
     for k in tree.locked:
         momentum[k] = pushed[k] = a[k]
     return UnknownJump(
@@ -170,8 +173,7 @@ def unknown_jump(case: ImpactCase, tree: Tree, impact: Wrench, label: str = "") 
         rest=ca.vertcat(pushed, ca.SX(f.numel(), 1)),
         derivatives=JumpDerivatives(tree, feet),
         compliance=case.compliance,
-        locked=tree.locked,
-        mass_a=mass_a,
+        tree=tree,
         contact_velocity=tree.point_velocity(impact.point, velocities)[:3],
     )
 

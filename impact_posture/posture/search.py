@@ -193,8 +193,9 @@ class Search:
             return [k for k in waiting if k < _FIRST]
         if self._finish_all or not all(k in runs for k in waiting):
             return waiting
+        groups = self._shared(sorted(waiting, key=lambda k: runs[k].minimized))
         count = max(_BATCH // self._unknowns, 1)
-        return sorted(sorted(waiting, key=lambda k: runs[k].minimized)[:count])
+        return sorted(k for group in list(groups.values())[:count] for k in group)
 
     def _clear(self, run: Run) -> bool:
         """Whether no original shapes touch at the end of a run."""

@@ -15,6 +15,7 @@ import numpy as np
 import pinocchio as pin
 
 from impact_posture.arrays import Array
+from impact_posture.dynamics.spatial import constant
 from impact_posture.dynamics.tree import PointOnLink, Tree, Wrench
 
 
@@ -85,17 +86,11 @@ class StaticLoad:
 
     def symbolic(self, tree: Tree, z: ca.SX) -> ca.SX:
         """Return ``τ(q, z)`` as an expression, shape (nv, 1)."""
-        gravity, none = np.array(self.model.gravity.linear), ca.SX(3, 1)
         wrenches = []
-        for joint in range(1, self.model.njoints):
-            inertia = self.model.inertias[joint]
-            if inertia.mass:
-                center = PointOnLink(joint, np.array(inertia.lever), np.eye(3))
-                wrenches.append(Wrench(center, ca.SX(inertia.mass * gravity), none))
         for source, start, stop in zip(self.sources, self._parts, self._parts[1:], strict=False):
             w = ca.SX(source.columns) @ z[int(start) : int(stop)] + ca.SX(source.constant)
             wrenches.append(Wrench(source.point, w[:3], w[3:], source.in_frame))
-        return -tree.generalized_force(wrenches)
+        return -tree.generalized_force(wrenches, constant(self.model.gravity.linear))
 
     def torque(self, q: Array, z: Array, *, by_posture: bool = True) -> StaticTorque:
         """Return ``τ`` and its derivatives at a posture, or ``τ`` and ``∂τ/∂z`` alone, which takes less time.
