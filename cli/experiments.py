@@ -28,7 +28,7 @@ Compile = Annotated[
     CompileMode,
     option(
         "--compile", panel=RUN,
-        help="Whether controllers are compiled to machine code. auto: from 3 seeds on, which pay for it.",
+        help="Whether controllers are compiled to machine code. auto: from 2 seeds on, which pay for it.",
     ),
 ]  # fmt: skip
 Processes = Annotated[int, option("--jobs", panel=RUN, min=1, help="Number of processes that run at the same time.")]

@@ -23,9 +23,9 @@ from impact_posture.simulation.scenario import set_up
 from impact_posture.simulation.scenario_file import read_scenario
 
 SCHEMA = "impact-posture/simulation/4"
-# Runs from which building pays: a humanoid's library takes about 10 s, and saves 4 s of each run.  The cache does not
+# Runs from which building pays: a humanoid's library takes about 6 s, and saves 4 s of each run.  The cache does not
 # count, because a run would then depend on what ran before, and differ from another one by amplified rounding.
-_PAYS = 3
+_PAYS = 2
 
 
 @dataclass(frozen=True)
@@ -71,7 +71,7 @@ class Job:
 def worth_compiling(compile: CompileMode, runs: int) -> CompileMode:
     """Return what :attr:`Job.compile` says where each controller has a number of runs.
 
-    ``auto`` means machine code from three runs on.
+    ``auto`` means machine code from two runs on.
     """
     return "never" if compile == "auto" and runs < _PAYS else compile
 
