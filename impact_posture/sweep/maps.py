@@ -212,7 +212,8 @@ def _draw(
     rows, columns = table.value.shape
     others = [f"{a.name} {a.values[len(a.values) // 2]}" for k, a in enumerate(grid.axes) if k not in axes]
     contacts = ", ".join(contact.frame for contact in problem.objective.contacts)
-    what = [f"{problem.robot.name} at {contacts}", f"objective in {problem.objective.units}"]
+    units = getattr(problem.objective, "units", "its own units")
+    what = [f"{problem.robot.name} at {contacts}", f"objective in {units}"]
     facts = " · ".join(what + [f"{key} {value}" for key, value in values.items()] + others)
     notes = [f"{len(table.switches)} steps between neighbors switch to another optimum."]
     missing = int((table.status == "").sum())
