@@ -33,6 +33,16 @@ def out_option(help: str, default: str = "") -> Any:
     return option("--out", metavar="DIR", panel=OUTPUT, show_default=default or True, help=help, **home)
 
 
+def _check_prefix(prefix: str | None) -> str | None:
+    from impact_posture.codegen.naming import check_prefix
+    from impact_posture.errors import InputError
+
+    try:
+        return prefix if prefix is None else check_prefix(prefix)
+    except InputError as error:
+        raise typer.BadParameter(f"{error.what}; {error.hint}") from None
+
+
 RobotName = Annotated[
     str, typer.Argument(metavar="ROBOT", help="Known name, path to a .urdf, or example-robot-data:PATH.")
 ]
@@ -56,8 +66,11 @@ Out = Annotated[str | None, out_option("Result folder.", "./ROBOT-FRAME")]
 Force = Annotated[bool, option("--force", panel=OUTPUT, help="Replace an existing result folder.")]
 Prefix = Annotated[
     str | None,
-    option("--prefix", metavar="NAME", panel=OUTPUT, show_default="ROBOT_FRAME", help="Beginning of all names in C."),
-]
+    option(
+        "--prefix", metavar="NAME", panel=OUTPUT, show_default="ROBOT_FRAME", help="Beginning of all names in C.",
+        callback=_check_prefix,
+    ),
+]  # fmt: skip
 ExportOut = Annotated[str | None, out_option("Folder of the C code.", "./PREFIX-c")]
 Float = Annotated[bool, option("--float", panel=OUTPUT, help="Compute in float instead of double.")]
 Portable = Annotated[

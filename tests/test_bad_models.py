@@ -8,7 +8,7 @@ from pathlib import Path
 
 import pytest
 
-from impact_posture.errors import ImpactPostureError, InertiaError, SpecError, UrdfError
+from impact_posture.errors import ImpactPostureError, InertiaError, JointNotFound, SpecError, UrdfError
 from impact_posture.robot.robot_loader import load_robot
 from impact_posture.settings import LoadOptions
 
@@ -101,6 +101,17 @@ def test_files_that_are_no_robot(
     # The parser's own words do not reach the terminal.
     out, err = capfd.readouterr()
     assert (out, err) == ("", "")
+
+
+def test_a_joint_that_mimics_no_joint(load: Load) -> None:
+    """Pinocchio ignores whatever stands there."""
+    both = link("a", GOOD), link("b", OFF_AXIS), link("c", OFF_AXIS)
+    for other, words in (("a_bb", ("no joint 'a_bb'", "did you mean a_b", "<mimic> of joint 'b_c'")), ("", ("''",))):
+        mimic = joint("b", "c").replace("</joint>", f'<mimic joint="{other}"/></joint>')
+        with pytest.raises(JointNotFound) as caught:
+            load(*both, joint("a", "b"), mimic)
+        one_line(caught.value, *words)
+    load(*both, joint("a", "b"), joint("b", "c").replace("</joint>", '<mimic joint="a_b"/></joint>'))
 
 
 def test_swapped_limits(load: Load) -> None:

@@ -14,6 +14,7 @@ from pathlib import Path
 import numpy as np
 import pytest
 
+import impact_posture as ip
 from impact_posture import plot
 from impact_posture.plot.view import header_lines
 from impact_posture.result_view import load_view
@@ -147,6 +148,25 @@ def test_posture_file_starts_the_next_optimization(result: Path, tmp_path: Path)
     document = json.loads(done.stdout)
     assert document["reduction"] == pytest.approx(0.0, abs=1e-6)
     assert any("no better posture" in note for note in document["notes"])
+
+
+def test_nothing_gained_is_said_where_a_mirrored_posture_is_shown() -> None:
+    result = ip.optimize(
+        ip.PostureProblem(ip.ImpactObjective(ip.load_robot("xarm7"), ip.ImpactContact("link_eef", (0, 0, 1)))), jobs=1
+    )
+    assert 0 <= result.reduction < 1e-3
+    assert np.linalg.norm(result.q - result.initial) > 1
+    (note,) = [note for note in result.solution.notes if "no better posture" in note]
+    assert note.endswith("another one of equal objective")
+
+
+def test_joints_that_robot_toml_holds_and_the_option_releases_are_named() -> None:
+    objective = ip.ImpactObjective(ip.load_robot("panda"), ip.ImpactContact("panda_hand_tcp", (0, 0, 1)))
+    both = ("panda_finger_joint1", "panda_finger_joint2")
+    for hold, released in (((), ", ".join(both)), (both[:1], both[1]), (both, None), (None, None)):
+        notes = [n for n in ip.PostureProblem(objective, hold=hold).problem.notes if "robot.toml also holds" in n]
+        assert len(notes) == (released is not None)
+        assert not notes or f"holds {released}; your `hold` replaces its list" in notes[0]
 
 
 def test_human_output_fits_80_columns(tmp_path: Path) -> None:

@@ -260,7 +260,16 @@ def test_the_front_of_jump_and_force_is_that_of_searches_with_a_bound(name: str)
         ({"base": "level:90"}, SpecError, "level:DEG"),
         ({"base": "level:0.01"}, SpecError, "0.1 degrees or more"),
         ({"base": "aligned:20"}, SpecError, "level:DEG"),
-        ({"max_force": 1.0, "contact_stiffness": "steel"}, Infeasible, "bounds on the impact"),
+        (
+            {"max_force": 1.0, "contact_stiffness": "steel"},
+            Infeasible,
+            r"bounds on the impact: peak force, in kg of effective mass \(off by",
+        ),
+        (
+            {"robot": "xarm7", "max_joint_jump": 1e-3},
+            Infeasible,
+            r"bounds on the impact: jump of .+, in rad/s \(m/s\) per m/s of approach \(off by",
+        ),
     ],
 )
 def test_refusals(values: dict[str, object], error: type[Exception], words: str) -> None:

@@ -54,14 +54,14 @@ def check_prefix(prefix: str) -> str:
     if not _IDENTIFIER.fullmatch(prefix):
         raise InputError(
             f"the prefix '{prefix}' is no C identifier",
-            where="--prefix",
+            where="prefix",
             hint=f"letters, digits and underscores, a letter first, such as {c_identifier(prefix, '')}",
         )
     if prefix.lower() == "example":
-        raise InputError("the prefix 'example' is taken by example.c", where="--prefix", hint="choose another")
+        raise InputError("the prefix 'example' is taken by example.c", where="prefix", hint="choose another")
     if prefix.lower() in _C_HEADERS:
         raise InputError(
-            f"the prefix '{prefix}' is the name of the C header {prefix}.h", where="--prefix", hint="choose another"
+            f"the prefix '{prefix}' is the name of the C header {prefix}.h", where="prefix", hint="choose another"
         )
     return prefix
 
@@ -80,6 +80,6 @@ def stems(prefix: str, frames: Sequence[str]) -> tuple[str, ...]:
         if stem in found:
             other = found[stem]
             what = f"'{frame}' is given twice" if other == frame else f"'{other}' and '{frame}' are one name in C"
-            raise InputError(what, where="--frame", hint="give each frame once, or export one by one")
+            raise InputError(what, where="frame", hint="give each frame once, or export one by one")
         found[stem] = frame
     return tuple(found)

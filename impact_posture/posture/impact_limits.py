@@ -87,6 +87,15 @@ class ImpactLimits(ExpressionConstraint):
                 gradients.append((jumps[k] - found.jump[k] / found.G * slope) / found.G)
         return np.array(values), np.array(gradients).reshape(len(values), -1)
 
+    def conflicts(self, excess: Array) -> dict[str, float]:
+        """See :class:`Constraint`."""
+        forces = int(self._least > 0)
+        names = [f"{self.name}: {self.row_name(row)}" for row in range(self.rows)]
+        jump = "in rad/s (m/s) per m/s of approach"
+        units = ["in kg of effective mass"] * forces + [jump] * (self.rows - forces)
+        found = zip(names, units, excess, strict=True)
+        return {f"{name}, {unit}": abs(float(value)) for name, unit, value in found if value}
+
     def row_name(self, row: int) -> str:
         """See :class:`Constraint`."""
         forces = int(self._least > 0)

@@ -18,6 +18,7 @@ from impact_posture.posture.build_problem import build_problem
 from impact_posture.posture.pose_constraints import CenterOfMassOverFeet
 from impact_posture.posture.problem import PostureProblem, Requirements
 from impact_posture.robot.model_variant import ModelVariant
+from impact_posture.robot.robot import Robot
 from impact_posture.robot.robot_loader import from_folder, names_a_path
 from impact_posture.robot.urdf import EXAMPLE_PREFIX
 from impact_posture.settings import ProblemSettings
@@ -89,7 +90,15 @@ def prepare(settings: ProblemSettings, impact: ResolvedImpact | None = None) -> 
             raise InputError(what, where=settings.robot, hint=impact.missing_support)
         impact = replace(impact, missing_support="")
     problem = build_problem(impact.robot, impact.objective, impact.q, requirements(settings, impact.objective))
+    released = [joint for joint in _held_by_default(impact.robot) if joint not in problem.requirements.hold]
+    if released:
+        note = f"robot.toml also holds {', '.join(released)}; your `hold` replaces its list, so they are free"
+        problem = replace(problem, notes=(note, *problem.notes))
     return Prepared(settings, impact, problem)
+
+
+def _held_by_default(robot: Robot) -> tuple[str, ...]:
+    return tuple(joint for joint in robot.spec.constraints.hold if joint not in robot.locked)
 
 
 def requirements(settings: ProblemSettings, objective: Objective) -> Requirements:
@@ -102,7 +111,6 @@ def requirements(settings: ProblemSettings, objective: Objective) -> Requirement
     """
     robot, spec = objective.robot, objective.robot.spec.constraints
     poses = [settings.contact_pose or robot.contact_pose(contact.frame) for contact in objective.contacts]
-    free = tuple(j for j in spec.hold if j not in robot.locked)
     base = "level" if spec.level_base and robot.floating else "free"
     com = spec.com_over_feet and bool(objective.supports) if settings.com is None else settings.com
     if settings.obstacles and not settings.collision:
@@ -121,7 +129,7 @@ def requirements(settings: ProblemSettings, objective: Objective) -> Requirement
         contact_pose=poses[0] if poses else "free",
         other_poses=tuple(poses[1:]),
         base=settings.base or base,
-        hold=free if settings.hold is None else settings.hold,
+        hold=_held_by_default(robot) if settings.hold is None else settings.hold,
         com_over_feet=com,
         com_asked=settings.com is not None,
         com_margin=spec.com_margin if settings.com_margin is None else settings.com_margin,

@@ -24,6 +24,8 @@ from impact_posture.posture.search import Progress, Run, Search
 
 # Optima closer than this in posture (tangent norm) and in objective (relative) are the same optimum.
 SAME_POSTURE, _SAME_OBJECTIVE = 1e-2, 1e-4
+# A reduction below this share is no gain: the jump, a square root, changes by less than 0.05 %.
+_NO_GAIN = 1e-3
 # From this number of starts on, a single hit of the best optimum gets a note.
 _MANY = 8
 
@@ -154,8 +156,10 @@ def solve(
         notes.append("no redundancy left: the constraints alone determine the posture, there is nothing to optimize")
     elif redundancy == 0:
         notes.append("no redundancy left: this is the best of separate postures that the constraints allow")
-    elif best.objective > scale * (1 - 1e-6):
-        notes.append("no better posture found: the initial one is already (locally) optimal for this impact")
+    elif best.objective > scale * (1 - _NO_GAIN):
+        note = "no better posture found: the initial one is already optimal for this impact, or nearly so"
+        other = np.linalg.norm(wrapped_difference(problem, initial, q)) > SAME_POSTURE
+        notes.append(f"{note}; the posture shown is another one of equal objective" if other else note)
     optima = distinct(problem, [(r.record.q, r.objective) for r in good if r.record is not None])
     notes += notes_on_impacts(problem.objective, initial, q)
     if touching:

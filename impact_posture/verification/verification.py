@@ -128,9 +128,9 @@ def verify(
         CompilerError: The compiler failed; with its words and the command.
     """
     if samples < 1:
-        raise InputError(f"the number of samples is {samples}", where="--samples", hint="give one or more")
+        raise InputError(f"the number of samples is {samples}", where="samples", hint="give one or more")
     if seed < 0:
-        raise InputError(f"the seed is {seed}", where="--seed", hint="give zero or more")
+        raise InputError(f"the seed is {seed}", where="seed", hint="give zero or more")
     drawn = random_samples(objective.robot, samples, seed, np.array(objective.contact.normal))
     expected = [pinocchio_numbers(objective, sample) for sample in drawn]
     allowed, by_differences = _ON_FEET if objective.supports else (_VALUES, _DIFFERENCES)
