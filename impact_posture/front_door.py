@@ -10,6 +10,7 @@ from typing import TYPE_CHECKING, Any, get_args
 
 import numpy as np
 
+from impact_posture.argument_types import checked
 from impact_posture.arrays import Array
 from impact_posture.errors import InputError, check_choice
 from impact_posture.front_door_problem import PostureProblem
@@ -101,6 +102,7 @@ class PostureResult:
             raise AssertionError
         return self.problem.prepared
 
+    @checked
     def trade_off(
         self,
         points: int = 16,
@@ -133,6 +135,7 @@ class PostureResult:
         curve = pareto_front(self.solution, points, force=force, compile=compile, progress=progress)
         return replace(self, tradeoff=curve)
 
+    @checked
     def path(self, *, seed: int = 0) -> PostureResult:
         """Return the same result with a path from the start to the optimum, timed within the robot's limits.
 
@@ -149,6 +152,7 @@ class PostureResult:
 
         return replace(self, motion=posture_path(self.solution, seed=seed))
 
+    @checked
     def save(
         self,
         out: str | Path,
@@ -204,6 +208,7 @@ class PostureResult:
                     progress(done, count)
         return Written(Path(out), export, compiler_error, report_error)
 
+    @checked
     def plot(
         self, out: str | Path, formats: Sequence[str] = FORMATS, only: Sequence[str] | None = None
     ) -> list[Path]:
@@ -212,6 +217,7 @@ class PostureResult:
 
         return draw_all(result_view(self._prepared, self._found, self.motion), Path(out), formats, only)
 
+    @checked
     def export(self, out: str | Path, *, build: bool = True, **options: Any) -> Export:
         """Write the C code as :meth:`ImpactObjective.export` does, with the optimal posture as a constant."""
         from impact_posture.codegen.export import write_export
@@ -220,6 +226,7 @@ class PostureResult:
         return write_export([objective], Path(out), posture=self.q, build=build, **options)
 
 
+@checked
 def optimize(
     problem: PostureProblem,
     *,

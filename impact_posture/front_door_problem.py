@@ -13,6 +13,8 @@ from typing import TYPE_CHECKING, Any, get_args
 import numpy as np
 from numpy.typing import ArrayLike
 
+from impact_posture.argument_types import checked, checked_class
+from impact_posture.arrays import Array
 from impact_posture.errors import InputError, check_choice, shown
 from impact_posture.impact import objective as core
 from impact_posture.impact.contact import ImpactContact, check_compliance
@@ -44,6 +46,7 @@ if TYPE_CHECKING:
     from impact_posture.codegen.export import Export
 
 
+@checked_class
 class ImpactObjective(core.ImpactObjective):
     """The objective of one or several impacts, by default with the supports of the robot.
 
@@ -112,10 +115,12 @@ class ImpactObjective(core.ImpactObjective):
         # This is a hint and no error, because evaluating an impact needs no support.
         object.__setattr__(self, "_missing", missing_support(robot) if supports is None and not feet else "")
 
+    @checked
     def evaluate(self, q: ArrayLike, speed: float = 1.0, restitution: float = 0.0) -> Evaluation:
         """Compute H, G, V, S, E, the ellipsoid and the predicted jump at ``q``; see :func:`evaluate`."""
         return evaluate(self, self.robot.check_posture(np.asarray(q, dtype=float), limits=False), speed, restitution)
 
+    @checked
     def export(self, out: str | Path, *, build: bool = True, **options: Any) -> Export:
         """Write the C code of H, its gradient and this objective into a folder, and build its library.
 
@@ -153,6 +158,7 @@ def _supports(robot: Robot, supports: Sequence[str | Support] | None) -> tuple[S
 _OF_THE_OBJECTIVE = {field.name for field in fields(ImpactSettings)} - {"contact_stiffness", "contact_duration"}
 
 
+@checked_class
 class PostureProblem:
     """``min_q objective(q)`` under the constraints of a task; a missing argument comes from the robot.
 
@@ -176,7 +182,7 @@ class PostureProblem:
     def __init__(
         self,
         objective: core.Objective,
-        posture: str | ArrayLike | None = None,
+        posture: str | Array | Sequence[float] | None = None,
         *,
         speed: float = 1.0,
         restitution: float = 0.0,

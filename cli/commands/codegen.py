@@ -64,7 +64,7 @@ def codegen(
 
         made, formulation, objective = _controller_parts(given, robot, controller, flow, scenario)
         written = export_controller(
-            made, formulation, place, objective=objective, prefix=prefix, daqp=Path(daqp) if daqp else None,
+            made, formulation, place, objective=objective, prefix=prefix, daqp=daqp,
             build=compile, force=force,
         )  # fmt: skip
         posture = "nominal posture" if objective is None else "reference flow" if flow else "impact-robust"

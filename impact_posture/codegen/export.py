@@ -11,6 +11,7 @@ from typing import Any
 
 import numpy as np
 
+from impact_posture.argument_types import checked
 from impact_posture.arrays import Array
 from impact_posture.codegen.build_check import compile_and_check
 from impact_posture.codegen.code import Code, build_code
@@ -183,6 +184,7 @@ def cached_code(
     return exported, build_code(exported, prefix, real, portable=portable)
 
 
+@checked
 def write_export(
     objectives: Sequence[ImpactObjective],
     out: Path | None = None,

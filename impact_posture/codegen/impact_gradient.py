@@ -11,6 +11,7 @@ from typing import TYPE_CHECKING, Any
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
+from impact_posture.argument_types import checked
 from impact_posture.codegen.naming import SIGNATURES, lengths
 from impact_posture.codegen.reader import check_library, check_robot, frame_block, read_manifest
 from impact_posture.errors import InputError, ManifestMismatch, MetricError, PostureError, SpecError
@@ -71,6 +72,7 @@ class ImpactGradient:
         self._batch = getattr(library, symbols["eval_batch"])
 
     @classmethod
+    @checked
     def load(
         cls, path: str | Path, *, robot: Robot | None = None, frame: str | None = None, free: bool = False
     ) -> ImpactGradient:
@@ -114,6 +116,7 @@ class ImpactGradient:
         """Return the same functions with buffers of their own, for another thread."""
         return ImpactGradient(self._library, self.manifest, self.frame, free=self.free)
 
+    @checked
     def check_robot(self, robot: Robot) -> None:
         """Refuse another robot than that of the export; its joint model may be another one.
 

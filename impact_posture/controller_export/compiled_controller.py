@@ -12,6 +12,7 @@ import numpy as np
 import pinocchio as pin
 from numpy.typing import ArrayLike
 
+from impact_posture.argument_types import checked
 from impact_posture.arrays import Array
 from impact_posture.codegen.reader import check_library, check_robot
 from impact_posture.controller_export.manifest import Manifest, build_controller, read_controller
@@ -72,6 +73,7 @@ class CompiledController:
         self._ready = False
 
     @classmethod
+    @checked
     def load(cls, path: str | Path, *, robot: Robot | None = None) -> CompiledController:
         """Load an exported controller.  **This runs its code**, so load only what you would run as a program.
 

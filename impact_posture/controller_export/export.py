@@ -12,6 +12,7 @@ from typing import Any
 
 import casadi as ca
 
+from impact_posture.argument_types import checked
 from impact_posture.codegen.export import WrittenCode
 from impact_posture.codegen.export import export as export_gradient
 from impact_posture.codegen.manifest_builder import configuration_names
@@ -65,15 +66,16 @@ class ControllerExport(WrittenCode):
         return CompiledController.load(self.out, robot=self.robot)
 
 
+@checked
 def export_controller(
     robot: Robot,
     formulation: TaskFormulation,
-    out: Path | None = None,
+    out: str | Path | None = None,
     *,
     objective: ImpactObjective | None = None,
     prefix: str | None = None,
     period: float = 1e-3,
-    daqp: Path | None = None,
+    daqp: str | Path | None = None,
     build: bool = False,
     force: bool = False,
     generated: Sequence[str] = (),
@@ -109,7 +111,7 @@ def export_controller(
         what = "the posture task has no objective" if objective is None else "no task uses the objective"
         hint = "give the objective of its gradient" if objective is None else "give a posture task that follows one"
         raise InputError(what, where="controller export", hint=hint)
-    sources = daqp_sources(daqp)
+    sources = daqp_sources(Path(daqp) if daqp else None)
     fields = tuple(parameters(structure, period))
     if shared:
         numbers = ModelParameters(robot.model).values
@@ -127,7 +129,7 @@ def export_controller(
     texts[f"{prefix}.json"] = json.dumps(manifest, indent=2, allow_nan=False) + "\n"
     texts |= {} if objective is None or metric is None or shared else _metric(objective, metric)
     texts["Makefile"], texts["CMakeLists.txt"] = _makefile(manifest), _cmake(manifest)
-    out = Path(f"{prefix}-c") if out is None else out
+    out = Path(out or f"{prefix}-c")
     library = library_path(out, prefix)
     products = (library.name, f"{library.name}.sha256")
     with whole_folder(out, force=force, kind="export", products=products) as folder:

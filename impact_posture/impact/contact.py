@@ -8,6 +8,7 @@ from typing import get_args
 import numpy as np
 import pinocchio as pin
 
+from impact_posture.argument_types import check_types
 from impact_posture.arrays import Array
 from impact_posture.dynamics.tree import PointOnLink
 from impact_posture.errors import ContactError, InputError, check_choice, shown
@@ -54,10 +55,14 @@ class ImpactContact:
         check_choice("normal_frame", self.normal_frame, get_args(NormalFrame))
         if not isinstance(self.frame, str):
             raise ContactError(f"'{shown(self.frame)}' is no name", where="frame", hint="give the name of a frame")
-        n = np.array(self.normal, dtype=float)
+        check_types(type(self).__init__, vars(self) | {"normal": (0, 0, 1)})
+        try:
+            n = np.array(self.normal, dtype=float)
+        except (TypeError, ValueError):
+            n = np.zeros(0)
         if n.shape != (3,) or not np.isfinite(n).all() or np.abs(n).max() < _DUST:
             raise ContactError(
-                f"the normal {tuple(self.normal)} has no direction",
+                f"the normal {shown(self.normal)} has no direction",
                 where="normal",
                 hint="give three numbers, not all zero",
             )
@@ -72,8 +77,6 @@ class ImpactContact:
                 where="impulse",
                 hint=f"give {1 / LARGEST:g} to {LARGEST:g} N·s",
             )
-        if isinstance(self.friction, str) or self.friction is None:
-            raise ContactError(f"the coefficient is {self.friction!r}", where="friction", hint="give a number")
         if not 0 <= self.friction <= LARGEST:
             raise ContactError(
                 f"the coefficient is {self.friction:g}", where="friction", hint=f"give 0 to {LARGEST:g}"

@@ -9,6 +9,7 @@ from typing import get_args
 
 import numpy as np
 
+from impact_posture.argument_types import check_types
 from impact_posture.arrays import Array
 from impact_posture.errors import MetricError, check_choice
 from impact_posture.robot.model_joints import v_slice
@@ -37,6 +38,7 @@ class Metric:
 
     def __post_init__(self) -> None:
         check_choice("metric", self.kind, get_args(MetricKind))
+        check_types(type(self).__init__, vars(self))
         if (self.kind == "weighted") != (self.weights is not None):
             what = "needs weights" if self.weights is None else "takes no weights"
             raise MetricError(f"the {self.kind} metric {what}", where="metric", hint="see build_metric")

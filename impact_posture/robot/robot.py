@@ -11,6 +11,7 @@ from functools import cached_property
 import numpy as np
 import pinocchio as pin
 
+from impact_posture.argument_types import checked
 from impact_posture.arrays import Array
 from impact_posture.errors import (
     FrameNotFound,
@@ -167,6 +168,7 @@ class Robot:
             joints.append([str(model.names[i]), str(model.joints[i].shortname()), int(model.parents[i]), *numbers])
         return hashlib.sha256(json.dumps([joints, _rounded(armature)]).encode()).hexdigest()
 
+    @checked
     def frame_id(self, name: str) -> int:
         """Return the index of the frame ``name``; if a link and a joint share the name, that of the link.
 
@@ -185,6 +187,7 @@ class Robot:
         # The first of a name counts, and a link before what is none.
         return {name: i for i, name in reversed([*links, *others])}
 
+    @checked
     def joint_id(self, name: str) -> int:
         """Return the index of the joint ``name`` in the model.
 
@@ -198,11 +201,13 @@ class Robot:
             raise JointNotFound(name, self.joint_names, where=self.name)
         return int(self.model.getJointId(name))
 
+    @checked
     def contact_pose(self, frame: str) -> ContactPose:
         """Return the default pose mode of a contact frame, which is ``position`` for a point foot."""
         balls = [foot.frame for foot in self.spec.supports if foot.kind == "point"]
         return self.spec.contact.frames.get(frame, "position" if frame in balls else self.spec.contact.pose)
 
+    @checked
     def posture(self, name: str | None = None) -> Array:
         """Return a copy of the named posture, or of the default one, shape (nq,).
 
@@ -219,6 +224,7 @@ class Robot:
         """Direction in a floating base that is vertical in the default posture, shape (3,), or ``None``."""
         return pin.Quaternion(self.posture()[3:7]).matrix()[2].copy() if self.floating else None
 
+    @checked
     def check_posture(self, q: Array, *, where: str = "posture", limits: bool = True) -> Array:
         """Check length, finiteness, quaternion and limits of ``q``; return it with unit quaternions.
 
@@ -270,6 +276,7 @@ class Robot:
         what = f"the base quaternion {fault} and looks like w x y z"
         raise PostureError(what, where=where, hint="give it as x y z w (scalar last)")
 
+    @checked
     def check_limits(self, q: Array, *, where: str = "posture") -> None:
         """Raise :class:`NotWithinLimits` for the first joint of ``q`` outside its position limits."""
         for joint in self.joint_names:

@@ -11,6 +11,7 @@ from typing import Any, NamedTuple
 import numpy as np
 import pinocchio as pin
 
+from impact_posture.argument_types import checked
 from impact_posture.arrays import Array
 from impact_posture.errors import InputError, JointNotFound, PackageNotFound, RobotNotFound, SpecError, UrdfError
 from impact_posture.robot.armature import armature_warning, set_armature
@@ -29,6 +30,7 @@ def known_robots() -> tuple[str, ...]:
     return tuple(sorted(p.parent.name for p in robots_data().glob("*/robot.toml")))
 
 
+@checked
 def load_robot(robot: str, options: LoadOptions | None = None, **settings: Any) -> Robot:
     """Load a robot by known name, by path to a ``.urdf``, or by ``example-robot-data:<path below robots/>``.
 

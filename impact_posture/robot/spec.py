@@ -8,6 +8,7 @@ from typing import Annotated, Any, ClassVar, Literal
 
 from pydantic import Field
 
+from impact_posture.argument_types import checked_class
 from impact_posture.errors import SpecError, shown
 from impact_posture.settings import ContactPose, Root, SupportKind, TransmissionKind, Vector3
 from impact_posture.tables import read_toml, validate
@@ -54,6 +55,7 @@ class ContactSpec(_Table):
     frames: dict[str, ContactPose] = field(default_factory=dict)
 
 
+@checked_class
 @dataclass(frozen=True)
 class Support(_Table):
     """A foot that stays on the ground; its velocities are zero up to the compliance.

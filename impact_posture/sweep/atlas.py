@@ -11,6 +11,7 @@ from functools import lru_cache
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
+from impact_posture.argument_types import checked
 from impact_posture.errors import InputError, OutputError, SpecError
 from impact_posture.libraries import source_key
 from impact_posture.output_folder import check_output, is_ours, write_record, write_whole
@@ -204,6 +205,7 @@ def read_manifest(folder: Path) -> dict[str, Any]:
         raise SpecError(what, where=str(path), hint="name a folder that sweep wrote") from None
 
 
+@checked
 def open_atlas(folder: str | Path) -> Dataset:
     """Open the table of a sweep, finished or not, as a ``pyarrow.dataset.Dataset``.
 

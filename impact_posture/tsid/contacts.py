@@ -11,6 +11,7 @@ from typing import get_args
 import numpy as np
 import pinocchio as pin
 
+from impact_posture.argument_types import checked, checked_class
 from impact_posture.arrays import Array
 from impact_posture.errors import ContactError, check_choice
 from impact_posture.robot.robot import Robot
@@ -20,6 +21,7 @@ from impact_posture.tsid.qp import stacked_rows
 from impact_posture.tsid.state import State
 
 
+@checked_class
 @dataclass(frozen=True, eq=False)
 class SupportContact:
     """A foot (or hand) on the ground.
@@ -85,6 +87,7 @@ class SupportContact:
         return to_world(surface_cone(self.friction, *self.half), normal, rotation[:, 0])
 
 
+@checked
 def support_contacts(robot: Robot, *, friction: float = 0.7) -> tuple[SupportContact, ...]:
     """Return the supports of ``robot.toml`` on level ground: soles are hard constraints, points have a weight.
 

@@ -9,6 +9,7 @@ from enum import Enum
 import numpy as np
 from numpy.typing import ArrayLike
 
+from impact_posture.argument_types import checked_class
 from impact_posture.arrays import Array
 from impact_posture.errors import InputError, PostureError
 from impact_posture.robot.robot import Robot
@@ -99,6 +100,7 @@ class Report:
     iterations: int
 
 
+@checked_class
 class Controller:
     """Task-space inverse dynamics by one QP per tick.
 

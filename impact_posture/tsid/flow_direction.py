@@ -7,6 +7,7 @@ from dataclasses import asdict, dataclass
 
 import numpy as np
 
+from impact_posture.argument_types import checked_class
 from impact_posture.arrays import Array
 from impact_posture.errors import InputError
 from impact_posture.robot.robot import Robot
@@ -30,6 +31,7 @@ _SPENT = 9e-4
 _STIFFNESS = 3e4
 
 
+@checked_class
 @dataclass(frozen=True)
 class FlowOptions:
     """Parameters of the reference flow; the same for every robot.

@@ -11,6 +11,7 @@ import numpy as np
 import pinocchio as pin
 from numpy.typing import ArrayLike
 
+from impact_posture.argument_types import checked_class
 from impact_posture.arrays import Array
 from impact_posture.errors import InputError
 from impact_posture.tsid.points import Point, PointState
@@ -18,6 +19,7 @@ from impact_posture.tsid.state import State
 from impact_posture.tsid.task import Target, TargetTask
 
 
+@checked_class
 @dataclass(frozen=True)
 class Impedance:
     """Apparent inertia by which a measured force accelerates a frame: ``M_d⁻¹ F̂``.
@@ -46,6 +48,7 @@ class Impedance:
         return np.array([1.0 / self.mass] * 3 + [turn] * 3)
 
 
+@checked_class
 class FrameTask(TargetTask[Target]):
     """Base of the tasks of a point that moves with a frame.
 
@@ -157,6 +160,7 @@ class FramePose(FrameTask[pin.SE3]):
         return six
 
 
+@checked_class
 class FrameAligned(FrameTask[pin.SE3]):
     """Regulate the world position of a point and the direction of an axis; spin about the axis is free (5 × nv).
 
@@ -184,8 +188,8 @@ class FrameAligned(FrameTask[pin.SE3]):
         super().__init__(point, **gains)
         self._axis = np.array(axis, dtype=float)
         length = float(np.linalg.norm(self._axis))
-        if not (length > 0 and math.isfinite(length)):
-            raise InputError("the axis has no direction", where=self.name, hint="give a vector that is not zero")
+        if self._axis.shape != (3,) or not 0 < length < math.inf:
+            raise InputError("the axis has no direction", where=self.name, hint="give three numbers, not all zero")
         self._axis /= length
         # The last two right singular vectors of a row vector are orthogonal to it.
         self._across = np.linalg.svd(self._axis[None])[2][1:]

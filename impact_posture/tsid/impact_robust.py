@@ -10,6 +10,7 @@ import numpy as np
 import pinocchio as pin
 from numpy.typing import ArrayLike
 
+from impact_posture.argument_types import checked_class
 from impact_posture.arrays import Array
 from impact_posture.codegen.impact_gradient import ImpactGradient
 from impact_posture.errors import InputError, MetricError, check_choice
@@ -57,6 +58,7 @@ def fitting_gradient(robot: Robot, gradient: Gradient | ImpactGradient) -> Gradi
     return gradient_of(gradient)
 
 
+@checked_class
 class ImpactRobustPosture(JointPosture):
     """``ν̇* = K_p (q_des ⊖ q) − K_d ν − α K s(q) ∇H(q)/λ`` (Afifi et al. 2026, impact-robust posture).
 

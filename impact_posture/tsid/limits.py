@@ -6,6 +6,7 @@ from dataclasses import dataclass
 
 import numpy as np
 
+from impact_posture.argument_types import checked_class
 from impact_posture.arrays import Array
 from impact_posture.errors import InputError
 from impact_posture.robot.robot import Robot
@@ -13,6 +14,7 @@ from impact_posture.tsid.ranges import JointRanges
 from impact_posture.tsid.state import State
 
 
+@checked_class
 @dataclass(frozen=True)
 class LimitLaw:
     """Law that stops joints at their limits.

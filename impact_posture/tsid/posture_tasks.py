@@ -6,6 +6,7 @@ import numpy as np
 import pinocchio as pin
 from numpy.typing import ArrayLike
 
+from impact_posture.argument_types import checked, checked_class
 from impact_posture.arrays import Array
 from impact_posture.errors import InputError
 from impact_posture.robot.robot import Robot
@@ -14,6 +15,7 @@ from impact_posture.tsid.state import State
 from impact_posture.tsid.task import Task, gain
 
 
+@checked_class
 class JointPosture(Task):
     """Regulate the posture by ``ν̇* = K_p (q_des ⊖ q) − K_d ν`` (Afifi et al. 2026, nominal posture).
 
@@ -93,6 +95,7 @@ class JointPosture(Task):
         self._target[:] = state.q if self._given is None else self._given
         self._blend = 1.0
 
+    @checked
     def move_to(self, target: ArrayLike, over: float = 0.5) -> None:
         """Fade ``q_des`` to another posture within ``over`` seconds.
 

@@ -8,6 +8,7 @@ from typing import Any
 import numpy as np
 from numpy.typing import ArrayLike
 
+from impact_posture.argument_types import checked_class
 from impact_posture.codegen.impact_gradient import ImpactGradient
 from impact_posture.errors import InputError
 from impact_posture.robot.robot import Robot
@@ -21,6 +22,7 @@ from impact_posture.tsid.state import State
 from impact_posture.tsid.task_formulation import TaskFormulation
 
 
+@checked_class
 class ReferenceFlowPosture(JointPosture):
     """``ν̇* = K_p (q_r ⊖ q) + K_d (u − ν) + u̇``, where ``q_r`` follows the reference flow.
 

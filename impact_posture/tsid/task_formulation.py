@@ -5,6 +5,7 @@ from __future__ import annotations
 from dataclasses import dataclass, field
 from typing import Literal
 
+from impact_posture.argument_types import checked, checked_class
 from impact_posture.errors import InputError
 from impact_posture.robot.robot import Robot
 from impact_posture.tsid.body_tasks import BaseOrientation, CenterOfMass, Tilt
@@ -19,6 +20,7 @@ from impact_posture.tsid.task import Task
 Order = Literal["strict", "weighted"]
 
 
+@checked_class
 @dataclass(frozen=True, eq=False)
 class TaskFormulation:
     """Tasks, contacts and limits that a controller solves for at each tick.
@@ -72,6 +74,7 @@ class TaskFormulation:
         return tuple(dict.fromkeys(found))
 
 
+@checked
 def aerial_formulation(
     robot: Robot,
     posture: JointPosture,
@@ -103,6 +106,7 @@ def aerial_formulation(
     return _manipulator(robot, (tilt or Tilt(),), end_effector, posture, order, law)
 
 
+@checked
 def arm_formulation(
     robot: Robot,
     posture: JointPosture,
@@ -129,6 +133,7 @@ def arm_formulation(
     return _manipulator(robot, (), end_effector, posture, order, law)
 
 
+@checked
 def legged_formulation(
     robot: Robot,
     posture: JointPosture,
