@@ -176,7 +176,7 @@ class ExactImpact:
 
     @cached_property
     def dJs(self) -> Vector:
-        return np.concatenate([self._rate(point, rows) for point, rows in self.oracle.feet])
+        return np.concatenate([self._rate(foot.point, foot.rows) for foot in self.oracle.feet])
 
     def _rate(self, point: Any, rows: int) -> Vector:
         numeric = self.oracle.numeric

@@ -90,7 +90,7 @@ def contact_stability(oracle: ImpactOracle, supports: tuple[Support, ...], q: Ar
     particular = oracle.quantities(q).support_impulse
     values, vectors = np.linalg.eigh(oracle.Js @ oracle.Js.T)
     basis = vectors[:, values <= _RANK**2 * max(float(values[-1]), 1e-300)]
-    cones = FrictionCones(supports, [oracle.numeric.placement(p).rotation for p, _ in oracle.feet])
+    cones = FrictionCones(supports, [oracle.numeric.placement(foot.point).rotation for foot in oracle.feet])
     none = _NONE * max(float(np.abs(particular).max(initial=0.0)), 1e-300)
 
     def verdict(friction: float | None, impulse: Array) -> ContactStability:

@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 from contextlib import suppress
-from dataclasses import replace
 
 import casadi as ca
 import numpy as np
@@ -84,7 +83,7 @@ class CoulombKind(ImpactKind):
         """Return the value under the equations of :meth:`unknowns` and ``κ ≥ 0``, ``o ≥ 0``, ``κo = 0``."""
         jump = self.unknowns(tree, parameters)
         slip, inside = jump.variables[-2], jump.variables[-1]
-        return replace(Lifted.of([jump], self.lifted_value(jump)), inequalities=slip * inside - _CORNER)
+        return Lifted.of([jump], self.lifted_value(jump), inequalities=[slip * inside - _CORNER])
 
     def jump(self, q: Array) -> tuple[Array, Array]:
         """Return the jump with friction, and ``λ``, ``d``, ``κ`` and ``o``."""

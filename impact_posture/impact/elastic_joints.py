@@ -29,8 +29,9 @@ import scipy
 from impact_posture.arrays import Array
 from impact_posture.errors import ContactError, InputError
 from impact_posture.impact.contact import LARGEST
+from impact_posture.impact.held_point import Answer
 from impact_posture.impact.impact_case import ImpactCase
-from impact_posture.impact.oracle import Answer, ImpactOracle
+from impact_posture.impact.oracle import ImpactOracle
 from impact_posture.robot.joint_model import transmissions, with_joint_model
 from impact_posture.tables import json_block
 

@@ -187,8 +187,7 @@ class ImpulseBox:
         case = self.oracle.case
         jumps = [unknown_jump(case, tree, impact, f"{i}_") for i, impact in enumerate(self._impacts(parameters))]
         K = _gram(len(jumps), lambda i, j: weighed(case.metric, jumps[i], jumps[j]))
-        parts = [Lifted.of([jump], ca.SX(0)) for jump in jumps]
-        return worst_of(parts, [_form(K, ca.DM(corner)) for corner in self.corners], scale)
+        return worst_of(jumps, [_form(K, ca.DM(corner)) for corner in self.corners], scale)
 
     def guess(self, q: Array, scale: float, attempt: int = 0) -> Guess:
         """See :class:`~impact_posture.impact.worst_case.WorstCase`."""

@@ -40,18 +40,25 @@ class Lifted:
 
     @staticmethod
     def of(
-        jumps: Sequence[UnknownJump], value: ca.SX, *, others: ca.SX | None = None, equations: ca.SX | None = None
+        parts: Sequence[Lifted | UnknownJump],
+        value: ca.SX,
+        *,
+        others: Sequence[ca.SX] = (),
+        equations: Sequence[ca.SX] = (),
+        inequalities: Sequence[ca.SX] = (),
     ) -> Lifted:
-        """Return a form with unknown jumps, ``others`` beside their unknowns and ``equations`` beside theirs."""
+        """Return a form over the unknowns, equations and inequalities of all parts, and more of each."""
         row, column, placed = 0, 0, list[PlacedJump]()
-        for jump in jumps:
-            placed += [PlacedJump(jump, row, column)] if jump.derivatives.exist else []
-            row, column = row + jump.residual.numel(), column + jump.variables.numel()
+        for part in parts:
+            placed += [PlacedJump(jump, row + below, column + right) for jump, below, right in part.jumps]
+            row, column = row + part.residual.numel(), column + part.variables.numel()
+        bounds = [part.inequalities for part in parts if isinstance(part, Lifted)]
         return Lifted(
-            ca.vertcat(*[jump.variables for jump in jumps], *([] if others is None else [others])),
-            ca.vertcat(*[jump.residual for jump in jumps], *([] if equations is None else [equations])),
+            ca.vertcat(*[part.variables for part in parts], *others),
+            ca.vertcat(*[part.residual for part in parts], *equations),
             value,
-            jumps=tuple(placed),
+            ca.vertcat(ca.SX(0, 1), *bounds, *inequalities),
+            tuple(placed),
         )
 
     @property
@@ -119,6 +126,11 @@ class UnknownJump:
     compliance: float
     tree: Tree
     contact_velocity: ca.SX
+
+    @property
+    def jumps(self) -> tuple[PlacedJump, ...]:
+        """Itself, as a part of a :class:`Lifted`, if its derivatives are known."""
+        return (PlacedJump(self, 0, 0),) if self.derivatives.exist else ()
 
     @property
     def mass_a(self) -> ca.SX:
@@ -196,20 +208,10 @@ def weighed(metric: Metric, one: UnknownJump, other: UnknownJump) -> ca.SX:
     return ca.dot(one.a, ca.SX(metric.diagonal(one.a.numel())) * other.a)
 
 
-def worst_of(parts: Sequence[Lifted], values: Sequence[ca.SX], scale: ca.SX) -> Lifted:
+def worst_of(parts: Sequence[Lifted | UnknownJump], values: Sequence[ca.SX], scale: ca.SX) -> Lifted:
     """Return ``t`` with ``values[k] ≤ t · scale``, over the unknowns and equations of all parts."""
     t = ca.SX.sym("t")
-    row, column, jumps = 0, 0, list[PlacedJump]()
-    for part in parts:
-        jumps += [PlacedJump(jump, row + below, column + right) for jump, below, right in part.jumps]
-        row, column = row + part.residual.numel(), column + part.variables.numel()
-    return Lifted(
-        variables=ca.vertcat(*[p.variables for p in parts], t),
-        residual=ca.vertcat(*[p.residual for p in parts]),
-        value=t * scale,
-        inequalities=ca.vertcat(*[p.inequalities for p in parts], *[v / scale - t for v in values]),
-        jumps=tuple(jumps),
-    )
+    return Lifted.of(parts, t * scale, others=[t], inequalities=[v / scale - t for v in values])
 
 
 def worst_of_guesses(parts: Sequence[Guess], largest: float, attempt: int) -> Guess:

@@ -150,8 +150,8 @@ class NormalCone:
         return Lifted.of(
             jumps,
             kind.of_form_expression(unit * t),
-            others=ca.vertcat(tau, rho, root),
-            equations=ca.vertcat(*[gap[i, j] for i, j in _UPPER]),
+            others=[tau, rho, root],
+            equations=[gap[i, j] for i, j in _UPPER],
         )
 
     def guess(self, q: Array, scale: float, attempt: int = 0) -> Guess:

@@ -9,16 +9,15 @@ from __future__ import annotations
 from dataclasses import dataclass
 
 import numpy as np
-from numpy.typing import NDArray
 
 from impact_posture.arrays import Array
+from impact_posture.dynamics.jump_derivatives import Foot
 from impact_posture.dynamics.numeric import Numeric, hold_locked
 from impact_posture.errors import MetricError
 from impact_posture.impact.contact import point_on
+from impact_posture.impact.held_point import Answer, HeldPoint
 from impact_posture.impact.impact_case import ImpactCase
 
-# Relative size of an eigenvalue of JM⁻¹Jᵀ, and of the part of n outside its range, that counts as zero.
-SINGULAR = 1e-9
 # A contact whose 1/m_eff along the normal is below this share of the largest mobility cannot move along it.
 _BLOCKED = 1e-12
 # Postures whose factorization is kept, because a search comes back to its starts.
@@ -75,19 +74,6 @@ class _Factorized:
     quantities: ImpactQuantities | None = None
 
 
-@dataclass(frozen=True, eq=False)
-class Answer:
-    """Jump of the robot under a generalized impulse, or under several.
-
-    Attributes:
-        a: ``(M + J_sᵀJ_s/ε)⁻¹ τ``, shape (nv,) or (nv, k).
-        f: Support impulses ``−J_s a/ε``, shape (rows,) or (rows, k).
-    """
-
-    a: Array
-    f: Array
-
-
 class ImpactOracle:
     """Numeric ``H, G, V, S, E, Λ_c`` and tangent gradients of one impact."""
 
@@ -95,7 +81,7 @@ class ImpactOracle:
         self.case, self.robot, self.contact, self.metric = case, case.robot, case.contact, case.metric
         self.numeric = Numeric(case.robot.model)
         self.point = case.point
-        self.feet = [(point_on(case.robot, s.frame, s.offset), s.rows) for s in case.supports]
+        self.feet = [Foot(point_on(case.robot, s.frame, s.offset), s.rows) for s in case.supports]
         self.compliance = case.compliance
         self._nv = case.robot.nv
         self._key = b""
@@ -116,7 +102,7 @@ class ImpactOracle:
 
     def _factorized(self) -> _Factorized:
         num = self.numeric
-        parts = [num.jacobian(point)[:rows] for point, rows in self.feet]
+        parts = [num.jacobian(foot.point)[: foot.rows] for foot in self.feet]
         Js = np.vstack(parts) if parts else np.zeros((0, self._nv))
         M, J, Js = hold_locked(num.locked, num.mass_matrix(), num.jacobian(self.point)[:3], Js)
         kkt = np.zeros((self._nv + len(Js),) * 2)
@@ -155,7 +141,7 @@ class ImpactOracle:
         ellipsoid = A.T @ self.weigh(A)
         a = A @ self.n
         H, G = float(a @ self.weigh(a)), float(self.n @ mobility @ self.n)
-        held = _HeldPoint.of(self._kkt, self.J, mobility, ~self.numeric.locked)
+        held = HeldPoint.of(self._kkt, self.J, mobility, ~self.numeric.locked)
         stuck, s = None, None
         if held.can_move(self.n):
             found, s = held.answer(velocity=self.n)
@@ -180,10 +166,10 @@ class ImpactOracle:
         """Return ``a`` and its support impulses ``−J_s a/ε``, in the axes of the feet at the last posture."""
         f = -self.Js @ a / self.compliance
         parts, start = [a], 0
-        for foot, rows in self.feet:
-            R = np.array(self.numeric.placement(foot).rotation)
-            parts += [R.T @ f[k : k + 3] for k in range(start, start + rows, 3)]
-            start += rows
+        for foot in self.feet:
+            R = np.array(self.numeric.placement(foot.point).rotation)
+            parts += [R.T @ f[k : k + 3] for k in range(start, start + foot.rows, 3)]
+            start += foot.rows
         return np.concatenate(parts)
 
     # ---- gradients --------------------------------------------------------------------------------------------
@@ -220,7 +206,7 @@ class ImpactOracle:
         """
         self.at(q)
         _, n = self._normals(normal)
-        held = _HeldPoint.of(self._kkt, self.J, self.J @ self.solve(self.J.T), ~self.numeric.locked)
+        held = HeldPoint.of(self._kkt, self.J, self.J @ self.solve(self.J.T), ~self.numeric.locked)
         if not held.can_move(n):
             raise no_sticking()
         x, s = held.answer(velocity=n)
@@ -283,62 +269,17 @@ class ImpactOracle:
         """Return ``∂_q [lᵀMr − f_lᵀJ_s r − f_rᵀJ_s l]`` with all four letters held: ``∂_q lᵀ(M + J_sᵀJ_s/ε)r``."""
         gradient = self.numeric.inertial_gradient(left.a, right.a)
         first = 0
-        for point, rows in self.feet:
+        for foot in self.feet:
             for one, other in ((left, right), (right, left)):
                 wrench = np.zeros(6)
-                wrench[:rows] = one.f[first : first + rows]
-                gradient = gradient - self.numeric.coupling_gradient(point, wrench, other.a)
-            first += rows
+                wrench[: foot.rows] = one.f[first : first + foot.rows]
+                gradient = gradient - self.numeric.coupling_gradient(foot.point, wrench, other.a)
+            first += foot.rows
         return gradient
 
     def metric_gradient(self, a: Array) -> Array:
         """Return ``∂_q aᵀWa`` with ``a`` held fixed, shape (nv,); zero unless W = M."""
         return self.numeric.inertial_gradient(a, a) if self.metric.kind == "kinetic" else np.zeros(self._nv)
-
-
-@dataclass(frozen=True, eq=False)
-class _HeldPoint:
-    """The contact point held beside the feet, in the directions in which it can move.
-
-    ``M a − J_sᵀf − Jᵀs = τ, J_s a + εf = 0, J a = v`` is factorized as it stands.  Through ``(JM⁻¹Jᵀ)⁻¹`` the adjoint
-    of ∇S would be a small difference of large numbers, with an error of the square of that matrix's condition.
-    """
-
-    system: Array
-    axes: Array
-    outside: Array
-    mobile: NDArray[np.bool_]
-
-    @property
-    def nv(self) -> int:
-        return len(self.mobile)
-
-    @staticmethod
-    def of(kkt: Array, J: Array, mobility: Array, mobile: NDArray[np.bool_]) -> _HeldPoint:
-        values, vectors = np.linalg.eigh((mobility + mobility.T) / 2)
-        kept = values > SINGULAR * max(float(values[-1]), 1e-300)
-        axes = np.eye(3) if kept.all() else vectors[:, kept]
-        size, nv = len(kkt), J.shape[1]
-        system = np.zeros((size + axes.shape[1],) * 2)
-        system[:size, :size] = kkt
-        system[size:, :nv] = axes.T @ J
-        system[:nv, size:] = -system[size:, :nv].T
-        return _HeldPoint(system, axes, vectors[:, ~kept], mobile)
-
-    def can_move(self, n: Array) -> bool:
-        """Return whether the point can move along ``n``."""
-        return bool(np.linalg.norm(self.outside.T @ n) <= np.sqrt(SINGULAR))
-
-    def answer(self, *, tau: Array | None = None, velocity: Array | None = None) -> tuple[Answer, Array]:
-        """Return the jump under ``τ`` with the point moving at ``v``, and the impulse ``s`` of the point."""
-        right = np.zeros(len(self.system))
-        size = len(right) - self.axes.shape[1]
-        if tau is not None:
-            right[: self.nv] = tau * self.mobile
-        if velocity is not None:
-            right[size:] = self.axes.T @ velocity
-        found = np.asarray(np.linalg.solve(self.system, right), dtype=np.float64)
-        return Answer(found[: self.nv], found[self.nv : size]), np.asarray(self.axes @ found[size:])
 
 
 def no_sticking() -> MetricError:

@@ -8,9 +8,10 @@ import numpy as np
 
 from impact_posture.arrays import Array
 from impact_posture.errors import MetricError
+from impact_posture.impact.held_point import SINGULAR
 from impact_posture.impact.impact_kind import ImpactKind
 from impact_posture.impact.objective import ImpactObjective
-from impact_posture.impact.oracle import SINGULAR, ImpactQuantities
+from impact_posture.impact.oracle import ImpactQuantities
 
 
 @dataclass(frozen=True)

@@ -7,10 +7,11 @@ import numpy as np
 
 from impact_posture.arrays import Array
 from impact_posture.dynamics.tree import Tree, Wrench
+from impact_posture.impact.held_point import SINGULAR
 from impact_posture.impact.impact_kind import QuadraticKind
 from impact_posture.impact.kernel import ImpactKernel
 from impact_posture.impact.lifted import UnknownJump, in_world, unknown_jump
-from impact_posture.impact.oracle import SINGULAR, no_sticking
+from impact_posture.impact.oracle import no_sticking
 
 
 class StickingKind(QuadraticKind):

@@ -187,7 +187,7 @@ class Scene:
         numeric = Numeric(self._robot.model).at(self._layout.q(data.qpos))
         moved = numeric.jacobian(self._point)[:3] @ after
         normal = float(self._n @ moved)
-        feet = [np.abs(numeric.jacobian(point)[:rows] @ after).max() for point, rows in self._feet]
+        feet = [np.abs(numeric.jacobian(foot.point)[: foot.rows] @ after).max() for foot in self._feet]
         return Measured(
             jump=after - before,
             restitution=normal / speed,
