@@ -6,7 +6,8 @@ joints.  The model has no geometry.  A simulation adds it with :meth:`Mjcf.add_g
 
 from __future__ import annotations
 
-from collections.abc import Sequence
+from collections.abc import Iterator, Sequence
+from contextlib import contextmanager
 from dataclasses import dataclass
 from typing import Any, Literal
 
@@ -274,3 +275,19 @@ def _add_sites(elements: dict[int, Any], model: pin.Model) -> dict[int, str]:
             sites[k] = _unique(str(frame.name), taken)
             elements[int(frame.parentJoint)].add_site(name=sites[k], **pose(frame.placement))
     return sites
+
+
+def _ignore(message: str) -> None:
+    """Take a warning and do nothing."""
+
+
+@contextmanager
+def unwarned() -> Iterator[None]:
+    """Keep MuJoCo from writing warnings to a log file in the working directory.  The state shows the problem."""
+    mujoco = import_mujoco()
+    before = mujoco.get_mju_user_warning()
+    mujoco.set_mju_user_warning(_ignore)
+    try:
+        yield
+    finally:
+        mujoco.set_mju_user_warning(before)

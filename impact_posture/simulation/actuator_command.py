@@ -9,6 +9,7 @@ import numpy as np
 
 from impact_posture.arrays import Array
 from impact_posture.dynamics.mjcf import import_mujoco
+from impact_posture.errors import InputError
 from impact_posture.settings import Vector3
 from impact_posture.simulation.contact_forces import ShapeTruth
 
@@ -62,6 +63,18 @@ class ActivePushes:
         bodies, points, forces, ends = zip(*self.active, strict=True) if self.active else ((), (), (), ())
         return {"pushes": len(bodies), "push_body": bodies, "push_end": ends,
                 "push": [[*point, *force] for point, force in zip(points, forces, strict=True)]}  # fmt: skip
+
+    def begin(self, push: Push, body: int, point: Array, step: int) -> None:
+        """Begin a push at a step, on a body, at a point in its axes.
+
+        Raises:
+            InputError: The force is not finite, or the duration is shorter than a time step.
+        """
+        count = round(push.duration / self._model.opt.timestep) if np.isfinite(push.duration) else 0
+        if count < 1 or not np.isfinite(push.force).all():
+            raise InputError("has no force or no duration", where=f"push at '{push.frame}'",
+                             hint="give newtons, and seconds of at least a time step")  # fmt: skip
+        self.active.append((body, point, np.array(push.force, dtype=float), step + count))
 
     def apply(self, data: Any, step: int) -> None:
         """Add the forces to a step, and forget the pushes that have ended."""

@@ -13,13 +13,13 @@ from typing import Any, NamedTuple
 import numpy as np
 
 from impact_posture.arrays import Array
-from impact_posture.dynamics.mjcf import import_mujoco
+from impact_posture.dynamics.mjcf import import_mujoco, unwarned
 from impact_posture.errors import CompilerError
 from impact_posture.libraries import build_library, cache_folder, is_cached, library_path, load_library, source_key
 from impact_posture.simulation.actuator_command import ActuatorCommand, Trace
 from impact_posture.simulation.compiled_tick import CompiledTick
 from impact_posture.simulation.scenario_objective import locked
-from impact_posture.simulation.world import World, unwarned
+from impact_posture.simulation.world import World
 
 _NAME = "world_ticks"
 # Most propellers, as in C.
@@ -98,9 +98,9 @@ class CompiledWorld:
             done = int(self._run(ctypes.byref(own), n))
         world.go_to(own.steps)
         if own.refused:
-            world.checked(self._command())
+            world.limits.within(self._command())
         row: dict[str, Any] = {name: self._arrays[f"row_{name}"][:done] for name in shapes}
-        row["stopped"], row["touching"] = world.stopped(row["qpos"]), row["touching"] > 0
+        row["stopped"], row["touching"] = world.stops.reached(row["qpos"]), row["touching"] > 0
         row["began"] = np.where(np.isinf(row["began"]), np.nan, row["began"])
         return Ticks(Trace(*(row[name] for name in Trace._fields)), row["command"], row["level"], row["status"])
 

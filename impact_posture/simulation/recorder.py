@@ -96,7 +96,7 @@ class Recorder:
             force = pushed * ((begin < t) & (t <= end + 1e-9))[:, None]
             peak, slip = np.linalg.norm(force, axis=1), trace.slip.max(axis=1, initial=0.0)
         stopped, names = np.zeros(trace.v.shape, dtype=bool), self._setup.robot.tangent_names
-        for name, there in zip(self._world.limited, trace.stopped.T, strict=True):
+        for name, there in zip(self._world.stops.names, trace.stopped.T, strict=True):
             if name in names:
                 stopped[:, names.index(name)] = there
         objective = np.full(t.size, np.nan)

@@ -4,15 +4,13 @@ from __future__ import annotations
 
 import math
 from collections import deque
-from collections.abc import Iterator
-from contextlib import contextmanager
 from typing import Any
 
 import numpy as np
 from numpy.typing import ArrayLike
 
 from impact_posture.arrays import Array
-from impact_posture.dynamics.mjcf import import_mujoco
+from impact_posture.dynamics.mjcf import import_mujoco, unwarned
 from impact_posture.errors import InputError, SimulationDiverged
 from impact_posture.impact.contact import point_on
 from impact_posture.robot.actuation import hover
@@ -24,28 +22,11 @@ from impact_posture.simulation.scene import Scene
 from impact_posture.simulation.sensor_noise import NO_FORCE, ForceFilter, Reading, Sample, SensorNoise
 from impact_posture.simulation.throw import Ball, Throw
 from impact_posture.simulation.world_builder import BuiltScene, build_scene
+from impact_posture.simulation.world_limits import RUNAWAY, CommandLimits, JointStops
 from impact_posture.tsid.controller import Command
 from impact_posture.tsid.state import checked_velocity
 
-# No robot is so far away or so fast, m, m/s, rad/s, and no torque so large, N·m.
-RUNAWAY = 1e6
 _NOTHING = np.zeros(0)
-
-
-def _ignore(message: str) -> None:
-    """Take a warning and do nothing."""
-
-
-@contextmanager
-def unwarned() -> Iterator[None]:
-    """Keep MuJoCo from writing warnings to a log file in the working directory.  The state shows the problem."""
-    mujoco = import_mujoco()
-    before = mujoco.get_mju_user_warning()
-    mujoco.set_mju_user_warning(_ignore)
-    try:
-        yield
-    finally:
-        mujoco.set_mju_user_warning(before)
 
 
 class World:
@@ -58,7 +39,8 @@ class World:
         scene: Its surroundings.
         built: The MuJoCo model, and where the surfaces are.
         timestep: Time step of the physics, s.
-        limited: Names of the joints with position limits, in the order of :class:`Trace`.
+        limits: Limits of the commands.
+        stops: The joints with position limits.
     """
 
     def __init__(self, robot: Robot, scene: Scene, built: BuiltScene) -> None:
@@ -82,20 +64,15 @@ class World:
         if propulsion is not None and sensors.unbalance:
             self._vibration = Vibration(robot.model, propulsion, sensors.unbalance)
         self._count = 0 if propulsion is None else len(propulsion.rotors)
-        effort = np.asarray(robot.model.effortLimit, dtype=float)[6 if robot.floating else 0 :]
-        # An effort limit of zero means that none is stated.
-        self._effort = np.where(effort > 0, effort, np.inf)
-        self._torques: Array = np.zeros(self._effort.size)
+        self.limits = CommandLimits(robot, self._rotors)
+        self._torques: Array = np.zeros(self.limits.effort.size)
         self._felt = None if sensors.force_frame is None else frames.index(sensors.force_frame)
         self._filter = ForceFilter(sensors.force_cutoff * self.timestep)
         self._marks: list[tuple[float, Sample, Array, Array]] = []
         self._past: deque[Sample] = deque(maxlen=1 + round(sensors.delay / self.timestep))
         self._pushes = ActivePushes(self._model)
         self._steps = 0
-        limited = np.array(self._model.jnt_limited, dtype=bool)
-        self._limited = np.array(self._model.jnt_qposadr)[limited]
-        self._low, self._high = np.array(self._model.jnt_range)[limited].T
-        self.limited = tuple(self._model.joint(int(k)).name for k in np.flatnonzero(limited))
+        self.stops = JointStops(self._model)
 
     def reset(
         self, q: ArrayLike, v: ArrayLike | None = None, seed: int = 0, *, rotor_speed: ArrayLike | None = None
@@ -126,7 +103,7 @@ class World:
         self._log.reset()
         self._marks.clear()
         self._filter.force = NO_FORCE
-        self._torques = np.zeros(self._effort.size)
+        self._torques = np.zeros(self.limits.effort.size)
         self._pushes.active.clear()
         self._steps = 0
         self._mujoco.mj_step1(self._model, self._data)
@@ -153,12 +130,8 @@ class World:
             InputError: The force is not finite, or the duration is shorter than a time step.
         """
         point = point_on(self.robot, push.frame, push.offset)
-        steps = round(push.duration / self.timestep) if np.isfinite(push.duration) else 0
-        if steps < 1 or not np.isfinite(push.force).all():
-            raise InputError("has no force or no duration", where=f"push at '{push.frame}'",
-                             hint="give newtons, and seconds of at least a time step")  # fmt: skip
         body = int(self._model.body(self.built.mjcf.bodies[point.joint]).id)
-        self._pushes.active.append((body, point.position, np.array(push.force, dtype=float), self._steps + steps))
+        self._pushes.begin(push, body, point.position, self._steps)
 
     def throw(self, sign: int = 1) -> None:
         """Throw the ball of the scenario now.
@@ -183,7 +156,7 @@ class World:
             SimulationDiverged: The state ran away.
         """
         self._check_ready()
-        speed, self._torques = self.checked(command)
+        speed, self._torques = self.limits.within(command)
         self._data.ctrl[self._count :] = self._torques
         if not count:
             return
@@ -257,14 +230,9 @@ class World:
         times, samples, torques, speeds = zip(*self._marks, strict=True)
         self._marks = []
         q, v = zip(*(sample.state for sample in samples), strict=True)
-        stopped = self.stopped(np.array([sample.qpos for sample in samples]))
+        stopped = self.stops.reached(np.array([sample.qpos for sample in samples]))
         parts = [np.array(column) for column in (times, q, v, speeds, torques)]
         return Trace._make([*parts, stopped, *self._log.look()])
-
-    def stopped(self, qpos: Array) -> Array:
-        """Return the joints with limits that are at one, shape (n, joints), for ``qpos`` of shape (n, numbers)."""
-        values = qpos[:, self._limited]
-        return np.asarray((values <= self._low) | (values >= self._high))
 
     def truth(self) -> Truth:
         """Return the true state.  The peak force and the first touch of each shape begin again, as do all marks."""
@@ -275,7 +243,7 @@ class World:
             for frame, on, force, impulse, peak, began, slip in zip(self._frames, *contacts, strict=True)
         )
         thrusts = speeds if self._rotors is None else self._rotors.thrusts(speeds)
-        stops = tuple(name for name, there in zip(self.limited, stopped, strict=True) if there)
+        stops = tuple(name for name, there in zip(self.stops.names, stopped, strict=True) if there)
         return Truth(float(t), q, v, speeds, thrusts, torques, shapes, stops)
 
     def in_c(self, count: int) -> dict[str, Any] | None:
@@ -291,8 +259,8 @@ class World:
         q, v = sample.state
         found = {"model": self._model._address, "data": self._data._address, "runaway": RUNAWAY**2,
                  "nq": q.size, "nv": v.size, "nqpos": self._data.qpos.size, "floating": int(floating),
-                 "q_at": places[0], "v_at": places[1], "true_q": q, "true_v": v, "joints": self._effort.size,
-                 "effort": self._effort, "torque": self._torques, "steps": self._steps, "count": count,
+                 "q_at": places[0], "v_at": places[1], "true_q": q, "true_v": v, "joints": self.limits.effort.size,
+                 "effort": self.limits.effort, "torque": self._torques, "steps": self._steps, "count": count,
                  "timestep": self.timestep, "rotors": 0, "vibrates": 0, "refused": 0,
                  "felt": -1 if self._felt is None else self._felt}  # fmt: skip
         parts = [self._filter.in_c(), self._noise.in_c(), self._log.in_c()]
@@ -307,26 +275,6 @@ class World:
     def go_to(self, steps: int) -> None:
         """Take note that C has gone to a number of steps since the reset."""
         self._steps = steps
-
-    def checked(self, command: Command | ActuatorCommand) -> tuple[Array, Array]:
-        """Return rotor speeds, shape (rotors,), and joint torques, shape (joints,), within their limits.
-
-        Raises:
-            InputError: The command has other sizes, is not finite, or has a torque without end.
-        """
-        speed, torque = np.asarray(command.rotor_speed, dtype=float), np.asarray(command.torque, dtype=float)
-        if speed.shape != (self._count,) or torque.shape != self._effort.shape:
-            sizes = f"give {self._count} and {self._effort.size}"
-            raise InputError(f"{speed.size} rotor speeds and {torque.size} torques", where="command", hint=sizes)
-        # A sum of squares that is not absurd settles it.
-        with np.errstate(over="ignore"):
-            usual = speed.dot(speed) + torque.dot(torque) < RUNAWAY**2
-        if not usual and not (np.isfinite(speed).all() and np.isfinite(torque).all()):
-            raise InputError("is not finite", where="command", hint="hold the last one instead")
-        torque = np.minimum(np.maximum(torque, -self._effort), self._effort)
-        if not usual and not np.abs(torque).max(initial=0.0) < RUNAWAY:
-            raise InputError("has an endless torque", where="command", hint="give the joints effort limits")
-        return speed if self._rotors is None else self._rotors.within(speed), torque
 
     def _check_ready(self) -> None:
         if not self._past:

@@ -131,11 +131,11 @@ def test_a_command_is_refused_or_cut_as_in_python(name: str, wrong: float) -> No
         tick(*6 * [None])
         command = ActuatorCommand(out["u"][rotors:], out["rotor_speed"][:rotors])
         if np.isfinite(wrong):
-            world.checked(command)
+            world.limits.within(command)
             assert loop.take(1, lambda t: None).level.size == 1
             continue
         with pytest.raises(InputError, match="command: is not finite"):
-            world.checked(command)
+            world.limits.within(command)
         with pytest.raises(InputError, match="command: is not finite"):
             loop.take(1, lambda t: None)
 

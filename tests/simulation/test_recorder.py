@@ -29,7 +29,7 @@ class Told:
     """In place of a world: rows made by hand, which it tells as traces."""
 
     def __init__(self, setup: Setup) -> None:
-        self.limited, self._setup, self.marks, self.next = setup.world.limited, setup, 0, 0
+        self.stops, self._setup, self.marks, self.next = setup.world.stops, setup, 0, 0
         self.rows: list[tuple[Any, ...]] = []
 
     def add(
@@ -41,7 +41,7 @@ class Told:
         ones = np.ones(shapes)
         self.rows.append((
             t, self._setup.q, np.full(robot.nv, 0.1), np.full(rotors, 50.0), np.ones(robot.nv - 6),
-            np.array([name == stop for name in self.limited]), touching * ones > 0,
+            np.array([name == stop for name in self.stops.names]), touching * ones > 0,
             np.tile([0, 0, 5.0 * touching], (shapes, 1)), np.zeros((shapes, 3)), 9.0 * touching * ones,
             ones * (np.nan if began is None else began), slip * touching * (np.arange(shapes) + (shapes == 1)),
         ))  # fmt: skip

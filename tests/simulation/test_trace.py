@@ -50,7 +50,7 @@ def test_a_trace_is_the_truth_of_every_tick(name: str, monkeypatch: pytest.Monke
     for k, truth in enumerate(truths[16:]):
         for key in ("t", "q", "v", "rotor_speeds", "torques"):
             np.testing.assert_array_equal(getattr(trace, key)[k], getattr(truth, key), key)
-        stops = [name for name, there in zip(world.limited, trace.stopped[k], strict=True) if there]
+        stops = [name for name, there in zip(world.stops.names, trace.stopped[k], strict=True) if there]
         assert tuple(stops) == truth.at_stops
         for j, shape in enumerate(truth.shapes):
             assert trace.touching[k, j] == shape.touching and trace.slip[k, j] == shape.slip
