@@ -2,8 +2,6 @@
 
 from __future__ import annotations
 
-import hashlib
-import json
 from collections.abc import Mapping
 from dataclasses import dataclass
 from functools import cached_property
@@ -21,6 +19,7 @@ from impact_posture.errors import (
     PostureError,
     PostureNotFound,
 )
+from impact_posture.robot.model_hash import dynamics_hash, hash_of, kinematics_hash, rounded
 from impact_posture.robot.model_joints import joint_range, q_slice
 from impact_posture.robot.spec import RobotSpec
 from impact_posture.settings import ContactPose, JointModel, RobotSettings, Root
@@ -31,8 +30,6 @@ CONVENTION = (
 )
 FIXED_CONVENTION = "q = [joints]; v = [joint rates]; SI units, radians"
 
-# Rounding error of a zero in a rotation matrix or an inertia (SI units).
-_ROUNDING = 1e-14
 # Largest distance (rad, m) beyond a position limit that counts as on it.
 _ON_LIMIT = 1e-6
 
@@ -134,39 +131,23 @@ class Robot:
     @cached_property
     def model_sha256(self) -> str:
         """Hash of the quantities that determine the dynamics: joints, placements, inertias and armature as stated."""
-        return self._hash(self.armature)
+        return dynamics_hash(self.model, self.armature)
 
     @cached_property
     def impact_sha256(self) -> str:
         """The same hash with the armature that the joint model leaves to an impact."""
-        return self._hash(np.asarray(self.model.armature))
+        return dynamics_hash(self.model, np.asarray(self.model.armature))
 
     @cached_property
     def kinematics_sha256(self) -> str:
         """Hash of joints, frames, limits of positions, and postures."""
-        model = self.model
-        placed = [(f.name, int(f.parentJoint), _rounded(f.placement.homogeneous)) for f in model.frames]
-        for k in range(1, model.njoints):
-            joint, numbers = model.joints[k], model.jointPlacements[k].homogeneous
-            placed.append((joint.shortname(), int(model.parents[k]), _rounded([*numbers.flat, *_axis(joint)])))
-        arrays = model.lowerPositionLimit, model.upperPositionLimit, *self.postures.values()
-        content = placed, [_rounded(values) for values in arrays], self.default_posture
-        return hashlib.sha256(json.dumps(content).encode()).hexdigest()
+        return kinematics_hash(self.model, self.postures, self.default_posture)
 
     @cached_property
     def data_sha256(self) -> str:
         """Hash of all data but shapes: dynamics, kinematics, limits, and what ``robot.toml`` says."""
-        efforts, rates = _rounded(self.model.effortLimit), _rounded(self.model.velocityLimit)
-        content = self.model_sha256, self.kinematics_sha256, efforts, rates, repr(self.spec)
-        return hashlib.sha256(json.dumps(content).encode()).hexdigest()
-
-    def _hash(self, armature: Array) -> str:
-        model, joints = self.model, []
-        for i in range(1, model.njoints):
-            arrays = model.jointPlacements[i].homogeneous, model.inertias[i].matrix(), _axis(model.joints[i])
-            numbers = [number for array in arrays for number in _rounded(array)]
-            joints.append([str(model.names[i]), str(model.joints[i].shortname()), int(model.parents[i]), *numbers])
-        return hashlib.sha256(json.dumps([joints, _rounded(armature)]).encode()).hexdigest()
+        efforts, rates = rounded(self.model.effortLimit), rounded(self.model.velocityLimit)
+        return hash_of((self.model_sha256, self.kinematics_sha256, efforts, rates, repr(self.spec)))
 
     @checked
     def frame_id(self, name: str) -> int:
@@ -288,19 +269,6 @@ class Robot:
                 low, high = float(self.model.lowerPositionLimit[k]), float(self.model.upperPositionLimit[k])
                 if not low - _ON_LIMIT <= q[k] <= high + _ON_LIMIT:
                     raise NotWithinLimits(joint, float(q[k]), low, high, where=where)
-
-
-def _axis(joint: pin.JointModel) -> Array:
-    """Return the motion subspace of a joint at the identity, which distinguishes two unaligned joints."""
-    model, data = pin.Model(), joint.createData()
-    model.addJoint(0, joint, pin.SE3.Identity(), "joint")
-    joint.calc(data, pin.neutral(model))
-    return np.asarray(data.S).reshape(-1)
-
-
-def _rounded(values: object) -> list[str]:
-    # 12 digits, and zero for the rounding errors of sines, so that a model has the same hash on every machine.
-    return [f"{v:.12g}" if abs(v) > _ROUNDING else "0" for v in map(float, np.asarray(values).reshape(-1))]
 
 
 def unit_parts(model: pin.Model) -> list[tuple[int, slice]]:
