@@ -15,15 +15,13 @@ from numpy.typing import ArrayLike
 from impact_posture.argument_types import checked
 from impact_posture.arrays import Array
 from impact_posture.codegen.reader import check_library, check_robot
+from impact_posture.controller_export.compiled_report import STATUSES, read_report
 from impact_posture.controller_export.manifest import Manifest, build_controller, read_controller
 from impact_posture.errors import ContactError, InputError, MetricError, PostureError, SpecError
 from impact_posture.libraries import library_path, load_library
 from impact_posture.robot.robot import Robot
-from impact_posture.tsid.controller import Command, Report, Status
-from impact_posture.tsid.relaxation import Relaxed
+from impact_posture.tsid.controller import Command, Report
 
-# Statuses in the order of their numbers in C.
-_STATUSES = tuple(Status)
 _FUNCTIONS = ("init", "reset", "tick", "last_report", "move_to", "lead_posture", "brace", "contact", "release")
 # Numbers of a target: set, position, rotation, velocity, acceleration.
 TARGET = 25
@@ -171,32 +169,9 @@ class CompiledController:
 
     def report(self) -> Report:
         """Return the diagnosis of the last tick."""
-        checked, found = self._checked, self._diagnosis
         self._call("last_report", ctypes.byref(self._report))
-        status = _STATUSES[self._report.status]
-        residuals: dict[str, Array] = {}
-        active: list[tuple[str, str]] = []
-        if status in (Status.SOLVED, Status.RELAXED):
-            start = 0
-            for task in checked.tasks:
-                residuals[task.name] = found["rows"][start : start + task.rows].copy()
-                start += task.rows
-            if checked.posture is not None:
-                residuals[checked.posture] = found["posture"].copy()
-            if checked.sizes["FORCES"]:
-                residuals["contacts"] = found["contacts"].copy()
-            first = checked.sizes["SIMPLE"]
-            equations = range(first, first + checked.sizes["EQUATIONS"])
-            for k, (name, multiplier) in enumerate(zip(checked.bounds, found["multipliers"], strict=True)):
-                if multiplier and k not in equations:
-                    active.append((name, "upper" if multiplier > 0 else "lower"))
-        dynamics, level, value = (float(found[name][0]) for name in ("dynamics", "level", "value"))
-        names = ("joint limits", *(name for name, _ in checked.levels))
-        relaxed = tuple(Relaxed(n, float(x)) for n, x in zip(names, found["relaxed"], strict=True) if x > 0)
-        missed = zip(names[1:], found["deficient"], strict=False)
-        deficient = tuple(Relaxed(n, float(x)) for n, x in missed if x > 0)
-        iterations = int(self._report.iterations)
-        return Report(status, relaxed, deficient, residuals, tuple(active), dynamics, level, value, iterations)
+        status, iterations = STATUSES[self._report.status], int(self._report.iterations)
+        return read_report(self._checked, status, iterations, self._diagnosis)
 
     def set_target(
         self, task: str, target: pin.SE3 | ArrayLike, velocity: ArrayLike = 0.0, acceleration: ArrayLike = 0.0
@@ -305,7 +280,7 @@ class CompiledController:
     def _commanded(self) -> Command:
         sizes, out = self._checked.sizes, self._out
         u, rotors = out["u"][: sizes["CONTROLS"]].copy(), sizes["ROTORS"]
-        status = _STATUSES[self._command.status]
+        status = STATUSES[self._command.status]
         speeds, forces = out["rotor_speed"][:rotors].copy(), out["forces"][: sizes["FORCES"]].copy()
         return Command(u, u[rotors:], speeds, status, out["acceleration"].copy(), forces)
 
