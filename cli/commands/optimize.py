@@ -3,28 +3,23 @@
 from __future__ import annotations
 
 import gc
-from collections import Counter
 from pathlib import Path
-from typing import TYPE_CHECKING, Annotated, Any
+from typing import TYPE_CHECKING, Annotated
 
 import typer
 
 from impact_posture.settings import ProblemSettings
 from impact_posture_cli import options
-from impact_posture_cli.impact_tables import alone_line, contact_names, impact_rows, worst_lines, worst_tables
-from impact_posture_cli.output import Page, number, print_json
+from impact_posture_cli.optimize_summary import announce, summarize
+from impact_posture_cli.output import Page, print_json
 from impact_posture_cli.progress_line import progress
 from impact_posture_cli.settings_options import Given, with_settings
 
 if TYPE_CHECKING:
-    from impact_posture.posture.problem_settings import Prepared
-    from impact_posture.posture.solve import PostureSolution
     from impact_posture.result_folder import Written
 
 # Thresholds of the garbage collector.
 _RARELY = 200_000, 50, 100
-# Actuators in the table of what holding a posture takes.
-_TIGHTEST = 3
 
 RobotOrProblem = Annotated[
     str,
@@ -73,7 +68,7 @@ def optimize(
             prepared = prepare(settings)
         folder = Path(out) if out else default_out(prepared)
         check_output(folder, force=force, kind="result")
-        _announce(page, prepared)
+        announce(page, prepared)
         with progress("solving", "starts", shown=shown, first="building the expressions") as advance:
             result = solve(
                 PostureProblem.of(prepared),
@@ -96,7 +91,7 @@ def optimize(
                 result = result.path(seed=settings.seed)
         if not json:
             # The result comes first, because figures and C code take longer.
-            _summarize(page, prepared, result.solution, result.document)
+            summarize(page, prepared, result.solution, result.document)
         with progress("drawing" if no_codegen else "drawing and compiling", "files", shown=shown) as advance:
             written = result.save(
                 folder,
@@ -146,156 +141,6 @@ def _refuse_idle(given: Given, settings: ProblemSettings) -> None:
     ):
         if name in given.values and not used:
             raise typer.BadParameter(f"does nothing without {hint}", param_hint=f"'--{name.replace('_', '-')}'")
-
-
-def _announce(page: Page, prepared: Prepared) -> None:
-    if page.quiet:
-        return
-    impact, problem = prepared.impact, prepared.problem
-    contacts = impact.objective.contacts
-    page.title(f"{impact.robot.name} at {', '.join(c.frame for c in contacts)}", f"objective {impact.objective.kind}")
-    axes = "world" if impact.contact.normal_frame == "world" else "contact frame"
-    degrees, variants = impact.objective.normal_cone_deg, impact.objective.model_variants
-    rows = impact_rows(impact, [c.normal for c in contacts], axes)
-    if degrees:
-        rows.append(("worst normal", f"within {degrees:g}° of the normal"))
-    if impact.objective.bilateral:
-        rows.append(("pull", "as well as push"))
-    if variants:
-        rows.append(("model variants", "; ".join(v.name for v in variants)))
-    page.pairs(rows)
-    if impact.choice:
-        page.line(impact.choice)
-    page.gap()
-    page.line("constraints")
-    for line in problem.describe():
-        page.line(f"  {line}")
-    for note in problem.notes:
-        page.line(f"  ({note})", style="dim")
-    page.warnings(impact.warnings)
-    page.gap()
-
-
-def _summarize(page: Page, prepared: Prepared, solution: PostureSolution, document: dict[str, Any]) -> None:
-    from impact_posture.impact.quantity_table import quantity_rows
-    from impact_posture.posture.caveats import percent
-
-    initial, optimal = document["initial"], document["optimal"]
-    impact, blocks = prepared.impact, {"before": initial, "after": optimal}
-    page.line(document["verdict"]["line"], style="bold")
-    for line in document["verdict"]["advice"]:
-        page.line(f"  {line}")
-    page.gap()
-    rows = [
-        (f"  {row.key}", number(row.before), number(row.after), row.unit, row.meaning)
-        for row in quantity_rows(impact, initial, optimal)
-    ]
-    page.table(("", *blocks, "unit", "meaning"), rows, right=(1, 2))
-    frames = contact_names(impact.objective.contacts)
-    alone_line(page, frames, "H, G, V, S, E")
-    worst_tables(page, frames, blocks)
-    page.gap()
-    worst_lines(page, frames, blocks)
-    _holding(page, initial["holding"], optimal["holding"])
-    free = f"{solution.redundancy} degree{'' if solution.redundancy == 1 else 's'} of freedom"
-    page.line(f"reduction {percent(solution.reduction)}; {free} left by the constraints")
-    if "robustness" in document:
-        page.line(document["robustness"]["line"])
-    for note in solution.notes[len(prepared.problem.notes) :]:
-        page.line(note)
-    if solution.moved > 1e-6:
-        page.line(f"the given posture did not satisfy the constraints: moved by {solution.moved:.3g} first")
-    if document["active"]:
-        page.line("active: " + ", ".join(_active(a) for a in document["active"]))
-    found = solution.certificate
-    page.line(
-        f"certificate ({found.recomputed_with}): stationarity {found.stationarity:.1e}, "
-        f"violation {found.primal:.1e}, pose error {found.pose_error_m:.1e} m, {found.pose_error_rad:.1e} rad"
-    )
-    if "collision" in document:
-        at = document["collision"]["optimal"]
-        page.line(f"no collision; closest: {at['closest']}, {1e3 * at['distance']:.3g} mm")
-    # Mirrored postures are optima of one value.
-    hits = Counter[str]()
-    for optimum in solution.optima:
-        hits[number(optimum.objective)] += optimum.hits
-    optima = ", ".join(f"{value} ({count}×)" for value, count in list(hits.items())[:5])
-    more = f" and {len(hits) - 5} more" if len(hits) > 5 else ""
-    left = solution.dominated_starts
-    page.line(
-        f"{solution.certified_starts} of {solution.starts} starts certified in {solution.solve_time_s:.1f} s; "
-        + (f"{left} could not become the best (--finish-all); " if left else "")
-        + f"optima: {optima}{more}"
-    )
-    if "global" in document:
-        page.line(document["global"]["line"])
-    if "tradeoff" in document:
-        _tradeoff(page, document, [n for n in document["notes"] if n.startswith("trade-off:")])
-    if "path" in document:
-        _path(page, document["path"])
-    # The warnings of the robot were printed before the solver started.
-    page.warnings(document["warnings"][len(prepared.impact.warnings) :])
-
-
-def _holding(page: Page, before: dict[str, Any] | None, after: dict[str, Any] | None) -> None:
-    """Show the actuators that come nearest to their limits, under each load."""
-    if before is None or after is None:
-        return
-    rows = []
-    for one, other in zip((before, *before["other_loads"]), (after, *after["other_loads"]), strict=True):
-        shares = {name: (load["share"], other["actuators"][name]["share"]) for name, load in one["actuators"].items()}
-        for name in sorted(shares, key=lambda name: -max(shares[name]))[:_TIGHTEST]:
-            used = (f"{share:.0%}" for share in shares[name])
-            load = other["actuators"][name]
-            rows.append((f"  {name}", *used, f"{number(load['low'])} to {number(load['high'])}", one["load"]))
-    page.line("share of the limits of the actuators that hold the posture (0% is mid-range)")
-    page.table(("", "before", "after", "range, N·m or N", ""), rows, right=(1, 2))
-    page.gap()
-
-
-def _tradeoff(page: Page, document: dict[str, Any], notes: list[str]) -> None:
-    """Show the trade-off between the objective and the distance or force."""
-    from impact_posture.posture.caveats import percent
-
-    points = document["tradeoff"]
-    page.gap()
-    digits = 3 if document["tradeoff_against"] == "distance" else 1
-    bound = {"distance": "a distance from the initial one (rad, mixed with m)", "force": "a peak force (N)"}
-    page.line(f"trade-off: the best posture within {bound[document['tradeoff_against']]}")
-    first, last = points[0]["objective"], points[-1]["objective"]
-    rows = []
-    for point in points:
-        gain = percent((first - point["objective"]) / (first - last)) if last < first else ""
-        marks = (["knee"] if point["knee"] else []) + ([] if point["certified"] else ["not certified"])
-        keys = ("objective", "H", "G", "V", "S")
-        rows.append(
-            (f"  {point['within']:.{digits}f}", gain, *(number(point[key]) for key in keys), ", ".join(marks))
-        )
-    page.table(("  within", "gain", "objective", "H", "G", "V", "S", ""), rows, right=range(7))
-    for note in notes:
-        page.line(note)
-
-
-def _path(page: Page, path: dict[str, Any]) -> None:
-    """Show the path to the optimum."""
-    page.gap()
-    end = "the optimum" if path["found"] else f"objective {number(path['objective'])}"
-    limit = path["limits"].get("active")
-    bound = f", bound by {limit}" if limit else ""
-    if path["points"] > 1:
-        page.line(
-            f"path to {end} by {path['method']}: {path['length']:.3g} rad (m) in {path['duration_s']:.3g} s"
-            f" ({path['timing']}{bound}), violation {path['max_violation']:.1e}"
-        )
-    else:
-        page.line("path: the start is the optimum" if path["found"] else "path: none leads away from the start")
-    if path["reason"]:
-        page.line(f"  {path['reason']}")
-
-
-def _active(entry: dict[str, Any]) -> str:
-    words = "limit" if entry["constraint"].startswith("joint ") else "bound"
-    return f"{entry['constraint']} at its {entry['side']} {words}"
 
 
 def _contents(written: Written) -> str:
