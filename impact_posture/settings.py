@@ -9,16 +9,15 @@ Nothing heavy is imported here, because ``--help`` reads this module.
 
 from __future__ import annotations
 
-import math
 from collections.abc import Mapping
 from dataclasses import dataclass, field
 from typing import Any, ClassVar, Literal, get_args
 
 from impact_posture import setting as demand
-from impact_posture.errors import InputError
+from impact_posture.obstacle import Obstacle
 from impact_posture.parsing import parse_armature, parse_number_or_name, parse_payloads
 from impact_posture.setting import CONTACT, METRIC, ROBOT, SEARCH, TASK, setting, with_demands
-from impact_posture.tables import STRICT, Checked
+from impact_posture.tables import STRICT
 
 Vector3 = tuple[float, float, float]
 Root = Literal["free-flyer", "fixed"]
@@ -38,8 +37,6 @@ TransmissionKind = Literal["rigid", "elastic", "locked"]
 # Mechanics of Materials, 5th ed. (steel; oak in bending; rubber; concrete).
 MATERIALS = {"steel": (200e9, 0.28), "wood": (11.5e9, 0.3), "rubber": (0.03e9, 0.48), "ground": (24e9, 0.15)}
 
-# Most characters of the name of an obstacle, which errors print.
-_LONGEST_NAME = 60
 # Least distance (m) of links that stay apart, and edge length (m) of a surface that ends before the robot's stand.
 CLEARANCE, PATCH = 0.001, 0.3
 # Coulomb coefficient of an ordinary surface.
@@ -174,48 +171,6 @@ class ImpactSettings(RobotSettings):
         repeatable=True,
     )  # fmt: skip
     support_compliance: float | None = None
-
-
-@dataclass(frozen=True, kw_only=True)
-@with_demands
-class Obstacle(Checked):
-    """A box or a ball that the robot stays clear of.
-
-    Attributes:
-        name: Name in messages.
-        box: Edge lengths of a box along its own axes, m.
-        sphere: Radius of a ball, m.
-        position: Center in the world, m.
-        quaternion: Orientation of a box in the world, x y z w.
-
-    Raises:
-        InputError: A value does not fit, there is not exactly one of ``box`` and ``sphere``, or the quaternion has no
-            unit length.
-    """
-
-    name: str
-    box: Vector3 | None = setting(None, "Edge lengths, m.", **demand.LENGTHS)
-    sphere: float | None = setting(None, "Radius, m.", **demand.ABOVE_ZERO)
-    position: Vector3 = setting((0.0, 0.0, 0.0), "Center in the world, m.", **demand.NUMBERS)
-    quaternion: tuple[float, float, float, float] = setting(
-        (0.0, 0.0, 0.0, 1.0), "Orientation x y z w.", **demand.NUMBERS
-    )
-
-    def __post_init__(self) -> None:
-        """Check the values."""
-        super().__post_init__()
-        if not self.name.strip() or len(self.name) > _LONGEST_NAME:
-            what = "has no name" if not self.name.strip() else f"has a name of {len(self.name)} characters"
-            raise InputError(what, where="obstacles", hint=f"give each a name of up to {_LONGEST_NAME} characters")
-        where = f"obstacle '{self.name}'"
-        if (self.box is None) == (self.sphere is None):
-            what = "neither edge lengths nor a radius" if self.box is None else "edge lengths and a radius"
-            raise InputError(f"has {what}", where=where, hint="give one of the keys box and sphere")
-        norm = math.hypot(*self.quaternion)
-        if abs(norm - 1) > 1e-3:
-            raise InputError(
-                f"the quaternion has norm {norm:.4g}", where=where, hint="give a unit quaternion x y z w"
-            )
 
 
 @dataclass(frozen=True, kw_only=True)

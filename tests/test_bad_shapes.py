@@ -22,9 +22,9 @@ from impact_posture.collision.obstacle import obstacle_hull
 from impact_posture.collision.shapes import NO_SHAPES, RobotShapes, load_shapes
 from impact_posture.collision.swept_hull import distance_from_hull
 from impact_posture.errors import InputError, SpecError, UrdfError
+from impact_posture.obstacle import Obstacle
 from impact_posture.robot.robot import Robot
 from impact_posture.robot.robot_loader import load_robot
-from impact_posture.settings import Obstacle
 from impact_posture.tables import validate
 
 TETRAHEDRON = np.array([[0, 0, 0], [0.1, 0, 0], [0, 0.1, 0], [0, 0, 0.1]])

@@ -19,6 +19,7 @@ from impact_posture.dynamics.numeric import Numeric
 from impact_posture.dynamics.tree import PointOnLink, Tree
 from impact_posture.errors import Infeasible, InputError
 from impact_posture.impact.contact import point_on
+from impact_posture.obstacle import Obstacle
 from impact_posture.posture.build_problem import retarget
 from impact_posture.posture.clearance import Clearance
 from impact_posture.posture.elastic import ElasticProgram, elastic
@@ -30,7 +31,7 @@ from impact_posture.posture.solve import solve
 from impact_posture.posture.starts import Projector, random_posture
 from impact_posture.robot.robot import Robot
 from impact_posture.robot.robot_loader import load_robot
-from impact_posture.settings import Obstacle, ProblemSettings
+from impact_posture.settings import ProblemSettings
 from impact_posture.tables import validate
 
 BOX = np.array(list(product((-0.04, 0.05), (-0.03, 0.06), (-0.05, 0.07))))

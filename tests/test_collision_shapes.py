@@ -19,10 +19,10 @@ from impact_posture.collision.mesh_check import MeshCheck, mesh_collisions
 from impact_posture.collision.obstacle import obstacle_hull
 from impact_posture.collision.shapes import load_shapes
 from impact_posture.collision.swept_hull import SweptHull, separation, transform
+from impact_posture.obstacle import Obstacle
 from impact_posture.robot.robot import Robot
 from impact_posture.robot.robot_loader import load_robot
 from impact_posture.robot.urdf import resolve_path, robots_data
-from impact_posture.settings import Obstacle
 from tests.test_swept_hull import distance_of_hulls
 
 ROBOTS = ("tilthex_arm", "panda", "solo8", "talos")

@@ -17,9 +17,9 @@ from impact_posture.collision.mesh_check import mesh_collisions
 from impact_posture.collision.mesh_triangles import Corrected, mesh_points, mesh_triangles, renumbered
 from impact_posture.collision.obstacle import obstacle_hull
 from impact_posture.collision.urdf_shapes import read_urdf_shapes
+from impact_posture.obstacle import Obstacle
 from impact_posture.report.shapes import draw_robot
 from impact_posture.robot.robot_loader import load_robot
-from impact_posture.settings import Obstacle
 from tests.test_bad_shapes import arm, mesh, own_cache
 
 __all__ = ["own_cache"]

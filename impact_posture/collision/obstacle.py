@@ -8,7 +8,7 @@ import numpy as np
 import pinocchio as pin
 
 from impact_posture.collision.swept_hull import SweptHull
-from impact_posture.settings import Obstacle
+from impact_posture.obstacle import Obstacle
 
 
 def obstacle_hull(obstacle: Obstacle) -> SweptHull:

@@ -13,10 +13,11 @@ from impact_posture.dynamics.numeric import Numeric
 from impact_posture.errors import InputError
 from impact_posture.impact.lifted import Guess
 from impact_posture.impact.objective import ImpactObjective, Objective
+from impact_posture.obstacle import Obstacle
 from impact_posture.posture.constraint import Constraint
 from impact_posture.posture.surroundings import Surroundings
 from impact_posture.robot.robot import Robot
-from impact_posture.settings import CLEARANCE, Obstacle, Vector3
+from impact_posture.settings import CLEARANCE, Vector3
 
 # A direction of the tangent space is held if a unit step along it moves a constraint by more than this.
 RANK_TOLERANCE = 1e-7

@@ -18,11 +18,12 @@ from impact_posture.dynamics.numeric import Numeric
 from impact_posture.dynamics.tree import PointOnLink
 from impact_posture.errors import InputError
 from impact_posture.impact.contact import ImpactContact, Support, point_on
+from impact_posture.obstacle import Obstacle
 from impact_posture.posture.clearance import Clearance
 from impact_posture.posture.nested_links import NestedLinks
 from impact_posture.posture.separator import Body, Separator
 from impact_posture.robot.robot import Robot
-from impact_posture.settings import PATCH, Obstacle
+from impact_posture.settings import PATCH
 
 # A contact point this near (m) to a plane lies in it.
 _BESIDE = 0.03
