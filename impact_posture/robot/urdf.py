@@ -14,7 +14,7 @@ from typing import IO
 
 import pinocchio as pin
 
-from impact_posture.errors import JointNotFound, PackageNotFound, SpecError, UrdfError
+from impact_posture.errors import PackageNotFound, SpecError, UrdfError, nearest
 from impact_posture.robot.inertia_checks import check_inertias
 
 # The data of Pinocchio always hold 6 nv³ numbers: 0.4 GB at 200 degrees of freedom and 48 GB at 1,000.
@@ -92,7 +92,6 @@ def build_model(path: Path, *, free_flyer: bool, accept_inertias: bool = False) 
     """
     root = parse_urdf(path)
     _check_depth(root, path)
-    _check_mimics(root, path)
     try:
         with quiet_stderr() as words:
             model = pin.buildModelFromUrdf(str(path), *([pin.JointModelFreeFlyer()] if free_flyer else []))
@@ -114,7 +113,7 @@ def build_model(path: Path, *, free_flyer: bool, accept_inertias: bool = False) 
             where=str(path),
             hint="fix joints in the URDF that hardly matter",
         )
-    return model, check_inertias(root, model, path, accept_inertias)
+    return model, (*check_inertias(root, model, path, accept_inertias), *_lost_mimics(root))
 
 
 def _check_depth(root: ET.Element, path: Path) -> None:
@@ -138,12 +137,16 @@ def _check_depth(root: ET.Element, path: Path) -> None:
             raise UrdfError(f"has a chain of more than {_DEEPEST} joints", where=str(path), hint=hint)
 
 
-def _check_mimics(root: ET.Element, path: Path) -> None:
-    """Refuse a joint that mimics no joint, which Pinocchio ignores."""
+def _lost_mimics(root: ET.Element) -> list[str]:
+    """Return a warning for each joint that mimics a joint that does not exist, nearest names included."""
     joints = {joint.get("name", ""): joint.find("mimic") for joint in root.findall("joint")}
-    for name, mimic in joints.items():
-        if mimic is not None and (other := mimic.get("joint", "")) not in joints:
-            raise JointNotFound(other, joints, where=f"{path}, <mimic> of joint '{name}'")
+    followed = {name: mimic.get("joint", "") for name, mimic in joints.items() if mimic is not None}
+    return [
+        f"joint '{name}' mimics '{other}', which is no joint of the URDF (did you mean "
+        f"{nearest(other, joints, 1)[0]}?): it moves by itself; correct its <mimic>"
+        for name, other in followed.items()
+        if other not in joints
+    ]
 
 
 def parse_urdf(path: Path) -> ET.Element:
