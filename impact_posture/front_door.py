@@ -6,13 +6,13 @@ from collections.abc import Sequence
 from dataclasses import dataclass, replace
 from functools import cached_property, partial
 from pathlib import Path
-from typing import TYPE_CHECKING, Any, get_args
+from typing import TYPE_CHECKING, Any
 
 import numpy as np
 
 from impact_posture.argument_types import checked
 from impact_posture.arrays import Array
-from impact_posture.errors import InputError, check_choice
+from impact_posture.errors import InputError
 from impact_posture.front_door_problem import PostureProblem
 from impact_posture.output_folder import whole_folder, write_json
 from impact_posture.posture.certificate import Certificate
@@ -255,7 +255,6 @@ def optimize(
         Infeasible: No posture satisfies the constraints; the error names the conflicting constraints.
         SolverFailed: No run ended at a certified posture.
     """
-    check_choice("search", search, get_args(Search))
     if search == "global":
         check_searchable(problem.problem)
     found = solve_robustly(

@@ -8,14 +8,14 @@ from __future__ import annotations
 from collections.abc import Sequence
 from dataclasses import fields, replace
 from pathlib import Path
-from typing import TYPE_CHECKING, Any, get_args
+from typing import TYPE_CHECKING, Any
 
 import numpy as np
 from numpy.typing import ArrayLike
 
 from impact_posture.argument_types import checked, checked_class
 from impact_posture.arrays import Array
-from impact_posture.errors import InputError, check_choice, shown
+from impact_posture.errors import InputError
 from impact_posture.impact import objective as core
 from impact_posture.impact.contact import ImpactContact, check_compliance
 from impact_posture.impact.contact_compression import ContactStiffness
@@ -90,8 +90,6 @@ class ImpactObjective(core.ImpactObjective):
         payloads: Sequence[tuple[str, float]] = (),
         joint_model: JointModel | None = None,
     ) -> None:
-        check_choice("joint_model", joint_model or robot.joint_model, get_args(JointModel))
-        check_choice("kind", kind, get_args(ObjectiveKind))
         robot = with_joint_model(robot, joint_model or robot.joint_model)
         given = [contact] if isinstance(contact, ImpactContact) else list(contact)
         if not given:
@@ -135,8 +133,6 @@ class ImpactObjective(core.ImpactObjective):
 
 
 def _at_own_frame(robot: Robot, contact: ImpactContact) -> ImpactContact:
-    if not isinstance(contact, ImpactContact):
-        raise InputError(f"'{shown(contact)}' is no contact", where="contact", hint="give an ImpactContact")
     own = robot.spec.contact
     if contact.frame != own.frame or any(contact.offset) or not any(own.offset):
         return contact
@@ -146,10 +142,6 @@ def _at_own_frame(robot: Robot, contact: ImpactContact) -> ImpactContact:
 def _supports(robot: Robot, supports: Sequence[str | Support] | None) -> tuple[Support, ...]:
     if supports is None:
         return resolve_supports(robot, None)
-    for support in supports:
-        if not isinstance(support, str | Support):
-            hint = "give FRAME, FRAME:point, FRAME:surface or a Support"
-            raise InputError(f"'{shown(support)}' is no support", where="supports", hint=hint)
     texts = tuple(support for support in supports if isinstance(support, str))
     return (*resolve_supports(robot, texts), *(support for support in supports if isinstance(support, Support)))
 

@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 from dataclasses import dataclass
-from typing import get_args
 
 import numpy as np
 import pinocchio as pin
@@ -11,7 +10,7 @@ import pinocchio as pin
 from impact_posture.argument_types import check_types
 from impact_posture.arrays import Array
 from impact_posture.dynamics.tree import PointOnLink
-from impact_posture.errors import ContactError, InputError, check_choice, shown
+from impact_posture.errors import ContactError, InputError, shown
 from impact_posture.robot.robot import Robot
 from impact_posture.robot.spec import Support as Support
 from impact_posture.settings import FRICTION, NormalFrame, Vector3
@@ -52,7 +51,6 @@ class ImpactContact:
     friction: float = FRICTION
 
     def __post_init__(self) -> None:
-        check_choice("normal_frame", self.normal_frame, get_args(NormalFrame))
         if not isinstance(self.frame, str):
             raise ContactError(f"'{shown(self.frame)}' is no name", where="frame", hint="give the name of a frame")
         check_types(type(self).__init__, vars(self) | {"normal": (0, 0, 1)})

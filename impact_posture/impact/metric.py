@@ -11,7 +11,7 @@ import numpy as np
 
 from impact_posture.argument_types import check_types
 from impact_posture.arrays import Array
-from impact_posture.errors import MetricError, check_choice
+from impact_posture.errors import MetricError
 from impact_posture.robot.model_joints import v_slice
 from impact_posture.robot.robot import Robot
 from impact_posture.settings import MetricKind
@@ -37,7 +37,6 @@ class Metric:
     source: str = ""
 
     def __post_init__(self) -> None:
-        check_choice("metric", self.kind, get_args(MetricKind))
         check_types(type(self).__init__, vars(self))
         if (self.kind == "weighted") != (self.weights is not None):
             what = "needs weights" if self.weights is None else "takes no weights"

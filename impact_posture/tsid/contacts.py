@@ -6,14 +6,13 @@ import itertools
 import math
 from collections.abc import Sequence
 from dataclasses import dataclass
-from typing import get_args
 
 import numpy as np
 import pinocchio as pin
 
 from impact_posture.argument_types import checked, checked_class
 from impact_posture.arrays import Array
-from impact_posture.errors import ContactError, check_choice
+from impact_posture.errors import ContactError
 from impact_posture.robot.robot import Robot
 from impact_posture.settings import SupportKind
 from impact_posture.tsid.points import Point
@@ -53,7 +52,6 @@ class SupportContact:
     def __post_init__(self) -> None:
         """Refuse values that make no contact."""
         where = f"contact at {self.point.frame}"
-        check_choice(f"{where}: kind", self.kind, get_args(SupportKind))
         if not min(self.least, self.kp, self.kd) >= 0 or not math.isfinite(self.least + self.kp + self.kd):
             raise ContactError(
                 "least, kp or kd is out of range", where=where, hint="give finite numbers from zero up"

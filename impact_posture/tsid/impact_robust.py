@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import math
 from collections.abc import Callable
-from typing import Any, Literal, get_args
+from typing import Any, Literal
 
 import numpy as np
 import pinocchio as pin
@@ -13,7 +13,7 @@ from numpy.typing import ArrayLike
 from impact_posture.argument_types import checked_class
 from impact_posture.arrays import Array
 from impact_posture.codegen.impact_gradient import ImpactGradient
-from impact_posture.errors import InputError, MetricError, check_choice
+from impact_posture.errors import InputError, MetricError
 from impact_posture.robot.robot import Robot
 from impact_posture.tsid.activation import Activation, Phase
 from impact_posture.tsid.posture_tasks import JointPosture
@@ -129,7 +129,6 @@ class ImpactRobustPosture(JointPosture):
             InputError: A number is out of range.
             ManifestMismatch: The export is of another robot.
         """
-        check_choice("spring", spring, get_args(Spring))
         super().__init__(robot, target, name=name, **gains)
         sound = 0 <= K < math.inf and reach > 0 and follow > 0 and 0 <= fade[0] < fade[1]
         if not (sound and every >= 1 and (scale or 1) > 0):
