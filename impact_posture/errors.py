@@ -93,18 +93,6 @@ class InputError(ImpactPostureError):
     """A value given by the user is wrong."""
 
 
-def check_choice(name: str, value: object, choices: Iterable[str]) -> None:
-    """Refuse a value that is none of the choices.
-
-    Raises:
-        InputError: With the choices, or the nearest of them.
-    """
-    names = list(choices)
-    if not isinstance(value, str) or value not in names:
-        what, hint = not_one_of(value, names)
-        raise InputError(what, where=name, hint=hint)
-
-
 class NameNotFound(InputError):
     """A name that does not exist; carries the nearest valid names."""
 
