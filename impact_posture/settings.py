@@ -197,8 +197,9 @@ class ProblemSettings(ImpactSettings):
     )
     keep: tuple[str, ...] = setting((), "Hold the pose of another frame; repeatable.", TASK, "FRAME", repeatable=True)
     hold: tuple[str, ...] | None = setting(
-        None, "Keep a joint at its value; repeatable.", TASK, "JOINT", "robot.toml's", repeatable=True
-    )
+        None, "Keep a joint at its value, in place of robot.toml's; repeatable.", TASK, "JOINT", "robot.toml's",
+        repeatable=True,
+    )  # fmt: skip
     base: str | None = setting(
         None,
         "Constraint on a floating base: free, level (yaw free), level:DEG (and tilted by up to DEG), fixed or "
