@@ -8,6 +8,7 @@ from dataclasses import replace
 from functools import cache
 from itertools import pairwise
 from pathlib import Path
+from typing import Any
 
 import casadi as ca
 import numpy as np
@@ -59,6 +60,29 @@ def moved(problem: PostureProblem, q: np.ndarray, start: np.ndarray) -> float:
         # |R − R'|² = 4 (1 − cos Δ) for a turn by Δ, and 4 sin²(Δ/2) = 2 (1 − cos Δ).
         base = float(np.sum((q[:3] - start[:3]) ** 2) + turn / 2)
     return float(np.sqrt(step @ step + base))
+
+
+@pytest.mark.parametrize("case", ["fixed", "floating"])
+def test_a_solve_goes_on_from_the_end_of_the_one_before(case: str, monkeypatch: pytest.MonkeyPatch) -> None:
+    """Without its multipliers the curve is the same and takes more iterations."""
+    found: list[tuple[int, list[float]]] = []
+    solution = solve(prepare(make_settings(CASES[case])).problem, starts=4, jobs=1)
+    one_solve = nlp.PostureNLP.solve
+    for warm in (True, False):
+        taken: list[int] = []
+
+        def run_and_count(
+            self: nlp.PostureNLP, start: np.ndarray, *, goes_on: bool = warm, taken: list[int] = taken, **options: Any
+        ) -> nlp.SolveRecord:
+            record = one_solve(self, start, **options | ({} if goes_on else {"warm": None}))
+            taken.append(record.iterations)
+            return record
+
+        monkeypatch.setattr(nlp.PostureNLP, "solve", run_and_count)
+        curve = pareto_front(solution, 10, compile="never")
+        found.append((sum(taken), [point.objective for point in curve.points]))
+    assert found[0][0] < found[1][0]
+    np.testing.assert_allclose(found[0][1], found[1][1], rtol=1e-6)
 
 
 # ---- the distance -----------------------------------------------------------------------------------------------

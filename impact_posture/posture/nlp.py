@@ -105,8 +105,14 @@ class PostureNLP:
 
     def at(self, problem: PostureProblem) -> PostureNLP:
         """Return the program with another target, whose expressions and bounds of rows are the same."""
+        found = self.bounded(problem)
+        vars(found)["_row_bounds"] = self._row_bounds
+        return found
+
+    def bounded(self, problem: PostureProblem) -> PostureNLP:
+        """Return the program with other bounds of its rows."""
         found = replace(self, problem=problem)
-        vars(found).update(_row_bounds=self._row_bounds, _warm_solver=self._warm_solver)
+        vars(found)["_warm_solver"] = self._warm_solver
         return found
 
     def grown(self, problem: PostureProblem, *, compile: CompileMode = "auto") -> PostureNLP:

@@ -9,7 +9,8 @@ for a series of prices d from the least to that of the optimum.  The price is th
 not a penalty, because the minimizers of ``objective + w·price`` reach the convex hull of the curve only.
 
 One program, with the price as the bound of a row, is solved along two paths: outward from the posture at the least
-price and inward from the optimum.  Each solve starts at the end of the previous solve.  The best certified end at
+price and inward from the optimum.  Each solve starts at the end of the previous solve, with its multipliers if this
+end is within the bound.  The best certified end at
 each price counts.  If the end at the next price was found on another path, that path is tried here as well.  So the
 curve is the lower envelope of the paths.  It falls only because better postures were found.
 """
@@ -27,7 +28,7 @@ from impact_posture.errors import InputError, MetricError
 from impact_posture.impact.contact_compression import ContactStiffness
 from impact_posture.posture.certificate import Certificate, certify
 from impact_posture.posture.compiled import CompileMode
-from impact_posture.posture.nlp import PostureNLP, build_nlp
+from impact_posture.posture.nlp import PostureNLP, WarmStart, build_nlp
 from impact_posture.posture.problem import PostureProblem
 from impact_posture.posture.rulers import DistanceRuler, ForceRuler, Ruler
 from impact_posture.posture.search import Progress, run_start
@@ -141,6 +142,8 @@ class _Curve:
         self._scale = problem.objective.value(ruler.nearest)
         self._best: list[_Found | None] = [None] * len(levels)
         self._tried: set[tuple[int, bytes]] = set()
+        # Ends of solves by their postures.
+        self._ends: dict[bytes, WarmStart] = {}
         self.solves = 0
         self._take(0, "outward", ruler.nearest)
 
@@ -197,7 +200,10 @@ class _Curve:
         start = self._ruler.within(start, level)
         try:
             for _ in range(_GROWTH):
-                record, certificate = run_start(replace(self._nlp, problem=self._at(level)), start, self._scale)
+                nlp, warm = self._nlp.bounded(self._at(level)), self._ends.get(start.tobytes())
+                first = nlp.solve(start, scale=self._scale, warm=warm)
+                record, certificate = run_start(nlp, start, self._scale, first=first)
+                self._ends[record.q.tobytes()] = record.end
                 grown = self._problem.grown([record.q])
                 if grown is self._problem:
                     break
