@@ -1,4 +1,8 @@
-"""Check of the arguments from Python against the annotations of the function that takes them."""
+"""Check of the arguments from Python against the annotations of the function that takes them.
+
+Libraries that check types while a program runs refuse NumPy's numbers for ``int`` and ``float``, and arrays for
+sequences.  Users of this package pass both, so they count here.
+"""
 
 from __future__ import annotations
 
