@@ -60,7 +60,7 @@ def both(name: str, path: tuple[float, ...] = ()) -> tuple[Controller, Reference
 
 @pytest.mark.parametrize(
     ("name", "path", "tilt", "ticks"),
-    [("tilthex_arm", (), 0.8, 300), ("solo8", (), 0.8, 300), ("solo8", (), 0.053, 600), ("panda", ELBOW, 0.8, 300)],
+    [("tilthex_arm", (), 0.8, 300), ("solo8", (), 0.8, 300), ("solo8", (), 0.06, 600), ("panda", ELBOW, 0.8, 300)],
 )
 def test_the_reference_goes_as_in_python(name: str, path: tuple[float, ...], tilt: float, ticks: int) -> None:
     """Each controller moves a robot of its own, through all phases."""
@@ -93,7 +93,7 @@ def test_the_reference_goes_as_in_python(name: str, path: tuple[float, ...], til
         assert report.level == posture.level and report.objective == pytest.approx(posture.value, rel=1e-7)
     away = np.abs(pin.difference(r.model, start, theirs.target)).max()
     assert away > 0.02 and theirs.flow_failures == 0
-    # Without the bound it comes to 0.06.
+    # Without the bound it comes to 0.0608.
     assert tilt > 0.5 or 0.0515 < most < tilt
     assert path or posture.value < 0.95 * first
     assert np.abs(posture.flow.velocity).max() < 0.02

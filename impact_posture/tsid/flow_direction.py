@@ -27,6 +27,11 @@ _LEVEL = 1e-6
 _NEAR = 1e-3
 # What of that the flow takes where a limit is missed by so much already: along it, the flow would creep across.
 _SPENT = 9e-4
+# Distance from every limit to which the flow aims, rad (m), or as a share: what limits and curvature that are learned
+# may be wrong by where it moves fast.
+_RESERVE = 6e-3
+# Square of the length below which a row has no direction on the constraints.
+_FLAT = 1e-6
 # Stiffness of those springs relative to ``H₀``, 1/m²: an error of 6 mm costs half of ``H₀``.
 _STIFFNESS = 3e4
 
@@ -38,7 +43,7 @@ class FlowOptions:
 
     Attributes:
         speed: Largest speed ``v`` of an entry of ``q_r``, rad/s (m/s).
-        acceleration: Largest acceleration ``a``, rad/s² (m/s²); a third of it stops the flow on its step.
+        acceleration: Largest acceleration ``a``, rad/s² (m/s²); two fifths of it stop the flow on its step.
         rho: ρ, pull of the joints towards the start per rad², relative to ``H₀``.
         mu: μ, least curvature per rad², relative to ``H₀``.
         epsilon: ε, predicted decrease relative to ``H₀`` below which the flow rests; it resumes above 4 ε.
@@ -51,10 +56,10 @@ class FlowOptions:
     """
 
     speed: float = 1.0
-    acceleration: float = 2.0
+    acceleration: float = 3.0
     rho: float = 0.001
     mu: float = 0.05
-    epsilon: float = 3e-4
+    epsilon: float = 7e-5
     joint_margin: float = 0.1
     com_margin: float = 0.05
     tilt: float = 0.8
@@ -183,6 +188,8 @@ class FlowDirection:
             count += 1
         upper[count:] = 1.0 - shares
         lower[count:] = -1.0 - shares
+        upper -= _RESERVE
+        lower += _RESERVE
         ahead = self._rows @ coasting
         np.maximum(upper, -_SPENT, out=self._room[0])
         np.minimum(lower, _SPENT, out=self._room[1])
@@ -237,6 +244,25 @@ class FlowDirection:
         """Return whether ``flow``, shape (nv,), stays within the limits for so many seconds."""
         ahead = self._rows @ (flow * time)
         return not float(np.maximum(ahead - self._room[0], self._room[1] - ahead).max(initial=0.0)) > _NEAR
+
+    def along(self, Z: Array, flow: Array, time: float, step: Array) -> Array:
+        """Return a step of the flow without the part of it by which limits would be crossed, one after the other.
+
+        Args:
+            Z: Basis of the redundancy, shape (nv, r).
+            flow: ``u``, shape (nv,).
+            time: Time for which ``flow + step`` goes on, s.
+            step: Change of ``u``, shape (nv,).
+        """
+        for row, high, low in zip(self._rows, *self._room, strict=True):
+            ahead = time * float(row @ (flow + step))
+            if low <= ahead <= high:
+                continue
+            across = Z @ (Z.T @ row)
+            square = float(across @ across)
+            if square > _FLAT:
+                step = step - across * ((ahead - min(max(ahead, low), high)) / time / square)
+        return step
 
     def _solve(self, way: Array, slope: Array) -> Array:
         """Return ``δ = way·y`` for the least ``½‖y‖² + slope·y``; zero if the solver fails."""

@@ -36,6 +36,12 @@ _STILL = 1e-5
 _EMPTY = 1e-24
 # Length of what is new in a direction below which once more makes it exact.
 _NEW = 0.1
+# Length of a velocity below which the flow has no way to stop on.
+_SLOW = 1e-3
+# How often a change of the flow is tried: as it is, and twice without what crosses limits.
+_TIMES = 3
+# Least share of the acceleration with which the flow counts on braking, and its growth with each change.
+_ABLE = 0.1
 # Pull to zero of the base's share in a motion that the joints do not determine.
 _IDLE = 1e-9
 
@@ -116,6 +122,7 @@ class ReferenceFlow:
         self._phase, self._next, self._visited, self._elapsed, self._clock = 0, 0, 0, 0.0, 0.0
         self._deadline = np.inf
         self.on, self.resting, self.failed = False, False, False
+        self._ahead, self._able = False, 1.0
         state.update(q, self.velocity)
         kinds = {3: FramePosition, 6: FramePose}
         self._held: list[Task] = [*(kinds[c.size](c.point) for c in self._contacts), *self._tasks]
@@ -191,6 +198,13 @@ class ReferenceFlow:
         Z = self._space.basis
         if self.failed or not Z.shape[1]:
             return
+        self._ahead = not self._ahead
+        size = math.sqrt(float(self._flow @ self._flow))
+        if self._ahead and size > _SLOW:
+            # Where the flow stops: what it learns there is what it needs to know.
+            z, length = self._flow / size, max(size * self._stopping(self._flow), _STEP)
+            self._beside(z, length)
+            return
         k = self._next % Z.shape[1]
         # The columns of Z are as good as any others of that space.  What a fixed direction has in it is unique.
         z, seen = self._seen[k], self._seen[:k]
@@ -201,13 +215,21 @@ class ReferenceFlow:
             z /= length
             if length > _NEW:
                 break
-        q = pin.integrate(self._model, self._here, _STEP * z)
+        self._next += int(self._beside(z, _STEP))
+
+    def _beside(self, z: Array, length: float) -> bool:
+        """Learn from the end of a way ``z · length`` from the last look; return whether ``H`` exists there."""
+        q = pin.integrate(self._model, self._here, length * z)
         _, slope = self._evaluate(q)
         self._place(q)
         if not self.failed:
             reduced = slope - self._J.T @ self._multipliers
-            self._compare(z, _STEP, reduced, self._static.shares(self._state, self._J))
-            self._next += 1
+            self._compare(z, length, reduced, self._static.shares(self._state, self._J))
+        return not self.failed
+
+    def _stopping(self, flow: Array) -> float:
+        """Return the time in which a flow stops evenly, s, which takes twice the way that braking takes."""
+        return float(np.abs(flow).max()) / self.options.acceleration
 
     def _compare(self, z: Array, length: float, reduced: Array, shares: Array) -> None:
         """Learn from reduced gradient and static controls at the end of a way ``z · length`` from the last look."""
@@ -242,9 +264,9 @@ class ReferenceFlow:
         fastest = options.speed * max(1.0 - error / options.tracking, 0.0)
         # The speed is that at the next change, and rest comes with the one after.
         fastest = min(fastest, options.acceleration * max(self._deadline - self._clock - 2 * period, 0.0))
-        # A third of the acceleration stops a speed of √(2/3 a δ) on the step δ.  Below v/2, it is 4/3 a/v δ.
-        least = 3 * options.speed**2 / (8 * options.acceleration)
-        wanted = self._wanted * math.sqrt(2 * options.acceleration / 3 / max(np.abs(self._wanted).max(), least))
+        # Two fifths of the acceleration stop a speed of √(4/5 a δ) on the step δ.  Below v/2, it is 8/5 a/v δ.
+        least = 0.3125 * options.speed**2 / options.acceleration
+        wanted = self._wanted * math.sqrt(0.8 * options.acceleration / max(np.abs(self._wanted).max(), least))
         if not self.on:
             fastest = 0.0
         rate = self.error / _RETURN
@@ -260,7 +282,9 @@ class ReferenceFlow:
         self._flow = Z @ (Z.T @ self._flow)
         step = self._change(limited(wanted, fastest), options.acceleration * period, fastest > 0)
         known = (self._flow + back - self.velocity) / period
-        step *= self._static.permitted(self._state.M, known, step / period, self.shares, options.haste)
+        part = self._static.permitted(self._state.M, known, step / period, self.shares, options.haste)
+        self._able = min(max(part, _ABLE), self._able + _ABLE)
+        step *= part
         self._flow += step
         self.acceleration[:] = known + step / period
 
@@ -268,20 +292,23 @@ class ReferenceFlow:
         """Return the change of the flow towards the wanted one, shape (nv,), by at most ``most`` an entry.
 
         Each joint turns as fast as it can, and then all stay on the constraints; or all change evenly; or all brake
-        evenly.  The first of these counts from which the flow can stop within the limits by braking evenly.
+        evenly.  The first two count twice more without what crosses limits.  The first change counts from which the
+        flow can stop within the limits by braking evenly, as hard as it lately could.
         """
-        Z, flow, acceleration = self._space.basis, self._flow, self.options.acceleration
-        away = wanted - flow
-        fast = Z @ (Z.T @ np.minimum(np.maximum(away, -most), most))
-        for step in (fast, away):
+        Z, flow, direction = self._space.basis, self._flow, self.direction
+        away, period = wanted - flow, most / self.options.acceleration
+        # Twice the way on which it stops, because the curvature may grow on it.
+        stop = flow * self._stopping(flow)
+        for step in (Z @ (Z.T @ np.minimum(np.maximum(away, -most), most)), away):
             step = limited(step, most)
-            if moving and self._visited == len(self._path):
-                # Twice the way on which it stops, because the curvature may grow on it.
-                stop = flow * (np.abs(flow).max() / acceleration)
-                step = limited(self.direction.downhill(Z, self._slope, flow, stop, step), most)
-            time = np.abs(flow + step).max() / (2 * acceleration) + most / acceleration
-            if self.direction.stops(flow + step, time):
-                return step
+            for again in range(_TIMES):
+                if again:
+                    step = direction.along(Z, flow, self._stopping(flow + step) / 2 / self._able + period, step)
+                if moving and self._visited == len(self._path):
+                    step = direction.downhill(Z, self._slope, flow, stop, step)
+                step = limited(step, most)
+                if direction.stops(flow + step, self._stopping(flow + step) / 2 / self._able + period):
+                    return step
         return limited(-flow, most)
 
     def _coast(self) -> None:

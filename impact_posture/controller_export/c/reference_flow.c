@@ -14,16 +14,8 @@
 #define IP_MOVED 1e-6
 /* Length of what is new in a direction below which it is taken twice. */
 #define IP_NEW 0.1
-
-static double ip_largest(const double *x, int first)
-{
-  double most = 0.0;
-  int i;
-  for (i = first; i < IP_NV; ++i) {
-    most = fmax(most, fabs(x[i]));
-  }
-  return most;
-}
+/* Length of a velocity below which the flow has no way to stop on. */
+#define IP_SLOW 1e-3
 
 /* Model and rows of the constraints at a posture at rest; their errors too, where they are wanted. */
 static void ip_flow_place(ip_context *c, const double *q, double *error)
@@ -149,19 +141,27 @@ static void ip_flow_aim(ip_flow *f)
   }
 }
 
-/* Evaluate the gradient beside the posture of the last look. */
+/* Evaluate the gradient where the flow would stop, in every other update, or beside the posture of the last look. */
 static void ip_flow_probe(ip_context *c)
 {
   ip_flow *f = &c->flow;
+  const double size = sqrt(ip_dot(f->flow, f->flow, IP_NV));
   double q[IP_NQ];
   f->length = 0.0;
   if (f->failed || !f->left) {
     return;
   }
-  f->probed = f->next % f->left;
-  f->length = IP_PROBE;
-  ip_flow_aim(f);
-  memcpy(f->z, f->seen[f->probed], sizeof f->z);
+  f->turn = !f->turn;
+  if (f->turn && size > IP_SLOW) {
+    f->probed = -1;
+    f->length = fmax(size * ip_flow_stopping(f, &c->p), IP_PROBE);
+    ip_scaled(f->flow, 1.0 / size, f->z, IP_NV);
+  } else {
+    f->probed = f->next % f->left;
+    f->length = IP_PROBE;
+    ip_flow_aim(f);
+    memcpy(f->z, f->seen[f->probed], sizeof f->z);
+  }
   ip_integrate(f->here, f->z, f->length, q);
   ip_flow_evaluate(f, q, f->there);
   ip_flow_place(c, q, NULL);
@@ -179,7 +179,7 @@ static void ip_flow_compare(ip_context *c)
   ip_flow_shares(c, shares);
   if (!f->failed) {
     ip_flow_learn(f, f->there, shares);
-    ++f->next;
+    f->next += f->probed >= 0;
   }
 }
 

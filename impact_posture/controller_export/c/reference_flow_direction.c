@@ -5,8 +5,23 @@
 #define IP_LEAST_VALUE 1e-8
 /* What of IP_NEAR the flow takes where a limit is missed by so much already: along it, the flow would creep across. */
 #define IP_SPENT 9e-4
+/* Distance from every limit to which the flow aims, rad (m), or as a share. */
+#define IP_RESERVE 6e-3
+/* Square of the length below which a row has no direction on the constraints. */
+#define IP_FLAT 1e-6
 /* Sine of an angle of the base below which the tilt has no slope. */
 #define IP_LEVEL 1e-6
+
+/* The largest entry from the first one on. */
+static double ip_largest(const double *x, int first)
+{
+  double most = 0.0;
+  int i;
+  for (i = first; i < IP_NV; ++i) {
+    most = fmax(most, fabs(x[i]));
+  }
+  return most;
+}
 
 /* How much a row changes along a way. */
 static double ip_flow_along(const ip_flow *f, int r, const double *way)
@@ -74,6 +89,8 @@ static void ip_flow_limits(ip_context *c)
         ahead = ip_dot(f->T[k], coasting, IP_NV);
       }
     }
+    high -= IP_RESERVE;
+    low += IP_RESERVE;
     f->room[0][r] = fmax(high, -IP_SPENT);
     f->room[1][r] = fmin(low, IP_SPENT);
     f->high[r] = fmax(high - fmax(ahead, 0.0), 0.0);
@@ -252,4 +269,41 @@ static void ip_flow_downhill(const ip_flow *f, const double *stop, double *step)
       ip_add(step, -climb / ip_dot(uphill, uphill, IP_NV), uphill, IP_NV);
     }
   }
+}
+
+/* Take out of a step of the flow, which then goes on for a time, the parts by which limits would be crossed, one after the
+ * other. */
+static void ip_flow_along_limits(const ip_flow *f, double time, double *step)
+{
+  double to[IP_NV], across[IP_NV], over, square;
+  int i, r;
+  for (i = 0; i < IP_NV; ++i) {
+    to[i] = f->flow[i] + step[i];
+  }
+  for (r = 0; r < IP_FLOW_ROWS; ++r) {
+    const int k = r - IP_JOINTS_V;
+    over = time * ip_flow_along(f, r, to);
+    over -= fmin(fmax(over, f->room[1][r]), f->room[0][r]);
+    if (over == 0.0) {
+      continue;
+    }
+    memset(across, 0, sizeof across);
+    if (k < 0) {
+      across[IP_BASE + r] = 1.0;
+    } else {
+      memcpy(across, k < IP_PLACED ? f->row[k] : f->T[k - IP_PLACED], sizeof across);
+    }
+    ip_flow_project(f, across);
+    square = ip_dot(across, across, IP_NV);
+    if (square > IP_FLAT) {
+      ip_add(step, -over / time / square, across, IP_NV);
+      ip_add(to, -over / time / square, across, IP_NV);
+    }
+  }
+}
+
+/* Time in which the flow stops evenly, which takes twice the way that braking takes. */
+static double ip_flow_stopping(const ip_flow *f, const ip_params *p)
+{
+  return ip_largest(f->flow, 0) / p->flow_acceleration[0];
 }

@@ -5,6 +5,10 @@
 #define IP_STILL 1e-5
 /* What a limit may be missed by where the flow brakes, rad (m), or as a share. */
 #define IP_NEAR 1e-3
+/* How often a change of the flow is tried: as it is, and twice without what crosses limits. */
+#define IP_TIMES 3
+/* Least share of the acceleration with which the flow counts on braking, and its growth with each change. */
+#define IP_ABLE 0.1
 
 /* Shorten x so that no entry exceeds a number. */
 static void ip_shorten(double *x, double most)
@@ -45,15 +49,26 @@ static void ip_flow_back(ip_context *c, double *back)
 #endif
 }
 
-/* Whether the flow stays within the limits if it changes by a step and then brakes, all entries evenly. */
+/* Time for which the flow goes on if it changes by a step and then brakes, all entries evenly, as hard as it lately could. */
+static double ip_flow_braking(const ip_flow *f, const ip_params *p, const double *step, double period)
+{
+  double way[IP_NV];
+  int i;
+  for (i = 0; i < IP_NV; ++i) {
+    way[i] = f->flow[i] + step[i];
+  }
+  return ip_largest(way, 0) / (2.0 * f->able * p->flow_acceleration[0]) + period;
+}
+
+/* Whether the flow then stays within the limits. */
 static int ip_flow_stops(const ip_flow *f, const ip_params *p, const double *step, double period)
 {
-  double way[IP_NV], time;
+  const double time = ip_flow_braking(f, p, step, period);
+  double way[IP_NV];
   int i, r;
   for (i = 0; i < IP_NV; ++i) {
     way[i] = f->flow[i] + step[i];
   }
-  time = ip_largest(way, 0) / (2.0 * p->flow_acceleration[0]) + period;
   for (r = 0; r < IP_FLOW_ROWS; ++r) {
     const double ahead = time * ip_flow_along(f, r, way);
     if (ahead > f->room[0][r] + IP_NEAR || ahead < f->room[1][r] - IP_NEAR) {
@@ -63,40 +78,48 @@ static int ip_flow_stops(const ip_flow *f, const ip_params *p, const double *ste
   return 1;
 }
 
-/* The change of the flow towards the wanted step, by at most so much an entry: as fast as each joint can, or straight, or
- * braking.  The first of them counts from which the flow can stop within the limits. */
+/* The change of the flow towards the wanted step, by at most so much an entry: as fast as each joint can, or straight, each
+ * of them twice without what crosses limits, or braking.  The first of them counts from which the flow can stop within the
+ * limits. */
 static void ip_flow_change(const ip_flow *f, const ip_params *p, double period, double fastest, double *step)
 {
   enum { N = IP_NV, FAST = 0, BRAKE = 2 };
-  const double a = p->flow_acceleration[0], most = a * period, time = ip_largest(f->flow, 0) / a;
-  /* A third of the acceleration stops a speed of sqrt(2/3 a d) on the step d.  Below v/2, it is 4/3 a/v d. */
-  const double least = 3.0 * p->flow_speed[0] * p->flow_speed[0] / (8.0 * a);
-  const double pace = sqrt(2.0 * a / 3.0 / fmax(ip_largest(f->wanted, 0), least));
+  const double v = p->flow_speed[0], a = p->flow_acceleration[0], most = a * period, time = ip_flow_stopping(f, p);
+  /* Two fifths of the acceleration stop a speed of sqrt(4/5 a d) on the step d.  Below v/2, it is 8/5 a/v d. */
+  const double pace = sqrt(0.8 * a / fmax(ip_largest(f->wanted, 0), 0.3125 * v * v / a));
+  const int descends = fastest > 0.0 && f->visited == IP_PATH;
   double wanted[N], stop[N];
-  int i, k;
+  int i, k, again;
   for (i = 0; i < N; ++i) {
     wanted[i] = pace * f->wanted[i];
     /* Twice the way on which it stops, because the curvature may grow on it. */
     stop[i] = time * f->flow[i];
   }
   ip_shorten(wanted, fastest);
-  for (k = FAST; k <= BRAKE; ++k) {
+  for (k = FAST; k < BRAKE; ++k) {
     for (i = 0; i < N; ++i) {
-      step[i] = (k == BRAKE ? 0.0 : wanted[i]) - f->flow[i];
+      step[i] = wanted[i] - f->flow[i];
       step[i] = k == FAST ? fmin(fmax(step[i], -most), most) : step[i];
     }
     if (k == FAST) {
       ip_flow_project(f, step);
     }
     ip_shorten(step, most);
-    if (k < BRAKE && fastest > 0.0 && f->visited == IP_PATH) {
-      ip_flow_downhill(f, stop, step);
+    for (again = 0; again < IP_TIMES; ++again) {
+      if (again) {
+        ip_flow_along_limits(f, ip_flow_braking(f, p, step, period), step);
+      }
+      if (descends) {
+        ip_flow_downhill(f, stop, step);
+      }
       ip_shorten(step, most);
-    }
-    if (ip_flow_stops(f, p, step, period)) {
-      return;
+      if (ip_flow_stops(f, p, step, period)) {
+        return;
+      }
     }
   }
+  ip_scaled(f->flow, -1.0, step, N);
+  ip_shorten(step, most);
 }
 
 /* Limit speed and acceleration, and return to contacts and tasks. */
@@ -125,6 +148,7 @@ static void ip_flow_govern(ip_context *c)
     more[i] = step[i] / period;
   }
   part = ip_flow_permitted(c, known, more);
+  f->able = fmin(fmax(part, IP_ABLE), f->able + IP_ABLE);
   ip_add(f->flow, part, step, N);
   ip_add(known, part, more, N);
   memcpy(f->acceleration, known, sizeof known);
@@ -153,6 +177,7 @@ static int ip_flow_begin(ip_context *c)
   memcpy(f->first, c->q, sizeof f->first);
   memcpy(f->here, c->q, sizeof f->here);
   f->deadline = INFINITY;
+  f->able = 1.0;
   IP_CONSTANTS(c, &f->m);
   IP_CONSTANTS(c, &f->ahead);
   for (k = 0; k < IP_TASKS; ++k) {
