@@ -142,6 +142,8 @@ class FlowDirection:
         self._margin = np.minimum(options.joint_margin, width / 8)
         self._edges, self._mu, self._tilt = edges, options.mu, options.tilt
         self._up = robot.upright
+        # The row of the tilt, the tilt and the vertical in the base.
+        self._tilting, self._angle, self._vertical = self._joints.size + edges.shape[0], 0.0, np.zeros(3)
         # The pull towards the start acts on joints.  Others lead the base.
         self._pull = np.full(nv, options.rho)
         self._pull[: 6 if robot.floating else 0] = 0.0
@@ -184,7 +186,8 @@ class FlowDirection:
             axis = np.cross(vertical, self._up)
             sine = math.sqrt(float(axis @ axis))
             self._rows[count, 3:6] = axis / sine if sine > _LEVEL else 0.0
-            upper[count] = self._tilt - math.atan2(sine, float(vertical @ self._up))
+            self._angle, self._vertical[:] = math.atan2(sine, float(vertical @ self._up)), vertical
+            upper[count] = self._tilt - self._angle
             count += 1
         upper[count:] = 1.0 - shares
         lower[count:] = -1.0 - shares
@@ -242,8 +245,17 @@ class FlowDirection:
 
     def stops(self, flow: Array, time: float) -> bool:
         """Return whether ``flow``, shape (nv,), stays within the limits for so many seconds."""
-        ahead = self._rows @ (flow * time)
+        way = flow * time
+        ahead = self._rows @ way
+        if self._up is not None:
+            ahead[self._tilting] = self._tilted(way, float(ahead[self._tilting]))
         return not float(np.maximum(ahead - self._room[0], self._room[1] - ahead).max(initial=0.0)) > _NEAR
+
+    def _tilted(self, way: Array, along: float) -> float:
+        """Return how much the tilt changes along a way, shape (nv,), which also turns it aside."""
+        turn = float(self._vertical @ way[3:6])
+        aside = float(way[3:6] @ way[3:6]) - turn**2 - along**2
+        return math.hypot(self._angle + along, math.sqrt(max(aside, 0.0))) - self._angle
 
     def along(self, Z: Array, flow: Array, time: float, step: Array) -> Array:
         """Return a step of the flow without the part of it by which limits would be crossed, one after the other.
@@ -254,8 +266,11 @@ class FlowDirection:
             time: Time for which ``flow + step`` goes on, s.
             step: Change of ``u``, shape (nv,).
         """
-        for row, high, low in zip(self._rows, *self._room, strict=True):
-            ahead = time * float(row @ (flow + step))
+        for k, (row, high, low) in enumerate(zip(self._rows, *self._room, strict=True)):
+            way = time * (flow + step)
+            ahead = float(row @ way)
+            if self._up is not None and k == self._tilting:
+                ahead = self._tilted(way, ahead)
             if low <= ahead <= high:
                 continue
             across = Z @ (Z.T @ row)

@@ -17,6 +17,8 @@ from impact_posture.tsid.state import State
 _MOMENT = 100.0
 # Least share of the half range of a control that counts as left.
 _LEFT = 0.1
+# Share of the weight that is spread evenly over soles.
+_EVEN = 0.5
 # Share of the trace that makes the balance of the base solvable where the feet cannot carry it.
 _TINY = 1e-12
 
@@ -97,8 +99,11 @@ class StaticControls:
 
 
 def support_edges(state: State, contacts: Sequence[SupportContact]) -> tuple[Array, Array]:
-    """Return ``n`` (k, 2) and ``b`` (k,) of the support polygon ``n·c + b ≤ 0`` of feet on level ground, m.
+    """Return ``n`` (k, 2) and ``b`` (k,) of the polygon ``n·c + b ≤ 0`` of feet on level ground, m.
 
+    Where the center of mass ``c`` is in it, each sole carries its part of what is spread evenly.  A sole that carries
+    nothing leaves the ground with the least push.  Each corner of a sole is moved towards the mean of these corners.
+    Point feet stay as they are, because three of four carry a robot.
     Feet that span no area allow no motion of the center of mass: each direction then is an edge out of reach.
     """
     corners = []
@@ -109,7 +114,9 @@ def support_edges(state: State, contacts: Sequence[SupportContact]) -> tuple[Arr
             corners.append((here.position + here.rotation @ corner)[:2])
     if not corners:
         return np.zeros((0, 2)), np.zeros(0)
-    edges = polygon_edges(corners)
+    places = np.reshape(corners, (-1, 4, 2))
+    even = _EVEN if all(contact.size == 6 for contact in contacts) else 0.0
+    edges = polygon_edges(list((places + even * (places.mean(axis=0) - places)).reshape(-1, 2)))
     if edges is None:
         return np.vstack([np.eye(2), -np.eye(2)]), np.full(4, np.inf)
     return edges[0], -edges[1]

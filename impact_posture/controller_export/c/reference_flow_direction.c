@@ -31,6 +31,19 @@ static double ip_flow_along(const ip_flow *f, int r, const double *way)
                                        : ip_dot(f->T[r - IP_JOINTS_V - IP_PLACED], way, IP_NV);
 }
 
+/* How much a row changes along a way of the flow.  The base tilts about the way as well as along it. */
+static double ip_flow_ahead(const ip_flow *f, int r, const double *way)
+{
+  const double along = ip_flow_along(f, r, way);
+#if IP_BASE
+  if (r == IP_JOINTS_V + IP_EDGES) {
+    const double turn = ip_dot(f->vertical, way + 3, 3), aside = ip_dot(way + 3, way + 3, 3) - turn * turn - along * along;
+    return hypot(f->tilt + along, sqrt(fmax(aside, 0.0))) - f->tilt;
+  }
+#endif
+  return along;
+}
+
 #if IP_BASE
 /* Angle between the vertical and the direction that is upright in the base, rad, and its slope. */
 static double ip_flow_tilt(const ip_flow *f, double *row)
@@ -78,7 +91,9 @@ static void ip_flow_limits(ip_context *c)
       }
 #if IP_BASE
     } else if (r < IP_JOINTS_V + IP_PLACED) {
-      high = p->flow_tilt[0] - ip_flow_tilt(f, f->row[IP_EDGES]);
+      memcpy(f->vertical, f->m.base + 6, sizeof f->vertical);
+      f->tilt = ip_flow_tilt(f, f->row[IP_EDGES]);
+      high = p->flow_tilt[0] - f->tilt;
       ahead = ip_dot(f->row[IP_EDGES], coasting, IP_NV);
 #endif
     } else {
@@ -275,14 +290,14 @@ static void ip_flow_downhill(const ip_flow *f, const double *stop, double *step)
  * other. */
 static void ip_flow_along_limits(const ip_flow *f, double time, double *step)
 {
-  double to[IP_NV], across[IP_NV], over, square;
+  double way[IP_NV], across[IP_NV], over, square;
   int i, r;
   for (i = 0; i < IP_NV; ++i) {
-    to[i] = f->flow[i] + step[i];
+    way[i] = time * (f->flow[i] + step[i]);
   }
   for (r = 0; r < IP_FLOW_ROWS; ++r) {
     const int k = r - IP_JOINTS_V;
-    over = time * ip_flow_along(f, r, to);
+    over = ip_flow_ahead(f, r, way);
     over -= fmin(fmax(over, f->room[1][r]), f->room[0][r]);
     if (over == 0.0) {
       continue;
@@ -297,7 +312,7 @@ static void ip_flow_along_limits(const ip_flow *f, double time, double *step)
     square = ip_dot(across, across, IP_NV);
     if (square > IP_FLAT) {
       ip_add(step, -over / time / square, across, IP_NV);
-      ip_add(to, -over / time / square, across, IP_NV);
+      ip_add(way, -over / square, across, IP_NV);
     }
   }
 }

@@ -67,10 +67,10 @@ static int ip_flow_stops(const ip_flow *f, const ip_params *p, const double *ste
   double way[IP_NV];
   int i, r;
   for (i = 0; i < IP_NV; ++i) {
-    way[i] = f->flow[i] + step[i];
+    way[i] = time * (f->flow[i] + step[i]);
   }
   for (r = 0; r < IP_FLOW_ROWS; ++r) {
-    const double ahead = time * ip_flow_along(f, r, way);
+    const double ahead = ip_flow_ahead(f, r, way);
     if (ahead > f->room[0][r] + IP_NEAR || ahead < f->room[1][r] - IP_NEAR) {
       return 0;
     }

@@ -14,6 +14,8 @@
 #define IP_IDLE 1e-9
 /* Least share of the half range of a control that counts as left. */
 #define IP_LEFT 0.1
+/* Share of the weight that is spread evenly over soles. */
+#define IP_EVEN 0.5
 
 #if IP_BASE
 /* Solve R'R x = b in place, R upper triangular in n x n. */
@@ -226,14 +228,16 @@ static double ip_flow_permitted(const ip_context *c, const double *known, const 
 }
 
 #if IP_CONTACTS
-/* Outward normals n and offsets b of the polygon n c + b <= 0 of the feet on level ground.  Feet that span no area allow
+/* Outward normals n and offsets b of the polygon n c + b <= 0 of the feet on level ground, on which each sole carries what is
+ * spread evenly.  Feet that span no area allow
  * no motion of the center of mass: each direction is then an edge out of reach. */
 static void ip_flow_polygon(ip_context *c)
 {
   enum { COUNT = 4 * IP_CONTACTS };
   ip_flow *f = &c->flow;
-  double x[COUNT][2];
+  double x[COUNT][2], mean[4][2] = {{0.0}};
   int i, j, start = 0, at, next, edges = 0;
+  double even = IP_EVEN;
   for (i = 0; i < COUNT; ++i) {
     const double *R = c->m.rotation[ip_contact_point[i / 4]], *half = c->p.contact_half + 2 * (i / 4);
     const int sole = ip_contact_row[i / 4 + 1] - ip_contact_row[i / 4] == 6;
@@ -241,6 +245,13 @@ static void ip_flow_polygon(ip_context *c)
       x[i][j] = c->m.position[ip_contact_point[i / 4]][j];
       /* Points have no rotation in the model. */
       x[i][j] += sole ? (i & 1 ? 1.0 : -1.0) * half[0] * R[3 * j] + (i & 2 ? 1.0 : -1.0) * half[1] * R[3 * j + 1] : 0.0;
+    }
+    ip_add(mean[i % 4], 1.0 / IP_CONTACTS, x[i], 2);
+    even = sole ? even : 0.0;
+  }
+  for (i = 0; i < COUNT; ++i) {
+    for (j = 0; j < 2; ++j) {
+      x[i][j] += even * (mean[i % 4][j] - x[i][j]);
     }
     /* A corner, and no point on the way between two. */
     start = x[i][0] < x[start][0] - IP_ON_LINE || (x[i][0] <= x[start][0] + IP_ON_LINE && x[i][1] < x[start][1]) ? i
