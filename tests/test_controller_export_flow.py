@@ -60,7 +60,7 @@ def both(name: str, path: tuple[float, ...] = ()) -> tuple[Controller, Reference
 
 @pytest.mark.parametrize(
     ("name", "path", "tilt", "ticks"),
-    [("tilthex_arm", (), 0.8, 300), ("solo8", (), 0.8, 300), ("solo8", (), 0.06, 600), ("panda", ELBOW, 0.8, 300)],
+    [("tilthex_arm", (), 0.8, 300), ("solo8", (), 0.8, 300), ("solo8", (), 0.055, 600), ("panda", ELBOW, 0.8, 300)],
 )
 def test_the_reference_goes_as_in_python(name: str, path: tuple[float, ...], tilt: float, ticks: int) -> None:
     """Each controller moves a robot of its own, through all phases."""

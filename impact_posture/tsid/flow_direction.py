@@ -27,9 +27,10 @@ _LEVEL = 1e-6
 _NEAR = 1e-3
 # What of that the flow takes where a limit is missed by so much already: along it, the flow would creep across.
 _SPENT = 9e-4
-# Distance from every limit to which the flow aims, rad (m), or as a share: what limits and curvature that are learned
-# may be wrong by where it moves fast.
-_RESERVE = 6e-3
+# Distance from the limits of joints to which the flow aims, rad (m).
+_AIM = 2e-3
+# Distance from those of static controls, whose slope it learns, as a share.
+_RESERVE = 8e-3
 # Square of the length below which a row has no direction on the constraints.
 _FLAT = 1e-6
 # Stiffness of those springs relative to ``H₀``, 1/m²: an error of 6 mm costs half of ``H₀``.
@@ -191,8 +192,9 @@ class FlowDirection:
             count += 1
         upper[count:] = 1.0 - shares
         lower[count:] = -1.0 - shares
-        upper -= _RESERVE
-        lower += _RESERVE
+        for rows, aim in ((slice(0, self._joints.size), _AIM), (slice(count, None), _RESERVE)):
+            upper[rows] -= aim
+            lower[rows] += aim
         ahead = self._rows @ coasting
         np.maximum(upper, -_SPENT, out=self._room[0])
         np.minimum(lower, _SPENT, out=self._room[1])

@@ -5,8 +5,10 @@
 #define IP_LEAST_VALUE 1e-8
 /* What of IP_NEAR the flow takes where a limit is missed by so much already: along it, the flow would creep across. */
 #define IP_SPENT 9e-4
-/* Distance from every limit to which the flow aims, rad (m), or as a share. */
-#define IP_RESERVE 6e-3
+/* Distance from the limits of joints to which the flow aims, rad (m), and from those of static controls, whose slope it
+ * learns, as a share. */
+#define IP_AIM 2e-3
+#define IP_RESERVE 8e-3
 /* Square of the length below which a row has no direction on the constraints. */
 #define IP_FLAT 1e-6
 /* Sine of an angle of the base below which the tilt has no slope. */
@@ -70,7 +72,7 @@ static void ip_flow_limits(ip_context *c)
   ip_scaled(f->flow, p->flow_speed[0] / p->flow_acceleration[0] / 2.0, coasting, IP_NV);
   ip_center_of_mass(&f->m, f->here, position, J, drift);
   for (r = 0; r < IP_FLOW_ROWS; ++r) {
-    double high = INFINITY, low = -INFINITY, ahead = 0.0;
+    double high = INFINITY, low = -INFINITY, ahead = 0.0, aim;
     if (r < IP_JOINTS_V) {
       const double upper = p->joint_upper[IP_BASE + r], lower = p->joint_lower[IP_BASE + r];
       const double at = f->here[ip_limit_q[IP_BASE + r]], margin = fmin(p->flow_joint_margin[0], (upper - lower) / 8.0);
@@ -104,8 +106,9 @@ static void ip_flow_limits(ip_context *c)
         ahead = ip_dot(f->T[k], coasting, IP_NV);
       }
     }
-    high -= IP_RESERVE;
-    low += IP_RESERVE;
+    aim = r < IP_JOINTS_V ? IP_AIM : r < IP_JOINTS_V + IP_PLACED ? 0.0 : IP_RESERVE;
+    high -= aim;
+    low += aim;
     f->room[0][r] = fmax(high, -IP_SPENT);
     f->room[1][r] = fmin(low, IP_SPENT);
     f->high[r] = fmax(high - fmax(ahead, 0.0), 0.0);

@@ -228,9 +228,9 @@ static double ip_flow_permitted(const ip_context *c, const double *known, const 
 }
 
 #if IP_CONTACTS
-/* Outward normals n and offsets b of the polygon n c + b <= 0 of the feet on level ground, on which each sole carries what is
- * spread evenly.  Feet that span no area allow
- * no motion of the center of mass: each direction is then an edge out of reach. */
+/* Outward normals n and offsets b of the polygon n c + b <= 0 of the feet on level ground, on which each sole carries its part
+ * of what is spread evenly.  Feet that span no area allow no motion of the center of mass: each direction is then an edge out
+ * of reach. */
 static void ip_flow_polygon(ip_context *c)
 {
   enum { COUNT = 4 * IP_CONTACTS };
