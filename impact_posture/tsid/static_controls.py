@@ -18,7 +18,7 @@ _MOMENT = 100.0
 # Least share of the half range of a control that counts as left.
 _LEFT = 0.1
 # Share of the weight that is spread evenly over soles.
-_EVEN = 0.5
+_EVEN = 0.6
 # Share of the trace that makes the balance of the base solvable where the feet cannot carry it.
 _TINY = 1e-12
 

@@ -15,7 +15,7 @@
 /* Least share of the half range of a control that counts as left. */
 #define IP_LEFT 0.1
 /* Share of the weight that is spread evenly over soles. */
-#define IP_EVEN 0.5
+#define IP_EVEN 0.6
 
 #if IP_BASE
 /* Solve R'R x = b in place, R upper triangular in n x n. */
