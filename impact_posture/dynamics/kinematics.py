@@ -49,6 +49,7 @@ class Kinematics:
 
     Attributes:
         locked: Velocity entries of locked joints.
+        chart_x: The chart coordinates of ``q``, if they are known.
 
     Args:
         model: The model, with joints of every type that the URDF parser of Pinocchio makes.  An infinite armature
@@ -71,7 +72,7 @@ class Kinematics:
         self.model, self.q = model, q
         self.chart = Chart(model)
         self.nv = self.chart.nv
-        self._x = chart_x
+        self.chart_x = chart_x
         self._parents = [int(p) for p in model.parents]
         self._extra = dict(extra_inertia or {})
         self._R: ByJoint = {}
@@ -125,12 +126,12 @@ class Kinematics:
     @cached_property
     def quaternions(self) -> ByJoint:
         """World orientation of every link as a quaternion x y z w, polynomial in half angles."""
-        if self._x is None:
+        if self.chart_x is None:
             raise ValueError("quaternions need chart_x")
         found: ByJoint = {0: ca.SX([0, 0, 0, 1])}
         for slot, i, parent in self._joints:
             rest = constant_quaternion(self.model.jointPlacements[i].rotation)
-            turned = quaternion_product(rest, joint_quaternion(slot.kind, self._x[slot.x]))
+            turned = quaternion_product(rest, joint_quaternion(slot.kind, self.chart_x[slot.x]))
             found[i] = quaternion_product(found[parent], turned)
         return found
 
