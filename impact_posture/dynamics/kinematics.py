@@ -17,7 +17,7 @@ from numpy.typing import ArrayLike, NDArray
 from impact_posture.dynamics.chart import Chart
 from impact_posture.dynamics.joints import joint_quaternion, joint_spin, joint_transform
 from impact_posture.dynamics.repeated_limbs import RepeatedLimbs
-from impact_posture.dynamics.spatial import constant, quaternion_product, transposed_times
+from impact_posture.dynamics.spatial import constant, motion_to_root, quaternion_product, transposed_times
 from impact_posture.robot.model_joints import finite_armature
 
 # Spatial inertias, forces or motions by joint index.
@@ -152,6 +152,19 @@ class Kinematics:
             R, p = self._below(base, self._parents[joint])
             self._placed[base, joint] = R @ self._R[joint], p + R @ self._p[joint]
         return self._placed[base, joint]
+
+    @cached_property
+    def root_places(self) -> dict[int, tuple[ca.SX, ca.SX]]:
+        """Rotation (3, 3) and origin (3,) of every link in the coordinates of its root link."""
+        return {i: self.relative(int(list(self.model.supports[i])[1]), i) for i in self._R}
+
+    @cached_property
+    def root_subspaces(self) -> ca.SX:
+        """Motion subspaces of all joints in the coordinates of their root links, shape (6, nv)."""
+        columns = []
+        for slot, i, _ in self._joints:
+            columns += [motion_to_root(*self.root_places[i], self._S[i][:, k]) for k in range(slot.kind.nv)]
+        return ca.horzcat(*columns)
 
     def position(self, point: PointOnLink) -> ca.SX:
         """Return the world position of a point, shape (3,)."""

@@ -3,14 +3,12 @@
 from __future__ import annotations
 
 from collections.abc import Sequence
-from functools import cached_property
 
 import casadi as ca
 import numpy as np
 
 from impact_posture.arrays import Array
 from impact_posture.dynamics.kinematics import ByJoint, Kinematics
-from impact_posture.dynamics.spatial import constant, cross, template
 
 # Families of joints with one degree of freedom, whose coordinate in the chart changes at their velocity.
 _ONE_AXIS = ("revolute", "continuous", "prismatic")
@@ -42,20 +40,15 @@ class RootAxes:
         paths = {end: {int(i) for i in self._tree.model.supports[end]} - (set() if itself else {end}) for end in ends}
         return np.array([[joint in paths[end] for joint in joints] for end in ends], dtype=bool)
 
-    @cached_property
+    @property
     def _places(self) -> dict[int, tuple[ca.SX, ca.SX]]:
         """Rotation and origin of every link."""
-        root = {i: int(list(self._tree.model.supports[i])[1]) for i in set(self._of_v)}
-        return {i: self._tree.relative(root[i], i) for i in root}
+        return self._tree.root_places
 
-    @cached_property
+    @property
     def _subspaces(self) -> ca.SX:
         """Motion subspaces of all joints, shape (6, nv)."""
-        columns = []
-        for slot in self._tree.chart.slots:
-            place, S = self._places[slot.index], constant(slot.kind.subspace)
-            columns += [_motion_of_link(*place, S[:, k]) for k in range(slot.kind.nv)]
-        return ca.horzcat(*columns)
+        return self._tree.root_subspaces
 
     def _gathered(self, of_links: ByJoint) -> ByJoint:
         """Return sums over the subtrees of all joints."""
@@ -69,10 +62,3 @@ class RootAxes:
 def kept(matrix: ca.SX, pattern: Array) -> ca.SX:
     """Return a matrix without the entries outside a pattern."""
     return matrix * ca.sparsify(ca.SX(pattern.astype(float)))
-
-
-@template
-def _motion_of_link(R: ca.SX, p: ca.SX, motion: ca.SX) -> ca.SX:
-    """Express the motion of a link in the axes of its root."""
-    angular = R @ motion[3:]
-    return ca.vertcat(R @ motion[:3] + cross(p, angular), angular)

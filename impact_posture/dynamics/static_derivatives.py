@@ -23,7 +23,7 @@ import casadi as ca
 
 from impact_posture.dynamics.kinematics import ByJoint, Kinematics, PointOnLink
 from impact_posture.dynamics.root_axes import RootAxes, kept
-from impact_posture.dynamics.spatial import constant, cross, skew
+from impact_posture.dynamics.spatial import constant, cross, skew, template
 
 
 class StaticDerivatives(RootAxes):
@@ -80,8 +80,8 @@ class StaticDerivatives(RootAxes):
         """
         S, weight = self._subspaces, u[:3]
         own = [slot.v.start for slot in self._beyond]
-        S_v, S_w = S[:3, :], S[3:, :]
-        linear, angular, momenta = self._moving(b)
+        S_w = S[3:, :]
+        velocities, momenta = self._moving(b)
         pushed = [u[3 * k : 3 * k + 3] for k in range(1, 1 + len(self._points))]
         # Sums of forces and of the products of points and forces over subtrees.
         total: ByJoint = {i: ca.SX(3, 1) for i in self._places}
@@ -91,30 +91,26 @@ class StaticDerivatives(RootAxes):
             dyads[point.joint] += place @ force.T
         total, dyads = self._gathered(total), self._gathered(dyads)
         B: ByJoint = {i: ca.SX(3, 3) for i in self._places}
-        N: ByJoint = {}
-        mixed = []
+        shares: ByJoint = dict(B)
+        N, crossed, mixed = list[ca.SX](), list[ca.SX](), list[ca.SX]()
         for slot in self._beyond:
-            i, k, parent = slot.index, slot.v.start, self._parents[slot.index]
-            mass, moment = self._masses[i], self._moments[i]
-            v, w = S_v[:, k], S_w[:, k]
-            A = v @ (total[i] + mass * weight).T + skew(w) @ (dyads[i] + moment @ weight.T)
-            N[i] = ca.vertcat(A[1, 2] - A[2, 1], A[2, 0] - A[0, 2], A[0, 1] - A[1, 0])
-            B[i] = A - ca.trace(A) * ca.SX.eye(3)
-            # What the joint changes of the momentum of its subtree and of the velocities of points beyond it.
-            rest = momenta[i] - mass * linear[parent] - cross(angular[parent], moment)
-            row = [cross(angular[parent], mass * v + cross(w, moment)) + cross(w, rest)]
+            i, k, before = slot.index, slot.v.start, velocities[self._parents[slot.index]]
+            weighed = S[:, k], self._masses[i], self._moments[i]
+            B[i], shares[i], moment, turn, row = _of_joint(
+                *weighed, total[i], dyads[i], weight, before, momenta[i], b[k]
+            )
+            N.append(moment)
+            crossed.append(turn)
+            rows = [row]
             for point, place in zip(self._points, self._positions, strict=True):
-                if i not in self._tree.model.supports[point.joint]:
-                    row.append(ca.SX(3, 1))
-                    continue
-                rest = linear[point.joint] - linear[parent] + cross(angular[point.joint] - angular[parent], place)
-                row.append(cross(angular[parent], v + cross(w, place)) + cross(w, rest))
-            mixed.append(ca.vertcat(*row).T)
-        sums = self._gathered({i: b[self._v[i]] * B[i] if i in N else B[i] for i in self._places})
-        before = ca.horzcat(ca.SX(3, 0), *[angular[self._parents[i]] for i in self._of_u])
-        y = [B[i] @ angular[self._parents[i]] + sums[i] @ S_w[:, self._v[i]] for i in self._of_u]
-        turns, moments = S_w[:, own], ca.horzcat(ca.SX(3, 0), *N.values())
-        crossed = [cross(before[:, k], turns[:, k]) for k in range(len(own))]
+                beyond = i in self._tree.model.supports[point.joint]
+                rows.append(_of_point(S[:, k], place, before, velocities[point.joint]) if beyond else ca.SX(3, 1))
+            mixed.append(ca.vertcat(*rows).T)
+        sums = self._gathered(shares)
+        y = [
+            _bent(B[i], velocities[self._parents[i]], sums[i], S[:, k]) for i, k in zip(self._of_u, own, strict=True)
+        ]
+        turns, moments = S_w[:, own], ca.horzcat(ca.SX(3, 0), *N)
         products = ca.vertcat(ca.horzcat(ca.SX(3, 0), *y), moments).T @ ca.vertcat(
             turns, ca.horzcat(ca.SX(3, 0), *crossed)
         )
@@ -123,16 +119,9 @@ class StaticDerivatives(RootAxes):
         by_joints = outer.T
         by_joints[own, :] += kept(outer[:, own], self._lies_on(self._of_u, self._of_u, itself=False))
         rates = [momenta[self._tree.chart.slots[0].index]]
-        rates += [
-            linear[p.joint] + cross(angular[p.joint], place)
-            for p, place in zip(self._points, self._positions, strict=True)
-        ]
+        for point, place in zip(self._points, self._positions, strict=True):
+            rates.append(_velocity(velocities[point.joint], place))
         return self._jacobian, ca.vertcat(*rates), ca.vertcat(ca.SX(0, u.numel()), *mixed), by_joints, curvature
-
-    @cached_property
-    def _v(self) -> dict[int, int]:
-        """Velocity entry of every joint beyond the base."""
-        return {slot.index: slot.v.start for slot in self._beyond}
 
     @cached_property
     def _positions(self) -> list[ca.SX]:
@@ -141,13 +130,9 @@ class StaticDerivatives(RootAxes):
         return [p + R @ constant(point.position) for (R, p), point in zip(places, self._points, strict=True)]
 
     @cached_property
-    def _masses(self) -> dict[int, float]:
+    def _masses(self) -> ByJoint:
         """Mass of the subtree of every joint."""
-        found = {i: float(self._tree.model.inertias[i].mass) for i in self._places}
-        for i in sorted(found, reverse=True):
-            if parent := self._parents[i]:
-                found[parent] += found[i]
-        return found
+        return self._gathered({i: ca.SX(float(self._tree.model.inertias[i].mass)) for i in self._places})
 
     @cached_property
     def _of_links(self) -> ByJoint:
@@ -174,16 +159,59 @@ class StaticDerivatives(RootAxes):
             blocks.append(velocity)
         return ca.vertcat(*blocks)
 
-    def _moving(self, b: ca.SX) -> tuple[ByJoint, ByJoint, ByJoint]:
-        """Return velocities at the origin, angular velocities, and momenta of subtrees, under the velocity b."""
-        S = self._subspaces
-        linear: ByJoint = {0: ca.SX(3, 1)}
-        angular: ByJoint = {0: ca.SX(3, 1)}
+    def _moving(self, b: ca.SX) -> tuple[ByJoint, ByJoint]:
+        """Return spatial velocities of links about the origin of the base, and momenta of subtrees, under b."""
+        velocities: ByJoint = {0: ca.SX(6, 1)}
         momenta: ByJoint = {}
         for slot in self._tree.chart.slots:
-            i, parent = slot.index, self._parents[slot.index]
-            motion = S[:, slot.v] @ b[slot.v]
-            linear[i], angular[i] = linear[parent] + motion[:3], angular[parent] + motion[3:]
-            mass = float(self._tree.model.inertias[i].mass)
-            momenta[i] = mass * linear[i] + cross(angular[i], self._of_links[i])
-        return linear, angular, self._gathered(momenta)
+            i = slot.index
+            velocities[i] = velocities[self._parents[i]] + self._subspaces[:, slot.v] @ b[slot.v]
+            mass = ca.SX(float(self._tree.model.inertias[i].mass))
+            momenta[i] = _momentum(velocities[i], mass, self._of_links[i])
+        return velocities, self._gathered(momenta)
+
+
+@template
+def _velocity(motion: ca.SX, place: ca.SX) -> ca.SX:
+    """Return the velocity of a point under a spatial motion about the origin."""
+    return motion[:3] + cross(motion[3:], place)
+
+
+@template
+def _momentum(motion: ca.SX, mass: ca.SX, moment: ca.SX) -> ca.SX:
+    """Return the linear momentum of a body under a spatial motion about the origin."""
+    return mass * motion[:3] + cross(motion[3:], moment)
+
+
+@template
+def _of_joint(
+    S: ca.SX,
+    mass: ca.SX,
+    moment: ca.SX,
+    total: ca.SX,
+    dyad: ca.SX,
+    weight: ca.SX,
+    before: ca.SX,
+    momentum: ca.SX,
+    b: ca.SX,
+) -> tuple[ca.SX, ...]:
+    """Return ``B``, ``bB``, ``N``, ``w × ω``, and the derivative over the joint of the momentum of its subtree."""
+    v, w, turning = S[:3], S[3:], before[3:]
+    A = v @ (total + mass * weight).T + skew(w) @ (dyad + moment @ weight.T)
+    N = ca.vertcat(A[1, 2] - A[2, 1], A[2, 0] - A[0, 2], A[0, 1] - A[1, 0])
+    B = A - ca.trace(A) * ca.SX.eye(3)
+    rest = momentum - _momentum(before, mass, moment)
+    return B, b * B, N, cross(turning, w), cross(turning, _momentum(S, mass, moment)) + cross(w, rest)
+
+
+@template
+def _of_point(S: ca.SX, place: ca.SX, before: ca.SX, motion: ca.SX) -> ca.SX:
+    """Return the derivative over a joint of the velocity of a point beyond it."""
+    rest = _velocity(motion - before, place)
+    return cross(before[3:], _velocity(S, place)) + cross(S[3:], rest)
+
+
+@template
+def _bent(B: ca.SX, before: ca.SX, beyond: ca.SX, S: ca.SX) -> ca.SX:
+    """Return ``y``."""
+    return B @ before[3:] + beyond @ S[3:]
