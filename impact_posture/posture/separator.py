@@ -34,6 +34,9 @@ EQUATIONS = 4
 _SHORT = 0.8
 # A slack starts so far (m) above the penetration, and a normal at this length, inside their bounds.
 _ABOVE, _LENGTH = 0.01, 0.98
+# Unit (m) of the slack among the unknowns.  At the usual price of a meter its multiplier is then one, which is where
+# IPOPT begins, and a run takes a quarter fewer iterations than with meters.
+_UNIT = 0.02
 # Tangent of the tilt at which more corners of a body get a row, and the sides to which it tilts.
 _TILT = 0.5
 _AROUND = np.array([[0.0, 0.0], *[[np.cos(a), np.sin(a)] for a in np.arange(8) * np.pi / 4]])
@@ -95,8 +98,11 @@ class Body:
         if self.point.joint == 0:
             return np.zeros((len(positions), model.model.nv))
         J = model.jacobian(self.point)
-        turning = np.cross(positions - model.placement(self.point).translation, direction) @ J[3:]
-        return np.asarray(direction @ J[:3] + (turning if self.turns else np.zeros_like(turning)))
+        heights = np.broadcast_to(direction @ J[:3], (len(positions), J.shape[1]))
+        if not self.turns:
+            return np.array(heights)
+        arms = (positions - model.placement(self.point).translation) @ pin.skew(direction)
+        return np.asarray(heights + arms @ J[3:])
 
 
 class Corners(NamedTuple):
@@ -150,6 +156,8 @@ class Separator:
     def lift(self, tree: Tree, label: str, known: ca.SX) -> LiftedRows:
         """Return the equations, the unknowns ``n, c, m, d, s`` (``m, d, s`` for a half-space), and the slack.
 
+        The unknown ``s`` is in units of 2 cm.
+
         Args:
             tree: The dynamics at the posture.
             label: End of the names of the unknowns.
@@ -160,12 +168,12 @@ class Separator:
         both = known if self.known else plane
         n, c = both[:3], both[3]
         Q, t = self._relative(tree)
-        return LiftedRows(ca.vertcat(m - Q.T @ n, d - (ca.dot(n, t) - c)), ca.vertcat(plane, m, d, s), s)
+        return LiftedRows(ca.vertcat(m - Q.T @ n, d - (ca.dot(n, t) - c)), ca.vertcat(plane, m, d, s), _UNIT * s)
 
     def sides(self, variables: ca.SX, corners: Corners) -> ca.SX:
         """Return the rows of corners, over the unknowns of :meth:`lift`."""
         m, d, s = variables[-5:-2], variables[-2], variables[-1]
-        rows = [ca.SX(self._x[sorted(corners.a)]) @ m + d + s]
+        rows = [ca.SX(self._x[sorted(corners.a)]) @ m + d + _UNIT * s]
         if not self.known:
             n, c = variables[:3], variables[3]
             rows += [ca.SX(self._y[sorted(corners.b)]) @ n - c, ca.dot(n, n)]
@@ -219,23 +227,22 @@ class Separator:
     def guess(self, model: Numeric) -> Guess:
         """Return the unknowns at the closest points, with their bounds."""
         value, normal, _ = self.distance(model)
-        n, c = self._plane(model, normal)
+        at_b = self.b.placement(model)
+        relative = at_b.actInv(self.a.placement(model))
+        n, c = self._plane(at_b, relative, normal)
         n = n if self.known else _LENGTH * n
-        relative = self.b.placement(model).actInv(self.a.placement(model))
         plane = [] if self.known else [*n, c]
-        values = np.array(
-            [*plane, *(relative.rotation.T @ n), n @ relative.translation - c, max(0.0, -value) + _ABOVE]
-        )
+        slack = (max(0.0, -value) + _ABOVE) / _UNIT
+        values = np.array([*plane, *(n @ relative.rotation), n @ relative.translation - c, slack])
         lower = np.full(len(values), -np.inf)
         lower[-1] = 0.0
         return Guess(values, lower)
 
-    def _plane(self, model: Numeric, normal: Array) -> tuple[Array, float]:
+    def _plane(self, at_b: pin.SE3, relative: pin.SE3, normal: Array) -> tuple[Array, float]:
         """The plane in the axes of ``b`` with a world normal, in the middle between the swept bodies."""
         if self.b.normal is not None:
             return self.b.normal, self.b.offset
-        relative = self.b.placement(model).actInv(self.a.placement(model))
-        n = self.b.placement(model).rotation.T @ normal
+        n = normal @ at_b.rotation
         points = self._x @ relative.rotation.T + relative.translation
         return n, float((points @ n).min() - self.gap + (self._y @ n).max()) / 2
 
@@ -251,7 +258,9 @@ class Separator:
             # A plane of the program may cut corners that have no row there, and then the pair is not active.
             if max((found.lower - found.value).max(), (found.value - found.upper).max()) <= _KEPT:
                 return found
-        return self.linearize_at(model, *self._plane(model, self.distance(model)[1]))
+        at_b = self.b.placement(model)
+        relative = at_b.actInv(self.a.placement(model))
+        return self.linearize_at(model, *self._plane(at_b, relative, self.distance(model)[1]))
 
     def linearize_at(self, model: Numeric, n: Array, c: float) -> Linearization:
         """Return the rows for the plane ``{y: n·y = c}`` in the axes of body b."""
