@@ -16,7 +16,8 @@ from impact_posture.dynamics.numeric import Numeric
 from impact_posture.dynamics.tree import Tree
 from impact_posture.impact.lifted import Guess
 from impact_posture.posture.constraint import Constraint, LiftedRows, Linearization
-from impact_posture.posture.separator import EQUATIONS, Body, Corners, Separator
+from impact_posture.posture.pair_distances import PairDistances
+from impact_posture.posture.separator import EQUATIONS, Corners, Separator
 
 # Pairs closer than this (m) beyond their clearance are computed exactly; a bound is enough for the others.
 _NEAR = 0.01
@@ -32,7 +33,6 @@ class Clearance(Constraint):
     """``distance(a, b) − clearance ≥ 0`` for pairs of bodies; the program has the pairs that were found to matter.
 
     A pair that no solve brings close costs nothing.  :meth:`grown` adds pairs that the end of a solve violates.
-    The last exact distance of a pair, less what its bodies have moved since, is a bound as well.
 
     Args:
         name: Name of the constraint.
@@ -40,6 +40,7 @@ class Clearance(Constraint):
         words: Description in one line.
         active: Pairs in the program, by index, with the corners that have rows there.
         lifted: Equations of pairs by tree and index, which all constraints share that one grows into.
+        distances: The distances of the pairs, which these constraints share as well.
     """
 
     projected = False
@@ -52,40 +53,17 @@ class Clearance(Constraint):
         words: str,
         active: Mapping[int, Corners] | None = None,
         lifted: WeakKeyDictionary[Tree, dict[int, LiftedRows]] | None = None,
+        distances: PairDistances | None = None,
     ) -> None:
         self.name, self._separators, self._words = name, tuple(separators), words
         self.active: Mapping[int, Corners] = active or {}
         self._lifted = WeakKeyDictionary[Tree, dict[int, LiftedRows]]() if lifted is None else lifted
         self.lower, self.upper = np.zeros(len(self._separators)), np.full(len(self._separators), np.inf)
-        bodies: dict[int, Body] = {}
-        for one in self._separators:
-            bodies |= {id(one.a): one.a, id(one.b): one.b}
-        self._bodies = list(bodies.values())
-        where = {key: k for k, key in enumerate(bodies)}
-        self._first = np.array([where[id(one.a)] for one in self._separators], dtype=int)
-        self._margins = np.array([one.margin for one in self._separators])
-        self._second = np.array([where[id(one.b)] for one in self._separators], dtype=int)
-        # A body that does not turn keeps world axes around its point.
-        self._turns = np.array([body.turns for body in self._bodies], dtype=bool)
-        self._joints = np.array([body.point.joint for body in self._bodies], dtype=int)
-        still = np.where(self._turns, 0.0, 1.0)[:, None]
-        centers = np.array([body.center for body in self._bodies]).reshape(-1, 3)
-        points = np.array([body.point.position for body in self._bodies]).reshape(-1, 3)
-        self._carried, self._beside = (1 - still) * centers + still * points, still * centers
-        self._reach = np.array([0.0 if body.hull is None else body.hull.reach for body in self._bodies])
-        # The last exact distance of each pair and the places of its bodies then; a plane that turns has no reach.
-        turning = [body.normal is not None and body.turns and body.point.joint > 0 for body in self._bodies]
-        self._lasting = ~np.array(turning, dtype=bool)[self._second]
-        self._latest = np.full(len(self._separators), -np.inf)
-        self._then = np.zeros((2, len(self._separators), 12))
-        self._planes = [
-            (k, self._second == k, body.normal, body.offset)
-            for k, body in enumerate(self._bodies)
-            if body.normal is not None
-        ]
+        self._distances = PairDistances(separators) if distances is None else distances
+        planes = [(k, body.plane) for k, body in enumerate(self._distances.bodies) if body.normal is not None]
         # Programs with other planes are the same.
-        self.parameters = np.concatenate([np.zeros(0), *[body.plane for body in self._bodies]])
-        self._first_parameter = {k: 4 * index for index, (k, *_) in enumerate(self._planes)}
+        self.parameters = np.concatenate([np.zeros(0), *[plane for _, plane in planes]])
+        self._first_parameter = {k: 4 * index for index, (k, _) in enumerate(planes)}
 
     def describe(self) -> str:
         """See :class:`Constraint`."""
@@ -108,39 +86,9 @@ class Clearance(Constraint):
 
     # ---- numbers ----------------------------------------------------------------------------------------------
 
-    def _placed(self, model: Numeric) -> tuple[Array, Array]:
-        """Return the axes, shape (k, 3, 3), and the centers, shape (k, 3), m, of all bodies in the world."""
-        links = np.array([at.homogeneous for at in model.data.oMi])[self._joints]
-        centers = (links[:, :3, :3] @ self._carried[:, :, None])[:, :, 0] + links[:, :3, 3] + self._beside
-        return np.where(self._turns[:, None, None], links[:, :3, :3], np.eye(3)), centers
-
-    def _bounds(self, model: Numeric, centers: Array) -> Array:
-        """Return lower bounds on all distances from a sphere around each body."""
-        apart = centers[self._first] - centers[self._second]
-        bound = np.sqrt((apart * apart).sum(axis=1))
-        for k, mine, normal, offset in self._planes:
-            bound[mine] = apart[mine] @ (self._bodies[k].placement(model).rotation @ normal) - offset
-        return np.asarray(bound - self._reach[self._first] - self._reach[self._second] - self._margins)
-
-    def _distances(self, model: Numeric, within: float) -> tuple[Array, dict[int, tuple[Array, Array]]]:
-        """Return all distances, exact below ``within`` and else lower bounds, and normal and points of the former."""
-        axes, centers = self._placed(model)
-        values, found = self._bounds(model, centers), {}
-        near = np.flatnonzero(values < within)
-        if near.size:
-            places = np.hstack([axes.reshape(-1, 9) * self._reach[:, None], centers])
-            now = places[self._first[near]], places[self._second[near]]
-            values[near] = np.maximum(values[near], self._latest[near] - sum(map(_moved, now, self._then[:, near])))
-        for k in map(int, np.flatnonzero(values < within)):
-            values[k], normal, points = self._separators[k].distance(model)
-            found[k] = normal, points
-            if self._lasting[k]:
-                self._latest[k], self._then[:, k] = values[k], places[[self._first[k], self._second[k]]]
-        return values, found
-
     def evaluate(self, model: Numeric) -> tuple[Array, Array]:
         """See :class:`Constraint`; a distance beyond 1 cm may be a lower bound, with a zero Jacobian."""
-        values, found = self._distances(model, _NEAR)
+        values, found = self._distances.within(model, _NEAR)
         jacobian = np.zeros((self.rows, model.model.nv))
         for k, (normal, points) in found.items():
             one = self._separators[k]
@@ -150,11 +98,11 @@ class Clearance(Constraint):
 
     def value(self, model: Numeric) -> Array:
         """See :class:`Constraint`."""
-        return self._distances(model, 0.0)[0]
+        return self._distances.within(model, 0.0)[0]
 
     def closest(self, model: Numeric) -> tuple[str, float]:
         """Return the pair that is closest, and its distance less the clearance, m."""
-        bounds, found = self._bounds(model, self._placed(model)[1]), ("", np.inf)
+        bounds, found = self._distances.bounds(model), ("", np.inf)
         for k in np.argsort(bounds, kind="stable"):
             if bounds[k] >= found[1]:
                 break
@@ -162,21 +110,29 @@ class Clearance(Constraint):
             found = min(found, (one.name, one.distance(model)[0]), key=lambda pair: pair[1])
         return found
 
-    def grown(self, model: Numeric) -> Self:
+    def grown(self, model: Numeric, program: Self | None = None) -> Self:
         """See :class:`Constraint`."""
         values, active = self.value(model), dict(self.active)
+        nothing = Corners(frozenset(), frozenset())
+        had_by_program = (program or self).active
         added = 0
         for k in np.argsort(values, kind="stable"):
             if values[k] >= -_MISSING or added == _MOST:
                 break
-            one, old = self._separators[int(k)], active.get(int(k), Corners(frozenset(), frozenset()))
+            one, had, old = self._separators[int(k)], had_by_program.get(int(k), nothing), active.get(int(k), nothing)
             # A plane of the program that is not the one between the closest points may cut any corner without a row.
             for new in (one.corners(model), one.every_corner):
-                if not (new.a <= old.a and new.b <= old.b):
-                    active[int(k)] = Corners(old.a | new.a, old.b | new.b)
-                    added += 1
+                if not (new.a <= had.a and new.b <= had.b):
+                    # Other ends of the same program may have added them already.
+                    if not (new.a <= old.a and new.b <= old.b):
+                        active[int(k)] = Corners(old.a | new.a, old.b | new.b)
+                        added += 1
                     break
-        return type(self)(self.name, self._separators, self._words, active, self._lifted) if added else self
+        return (
+            type(self)(self.name, self._separators, self._words, active, self._lifted, self._distances)
+            if added
+            else self
+        )
 
     # ---- lifted form ------------------------------------------------------------------------------------------
 
@@ -186,7 +142,7 @@ class Clearance(Constraint):
 
     def _own_plane(self, k: int) -> slice:
         """Where the plane of a pair with a half-space is among the parameters; empty for another pair."""
-        first = self._first_parameter.get(int(self._second[k]))
+        first = self._first_parameter.get(int(self._distances.second[k]))
         return slice(0) if first is None else slice(first, first + 4)
 
     def lift(self, tree: Tree, parameters: ca.SX) -> LiftedRows:
@@ -220,21 +176,10 @@ class Clearance(Constraint):
 
     def linearize(self, model: Numeric, auxiliaries: Array) -> Linearization:
         """See :class:`Constraint`; the rows of pairs that are near, in the program or not."""
-        near = np.flatnonzero(self._distances(model, _ROWS)[0] < _ROWS)
+        near = np.flatnonzero(self._distances.within(model, _ROWS)[0] < _ROWS)
         own: dict[int, Array] = {}
         if near.size and self.active:
             counts = [one.count for _, one, _ in self._program]
             own = dict(zip(self.active, np.split(auxiliaries, np.cumsum(counts)[:-1]), strict=True))
         parts = [self._separators[int(k)].linearize(model, own.get(int(k))) for k in near]
         return Linearization.joined(parts, model.model.nv)
-
-
-def _moved(now: Array, then: Array) -> Array:
-    """Return how far a point of each body has moved at most, ``|Δc| + |ΔR| r``, m, shape (k,).
-
-    Args:
-        now: Axes ``R`` times reach ``r``, and center ``c`` of each body, shape (k, 12).
-        then: The same before.
-    """
-    change = (now - then) ** 2
-    return np.asarray(np.sqrt(change[:, 9:].sum(axis=1)) + np.sqrt(change[:, :9].sum(axis=1)))

@@ -253,7 +253,9 @@ class Search:
         minimized = objective / scale
         if problem.requirements.regularization:
             minimized += problem.requirements.regularization * distance(nlp.chart, record.q, problem.given) ** 2
-        anew = record.converged and not lacks and trapped < _ANEW and not feasible(problem, record.q, numeric)
+        certified = certificate is not None and certificate.holds()
+        anew = record.converged and not (lacks or certified) and trapped < _ANEW
+        anew = anew and not feasible(problem, record.q, numeric)
         return Run(start, record, objective, minimized, certificate, lacks, trapped=anew)
 
 
