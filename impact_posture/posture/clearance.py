@@ -40,7 +40,7 @@ class Clearance(Constraint):
         words: Description in one line.
         active: Pairs in the program, by index, with the corners that have rows there.
         lifted: Equations of pairs by tree and index, which all constraints share that one grows into.
-        distances: The distances of the pairs, which these constraints share as well.
+        distances: Distances of these pairs and of others, with the places of these; by default made here.
     """
 
     projected = False
@@ -53,17 +53,18 @@ class Clearance(Constraint):
         words: str,
         active: Mapping[int, Corners] | None = None,
         lifted: WeakKeyDictionary[Tree, dict[int, LiftedRows]] | None = None,
-        distances: PairDistances | None = None,
+        distances: tuple[PairDistances, range] | None = None,
     ) -> None:
         self.name, self._separators, self._words = name, tuple(separators), words
         self.active: Mapping[int, Corners] = active or {}
         self._lifted = WeakKeyDictionary[Tree, dict[int, LiftedRows]]() if lifted is None else lifted
         self.lower, self.upper = np.zeros(len(self._separators)), np.full(len(self._separators), np.inf)
-        self._distances = PairDistances(separators) if distances is None else distances
-        planes = [(k, body.plane) for k, body in enumerate(self._distances.bodies) if body.normal is not None]
+        own = range(len(self._separators))
+        self._distances, self._own = (PairDistances(separators), own) if distances is None else distances
+        planes = {id(one.b): one.b.plane for one in self._separators if one.known}
         # Programs with other planes are the same.
-        self.parameters = np.concatenate([np.zeros(0), *[plane for _, plane in planes]])
-        self._first_parameter = {k: 4 * index for index, (k, _) in enumerate(planes)}
+        self.parameters = np.concatenate([np.zeros(0), *planes.values()])
+        self._first_parameter = {body: 4 * index for index, body in enumerate(planes)}
 
     def describe(self) -> str:
         """See :class:`Constraint`."""
@@ -88,21 +89,22 @@ class Clearance(Constraint):
 
     def evaluate(self, model: Numeric) -> tuple[Array, Array]:
         """See :class:`Constraint`; a distance beyond 1 cm may be a lower bound, with a zero Jacobian."""
-        values, found = self._distances.within(model, _NEAR)
+        values = self._distances.within(model, _NEAR, self._own)
         jacobian = np.zeros((self.rows, model.model.nv))
-        for k, (normal, points) in found.items():
+        for k in np.flatnonzero(values < _NEAR):
             one = self._separators[k]
+            normal, points = one.distance(model)[1:]
             first, second = (b.rates(model, normal, p[None])[0] for b, p in zip((one.a, one.b), points, strict=True))
             jacobian[k] = first - second
         return values, jacobian
 
     def value(self, model: Numeric) -> Array:
         """See :class:`Constraint`."""
-        return self._distances.within(model, 0.0)[0]
+        return self._distances.within(model, 0.0, self._own)
 
     def closest(self, model: Numeric) -> tuple[str, float]:
         """Return the pair that is closest, and its distance less the clearance, m."""
-        bounds, found = self._distances.bounds(model), ("", np.inf)
+        bounds, found = self._distances.bounds(model, self._own), ("", np.inf)
         for k in np.argsort(bounds, kind="stable"):
             if bounds[k] >= found[1]:
                 break
@@ -129,7 +131,7 @@ class Clearance(Constraint):
                         added += 1
                     break
         return (
-            type(self)(self.name, self._separators, self._words, active, self._lifted, self._distances)
+            type(self)(self.name, self._separators, self._words, active, self._lifted, (self._distances, self._own))
             if added
             else self
         )
@@ -142,7 +144,7 @@ class Clearance(Constraint):
 
     def _own_plane(self, k: int) -> slice:
         """Where the plane of a pair with a half-space is among the parameters; empty for another pair."""
-        first = self._first_parameter.get(int(self._distances.second[k]))
+        first = self._first_parameter.get(id(self._separators[k].b))
         return slice(0) if first is None else slice(first, first + 4)
 
     def lift(self, tree: Tree, parameters: ca.SX) -> LiftedRows:
@@ -176,7 +178,7 @@ class Clearance(Constraint):
 
     def linearize(self, model: Numeric, auxiliaries: Array) -> Linearization:
         """See :class:`Constraint`; the rows of pairs that are near, in the program or not."""
-        near = np.flatnonzero(self._distances.within(model, _ROWS)[0] < _ROWS)
+        near = np.flatnonzero(self._distances.within(model, _ROWS, self._own) < _ROWS)
         own: dict[int, Array] = {}
         if near.size and self.active:
             counts = [one.count for _, one, _ in self._program]

@@ -5,6 +5,7 @@ from __future__ import annotations
 from collections.abc import Sequence
 
 import numpy as np
+from numpy.typing import NDArray
 
 from impact_posture.arrays import Array
 from impact_posture.dynamics.numeric import Numeric
@@ -14,9 +15,9 @@ from impact_posture.posture.separator import Body, Separator
 class PairDistances:
     """Distances less the clearance of pairs of bodies, at one posture after another.
 
-    The balls around two bodies bound their distance.  The last exact distance of a pair, less what its bodies have
-    moved since, is a bound as well.  What is known of the last posture stays known, because a search looks at one
-    several times.
+    Cheap lower bounds show for most pairs that they are apart: balls around the bodies, the last exact distance less
+    what the bodies have moved since, and the gap between the hulls along two directions.  What is known of the last
+    posture stays known, because a search looks at a posture several times.
 
     Args:
         separators: The pairs.
@@ -32,81 +33,115 @@ class PairDistances:
         self._first = np.array([where[id(one.a)] for one in self._separators], dtype=int)
         self._second = np.array([where[id(one.b)] for one in self._separators], dtype=int)
         # A body that does not turn keeps world axes around its point.
-        self._turns = np.array([body.turns for body in self._bodies], dtype=bool)
-        self._joints = np.array([body.point.joint for body in self._bodies], dtype=int)
-        still = np.where(self._turns, 0.0, 1.0)[:, None]
+        self._turns = np.array([body.turns for body in self._bodies], dtype=bool)[:, None, None]
+        self._joints, self._on = np.unique([body.point.joint for body in self._bodies], return_inverse=True)
+        still = np.where(self._turns[:, 0], 0.0, 1.0)
         centers = np.array([body.center for body in self._bodies]).reshape(-1, 3)
         points = np.array([body.point.position for body in self._bodies]).reshape(-1, 3)
-        self._carried, self._beside = (1 - still) * centers + still * points, still * centers
+        self._carried, self._beside = ((1 - still) * centers + still * points)[:, :, None], still * centers
         self._reach = np.array([0.0 if body.hull is None else body.hull.reach for body in self._bodies])
         margins = np.array([one.margin for one in self._separators])
+        self._ends = (0, self._first), (1, self._second)
         self._least = self._reach[self._first] + self._reach[self._second] + margins
-        # The last exact distance of each pair and the places of its bodies then; a plane that turns has no reach.
-        turning = [body.normal is not None and body.turns and body.point.joint > 0 for body in self._bodies]
-        self._lasting = ~np.array(turning, dtype=bool)[self._second]
+        # Corners of the hulls around their centers, in axes that turn with the body; the last one fills the rows.
+        corners = [_corners(body) for body in self._bodies]
+        most = max((len(own) for own in corners), default=0)
+        filled = [np.vstack([own, np.repeat(own[-1:], most - len(own), axis=0)]) for own in corners]
+        self._corners = np.array(filled).reshape(-1, most, 3)
+        self._gaps = np.array([one.gap for one in self._separators])
+        self._planes = [(k, body) for k, body in enumerate(self._bodies) if body.normal is not None]
+        self._offsets = np.array([body.offset for body in self._bodies])
+        self._known = np.array([one.known for one in self._separators], dtype=bool)
+        # The last exact distance of each pair of hulls, its normal, and the places of its bodies then.
         self._latest = np.full(len(self._separators), -np.inf)
+        self._normals = np.zeros((len(self._separators), 3))
         self._then = np.zeros((2, len(self._separators), 12))
-        self._planes = [
-            (self._second == k, body, body.normal, body.offset)
-            for k, body in enumerate(self._bodies)
-            if body.normal is not None
-        ]
-        # The last posture, the bodies there, and what is known of the distances.
+        # The last posture, the bodies there, the normals of planes, and what is known of the distances.
         self._q = np.zeros(0)
-        self._places = np.zeros((0, 12))
-        self._values = np.zeros(0)
-        self._exact: dict[int, tuple[Array, Array]] = {}
+        self._axes, self._centers = np.zeros((0, 3, 3)), np.zeros((0, 3))
+        self._up = np.zeros((len(self._bodies), 3))
+        self._balls = self._values = np.zeros(0)
+        self._exact = np.zeros(len(self._separators), dtype=bool)
 
-    @property
-    def bodies(self) -> list[Body]:
-        """The bodies of all pairs."""
-        return self._bodies
+    def bounds(self, model: Numeric, pairs: range) -> Array:
+        """Return lower bounds on the distances of some pairs from a ball around each body, m."""
+        self._move(model)
+        return np.array(self._balls[pairs.start : pairs.stop])
 
-    @property
-    def second(self) -> Array:
-        """Index of the second body of each pair, shape (k,)."""
-        return self._second
-
-    def bounds(self, model: Numeric) -> Array:
-        """Return lower bounds on all distances from a ball around each body, shape (k,), m."""
-        return self._bounds(model, self._placed(model)[1])
-
-    def within(self, model: Numeric, limit: float) -> tuple[Array, dict[int, tuple[Array, Array]]]:
-        """Return all distances, and the normal and the closest points of those that are exact.
+    def within(self, model: Numeric, limit: float, pairs: range) -> Array:
+        """Return the distances of some pairs, m: exact below a limit, and else exact or lower bounds.
 
         Args:
             model: The model at the posture.
-            limit: Distances below it are exact, others may be lower bounds, m.
+            limit: The limit, m.
+            pairs: The pairs.
         """
-        if not np.array_equal(self._q, model.q):
-            axes, centers = self._placed(model)
-            self._places = np.hstack([axes.reshape(-1, 9) * self._reach[:, None], centers])
-            self._values, self._exact, self._q = self._bounds(model, centers), {}, model.q
-        values, places = self._values, self._places
-        near = [k for k in np.flatnonzero(values < limit).tolist() if k not in self._exact]
-        if near:
-            now = places[self._first[near]], places[self._second[near]]
-            values[near] = np.maximum(values[near], self._latest[near] - sum(map(_moved, now, self._then[:, near])))
-        for k in near:
-            if values[k] < limit:
-                values[k], normal, points = self._separators[k].distance(model)
-                self._exact[k] = normal, points
-                if self._lasting[k]:
-                    self._latest[k], self._then[:, k] = values[k], places[[self._first[k], self._second[k]]]
-        return values.copy(), dict(self._exact)
+        self._move(model)
+        own = slice(pairs.start, pairs.stop)
+        near = pairs.start + np.flatnonzero((self._values[own] < limit) & ~self._exact[own])
+        if near.size:
+            hulls = near[~self._known[near]]
+            if hulls.size:
+                moved = [_moved(self._places(ends[hulls]), self._then[k, hulls]) for k, ends in self._ends]
+                self._values[hulls] = np.maximum(self._values[hulls], self._latest[hulls] - moved[0] - moved[1])
+            near = near[self._values[near] < limit]
+        if near.size:
+            self._values[near] = np.maximum(self._values[near], self._along(near))
+            self._exact[near] |= self._known[near]
+        for k in near[(self._values[near] < limit) & ~self._known[near]].tolist():
+            self._values[k], self._normals[k], _ = self._separators[k].distance(model)
+            self._latest[k], self._exact[k] = self._values[k], True
+            self._then[:, k] = self._places(np.array([self._first[k], self._second[k]]))
+        return self._values[own].copy()
 
-    def _placed(self, model: Numeric) -> tuple[Array, Array]:
-        """Return the axes, shape (k, 3, 3), and the centers, shape (k, 3), m, of all bodies in the world."""
-        links = np.array([at.homogeneous for at in model.data.oMi])[self._joints]
-        centers = (links[:, :3, :3] @ self._carried[:, :, None])[:, :, 0] + links[:, :3, 3] + self._beside
-        return np.where(self._turns[:, None, None], links[:, :3, :3], np.eye(3)), centers
+    def _move(self, model: Numeric) -> None:
+        """Place all bodies, unless the posture is the last one."""
+        if np.array_equal(self._q, model.q):
+            return
+        self._q = model.q
+        self._exact[:] = False
+        oMi = model.data.oMi
+        links = np.array([oMi[joint].homogeneous for joint in self._joints.tolist()])[self._on]
+        axes = links[:, :3, :3]
+        self._centers = (axes @ self._carried)[:, :, 0] + links[:, :3, 3] + self._beside
+        self._axes = np.where(self._turns, axes, np.eye(3))
+        for k, body in self._planes:
+            self._up[k] = body.placement(model).rotation @ body.normal
+        apart = self._centers[self._first] - self._centers[self._second]
+        heights = (apart * self._up[self._second]).sum(axis=1) - self._offsets[self._second]
+        bound = np.where(self._known, heights, np.sqrt((apart * apart).sum(axis=1)))
+        self._balls = bound - self._least
+        self._values = self._balls.copy()
 
-    def _bounds(self, model: Numeric, centers: Array) -> Array:
-        apart = centers[self._first] - centers[self._second]
-        bound = np.sqrt((apart * apart).sum(axis=1))
-        for mine, body, normal, offset in self._planes:
-            bound[mine] = apart[mine] @ (body.placement(model).rotation @ normal) - offset
-        return np.asarray(bound - self._least)
+    def _places(self, bodies: Array) -> Array:
+        """Return the axes times the reach, and the center of bodies, shape (k, 12)."""
+        axes = self._axes[bodies] * self._reach[bodies][:, None, None]
+        return np.hstack([axes.reshape(-1, 9), self._centers[bodies]])
+
+    def _along(self, pairs: NDArray[np.intp]) -> Array:
+        """Return the gaps of pairs along the normal of the plane, or the larger one along two directions, m."""
+        first, second = self._first[pairs], self._second[pairs]
+        apart = self._centers[first] - self._centers[second]
+        # The direction between the centers, and the normal when the pair was near.
+        length = np.sqrt((apart * apart).sum(axis=1, keepdims=True))
+        between = apart / np.maximum(length, np.finfo(float).tiny)
+        along = np.stack(
+            [np.where(self._known[pairs, None], self._up[second], between), self._normals[pairs]], axis=2
+        )
+        low = (self._corners[first] @ (self._axes[first].transpose(0, 2, 1) @ along)).min(axis=1)
+        high = (self._corners[second] @ (self._axes[second].transpose(0, 2, 1) @ along)).max(axis=1)
+        gaps = (apart[:, None] @ along)[:, 0] + low - high
+        # A pair that was never near has no normal, and a gap of zero along it.
+        best = np.where(self._normals[pairs].any(axis=1), gaps.max(axis=1), gaps[:, 0])
+        return np.asarray(best - self._gaps[pairs] - self._offsets[second])
+
+
+def _corners(body: Body) -> Array:
+    """Return the corners of a hull around its center, in axes that turn with the body; one of a half-space."""
+    if body.hull is None:
+        return np.zeros((1, 3))
+    corners = body.hull.vertices - body.hull.center
+    return np.asarray(corners @ body.point.rotation.T if body.turns else corners)
 
 
 def _moved(now: Array, then: Array) -> Array:

@@ -21,6 +21,7 @@ from impact_posture.impact.contact import ImpactContact, Support, point_on
 from impact_posture.obstacle import Obstacle
 from impact_posture.posture.clearance import Clearance
 from impact_posture.posture.nested_links import NestedLinks
+from impact_posture.posture.pair_distances import PairDistances
 from impact_posture.posture.separator import Body, Separator
 from impact_posture.robot.robot import Robot
 from impact_posture.settings import PATCH
@@ -150,15 +151,20 @@ class Surroundings:
         """Return one constraint for the links among themselves, and one for each wall."""
         near = f"at least {1e3 * self._clearance:g} mm apart"
         pairs = [Separator(self._bodies[i], self._bodies[j], self._clearance) for i, j in self.shapes.pairs]
-        found = [Clearance("self-collision", pairs, f"links {near} ({len(pairs)} pairs)")] if pairs else []
+        groups = [("self-collision", pairs, f"links {near} ({len(pairs)} pairs)")]
         for wall in self._walls:
             apart = [
                 Separator(body, wall.body, self._clearance)
                 for body in self._bodies
                 if body.point.joint not in wall.exempt
             ]
-            if apart:
-                found.append(Clearance(wall.body.name, apart, f"links and {wall.body.name} {near}"))
+            groups.append((wall.body.name, apart, f"links and {wall.body.name} {near}"))
+        # All are needed at each posture that one is needed at.
+        distances, first, found = PairDistances([one for _, own, _ in groups for one in own]), 0, []
+        for name, own, words in groups:
+            if own:
+                found.append(Clearance(name, own, words, distances=(distances, range(first, first + len(own)))))
+                first += len(own)
         return found
 
     def closest(self, q: Array) -> dict[str, object]:
