@@ -25,8 +25,9 @@ _NEAR = 0.01
 _ROWS = 1e-3
 # A pair is missing in the program if it violates its clearance by more than this (m), half of what certifies.
 _MISSING = 5e-9
-# Most pairs that one posture adds to the program, the deepest first.
-_MOST = 6
+# Most pairs that one posture adds to the program, the deepest first: of links, and of links and a plane.  Links
+# behind a plane are mostly next to each other, and the deepest takes the others along.
+_MOST, _MOST_BEHIND = 6, 2
 
 
 class Clearance(Constraint):
@@ -112,29 +113,24 @@ class Clearance(Constraint):
             found = min(found, (one.name, one.distance(model)[0]), key=lambda pair: pair[1])
         return found
 
-    def grown(self, model: Numeric, program: Self | None = None) -> Self:
+    def grown(self, model: Numeric) -> Self:
         """See :class:`Constraint`."""
         values, active = self.value(model), dict(self.active)
-        nothing = Corners(frozenset(), frozenset())
-        had_by_program = (program or self).active
-        added = 0
+        most, added = _MOST_BEHIND if self._separators[0].known else _MOST, 0
         for k in np.argsort(values, kind="stable"):
-            if values[k] >= -_MISSING or added == _MOST:
+            if values[k] >= -_MISSING or added == most:
                 break
-            one, had, old = self._separators[int(k)], had_by_program.get(int(k), nothing), active.get(int(k), nothing)
+            one, old = self._separators[int(k)], active.get(int(k), Corners(frozenset(), frozenset()))
             # A plane of the program that is not the one between the closest points may cut any corner without a row.
             for new in (one.corners(model), one.every_corner):
-                if not (new.a <= had.a and new.b <= had.b):
-                    # Other ends of the same program may have added them already.
-                    if not (new.a <= old.a and new.b <= old.b):
-                        active[int(k)] = Corners(old.a | new.a, old.b | new.b)
-                        added += 1
+                if not (new.a <= old.a and new.b <= old.b):
+                    active[int(k)] = Corners(old.a | new.a, old.b | new.b)
+                    added += 1
                     break
-        return (
-            type(self)(self.name, self._separators, self._words, active, self._lifted, (self._distances, self._own))
-            if added
-            else self
-        )
+        if not added:
+            return self
+        shared = self._lifted, (self._distances, self._own)
+        return type(self)(self.name, self._separators, self._words, active, *shared)
 
     # ---- lifted form ------------------------------------------------------------------------------------------
 

@@ -170,13 +170,8 @@ class Constraint(ABC):
         names = [self.row_name(row) for row in range(self.rows)]
         return Linearization(names, value, self.lower, self.upper, jacobian, np.zeros((self.rows, 0)))
 
-    def grown(self, model: Numeric, program: Self | None = None) -> Self:
-        """Return the constraint with the parts that its program lacks at ``model.q``; itself if it lacks none.
-
-        Args:
-            model: The model at a posture where a program ended.
-            program: The constraint of that program, if this one has grown since; by default this one.
-        """
+    def grown(self, model: Numeric) -> Self:
+        """Return the constraint with the parts that its program lacks at ``model.q``; itself if it lacks none."""
         return self
 
     # ---- words ------------------------------------------------------------------------------------------------

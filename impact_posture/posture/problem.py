@@ -171,7 +171,7 @@ class PostureProblem:
         constraints, numeric = list(self.constraints), numeric or Numeric(self.robot.model)
         for q in postures:
             numeric.at(q)
-            constraints = [c.grown(numeric, own) for c, own in zip(constraints, self.constraints, strict=True)]
+            constraints = [c.grown(numeric) for c in constraints]
         if all(one is other for one, other in zip(constraints, self.constraints, strict=True)):
             return self
         rows = tuple(
