@@ -19,7 +19,7 @@ from impact_posture.posture.nlp import SLACK_PRICE, PostureNLP, SolveRecord, bui
 from impact_posture.posture.posture_distance import distance
 from impact_posture.posture.problem import PostureProblem
 from impact_posture.posture.program_rows import ProgramRows
-from impact_posture.posture.starts import ATTEMPTS, CANDIDATES, FEASIBLE, Projector, feasible_start
+from impact_posture.posture.starts import ATTEMPTS, CANDIDATES, FEASIBLE, Projector, StartDraw
 from impact_posture.processes import fork_map
 
 Progress = Callable[[int, int], None]
@@ -126,6 +126,8 @@ class Search:
         self.nlp = build_nlp(problem, compile=compile, starts=starts, rows=rows)
         # The constraints that starts are pulled onto do not grow.
         self._projector = Projector(problem)
+        # A start that begins anew goes on with the postures that it drew before.
+        self._draws: dict[int, StartDraw] = {}
         self._small = starts * self._unknowns <= _SMALL
         self._starts, self._finish_all = starts, finish_all or self._small
         self.build_time_s = self.nlp.build_time_s
@@ -237,7 +239,9 @@ class Search:
             other = index + max(trapped - 1, 0) * self._starts
             count = ATTEMPTS if trapped else CANDIDATES
             # Near the first start, because the given posture may be far from all that satisfies the constraints.
-            start = feasible_start(problem, other, self._seed, count, self._known[0], self._projector)
+            if other not in self._draws:
+                self._draws[other] = StartDraw(problem, other, self._seed, self._known[0], self._projector)
+            start = self._draws[other].choose(count)
         if start is None:
             return Run()
         price = HIGH_PRICE if trapped else self._price

@@ -20,6 +20,8 @@ ATTEMPTS = 20
 _STEPS = 80
 # A posture whose violation has not fallen by a fifth in so many steps hardly ever reaches the constraints.
 _PATIENCE = 16
+# Of random postures a fiftieth are lost with so many steps, and drawing others instead takes a fifth less time.
+_DRAWN_PATIENCE = 8
 # Most postures on the projected constraints that one start chooses from.
 CANDIDATES = 3
 # This share of the size of a singular matrix makes it regular.
@@ -84,8 +86,14 @@ class Projector:
             total += float(np.abs(constraint.excess(constraint.value(self.numeric))).sum())
         return total
 
-    def project(self, q: Array, tolerance: float = 1e-9) -> Projection:
-        """Pull ``q`` onto the constraints.  The result may still violate them."""
+    def project(self, q: Array, tolerance: float = 1e-9, patience: int = _PATIENCE) -> Projection:
+        """Pull ``q`` onto the constraints.  The result may still violate them.
+
+        Args:
+            q: The posture, shape (nq,).
+            tolerance: Largest violation to end with.
+            patience: Steps within which the violation has to fall by a fifth.
+        """
         q = self.clip(q)
         value, jacobian = self.residual(q)
         damping, norms, one = 1e-3, list[float](), np.eye(len(value))
@@ -93,7 +101,7 @@ class Projector:
             size = float(np.abs(value).max(initial=0.0))
             squared = float(value @ value)
             norms.append(squared**0.5)
-            stuck = len(norms) > _PATIENCE and norms[-1] > 0.8 * norms[-1 - _PATIENCE]
+            stuck = len(norms) > patience and norms[-1] > 0.8 * norms[-1 - patience]
             if size < tolerance or damping > 1e6 or stuck:
                 break
             free = jacobian.copy()
@@ -144,22 +152,44 @@ def feasible_start(
         around: Posture that odd starts are near, shape (nq,).
         projector: That of the problem, or of one that grew into it, if the caller has it.
     """
-    projector, around = projector or Projector(problem), problem.given if around is None else around
     if index == 0:
-        found = projector.project(problem.given)
+        found = (projector or Projector(problem)).project(problem.given)
         return found.q if found.violation <= FEASIBLE else None
-    rng = np.random.default_rng([seed, index])
-    best, least, tried = None, np.inf, 0
-    for attempt in range(ATTEMPTS):
-        near = around if (index + attempt) % 2 else None
-        found = projector.project(random_posture(problem, projector.chart, rng, near))
-        if found.violation <= FEASIBLE:
-            outside, tried = projector.outside(found.q, least), tried + 1
-            if outside < least:
-                best, least = found.q, outside
-            if least <= FEASIBLE or tried == candidates:
-                break
-    return best
+    return StartDraw(problem, index, seed, around, projector).choose(candidates)
+
+
+class StartDraw:
+    """The random postures of one start, which are drawn as far as they are needed; see :func:`feasible_start`."""
+
+    def __init__(
+        self,
+        problem: PostureProblem,
+        index: int,
+        seed: int,
+        around: Array | None = None,
+        projector: Projector | None = None,
+    ) -> None:
+        self._problem, self._index = problem, index
+        self._around = problem.given if around is None else around
+        self._projector = projector or Projector(problem)
+        self._rng = np.random.default_rng([seed, index])
+        self._attempts = self._tried = 0
+        self._best: Array | None = None
+        self._least = np.inf
+
+    def choose(self, candidates: int) -> Array | None:
+        """Return the best of so many postures on the projected constraints, those of the last call among them."""
+        while self._attempts < ATTEMPTS and self._tried < candidates and self._least > FEASIBLE:
+            near = self._around if (self._index + self._attempts) % 2 else None
+            self._attempts += 1
+            posture = random_posture(self._problem, self._projector.chart, self._rng, near)
+            found = self._projector.project(posture, patience=_DRAWN_PATIENCE)
+            if found.violation <= FEASIBLE:
+                outside = self._projector.outside(found.q, self._least)
+                self._tried += 1
+                if outside < self._least:
+                    self._best, self._least = found.q, outside
+        return self._best
 
 
 def random_posture(
