@@ -24,6 +24,7 @@ from impact_posture.posture.build_problem import retarget
 from impact_posture.posture.clearance import Clearance
 from impact_posture.posture.elastic import ElasticProgram, elastic
 from impact_posture.posture.nlp import build_nlp
+from impact_posture.posture.pair_distances import PairDistances
 from impact_posture.posture.problem_settings import prepare
 from impact_posture.posture.search import feasible
 from impact_posture.posture.separator import EQUATIONS, Body, Separator
@@ -186,6 +187,23 @@ def test_bound_on_distances_is_one(seed: int) -> None:
         exact = np.array([one.distance(numeric)[0] for one in separators])
         assert (values <= exact + 1e-9).all()
         assert ((values < 0) == (exact < 0)).all() and np.allclose(values[exact < 0], exact[exact < 0])
+
+
+@settings(max_examples=25, deadline=None)
+@given(seed=st.integers(0, 10_000))
+def test_distances_of_some_pairs_do_not_depend_on_what_was_asked_before(seed: int) -> None:
+    robot, rng = load_robot("tilthex_arm"), np.random.default_rng(seed)
+    separators = [_separator(robot, kind) for kind in KINDS]
+    known, numeric = PairDistances(separators), Numeric(robot.model)
+    q = _random(robot, rng)
+    for _ in range(3):
+        q = pin.integrate(robot.model, q, 0.1 * rng.normal(size=robot.nv))
+        exact = np.array([one.distance(numeric.at(q))[0] for one in separators])
+        assert (known.bounds(numeric, range(5)) <= exact + 1e-9).all()
+        for limit, pairs in product(rng.permutation([-0.1, 0.0, 0.05, 1.0]), (range(2), range(2, 5), range(5))):
+            found, own = known.within(numeric, float(limit), pairs), exact[pairs.start : pairs.stop]
+            assert (found <= own + 1e-9).all() and np.allclose(found[own < limit], own[own < limit], atol=1e-9)
+            assert not (found[own >= limit] < limit - 1e-9).any()
 
 
 def _problem(**changes: object) -> ProblemSettings:

@@ -18,7 +18,7 @@ from impact_posture.posture.null_space_path import null_space_path
 from impact_posture.posture.problem import RANK_TOLERANCE, PostureProblem, equality_jacobian, rank
 from impact_posture.posture.problem_settings import dump_settings, prepare, read_settings, resolved_settings
 from impact_posture.posture.solve import PostureSolution, distinct, solve
-from impact_posture.posture.starts import Projector, feasible_start
+from impact_posture.posture.starts import Projector, StartDraw, feasible_start
 from impact_posture.settings import ProblemSettings
 from tests.settings import make_settings
 
@@ -224,6 +224,15 @@ def test_starts_are_feasible_and_differ_by_seed() -> None:
     for q in (a, b):
         assert np.abs(projector.residual(q)[0]).max() < 1e-8
         problem.robot.check_limits(q)
+
+
+def test_a_start_that_draws_more_ends_where_one_draw_does() -> None:
+    problem = prepare(make_settings({"robot": "xarm7", "normal": (-1, 0, 0), "collision": True})).problem
+    for index in (2, 3, 7):
+        draw = StartDraw(problem, index, seed=2)
+        few, many = draw.choose(3), draw.choose(20)
+        assert np.array_equal(few, feasible_start(problem, index, seed=2, candidates=3))
+        assert np.array_equal(many, feasible_start(problem, index, seed=2, candidates=20))
 
 
 def test_distinct_counts_every_end_once() -> None:

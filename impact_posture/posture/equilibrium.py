@@ -14,6 +14,8 @@ from impact_posture.posture.static_load import ForceSource, StaticLoad
 
 # Shares closer to the largest than this are as large.
 _TIED = 1e-9
+# Times that forces near even ones leave out feet that would have to pull.
+_TURNS = 4
 # Rate above which a load meets no limit.
 _MOST = 1e6
 
@@ -138,7 +140,15 @@ class Equilibrium:
         pushing = np.isfinite(lower) & np.isinf(upper)
         even = np.where(pushing, 1 / max(pushing.sum(), 1), 0.0)
         even[self._free] = (lower + upper)[self._free] / 2
-        z = even - np.linalg.pinv(A) @ (A @ even + b) if len(A) else even
+        z, used = even, np.ones(len(even), dtype=bool)
+        for _ in range(_TURNS if len(A) else 0):
+            z = np.where(used, even, 0.0)
+            z[used] -= np.linalg.pinv(A[:, used]) @ (A @ z + b)
+            pulling = pushing & (z < 0)
+            if not pulling.any():
+                break
+            # What would have to pull does nothing, and the rest carries the load.
+            used &= ~pulling
         balanced = np.abs(A @ z + b).max(initial=0.0) < _TIED and (z[pushing] >= 0).all()
         return float(np.abs(S @ z + c).max(initial=0.0)) if balanced else np.inf
 
