@@ -20,8 +20,6 @@ ATTEMPTS = 20
 _STEPS = 80
 # A posture whose violation has not fallen by a fifth in so many steps hardly ever reaches the constraints.
 _PATIENCE = 16
-# Of random postures a fiftieth are lost with so many steps, and drawing others instead takes a fifth less time.
-_DRAWN_PATIENCE = 8
 # Most postures on the projected constraints that one start chooses from.
 CANDIDATES = 3
 # This share of the size of a singular matrix makes it regular.
@@ -86,14 +84,8 @@ class Projector:
             total += float(np.abs(constraint.excess(constraint.value(self.numeric))).sum())
         return total
 
-    def project(self, q: Array, tolerance: float = 1e-9, patience: int = _PATIENCE) -> Projection:
-        """Pull ``q`` onto the constraints.  The result may still violate them.
-
-        Args:
-            q: The posture, shape (nq,).
-            tolerance: Largest violation to end with.
-            patience: Steps within which the violation has to fall by a fifth.
-        """
+    def project(self, q: Array, tolerance: float = 1e-9) -> Projection:
+        """Pull ``q`` onto the constraints.  The result may still violate them."""
         q = self.clip(q)
         value, jacobian = self.residual(q)
         damping, norms, one = 1e-3, list[float](), np.eye(len(value))
@@ -101,7 +93,7 @@ class Projector:
             size = float(np.abs(value).max(initial=0.0))
             squared = float(value @ value)
             norms.append(squared**0.5)
-            stuck = len(norms) > patience and norms[-1] > 0.8 * norms[-1 - patience]
+            stuck = len(norms) > _PATIENCE and norms[-1] > 0.8 * norms[-1 - _PATIENCE]
             if size < tolerance or damping > 1e6 or stuck:
                 break
             free = jacobian.copy()
@@ -183,7 +175,7 @@ class StartDraw:
             near = self._around if (self._index + self._attempts) % 2 else None
             self._attempts += 1
             posture = random_posture(self._problem, self._projector.chart, self._rng, near)
-            found = self._projector.project(posture, patience=_DRAWN_PATIENCE)
+            found = self._projector.project(posture)
             if found.violation <= FEASIBLE:
                 outside = self._projector.outside(found.q, self._least)
                 self._tried += 1
