@@ -352,3 +352,10 @@ def test_starts_lie_near_a_posture_that_is_clear() -> None:
     posed = prepare(ProblemSettings(robot="xarm7", normal=(-1, 0, 0), holdable=False)).problem
     found = solve(posed, starts=16, jobs=1, compile="never", finish_all=True)
     assert found.certified_starts == 16
+
+
+@pytest.mark.parametrize("seed", [1, 9, 33])
+def test_the_way_past_a_wall_is_found_from_every_seed(seed: int) -> None:
+    # Few random postures lead to the free part.
+    posed = prepare(ProblemSettings(robot="xarm7", normal=(-1, 0, 0))).problem
+    assert not elastic(posed, seed).conflicts

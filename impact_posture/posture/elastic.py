@@ -24,11 +24,11 @@ _KEPT = 1e-6
 _SLACK_PRICE = 0.03
 # Price of the squared distance from the given posture, which makes the answer unique.
 _AWAY_PRICE = 1e-6
-# Most postures to begin from.  In xarm7 before a wall, the 14th was the first that led to a posture free of it.
-_TRIES = 24
+# Most postures to begin from, and most that are drawn: the clearest of many lead to a posture where any 24 may not.
+_TRIES, _DRAWN = 24, 200
 # Postures that confirm what conflicts nearby.  In panda before a wall two find the way past a body, if there is one.
 _CONFIRMING = 4
-# Postures that are drawn at once: mostly few are needed, and to draw all takes longer than to relax a small robot.
+# Postures that are drawn first: mostly few are needed, and to draw all takes longer than to relax a small robot.
 _DRAW = 8
 # Most times that the program grows for one start.
 _ROUNDS = 20
@@ -91,7 +91,7 @@ def _starts(problem: PostureProblem, chart: Chart, seed: int) -> Iterator[Array]
     """Yield the given posture, then random ones on the projected constraints, of each draw the clearest first."""
     yield problem.given
     rng, projector = np.random.default_rng(seed), Projector(problem)
-    near = [problem.given if k % 2 else None for k in range(1, _TRIES)]
+    near = [problem.given if k % 2 else None for k in range(1, _DRAWN)]
     for some in near[:_DRAW], near[_DRAW:]:
         found = [projector.project(random_posture(problem, chart, rng, posture)) for posture in some]
         order = [(each.violation > FEASIBLE, projector.outside(each.q)) for each in found]
