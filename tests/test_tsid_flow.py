@@ -17,8 +17,9 @@ from impact_posture.errors import InputError, MetricError
 from impact_posture.robot.robot import Robot
 from impact_posture.tsid.actuators import Actuators
 from impact_posture.tsid.controller import Controller, Status
-from impact_posture.tsid.flow_direction import FlowOptions, Redundancy
+from impact_posture.tsid.flow_direction import FlowOptions
 from impact_posture.tsid.posture_tasks import JointPosture
+from impact_posture.tsid.redundancy import Redundancy
 from impact_posture.tsid.reference_flow import PHASES, ReferenceFlow
 from impact_posture.tsid.reference_flow_posture import ReferenceFlowPosture
 from tests.benchmarks.flow_course import formulation_for
@@ -106,7 +107,7 @@ def test_no_limit_is_crossed_wherever_the_goal_is(name: str, seed: int) -> None:
     for _ in range(1500):
         before = flow.velocity.copy()
         flow.advance(DT, flow.q)
-        assert np.abs(flow._flow).max() <= options.speed * (1 + 1e-9)
+        assert np.abs(flow._governor.flow).max() <= options.speed * (1 + 1e-9)
         assert np.abs(flow.velocity - before).max() <= 1.6 * options.acceleration * DT
         assert np.abs(flow.shares).max() < worst + 0.03
     room = flow._state.update(flow.q, np.zeros(r.nv)).room

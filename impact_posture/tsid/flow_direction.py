@@ -14,11 +14,9 @@ from impact_posture.robot.robot import Robot
 from impact_posture.tsid.daqp_solver import DaqpSolver
 from impact_posture.tsid.qp import QP
 from impact_posture.tsid.ranges import JointRanges
+from impact_posture.tsid.redundancy import Redundancy
 from impact_posture.tsid.state import State
 
-# Singular value of the constraints, relative to the largest, below which they are springs.  The rows of points on one
-# body can depend on each other almost: held exactly in one posture, free in the next, a flow would never rest.
-_SOFT = 2e-2
 # Least ``H/H₀`` whose root counts.
 _LEAST = 1e-8
 # Sine of an angle of the base below which the tilt has no slope.
@@ -33,8 +31,6 @@ _AIM = 2e-3
 _RESERVE = 8e-3
 # Square of the length below which a row has no direction on the constraints.
 _FLAT = 1e-6
-# Stiffness of those springs relative to ``H₀``, 1/m²: an error of 6 mm costs half of ``H₀``.
-_STIFFNESS = 3e4
 
 
 @checked_class
@@ -75,39 +71,6 @@ class FlowOptions:
         good = all(x > 0 or (x == 0 and name in may_vanish) for name, x in asdict(self).items())
         if not (good and max(self.share, self.haste) <= 1):
             raise InputError("a number is out of range", where="flow options", hint="see the docstring")
-
-
-@dataclass(frozen=True)
-class Redundancy:
-    """Directions that the constraints leave, ``J = U S Vᵀ``, and a pseudo-inverse of those that they hold.
-
-    Attributes:
-        basis: ``Z``, orthonormal, shape (nv, r).
-        inverse: ``J⁺`` of the held directions, shape (nv, rows).
-        springs: ``k JZ`` of nearly dependent constraints, shape (rows, r); ``None`` where there are none.
-        stiffness: Their stiffness ``k s²`` along each column of ``Z``, shape (r,), or ``None``.
-    """
-
-    basis: Array
-    inverse: Array
-    springs: Array | None = None
-    stiffness: Array | None = None
-
-    @classmethod
-    def of(cls, J: Array) -> Redundancy:
-        """Decompose ``J``, shape (rows, nv)."""
-        rows, nv = J.shape
-        if not rows:
-            return cls(np.eye(nv), np.zeros((nv, 0)))
-        U, s, Vt = np.linalg.svd(J)
-        rank = int(np.count_nonzero(s > _SOFT * s[0]))
-        Z, soft = Vt[rank:].T, s[rank:]
-        springs = stiffness = None
-        if soft.size:
-            springs, stiffness = np.zeros((rows, Z.shape[1])), np.zeros(Z.shape[1])
-            springs[:, : soft.size] = U[:, rank : s.size] * (_STIFFNESS * soft)
-            stiffness[: soft.size] = _STIFFNESS * soft**2
-        return cls(Z, (Vt[:rank].T / s[:rank]) @ U[:, :rank].T, springs, stiffness)
 
 
 class FlowDirection:
@@ -296,9 +259,3 @@ class FlowDirection:
         y = solved.z[:r]
         self.gain = -float(slope @ y + y @ y / 2)
         return np.asarray(way @ y)
-
-
-def limited(vector: Array, largest: float) -> Array:
-    """Return the vector, shortened so that no entry exceeds ``largest``."""
-    size = float(np.abs(vector).max(initial=0.0))
-    return vector * (largest / size) if size > largest else vector

@@ -13,10 +13,13 @@ from impact_posture.errors import MetricError
 from impact_posture.robot.robot import Robot
 from impact_posture.tsid.actuators import Actuators
 from impact_posture.tsid.body_tasks import BaseOrientation, CenterOfMass
-from impact_posture.tsid.flow_direction import FlowDirection, FlowOptions, Redundancy, limited
+from impact_posture.tsid.flow_direction import FlowDirection, FlowOptions
+from impact_posture.tsid.flow_governor import FlowGovernor
+from impact_posture.tsid.flow_probes import ProbeDirections
 from impact_posture.tsid.frame_tasks import FramePose, FramePosition
 from impact_posture.tsid.impact_robust import Gradient
 from impact_posture.tsid.qp import stacked_rows
+from impact_posture.tsid.redundancy import Redundancy
 from impact_posture.tsid.state import State
 from impact_posture.tsid.static_controls import StaticControls, support_edges
 from impact_posture.tsid.task import Task
@@ -32,18 +35,8 @@ _RETURN = 0.1
 _REACHED = 0.02
 # Speed below which a flow that is off stands still, rad/s (m/s).
 _STILL = 1e-5
-# Square of the length below which a direction is none.
-_EMPTY = 1e-24
-# Length of what is new in a direction below which once more makes it exact.
-_NEW = 0.1
 # Length of a velocity below which the flow has no way to stop on.
 _SLOW = 1e-3
-# How often a change of the flow is tried: as it is, and twice without what crosses limits.
-_TIMES = 3
-# Least share of the acceleration with which the flow counts on braking, and its growth with each change.
-_ABLE = 0.1
-# Pull to zero of the base's share in a motion that the joints do not determine.
-_IDLE = 1e-9
 
 
 class ReferenceFlow:
@@ -105,7 +98,7 @@ class ReferenceFlow:
         self._static = StaticControls(actuators, self._contacts, options.share)
         self.q, self.velocity, self.acceleration = robot.posture(), np.zeros(nv), np.zeros(nv)
         self.robot, self._path = robot, tuple(path)
-        self._mixed, self._seen = mixed_directions(nv), np.zeros((nv, nv))
+        self._aside = ProbeDirections(nv)
 
     def reset(self, q: Array) -> None:
         """Begin at rest at a posture, shape (nq,), and measure the curvature there.
@@ -116,13 +109,13 @@ class ReferenceFlow:
         state = self._state
         self.q[:], self.velocity[:], self.acceleration[:] = q, 0.0, 0.0
         self._first, self._here = self.q.copy(), self.q.copy()
-        self._wanted, self._flow, self._slope = np.zeros((3, self.velocity.size))
+        self._wanted, self._slope = np.zeros((2, self.velocity.size))
         self._before = np.zeros_like(self._J)
         self.shares = np.zeros(self._static.limited.size)
-        self._phase, self._next, self._visited, self._elapsed, self._clock = 0, 0, 0, 0.0, 0.0
+        self._phase, self._visited, self._elapsed, self._clock = 0, 0, 0.0, 0.0
         self._deadline = np.inf
         self.on, self.resting, self.failed = False, False, False
-        self._ahead, self._able = False, 1.0
+        self._ahead = False
         state.update(q, self.velocity)
         kinds = {3: FramePosition, 6: FramePose}
         self._held: list[Task] = [*(kinds[c.size](c.point) for c in self._contacts), *self._tasks]
@@ -132,15 +125,17 @@ class ReferenceFlow:
         self._turning = [(t, self._J[r]) for t, r in zip(self._held, self._places, strict=True) if not t.constant]
         self._edges, self._offsets = support_edges(state, self._contacts)
         self.direction = FlowDirection(self.robot, self._edges, self._static.limited.size, self.options)
+        self._governor = FlowGovernor(self.direction, self.options)
         self.start = 1.0
         self.value, _ = self._evaluate(self.q)
         if not (np.isfinite(self.value) and self.value != 0):
             raise MetricError("the objective vanishes or does not exist", where="reset", hint="start elsewhere")
         self.start = abs(self.value)
         self._look()
+        self._aside.count = 0
         for _ in range(self._space.basis.shape[1]):
             self._probe()
-        self._next = 0
+        self._aside.count = 0
 
     def advance(self, dt: float, measured: Array) -> None:
         """Advance by ``dt`` seconds; ``measured`` is the configuration of the robot that follows, shape (nq,)."""
@@ -190,32 +185,23 @@ class ReferenceFlow:
         rooms = self._offsets
         if rooms.size:
             rooms = -rooms - self.options.com_margin - self._edges @ state.center_of_mass()[0][:2]
-        coasting = self._flow * (self.options.speed / self.options.acceleration / 2)
+        coasting = self._governor.flow * (self.options.speed / self.options.acceleration / 2)
         direction.limit(state, rooms, self.shares, coasting)
 
     def _probe(self) -> None:
         """Evaluate the reduced gradient and the static controls beside the posture of the last look, and learn."""
-        Z = self._space.basis
-        if self.failed or not Z.shape[1]:
+        if self.failed or not self._space.basis.shape[1]:
             return
         self._ahead = not self._ahead
-        size = math.sqrt(float(self._flow @ self._flow))
+        flow = self._governor.flow
+        size = math.sqrt(float(flow @ flow))
         if self._ahead and size > _SLOW:
             # Where the flow stops: what it learns there is what it needs to know.
-            z, length = self._flow / size, max(size * self._stopping(self._flow), _STEP)
+            z, length = flow / size, max(size * self._governor.stopping(flow), _STEP)
             self._beside(z, length)
             return
-        k = self._next % Z.shape[1]
-        # The columns of Z are as good as any others of that space.  What a fixed direction has in it is unique.
-        z, seen = self._seen[k], self._seen[:k]
-        z[:] = self._mixed[k]
-        for _ in range(2):
-            z[:] = Z @ (Z.T @ (z - (seen @ z) @ seen))
-            length = math.sqrt(max(float(z @ z), _EMPTY))
-            z /= length
-            if length > _NEW:
-                break
-        self._next += int(self._beside(z, _STEP))
+        if self._beside(self._aside.next(self._space), _STEP):
+            self._aside.count += 1
 
     def _beside(self, z: Array, length: float) -> bool:
         """Learn from the end of a way ``z · length`` from the last look; return whether ``H`` exists there."""
@@ -226,10 +212,6 @@ class ReferenceFlow:
             reduced = slope - self._J.T @ self._multipliers
             self._compare(z, length, reduced, self._static.shares(self._state, self._J))
         return not self.failed
-
-    def _stopping(self, flow: Array) -> float:
-        """Return the time in which a flow stops evenly, s, which takes twice the way that braking takes."""
-        return float(np.abs(flow).max()) / self.options.acceleration
 
     def _compare(self, z: Array, length: float, reduced: Array, shares: Array) -> None:
         """Learn from reduced gradient and static controls at the end of a way ``z · length`` from the last look."""
@@ -255,7 +237,7 @@ class ReferenceFlow:
 
     def _govern(self) -> None:
         """Limit speed and acceleration, and return to contacts and tasks."""
-        options, Z = self.options, self._space.basis
+        options = self.options
         period, self._elapsed = self._elapsed, 0.0
         if not period > 0:
             # A clock that stands still.
@@ -264,52 +246,18 @@ class ReferenceFlow:
         fastest = options.speed * max(1.0 - error / options.tracking, 0.0)
         # The speed is that at the next change, and rest comes with the one after.
         fastest = min(fastest, options.acceleration * max(self._deadline - self._clock - 2 * period, 0.0))
-        # Two fifths of the acceleration stop a speed of √(4/5 a δ) on the step δ.  Below v/2, it is 8/5 a/v δ.
-        least = 0.3125 * options.speed**2 / options.acceleration
-        wanted = self._wanted * math.sqrt(0.8 * options.acceleration / max(np.abs(self._wanted).max(), least))
         if not self.on:
             fastest = 0.0
         rate = self.error / _RETURN
         for task, rows in zip(self._held, self._places, strict=True):
             rate[rows] += task.target_velocity
-        back = self._space.inverse @ rate
-        if self._base:
-            # Of all motions that bring the tasks there, that of the base and not of the joints.
-            joints = Z[self._base :]
-            square = joints.T @ joints
-            square.flat[:: square.shape[0] + 1] += _IDLE
-            back -= Z @ np.linalg.solve(square, joints.T @ back[self._base :])
-        self._flow = Z @ (Z.T @ self._flow)
-        step = self._change(limited(wanted, fastest), options.acceleration * period, fastest > 0)
-        known = (self._flow + back - self.velocity) / period
-        part = self._static.permitted(self._state.M, known, step / period, self.shares, options.haste)
-        self._able = min(max(part, _ABLE), self._able + _ABLE)
-        step *= part
-        self._flow += step
-        self.acceleration[:] = known + step / period
-
-    def _change(self, wanted: Array, most: float, moving: bool) -> Array:
-        """Return the change of the flow towards the wanted one, shape (nv,), by at most ``most`` an entry.
-
-        Each joint turns as fast as it can, and then all stay on the constraints; or all change evenly; or all brake
-        evenly.  The first two count twice more without what crosses limits.  The first change counts from which the
-        flow can stop within the limits by braking evenly, as hard as it lately could.
-        """
-        Z, flow, direction = self._space.basis, self._flow, self.direction
-        away, period = wanted - flow, most / self.options.acceleration
-        # Twice the way on which it stops, because the curvature may grow on it.
-        stop = flow * self._stopping(flow)
-        for step in (Z @ (Z.T @ np.minimum(np.maximum(away, -most), most)), away):
-            step = limited(step, most)
-            for again in range(_TIMES):
-                if again:
-                    step = direction.along(Z, flow, self._stopping(flow + step) / 2 / self._able + period, step)
-                if moving and self._visited == len(self._path):
-                    step = direction.downhill(Z, self._slope, flow, stop, step)
-                step = limited(step, most)
-                if direction.stops(flow + step, self._stopping(flow + step) / 2 / self._able + period):
-                    return step
-        return limited(-flow, most)
+        governor = self._governor
+        governor.flow = self._space.project(governor.flow)
+        descends = fastest > 0 and self._visited == len(self._path)
+        change = governor.change(self._space, self._wanted, fastest, period, self._slope if descends else None)
+        known = (governor.flow + self._space.back(rate, self._base) - self.velocity) / period
+        part = self._static.permitted(self._state.M, known, change / period, self.shares, options.haste)
+        self.acceleration[:] = known + governor.take(change, part) / period
 
     def _coast(self) -> None:
         """Do nothing, because the controller in C spreads the parts over these ticks, so that none takes long."""
@@ -330,15 +278,6 @@ class ReferenceFlow:
             # A user's function may raise anything, but the tick must go on.  `failed` reports it.
             self.failed = True
         return (np.nan, np.zeros(self.velocity.size)) if self.failed else (float(value), found)
-
-
-def mixed_directions(nv: int) -> Array:
-    """Return directions in which no entry is left out, shape (nv, nv), bit for bit the same on every machine.
-
-    The fractions of ``k² φ``, φ the golden ratio in 32 bits, are spread like random numbers.
-    """
-    k = np.arange(1, nv * nv + 1, dtype=np.uint32)
-    return np.asarray((k * k * np.uint32(2654435769) / 2.0**32 - 0.5).reshape(nv, nv))
 
 
 PHASES: tuple[Callable[[ReferenceFlow], None], ...] = (
