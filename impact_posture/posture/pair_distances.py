@@ -47,7 +47,7 @@ class PairDistances:
         corners = [_corners(body) for body in self._bodies]
         most = max((len(own) for own in corners), default=0)
         filled = [np.vstack([own, np.repeat(own[-1:], most - len(own), axis=0)]) for own in corners]
-        self._corners = np.array(filled).reshape(-1, most, 3)
+        self._corners = np.array(filled).reshape(len(corners), most, 3)
         self._gaps = np.array([one.gap for one in self._separators])
         self._planes = [(k, body) for k, body in enumerate(self._bodies) if body.normal is not None]
         self._offsets = np.array([body.offset for body in self._bodies])
