@@ -31,8 +31,8 @@ PAPER: dict[str, PaperRow] = {
 
 # The controllers that keep their targets most often over the envelope (docs: reproduction), or at least come nearest.
 RECOMMENDED: dict[str, str] = {
-    "aerial-vertical": "robust-flow",
+    "aerial-vertical": "posture",
     "aerial-lateral": "robust-flow",
     "solo8-push": "stiff",
-    "talos-push": "posture",
+    "talos-push": "robust-flow",
 }
