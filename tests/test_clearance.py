@@ -359,3 +359,11 @@ def test_the_way_past_a_wall_is_found_from_every_seed(seed: int) -> None:
     # Few random postures lead to the free part.
     posed = prepare(ProblemSettings(robot="xarm7", normal=(-1, 0, 0))).problem
     assert not elastic(posed, seed).conflicts
+
+
+def test_no_slack_is_left_where_the_objective_falls_steeply() -> None:
+    # The first price of the slack lets every start end 0.6 mm inside the clearance of the surface.
+    urdf = "example-robot-data:ur_description/urdf/ur10_robot.urdf"
+    posed = prepare(ProblemSettings(robot=urdf, frame="tool0", normal=(0, 0, 1))).problem
+    found = solve(posed, starts=4, jobs=1, compile="never", finish_all=True)
+    assert found.certified_starts == 4

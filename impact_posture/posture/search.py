@@ -35,8 +35,9 @@ _BATCH, _FAR = 1500, 0.05
 _FORK = 200
 # Starts that go on from postures this close (rad, m) share one run, which would end at the same posture.
 _SAME = 1e-6
-# Price of a meter of slack for runs that ended in a trap, and how often they begin anew.
-HIGH_PRICE, _ANEW = 20 * SLACK_PRICE, 4
+# Price of a meter of slack for runs that ended in a trap, and how often they begin anew, each time ten times as dear:
+# where the objective falls steeply, as that of a stretched ur10 does, any fixed price leaves some slack.
+HIGH_PRICE, _ANEW, _DEARER = 20 * SLACK_PRICE, 4, 10
 
 
 @dataclass(frozen=True)
@@ -244,7 +245,7 @@ class Search:
             start = self._draws[other].choose(count)
         if start is None:
             return Run()
-        price = HIGH_PRICE if trapped else self._price
+        price = HIGH_PRICE * _DEARER ** (trapped - 1) if trapped else self._price
         try:
             record, certificate = nlp.solve(start, scale=scale, price=price), None
             lacks = record.converged and problem.grown([record.q], numeric) is not problem
