@@ -23,9 +23,12 @@ from functools import cached_property
 import casadi as ca
 import numpy as np
 
+from impact_posture.arrays import Array
 from impact_posture.dynamics.kinematics import ByJoint, Kinematics, PointOnLink
-from impact_posture.dynamics.root_axes import RootAxes, kept
 from impact_posture.dynamics.spatial import constant, cross, motion_cross_force, skew, symmetric, template
+
+# Families of joints with one degree of freedom, whose coordinate in the chart changes at their velocity.
+_ONE_AXIS = ("revolute", "continuous", "prismatic")
 
 
 @dataclass(frozen=True, eq=False)
@@ -54,7 +57,7 @@ class _Motion:
     changed: ca.SX
 
 
-class JumpDerivatives(RootAxes):
+class JumpDerivatives:
     """Derivatives of the equations of jumps at one symbolic configuration.
 
     Args:
@@ -63,8 +66,18 @@ class JumpDerivatives(RootAxes):
     """
 
     def __init__(self, tree: Kinematics, feet: Sequence[Foot]) -> None:
-        super().__init__(tree)
-        self._feet = tuple(feet)
+        self._tree, self._feet = tree, tuple(feet)
+        self._parents = [int(parent) for parent in tree.model.parents]
+        slots = tree.chart.slots
+        self._beyond = [slot for slot in slots if self._parents[slot.index]]
+        # Joints of the degrees of freedom and of the columns of a motion.
+        self._of_v = [slot.index for slot in slots for _ in range(slot.kind.nv)]
+        self._of_u = [slot.index for slot in self._beyond]
+
+    @property
+    def exist(self) -> bool:
+        """Whether all joints but those of root links have one degree of freedom."""
+        return all(slot.kind.family in _ONE_AXIS for slot in self._beyond)
 
     def of(self, a: ca.SX, f: ca.SX, b: ca.SX, multipliers: ca.SX, compliance: float) -> tuple[ca.SX, ca.SX]:
         """Return the Jacobian of the equations and the Hessian of ``φ`` over chart coordinates, ``a`` and ``f``.
@@ -85,7 +98,7 @@ class JumpDerivatives(RootAxes):
         mixed[:, in_x] = ca.vertcat(self._of_momentum(other), -self._at_feet(other.turned, self._of_u))
         products = one.changed.T @ other.turned + other.changed.T @ one.turned
         curvature = ca.SX(nx, nx)
-        curvature[in_x, in_x] = ca.tril2symm(kept(products, self._lies_on(self._of_u, self._of_u)))
+        curvature[in_x, in_x] = ca.tril2symm(_kept(products, self._lies_on(self._of_u, self._of_u)))
         return (
             ca.horzcat(by_x, ca.blockcat([[self._mass, -J.T], [J, held]])),
             ca.blockcat([[curvature, mixed.T], [mixed, ca.SX(others, others)]]),
@@ -93,27 +106,47 @@ class JumpDerivatives(RootAxes):
 
     # ---- blocks -----------------------------------------------------------------------------------------------
 
+    def _lies_on(self, ends: Sequence[int], joints: Sequence[int], *, itself: bool = True) -> Array:
+        """Return whether each of the ``joints`` (columns) is on the path from a root to each of the ends (rows)."""
+        paths = {end: {int(i) for i in self._tree.model.supports[end]} - (set() if itself else {end}) for end in ends}
+        return np.array([[joint in paths[end] for joint in joints] for end in ends], dtype=bool)
+
     @cached_property
     def _mass(self) -> ca.SX:
         """``M``, shape (nv, nv)."""
         products = self._momenta.T @ self._subspaces
-        below = kept(products, self._lies_on(self._of_v, self._of_v) & np.tri(len(self._of_v), dtype=bool))
+        below = _kept(products, self._lies_on(self._of_v, self._of_v) & np.tri(len(self._of_v), dtype=bool))
         return ca.tril2symm(below) + ca.diag(self._tree.armature)
 
     def _of_momentum(self, motion: _Motion) -> ca.SX:
         """Return the derivative of ``M x`` and of the impulses of the feet, shape (nv, joints)."""
-        below = kept(self._momenta.T @ motion.turned, self._lies_on(self._of_v, self._of_u))
-        above = kept(motion.changed.T @ self._subspaces, self._lies_on(self._of_u, self._of_v, itself=False))
+        below = _kept(self._momenta.T @ motion.turned, self._lies_on(self._of_v, self._of_u))
+        above = _kept(motion.changed.T @ self._subspaces, self._lies_on(self._of_u, self._of_v, itself=False))
         return below + above.T
 
     def _at_feet(self, motions: ca.SX, joints: Sequence[int]) -> ca.SX:
         """Return the held entries of the feet under motions of all that lies beyond joints, shape (rows, joints)."""
         rows = [ca.SX(0, len(joints))]
         for foot, X in zip(self._feet, self._foot_motions, strict=True):
-            rows.append(kept(X @ motions, np.tile(self._lies_on([foot.point.joint], joints), (foot.rows, 1))))
+            rows.append(_kept(X @ motions, np.tile(self._lies_on([foot.point.joint], joints), (foot.rows, 1))))
         return ca.vertcat(*rows)
 
     # ---- the tree in the axes of its roots --------------------------------------------------------------------
+
+    @cached_property
+    def _places(self) -> dict[int, tuple[ca.SX, ca.SX]]:
+        """Rotation and origin of every link."""
+        root = {i: int(list(self._tree.model.supports[i])[1]) for i in set(self._of_v)}
+        return {i: self._tree.relative(root[i], i) for i in root}
+
+    @cached_property
+    def _subspaces(self) -> ca.SX:
+        """Motion subspaces of all joints, shape (6, nv)."""
+        columns = []
+        for slot in self._tree.chart.slots:
+            place, S = self._places[slot.index], constant(slot.kind.subspace)
+            columns += [_motion_of_link(*place, S[:, k]) for k in range(slot.kind.nv)]
+        return ca.horzcat(*columns)
 
     @cached_property
     def _inertias(self) -> ByJoint:
@@ -129,6 +162,14 @@ class JumpDerivatives(RootAxes):
     def _subtrees(self) -> ByJoint:
         """The same of the subtree of every joint."""
         return self._gathered(self._inertias)
+
+    def _gathered(self, of_links: ByJoint) -> ByJoint:
+        """Return sums over the subtrees of all joints."""
+        found = dict(of_links)
+        for i in sorted(found, reverse=True):
+            if parent := self._parents[i]:
+                found[parent] = found[parent] + found[i]
+        return found
 
     @cached_property
     def _momenta(self) -> ca.SX:
@@ -169,6 +210,18 @@ class JumpDerivatives(RootAxes):
             for i in [slot.index]
         ]
         return _Motion(ca.horzcat(ca.SX(6, 0), *turned.values()), ca.horzcat(ca.SX(6, 0), *changed))
+
+
+def _kept(matrix: ca.SX, pattern: Array) -> ca.SX:
+    """Return a matrix without the entries outside a pattern."""
+    return matrix * ca.sparsify(ca.SX(pattern.astype(float)))
+
+
+@template
+def _motion_of_link(R: ca.SX, p: ca.SX, motion: ca.SX) -> ca.SX:
+    """Express the motion of a link in the axes of its root."""
+    angular = R @ motion[3:]
+    return ca.vertcat(R @ motion[:3] + cross(p, angular), angular)
 
 
 @template

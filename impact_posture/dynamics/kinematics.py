@@ -17,7 +17,7 @@ from numpy.typing import ArrayLike, NDArray
 from impact_posture.dynamics.chart import Chart
 from impact_posture.dynamics.joints import joint_quaternion, joint_spin, joint_transform
 from impact_posture.dynamics.repeated_limbs import RepeatedLimbs
-from impact_posture.dynamics.spatial import constant, motion_to_root, quaternion_product, transposed_times
+from impact_posture.dynamics.spatial import constant, quaternion_product, transposed_times
 from impact_posture.robot.model_joints import finite_armature
 
 # Spatial inertias, forces or motions by joint index.
@@ -49,7 +49,6 @@ class Kinematics:
 
     Attributes:
         locked: Velocity entries of locked joints.
-        chart_x: The chart coordinates of ``q``, if they are known.
 
     Args:
         model: The model, with joints of every type that the URDF parser of Pinocchio makes.  An infinite armature
@@ -72,7 +71,7 @@ class Kinematics:
         self.model, self.q = model, q
         self.chart = Chart(model)
         self.nv = self.chart.nv
-        self.chart_x = chart_x
+        self._x = chart_x
         self._parents = [int(p) for p in model.parents]
         self._extra = dict(extra_inertia or {})
         self._R: ByJoint = {}
@@ -126,12 +125,12 @@ class Kinematics:
     @cached_property
     def quaternions(self) -> ByJoint:
         """World orientation of every link as a quaternion x y z w, polynomial in half angles."""
-        if self.chart_x is None:
+        if self._x is None:
             raise ValueError("quaternions need chart_x")
         found: ByJoint = {0: ca.SX([0, 0, 0, 1])}
         for slot, i, parent in self._joints:
             rest = constant_quaternion(self.model.jointPlacements[i].rotation)
-            turned = quaternion_product(rest, joint_quaternion(slot.kind, self.chart_x[slot.x]))
+            turned = quaternion_product(rest, joint_quaternion(slot.kind, self._x[slot.x]))
             found[i] = quaternion_product(found[parent], turned)
         return found
 
@@ -152,19 +151,6 @@ class Kinematics:
             R, p = self._below(base, self._parents[joint])
             self._placed[base, joint] = R @ self._R[joint], p + R @ self._p[joint]
         return self._placed[base, joint]
-
-    @cached_property
-    def root_places(self) -> dict[int, tuple[ca.SX, ca.SX]]:
-        """Rotation (3, 3) and origin (3,) of every link in the coordinates of its root link."""
-        return {i: self.relative(int(list(self.model.supports[i])[1]), i) for i in self._R}
-
-    @cached_property
-    def root_subspaces(self) -> ca.SX:
-        """Motion subspaces of all joints in the coordinates of their root links, shape (6, nv)."""
-        columns = []
-        for slot, i, _ in self._joints:
-            columns += [motion_to_root(*self.root_places[i], self._S[i][:, k]) for k in range(slot.kind.nv)]
-        return ca.horzcat(*columns)
 
     def position(self, point: PointOnLink) -> ca.SX:
         """Return the world position of a point, shape (3,)."""

@@ -75,13 +75,6 @@ def transposed_times(A: ca.SX, b: ca.SX) -> ca.SX:
 
 
 @template
-def motion_to_root(R: ca.SX, p: ca.SX, motion: ca.SX) -> ca.SX:
-    """Express the motion of a link in the coordinates of its root link: ``w = R w, v = R v + p × w``."""
-    angular = R @ motion[3:]
-    return ca.vertcat(R @ motion[:3] + cross(p, angular), angular)
-
-
-@template
 def motion_to_child(R: ca.SX, p: ca.SX, motion: ca.SX) -> ca.SX:
     """Express a parent-frame motion in the child frame: ``w = Rᵀw, v = Rᵀ(v + w × p)``."""
     linear, angular = motion[:3], motion[3:]

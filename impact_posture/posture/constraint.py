@@ -9,7 +9,7 @@ else.
 from __future__ import annotations
 
 from abc import ABC, abstractmethod
-from collections.abc import Callable, Sequence
+from collections.abc import Sequence
 from dataclasses import dataclass, field
 from typing import Self
 
@@ -32,8 +32,6 @@ class LiftedRows:
         slack: Sum of those auxiliaries that relax rows, meters; the program drives it to zero.
         sides: More rows, which see only ``z``.
         pieces: The pieces of a constraint that grows.  The expressions of a piece's ``rows`` stay the same object.
-        known: Function of multipliers ``λ``, shape (m, 1), that returns the Jacobian of ``rows`` and the Hessian of
-            ``λᵀ rows`` over ``(x, z)``; ``None`` where automatic differentiation has to find them.
     """
 
     rows: ca.SX
@@ -41,7 +39,6 @@ class LiftedRows:
     slack: ca.SX = field(default_factory=lambda: ca.SX(1, 1))
     sides: ca.SX = field(default_factory=lambda: ca.SX(0, 1))
     pieces: tuple[LiftedRows, ...] = ()
-    known: Callable[[ca.SX], tuple[ca.SX, ca.SX]] | None = None
 
     @staticmethod
     def joined(pieces: Sequence[LiftedRows]) -> LiftedRows:

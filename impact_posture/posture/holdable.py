@@ -108,15 +108,8 @@ class Holdable(Constraint):
             return LiftedRows(ca.SX(0, 1))
         rest, load = self._rest, self._rest.load
         z = ca.SX.sym("z", load.count)
-        own = tree if tree.model is load.model else Tree(load.model, tree.q, tree.chart_x)
-        rows, torque = _rows(rest.rows), load.derivatives(own, z)
-
-        def known(multipliers: ca.SX) -> tuple[ca.SX, ca.SX]:
-            assert torque is not None  # noqa: S101 (narrows a type)
-            jacobian, hessian = torque(rows.T @ multipliers)
-            return rows @ jacobian, hessian
-
-        return LiftedRows(rows @ load.symbolic(own, z) + rest.offset, z, known=known if torque else None)
+        own = tree if tree.model is load.model else Tree(load.model, tree.q)
+        return LiftedRows(_rows(rest.rows) @ load.symbolic(own, z) + rest.offset, z)
 
     @property
     def unknowns(self) -> int:

@@ -98,9 +98,7 @@ class ProgramRows:
             if key not in self._lifted:
                 lifted = constraint.lift(self.tree, self.parameters[index])
                 if not lifted.pieces:
-                    # Known derivatives are those of all rows.
-                    known = lifted.known if len(carried) == lifted.rows.numel() else None
-                    lifted = LiftedRows(lifted.rows[carried], lifted.variables, lifted.slack, known=known)
+                    lifted = LiftedRows(lifted.rows[carried], lifted.variables, lifted.slack)
                 self._lifted[key] = lifted
             found.append(self._lifted[key])
         return LiftedRows.joined(found)
@@ -138,14 +136,9 @@ class ProgramRows:
         return Derivatives(multipliers[new_rows], J[new_rows, new_columns], H[new_columns, new_columns])
 
     def _differentiate(self, pieces: list[LiftedRows]) -> None:
-        """Differentiate the pieces that are new, together unless known, because they share expressions."""
-        found = {id(piece.rows) for _, block in self._blocks for piece in block}
-        new = [piece for piece in pieces if id(piece.rows) not in found]
-        for piece in new:
-            if piece.known:
-                multipliers = ca.SX.sym("multipliers", piece.rows.numel())
-                self._blocks.append((Derivatives(multipliers, *piece.known(multipliers)), [piece]))
-        new = [piece for piece in new if not piece.known]
+        """Differentiate the pieces that are new, together, because they share expressions."""
+        known = {id(piece.rows) for _, block in self._blocks for piece in block}
+        new = [piece for piece in pieces if id(piece.rows) not in known]
         if new:
             unknowns = ca.vertcat(self.x, *[piece.variables for piece in new])
             self._blocks.append((Derivatives.of(ca.vertcat(*[piece.rows for piece in new]), unknowns), new))

@@ -7,9 +7,8 @@ are the unbalanced wrench of a floating base, which nothing bears.
 
 from __future__ import annotations
 
-from collections.abc import Callable, Sequence
+from collections.abc import Sequence
 from dataclasses import dataclass, field
-from functools import partial
 
 import casadi as ca
 import numpy as np
@@ -17,7 +16,6 @@ import pinocchio as pin
 
 from impact_posture.arrays import Array
 from impact_posture.dynamics.spatial import constant
-from impact_posture.dynamics.static_derivatives import StaticDerivatives
 from impact_posture.dynamics.tree import PointOnLink, Tree, Wrench
 
 
@@ -93,23 +91,6 @@ class StaticLoad:
             w = ca.SX(source.columns) @ z[int(start) : int(stop)] + ca.SX(source.constant)
             wrenches.append(Wrench(source.point, w[:3], w[3:], source.in_frame))
         return -tree.generalized_force(wrenches, constant(self.model.gravity.linear))
-
-    def derivatives(self, tree: Tree, z: ca.SX) -> Callable[[ca.SX], tuple[ca.SX, ca.SX]] | None:
-        """Return the function of multipliers ``b`` that gives the Jacobian of ``τ`` and the Hessian of ``bᵀτ``.
-
-        Both are over the chart coordinates and ``z``.  ``None`` where they have no closed form here: on a fixed base,
-        and with moments and wrenches that turn with a link.
-        """
-        moments = any(s.in_frame or s.columns[3:].any() or s.constant[3:].any() for s in self.sources)
-        gravity = constant(self.model.gravity.linear)
-        found = StaticDerivatives(tree, gravity, [source.point for source in self.sources])
-        if moments or tree.chart_x is None or not found.exist:
-            return None
-        forces = [
-            constant(source.columns[:3]) @ z[int(start) : int(stop)] + constant(source.constant[:3])
-            for source, start, stop in zip(self.sources, self._parts, self._parts[1:], strict=False)
-        ]
-        return partial(found.of, tree.chart_x, forces, z)
 
     def torque(self, q: Array, z: Array, *, by_posture: bool = True) -> StaticTorque:
         """Return ``τ`` and its derivatives at a posture, or ``τ`` and ``∂τ/∂z`` alone, which takes less time.
