@@ -171,6 +171,28 @@ def test_a_pair_that_stays_violated_has_rows_for_all_corners_in_the_end() -> Non
     assert seen == {False, True}
 
 
+def test_a_pair_that_slack_lets_off_gets_no_more_corners() -> None:
+    """More rows do not keep bodies apart where to penetrate pays; without slack it is corners that are missing."""
+    robot, rng = load_robot("tilthex_arm"), np.random.default_rng(5)
+    constraint = Clearance("c", [_separator(robot, kind) for kind in KINDS], "words")
+    numeric, seen = Numeric(robot.model), 0
+    for _ in range(100):
+        q = _random(robot, rng)
+        first = constraint.grown(numeric.at(q))
+        numeric.at(pin.integrate(robot.model, q, 0.3 * rng.normal(size=robot.nv)))
+        # The guess of each pair has the slack for what it violates, as the end of a run has where that pays.
+        let_off = first.guess(numeric).values
+        strict = let_off.copy()
+        strict[[int(own[-1]) for own in first._ends(np.arange(strict.size)).values()]] = 0.0
+        depths = np.maximum(0.0, -constraint.value(numeric))[list(first.active)]
+        assert first.slack(let_off) >= depths.max(initial=0.0) and first.slack(strict) == 0
+        kept, more = first.grown(numeric, let_off).active, first.grown(numeric, strict).active
+        assert all(kept[k] == corners for k, corners in first.active.items())
+        assert more == first.grown(numeric).active
+        seen += any(more[k] != corners for k, corners in first.active.items())
+    assert seen > 5
+
+
 @settings(max_examples=25, deadline=None)
 @given(seed=st.integers(0, 10_000))
 def test_bound_on_distances_is_one(seed: int) -> None:

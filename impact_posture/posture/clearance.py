@@ -113,14 +113,17 @@ class Clearance(Constraint):
             found = min(found, (one.name, one.distance(model)[0]), key=lambda pair: pair[1])
         return found
 
-    def grown(self, model: Numeric) -> Self:
-        """See :class:`Constraint`."""
+    def grown(self, model: Numeric, auxiliaries: Array | None = None) -> Self:
+        """See :class:`Constraint`; a pair whose slack makes up for most of its violation needs no more corners."""
         values, active = self.value(model), dict(self.active)
+        ends = {} if auxiliaries is None else self._ends(auxiliaries)
         most, added = _MOST_BEHIND if self._separators[0].known else _MOST, 0
         for k in np.argsort(values, kind="stable"):
             if values[k] >= -_MISSING or added == most:
                 break
             one, old = self._separators[int(k)], active.get(int(k), Corners(frozenset(), frozenset()))
+            if k in ends and one.slack(ends[int(k)]) > -values[k] / 2:
+                continue
             # A plane of the program that is not the one between the closest points may cut any corner without a row.
             for new in (one.corners(model), one.every_corner):
                 if not (new.a <= old.a and new.b <= old.b):
@@ -131,6 +134,17 @@ class Clearance(Constraint):
             return self
         shared = self._lifted, (self._distances, self._own)
         return type(self)(self.name, self._separators, self._words, active, *shared)
+
+    def slack(self, auxiliaries: Array) -> float:
+        """See :class:`Constraint`; the largest of a pair."""
+        ends = self._ends(auxiliaries)
+        return max((self._separators[k].slack(own) for k, own in ends.items()), default=0.0)
+
+    def _ends(self, auxiliaries: Array) -> dict[int, Array]:
+        """Return the unknowns of each pair; none of those that came in after the program was built."""
+        counts = [one.count for _, one, _ in self._program]
+        parts = np.split(auxiliaries, np.cumsum(counts)[:-1]) if counts else []
+        return {k: own for k, own in zip(self.active, parts, strict=True) if own.size}
 
     # ---- lifted form ------------------------------------------------------------------------------------------
 
@@ -175,9 +189,6 @@ class Clearance(Constraint):
     def linearize(self, model: Numeric, auxiliaries: Array) -> Linearization:
         """See :class:`Constraint`; the rows of pairs that are near, in the program or not."""
         near = np.flatnonzero(self._distances.within(model, _ROWS, self._own) < _ROWS)
-        own: dict[int, Array] = {}
-        if near.size and self.active:
-            counts = [one.count for _, one, _ in self._program]
-            own = dict(zip(self.active, np.split(auxiliaries, np.cumsum(counts)[:-1]), strict=True))
+        own = self._ends(auxiliaries) if near.size else {}
         parts = [self._separators[int(k)].linearize(model, own.get(int(k))) for k in near]
         return Linearization.joined(parts, model.model.nv)

@@ -167,9 +167,22 @@ class Constraint(ABC):
         names = [self.row_name(row) for row in range(self.rows)]
         return Linearization(names, value, self.lower, self.upper, jacobian, np.zeros((self.rows, 0)))
 
-    def grown(self, model: Numeric) -> Self:
-        """Return the constraint with the parts that its program lacks at ``model.q``; itself if it lacks none."""
+    def grown(self, model: Numeric, auxiliaries: Array | None = None) -> Self:
+        """Return the constraint with the parts that its program lacks at ``model.q``; itself if it lacks none.
+
+        Args:
+            model: The model at the posture.
+            auxiliaries: The auxiliaries of the program there, if the posture is the end of a run, shape (k,).
+        """
         return self
+
+    def slack(self, auxiliaries: Array) -> float:
+        """Return by how much (m) a run was let off where it ended; zero without slack.
+
+        Args:
+            auxiliaries: The auxiliaries of the program at the end, shape (k,).
+        """
+        return 0.0
 
     # ---- words ------------------------------------------------------------------------------------------------
 

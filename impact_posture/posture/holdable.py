@@ -83,7 +83,7 @@ class Holdable(Constraint):
         """See :class:`Constraint`; at the limits of all actuators where even forces show that it holds."""
         return np.zeros(self.rows) if self._rest.spares(model.q, 0.0) else self.evaluate(model)[0]
 
-    def grown(self, model: Numeric) -> Self:
+    def grown(self, model: Numeric, auxiliaries: Array | None = None) -> Self:
         """See :class:`Constraint`."""
         if self.active or self.value(model).max() <= _KEPT:
             return self

@@ -204,7 +204,7 @@ class _Curve:
                 first = nlp.solve(start, scale=self._scale, warm=warm)
                 record, certificate = run_start(nlp, start, self._scale, first=first)
                 self._ends[record.q.tobytes()] = record.end
-                grown = self._problem.grown([record.q])
+                grown = self._problem.grown([record.q], auxiliaries=[record.auxiliaries])
                 if grown is self._problem:
                     break
                 self._problem, self._nlp = grown, self._nlp.grown(grown, compile=self._compile)

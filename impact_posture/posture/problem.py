@@ -161,17 +161,21 @@ class PostureProblem:
         """Whether the program may lack parts."""
         return any(c.grows for c in self.constraints)
 
-    def grown(self, postures: Sequence[Array], numeric: Numeric | None = None) -> PostureProblem:
+    def grown(
+        self, postures: Sequence[Array], numeric: Numeric | None = None, auxiliaries: Sequence[Array] | None = None
+    ) -> PostureProblem:
         """Return the problem with the parts that its program lacks at any of the postures; itself if none.
 
         Args:
             postures: The postures, shape (nq,) each.
             numeric: The model, if the caller has it; it is moved.
+            auxiliaries: Those of the program at the postures, if these are ends of runs, shape (k,) each.
         """
         constraints, numeric = list(self.constraints), numeric or Numeric(self.robot.model)
-        for q in postures:
+        for index, q in enumerate(postures):
             numeric.at(q)
-            constraints = [c.grown(numeric) for c in constraints]
+            ends = [None] * len(constraints) if auxiliaries is None else self.split(auxiliaries[index])
+            constraints = [c.grown(numeric, end) for c, end in zip(constraints, ends, strict=True)]
         if all(one is other for one, other in zip(constraints, self.constraints, strict=True)):
             return self
         rows = tuple(
@@ -179,6 +183,11 @@ class PostureProblem:
             for kept, now, before in zip(self.rows, constraints, self.constraints, strict=False)
         )
         return replace(self, constraints=tuple(constraints), rows=rows)
+
+    def slack(self, auxiliaries: Array) -> float:
+        """Return by how much (m) the constraints let off a run that ended at these auxiliaries."""
+        ends = self.split(auxiliaries)
+        return max((c.slack(end) for c, end in zip(self.constraints, ends, strict=True)), default=0.0)
 
     def violations(self, numeric: Numeric) -> list[Array]:
         """Return the signed violation of each constraint at ``numeric.q``, shape (rows,) each; zero if satisfied."""

@@ -52,7 +52,8 @@ class Run:
         certificate: Certificate of the end; ``None`` while the program lacks parts.
         lacks: Whether the program lacks parts at the end.
         dominated: Whether it was left there, because it could not become the best.
-        trapped: Whether the end violates something although the program lacks nothing, and another start is tried.
+        trapped: Whether the end violates something although the program lacks nothing, or because that pays.  The run
+            begins anew, at a higher price.
         time_s: Wall time of this run and of those before it from the same start; an even share of shared runs.
     """
 
@@ -161,7 +162,7 @@ class Search:
                     progress(min(len(runs), starts), starts)
                 if run.good and run.minimized < best and self._clear(run):
                     best = run.minimized
-            lacking = {k: r.q for k in batch if (r := runs[k].record) is not None and runs[k].lacks and k not in last}
+            lacking = {k: r for k in batch if (r := runs[k].record) is not None and runs[k].lacks and k not in last}
             # A run without all rows goes through bodies and may end between them.  With the rows and a higher price
             # it keeps what its start satisfies.
             trapped = {k for k in batch if runs[k].trapped and k not in last}
@@ -169,15 +170,17 @@ class Search:
                 # Passing through something is worth more than the price to each of the first starts.
                 self._price = HIGH_PRICE
             self._trapped.update(trapped)
-            self._ends = {k: q for k, q in (self._ends | lacking).items() if k not in trapped}
+            ends = self._ends | {k: r.q for k, r in lacking.items()}
+            self._ends = {k: q for k, q in ends.items() if k not in trapped}
             waiting = sorted({*waiting} - {*batch} | {*lacking, *trapped})
             if not self._finish_all:
                 dominated = {k for k in waiting if k in runs and runs[k].minimized > best + _FAR * abs(best)}
                 runs |= {k: replace(runs[k], dominated=True) for k in dominated}
                 waiting = [k for k in waiting if k not in dominated]
-                lacking = {k: q for k, q in lacking.items() if k not in dominated}
+                lacking = {k: r for k, r in lacking.items() if k not in dominated}
             if lacking:
-                self.problem = self.problem.grown(list(lacking.values()))
+                ended = list(lacking.values())
+                self.problem = self.problem.grown([r.q for r in ended], auxiliaries=[r.auxiliaries for r in ended])
                 self.nlp = self.nlp.grown(self.problem, compile=self._compile)
                 self.build_time_s += self.nlp.build_time_s
         return [runs[index] for index in range(starts)]
@@ -248,7 +251,7 @@ class Search:
         price = HIGH_PRICE * _DEARER ** (trapped - 1) if trapped else self._price
         try:
             record, certificate = nlp.solve(start, scale=scale, price=price), None
-            lacks = record.converged and problem.grown([record.q], numeric) is not problem
+            lacks = record.converged and problem.grown([record.q], numeric, [record.auxiliaries]) is not problem
             if last or not lacks:
                 record, certificate = run_start(nlp, start, scale, price, record)
             objective = problem.objective.value(record.q)
@@ -259,7 +262,9 @@ class Search:
         if problem.requirements.regularization:
             minimized += problem.requirements.regularization * distance(nlp.chart, record.q, problem.given) ** 2
         certified = certificate is not None and certificate.holds()
-        anew = record.converged and not (lacks or certified) and trapped < _ANEW
+        # More rows do not help where a violation pays.
+        pays = record.converged and problem.slack(record.auxiliaries) > FEASIBLE
+        anew = record.converged and (pays or not lacks) and not certified and trapped < _ANEW
         anew = anew and not feasible(problem, record.q, numeric)
         return Run(start, record, objective, minimized, certificate, lacks, trapped=anew)
 

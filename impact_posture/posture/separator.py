@@ -135,6 +135,10 @@ class Separator:
         """Number of unknowns."""
         return 5 if self.known else 9
 
+    def slack(self, unknowns: Array) -> float:
+        """Return the slack in the unknowns of :meth:`lift`, m."""
+        return _UNIT * float(unknowns[-1])
+
     @property
     def known(self) -> bool:
         """Whether the plane is known."""

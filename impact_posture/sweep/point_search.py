@@ -189,7 +189,8 @@ class _Attempt:
             if not found:
                 return None
             guesses = [Start(end.q) for end in found]
-            self.problem = problem.grown([end.q for end in found], nlp.program.numeric)
+            own = [end.auxiliaries for end in found]
+            self.problem = problem.grown([end.q for end in found], nlp.program.numeric, own)
             if self.problem is not problem:
                 self._walk.grow(self.problem)
             elif price == SLACK_PRICE:
