@@ -258,18 +258,24 @@ def test_a_sweep_goes_on_with_what_is_missing_or_damaged(aerial: Path, tmp_path:
     assert solve(AERIAL, tmp_path).shards == 0
 
 
+@pytest.fixture(scope="module")
+def whole(tmp_path_factory: pytest.TempPathFactory) -> dict[str, bytes]:
+    """The shards of a sweep that nothing stopped."""
+    folder = tmp_path_factory.mktemp("whole")
+    solve(SWITCHING.format(starts=1, shard=7), folder)
+    return shards(folder / "out")
+
+
 @pytest.mark.parametrize("mine", [False, True])
-def test_a_sweep_that_was_stopped_in_either_pass_goes_on(tmp_path: Path, mine: bool) -> None:
+def test_a_sweep_that_was_stopped_in_either_pass_goes_on(tmp_path: Path, whole: dict[str, bytes], mine: bool) -> None:
     """Each run ends after two shards, and what it has written is the table so far."""
-    sweep = SWITCHING.format(starts=1, shard=7)
-    solve(sweep, tmp_path, name="whole")
-    wanted, folder, stops = shards(tmp_path / "whole"), tmp_path / "out", 0
+    sweep, folder, stops = SWITCHING.format(starts=1, shard=7), tmp_path / "out", 0
 
     def stop(done: int, count: int) -> None:
         if 7 < done < count:
             raise KeyboardInterrupt
 
-    while shards(folder) != wanted:
+    while shards(folder) != whole:
         with contextlib.suppress(KeyboardInterrupt):
             solve(sweep, tmp_path, progress=stop)
         assert ip.sweep.open(folder).count_rows() == min(25, 14 * (stops := stops + 1))
