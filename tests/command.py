@@ -28,7 +28,6 @@ from matplotlib.figure import Figure
 
 # What the commands import when they run, once for all of them.
 import impact_posture.codegen.export
-import impact_posture.experiment.figures
 import impact_posture.experiment.folders
 import impact_posture.experiment.jobs
 import impact_posture.experiment.reproduction
@@ -173,7 +172,7 @@ def _command(
     impact_posture.plot.FIGURES.update(dict.fromkeys(set(ALL_PICTURES) - set(pictures), blank))
     if not pictures:
         # Of a run the snapshots stay, as blank.
-        figures = impact_posture.experiment.figures
+        figures = impact_posture.experiment.folders
         figures.figures_of_run = figures.figures_of_comparison = lambda views: {"snapshots": blank(views)}
         if words[0] != "report":
             # A page without figures is made where it is what a test is about.

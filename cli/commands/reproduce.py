@@ -39,8 +39,7 @@ def reproduce(
     """Run ``impact-posture reproduce``."""
     from impact_posture.errors import ScenarioNotFound
     from impact_posture.experiment.folders import FORMATS, Output, store_beside, write_reproduction
-    from impact_posture.experiment.paper import PAPER
-    from impact_posture.experiment.reproduction import controllers_of
+    from impact_posture.experiment.reproduction import PAPER, controllers_of
     from impact_posture.experiment.reproduction import reproduce as reproduce_all
     from impact_posture.experiment.reproduction_summary import advice
     from impact_posture.output_folder import check_output

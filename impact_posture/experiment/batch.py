@@ -10,10 +10,9 @@ from contextlib import suppress
 from dataclasses import asdict
 from functools import cache
 from pathlib import Path
-from typing import Any
 
 from impact_posture.errors import ImpactPostureError, InputError, MetricError, OutputError, SpecError
-from impact_posture.experiment.jobs import Job, controller_factory, execute, lost
+from impact_posture.experiment.jobs import Document, Job, controller_factory, execute, lost
 from impact_posture.libraries import source_key
 from impact_posture.output_folder import is_ours, write_record, write_whole
 from impact_posture.posture.ipopt import one_blas_thread
@@ -23,21 +22,9 @@ from impact_posture.simulation.scenario_file import scenario_path
 from impact_posture.simulation.series import Series
 from impact_posture.version import __version__
 
-Document = dict[str, Any]
 Progress = Callable[[int, int], None]
-_PARTS = (
-    "robot",
-    "dynamics",
-    "collision",
-    "impact",
-    "posture",
-    "path",
-    "codegen",
-    "tsid",
-    "controller_export",
-    "simulation",
-    "experiment",
-)
+_PARTS = ("robot", "dynamics", "collision", "impact", "posture", "path", "codegen", "tsid", "controller_export",
+          "simulation", "experiment")  # fmt: skip
 
 
 class Store:

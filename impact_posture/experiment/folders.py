@@ -1,19 +1,21 @@
-"""Output folders of runs, comparisons and reproductions.  Each is written completely or not at all."""
+"""Output folders of runs, comparisons and reproductions, with their figures.  Each is written whole or not at all."""
 
 from __future__ import annotations
 
 from collections.abc import Sequence
 from dataclasses import dataclass
 from pathlib import Path
-from typing import Any
+
+import numpy as np
 
 from impact_posture.experiment.batch import Store
-from impact_posture.experiment.figures import draw_reproduction, draw_runs, draw_side_by_side
-from impact_posture.experiment.jobs import Job
-from impact_posture.experiment.reproduction import Reproduction
+from impact_posture.experiment.jobs import Document, Job
+from impact_posture.experiment.reproduction import PAPER, Reproduction
 from impact_posture.experiment.reproduction_summary import summary
-from impact_posture.experiment.run_reports import COMPARISON, SIMULATION, keep_runs, try_report
+from impact_posture.experiment.run_reports import COMPARISON, SIMULATION, keep_runs, kept_run, run_view, try_report
 from impact_posture.output_folder import whole_folder, write_json
+from impact_posture.plot import Bar, bars_figure, figures_of_comparison, figures_of_run, save, save_all
+from impact_posture.progress import tell
 from impact_posture.simulation.run import Run
 
 REPRODUCTION = "reproduction.json"
@@ -39,7 +41,7 @@ class Output:
     meshes: bool = False
 
 
-def write_simulation(output: Output, job: Job, runs: Sequence[Run], document: dict[str, Any]) -> str:
+def write_simulation(output: Output, job: Job, runs: Sequence[Run], document: Document) -> str:
     """Write ``run.json``, ``series.npz`` (``series-minus.npz`` for a push with sign -1), figures and ``report.html``.
 
     Returns:
@@ -76,7 +78,7 @@ def write_comparison(output: Output, found: Reproduction, store: Store) -> str:
     return failure
 
 
-def write_reproduction(output: Output, found: Reproduction, store: Store) -> dict[str, Any]:
+def write_reproduction(output: Output, found: Reproduction, store: Store) -> Document:
     """Write ``reproduction.json``, ``SUMMARY.md``, all documents in ``runs/``, and figures, and remove the store.
 
     Returns:
@@ -100,3 +102,36 @@ def write_reproduction(output: Output, found: Reproduction, store: Store) -> dic
 def store_beside(out: Path) -> Store:
     """Return the store that keeps the runs of an output folder until it is written."""
     return Store(out.absolute().parent / f".{out.name}.runs")
+
+
+def draw_runs(job: Job, runs: Sequence[Run], document: Document, folder: Path, formats: Sequence[str]) -> None:
+    """Draw the figures of a job.  Those of the push with sign -1 are in ``minus/``."""
+    for one, part in zip(runs, document["runs"], strict=True):
+        into = folder if one is runs[0] else folder / "minus"
+        tell("drawing")
+        save_all(figures_of_run(run_view(job, part, one.series)), into, formats)
+
+
+def draw_side_by_side(jobs: Sequence[Job], store: Store, folder: Path, formats: Sequence[str]) -> None:
+    """Draw several controllers in one scenario, with the first sign of a push."""
+    tell("drawing")
+    kept = [(job, kept_run(job, store)) for job in jobs]
+    views = [run_view(job, found[0]["runs"][0], found[1]) for job, found in kept if found is not None]
+    if views:
+        save_all(figures_of_comparison(views), folder, formats)
+
+
+def draw_reproduction(found: Reproduction, store: Store, folder: Path, formats: Sequence[str]) -> None:
+    """Draw ``bars``, and for each scenario a folder with nominal, robust and the best controller side by side."""
+    bars = []
+    for row in found.rows:
+        paper, total = PAPER.get(row.scenario), row.metrics.get("q_total_impact")
+        mean, half = (np.nan, 0.0) if total is None else (total.mean, total.half_width or 0.0)
+        # The paper has the nominal and the robust controller.
+        bars.append(Bar(row.scenario, row.controller, mean, half, getattr(paper, row.controller, None)))
+    save(bars_figure(bars), folder, "bars", formats)
+    for scenario in found.scenarios:
+        best = found.best(scenario)
+        shown = dict.fromkeys(("nominal", "robust", *(() if best is None else (best.controller,))))
+        labels = {job.label: job for job in found.shown if job.scenario == scenario}
+        draw_side_by_side([labels[label] for label in shown if label in labels], store, folder / scenario, formats)

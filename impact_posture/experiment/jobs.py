@@ -22,6 +22,8 @@ from impact_posture.simulation.run import Run, run
 from impact_posture.simulation.scenario import set_up
 from impact_posture.simulation.scenario_file import read_scenario
 
+Document = dict[str, Any]
+
 SCHEMA = "impact-posture/simulation/4"
 # Runs from which building pays: a humanoid's library takes about 6 s, and saves 4 s of each run.  The cache does not
 # count, because a run would then depend on what ran before, and differ from another one by amplified rounding.
@@ -99,7 +101,7 @@ def controller_factory(scenario: str, free: bool = False) -> ControllerFactory:
     return ControllerFactory(set_up(read_scenario(scenario)), free)
 
 
-def execute(job: Job, factory: ControllerFactory | None = None) -> tuple[tuple[Run, ...], dict[str, Any]]:
+def execute(job: Job, factory: ControllerFactory | None = None) -> tuple[tuple[Run, ...], Document]:
     """Run a job and return its runs and its document.
 
     Args:
@@ -146,7 +148,7 @@ def execute(job: Job, factory: ControllerFactory | None = None) -> tuple[tuple[R
     return found, jsonable(document)
 
 
-def lost(job: Job, error: Exception) -> dict[str, Any]:
+def lost(job: Job, error: Exception) -> Document:
     """Return the document of a job that failed on its own, with the status ``control lost`` and without runs."""
     event = {"status": "control lost", "time": getattr(error, "time", None), "what": str(error), "sign": None}
     return {"schema": SCHEMA, "scenario": job.scenario, "controller": job.controller, "mode": job.mode,
@@ -172,7 +174,7 @@ def together(metrics: list[Metrics]) -> Metrics:
     return Metrics(**{**values, **ticks, **largest, "stops": stops, "rested": all(m.rested for m in metrics)})
 
 
-def _run_document(factory: ControllerFactory, one: Run, metrics: Metrics) -> dict[str, Any]:
+def _run_document(factory: ControllerFactory, one: Run, metrics: Metrics) -> Document:
     events = judge(factory.setup, one)
     content = {
         "sign": one.sign,
@@ -187,9 +189,9 @@ def _run_document(factory: ControllerFactory, one: Run, metrics: Metrics) -> dic
     return dict(jsonable(content))
 
 
-def _mean_prediction(impacts: list[dict[str, Any]]) -> dict[str, Any]:
+def _mean_prediction(impacts: list[Document]) -> Document:
     """Return means over the impacts, and ``None`` where a value is undefined for one of them."""
-    found: dict[str, Any] = {"impacts": len(impacts)}
+    found: Document = {"impacts": len(impacts)}
     for key in ("H", "G", "V", "S", "approach", "frictionless", "sticking", "coulomb", "measured", "ratio"):
         values = [impact[key] for impact in impacts]
         found[key] = None if not values or None in values else float(np.mean(values))

@@ -7,8 +7,7 @@ from collections.abc import Sequence
 import numpy as np
 
 from impact_posture.escape import markdown
-from impact_posture.experiment.paper import PAPER
-from impact_posture.experiment.reproduction import Reproduction, missed_targets
+from impact_posture.experiment.reproduction import PAPER, Reproduction, missed_targets
 from impact_posture.experiment.statistics import Interval, Row
 from impact_posture.simulation.controller_factory import MEANING
 

@@ -5,7 +5,7 @@ from __future__ import annotations
 import json
 import shlex
 from collections.abc import Iterable, Mapping, Sequence
-from dataclasses import replace
+from dataclasses import fields, replace
 from pathlib import Path
 from typing import Any
 
@@ -14,9 +14,8 @@ import numpy as np
 from impact_posture.dynamics.numeric import Numeric
 from impact_posture.errors import ImpactPostureError, InputError, SpecError, one_line
 from impact_posture.escape import file_name
-from impact_posture.experiment.batch import Document, Store
-from impact_posture.experiment.figures import run_view
-from impact_posture.experiment.jobs import Job, controller_factory
+from impact_posture.experiment.batch import Store
+from impact_posture.experiment.jobs import Document, Job, controller_factory
 from impact_posture.impact.contact import point_on
 from impact_posture.impact.objective import ImpactObjective
 from impact_posture.output_folder import typed_command
@@ -44,6 +43,8 @@ _METRICS = (
 _FINE, _COARSE = 0.001, 0.025
 # No position of a robot that is under control is larger, m or rad.
 _AWAY = 1e3
+# Columns of the time series that figures show.
+_COLUMNS = {field.name for field in fields(RunView)} & {field.name for field in fields(Series)}
 _BROKEN = (LookupError, ValueError, TypeError, AttributeError, OSError, RecursionError)
 _MOVES = (
     "The slider goes through time: every millisecond within the impact windows, every 25 ms elsewhere. Within a "
@@ -60,14 +61,38 @@ def keep_runs(folder: Path, jobs: Sequence[Job], store: Store) -> None:
     """
     (folder / RUNS).mkdir()
     for job in jobs:
-        document = store.find(job)
-        if document is None or not document["runs"]:
-            continue
-        path = folder / RUNS / _stem(job.label)
-        path.with_name(f"{path.name}.json").write_text(json.dumps(document, indent=1) + "\n", encoding="utf-8")
-        part = document["runs"][0]
-        windows = [Window(**window) for window in part["windows"]]
-        thin(Series.load(store.series(job, part["sign"])), windows).save(_series(path, part["sign"]))
+        found = kept_run(job, store)
+        if found is not None:
+            (document, series), path = found, folder / RUNS / _stem(job.label)
+            path.with_name(f"{path.name}.json").write_text(json.dumps(document, indent=1) + "\n", encoding="utf-8")
+            part = document["runs"][0]
+            thin(series, _windows(part)).save(_series(path, part["sign"]))
+
+
+def kept_run(job: Job, store: Store) -> tuple[Document, Series] | None:
+    """Return the document of a stored job and the time series of its first run, or ``None`` if it has no runs."""
+    document = store.find(job)
+    if document is None or not document["runs"]:
+        return None
+    return document, Series.load(store.series(job, document["runs"][0]["sign"]))
+
+
+def run_view(job: Job, part: Document, series: Series) -> RunView:
+    """Return the view of a run from its document, with a label that says if the run did not complete."""
+    factory = controller_factory(job.scenario, job.free)
+    setup, scenario, objective = factory.setup, factory.setup.scenario, factory.objective()
+    return RunView(
+        scenario=scenario.name,
+        controller=job.controller,
+        robot=setup.robot,
+        contact=objective.contact,
+        **{name: getattr(series, name) for name in _COLUMNS},
+        windows=_windows(part),
+        surface=np.array(setup.world.built.points[scenario.surface.name]) if scenario.contacts else None,
+        supports=objective.supports,
+        label=job.label if part["status"] == "completed" else f"{job.label} ({part['status']})",
+        facts=(f"seed {job.seed}", *(() if scenario.contacts else (f"push {part['sign']:+d}",))),
+    )
 
 
 def try_report(folder: Path, scenario: str, *, meshes: bool) -> str:
@@ -178,6 +203,10 @@ def _stem(label: str) -> str:
     return file_name(label.replace(":", "-"))
 
 
+def _windows(part: Document) -> tuple[Window, ...]:
+    return tuple(Window(**window) for window in part["windows"])
+
+
 def _series(stem: Path, sign: int) -> Path:
     return stem.with_name(f"{stem.name}{'' if sign > 0 else '-minus'}.npz")
 
@@ -197,9 +226,7 @@ def _runs(document: Document, stem: Path, scenario: str, count: int) -> list[tup
     if document["model_sha256"] != factory.setup.robot.model_sha256:
         raise SpecError("was run with another robot model", where=str(stem.parent), hint="run it again")
     for part in document["runs"][:count]:
-        windows = [Window(**window) for window in part["windows"]]
-        ticks = thin(Series.load(_series(stem, part["sign"])), windows)
-        view = run_view(job, ticks, windows, part["sign"], part["status"])
+        view = run_view(job, part, thin(Series.load(_series(stem, part["sign"])), _windows(part)))
         label = f"{view.label}, push {part['sign']:+d}" if count > 1 else view.label
         found.append((replace(view, label=label), factory.objective()))
     return found

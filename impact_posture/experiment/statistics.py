@@ -4,15 +4,14 @@ from __future__ import annotations
 
 from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass, fields, replace
-from typing import Any
 
 import numpy as np
 from scipy.special import stdtrit
 
+from impact_posture.experiment.jobs import Document
 from impact_posture.simulation.metrics import Metrics
 from impact_posture.simulation.outcome import Outcome, gravest
 
-Document = dict[str, Any]
 # The metrics that have a mean and an interval.
 QUANTITIES = tuple(f.name for f in fields(Metrics) if f.name not in ("stops", "contacts", "contacts_asked", "rested"))
 

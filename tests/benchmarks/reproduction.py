@@ -13,9 +13,8 @@ from collections.abc import Iterator
 from pathlib import Path
 
 from impact_posture.experiment.batch import Store
-from impact_posture.experiment.figures import draw_reproduction
-from impact_posture.experiment.paper import PAPER
-from impact_posture.experiment.reproduction import Reproduction, controllers_of, reproduce
+from impact_posture.experiment.folders import draw_reproduction
+from impact_posture.experiment.reproduction import PAPER, Reproduction, controllers_of, reproduce
 from impact_posture.experiment.reproduction_summary import LEGEND, advice, remarks, scenario_table, table_one
 from tests.benchmarks.core import ROOT, Request, say
 

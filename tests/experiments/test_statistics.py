@@ -12,8 +12,9 @@ from scipy import stats
 
 from impact_posture.errors import InputError
 from impact_posture.experiment.jobs import Job, jsonable, parse_controller, together
-from impact_posture.experiment.paper import PAPER, RECOMMENDED
 from impact_posture.experiment.reproduction import (
+    PAPER,
+    RECOMMENDED,
     Reproduction,
     best_of,
     controllers_of,

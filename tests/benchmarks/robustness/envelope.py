@@ -5,7 +5,7 @@ from __future__ import annotations
 import math
 from collections.abc import Iterator, Mapping, Sequence
 
-from impact_posture.experiment.paper import PAPER
+from impact_posture.experiment.reproduction import PAPER
 from impact_posture.simulation.controller_factory import MEANING
 from tests.benchmarks.core import table
 from tests.benchmarks.robustness.draws import COUNT, DWELL, PAUSE

@@ -13,8 +13,7 @@ import pinocchio as pin
 
 from impact_posture.dynamics.numeric import Numeric
 from impact_posture.errors import ImpactPostureError
-from impact_posture.experiment.batch import Document
-from impact_posture.experiment.jobs import Job, execute, lost, parse_controller
+from impact_posture.experiment.jobs import Document, Job, execute, lost, parse_controller
 from impact_posture.experiment.reproduction import missed_targets
 from impact_posture.experiment.statistics import Row, row_of
 from impact_posture.impact.contact import point_on
