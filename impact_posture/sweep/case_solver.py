@@ -20,9 +20,8 @@ from impact_posture.posture.nlp import PostureNLP, build_nlp
 from impact_posture.posture.problem import PostureProblem
 from impact_posture.posture.problem_settings import Prepared, prepare
 from impact_posture.robot.robot_loader import load_robot
-from impact_posture.sweep.grid import Grid
 from impact_posture.sweep.point_search import Place, Timer, Walk
-from impact_posture.sweep.sweep_file import OFFSETS, Case
+from impact_posture.sweep.sweep_file import OFFSETS, Case, Grid
 
 # Problems and programs that a process keeps, and most problems if the speed varies.  Each takes about a MB, and all
 # but the speeds of one normal are done for good.

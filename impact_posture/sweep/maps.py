@@ -24,9 +24,9 @@ from impact_posture.posture.problem_settings import prepare
 from impact_posture.posture.solve import wrapped_difference
 from impact_posture.settings import ProblemSettings
 from impact_posture.sweep.atlas import open_atlas, read_manifest
-from impact_posture.sweep.grid import Axis, Grid
 from impact_posture.sweep.point_search import SWITCH
 from impact_posture.sweep.shard_table import STATUS
+from impact_posture.sweep.sweep_file import Axis, Grid
 from impact_posture.tables import validate
 
 # The best posture switches between neighbors that differ (tangent norm, without the place of the base) by more than
@@ -129,13 +129,11 @@ def _chosen(grid: Grid, asked: Sequence[str] | None) -> tuple[int, int | None]:
 
 def _plane(grid: Grid, across: int, upwards: int | None) -> NDArray[np.int64]:
     """Return the points of a map, shape (rows, columns); other axes are at their middle value."""
-    middle = [count // 2 for count in grid.shape]
-    rows = grid.shape[upwards] if upwards is not None else 1
-    place = np.tile(np.array(middle), (rows, grid.shape[across], 1))
-    place[:, :, across] = np.arange(grid.shape[across])[None, :]
+    place: list[Any] = [count // 2 for count in grid.shape]
+    place[across] = np.arange(grid.shape[across])
     if upwards is not None:
-        place[:, :, upwards] = np.arange(rows)[:, None]
-    return np.asarray(np.ravel_multi_index(np.moveaxis(place, -1, 0), grid.shape), dtype=np.int64)
+        place[upwards] = np.arange(grid.shape[upwards])[:, None]
+    return np.atleast_2d(np.ravel_multi_index(tuple(place), grid.shape))
 
 
 class _Slice:

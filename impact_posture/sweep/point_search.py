@@ -74,13 +74,7 @@ class Walk:
         timer: Where the time of the solver is added.
     """
 
-    def __init__(
-        self,
-        template: PostureProblem,
-        settings: ProblemSettings,
-        nlp: PostureNLP,
-        timer: Timer,
-    ) -> None:
+    def __init__(self, template: PostureProblem, settings: ProblemSettings, nlp: PostureNLP, timer: Timer) -> None:
         # The template is kept, because a shard knows it by its identity.
         self._template, self.settings, self.timer = template, settings, timer
         self.problem, self.nlp = template, nlp

@@ -1,19 +1,22 @@
-"""``SWEEP.toml``: one posture problem, and the values that vary over a grid."""
+"""``SWEEP.toml``: one posture problem, and the values that vary over a grid, in the order of its points."""
 
 from __future__ import annotations
 
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, fields
+from functools import cached_property
 from itertools import product
+from math import prod
 from pathlib import Path
 from typing import Any, ClassVar, Literal
+
+import numpy as np
 
 from impact_posture.errors import SpecError, nearest
 from impact_posture.escape import printable
 from impact_posture.robot.robot_loader import from_folder
 from impact_posture.setting import between, setting, with_demands
 from impact_posture.settings import ProblemSettings
-from impact_posture.sweep.grid import Axis, Grid
 from impact_posture.tables import STRICT, read_toml, validate
 
 # Axes that one program serves, from the slowest to the fastest.  ``x``, ``y`` and ``z`` are offsets of the target.
@@ -25,6 +28,66 @@ _NO_AXIS = ("schema", "q", "starts", "seed", "tradeoff", "tradeoff_against", "pa
 _FILES = ("srdf", "config", "weights", "armature", "posture")
 # Most points of a grid, which keeps every index a 64-bit integer.
 _MOST = 10**15
+# Neighbors from which a point is warm started: those along the fastest axes.
+_NEIGHBORS = 2
+
+
+@dataclass(frozen=True)
+class Axis:
+    """One varied value.
+
+    Attributes:
+        name: ``x``, ``y`` or ``z`` (an offset, world, meters), or the name of a setting.
+        values: Its values, in the order of the file.
+    """
+
+    name: str
+    values: tuple[Any, ...]
+
+
+@dataclass(frozen=True)
+class Grid:
+    """All combinations of the values of several axes; the last axis varies fastest.
+
+    Attributes:
+        axes: The axes, from the slowest to the fastest.
+    """
+
+    axes: tuple[Axis, ...]
+
+    @cached_property
+    def shape(self) -> tuple[int, ...]:
+        """Number of values of each axis."""
+        return tuple(len(axis.values) for axis in self.axes)
+
+    @property
+    def size(self) -> int:
+        """Number of points."""
+        return prod(self.shape)
+
+    def place(self, point: int) -> tuple[int, ...]:
+        """Return the index of a point on each axis."""
+        return tuple(int(k) for k in np.unravel_index(point, self.shape))
+
+    def values(self, point: int) -> dict[str, Any]:
+        """Return the value of each axis at a point."""
+        return {axis.name: axis.values[k] for axis, k in zip(self.axes, self.place(point), strict=True)}
+
+    def neighbors(self, point: int, first: int) -> list[int]:
+        """Return the neighbors before ``point`` along the fastest axes, not before ``first``, the nearest first.
+
+        They depend on nothing but the grid and the shard, and so do the bytes of the shard.
+        """
+        return [other for other in self.around(point) if first <= other < point][:_NEIGHBORS]
+
+    def around(self, point: int) -> list[int]:
+        """Return the neighbors along all axes, the fastest first: the one before ``point``, then the one after it."""
+        found: list[int] = []
+        stride = 1
+        for count, k in zip(reversed(self.shape), reversed(self.place(point)), strict=True):
+            found += [point - stride] * (k > 0) + [point + stride] * (k + 1 < count)
+            stride *= count
+        return found
 
 
 @dataclass(frozen=True)
