@@ -23,9 +23,14 @@ from impact_posture.impact.resolved_impact import resolve
 from impact_posture.settings import ImpactSettings
 from impact_posture.toolchain import find_compiler
 from impact_posture.verification import verification as module
-from impact_posture.verification.differences import difference_gradient
-from impact_posture.verification.samples import Sample, random_samples
-from impact_posture.verification.sources import Numbers, casadi_source, pinocchio_numbers
+from impact_posture.verification.sources import (
+    Numbers,
+    Sample,
+    casadi_source,
+    difference_gradient,
+    pinocchio_numbers,
+    random_samples,
+)
 from impact_posture.verification.verification import (
     CASADI,
     COMPILED,

@@ -1,4 +1,4 @@
-"""Sources that compute the same quantities of an impact by different means."""
+"""Sources that compute the same quantities of an impact by different means, and the postures at which they do."""
 
 from __future__ import annotations
 
@@ -7,20 +7,73 @@ from contextlib import contextmanager
 from dataclasses import dataclass, field, replace
 
 import numpy as np
+import pinocchio as pin
 
 from impact_posture.arrays import Array
 from impact_posture.codegen.build_check import RESULTS
 from impact_posture.codegen.export import export
 from impact_posture.codegen.functions import casadi_reference, oracle_along
 from impact_posture.codegen.impact_gradient import ImpactGradient
+from impact_posture.dynamics.chart import Chart
 from impact_posture.dynamics.mjcf_numeric import MujocoNumeric
 from impact_posture.dynamics.numeric import hold_locked
 from impact_posture.impact.objective import ImpactObjective
 from impact_posture.libraries import build_library, load_library
 from impact_posture.robot.model_joints import finite_armature
+from impact_posture.robot.robot import Robot
 from impact_posture.scratch_folder import scratch_folder
-from impact_posture.verification.differences import difference_gradient
-from impact_posture.verification.samples import Sample
+
+# First step of the finite differences, and their number, each half of the one before.
+_FIRST_STEP, _LEVELS = 0.02, 7
+# H, G and ∇H vanish where the contact cannot move along n.  Their errors are relative to this share of their largest
+# value over all normals.
+_FLOOR = 1e-3
+
+
+@dataclass(frozen=True, eq=False)
+class Sample:
+    """A configuration and a normal.
+
+    Attributes:
+        q: Configuration, shape (nq,).
+        normal: Unit vector, shape (3,), in the contact's normal frame.
+    """
+
+    q: Array
+    normal: Array
+
+
+def random_samples(robot: Robot, count: int, seed: int, normal: Array | None = None) -> tuple[Sample, ...]:
+    """Return random postures, each with a random normal; one seed gives one result.
+
+    The first sample has ``normal``, shape (3,), if it is given.
+
+    Joints are uniform within their limits.  Without limits, angles are within ±π and lengths within 1 m of the
+    default posture, and orientations are uniform.  A limit missing on one side lies as far from the default posture.
+    """
+    generator, chart = np.random.default_rng(seed), Chart(robot.model)
+    start = chart.to_x(robot.posture())
+    lower, upper = chart.bounds()
+    reach = np.ones(chart.nx)
+    for slot in chart.slots:
+        if slot.kind.family in ("revolute", "continuous", "planar"):
+            reach[slot.x.stop - 1] = np.pi
+    lower = np.where(np.isfinite(lower), lower, np.minimum(start, upper) - reach)
+    upper = np.where(np.isfinite(upper), upper, np.maximum(start, lower) + reach)
+    found = []
+    for k in range(count):
+        x = generator.uniform(lower, upper)
+        for quaternion in chart.quaternion_slices():
+            x[quaternion] = _direction(generator, 4)
+        drawn = _direction(generator, 3)
+        found.append(Sample(chart.to_q(x), drawn if k or normal is None else normal))
+    return tuple(found)
+
+
+def _direction(generator: np.random.Generator, size: int) -> Array:
+    """Return a unit vector, uniform on the sphere."""
+    vector = generator.normal(size=size)
+    return np.asarray(vector / np.linalg.norm(vector))
 
 
 @dataclass(frozen=True, eq=False)
@@ -37,10 +90,6 @@ class Numbers:
 
 
 Source = Callable[[Sample], Numbers]
-
-# H, G and ∇H vanish where the contact cannot move along n.  Their errors are relative to this share of their largest
-# value over all normals.
-_FLOOR = 1e-3
 
 
 def pinocchio_numbers(objective: ImpactObjective, sample: Sample) -> Numbers:
@@ -144,3 +193,35 @@ class MujocoSource:
         ellipsoid, mobility = A.T @ weighed, J @ A
         H, G = np.array([n @ ellipsoid @ n]), np.array([n @ mobility @ n])
         return {"H": H, "G": G, "Λ_c": ellipsoid, "M": M, "J": J}
+
+
+def difference_gradient(value: Callable[[Array], float], model: pin.Model, q: Array) -> Array:
+    """Return ``d/dε value(q ⊕ ε e_i)``, shape (nv,), by Ridders' extrapolation of central differences.
+
+    Each entry is the one of its tableau that differs least from its neighbors.  So the steps need no tuning, neither
+    to stiff supports nor to a flat direction (Ridders 1982, "Accurate computation of F'(x) and F'(x)F''(x)").
+
+    Args:
+        value: The function.
+        model: The model that defines ``⊕``.
+        q: Configuration, shape (nq,).
+    """
+    directions = np.eye(model.nv)
+
+    def central(step: float) -> Array:
+        ahead, behind = ([value(pin.integrate(model, q, s * e)) for e in directions] for s in (step, -step))
+        return np.asarray((np.array(ahead) - np.array(behind)) / (2 * step))
+
+    best, least = np.full(model.nv, np.nan), np.full(model.nv, np.inf)
+    before: list[Array] = []
+    for level in range(_LEVELS):
+        row = [central(_FIRST_STEP / 2**level)]
+        for order, old in enumerate(before, start=1):
+            factor = 4.0**order
+            better = (factor * row[-1] - old) / (factor - 1)
+            doubt = np.maximum(np.abs(better - row[-1]), np.abs(better - old))
+            closer = doubt < least
+            best, least = np.where(closer, better, best), np.where(closer, doubt, least)
+            row.append(better)
+        before = row
+    return best

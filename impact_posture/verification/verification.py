@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable, Mapping, Sequence
+from collections.abc import Callable, Sequence
 from contextlib import ExitStack
 from dataclasses import asdict, dataclass
 from functools import partial
@@ -16,15 +16,16 @@ from impact_posture.errors import InputError
 from impact_posture.impact.objective import ImpactObjective
 from impact_posture.robot.robot import Robot
 from impact_posture.toolchain import GET_ONE, find_compiler
-from impact_posture.verification.samples import Sample, random_samples
 from impact_posture.verification.sources import (
     MujocoSource,
     Numbers,
+    Sample,
     Source,
     casadi_source,
     compiled_source,
     pinocchio_differences,
     pinocchio_numbers,
+    random_samples,
 )
 
 Verdict = Literal["pass", "fail", "skipped"]
@@ -135,55 +136,48 @@ def verify(
     expected = [pinocchio_numbers(objective, sample) for sample in drawn]
     allowed, by_differences = _ON_FEET if objective.supports else (_VALUES, _DIFFERENCES)
     values = dict.fromkeys(("H", "G", "Λ_c", "∇H"), allowed)
-    of_mujoco = {"M": _MODEL, "J": _MODEL} | values | {"∇H": by_differences}
+    tolerances = {CASADI: values, COMPILED: values, DIFFERENCES: {"∇H": by_differences},
+                  MUJOCO: {"M": _MODEL, "J": _MODEL, **values, "∇H": by_differences}}  # fmt: skip
     with ExitStack() as stack:
-        compiled = None if find_compiler() is None else stack.enter_context(compiled_source(objective))
-        candidates = (
-            _Candidate(CASADI, values, casadi_source(objective)),
-            _Candidate(COMPILED, values, compiled, NO_COMPILER),
-            _Candidate(DIFFERENCES, {"∇H": by_differences}, partial(pinocchio_differences, objective)),
-            _mujoco(objective, of_mujoco),
-        )
-        compared, total = 0, sum(own.source is not None for own in candidates) * len(drawn)
+        compiled: Source | Row = Row(COMPILED, "", "skipped", note=NO_COMPILER)
+        if find_compiler() is not None:
+            compiled = stack.enter_context(compiled_source(objective))
+        sources: dict[str, Source | Row] = {
+            CASADI: casadi_source(objective),
+            COMPILED: compiled,
+            DIFFERENCES: partial(pinocchio_differences, objective),
+            MUJOCO: _mujoco(objective),
+        }
+        compared, total = 0, sum(not isinstance(source, Row) for source in sources.values()) * len(drawn)
         rows: list[Row] = []
-        for own in candidates:
-            if own.source is None:
-                rows.append(Row(own.name, "", "fail" if own.failed else "skipped", note=own.note))
+        for name, source in sources.items():
+            if isinstance(source, Row):
+                rows.append(source)
                 continue
             found: list[Numbers] = []
             for sample in drawn:
-                found.append(own.source(sample))
+                found.append(source(sample))
                 compared += 1
                 if progress is not None:
                     progress(compared, total)
             rows += [
-                _row(objective.robot, own.name, quantity, tolerance, found, expected)
-                for quantity, tolerance in own.tolerances.items()
+                _row(objective.robot, name, quantity, tolerance, found, expected)
+                for quantity, tolerance in tolerances[name].items()
             ]
     return VerificationReport(tuple(rows), drawn, seed)
 
 
-@dataclass(frozen=True, eq=False)
-class _Candidate:
-    """A source to compare, with the tolerance of each quantity, or the reason why there is no source."""
-
-    name: str
-    tolerances: Mapping[str, float]
-    source: Source | None = None
-    note: str = ""
-    failed: bool = False
-
-
-def _mujoco(objective: ImpactObjective, tolerances: Mapping[str, float]) -> _Candidate:
+def _mujoco(objective: ImpactObjective) -> Source | Row:
+    """Return the source of MuJoCo, or the row that says why there is none."""
     try:
         import_mujoco()
     except InputError as error:
-        return _Candidate(MUJOCO, tolerances, note=f"not installed: {error.hint}")
+        return Row(MUJOCO, "", "skipped", note=f"not installed: {error.hint}")
     try:
-        return _Candidate(MUJOCO, tolerances, MujocoSource(objective))
+        return MujocoSource(objective)
     except InputError as error:
         # The other sources remain.
-        return _Candidate(MUJOCO, tolerances, note=error.line, failed=True)
+        return Row(MUJOCO, "", "fail", note=error.line)
 
 
 def _row(
