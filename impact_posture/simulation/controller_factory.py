@@ -26,10 +26,9 @@ from impact_posture.simulation.baselines import (
     spring_of_term,
 )
 from impact_posture.simulation.compiled_tick import CompiledTick, compiled_tick
-from impact_posture.simulation.driver import Driver, FlowDriver, PostureDriver, RobustDriver
+from impact_posture.simulation.driver import Driver, FlowDriver, PathDriver, PostureDriver, RobustDriver
 from impact_posture.simulation.impact_baselines import ImpactAwareDriver, InvariantDriver, ReferenceSpreadingDriver
 from impact_posture.simulation.offline import OfflinePosture, offline_posture
-from impact_posture.simulation.path_driver import PathDriver
 from impact_posture.simulation.scenario import Setup
 from impact_posture.simulation.scenario_objective import Gradient, compiled, interpreted, scenario_objective
 from impact_posture.simulation.task_formulations import nominal_posture, posture_options

@@ -8,12 +8,13 @@ import numpy as np
 import pinocchio as pin
 
 from impact_posture.arrays import Array
+from impact_posture.path.posture_path import PosturePath
 from impact_posture.simulation.compiled_tick import CompiledTick
 from impact_posture.simulation.reference import ReferencePoint
 from impact_posture.simulation.scenario import Setup
 from impact_posture.simulation.sensor_noise import Reading
 from impact_posture.simulation.task_formulations import build_formulation, end_effector_task
-from impact_posture.tsid.body_tasks import BaseOrientation, CenterOfMass
+from impact_posture.tsid.body_tasks import BaseOrientation, BodyTaskLead, CenterOfMass
 from impact_posture.tsid.controller import Command, Controller
 from impact_posture.tsid.impact_robust import ImpactRobustPosture
 from impact_posture.tsid.posture_tasks import JointPosture
@@ -190,3 +191,55 @@ class PostureDriver(Driver):
     def level(self) -> float:
         """Share of the way to the goal, 0 to 1."""
         return 0.0 if self._since is None else smooth(self._since / MOVE)
+
+
+class PathDriver(Driver):
+    """Nominal controller whose posture follows a timed path, from :meth:`brace` on.
+
+    Between two points of the path, the posture is interpolated on the manifold, velocity and acceleration linearly.
+    Center of mass and base orientation follow too.
+
+    Attributes:
+        path: The path, which begins at the start of the scenario, as far as that satisfies the constraints.
+    """
+
+    def __init__(self, setup: Setup, posture: JointPosture, path: PosturePath) -> None:
+        """Set the path."""
+        super().__init__(setup, posture)
+        self.path = path
+        self._since: float | None = None
+        self._body = BodyTaskLead(setup.robot.model)
+
+    def reset(self, q: Array) -> Command:
+        """Begin at rest."""
+        self._since = None
+        rest = np.zeros(self.setup.robot.nv)
+        self.posture.lead(q, rest, rest)
+        return super().reset(q)
+
+    def brace(self) -> None:
+        """Start the path."""
+        self._since = 0.0
+
+    def lead(self, t: float, reference: ReferencePoint | None = None) -> None:
+        """Move posture and body tasks along the path."""
+        if self._since is not None and self.level < 1:
+            self._since += self.controller.period
+            path, model = self.path, self.setup.robot.model
+            if self._since >= path.duration:
+                q, v, a = path.q[-1], np.zeros(model.nv), np.zeros(model.nv)
+            else:
+                k = int(np.searchsorted(path.t, self._since, side="right")) - 1
+                share = (self._since - path.t[k]) / (path.t[k + 1] - path.t[k])
+                q = np.asarray(pin.interpolate(model, path.q[k], path.q[k + 1], share))
+                v, a = ((1 - share) * x[k] + share * x[k + 1] for x in (path.v, path.a))
+            self.posture.lead(q, v, a)
+            self._body.lead(self._body_tasks, q, v, a)
+        super().lead(t, reference)
+
+    @property
+    def level(self) -> float:
+        """Share of the duration of the path that has passed, 0 to 1."""
+        if self._since is None:
+            return 0.0
+        return min(1.0, self._since / self.path.duration) if self.path.duration else 1.0

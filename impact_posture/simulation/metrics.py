@@ -125,9 +125,7 @@ def saturated(setup: Setup, series: Series) -> tuple[Flags, Flags]:
         near = _NEAR * (high - low)
         at_limit = (series.rotor_command <= low + near) | (series.rotor_command >= high - near)
         rotors = np.any(at_limit, axis=1)
-    effort = np.asarray(setup.robot.model.effortLimit)[6 if setup.robot.floating else 0 :]
-    limited = effort > 0
-    joints: Flags = np.any(np.abs(series.torque[:, limited]) >= (1 - _NEAR) * effort[limited], axis=1)
+    joints: Flags = np.any(np.abs(series.torque) >= (1 - _NEAR) * setup.world.limits.effort, axis=1)
     return rotors, joints
 
 

@@ -15,14 +15,22 @@ from impact_posture.errors import InputError, SimulationDiverged
 from impact_posture.impact.contact import point_on
 from impact_posture.robot.actuation import hover
 from impact_posture.robot.robot import Robot
-from impact_posture.simulation.actuator_command import ActivePushes, ActuatorCommand, Push, Trace, Truth
+from impact_posture.simulation.actuator_command import (
+    RUNAWAY,
+    ActivePushes,
+    ActuatorCommand,
+    CommandLimits,
+    JointStops,
+    Push,
+    Trace,
+    Truth,
+)
 from impact_posture.simulation.contact_forces import ContactLog, ShapeTruth
 from impact_posture.simulation.rotors import Rotors, Vibration
 from impact_posture.simulation.scene import Scene
 from impact_posture.simulation.sensor_noise import NO_FORCE, ForceFilter, Reading, Sample, SensorNoise
 from impact_posture.simulation.throw import Ball, Throw
 from impact_posture.simulation.world_builder import BuiltScene, build_scene
-from impact_posture.simulation.world_limits import RUNAWAY, CommandLimits, JointStops
 from impact_posture.tsid.controller import Command
 from impact_posture.tsid.state import checked_velocity
 
@@ -197,14 +205,8 @@ class World:
 
     def _sample(self, speeds: Array, phases: Array) -> Sample:
         data, layout = self._data, self._layout
-        return Sample(
-            layout,
-            data.qpos[: layout.nqpos].copy(),
-            data.qvel[: layout.nv].copy(),
-            speeds,
-            phases,
-            self._filter.force,
-        )
+        qpos, qvel = data.qpos[: layout.nqpos].copy(), data.qvel[: layout.nv].copy()
+        return Sample(layout, qpos, qvel, speeds, phases, self._filter.force)
 
     def read(self) -> Reading:
         """Return what the sensors measure now.  Every call draws new noise."""

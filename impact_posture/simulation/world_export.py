@@ -60,8 +60,7 @@ def _parameters(setup: Setup, model: Any) -> Iterable[tuple[str, Iterable[float]
     yield "jump", [JUMP]
     yield "q", setup.q
     yield from _joints(setup)
-    effort = np.asarray(robot.model.effortLimit)[6 if robot.floating else 0 :]
-    yield "effort", np.where(effort > 0, effort, np.inf)
+    yield "effort", setup.world.limits.effort
     yield "shapes", [model.geom(name).id for name in built.shape_geoms]
     propulsion = robot.spec.propulsion
     if propulsion is not None:

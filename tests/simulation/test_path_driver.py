@@ -11,7 +11,7 @@ import pytest
 from impact_posture.errors import InputError
 from impact_posture.path import posture_path as module
 from impact_posture.simulation.controller_factory import ControllerFactory
-from impact_posture.simulation.path_driver import PathDriver
+from impact_posture.simulation.driver import PathDriver
 from impact_posture.simulation.sensor_noise import Reading
 from impact_posture.tsid.body_tasks import CenterOfMass
 from tests.simulation.factories import controller_factory, driven, near
