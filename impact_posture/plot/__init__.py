@@ -17,7 +17,6 @@ from impact_posture.plot import (
     classical_figure,
     ellipsoid_figure,
     jump_figure,
-    motion_figure,
     path_figures,
     self_motion_figure,
 )
@@ -52,7 +51,7 @@ FIGURES: dict[str, Callable[[ResultView], Figure]] = {
     "classical": classical_figure.classical_figure,
     "postures": postures_figure,
     "tradeoff": path_figures.tradeoff_figure,
-    "path": motion_figure.motion_figure,
+    "path": path_figures.motion_figure,
     "self_motion": self_motion_figure.self_motion_figure,
     "nullspace": path_figures.path_figure,
 }

@@ -1,4 +1,7 @@
-"""Figure ``ellipsoid``: the dynamic impact ellipsoid Λ_c before and after, as shadows and in space."""
+"""Figure ``ellipsoid``: the dynamic impact ellipsoid Λ_c before and after, as shadows and in space.
+
+Of an uncertain normal it shows the cone and the worst normals, too.
+"""
 
 from __future__ import annotations
 
@@ -8,14 +11,17 @@ from typing import Any
 import numpy as np
 from matplotlib.figure import Figure
 from matplotlib.lines import Line2D
+from matplotlib.patches import Patch
 
 from impact_posture.arrays import Array
+from impact_posture.impact.cone import WorstNormal
 from impact_posture.impact.oracle import ImpactQuantities
-from impact_posture.plot.cone_figure import draw_uncertainty, draw_uncertainty_3d, has_cone, uncertainty_handles
 from impact_posture.plot.labels import Label, draw_arrow, draw_end_on
 from impact_posture.plot.shapes import (
     COORDINATE_PLANES,
     Plane,
+    cone_rim,
+    cone_shadow,
     half_width,
     principal_sections,
     shadow,
@@ -24,9 +30,23 @@ from impact_posture.plot.shapes import (
     upright_plane,
 )
 from impact_posture.plot.space import Space, frame_space
-from impact_posture.plot.style import AFTER, BEFORE, BLUE, FREE_AFTER, FREE_BEFORE, GRAY, INK, framed
+from impact_posture.plot.style import (
+    AFTER,
+    BEFORE,
+    BLUE,
+    FREE_AFTER,
+    FREE_BEFORE,
+    GRAY,
+    INK,
+    PALE,
+    WORST_AFTER,
+    WORST_BEFORE,
+    framed,
+)
 from impact_posture.plot.view import ResultView, header_lines, jump_unit, number
 
+# Length of arrows as a part of the limit of the panel. A worst normal on the edge of the cone ends on the rim.
+REACH = 0.92
 _FREE = "Free (thin): the same robot with feet that are not held."
 _CONE = "The objective counts the worst normal of the cone. All equally bad normals are drawn."
 NOTES = (
@@ -104,7 +124,7 @@ def draw_normals(axes: Any, plane: Plane, named: list[tuple[str, Array]], limit:
         if np.linalg.norm(flat) < 0.05:
             draw_end_on(axes, name, plane, n, np.zeros(2))
             continue
-        tip = flat * limit * 0.92
+        tip = flat * limit * REACH
         draw_arrow(axes, np.zeros(2), tip, 5, color=INK, linewidth=1.1)
         axes.add_artist(Label(name, tip, (flat[0], flat[1])))
 
@@ -183,3 +203,61 @@ def _legend(axes: Any, states: list[_State], unit: str, view: ResultView) -> Non
     # Below the legend, whatever its length.
     look = {"xycoords": legend, "textcoords": "offset points", "va": "top", "fontsize": 7.0, "linespacing": 1.4}
     axes.annotate("\n".join(rows), (0, 0), (0, -8), **look)
+
+
+def has_cone(view: ResultView) -> bool:
+    """Return whether the normal is uncertain."""
+    return view.objective.normal_cone_deg > 0
+
+
+def draw_uncertainty(axes: Any, plane: Plane, view: ResultView, limit: float) -> None:
+    """Draw the shadow of the cone (two cones where n turned) and the worst normals before and after."""
+    for n in _axes_of_cones(view):
+        outline = cone_shadow(n, view.objective.normal_cone_deg, REACH * limit, plane.axes)
+        axes.fill(*outline, facecolor=PALE, edgecolor="none", alpha=0.55, zorder=0.5)
+        axes.plot(*outline, color=GRAY, linewidth=0.6, zorder=0.6)
+    for word, found, _, line in _worst(view):
+        for normal in found.normals:
+            # The dashes lie on top, as with the ellipsoids.
+            zorder = 4.6 if word == "before" else 4.5
+            draw_arrow(axes, np.zeros(2), plane.axes @ normal * REACH * limit, zorder, mutation_scale=8, **line)
+
+
+def draw_uncertainty_3d(axes: Any, view: ResultView, limit: float) -> None:
+    """Draw the surface and rim of the cone, and the worst normals."""
+    for n in _axes_of_cones(view):
+        rim = cone_rim(n, view.objective.normal_cone_deg, limit, 49)
+        sheet = [row[None] * [[0.0], [1.0]] for row in rim]
+        axes.plot_surface(*sheet, color=GRAY, alpha=0.15, shade=False, linewidth=0)
+        axes.plot(*rim, color=GRAY, linewidth=0.6)
+    for _, found, _, line in _worst(view):
+        for normal in found.normals:
+            axes.quiver(0, 0, 0, *(normal * limit), arrow_length_ratio=0.12, **line)
+
+
+def uncertainty_handles(view: ResultView) -> list[Any]:
+    """Return the legend entries of the cone and of the worst normals with the half-width of Λ_c along them."""
+    if not has_cone(view):
+        return []
+    cone = f"cone of {view.objective.normal_cone_deg:g}° about n"
+    handles: list[Any] = [Patch(facecolor=PALE, edgecolor=GRAY, linewidth=0.6, label=cone)]
+    for word, found, ellipsoid, line in _worst(view):
+        width = number(half_width(ellipsoid, found.normal))
+        tied = f", {len(found.normals)} tied" if found.tied else ""
+        label = f"worst {word}: {number(found.angle_deg)}° off{tied},\njump {width} per N·s"
+        handles.append(Line2D([], [], label=label, **line))
+    return handles
+
+
+def _axes_of_cones(view: ResultView) -> list[Array]:
+    """Return the world axis of the cone, or both axes where it turned with the contact frame; none without a cone."""
+    return [n for _, n in normals(view.before, view.after)] if has_cone(view) else []
+
+
+def _worst(view: ResultView) -> list[tuple[str, WorstNormal, Array, dict[str, Any]]]:
+    """Return name, worst normals, ellipsoid and line of each posture that has worst normals."""
+    found = [
+        ("before", view.worst[0], view.before.ellipsoid, WORST_BEFORE),
+        ("after", view.worst[1], view.after.ellipsoid, WORST_AFTER),
+    ]
+    return [(word, worst, ellipsoid, line) for word, worst, ellipsoid, line in found if worst is not None]

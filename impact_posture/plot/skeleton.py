@@ -11,6 +11,7 @@ import pinocchio as pin
 from impact_posture.arrays import Array
 from impact_posture.dynamics.tree import PointOnLink
 from impact_posture.impact.contact import ImpactContact, Support, point_on
+from impact_posture.plot.shapes import cone_rim
 from impact_posture.plot.silhouette import PlacedHull, place_hulls
 from impact_posture.robot.robot import Robot
 
@@ -163,12 +164,9 @@ def _rotors(robot: Robot, places: list[pin.SE3]) -> Array:
     centers = [np.array(rotor.position) for rotor in propulsion.rotors]
     gaps = [float(np.linalg.norm(a - b)) for k, a in enumerate(centers) for b in centers[:k]]
     radius = 0.4 * min(gaps, default=0.5)
-    angle = np.linspace(0.0, 2 * np.pi, 24, endpoint=False)
     circles = []
     for center, rotor in zip(centers, propulsion.rotors, strict=True):
-        thrust = np.array(rotor.direction) / np.linalg.norm(rotor.direction)
-        # Two directions across the thrust span the null space of its row.
-        across = np.linalg.svd(thrust[None])[2][1:]
-        ring = center[:, None] + radius * across.T @ np.array([np.cos(angle), np.sin(angle)])
-        circles.append(np.asarray(place.rotation) @ ring + np.asarray(place.translation)[:, None])
+        # Across the thrust; the last point is the first one again.
+        ring = cone_rim(np.array(rotor.direction) / np.linalg.norm(rotor.direction), 90.0, radius, 25)[:, :-1]
+        circles.append(place.rotation @ (center[:, None] + ring) + np.asarray(place.translation)[:, None])
     return np.array(circles)
