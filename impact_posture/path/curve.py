@@ -69,12 +69,9 @@ class PathCurve:
         The first distance above the one that is allowed is returned, because such a curve needs more knots anyway.
         It is taken at so many places that no frame moves more than the check distance between two of them.
         """
-        worst, before, parts = (
-            0.0,
-            self.at(self.z[0]),
-            # The knots themselves are on the constraints.
-            max(2, self._space.checks(np.abs(np.diff(self.z, axis=0)).max(axis=0))),
-        )
+        worst, before = 0.0, self.at(self.z[0])
+        # The knots themselves are on the constraints.
+        parts = max(2, self._space.checks(np.abs(np.diff(self.z, axis=0)).max(axis=0)))
         for s in np.linspace(0.0, 1.0, parts * (len(self.s) - 1) + 1):
             off = self.posture(float(s))
             q = self._space.pulled(off)

@@ -1,10 +1,11 @@
-"""The shapes of a robot as the page draws them: small meshes, each stored once."""
+"""The shapes of a robot as the page draws them: small meshes, each stored once, and the terms of their authors."""
 
 from __future__ import annotations
 
 import re
 from dataclasses import dataclass
-from functools import lru_cache
+from functools import cache, lru_cache
+from pathlib import Path
 from typing import Annotated
 
 import coal
@@ -17,9 +18,10 @@ from impact_posture.collision.geometry import geometry_key, load_geometry
 from impact_posture.collision.mesh_triangles import Triangles, hull_surface
 from impact_posture.collision.shape_points import shape_points, surface_of
 from impact_posture.collision.urdf_shapes import UrdfShape, read_urdf_shapes
+from impact_posture.errors import PackageNotFound
 from impact_posture.libraries import source_key
-from impact_posture.report.mesh_license import MeshLicense, license_of
 from impact_posture.robot.robot import Robot
+from impact_posture.robot.urdf import example_robot_data
 from impact_posture.stored_text import StoredArray, read_stored, write_stored
 
 # Most triangles of all meshes of a page, which bounds its size and the time to draw it in software.
@@ -80,6 +82,28 @@ class PlacedSolids:
     solids: tuple[Solid, ...]
     places: tuple[tuple[str, int, int, _Placement], ...]
     warnings: tuple[str, ...]
+
+
+@dataclass(frozen=True)
+class MeshLicense:
+    """The terms of the meshes of a package.
+
+    Attributes:
+        package: Folder of the package in example-robot-data.
+        license: Name of the license, as the package states it; empty if it states none.
+        upstream: Address of the original.
+        text: Text of the license, if the package holds it.
+    """
+
+    package: str
+    license: str
+    upstream: str
+    text: str
+
+    @property
+    def allows(self) -> bool:
+        """Whether simplified meshes may be passed on: a license is stated, and permits changed copies."""
+        return bool(self.license) and "-ND" not in self.license.upper()
 
 
 @dataclass(frozen=True, eq=False)
@@ -208,3 +232,25 @@ def _color(shape: UrdfShape) -> Color:
         found = re.findall(rb"<diffuse>\s*<color[^>]*>\s*([\d.eE+-]+)\s+([\d.eE+-]+)\s+([\d.eE+-]+)\s", head)
         color = np.mean([[float(v) for v in one] for one in found] or [color], axis=0).tolist()
     return (*np.clip(color, _DARKEST, 1.0).tolist(), opacity)
+
+
+def license_of(mesh: Path) -> MeshLicense | None:
+    """Return the terms of a mesh of example-robot-data; ``None`` for a mesh of another origin."""
+    try:
+        root = example_robot_data().resolve()
+    except PackageNotFound:
+        return None
+    path = mesh.resolve()
+    return _read_license(root / path.relative_to(root).parts[0]) if path.is_relative_to(root) else None
+
+
+@cache
+def _read_license(folder: Path) -> MeshLicense:
+    """Read the README of a package, which states ``license:`` and ``upstream:``, and its LICENSE."""
+    readme, text = (
+        path.read_text(encoding="utf-8", errors="replace") if path.is_file() else ""
+        for path in (folder / "README.md", folder / "LICENSE")
+    )
+    found = (re.search(rf"^{key}:\s*(\S.*)$", readme, re.I | re.M) for key in ("license", "upstream"))
+    license, upstream = ("" if match is None else match[1].strip() for match in found)
+    return MeshLicense(folder.name, license, upstream, text)
