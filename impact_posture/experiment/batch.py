@@ -145,14 +145,13 @@ def run_batch(
     for k, job in enumerate(jobs):
         # Every wrong scenario or controller is refused here, before hours of runs.
         factory = controller_factory(job.scenario, job.free)
-        found = None
         if job.controller not in CONTROLLERS:
             # The key of a stored job does not cover the code of another package, so the job runs again.
             factory.driver(job.controller)
         elif store is not None:
             found = store.find(job)
-        if found is not None and store is not None and (not job.shown or store.has_series(job, found)):
-            done[k] = found
+            if found is not None and (not job.shown or store.has_series(job, found)):
+                done[k] = found
     waiting = [k for k in range(len(jobs)) if k not in done]
     if progress:
         progress(len(done), len(jobs))

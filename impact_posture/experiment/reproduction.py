@@ -172,11 +172,7 @@ class Reproduction:
             missed, targets = missed_targets(row), None
             if missed is not None:
                 targets = {name: name not in missed for name in _TARGETS} | {"met": not missed}
-            more = {
-                "paper": PAPER.get(row.scenario),
-                "targets": targets,
-                "best": row is self.best(row.scenario),
-            }
+            more = {"paper": PAPER.get(row.scenario), "targets": targets, "best": row is self.best(row.scenario)}
             rows.append(jsonable(row) | jsonable(more))
         return {"schema": SCHEMA, "seeds": list(range(self.seeds)), "rows": rows}
 

@@ -71,14 +71,8 @@ class Rotors:
     def in_c(self, count: int) -> dict[str, Any]:
         """Return the members of ``c/world_ticks.c`` that are of these rotors, for a number of steps in a tick."""
         up, down = self._ways(count)
-        limits = {"lowest": self._lowest, "highest": self._highest, "thrust": self._coefficient}
-        return {
-            "rotors": self.speeds.size,
-            "speeds": self.speeds,
-            "phases": 0 * self.speeds,
-            "up": up,
-            "down": down,
-        } | limits
+        return {"rotors": self.speeds.size, "speeds": self.speeds, "phases": 0 * self.speeds, "up": up, "down": down,
+                "lowest": self._lowest, "highest": self._highest, "thrust": self._coefficient}  # fmt: skip
 
     def thrusts(self, speeds: Array) -> Array:
         """Return thrusts ``c_f ω²``, N, in the shape of the speeds."""
