@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import os
+import resource
 import signal
 import sys
 from contextlib import suppress
@@ -35,10 +36,6 @@ def finish() -> None:
 
 def memory_fault() -> str:
     """Say what is wrong with the memory limit of the process; empty if nothing is."""
-    if sys.platform == "win32":
-        return ""
-    import resource
-
     limit = resource.getrlimit(resource.RLIMIT_AS)[0]
     if limit == resource.RLIM_INFINITY or limit >= _LEAST_MEMORY:
         return ""

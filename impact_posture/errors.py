@@ -5,6 +5,7 @@ The command line prints ``what``, ``where`` and ``hint`` as one line and exits w
 
 from __future__ import annotations
 
+import copyreg
 import difflib
 import reprlib
 from collections.abc import Iterable
@@ -79,14 +80,7 @@ class ImpactPostureError(Exception):
 
     def __reduce__(self) -> tuple[object, ...]:
         # Subclasses take other arguments, but worker processes must be able to return them.
-        return (_rebuild, (type(self), self.__dict__.copy(), self.line))
-
-
-def _rebuild(cls: type[ImpactPostureError], state: dict[str, object], line: str) -> ImpactPostureError:
-    error = cls.__new__(cls)
-    Exception.__init__(error, line)
-    error.__dict__.update(state)
-    return error
+        return copyreg.__newobj__, (type(self), self.line), self.__dict__.copy()
 
 
 class InputError(ImpactPostureError):

@@ -11,8 +11,7 @@ Listener = Callable[[str, float | None], None]
 
 _LISTENERS: list[Listener] = []
 # A forked process must not write on the terminal of its parent.
-if hasattr(os, "register_at_fork"):
-    os.register_at_fork(after_in_child=_LISTENERS.clear)
+os.register_at_fork(after_in_child=_LISTENERS.clear)
 
 
 def tell(doing: str, share: float | None = None) -> None:

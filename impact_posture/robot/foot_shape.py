@@ -7,7 +7,9 @@ from collections.abc import Sequence
 from dataclasses import replace
 from itertools import product
 from pathlib import Path
+from typing import Any
 
+import coal
 import numpy as np
 import pinocchio as pin
 
@@ -16,6 +18,7 @@ from impact_posture.robot.guess import joints_to, upright_frames
 from impact_posture.robot.robot import Robot
 from impact_posture.robot.spec import Support
 from impact_posture.robot.support_polygon import polygon_edges
+from impact_posture.robot.urdf import quiet_stderr
 
 # Points of a foot within this distance (m) of its lowest one touch the ground with it.
 _PATCH = 2e-3
@@ -69,45 +72,29 @@ def support_depth(robot: Robot, feet: Sequence[Support]) -> float:
 
 def _lowest_points(robot: Robot, data: pin.Data, index: int, urdf: Path) -> Array:
     """Return the lowest points (world) of the primitive collision shapes that move with a frame, without meshes."""
-    model = robot.model
-    joint = model.frames[index].parentJoint
-    found: list[Array] = []
-    for link in ET.parse(urdf).getroot().iter("link"):
-        name = link.get("name", "")
-        if not model.existFrame(name, pin.FrameType.BODY):
-            continue
-        body = model.getFrameId(name, pin.FrameType.BODY)
-        if model.frames[body].parentJoint != joint:
-            continue
-        for collision in link.iter("collision"):
-            at = data.oMf[body] * _origin(collision.find("origin"))
-            for shape in collision.iterfind("geometry/*"):
-                found += _bottom(shape, at)
+    joint, root = robot.model.frames[index].parentJoint, ET.parse(urdf).getroot()
+    for link in root.iter("link"):
+        for collision in link.findall("collision"):
+            if collision.find("geometry/mesh") is not None:
+                link.remove(collision)
+    with quiet_stderr():
+        shapes = pin.buildGeomFromUrdfString(robot.model, ET.tostring(root, "unicode"), pin.GeometryType.COLLISION)
+    moving = [shape for shape in shapes.geometryObjects if shape.parentJoint == joint]
+    found = [point for shape in moving for point in _bottom(shape.geometry, data.oMi[joint] * shape.placement)]
     return np.array(found).reshape(-1, 3)
 
 
-def _origin(tag: ET.Element | None) -> pin.SE3:
-    xyz, rpy = (_numbers(tag, key) for key in ("xyz", "rpy"))
-    return pin.SE3(pin.rpy.rpyToMatrix(rpy), xyz)
-
-
-def _numbers(tag: ET.Element | None, key: str) -> Array:
-    words = (tag.get(key) or "").split() if tag is not None else []
-    return np.array([float(w) for w in words]) if len(words) == 3 else np.zeros(3)
-
-
-def _bottom(shape: ET.Element, at: pin.SE3) -> Sequence[Array]:
-    """Return points of a shape that include its lowest ones; none for a mesh."""
-    if shape.tag == "sphere":
-        return [np.array(at.translation) - [0, 0, float(shape.get("radius", 0))]]
-    if shape.tag == "box":
-        half = _numbers(shape, "size") / 2
-        return [at.act(np.array(signs) * half) for signs in product((-1, 1), repeat=3)]
-    if shape.tag == "cylinder":
-        radius, half_length = float(shape.get("radius", 0)), float(shape.get("length", 0)) / 2
-        axis = np.array(at.rotation[:, 2])
-        down = np.array([0, 0, -1.0]) + axis[2] * axis
-        reach = float(np.linalg.norm(down))
-        edge = radius * down / reach if reach > 1e-9 else np.zeros(3)
-        return [np.array(at.translation) + sign * half_length * axis + edge for sign in (-1, 1)]
+def _bottom(shape: Any, at: pin.SE3) -> Sequence[Array]:
+    """Return points of a primitive shape that include its lowest ones."""
+    match shape:
+        case coal.Sphere():
+            return [at.translation - [0, 0, shape.radius]]
+        case coal.Box():
+            return [at.act(np.array(signs) * shape.halfSide) for signs in product((-1, 1), repeat=3)]
+        case coal.Cylinder():
+            axis = np.array(at.rotation[:, 2])
+            down = np.array([0, 0, -1.0]) + axis[2] * axis
+            reach = float(np.linalg.norm(down))
+            edge = shape.radius * down / reach if reach > 1e-9 else np.zeros(3)
+            return [at.translation + sign * shape.halfLength * axis + edge for sign in (-1, 1)]
     return []

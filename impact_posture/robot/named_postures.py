@@ -10,7 +10,7 @@ import pinocchio as pin
 
 from impact_posture.arrays import Array
 from impact_posture.errors import SpecError, UrdfError
-from impact_posture.robot.model_joints import joint_index, joint_range, q_slice, scalar_entries
+from impact_posture.robot.model_joints import joint_index, q_slice, scalar_entries
 from impact_posture.robot.spec import RobotSpec
 from impact_posture.settings import Root
 
@@ -33,7 +33,8 @@ def named_postures(
     """
     postures = _srdf_postures(model, srdf, spec) | _toml_postures(model, spec, root, name)
     default = spec.default_posture or next(iter(postures), "neutral")
-    postures.setdefault("neutral", _neutral(model))
+    # A joint whose limits exclude zero starts at the nearest of them.
+    postures.setdefault("neutral", np.clip(pin.neutral(model), model.lowerPositionLimit, model.upperPositionLimit))
     if default not in postures:
         raise SpecError(
             f"default_posture '{default}' does not exist", where=name, hint=f"one of: {', '.join(postures)}"
@@ -106,13 +107,3 @@ def _toml_postures(model: pin.Model, spec: RobotSpec, root: Root, name: str) -> 
             q[q_slice(model, index)] = scalar_entries(model, index, value)
         result[key] = np.asarray(pin.normalize(model, q))
     return result
-
-
-def _neutral(model: pin.Model) -> Array:
-    """Return the neutral configuration, clipped to the limits of the joints that zero violates."""
-    q = np.array(pin.neutral(model), dtype=float)
-    for i in joint_range(model):
-        if model.nqs[i] == 1:
-            k = model.idx_qs[i]
-            q[k] = np.clip(q[k], model.lowerPositionLimit[k], model.upperPositionLimit[k])
-    return q

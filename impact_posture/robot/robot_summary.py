@@ -66,15 +66,9 @@ def summarize(robot: Robot) -> dict[str, Any]:
         "frames": _frames(robot),
         "postures": [_posture(robot, name) for name in robot.postures],
         "default_posture": robot.default_posture,
-        "contact": {
-            "frame": spec.contact.frame,
-            "offset": list(spec.contact.offset),
-            "pose": None if spec.contact.frame is None else robot.contact_pose(spec.contact.frame),
-            "frames": dict(spec.contact.frames),
-        },
-        "supports": [
-            {"frame": s.frame, "kind": s.kind, "offset": list(s.offset), "size": list(s.size)} for s in spec.supports
-        ],
+        "contact": asdict(spec.contact)
+        | {"pose": None if spec.contact.frame is None else robot.contact_pose(spec.contact.frame)},
+        "supports": [asdict(support) for support in spec.supports],
         "constraints": asdict(spec.constraints),
         "actuation": _actuation(robot, spec.propulsion) if spec.propulsion and robot.floating else None,
         "sources": list(spec.sources),
