@@ -21,19 +21,23 @@ from typing import TYPE_CHECKING, Any
 from impact_posture.version import __version__
 
 if TYPE_CHECKING:
-    from impact_posture import sweep, tsid
-    from impact_posture.codegen.export import Export
-    from impact_posture.codegen.impact_gradient import ImpactGradient
-    from impact_posture.controller_export.compiled_controller import CompiledController
-    from impact_posture.controller_export.export import export_controller
-    from impact_posture.errors import ImpactPostureError
-    from impact_posture.front_door import PostureResult, optimize
-    from impact_posture.front_door_problem import ImpactObjective, PostureProblem
-    from impact_posture.impact.contact import ImpactContact
-    from impact_posture.impact.metric import Metric
-    from impact_posture.robot.robot import Robot
-    from impact_posture.robot.robot_loader import known_robots, load_robot
-    from impact_posture.robot.spec import Support
+    from impact_posture import sweep as sweep
+    from impact_posture import tsid as tsid
+    from impact_posture.codegen.export import Export as Export
+    from impact_posture.codegen.impact_gradient import ImpactGradient as ImpactGradient
+    from impact_posture.controller_export.compiled_controller import CompiledController as CompiledController
+    from impact_posture.controller_export.export import export_controller as export_controller
+    from impact_posture.errors import ImpactPostureError as ImpactPostureError
+    from impact_posture.front_door import PostureResult as PostureResult
+    from impact_posture.front_door import optimize as optimize
+    from impact_posture.front_door_problem import ImpactObjective as ImpactObjective
+    from impact_posture.front_door_problem import PostureProblem as PostureProblem
+    from impact_posture.impact.contact import ImpactContact as ImpactContact
+    from impact_posture.impact.metric import Metric as Metric
+    from impact_posture.robot.robot import Robot as Robot
+    from impact_posture.robot.robot_loader import known_robots as known_robots
+    from impact_posture.robot.robot_loader import load_robot as load_robot
+    from impact_posture.robot.spec import Support as Support
 
 
 _HOMES = {
@@ -56,26 +60,7 @@ _HOMES = {
     "tsid": "",
 }
 
-__all__ = [
-    "CompiledController",
-    "Export",
-    "ImpactContact",
-    "ImpactGradient",
-    "ImpactObjective",
-    "ImpactPostureError",
-    "Metric",
-    "PostureProblem",
-    "PostureResult",
-    "Robot",
-    "Support",
-    "__version__",
-    "export_controller",
-    "known_robots",
-    "load_robot",
-    "optimize",
-    "sweep",
-    "tsid",
-]
+__all__ = ["__version__", *_HOMES]
 
 
 def __getattr__(name: str) -> Any:

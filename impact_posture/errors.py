@@ -5,7 +5,6 @@ The command line prints ``what``, ``where`` and ``hint`` as one line and exits w
 
 from __future__ import annotations
 
-import copyreg
 import difflib
 import reprlib
 from collections.abc import Iterable
@@ -80,7 +79,7 @@ class ImpactPostureError(Exception):
 
     def __reduce__(self) -> tuple[object, ...]:
         # Subclasses take other arguments, but worker processes must be able to return them.
-        return copyreg.__newobj__, (type(self), self.line), self.__dict__.copy()
+        return BaseException.__new__, (type(self), self.line), self.__dict__.copy()
 
 
 class InputError(ImpactPostureError):

@@ -1,4 +1,4 @@
-"""An obstacle as a setting; :mod:`impact_posture.collision.obstacle` makes its shape."""
+"""An obstacle as a setting; :mod:`impact_posture.collision.swept_hull` makes its shape."""
 
 from __future__ import annotations
 

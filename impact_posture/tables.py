@@ -1,8 +1,10 @@
-"""Reading of tables from TOML files or options, and their validation against dataclasses."""
+"""Reading of text and TOML files that a user names, and validation of tables against dataclasses."""
 
 from __future__ import annotations
 
+import errno
 import json
+import os
 import re
 import tomllib
 from dataclasses import asdict, fields, is_dataclass
@@ -11,7 +13,9 @@ from pathlib import Path
 from typing import Any, ClassVar, TypeVar, get_type_hints
 
 from impact_posture.errors import InputError, SpecError, nearest, not_one_of, shown
-from impact_posture.text_file import read_text
+
+# The largest file that this package writes, a result of a long search, has about a million characters.
+MOST_CHARACTERS = 1 << 26
 
 _Table = TypeVar("_Table")
 
@@ -95,6 +99,20 @@ def _keys_at(cls: type, location: tuple[int | str, ...]) -> list[str]:
         inner = [c for c in (hint, *getattr(hint, "__args__", ())) if isinstance(c, type) and is_dataclass(c)]
         cls = inner[0] if inner else cls
     return [field.name for field in fields(cls)]
+
+
+def read_text(path: Path) -> str:
+    """Return the content of a UTF-8 file; a device without an end, such as ``/dev/zero``, is refused.
+
+    Raises:
+        OSError: The file cannot be read, or is larger than :data:`MOST_CHARACTERS`.
+        UnicodeDecodeError: The file is not UTF-8.
+    """
+    with path.open(encoding="utf-8") as file:
+        text = file.read(MOST_CHARACTERS + 1)
+    if len(text) > MOST_CHARACTERS:
+        raise OSError(errno.EFBIG, os.strerror(errno.EFBIG), str(path))
+    return text
 
 
 def read_toml(path: Path) -> dict[str, object]:

@@ -18,9 +18,8 @@ from impact_posture import stored_text
 from impact_posture.arrays import Array
 from impact_posture.collision import shapes as collision_shapes
 from impact_posture.collision.mesh_check import mesh_collisions
-from impact_posture.collision.obstacle import obstacle_hull
 from impact_posture.collision.shapes import NO_SHAPES, RobotShapes, load_shapes
-from impact_posture.collision.swept_hull import distance_from_hull
+from impact_posture.collision.swept_hull import distance_from_hull, obstacle_hull
 from impact_posture.errors import InputError, SpecError, UrdfError
 from impact_posture.obstacle import Obstacle
 from impact_posture.robot.robot import Robot

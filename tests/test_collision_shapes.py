@@ -16,9 +16,8 @@ from scipy.spatial import ConvexHull
 
 from impact_posture.arrays import Array
 from impact_posture.collision.mesh_check import MeshCheck, mesh_collisions
-from impact_posture.collision.obstacle import obstacle_hull
 from impact_posture.collision.shapes import load_shapes
-from impact_posture.collision.swept_hull import SweptHull, separation, transform
+from impact_posture.collision.swept_hull import SweptHull, obstacle_hull, separation, transform
 from impact_posture.obstacle import Obstacle
 from impact_posture.robot.robot import Robot
 from impact_posture.robot.robot_loader import load_robot

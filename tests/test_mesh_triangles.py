@@ -14,8 +14,8 @@ from hypothesis import strategies as st
 from impact_posture.arrays import Array
 from impact_posture.collision.geometry import load_geometry
 from impact_posture.collision.mesh_check import mesh_collisions
-from impact_posture.collision.mesh_triangles import Corrected, mesh_points, mesh_triangles, renumbered
-from impact_posture.collision.obstacle import obstacle_hull
+from impact_posture.collision.shape_points import Corrected, mesh_points, mesh_triangles, renumbered
+from impact_posture.collision.swept_hull import obstacle_hull
 from impact_posture.collision.urdf_shapes import read_urdf_shapes
 from impact_posture.obstacle import Obstacle
 from impact_posture.report.shapes import draw_robot
@@ -128,7 +128,7 @@ def test_parts_of_a_file_are_told_apart(nodes: list[list[int]]) -> None:
 def test_the_hull_takes_the_place_of_parts_that_cannot_be_told_apart(
     tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
-    monkeypatch.setattr("impact_posture.collision.mesh_triangles.renumbered", lambda *_: None)
+    monkeypatch.setattr("impact_posture.collision.shape_points.renumbered", lambda *_: None)
     collada(tmp_path / "cubes.dae")
     shapes = arm(tmp_path, mesh("cubes.dae"))
     (line,) = shapes.warnings

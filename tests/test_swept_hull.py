@@ -11,10 +11,15 @@ from scipy.optimize import nnls
 from scipy.spatial import ConvexHull
 
 from impact_posture.arrays import Array
-from impact_posture.collision.hull_fit import fit_hull
-from impact_posture.collision.obstacle import obstacle_hull
 from impact_posture.collision.shape_points import shape_points
-from impact_posture.collision.swept_hull import MOST_VERTICES, SweptHull, hull_corners, separation
+from impact_posture.collision.swept_hull import (
+    MOST_VERTICES,
+    SweptHull,
+    fit_hull,
+    hull_corners,
+    obstacle_hull,
+    separation,
+)
 from impact_posture.obstacle import Obstacle
 
 SEEDS = st.integers(0, 2**32 - 1)

@@ -11,9 +11,8 @@ import pinocchio as pin
 from numpy.typing import NDArray
 
 from impact_posture.arrays import Array
-from impact_posture.collision.mesh_triangles import Corrected
 from impact_posture.collision.pairs import pairs_apart
-from impact_posture.collision.shape_points import shape_points
+from impact_posture.collision.shape_points import Corrected, shape_points
 from impact_posture.collision.urdf_shapes import (
     UnusableShape,
     UrdfShape,

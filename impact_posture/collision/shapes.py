@@ -11,10 +11,9 @@ import pinocchio as pin
 
 from impact_posture.collision.bodies import Body, merged_bodies
 from impact_posture.collision.geometry import Geometry, geometry_key, load_geometry
-from impact_posture.collision.hull_fit import Fit, fit_hull
 from impact_posture.collision.joint_planes import JointPlanes, joint_planes
 from impact_posture.collision.pairs import Pair, hindered, mostly_touching, pairs_of, touch_of
-from impact_posture.collision.swept_hull import SweptHull
+from impact_posture.collision.swept_hull import Fit, SweptHull, fit_hull
 from impact_posture.collision.urdf_shapes import UrdfShape, read_urdf_shapes
 from impact_posture.progress import tell
 from impact_posture.robot.robot import Robot

@@ -15,7 +15,7 @@ import coal
 import numpy as np
 import pinocchio as pin
 
-from impact_posture.collision.mesh_triangles import Corrected, correct, mesh_points
+from impact_posture.collision.shape_points import Corrected, correct, mesh_points
 from impact_posture.errors import UrdfError, one_line
 from impact_posture.robot.robot import Robot
 from impact_posture.robot.robot_loader import locate, srdf_path

@@ -15,14 +15,16 @@ from numpy.typing import ArrayLike
 from impact_posture.argument_types import checked
 from impact_posture.arrays import Array
 from impact_posture.codegen.reader import check_library, check_robot
-from impact_posture.controller_export.compiled_report import STATUSES, read_report
 from impact_posture.controller_export.manifest import Manifest, build_controller, read_controller
 from impact_posture.errors import ContactError, InputError, MetricError, PostureError, SpecError
 from impact_posture.libraries import library_path, load_library
 from impact_posture.robot.robot import Robot
-from impact_posture.tsid.controller import Command, Report
+from impact_posture.tsid.controller import Command, Report, Status
+from impact_posture.tsid.relaxation import Relaxed
 
 _FUNCTIONS = ("init", "reset", "tick", "last_report", "move_to", "lead_posture", "brace", "contact", "release")
+# Statuses in the order of their numbers in C.
+_STATUSES = tuple(Status)
 # Numbers of a target: set, position, rotation, velocity, acceleration.
 TARGET = 25
 
@@ -170,8 +172,8 @@ class CompiledController:
     def report(self) -> Report:
         """Return the diagnosis of the last tick."""
         self._call("last_report", ctypes.byref(self._report))
-        status, iterations = STATUSES[self._report.status], int(self._report.iterations)
-        return read_report(self._checked, status, iterations, self._diagnosis)
+        status, iterations = _STATUSES[self._report.status], int(self._report.iterations)
+        return _read_report(self._checked, status, iterations, self._diagnosis)
 
     def set_target(
         self, task: str, target: pin.SE3 | ArrayLike, velocity: ArrayLike = 0.0, acceleration: ArrayLike = 0.0
@@ -181,7 +183,10 @@ class CompiledController:
         Raises:
             InputError: There is no such task.
         """
-        row = self._target(task)
+        if task not in self.targets:
+            known = ", ".join(self.targets) or "none"
+            raise InputError(f"there is no task '{task}'", where="controller", hint=f"one of: {known}")
+        row = self.targets[task]
         if isinstance(target, pin.SE3):
             row[1:4], row[4:13] = target.translation, target.rotation.ravel()
         else:
@@ -189,14 +194,6 @@ class CompiledController:
             row[slice(1, 4) if given.size == 3 else slice(4, 13)] = given.ravel()
         rows = next(t.rows for t in self._checked.tasks if t.name == task)
         row[0], row[13 : 13 + rows], row[19 : 19 + rows] = 1.0, velocity, acceleration
-
-    def forget_target(self, task: str) -> None:
-        """Let the next :meth:`reset` take the present output as the target of a task.
-
-        Raises:
-            InputError: There is no such task.
-        """
-        self._target(task)[:] = 0.0
 
     def move_to(self, q: ArrayLike, over: float = 0.5) -> None:
         """Fade the posture task to ``q``, shape (nq,), within ``over`` seconds.
@@ -268,19 +265,13 @@ class CompiledController:
             words = f"'{function.partition('_')[0]}' at {times[0]:g} s does not follow the phase before it"
             raise InputError(words, where="controller", hint="give phases in the order of their times, or reset it")
 
-    def _target(self, task: str) -> Array:
-        if task not in self.targets:
-            known = ", ".join(self.targets) or "none"
-            raise InputError(f"there is no task '{task}'", where="controller", hint=f"one of: {known}")
-        return self.targets[task]
-
     def _call(self, name: str, *arguments: Any) -> int:
         return int(self._functions[name](self._context, *arguments))
 
     def _commanded(self) -> Command:
         sizes, out = self._checked.sizes, self._out
         u, rotors = out["u"][: sizes["CONTROLS"]].copy(), sizes["ROTORS"]
-        status = STATUSES[self._command.status]
+        status = _STATUSES[self._command.status]
         speeds, forces = out["rotor_speed"][:rotors].copy(), out["forces"][: sizes["FORCES"]].copy()
         return Command(u, u[rotors:], speeds, status, out["acceleration"].copy(), forces)
 
@@ -291,3 +282,29 @@ def _structure(arrays: list[tuple[str, int]], integers: list[str]) -> tuple[Any,
     kind = type("Block", (ctypes.Structure,), {"_fields_": [*fields, *((name, ctypes.c_int) for name in integers)]})
     block = kind()
     return block, {name: np.frombuffer(getattr(block, name), dtype=float) for name, _ in arrays}
+
+
+def _read_report(manifest: Manifest, status: Status, iterations: int, found: Mapping[str, Array]) -> Report:
+    """Return a report from the arrays of the structure in C, by the names of its members."""
+    residuals: dict[str, Array] = {}
+    active: list[tuple[str, str]] = []
+    if status in (Status.SOLVED, Status.RELAXED):
+        start = 0
+        for task in manifest.tasks:
+            residuals[task.name] = found["rows"][start : start + task.rows].copy()
+            start += task.rows
+        if manifest.posture is not None:
+            residuals[manifest.posture] = found["posture"].copy()
+        if manifest.sizes["FORCES"]:
+            residuals["contacts"] = found["contacts"].copy()
+        first = manifest.sizes["SIMPLE"]
+        equations = range(first, first + manifest.sizes["EQUATIONS"])
+        for k, (name, multiplier) in enumerate(zip(manifest.bounds, found["multipliers"], strict=True)):
+            if multiplier and k not in equations:
+                active.append((name, "upper" if multiplier > 0 else "lower"))
+    dynamics, level, value = (float(found[name][0]) for name in ("dynamics", "level", "value"))
+    names = ("joint limits", *(name for name, _ in manifest.levels))
+    relaxed = tuple(Relaxed(n, float(x)) for n, x in zip(names, found["relaxed"], strict=True) if x > 0)
+    missed = zip(names[1:], found["deficient"], strict=False)
+    deficient = tuple(Relaxed(n, float(x)) for n, x in missed if x > 0)
+    return Report(status, relaxed, deficient, residuals, tuple(active), dynamics, level, value, iterations)

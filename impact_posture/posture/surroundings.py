@@ -11,9 +11,8 @@ import pinocchio as pin
 
 from impact_posture.arrays import Array
 from impact_posture.collision.mesh_check import HalfSpace, MeshCheck
-from impact_posture.collision.obstacle import obstacle_hull
 from impact_posture.collision.shapes import load_shapes
-from impact_posture.collision.swept_hull import SweptHull
+from impact_posture.collision.swept_hull import SweptHull, obstacle_hull
 from impact_posture.dynamics.numeric import Numeric
 from impact_posture.dynamics.tree import PointOnLink
 from impact_posture.errors import InputError

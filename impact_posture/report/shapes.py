@@ -15,8 +15,7 @@ from pydantic import PlainSerializer, PlainValidator
 
 from impact_posture.arrays import Array
 from impact_posture.collision.geometry import geometry_key, load_geometry
-from impact_posture.collision.mesh_triangles import Triangles, hull_surface
-from impact_posture.collision.shape_points import shape_points, surface_of
+from impact_posture.collision.shape_points import Triangles, hull_surface, shape_points, surface_of
 from impact_posture.collision.urdf_shapes import UrdfShape, read_urdf_shapes
 from impact_posture.errors import PackageNotFound
 from impact_posture.libraries import source_key
