@@ -245,6 +245,14 @@ def test_targets_are_set_by_the_name_of_their_task() -> None:
     theirs.move_to(goal, 0.01)
     for k in range(4):
         assert difference(ours.tick(0.004 * k, q, v), theirs.tick(0.004 * k, q, v)) < 1e-9
+    # Without its target, the task holds where the next reset finds it.
+    theirs.forget_target(name)
+    fresh = compiled("panda")
+    for controller in (theirs, fresh):
+        controller.reset(q, v)
+    assert difference(theirs.tick(0.0, q, v), fresh.tick(0.0, q, v)) < 1e-12
+    with pytest.raises(InputError, match="there is no task 'hand'"):
+        theirs.forget_target("hand")
 
 
 def test_a_moving_reference_leads_the_posture() -> None:

@@ -183,10 +183,7 @@ class CompiledController:
         Raises:
             InputError: There is no such task.
         """
-        if task not in self.targets:
-            known = ", ".join(self.targets) or "none"
-            raise InputError(f"there is no task '{task}'", where="controller", hint=f"one of: {known}")
-        row = self.targets[task]
+        row = self._target(task)
         if isinstance(target, pin.SE3):
             row[1:4], row[4:13] = target.translation, target.rotation.ravel()
         else:
@@ -194,6 +191,20 @@ class CompiledController:
             row[slice(1, 4) if given.size == 3 else slice(4, 13)] = given.ravel()
         rows = next(t.rows for t in self._checked.tasks if t.name == task)
         row[0], row[13 : 13 + rows], row[19 : 19 + rows] = 1.0, velocity, acceleration
+
+    def forget_target(self, task: str) -> None:
+        """Let the next :meth:`reset` take the present output as the target of a task.
+
+        Raises:
+            InputError: There is no such task.
+        """
+        self._target(task)[:] = 0.0
+
+    def _target(self, task: str) -> Array:
+        if task not in self.targets:
+            known = ", ".join(self.targets) or "none"
+            raise InputError(f"there is no task '{task}'", where="controller", hint=f"one of: {known}")
+        return self.targets[task]
 
     def move_to(self, q: ArrayLike, over: float = 0.5) -> None:
         """Fade the posture task to ``q``, shape (nq,), within ``over`` seconds.
