@@ -19,6 +19,4 @@ def main() -> None:
     from impact_posture_cli.argv import put_right
     from impact_posture_cli.error_boundary import run
 
-    code = run(typer.main.get_command(app), put_right(sys.argv[1:]))
-    finish()
-    sys.exit(code)
+    finish(run(typer.main.get_command(app), put_right(sys.argv[1:])))

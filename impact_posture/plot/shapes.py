@@ -5,14 +5,16 @@ from __future__ import annotations
 from dataclasses import dataclass
 
 import numpy as np
-import scipy
 
 from impact_posture.arrays import Array
+from impact_posture.robot.support_polygon import convex_ring
 
 # A direction within 1° of a plane counts as in it: its half-width differs there by less than 2e-4 of itself.
 IN_PLANE = float(np.cos(np.radians(1.0)))
 # A semi-axis this much shorter than the longest is a rounding error (or cannot be seen).
 _NEGLIGIBLE = 1e-6
+# Directions around a point of the plane, in which a hull has its extreme points, shape (16, 2).
+_AROUND = np.array([[np.cos(angle), np.sin(angle)] for angle in np.arange(16) * np.pi / 8])
 
 
 @dataclass(frozen=True, eq=False)
@@ -139,7 +141,15 @@ def cone_shadow(axis: Array, degrees: float, length: float, axes: Array) -> Arra
 
 def outline(points: Array) -> Array:
     """Return the convex hull of points of shape (2, k), closed."""
-    edge = scipy.spatial.ConvexHull(points.T).vertices
+    extreme = points[:, (_AROUND @ points).argmax(axis=1)]
+    steps = np.roll(extreme, -1, axis=1) - extreme
+    sides = np.flatnonzero(steps.any(axis=0))
+    # Most points are inside of the polygon of the extreme ones.
+    left = steps[0, sides, None] * (points[1] - extreme[1, sides, None]) - steps[1, sides, None] * (
+        points[0] - extreme[0, sides, None]
+    )
+    points = points[:, (left <= 0).any(axis=0) | (sides.size == 0)]
+    edge = convex_ring(points.T)
     return np.asarray(points[:, [*edge, edge[0]]])
 
 

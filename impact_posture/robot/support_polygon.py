@@ -1,4 +1,4 @@
-"""Support polygon of feet on level ground."""
+"""Convex hulls in the plane, and the support polygon of feet on level ground."""
 
 from __future__ import annotations
 
@@ -12,13 +12,36 @@ from impact_posture.arrays import Array
 _ROUNDING, _DIGITS = 1e-9, 12
 
 
+def convex_ring(points: Array) -> list[int]:
+    """Return the corners of the convex hull of points of the plane as indices, counter-clockwise.
+
+    Each chain of the hull goes along the sorted points and leaves out those that do not turn left (A. M. Andrew,
+    "Another efficient algorithm for convex hulls in two dimensions", Inf. Process. Lett. 1979).  SciPy has convex
+    hulls as well, but takes longer to import than many problems take to solve.
+
+    Args:
+        points: Points, shape (k, 2).
+    """
+    order = np.lexsort((points[:, 1], points[:, 0])).tolist()
+    x, y = points[:, 0].tolist(), points[:, 1].tolist()
+    corners: list[int] = []
+    for chain in (order, order[::-1]):
+        hull: list[int] = []
+        for k in chain:
+            while len(hull) > 1:
+                a, b = hull[-2:]
+                if (y[k] - y[a]) * (x[b] - x[a]) - (x[k] - x[a]) * (y[b] - y[a]) > 0:
+                    break
+                hull.pop()
+            hull.append(k)
+        corners += hull[:-1]
+    return corners or order[:1]
+
+
 def polygon_edges(points: Iterable[Array]) -> tuple[Array, Array] | None:
     """Return the edges ``n·p ≤ b`` of the convex hull of points of the plane; ``None`` if they span no area.
 
-    Each chain of the hull goes along the sorted points and leaves out those that do not turn left (A. M. Andrew,
-    "Another efficient algorithm for convex hulls in two dimensions", Inf. Process. Lett. 1979).  Corners that lie on
-    the line of their neighbors then go.  SciPy has convex hulls as well, but takes longer to import than many
-    problems take to solve.
+    Corners that lie on the line of their neighbors are left out.
 
     Args:
         points: Points, shape (2,) each, m.
@@ -26,15 +49,8 @@ def polygon_edges(points: Iterable[Array]) -> tuple[Array, Array] | None:
     Returns:
         Outward unit normals ``n``, shape (k, 2), and offsets ``b``, m, shape (k,).
     """
-    ordered = sorted({(float(x), float(y)) for x, y in points})
-    corners: list[Array] = []
-    for chain in (ordered, ordered[::-1]):
-        hull: list[Array] = []
-        for point in map(np.array, chain):
-            while len(hull) > 1 and _height(hull[-2], point, hull[-1]) <= 0:
-                hull.pop()
-            hull.append(point)
-        corners += hull[:-1]
+    places = np.array(list(points), dtype=float).reshape(-1, 2)
+    corners = [places[k] for k in convex_ring(places)]
     while len(corners) > 2:
         # Only now is a point near the line of its neighbors also between them.
         around = zip(np.roll(corners, 1, axis=0), np.roll(corners, -1, axis=0), corners, strict=True)
