@@ -87,6 +87,7 @@ def load(
     import impact_posture.plot  # noqa: F401 (the import is what takes long)
     from impact_posture.codegen.emitter import DOUBLE
     from impact_posture.codegen.export import cached_code, default_prefix
+    from impact_posture.codegen.functions import casadi_reference
     from impact_posture.codegen.render import load_templates
     from impact_posture.posture.problem_settings import prepare
     from impact_posture.result_folder import finish_result
@@ -98,7 +99,7 @@ def load(
     # What goes wrong here goes wrong again for the result, which says so.
     with suppress(Exception):
         if report:
-            from impact_posture.report.page import load_template
+            from impact_posture.report.page import load_template, read_viewer
             from impact_posture.report.shapes import draw_robot
 
             load_template()
@@ -106,5 +107,8 @@ def load(
         # A large robot takes so long to solve that there is time to do more.
         if not requested():
             objectives = (prepared.impact.objective,)
-            cached_code(objectives, default_prefix(objectives), DOUBLE, False)
+            exported, _ = cached_code(objectives, default_prefix(objectives), DOUBLE, False)
+            for own in exported:
+                casadi_reference(own.objective)
+            read_viewer()
     return partial(finish_result, prepared)

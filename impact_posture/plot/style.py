@@ -15,9 +15,9 @@ import numpy as np
 from matplotlib.backends.backend_agg import FigureCanvasAgg
 from matplotlib.figure import Figure
 from matplotlib.font_manager import FontProperties
-from matplotlib.image import imsave
 from matplotlib.textpath import text_to_path
 from matplotlib.transforms import Bbox
+from PIL import Image
 
 from impact_posture.errors import InputError, OutputError
 from impact_posture.escape import printable
@@ -236,8 +236,9 @@ def save(figure: Figure, out_dir: Path, name: str, formats: Iterable[str] = DEFA
             with scratch_folder(path.parent) as beside, style():
                 if extension == "png":
                     # It is drawn already, and `savefig` would draw it twice.  A higher level takes long for 3 %.
-                    quick = {"compress_level": 3}
-                    imsave(beside / path.name, canvas.buffer_rgba(), format="png", dpi=figure.dpi, pil_kwargs=quick)
+                    # Nothing shows through, and three channels take a quarter less time to write and to read.
+                    picture = Image.fromarray(np.asarray(canvas.buffer_rgba())).convert("RGB")
+                    picture.save(beside / path.name, compress_level=3, dpi=(figure.dpi, figure.dpi))
                 else:
                     # Without a date, so that the same result gives the same file.
                     metadata = {"Date" if extension == "svg" else "CreationDate": None}

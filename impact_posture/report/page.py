@@ -125,7 +125,7 @@ def _address(path: Path) -> str:
 
         with Image.open(path) as picture, io.BytesIO() as file:
             picture.convert("RGB").quantize(_COLORS, Image.Quantize.FASTOCTREE, dither=Image.Dither.NONE).save(
-                file, "PNG", compress_level=7
+                file, "PNG", compress_level=6
             )
             content = file.getvalue()
     return f"data:{_TYPES[path.suffix]};base64,{base64.b64encode(content).decode('ascii')}"
