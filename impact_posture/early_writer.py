@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import gc
 import multiprocessing
 import os
 import tempfile
@@ -111,4 +112,6 @@ def load(
             for own in exported:
                 casadi_reference(own.objective)
             read_viewer()
+    # All this is needed to the end.  To look for garbage in it takes each process that draws 0.07 s.
+    gc.freeze()
     return partial(finish_result, prepared)
