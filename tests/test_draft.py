@@ -14,7 +14,8 @@ import pytest
 from impact_posture.errors import InputError, OutputError
 from impact_posture.posture.problem_settings import prepare
 from impact_posture.posture.solve import solve
-from impact_posture.robot.draft import Draft, write_draft
+from impact_posture.robot.draft import write_draft
+from impact_posture.robot.draft_text import Draft
 from impact_posture.robot.foot_shape import support
 from impact_posture.robot.guess import feet, tips
 from impact_posture.robot.robot_loader import load_robot

@@ -15,16 +15,14 @@ from numpy.typing import ArrayLike
 from impact_posture.argument_types import checked
 from impact_posture.arrays import Array
 from impact_posture.codegen.reader import check_library, check_robot
+from impact_posture.controller_export.compiled_report import STATUSES, read_report
 from impact_posture.controller_export.manifest import Manifest, build_controller, read_controller
 from impact_posture.errors import ContactError, InputError, MetricError, PostureError, SpecError
 from impact_posture.libraries import library_path, load_library
 from impact_posture.robot.robot import Robot
-from impact_posture.tsid.controller import Command, Report, Status
-from impact_posture.tsid.relaxation import Relaxed
+from impact_posture.tsid.controller import Command, Report
 
 _FUNCTIONS = ("init", "reset", "tick", "last_report", "move_to", "lead_posture", "brace", "contact", "release")
-# Statuses in the order of their numbers in C.
-_STATUSES = tuple(Status)
 # Numbers of a target: set, position, rotation, velocity, acceleration.
 TARGET = 25
 
@@ -172,8 +170,8 @@ class CompiledController:
     def report(self) -> Report:
         """Return the diagnosis of the last tick."""
         self._call("last_report", ctypes.byref(self._report))
-        status, iterations = _STATUSES[self._report.status], int(self._report.iterations)
-        return _read_report(self._checked, status, iterations, self._diagnosis)
+        status, iterations = STATUSES[self._report.status], int(self._report.iterations)
+        return read_report(self._checked, status, iterations, self._diagnosis)
 
     def set_target(
         self, task: str, target: pin.SE3 | ArrayLike, velocity: ArrayLike = 0.0, acceleration: ArrayLike = 0.0
@@ -282,7 +280,7 @@ class CompiledController:
     def _commanded(self) -> Command:
         sizes, out = self._checked.sizes, self._out
         u, rotors = out["u"][: sizes["CONTROLS"]].copy(), sizes["ROTORS"]
-        status = _STATUSES[self._command.status]
+        status = STATUSES[self._command.status]
         speeds, forces = out["rotor_speed"][:rotors].copy(), out["forces"][: sizes["FORCES"]].copy()
         return Command(u, u[rotors:], speeds, status, out["acceleration"].copy(), forces)
 
@@ -293,29 +291,3 @@ def _structure(arrays: list[tuple[str, int]], integers: list[str]) -> tuple[Any,
     kind = type("Block", (ctypes.Structure,), {"_fields_": [*fields, *((name, ctypes.c_int) for name in integers)]})
     block = kind()
     return block, {name: np.frombuffer(getattr(block, name), dtype=float) for name, _ in arrays}
-
-
-def _read_report(manifest: Manifest, status: Status, iterations: int, found: Mapping[str, Array]) -> Report:
-    """Return a report from the arrays of the structure in C, by the names of its members."""
-    residuals: dict[str, Array] = {}
-    active: list[tuple[str, str]] = []
-    if status in (Status.SOLVED, Status.RELAXED):
-        start = 0
-        for task in manifest.tasks:
-            residuals[task.name] = found["rows"][start : start + task.rows].copy()
-            start += task.rows
-        if manifest.posture is not None:
-            residuals[manifest.posture] = found["posture"].copy()
-        if manifest.sizes["FORCES"]:
-            residuals["contacts"] = found["contacts"].copy()
-        first = manifest.sizes["SIMPLE"]
-        equations = range(first, first + manifest.sizes["EQUATIONS"])
-        for k, (name, multiplier) in enumerate(zip(manifest.bounds, found["multipliers"], strict=True)):
-            if multiplier and k not in equations:
-                active.append((name, "upper" if multiplier > 0 else "lower"))
-    dynamics, level, value = (float(found[name][0]) for name in ("dynamics", "level", "value"))
-    names = ("joint limits", *(name for name, _ in manifest.levels))
-    relaxed = tuple(Relaxed(n, float(x)) for n, x in zip(names, found["relaxed"], strict=True) if x > 0)
-    missed = zip(names[1:], found["deficient"], strict=False)
-    deficient = tuple(Relaxed(n, float(x)) for n, x in missed if x > 0)
-    return Report(status, relaxed, deficient, residuals, tuple(active), dynamics, level, value, iterations)

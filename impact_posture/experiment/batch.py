@@ -23,8 +23,19 @@ from impact_posture.simulation.series import Series
 from impact_posture.version import __version__
 
 Progress = Callable[[int, int], None]
-_PARTS = ("robot", "dynamics", "collision", "impact", "posture", "path", "codegen", "tsid", "controller_export",
-          "simulation", "experiment")  # fmt: skip
+_PARTS = (
+    "robot",
+    "dynamics",
+    "collision",
+    "impact",
+    "posture",
+    "path",
+    "codegen",
+    "tsid",
+    "controller_export",
+    "simulation",
+    "experiment",
+)
 
 
 class Store:

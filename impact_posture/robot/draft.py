@@ -3,18 +3,17 @@
 from __future__ import annotations
 
 import os
-import textwrap
 import xml.etree.ElementTree as ET
 from collections.abc import Sequence
-from dataclasses import dataclass, field
 from fnmatch import fnmatchcase
 from pathlib import Path
 
 import numpy as np
 
 from impact_posture.errors import InputError, OutputError
-from impact_posture.escape import printable, toml
+from impact_posture.escape import toml
 from impact_posture.robot import guess
+from impact_posture.robot.draft_text import Draft, comment_lines
 from impact_posture.robot.foot_shape import foot_specs, support_depth
 from impact_posture.robot.robot import Robot
 from impact_posture.robot.robot_loader import Located, build_robot, known_robots, load_robot, locate
@@ -26,51 +25,6 @@ from impact_posture.settings import LoadOptions, Root
 _POSES = ((7, "full"), (6, "aligned"), (4, "position"), (0, "free"))
 # Least depth (m) of the center of mass in the support polygon for com_over_feet.
 _LEAST_DEPTH = 0.02
-# Longest line of the file.
-_WIDTH = 100
-
-
-@dataclass
-class Draft:
-    """Text of a ``robot.toml``, written line by line.
-
-    Attributes:
-        lines: Lines of the text.
-        guesses: Values that the user must check, one line each.
-    """
-
-    lines: list[str] = field(default_factory=list)
-    guesses: list[str] = field(default_factory=list)
-
-    @property
-    def text(self) -> str:
-        """The whole file."""
-        return "\n".join(self.lines) + "\n"
-
-    def key(self, name: str, value: object, why: str, *, guessed: bool = False) -> None:
-        """Add a key and the source of its value."""
-        line, comment = f"{name} = {toml(value)}", comment_lines(f"GUESS: {why}" if guessed else why)
-        beside = f"{line}  {comment[0]}"
-        self.lines += [beside] if len(comment) == 1 and len(beside) <= _WIDTH else [*comment, line]
-        if guessed:
-            self.guesses.append(f"{line}: {why}")
-
-    def note(self, text: str, *example: str) -> None:
-        """Add a comment, and lines that a user can uncomment."""
-        self.lines += ["", *comment_lines(text), *(f"# {line}" for line in example)]
-
-
-def comment_lines(text: str) -> list[str]:
-    """Return the lines of a comment."""
-    # Names may contain line breaks, which would end the comment.
-    return textwrap.wrap(
-        printable(text),
-        _WIDTH,
-        initial_indent="# ",
-        subsequent_indent="# ",
-        break_long_words=False,
-        break_on_hyphens=False,
-    )
 
 
 def write_draft(robot: str, options: LoadOptions, out: Path | None, *, force: bool = False) -> tuple[Path, Draft]:

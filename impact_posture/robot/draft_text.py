@@ -1,0 +1,53 @@
+"""Text of a drafted ``robot.toml``, with the source of every value."""
+
+from __future__ import annotations
+
+import textwrap
+from dataclasses import dataclass, field
+
+from impact_posture.escape import printable, toml
+
+_WIDTH = 100
+
+
+@dataclass
+class Draft:
+    """Text of a ``robot.toml``, written line by line.
+
+    Attributes:
+        lines: Lines of the text.
+        guesses: Values that the user must check, one line each.
+    """
+
+    lines: list[str] = field(default_factory=list)
+    guesses: list[str] = field(default_factory=list)
+
+    @property
+    def text(self) -> str:
+        """The whole file."""
+        return "\n".join(self.lines) + "\n"
+
+    def key(self, name: str, value: object, why: str, *, guessed: bool = False) -> None:
+        """Add a key and the source of its value."""
+        line, comment = f"{name} = {toml(value)}", comment_lines(f"GUESS: {why}" if guessed else why)
+        beside = f"{line}  {comment[0]}"
+        self.lines += [beside] if len(comment) == 1 and len(beside) <= _WIDTH else [*comment, line]
+        if guessed:
+            self.guesses.append(f"{line}: {why}")
+
+    def note(self, text: str, *example: str) -> None:
+        """Add a comment, and lines that a user can uncomment."""
+        self.lines += ["", *comment_lines(text), *(f"# {line}" for line in example)]
+
+
+def comment_lines(text: str) -> list[str]:
+    """Return the lines of a comment."""
+    # Names may contain line breaks, which would end the comment.
+    return textwrap.wrap(
+        printable(text),
+        _WIDTH,
+        initial_indent="# ",
+        subsequent_indent="# ",
+        break_long_words=False,
+        break_on_hyphens=False,
+    )
