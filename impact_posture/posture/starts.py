@@ -58,8 +58,11 @@ class Projector:
 
     def clip(self, q: Array) -> Array:
         """Clamp ``q`` to the bounds."""
-        x = np.maximum(self.chart.to_x(q), self.problem.lower)
-        return self.chart.to_q(np.minimum(x, self.problem.upper))
+        return self.chart.to_q(self._clipped(q))
+
+    def _clipped(self, q: Array) -> Array:
+        """Return the chart coordinates of ``q`` within the bounds, shape (nx,)."""
+        return np.minimum(np.maximum(self.chart.to_x(q), self.problem.lower), self.problem.upper)
 
     def residual(self, q: Array) -> tuple[Array, Array]:
         """Return the violations of all rows at ``q``, zero where an inequality holds, and their Jacobian."""
@@ -86,36 +89,45 @@ class Projector:
 
     def project(self, q: Array, tolerance: float = 1e-9) -> Projection:
         """Pull ``q`` onto the constraints.  The result may still violate them."""
-        q = self.clip(q)
+        x = self._clipped(q)
+        q = self.chart.to_q(x)
         value, jacobian = self.residual(q)
-        damping, norms, one = 1e-3, list[float](), np.eye(len(value))
+        squared = float(value @ value)
+        damping, norms, moved = 1e-3, list[float](), True
         for _ in range(_STEPS):
             size = float(np.abs(value).max(initial=0.0))
-            squared = float(value @ value)
             norms.append(squared**0.5)
             stuck = len(norms) > _PATIENCE and norms[-1] > 0.8 * norms[-1 - _PATIENCE]
             if size < tolerance or damping > 1e6 or stuck:
                 break
-            free = jacobian.copy()
-            free[:, self._held | self._blocked(q, -jacobian.T @ value)] = 0.0
-            gram = free @ free.T
-            # Rows may repeat others (two frames on one link), so the damping must not fall below rounding.
-            damped = damping * min(1.0, size) + _ROUNDING * max(1.0, float(np.trace(gram)))
-            step = -free.T @ np.linalg.solve(gram + damped * one, value)
+            if moved:
+                free = jacobian.copy()
+                free[:, self._held | self._blocked(x, -jacobian.T @ value)] = 0.0
+                gram = free @ free.T
+                diagonal = gram.reshape(-1)[:: len(gram) + 1]
+                plain = diagonal.copy()
+                # Rows may repeat others (two frames on one link), so the damping must not fall below rounding.
+                least = _ROUNDING * max(1.0, float(plain.sum()))
+            diagonal[:] = plain + (damping * min(1.0, size) + least)
+            step = -free.T @ np.linalg.solve(gram, value)
             step *= min(1.0, 1.0 / max(float(np.abs(step).max()), 1e-12))
-            candidate = self.clip(pin.integrate(self.problem.robot.model, q, step))
+            new_x = self._clipped(pin.integrate(self.problem.robot.model, q, step))
+            candidate = self.chart.to_q(new_x)
             new_value, new_jacobian = self.residual(candidate)
-            if new_value @ new_value < squared:
-                q, value, jacobian, damping = candidate, new_value, new_jacobian, max(damping / 5, 1e-9)
+            new_squared = float(new_value @ new_value)
+            moved = new_squared < squared
+            if moved:
+                x, q, value, jacobian, squared = new_x, candidate, new_value, new_jacobian, new_squared
+                damping = max(damping / 5, 1e-9)
             else:
                 damping = max(damping * 10, 1e-6)
         return Projection(q, float(np.abs(value).max(initial=0.0)))
 
-    def _blocked(self, q: Array, direction: Array) -> NDArray[np.bool_]:
-        """Joints on a limit that the descent direction would violate."""
-        x, along = self.chart.to_x(q)[self._in_x], direction[self._in_v]
-        at_low = (x <= self._low + 1e-12) & (along < 0)
-        at_high = (x >= self._high - 1e-12) & (along > 0)
+    def _blocked(self, x: Array, direction: Array) -> NDArray[np.bool_]:
+        """Joints on a limit that the descent direction would violate, at the chart coordinates of a posture."""
+        at, along = x[self._in_x], direction[self._in_v]
+        at_low = (at <= self._low + 1e-12) & (along < 0)
+        at_high = (at >= self._high - 1e-12) & (along > 0)
         blocked = np.zeros(self.problem.robot.nv, dtype=bool)
         blocked[self._in_v] = at_low | at_high
         return blocked

@@ -70,7 +70,7 @@ STUDIES = {
         Study("relaxed", "relaxed", "relaxed ticks in C of pushed robots; budget of iterations", 100, page=False),
         Study("digits", "digits", "the digits that double precision keeps with feet; random postures", 3),
         Study("shapes", "shapes", "the collision shapes of the catalogue, fitted anew"),
-        Study("feasible", "feasible", "what it costs to be clear of collisions and held", target="study-feasible"),
+        Study("feasible", "feasible", "what feasibility costs; seeds", 3, target="study-feasible"),
         Study("approach", "approach", "how fast robots arrive in their optima", target="study-feasible"),
         Study("restitution", "restitution", "rebound of each contact law", target="calibration"),
         Study("impacts", "impact.page", "objectives against impacts in MuJoCo; postures", 30, target="study-impacts"),
