@@ -110,19 +110,18 @@ def _row(robot: str, name: str, request: Request, ends: list[int], left: list[in
 
 
 def _cost(asked: dict[str, object], demands: dict[str, object], seeds: Sequence[int]) -> Cost | str:
-    """Search with demands from several seeds; return why there is no posture where the first finds none."""
+    """Search with demands from several seeds; return why there is no posture where one of them finds none."""
     found, starts, searches, times = list[PostureSolution](), list[float](), list[float](), list[float]()
     for seed in seeds:
         # Other work on the machine changes the speed, so each ratio has a free search of its own.
         apart = solved(asked | {"seed": seed})[1]
         solution, took = solved(asked | demands | {"seed": seed})
-        if isinstance(solution, PostureSolution):
-            found.append(solution)
-            starts.append(took[0] / apart[0])
-            searches.append(took[1] / apart[1])
-            times.append(took[1])
-        elif not found:
+        if not isinstance(solution, PostureSolution):
             return solution
+        found.append(solution)
+        starts.append(took[0] / apart[0])
+        searches.append(took[1] / apart[1])
+        times.append(took[1])
     return Cost(tuple(found), statistics.median(starts), statistics.median(searches), times[0])
 
 
