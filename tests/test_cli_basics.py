@@ -73,6 +73,19 @@ def test_help_imports_nothing_heavy() -> None:
     assert done.stderr == ""
 
 
+def test_what_others_have_to_do_at_the_end_is_done() -> None:
+    code = (
+        "import atexit, sys\nfrom impact_posture_cli import main, process\n"
+        "begin = process.prepare\n"
+        "def prepare():\n    begin()\n    atexit.register(print, 'the end')\n"
+        "main.prepare = prepare\n"
+        "sys.argv = ['impact-posture', *sys.argv[1:]]\nmain.main()\n"
+    )
+    for argument, expected in (("--version", 0), ("--nonsense", 2)):
+        done = subprocess.run([sys.executable, "-c", code, argument], capture_output=True, text=True, timeout=60)
+        assert (done.returncode, done.stdout.splitlines()[-1]) == (expected, "the end")
+
+
 def test_version() -> None:
     done = start("--version")
     assert (done.returncode, done.stdout) == (0, f"impact-posture {__version__}\n")

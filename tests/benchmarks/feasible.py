@@ -69,7 +69,8 @@ def lines(request: Request) -> Iterator[str]:
 def _row(robot: str, name: str, request: Request, ends: list[int], left: list[int]) -> list[str]:
     say(f"{robot} {name}")
     asked = {"robot": robot, "normal": _NORMALS[name], "seed": request.seed}
-    clear, everything = {"collision": True}, {"collision": True, "holdable": True}
+    clear: dict[str, object] = {"collision": True}
+    everything = clear | {"holdable": True}
     free, apart = solved(asked)
     around = _surroundings(asked | clear)
     if not isinstance(free, PostureSolution):

@@ -6,6 +6,7 @@ import functools
 
 import numpy as np
 import pytest
+from scipy.spatial import ConvexHull
 
 from impact_posture.plot import (
     ResultView,
@@ -16,6 +17,7 @@ from impact_posture.plot.shapes import (
     cone_rim,
     cone_shadow,
     half_width,
+    outline,
     polar,
     principal_sections,
     shadow,
@@ -128,3 +130,20 @@ def test_cone_shadow_is_the_projection_of_the_cone(degrees: float, plane: Plane)
     directions = np.array([np.cos(angle), np.sin(angle)]).T
     seen = np.maximum((directions @ plane.axes @ rim).max(axis=1), 0.0)
     np.testing.assert_allclose((directions @ outline).max(axis=1), seen, atol=4e-3)
+
+
+@pytest.mark.parametrize("count", [3, 4, 10, 100, 1000])
+def test_an_outline_is_the_convex_hull(count: int) -> None:
+    points = np.random.default_rng(count).normal(size=(2, count)) * [[1e-2], [3.0]]
+    found = outline(points)
+    np.testing.assert_array_equal(found[:, 0], found[:, -1])
+    hull = points[:, ConvexHull(points.T).vertices]
+    assert sorted(map(tuple, found[:, 1:].T)) == sorted(map(tuple, hull.T))
+    # Counter-clockwise, as the corners of SciPy.
+    x, y = found
+    assert float(x[:-1] @ y[1:] - x[1:] @ y[:-1]) / 2 == pytest.approx(ConvexHull(points.T).volume, rel=1e-12)
+
+
+def test_an_outline_of_points_in_a_row() -> None:
+    np.testing.assert_array_equal(outline(np.array([[0.0, 2.0, 1.0], [1.0, 5.0, 3.0]])), [[0, 2, 0], [1, 5, 1]])
+    np.testing.assert_array_equal(outline(np.ones((2, 3))), 1.0)
