@@ -33,8 +33,6 @@ IPOPT_OPTIONS: dict[str, Any] = {
     # The rows of a program are of like size.  To scale and permute each matrix takes MUMPS longer than it saves.
     "ipopt.mumps_scaling": 0,
     "ipopt.mumps_permuting_scaling": 0,
-    # One more solve with each factorization improves what is accurate already.  Where it is not, IPOPT still does it.
-    "ipopt.min_refinement_steps": 0,
     "ipopt.max_iter": 300,
     "print_time": False,
     "calc_lam_p": False,
