@@ -24,7 +24,7 @@ _LEVEL = 1e-6
 # What a limit may be missed by where the flow brakes, rad (m), or as a share.
 _NEAR = 1e-3
 # What of that the flow takes where a limit is missed by so much already: along it, the flow would creep across.
-_SPENT = 9e-4
+_SPENT = 9.9e-4
 # Distance from the limits of joints to which the flow aims, rad (m).
 _AIM = 2e-3
 # Distance from those of static controls, whose slope it learns, as a share.
@@ -53,7 +53,7 @@ class FlowOptions:
     """
 
     speed: float = 1.0
-    acceleration: float = 3.0
+    acceleration: float = 5.0
     rho: float = 0.001
     mu: float = 0.05
     epsilon: float = 7e-5

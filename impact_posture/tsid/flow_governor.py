@@ -14,6 +14,12 @@ from impact_posture.tsid.redundancy import Redundancy
 _TIMES = 3
 # Least share of the acceleration with which the flow counts on braking, and its growth with each change.
 _ABLE = 0.1
+# What it counts on braking longer, because the slopes of the limits change on that way.
+_CAUTION = 1.5
+# Largest share of its step that the flow goes in a second, 1/s.
+_RATE = 4.8
+# Size below which a step has no pace, rad (m).
+_TINY = 1e-12
 
 
 class FlowGovernor:
@@ -37,8 +43,8 @@ class FlowGovernor:
         """Return the time in which a flow stops evenly, s, which takes twice the way that braking takes."""
         return float(np.abs(flow).max()) / self._options.acceleration
 
-    def change(self, space: Redundancy, step: Array, fastest: float, period: float, slope: Array | None) -> Array:
-        """Return the change of the flow towards a step, shape (nv,).
+    def change(self, space: Redundancy, step: Array, fastest: float, period: float, slope: Array | None) -> tuple[Array, bool]:
+        """Return the change of the flow towards a step, shape (nv,), and whether it is that which only brakes.
 
         Each joint turns as fast as it can, and then all stay on the constraints; or all change evenly; or all brake
         evenly.  The first two count twice more without what crosses limits.  The first change counts from which the
@@ -53,10 +59,9 @@ class FlowGovernor:
         """
         options, direction, Z, flow = self._options, self._direction, space.basis, self.flow
         most = options.acceleration * period
-        # Two fifths of the acceleration stop a speed of √(4/5 a δ) on the step δ.  Below v/2, it is 8/5 a/v δ.
-        least = 0.3125 * options.speed**2 / options.acceleration
-        wanted = step * math.sqrt(0.8 * options.acceleration / max(np.abs(step).max(), least))
-        away = limited(wanted, fastest) - flow
+        # Two fifths of the acceleration stop a speed of √(4/5 a δ) on the step δ.
+        pace = min(math.sqrt(0.8 * options.acceleration / max(np.abs(step).max(), _TINY)), _RATE)
+        away = limited(pace * step, fastest) - flow
         # Twice the way on which it stops, because the curvature may grow on it.
         stop = flow * self.stopping(flow)
         for change in (space.project(np.minimum(np.maximum(away, -most), most)), away):
@@ -68,8 +73,8 @@ class FlowGovernor:
                     change = direction.downhill(Z, slope, flow, stop, change)
                 change = limited(change, most)
                 if direction.stops(flow + change, self._braking(change, period)):
-                    return change
-        return limited(-flow, most)
+                    return change, False
+        return limited(-flow, most), True
 
     def take(self, change: Array, part: float) -> Array:
         """Change the flow by the part of a change that the actuators permit, and return that, shape (nv,)."""
@@ -80,7 +85,7 @@ class FlowGovernor:
 
     def _braking(self, change: Array, period: float) -> float:
         """Return the time for which the flow goes on if it changes and then brakes evenly, s."""
-        return self.stopping(self.flow + change) / 2 / self._able + period
+        return _CAUTION * self.stopping(self.flow + change) / 2 / self._able + period
 
 
 def limited(vector: Array, largest: float) -> Array:

@@ -244,8 +244,8 @@ class ReferenceFlow:
             return
         error = np.abs(pin.difference(self._model, self._measured, self.q)[self._base :]).max(initial=0.0)
         fastest = options.speed * max(1.0 - error / options.tracking, 0.0)
-        # The speed is that at the next change, and rest comes with the one after.
-        fastest = min(fastest, options.acceleration * max(self._deadline - self._clock - 2 * period, 0.0))
+        # The speed is that at the next change, and rest comes with the one after, on two fifths of the acceleration.
+        fastest = min(fastest, 0.4 * options.acceleration * max(self._deadline - self._clock - 2 * period, 0.0))
         if not self.on:
             fastest = 0.0
         rate = self.error / _RETURN
@@ -254,9 +254,11 @@ class ReferenceFlow:
         governor = self._governor
         governor.flow = self._space.project(governor.flow)
         descends = fastest > 0 and self._visited == len(self._path)
-        change = governor.change(self._space, self._wanted, fastest, period, self._slope if descends else None)
+        change, brakes = governor.change(self._space, self._wanted, fastest, period, self._slope if descends else None)
         known = (governor.flow + self._space.back(rate, self._base) - self.velocity) / period
-        part = self._static.permitted(self._state.M, known, change / period, self.shares, options.haste)
+        # To stop within the limits counts more than to leave the actuators much.
+        most = (1 + options.haste) / 2 if brakes else options.haste
+        part = self._static.permitted(self._state.M, known, change / period, self.shares, most)
         self.acceleration[:] = known + governor.take(change, part) / period
 
     def _coast(self) -> None:

@@ -4,7 +4,7 @@
 /* Least H/H0 whose root counts. */
 #define IP_LEAST_VALUE 1e-8
 /* What of IP_NEAR the flow takes where a limit is missed by so much already: along it, the flow would creep across. */
-#define IP_SPENT 9e-4
+#define IP_SPENT 9.9e-4
 /* Distance from the limits of joints to which the flow aims, rad (m), and from those of static controls, whose slope it
  * learns, as a share. */
 #define IP_AIM 2e-3

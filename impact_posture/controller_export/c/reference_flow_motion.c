@@ -9,6 +9,10 @@
 #define IP_TIMES 3
 /* Least share of the acceleration with which the flow counts on braking, and its growth with each change. */
 #define IP_ABLE 0.1
+/* What it counts on braking longer, because the slopes of the limits change on that way. */
+#define IP_CAUTION 1.5
+/* Largest share of its step that the flow goes in a second, 1/s. */
+#define IP_RATE 4.8
 
 /* Shorten x so that no entry exceeds a number. */
 static void ip_shorten(double *x, double most)
@@ -57,7 +61,7 @@ static double ip_flow_braking(const ip_flow *f, const ip_params *p, const double
   for (i = 0; i < IP_NV; ++i) {
     way[i] = f->flow[i] + step[i];
   }
-  return ip_largest(way, 0) / (2.0 * f->able * p->flow_acceleration[0]) + period;
+  return IP_CAUTION * ip_largest(way, 0) / (2.0 * f->able * p->flow_acceleration[0]) + period;
 }
 
 /* Whether the flow then stays within the limits. */
@@ -80,13 +84,13 @@ static int ip_flow_stops(const ip_flow *f, const ip_params *p, const double *ste
 
 /* The change of the flow towards the wanted step, by at most so much an entry: as fast as each joint can, or straight, each
  * of them twice without what crosses limits, or braking.  The first of them counts from which the flow can stop within the
- * limits. */
-static void ip_flow_change(const ip_flow *f, const ip_params *p, double period, double fastest, double *step)
+ * limits.  Return whether it is that which only brakes. */
+static int ip_flow_change(const ip_flow *f, const ip_params *p, double period, double fastest, double *step)
 {
   enum { N = IP_NV, FAST = 0, BRAKE = 2 };
-  const double v = p->flow_speed[0], a = p->flow_acceleration[0], most = a * period, time = ip_flow_stopping(f, p);
-  /* Two fifths of the acceleration stop a speed of sqrt(4/5 a d) on the step d.  Below v/2, it is 8/5 a/v d. */
-  const double pace = sqrt(0.8 * a / fmax(ip_largest(f->wanted, 0), 0.3125 * v * v / a));
+  const double a = p->flow_acceleration[0], most = a * period, time = ip_flow_stopping(f, p);
+  /* Two fifths of the acceleration stop a speed of sqrt(4/5 a d) on the step d. */
+  const double pace = fmin(sqrt(0.8 * a / fmax(ip_largest(f->wanted, 0), IP_TINY)), IP_RATE);
   const int descends = fastest > 0.0 && f->visited == IP_PATH;
   double wanted[N], stop[N];
   int i, k, again;
@@ -114,12 +118,13 @@ static void ip_flow_change(const ip_flow *f, const ip_params *p, double period, 
       }
       ip_shorten(step, most);
       if (ip_flow_stops(f, p, step, period)) {
-        return;
+        return 0;
       }
     }
   }
   ip_scaled(f->flow, -1.0, step, N);
   ip_shorten(step, most);
+  return 1;
 }
 
 /* Limit speed and acceleration, and return to contacts and tasks. */
@@ -130,24 +135,25 @@ static void ip_flow_govern(ip_context *c)
   const ip_params *p = &c->p;
   const double period = f->elapsed;
   double e[N], back[N], step[N], known[N], more[N], fastest, part;
-  int i;
+  int i, brakes;
   f->elapsed = 0.0;
   if (!(period > 0.0)) {
     return;
   }
   ip_difference(c->q, f->q, e);
   fastest = p->flow_speed[0] * fmax(1.0 - ip_largest(e, IP_BASE) / p->flow_tracking[0], 0.0);
-  /* The speed is that at the next change, and rest comes with the one after. */
-  fastest = fmin(fastest, p->flow_acceleration[0] * fmax(f->deadline - f->clock - 2.0 * period, 0.0));
+  /* The speed is that at the next change, and rest comes with the one after, on two fifths of the acceleration. */
+  fastest = fmin(fastest, 0.4 * p->flow_acceleration[0] * fmax(f->deadline - f->clock - 2.0 * period, 0.0));
   fastest = f->on ? fastest : 0.0;
   ip_flow_back(c, back);
   ip_flow_project(f, f->flow);
-  ip_flow_change(f, p, period, fastest, step);
+  brakes = ip_flow_change(f, p, period, fastest, step);
   for (i = 0; i < N; ++i) {
     known[i] = (f->flow[i] + back[i] - f->velocity[i]) / period;
     more[i] = step[i] / period;
   }
-  part = ip_flow_permitted(c, known, more);
+  /* To stop within the limits counts more than to leave the actuators much. */
+  part = ip_flow_permitted(c, known, more, brakes ? (1.0 + p->flow_haste[0]) / 2.0 : p->flow_haste[0]);
   f->able = fmin(fmax(part, IP_ABLE), f->able + IP_ABLE);
   ip_add(f->flow, part, step, N);
   ip_add(known, part, more, N);

@@ -205,8 +205,8 @@ static void ip_flow_shares(ip_context *c, double *shares)
   }
 }
 
-/* The part of `more`, 0 to 1, that accelerations permit which take `flow_haste` of what rest leaves. */
-static double ip_flow_permitted(const ip_context *c, const double *known, const double *more)
+/* The part of `more`, 0 to 1, that accelerations permit which take `haste` of what rest leaves. */
+static double ip_flow_permitted(const ip_context *c, const double *known, const double *more, double haste)
 {
   const ip_flow *f = &c->flow;
   double force[2][IP_NV], taken[IP_CONTROLS], added[IP_CONTROLS], part = 1.0;
@@ -221,7 +221,7 @@ static double ip_flow_permitted(const ip_context *c, const double *known, const 
     const double side = added[i] < 0.0 ? -1.0 : 1.0;
     const double room = fmax(1.0 / c->p.flow_share[0] - side * f->shares[i], IP_LEFT / c->p.flow_share[0]);
     if (added[i] != 0.0) {
-      part = fmin(part, (c->p.flow_haste[0] * room - side * taken[i]) / fmax(fabs(added[i]), IP_TINY));
+      part = fmin(part, (haste * room - side * taken[i]) / fmax(fabs(added[i]), IP_TINY));
     }
   }
   return fmax(part, 0.0);
