@@ -43,7 +43,9 @@ class FlowGovernor:
         """Return the time in which a flow stops evenly, s, which takes twice the way that braking takes."""
         return float(np.abs(flow).max()) / self._options.acceleration
 
-    def change(self, space: Redundancy, step: Array, fastest: float, period: float, slope: Array | None) -> tuple[Array, bool]:
+    def change(
+        self, space: Redundancy, step: Array, fastest: float, period: float, slope: Array | None
+    ) -> tuple[Array, bool]:
         """Return the change of the flow towards a step, shape (nv,), and whether it is that which only brakes.
 
         Each joint turns as fast as it can, and then all stay on the constraints; or all change evenly; or all brake

@@ -254,7 +254,8 @@ class ReferenceFlow:
         governor = self._governor
         governor.flow = self._space.project(governor.flow)
         descends = fastest > 0 and self._visited == len(self._path)
-        change, brakes = governor.change(self._space, self._wanted, fastest, period, self._slope if descends else None)
+        slope = self._slope if descends else None
+        change, brakes = governor.change(self._space, self._wanted, fastest, period, slope)
         known = (governor.flow + self._space.back(rate, self._base) - self.velocity) / period
         # To stop within the limits counts more than to leave the actuators much.
         most = (1 + options.haste) / 2 if brakes else options.haste
