@@ -1,0 +1,146 @@
+/* Limits of the reference flow: how much room each has, and steps without what crosses it.  The formulas are in
+ * impact_posture/tsid/flow_direction.py. */
+
+/* What of IP_NEAR the flow takes where a limit is missed by so much already: along it, the flow would creep across. */
+#define IP_SPENT 9.9e-4
+/* Distance from the limits of joints to which the flow aims, rad (m), and from those of static controls, whose slope it
+ * learns, as a share. */
+#define IP_AIM 2e-3
+#define IP_RESERVE 8e-3
+/* Square of the length below which a row has no direction on the constraints. */
+#define IP_FLAT 1e-6
+/* Sine of an angle of the base below which the tilt has no slope. */
+#define IP_LEVEL 1e-6
+
+/* The largest entry from the first one on. */
+static double ip_largest(const double *x, int first)
+{
+  double most = 0.0;
+  int i;
+  for (i = first; i < IP_NV; ++i) {
+    most = fmax(most, fabs(x[i]));
+  }
+  return most;
+}
+
+/* How much a row changes along a way. */
+static double ip_flow_along(const ip_flow *f, int r, const double *way)
+{
+  return r < IP_JOINTS_V               ? way[IP_BASE + r]
+         : r < IP_JOINTS_V + IP_PLACED ? ip_dot(f->row[r - IP_JOINTS_V], way, IP_NV)
+                                       : ip_dot(f->T[r - IP_JOINTS_V - IP_PLACED], way, IP_NV);
+}
+
+/* How much a row changes along a way of the flow.  The base tilts about the way as well as along it. */
+static double ip_flow_ahead(const ip_flow *f, int r, const double *way)
+{
+  const double along = ip_flow_along(f, r, way);
+#if IP_BASE
+  if (r == IP_JOINTS_V + IP_EDGES) {
+    const double turn = ip_dot(f->vertical, way + 3, 3), aside = ip_dot(way + 3, way + 3, 3) - turn * turn - along * along;
+    return hypot(f->tilt + along, sqrt(fmax(aside, 0.0))) - f->tilt;
+  }
+#endif
+  return along;
+}
+
+#if IP_BASE
+/* Angle between the vertical and the direction that is upright in the base, rad, and its slope. */
+static double ip_flow_tilt(const ip_flow *f, double *row)
+{
+  const double *vertical = f->m.base + 6;
+  double axis[3], sine;
+  int i;
+  ip_cross(vertical, ip_upright, axis);
+  sine = sqrt(ip_dot(axis, axis, 3));
+  for (i = 0; i < 3; ++i) {
+    row[3 + i] = sine > IP_LEVEL ? axis[i] / sine : 0.0;
+  }
+  return atan2(sine, ip_dot(vertical, ip_upright, 3));
+}
+#endif
+
+/* Bounds of the rows on the step, at the model of the flow, less what the flow needs to brake. */
+static void ip_flow_limits(ip_context *c)
+{
+  ip_flow *f = &c->flow;
+  const ip_params *p = &c->p;
+  double position[3], J[3 * IP_NV], drift[3], coasting[IP_NV];
+  int j, k, r;
+  ip_scaled(f->flow, p->flow_speed[0] / p->flow_acceleration[0] / 2.0, coasting, IP_NV);
+  ip_center_of_mass(&f->m, f->here, position, J, drift);
+  for (r = 0; r < IP_FLOW_ROWS; ++r) {
+    double high = INFINITY, low = -INFINITY, ahead = 0.0, aim;
+    if (r < IP_JOINTS_V) {
+      const double upper = p->joint_upper[IP_BASE + r], lower = p->joint_lower[IP_BASE + r];
+      const double at = f->here[ip_limit_q[IP_BASE + r]], margin = fmin(p->flow_joint_margin[0], (upper - lower) / 8.0);
+      ahead = coasting[IP_BASE + r];
+      if (isfinite(upper) && isfinite(lower)) {
+        high = upper - at - margin;
+        low = -(at - lower - margin);
+      }
+    } else if (r < IP_JOINTS_V + IP_EDGES) {
+      k = r - IP_JOINTS_V;
+      memset(f->row[k], 0, sizeof f->row[k]);
+      if (k < f->edges) {
+        for (j = 0; j < IP_NV; ++j) {
+          f->row[k][j] = f->edge[k][0] * J[j] + f->edge[k][1] * J[IP_NV + j];
+        }
+        high = -f->offset[k] - p->flow_com_margin[0] - ip_dot(f->edge[k], position, 2);
+        ahead = ip_dot(f->row[k], coasting, IP_NV);
+      }
+#if IP_BASE
+    } else if (r < IP_JOINTS_V + IP_PLACED) {
+      memcpy(f->vertical, f->m.base + 6, sizeof f->vertical);
+      f->tilt = ip_flow_tilt(f, f->row[IP_EDGES]);
+      high = p->flow_tilt[0] - f->tilt;
+      ahead = ip_dot(f->row[IP_EDGES], coasting, IP_NV);
+#endif
+    } else {
+      k = r - IP_JOINTS_V - IP_PLACED;
+      if (ip_flow_half(p, k) > 0.0) {
+        high = 1.0 - f->shares[k];
+        low = -1.0 - f->shares[k];
+        ahead = ip_dot(f->T[k], coasting, IP_NV);
+      }
+    }
+    aim = r < IP_JOINTS_V ? IP_AIM : r < IP_JOINTS_V + IP_PLACED ? 0.0 : IP_RESERVE;
+    high -= aim;
+    low += aim;
+    f->room[0][r] = fmax(high, -IP_SPENT);
+    f->room[1][r] = fmin(low, IP_SPENT);
+    f->high[r] = fmax(high - fmax(ahead, 0.0), 0.0);
+    f->low[r] = fmin(low - fmin(ahead, 0.0), 0.0);
+  }
+}
+
+/* Take out of a step of the flow, which then goes on for a time, the parts by which limits would be crossed, one after the
+ * other. */
+static void ip_flow_along_limits(const ip_flow *f, double time, double *step)
+{
+  double way[IP_NV], across[IP_NV], over, square;
+  int i, r;
+  for (i = 0; i < IP_NV; ++i) {
+    way[i] = time * (f->flow[i] + step[i]);
+  }
+  for (r = 0; r < IP_FLOW_ROWS; ++r) {
+    const int k = r - IP_JOINTS_V;
+    over = ip_flow_ahead(f, r, way);
+    over -= fmin(fmax(over, f->room[1][r]), f->room[0][r]);
+    if (over == 0.0) {
+      continue;
+    }
+    memset(across, 0, sizeof across);
+    if (k < 0) {
+      across[IP_BASE + r] = 1.0;
+    } else {
+      memcpy(across, k < IP_PLACED ? f->row[k] : f->T[k - IP_PLACED], sizeof across);
+    }
+    ip_flow_project(f, across);
+    square = ip_dot(across, across, IP_NV);
+    if (square > IP_FLAT) {
+      ip_add(step, -over / time / square, across, IP_NV);
+      ip_add(way, -over / square, across, IP_NV);
+    }
+  }
+}
