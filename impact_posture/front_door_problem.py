@@ -122,14 +122,17 @@ class ImpactObjective(core.ImpactObjective):
     def export(self, out: str | Path, *, build: bool = True, **options: Any) -> Export:
         """Write the C code of H, its gradient and this objective into a folder, and build its library.
 
+        A folder that holds this code already, such as ``c/`` of a result, is used as it is.
+
         Args:
             out: The folder.
             build: Whether to build and check the library, if a C compiler is installed.
             options: Options ``prefix``, ``posture``, ``single``, ``portable`` and ``force`` of :func:`write_export`.
         """
-        from impact_posture.codegen.export import write_export
+        from impact_posture.codegen.export import kept_export, write_export
 
-        return write_export([self], Path(out), build=build, **options)
+        kept = None if options else kept_export(self, Path(out), build=build)
+        return kept or write_export([self], Path(out), build=build, **options)
 
 
 def _at_own_frame(robot: Robot, contact: ImpactContact) -> ImpactContact:

@@ -11,7 +11,12 @@ from functools import cache
 from pathlib import Path
 
 # Options that are no settings.
-_OTHERS = {"compile", "controller", "force", "gain", "jobs", "mode", "out", "prefix", "samples", "sign"}
+_OTHERS = {
+    "compile", "controller", "daqp", "force", "gain", "jobs", "mode", "mpi", "out", "prefix", "samples", "scheduler",
+    "sign", "slurm",
+}  # fmt: skip
+# Parameters whose option has another name.
+_RENAMED = {"build": "compile", "kind": "controller"}
 
 
 @cache
@@ -52,4 +57,4 @@ def _as_option(found: re.Match[str]) -> str:
 
 
 def _option(name: str) -> str:
-    return f"--{name.replace('_', '-')}"
+    return f"--{_RENAMED.get(name, name).replace('_', '-')}"

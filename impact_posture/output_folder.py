@@ -39,7 +39,7 @@ def check_output(out: Path, *, force: bool, kind: Kind) -> None:
     if out.is_symlink():
         raise OutputError("is a symbolic link", where=str(out), hint="name the folder that it leads to, or another")
     if os.path.lexists(out) and not out.is_dir():
-        raise OutputError("exists and is no folder", where=str(out), hint="choose another --out")
+        raise OutputError("exists and is no folder", where=str(out), hint="choose another `out`")
     if Path(os.path.realpath(out)) in (Path.cwd(), *Path.cwd().parents):
         raise OutputError(
             "is the current folder or one around it", where=str(out), hint="choose a new folder, such as ./result"
@@ -48,11 +48,11 @@ def check_output(out: Path, *, force: bool, kind: Kind) -> None:
         raise OutputError("is a mount point", where=str(out), hint="choose a folder in it")
     if out.is_dir() and any(out.iterdir()):
         if not force:
-            raise OutputError("exists", where=str(out), hint="choose another --out, or --force to replace it")
+            raise OutputError("exists", where=str(out), hint="choose another `out`, or `force=True` to replace it")
         _check_ours(out, kind)
     parent = next(folder for folder in out.absolute().parents if folder.exists())
     if not parent.is_dir() or not os.access(parent, os.W_OK | os.X_OK):
-        raise OutputError("cannot be written", where=str(parent), hint="choose another --out")
+        raise OutputError("cannot be written", where=str(parent), hint="choose another `out`")
 
 
 @contextmanager
@@ -88,7 +88,7 @@ def whole_folder(out: Path, *, force: bool, kind: Kind, products: Sequence[str] 
             # What is missing may be another file than those of the folder.
             words = f"{words}: {error.filename}"
         raise OutputError(
-            f"cannot be written ({words})", where=str(out), hint="free space or choose another --out"
+            f"cannot be written ({words})", where=str(out), hint="free space or choose another `out`"
         ) from error
 
 
@@ -115,6 +115,12 @@ def is_ours(folder: Path, kind: Kind) -> bool:
     """Return whether a folder has a record of this kind; it may hold other files too."""
     content = _read_record(folder)
     return content is not None and content["kind"] == kind
+
+
+def own_files(folder: Path, kind: Kind) -> list[str]:
+    """Return the files that the record of a folder of this kind lists; none where there is no such record."""
+    content = _read_record(folder)
+    return [] if content is None or content["kind"] != kind else list(content["files"])
 
 
 def add_to_record(folder: Path, paths: Iterable[Path]) -> None:
@@ -164,7 +170,7 @@ def _check_ours(out: Path, kind: Kind) -> None:
     content = _read_record(out)
     if content is not None and content["kind"] != kind:
         raise OutputError(
-            f"holds another command's results ({content['kind']})", where=str(out), hint="choose another --out"
+            f"holds another command's results ({content['kind']})", where=str(out), hint="choose another `out`"
         )
     foreign = _foreign(out, set())
     if foreign:
@@ -172,7 +178,7 @@ def _check_ours(out: Path, kind: Kind) -> None:
         raise OutputError(
             f"holds {', '.join(foreign[:_SHOWN])}{more}, which this command did not write",
             where=str(out),
-            hint="choose another --out, or move that away: --force replaces earlier results only",
+            hint="choose another `out`, or move that away: `force=True` replaces earlier results only",
         )
 
 
@@ -216,7 +222,7 @@ def _replace(beside: Path, out: Path, force: bool, kind: Kind) -> None:
         except OSError as error:
             if error.errno in (errno.ENOTEMPTY, errno.EEXIST):
                 raise OutputError(
-                    "exists", where=str(out), hint="choose another --out, or --force to replace it"
+                    "exists", where=str(out), hint="choose another `out`, or `force=True` to replace it"
                 ) from None
             raise
         return
@@ -252,6 +258,6 @@ def _parents_of(out: Path) -> Iterator[None]:
                 folder.mkdir(exist_ok=True)
         except OSError as error:
             raise OutputError(
-                f"cannot be made ({error.strerror})", where=str(missing[-1]), hint="choose another --out"
+                f"cannot be made ({error.strerror})", where=str(missing[-1]), hint="choose another `out`"
             ) from None
         yield

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import ast
 import re
 from pathlib import Path
 
@@ -43,3 +44,16 @@ def test_the_machine_path_pattern_finds_them_and_spares_others() -> None:
         assert MACHINE.search(bad), bad
     for good in ("https://a.b/home/x", "m/s, N·m/work", "robots/tmp/x", "$ROOT/opt/x"):
         assert not MACHINE.search(good), good
+
+
+def test_errors_of_the_library_name_parameters_and_no_options() -> None:
+    """The command line writes `parameter` as an option (``option_names``); in Python there are no options."""
+    found = [
+        f"{path.name}:{text.lineno}: {text.value}"
+        for path in Path(impact_posture.__path__[0]).rglob("*.py")
+        for node in ast.walk(ast.parse(path.read_text(encoding="utf-8")))
+        if isinstance(node, ast.Raise)
+        for text in ast.walk(node)
+        if isinstance(text, ast.Constant) and isinstance(text.value, str) and re.search(r"--[a-z]", text.value)
+    ]
+    assert not found, "\n".join(found)

@@ -47,7 +47,7 @@ def in_cache(cache: Path, **members: tarfile.TarInfo | bytes) -> None:
 def test_no_network_is_one_line(cache: Path) -> None:
     with pytest.raises(InputError) as caught:
         daqp_sources()
-    assert "cannot be downloaded" in caught.value.line and "--daqp" in caught.value.hint
+    assert "cannot be downloaded" in caught.value.line and "`daqp`" in caught.value.hint
     assert "\n" not in caught.value.line
     assert not list(cache.iterdir())
 

@@ -15,7 +15,7 @@ import pytest
 
 import impact_posture as ip
 from impact_posture import plot
-from impact_posture.errors import ContactError, InputError, MetricError, PostureError, SpecError
+from impact_posture.errors import ContactError, InputError, MetricError, OutputError, PostureError, SpecError
 from impact_posture.impact.evaluation import Evaluation
 from impact_posture.posture.problem_settings import prepare
 from impact_posture.toolchain import find_compiler
@@ -176,6 +176,39 @@ def test_a_result_draws_and_exports_itself(result: ip.PostureResult, tmp_path: P
     q, v = robot.posture(), np.zeros(robot.nv)
     controller.reset(q, v)
     assert controller.tick(0.0, q, v).status is ip.tsid.Status.SOLVED and slope.shape == (robot.nv,)
+
+
+def test_the_code_of_a_result_is_that_of_its_objective(result: ip.PostureResult, tmp_path: Path) -> None:
+    result.save(tmp_path / "out", formats=("png",), report=False, jobs=1)
+    folder = tmp_path / "out" / "c"
+    before = {path.name: path.read_bytes() for path in folder.iterdir()}
+    objective = arm()
+    written = objective.export(folder)
+    assert {path: path.read_bytes() for path in written.files} == {
+        folder / p.name: before[p.name] for p in written.files
+    }
+    assert written.compiled == (find_compiler() is not None) and written.manifest["posture"] == result.q.tolist()
+    if written.compiled:
+        assert written.library is not None and written.library.is_file()
+        value, _ = written.load().objective(result.q)
+        assert value == pytest.approx(objective.value(result.q), rel=1e-9)
+    others = (
+        ip.ImpactObjective(objective.robot, objective.contact, kind="speed"),
+        ip.ImpactObjective(objective.robot, ip.ImpactContact("ee", (0, 1, 0))),
+    )
+    for other in others:
+        with pytest.raises(OutputError, match="`force=True` to replace it"):
+            other.export(folder)
+    # What asks for more than the defaults is never taken as it is.
+    with pytest.raises(OutputError, match="choose another `out`"):
+        objective.export(folder, prefix="arm")
+    (folder / "tilthex_arm_ee.c").unlink()
+    with pytest.raises(OutputError, match="exists"):
+        objective.export(folder)
+
+
+def test_the_entrance_lists_its_names_only() -> None:
+    assert dir(ip) == sorted(ip.__all__) and {"load_robot", "optimize", "PostureProblem", "tsid"} < set(dir(ip))
 
 
 def test_a_trade_off_is_added_to_a_result(result: ip.PostureResult) -> None:

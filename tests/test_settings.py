@@ -107,7 +107,9 @@ def test_options_are_named_where_the_library_names_settings() -> None:
     assert as_options("`root='free-flyer'`, `force=True`, `com=False`, `seed`, `jobs=1`") == (
         "--root free-flyer, --force, --no-com, --seed, --jobs 1"
     )
+    assert as_options("`build=True`, `kind='legged'`, `daqp`") == "--compile, --controller legged, --daqp"
     assert option_of("normal_cone") == "--normal-cone" and option_of("panda") == "panda"
+    assert option_of("scheduler tcp://a:1") == "--scheduler tcp://a:1"
     assert option_of("posture p.json") == "--posture p.json"
 
 

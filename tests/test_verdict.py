@@ -132,3 +132,28 @@ def test_the_command_says_it_first(tmp_path: Path) -> None:
     free = ("--starts", 2, "--no-collision", "--no-holdable", "--no-codegen", "--out", tmp_path / "talos")
     paper = run("optimize", "talos", "--normal", -1, 0, 0, *free)
     assert "verdict: worse." in paper.stdout and "--objective coulomb minimizes this jump" in paper.stdout
+
+
+@pytest.mark.parametrize(
+    ("kind", "more", "better"),
+    [
+        ("impulse", {}, "coulomb"),
+        ("impulse", {"friction": 0.0}, "coulomb"),
+        ("impulse", {"normal_cone": 5.0}, "sticking"),
+        ("impulse", {"normal_cone": 5.0, "friction": 0.0}, None),
+        # What minimizes the very jump of the verdict is not blamed for it.
+        ("speed", {"friction": 0.0}, None),
+        ("sticking", {"friction": 5.0}, None),
+        ("sticking", {"friction": 0.0}, "coulomb"),
+    ],
+)
+def test_another_objective_is_advised_only_if_it_minimizes_the_jump(
+    kind: str, more: dict[str, object], better: str | None
+) -> None:
+    prepared = prepare(make_settings({"robot": "panda", **NORMAL, "objective": kind, **more}))
+    found = prepared.impact.evaluate()
+    # The posture that was given is no better than itself.
+    told = verdict(prepared.impact, found, found)
+    assert told.outcome == "no better"
+    advised = [line for line in told.advice if "minimizes this jump" in line]
+    assert [line.split("'")[1] for line in advised] == ([] if better is None else [better])

@@ -57,4 +57,4 @@ def default_formulation(
         return _BUILD[kind](robot, posture)
     except InputError as error:
         fits = "legged" if robot.spec.supports else "aerial" if robot.spec.propulsion else "arm"
-        raise InputError(error.what, where=error.where, hint=f"try --controller {fits}") from None
+        raise InputError(error.what, where=error.where, hint=f"try `kind='{fits}'`") from None

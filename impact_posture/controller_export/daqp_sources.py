@@ -42,7 +42,7 @@ def prepare_metadata_for_build_wheel(folder, settings=None):
     (made / "METADATA").write_text("Metadata-Version: 2.1\\nName: daqp\\nVersion: {VERSION}\\n")
     return made.name
 """
-_GIVE_FOLDER = f"give the folder of DAQP {VERSION}'s sources with --daqp"
+_GIVE_FOLDER = f"give the folder of DAQP {VERSION}'s sources with `daqp`"
 
 
 def daqp_sources(given: Path | None = None) -> dict[str, bytes]:

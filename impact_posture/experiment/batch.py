@@ -63,7 +63,7 @@ class Store:
                 write_record(self.folder, "runs")
         except OSError as error:
             words = f"cannot be written ({error.strerror or error})"
-            raise OutputError(words, where=str(self.folder), hint="free space or choose another --out") from error
+            raise OutputError(words, where=str(self.folder), hint="free space or choose another `out`") from error
 
     def remove(self) -> None:
         """Remove the folder, if :meth:`make` made it."""

@@ -74,7 +74,7 @@ def verdict(impact: ResolvedImpact, before: Evaluation, after: Evaluation) -> Ve
     line = f"verdict: {outcome}. At {impact.speed:g} m/s {contact} {', '.join(parts[:-1])} and {parts[-1]}."
     advice = (
         *_without_friction(before, after, jump),
-        *_better_objective(impact, outcome),
+        *_better_objective(impact, outcome, (pair[0], pair[1])),
         *_other_joint_model(impact, before, after),
     )
     return Verdict(outcome, line, jump, impulse, force, advice)
@@ -124,11 +124,15 @@ def _without_friction(before: Evaluation, after: Evaluation, jump: float) -> Ite
         yield f"without friction the jump {_words(change)}"
 
 
-def _better_objective(impact: ResolvedImpact, outcome: Outcome) -> Iterator[str]:
+def _better_objective(impact: ResolvedImpact, outcome: Outcome, jumps: tuple[Jump, Jump]) -> Iterator[str]:
     objective = impact.objective
     if outcome in ("worse", "no better") and objective.kind != "coulomb" and not objective.others:
         kind = "sticking" if objective.normal_cone_deg else "coulomb"
-        if kind != objective.kind:
+        # The jump with friction is that of S where the contact sticks at both postures, and that of V at friction 0.
+        slides = impact.contact.friction == 0
+        sticks = all(isinstance(jump, CoulombJump) and jump.sticks for jump in jumps)
+        same = (kind, "speed" if slides else "", "sticking" if sticks else "")
+        if objective.kind not in same and not (slides and kind == "sticking"):
             yield f"`objective='{kind}'` minimizes this jump; '{objective.kind}' minimizes another quantity"
     if outcome == "better at the price of force":
         yield "`max_force` bounds the force"

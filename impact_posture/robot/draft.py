@@ -41,14 +41,14 @@ def write_draft(robot: str, options: LoadOptions, out: Path | None, *, force: bo
         OutputError: The file exists and ``force`` is not set, or it cannot be written.
     """
     if robot in known_robots():
-        hint = "name a .urdf, or write the differences into a file and give it by --config"
+        hint = "name a .urdf, or write the differences into a file and give it by `config`"
         raise InputError("has its robot.toml already", where=robot, hint=hint)
     # The empty file replaces a robot.toml beside the URDF.
     located = locate(robot, LoadOptions(config=os.devnull))
     in_package = located.source.startswith(EXAMPLE_PREFIX)
     out = out or (Path(f"{located.urdf.stem}.toml") if in_package else located.urdf.parent / "robot.toml")
     if out.exists() and not force:
-        raise OutputError("exists", where=str(out), hint="name another file, or --force to replace it")
+        raise OutputError("exists", where=str(out), hint="name another file, or `force=True` to replace it")
     draft = draft_spec(located, options, out.absolute().parent)
     # The temporary file is in the same folder, so that its relative paths are the same.
     beside = out.with_name(f".{out.name}-{os.getpid()}")

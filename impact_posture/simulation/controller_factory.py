@@ -176,13 +176,13 @@ class ControllerFactory:
         self.in_c = False
         modes = get_args(Mode)
         if mode not in modes:
-            raise InputError(f"there is no mode '{mode}'", where="--mode", hint=f"one of: {', '.join(modes)}")
+            raise InputError(f"there is no mode '{mode}'", where="mode", hint=f"one of: {', '.join(modes)}")
         if self.compile not in (choices := get_args(CompileMode)):
             raise InputError(f"no mode '{self.compile}'", where="compile", hint=f"choose from {', '.join(choices)}")
         if name.removesuffix(_STIFF) not in CONTROLLERS:
             return self._driver_from_outside(name, mode, gain)
         if mode == "held" and not (name.startswith("robust") or name == "walker"):
-            raise InputError(f"'{name}' has no term to hold", where="--mode", hint="only robust… and walker have one")
+            raise InputError(f"'{name}' has no term to hold", where="mode", hint="only robust… and walker have one")
         driver = self._made(name, mode, gain)
         driver.compiled = self._compiled(driver, name)
         self.in_c = driver.compiled is not None

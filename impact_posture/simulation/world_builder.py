@@ -179,7 +179,7 @@ def _add_motors(mjcf: Mjcf, robot: Robot) -> None:
             raise UnsupportedJoint(
                 f"no motor drives joint '{slot.name}' ({slot.kind.family})",
                 where="simulation",
-                hint="lock it (--lock), or model it as slides and hinges",
+                hint="lock it (`lock`), or model it as slides and hinges",
             )
         targets = mjcf.joints[slot.index]
         motors = [(f"motor {name}", name, np.eye(3)[0]) for name in targets]

@@ -79,12 +79,12 @@ class Atlas:
                 write_record(self.folder, "sweep")
             except OSError as error:
                 words = f"cannot be written ({error.strerror or error})"
-                raise OutputError(words, where=str(self.folder), hint="free space or choose another --out") from None
+                raise OutputError(words, where=str(self.folder), hint="free space or choose another `out`") from None
             write_whole(manifest, json.dumps(self._manifest(), indent=1) + "\n")
         known = read_manifest(self.folder)
         if known["key"] != self._key:
             other = "another version" if known["version"] != __version__ else "another sweep, or other code or robots"
-            raise OutputError(f"holds results of {other}", where=str(self.folder), hint="choose another --out")
+            raise OutputError(f"holds results of {other}", where=str(self.folder), hint="choose another `out`")
         with builtins.open(manifest, "rb") as held:
             try:
                 fcntl.flock(held, fcntl.LOCK_EX | fcntl.LOCK_NB)
@@ -92,7 +92,7 @@ class Atlas:
                 raise OutputError(
                     "is in use by another process",
                     where=str(self.folder),
-                    hint="wait for it, or choose another --out",
+                    hint="wait for it, or choose another `out`",
                 ) from None
             except OSError:
                 # This file system knows no locks.

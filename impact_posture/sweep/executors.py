@@ -53,7 +53,7 @@ def dask_cluster(address: str) -> Iterator[Executor]:
     except (OSError, ValueError) as error:
         raise InputError(
             f"no Dask scheduler answers ({error})",
-            where=f"--scheduler {address}",
+            where=f"scheduler {address}",
             hint="start one, or correct the address",
         ) from None
     with client:
@@ -71,7 +71,7 @@ def mpi_ranks() -> Iterator[Executor]:
     try:
         from mpi4py.futures import MPIPoolExecutor
     except (ImportError, RuntimeError) as error:
-        raise InputError(f"MPI cannot be loaded ({error})", where="--mpi", hint="install an MPI library") from None
+        raise InputError(f"MPI cannot be loaded ({error})", where="mpi", hint="install an MPI library") from None
     with MPIPoolExecutor() as pool:
         yield pool
 
@@ -93,9 +93,7 @@ class SlurmJobs(Executor):
             try:
                 self._executor(Path(place))
             except (NameError, TypeError, ValueError, AssertionError) as error:
-                raise InputError(
-                    str(error), where="--slurm", hint="name parameters of submitit.AutoExecutor"
-                ) from None
+                raise InputError(str(error), where="slurm", hint="name parameters of submitit.AutoExecutor") from None
         self._waiting = ThreadPoolExecutor(1 << 10)
 
     def _executor(self, folder: Path) -> Any:
@@ -134,6 +132,6 @@ def parse_options(texts: Sequence[str]) -> dict[str, Any]:
     for text in texts:
         key, _, value = text.partition("=")
         if not (key.isidentifier() and value):
-            raise InputError(f"'{text}' is no KEY=VALUE", where="--slurm", hint="give for example timeout_min=60")
+            raise InputError(f"'{text}' is no KEY=VALUE", where="slurm", hint="give for example timeout_min=60")
         found[key] = int(value) if value.isdecimal() else value
     return found
