@@ -70,10 +70,9 @@ def write_comparison(output: Output, found: Reproduction, store: Store) -> str:
     with whole_folder(output.folder, force=output.force, kind="comparison") as folder:
         write_json(folder / COMPARISON, found.comparison())
         draw_side_by_side(found.shown, store, folder, output.formats)
-        failure = ""
-        if output.report:
-            keep_runs(folder, found.shown, store)
-            failure = try_report(folder, found.shown[0].scenario, meshes=output.meshes)
+        keep_runs(folder, found.shown, store)
+        scenario = found.shown[0].scenario
+        failure = try_report(folder, scenario, meshes=output.meshes) if output.report else ""
     store.remove()
     return failure
 

@@ -5,6 +5,7 @@ from __future__ import annotations
 import json
 import shlex
 from collections.abc import Iterable, Mapping, Sequence
+from contextlib import suppress
 from dataclasses import fields, replace
 from pathlib import Path
 from typing import Any
@@ -18,7 +19,7 @@ from impact_posture.experiment.batch import Store
 from impact_posture.experiment.jobs import Document, Job, controller_factory
 from impact_posture.impact.contact import point_on
 from impact_posture.impact.objective import ImpactObjective
-from impact_posture.output_folder import typed_command
+from impact_posture.output_folder import typed_command, write_json
 from impact_posture.plot.run_view import RunView, run_header
 from impact_posture.plot.view import number
 from impact_posture.report.page import Content, Table, write_page
@@ -56,6 +57,8 @@ _MOVES = (
 def keep_runs(folder: Path, jobs: Sequence[Job], store: Store) -> None:
     """Write the document and the ticks that a report shows of each stored job into ``runs/`` of a comparison.
 
+    A run whose state runs away at once is left out.
+
     Raises:
         OSError: They cannot be written.
     """
@@ -64,9 +67,10 @@ def keep_runs(folder: Path, jobs: Sequence[Job], store: Store) -> None:
         found = kept_run(job, store)
         if found is not None:
             (document, series), path = found, folder / RUNS / _stem(job.label)
-            path.with_name(f"{path.name}.json").write_text(json.dumps(document, indent=1) + "\n", encoding="utf-8")
             part = document["runs"][0]
-            thin(series, _windows(part)).save(_series(path, part["sign"]))
+            with suppress(InputError):
+                thin(series, _windows(part)).save(_series(path, part["sign"]))
+                write_json(path.with_name(f"{path.name}.json"), document)
 
 
 def kept_run(job: Job, store: Store) -> tuple[Document, Series] | None:
@@ -127,6 +131,8 @@ def write_run_report(folder: Path, scenario: str = "", *, meshes: bool = False) 
             for stem in (_stem(row["controller"]) for row in document["rows"]):
                 if (folder / RUNS / f"{stem}.json").is_file():
                     runs += _runs(_read(folder / RUNS / f"{stem}.json"), folder / RUNS / stem, scenario, 1)
+            if not runs:
+                raise SpecError("holds no run to show", where=str(folder), hint="see the status in comparison.json")
             content = _comparison_content(folder, document, runs[0][0])
         return write_page(folder, content, run_scene(runs, meshes=meshes))
     except _BROKEN as error:

@@ -105,7 +105,7 @@ def test_simulate_a_robot_that_falls(falls: Path, tmp_path: Path) -> None:
 
 
 def test_compare_robots_that_fall(falls: Path, tmp_path: Path) -> None:
-    options = "--controllers nominal,stiff --seeds 1 --out both --format png --quiet".split()
+    options = "--controllers nominal,stiff --seeds 1 --out both --format png --quiet --no-report".split()
     done = start("compare", str(falls), *options, cwd=tmp_path)
     assert (done.returncode, done.stderr) == (0, "")
     rows = [line.split() for line in done.stdout.splitlines()]
@@ -116,6 +116,14 @@ def test_compare_robots_that_fall(falls: Path, tmp_path: Path) -> None:
     for row in found["rows"]:
         assert (row["status"], row["runs"], row["completed"]) == ("fell", 1, 0)
         assert row["metrics"] == {} and row["reduction"] is None and len(row["failed"]) == 1
+    # The page can be written later.
+    assert not (tmp_path / "both" / "report.html").exists()
+    done = start("report", "both", "--quiet", cwd=tmp_path)
+    assert (done.returncode, done.stderr) == (0, "") and "(fell)" in (tmp_path / "both" / "report.html").read_text()
+    for path in (tmp_path / "both" / "runs").iterdir():
+        path.unlink()
+    done = start("report", "both", cwd=tmp_path)
+    assert done.returncode == 1 and "both: holds no run to show" in done.stderr
 
 
 def test_contacts_are_counted_against_what_was_asked_for(capsys: pytest.CaptureFixture[str]) -> None:
