@@ -49,6 +49,14 @@ def test_the_changes_are_those_of_the_predicted_jumps(name: str, friction: float
         assert ("sticking)" if after.coulomb.sticks else "slipping)") in told.line
         assert any("objective='coulomb'" in line for line in told.advice) == (expected in ("worse", "no better"))
         assert any("max_force" in line for line in told.advice) == (expected == "better at the price of force")
+        assert told.before is not None and told.after is not None
+        for side, found in ((told.before, before), (told.after, after)):
+            assert found.coulomb is not None and found.compression is not None
+            assert (side.jump, side.impulse) == (found.coulomb.norm, found.coulomb.impulse_size)
+            assert (side.peak_force, side.sticks) == (found.compression.peak_force, found.coulomb.sticks)
+        assert told.assumptions[0] == f"rigid impact at 0.6 m/s with restitution 0 and friction {friction:g}"
+        assert ("the feet stay on the ground" in told.assumptions) == bool(impact.objective.supports)
+        assert told.assumptions[-1] == "peak force of the stated contact, without friction"
 
 
 def test_a_posture_against_itself() -> None:
@@ -62,6 +70,7 @@ def test_there_is_none_without_a_speed() -> None:
     impact = resolved("panda", speed=0.0)
     told = verdict(impact, impact.evaluate(), impact.evaluate())
     assert told.outcome == "unknown" and "no approach speed" in told.line
+    assert told.to_dict()["before"] is None and told.to_dict()["assumptions"] == []
 
 
 def test_the_joint_model_that_fits_has_its_say() -> None:
@@ -129,6 +138,8 @@ def test_the_command_says_it_first(tmp_path: Path) -> None:
     assert document["metric"]["objective"] == "coulomb" and document["notes"][0].startswith("objective coulomb")
     told = np.array([document[name]["jump"]["coulomb"]["norm"] for name in ("initial", "optimal")])
     assert document["verdict"]["jump"] == pytest.approx(told[1] / told[0] - 1)
+    assert [document["verdict"][side]["jump"] for side in ("before", "after")] == told.tolist()
+    assert document["verdict"]["before"]["peak_force"] is None and document["verdict"]["after"]["sticks"] is not None
     free = ("--starts", 2, "--no-collision", "--no-holdable", "--no-codegen", "--out", tmp_path / "talos")
     paper = run("optimize", "talos", "--normal", -1, 0, 0, *free)
     assert "verdict: worse." in paper.stdout and "--objective coulomb minimizes this jump" in paper.stdout

@@ -23,6 +23,27 @@ _SAME = 0.01
 
 
 @dataclass(frozen=True)
+class PredictedImpact:
+    """What the impact at the stated approach speed does in a posture.
+
+    Attributes:
+        jump: ``‖Δν‖_W``.
+        impulse: Size of the impulse, N·s.
+        peak_force: Peak force without friction, N; ``None`` where no contact is stated.
+        sticks: Whether the contact point sticks; ``None`` of a jump without friction.
+    """
+
+    jump: float
+    impulse: float
+    peak_force: float | None
+    sticks: bool | None
+
+    def to_dict(self) -> dict[str, object]:
+        """Return JSON content."""
+        return json_block(self)
+
+
+@dataclass(frozen=True)
 class Verdict:
     """What the optimal posture changes at the stated approach speed, with the stated friction.
 
@@ -33,6 +54,9 @@ class Verdict:
         impulse: Relative change of the size of the impulse.
         peak_force: Relative change of the peak force without friction.
         advice: The jump without friction, what would do better, or which joint model fits; one line each.
+        before: The impact in the initial posture; ``None`` where it is not known.
+        after: The impact in the optimal posture.
+        assumptions: What the numbers assume, one line each.
     """
 
     outcome: Outcome
@@ -41,10 +65,13 @@ class Verdict:
     impulse: float | None
     peak_force: float | None
     advice: tuple[str, ...]
+    before: PredictedImpact | None = None
+    after: PredictedImpact | None = None
+    assumptions: tuple[str, ...] = ()
 
     def to_dict(self) -> dict[str, object]:
         """Return JSON content."""
-        return json_block(self) | {"advice": list(self.advice)}
+        return json_block(self)
 
 
 def verdict(impact: ResolvedImpact, before: Evaluation, after: Evaluation) -> Verdict:
@@ -77,7 +104,27 @@ def verdict(impact: ResolvedImpact, before: Evaluation, after: Evaluation) -> Ve
         *_better_objective(impact, outcome, (pair[0], pair[1])),
         *_other_joint_model(impact, before, after),
     )
-    return Verdict(outcome, line, jump, impulse, force, advice)
+    sides = _predicted(before, pair[0]), _predicted(after, pair[1])
+    return Verdict(outcome, line, jump, impulse, force, advice, *sides, _assumptions(impact, after, force))
+
+
+def _predicted(found: Evaluation, jump: Jump) -> PredictedImpact:
+    # The force of several contacts at once is not known.
+    peak = None if found.contacts or found.compression is None else found.compression.peak_force
+    return PredictedImpact(jump.norm, jump.impulse_size, peak, jump.sticks if isinstance(jump, CoulombJump) else None)
+
+
+def _assumptions(impact: ResolvedImpact, after: Evaluation, force: float | None) -> tuple[str, ...]:
+    friction = f"friction {impact.contact.friction:g}" if isinstance(_jump(after), CoulombJump) else "no friction"
+    # Of several contacts at once, the impact is plastic.
+    restitution = 0.0 if after.together else impact.restitution
+    stated = "the stated contact" if impact.contact_stiffness else "a linear contact, the same before and after"
+    return (
+        f"rigid impact at {impact.speed:g} m/s with restitution {restitution:g} and {friction}",
+        f"jump in the {impact.objective.metric.kind} metric, with joint model '{impact.robot.joint_model}'",
+        *(("the feet stay on the ground",) if impact.objective.supports else ()),
+        *((f"peak force of {stated}, without friction",) if force is not None else ()),
+    )
 
 
 def _jump(found: Evaluation) -> Jump | None:
