@@ -19,6 +19,7 @@ from impact_posture.impact.evaluation import evaluate
 from impact_posture.impact.impulse_box import ImpulseBox, WorstImpulses, corners
 from impact_posture.impact.metric import Metric
 from impact_posture.impact.objective import ImpactObjective
+from impact_posture.posture.clearance import Clearance
 from impact_posture.posture.kept_feet import KeptFeet
 from impact_posture.posture.problem import PostureProblem
 from impact_posture.posture.problem_settings import dump_settings, prepare, read_settings, resolved_settings
@@ -320,6 +321,28 @@ def test_struck_feet_that_are_balls_are_held_in_place_only() -> None:
     problem = problem_of({k: v for k, v in TASKS["two feet"].items() if k != "contact_pose"})
     names = [c.name for c in problem.constraints]
     assert "position of FL_FOOT" in names and "pose of FL_FOOT" not in names
+
+
+HANDS = ("gripper_right_base_link", "gripper_left_base_link")
+
+
+@pytest.mark.parametrize(
+    ("normals", "stops"),
+    [
+        (("-1,0,0", "-1,0,0"), False),
+        # The left hand meets another surface, and stays clear of that of the right one.
+        (("-1,0,0", "0,1,0"), True),
+    ],
+)
+def test_two_hands_at_one_wall_may_both_touch_it(normals: tuple[str, str], stops: bool) -> None:
+    contacts = tuple(f"{hand}:{normal}" for hand, normal in zip(HANDS, normals, strict=True))
+    problem = problem_of({"robot": "talos", "contact": contacts, "collision": True})
+    (wall,) = [c for c in problem.constraints if c.name == f"surface at {HANDS[0]}"]
+    assert isinstance(wall, Clearance)
+    bodies = [wall.row_name(k).split(" / ")[0] for k in range(len(wall.lower))]
+    assert "torso_2_link" in bodies and any("arm_left_5" in name for name in bodies)
+    assert not any("gripper_right" in name for name in bodies)
+    assert any("gripper_left" in name for name in bodies) == stops
 
 
 def test_kept_feet_of_each_impact() -> None:

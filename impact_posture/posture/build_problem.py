@@ -142,7 +142,7 @@ def _surroundings(
             width = float("inf") if requirements.surface == "plane" else requirements.surface
             points = [point_on(objective.robot, foot.frame, foot.offset) for foot in objective.supports]
             points += [point_on(objective.robot, other.frame, other.offset) for other in objective.contacts]
-            found.add_surface(contact, width if width is None else float(width), points)
+            found.add_surface(contact, width if width is None else float(width), points, objective.contacts)
     found.add_obstacles(requirements.obstacles)
     return found
 

@@ -27,6 +27,8 @@ from impact_posture.settings import PATCH
 
 # A contact point this near (m) to a plane lies in it.
 _BESIDE = 0.03
+# Least cosine between the normals of contacts at the same surface.
+_PARALLEL = 0.999
 # A body that cannot move and lies this far (m) behind the plane of the surface shows that the surface ends before it.
 _BEHIND = 1e-3
 
@@ -80,18 +82,26 @@ class Surroundings:
         body = Body("ground", None, PointOnLink(0, np.array([0.0, 0.0, height]), np.eye(3)), normal=up)
         self._walls.append(_Wall(body, exempt))
 
-    def add_surface(self, contact: ImpactContact, width: float | None, touching: Sequence[PointOnLink] = ()) -> None:
+    def add_surface(
+        self,
+        contact: ImpactContact,
+        width: float | None,
+        touching: Sequence[PointOnLink] = (),
+        others: Sequence[ImpactContact] = (),
+    ) -> None:
         """Put the surface behind a contact: the whole plane, or a square patch of it.
 
         The plane passes through the contact point, or behind the link of the contact (with what held joints fix to
         it) if that reaches farther at the given posture.  This link may touch it, and so may a link whose own contact
-        lies in the plane, such as a foot beside the one that is struck.  The surface is a patch as well if a foot or
-        a fixed base lies behind the plane, because then it ends before it reaches there.
+        lies in the plane, such as a foot beside the one that is struck, or that meets the same surface, such as the
+        other hand at a wall.  The surface is a patch as well if a foot or a fixed base lies behind the plane, because
+        then it ends before it reaches there.
 
         Args:
             contact: The contact.
             width: Edge length of the patch, m; infinite for the plane, ``None`` to decide.
             touching: Contact points of feet and of other impacts.
+            others: Contacts that act at the same time.
         """
         point = point_on(self.robot, contact.frame, contact.offset)
         turns = contact.normal_frame == "contact"
@@ -99,11 +109,15 @@ class Surroundings:
         name = f"surface at {contact.frame}"
         exempt = self._rigid([point.joint])
         own = [b for b in self._bodies if b.point.joint in exempt]
-        plane = Body(name, None, point, turns, n)
-        depth = max([0.0, *[-self._height(body, plane) for body in own]])
+        through = Body(name, None, point, turns, n)
+        depth = max([0.0, *[-self._height(body, through) for body in own]])
         self._depths[contact] = depth
-        plane = replace(plane, offset=-depth)
+        plane = replace(through, offset=-depth)
         beside = [p.joint for p in touching if abs(self._above(p, plane)) < _BESIDE]
+        # Links of the same kind reach equally far behind their contact points, where the surface is.
+        facing = [c for c in others if not turns and c.normal_frame == "world" and n @ c.normal > _PARALLEL]
+        level = [point_on(self.robot, c.frame, c.offset) for c in facing]
+        beside += [p.joint for p in level if abs(self._above(p, through)) < _BESIDE]
         exempt |= self._rigid(beside)
         behind = self._stands_behind(plane, exempt)
         if width is None and behind:
