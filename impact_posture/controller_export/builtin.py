@@ -5,11 +5,17 @@ from __future__ import annotations
 from collections.abc import Callable
 from typing import Literal
 
+import numpy as np
+
 from impact_posture.arrays import Array
+from impact_posture.dynamics.numeric import Numeric
 from impact_posture.errors import InputError
+from impact_posture.impact.contact import point_on
 from impact_posture.impact.objective import ImpactObjective
 from impact_posture.robot.robot import Robot
+from impact_posture.tsid.frame_tasks import EndEffector, FrameAligned, FramePose, FramePosition
 from impact_posture.tsid.impact_robust import ImpactRobustPosture
+from impact_posture.tsid.points import Point
 from impact_posture.tsid.posture_tasks import JointPosture
 from impact_posture.tsid.reference_flow_posture import ReferenceFlowPosture
 from impact_posture.tsid.task_formulation import (
@@ -20,17 +26,17 @@ from impact_posture.tsid.task_formulation import (
 )
 
 ControllerKind = Literal["aerial", "legged", "arm"]
-_BUILD: dict[str, Callable[[Robot, JointPosture], TaskFormulation]] = {
-    "aerial": aerial_formulation,
-    "legged": legged_formulation,
-    "arm": arm_formulation,
-}
+_BUILD: dict[str, Callable[..., TaskFormulation]] = {"aerial": aerial_formulation, "arm": arm_formulation}
+_TIP_KP = 60.0
 
 
 def default_formulation(
     robot: Robot, kind: ControllerKind, objective: ImpactObjective | None = None, *, flow: bool = False
 ) -> TaskFormulation:
     """Return the formulation of a kind of robot with default gains.
+
+    Of the end effector of ``aerial`` and ``arm``, the task holds what ``optimize`` holds by default, so that the same
+    redundancy is left.
 
     Args:
         robot: The robot.
@@ -39,7 +45,7 @@ def default_formulation(
         flow: Follow it by a reference flow, and not by the impact-robust term.
 
     Raises:
-        InputError: The robot is of another kind.
+        InputError: The robot is of another kind, or nothing names its end effector.
     """
     # The posture of a robot that stands is light beside the tasks of its center of mass and base (10 and 1).
     kp, weight, base = (20.0, 0.1, 0.0) if kind == "legged" else (10.0, 1.0, None)
@@ -54,7 +60,45 @@ def default_formulation(
         law = ReferenceFlowPosture if flow else ImpactRobustPosture
         posture = law(robot, gradient, kp=kp, weight=weight, base_weight=base)
     try:
-        return _BUILD[kind](robot, posture)
+        if kind == "legged":
+            return legged_formulation(robot, posture)
+        return _BUILD[kind](robot, posture, end_effector=_end_effector(robot, objective))
     except InputError as error:
-        fits = "legged" if robot.spec.supports else "aerial" if robot.spec.propulsion else "arm"
-        raise InputError(error.what, where=error.where, hint=f"try `kind='{fits}'`") from None
+        raise InputError(error.what, where=error.where, hint=_hint(robot, kind, error)) from None
+
+
+def _end_effector(robot: Robot, objective: ImpactObjective | None) -> EndEffector | None:
+    """Return the task of the frame that an impact meets, else of the default contact frame; ``None`` without one.
+
+    It has the rows of the frame's default pose mode.  Without an impact there is no normal to align with, so the task
+    holds the whole pose.  A frame whose pose is free is pushed, so the task holds the default contact frame.
+    """
+    frame, offset = robot.spec.contact.frame, robot.spec.contact.offset
+    aligned = None
+    if objective is not None and robot.contact_pose(objective.contact.frame) != "free":
+        contact = objective.contact
+        frame, offset = contact.frame, contact.offset
+        aligned = np.array(contact.normal)
+        if contact.normal_frame == "world":
+            placed = Numeric(robot.model).at(robot.posture()).placement(point_on(robot, frame))
+            aligned = placed.rotation.T @ aligned
+    if frame is None:
+        return None
+    point, pose = Point(frame, offset), robot.contact_pose(frame)
+    if pose in ("position", "box"):
+        return FramePosition(point, kp=_TIP_KP)
+    if pose == "aligned" and aligned is not None:
+        return FrameAligned(point, aligned, kp=_TIP_KP)
+    return FramePose(point, kp=_TIP_KP)
+
+
+def _hint(robot: Robot, kind: ControllerKind, error: InputError) -> str:
+    """Return which kind the robot is, or what its data lack for the one that was given."""
+    if robot.floating and not robot.spec.supports and robot.spec.propulsion is None:
+        return "name [propulsion] or [[supports]] in robot.toml"
+    fits = "legged" if robot.spec.supports else "aerial" if robot.spec.propulsion else "arm"
+    if fits != kind:
+        return f"try `kind='{fits}'`"
+    if robot.spec.contact.frame is None:
+        return "give `frame` and `normal`, or name contact.frame in robot.toml"
+    return error.hint or ""
