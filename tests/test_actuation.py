@@ -184,6 +184,7 @@ def test_coplanar_rotors_hover_but_cannot_push_sideways(model: pin.Model) -> Non
     assert result.feasible, result.violations
     force = lateral_force_range(model, spec, q)
     assert force.forward == pytest.approx(0.0, abs=1e-6)
+    assert not any(np.signbit([force.forward, force.backward, force.left, force.right])), "prints -0"
 
 
 def test_tilted_base_with_coplanar_rotors_does_not_hover(model: pin.Model) -> None:

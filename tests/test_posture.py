@@ -17,7 +17,7 @@ from impact_posture.posture.certificate import certify, nonnegative_least_square
 from impact_posture.posture.null_space_path import null_space_path
 from impact_posture.posture.problem import RANK_TOLERANCE, PostureProblem, equality_jacobian, rank
 from impact_posture.posture.problem_settings import dump_settings, prepare, read_settings, resolved_settings
-from impact_posture.posture.solve import PostureSolution, distinct, solve
+from impact_posture.posture.solve import Optimum, PostureSolution, distinct, hits_of_best, solve
 from impact_posture.posture.starts import Projector, StartDraw, feasible_start
 from impact_posture.settings import ProblemSettings
 from tests.settings import make_settings
@@ -382,3 +382,9 @@ def test_an_option_replaces_what_the_file_says_in_other_words(
 def test_listed_weights_need_the_weighted_metric(tmp_path) -> None:
     with pytest.raises(InputError, match="metric is kinetic"):
         prepare(make_settings({"robot": "panda", "normal": (0, 0, 1), "metric": "kinetic", "weights": (1.0,) * 9}))
+
+
+def test_equal_optima_at_different_postures_count_together() -> None:
+    far, near = np.zeros(3), np.ones(3)
+    assert hits_of_best((Optimum(far, 0.5, 1), Optimum(near, 0.5 + 1e-9, 3), Optimum(near, 0.6, 9))) == 4
+    assert hits_of_best((Optimum(far, 0.5, 1), Optimum(near, 0.6, 9))) == 1

@@ -166,7 +166,7 @@ def solve(
         count = len(certified) - len(good)
         notes.append(f"{count} certified postures left out, because original shapes touch there: {touching}")
     dominated = sum(r.dominated for r in runs)
-    if optima[0].hits == 1 and dominated + sum(o.hits for o in optima) >= _MANY:
+    if hits_of_best(optima) == 1 and dominated + sum(o.hits for o in optima) >= _MANY:
         notes.append("only one start ended at the best optimum: more `starts` may find a better one")
     return PostureSolution(
         problem=problem,
@@ -227,6 +227,12 @@ def distinct(problem: PostureProblem, ends: list[tuple[Array, float]]) -> tuple[
         else:
             found.append(Optimum(q, objective, 1))
     return tuple(found)
+
+
+def hits_of_best(optima: Sequence[Optimum]) -> int:
+    """Return how many starts reached the best objective, at any posture: ends on a flat optimum are distinct."""
+    best = optima[0].objective
+    return sum(o.hits for o in optima if o.objective - best <= _SAME_OBJECTIVE * abs(best))
 
 
 def wrapped_difference(problem: PostureProblem, one: Array, other: Array) -> Array:

@@ -231,7 +231,7 @@ def lateral_force_range(model: pin.Model, propulsion: PropulsionSpec, q: ArrayLi
             np.r_[(limits - load[6:])[held], (limits + load[6:])[held]],
             [(low, high)] * count + [(0.0, None)],
         )
-        return float("nan") if found is None else mass * float(found[-1])
+        return float("nan") if found is None else max(0.0, mass * float(found[-1]))  # no -0
 
     return LateralForce(largest(forward), largest(-forward), largest(left), largest(-left))
 

@@ -62,8 +62,9 @@ def armature_warning(model: pin.Model, source: str, held: Sequence[str] = ()) ->
         return ()
     listed = ", ".join(bare[:3]) + (f" and {len(bare) - 3} more" if len(bare) > 3 else "")
     which = "" if len(bare) == len(counted) else f" at {listed}"
+    origin = "" if source == "none" else f" ({source})"
     return (
-        f"armature is zero{which} ({source}). Geared motors usually have some, and H scales like 1/armature² "
+        f"armature is zero{which}{origin}. Geared motors usually have some, and H scales like 1/armature² "
         "where it dominates; give `armature` or robot.toml [armature]",
     )
 
