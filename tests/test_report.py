@@ -341,6 +341,13 @@ def test_primitives_and_robots_without_shapes(tmp_path: Path) -> None:
     sticks = draw_robot(own(tmp_path / "bare", "", visual('<mesh filename="missing.obj"/>')))
     assert len(sticks.parts) == 1 and "sticks" in sticks.notes[-1] and "missing.obj" in sticks.notes[0]
     assert np.ptp(sticks.solids[0].points[:, 2]) >= 0.5
+    # The last stick goes on to the farthest frame of the last link, where contacts are.
+    tool = """<link name="tool"/><joint name="flange" type="fixed"><origin xyz="0.3 0 0"/><parent link="b"/>
+    <child link="tool"/></joint></robot>"""
+    (tmp_path / "tool.urdf").write_text(URDF.format(inertial=INERTIAL, a="", b="").replace("</robot>", tool))
+    sticks = draw_robot(ip.load_robot(str(tmp_path / "tool.urdf")))
+    assert [joint for joint, *_ in sticks.parts] == [0, 1]
+    assert 0.3 < np.ptp(sticks.solids[1].points[:, 0]) < 0.34
 
 
 # ---- in a browser --------------------------------------------------------------------------------------------------

@@ -272,9 +272,11 @@ def _summary(metrics: Mapping[str, Any]) -> str:
 def _comparison_content(folder: Path, document: Document, view: RunView) -> Content:
     rows = document["rows"]
     labels = [str(row["controller"]) for row in rows]
+    # An interval from two seeds is too wide to say anything: its quantile of Student's t is 12.7.
+    intervals = len(document["seeds"]) > 2
     table = [("status", *(str(row["status"]) for row in rows), "", "")]
     for key, unit, meaning in _METRICS:
-        table.append((key, *(_interval(row["metrics"].get(key)) for row in rows), unit, meaning))
+        table.append((key, *(_mean(row["metrics"].get(key), intervals) for row in rows), unit, meaning))
     verdict = []
     for row in rows:
         if row["reduction"] is not None and row["controller"] != "nominal":
@@ -284,7 +286,7 @@ def _comparison_content(folder: Path, document: Document, view: RunView) -> Cont
         f"Within the impact windows, against nominal: {'; '.join(verdict)}." if verdict else "No reduction is known."
     )
     seeds = str(len(document["seeds"]))
-    means = f"Means of {seeds} seeds, with 95 % intervals" if seeds != "1" else "One seed"
+    means = f"Means of {seeds} seeds{', with 95 % intervals' if intervals else ''}" if seeds != "1" else "One seed"
     command = ["impact-posture", "compare", view.scenario, "--controllers", ",".join(labels), "--seeds", seeds]
     return Content(
         title=f"{document['scenario']}: {', '.join(labels)}",
@@ -297,8 +299,9 @@ def _comparison_content(folder: Path, document: Document, view: RunView) -> Cont
     )
 
 
-def _interval(found: Mapping[str, Any] | None) -> str:
+def _mean(found: Mapping[str, Any] | None, interval: bool) -> str:
+    """Return a mean, with half of its interval where that is stated."""
     if found is None:
         return "–"
-    half = "" if found["half_width"] is None else f" ± {number(found['half_width'])}"
+    half = "" if not interval or found["half_width"] is None else f" ± {number(found['half_width'])}"
     return f"{number(found['mean'])}{half}"

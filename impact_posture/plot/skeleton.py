@@ -115,7 +115,7 @@ def build_skeleton(
     done |= {point.joint for point in hanging if np.linalg.norm(point.position) > 1e-3}
     for leaf in range(first, model.njoints):
         if leaf not in done:
-            bones.append((origins[leaf], np.array(places[leaf].act(_tip(model, leaf)))))
+            bones.append((origins[leaf], np.array(places[leaf].act(link_tip(model, leaf)))))
     return Skeleton(
         bones=np.array(bones),
         joints=np.array(origins[first:]).reshape(-1, 3),
@@ -147,7 +147,7 @@ def _placed(places: Sequence[pin.SE3], point: PointOnLink) -> pin.SE3:
     return places[point.joint] * pin.SE3(point.rotation, point.position)
 
 
-def _tip(model: pin.Model, joint: int) -> Array:
+def link_tip(model: pin.Model, joint: int) -> Array:
     """Return the frame of a link that is farthest from its joint, in joint axes; else the center of mass."""
     places = [np.array(f.placement.translation) for f in model.frames if f.parentJoint == joint]
     tip = max(places, key=lambda place: float(np.linalg.norm(place)), default=np.zeros(3))

@@ -19,6 +19,7 @@ from impact_posture.collision.shape_points import Triangles, hull_surface, shape
 from impact_posture.collision.urdf_shapes import UrdfShape, read_urdf_shapes
 from impact_posture.errors import PackageNotFound
 from impact_posture.libraries import source_key
+from impact_posture.plot.skeleton import link_tip
 from impact_posture.robot.robot import Robot
 from impact_posture.robot.urdf import example_robot_data
 from impact_posture.stored_text import StoredArray, read_stored, write_stored
@@ -214,9 +215,12 @@ def _coarser(solid: Solid, bits: int) -> Solid:
 
 
 def _sticks(robot: Robot) -> tuple[list[Solid], list[tuple[int, int, pin.SE3, Color]]]:
-    """Return rods from each joint to the next ones."""
+    """Return rods from each joint to the next ones, and from the last joint of each chain to the tip of its link."""
     model = robot.model
     spans = [(int(model.parents[k]), np.array(model.jointPlacements[k].translation)) for k in range(1, model.njoints)]
+    inner = {parent for parent, _ in spans}
+    tips = [(k, link_tip(model, k)) for k in range(1, model.njoints) if k not in inner]
+    spans += [(k, tip) for k, tip in tips if np.any(tip)]
     ball = shape_points(coal.Sphere(0.02 * max(0.1, *(float(np.linalg.norm(span)) for _, span in spans))))
     rods = [hull_of(np.vstack([ball, ball + span])) for _, span in spans]
     return rods, [(parent, k, pin.SE3.Identity(), _GRAY) for k, (parent, _) in enumerate(spans)]

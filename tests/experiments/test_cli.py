@@ -181,6 +181,7 @@ def test_compare(aerial: Path, tmp_path: Path) -> None:
     page = (tmp_path / "both" / "report.html").read_text()
     assert "default-src 'none'" in page and len(page) < 2e6
     assert all(f'<option value="{k}">{name}</option>' in page for k, name in enumerate(("nominal", "robust")))
+    assert "Means of 2 seeds</caption>" in page and "±" not in page, "intervals from 3 seeds on, as on the terminal"
 
 
 def test_reproduce(tmp_path: Path) -> None:
