@@ -18,6 +18,8 @@ from impact_posture.tsid.controller import Controller
 from impact_posture.tsid.frame_tasks import FrameAligned, FramePose, FramePosition, FrameTask
 from impact_posture.tsid.impact_robust import ImpactRobustPosture
 from impact_posture.tsid.task_formulation import TaskFormulation
+from tests.command import run
+from tests.daqp import sources_or_skip
 
 INERTIAL = '<inertial><mass value="1"/><inertia ixx="1" iyy="1" izz="1" ixy="0" ixz="0" iyz="0"/></inertial>'
 BARE_ARM = f"""<robot name="bare"><link name="base">{INERTIAL}</link><link name="arm">{INERTIAL}</link>
@@ -101,3 +103,29 @@ def test_a_floating_robot_without_rotors_and_feet_is_no_kind(kind: ControllerKin
     (tmp_path / "robot.toml").write_text('[model]\nroot = "free-flyer"\n')
     with pytest.raises(InputError, match="propulsion"):
         default_formulation(load_robot(str(tmp_path / "bare.urdf")), kind)
+
+
+SCENARIO = """name = "mine"
+robot = "bare.urdf"
+surfaces = [{ name = "wall", normal = [0, -1, 0], gap = 0.01 }]
+shapes = [{ frame = "arm", size = [0.01], offset = [1, 0.01, 0] }]
+contacts = { frame = "arm", surface = "wall", speed = 0.1 }
+[control]
+end_effector = { kp = 100, pose = "position" }
+posture = { kp = 10 }
+robust = { gain = 20 }
+"""
+
+
+def test_a_scenario_is_of_the_urdf_that_both_name(tmp_path: Path) -> None:
+    pytest.importorskip("mujoco", reason="mujoco is not installed (the extra 'sim')")
+    sources_or_skip()
+    (tmp_path / "bare.urdf").write_text(BARE_ARM)
+    (tmp_path / "mine.toml").write_text(SCENARIO)
+    (tmp_path / "other.urdf").write_text(BARE_ARM)
+    asked = ["--controller", "arm", "--scenario", str(tmp_path / "mine.toml"), "--out", str(tmp_path / "out")]
+    refused = run("codegen", str(tmp_path / "other.urdf"), *asked)
+    assert refused.returncode == 2 and "is of bare" in " ".join(refused.stderr.split())
+    done = run("codegen", str(tmp_path / "bare.urdf"), *asked)
+    assert done.returncode == 0, done.stderr
+    assert (tmp_path / "out" / "bare_controller.h").is_file()

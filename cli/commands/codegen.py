@@ -140,7 +140,8 @@ def _controller_parts(
         if given.values:
             raise UsageError(f"--{next(iter(given.values))} contradicts --scenario, which has robot and impact.")
         setup = set_up(read_scenario(scenario))
-        if setup.robot.name != robot:
+        known = {setup.robot.name, setup.robot.source}
+        if robot not in known and Path(robot).resolve() != Path(setup.robot.source).resolve():
             raise UsageError(f"The scenario {scenario} is of {setup.robot.name}, not of {robot}.")
         factory = ControllerFactory(setup, gradient_of=interpreted)
         driver = factory.driver("robust-flow" if flow else "robust")

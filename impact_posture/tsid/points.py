@@ -70,7 +70,8 @@ class PointKinematics:
         """
         model, nv, count = robot.model, robot.nv, len(points)
         frames = [model.frames[robot.frame_id(point.frame)] for point in points]
-        self._J, self._dJ_transposed = data.J, data.dJ.T
+        # Pinocchio gives vectors for a robot with one degree of freedom.
+        self._J, self._dJ_transposed = data.J.reshape(6, nv), data.dJ.reshape(6, nv).T
         mask = np.zeros((count, nv))
         for k, frame in enumerate(frames):
             for joint in model.supports[frame.parentJoint]:
