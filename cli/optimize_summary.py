@@ -62,7 +62,7 @@ def summarize(page: Page, prepared: Prepared, solution: PostureSolution, documen
     ]
     page.table(("", *blocks, "unit", "meaning"), rows, right=(1, 2))
     frames = contact_names(impact.objective.contacts)
-    alone_line(page, frames, "H, G, V, S, E")
+    alone_line(page, frames, ", ".join(row[0].strip() for row in rows if row[0].strip() != "objective"))
     worst_tables(page, frames, blocks)
     page.gap()
     worst_lines(page, frames, blocks)

@@ -124,6 +124,14 @@ def test_auto_with_several_contacts() -> None:
     assert resolve(chosen).objective.kind == "impulse"
 
 
+def test_several_contacts_come_at_once() -> None:
+    contacts = ("gripper_right_base_link:-1,0,0", "gripper_left_base_link:-1,0,0")
+    impact = resolve(make_settings({"robot": "talos", "contact": contacts}))
+    told = verdict(impact, impact.evaluate(), impact.evaluate())
+    assert ", all contacts at once, the jump stays" in told.line
+    assert "the impulse at gripper_right_base_link stays" in told.line
+
+
 def test_the_command_says_it_first(tmp_path: Path) -> None:
     out = tmp_path / "out"
     done = run(

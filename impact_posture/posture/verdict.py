@@ -94,10 +94,15 @@ def verdict(impact: ResolvedImpact, before: Evaluation, after: Evaluation) -> Ve
     elif jump > -_SAME:
         outcome = "no better"
     parts = [f"the jump {_words(jump)} ({pair[0].norm:.3g} to {pair[1].norm:.3g}{_slip(pair[1])})"]
-    parts.append(f"the impulse {_words(impulse)} ({pair[0].impulse_size:.3g} to {pair[1].impulse_size:.3g} N·s)")
+    where = f" at {impact.contact.frame}" if after.together else ""
+    parts.append(
+        f"the impulse{where} {_words(impulse)} ({pair[0].impulse_size:.3g} to {pair[1].impulse_size:.3g} N·s)"
+    )
     if force is not None:
         parts.append(f"the peak force {_words(force)}{_newtons(before, after)}")
     contact = f"with friction {impact.contact.friction:g}" if isinstance(pair[1], CoulombJump) else "without friction"
+    if after.together:
+        contact += ", all contacts at once,"
     line = f"verdict: {outcome}. At {impact.speed:g} m/s {contact} {', '.join(parts[:-1])} and {parts[-1]}."
     advice = (
         *_without_friction(before, after, jump),
