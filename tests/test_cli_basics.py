@@ -117,9 +117,10 @@ def test_inspect_has_it_all() -> None:
 
 
 def test_inspect_pages_fit_the_terminal() -> None:
-    for name in ("tilthex_arm", "talos"):
+    for name in ("panda", "tilthex_arm", "talos"):
         page = start("inspect", name)
         assert page.returncode == 0
+        assert ("fixed to the world" in page.stdout) == (name == "panda")
         assert max(len(line) for line in page.stdout.splitlines()) <= 80
     assert "left_sole_link (surface)" in page.stdout
     assert "half_sitting" in page.stdout

@@ -73,7 +73,7 @@ def _write(robot: str, load: LoadOptions, out: str, *, force: bool, json: bool, 
     if not quiet:
         page.line("Check what was guessed:")
         page.table((), [("  -", line) for line in dict.fromkeys(draft.guesses)])
-        page.line("Options that this file answers are no longer needed:")
+        page.line("Then optimize, without the options that this file answers:")
         beside = path.name == "robot.toml" and path.parent == Path(robot).parent
         config = "" if beside else f" --config {path}"
         # This line is not wrapped, because users copy it.
@@ -83,10 +83,12 @@ def _write(robot: str, load: LoadOptions, out: str, *, force: bool, json: bool, 
 def _head(page: Page, summary: dict[str, Any]) -> None:
     contact, supports = summary["contact"], summary["supports"]
     page.title(summary["name"], summary["description"])
+    # The root link does not move then.  A forgotten `root = "free-flyer"` shows here.
+    fixed = ", without what is fixed to the world" if summary["root"] == "fixed" else ""
     rows = [
         ("model", summary["source"]),
         ("root", f"{summary['root']}; nq {summary['nq']}, nv {summary['nv']}"),
-        ("mass", f"{summary['mass']:.4g} kg"),
+        ("mass", f"{summary['mass']:.4g} kg{fixed}"),
         ("armature from", summary["armature_source"]),
         ("contact frame", _contact(contact)),
     ]
