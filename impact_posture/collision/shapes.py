@@ -19,7 +19,7 @@ from impact_posture.progress import tell
 from impact_posture.robot.robot import Robot
 from impact_posture.stored_text import StoredArray, read_stored, write_stored
 
-NO_SHAPES = "the robot has no shapes, so collisions are checked by joint origins only"
+NO_SHAPES = "the robot has no shapes, so nothing keeps its links apart; joint origins are checked at the end"
 
 
 @dataclass(frozen=True, eq=False)

@@ -16,7 +16,7 @@ from impact_posture.posture.compiled import CompileMode
 from impact_posture.posture.result import versions
 from impact_posture.simulation.controller_factory import ControllerFactory, Mode
 from impact_posture.simulation.metrics import Metrics, measure
-from impact_posture.simulation.outcome import gravest, judge
+from impact_posture.simulation.outcome import gravest, judge, links_behind
 from impact_posture.simulation.prediction import predict
 from impact_posture.simulation.run import Run, run
 from impact_posture.simulation.scenario import set_up
@@ -141,7 +141,7 @@ def execute(job: Job, factory: ControllerFactory | None = None) -> tuple[tuple[R
         "runs": parts,
         "offline": None if offline is None else offline.to_dict(),
         "path": factory.path.to_dict() if job.controller.removesuffix("-stiff") == "path" else None,
-        "warnings": factory.warnings,
+        "warnings": [*factory.warnings, *(links_behind(factory.setup, found) if completed else ())],
         "model_sha256": factory.setup.robot.model_sha256,
         "versions": versions() | {"mujoco": str(import_mujoco().__version__)},
     }

@@ -10,6 +10,7 @@ import numpy as np
 import pinocchio as pin
 from scipy import ndimage
 
+from impact_posture.arrays import Array
 from impact_posture.simulation.recorder import feet_of
 from impact_posture.simulation.run import Run
 from impact_posture.simulation.scenario import Setup
@@ -18,6 +19,8 @@ from impact_posture.simulation.series import Flags, Series
 # Each is graver than the one before.
 Outcome = Literal["completed", "lost contact", "control lost", "fell"]
 OUTCOMES: tuple[Outcome, ...] = get_args(Outcome)
+# Every so many ticks of a run is looked at, and a joint origin so far behind a surface (m) is no longer contact.
+_EVERY, _DEEP = 25, 0.02
 
 
 @dataclass(frozen=True)
@@ -38,6 +41,33 @@ class Event:
 def gravest(found: Iterable[Outcome]) -> Outcome:
     """Return the gravest status, or ``completed`` if there is none."""
     return max(found, key=OUTCOMES.index, default="completed")
+
+
+def links_behind(setup: Setup, runs: Iterable[Run]) -> tuple[str, ...]:
+    """Return a warning about each surface that links without a shape went through, because nothing stops these links.
+
+    A joint counts if its origin was more than 2 cm behind the plane, and was in front of it at the start.
+    """
+    robot, built = setup.robot, setup.world.built
+    model, data = robot.model, robot.model.createData()
+    shaped = {int(model.frames[robot.frame_id(s.frame)].parentJoint) for s in setup.scenario.shapes}
+    joints = [k for k in range(1, model.njoints) if k not in shaped]
+    lines = []
+    for name, n in built.normals.items():
+
+        def heights(q: Array, n: Array = n, point: Array = built.points[name]) -> Array:
+            pin.forwardKinematics(model, data, q)
+            return np.array([n @ (data.oMi[k].translation - point) for k in joints])
+
+        start = heights(setup.q)
+        lowest = np.min([heights(q) for run in runs for q in run.series.q[::_EVERY]], axis=0, initial=np.inf)
+        deep = {model.names[k]: -b for k, a, b in zip(joints, start, lowest, strict=True) if a > 0 and b < -_DEEP}
+        if deep:
+            lines.append(
+                f"{', '.join(deep)} went up to {max(deep.values()):.2g} m behind the surface '{name}': these links "
+                "have no shapes that stop them (scenario.toml [[shapes]])"
+            )
+    return tuple(lines)
 
 
 def judge(setup: Setup, run: Run) -> tuple[Event, ...]:

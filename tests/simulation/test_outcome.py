@@ -12,7 +12,7 @@ import pytest
 
 from impact_posture.errors import SpecError
 from impact_posture.simulation.metrics import measure
-from impact_posture.simulation.outcome import Event, judge
+from impact_posture.simulation.outcome import Event, judge, links_behind
 from impact_posture.simulation.recorder import STATUSES
 from impact_posture.simulation.run import Run
 from impact_posture.simulation.scenario import Bounds, Setup, set_up
@@ -55,6 +55,25 @@ def test_tilt_is_measured_from_the_start_and_yaw_is_none(name: str) -> None:
     assert judged(setup, {"q": turned(setup, (1, 0, 0), 59)}) == ()
     (event,) = judged(setup, {"q": turned(setup, (0, 1, 0), -61)})
     assert event.status == "fell" and "tilted beyond 60°" in event.what and event.time == pytest.approx(0.401)
+
+
+def test_links_without_shapes_behind_a_surface_are_told() -> None:
+    setup = factory("aerial-vertical").setup
+    surface = setup.scenario.surfaces[0].name
+    n, point = setup.world.built.normals[surface], setup.world.built.points[surface]
+    data = setup.robot.model.createData()
+    pin.forwardKinematics(setup.robot.model, data, setup.q)
+    elbow = n @ (data.oMi[setup.robot.joint_id("elbow_pitch")].translation - point)
+    for depth, told in ((0.01, False), (0.05, True)):
+        q = np.tile(setup.q, (1000, 1))
+        q[600:700, :3] -= (elbow + depth) * n
+        # The elbow carries the shape, which the surface stops; the joints above it are still in front.
+        assert links_behind(setup, [Run(by_hand(setup, 1000, q=q), ())]) == ()
+        q[600:700, :3] = setup.q[:3] - ((setup.q[:3] - point) @ n + depth) * n
+        found = links_behind(setup, [Run(by_hand(setup, 1000, q=q), ())])
+        assert bool(found) and f"the surface '{surface}'" in found[0] and "shoulder" in found[0]
+        assert ("root_joint" in found[0]) is told
+    assert links_behind(setup, [Run(by_hand(setup, 1000), ())]) == ()
 
 
 @pytest.mark.parametrize("name", SHIPPED)
