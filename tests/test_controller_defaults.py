@@ -94,7 +94,7 @@ def test_an_arm_without_data_needs_the_frame_of_the_impact_only(tmp_path: Path) 
     assert tip(default_formulation(robot, "arm", impact)).point.offset == (1, 0, 0)
     with pytest.raises(InputError, match="no default contact frame") as caught:
         default_formulation(robot, "arm")
-    assert "--frame" in str(caught.value)
+    assert "`frame`" in str(caught.value)
 
 
 @pytest.mark.parametrize("kind", ["aerial", "arm", "legged"])
