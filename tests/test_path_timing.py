@@ -154,6 +154,21 @@ def test_without_a_torque_limit_velocities_count_and_this_is_said() -> None:
     assert motion.t[-1] == pytest.approx(15 / 8 / 10.0, rel=1e-3)
 
 
+def test_a_joint_without_a_torque_limit_leaves_those_of_the_others() -> None:
+    """Of two upright hinges the first has a motor of known torque, and takes the time of bang-bang."""
+    made = arm([Z, Z], [0.0, 0.0], floating=False, rods=[(0.5, 0, 0)] * 2, effort=0.5)
+    made.model.effortLimit = np.array([0.5, 0.0])
+    objective = ImpactObjective(made, ImpactContact(TIP, (0, 1, 0)))
+    space = PathSpace(build_problem(made, objective, made.posture(), Requirements(contact_pose="free")))
+    inertia = float(pin.crba(space.model, space.model.createData(), space.problem.given)[0, 0])
+    curve = PathCurve(space, [space.problem.given + np.array([x, 0.0]) for x in np.linspace(0, 1.0, 6)])
+    limits = limits_of(space)
+    assert limits.names == ("joint_0",) and not limits.missing
+    fastest = timing.timed(space, curve, limits)
+    assert fastest.method == "time-optimal"
+    assert fastest.t[-1] == pytest.approx(2 * np.sqrt(inertia / 0.5), rel=5e-3)
+
+
 def test_a_posture_that_the_motor_cannot_hold_is_named() -> None:
     space = pendulum(0.2, gravity=9.81)
     limits = limits_of(space)

@@ -122,16 +122,19 @@ def time_optimal(space: PathSpace, curve: PathCurve, limits: ActuatorLimits) -> 
     # Joints without a limit get a bound that nothing reaches; the solver takes no infinities.
     bound = np.where(np.isfinite(speed), speed, 1e6)
 
+    # TOPP-RA wants a torque for every joint; that of a joint without a limit stays zero.
+    count, limited = space.model.nv, len(limits.names)
+
     def used(z: Array, v: Array, a: Array) -> Array:
         q = curve.at(z)
         found = limits.shares(q, limits.load(q, v, a))
         assert found is not None  # noqa: S101 (a fixed base balances every load)
-        return found
+        return np.concatenate([found, np.zeros(count - limited)])
 
     constraints = [
         JointVelocityConstraint(np.column_stack([-bound, bound])),
         JointTorqueConstraint(
-            used, np.tile([-1.0, 1.0], (len(limits.names), 1)), np.zeros(len(limits.names)),
+            used, np.tile([-1.0, 1.0], (count, 1)), np.zeros(count),
             discretization_scheme=DiscretizationType.Interpolation,
         ),
     ]  # fmt: skip
