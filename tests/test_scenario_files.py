@@ -14,7 +14,9 @@ import pytest
 from impact_posture.errors import ImpactPostureError, InputError, ScenarioNotFound, SpecError
 from impact_posture.simulation.actuator_command import ActuatorCommand
 from impact_posture.simulation.control import Gains, StanceGains
+from impact_posture.simulation.controller_factory import ControllerFactory
 from impact_posture.simulation.reference import Reference
+from impact_posture.simulation.run import run
 from impact_posture.simulation.scenario import Bounds, RepeatedContacts, Scenario, SinglePush, set_up
 from impact_posture.simulation.scenario_file import known_scenarios, read_scenario
 
@@ -132,6 +134,9 @@ gain = 20
 """
 
 
+LED = f"{OWN}\n[control.end_effector]\npose = 'position'\nkp = 100\n"
+
+
 def write(folder: Path, text: str) -> Path:
     path = folder / "my_scenario.toml"
     path.write_text(text, encoding="utf-8")
@@ -169,6 +174,8 @@ def test_anybodys_urdf_and_scenario_run_from_anywhere(folder: Path, monkeypatch:
         ("speed = 0.2", "speed = -0.2", r"key 'contacts.speed'"),
         ("normal = [0, 0, 2]", "normal = [0, 0]", r"key 'surfaces.0.normal"),
         ("normal = [0, 0, 2]", "normal = [0, 0, 0]", r"surface 'table': the normal has no direction"),
+        ("normal = [0, 0, 2]", "normal = [1e308, 1e308, 1e308]", r"surface 'table': the normal has no direction"),
+        ("[physics]", "[sensors]\ndelay = 1e300\n\n[physics]", r"key 'sensors.delay'"),
         ("timestep = 0.0005", "timestep = 0.005", r"table: solref|stops: solref"),
         ("kp = 10", "kp = [10, 0]", r"key 'control.posture.kp"),
         ('surface = "table"', 'surface = "tabel"', r"key 'contacts.surface': there is no 'tabel'; one of: table"),
@@ -183,6 +190,38 @@ def test_what_is_wrong_in_a_file_is_one_line(folder: Path, old: str, new: str, w
     with pytest.raises(SpecError, match=words) as caught:
         read_scenario(write(folder, OWN.replace(old, new)))
     assert "\n" not in caught.value.line and "my_scenario.toml" in caught.value.line
+
+
+@pytest.mark.parametrize(
+    ("old", "new", "words"),
+    [
+        ("speed = 0.2", "speed = 0.2\ncount = 10000000000000", r"more than 1e\+07 ticks"),
+        ("speed = 0.2", "speed = 0.2\nsettle = 1e12", r"more than 1e\+07 ticks"),
+        ("speed = 0.2", "speed = 0.2\ndwell = 1e308", r"more than 1e\+07 ticks"),
+        ("speed = 0.2", "speed = 1e308", r"takes inf m"),
+        ("[control.posture]", "[control]\nperiod = 1e2\n\n[control.posture]", r"more than 1e\+05 times the physics"),
+        ("[control.posture]", "[control]\nperiod = 30.0\n\n[control.posture]", r"fewer than two ticks"),
+        ("timestep = 0.0005", "timestep = 1e-12", r"more than 1e\+05 times the physics"),
+    ],
+)
+def test_a_run_without_end_is_refused(folder: Path, old: str, new: str, words: str) -> None:
+    needs_mujoco()
+    assert old in OWN
+    factory = ControllerFactory(set_up(read_scenario(write(folder, LED.replace(old, new)))))
+    with pytest.raises(InputError, match=words) as caught:
+        run(factory, "nominal")
+    assert "\n" not in caught.value.line and caught.value.hint
+
+
+def test_a_robot_with_one_joint_runs(folder: Path) -> None:
+    needs_mujoco()
+    setup = set_up(read_scenario(write(folder, OWN)))
+    others = [name for name in setup.robot.joint_names if name != "elbow"]
+    text = LED.replace('robot = "rail_arm.urdf"', f'robot = "rail_arm.urdf"\nlock = {others}'.replace("'", '"'))
+    one = set_up(read_scenario(write(folder, text)))
+    assert one.robot.nv == 1
+    command = ControllerFactory(one).driver("nominal").reset(one.q)
+    assert command.torque.shape == (1,) and np.isfinite(command.torque).all()
 
 
 def test_no_task_is_refused(folder: Path) -> None:

@@ -50,7 +50,8 @@ class Reference:
 
     def __init__(self, task: RepeatedContacts, gap: float) -> None:
         v, a = task.speed, task.acceleration
-        run_up = v**2 / (2 * a)
+        # A product is infinite where a power of Python fails.
+        run_up = v * v / (2 * a)
         if not run_up <= gap:
             raise InputError(
                 f"{v:g} m/s at {a:g} m/s² takes {run_up:.3g} m, the gap is {gap:.3g} m",

@@ -29,6 +29,10 @@ BRACE = 0.1
 _TELL, _TELL_IN_C = 100, 1000
 # Times that differ by less are equal, because sums of periods are not exact, s.
 _SAME = 1e-9
+# Most ticks of a run, nearly three hours at 1 kHz.  A tick of an arm takes about a kilobyte of memory.
+_MOST = 10**7
+# Most physics steps of a tick, which no signal interrupts.
+_MOST_STEPS = 10**5
 
 
 @dataclass(frozen=True, eq=False)
@@ -93,9 +97,10 @@ class _Loop:
         self.setup, self.driver, self.world = setup, driver, setup.world
         self.period, self.ramp = setup.scenario.control.period, setup.scenario.control.robust.ramp
         self.count = round(self.period / self.world.timestep)
-        if self.count < 1 or abs(self.count * self.world.timestep - self.period) > 1e-9:
+        if not 1 <= self.count <= _MOST_STEPS or abs(self.count * self.world.timestep - self.period) > 1e-9:
+            fault = "no multiple of" if self.count <= _MOST_STEPS else f"more than {_MOST_STEPS:.0e} times"
             raise InputError(
-                f"a tick of {self.period:g} s is no multiple of the physics' {self.world.timestep:g} s",
+                f"a tick of {self.period:g} s is {fault} the physics' {self.world.timestep:g} s",
                 where=setup.scenario.source,
                 hint="change control.period or physics.timestep",
             )
@@ -125,6 +130,19 @@ class _Loop:
                 break
             tell(f"simulating, t = {self.t:.1f} s", None if reference is None else self.t / reference.total)
         return speeds
+
+    def check_length(self, t: float) -> None:
+        """Refuse a run until a time that has fewer than two ticks or more than :data:`_MOST`, s.
+
+        Raises:
+            InputError: It has.
+        """
+        if not 2 * self.period <= t <= _MOST * self.period:
+            fault, hint = f"more than {_MOST:.0e}", "lower the contacts' count or the times, or raise control.period"
+            if t < 2 * self.period:
+                fault, hint = "fewer than two", "lower control.period"
+            what = f"a run of {t:g} s has {fault} ticks of {self.period:g} s"
+            raise InputError(what, where=self.setup.scenario.source, hint=hint)
 
     def until(self, t: float) -> int:
         """Return the number of ticks, at least one, until a time has come, s."""
@@ -166,6 +184,7 @@ class _Loop:
 
 def _contacts(loop: _Loop, task: RepeatedContacts, mode: Mode) -> Run:
     driver, reference = loop.driver, Reference(task, loop.setup.gap)
+    loop.check_length(reference.total)
     # The way in crosses the surface here, and brakes behind it.
     crossing = reference.inward - 2 * task.beyond / task.speed
     starts = [reference.start(k) for k in range(task.count)]
@@ -196,6 +215,8 @@ def _contacts(loop: _Loop, task: RepeatedContacts, mode: Mode) -> Run:
 
 def _pushes(loop: _Loop, task: SinglePush | Throw, signs: Sequence[int], mode: Mode) -> tuple[Run, ...]:
     """Settle once and push with each sign from there, the other signs in forked processes."""
+    length = task.window if isinstance(task, Throw) else task.duration
+    loop.check_length(task.settle + task.patience + length + task.after)
     # All controllers begin to prepare before a push, whatever the patience of the scenario is.
     rested = _settle(loop, task, max(task.settle, BRACE + loop.period), [loop.driver.brace])
     if mode == "held":

@@ -9,6 +9,7 @@ import numpy as np
 from pydantic import Field
 
 from impact_posture.errors import InputError
+from impact_posture.impact.contact import LARGEST
 from impact_posture.robot.spec import NonNegative, Positive
 from impact_posture.tables import Checked
 
@@ -67,10 +68,9 @@ class Surface(ContactLaw):
     def __post_init__(self) -> None:
         """Refuse a normal without direction."""
         super().__post_init__()
-        if not np.abs(self.normal).max() > 1e-9:
-            raise InputError(
-                "the normal has no direction", where=f"surface '{self.name}'", hint="give three numbers, not all zero"
-            )
+        if not 1e-9 < np.abs(self.normal).max() <= LARGEST:
+            hint = f"give three numbers, not all zero, up to {LARGEST:g}"
+            raise InputError("the normal has no direction", where=f"surface '{self.name}'", hint=hint)
 
 
 @dataclass(frozen=True)
@@ -145,7 +145,7 @@ class Sensors(Checked):
         force_frame: Shape whose contact force is measured, or ``None`` for no force sensor.
         force: N, each axis.
         force_cutoff: Cutoff frequency of the low-pass filter of the force, Hz.
-        delay: Age of a reading, s, rounded to physics steps.
+        delay: Age of a reading, s, up to an hour, rounded to physics steps.
     """
 
     base_position: NonNegative = 0.0
@@ -159,7 +159,7 @@ class Sensors(Checked):
     force_frame: str | None = None
     force: NonNegative = 0.0
     force_cutoff: Positive = 100.0
-    delay: NonNegative = 0.0
+    delay: Annotated[float, Field(ge=0, le=3600)] = 0.0
 
 
 @dataclass(frozen=True)
