@@ -14,6 +14,7 @@ import numpy as np
 
 from impact_posture.errors import SpecError, nearest
 from impact_posture.escape import printable
+from impact_posture.impact.contact import LARGEST
 from impact_posture.robot.robot_loader import from_folder
 from impact_posture.setting import between, setting, with_demands
 from impact_posture.settings import ProblemSettings
@@ -28,6 +29,8 @@ _NO_AXIS = ("schema", "q", "starts", "seed", "tradeoff", "tradeoff_against", "pa
 _FILES = ("srdf", "config", "weights", "armature", "posture")
 # Most points of a grid, which keeps every index a 64-bit integer.
 _MOST = 10**15
+# Most combinations of values that need a program of their own.  The settings of each stay in memory.
+_MOST_CASES = 10**5
 # Neighbors from which a point is warm started: those along the fastest axes.
 _NEIGHBORS = 2
 
@@ -190,6 +193,12 @@ def read_sweep(path: Path) -> Sweep:
     outer = [name for name in values if name not in _INNER]
     inner = [name for name in _INNER if name in values]
     _check_names([*outer, *inner], f"{path}: grid")
+    for count, most, words in (
+        (prod(map(len, values.values())), _MOST, "points"),
+        (prod(len(values[name]) for name in outer), _MOST_CASES, f"combinations of {', '.join(outer)}"),
+    ):
+        if count > most:
+            raise SpecError(f"has {count} {words}", where=f"{path}: grid", hint=f"give at most {most:.0e}")
     if "contact" in problem:
         raise SpecError("a sweep is of one contact", where=f"{where}.contact", hint="give `frame` and `normal`")
     first = {name: values[name][0] for name in inner if name not in OFFSETS}
@@ -204,17 +213,14 @@ def read_sweep(path: Path) -> Sweep:
         of_case = dict(zip(outer, chosen, strict=True))
         own = from_folder(problem | first | of_case, folder, [name for name in _FILES if name in outer])
         cases.append(Case(validate(ProblemSettings, own, str(path)), of_case))
-    sweep = Sweep(tuple(cases), tuple(Axis(name, values[name]) for name in outer), Grid(axes), settings.shard)
-    if sweep.points > _MOST:
-        raise SpecError(f"has {sweep.points} points", where=f"{path}: grid", hint=f"give at most {_MOST:.0e}")
-    return sweep
+    return Sweep(tuple(cases), tuple(Axis(name, values[name]) for name in outer), Grid(axes), settings.shard)
 
 
 def _values(name: str, given: Any, where: str) -> tuple[Any, ...]:
     """Return the values of an axis, from a list or from ``{from, to, count}``."""
     if isinstance(given, dict):
         low, high, count = (given.get(key, "") for key in ("from", "to", "count"))
-        ends = all(isinstance(v, int | float) and abs(v) < float("inf") for v in (low, high))
+        ends = all(type(v) in (int, float) and abs(v) <= LARGEST for v in (low, high))
         if not ends or set(given) != {"from", "to", "count"} or type(count) is not int or not 2 <= count <= 10**6:
             raise SpecError("is no range", where=where, hint="give from, to and count (2 to 1e6), or a list")
         # Rounded, so that a tenth is a tenth and zero is zero.
@@ -222,7 +228,8 @@ def _values(name: str, given: Any, where: str) -> tuple[Any, ...]:
         return tuple(0.0 if abs(v) < 1e-12 * abs(high - low) else float(f"{v:.12g}") for v in even)
     if not isinstance(given, list) or not given:
         raise SpecError("is no axis", where=where, hint="give a list of values, or { from, to, count }")
-    return tuple(float(v) if name in _INNER and type(v) is int else v for v in given)
+    # A larger number is no float; the demand of the setting refuses it.
+    return tuple(float(v) if name in _INNER and type(v) is int and abs(v) <= LARGEST else v for v in given)
 
 
 def _check_names(names: Sequence[str], where: str) -> None:
