@@ -12,6 +12,9 @@ from impact_posture.parsing import parse_contact
 
 CONTACT, METRIC, ROBOT, TASK, SEARCH, OUTPUT = "Contact", "Measure", "Robot", "Task", "Search", "Output"
 _LARGEST = float("inf")
+# Largest length (m), beyond which the solver does not come back, and largest mass (kg), beyond which a mass matrix
+# is singular in double precision.
+_FARTHEST, _HEAVIEST = 1e100, 1e12
 # Degrees below which the cosine of a tilt says nothing at the precision that certifies.
 _LEAST_TILT = 0.1
 # Largest distance of the norm of a given quaternion from 1.
@@ -108,7 +111,10 @@ def _contacts(value: Any) -> bool:
 
 
 # Demands on values, as keyword arguments of a setting.
-NUMBERS = {"holds": _finite, "demand": "give finite numbers"}
+NUMBERS = {
+    "holds": lambda value: all(abs(v) <= _FARTHEST for v in value),
+    "demand": f"give finite numbers, up to {_FARTHEST:g}",
+}
 LENGTHS = {"holds": _positive, "demand": "give three numbers above zero"}
 ABOVE_ZERO = {"holds": _positive, "demand": "give a number above zero"}
 ONE_OR_MORE = {"holds": _positive, "demand": "give 1 or more"}
@@ -123,8 +129,8 @@ FACTORS = {
     "demand": "give two factors above zero, the lower first, such as 0.5 2",
 }
 MASSES = {
-    "holds": lambda value: all(0 < mass < _LARGEST for _, mass in value),
-    "demand": "give a frame and kg above zero each",
+    "holds": lambda value: all(0 < mass <= _HEAVIEST for _, mass in value),
+    "demand": f"give a frame and kg above zero each, up to {_HEAVIEST:g}",
 }
 
 

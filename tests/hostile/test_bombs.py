@@ -69,7 +69,14 @@ def test_a_file_without_end(arena: Path) -> None:
     assert "File too large" in outcome.err
 
 
-@pytest.mark.parametrize(("old", "new"), [('xyz="0 0 0.2"', 'xyz="0 0 1e200"'), ('xyz="0 0 0.4"', 'xyz="0 0 1e308"')])
+@pytest.mark.parametrize(
+    ("old", "new"),
+    [
+        ('xyz="0 0 0.2"', 'xyz="0 0 1e200"'),
+        ('xyz="0 0 0.4"', 'xyz="0 0 1e308"'),
+        ('mass value="0.8"', 'mass value="1e300"'),
+    ],
+)
 def test_models_beyond_all_numbers(old: str, new: str, arena: Path) -> None:
     text = (arena / "small.urdf").read_text()
     assert old in text
@@ -77,3 +84,12 @@ def test_models_beyond_all_numbers(old: str, new: str, arena: Path) -> None:
     outcome = strike(arena, "inspect", "huge.urdf", "--json")
     assert (outcome.code, outcome.complaints) == (1, []), outcome.err
     assert "huge.urdf" in outcome.err
+
+
+@pytest.mark.parametrize(
+    "words", [("--payload", "tip", "1e100"), ("--target-position", "1e300", "0", "0", "--contact-pose", "position")]
+)
+def test_tasks_beyond_all_numbers(words: tuple[str, ...], arena: Path) -> None:
+    outcome = strike(arena, "optimize", *PUSH, *words, "--out", "precious", "--force")
+    assert (outcome.code, outcome.complaints) == (2, []), outcome.err
+    assert "up to 1e+" in outcome.err
