@@ -8,7 +8,7 @@ from __future__ import annotations
 
 import builtins
 import inspect
-from collections.abc import Callable, Collection, Mapping
+from collections.abc import Callable, Collection, Mapping, Set
 from functools import cache, wraps
 from numbers import Integral, Real
 from types import UnionType
@@ -110,6 +110,9 @@ def _fits(value: object, hint: Any) -> bool:
     if isinstance(origin, type) and issubclass(origin, Collection) and not issubclass(origin, Mapping):
         if isinstance(value, str | bytes | Mapping) or not isinstance(value, Collection):
             return False
+        if (isinstance(value, np.ndarray) and value.ndim == 0) or (isinstance(value, Set) and parts[0] is float):
+            # An array without axes has no entries, and those of a set have no order.
+            return False
         if origin is tuple and parts[-1] is not ...:
             return len(value) == len(parts) and all(map(_fits, value, parts))
         return all(_fits(entry, parts[0]) for entry in value)
@@ -119,7 +122,7 @@ def _fits(value: object, hint: Any) -> bool:
     if isinstance(hint, type) and issubclass(hint, _Named):
         return any(base.__name__ == hint.__name__ for base in type(value).__mro__)
     if hint in _NUMBERS:
-        return isinstance(value, _NUMBERS[hint]) and not isinstance(value, bool)
+        return isinstance(value, _NUMBERS[hint]) and not isinstance(value, bool) and (hint is int or _is_float(value))
     if hint is bool:
         return isinstance(value, bool | np.bool_)
     kind = origin or hint
@@ -138,6 +141,14 @@ def _is_numeric(value: object) -> bool:
         return np.asarray(value).dtype.kind in "biuf"
     except ValueError:  # a ragged list
         return False
+
+
+def _is_float(value: Any) -> bool:
+    try:
+        float(value)
+    except OverflowError:  # an integer of more than 308 digits
+        return False
+    return True
 
 
 def _words(hint: Any) -> str:

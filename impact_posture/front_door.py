@@ -251,10 +251,12 @@ def optimize(
         finish_all: Finish starts that can no longer become the best, too.  The search ``global`` always does.
 
     Raises:
-        InputError: The problem is none for the search ``global``.
+        InputError: There is no start, or the problem is none for the search ``global``.
         Infeasible: No posture satisfies the constraints; the error names the conflicting constraints.
         SolverFailed: No run ended at a certified posture.
     """
+    if starts < 1:
+        raise InputError(f"is {starts}", where="starts", hint="give 1 or more")
     if search == "global":
         check_searchable(problem.problem)
     found = solve_robustly(

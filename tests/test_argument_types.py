@@ -116,6 +116,13 @@ def test_no_parameter_takes_an_odd_value(function: Callable[..., Any], good: dic
         (lambda: RESULT.save("out", force="no"), "force: is 'no'; give True or False"),  # type: ignore[arg-type]
         (lambda: ip.ImpactObjective(ROBOT, CONTACT, supports="ee"), "a list of text or Support or None"),
         (lambda: ip.PostureProblem(OBJECTIVE, starts="a"), "PostureProblem: key 'starts'"),
+        (lambda: ip.optimize(PROBLEM, starts=0), "starts: is 0; give 1 or more"),
+        (lambda: ip.ImpactContact("ee", (0, 0, 1), np.array(0.5)), "give (a number, a number, a number)"),  # type: ignore[arg-type]
+        (lambda: ip.ImpactContact("ee", (10**400, 0, 1)), "has no direction"),
+        (lambda: OBJECTIVE.evaluate(ROBOT.posture(), speed=10**400), "speed: is "),
+        (lambda: ip.PostureProblem(OBJECTIVE, posture=np.array(0.5)), "posture: is "),
+        (lambda: ip.PostureProblem(OBJECTIVE, posture={0.1, 0.2}), "posture: is "),  # type: ignore[arg-type]
+        (lambda: ip.Metric("weighted", np.array([1.0, -2.0])), "a weight is -2"),  # type: ignore[arg-type]
     ],
 )
 def test_the_line_says_what_to_give(call: Callable[[], Any], line: str) -> None:
@@ -140,4 +147,5 @@ def test_what_fits_passes() -> None:
     with pytest.raises(TypeError, match=r"missing a required argument|missing 1 required"):
         function(1, 1, True, (1, 2), {})  # type: ignore[call-arg]
     objective = ip.ImpactObjective(ROBOT, [CONTACT], compliance=np.float64(0), supports=np.array([], dtype=str))  # type: ignore[arg-type]
+    assert ip.Metric("weighted", np.ones(2)) == ip.Metric("weighted", (1.0, 1.0))  # type: ignore[arg-type]
     assert ip.PostureProblem(objective, posture=list(ROBOT.posture())).problem.given.shape == (ROBOT.nq,)

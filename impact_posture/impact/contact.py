@@ -56,7 +56,7 @@ class ImpactContact:
         check_types(type(self).__init__, vars(self) | {"normal": (0, 0, 1)})
         try:
             n = np.array(self.normal, dtype=float)
-        except (TypeError, ValueError):
+        except (TypeError, ValueError, OverflowError):
             n = np.zeros(0)
         if n.shape != (3,) or not np.isfinite(n).all() or np.abs(n).max() < _DUST:
             raise ContactError(

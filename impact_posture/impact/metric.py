@@ -41,6 +41,9 @@ class Metric:
         if (self.kind == "weighted") != (self.weights is not None):
             what = "needs weights" if self.weights is None else "takes no weights"
             raise MetricError(f"the {self.kind} metric {what}", where="metric", hint="see build_metric")
+        if self.weights is not None:
+            # An array has neither truth value nor hash.
+            object.__setattr__(self, "weights", tuple(float(weight) for weight in self.weights))
         for value in self.weights or ():
             if not (np.isfinite(value) and value > 0):
                 raise MetricError(
