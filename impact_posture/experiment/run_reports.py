@@ -46,7 +46,7 @@ _FINE, _COARSE = 0.001, 0.025
 _AWAY = 1e3
 # Columns of the time series that figures show.
 _COLUMNS = {field.name for field in fields(RunView)} & {field.name for field in fields(Series)}
-_BROKEN = (LookupError, ValueError, TypeError, AttributeError, OSError, RecursionError)
+_BROKEN = (LookupError, ArithmeticError, ValueError, TypeError, AttributeError, OSError, RecursionError)
 _MOVES = (
     "The slider goes through time: every millisecond within the impact windows, every 25 ms elsewhere. Within a "
     "window, the orange arrows show the change of velocity since it began. H, V, S and the ellipsoid are those of "

@@ -50,6 +50,11 @@ def test_simulate(aerial: Path, tmp_path: Path) -> None:
     assert refused.returncode == 1 and "--force" in refused.stderr
     again = document(*asked, "--force", cwd=tmp_path)
     assert again == found
+    # Time that stands still is no run, and its report says so.
+    columns = vars(series) | {"t": np.zeros_like(series.t)}
+    Series(**columns).save(tmp_path / "run" / "series.npz")
+    refused = start("report", "run", cwd=tmp_path)
+    assert refused.returncode == 1 and "run: holds no whole run" in refused.stderr
 
 
 def test_simulate_without_a_compiler(aerial: Path, tmp_path: Path) -> None:
