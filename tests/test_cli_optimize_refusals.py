@@ -40,6 +40,15 @@ def test_normal_without_a_direction_in_a_file(normal: str, tmp_path: Path) -> No
     untouched(tmp_path, "p.toml")
 
 
+def test_a_result_folder_is_no_robot_but_where_a_robot_has_its_name(tmp_path: Path) -> None:
+    for name in ("out", "tilthex_arm"):
+        (tmp_path / name).mkdir()
+        (tmp_path / name / "problem.toml").write_text("")
+    done = run("optimize", "out", "--normal", 0, 0, 1, *FAST, cwd=tmp_path)
+    assert done.returncode == 2 and "out/problem.toml" in done.stderr
+    assert run(*BASE, "--out", "new", "--no-report", cwd=tmp_path).returncode == 0
+
+
 def _posture(folder: Path, q: list[float]) -> str:
     names = ["shoulder_roll", "shoulder_pitch", "elbow_pitch"]
     (folder / "q.json").write_text(json.dumps({"joint_names": names, "q": q}))

@@ -4,7 +4,6 @@ from __future__ import annotations
 
 import hashlib
 import json
-import shutil
 from collections.abc import Callable, Sequence
 from contextlib import suppress
 from dataclasses import asdict
@@ -66,9 +65,13 @@ class Store:
             raise OutputError(words, where=str(self.folder), hint="free space or choose another `out`") from error
 
     def remove(self) -> None:
-        """Remove the folder, if :meth:`make` made it."""
+        """Remove the folder, if :meth:`make` made it; files of others stay, and the folder with them."""
         if is_ours(self.folder, "runs"):
-            shutil.rmtree(self.folder, ignore_errors=True)
+            with suppress(OSError):
+                for path in self.folder.iterdir():
+                    if path.suffix in (".json", ".npz"):
+                        path.unlink()
+                self.folder.rmdir()
 
     def find(self, job: Job) -> Document | None:
         """Return the document of a finished job, or ``None`` for no file, a damaged file, or that of another job."""

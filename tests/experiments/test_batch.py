@@ -133,6 +133,18 @@ def test_a_damaged_file_is_run_anew(aerial: Path, tmp_path: Path, damage: str) -
     assert store.find(job) is None
 
 
+def test_a_store_leaves_the_files_of_others(aerial: Path, tmp_path: Path) -> None:
+    job, store = Job(str(aerial), "nominal"), Store(tmp_path / "kept")
+    store.keep(job, {"status": "completed", "runs": []})
+    (store.folder / "notes.txt").write_text("mine")
+    store.remove()
+    assert [path.name for path in store.folder.iterdir()] == ["notes.txt"]
+    other = Store(tmp_path / "alone")
+    other.keep(job, {"status": "completed", "runs": []})
+    other.remove()
+    assert not other.folder.exists()
+
+
 @pytest.mark.parametrize("damage", ["missing", "half", "garbage", "flipped"])
 def test_a_damaged_series_is_run_anew(
     push: Path, tmp_path: Path, damage: str, monkeypatch: pytest.MonkeyPatch
