@@ -129,7 +129,8 @@ class ImpactObjective(core.ImpactObjective):
             build: Whether to build and check the library, if a C compiler is installed.
             options: Options ``prefix``, ``posture``, ``single``, ``portable`` and ``force`` of :func:`write_export`.
         """
-        from impact_posture.codegen.export import kept_export, write_export
+        from impact_posture.codegen.export import write_export
+        from impact_posture.codegen.kept_export import kept_export
 
         kept = None if options else kept_export(self, Path(out), build=build)
         return kept or write_export([self], Path(out), build=build, **options)

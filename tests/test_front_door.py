@@ -202,6 +202,12 @@ def test_the_code_of_a_result_is_that_of_its_objective(result: ip.PostureResult,
     # What asks for more than the defaults is never taken as it is.
     with pytest.raises(OutputError, match="choose another `out`"):
         objective.export(folder, prefix="arm")
+    manifest = folder / "tilthex_arm_ee.json"
+    for text in ("{}", "[]", "[" * 100_000):
+        manifest.write_text(text)
+        with pytest.raises(OutputError, match="exists"):
+            objective.export(folder)
+    manifest.write_bytes(before[manifest.name])
     (folder / "tilthex_arm_ee.c").unlink()
     with pytest.raises(OutputError, match="exists"):
         objective.export(folder)

@@ -25,7 +25,7 @@ from impact_posture.errors import CompilerError, InputError, OutputError
 from impact_posture.impact.contact_compression import Compression
 from impact_posture.impact.objective import ImpactObjective
 from impact_posture.libraries import library_path
-from impact_posture.output_folder import own_files, whole_folder, write_whole
+from impact_posture.output_folder import whole_folder, write_whole
 from impact_posture.robot.robot import Robot
 from impact_posture.toolchain import GET_ONE, find_compiler
 
@@ -233,44 +233,6 @@ def write_export(
     library = None if agreement is None else library_path(out, prefix)
     files = tuple(out / path.name for path in made.files)
     return replace(made, out=out, files=files, agreement=agreement, library=library, requested=build)
-
-
-def kept_export(objective: ImpactObjective, out: Path, *, build: bool) -> Export | None:
-    """Return the export of an objective that a folder holds already, such as ``c/`` of a result; else ``None``.
-
-    It may also state a posture and the compression of the impact.  All else that :func:`export` would write into the
-    manifest is there.
-
-    Args:
-        objective: The objective.
-        out: The folder.
-        build: As :func:`write_export`.
-
-    Raises:
-        CompilerError: The compiler failed, or its code computes other numbers.
-    """
-    prefix = default_prefix([objective])
-    files = own_files(out, "export")
-    if f"{prefix}.json" not in files or not all((out / name).is_file() for name in files):
-        return None
-    try:
-        manifest = json.loads((out / f"{prefix}.json").read_text(encoding="utf-8"))
-        expected = json.loads(json.dumps(build_manifest([objective], prefix, None, None)))
-        if _comparable(manifest) != _comparable(expected):
-            return None
-    except (OSError, ValueError, TypeError, AttributeError):
-        return None
-    made = Export(out, objective.robot, tuple(out / name for name in files), manifest, requested=build)
-    if not build or find_compiler() is None:
-        return made
-    agreement = compile_and_check(out, prefix, [objective], keep=True)
-    return replace(made, agreement=agreement, library=library_path(out, prefix))
-
-
-def _comparable(manifest: dict[str, Any]) -> dict[str, Any]:
-    """Return a manifest without what depends on more than the objective."""
-    rest = {key: value for key, value in manifest.items() if key not in {"posture", "compression", "stack_bytes"}}
-    return rest | {"symbols": {name: symbol for name, symbol in rest["symbols"].items() if name != "posture"}}
 
 
 def default_prefix(objectives: Sequence[ImpactObjective]) -> str:
