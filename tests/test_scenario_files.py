@@ -176,6 +176,8 @@ def test_anybodys_urdf_and_scenario_run_from_anywhere(folder: Path, monkeypatch:
         ("normal = [0, 0, 2]", "normal = [0, 0, 0]", r"surface 'table': the normal has no direction"),
         ("normal = [0, 0, 2]", "normal = [1e308, 1e308, 1e308]", r"surface 'table': the normal has no direction"),
         ("[physics]", "[sensors]\ndelay = 1e300\n\n[physics]", r"key 'sensors.delay'"),
+        ("timestep = 0.0005", "timestep = 1e-320", r"key 'physics.timestep'"),
+        ("[control.posture]", "[control]\nperiod = 1e308\n\n[control.posture]", r"key 'control.period'"),
         ("timestep = 0.0005", "timestep = 0.005", r"table: solref|stops: solref"),
         ("kp = 10", "kp = [10, 0]", r"key 'control.posture.kp"),
         ('surface = "table"', 'surface = "tabel"', r"key 'contacts.surface': there is no 'tabel'; one of: table"),

@@ -80,7 +80,7 @@ class Control(Checked):
     Attributes:
         posture: Gains of the posture task.
         robust: The impact-robust term.
-        period: Time from tick to tick, s.
+        period: Time from tick to tick, s, up to an hour.
         tilt: Gains of the level base, first priority.
         end_effector: Gains of the end effector, second priority, linear rows first.
         apparent_mass: M_d of ``F̂/M_d`` in the law of the end effector, kg.  ``None`` leaves the force out.
@@ -91,7 +91,7 @@ class Control(Checked):
 
     posture: Gains
     robust: RobustTerm
-    period: Positive = 1e-3
+    period: Annotated[float, Field(gt=0, le=3600)] = 1e-3
     tilt: Gains | None = None
     end_effector: EndEffectorGains | None = None
     apparent_mass: Positive | None = None

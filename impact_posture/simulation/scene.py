@@ -109,13 +109,13 @@ class Physics(Checked):
     """Time step, gravity, and the stops of the joints.
 
     Attributes:
-        timestep: Time step, s.
+        timestep: Time step, s, a picosecond or more.
         gravity: Gravity, world, m/s².  ``None`` takes that of the robot model.
         stop_solref: ``solref`` of the joint stops, as in :class:`ContactLaw`.
         stop_solimp: ``solimp`` of the joint stops.
     """
 
-    timestep: Positive = 2.5e-4
+    timestep: Annotated[float, Field(ge=1e-12, allow_inf_nan=False)] = 2.5e-4
     gravity: FiniteVector | None = None
     stop_solref: tuple[Finite, Finite] = (0.005, 1.0)
     stop_solimp: FiniteVector = (0.95, 0.99, 0.001)
