@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Iterable
+from collections.abc import Iterable, Sequence
 from dataclasses import dataclass
 from typing import Literal, get_args
 
@@ -19,8 +19,10 @@ from impact_posture.simulation.series import Flags, Series
 # Each is graver than the one before.
 Outcome = Literal["completed", "lost contact", "control lost", "fell"]
 OUTCOMES: tuple[Outcome, ...] = get_args(Outcome)
-# Every so many ticks of a run is looked at, and a joint origin so far behind a surface (m) is no longer contact.
-_EVERY, _DEEP = 25, 0.02
+# Ticks from one posture that is checked for links behind a surface to the next.
+_EVERY = 25
+# Depth of a joint origin behind a surface that no contact explains, m.
+_DEEP = 0.02
 
 
 @dataclass(frozen=True)
@@ -49,25 +51,31 @@ def links_behind(setup: Setup, runs: Iterable[Run]) -> tuple[str, ...]:
     A joint counts if its origin was more than 2 cm behind the plane, and was in front of it at the start.
     """
     robot, built = setup.robot, setup.world.built
-    model, data = robot.model, robot.model.createData()
-    shaped = {int(model.frames[robot.frame_id(s.frame)].parentJoint) for s in setup.scenario.shapes}
-    joints = [k for k in range(1, model.njoints) if k not in shaped]
+    shaped = {int(robot.model.frames[robot.frame_id(s.frame)].parentJoint) for s in setup.scenario.shapes}
+    joints = [k for k in range(1, robot.model.njoints) if k not in shaped]
+    q = np.vstack([setup.q, *[run.series.q[::_EVERY] for run in runs]])
+    origins = _origins(robot.model, joints, q)
     lines = []
     for name, n in built.normals.items():
-
-        def heights(q: Array, n: Array = n, point: Array = built.points[name]) -> Array:
-            pin.forwardKinematics(model, data, q)
-            return np.array([n @ (data.oMi[k].translation - point) for k in joints])
-
-        start = heights(setup.q)
-        lowest = np.min([heights(q) for run in runs for q in run.series.q[::_EVERY]], axis=0, initial=np.inf)
-        deep = {model.names[k]: -b for k, a, b in zip(joints, start, lowest, strict=True) if a > 0 and b < -_DEEP}
-        if deep:
+        heights = (origins - built.points[name]) @ n
+        through = (heights[0] > 0) & (heights.min(axis=0) < -_DEEP)
+        if through.any():
+            names = ", ".join(robot.model.names[joints[k]] for k in np.flatnonzero(through))
             lines.append(
-                f"{', '.join(deep)} went up to {max(deep.values()):.2g} m behind the surface '{name}': these links "
+                f"{names} went up to {-heights[:, through].min():.2g} m behind the surface '{name}': these links "
                 "have no shapes that stop them (scenario.toml [[shapes]])"
             )
     return tuple(lines)
+
+
+def _origins(model: pin.Model, joints: Sequence[int], postures: Array) -> Array:
+    """Return the origins of joints in each posture, world, m, shape (postures, joints, 3)."""
+    data, found = model.createData(), np.empty((len(postures), len(joints), 3))
+    for one, q in zip(found, postures, strict=True):
+        pin.forwardKinematics(model, data, q)
+        for k, joint in enumerate(joints):
+            one[k] = data.oMi[joint].translation
+    return found
 
 
 def judge(setup: Setup, run: Run) -> tuple[Event, ...]:
