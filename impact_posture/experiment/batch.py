@@ -65,11 +65,12 @@ class Store:
             raise OutputError(words, where=str(self.folder), hint="free space or choose another `out`") from error
 
     def remove(self) -> None:
-        """Remove the folder, if :meth:`make` made it; files of others stay, and the folder with them."""
+        """Remove the folder, if :meth:`make` made it.  Files of other types stay, and the folder with them."""
         if is_ours(self.folder, "runs"):
             with suppress(OSError):
                 for path in self.folder.iterdir():
-                    if path.suffix in (".json", ".npz"):
+                    # A process that was killed leaves the part of a file.
+                    if path.suffix in (".json", ".npz", ".part"):
                         path.unlink()
                 self.folder.rmdir()
 

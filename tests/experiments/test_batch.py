@@ -141,6 +141,7 @@ def test_a_store_leaves_the_files_of_others(aerial: Path, tmp_path: Path) -> Non
     assert [path.name for path in store.folder.iterdir()] == ["notes.txt"]
     other = Store(tmp_path / "alone")
     other.keep(job, {"status": "completed", "runs": []})
+    (other.folder / ".aerial.json.99.part").write_text("half a docu")
     other.remove()
     assert not other.folder.exists()
 
