@@ -130,6 +130,14 @@ def test_several_contacts_come_at_once() -> None:
     told = verdict(impact, impact.evaluate(), impact.evaluate())
     assert ", all contacts at once, the jump stays" in told.line
     assert "the impulse at gripper_right_base_link stays" in told.line
+    found = impact.evaluate()
+    assert found.together is not None and found.coulomb is not None
+    # Where the jump of all is unknown at one posture, the first contact alone is compared, and the line says so.
+    unknown = replace(found, together=None)
+    pulls = resolve(make_settings({"robot": "talos", "contact": contacts, "bilateral": True}))
+    for said in (verdict(impact, found, unknown), verdict(impact, unknown, found), verdict(pulls, unknown, unknown)):
+        assert said.outcome == "no better" and ", at gripper_right_base_link alone, the jump stays" in said.line
+        assert said.before is not None and said.before == said.after and said.before.jump == found.coulomb.norm
 
 
 def test_the_command_says_it_first(tmp_path: Path) -> None:

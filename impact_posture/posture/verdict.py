@@ -28,9 +28,9 @@ class PredictedImpact:
 
     Attributes:
         jump: ``‖Δν‖_W``.
-        impulse: Size of the impulse, N·s.
-        peak_force: Peak force without friction, N; ``None`` where no contact is stated.
-        sticks: Whether the contact point sticks; ``None`` of a jump without friction.
+        impulse: Size of the impulse, N·s; that of the first contact where several come at once.
+        peak_force: Peak force without friction, N; ``None`` where no contact is stated or several come at once.
+        sticks: Whether the contact point sticks, the first one of several; ``None`` for a jump without friction.
     """
 
     jump: float
@@ -78,9 +78,11 @@ def verdict(impact: ResolvedImpact, before: Evaluation, after: Evaluation) -> Ve
     """Compare the predicted jumps of the initial and the optimal posture.
 
     The jump is that with the friction of the contact.  The peak force is that of the stated contact, or that of a
-    linear contact of any stiffness, ``F ∝ √m``.
+    linear contact of any stiffness, ``F ∝ √m``.  Of several contacts, the jump is that of all at once, or that of the
+    first contact alone where the former is not known at both postures.
     """
-    pair = _jump(before), _jump(after)
+    together = bool(before.together and after.together)
+    pair = _jump(before, together), _jump(after, together)
     if impact.speed <= 0 or pair[0] is None or pair[1] is None:
         why = "there is no approach speed" if impact.speed <= 0 else "the contact cannot move along the normal"
         return Verdict("unknown", f"no verdict: {why}.", None, None, None, ())
@@ -94,15 +96,15 @@ def verdict(impact: ResolvedImpact, before: Evaluation, after: Evaluation) -> Ve
     elif jump > -_SAME:
         outcome = "no better"
     parts = [f"the jump {_words(jump)} ({pair[0].norm:.3g} to {pair[1].norm:.3g}{_slip(pair[1])})"]
-    where = f" at {impact.contact.frame}" if after.together else ""
+    where = f" at {impact.contact.frame}" if together else ""
     parts.append(
         f"the impulse{where} {_words(impulse)} ({pair[0].impulse_size:.3g} to {pair[1].impulse_size:.3g} N·s)"
     )
     if force is not None:
         parts.append(f"the peak force {_words(force)}{_newtons(before, after)}")
     contact = f"with friction {impact.contact.friction:g}" if isinstance(pair[1], CoulombJump) else "without friction"
-    if after.together:
-        contact += ", all contacts at once,"
+    if impact.objective.others:
+        contact += ", all contacts at once," if together else f", at {impact.contact.frame} alone,"
     line = f"verdict: {outcome}. At {impact.speed:g} m/s {contact} {', '.join(parts[:-1])} and {parts[-1]}."
     advice = (
         *_without_friction(before, after, jump),
@@ -110,7 +112,8 @@ def verdict(impact: ResolvedImpact, before: Evaluation, after: Evaluation) -> Ve
         *_other_joint_model(impact, before, after),
     )
     sides = _predicted(before, pair[0]), _predicted(after, pair[1])
-    return Verdict(outcome, line, jump, impulse, force, advice, *sides, _assumptions(impact, after, force))
+    assumptions = _assumptions(impact, pair[1], together, force)
+    return Verdict(outcome, line, jump, impulse, force, advice, *sides, assumptions)
 
 
 def _predicted(found: Evaluation, jump: Jump) -> PredictedImpact:
@@ -119,10 +122,10 @@ def _predicted(found: Evaluation, jump: Jump) -> PredictedImpact:
     return PredictedImpact(jump.norm, jump.impulse_size, peak, jump.sticks if isinstance(jump, CoulombJump) else None)
 
 
-def _assumptions(impact: ResolvedImpact, after: Evaluation, force: float | None) -> tuple[str, ...]:
-    friction = f"friction {impact.contact.friction:g}" if isinstance(_jump(after), CoulombJump) else "no friction"
+def _assumptions(impact: ResolvedImpact, jump: Jump, together: bool, force: float | None) -> tuple[str, ...]:
+    friction = f"friction {impact.contact.friction:g}" if isinstance(jump, CoulombJump) else "no friction"
     # Of several contacts at once, the impact is plastic.
-    restitution = 0.0 if after.together else impact.restitution
+    restitution = 0.0 if together else impact.restitution
     stated = "the stated contact" if impact.contact_stiffness else "a linear contact, the same before and after"
     return (
         f"rigid impact at {impact.speed:g} m/s with restitution {restitution:g} and {friction}",
@@ -132,8 +135,8 @@ def _assumptions(impact: ResolvedImpact, after: Evaluation, force: float | None)
     )
 
 
-def _jump(found: Evaluation) -> Jump | None:
-    return found.together[0] if found.together else found.coulomb or found.frictionless
+def _jump(found: Evaluation, together: bool) -> Jump | None:
+    return found.together[0] if found.together and together else found.coulomb or found.frictionless
 
 
 def _change(before: float, after: float) -> float:
