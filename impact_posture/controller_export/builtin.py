@@ -19,6 +19,7 @@ from impact_posture.tsid.points import Point
 from impact_posture.tsid.posture_tasks import JointPosture
 from impact_posture.tsid.reference_flow_posture import ReferenceFlowPosture
 from impact_posture.tsid.task_formulation import (
+    END_EFFECTOR_KP,
     TaskFormulation,
     aerial_formulation,
     arm_formulation,
@@ -27,7 +28,6 @@ from impact_posture.tsid.task_formulation import (
 
 ControllerKind = Literal["aerial", "legged", "arm"]
 _BUILD: dict[str, Callable[..., TaskFormulation]] = {"aerial": aerial_formulation, "arm": arm_formulation}
-_TIP_KP = 60.0
 
 
 def default_formulation(
@@ -70,8 +70,9 @@ def default_formulation(
 def _end_effector(robot: Robot, objective: ImpactObjective | None) -> EndEffector | None:
     """Return the task of the frame that an impact meets, else of the default contact frame; ``None`` without one.
 
-    It has the rows of the frame's default pose mode.  Without an impact there is no normal to align with, so the task
-    holds the whole pose.  A frame whose pose is free is pushed, so the task holds the default contact frame.
+    It has the rows of the frame's default pose mode.  ``aligned`` takes the normal at the default posture; without an
+    impact there is none, so the task holds the whole pose.  A frame whose pose is free is pushed, so the task holds
+    the default contact frame, as a whole pose if that is free, too.
     """
     frame, offset = robot.spec.contact.frame, robot.spec.contact.offset
     aligned = None
@@ -86,10 +87,10 @@ def _end_effector(robot: Robot, objective: ImpactObjective | None) -> EndEffecto
         return None
     point, pose = Point(frame, offset), robot.contact_pose(frame)
     if pose in ("position", "box"):
-        return FramePosition(point, kp=_TIP_KP)
+        return FramePosition(point, kp=END_EFFECTOR_KP)
     if pose == "aligned" and aligned is not None:
-        return FrameAligned(point, aligned, kp=_TIP_KP)
-    return FramePose(point, kp=_TIP_KP)
+        return FrameAligned(point, aligned, kp=END_EFFECTOR_KP)
+    return FramePose(point, kp=END_EFFECTOR_KP)
 
 
 def _hint(robot: Robot, kind: ControllerKind, error: InputError) -> str:

@@ -108,7 +108,7 @@ def parameters(s: Structure, period: float) -> Iterator[Field]:
             ("com_margin", "nonnegative", "distance of the center of mass from the edges of the support polygon, m"),
             ("tilt", "amount", "largest tilt of the base from the default posture, rad"),
             ("share", "share", "share of the limits of the actuators that rest may take"),
-            ("haste", "share", "share of what is left of them that accelerating may take"),
+            ("haste", "share", "share of what is left of them for accelerating; braking may take (1 + haste)/2"),
             ("tracking", "amount", "error of the joints at which the flow waits, rad or m"),
         ):
             yield field(f"flow_{name}", rule, f"{text}, of the flow", getattr(s.flow.options, name))  # type: ignore[arg-type]

@@ -48,7 +48,8 @@ class FlowOptions:
         com_margin: Distance of the center of mass from the edges of the support polygon, m.
         tilt: Largest angle between the vertical and :attr:`~impact_posture.robot.robot.Robot.upright`, rad.
         share: Share of the actuators' limits that holding ``q_r`` may take.
-        haste: Share that accelerating may take of what is then left of the actuators' limits.
+        haste: Share that accelerating may take of what is then left of the actuators' limits.  Braking before a limit
+            may take half of the rest as well.
         tracking: Error of the joints at which the flow waits for the robot, rad (m).
     """
 

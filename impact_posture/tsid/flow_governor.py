@@ -14,11 +14,11 @@ from impact_posture.tsid.redundancy import Redundancy
 _TIMES = 3
 # Least share of the acceleration with which the flow counts on braking, and its growth with each change.
 _ABLE = 0.1
-# What it counts on braking longer, because the slopes of the limits change on that way.
+# Factor of the time of braking, because the slopes of the limits change on the way.
 _CAUTION = 1.5
-# Largest share of its step that the flow goes in a second, 1/s.
+# Largest ratio of the speed of the flow to its step, 1/s.
 _RATE = 4.8
-# Size below which a step has no pace, rad (m).
+# Least size of a step that the pace is divided by, rad (m).
 _TINY = 1e-12
 
 
@@ -46,7 +46,7 @@ class FlowGovernor:
     def change(
         self, space: Redundancy, step: Array, fastest: float, period: float, slope: Array | None
     ) -> tuple[Array, bool]:
-        """Return the change of the flow towards a step, shape (nv,), and whether it is that which only brakes.
+        """Return the change of the flow towards a step, shape (nv,), and whether it only brakes.
 
         Each joint turns as fast as it can, and then all stay on the constraints; or all change evenly; or all brake
         evenly.  The first two count twice more without what crosses limits.  The first change counts from which the

@@ -18,6 +18,8 @@ from impact_posture.tsid.posture_tasks import JointPosture
 from impact_posture.tsid.task import Task
 
 Order = Literal["strict", "weighted"]
+# Stiffness of the end effector's task by default, 1/s².
+END_EFFECTOR_KP = 60.0
 
 
 @checked_class
@@ -184,7 +186,7 @@ def _manipulator(
     if end_effector is None:
         if frame is None:
             raise InputError("has no default contact frame", where=robot.name, hint="give the end effector's task")
-        end_effector = FramePose(Point(frame), kp=60.0)
+        end_effector = FramePose(Point(frame), kp=END_EFFECTOR_KP)
     tasks = (*above, end_effector)
     levels, weighted = (tuple((task,) for task in tasks), ()) if order == "strict" else ((), tasks)
     return TaskFormulation(levels, weighted, posture, force_point=end_effector.point, law=law)

@@ -9,9 +9,9 @@
 #define IP_TIMES 3
 /* Least share of the acceleration with which the flow counts on braking, and its growth with each change. */
 #define IP_ABLE 0.1
-/* What it counts on braking longer, because the slopes of the limits change on that way. */
+/* Factor of the time of braking, because the slopes of the limits change on the way. */
 #define IP_CAUTION 1.5
-/* Largest share of its step that the flow goes in a second, 1/s. */
+/* Largest ratio of the speed of the flow to its step, 1/s. */
 #define IP_RATE 4.8
 
 /* Shorten x so that no entry exceeds a number. */
@@ -84,7 +84,7 @@ static int ip_flow_stops(const ip_flow *f, const ip_params *p, const double *ste
 
 /* The change of the flow towards the wanted step, by at most so much an entry: as fast as each joint can, or straight, each
  * of them twice without what crosses limits, or braking.  The first of them counts from which the flow can stop within the
- * limits.  Return whether it is that which only brakes. */
+ * limits.  Return whether it only brakes. */
 static int ip_flow_change(const ip_flow *f, const ip_params *p, double period, double fastest, double *step)
 {
   enum { N = IP_NV, FAST = 0, BRAKE = 2 };
