@@ -42,6 +42,7 @@ def compare(
         raise typer.BadParameter("name at least one controller", param_hint="--controllers")
     from impact_posture.experiment.folders import FORMATS, Output, store_beside, write_comparison
     from impact_posture.experiment.reproduction import reproduce
+    from impact_posture.experiment.statistics import FEWEST
     from impact_posture.output_folder import check_output
 
     plan = {scenario: list(dict.fromkeys(labels))}
@@ -61,7 +62,7 @@ def compare(
         print_json(found.comparison())
         return
     page = Page(quiet=quiet)
-    shown = "mean ± half of the 95 % interval" if seeds > 2 else "means (intervals from 3 seeds on)"
+    shown = "mean ± half of the 95 % interval" if seeds >= FEWEST else f"means (intervals from {FEWEST} seeds on)"
     page.title(found.rows[0].scenario, f"{seeds} seeds, {shown}" if seeds > 1 else "1 seed")
     rows_table(page, found.rows)
     if folder is not None:

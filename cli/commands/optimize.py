@@ -115,17 +115,13 @@ def optimize(
         page.line(f"written to {written.out}: {_contents(written)}")
 
 
-def _is_known(robot: str) -> bool:
-    # Loaded where a folder has the name only.
-    from impact_posture.robot.robot_loader import known_robots
-
-    return robot in known_robots()
-
-
 def _settings(robot: str, given: Given) -> ProblemSettings:
     from_file = robot.endswith(".toml")
-    if not from_file and (problem := Path(robot) / "problem.toml").is_file() and not _is_known(robot):
-        raise typer.BadParameter(f"a result folder is no robot; its problem is {problem}", param_hint="'ROBOT'")
+    if not from_file and (problem := Path(robot) / "problem.toml").is_file():
+        from impact_posture.robot.robot_loader import known_robots
+
+        if robot not in known_robots():
+            raise typer.BadParameter(f"a result folder is no robot; its problem is {problem}", param_hint="'ROBOT'")
     if not from_file or "contact" in given.values:
         given.check_contact()
     if not from_file:

@@ -125,7 +125,7 @@ def draw_reproduction(found: Reproduction, store: Store, folder: Path, formats: 
     bars = []
     for row in found.rows:
         paper, total = PAPER.get(row.scenario), row.metrics.get("q_total_impact")
-        mean, half = (np.nan, 0.0) if total is None else (total.mean, total.half_width or 0.0)
+        mean, half = (np.nan, 0.0) if total is None else (total.mean, total.shown or 0.0)
         # The paper has the nominal and the robust controller.
         bars.append(Bar(row.scenario, row.controller, mean, half, getattr(paper, row.controller, None)))
     save(bars_figure(bars), folder, "bars", formats)

@@ -8,7 +8,7 @@ import numpy as np
 
 from impact_posture.escape import markdown
 from impact_posture.experiment.reproduction import PAPER, Reproduction, missed_targets
-from impact_posture.experiment.statistics import Interval, Row
+from impact_posture.experiment.statistics import FEWEST, Interval, Row
 from impact_posture.simulation.controller_factory import MEANING
 
 # Most decimals of a number that is nearly zero.
@@ -78,7 +78,7 @@ def _table(head: str, rows: Sequence[Sequence[str]]) -> str:
 def summary(found: Reproduction) -> str:
     """Return the content of ``SUMMARY.md``."""
     many = f"{found.seeds} seeds" if found.seeds > 1 else "one seed"
-    shown = ", with 95 % confidence intervals." if found.seeds > 2 else ", so there are no intervals."
+    shown = ", with 95 % confidence intervals." if found.seeds >= FEWEST else ", so there are no intervals."
     parts = [
         "# The experiments of the paper, simulated again",
         f"Means over {many}{shown}",
@@ -181,7 +181,7 @@ def remarks(found: Reproduction, scenario: str) -> list[str]:
 def interval_text(value: Interval, digits: int = 3) -> str:
     """Return ``mean ± half width`` with a number of significant digits of the mean.
 
-    There is no half width for fewer than three samples, because it would say more about Student's t than about them.
+    There is no half width for few samples (:attr:`Interval.shown`).
     """
     decimals = max(0, digits - 1 - int(np.floor(np.log10(abs(value.mean))))) if value.mean else 0
     return _plus_minus(value, min(decimals, _DECIMALS))
@@ -195,9 +195,7 @@ def percent(value: Interval | None, unit: str = " %") -> str:
 def _plus_minus(value: Interval, decimals: int, factor: int = 1) -> str:
     # Adding zero turns -0.0 into 0.0.
     text = f"{round(factor * value.mean, decimals) + 0.0:.{decimals}f}"
-    if value.half_width is None or value.samples < 3:
-        return text
-    return f"{text} ± {factor * value.half_width:.{decimals}f}"
+    return text if value.shown is None else f"{text} ± {factor * value.shown:.{decimals}f}"
 
 
 def reduction_text(row: Row | None) -> str:

@@ -17,6 +17,7 @@ from impact_posture.errors import ImpactPostureError, InputError, SpecError, one
 from impact_posture.escape import file_name
 from impact_posture.experiment.batch import Store
 from impact_posture.experiment.jobs import Document, Job, controller_factory
+from impact_posture.experiment.statistics import FEWEST, Interval
 from impact_posture.impact.contact import point_on
 from impact_posture.impact.objective import ImpactObjective
 from impact_posture.output_folder import typed_command, write_json
@@ -272,11 +273,9 @@ def _summary(metrics: Mapping[str, Any]) -> str:
 def _comparison_content(folder: Path, document: Document, view: RunView) -> Content:
     rows = document["rows"]
     labels = [str(row["controller"]) for row in rows]
-    # An interval from two seeds is too wide to say anything: its quantile of Student's t is 12.7.
-    intervals = len(document["seeds"]) > 2
     table = [("status", *(str(row["status"]) for row in rows), "", "")]
     for key, unit, meaning in _METRICS:
-        table.append((key, *(_mean(row["metrics"].get(key), intervals) for row in rows), unit, meaning))
+        table.append((key, *(_mean(row["metrics"].get(key)) for row in rows), unit, meaning))
     verdict = []
     for row in rows:
         if row["reduction"] is not None and row["controller"] != "nominal":
@@ -285,9 +284,10 @@ def _comparison_content(folder: Path, document: Document, view: RunView) -> Cont
     line = (
         f"Within the impact windows, against nominal: {'; '.join(verdict)}." if verdict else "No reduction is known."
     )
-    seeds = str(len(document["seeds"]))
-    means = f"Means of {seeds} seeds{', with 95 % intervals' if intervals else ''}" if seeds != "1" else "One seed"
-    command = ["impact-posture", "compare", view.scenario, "--controllers", ",".join(labels), "--seeds", seeds]
+    seeds = len(document["seeds"])
+    intervals = ", with 95 % intervals" if seeds >= FEWEST else ""
+    means = "One seed" if seeds == 1 else f"Means of {seeds} seeds{intervals}"
+    command = ["impact-posture", "compare", view.scenario, "--controllers", ",".join(labels), "--seeds", str(seeds)]
     return Content(
         title=f"{document['scenario']}: {', '.join(labels)}",
         command=typed_command(folder) or shlex.join(command),
@@ -299,9 +299,9 @@ def _comparison_content(folder: Path, document: Document, view: RunView) -> Cont
     )
 
 
-def _mean(found: Mapping[str, Any] | None, interval: bool) -> str:
-    """Return a mean, with half of its interval where that is stated."""
+def _mean(found: Mapping[str, Any] | None) -> str:
+    """Return a mean, with half of its interval where it is shown."""
     if found is None:
         return "–"
-    half = "" if not interval or found["half_width"] is None else f" ± {number(found['half_width'])}"
-    return f"{number(found['mean'])}{half}"
+    half = Interval(**found).shown
+    return number(found["mean"]) + ("" if half is None else f" ± {number(half)}")

@@ -15,6 +15,9 @@ from impact_posture.simulation.outcome import Outcome, gravest
 # The metrics that have a mean and an interval.
 QUANTITIES = tuple(f.name for f in fields(Metrics) if f.name not in ("stops", "contacts", "contacts_asked", "rested"))
 
+# Fewest samples whose interval is shown.  That of two says nothing, because its quantile of Student's t is 12.7.
+FEWEST = 3
+
 
 @dataclass(frozen=True)
 class Interval:
@@ -29,6 +32,11 @@ class Interval:
     mean: float
     half_width: float | None
     samples: int
+
+    @property
+    def shown(self) -> float | None:
+        """Half width that people see, ``None`` for fewer than :data:`FEWEST` samples."""
+        return self.half_width if self.samples >= FEWEST else None
 
     @staticmethod
     def of(values: Sequence[float]) -> Interval:

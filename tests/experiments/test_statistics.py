@@ -46,6 +46,7 @@ NOMINAL = [document("nominal", k, 2.0 + 0.1 * k) for k in range(4)]
 def test_interval_is_students() -> None:
     samples = [1.0, 2.0, 4.0, 4.5]
     found = Interval.of(samples)
+    assert found.shown == found.half_width and Interval.of(samples[:2]).shown is None
     low, high = stats.t.interval(0.95, 3, loc=np.mean(samples), scale=stats.sem(samples))
     assert found.mean - found.half_width == pytest.approx(low)
     assert found.mean + found.half_width == pytest.approx(high)
