@@ -118,9 +118,9 @@ def is_ours(folder: Path, kind: Kind) -> bool:
 
 
 def own_files(folder: Path, kind: Kind) -> list[str]:
-    """Return the files that the record of a folder of this kind lists; none where there is no such record."""
+    """Return the files that the record of a folder of this kind lists, without itself; none without such a record."""
     content = _read_record(folder)
-    return [] if content is None or content["kind"] != kind else list(content["files"])
+    return [] if content is None or content["kind"] != kind else [name for name in content["files"] if name != RECORD]
 
 
 def add_to_record(folder: Path, paths: Iterable[Path]) -> None:

@@ -184,6 +184,8 @@ def test_the_code_of_a_result_is_that_of_its_objective(result: ip.PostureResult,
     before = {path.name: path.read_bytes() for path in folder.iterdir()}
     objective = arm()
     written = objective.export(folder)
+    apart = objective.export(tmp_path / "apart", build=False)
+    assert sorted(path.name for path in written.files) == sorted(path.name for path in apart.files)
     assert {path: path.read_bytes() for path in written.files} == {
         folder / p.name: before[p.name] for p in written.files
     }
