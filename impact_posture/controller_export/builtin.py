@@ -35,7 +35,7 @@ def default_formulation(
 ) -> TaskFormulation:
     """Return the formulation of a kind of robot with default gains.
 
-    Of the end effector of ``aerial`` and ``arm``, the task holds what ``optimize`` holds by default, so that the same
+    The task of the end effector (``aerial`` and ``arm``) holds what ``optimize`` holds by default, so that the same
     redundancy is left.
 
     Args:

@@ -122,7 +122,7 @@ def time_optimal(space: PathSpace, curve: PathCurve, limits: ActuatorLimits) -> 
     # Joints without a limit get a bound that nothing reaches; the solver takes no infinities.
     bound = np.where(np.isfinite(speed), speed, 1e6)
 
-    # TOPP-RA wants a torque for every joint; that of a joint without a limit stays zero.
+    # TOPP-RA needs a torque for every joint.  That of a joint without a limit stays zero.
     count, limited = space.model.nv, len(limits.names)
 
     def used(z: Array, v: Array, a: Array) -> Array:

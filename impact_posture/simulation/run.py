@@ -132,10 +132,13 @@ class _Loop:
         return speeds
 
     def check_length(self, t: float) -> None:
-        """Refuse a run until a time that has fewer than two ticks or more than :data:`_MOST`, s.
+        """Refuse a run of fewer than two ticks, or of more than :data:`_MOST`.
+
+        Args:
+            t: Duration of the run, s.
 
         Raises:
-            InputError: It has.
+            InputError: The run is too short or too long.
         """
         if not 2 * self.period <= t <= _MOST * self.period:
             fault, hint = f"more than {_MOST:.0e}", "lower the contacts' count or the times, or raise control.period"

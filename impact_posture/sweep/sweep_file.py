@@ -228,7 +228,7 @@ def _values(name: str, given: Any, where: str) -> tuple[Any, ...]:
         return tuple(0.0 if abs(v) < 1e-12 * abs(high - low) else float(f"{v:.12g}") for v in even)
     if not isinstance(given, list) or not given:
         raise SpecError("is no axis", where=where, hint="give a list of values, or { from, to, count }")
-    # A larger number is no float; the demand of the setting refuses it.
+    # A larger integer may be no float.  The demand of the setting refuses it.
     return tuple(float(v) if name in _INNER and type(v) is int and abs(v) <= LARGEST else v for v in given)
 
 
