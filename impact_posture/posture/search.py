@@ -28,9 +28,10 @@ Progress = Callable[[int, int], None]
 _FIRST, _ROUNDS = 2, 10
 # Unknowns of all starts together up to which every start is finished, because that takes no longer.
 _SMALL = 1000
-# Where only the best counts: unknowns of the starts that go on together, which takes longer than to build a program,
-# and the share above the best from which a bound dominates.  A run that ended in a trap may end below its bound.
-_BATCH, _FAR = 1500, 0.05
+# Where only the best counts: unknowns of the starts that go on together, their least number, and the share above the
+# best from which a bound dominates.  With more starts, the program gets what none of the best needs; with fewer, it
+# is built more often.  A run that ended in a trap may end below its bound.
+_BATCH, _LEAST, _FAR = 600, 2, 0.05
 # A fork takes as long as the runs of programs with so many unknowns in all.
 _FORK = 200
 # Starts that go on from postures this close (rad, m) share one run, which would end at the same posture.
@@ -149,8 +150,11 @@ class Search:
         runs: dict[int, Run] = {}
         starts, best = self._starts, np.inf
         waiting, counts = list(range(starts)), [0] * starts
+        # Ends that lack something, with the problem of their run: what starts lack that go on later waits with them.
+        owed: dict[int, tuple[SolveRecord, PostureProblem]] = {}
         while waiting:
             batch = self._next(waiting, runs)
+            self._grow([owed.pop(k) for k in batch if k in owed])
             shared = self._shared(batch)
             last = {k for own in shared.values() if max(counts[j] for j in own) >= _ROUNDS - 1 for k in own}
             for leader, run in self._round(list(shared), jobs, last):
@@ -170,6 +174,7 @@ class Search:
                 # Passing through something is worth more than the price to each of the first starts.
                 self._price = HIGH_PRICE
             self._trapped.update(trapped)
+            owed |= {k: (r, self.problem) for k, r in lacking.items()}
             ends = self._ends | {k: r.q for k, r in lacking.items()}
             self._ends = {k: q for k, q in ends.items() if k not in trapped}
             waiting = sorted({*waiting} - {*batch} | {*lacking, *trapped})
@@ -177,13 +182,17 @@ class Search:
                 dominated = {k for k in waiting if k in runs and runs[k].minimized > best + _FAR * abs(best)}
                 runs |= {k: replace(runs[k], dominated=True) for k in dominated}
                 waiting = [k for k in waiting if k not in dominated]
-                lacking = {k: r for k, r in lacking.items() if k not in dominated}
-            if lacking:
-                ended = list(lacking.values())
-                self.problem = self.problem.grown([r.q for r in ended], auxiliaries=[r.auxiliaries for r in ended])
-                self.nlp = self.nlp.grown(self.problem, compile=self._compile)
-                self.build_time_s += self.nlp.build_time_s
         return [runs[index] for index in range(starts)]
+
+    def _grow(self, owed: list[tuple[SolveRecord, PostureProblem]]) -> None:
+        """Give the program what it lacks at ends of runs, each with the problem of its run."""
+        # The auxiliaries of another program say nothing.
+        now = [record for record, problem in owed if problem is self.problem]
+        before = [record.q for record, problem in owed if problem is not self.problem]
+        grown = self.problem.grown([r.q for r in now], auxiliaries=[r.auxiliaries for r in now]).grown(before)
+        if grown is not self.problem:
+            self.problem, self.nlp = grown, self.nlp.grown(grown, compile=self._compile)
+            self.build_time_s += self.nlp.build_time_s
 
     @property
     def _unknowns(self) -> int:
@@ -200,7 +209,7 @@ class Search:
         if self._finish_all or not all(k in runs for k in waiting):
             return waiting
         groups = self._shared(sorted(waiting, key=lambda k: runs[k].minimized))
-        count = max(_BATCH // self._unknowns, 1)
+        count = max(_BATCH // self._unknowns, _LEAST)
         return sorted(k for group in list(groups.values())[:count] for k in group)
 
     def _clear(self, run: Run) -> bool:
