@@ -140,9 +140,8 @@ def _surroundings(
     for contact, _ in touching:
         if requirements.surface != "none":
             width = float("inf") if requirements.surface == "plane" else requirements.surface
-            points = [point_on(objective.robot, foot.frame, foot.offset) for foot in objective.supports]
-            points += [point_on(objective.robot, other.frame, other.offset) for other in objective.contacts]
-            found.add_surface(contact, width if width is None else float(width), points, objective.contacts)
+            feet = [point_on(objective.robot, foot.frame, foot.offset) for foot in objective.supports]
+            found.add_surface(contact, width if width is None else float(width), feet, objective.contacts)
     found.add_obstacles(requirements.obstacles)
     return found
 

@@ -86,8 +86,8 @@ class Surroundings:
         self,
         contact: ImpactContact,
         width: float | None,
-        touching: Sequence[PointOnLink] = (),
-        others: Sequence[ImpactContact] = (),
+        feet: Sequence[PointOnLink] = (),
+        contacts: Sequence[ImpactContact] = (),
     ) -> None:
         """Put the surface behind a contact: the whole plane, or a square patch of it.
 
@@ -100,8 +100,8 @@ class Surroundings:
         Args:
             contact: The contact.
             width: Edge length of the patch, m; infinite for the plane, ``None`` to decide.
-            touching: Contact points of feet and of other impacts.
-            others: Contacts that act at the same time.
+            feet: Contact points of the feet.
+            contacts: Contacts that act at the same time.
         """
         point = point_on(self.robot, contact.frame, contact.offset)
         turns = contact.normal_frame == "contact"
@@ -113,12 +113,14 @@ class Surroundings:
         depth = max([0.0, *[-self._height(body, through) for body in own]])
         self._depths[contact] = depth
         plane = replace(through, offset=-depth)
-        beside = [p.joint for p in touching if abs(self._above(p, plane)) < _BESIDE]
-        # Links of the same kind reach equally far behind their contact points, where the surface is.
-        facing = [c for c in others if not turns and c.normal_frame == "world" and n @ c.normal > _PARALLEL]
-        level = [point_on(self.robot, c.frame, c.offset) for c in facing]
-        beside += [p.joint for p in level if abs(self._above(p, through)) < _BESIDE]
-        exempt |= self._rigid(beside)
+        beside = [foot for foot in feet if abs(self._above(foot, plane)) < _BESIDE]
+        for other in contacts:
+            # Links of the same kind reach equally far behind their contact points, where the surface is.
+            facing = not turns and other.normal_frame == "world" and n @ other.normal > _PARALLEL
+            at = point_on(self.robot, other.frame, other.offset)
+            if any(abs(self._above(at, one)) < _BESIDE for one in ((plane, through) if facing else (plane,))):
+                beside.append(at)
+        exempt |= self._rigid(at.joint for at in beside)
         behind = self._stands_behind(plane, exempt)
         if width is None and behind:
             width = PATCH
