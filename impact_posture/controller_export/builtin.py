@@ -13,7 +13,7 @@ from impact_posture.errors import InputError
 from impact_posture.impact.contact import point_on
 from impact_posture.impact.objective import ImpactObjective
 from impact_posture.robot.robot import Robot
-from impact_posture.tsid.frame_tasks import EndEffector, FrameAligned, FramePose, FramePosition
+from impact_posture.tsid.frame_tasks import EndEffector, pose_task
 from impact_posture.tsid.impact_robust import ImpactRobustPosture
 from impact_posture.tsid.points import Point
 from impact_posture.tsid.posture_tasks import JointPosture
@@ -85,12 +85,7 @@ def _end_effector(robot: Robot, objective: ImpactObjective | None) -> EndEffecto
             aligned = placed.rotation.T @ aligned
     if frame is None:
         return None
-    point, pose = Point(frame, offset), robot.contact_pose(frame)
-    if pose in ("position", "box"):
-        return FramePosition(point, kp=END_EFFECTOR_KP)
-    if pose == "aligned" and aligned is not None:
-        return FrameAligned(point, aligned, kp=END_EFFECTOR_KP)
-    return FramePose(point, kp=END_EFFECTOR_KP)
+    return pose_task(Point(frame, offset), robot.contact_pose(frame), aligned, kp=END_EFFECTOR_KP)
 
 
 def _hint(robot: Robot, kind: ControllerKind, error: InputError) -> str:

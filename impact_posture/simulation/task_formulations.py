@@ -14,7 +14,7 @@ from impact_posture.simulation.control import StanceGains
 from impact_posture.simulation.scenario import Setup
 from impact_posture.tsid.body_tasks import BaseOrientation, CenterOfMass, Tilt
 from impact_posture.tsid.contacts import SupportContact, support_contacts
-from impact_posture.tsid.frame_tasks import EndEffector, FrameAligned, FramePose, FramePosition, Impedance
+from impact_posture.tsid.frame_tasks import EndEffector, Impedance, pose_task
 from impact_posture.tsid.points import Point
 from impact_posture.tsid.posture_tasks import JointPosture
 from impact_posture.tsid.task import Task
@@ -42,12 +42,17 @@ def end_effector_task(setup: Setup) -> EndEffector | None:
     mass, frame = scenario.control.apparent_mass, scenario.shape.frame
     impedance = None if mass is None else Impedance(mass)
     point = Point(frame, scenario.shape.offset)
-    options: dict[str, Any] = {"kp": gains.kp, "kd": gains.kd, "weight": gains.weight, "impedance": impedance}
-    if gains.pose == "aligned":
-        placed = Numeric(setup.robot.model).at(setup.q).placement(point_on(setup.robot, frame))
-        return FrameAligned(point, placed.rotation.T @ scenario.normal, name="end effector", **options)
-    kind = FramePose if gains.pose == "full" else FramePosition
-    return kind(point, name="end effector", **options)
+    placed = Numeric(setup.robot.model).at(setup.q).placement(point_on(setup.robot, frame))
+    return pose_task(
+        point,
+        gains.pose,
+        placed.rotation.T @ scenario.normal,
+        kp=gains.kp,
+        kd=gains.kd,
+        weight=gains.weight,
+        impedance=impedance,
+        name="end effector",
+    )
 
 
 def build_formulation(setup: Setup, posture: JointPosture, end_effector: EndEffector | None) -> TaskFormulation:

@@ -219,6 +219,22 @@ class FrameAligned(FrameTask[pin.SE3]):
 EndEffector = FramePose | FramePosition | FrameAligned
 
 
+def pose_task(point: Point, pose: str, axis: Array | None, **options: Any) -> EndEffector:
+    """Return the task that holds of a point what a pose mode holds.
+
+    Args:
+        point: The point.
+        pose: The pose mode.  ``box`` holds the position, as ``position`` does.
+        axis: Unit vector of ``aligned`` in the axes of the frame, shape (3,); without one, it is the whole pose.
+        options: Gains, weight and name of the task.
+    """
+    if pose in ("position", "box"):
+        return FramePosition(point, **options)
+    if pose == "aligned" and axis is not None:
+        return FrameAligned(point, axis, **options)
+    return FramePose(point, **options)
+
+
 def placement(point: PointState) -> pin.SE3:
     """Return the world placement of a point with the rotation of its frame."""
     return pin.SE3(point.rotation, point.position)
