@@ -5,8 +5,12 @@ from __future__ import annotations
 import os
 import subprocess
 import sys
+from collections.abc import Callable
+from contextlib import AbstractContextManager
 from dataclasses import replace
+from functools import partial
 from pathlib import Path
+from typing import Any
 
 import numpy as np
 import pytest
@@ -21,11 +25,14 @@ from impact_posture.codegen.functions import named_objectives
 from impact_posture.dynamics.numeric import Numeric
 from impact_posture.impact.objective import ImpactObjective
 from impact_posture.posture import search as search_module
+from impact_posture.posture import start_draws as draws_module
 from impact_posture.posture.load_cases import load_cases
 from impact_posture.posture.problem_settings import prepare
 from impact_posture.posture.search import Search
 from impact_posture.posture.solve import solve
+from impact_posture.posture.start_draws import StartDraws
 from impact_posture.posture.starts import Projector, feasible_start
+from impact_posture.processes import fork_server
 from impact_posture.report import shapes as report_shapes
 from impact_posture.report.shapes import DrawnRobot, draw_robot
 from impact_posture.robot.robot_loader import load_robot
@@ -136,7 +143,8 @@ def test_drawn_shapes_from_the_cache_are_the_shapes(
 def test_an_end_that_lacks_parts_is_certified_in_the_last_round_only(monkeypatch: pytest.MonkeyPatch) -> None:
     problem = prepare(ProblemSettings(robot="panda", frame="panda_hand_tcp", normal=(-1.0, 0.0, 0.0))).problem
     scale = problem.objective.value(problem.given)
-    search = Search(problem, (problem.given,), scale, starts=2, seed=0, compile="never", finish_all=True)
+    draws = StartDraws(problem, (problem.given,), 2, 0)
+    search = Search(problem, draws, scale, compile="never", finish_all=True)
     runs = [search._run(index, last=False) for index in range(2)]
     lacking = [index for index, run in enumerate(runs) if run.lacks]
     # Without such an end the test shows nothing.
@@ -148,6 +156,27 @@ def test_an_end_that_lacks_parts_is_certified_in_the_last_round_only(monkeypatch
             assert ended.certificate is not None and not ended.good
     monkeypatch.setattr(search_module, "_ROUNDS", 1)
     assert [run.good for run in search.run(1, None)][lacking[0]] is False
+
+
+@pytest.mark.parametrize("count", [0, 2, 4, None])
+def test_starts_are_the_same_whoever_draws_them(count: int | None, monkeypatch: pytest.MonkeyPatch) -> None:
+    """The copy of the process is asked after so many starts, or dies."""
+    problem = prepare(ProblemSettings(robot="solo8", normal=(0.0, 0.0, 1.0))).problem
+    here, ahead = (StartDraws(problem, (problem.given,), 6, 3) for _ in range(2))
+    answers = [False] * (count or 0)
+
+    def server(begin: Callable[..., Any]) -> AbstractContextManager[Any]:
+        asked = partial(os._exit, 1) if count is None else lambda: not answers or answers.pop()
+        return fork_server(lambda _: begin(asked))
+
+    monkeypatch.setattr(draws_module, "fork_server", server)
+    with ahead.ahead(2):
+        ahead.collect()
+    assert len(ahead._drawn) == (count or 0)
+    for index in range(6):
+        drawn, expected = ahead.choose(index), here.choose(index)
+        assert drawn is not None and expected is not None
+        np.testing.assert_array_equal(drawn, expected)
 
 
 def test_what_even_forces_hold_needs_no_linear_program(monkeypatch: pytest.MonkeyPatch) -> None:

@@ -29,6 +29,8 @@ _MISSING = 5e-9
 # behind a plane are mostly next to each other, and the deepest takes the others along.
 _MOST, _MOST_BEHIND = 6, 2
 
+_Lifted = WeakKeyDictionary[Tree, dict[int, tuple[Corners, LiftedRows]]]
+
 
 class Clearance(Constraint):
     """``distance(a, b) − clearance ≥ 0`` for pairs of bodies; the program has the pairs that were found to matter.
@@ -40,7 +42,7 @@ class Clearance(Constraint):
         separators: The pairs.
         words: Description in one line.
         active: Pairs in the program, by index, with the corners that have rows there.
-        lifted: Equations of pairs by tree and index, which all constraints share that one grows into.
+        lifted: Rows of pairs by tree and index with their corners, which all constraints share that one grows into.
         distances: Distances of these pairs and of others, with the places of these; by default made here.
     """
 
@@ -53,12 +55,12 @@ class Clearance(Constraint):
         separators: Sequence[Separator],
         words: str,
         active: Mapping[int, Corners] | None = None,
-        lifted: WeakKeyDictionary[Tree, dict[int, LiftedRows]] | None = None,
+        lifted: _Lifted | None = None,
         distances: tuple[PairDistances, range] | None = None,
     ) -> None:
         self.name, self._separators, self._words = name, tuple(separators), words
         self.active: Mapping[int, Corners] = active or {}
-        self._lifted = WeakKeyDictionary[Tree, dict[int, LiftedRows]]() if lifted is None else lifted
+        self._lifted = _Lifted() if lifted is None else lifted
         self.lower, self.upper = np.zeros(len(self._separators)), np.full(len(self._separators), np.inf)
         own = range(len(self._separators))
         self._distances, self._own = (PairDistances(separators), own) if distances is None else distances
@@ -159,13 +161,12 @@ class Clearance(Constraint):
 
     def lift(self, tree: Tree, parameters: ca.SX) -> LiftedRows:
         """See :class:`Constraint`; a pair keeps its equations while others, and more corners, come in."""
-        pieces, lifted = [], self._lifted.setdefault(tree, {})
+        lifted = self._lifted.setdefault(tree, {})
         for k, one, corners in self._program:
-            if k not in lifted:
-                lifted[k] = one.lift(tree, f"{self.name}{k}", parameters[self._own_plane(k)])
-            pair = lifted[k]
-            pieces.append(replace(pair, sides=one.sides(pair.variables, corners)))
-        return LiftedRows.joined(pieces)
+            before, pair = lifted.get(k) or (None, one.lift(tree, f"{self.name}{k}", parameters[self._own_plane(k)]))
+            if corners != before:
+                lifted[k] = corners, replace(pair, sides=one.sides(pair.variables, corners))
+        return LiftedRows.joined([lifted[k][1] for k in self.active])
 
     @property
     def lifted_bounds(self) -> tuple[Array, Array]:

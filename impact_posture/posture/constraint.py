@@ -22,7 +22,7 @@ from impact_posture.dynamics.tree import Tree
 from impact_posture.impact.lifted import Guess
 
 
-@dataclass(frozen=True)
+@dataclass(frozen=True, eq=False)
 class LiftedRows:
     """A constraint in the unknowns of the program: ``lower ≤ g(q, z) ≤ upper`` with auxiliaries z.
 

@@ -8,6 +8,7 @@ from __future__ import annotations
 
 from copy import copy
 from dataclasses import dataclass
+from weakref import WeakKeyDictionary
 
 import casadi as ca
 import numpy as np
@@ -81,6 +82,7 @@ class ProgramRows:
         self.parameters = [ca.SX.sym(f"p{k}", len(c.parameters)) for k, c in enumerate(problem.constraints)]
         self._lifted: dict[tuple[int, str, tuple[int, ...]], LiftedRows] = {}
         self._blocks: list[tuple[Derivatives, list[LiftedRows]]] = []
+        self._sides = WeakKeyDictionary[LiftedRows, Derivatives]()
 
     def branch(self) -> ProgramRows:
         """Return rows that grow on their own from here."""
@@ -126,14 +128,19 @@ class ProgramRows:
         at = [k for _, block in self._blocks for piece in block for k in columns[id(piece.rows)]]
         for found, block in self._blocks:
             present = [pieces[id(piece.rows)] for piece in block]
-            below = [Derivatives.of(piece.sides, piece.variables) for piece in present]
-            parts.append(_with_sides(found, below, nx))
+            parts.append(_with_sides(found, [self._of_sides(piece) for piece in present], nx))
             order += [k for places in (rows, sides) for piece in present for k in places[id(piece.rows)]]
         J, H = _stacked(parts, nx)
         new_columns = [*range(nx), *(nx + np.argsort(at)).tolist()]
         multipliers = ca.vertcat(*[part.multipliers for part in parts])
         new_rows = np.argsort(order).tolist()
         return Derivatives(multipliers[new_rows], J[new_rows, new_columns], H[new_columns, new_columns])
+
+    def _of_sides(self, piece: LiftedRows) -> Derivatives:
+        """Differentiate the sides of a piece, which are another object where they change."""
+        if piece not in self._sides:
+            self._sides[piece] = Derivatives.of(piece.sides, piece.variables)
+        return self._sides[piece]
 
     def _differentiate(self, pieces: list[LiftedRows]) -> None:
         """Differentiate the pieces that are new, together, because they share expressions."""

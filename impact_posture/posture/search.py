@@ -19,13 +19,16 @@ from impact_posture.posture.nlp import SLACK_PRICE, PostureNLP, SolveRecord, bui
 from impact_posture.posture.posture_distance import distance
 from impact_posture.posture.problem import PostureProblem
 from impact_posture.posture.program_rows import ProgramRows
-from impact_posture.posture.starts import ATTEMPTS, CANDIDATES, FEASIBLE, Projector, StartDraw
+from impact_posture.posture.start_draws import StartDraws
+from impact_posture.posture.starts import FEASIBLE
 from impact_posture.processes import fork_map
 
 Progress = Callable[[int, int], None]
 
-# Starts that run before the others, and most runs from one start, each with a program that has grown.
-_FIRST, _ROUNDS = 2, 10
+# Starts that run before the others in a program that grows.
+FIRST = 2
+# Most runs from one start, each with a program that has grown.
+_ROUNDS = 10
 # Unknowns of all starts together up to which every start is finished, because that takes no longer.
 _SMALL = 1000
 # Where only the best counts: unknowns of the starts that go on together, their least number, and the share above the
@@ -33,7 +36,7 @@ _SMALL = 1000
 # is built more often.  A run that ended in a trap may end below its bound.
 _BATCH, _LEAST, _FAR = 600, 2, 0.05
 # A fork takes as long as the runs of programs with so many unknowns in all.
-_FORK = 200
+FORK = 200
 # Starts that go on from postures this close (rad, m) share one run, which would end at the same posture.
 _SAME = 1e-6
 # Price of a meter of slack for runs that ended in a trap, and how often they begin anew, each time ten times as dear:
@@ -104,10 +107,8 @@ class Search:
 
     Args:
         problem: The posture problem.
-        known: The first starts.
+        draws: The starts.
         scale: The initial objective.
-        starts: Number of starts.
-        seed: Seed of the starts that are not known.
         compile: Whether to compile the program.
         finish_all: Whether starts go on that cannot become the best; in small programs they always do.
         rows: The rows of the constraints, if another program of the problem has them.
@@ -116,23 +117,17 @@ class Search:
     def __init__(
         self,
         problem: PostureProblem,
-        known: tuple[Array, ...],
+        draws: StartDraws,
         scale: float,
         *,
-        starts: int,
-        seed: int,
         compile: CompileMode,
         finish_all: bool,
         rows: ProgramRows | None = None,
     ) -> None:
-        self.problem, self._known, self._scale, self._seed, self._compile = problem, known, scale, seed, compile
-        self.nlp = build_nlp(problem, compile=compile, starts=starts, rows=rows)
-        # The constraints that starts are pulled onto do not grow.
-        self._projector = Projector(problem)
-        # A start that begins anew goes on with the postures that it drew before.
-        self._draws: dict[int, StartDraw] = {}
-        self._small = starts * self._unknowns <= _SMALL
-        self._starts, self._finish_all = starts, finish_all or self._small
+        self.problem, self._draws, self._scale, self._compile = problem, draws, scale, compile
+        self.nlp = build_nlp(problem, compile=compile, starts=draws.count, rows=rows)
+        self._small = draws.count * self._unknowns <= _SMALL
+        self._finish_all = finish_all or self._small
         self.build_time_s = self.nlp.build_time_s
         # A run goes on from where it ended without what the program lacked.
         self._ends: dict[int, Array] = {}
@@ -148,13 +143,15 @@ class Search:
         The starts with the lowest bounds go on first, and those whose bound is well above a certified end not at all.
         """
         runs: dict[int, Run] = {}
-        starts, best = self._starts, np.inf
+        starts, best = self._draws.count, np.inf
         waiting, counts = list(range(starts)), [0] * starts
         # Ends that lack something, with the problem of their run: what starts lack that go on later waits with them.
         owed: dict[int, tuple[SolveRecord, PostureProblem]] = {}
         while waiting:
             batch = self._next(waiting, runs)
             self._grow([owed.pop(k) for k in batch if k in owed])
+            if runs:
+                self._draws.collect()
             shared = self._shared(batch)
             last = {k for own in shared.values() if max(counts[j] for j in own) >= _ROUNDS - 1 for k in own}
             for leader, run in self._round(list(shared), jobs, last):
@@ -170,7 +167,7 @@ class Search:
             # A run without all rows goes through bodies and may end between them.  With the rows and a higher price
             # it keeps what its start satisfies.
             trapped = {k for k in batch if runs[k].trapped and k not in last}
-            if len(runs) < starts and trapped == {*range(_FIRST)}:
+            if len(runs) < starts and trapped == {*range(FIRST)}:
                 # Passing through something is worth more than the price to each of the first starts.
                 self._price = HIGH_PRICE
             self._trapped.update(trapped)
@@ -189,7 +186,8 @@ class Search:
         # The auxiliaries of another program say nothing.
         now = [record for record, problem in owed if problem is self.problem]
         before = [record.q for record, problem in owed if problem is not self.problem]
-        grown = self.problem.grown([r.q for r in now], auxiliaries=[r.auxiliaries for r in now]).grown(before)
+        numeric = self.nlp.program.numeric
+        grown = self.problem.grown([r.q for r in now], numeric, [r.auxiliaries for r in now]).grown(before, numeric)
         if grown is not self.problem:
             self.problem, self.nlp = grown, self.nlp.grown(grown, compile=self._compile)
             self.build_time_s += self.nlp.build_time_s
@@ -202,10 +200,10 @@ class Search:
         """Return the starts to run next."""
         if not runs and self.problem.grows:
             # What the first starts lack is what most others will.
-            return waiting[:_FIRST]
-        if self._small and len(runs) == _FIRST and waiting[0] < _FIRST:
+            return waiting[:FIRST]
+        if self._small and len(runs) == FIRST and waiting[0] < FIRST:
             # A little more in a small program costs the others less than another run.
-            return [k for k in waiting if k < _FIRST]
+            return [k for k in waiting if k < FIRST]
         if self._finish_all or not all(k in runs for k in waiting):
             return waiting
         groups = self._shared(sorted(waiting, key=lambda k: runs[k].minimized))
@@ -227,7 +225,7 @@ class Search:
         return groups
 
     def _round(self, waiting: list[int], jobs: int, last: set[int]) -> Iterator[tuple[int, Run]]:
-        jobs = jobs if len(waiting) * self._unknowns > _FORK else 1
+        jobs = jobs if len(waiting) * self._unknowns > FORK else 1
         with fork_map(lambda k: self._timed(waiting[k], last=waiting[k] in last), len(waiting), jobs) as results:
             if around := self.problem.surroundings:
                 # The last word needs the shapes themselves, and this process would only wait.
@@ -245,16 +243,8 @@ class Search:
         nlp, scale, problem = self.nlp, self._scale, self.problem
         numeric = nlp.program.numeric
         trapped, start = self._trapped[index], self._ends.get(index)
-        if start is None and index < len(self._known) and trapped <= 1:
-            start = self._known[index]
-        elif start is None:
-            # What is not clear of other bodies may not get out from between them.
-            other = index + max(trapped - 1, 0) * self._starts
-            count = ATTEMPTS if trapped else CANDIDATES
-            # Near the first start, because the given posture may be far from all that satisfies the constraints.
-            if other not in self._draws:
-                self._draws[other] = StartDraw(problem, other, self._seed, self._known[0], self._projector)
-            start = self._draws[other].choose(count)
+        if start is None:
+            start = self._draws.choose(index, trapped)
         if start is None:
             return Run()
         price = HIGH_PRICE * _DEARER ** (trapped - 1) if trapped else self._price

@@ -20,7 +20,8 @@ from impact_posture.posture.initial_posture import initial_objective, initial_po
 from impact_posture.posture.ipopt import one_blas_thread
 from impact_posture.posture.problem import PostureProblem, equality_jacobian, rank
 from impact_posture.posture.program_rows import ProgramRows
-from impact_posture.posture.search import Progress, Run, Search
+from impact_posture.posture.search import FIRST, FORK, Progress, Run, Search
+from impact_posture.posture.start_draws import StartDraws
 
 # Optima closer than this in posture (tangent norm) and in objective (relative) are the same optimum.
 SAME_POSTURE, _SAME_OBJECTIVE = 1e-2, 1e-4
@@ -124,17 +125,12 @@ def solve(
     problem, initial = initial_posture(problem, seed, rows)
     scale = initial_objective(problem, initial)
     began = time.perf_counter()
-    search = Search(
-        problem,
-        (initial, *guesses),
-        scale,
-        starts=starts,
-        seed=seed,
-        compile=compile,
-        finish_all=finish_all,
-        rows=rows,
-    )
-    runs = search.run(jobs, progress)
+    draws = StartDraws(problem, (initial, *guesses), starts, seed)
+    # The other core has time for this while the program is built.
+    early = problem.grows and jobs > 1 and starts * initial.size > FORK
+    with draws.ahead(FIRST if early else starts):
+        search = Search(problem, draws, scale, compile=compile, finish_all=finish_all, rows=rows)
+        runs = search.run(jobs, progress)
     problem, nlp = search.problem, search.nlp
     certified = [r for r in runs if r.good]
     if not certified:
