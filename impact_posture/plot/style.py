@@ -164,7 +164,8 @@ def lay_out(figure: Figure) -> FigureCanvasAgg:
             engine.execute(figure)
         for axes in equal:
             del axes.get_tightbbox
-        figure.set_layout_engine("none")
+        # With an engine, even one that does nothing, `savefig` would draw twice.
+        figure.set_layout_engine(None)
         # Rounded, because the solver of the layout differs in the last digits from run to run.
         for part in figure.subfigs:
             box = part.bbox_relative

@@ -55,8 +55,8 @@ def defects(figure: Figure) -> list[str]:
     """What is wrong with a figure: texts on each other, on lines or off the page, axes without units, legends."""
     figure.set_dpi(100)
     canvas = FigureCanvasAgg(figure)
+    # It draws everything as well, so that texts know where they stand.
     lay_out(figure)
-    figure.draw_without_rendering()
     texts = [t for t in figure.findobj(Text) if t.get_visible() and t.get_text().strip() and _shown(t, figure)]
     words = [Words.of(text) for text in texts]
     found = [
