@@ -189,16 +189,17 @@ def read_sweep(path: Path) -> Sweep:
         where, problem = str(at), from_folder(read_toml(at), at.parent, _FILES)
     else:
         where, problem = f"{path}: problem", from_folder(settings.problem, folder, _FILES)
-    values = {name: _values(name, given, f"{path}: grid.{name}") for name, given in settings.grid.items()}
-    outer = [name for name in values if name not in _INNER]
-    inner = [name for name in _INNER if name in values]
+    sizes = {name: _size(given, f"{path}: grid.{name}") for name, given in settings.grid.items()}
+    outer = [name for name in sizes if name not in _INNER]
+    inner = [name for name in _INNER if name in sizes]
     _check_names([*outer, *inner], f"{path}: grid")
     for count, most, words in (
-        (prod(map(len, values.values())), _MOST, "points"),
-        (prod(len(values[name]) for name in outer), _MOST_CASES, f"combinations of {', '.join(outer)}"),
+        (prod(sizes.values()), _MOST, "points"),
+        (prod(sizes[name] for name in outer), _MOST_CASES, f"combinations of {', '.join(outer)}"),
     ):
         if count > most:
             raise SpecError(f"has {count} {words}", where=f"{path}: grid", hint=f"give at most {most:.0e}")
+    values = {name: _values(name, given) for name, given in settings.grid.items()}
     if "contact" in problem:
         raise SpecError("a sweep is of one contact", where=f"{where}.contact", hint="give `frame` and `normal`")
     first = {name: values[name][0] for name in inner if name not in OFFSETS}
@@ -216,18 +217,26 @@ def read_sweep(path: Path) -> Sweep:
     return Sweep(tuple(cases), tuple(Axis(name, values[name]) for name in outer), Grid(axes), settings.shard)
 
 
-def _values(name: str, given: Any, where: str) -> tuple[Any, ...]:
-    """Return the values of an axis, from a list or from ``{from, to, count}``."""
+def _size(given: Any, where: str) -> int:
+    """Return the number of values of an axis, a list or ``{from, to, count}``."""
     if isinstance(given, dict):
         low, high, count = (given.get(key, "") for key in ("from", "to", "count"))
         ends = all(type(v) in (int, float) and abs(v) <= LARGEST for v in (low, high))
         if not ends or set(given) != {"from", "to", "count"} or type(count) is not int or not 2 <= count <= 10**6:
             raise SpecError("is no range", where=where, hint="give from, to and count (2 to 1e6), or a list")
+        return count
+    if not isinstance(given, list) or not given:
+        raise SpecError("is no axis", where=where, hint="give a list of values, or { from, to, count }")
+    return len(given)
+
+
+def _values(name: str, given: Any) -> tuple[Any, ...]:
+    """Return the values of an axis that has a :func:`_size`."""
+    if isinstance(given, dict):
+        low, high, count = given["from"], given["to"], given["count"]
         # Rounded, so that a tenth is a tenth and zero is zero.
         even = [low + (high - low) * k / (count - 1) for k in range(count)]
         return tuple(0.0 if abs(v) < 1e-12 * abs(high - low) else float(f"{v:.12g}") for v in even)
-    if not isinstance(given, list) or not given:
-        raise SpecError("is no axis", where=where, hint="give a list of values, or { from, to, count }")
     # A larger integer may be no float.  The demand of the setting refuses it.
     return tuple(float(v) if name in _INNER and type(v) is int and abs(v) <= LARGEST else v for v in given)
 
