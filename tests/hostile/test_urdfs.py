@@ -199,7 +199,7 @@ def test_shapes_of_which_no_two_can_meet(arena: Path) -> None:
     (arena / "boxes.urdf").write_text(SMALL.replace("</inertial>", f"</inertial>{box}"))
     push = ("--frame", "tip", "--normal", "1", "0", "0", "--contact-pose", "free")
     outcome = strike(
-        arena, "optimize", "boxes.urdf", *push, "--starts", "1", "--no-codegen", "--format", "svg", "--out", "out",
+        arena, "optimize", "boxes.urdf", *push, "--starts", "1", "--no-codegen", "--format", "png", "--out", "out",
         "--quiet",
     )  # fmt: skip
     assert (outcome.code, outcome.complaints) == (0, []), outcome.err
