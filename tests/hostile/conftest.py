@@ -10,18 +10,21 @@ from tests.hostile.arena import SMALL, strike
 
 
 @pytest.fixture(scope="session")
-def loaded() -> None:
-    """Everything imported once: each attack then is a fork."""
+def sound(tmp_path_factory: pytest.TempPathFactory) -> None:
+    """The small robot can be evaluated, with everything imported once: each attack then is a fork."""
     import tests.command  # noqa: F401
+
+    folder = tmp_path_factory.mktemp("sound")
+    (folder / "small.urdf").write_text(SMALL)
+    found = strike(folder, "evaluate", "small.urdf", "--frame", "tip", "--normal", "0", "0", "1")
+    assert (found.code, found.complaints) == (0, []), found.err
 
 
 @pytest.fixture
-def arena(tmp_path: Path, loaded: None) -> Path:
+def arena(tmp_path: Path, sound: None) -> Path:
     (tmp_path / "small.urdf").write_text(SMALL)
     (tmp_path / "precious").mkdir()
     (tmp_path / "precious" / "thesis.txt").write_text("ten years")
     (tmp_path / "wrong.json").write_text('{"names": 3, "joints": ["nobody"]}')
     (tmp_path / "wrong.toml").write_text("[[[")
-    sound = strike(tmp_path, "evaluate", "small.urdf", "--frame", "tip", "--normal", "0", "0", "1")
-    assert (sound.code, sound.complaints) == (0, []), sound.err
     return tmp_path
