@@ -152,15 +152,15 @@ def stepped(case: ImpactCase, q: Vector, stiffness: float, speed: float) -> Step
     last = run.y_events[0][0]
     dx, dy = last[2 * nv : 4 * nv].reshape(2, nv)
     between = run.sol(np.linspace(0, run.t_events[0][0], 5000)).T
-    torques = np.array([torque(state) for state in between])
-    squares = [state[2 * nv : 3 * nv] @ W @ state[2 * nv : 3 * nv] for state in between]
+    x, y, dxs, dys = np.moveaxis(between[:, : 4 * nv].reshape(-1, 4, nv), 1, 0)
+    torques, squares = K * (x - y) + D * (dxs - dys), np.sum((dxs @ W) * dxs, axis=1)
     x, y = last[: 2 * nv].reshape(2, nv)
     delta, impulse, loss = last[4 * nv :]
     stored = stiffness * delta**2 / 2 + np.sum(K * (x - y) ** 2) / 2
     return Stepped(
         duration=float(run.t_events[0][0]), x=dx, y=np.where(soft, dy, dx), delta=delta, impulse=impulse,
-        torque=torque(last), largest_torque=np.abs(torques).max(axis=0), largest_square=max(squares), loss=loss,
-        energy=float(dx @ M @ dx / 2 + dy @ (B * soft * dy) / 2 + stored),
+        torque=torque(last), largest_torque=np.abs(torques).max(axis=0), largest_square=float(squares.max()),
+        loss=loss, energy=float(dx @ M @ dx / 2 + dy @ (B * soft * dy) / 2 + stored),
     )  # fmt: skip
 
 
