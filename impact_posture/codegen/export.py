@@ -161,7 +161,7 @@ def export(
         # Normalizing a configuration of unit norm changes its last digits.  Keep those that result.json has.
         posture = given if np.allclose(given, posture, rtol=0, atol=1e-9) else posture
     exported, code = cached_code(tuple(objectives), prefix, real, portable)
-    manifest = build_manifest(objectives, prefix, posture, compression, real, code.stack_bytes)
+    manifest = build_manifest(objectives, prefix, posture, compression, real, code.stack_bytes, portable=portable)
     texts = render(exported, prefix, manifest, code, real)
     texts[f"{prefix}.json"] = json.dumps(manifest, indent=2, allow_nan=False) + "\n"
     there = [name for name in texts if (out / name).exists()]

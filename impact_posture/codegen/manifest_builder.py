@@ -76,6 +76,8 @@ def build_manifest(
     compression: Compression | None,
     real: Real = DOUBLE,
     stack_bytes: int = 0,
+    *,
+    portable: bool = False,
 ) -> dict[str, Any]:
     """Return all that a reader needs to know whether the export fits the robot in hand.
 
@@ -105,6 +107,7 @@ def build_manifest(
         "schema": SCHEMA,
         "prefix": prefix,
         "real": real.name,
+        "portable": portable,
         "stack_bytes": stack_bytes,
         "model_sha256": robot.model_sha256,
         "robot": robot.name,
