@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import inspect
+import os
 from collections.abc import Callable, Collection, Mapping
 from dataclasses import MISSING, dataclass, fields
 from pathlib import Path
@@ -56,7 +57,7 @@ class Given:
         Raises:
             UsageError: An option contradicts the result folder; exit code 2.
         """
-        if not (Path(robot) / "result.json").is_file():
+        if not os.path.isfile(Path(robot) / "result.json"):
             return False
         for name in self.context.params:
             if name not in {"robot", "json", "quiet", *free} and _on_command_line(self.context, name):

@@ -6,9 +6,9 @@ Messages of the library hold parameters between backquotes, for example ``force=
 from __future__ import annotations
 
 import ast
+import os
 import re
 from functools import cache
-from pathlib import Path
 
 # Options that are no settings.
 _OTHERS = {
@@ -38,7 +38,7 @@ def as_options(text: str) -> str:
 def option_of(where: str) -> str:
     """Write the place of an error as an option, where it is a setting or begins with a setting."""
     name, *rest = where.split(" ", maxsplit=1)
-    return " ".join([_option(name), *rest]) if name in _names() and not Path(where).exists() else where
+    return " ".join([_option(name), *rest]) if name in _names() and not os.path.exists(where) else where
 
 
 def _as_option(found: re.Match[str]) -> str:

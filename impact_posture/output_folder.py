@@ -36,6 +36,7 @@ def check_output(out: Path, *, force: bool, kind: Kind) -> None:
         OutputError: The folder exists, is no folder, holds foreign files, cannot be replaced, or its parent cannot be
             written.
     """
+    check_name(out)
     if out.is_symlink():
         raise OutputError("is a symbolic link", where=str(out), hint="name the folder that it leads to, or another")
     if os.path.lexists(out) and not out.is_dir():
@@ -53,6 +54,21 @@ def check_output(out: Path, *, force: bool, kind: Kind) -> None:
     parent = next(folder for folder in out.absolute().parents if folder.exists())
     if not parent.is_dir() or not os.access(parent, os.W_OK | os.X_OK):
         raise OutputError("cannot be written", where=str(parent), hint="choose another `out`")
+
+
+def check_name(out: Path) -> None:
+    """Refuse a name that no file or folder can have, and one that cannot be looked up.
+
+    Raises:
+        OutputError: The system refuses the name.
+    """
+    try:
+        os.lstat(out)
+    except (FileNotFoundError, NotADirectoryError):
+        pass
+    except (OSError, ValueError) as error:
+        words = f"cannot be written ({getattr(error, 'strerror', None) or error})"
+        raise OutputError(words, where=str(out), hint="choose another `out`") from None
 
 
 @contextmanager
@@ -248,8 +264,8 @@ def _parents_of(out: Path) -> Iterator[None]:
     missing = [folder for folder in out.parents if not folder.exists()]
 
     def remove() -> None:
-        with suppress(OSError):
-            for folder in missing:
+        for folder in missing:
+            with suppress(OSError):
                 folder.rmdir()
 
     with undone(remove):
@@ -258,6 +274,6 @@ def _parents_of(out: Path) -> Iterator[None]:
                 folder.mkdir(exist_ok=True)
         except OSError as error:
             raise OutputError(
-                f"cannot be made ({error.strerror})", where=str(missing[-1]), hint="choose another `out`"
+                f"cannot be made ({error.strerror})", where=str(error.filename), hint="choose another `out`"
             ) from None
         yield

@@ -2,8 +2,8 @@
 
 from __future__ import annotations
 
+import os
 from collections.abc import Mapping, Sequence
-from pathlib import Path
 
 from impact_posture.errors import ContactError, InputError
 
@@ -37,7 +37,7 @@ def parse_armature(texts: Sequence[str]) -> Mapping[str, float] | str | None:
     """
     if not texts:
         return None
-    if len(texts) == 1 and ("=" not in texts[0] or Path(texts[0]).is_file()):
+    if len(texts) == 1 and ("=" not in texts[0] or os.path.isfile(texts[0])):
         return texts[0]
     values: dict[str, float] = {}
     for text in texts:

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import json
+import os
 from collections.abc import Sequence
 from dataclasses import dataclass, fields
 from pathlib import Path
@@ -80,7 +81,7 @@ def load_result(folder: Path) -> tuple[Prepared, ResultView, dict[str, Any]]:
     Raises:
         SpecError: As :func:`load_view`.
     """
-    if not (folder / "result.json").is_file():
+    if not os.path.isfile(folder / "result.json"):
         raise SpecError("holds no result.json", where=str(folder), hint="name a folder that optimize wrote")
     try:
         document = json.loads(read_text(folder / "result.json"), parse_constant=_refuse_constant)

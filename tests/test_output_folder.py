@@ -11,10 +11,20 @@ from collections.abc import Callable
 from pathlib import Path
 
 import pytest
+from matplotlib.figure import Figure
 
-from impact_posture.errors import OutputError
+import impact_posture as ip
+from impact_posture.errors import InputError, OutputError
+from impact_posture.experiment.run_reports import write_run_report
 from impact_posture.output_folder import Kind, add_to_record, check_output, whole_folder
+from impact_posture.plot.style import save
+from impact_posture.result_view import load_view
+from impact_posture.robot.draft import write_draft
+from impact_posture.robot.postures import read_posture
+from impact_posture.robot.robot_loader import load_robot
 from impact_posture.scratch_folder import RECORD, scratch_folder
+from impact_posture.settings import LoadOptions
+from impact_posture.simulation.scenario_file import read_scenario
 
 
 def write(out: Path, text: str, *, force: bool = False, kind: Kind = "result") -> None:
@@ -254,3 +264,37 @@ def test_what_a_killed_run_left_is_swept_by_the_next_and_nothing_else(tmp_path: 
     assert not left.exists()
     assert sorted(os.listdir(tmp_path)) == sorted([*others, "out"])
     assert all((tmp_path / name / file).read_text() == text for name in others for file, text in others[name].items())
+
+
+# ---- names that no file has ----------------------------------------------------------------------------------------
+
+
+@pytest.mark.parametrize("name", ["a\0b", "x" * 300, "a\ud800"])
+def test_names_that_no_file_can_have_are_refused(name: str, tmp_path: Path) -> None:
+    arm, contact = load_robot("tilthex_arm"), ip.ImpactContact("ee", (0.0, 0.0, 1.0))
+    objective, out = ip.ImpactObjective(arm, contact), tmp_path / name
+    for use in (
+        lambda: write(out, "one"),
+        lambda: objective.export(out, build=False),
+        lambda: save(Figure(), out, "one"),
+        lambda: write_draft("example-robot-data:ur_description/urdf/ur5_robot.urdf", LoadOptions(), out),
+        lambda: load_robot(str(out)),
+        lambda: load_robot(name),
+        lambda: load_robot("ur5", srdf=str(out)),
+        lambda: load_robot("ur5", package_dir=(str(out),)),
+        lambda: read_posture(arm, name, where="posture"),
+        lambda: read_scenario(name),
+        lambda: load_view(out),
+        lambda: write_run_report(out),
+        lambda: ip.ImpactGradient.load(out),
+    ):
+        with pytest.raises(InputError) as caught:
+            use()
+        assert caught.value.hint and "\n" not in caught.value.line
+    assert not list(tmp_path.iterdir())
+
+
+def test_a_long_name_between_folders_that_are_missing_is_named(tmp_path: Path) -> None:
+    with pytest.raises(OutputError) as caught:
+        write(tmp_path / "missing" / ("x" * 300) / "out", "one")
+    assert "x" * 300 in caught.value.where and not list(tmp_path.iterdir())

@@ -100,7 +100,7 @@ def codegen(
 
 def _check_problem(given: Given, robot: str) -> None:
     """Check that there is a contact. Without one, a folder or a path to one is meant as a result folder."""
-    if not {"contact", "normal"} & given.values.keys() and (Path(robot).is_dir() or robot.endswith(os.sep)):
+    if not {"contact", "normal"} & given.values.keys() and (os.path.isdir(robot) or robot.endswith(os.sep)):
         from impact_posture.result_view import load_view
         from impact_posture.robot.robot_loader import known_robots
 

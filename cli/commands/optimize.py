@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import gc
+import os
 from pathlib import Path
 from typing import TYPE_CHECKING, Annotated
 
@@ -117,7 +118,7 @@ def optimize(
 
 def _settings(robot: str, given: Given) -> ProblemSettings:
     from_file = robot.endswith(".toml")
-    if not from_file and (problem := Path(robot) / "problem.toml").is_file():
+    if not from_file and os.path.isfile(problem := Path(robot) / "problem.toml"):
         from impact_posture.robot.robot_loader import known_robots
 
         if robot not in known_robots():

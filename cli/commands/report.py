@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import os
 from collections.abc import Callable
 from pathlib import Path
 from typing import Annotated
@@ -29,7 +30,7 @@ def report(
 
     place = Path(folder)
     rewrite: Callable[..., Path]
-    if any((place / name).is_file() for name in ("run.json", "comparison.json")):
+    if any(os.path.isfile(place / name) for name in ("run.json", "comparison.json")):
         from impact_posture.experiment.run_reports import write_run_report as rewrite
     else:
         from impact_posture.result_view import rewrite_report as rewrite

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import os
 from pathlib import Path
 
 from impact_posture_cli import options
@@ -16,7 +17,7 @@ def view(folder: OutputFolder, json: options.Json = False, quiet: options.Quiet 
     from impact_posture.report import REPORT
 
     page = Path(folder) / REPORT
-    if not page.is_file():
+    if not os.path.isfile(page):
         raise InputError("is not there", where=str(page), hint=f"make it with `impact-posture report {folder}`")
     if not webbrowser.open(page.resolve().as_uri()):
         raise InputError("no browser could be started", where=str(page), hint="open this file in a browser")

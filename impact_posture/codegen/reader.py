@@ -5,6 +5,7 @@ from __future__ import annotations
 import ctypes
 import hashlib
 import json
+import os
 from collections.abc import Mapping
 from pathlib import Path
 from typing import TYPE_CHECKING, Annotated, Any, Literal, TypeVar
@@ -101,7 +102,7 @@ def read_checked(
     Raises:
         SpecError: There is no manifest, there are several, or it is broken.
     """
-    files = [path] if not path.is_dir() else sorted(p for p in path.glob("*.json") if _is_manifest(p, schema))
+    files = [path] if not os.path.isdir(path) else sorted(p for p in path.glob("*.json") if _is_manifest(p, schema))
     if len(files) != 1:
         words = f"holds no {what}" if not files else f"holds {len(files)} {what}s"
         hint = f"name the folder that {command} wrote" if not files else f"name one, such as {files[0].name}"

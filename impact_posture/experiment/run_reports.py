@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import json
+import os
 import shlex
 from collections.abc import Iterable, Mapping, Sequence
 from contextlib import suppress
@@ -123,7 +124,7 @@ def write_run_report(folder: Path, scenario: str = "", *, meshes: bool = False) 
         OutputError: The report cannot be written.
     """
     try:
-        if (folder / SIMULATION).is_file():
+        if os.path.isfile(folder / SIMULATION):
             document = _read(folder / SIMULATION)
             runs = _runs(document, folder / "series", scenario, len(document["runs"]))
             content = _run_content(folder, document, runs[0][0], _job(document, scenario))

@@ -21,6 +21,7 @@ from PIL import Image
 
 from impact_posture.errors import InputError, OutputError
 from impact_posture.escape import printable
+from impact_posture.output_folder import check_name
 from impact_posture.plot.labels import draw_with_labels
 from impact_posture.plot.view import SEPARATOR
 from impact_posture.scratch_folder import scratch_folder
@@ -228,6 +229,7 @@ def save(figure: Figure, out_dir: Path, name: str, formats: Iterable[str] = DEFA
     """
     paths = []
     wanted = check_formats(formats)
+    check_name(Path(out_dir))
     with style():
         canvas = lay_out(figure)
     for extension in wanted:

@@ -12,6 +12,7 @@ import numpy as np
 
 from impact_posture.errors import InputError, OutputError
 from impact_posture.escape import toml
+from impact_posture.output_folder import check_name
 from impact_posture.robot import guess
 from impact_posture.robot.draft_text import Draft, comment_lines
 from impact_posture.robot.foot_shape import foot_specs, support_depth
@@ -47,6 +48,7 @@ def write_draft(robot: str, options: LoadOptions, out: Path | None, *, force: bo
     located = locate(robot, LoadOptions(config=os.devnull))
     in_package = located.source.startswith(EXAMPLE_PREFIX)
     out = out or (Path(f"{located.urdf.stem}.toml") if in_package else located.urdf.parent / "robot.toml")
+    check_name(out)
     if out.exists() and not force:
         raise OutputError("exists", where=str(out), hint="name another file, or `force=True` to replace it")
     draft = draft_spec(located, options, out.absolute().parent)

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import json
 import math
+import os
 import re
 from collections import Counter
 from collections.abc import Mapping, Sequence
@@ -71,7 +72,7 @@ def write_posture(robot: Robot, q: Array) -> dict[str, object]:
 def posture_path(text: str) -> Path | None:
     """Return the path if ``text`` names a posture file, else ``None``."""
     path = Path(text).expanduser()
-    return path if path.suffix in (".json", ".yaml", ".yml") or path.is_file() else None
+    return path if path.suffix in (".json", ".yaml", ".yml") or os.path.isfile(path) else None
 
 
 def _load(path: Path) -> Mapping[str, object]:

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import os
 from collections.abc import Mapping, Sequence
 from dataclasses import fields, replace
 from fnmatch import fnmatchcase
@@ -96,7 +97,7 @@ def build_robot(located: Located, options: LoadOptions) -> Robot:
 def _check_package_dirs(folders: Sequence[str], base: Path, where: str) -> None:
     for folder in folders:
         path = base / Path(folder).expanduser()
-        if not path.is_dir():
+        if not os.path.isdir(path):
             siblings = sorted(str(Path(folder).with_name(p.name)) for p in path.parent.glob("*") if p.is_dir())
             raise PackageNotFound(folder, siblings, where=where, hint="name an existing folder")
 
@@ -105,7 +106,7 @@ def names_a_path(robot: str, folder: Path) -> bool:
     """Tell whether ROBOT is a path (from ``folder``), and not a known name or an example-robot-data URI."""
     if robot.startswith(EXAMPLE_PREFIX) or robot in known_robots():
         return False
-    return robot.endswith((".urdf", ".xml", ".xacro")) or "/" in robot or (folder / robot).is_file()
+    return robot.endswith((".urdf", ".xml", ".xacro")) or "/" in robot or os.path.isfile(folder / robot)
 
 
 def from_folder(data: dict[str, object], folder: Path, files: Sequence[str]) -> dict[str, object]:
@@ -119,7 +120,7 @@ def from_folder(data: dict[str, object], folder: Path, files: Sequence[str]) -> 
     data = dict(data)
     for key in files:
         value = data.get(key)
-        if isinstance(value, str) and (folder / value).is_file():
+        if isinstance(value, str) and os.path.isfile(folder / value):
             data[key] = str(folder / value)
     robot = data.get("robot")
     if isinstance(robot, str) and names_a_path(robot, folder):
@@ -143,7 +144,7 @@ class Located(NamedTuple):
 def locate(robot: str, options: LoadOptions) -> Located:
     """Find the files of a robot by name, path or URI."""
     own = robots_data() / robot / "robot.toml"
-    if "/" not in robot and own.is_file():
+    if "/" not in robot and os.path.isfile(own):
         spec, base = read_spec(own), own.parent
         text = spec.model.urdf or ""
         source = text if text.startswith(EXAMPLE_PREFIX) else f"impact-posture:{robot}/{text}"
@@ -164,7 +165,7 @@ def locate(robot: str, options: LoadOptions) -> Located:
         shipped = [EXAMPLE_PREFIX + p for p in example_models() if robot.casefold() in Path(p).stem.casefold()]
         raise RobotNotFound(robot, [*known_robots(), *shipped], hint="(or give a path to a .urdf)")
     config = Path(options.config) if options.config else urdf.parent / "robot.toml"
-    if options.config or (config.is_file() and EXAMPLE_PREFIX not in source):
+    if options.config or (os.path.isfile(config) and EXAMPLE_PREFIX not in source):
         spec, base = read_spec(config), config.parent
     else:
         spec, base = RobotSpec(), urdf.parent
@@ -181,7 +182,7 @@ def srdf_path(spec: RobotSpec, options: LoadOptions, base: Path) -> Path | None:
     if text is None:
         return None
     path = resolve_path(text, Path() if options.srdf else base)
-    if not path.is_file():
+    if not os.path.isfile(path):
         raise UrdfError("no such file", where=str(path), hint="check `srdf` or robot.toml [model] srdf")
     return path
 

@@ -66,7 +66,7 @@ def resolve_path(text: str, base: Path) -> Path:
         return (base / Path(text).expanduser()).resolve()
     root = example_robot_data()
     path = root / text.removeprefix(EXAMPLE_PREFIX)
-    if not path.is_file():
+    if not os.path.isfile(path):
         known = example_models(path.suffix)
         raise PackageNotFound(text.removeprefix(EXAMPLE_PREFIX), known, where=EXAMPLE_PREFIX.rstrip(":"))
     return path
@@ -155,7 +155,7 @@ def parse_urdf(path: Path) -> ET.Element:
     Raises:
         UrdfError: The file is missing or is no URDF.
     """
-    if path.is_dir():
+    if os.path.isdir(path):
         raise UrdfError("is a folder", where=str(path), hint="name the .urdf file in it")
     try:
         root = ET.parse(path).getroot()
@@ -163,7 +163,7 @@ def parse_urdf(path: Path) -> ET.Element:
         raise UrdfError("no such file", where=str(path), hint="check the path") from None
     except OSError as error:
         raise UrdfError(f"cannot be read ({error.strerror})", where=str(path), hint="check the file") from None
-    except (ET.ParseError, UnicodeDecodeError) as error:
+    except (ET.ParseError, ValueError) as error:  # A ValueError, if no file can have such a name.
         raise UrdfError(f"is not XML ({error})", where=str(path), hint="give a URDF file") from None
     if root.tag != "robot":
         raise UrdfError(

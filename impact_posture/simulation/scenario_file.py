@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import os
 from pathlib import Path
 
 from impact_posture.errors import InputError, ScenarioNotFound, SpecError, shown
@@ -50,6 +51,6 @@ def scenario_path(scenario: str | Path) -> Path:
     if isinstance(scenario, str):
         if scenario in known_scenarios():
             return SHIPPED / f"{scenario}.toml"
-        if "/" not in scenario and not scenario.endswith(".toml") and not Path(scenario).is_file():
+        if "/" not in scenario and not scenario.endswith(".toml") and not os.path.isfile(scenario):
             raise ScenarioNotFound(scenario, known_scenarios(), hint="(or give a path to a .toml)")
     return Path(scenario).expanduser()

@@ -5,6 +5,7 @@ from __future__ import annotations
 import builtins
 import fcntl
 import json
+import os
 from collections.abc import Iterator
 from contextlib import contextmanager, suppress
 from functools import lru_cache
@@ -70,7 +71,7 @@ class Atlas:
             OutputError: It holds something else, another sweep or version, or another process works in it.
         """
         manifest = self.folder / MANIFEST
-        if not manifest.is_file():
+        if not os.path.isfile(manifest):
             # A run that was killed before it wrote the manifest left a record, and no results that could be lost.
             if not is_ours(self.folder, "sweep") or (self.folder / _DATA).exists():
                 check_output(self.folder, force=False, kind="sweep")
