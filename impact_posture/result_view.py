@@ -19,7 +19,7 @@ from impact_posture.posture.null_space_path import NullSpacePath
 from impact_posture.posture.problem_settings import Prepared, prepare, read_settings
 from impact_posture.posture.result import SCHEMA
 from impact_posture.settings import Against
-from impact_posture.tables import read_text
+from impact_posture.tables import read_arrays, read_text
 
 # Matplotlib is imported where it is used, because that takes longer than a small problem.
 if TYPE_CHECKING:
@@ -90,12 +90,10 @@ def load_result(folder: Path) -> tuple[Prepared, ResultView, dict[str, Any]]:
                 f"schema '{shown(document['schema'])}'", where=str(folder / "result.json"), hint="run optimize again"
             )
         prepared = prepare(read_settings(folder / "problem.toml"))
-        with np.load(folder / "result.npz") as arrays:
-            path = NullSpacePath(
-                **{key: arrays[f"path_{key}"] for key in ("q", "s", "H", "G", "V", "S", "objective")}
-            )
-            names = [field.name for field in fields(SelfMotionMap)] if "self_motion_q" in arrays else []
-            mapped = SelfMotionMap(**{name: arrays[f"self_motion_{name}"] for name in names}) if names else None
+        arrays = read_arrays(folder / "result.npz")
+        path = NullSpacePath(**{key: arrays[f"path_{key}"] for key in ("q", "s", "H", "G", "V", "S", "objective")})
+        names = [field.name for field in fields(SelfMotionMap)] if "self_motion_q" in arrays else []
+        mapped = SelfMotionMap(**{name: arrays[f"self_motion_{name}"] for name in names}) if names else None
         robot, recorded = prepared.impact.robot, str(document["robot"]["model_sha256"])
         if recorded != robot.model_sha256:
             raise SpecError(

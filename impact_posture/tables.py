@@ -10,12 +10,17 @@ import tomllib
 from dataclasses import asdict, fields, is_dataclass
 from functools import cache
 from pathlib import Path
-from typing import Any, ClassVar, TypeVar, get_type_hints
+from typing import TYPE_CHECKING, Any, ClassVar, TypeVar, get_type_hints
 
 from impact_posture.errors import InputError, SpecError, nearest, not_one_of, shown
 
+if TYPE_CHECKING:
+    from numpy.typing import NDArray
+
 # The largest file that this package writes, a result of a long search, has about a million characters.
 MOST_CHARACTERS = 1 << 26
+# The arrays of a run of an hour at 1 kHz.
+MOST_BYTES = 1 << 32
 
 _Table = TypeVar("_Table")
 
@@ -113,6 +118,28 @@ def read_text(path: Path) -> str:
     if len(text) > MOST_CHARACTERS:
         raise OSError(errno.EFBIG, os.strerror(errno.EFBIG), str(path))
     return text
+
+
+def read_arrays(path: Path) -> dict[str, NDArray[Any]]:
+    """Return the arrays of an NPZ file; a small file that states or unpacks to more than fits is refused.
+
+    Raises:
+        OSError: The file cannot be read, or its arrays are larger than :data:`MOST_BYTES`.
+        ValueError: The file is no NPZ, or states more numbers than it has.
+        TypeError: The file holds one array without a name.
+        BadZipFile: The file is damaged; also ``EOFError`` and ``zlib.error``.
+    """
+    # Imported here because the help page does without.
+    import numpy as np
+
+    try:
+        with np.load(path, allow_pickle=False) as file:
+            if sum(entry.file_size for entry in file.zip.infolist()) > MOST_BYTES:
+                raise OSError(errno.EFBIG, os.strerror(errno.EFBIG), str(path))
+            return {name: file[name] for name in file.files}
+    except MemoryError:
+        # A header may state any size.
+        raise ValueError(f"{path.name} states more numbers than it has") from None
 
 
 def read_toml(path: Path) -> dict[str, object]:

@@ -14,10 +14,12 @@ from typing import Any
 import numpy as np
 
 from impact_posture.dynamics.numeric import Numeric
-from impact_posture.errors import ImpactPostureError, InputError, SpecError, one_line
+from impact_posture.errors import ImpactPostureError, InputError, SpecError, one_line, shown
 from impact_posture.escape import file_name
 from impact_posture.experiment.batch import Store
+from impact_posture.experiment.jobs import SCHEMA as SIMULATION_SCHEMA
 from impact_posture.experiment.jobs import Document, Job, controller_factory
+from impact_posture.experiment.reproduction import COMPARISON_SCHEMA
 from impact_posture.experiment.statistics import FEWEST, Interval
 from impact_posture.impact.contact import point_on
 from impact_posture.impact.objective import ImpactObjective
@@ -125,14 +127,15 @@ def write_run_report(folder: Path, scenario: str = "", *, meshes: bool = False) 
     """
     try:
         if os.path.isfile(folder / SIMULATION):
-            document = _read(folder / SIMULATION)
+            document = _read(folder / SIMULATION, SIMULATION_SCHEMA)
             runs = _runs(document, folder / "series", scenario, len(document["runs"]))
             content = _run_content(folder, document, runs[0][0], _job(document, scenario))
         else:
-            document, runs = _read(folder / COMPARISON), []
-            for stem in (_stem(row["controller"]) for row in document["rows"]):
-                if (folder / RUNS / f"{stem}.json").is_file():
-                    runs += _runs(_read(folder / RUNS / f"{stem}.json"), folder / RUNS / stem, scenario, 1)
+            document, runs = _read(folder / COMPARISON, COMPARISON_SCHEMA), []
+            # Each file is read once, however often it is named.
+            for stem in dict.fromkeys(_stem(row["controller"]) for row in document["rows"]):
+                if (path := folder / RUNS / f"{stem}.json").is_file():
+                    runs += _runs(_read(path, SIMULATION_SCHEMA), folder / RUNS / stem, scenario, 1)
             if not runs:
                 raise SpecError("holds no run to show", where=str(folder), hint="see the status in comparison.json")
             content = _comparison_content(folder, document, runs[0][0])
@@ -202,8 +205,11 @@ def _track(view: RunView, objective: ImpactObjective) -> Track:
     return Track(view.name, view.t, "s", view.q, [found], jumps, curves, view.force)
 
 
-def _read(path: Path) -> Document:
+def _read(path: Path, schema: str) -> Document:
     document: Document = json.loads(read_text(path))
+    if document["schema"] != schema:
+        what = f"schema '{shown(document['schema'])}'"
+        raise SpecError(what, where=str(path), hint="run simulate or compare again")
     return document
 
 
@@ -231,9 +237,12 @@ def _runs(document: Document, stem: Path, scenario: str, count: int) -> list[tup
     """Return the first runs of a document with their impact."""
     job, found = _job(document, scenario), []
     factory = controller_factory(job.scenario, job.free)
+    parts = document["runs"][:count]
+    if len({_series(stem, part["sign"]) for part in parts}) < len(parts):
+        raise SpecError("names one time series several times", where=str(stem.parent), hint="run it again")
     if document["model_sha256"] != factory.setup.robot.model_sha256:
         raise SpecError("was run with another robot model", where=str(stem.parent), hint="run it again")
-    for part in document["runs"][:count]:
+    for part in parts:
         view = run_view(job, part, thin(Series.load(_series(stem, part["sign"])), _windows(part)))
         label = f"{view.label}, push {part['sign']:+d}" if count > 1 else view.label
         found.append((replace(view, label=label), factory.objective()))

@@ -16,6 +16,7 @@ from impact_posture.escape import printable
 from impact_posture.path.posture_path import PosturePath
 from impact_posture.path.timing import LimitUse
 from impact_posture.robot.robot import Robot
+from impact_posture.tables import read_arrays
 
 _SHARES = ("at", "velocity", "torque", "thrust")
 # Fields of a path that result.json has.
@@ -54,12 +55,7 @@ def read_path(folder: Path, block: Mapping[str, Any], robot: Robot) -> PosturePa
     Raises:
         ValueError: The arrays do not fit each other or the robot.
     """
-    try:
-        with np.load(folder / "path.npz") as file:
-            arrays = {key: np.asarray(file[key], dtype=float) for key in file.files}
-    except MemoryError:
-        # A header may state any size.
-        raise ValueError("path.npz states more numbers than it has") from None
+    arrays = {key: np.asarray(found, dtype=float) for key, found in read_arrays(folder / "path.npz").items()}
     shares = {key.removeprefix("share_"): found for key, found in arrays.items() if key.startswith("share_")}
     count, samples = arrays["t"].size, arrays["objective"].size
     wanted = {"t": (count,), "q": (count, robot.nq), "v": (count, robot.nv), "a": (count, robot.nv)}

@@ -14,6 +14,7 @@ from typing import Any
 
 import numpy as np
 
+from impact_posture.errors import SpecError
 from impact_posture.escape import printable
 from impact_posture.option_names import as_options
 from impact_posture.output_folder import write_whole
@@ -105,14 +106,16 @@ def render(content: Content, scene: Scene, pictures: Sequence[tuple[str, str]]) 
 
 
 def figures(folder: Path, paths: Iterable[Path] | None = None) -> list[tuple[str, str]]:
-    """Return name and address of figures in a folder: SVG if there is one, else PNG in fewer colors.
+    """Return name and address of figures in a folder: SVG if there is one, else PNG in fewer colors.  Links are none.
 
     Args:
         folder: The folder.
         paths: Files in it; all that it holds and that are below it by default.  While others write there, it cannot
             be searched, because their temporary folders vanish.
     """
-    found = sorted(p for p in (folder.rglob("*") if paths is None else paths) if p.suffix in _TYPES and p.is_file())
+    every = (path for path in (folder.rglob("*") if paths is None else paths) if path.suffix in _TYPES)
+    # The file that a link leads to is not of the result, and the page would pass it on.
+    found = sorted(path for path in every if path.is_file() and not path.is_symlink())
     # An SVG comes behind the PNG of the same name and takes its place.
     each = {str(path.relative_to(folder).with_suffix("")): path for path in found}
     return [(name, _address(path)) for name, path in each.items()]
@@ -123,11 +126,15 @@ def _address(path: Path) -> str:
     if path.suffix == ".png":
         from PIL import Image
 
-        with Image.open(path) as picture, io.BytesIO() as file:
-            picture.convert("RGB").quantize(_COLORS, Image.Quantize.FASTOCTREE, dither=Image.Dither.NONE).save(
-                file, "PNG", compress_level=6
-            )
-            content = file.getvalue()
+        try:
+            with Image.open(path) as picture, io.BytesIO() as file:
+                picture.convert("RGB").quantize(_COLORS, Image.Quantize.FASTOCTREE, dither=Image.Dither.NONE).save(
+                    file, "PNG", compress_level=6
+                )
+                content = file.getvalue()
+        except (OSError, SyntaxError, ValueError, Image.DecompressionBombError) as error:
+            what = f"is no picture ({error})"
+            raise SpecError(what, where=str(path), hint="remove it from the folder") from None
     return f"data:{_TYPES[path.suffix]};base64,{base64.b64encode(content).decode('ascii')}"
 
 

@@ -12,6 +12,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from impact_posture.errors import SpecError
+from impact_posture.tables import read_arrays
 from impact_posture.tsid.controller import Status
 
 Array = NDArray[Any]
@@ -111,8 +112,8 @@ class Series:
             SpecError: It cannot be read, or is something else.
         """
         try:
-            with np.load(path, allow_pickle=False) as found:
-                columns = {f.name: found[f.name] for f in fields(Series)}
+            found = read_arrays(path)
+            columns = {f.name: found[f.name] for f in fields(Series)}
             if len({column.shape[0] for column in columns.values()}) != 1:
                 raise ValueError("columns of different lengths")
             return Series(**columns)
