@@ -28,8 +28,6 @@ _NORMAL = "n points out of the surface, towards the robot."
 _BEHIND = "The surface lies behind the link of the contact where that reaches behind the contact point."
 _BODY = "The body is the box between the hips, of no true height."
 HATCH = "/////"
-# Share of its length that a robot must be wide, or a view shows no more than a line.
-_LINE = 0.02
 # 3-D axes number the areas from 3 up, whatever their order.
 _FRONT = 50.0
 
@@ -119,9 +117,9 @@ def side_plane(first: Skeleton, second: Skeleton) -> Plane:
         return upright_plane(n)
     motion = second.points - first.points
     size = second.points - second.points.mean(axis=0)
-    # A planar robot is a line in the planes across its own.
-    spread = {plane: np.ptp(np.vstack([first.points, second.points]) @ plane.axes.T, axis=0) for plane in candidates}
-    candidates = [plane for plane in candidates if spread[plane].min() > _LINE * spread[plane].max()] or candidates
+    # A planar robot is seen edge-on in the planes across its own.
+    if second.across is not None:
+        candidates = [plane for plane in candidates if not plane.contains(second.across)] or candidates
 
     def shown(plane: Plane) -> float:
         # The size of the robot decides where there is little motion.

@@ -17,6 +17,8 @@ from impact_posture.robot.robot import Robot
 
 # Least height of a body, as a part of its shorter side.
 _LEAST_HEIGHT = 0.35
+# Sine of the angle between axes that count as parallel.
+_PARALLEL = 1e-3
 _AROUND = np.array([[0, 0], [1, 0], [1, 1], [0, 1]])
 
 
@@ -34,6 +36,7 @@ class Skeleton:
         feet: Contact points of the supports, shape (f, 3).
         rotors: Circles of the propellers, shape (r, 3, points).
         hulls: Hulls of the collision shapes; empty for a robot without shapes.
+        across: Unit direction across the plane in which a planar robot moves, shape (3,); ``None`` for another robot.
     """
 
     bones: Array
@@ -45,6 +48,7 @@ class Skeleton:
     feet: Array
     rotors: Array
     hulls: tuple[PlacedHull, ...] = ()
+    across: Array | None = None
 
     @property
     def contact(self) -> Array:
@@ -126,7 +130,17 @@ def build_skeleton(
         feet=np.array(ends[len(contacts) :]).reshape(-1, 3),
         rotors=_rotors(robot, places),
         hulls=place_hulls(robot, data, collisions),
+        across=_across(model, q),
     )
+
+
+def _across(model: pin.Model, q: Array) -> Array | None:
+    """Return the direction about which all joints turn and along which none slides; ``None`` if there is none."""
+    linear, angular = np.split(pin.computeJointJacobians(model, model.createData(), q), 2)
+    _, sizes, directions = np.linalg.svd(angular.T)
+    across = np.asarray(directions[0])
+    turns = sizes[0] > _PARALLEL and not (sizes[1:] > _PARALLEL).any()
+    return across if turns and np.abs(across @ linear).max() < _PARALLEL else None
 
 
 def _body(model: pin.Model, base: pin.SE3) -> Array:

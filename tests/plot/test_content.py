@@ -16,6 +16,7 @@ from mpl_toolkits.mplot3d import proj3d
 
 from impact_posture.collision.shapes import load_shapes
 from impact_posture.errors import InputError
+from impact_posture.impact.contact import ImpactContact
 from impact_posture.impact.velocity_jump import tangent_units
 from impact_posture.plot import FIGURES, ResultView, postures_figure
 from impact_posture.plot.classical_figure import classical_figure, kinds_of
@@ -26,6 +27,9 @@ from impact_posture.plot.robot_drawing import Surface, side_plane, surfaces_of
 from impact_posture.plot.self_motion_figure import self_motion_figure
 from impact_posture.plot.shapes import (
     COORDINATE_PLANES,
+    XY,
+    XZ,
+    YZ,
     Plane,
     half_width,
 )
@@ -33,6 +37,8 @@ from impact_posture.plot.skeleton import Skeleton, build_skeleton
 from impact_posture.plot.style import ORANGE, WIDTH, style, wrap
 from impact_posture.plot.view import SEPARATOR, contact_letters, header_lines, number
 from impact_posture.posture.null_space_path import NullSpacePath
+from impact_posture.robot.robot_loader import load_robot
+from tests.arms import TIP, X, Y, Z, arm
 from tests.plot.views import PENDULUM, make_view, text_of
 
 
@@ -462,3 +468,21 @@ def test_path_of_wrong_shape(panda: ResultView) -> None:
     view = ResultView(panda.objective, panda.q_initial, panda.q_optimal, path=path)
     with pytest.raises(InputError, match="G \\(2,\\)"):
         path_figure(view)
+
+
+@pytest.mark.parametrize(("axis", "plane"), [(Z, XY), (Y, XZ), (X, YZ)])
+@pytest.mark.parametrize("height", [0.0, 0.5])
+def test_a_planar_robot_is_seen_across_its_plane(axis: tuple[int, int, int], plane: Plane, height: float) -> None:
+    along = Y if axis == X else X
+    robot = arm([axis] * 3, np.zeros(3), floating=False, rods=[along] * 3)
+    robot.model.jointPlacements[1] = pin.SE3(np.eye(3), np.array([0.0, 0.0, height]))
+    for normal in (along, np.cross(axis, along)):
+        contact = ImpactContact(TIP, tuple(float(n) for n in normal))
+        states = [build_skeleton(robot, np.array(q), [contact]) for q in ((0.6, -0.9, 1.0), (0.8, 0.4, -0.9))]
+        assert side_plane(*states) is plane
+
+
+@pytest.mark.parametrize("name", ["ur5", "panda", "solo8"])
+def test_a_robot_with_other_axes_has_no_plane(name: str) -> None:
+    robot = load_robot(name)
+    assert build_skeleton(robot, robot.posture(), [ImpactContact(robot.frame_names[-1], (0, 0, 1))]).across is None
