@@ -68,8 +68,12 @@ class ImpactPostureError(Exception):
     exit_code: ClassVar[int] = 1
 
     def __init__(self, what: str, *, where: str = "", hint: str = "") -> None:
+        self.reword(what, where, hint)
+
+    def reword(self, what: str, where: str, hint: str) -> None:
+        """Replace the words of the message; type and data stay."""
         self.what, self.where, self.hint = (one_line(text) for text in (what, where, hint))
-        super().__init__(self.line)
+        self.args = (self.line,)
 
     @property
     def line(self) -> str:

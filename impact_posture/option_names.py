@@ -1,4 +1,4 @@
-"""Rewrite Python parameters in messages as options of the command line.
+"""Rewrite Python parameters in messages as options of the command line, or as keys of a file.
 
 Messages of the library hold parameters between backquotes, for example ``force=True`` or ``support=['foot']``.
 """
@@ -8,6 +8,7 @@ from __future__ import annotations
 import ast
 import os
 import re
+from collections.abc import Mapping
 from functools import cache
 
 # Options that are no settings.
@@ -16,7 +17,10 @@ _OTHERS = {
     "sign", "slurm",
 }  # fmt: skip
 # Parameters whose option has another name.
-_RENAMED = {"build": "compile", "kind": "controller"}
+_RENAMED = {"build": "compile", "kind": "objective"}
+# Those whose option depends on the value: a kind of controller is none of an impact.
+_RENAMED_WITH = {("kind", kind): "controller" for kind in ("aerial", "legged", "arm")}
+_PARAMETER = re.compile(r"`(\w+)(?:=([^`]*))?`")
 
 
 @cache
@@ -32,7 +36,22 @@ def _names() -> set[str]:
 
 def as_options(text: str) -> str:
     """Write each setting between backquotes as an option."""
-    return re.sub(r"`(\w+)(?:=([^`]*))?`", _as_option, text)
+    return _PARAMETER.sub(_as_option, text)
+
+
+def as_keys(text: str, renamed: Mapping[str, str]) -> str:
+    """Write each setting between backquotes as a key of a file.
+
+    Args:
+        text: The message.
+        renamed: Settings whose key has another name, with that name.
+    """
+
+    def key(found: re.Match[str]) -> str:
+        name = renamed.get(found[1], found[1])
+        return name if found[2] is None else f"{name} = {found[2]}"
+
+    return _PARAMETER.sub(key, text)
 
 
 def option_of(where: str) -> str:
@@ -42,13 +61,14 @@ def option_of(where: str) -> str:
 
 
 def _as_option(found: re.Match[str]) -> str:
-    option, text = _option(found[1]), found[2]
+    name, text = found[1], found[2]
     if text is None:
-        return option
+        return _option(name)
     try:
         value = ast.literal_eval(text)
     except (ValueError, SyntaxError):
         value = text
+    option = _option(_RENAMED_WITH.get((name, str(value)), name))
     if value is True:
         return option
     if value is False or value in ([], ()):

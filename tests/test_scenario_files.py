@@ -11,13 +11,14 @@ from typing import Any
 import numpy as np
 import pytest
 
-from impact_posture.errors import ImpactPostureError, InputError, ScenarioNotFound, SpecError
+from impact_posture.errors import ImpactPostureError, Infeasible, InputError, ScenarioNotFound, SpecError
 from impact_posture.simulation.actuator_command import ActuatorCommand
 from impact_posture.simulation.control import Gains, StanceGains
 from impact_posture.simulation.controller_factory import ControllerFactory
 from impact_posture.simulation.reference import Reference
 from impact_posture.simulation.run import run
 from impact_posture.simulation.scenario import Bounds, RepeatedContacts, Scenario, SinglePush, set_up
+from impact_posture.simulation.scenario_file import SHIPPED as SHIPPED_FOLDER
 from impact_posture.simulation.scenario_file import known_scenarios, read_scenario
 
 DOCS = Path(__file__).parents[1] / "docs"
@@ -331,3 +332,39 @@ def test_the_pages_scenario_is_one(folder: Path) -> None:
     (text,) = re.findall(r"^```toml\n(.*?)^```", page, re.M | re.S)
     found = read_scenario(write(folder, text))
     assert isinstance(found.task, RepeatedContacts) and found.surface.gap == 0.1
+
+
+@pytest.mark.parametrize(
+    ("line", "where", "words"),
+    [
+        ('posture = "nope"', "posture", "no posture 'nope'"),
+        ("armature = {panda_joint9 = 0.1}", "armature", "no joint 'panda_joint9'"),
+        ('package_dir = ["nope"]', "package_dir", "no path"),
+        ('robot = "pandaa"', "", "no robot 'pandaa'"),
+        ('srdf = "nope.srdf"', None, "check srdf or robot.toml"),
+    ],
+)
+def test_an_error_names_the_key_of_the_scenario_and_its_file(
+    line: str, where: str | None, words: str, tmp_path: Path
+) -> None:
+    key = line.partition(" ")[0]
+    text = re.sub(rf"(?m)^{key} = .*\n", "", (SHIPPED_FOLDER / "panda-tap.toml").read_text(encoding="utf-8"))
+    path = tmp_path / "mine.toml"
+    path.write_text(f"{line}\n{text}", encoding="utf-8")
+    with pytest.raises(ImpactPostureError) as caught:
+        set_up(read_scenario(path))
+    assert words in caught.value.line == str(caught.value) and "`" not in caught.value.line
+    if where is not None:
+        assert caught.value.where == (f"{path}, {where}" if where else str(path))
+
+
+def test_an_offline_posture_that_is_out_of_reach_names_keys(tmp_path: Path) -> None:
+    needs_mujoco()
+    text = (SHIPPED_FOLDER / "panda-tap.toml").read_text(encoding="utf-8")
+    path = tmp_path / "mine.toml"
+    path.write_text(text.replace("gap = 0.1 ", "gap = 3.0 "), encoding="utf-8")
+    factory = ControllerFactory(set_up(read_scenario(path)))
+    with pytest.raises(Infeasible) as caught:
+        factory.offline("posture")
+    assert caught.value.where == str(path) and "start from another posture" in caught.value.hint
+    assert "`" not in caught.value.line and caught.value.conflicts

@@ -9,7 +9,7 @@ from typing import Any
 import pytest
 
 from impact_posture.errors import ImpactPostureError, SpecError
-from impact_posture.option_names import as_options, option_of
+from impact_posture.option_names import as_keys, as_options, option_of
 from impact_posture.posture.problem_settings import dump_settings, prepare, read_settings, resolved_settings
 from impact_posture.setting import Setting
 from impact_posture.settings import ProblemSettings
@@ -108,6 +108,9 @@ def test_options_are_named_where_the_library_names_settings() -> None:
         "--root free-flyer, --force, --no-com, --seed, --jobs 1"
     )
     assert as_options("`build=True`, `kind='legged'`, `daqp`") == "--compile, --controller legged, --daqp"
+    assert as_options("`kind='speed'`, `kind`") == "--objective speed, --objective"
+    keys = as_keys("`srdf`, `contact_pose='position'`, `lock`", {"contact_pose": "control.end_effector.pose"})
+    assert keys == "srdf, control.end_effector.pose = 'position', lock"
     assert option_of("normal_cone") == "--normal-cone" and option_of("panda") == "panda"
     assert option_of("scheduler tcp://a:1") == "--scheduler tcp://a:1"
     assert option_of("posture p.json") == "--posture p.json"

@@ -19,7 +19,7 @@ from impact_posture.posture.problem_settings import requirements
 from impact_posture.posture.solve import PostureSolution, solve
 from impact_posture.progress import tell
 from impact_posture.settings import FRICTION, ProblemSettings
-from impact_posture.simulation.scenario import Setup
+from impact_posture.simulation.scenario import Setup, naming_keys
 from impact_posture.tsid.flow_direction import FlowOptions
 
 # Share of the limits that holding a posture may take.
@@ -90,8 +90,9 @@ def offline_posture(
     for collision, stops, edges in tries:
         demands = replace(wanted, collision=collision, limit_margin=stops, com_margin=edges)
         try:
-            solution = solve(build_problem(setup.robot, objective, setup.q, demands), starts=starts, jobs=1,
-                             progress=_tell)  # fmt: skip
+            with naming_keys(setup.scenario):
+                problem = build_problem(setup.robot, objective, setup.q, demands)
+                solution = solve(problem, starts=starts, jobs=1, progress=_tell)
         except (Infeasible, SolverFailed) as error:
             if (collision, stops, edges) == tries[-1]:
                 raise

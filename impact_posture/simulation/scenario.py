@@ -2,15 +2,17 @@
 
 from __future__ import annotations
 
-from collections.abc import Mapping
-from dataclasses import dataclass, field
+from collections.abc import Iterator, Mapping
+from contextlib import contextmanager
+from dataclasses import dataclass, field, fields
 from typing import Annotated, Literal
 
 import numpy as np
 from pydantic import Field
 
 from impact_posture.arrays import Array
-from impact_posture.errors import InputError, SpecError
+from impact_posture.errors import ImpactPostureError, InputError, SpecError
+from impact_posture.option_names import as_keys
 from impact_posture.progress import tell
 from impact_posture.robot.actuation import allocation
 from impact_posture.robot.postures import read_posture, set_joints
@@ -162,6 +164,11 @@ class ScenarioTable(Scene, RobotSettings):
                 raise InputError(what, hint="make it a sphere and give its center, at which the ball flies")
 
 
+_KEYS = {field.name for field in fields(ScenarioTable)}
+# Settings of a problem whose key in a scenario has another name.
+_RENAMED = {"contact_pose": "control.end_effector.pose"}
+
+
 @dataclass(frozen=True, eq=False, kw_only=True)
 class Scenario(ScenarioTable):
     """An experiment before anything is loaded.
@@ -260,12 +267,29 @@ def set_up(scenario: Scenario) -> Setup:
         ImpactPostureError: Something does not fit.
     """
     tell(f"loading {scenario.robot}")
-    robot = load_robot(scenario.robot, scenario)
-    _check_base(robot, scenario)
-    q = set_joints(robot, read_posture(robot, scenario.posture, where="posture"), scenario.joints, scenario.source)
-    q = robot.check_posture(q, where=scenario.source)
-    robot.frame_id(scenario.task.frame)
-    return Setup(scenario, robot, q, build_world(robot, scenario, q, scenario.throw))
+    with naming_keys(scenario):
+        robot = load_robot(scenario.robot, scenario)
+        _check_base(robot, scenario)
+        start = read_posture(robot, scenario.posture, where="posture")
+        q = set_joints(robot, start, scenario.joints, scenario.source)
+        q = robot.check_posture(q, where=scenario.source)
+        robot.frame_id(scenario.task.frame)
+        return Setup(scenario, robot, q, build_world(robot, scenario, q, scenario.throw))
+
+
+@contextmanager
+def naming_keys(scenario: Scenario) -> Iterator[None]:
+    """Let errors name the keys of a scenario and its file, where they name settings."""
+    try:
+        yield
+    except ImpactPostureError as error:
+        where = error.where
+        if where in ("", "problem"):
+            where = scenario.source
+        elif where.partition(" ")[0] in _KEYS and scenario.source:
+            where = f"{scenario.source}, {where}"
+        error.reword(as_keys(error.what, _RENAMED), where, as_keys(error.hint, _RENAMED))
+        raise
 
 
 def _check_base(robot: Robot, scenario: Scenario) -> None:
