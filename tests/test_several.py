@@ -326,17 +326,25 @@ def test_struck_feet_that_are_balls_are_held_in_place_only() -> None:
 HANDS = ("gripper_right_base_link", "gripper_left_base_link")
 
 
+@pytest.mark.parametrize("normal_frame", ["world", "contact"])
 @pytest.mark.parametrize(
     ("normals", "stops"),
     [
-        (("-1,0,0", "-1,0,0"), False),
+        (((-1, 0, 0), (-1, 0, 0)), False),
         # The left hand meets another surface, and stays clear of that of the right one.
-        (("-1,0,0", "0,1,0"), True),
+        (((-1, 0, 0), (0, 1, 0)), True),
     ],
 )
-def test_two_hands_at_one_wall_may_both_touch_it(normals: tuple[str, str], stops: bool) -> None:
-    contacts = tuple(f"{hand}:{normal}" for hand, normal in zip(HANDS, normals, strict=True))
-    problem = problem_of({"robot": "talos", "contact": contacts, "collision": True})
+def test_two_hands_at_one_wall_may_both_touch_it(
+    normals: tuple[tuple[int, int, int], ...], stops: bool, normal_frame: str
+) -> None:
+    talos, contacts = robot("talos"), []
+    for hand, normal in zip(HANDS, normals, strict=True):
+        turned = frame_placement(talos.model, talos.posture(), talos.frame_id(hand)).rotation.T @ np.array(normal)
+        x, y, z = normal if normal_frame == "world" else turned
+        contacts.append(f"{hand}:{x},{y},{z}")
+    task = {"robot": "talos", "contact": tuple(contacts), "normal_frame": normal_frame, "collision": True}
+    problem = problem_of(task)
     (wall,) = [c for c in problem.constraints if c.name == f"surface at {HANDS[0]}"]
     assert isinstance(wall, Clearance)
     bodies = [wall.row_name(k).split(" / ")[0] for k in range(len(wall.lower))]

@@ -116,7 +116,7 @@ class Surroundings:
         beside = [foot for foot in feet if abs(self._above(foot, plane)) < _BESIDE]
         for other in contacts:
             # Links of the same kind reach equally far behind their contact points, where the surface is.
-            facing = not turns and other.normal_frame == "world" and n @ other.normal > _PARALLEL
+            facing = self._world_normal(contact) @ self._world_normal(other) > _PARALLEL
             at = point_on(self.robot, other.frame, other.offset)
             if any(abs(self._above(at, one)) < _BESIDE for one in ((plane, through) if facing else (plane,))):
                 beside.append(at)
@@ -250,6 +250,13 @@ class Surroundings:
 
     def _is_still(self, body: Body) -> bool:
         return self._is_fixed(body) or body.point.joint in self._still
+
+    def _world_normal(self, contact: ImpactContact) -> Array:
+        """Normal of a contact at the given posture, world, shape (3,)."""
+        n = np.array(contact.normal)
+        if contact.normal_frame == "world":
+            return n
+        return np.asarray(self._numeric.placement(point_on(self.robot, contact.frame, contact.offset)).rotation @ n)
 
     def _above(self, point: PointOnLink, plane: Body) -> float:
         """Height of a point above a plane."""
