@@ -223,8 +223,13 @@ def test_a_robot_with_one_joint_runs(folder: Path) -> None:
     text = LED.replace('robot = "rail_arm.urdf"', f'robot = "rail_arm.urdf"\nlock = {others}'.replace("'", '"'))
     one = set_up(read_scenario(write(folder, text)))
     assert one.robot.nv == 1
-    command = ControllerFactory(one).driver("nominal").reset(one.q)
+    factory = ControllerFactory(one)
+    command = factory.driver("nominal").reset(one.q)
     assert command.torque.shape == (1,) and np.isfinite(command.torque).all()
+    # The end effector takes the only joint, so that a term of the posture changes nothing and pushes no harder.
+    (nominal,), (flow,) = (run(factory, name) for name in ("nominal", "robust-flow"))
+    np.testing.assert_allclose(flow.series.q, nominal.series.q, atol=1e-9)
+    assert flow.series.peak.max() == pytest.approx(nominal.series.peak.max(), rel=1e-6) and nominal.series.peak.any()
 
 
 def test_no_task_is_refused(folder: Path) -> None:
