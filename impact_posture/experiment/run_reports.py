@@ -4,12 +4,10 @@ from __future__ import annotations
 
 import json
 import os
-import shlex
-from collections.abc import Iterable, Mapping, Sequence
+from collections.abc import Iterable, Sequence
 from contextlib import suppress
 from dataclasses import fields, replace
 from pathlib import Path
-from typing import Any
 
 import numpy as np
 
@@ -20,13 +18,12 @@ from impact_posture.experiment.batch import Store
 from impact_posture.experiment.jobs import SCHEMA as SIMULATION_SCHEMA
 from impact_posture.experiment.jobs import Document, Job, controller_factory
 from impact_posture.experiment.reproduction import COMPARISON_SCHEMA
-from impact_posture.experiment.statistics import FEWEST, Interval
+from impact_posture.experiment.run_report_content import comparison_content, run_content
 from impact_posture.impact.contact import point_on
 from impact_posture.impact.objective import ImpactObjective
-from impact_posture.output_folder import typed_command, write_json
-from impact_posture.plot.run_view import RunView, run_header
-from impact_posture.plot.view import number
-from impact_posture.report.page import Content, Table, write_page
+from impact_posture.output_folder import write_json
+from impact_posture.plot.run_view import RunView
+from impact_posture.report.page import write_page
 from impact_posture.report.scene import Scene, Track, impact_curves
 from impact_posture.report.shapes import draw_robot
 from impact_posture.simulation.scenario_file import known_scenarios, scenario_path
@@ -34,16 +31,6 @@ from impact_posture.simulation.series import Series, Window
 from impact_posture.tables import read_text
 
 SIMULATION, COMPARISON, RUNS = "run.json", "comparison.json", "runs"
-# Metrics of a table: key, unit and meaning.
-_METRICS = (
-    ("q_total_impact", "m, rad", "way of the robot in the impact windows, ∫‖ν‖dt"),
-    ("q_total_recovery", "m, rad", "the same until 1 s after each impact began"),
-    ("peak_jump", "m/s, rad/s", "largest ‖ν − ν⁻‖ within 15 ms of the touch, mean of the contacts"),
-    ("peak_jump_max", "m/s, rad/s", "the largest of the contacts"),
-    ("peak_recovery", "m/s, rad/s", "as peak_jump, until 1 s after each impact began"),
-    ("peak_force", "N", "largest normal force in the impact windows"),
-    ("slip", "m", "way that the contact slid in the impact windows"),
-)
 # Time between frames in impact windows and elsewhere, s.
 _FINE, _COARSE = 0.001, 0.025
 # No position of a robot that is under control is larger, m or rad.
@@ -51,11 +38,6 @@ _AWAY = 1e3
 # Columns of the time series that figures show.
 _COLUMNS = {field.name for field in fields(RunView)} & {field.name for field in fields(Series)}
 _BROKEN = (LookupError, ArithmeticError, ValueError, TypeError, AttributeError, OSError, RecursionError)
-_MOVES = (
-    "The slider goes through time: every millisecond within the impact windows, every 25 ms elsewhere. Within a "
-    "window, the orange arrows show the change of velocity since it began. H, V, S and the ellipsoid are those of "
-    "the rigid model at the state of the robot."
-)
 
 
 def keep_runs(folder: Path, jobs: Sequence[Job], store: Store) -> None:
@@ -129,7 +111,7 @@ def write_run_report(folder: Path, scenario: str = "", *, meshes: bool = False) 
         if os.path.isfile(folder / SIMULATION):
             document = _read(folder / SIMULATION, SIMULATION_SCHEMA)
             runs = _runs(document, folder / "series", scenario, len(document["runs"]))
-            content = _run_content(folder, document, runs[0][0], _job(document, scenario))
+            content = run_content(folder, document, runs[0][0], _job(document, scenario))
         else:
             document, runs = _read(folder / COMPARISON, COMPARISON_SCHEMA), []
             # Each file is read once, however often it is named.
@@ -138,7 +120,7 @@ def write_run_report(folder: Path, scenario: str = "", *, meshes: bool = False) 
                     runs += _runs(_read(path, SIMULATION_SCHEMA), folder / RUNS / stem, scenario, 1)
             if not runs:
                 raise SpecError("holds no run to show", where=str(folder), hint="see the status in comparison.json")
-            content = _comparison_content(folder, document, runs[0][0])
+            content = comparison_content(folder, document, runs[0][0])
         return write_page(folder, content, run_scene(runs, meshes=meshes))
     except _BROKEN as error:
         what = f"holds no whole run or comparison ({type(error).__name__}: {error})"
@@ -247,71 +229,3 @@ def _runs(document: Document, stem: Path, scenario: str, count: int) -> list[tup
         label = f"{view.label}, push {part['sign']:+d}" if count > 1 else view.label
         found.append((replace(view, label=label), factory.objective()))
     return found
-
-
-def _run_content(folder: Path, document: Document, view: RunView, job: Job) -> Content:
-    scenario = controller_factory(job.scenario, job.free).setup.scenario
-    options = ["simulate", job.scenario, "--controller", job.controller, "--seed", str(job.seed)]
-    options += ["--mode", "held"] * (job.mode == "held") + ["--free"] * job.free
-    options += ["--gain", f"{job.gain:g}"] * (job.gain != scenario.control.robust.gain)
-    if scenario.push and len(document["runs"]) < len(scenario.push.signs):
-        options += ["--sign", f"{document['runs'][0]['sign']:+d}"]
-    metrics, status = document["metrics"], document["status"]
-    verdict = [f"{status}: its numbers are no result" if metrics is None else f"{status}: {_summary(metrics)}"]
-    verdict += [f"t = {event['time']:.2f} s: {event['what']}" for event in document["events"]]
-    rows = [] if metrics is None else [(key, number(metrics[key]), unit, words) for key, unit, words in _METRICS]
-    if document["prediction"] is not None:
-        rows.append(
-            ("H before", number(document["prediction"]["H"]), "jump²/(N·s)²", "jump² per impulse² at the impacts")
-        )
-    return Content(
-        title=run_header([view])[0],
-        command=typed_command(folder) or shlex.join(["impact-posture", *options]),
-        facts=tuple(run_header([view])[1]),
-        verdict=tuple(verdict),
-        tables=(Table("Metrics", ("", "value", "unit", "meaning"), tuple(rows)),),
-        moves=_MOVES,
-        notes=tuple(document["warnings"]),
-    )
-
-
-def _summary(metrics: Mapping[str, Any]) -> str:
-    jump, force = number(metrics["peak_jump"]), number(metrics["peak_force"])
-    return f"the impacts change the velocity by up to {jump} (m/s and rad/s), with forces of up to {force} N"
-
-
-def _comparison_content(folder: Path, document: Document, view: RunView) -> Content:
-    rows = document["rows"]
-    labels = [str(row["controller"]) for row in rows]
-    table = [("status", *(str(row["status"]) for row in rows), "", "")]
-    for key, unit, meaning in _METRICS:
-        table.append((key, *(_mean(row["metrics"].get(key)) for row in rows), unit, meaning))
-    verdict = []
-    for row in rows:
-        if row["reduction"] is not None and row["controller"] != "nominal":
-            share = row["reduction"]["mean"]
-            verdict.append(f"{row['controller']} moves {abs(share):.0%} {'less' if share > 0 else 'more'}")
-    line = (
-        f"Within the impact windows, against nominal: {'; '.join(verdict)}." if verdict else "No reduction is known."
-    )
-    seeds = len(document["seeds"])
-    intervals = ", with 95 % intervals" if seeds >= FEWEST else ""
-    means = "One seed" if seeds == 1 else f"Means of {seeds} seeds{intervals}"
-    command = ["impact-posture", "compare", view.scenario, "--controllers", ",".join(labels), "--seeds", str(seeds)]
-    return Content(
-        title=f"{document['scenario']}: {', '.join(labels)}",
-        command=typed_command(folder) or shlex.join(command),
-        facts=tuple(run_header([view])[1]),
-        verdict=(line, *(f"{row['controller']}: {reason}" for row in rows for reason in row["failed"])),
-        tables=(Table(means, ("", *labels, "unit", "meaning"), tuple(table)),),
-        moves=f"{_MOVES} The runs are those of the first seed.",
-        notes=(),
-    )
-
-
-def _mean(found: Mapping[str, Any] | None) -> str:
-    """Return a mean, with half of its interval where it is shown."""
-    if found is None:
-        return "–"
-    half = Interval(**found).shown
-    return number(found["mean"]) + ("" if half is None else f" ± {number(half)}")

@@ -1,0 +1,101 @@
+"""Texts and tables of the reports of runs and comparisons."""
+
+from __future__ import annotations
+
+import shlex
+from collections.abc import Mapping
+from pathlib import Path
+from typing import Any
+
+from impact_posture.experiment.jobs import Document, Job, controller_factory
+from impact_posture.experiment.statistics import FEWEST, Interval
+from impact_posture.output_folder import typed_command
+from impact_posture.plot.run_view import RunView, run_header
+from impact_posture.plot.view import number
+from impact_posture.report.page import Content, Table
+
+# Metrics of a table: key, unit and meaning.
+_METRICS = (
+    ("q_total_impact", "m, rad", "way of the robot in the impact windows, ∫‖ν‖dt"),
+    ("q_total_recovery", "m, rad", "the same until 1 s after each impact began"),
+    ("peak_jump", "m/s, rad/s", "largest ‖ν − ν⁻‖ within 15 ms of the touch, mean of the contacts"),
+    ("peak_jump_max", "m/s, rad/s", "the largest of the contacts"),
+    ("peak_recovery", "m/s, rad/s", "as peak_jump, until 1 s after each impact began"),
+    ("peak_force", "N", "largest normal force in the impact windows"),
+    ("slip", "m", "way that the contact slid in the impact windows"),
+)
+_MOVES = (
+    "The slider goes through time: every millisecond within the impact windows, every 25 ms elsewhere. Within a "
+    "window, the orange arrows show the change of velocity since it began. H, V, S and the ellipsoid are those of "
+    "the rigid model at the state of the robot."
+)
+
+
+def run_content(folder: Path, document: Document, view: RunView, job: Job) -> Content:
+    """Return the texts and the table of a page about one run."""
+    scenario = controller_factory(job.scenario, job.free).setup.scenario
+    options = ["simulate", job.scenario, "--controller", job.controller, "--seed", str(job.seed)]
+    options += ["--mode", "held"] * (job.mode == "held") + ["--free"] * job.free
+    options += ["--gain", f"{job.gain:g}"] * (job.gain != scenario.control.robust.gain)
+    if scenario.push and len(document["runs"]) < len(scenario.push.signs):
+        options += ["--sign", f"{document['runs'][0]['sign']:+d}"]
+    metrics, status = document["metrics"], document["status"]
+    verdict = [f"{status}: its numbers are no result" if metrics is None else f"{status}: {_summary(metrics)}"]
+    verdict += [f"t = {event['time']:.2f} s: {event['what']}" for event in document["events"]]
+    rows = [] if metrics is None else [(key, number(metrics[key]), unit, words) for key, unit, words in _METRICS]
+    if document["prediction"] is not None:
+        rows.append(
+            ("H before", number(document["prediction"]["H"]), "jump²/(N·s)²", "jump² per impulse² at the impacts")
+        )
+    return Content(
+        title=run_header([view])[0],
+        command=typed_command(folder) or shlex.join(["impact-posture", *options]),
+        facts=tuple(run_header([view])[1]),
+        verdict=tuple(verdict),
+        tables=(Table("Metrics", ("", "value", "unit", "meaning"), tuple(rows)),),
+        moves=_MOVES,
+        notes=tuple(document["warnings"]),
+    )
+
+
+def _summary(metrics: Mapping[str, Any]) -> str:
+    jump, force = number(metrics["peak_jump"]), number(metrics["peak_force"])
+    return f"the impacts change the velocity by up to {jump} (m/s and rad/s), with forces of up to {force} N"
+
+
+def comparison_content(folder: Path, document: Document, view: RunView) -> Content:
+    """Return the texts and the table of a page about a comparison, of which ``view`` is any run."""
+    rows = document["rows"]
+    labels = [str(row["controller"]) for row in rows]
+    table = [("status", *(str(row["status"]) for row in rows), "", "")]
+    for key, unit, meaning in _METRICS:
+        table.append((key, *(_mean(row["metrics"].get(key)) for row in rows), unit, meaning))
+    verdict = []
+    for row in rows:
+        if row["reduction"] is not None and row["controller"] != "nominal":
+            share = row["reduction"]["mean"]
+            verdict.append(f"{row['controller']} moves {abs(share):.0%} {'less' if share > 0 else 'more'}")
+    line = (
+        f"Within the impact windows, against nominal: {'; '.join(verdict)}." if verdict else "No reduction is known."
+    )
+    seeds = len(document["seeds"])
+    intervals = ", with 95 % intervals" if seeds >= FEWEST else ""
+    means = "One seed" if seeds == 1 else f"Means of {seeds} seeds{intervals}"
+    command = ["impact-posture", "compare", view.scenario, "--controllers", ",".join(labels), "--seeds", str(seeds)]
+    return Content(
+        title=f"{document['scenario']}: {', '.join(labels)}",
+        command=typed_command(folder) or shlex.join(command),
+        facts=tuple(run_header([view])[1]),
+        verdict=(line, *(f"{row['controller']}: {reason}" for row in rows for reason in row["failed"])),
+        tables=(Table(means, ("", *labels, "unit", "meaning"), tuple(table)),),
+        moves=f"{_MOVES} The runs are those of the first seed.",
+        notes=(),
+    )
+
+
+def _mean(found: Mapping[str, Any] | None) -> str:
+    """Return a mean, with half of its interval where it is shown."""
+    if found is None:
+        return "–"
+    half = Interval(**found).shown
+    return number(found["mean"]) + ("" if half is None else f" ± {number(half)}")
