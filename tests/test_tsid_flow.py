@@ -22,6 +22,7 @@ from impact_posture.tsid.posture_tasks import JointPosture
 from impact_posture.tsid.redundancy import Redundancy
 from impact_posture.tsid.reference_flow import PHASES, ReferenceFlow
 from impact_posture.tsid.reference_flow_posture import ReferenceFlowPosture
+from impact_posture.tsid.zero_moment_point import ZeroMomentPoint
 from tests.benchmarks.flow_course import formulation_for
 from tests.helpers import Vector, rng, robot
 from tests.test_tsid_controller import DT, integrate
@@ -189,13 +190,38 @@ def test_haste_takes_its_share_of_what_rest_leaves_of_the_motors(name: str, weak
 
     flow.on = True
     ratios = []
-    for k in range(600):
+    # Later talos brakes before a limit, with a larger share.
+    for k in range(500):
         flow.advance(DT, flow.q)
         if k % len(PHASES) == len(PHASES) - 1:
             static, whole = torques(none), torques(flow.acceleration)
             taken = whole - static
             ratios.append(float((taken / (np.sign(taken) - static)).max()))
     assert 0.9 * flow.options.haste < max(ratios) < 1.1 * flow.options.haste
+
+
+def test_the_zero_moment_point_stays_within_the_feet(monkeypatch: pytest.MonkeyPatch) -> None:
+    """The force that Pinocchio's recursive Newton-Euler algorithm asks for acts within the feet."""
+    r = robot("talos")
+    data, none = r.model.createData(), np.zeros(r.nv)
+
+    def least_room() -> float:
+        """The least distance from the point to an edge of the polygon of the feet, m."""
+        flow = flow_of(r, well(r, goal_of(r, "feet", 2.0)), acceleration=10.0)
+        ground = flow._state.at(flow._contacts[0].point).position[2]
+        flow.on, least = True, np.inf
+        for _ in range(400):
+            flow.advance(DT, flow.q)
+            wrench = pin.Force(pin.rnea(r.model, data, flow.q, none, flow.acceleration)[:6])
+            base = pin.SE3(pin.Quaternion(flow.q[3:7]).matrix(), flow.q[:3] - [0, 0, ground])
+            force, moment = (lambda w: (w.linear, w.angular))(base.act(wrench))
+            point = np.array([-moment[1], moment[0]]) / force[2]
+            least = min(least, float((-flow._offsets - flow._edges @ point).min()))
+        return least
+
+    assert least_room() > -1e-3
+    monkeypatch.setattr(ZeroMomentPoint, "keep", lambda self, space, period, step: step)
+    assert least_room() < -0.05
 
 
 def test_the_rest_is_an_optimum_under_the_constraints() -> None:

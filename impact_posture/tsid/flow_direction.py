@@ -54,7 +54,7 @@ class FlowOptions:
     """
 
     speed: float = 1.0
-    acceleration: float = 3.0
+    acceleration: float = 4.0
     rho: float = 0.001
     mu: float = 0.05
     epsilon: float = 7e-5

@@ -9,6 +9,7 @@ import numpy as np
 from impact_posture.arrays import Array
 from impact_posture.tsid.flow_direction import FlowDirection, FlowOptions
 from impact_posture.tsid.redundancy import Redundancy
+from impact_posture.tsid.zero_moment_point import ZeroMomentPoint
 
 # How often a change of the flow is tried: as it is, and twice without what crosses limits.
 _TIMES = 3
@@ -44,12 +45,13 @@ class FlowGovernor:
         return float(np.abs(flow).max()) / self._options.acceleration
 
     def change(
-        self, space: Redundancy, step: Array, fastest: float, period: float, slope: Array | None
+        self, space: Redundancy, step: Array, fastest: float, period: float, slope: Array | None, zmp: ZeroMomentPoint
     ) -> tuple[Array, bool]:
         """Return the change of the flow towards a step, shape (nv,), and whether it only brakes.
 
         Each joint turns as fast as it can, and then all stay on the constraints; or all change evenly; or all brake
-        evenly.  The first two count twice more without what crosses limits.  The first change counts from which the
+        evenly.  The first two count twice more without what crosses limits, and the first, unless it slows down,
+        without what moves the zero moment point too far.  The first change counts from which the
         flow can stop within the limits by braking evenly, as hard as it lately could.
 
         Args:
@@ -58,6 +60,7 @@ class FlowGovernor:
             fastest: Largest speed of an entry, rad/s (m/s).
             period: Time in which the flow changes, s.
             slope: ``∇H/H₀``, shape (nv,), of which the flow goes down; none while it may climb.
+            zmp: Bounds of the acceleration beside what is known of it.
         """
         options, direction, Z, flow = self._options, self._direction, space.basis, self.flow
         most = options.acceleration * period
@@ -66,9 +69,12 @@ class FlowGovernor:
         away = limited(pace * step, fastest) - flow
         # Twice the way on which it stops, because the curvature may grow on it.
         stop = flow * self.stopping(flow)
-        for change in (space.project(np.minimum(np.maximum(away, -most), most)), away):
+        fast = space.project(np.minimum(np.maximum(away, -most), most))
+        for change, keeps in ((fast, True), (away, False)):
             change = limited(change, most)
             for again in range(_TIMES):
+                if keeps and float(change @ flow) >= 0:
+                    change = zmp.keep(space, period, change)
                 if again:
                     change = direction.along(Z, flow, self._braking(change, period), change)
                 if slope is not None:

@@ -24,6 +24,7 @@ from impact_posture.tsid.state import State
 from impact_posture.tsid.static_controls import StaticControls, support_edges
 from impact_posture.tsid.task import Task
 from impact_posture.tsid.task_formulation import TaskFormulation
+from impact_posture.tsid.zero_moment_point import ZeroMomentPoint
 
 # Step of the differences along the redundancy, rad.
 _STEP = 1e-4
@@ -124,6 +125,8 @@ class ReferenceFlow:
             self._J[rows] = task.jacobian(state)
         self._turning = [(t, self._J[r]) for t, r in zip(self._held, self._places, strict=True) if not t.constant]
         self._edges, self._offsets = support_edges(state, self._contacts)
+        ground = float(state.at(self._contacts[0].point).position[2]) if self._contacts else 0.0
+        self._zmp = ZeroMomentPoint(self._edges, self._offsets, ground)
         self.direction = FlowDirection(self.robot, self._edges, self._static.limited.size, self.options)
         self._governor = FlowGovernor(self.direction, self.options)
         self.start = 1.0
@@ -255,8 +258,9 @@ class ReferenceFlow:
         governor.flow = self._space.project(governor.flow)
         descends = fastest > 0 and self._visited == len(self._path)
         slope = self._slope if descends else None
-        change, brakes = governor.change(self._space, self._wanted, fastest, period, slope)
         known = (governor.flow + self._space.back(rate, self._base) - self.velocity) / period
+        self._zmp.limit(self._state, known)
+        change, brakes = governor.change(self._space, self._wanted, fastest, period, slope, self._zmp)
         # To stop within the limits counts more than to leave the actuators much.
         most = (1 + options.haste) / 2 if brakes else options.haste
         part = self._static.permitted(self._state.M, known, change / period, self.shares, most)

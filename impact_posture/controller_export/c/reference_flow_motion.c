@@ -84,7 +84,8 @@ static int ip_flow_stops(const ip_flow *f, const ip_params *p, const double *ste
 
 /* The change of the flow towards the wanted step, by at most so much an entry: as fast as each joint can, or straight, each
  * of them twice without what crosses limits, or braking.  The first of them counts from which the flow can stop within the
- * limits.  Return whether it only brakes. */
+ * limits.  Where the first does not slow down, it goes without what moves the zero moment point too far.  Return whether the
+ * flow only brakes. */
 static int ip_flow_change(const ip_flow *f, const ip_params *p, double period, double fastest, double *step)
 {
   enum { N = IP_NV, FAST = 0, BRAKE = 2 };
@@ -110,6 +111,9 @@ static int ip_flow_change(const ip_flow *f, const ip_params *p, double period, d
     }
     ip_shorten(step, most);
     for (again = 0; again < IP_TIMES; ++again) {
+      if (k == FAST && ip_dot(step, f->flow, N) >= 0.0) {
+        ip_flow_keep_zmp(f, period, step);
+      }
       if (again) {
         ip_flow_along_limits(f, ip_flow_braking(f, p, step, period), step);
       }
@@ -147,9 +151,12 @@ static void ip_flow_govern(ip_context *c)
   fastest = f->on ? fastest : 0.0;
   ip_flow_back(c, back);
   ip_flow_project(f, f->flow);
-  brakes = ip_flow_change(f, p, period, fastest, step);
   for (i = 0; i < N; ++i) {
     known[i] = (f->flow[i] + back[i] - f->velocity[i]) / period;
+  }
+  ip_flow_limit_zmp(f, known);
+  brakes = ip_flow_change(f, p, period, fastest, step);
+  for (i = 0; i < N; ++i) {
     more[i] = step[i] / period;
   }
   /* To stop within the limits counts more than to leave the actuators much. */

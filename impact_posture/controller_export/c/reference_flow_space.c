@@ -238,6 +238,7 @@ static void ip_flow_polygon(ip_context *c)
   double x[COUNT][2], mean[4][2] = {{0.0}};
   int i, j, start = 0, at, next, edges = 0;
   double even = IP_EVEN;
+  f->ground = c->m.position[ip_contact_point[0]][2];
   for (i = 0; i < COUNT; ++i) {
     const double *R = c->m.rotation[ip_contact_point[i / 4]], *half = c->p.contact_half + 2 * (i / 4);
     const int sole = ip_contact_row[i / 4 + 1] - ip_contact_row[i / 4] == 6;
