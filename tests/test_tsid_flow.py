@@ -16,12 +16,15 @@ from hypothesis import strategies as st
 from impact_posture.errors import InputError, MetricError
 from impact_posture.robot.robot import Robot
 from impact_posture.tsid.actuators import Actuators
+from impact_posture.tsid.contacts import SupportContact
 from impact_posture.tsid.controller import Controller, Status
 from impact_posture.tsid.flow_direction import FlowOptions
+from impact_posture.tsid.points import Point
 from impact_posture.tsid.posture_tasks import JointPosture
 from impact_posture.tsid.redundancy import Redundancy
 from impact_posture.tsid.reference_flow import PHASES, ReferenceFlow
 from impact_posture.tsid.reference_flow_posture import ReferenceFlowPosture
+from impact_posture.tsid.task_formulation import TaskFormulation
 from impact_posture.tsid.zero_moment_point import ZeroMomentPoint
 from tests.benchmarks.flow_course import formulation_for
 from tests.helpers import Vector, rng, robot
@@ -222,6 +225,14 @@ def test_the_zero_moment_point_stays_within_the_feet(monkeypatch: pytest.MonkeyP
     assert least_room() > -1e-3
     monkeypatch.setattr(ZeroMomentPoint, "keep", lambda self, space, period, step: step)
     assert least_room() < -0.05
+
+
+def test_feet_that_share_the_weight_with_a_fixed_base_are_refused() -> None:
+    r = robot("panda")
+    formulation = TaskFormulation(posture=JointPosture(r), contacts=(SupportContact(Point("panda_link4")),))
+    flow = ReferenceFlow(r, well(r, r.posture()), formulation, Actuators(r), FlowOptions())
+    with pytest.raises(InputError, match="panda: its base is fixed"):
+        flow.reset(r.posture())
 
 
 def test_the_rest_is_an_optimum_under_the_constraints() -> None:

@@ -125,8 +125,7 @@ class ReferenceFlow:
             self._J[rows] = task.jacobian(state)
         self._turning = [(t, self._J[r]) for t, r in zip(self._held, self._places, strict=True) if not t.constant]
         self._edges, self._offsets = support_edges(state, self._contacts)
-        ground = float(state.at(self._contacts[0].point).position[2]) if self._contacts else 0.0
-        self._zmp = ZeroMomentPoint(self._edges, self._offsets, ground)
+        self._zmp = ZeroMomentPoint(self._edges, self._offsets, state, self._contacts)
         self.direction = FlowDirection(self.robot, self._edges, self._static.limited.size, self.options)
         self._governor = FlowGovernor(self.direction, self.options)
         self.start = 1.0

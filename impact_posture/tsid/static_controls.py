@@ -8,6 +8,7 @@ from itertools import product
 import numpy as np
 
 from impact_posture.arrays import Array
+from impact_posture.errors import InputError
 from impact_posture.robot.support_polygon import polygon_edges
 from impact_posture.tsid.actuators import Actuators
 from impact_posture.tsid.contacts import SupportContact
@@ -105,7 +106,13 @@ def support_edges(state: State, contacts: Sequence[SupportContact]) -> tuple[Arr
     nothing leaves the ground with the least push.  Each corner of a sole is moved towards the mean of these corners.
     Point feet stay as they are, because three of four carry a robot.
     Feet that span no area allow no motion of the center of mass: each direction then is an edge out of reach.
+
+    Raises:
+        InputError: The base is fixed, so feet do not bear the weight alone.
     """
+    if contacts and not state.robot.floating:
+        what = "its base is fixed, and the flow knows no feet that share the weight with it"
+        raise InputError(what, where=state.robot.name, hint="leave out `contacts`")
     corners = []
     for contact in contacts:
         here = state.at(contact.point)

@@ -2,9 +2,12 @@
 
 from __future__ import annotations
 
+from collections.abc import Sequence
+
 import numpy as np
 
 from impact_posture.arrays import Array
+from impact_posture.tsid.contacts import SupportContact
 from impact_posture.tsid.redundancy import Redundancy
 from impact_posture.tsid.state import State
 
@@ -24,10 +27,11 @@ class ZeroMomentPoint:
     ``z = (p_x − (τ_y + height f_x)/f_z, p_y + (τ_x − height f_y)/f_z)``, hence ``f_z (n·z + b)`` is linear in ``ν̇``.
     """
 
-    def __init__(self, edges: Array, offsets: Array, ground: float) -> None:
-        """Set the polygon: ``n`` (k, 2), ``b`` (k,), and the height of the ground in the world, m."""
+    def __init__(self, edges: Array, offsets: Array, state: State, contacts: Sequence[SupportContact]) -> None:
+        """Set the polygon: ``n`` (k, 2), ``b`` (k,), of contacts, the first of which is on the ground at a state."""
         bounded = np.isfinite(offsets)
-        self._edges, self._offsets, self._ground = edges[bounded], offsets[bounded], ground
+        self._edges, self._offsets = edges[bounded], offsets[bounded]
+        self._ground = float(state.at(contacts[0].point).position[2]) if contacts else 0.0
         self._rows, self._room = np.zeros((0, 0)), np.zeros(0)
 
     def limit(self, state: State, known: Array) -> None:

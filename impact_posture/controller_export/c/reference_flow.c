@@ -25,7 +25,9 @@ static void ip_flow_place(ip_context *c, const double *q, double *error)
   double e[6], drift[6];
   int k, row = 0, size;
   ip_dynamics(q, still, &f->m);
-  memcpy(f->base, q, sizeof(double) * (IP_BASE ? 3 : 0));
+#if IP_CONTACTS
+  memcpy(f->base, q, sizeof f->base);
+#endif
   for (k = 0; k < IP_CONTACTS; ++k, row += size) {
     const int point = ip_contact_point[k];
     size = ip_contact_row[k + 1] - ip_contact_row[k];
