@@ -42,6 +42,12 @@ def shown_output() -> dict[str, list[str]]:
     return found
 
 
+@pytest.mark.parametrize("file", sorted(EXAMPLES.rglob("*.py")), ids=lambda p: p.stem)
+def test_examples_need_no_file_of_the_checkout(file: Path) -> None:
+    """Readers download the examples; the package ``tests`` is not installed."""
+    assert not re.search(r"^\s*(from|import) tests\b", file.read_text(encoding="utf-8"), re.MULTILINE)
+
+
 # ---- pink ---------------------------------------------------------------------------------------------------------
 
 

@@ -25,7 +25,8 @@ from impact_posture.codegen.export import export
 from impact_posture.codegen.impact_gradient import ImpactGradient
 from impact_posture.posture.problem_settings import Prepared, prepare
 from impact_posture.posture.solve import PostureSolution, solve
-from tests.settings import make_settings
+from impact_posture.settings import ProblemSettings
+from impact_posture.tables import validate
 
 DT, DURATION, AT_REST = 0.01, 60.0, 1e-6  # s, s, and a norm of v
 
@@ -144,7 +145,9 @@ class Outcome:
 
 def follow(contact: Contact, speed: float = 5.0) -> Outcome:
     """Run pink from the start posture until it rests."""
-    prepared = prepare(make_settings(contact.settings))
+    # pink holds what the contact says and knows neither collisions nor loads, so the offline problem has none either.
+    settings = {"collision": False, "holdable": False, **contact.settings}
+    prepared = prepare(validate(ProblemSettings, settings, "options"))
     impact, offline = prepared.impact, solve(prepared.problem)
     frame, normal = impact.contact.frame, impact.contact.normal
     with tempfile.TemporaryDirectory() as folder:
