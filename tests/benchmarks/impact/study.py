@@ -182,7 +182,7 @@ class Choice:
 
 
 def choices(robot: str, starts: int = 16) -> list[Choice] | ImpactPostureError:
-    """Optimize each objective with the defaults of the command, and drop the robot in what comes out."""
+    """Optimize each objective without collisions and loads, and drop the robot in what comes out."""
     found: list[Choice] = []
     for objective in OBJECTIVES:
         problem = STUDIED[robot][0].problem(objective=objective, friction=PICKED_FOR)
