@@ -2,7 +2,7 @@
 
 Without friction the jump is ``Δν = a (1+e) v/G`` with ``a = M⁻¹Jᵀn`` and ``G = nᵀJa``, and the peak force falls with
 G (:mod:`impact_posture.impact.contact_compression`).  A joint controller with the velocity gain ``K_d`` answers the
-jump with the torque ``K_d Δν``, so a bound on that torque is one on the jump (Wang and Kheddar, arXiv 2006.01987).
+jump with the torque ``K_d Δν``, so a bound on that torque is one on the jump (Wang et al. 2020, arXiv:2006.01987).
 """
 
 from __future__ import annotations
