@@ -34,7 +34,8 @@ JointModel = Literal["reflected", "link", "locked", "elastic"]
 TransmissionKind = Literal["rigid", "elastic", "locked"]
 
 # Young's modulus (Pa) and Poisson's ratio of what a contact may touch: the middle of the ranges in J. M. Gere,
-# Mechanics of Materials, 5th ed. (steel; oak in bending; rubber; concrete).
+# Mechanics of Materials, 5th ed. (steel; oak in bending; concrete).  The rubber is stiff (0.01 to 0.1 GPa); Gere has
+# 0.0007 to 0.004 GPa.
 MATERIALS = {"steel": (200e9, 0.28), "wood": (11.5e9, 0.3), "rubber": (0.03e9, 0.48), "ground": (24e9, 0.15)}
 
 # Least distance (m) of links that stay apart, and edge length (m) of a surface that ends before the robot's stand.
