@@ -8,7 +8,6 @@ from collections.abc import Sequence
 from dataclasses import dataclass, fields
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
-from zipfile import BadZipFile
 
 import numpy as np
 
@@ -28,7 +27,7 @@ if TYPE_CHECKING:
     from impact_posture.robot.robot import Robot
 
 # Exceptions from reading a changed or incomplete result.
-_BROKEN = (LookupError, ValueError, TypeError, AttributeError, OSError, EOFError, BadZipFile, RecursionError)
+_BROKEN = (LookupError, ValueError, TypeError, AttributeError, OSError, RecursionError)
 
 
 @dataclass(frozen=True, eq=False)

@@ -125,21 +125,32 @@ def read_arrays(path: Path) -> dict[str, NDArray[Any]]:
 
     Raises:
         OSError: The file cannot be read, or its arrays are larger than :data:`MOST_BYTES`.
-        ValueError: The file is no NPZ, or states more numbers than it has.
-        TypeError: The file holds one array without a name.
-        BadZipFile: The file is damaged; also ``EOFError`` and ``zlib.error``.
+        ValueError: The file is no NPZ, is damaged, or states more numbers than it has.
     """
     # Imported here because the help page does without.
+    import zlib
+    from zipfile import BadZipFile
+
     import numpy as np
 
     try:
-        with np.load(path, allow_pickle=False) as file:
+        file = np.load(path, allow_pickle=False)
+        if isinstance(file, np.ndarray):
+            raise ValueError(f"{path.name} holds an array without a name")
+        with file:
             if sum(entry.file_size for entry in file.zip.infolist()) > MOST_BYTES:
                 raise OSError(errno.EFBIG, os.strerror(errno.EFBIG), str(path))
-            return {name: file[name] for name in file.files}
+            arrays = {name: file[name] for name in file.files}
     except MemoryError:
         # A header may state any size.
         raise ValueError(f"{path.name} states more numbers than it has") from None
+    except (BadZipFile, EOFError, RuntimeError, zlib.error) as error:
+        # A RuntimeError, if the damage states another compression or a password.
+        raise ValueError(f"{path.name} is damaged: {error}") from None
+    # Of an entry that is no array, NumPy returns the bytes.
+    if strange := [name for name, found in arrays.items() if not isinstance(found, np.ndarray)]:
+        raise ValueError(f"'{strange[0]}' of {path.name} is no array")
+    return arrays
 
 
 def read_toml(path: Path) -> dict[str, object]:

@@ -127,7 +127,8 @@ def _address(path: Path) -> str:
         from PIL import Image
 
         try:
-            with Image.open(path) as picture, io.BytesIO() as file:
+            # Of another format, Pillow may start a program, such as Ghostscript.
+            with Image.open(path, formats=("PNG",)) as picture, io.BytesIO() as file:
                 picture.convert("RGB").quantize(_COLORS, Image.Quantize.FASTOCTREE, dither=Image.Dither.NONE).save(
                     file, "PNG", compress_level=6
                 )

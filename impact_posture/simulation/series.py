@@ -2,11 +2,9 @@
 
 from __future__ import annotations
 
-import zlib
 from dataclasses import dataclass, fields
 from pathlib import Path
 from typing import Any
-from zipfile import BadZipFile
 
 import numpy as np
 from numpy.typing import NDArray
@@ -117,5 +115,5 @@ class Series:
             if len({column.shape[0] for column in columns.values()}) != 1:
                 raise ValueError("columns of different lengths")
             return Series(**columns)
-        except (OSError, ValueError, KeyError, TypeError, IndexError, EOFError, BadZipFile, zlib.error) as error:
+        except (OSError, ValueError, KeyError, TypeError, IndexError) as error:
             raise SpecError(f"is no time series ({error})", where=str(path), hint="run simulate again") from None

@@ -18,6 +18,7 @@ from impact_posture.errors import ImpactPostureError, SpecError
 from impact_posture.experiment import run_reports
 from impact_posture.experiment.run_reports import write_run_report
 from impact_posture.report.page import figures
+from impact_posture.tables import read_arrays
 from tests.command import run as start
 
 NOMINAL = "runs/nominal.json"
@@ -93,6 +94,34 @@ def test_arrays_that_unpack_to_more_than_any_run_has(both: Path, monkeypatch: py
         write_run_report(both)
 
 
+def spoil(path: Path, way: str) -> None:
+    """Change a few bytes of the first entry of an NPZ file, or what the file is."""
+    data = bytearray(path.read_bytes())
+    entry, content = data.index(b"PK\x01\x02"), 30 + sum(struct.unpack_from("<HH", data, 26))
+    if way == "array without a name":
+        file = io.BytesIO()
+        np.save(file, np.zeros(3))
+        data[:] = file.getvalue()
+    elif way == "text for an array":
+        file = io.BytesIO()
+        with zipfile.ZipFile(file, "w") as entries:
+            entries.writestr("t.npy", "ten years")
+        data[:] = file.getvalue()
+    else:
+        at = {"password": entry + 8, "compression": entry + 10, "content": content}[way]
+        data[at] = 1 if way == "password" else 0xFF
+    path.write_bytes(data)
+
+
+@pytest.mark.parametrize("way", ["password", "compression", "content", "array without a name", "text for an array"])
+def test_arrays_that_are_damaged_are_named(way: str, both: Path) -> None:
+    spoil(both / "runs" / "nominal.npz", way)
+    with pytest.raises(ValueError, match=r"nominal\.npz"):
+        read_arrays(both / "runs" / "nominal.npz")
+    with pytest.raises(SpecError, match="is no time series"):
+        write_run_report(both)
+
+
 def picture(width: int, height: int) -> bytes:
     """A PNG that states a size and has no content."""
 
@@ -103,7 +132,13 @@ def picture(width: int, height: int) -> bytes:
     return b"\x89PNG\r\n\x1a\n" + part(b"IHDR", head) + part(b"IDAT", zlib.compress(bytes(99))) + part(b"IEND", b"")
 
 
-@pytest.mark.parametrize("content", [picture(60_000, 60_000), picture(2**31 - 1, 2**31 - 1), picture(9, 9), b"none"])
+# A picture of another format.  Some formats have Pillow start other programs.
+BITMAP = b"BM" + struct.pack("<IIIIiiHHIIIIII", 58, 0, 54, 40, 1, 1, 1, 24, 0, 4, 0, 0, 0, 0) + bytes(4)
+
+
+@pytest.mark.parametrize(
+    "content", [picture(60_000, 60_000), picture(2**31 - 1, 2**31 - 1), picture(9, 9), b"none", BITMAP]
+)
 def test_a_picture_that_is_none_is_named(content: bytes, both: Path) -> None:
     (both / "x.png").write_bytes(content)
     with pytest.raises(SpecError, match="is no picture") as caught:
