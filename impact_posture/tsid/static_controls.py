@@ -20,6 +20,8 @@ _MOMENT = 100.0
 _LEFT = 0.1
 # Share of the weight that is spread evenly over soles.
 _EVEN = 0.6
+# An edge that turns less than this from the left is the last, rad.
+_START = 1e-8
 # Share of the trace that makes the balance of the base solvable where the feet cannot carry it.
 _TINY = 1e-12
 
@@ -100,7 +102,7 @@ class StaticControls:
 
 
 def support_edges(state: State, contacts: Sequence[SupportContact]) -> tuple[Array, Array]:
-    """Return ``n`` (k, 2) and ``b`` (k,) of the polygon ``n·c + b ≤ 0`` of feet on level ground, m.
+    """Return ``n`` (k, 2) and ``b`` (k,) of the polygon ``n·c + b ≤ 0`` of feet on level ground, m, around it.
 
     Where the center of mass ``c`` is in it, each sole carries its part of what is spread evenly.  A sole that carries
     nothing leaves the ground with the least push.  Each corner of a sole is moved towards the mean of these corners.
@@ -126,4 +128,8 @@ def support_edges(state: State, contacts: Sequence[SupportContact]) -> tuple[Arr
     edges = polygon_edges(list((places + even * (places.mean(axis=0) - places)).reshape(-1, 2)))
     if edges is None:
         return np.vstack([np.eye(2), -np.eye(2)]), np.full(4, np.inf)
-    return edges[0], -edges[1]
+    normals, offsets = edges
+    # Around from the leftmost corner as in C, because what edges forbid is removed one after the other.
+    turn = np.arctan2(normals[:, 1], normals[:, 0])
+    order = np.argsort(np.where(turn < _START - np.pi, np.pi, turn))
+    return normals[order], -offsets[order]
