@@ -20,8 +20,10 @@ from impact_posture.errors import InputError
 from impact_posture.impact.objective import ImpactObjective
 from impact_posture.libraries import library_path, load_library
 from impact_posture.toolchain import find_compiler
+from impact_posture.tsid.contacts import SupportContact
 from impact_posture.tsid.controller import Controller, Status
 from impact_posture.tsid.impact_robust import gradient_of
+from impact_posture.tsid.points import Point
 from impact_posture.tsid.redundancy import Redundancy
 from impact_posture.tsid.reference_flow import PHASES
 from impact_posture.tsid.reference_flow_posture import ReferenceFlowPosture
@@ -177,6 +179,9 @@ def test_what_is_no_time_no_parameter_and_no_task_is_refused() -> None:
 
     with pytest.raises(InputError, match=r"'flow posture' \(Mine\) has no C code"):
         structure_of(r, arm_formulation(r, Mine(r, lambda q: (1.0, q[: r.nv]))))
+    flow = ReferenceFlowPosture(r, lambda q: (1.0, q[: r.nv]))
+    with pytest.raises(InputError, match="feet that share the weight with a fixed base; leave out `contacts`"):
+        structure_of(r, replace(arm_formulation(r, flow), contacts=(SupportContact(Point("panda_link4")),)))
 
 
 @pytest.mark.parametrize("name", list(IMPACTS))

@@ -232,7 +232,9 @@ def _check(robot: Robot, formulation: TaskFormulation) -> None:
         if type(task) not in known:
             raise refuse(f"task '{task.name}' ({type(task).__name__}) has no C code")
     if isinstance(formulation.posture, ReferenceFlowPosture) and formulation.contacts and not robot.floating:
-        raise refuse(f"'{formulation.posture.name}' with contacts and a fixed base has no C code")
+        # Python refuses them at a reset, so that to run it there is no way out.
+        what = f"'{formulation.posture.name}' knows no feet that share the weight with a fixed base"
+        raise InputError(what, where="controller export", hint="leave out `contacts`")
     if formulation.row_limits:
         raise refuse(f"'{formulation.row_limits[0].name}' ({type(formulation.row_limits[0]).__name__}) has no C code")
     for slot in Chart(robot.model).slots:

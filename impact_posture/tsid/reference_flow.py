@@ -105,6 +105,7 @@ class ReferenceFlow:
         """Begin at rest at a posture, shape (nq,), and measure the curvature there.
 
         Raises:
+            InputError: The robot has feet and a fixed base.
             MetricError: The gradient does not exist there, or ``H`` vanishes.
         """
         state = self._state
