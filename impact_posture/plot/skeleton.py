@@ -136,7 +136,8 @@ def build_skeleton(
 
 def _across(model: pin.Model, q: Array) -> Array | None:
     """Return the direction about which all joints turn and along which none slides; ``None`` if there is none."""
-    linear, angular = np.split(pin.computeJointJacobians(model, model.createData(), q), 2)
+    # Of a single joint, Pinocchio returns a vector.
+    linear, angular = np.split(pin.computeJointJacobians(model, model.createData(), q).reshape(6, -1), 2)
     _, sizes, directions = np.linalg.svd(angular.T)
     across = np.asarray(directions[0])
     turns = sizes[0] > _PARALLEL and not (sizes[1:] > _PARALLEL).any()

@@ -472,13 +472,17 @@ def test_path_of_wrong_shape(panda: ResultView) -> None:
 
 @pytest.mark.parametrize(("axis", "plane"), [(Z, XY), (Y, XZ), (X, YZ)])
 @pytest.mark.parametrize("height", [0.0, 0.5])
-def test_a_planar_robot_is_seen_across_its_plane(axis: tuple[int, int, int], plane: Plane, height: float) -> None:
+@pytest.mark.parametrize("count", [1, 3])
+def test_a_planar_robot_is_seen_across_its_plane(
+    count: int, axis: tuple[int, int, int], plane: Plane, height: float
+) -> None:
     along = Y if axis == X else X
-    robot = arm([axis] * 3, np.zeros(3), floating=False, rods=[along] * 3)
+    robot = arm([axis] * count, np.zeros(count), floating=False, rods=[along] * count)
     robot.model.jointPlacements[1] = pin.SE3(np.eye(3), np.array([0.0, 0.0, height]))
     for normal in (along, np.cross(axis, along)):
         contact = ImpactContact(TIP, tuple(float(n) for n in normal))
-        states = [build_skeleton(robot, np.array(q), [contact]) for q in ((0.6, -0.9, 1.0), (0.8, 0.4, -0.9))]
+        postures = ((0.6, -0.9, 1.0), (0.8, 0.4, -0.9))
+        states = [build_skeleton(robot, np.array(q[:count]), [contact]) for q in postures]
         assert side_plane(*states) is plane
 
 
