@@ -345,6 +345,7 @@ def test_the_pages_scenario_is_one(folder: Path) -> None:
         ('posture = "nope"', "posture", "no posture 'nope'"),
         ("armature = {panda_joint9 = 0.1}", "armature", "no joint 'panda_joint9'"),
         ('package_dir = ["nope"]', "package_dir", "no path"),
+        ('lock = ["nope"]', "panda lock", "no joint 'nope'"),
         ('robot = "pandaa"', "", "no robot 'pandaa'"),
         ('srdf = "nope.srdf"', None, "check srdf or robot.toml"),
     ],

@@ -286,7 +286,7 @@ def naming_keys(scenario: Scenario) -> Iterator[None]:
         where = error.where
         if where in ("", "problem"):
             where = scenario.source
-        elif where.partition(" ")[0] in _KEYS and scenario.source:
+        elif {where.partition(" ")[0], where.rpartition(" ")[2]} & _KEYS and scenario.source:
             where = f"{scenario.source}, {where}"
         error.reword(as_keys(error.what, _RENAMED), where, as_keys(error.hint, _RENAMED))
         raise
