@@ -158,21 +158,28 @@ def test_an_end_that_lacks_parts_is_certified_in_the_last_round_only(monkeypatch
     assert [run.good for run in search.run(1, None)][lacking[0]] is False
 
 
-@pytest.mark.parametrize("count", [0, 2, 4, None])
-def test_starts_are_the_same_whoever_draws_them(count: int | None, monkeypatch: pytest.MonkeyPatch) -> None:
-    """The copy of the process is asked after so many starts, or dies."""
+@pytest.mark.parametrize("count", [0, 2, 4, "dies", "fails"])
+def test_starts_are_the_same_whoever_draws_them(count: int | str, monkeypatch: pytest.MonkeyPatch) -> None:
+    """The copy of the process is asked after so many starts, or dies, or runs out of memory when it is asked."""
     problem = prepare(ProblemSettings(robot="solo8", normal=(0.0, 0.0, 1.0))).problem
     here, ahead = (StartDraws(problem, (problem.given,), 6, 3) for _ in range(2))
-    answers = [False] * (count or 0)
+    answers = [False] * (count if isinstance(count, int) else 0)
+
+    def asked(poll: Callable[[float], bool]) -> bool:
+        if count == "dies":
+            os._exit(1)
+        if count == "fails" and poll(60.0):
+            raise MemoryError
+        return not answers or answers.pop()
 
     def server(begin: Callable[..., Any]) -> AbstractContextManager[Any]:
-        asked = partial(os._exit, 1) if count is None else lambda: not answers or answers.pop()
-        return fork_server(lambda _: begin(asked))
+        return fork_server(lambda poll: begin(partial(asked, poll)))
 
     monkeypatch.setattr(draws_module, "fork_server", server)
+    drawn_ahead = len(answers)
     with ahead.ahead(2):
         ahead.collect()
-    assert len(ahead._drawn) == (count or 0)
+    assert len(ahead._drawn) == drawn_ahead
     for index in range(6):
         drawn, expected = ahead.choose(index), here.choose(index)
         assert drawn is not None and expected is not None

@@ -68,8 +68,9 @@ class StartDraws:
             yield
 
     def collect(self) -> None:
-        """Take over the starts that the copy has drawn."""
+        """Take over the starts that the copy has drawn, none where it failed; :meth:`choose` draws the others."""
         ask, self._ask = self._ask, None
         if ask:
-            with suppress(OSError):
+            # An error of a start is raised again where this start runs.
+            with suppress(Exception):
                 self._drawn = next(iter(ask(None)))
