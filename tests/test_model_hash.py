@@ -4,8 +4,11 @@ from __future__ import annotations
 
 from pathlib import Path
 
+import numpy as np
+import pinocchio as pin
 import pytest
 
+from impact_posture.robot.model_hash import _axis
 from impact_posture.robot.robot_loader import load_robot
 from impact_posture.settings import LoadOptions
 from tests.helpers import NAMES, robot
@@ -61,3 +64,14 @@ def test_hash_does_not_follow_limits_postures_or_comments(arm: Path) -> None:
     assert load_robot(str(arm), LoadOptions(config=spec(arm.parent, text, "x.toml"))).model_sha256 == reference
     arm.write_text(ARM.replace("<link", "<!-- a link --><link"), encoding="utf-8")
     assert load_robot(str(arm)).model_sha256 == reference
+
+
+def test_the_hash_reads_a_joint_at_its_own_place_in_the_configuration() -> None:
+    """The motion subspace of a universal joint depends on its angle, which is far behind in a long chain."""
+    joint, none = pin.JointModelUniversal(np.array([1.0, 0, 0]), np.array([0, 1.0, 0])), pin.SE3.Identity()
+    alone, chain, parent = pin.Model(), pin.Model(), 0
+    for k in range(3000):
+        parent = chain.addJoint(parent, pin.JointModelRX(), none, f"joint{k}")
+    alone.addJoint(0, joint, none, "last")
+    last = chain.addJoint(parent, joint, none, "last")
+    np.testing.assert_array_equal(_axis(chain.joints[last]), _axis(alone.joints[1]))

@@ -47,7 +47,10 @@ def rounded(values: object) -> list[str]:
 
 def _axis(joint: pin.JointModel) -> Array:
     """Return the motion subspace of a joint at the identity, which distinguishes two unaligned joints."""
-    model, data = pin.Model(), joint.createData()
+    model = pin.Model()
     model.addJoint(0, joint, pin.SE3.Identity(), "joint")
-    joint.calc(data, pin.neutral(model))
+    # The copy, because the joint itself reads its own place in the configuration of its robot.
+    copy = model.joints[1]
+    data = copy.createData()
+    copy.calc(data, pin.neutral(model))
     return np.asarray(data.S).reshape(-1)

@@ -89,7 +89,7 @@ def _kind(joint: pin.JointModel) -> tuple[int, Vector]:
         return "XYZ".index(name[1]) + (4 if name[0] == "P" else 0), np.zeros(3)
     if name in ("RevoluteUnaligned", "PrismaticUnaligned"):
         data = joint.createData()
-        joint.calc(data, np.zeros(1))
+        joint.calc(data, np.zeros(joint.idx_q + 1))
         S = np.asarray(data.S).ravel()
         return (3, S[3:]) if name[0] == "R" else (7, S[:3])
     raise Absent(f"joints of type {name} are not in the C++ peer")
