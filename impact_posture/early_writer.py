@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 import gc
-import multiprocessing
 import os
 import tempfile
 import threading
@@ -43,7 +42,7 @@ def early_writer(
     """
     with ExitStack() as stack:
         finish = None
-        if jobs > 1 and "fork" in multiprocessing.get_all_start_methods():
+        if jobs > 1:
             try:
                 folder = stack.enter_context(scratch_folder())
                 load = partial(_load_in_background, settings, folder, report, meshes)

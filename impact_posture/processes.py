@@ -105,7 +105,7 @@ def fork_map(function: Callable[[int], _Result], count: int, jobs: int) -> Itera
     Raises:
         WorkerDied: A worker was killed, for example for lack of memory.
     """
-    if min(jobs, count) < 2 or "fork" not in multiprocessing.get_all_start_methods():
+    if min(jobs, count) < 2 or not hasattr(os, "fork"):
         yield ((index, function(index)) for index in range(count))
         return
     _WORK["function"] = function
@@ -163,6 +163,8 @@ def fork_server(
     Raises:
         OSError: The system cannot fork.
     """
+    if not hasattr(os, "fork"):
+        raise OSError("the system cannot fork")
     ours, theirs = multiprocessing.Pipe()
     with signals_held():
         parent, child = os.getpid(), os.fork()

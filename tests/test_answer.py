@@ -186,6 +186,15 @@ def test_starts_are_the_same_whoever_draws_them(count: int | str, monkeypatch: p
         np.testing.assert_array_equal(drawn, expected)
 
 
+def test_a_system_that_cannot_fork_draws_starts_when_they_run(monkeypatch: pytest.MonkeyPatch) -> None:
+    problem = prepare(ProblemSettings(robot="solo8", normal=(0.0, 0.0, 1.0))).problem
+    draws = StartDraws(problem, (problem.given,), 3, 0)
+    monkeypatch.delattr(os, "fork")
+    with draws.ahead(2):
+        draws.collect()
+    assert not draws._drawn and draws.choose(2) is not None
+
+
 def test_what_even_forces_hold_needs_no_linear_program(monkeypatch: pytest.MonkeyPatch) -> None:
     problem = prepare(
         ProblemSettings(robot="talos", frame="gripper_right_base_link", normal=(-1.0, 0.0, 0.0))

@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import multiprocessing
 from collections.abc import Callable, Iterable, Iterator
 from contextlib import ExitStack, contextmanager, suppress
 
@@ -62,7 +61,7 @@ class StartDraws:
 
         with ExitStack() as stack:
             # Where the system has no place for a process, the starts are drawn when they run.
-            if first < self.count and "fork" in multiprocessing.get_all_start_methods():
+            if first < self.count:
                 with suppress(OSError):
                     self._ask = stack.enter_context(fork_server(begin))
             yield
