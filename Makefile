@@ -22,7 +22,7 @@ help:
 	@echo "make study-global   how complete the search global is, and basin hopping beside multi-start"
 	@echo "make reproduction   the paper's experiments, many seeds, for the documentation (about ten minutes)"
 	@echo "make study-feasible  what it costs to be clear of collisions, held by the motors and reached at speed"
-	@echo "make study-flow     where the reference flow of robust-flow rests, from 1,000 random starts of each of two seeds (two minutes)"
+	@echo "make study-flow     where the reference flow of robust-flow rests, from 1,000 random starts of each of four seeds (three minutes)"
 	@echo "make study-real-impacts  balls, strikes, taps: what the rigid model predicts, and what MuJoCo finds (some minutes)"
 	@echo "make study-robustness  where each controller helps, and which targets it keeps: variations of each experiment (about ten minutes; goes on where it was)"
 	@echo "make study-scan     what decides along the redundancy of an arm and of a humanoid, as a picture"

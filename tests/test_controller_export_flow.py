@@ -64,14 +64,14 @@ def both(name: str, path: tuple[float, ...] = ()) -> tuple[Controller, Reference
 
 
 @pytest.mark.parametrize(
-    ("name", "path", "tilt", "ticks"),
+    ("name", "path", "options", "ticks"),
     [
-        ("tilthex_arm", (), 0.8, 300), ("solo8", (), 0.8, 300), ("solo8", (), 0.055, 600), ("panda", ELBOW, 0.8, 300),
-        ("talos", (), 0.8, 300),
+        ("tilthex_arm", (), {}, 300), ("tilthex_arm", (), {"duration": 0.5}, 600), ("solo8", (), {}, 300),
+        ("solo8", (), {"tilt": 0.055}, 600), ("panda", ELBOW, {}, 300), ("talos", (), {}, 300),
     ],
 )  # fmt: skip
 def test_the_reference_goes_as_in_python(
-    name: str, path: tuple[float, ...], tilt: float, ticks: int, monkeypatch: pytest.MonkeyPatch
+    name: str, path: tuple[float, ...], options: dict[str, float], ticks: int, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     """Each controller moves a robot of its own, through all phases."""
     edges: list[int] = []
@@ -84,9 +84,11 @@ def test_the_reference_goes_as_in_python(
     monkeypatch.setattr(ZeroMomentPoint, "keep", keep)
     r = robot(name)
     ours, posture, theirs = both(name, path)
-    posture.options = replace(posture.options, tilt=tilt)
-    theirs.parameters["flow_tilt"][:] = tilt
+    posture.options = replace(posture.options, **options)
+    for option, value in options.items():
+        theirs.parameters[f"flow_{option}"][:] = value
     # From its own posture, level as it is, solo8 tilts no way.
+    tilt = options.get("tilt", 0.8)
     start = np.array(pin.integrate(r.model, r.posture(), LEANING)) if tilt < 0.5 else r.posture()
     for controller in (ours, theirs):
         controller.reset(start, np.zeros(r.nv))
@@ -108,6 +110,7 @@ def test_the_reference_goes_as_in_python(
         if r.floating:
             most = max(most, float(np.arccos(pin.Quaternion(theirs.target[3:7]).matrix()[2, 2])))
         report = theirs.report()
+        assert bool(theirs._report.resting) == posture.flow.resting
         assert report.level == posture.level and report.objective == pytest.approx(posture.value, rel=1e-7)
     away = np.abs(pin.difference(r.model, start, theirs.target)).max()
     assert away > 0.02 and theirs.flow_failures == 0

@@ -330,6 +330,25 @@ def test_it_rests_before_an_impact_at_a_known_time() -> None:
     assert np.abs(posture.target[7:] - start[7:]).max() > moved + 0.05
 
 
+def test_it_moves_for_no_longer_than_it_may_and_then_for_as_long_again() -> None:
+    r = robot("tilthex_arm")
+    flow = flow_of(r, arm_well(), duration=0.5)
+    flow.on, moved = True, list[float]()
+    for late in (0, len(PHASES)):
+        # The second time, it rests until the next update.
+        for _ in range(round(0.5 / DT) + late):
+            flow.advance(DT, flow.q)
+        assert not np.abs(flow.velocity).max() > 1e-4
+        moved.append(float(np.abs(flow.q[7:] - r.posture()[7:]).max()))
+        stopped = flow.q.copy()
+        for _ in range(200):
+            flow.advance(DT, flow.q)
+        assert flow.resting and flow.direction.gain > 10 * flow.options.epsilon
+        np.testing.assert_allclose(flow.q, stopped, atol=1e-4)
+        flow.rest_at(np.inf)
+    assert moved[1] > 1.2 * moved[0] > 0.01
+
+
 def test_contact_and_release_stop_it_and_a_reset_forgets_all() -> None:
     controller, posture, q, v = flying(arm_well())
 

@@ -104,6 +104,7 @@ def parameters(s: Structure, period: float) -> Iterator[Field]:
             ("rho", "nonnegative", "pull of the joints towards the start, 1/rad2"),
             ("mu", "amount", "least curvature, 1/rad2"),
             ("epsilon", "amount", "predicted decrease of H/H0 below which the flow rests"),
+            ("duration", "amount", "longest time that it moves after a brace, without that on a path and at rest, s"),
             ("joint_margin", "nonnegative", "distance from the joint limits, rad or m"),
             ("com_margin", "nonnegative", "distance of the center of mass from the edges of the support polygon, m"),
             ("tilt", "amount", "largest tilt of the base from the default posture, rad"),

@@ -44,6 +44,7 @@ class FlowOptions:
         rho: ρ, pull of the joints towards the start per rad², relative to ``H₀``.
         mu: μ, least curvature per rad², relative to ``H₀``.
         epsilon: ε, predicted decrease relative to ``H₀`` below which the flow rests; it resumes above 4 ε.
+        duration: Longest time that the flow moves after it is told to, without that on a path and at rest, s.
         joint_margin: Distance from the joint limits, rad (m); at most an eighth of the range of a joint.
         com_margin: Distance of the center of mass from the edges of the support polygon, m.
         tilt: Largest angle between the vertical and :attr:`~impact_posture.robot.robot.Robot.upright`, rad.
@@ -58,6 +59,7 @@ class FlowOptions:
     rho: float = 0.001
     mu: float = 0.05
     epsilon: float = 7e-5
+    duration: float = 7.9
     joint_margin: float = 0.1
     com_margin: float = 0.05
     tilt: float = 0.8

@@ -59,7 +59,7 @@ class ReferenceFlow:
         value: ``H(q_r)`` at the last update.
         start: ``H₀``, its value at the reset.
         on: Whether the flow may move.
-        resting: Whether no step promises a decrease of more than ε.
+        resting: Whether no step promises a decrease of more than ε, or the flow has moved as long as it may.
         failed: Whether the last evaluation raised or was not finite.  The flow then brakes.
         led: Tasks that follow the flow.
         error: Distance from contacts and tasks at the last update, m and rad, and zeros for held joints.
@@ -115,7 +115,7 @@ class ReferenceFlow:
         self._before = np.zeros_like(self._J)
         self.shares = np.zeros(self._static.limited.size)
         self._phase, self._visited, self._elapsed, self._clock = 0, 0, 0.0, 0.0
-        self._deadline = np.inf
+        self._deadline, self._moved, self._remains = np.inf, 0.0, np.inf
         self.on, self.resting, self.failed = False, False, False
         self._ahead = False
         state.update(q, self.velocity)
@@ -151,8 +151,11 @@ class ReferenceFlow:
         self.q[:] = pin.integrate(self._model, self.q, dt * self.velocity)
 
     def rest_at(self, after: float) -> None:
-        """Come to rest within ``after`` seconds from now, as far as the acceleration permits, and stay."""
-        self._deadline = self._clock + after
+        """Come to rest within ``after`` seconds from now, as far as the acceleration permits, and stay.
+
+        The time that the flow may move is counted anew from now.
+        """
+        self._deadline, self._moved, self._remains = self._clock + after, 0.0, np.inf
 
     @property
     def moves(self) -> bool:
@@ -233,7 +236,7 @@ class ReferenceFlow:
         offset = pin.difference(self._model, self._first, self._here)
         self._wanted[:] = self.direction.newton(self._space, self._slope, self.value / self.start, offset, self.error)
         gain, least = self.direction.gain, self.options.epsilon
-        self.resting = gain < (4 * least if self.resting else least)
+        self.resting = gain < (4 * least if self.resting else least) or self._remains <= 0.0
         if self.resting:
             # It brakes as it turns, downhill.
             self._wanted[:] = 0.0
@@ -247,8 +250,11 @@ class ReferenceFlow:
             return
         error = np.abs(pin.difference(self._model, self._measured, self.q)[self._base :]).max(initial=0.0)
         fastest = options.speed * max(1.0 - error / options.tracking, 0.0)
+        if self.on and not self.resting and self._visited == len(self._path):
+            self._moved += period
         # The speed is that at the next change, and rest comes with the one after, on two fifths of the acceleration.
-        fastest = min(fastest, 0.4 * options.acceleration * max(self._deadline - self._clock - 2 * period, 0.0))
+        self._remains = min(self._deadline - self._clock, options.duration - self._moved) - 2 * period
+        fastest = min(fastest, 0.4 * options.acceleration * max(self._remains, 0.0))
         if not self.on:
             fastest = 0.0
         rate = self.error / _RETURN

@@ -28,7 +28,7 @@ def main() -> int:
     parser.add_argument("names", nargs="+", choices=list(STUDIES), metavar="NAME")
     parser.add_argument("--only", default="", metavar="TEXT", help="cases whose name has this in it")
     parser.add_argument("--count", type=int, help="how many of what the study counts")
-    parser.add_argument("--seed", type=int, default=0, help="of impacts and points; the first of two of flow")
+    parser.add_argument("--seed", type=int, default=0, help="of impacts and points; the first of four of flow")
     parser.add_argument("--number", type=int, help="points: print this one alone, run anew")
     parser.add_argument("--jobs", type=int, default=2, help="processes of points and reproduction")
     parser.add_argument("--against", default="", metavar="PROGRAM", help="answer: another impact-posture")

@@ -247,6 +247,8 @@ static void ip_enter(ip_context *c)
   c->level = c->flow.on;
   if (c->flow.on) {
     c->flow.deadline = c->flow.clock + c->impact[0] - ip_flow_settle(&c->p);
+    c->flow.moved = 0.0;
+    c->flow.remains = INFINITY;
   }
 #endif
 #if IP_ROBUST

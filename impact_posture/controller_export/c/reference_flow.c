@@ -250,7 +250,7 @@ static void ip_flow_direct(ip_context *c)
   ip_flow_solve(f);
   /* The flow does not climb for what the pull or the springs win. */
   f->gain = fmin(f->gain * ip_flow_root(f), -ip_dot(f->slope, f->wanted, IP_NV));
-  f->resting = f->gain < (f->resting ? 4.0 : 1.0) * c->p.flow_epsilon[0];
+  f->resting = f->gain < (f->resting ? 4.0 : 1.0) * c->p.flow_epsilon[0] || f->remains <= 0.0;
   if (f->resting) {
     /* It brakes as it turns, downhill. */
     memset(f->wanted, 0, sizeof f->wanted);

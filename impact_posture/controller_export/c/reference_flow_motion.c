@@ -146,8 +146,12 @@ static void ip_flow_govern(ip_context *c)
   }
   ip_difference(c->q, f->q, e);
   fastest = p->flow_speed[0] * fmax(1.0 - ip_largest(e, IP_BASE) / p->flow_tracking[0], 0.0);
+  if (f->on && !f->resting && f->visited == IP_PATH) {
+    f->moved += period;
+  }
   /* The speed is that at the next change, and rest comes with the one after, on two fifths of the acceleration. */
-  fastest = fmin(fastest, 0.4 * p->flow_acceleration[0] * fmax(f->deadline - f->clock - 2.0 * period, 0.0));
+  f->remains = fmin(f->deadline - f->clock, p->flow_duration[0] - f->moved) - 2.0 * period;
+  fastest = fmin(fastest, 0.4 * p->flow_acceleration[0] * fmax(f->remains, 0.0));
   fastest = f->on ? fastest : 0.0;
   ip_flow_back(c, back);
   ip_flow_project(f, f->flow);
@@ -189,7 +193,7 @@ static int ip_flow_begin(ip_context *c)
   memcpy(f->q, c->q, sizeof f->q);
   memcpy(f->first, c->q, sizeof f->first);
   memcpy(f->here, c->q, sizeof f->here);
-  f->deadline = INFINITY;
+  f->deadline = f->remains = INFINITY;
   f->able = 1.0;
   IP_CONSTANTS(c, &f->m);
   IP_CONSTANTS(c, &f->ahead);
