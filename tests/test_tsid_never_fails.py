@@ -257,3 +257,22 @@ def test_levels_against_one_quadratic_program_after_the_other(refined: bool, mon
             # What was reached is kept, with room for rounding.
             rows = np.vstack([rows, A, -A])
             least = np.concatenate([least, A @ x - 1e-7, -A @ x - 1e-7])
+
+
+def test_a_level_that_the_solver_gives_up_and_that_can_hold_holds(monkeypatch: pytest.MonkeyPatch) -> None:
+    generator, n = rng("given up"), 8
+    C, d = generator.normal(size=(10, n)), generator.uniform(0.1, 1, 10)
+    inside, below = 0.01 * generator.normal(size=n), generator.normal(size=(3, n))
+    limits = Level(np.eye(n), inside - 0.01, inside + 0.01)
+    levels = [Level(C, -d, d), limits, Level(below, *2 * [5 * generator.normal(size=3)])]
+    assert (np.abs(C @ inside) < d).all()
+    right, nearest, calls = lexicographic(levels), hierarchy._nearest, []
+
+    def gives_up(given: list[Level]) -> np.ndarray | None:
+        calls.append(len(given))
+        return nearest([given[0], given[2]] if len(calls) == 1 else given)
+
+    monkeypatch.setattr(hierarchy, "_nearest", gives_up)
+    found = lexicographic(levels)
+    assert calls == [3, 2] and right is not None and found is not None
+    assert np.allclose(found, right, rtol=0, atol=1e-9)

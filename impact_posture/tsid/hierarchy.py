@@ -55,7 +55,25 @@ def lexicographic(levels: Sequence[Level], units: Array | float = 1.0) -> Array 
     y, scaled = z / units, [Level(level.A * units, level.lower, level.upper) for level in given]
     refined = (_refined(scaled, y, at) for at in _AT)
     best = next((one for one in refined if _no_worse(scaled, one, y)), None)
-    return np.asarray(units * (_onto(scaled[0], y) if best is None else best))
+    y = _onto(scaled[0], y) if best is None else best
+    missed = next((k for k, level in enumerate(scaled) if k and not _holds(level, y)), 0)
+    if missed:
+        whole = _stacked(scaled[: missed + 1])
+        if _holds(whole, _onto(whole, y)):
+            # DAQP gave up a level that can hold.
+            return lexicographic([_stacked(given[: missed + 1]), *given[missed + 1 :]], units)
+    return np.asarray(units * y)
+
+
+def _stacked(levels: Sequence[Level]) -> Level:
+    """Return one level with the rows of all."""
+    return Level(*(np.concatenate([getattr(level, key) for level in levels]) for key in ("A", "lower", "upper")))
+
+
+def _holds(level: Level, y: Array) -> bool:
+    values = level.A @ y
+    off = np.abs(values - np.clip(values, level.lower, level.upper))
+    return bool((off <= _AT[0] * _size(y) * _lengths(level)).all())
 
 
 def _size(y: Array) -> float:
