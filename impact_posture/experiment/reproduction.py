@@ -46,7 +46,7 @@ PAPER: dict[str, PaperRow] = {
 # The controllers that keep their targets most often over the envelope (docs: reproduction), or at least come nearest.
 RECOMMENDED: dict[str, str] = {
     "aerial-vertical": "posture",
-    "aerial-lateral": "posture",
+    "aerial-lateral": "robust-flow",
     "solo8-push": "stiff",
     "talos-push": "robust-flow",
 }

@@ -58,7 +58,7 @@ class FlowOptions:
     acceleration: float = 4.0
     rho: float = 0.001
     mu: float = 0.05
-    epsilon: float = 7e-5
+    epsilon: float = 3e-6
     duration: float = 7.9
     joint_margin: float = 0.1
     com_margin: float = 0.05

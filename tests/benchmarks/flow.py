@@ -100,10 +100,10 @@ def lines(request: Request) -> Iterator[str]:
     yield f"{starts}, all on the same contacts and tool pose. Those that need"
     yield "more than 80 % of what the actuators can give are drawn again. The flow is that of the controller in C."
     yield "The robot follows exactly (no physics). The optimum of a basin is what the offline program (IPOPT) finds"
-    yield "from the end of the flow under the same rows. Where that lies elsewhere, or needs more torque or tilt, it is"
-    yield "the end of a finer flow (ρ = 0, ε = 10⁻⁷, 5 s more). Another basin: that optimum lies more than 1 % of H₀"
-    yield "above the best that any start has found. *Sent to the best*: of these, which visit that posture first,"
-    yield "those that end within 1 % of H₀ of it."
+    yield "from the end of the flow under the same rows. Where that lies elsewhere, or needs more torque or tilt,"
+    yield "it is the end of a finer flow (ρ = 0, ε = 10⁻⁷, 5 s more). Another basin: that optimum lies more than"
+    yield "1 % of H₀ above the best that any start has found. *Sent to the best*: of these, which visit that posture"
+    yield "first, those that end within 1 % of H₀ of it."
     yield ""
     seeds, chosen = range(request.seed, request.seed + 4), [case for case in CASES if request.only in case.name]
     rows = (_row(case, each, replace(request, seed=seed)) for case in chosen for seed in seeds)
