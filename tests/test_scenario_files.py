@@ -247,8 +247,10 @@ def test_a_misspelt_scenario_and_a_missing_file() -> None:
 
 def test_a_frame_that_the_robot_lacks_is_refused(folder: Path) -> None:
     needs_mujoco()
-    with pytest.raises(ImpactPostureError, match="no frame 'tool_tip'"):
-        set_up(read_scenario(write(folder, OWN.replace('frame = "', 'frame = "tool_tip" # '))))
+    path = write(folder, OWN.replace('frame = "', 'frame = "tool_tip" # '))
+    with pytest.raises(ImpactPostureError, match="no frame 'tool_tip'") as caught:
+        set_up(read_scenario(path))
+    assert caught.value.where == str(path)
 
 
 def test_surface_and_shape_of_a_push_are_refused() -> None:
@@ -348,6 +350,7 @@ def test_the_pages_scenario_is_one(folder: Path) -> None:
         ('lock = ["nope"]', "panda lock", "no joint 'nope'"),
         ('robot = "pandaa"', "", "no robot 'pandaa'"),
         ('srdf = "nope.srdf"', None, "check srdf or robot.toml"),
+        ('robot = "tiago"\njoints = {wheel_left_joint = 0.3}', "", "'wheel_left_joint' is locked"),
     ],
 )
 def test_an_error_names_the_key_of_the_scenario_and_its_file(

@@ -11,7 +11,7 @@ import numpy as np
 from pydantic import Field
 
 from impact_posture.arrays import Array
-from impact_posture.errors import ImpactPostureError, InputError, SpecError
+from impact_posture.errors import ImpactPostureError, InputError, JointLocked, NameNotFound, SpecError
 from impact_posture.option_names import as_keys
 from impact_posture.progress import tell
 from impact_posture.robot.actuation import allocation
@@ -270,6 +270,8 @@ def set_up(scenario: Scenario) -> Setup:
     with naming_keys(scenario):
         robot = load_robot(scenario.robot, scenario)
         _check_base(robot, scenario)
+        if rigid := [joint for joint in scenario.joints if joint in robot.locked]:
+            raise JointLocked(rigid[0], where=scenario.source)
         start = read_posture(robot, scenario.posture, where="posture")
         q = set_joints(robot, start, scenario.joints, scenario.source)
         q = robot.check_posture(q, where=scenario.source)
@@ -284,10 +286,10 @@ def naming_keys(scenario: Scenario) -> Iterator[None]:
         yield
     except ImpactPostureError as error:
         where = error.where
-        if where in ("", "problem"):
-            where = scenario.source
-        elif {where.partition(" ")[0], where.rpartition(" ")[2]} & _KEYS and scenario.source:
+        if {where.partition(" ")[0], where.rpartition(" ")[2]} & _KEYS and scenario.source:
             where = f"{scenario.source}, {where}"
+        elif where in ("", "problem") or isinstance(error, NameNotFound):
+            where = scenario.source
         error.reword(as_keys(error.what, _RENAMED), where, as_keys(error.hint, _RENAMED))
         raise
 
