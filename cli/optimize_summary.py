@@ -76,7 +76,7 @@ def summarize(page: Page, prepared: Prepared, solution: PostureSolution, documen
     if solution.moved > 1e-6:
         page.line(f"the given posture did not satisfy the constraints: moved by {solution.moved:.3g} first")
     if document["active"]:
-        page.line("active: " + ", ".join(_active(a) for a in document["active"]))
+        page.line("active: " + ", ".join(dict.fromkeys(_active(a) for a in document["active"])))
     found = solution.certificate
     page.line(
         f"certificate ({found.recomputed_with}): stationarity {found.stationarity:.1e}, "
@@ -164,5 +164,7 @@ def _path(page: Page, path: dict[str, Any]) -> None:
 
 
 def _active(entry: dict[str, Any]) -> str:
-    words = "limit" if entry["constraint"].startswith("joint ") else "bound"
-    return f"{entry['constraint']} at its {entry['side']} {words}"
+    name = entry["constraint"]
+    if " / " in name:
+        return f"{name} at their least distance"
+    return f"{name} at its {entry['side']} {'limit' if name.startswith('joint ') else 'bound'}"

@@ -15,6 +15,7 @@ import numpy as np
 import pytest
 
 import impact_posture as ip
+from cli.optimize_summary import _active
 from impact_posture import plot
 from impact_posture.plot.view import header_lines
 from impact_posture.result_view import load_view
@@ -175,6 +176,15 @@ def test_human_output_fits_80_columns(tmp_path: Path) -> None:
     assert max(len(line.rstrip()) for line in done.stdout.splitlines()) <= 80
     for word in ("constraints", "reduction", "certificate", "base roll", "before", "after"):
         assert word in done.stdout
+
+
+def test_active_constraints_are_named_in_words() -> None:
+    said = [_active({"constraint": name, "side": "lower"}) for name in ("arm / wall", "joint 'elbow'", "com")]
+    assert said == [
+        "arm / wall at their least distance",
+        "joint 'elbow' at its lower limit",
+        "com at its lower bound",
+    ]
 
 
 def test_no_redundancy_is_said(tmp_path: Path) -> None:
