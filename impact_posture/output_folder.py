@@ -18,10 +18,11 @@ from typing import Any, Literal
 from impact_posture.errors import OutputError
 from impact_posture.processes import signals_held, undone
 from impact_posture.scratch_folder import RECORD, SCHEMA, SCRATCH, made_by, remove_scratch, scratch_folder
+from impact_posture.tables import read_text
 
 _SHOWN = 3
 
-Kind = Literal["result", "export", "run", "comparison", "reproduction", "runs", "sweep", "world"]
+Kind = Literal["result", "export", "run", "comparison", "reproduction", "sweep", "world"]
 
 
 def check_output(out: Path, *, force: bool, kind: Kind) -> None:
@@ -87,7 +88,7 @@ def whole_folder(out: Path, *, force: bool, kind: Kind, products: Sequence[str] 
     check_output(out, force=force, kind=kind)
     out = out.absolute()
     try:
-        with _parents_of(out), scratch_folder(out.parent, 0o777) as beside:
+        with parents_of(out), scratch_folder(out.parent, 0o777) as beside:
             try:
                 yield beside
             except OutputError as error:
@@ -122,7 +123,7 @@ def write_record(folder: Path, kind: Kind, products: Sequence[str] = ()) -> None
 def typed_command(folder: Path) -> str:
     """Return the words with which a user made an output folder; empty where no command line made it."""
     try:
-        return str(json.loads((folder / RECORD).read_text(encoding="utf-8")).get("command", ""))
+        return str(json.loads(read_text(folder / RECORD)).get("command", ""))
     except (OSError, ValueError, AttributeError, RecursionError):
         return ""
 
@@ -172,7 +173,10 @@ def write_whole(path: Path, content: str | bytes) -> None:
 
     try:
         with undone(remove):
-            beside.write_bytes(content.encode() if isinstance(content, str) else content)
+            beside.unlink(missing_ok=True)
+            # This follows no link that somebody put there.
+            with beside.open("xb") as file:
+                file.write(content.encode() if isinstance(content, str) else content)
             os.replace(beside, path)
     except OSError as error:
         hint = "check the disk and permissions"
@@ -216,7 +220,7 @@ def _foreign(folder: Path, ours: set[str], below: str = "") -> list[str]:
 
 def _read_record(folder: Path) -> dict[str, Any] | None:
     try:
-        content = json.loads((folder / RECORD).read_text(encoding="utf-8"))
+        content = json.loads(read_text(folder / RECORD)) if (folder / RECORD).is_file() else None
     except (OSError, ValueError, RecursionError):
         return None
     if not isinstance(content, dict) or content.get("schema") != SCHEMA:
@@ -259,7 +263,7 @@ def _replace(beside: Path, out: Path, force: bool, kind: Kind) -> None:
 
 
 @contextmanager
-def _parents_of(out: Path) -> Iterator[None]:
+def parents_of(out: Path) -> Iterator[None]:
     """Make the folders above ``out``, and remove those that stay empty."""
     missing = [folder for folder in out.parents if not folder.exists()]
 

@@ -16,7 +16,7 @@ from matplotlib.figure import Figure
 import impact_posture as ip
 from impact_posture.errors import InputError, OutputError
 from impact_posture.experiment.run_reports import write_run_report
-from impact_posture.output_folder import Kind, add_to_record, check_output, whole_folder
+from impact_posture.output_folder import Kind, add_to_record, check_output, whole_folder, write_whole
 from impact_posture.plot.style import save
 from impact_posture.result_view import load_view
 from impact_posture.robot.draft import write_draft
@@ -189,6 +189,26 @@ def test_places_that_no_folder_can_take(
     with pytest.raises(OutputError, match=words), whole_folder(out, force=force, kind="result"):
         raise AssertionError("is not reached")
     assert sorted(os.listdir(tmp_path)) == before
+
+
+def test_a_file_goes_through_no_link(tmp_path: Path) -> None:
+    (tmp_path / "thesis.txt").write_text("ten years")
+    for name in ("x.json", f".x.json.{os.getpid()}.part"):
+        (tmp_path / name).symlink_to(tmp_path / "thesis.txt")
+    write_whole(tmp_path / "x.json", "ours")
+    assert content(tmp_path) == {"thesis.txt": "ten years", "x.json": "ours"}
+
+
+@pytest.mark.parametrize("kind", ["device", "pipe"])
+def test_a_record_without_end_is_none(kind: str, tmp_path: Path) -> None:
+    write(tmp_path / "out", "one")
+    (tmp_path / "out" / RECORD).unlink()
+    if kind == "device":
+        (tmp_path / "out" / RECORD).symlink_to("/dev/zero")
+    else:
+        os.mkfifo(tmp_path / "out" / RECORD)
+    with pytest.raises(OutputError, match="which this command did not write"):
+        write(tmp_path / "out", "two", force=True)
 
 
 # ---- interruptions -------------------------------------------------------------------------------------------------
