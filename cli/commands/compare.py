@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from contextlib import nullcontext
 from pathlib import Path
 from typing import Annotated
 
@@ -49,9 +50,9 @@ def compare(
     folder = None if out is None else Path(out)
     if folder is not None:
         check_output(folder, force=force, kind="comparison")
-    store = None if folder is None else store_beside(folder)
     failure = ""
-    with progress("running", "runs", shown=not (quiet or json)) as advance:
+    beside = nullcontext() if folder is None else store_beside(folder)
+    with beside as store, progress("running", "runs", shown=not (quiet or json)) as advance:
         found = reproduce(plan, seeds=seeds, processes=jobs, store=store, progress=advance, compile=compile)
         if folder is not None and store is not None:
             output = Output(folder, force, format or FORMATS, not no_report, meshes)

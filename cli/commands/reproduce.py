@@ -50,8 +50,7 @@ def reproduce(
             raise ScenarioNotFound(name, PAPER, hint="(others: simulate and compare)")
     folder = Path(out)
     check_output(folder, force=force, kind="reproduction")
-    store = store_beside(folder)
-    with progress("running", "runs", shown=not (quiet or json)) as advance:
+    with store_beside(folder) as store, progress("running", "runs", shown=not (quiet or json)) as advance:
         plan = {name: controllers_of(name, all_) for name in scenarios}
         found = reproduce_all(plan, seeds=seeds, processes=jobs, store=store, progress=advance, compile=compile)
         document = write_reproduction(Output(folder, force, format or FORMATS), found, store)

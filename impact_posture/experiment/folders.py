@@ -2,7 +2,8 @@
 
 from __future__ import annotations
 
-from collections.abc import Sequence
+from collections.abc import Iterator, Sequence
+from contextlib import contextmanager
 from dataclasses import dataclass
 from pathlib import Path
 
@@ -92,15 +93,21 @@ def write_reproduction(output: Output, found: Reproduction, store: Store) -> Doc
         (folder / "SUMMARY.md").write_text(document["summary"], encoding="utf-8")
         (folder / "runs").mkdir()
         for job in found.jobs:
-            write_json(folder / "runs" / f"{job.name}.json", store.find(job))
+            write_json(folder / "runs" / f"{job.name}.json", store.finished(job))
         draw_reproduction(found, store, folder, output.formats)
     store.remove()
     return document
 
 
-def store_beside(out: Path) -> Store:
-    """Return the store that keeps the runs of an output folder until it is written."""
-    return Store(out.absolute().parent / f".{out.name}.runs")
+@contextmanager
+def store_beside(out: Path) -> Iterator[Store]:
+    """Yield the store that keeps the runs of an output folder until it is written.
+
+    Raises:
+        OutputError: As :meth:`Store.taken`.
+    """
+    with Store(out.absolute().parent / f".{out.name}.runs").taken() as store:
+        yield store
 
 
 def draw_runs(job: Job, runs: Sequence[Run], document: Document, folder: Path, formats: Sequence[str]) -> None:

@@ -143,9 +143,14 @@ def execute(job: Job, factory: ControllerFactory | None = None) -> tuple[tuple[R
         "path": factory.path.to_dict() if job.controller.removesuffix("-stiff") == "path" else None,
         "warnings": [*factory.warnings, *(links_behind(factory.setup, found) if completed else ())],
         "model_sha256": factory.setup.robot.model_sha256,
-        "versions": versions() | {"mujoco": str(import_mujoco().__version__)},
+        "versions": software(),
     }
     return found, jsonable(document)
+
+
+def software() -> dict[str, str]:
+    """Return the versions of all software that a run depends on."""
+    return versions() | {"mujoco": str(import_mujoco().__version__)}
 
 
 def lost(job: Job, error: Exception) -> Document:

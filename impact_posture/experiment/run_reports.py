@@ -60,9 +60,13 @@ def keep_runs(folder: Path, jobs: Sequence[Job], store: Store) -> None:
 
 
 def kept_run(job: Job, store: Store) -> tuple[Document, Series] | None:
-    """Return the document of a stored job and the time series of its first run, or ``None`` if it has no runs."""
-    document = store.find(job)
-    if document is None or not document["runs"]:
+    """Return the document of a stored job and the time series of its first run, or ``None`` if it has no runs.
+
+    Raises:
+        OutputError: As :meth:`Store.finished`.
+    """
+    document = store.finished(job)
+    if not document["runs"]:
         return None
     return document, Series.load(store.series(job, document["runs"][0]["sign"]))
 

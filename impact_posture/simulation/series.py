@@ -4,7 +4,7 @@ from __future__ import annotations
 
 from dataclasses import dataclass, fields
 from pathlib import Path
-from typing import Any
+from typing import Any, BinaryIO
 
 import numpy as np
 from numpy.typing import NDArray
@@ -98,9 +98,9 @@ class Series:
         first, last = np.searchsorted(self.t, [begin + _SAME, end + _SAME], side="right")
         return slice(int(first), int(last))
 
-    def save(self, path: Path) -> None:
+    def save(self, file: Path | BinaryIO) -> None:
         """Write as NPZ."""
-        np.savez_compressed(path, **vars(self))
+        np.savez_compressed(file, **vars(self))
 
     @staticmethod
     def load(path: Path) -> Series:

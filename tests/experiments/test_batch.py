@@ -2,19 +2,29 @@
 
 from __future__ import annotations
 
+import errno
 import functools
 import json
+import os
+import re
+from collections.abc import Callable
 from dataclasses import replace
 from pathlib import Path
 from typing import Any
 
+import pinocchio as pin
 import pytest
 
-from impact_posture.errors import ControllerNotFound, ScenarioNotFound, SimulationDiverged
+from impact_posture.collision.urdf_shapes import UrdfShape
+from impact_posture.errors import ControllerNotFound, OutputError, ScenarioNotFound, SimulationDiverged
 from impact_posture.experiment import batch
 from impact_posture.experiment.batch import Store, key_of, run_batch
+from impact_posture.experiment.folders import draw_side_by_side, store_beside
 from impact_posture.experiment.jobs import SCHEMA, Job, controller_factory, execute
-from impact_posture.experiment.reproduction import jobs_of
+from impact_posture.experiment.reproduction import Reproduction, jobs_of
+from impact_posture.output_folder import whole_folder
+from tests.command import refused
+from tests.command import run as start
 
 
 def test_a_run_answers_with_its_document(aerial: Path) -> None:
@@ -75,10 +85,8 @@ def test_what_was_interrupted_goes_on(aerial: Path, tmp_path: Path, monkeypatch:
 
 def test_series_of_the_first_seed_are_kept(push: Path, tmp_path: Path) -> None:
     store, job = Store(tmp_path / "kept"), Job(str(push), "nominal")
-    store.keep(job, *run_batch([job]))
     run_batch([replace(job, seed=1)], store=store)
     assert not list(store.folder.glob("*.npz"))
-    # The document alone is not enough.
     run_batch([job], store=store)
     assert sorted(path.name for path in store.folder.glob("*.npz")) == sorted(
         [store.series(job, 1).name, store.series(job, -1).name]
@@ -99,6 +107,33 @@ def test_a_changed_scenario_or_a_broken_file_is_run_anew(aerial: Path, tmp_path:
     assert key_of(Job(str(path), "nominal", gain=3.0)) != key_of(job)
 
 
+@pytest.mark.parametrize("changed", ["posture", "mesh", "software"])
+def test_what_a_scenario_reads_counts(
+    changed: str, push: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    path, posture, mesh = (tmp_path / name for name in ("own.toml", "start.json", "ball.obj"))
+    text, count = re.subn(r"(?m)^posture = .*", 'posture = "start.json"', push.read_text(encoding="utf-8"))
+    assert count == 1
+    path.write_text(text, encoding="utf-8")
+    q = controller_factory(str(push)).setup.q.copy()
+    posture.write_text(json.dumps({"q": q.tolist()}))
+    mesh.write_text("v 0 0 0")
+    described = UrdfShape("ball", "base_link", pin.SE3.Identity(), "mesh", (1.0, 1.0, 1.0), mesh)
+    monkeypatch.setattr(batch, "read_urdf_shapes", lambda robot: ([described], []))
+    job, store = Job(str(path), "nominal"), Store(tmp_path / "kept")
+    store.keep(job, {"metrics": {}})
+    if changed == "posture":
+        q[-1] += 0.001
+        posture.write_text(json.dumps({"q": q.tolist()}))
+    elif changed == "mesh":
+        mesh.write_text("v 1 0 0")
+    else:
+        monkeypatch.setattr(batch, "software", lambda: {"mujoco": "99"})
+    batch._scenario.cache_clear()
+    controller_factory.cache_clear()
+    assert store.find(job) is None
+
+
 def test_runs_in_python_and_in_c_are_kept_apart(aerial: Path, tmp_path: Path) -> None:
     plan, store = {str(aerial): ["nominal"]}, Store(tmp_path / "kept")
     few, many = jobs_of(plan, 1), jobs_of(plan, 2)
@@ -113,7 +148,9 @@ def test_runs_in_python_and_in_c_are_kept_apart(aerial: Path, tmp_path: Path) ->
     assert [store.find(job) for job in jobs_of(plan, 1, "always")] == [None]
 
 
-@pytest.mark.parametrize("damage", ["empty", "half", "bytes", "other text", "another job's", "deep", "a folder"])
+@pytest.mark.parametrize(
+    "damage", ["empty", "half", "bytes", "other text", "another job's", "deep", "a folder", "a pipe"]
+)
 def test_a_damaged_file_is_run_anew(aerial: Path, tmp_path: Path, damage: str) -> None:
     job, store = Job(str(aerial), "nominal"), Store(tmp_path / "kept")
     store.keep(Job(str(aerial), "nominal", 1), {"status": "completed", "runs": []})
@@ -129,24 +166,57 @@ def test_a_damaged_file_is_run_anew(aerial: Path, tmp_path: Path, damage: str) -
     if damage in made:
         path.write_bytes(made[damage])
     else:
-        path.mkdir()
+        (os.mkfifo if damage == "a pipe" else os.mkdir)(path)
     assert store.find(job) is None
+    with pytest.raises(OutputError, match="the run of nominal with seed 0 is gone or was changed"):
+        store.finished(job)
+
+
+def test_a_file_without_end_is_not_read(aerial: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    job, store = Job(str(aerial), "nominal"), Store(tmp_path / "kept")
+    store.keep(job, {"status": "completed", "runs": []})
+    assert store.find(job) is not None
+    monkeypatch.setattr("impact_posture.tables.MOST_CHARACTERS", 64)
+    assert store.find(job) is None
+
+
+def test_nobody_but_the_user_can_seal(aerial: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    """Whoever knows this package and the scenario can write everything but the seal."""
+    job = Job(str(aerial), "nominal")
+    monkeypatch.setenv("IMPACT_POSTURE_CACHE", str(tmp_path / "theirs"))
+    Store(tmp_path / "kept").keep(job, {"status": "completed", "runs": []})
+    assert Store(tmp_path / "kept").find(job) is not None
+    monkeypatch.setenv("IMPACT_POSTURE_CACHE", str(tmp_path / "ours"))
+    assert Store(tmp_path / "kept").find(job) is None
 
 
 def test_a_store_leaves_the_files_of_others(aerial: Path, tmp_path: Path) -> None:
     job, store = Job(str(aerial), "nominal"), Store(tmp_path / "kept")
     store.keep(job, {"status": "completed", "runs": []})
-    (store.folder / "notes.txt").write_text("mine")
+    theirs = ["notes.json", "notes.txt", "of last year.npz", "thesis.part"]
+    for name in theirs:
+        (store.folder / name).write_text("mine")
     store.remove()
-    assert [path.name for path in store.folder.iterdir()] == ["notes.txt"]
+    assert sorted(path.name for path in store.folder.iterdir()) == theirs
     other = Store(tmp_path / "alone")
     other.keep(job, {"status": "completed", "runs": []})
-    (other.folder / ".aerial.json.99.part").write_text("half a docu")
+    (other.folder / f".{store.series(job, -1).name}.99.part").write_text("half a series")
     other.remove()
     assert not other.folder.exists()
 
 
-@pytest.mark.parametrize("damage", ["missing", "half", "garbage", "flipped"])
+def test_runs_go_through_no_link(push: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setattr(batch, "execute", lambda job, **options: _kept_run(str(push)))
+    store, job = Store(tmp_path / "kept"), Job(str(push), "nominal")
+    store.folder.mkdir()
+    (tmp_path / "thesis.txt").write_text("ten years")
+    for path in (store._path(job), store.series(job, 1), store.series(job, -1)):
+        path.symlink_to(tmp_path / "thesis.txt")
+    run_batch([job], store=store)
+    assert (tmp_path / "thesis.txt").read_text() == "ten years" and store.find(job) is not None
+
+
+@pytest.mark.parametrize("damage", ["missing", "half", "garbage", "flipped", "of the other push", "of another run"])
 def test_a_damaged_series_is_run_anew(
     push: Path, tmp_path: Path, damage: str, monkeypatch: pytest.MonkeyPatch
 ) -> None:
@@ -160,7 +230,14 @@ def test_a_damaged_series_is_run_anew(
     run_batch([job], store=store)
     monkeypatch.setattr(batch, "execute", lambda job, **options: _kept_run(str(push)))
     path.unlink()
-    if damage != "missing":
+    if damage == "of the other push":
+        path.write_bytes(store.series(job, 1).read_bytes())
+    elif damage == "of another run":
+        series = _kept_run(str(push))[0][1].series
+        series = replace(series, q=series.q + 0.1)
+        with path.open("wb") as file:
+            series.save(file)
+    elif damage != "missing":
         middle = len(whole) // 3
         flipped = whole[:middle] + bytes(255 - b for b in whole[middle : middle + 400]) + whole[middle + 400 :]
         path.write_bytes({"half": whole[: len(whole) // 2], "garbage": b"\x00" * 500, "flipped": flipped}[damage])
@@ -188,3 +265,90 @@ def test_what_is_misspelt_is_said_before_anything_runs(aerial: Path) -> None:
         run_batch([Job(str(aerial), "nominal"), Job(str(aerial), "robsut")])
     with pytest.raises(ScenarioNotFound, match="aerial-vertical"):
         run_batch([Job("arial-vertical", "nominal")])
+
+
+# ---- the folder ----------------------------------------------------------------------------------------------------
+
+
+def a_file(place: Path) -> None:
+    place.write_text("mine")
+
+
+def a_link(place: Path) -> None:
+    (place.parent / "real").mkdir()
+    place.symlink_to(place.parent / "real")
+
+
+def a_dangling_link(place: Path) -> None:
+    place.symlink_to(place.parent / "nowhere")
+
+
+def a_result(place: Path) -> None:
+    with whole_folder(place, force=False, kind="result") as folder:
+        (folder / "result.json").write_text("{}")
+
+
+@pytest.mark.parametrize(
+    ("make", "words"),
+    [
+        (a_file, "is no folder"),
+        (a_link, "is no folder"),
+        (a_dangling_link, "is no folder"),
+        (a_result, "holds results of another command"),
+    ],
+)
+def test_a_place_that_is_not_for_runs_is_refused_at_once(
+    make: Callable[[Path], None], words: str, tmp_path: Path
+) -> None:
+    make(tmp_path / ".both.runs")
+    before = sorted(tmp_path.rglob("*"))
+    done = start("compare", "aerial-lateral", "--out", "both", cwd=tmp_path)
+    refused(done, 1, f".both.runs: {words}", "choose another --out")
+    assert sorted(tmp_path.rglob("*")) == before
+
+
+def test_two_commands_do_not_share_a_store(tmp_path: Path) -> None:
+    with store_beside(tmp_path / "both") as store:
+        done = start("compare", "aerial-lateral", "--out", "both", cwd=tmp_path)
+        refused(done, 1, ".both.runs: another command keeps its runs there", "wait for its end")
+        assert store.folder.is_dir()
+    assert not list(tmp_path.iterdir())
+
+
+def test_a_store_without_runs_goes_and_one_with_runs_stays(aerial: Path, tmp_path: Path) -> None:
+    done = start("compare", str(aerial), "--controllers", "robst", "--out", "deep/er/both", cwd=tmp_path)
+    refused(done, 1, "did you mean robust")
+    assert not list(tmp_path.iterdir())
+    job = Job(str(aerial), "nominal")
+    with pytest.raises(KeyboardInterrupt), store_beside(tmp_path / "deep" / "both") as store:
+        store.keep(job, {"runs": []})
+        raise KeyboardInterrupt
+    with store_beside(tmp_path / "deep" / "both") as store:
+        assert store.find(job) == {"runs": []}
+        store.remove()
+    assert not list((tmp_path / "deep").iterdir())
+
+
+def test_a_run_that_is_gone_is_not_left_out(aerial: Path, tmp_path: Path) -> None:
+    """Another program may have removed it since it was run."""
+    found = Reproduction(1, (), (Job(str(aerial), "nominal"),))
+    with pytest.raises(OutputError, match="is gone or was changed"), store_beside(tmp_path / "both") as store:
+        draw_side_by_side(found.shown, store, tmp_path, ["png"])
+    assert not list(tmp_path.iterdir())
+
+
+def test_a_full_disk_is_named_and_keeps_what_was_there(
+    push: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    store, job = Store(tmp_path / "kept"), Job(str(push), "nominal")
+    store.keep(replace(job, seed=1), {"runs": []})
+    before = sorted(store.folder.iterdir())
+
+    def replaced(source: Path, target: Path) -> None:
+        raise OSError(errno.ENOSPC, os.strerror(errno.ENOSPC))
+
+    monkeypatch.setattr(os, "replace", replaced)
+    monkeypatch.setattr(batch, "execute", lambda job, **options: _kept_run(str(push)))
+    with pytest.raises(OutputError, match="No space left on device"):
+        run_batch([job], store=store)
+    assert sorted(store.folder.iterdir()) == before
