@@ -113,7 +113,7 @@ study-flow: $(VENV)/.installed-test
 	$(BIN)/python -m tests.benchmarks flow --jobs $(JOBS) --write
 
 study-controller: $(VENV)/.installed-test
-	$(BIN)/python -m tests.benchmarks.controller build/controller 10000 $(PART)
+	$(BIN)/python -m tests.benchmarks.controller 10000 $(PART)
 
 study-sweep: $(VENV)/.installed-test
 	$(BIN)/python -m tests.benchmarks.sweep

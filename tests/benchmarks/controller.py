@@ -1,7 +1,7 @@
 """The exported controller beside the one in Python, in three parts: equal answers, growth, and what a tick takes.
 
-``python -m tests.benchmarks.controller FOLDER [TICKS] [equality|growth|times]`` writes a part, or all of them, into
-``FOLDER``, and what is there into the page of the documentation.  Times need a quiet machine, the others do not.
+``python -m tests.benchmarks.controller [TICKS] [equality|growth|times]`` writes a part, or all of them, into pages of
+the documentation.  Times need a quiet machine, the others do not.
 """
 
 from __future__ import annotations
@@ -163,26 +163,20 @@ def _speeds(peer: Path | None, ratios: list[list[str]]) -> Iterator[list[str]]:
 PARTS = {"equality": equality, "growth": growth, "times": times_of_ticks}
 
 
-def main(out: Path, ticks: int, parts: list[str]) -> None:
-    """Write parts, and the page of all that are there."""
-    out.mkdir(parents=True, exist_ok=True)
+def main(ticks: int, parts: list[str]) -> None:
+    """Write parts, each into its page."""
     for part in parts:
-        lines = [machine("daqp"), ""]
+        lines = [_HEAD, "", machine("daqp"), ""]
         for line in PARTS[part](ticks):
             print(line, flush=True)
             lines.append(line)
-        (out / f"{part}.md").write_text("\n".join([*lines, ""]), encoding="utf-8")
-    texts = [file.read_text(encoding="utf-8") for part in PARTS if (file := out / f"{part}.md").is_file()]
-    page_of("controller").write_text("\n".join([_HEAD, "", *texts]), encoding="utf-8")
+        page_of(f"controller-{part}").write_text("\n".join([*lines, ""]), encoding="utf-8")
 
 
 if __name__ == "__main__":
     words = sys.argv[1:]
-    if (
-        not 1 <= len(words) <= 3
-        or not all(word.isdecimal() for word in words[1:2])
-        or words[2:] not in ([], *([part] for part in PARTS))
-    ):
-        sys.exit(f"usage: python -m tests.benchmarks.controller FOLDER [TICKS] [{'|'.join(PARTS)}]")
+    fits = all(word.isdecimal() for word in words[:1]) and words[1:] in ([], *([part] for part in PARTS))
+    if not fits:
+        sys.exit(f"usage: python -m tests.benchmarks.controller [TICKS] [{'|'.join(PARTS)}]")
     with one_core():
-        main(Path(words[0]), int(words[1]) if len(words) > 1 else 10_000, words[2:] or list(PARTS))
+        main(int(words[0]) if words else 10_000, words[1:] or list(PARTS))
