@@ -221,6 +221,7 @@ def test_a_robot_with_one_joint_runs(folder: Path) -> None:
     setup = set_up(read_scenario(write(folder, OWN)))
     others = [name for name in setup.robot.joint_names if name != "elbow"]
     text = LED.replace('robot = "rail_arm.urdf"', f'robot = "rail_arm.urdf"\nlock = {others}'.replace("'", '"'))
+    text = text.replace("speed = 0.2", "speed = 0.2\ncount = 1\nsettle = 1.0")
     one = set_up(read_scenario(write(folder, text)))
     assert one.robot.nv == 1
     factory = ControllerFactory(one)
