@@ -18,7 +18,7 @@ from typing import Any, Literal
 from impact_posture.errors import OutputError
 from impact_posture.processes import signals_held, undone
 from impact_posture.scratch_folder import RECORD, SCHEMA, SCRATCH, made_by, remove_scratch, scratch_folder
-from impact_posture.tables import read_text
+from impact_posture.text_files import read_text
 
 _SHOWN = 3
 

@@ -18,7 +18,8 @@ from impact_posture.posture.null_space_path import NullSpacePath
 from impact_posture.posture.problem_settings import Prepared, prepare, read_settings
 from impact_posture.posture.result import SCHEMA
 from impact_posture.settings import Against
-from impact_posture.tables import read_arrays, read_text
+from impact_posture.tables import read_arrays
+from impact_posture.text_files import read_text
 
 # Matplotlib is imported where it is used, because that takes longer than a small problem.
 if TYPE_CHECKING:

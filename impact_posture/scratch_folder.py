@@ -79,7 +79,8 @@ def _sweep(parent: Path) -> None:
 def _sweep_one(folder: Path) -> None:
     if folder.is_symlink() or folder.stat().st_uid != os.geteuid():
         return
-    record = os.open(folder / RECORD, os.O_RDWR | os.O_NOFOLLOW)
+    # A pipe in its place has nothing to read.
+    record = os.open(folder / RECORD, os.O_RDWR | os.O_NOFOLLOW | os.O_NONBLOCK)
     try:
         # This fails while the process of the folder lives.
         fcntl.flock(record, fcntl.LOCK_EX | fcntl.LOCK_NB)

@@ -13,12 +13,11 @@ from pathlib import Path
 from typing import TYPE_CHECKING, Any, ClassVar, TypeVar, get_type_hints
 
 from impact_posture.errors import InputError, SpecError, nearest, not_one_of, shown
+from impact_posture.text_files import read_text
 
 if TYPE_CHECKING:
     from numpy.typing import NDArray
 
-# The largest file that this package writes, a result of a long search, has about a million characters.
-MOST_CHARACTERS = 1 << 26
 # The arrays of a run of an hour at 1 kHz.
 MOST_BYTES = 1 << 32
 
@@ -104,20 +103,6 @@ def _keys_at(cls: type, location: tuple[int | str, ...]) -> list[str]:
         inner = [c for c in (hint, *getattr(hint, "__args__", ())) if isinstance(c, type) and is_dataclass(c)]
         cls = inner[0] if inner else cls
     return [field.name for field in fields(cls)]
-
-
-def read_text(path: Path) -> str:
-    """Return the content of a UTF-8 file; a device without an end, such as ``/dev/zero``, is refused.
-
-    Raises:
-        OSError: The file cannot be read, or is larger than :data:`MOST_CHARACTERS`.
-        UnicodeDecodeError: The file is not UTF-8.
-    """
-    with path.open(encoding="utf-8") as file:
-        text = file.read(MOST_CHARACTERS + 1)
-    if len(text) > MOST_CHARACTERS:
-        raise OSError(errno.EFBIG, os.strerror(errno.EFBIG), str(path))
-    return text
 
 
 def read_arrays(path: Path) -> dict[str, NDArray[Any]]:

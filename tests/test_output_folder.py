@@ -22,7 +22,7 @@ from impact_posture.result_view import load_view
 from impact_posture.robot.draft import write_draft
 from impact_posture.robot.postures import read_posture
 from impact_posture.robot.robot_loader import load_robot
-from impact_posture.scratch_folder import RECORD, scratch_folder
+from impact_posture.scratch_folder import RECORD, SCRATCH, scratch_folder
 from impact_posture.settings import LoadOptions
 from impact_posture.simulation.scenario_file import read_scenario
 
@@ -201,6 +201,8 @@ def test_a_file_goes_through_no_link(tmp_path: Path) -> None:
 
 @pytest.mark.parametrize("kind", ["device", "pipe"])
 def test_a_record_without_end_is_none(kind: str, tmp_path: Path) -> None:
+    (tmp_path / f"{SCRATCH}0").mkdir()
+    os.mkfifo(tmp_path / f"{SCRATCH}0" / RECORD)
     write(tmp_path / "out", "one")
     (tmp_path / "out" / RECORD).unlink()
     if kind == "device":

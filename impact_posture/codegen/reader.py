@@ -13,7 +13,7 @@ from typing import TYPE_CHECKING, Annotated, Any, Literal, TypeVar
 from pydantic import BaseModel, ConfigDict, Field, ValidationError
 
 from impact_posture.errors import FrameNotFound, ManifestMismatch, SpecError
-from impact_posture.tables import read_text
+from impact_posture.text_files import read_text
 
 if TYPE_CHECKING:
     from impact_posture.robot.robot import Robot

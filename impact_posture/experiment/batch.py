@@ -29,7 +29,8 @@ from impact_posture.simulation.controller_factory import CONTROLLERS
 from impact_posture.simulation.run import Run
 from impact_posture.simulation.scenario_file import scenario_path
 from impact_posture.stored_text import read_stored, write_stored
-from impact_posture.tables import MOST_BYTES, read_text
+from impact_posture.tables import MOST_BYTES
+from impact_posture.text_files import read_text
 
 Progress = Callable[[int, int], None]
 # Names of the files of a store, and of the parts of them that a killed process leaves.

@@ -28,7 +28,7 @@ from impact_posture.report.scene import Scene, Track, impact_curves
 from impact_posture.report.shapes import draw_robot
 from impact_posture.simulation.scenario_file import known_scenarios, scenario_path
 from impact_posture.simulation.series import Series, Window
-from impact_posture.tables import read_text
+from impact_posture.text_files import read_text
 
 SIMULATION, COMPARISON, RUNS = "run.json", "comparison.json", "runs"
 # Time between frames in impact windows and elsewhere, s.

@@ -16,7 +16,7 @@ from impact_posture.arrays import Array
 from impact_posture.errors import JointLocked, JointNotFound, PostureError, PostureNotFound, nearest, shown
 from impact_posture.robot.model_joints import q_slice, scalar_entries
 from impact_posture.robot.robot import Robot
-from impact_posture.tables import read_text
+from impact_posture.text_files import read_text
 
 SCHEMA = "impact-posture/posture/1"
 

@@ -20,7 +20,7 @@ from impact_posture.posture.problem_settings import dump_settings
 from impact_posture.sweep.case_solver import CaseSolver
 from impact_posture.sweep.shard_table import passes_of, read_postures
 from impact_posture.sweep.sweep_file import Sweep
-from impact_posture.tables import read_text
+from impact_posture.text_files import read_text
 from impact_posture.version import __version__
 
 if TYPE_CHECKING:

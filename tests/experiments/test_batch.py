@@ -176,7 +176,7 @@ def test_a_file_without_end_is_not_read(aerial: Path, tmp_path: Path, monkeypatc
     job, store = Job(str(aerial), "nominal"), Store(tmp_path / "kept")
     store.keep(job, {"status": "completed", "runs": []})
     assert store.find(job) is not None
-    monkeypatch.setattr("impact_posture.tables.MOST_CHARACTERS", 64)
+    monkeypatch.setattr("impact_posture.text_files.MOST_CHARACTERS", 64)
     assert store.find(job) is None
 
 

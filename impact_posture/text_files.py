@@ -1,0 +1,24 @@
+"""Reading of text files of limited length."""
+
+from __future__ import annotations
+
+import errno
+import os
+from pathlib import Path
+
+# The largest file that this package writes, a result of a long search, has about a million characters.
+MOST_CHARACTERS = 1 << 26
+
+
+def read_text(path: Path) -> str:
+    """Return the content of a UTF-8 file; a device without an end, such as ``/dev/zero``, is refused.
+
+    Raises:
+        OSError: The file cannot be read, or is larger than :data:`MOST_CHARACTERS`.
+        UnicodeDecodeError: The file is not UTF-8.
+    """
+    with path.open(encoding="utf-8") as file:
+        text = file.read(MOST_CHARACTERS + 1)
+    if len(text) > MOST_CHARACTERS:
+        raise OSError(errno.EFBIG, os.strerror(errno.EFBIG), str(path))
+    return text
