@@ -81,7 +81,7 @@ class ReferenceFlowPosture(JointPosture):
         return self._flow
 
     def brace(self, t_impact: float | None = None) -> None:
-        """Let the flow go, because an impact is coming.
+        """Let the flow go, for ``duration`` of its options at most, because an impact is coming.
 
         Args:
             t_impact: Time until the impact, s.  The flow then rests :attr:`settle` earlier and stays, as far as its
