@@ -115,7 +115,7 @@ class ReferenceFlow:
         self._before = np.zeros_like(self._J)
         self.shares = np.zeros(self._static.limited.size)
         self._phase, self._visited, self._elapsed, self._clock = 0, 0, 0.0, 0.0
-        self._deadline, self._moved, self._remains = np.inf, 0.0, np.inf
+        self.rest_at(np.inf)
         self.on, self.resting, self.failed = False, False, False
         self._ahead = False
         state.update(q, self.velocity)
