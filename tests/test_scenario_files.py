@@ -11,13 +11,27 @@ from typing import Any
 import numpy as np
 import pytest
 
-from impact_posture.errors import ImpactPostureError, Infeasible, InputError, ScenarioNotFound, SpecError
+from impact_posture.errors import (
+    FrameNotFound,
+    ImpactPostureError,
+    Infeasible,
+    InputError,
+    ScenarioNotFound,
+    SpecError,
+)
 from impact_posture.simulation.actuator_command import ActuatorCommand
 from impact_posture.simulation.control import Gains, StanceGains
 from impact_posture.simulation.controller_factory import ControllerFactory
 from impact_posture.simulation.reference import Reference
 from impact_posture.simulation.run import run
-from impact_posture.simulation.scenario import Bounds, RepeatedContacts, Scenario, SinglePush, set_up
+from impact_posture.simulation.scenario import (
+    Bounds,
+    RepeatedContacts,
+    Scenario,
+    SinglePush,
+    naming_keys,
+    set_up,
+)
 from impact_posture.simulation.scenario_file import SHIPPED as SHIPPED_FOLDER
 from impact_posture.simulation.scenario_file import known_scenarios, read_scenario
 
@@ -366,6 +380,14 @@ def test_an_error_names_the_key_of_the_scenario_and_its_file(
     assert words in caught.value.line == str(caught.value) and "`" not in caught.value.line
     if where is not None:
         assert caught.value.where == (f"{path}, {where}" if where else str(path))
+
+
+def test_a_key_of_the_robots_file_is_no_place_in_the_scenario() -> None:
+    scenario = read_scenario("panda-tap")
+    for where, named in (("propulsion.frame", "propulsion.frame"), ("panda", scenario.source)):
+        with pytest.raises(FrameNotFound) as caught, naming_keys(scenario):
+            raise FrameNotFound("nope", [], where=where)
+        assert caught.value.where == named
 
 
 def test_an_offline_posture_that_is_out_of_reach_names_keys(tmp_path: Path) -> None:

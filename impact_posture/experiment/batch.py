@@ -68,7 +68,7 @@ class Store:
 
     def _lock(self) -> int:
         """Return a descriptor of the folder, which keeps others out while it is open."""
-        try:
+        with self._writing():
             try:
                 self.folder.mkdir()
             except FileExistsError:
@@ -76,9 +76,6 @@ class Store:
                     hint = "runs are kept there until `out` is written: move it away, or choose another `out`"
                     raise OutputError(fault, where=str(self.folder), hint=hint) from None
             lock = os.open(self.folder, os.O_RDONLY | os.O_DIRECTORY | os.O_NOFOLLOW)
-        except OSError as error:
-            words = f"cannot be written ({error.strerror or error})"
-            raise OutputError(words, where=str(self.folder), hint="free space or choose another `out`") from None
         try:
             fcntl.flock(lock, fcntl.LOCK_EX | fcntl.LOCK_NB)
         except BlockingIOError:
@@ -89,6 +86,14 @@ class Store:
             # The file system has no locks.
             pass
         return lock
+
+    @contextmanager
+    def _writing(self) -> Iterator[None]:
+        try:
+            yield
+        except OSError as error:
+            words = f"cannot be written ({error.strerror or error})"
+            raise OutputError(words, where=str(self.folder), hint="free space or choose another `out`") from error
 
     def _fault(self) -> str:
         """Return why an existing folder cannot be used; empty if it can."""
@@ -147,11 +152,8 @@ class Store:
         Raises:
             OutputError: They cannot be written.
         """
-        try:
+        with self._writing():
             self.folder.mkdir(parents=True, exist_ok=True)
-        except OSError as error:
-            words = f"cannot be written ({error.strerror or error})"
-            raise OutputError(words, where=str(self.folder), hint="free space or choose another `out`") from error
         series = {}
         for one in runs:
             content = io.BytesIO()

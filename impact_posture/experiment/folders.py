@@ -2,8 +2,8 @@
 
 from __future__ import annotations
 
-from collections.abc import Iterator, Sequence
-from contextlib import contextmanager
+from collections.abc import Sequence
+from contextlib import AbstractContextManager
 from dataclasses import dataclass
 from pathlib import Path
 
@@ -99,15 +99,13 @@ def write_reproduction(output: Output, found: Reproduction, store: Store) -> Doc
     return document
 
 
-@contextmanager
-def store_beside(out: Path) -> Iterator[Store]:
-    """Yield the store that keeps the runs of an output folder until it is written.
+def store_beside(out: Path) -> AbstractContextManager[Store]:
+    """Take the store that keeps the runs of an output folder until it is written.
 
     Raises:
         OutputError: As :meth:`Store.taken`.
     """
-    with Store(out.absolute().parent / f".{out.name}.runs").taken() as store:
-        yield store
+    return Store(out.absolute().parent / f".{out.name}.runs").taken()
 
 
 def draw_runs(job: Job, runs: Sequence[Run], document: Document, folder: Path, formats: Sequence[str]) -> None:

@@ -288,7 +288,8 @@ def naming_keys(scenario: Scenario) -> Iterator[None]:
         where = error.where
         if {where.partition(" ")[0], where.rpartition(" ")[2]} & _KEYS and scenario.source:
             where = f"{scenario.source}, {where}"
-        elif where in ("", "problem") or isinstance(error, NameNotFound):
+        elif where in ("", "problem") or (isinstance(error, NameNotFound) and "." not in where):
+            # What a robot lacks is named in the scenario, but a key of robot.toml is not.
             where = scenario.source
         error.reword(as_keys(error.what, _RENAMED), where, as_keys(error.hint, _RENAMED))
         raise

@@ -71,9 +71,12 @@ def _stacked(levels: Sequence[Level]) -> Level:
 
 
 def _holds(level: Level, y: Array) -> bool:
+    return bool((np.abs(_violation(level, y)) <= _AT[0] * _size(y) * _lengths(level)).all())
+
+
+def _violation(level: Level, y: Array) -> Array:
     values = level.A @ y
-    off = np.abs(values - np.clip(values, level.lower, level.upper))
-    return bool((off <= _AT[0] * _size(y) * _lengths(level)).all())
+    return np.asarray(values - np.clip(values, level.lower, level.upper))
 
 
 def _size(y: Array) -> float:
@@ -116,9 +119,7 @@ def _refined(levels: Sequence[Level], y: Array, near: float) -> Array:
 def _no_worse(levels: Sequence[Level], new: Array, old: Array) -> bool:
     """Whether no level is violated more at ``new``, unless one above it is violated less."""
     for level in levels:
-        now, before = (
-            float(np.linalg.norm(level.A @ y - np.clip(level.A @ y, level.lower, level.upper))) for y in (new, old)
-        )
+        now, before = (float(np.linalg.norm(_violation(level, y))) for y in (new, old))
         if abs(now - before) > 1e-6 * before + 1e-10 * _size(old) * float(_lengths(level).max()):
             return now < before
     return True
