@@ -5,6 +5,7 @@ from __future__ import annotations
 import gc
 import tracemalloc
 from contextlib import suppress
+from itertools import pairwise
 from pathlib import Path
 
 import numpy as np
@@ -214,9 +215,9 @@ def test_ticks_leave_no_memory_behind() -> None:
 
     tracemalloc.start()
     try:
-        kept = [fly(ticks) for ticks in (60, 300, 300)]
-        # A number kept a tick would be 12,000 bytes, both times.  What is made once counts once.
-        assert min(kept[1] - kept[0], kept[2] - kept[1]) < 7_500
+        # A number kept a tick would be 7,200 bytes in every round.  NumPy's caches of small arrays fill up in the
+        # first rounds, by how much depends on what ran before.
+        assert any(after - before < 3_000 for before, after in pairwise(fly(300) for _ in range(9)))
     finally:
         tracemalloc.stop()
 
