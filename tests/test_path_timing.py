@@ -12,11 +12,11 @@ from scipy.optimize import lsq_linear
 from impact_posture.arrays import Array
 from impact_posture.impact.contact import ImpactContact
 from impact_posture.impact.objective import ImpactObjective
-from impact_posture.path import timing
+from impact_posture.path import timed_curve, timing
+from impact_posture.path.actuator_limits import ActuatorLimits
 from impact_posture.path.curve import PathCurve
 from impact_posture.path.path_space import PathSpace
 from impact_posture.path.posture_path import PosturePath, posture_path
-from impact_posture.path.timing import ActuatorLimits
 from impact_posture.posture.build_problem import build_problem
 from impact_posture.posture.problem import Requirements
 from impact_posture.posture.problem_settings import prepare
@@ -46,8 +46,8 @@ def dense(request: pytest.FixtureRequest) -> tuple[Robot, PosturePath]:
     solution = solved(request.param)
     coarse = posture_path(solution)
     with pytest.MonkeyPatch.context() as patch:
-        patch.setattr(timing, "SAMPLE_TIME", timing.SAMPLE_TIME / 10)
-        patch.setattr(timing, "_LEAST_POINTS", 10 * timing._LEAST_POINTS)
+        patch.setattr(timed_curve, "SAMPLE_TIME", timed_curve.SAMPLE_TIME / 10)
+        patch.setattr(timed_curve, "_LEAST_POINTS", 10 * timed_curve._LEAST_POINTS)
         fine = posture_path(solution)
     assert fine.found and fine.duration == pytest.approx(coarse.duration, rel=1e-9)
     assert len(fine.t) >= 9 * len(coarse.t)
@@ -140,6 +140,31 @@ def test_a_pendulum_takes_the_time_of_bang_bang(effort: float, angle: float) -> 
     assert fastest.t[-1] == pytest.approx(2 * np.sqrt(inertia * abs(angle) / effort), rel=5e-3)
     smooth = timing.scaled(space, curve_of(space, angle), limits)
     assert smooth.t[-1] == pytest.approx(np.sqrt(10 / np.sqrt(3) * inertia * abs(angle) / effort), rel=5e-3)
+
+
+@pytest.mark.parametrize("name", ["panda", "tilthex_arm"])
+def test_a_corner_is_passed_slowly_and_the_rest_is_not(name: str, monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setattr(timed_curve, "SAMPLE_TIME", timed_curve.SAMPLE_TIME / 10)
+    loaded = robot(name)
+    objective = ImpactObjective(loaded, ImpactContact(loaded.spec.contact.frame, (0, 0, 1)))
+    space = PathSpace(build_problem(loaded, objective, loaded.posture(), Requirements(contact_pose="free")))
+    moves = np.zeros((129, loaded.nv))
+    first, other = (6, 7) if loaded.floating else (0, 1)
+    moves[:, first] = np.interp(np.arange(129), [0, 48], [0, 0.4])
+    moves[48:, other] = np.linspace(0, 0.7, 81)
+    curve = PathCurve(space, [np.array(pin.integrate(loaded.model, space.problem.given, way)) for way in moves])
+    motion = timing.timed(space, curve, limits_of(space))
+    assert motion.method == "slowed" and not motion.notes
+    limits, largest = limits_of(space), 0.0
+    for z, v, a in zip(motion.z, motion.v, motion.a, strict=True):
+        q = curve.at(z)
+        shares = limits.shares(q, limits.load(q, v, a))
+        assert shares is not None
+        largest = max(largest, float(np.abs(shares).max()), float((np.abs(v) / loaded.velocity_limits).max()))
+    assert 0.5 < largest < 1.0
+    # Where the curve is straight, the motion is much faster than at the corner.
+    slow = np.linalg.norm(motion.z - curve.z[48], axis=1).argmin()
+    assert np.abs(motion.v[slow]).max() < 0.3 * np.abs(motion.v).max()
 
 
 def test_without_a_torque_limit_velocities_count_and_this_is_said() -> None:

@@ -162,7 +162,9 @@ class Compression:
         elif self.fitting == "reflected":
             meaning = "the rotors move with the links: joint model 'reflected'"
         else:
-            meaning = "neither 'link' nor 'reflected' is right; evaluate with `joint_model='elastic'`"
+            meaning = "neither 'link' nor 'reflected' is right; "
+            used = self.joint_model == "elastic"
+            meaning += "'elastic', as here, is" if used else "evaluate with `joint_model='elastic'`"
         return f"x = {self.x:.2g}: {meaning}"
 
     def to_dict(self) -> dict[str, object]:

@@ -17,6 +17,8 @@ DEVIATION = 1e-5
 _DOUBLINGS = 7
 # Step of central differences along the curve, whose length is 1.
 _STEP = 1e-5
+# Between knots of a corner, the curve bends so many times more than at the median knot.
+_SHARP = 5.0
 
 
 class PathCurve:
@@ -44,6 +46,12 @@ class PathCurve:
                 z[:, slot.v] = np.unwrap(z[:, slot.v], axis=0)
         self.z = z
         self.spline = CubicSpline(self.s, z)
+
+    @property
+    def corners(self) -> Array:
+        """Whether the curve turns sharply between each knot and the next, shape (n − 1,)."""
+        bend = np.abs(self.spline(self.s, 2)).max(axis=1)
+        return np.asarray(np.maximum(bend[1:], bend[:-1]) > _SHARP * np.median(bend))
 
     def at(self, z: Array) -> Array:
         """Return the posture of tangent coordinates, ``q₀ ⊕ z``, shape (nq,)."""

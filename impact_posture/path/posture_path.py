@@ -10,11 +10,12 @@ import numpy as np
 from impact_posture.arrays import Array
 from impact_posture.errors import InputError
 from impact_posture.impact.objective import Objective
+from impact_posture.path.actuator_limits import ActuatorLimits
 from impact_posture.path.curve import fitted_curve
 from impact_posture.path.own_component import OwnComponent
 from impact_posture.path.path_space import PathSpace
 from impact_posture.path.search import EFFORT, Connection, connect, shortened
-from impact_posture.path.timing import ActuatorLimits, LimitUse, limit_use, timed
+from impact_posture.path.timing import LimitUse, limit_use, timed
 from impact_posture.posture.solve import PostureSolution
 
 # Optima that are tried, best first.
@@ -33,7 +34,7 @@ class PosturePath:
         found: Whether the path ends at the optimum.
         reason: Why it does not, or what the timing leaves out; empty if there is nothing to say.
         method: How the path was found: ``continuation`` or ``sampling``; empty without a motion.
-        timing: ``time-optimal`` or ``scaled``; empty without a motion.
+        timing: ``time-optimal``, ``scaled`` or ``slowed``; empty without a motion.
         objective: Objective at the end of the path.
         t: Times, s, shape (n,); a single zero if the start is the end.
         q: Postures on the constraints, shape (n, nq).

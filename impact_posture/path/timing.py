@@ -3,110 +3,28 @@
 from __future__ import annotations
 
 from collections.abc import Sequence
-from dataclasses import dataclass, replace
+from dataclasses import dataclass
 
 import numpy as np
-import pinocchio as pin
 
 from impact_posture.arrays import Array
-from impact_posture.impact.objective import Objective
+from impact_posture.path.actuator_limits import ActuatorLimits
 from impact_posture.path.curve import PathCurve
 from impact_posture.path.path_space import PathSpace
-from impact_posture.posture.load_cases import load_cases
-from impact_posture.posture.problem import Requirements
+from impact_posture.path.speed_profile import slowed
+from impact_posture.path.timed_curve import SAMPLE_TIME, TimedCurve, times
 
-# Time between two points of a trajectory, s, and the least number of points.
-SAMPLE_TIME, _LEAST_POINTS = 0.01, 21
 # Intervals of the time-optimal parametrization, within which a limit may be exceeded by less than 1 %.
 _GRID = 400
-# Instants at which a scaled motion is checked.
-INSTANTS = 61
+# Instants at which a scaled motion is checked, besides the knots of its curve; places of the table that finds these.
+INSTANTS, _INVERSE = 61, 2001
 # Joint speed where the robot's data limit nothing, rad/s or m/s.
 _DEFAULT_SPEED = 1.0
 # From this share on, a limit is active.
 _ACTIVE = 0.98
 _ONE_AXIS = ("revolute", "continuous", "prismatic")
-# Least part of the weight that counts as a wrench on the base that the rotors cannot make.
-_UNREACHABLE = 1e-7
-
-
-class ActuatorLimits:
-    """Limits on the load ``M ν̇ + h`` of a motion, from what holds the robot at rest.
-
-    Motors, rotors and feet are those of :class:`~impact_posture.posture.equilibrium.Equilibrium`, which moves here.
-
-    Args:
-        objective: The objective, with the robot and its supports.
-        q: A posture with the feet in place, shape (nq,).
-        requirements: The friction of the feet.
-
-    Attributes:
-        names: Names of the actuators with a limit.
-        kinds: Kind of each: ``torque`` or ``thrust``.
-        missing: Why the limits of this robot are not known; empty if they are.
-    """
-
-    def __init__(self, objective: Objective, q: Array, requirements: Requirements) -> None:
-        robot = objective.robot
-        self._model = robot.model.copy()
-        # The rotors move with their joints, whatever an impact meets of them.
-        self._model.armature = np.where(np.isfinite(robot.armature), robot.armature, 0.0)
-        self._data = self._model.createData()
-        found = load_cases(objective, q, replace(requirements, hold_force=0.0))
-        self.missing = found.unknown
-        self.names: tuple[str, ...] = ()
-        self.kinds: tuple[str, ...] = ()
-        if found.cases:
-            self._held, unreachable = found.cases[0].equilibrium, found.cases[0].unreachable
-            self._unreachable = unreachable / self._held.weight
-            self.names, self.kinds = self._held.actuators, self._held.kinds
-
-    def load(self, q: Array, v: Array, a: Array) -> Array:
-        """Return the generalized forces of a motion, ``M ν̇ + h``, shape (nv,), by RNEA with gravity and armature."""
-        return np.array(pin.rnea(self._model, self._data, q, v, a))
-
-    def largest_rate(self, q: Array, rest: Array, dynamic: Array) -> float | None:
-        """Return the largest ``λ ≥ 0`` for which the limits allow the load ``rest + λ dynamic``; infinite if all do.
-
-        A motion that takes the time ``T`` has the load of gravity and ``1/T²`` times that of ``T = 1 s``.  So this is
-        the least duration at a posture.  ``None`` if the limits do not even allow the load at rest.
-        """
-        if self._out_of_reach(rest):
-            return None
-        return 0.0 if self._out_of_reach(rest + dynamic) else self._held.largest_rate(q, rest, dynamic)
-
-    def shares(self, q: Array, load: Array) -> Array | None:
-        """Return the signed shares of the limits that a load takes, the largest as small as possible, by name.
-
-        A share is 0 in the middle of the range of an actuator, and ±1 at its limits.  ``None`` if rotors or friction
-        do not allow the load.
-        """
-        return None if self._out_of_reach(load) else self._held.shares(q, load)
-
-    def _out_of_reach(self, load: Array) -> bool:
-        wrench = self._unreachable @ load[: self._unreachable.shape[1]] if len(self._unreachable) else np.zeros(0)
-        return bool(np.abs(wrench).max(initial=0.0) > _UNREACHABLE)
-
-
-@dataclass(frozen=True, eq=False)
-class TimedCurve:
-    """A motion along a curve.
-
-    Attributes:
-        t: Times, s, shape (n,).
-        z: Tangent coordinates on the curve, shape (n, nv).
-        v: Velocities ``ν``, shape (n, nv).
-        a: Accelerations ``ν̇``, shape (n, nv).
-        method: ``time-optimal`` (fixed base) or ``scaled`` (one time scale for the whole motion).
-        notes: What the motion does not respect, and why.
-    """
-
-    t: Array
-    z: Array
-    v: Array
-    a: Array
-    method: str
-    notes: tuple[str, ...] = ()
+# A time-optimal motion that takes a larger share of a limit at one of its points has corners, too.
+_EXCEEDED = 1.01
 
 
 def time_optimal(space: PathSpace, curve: PathCurve, limits: ActuatorLimits) -> TimedCurve | None:
@@ -148,7 +66,7 @@ def time_optimal(space: PathSpace, curve: PathCurve, limits: ActuatorLimits) -> 
     found = planner.compute_trajectory()
     if found is None:
         return None
-    t = _times(float(found.duration))
+    t = times(float(found.duration))
     z, v, a = (np.asarray(found(t, order)) for order in range(3))
     return TimedCurve(t, z, v, a, "time-optimal")
 
@@ -157,11 +75,16 @@ def scaled(space: PathSpace, curve: PathCurve, limits: ActuatorLimits) -> TimedC
     """Return the fastest motion of the form ``s(t) = 10 τ³ − 15 τ⁴ + 6 τ⁵``, ``τ = t/T``, within all known limits.
 
     The load of a motion is that of gravity and ``1/T²`` times a load that does not depend on ``T``.  So a linear
-    program at each instant gives the least ``T`` there, and the largest of them counts.
+    program at each instant gives the least ``T`` there, and the largest of them counts.  Instants are spread evenly,
+    and at the knots of the curve and midway between them, because a spline around a corner bends most at a knot.
+    A curve with corners is slowed there alone if that takes less time.
     """
-    notes, tau = [], np.linspace(0.0, 1.0, INSTANTS)
+    knots = np.concatenate([curve.s, (curve.s[1:] + curve.s[:-1]) / 2])
+    fine = np.linspace(0.0, 1.0, _INVERSE)
+    notes, tau = [], np.concatenate([np.linspace(0.0, 1.0, INSTANTS), np.interp(knots, _law(fine)[0], fine)])
     rates = [_rates(curve, float(x)) for x in tau]
     speed, known = space.problem.robot.velocity_limits, not limits.missing
+    least = np.zeros(len(tau))
     if known:
         zero = np.zeros(space.model.nv)
         rests = [(q, limits.load(q, zero, zero)) for q, _, _ in rates]
@@ -170,16 +93,21 @@ def scaled(space: PathSpace, curve: PathCurve, limits: ActuatorLimits) -> TimedC
             for (q, v, a), (_, rest) in zip(rates, rests, strict=True)
         ]
         known = all(found)
-        least = [rate**-0.5 for rate in found if rate]
+        least = np.array([rate**-0.5 if rate else 0.0 for rate in found])
     if not known:
         why = limits.missing or _cannot_move(space, limits, rests)
         notes.append(f"{why}: timed by velocities alone")
-        least = [0.0]
+        least[:] = 0.0
         speed = np.where(np.isfinite(speed), speed, _DEFAULT_SPEED)
         if not np.isfinite(space.problem.robot.velocity_limits).all():
             notes.append(f"where no velocity limit is known, {_DEFAULT_SPEED:g} rad/s or m/s counts")
-    duration = max(*least, *(float((np.abs(v) / speed).max()) for _, v, _ in rates), SAMPLE_TIME)
-    t = _times(duration)
+    least = np.maximum(least, [float((np.abs(v) / speed).max()) for _, v, _ in rates])
+    duration = max(float(least.max()), SAMPLE_TIME)
+    if known and curve.corners.any():
+        slower = slowed(space, curve, limits)
+        if slower is not None and slower.t[-1] < duration:
+            return slower
+    t = times(duration)
     motion = [_rates(curve, float(x)) for x in t / duration]
     return TimedCurve(
         t,
@@ -204,13 +132,29 @@ def _cannot_move(space: PathSpace, limits: ActuatorLimits, loads: Sequence[tuple
 
 
 def timed(space: PathSpace, curve: PathCurve, limits: ActuatorLimits) -> TimedCurve:
-    """Return the motion along a curve: time-optimal for a fixed base with known torques, else scaled."""
+    """Return the motion along a curve: time-optimal for a fixed base with known torques, else scaled.
+
+    A time-optimal motion that exceeds limits between the points of its grid gives way to one that does not.
+    """
     axes = all(slot.kind.family in _ONE_AXIS for slot in space.projector.chart.slots)
     if not limits.missing and axes and not space.problem.robot.floating:
         fastest = time_optimal(space, curve, limits)
-        if fastest is not None:
+        if fastest is not None and _exceeded(space, curve, fastest, limits) <= _EXCEEDED:
             return fastest
+        slower = slowed(space, curve, limits)
+        if slower is not None:
+            return slower
     return scaled(space, curve, limits)
+
+
+def _exceeded(space: PathSpace, curve: PathCurve, motion: TimedCurve, limits: ActuatorLimits) -> float:
+    """Return the largest share of a limit that a motion of a fixed base takes."""
+    largest = float((np.abs(motion.v) / space.problem.robot.velocity_limits).max())
+    for z, v, a in zip(motion.z, motion.v, motion.a, strict=True):
+        q = curve.at(z)
+        used = limits.shares(q, limits.load(q, v, a))
+        largest = max(largest, float(np.abs(used).max(initial=0.0)) if used is not None else np.inf)
+    return largest
 
 
 @dataclass(frozen=True, eq=False)
@@ -238,8 +182,10 @@ def limit_use(space: PathSpace, motion: TimedCurve, postures: Array, limits: Act
     Forces of feet and of more than six rotors are not determined: those count whose largest share is least.
     """
     robot, count = space.problem.robot, len(motion.t)
-    # A floating robot takes a linear program an instant.
-    every = sorted({round(k) for k in np.linspace(0, count - 1, INSTANTS)}) if robot.floating else list(range(count))
+    # A floating robot takes a linear program an instant.  Where it bends most, it may need most.
+    even = [round(k) for k in np.linspace(0, count - 1, INSTANTS)]
+    bent = np.argsort(-np.abs(motion.a).max(axis=1), kind="stable")[:INSTANTS].tolist()
+    every = sorted({*even, *bent}) if robot.floating else list(range(count))
     shares = np.full((len(every), len(limits.names)), np.nan)
     for row, k in enumerate([] if limits.missing else every):
         found = limits.shares(postures[k], limits.load(postures[k], motion.v[k], motion.a[k]))
@@ -262,10 +208,6 @@ def limit_use(space: PathSpace, motion: TimedCurve, postures: Array, limits: Act
         used.max(axis=1) if used.shape[1] else np.full(len(every), np.nan) for used, _ in groups.values()
     )
     return LimitUse(motion.t[every], velocity, torque, thrust, largest)
-
-
-def _times(duration: float) -> Array:
-    return np.linspace(0.0, duration, max(_LEAST_POINTS, int(np.ceil(duration / SAMPLE_TIME)) + 1))
 
 
 def _law(tau: Array) -> tuple[Array, Array, Array]:

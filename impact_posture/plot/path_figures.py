@@ -231,11 +231,12 @@ _SHARES: dict[str, dict[str, Any]] = {
     "torque": {"color": VERMILLION, "linestyle": (0, (5, 2))},
     "thrust": {"color": GREEN, "linestyle": (0, (1, 1))},
 }
-_SCALED = (
-    "One time scale for the whole motion: its fastest instant just meets a limit. Torques, thrusts and forces "
-    "on the feet that are not determined are those whose largest share is least."
-)
-_OPTIMAL = "Time-optimal: at each instant a limit is met, up to 1 % between grid points."
+_LEAST = "Torques, thrusts and forces on the feet that are not determined are those whose largest share is least."
+_NOTES = {
+    "scaled": f"One time scale for the whole motion: its fastest instant just meets a limit. {_LEAST}",
+    "slowed": f"At each place the speed is one that the limits allow there, which is low at corners. {_LEAST}",
+    "time-optimal": "Time-optimal: a limit is met all the time, up to 1 %; the curves join the points of the motion.",
+}
 
 
 def motion_figure(view: ResultView) -> Figure:
@@ -247,7 +248,7 @@ def motion_figure(view: ResultView) -> Figure:
     motion = view.motion
     if motion is None or motion.use is None:
         raise InputError("there is no motion to draw", where="figure path", hint="run optimize again with `path`")
-    notes = [_SCALED if motion.timing == "scaled" else _OPTIMAL]
+    notes = [_NOTES.get(motion.timing, "")]
     notes += [f"Note: {motion.reason}."] if motion.reason else []
     with framed(*header_lines(view), 6.2, notes) as (figure, body):
         joints, objective, shares = body.subplots(3, 1, sharex=True, height_ratios=[1.4, 1, 1])

@@ -153,7 +153,7 @@ def jump_unit(view: ResultView) -> str:
 def objective_unit(view: ResultView) -> str:
     """Return the unit of the objective."""
     jump = jump_unit(view)
-    square = "J" if jump == "√J" else f"{jump}²"
+    square = "J" if jump == "√J" else f"({jump})²" if "/" in jump and jump[0] != "(" else f"{jump}²"
     return {"impulse": square, "energy": "kg"}.get(view.objective.kind, f"{square}/(m/s)²")
 
 

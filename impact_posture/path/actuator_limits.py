@@ -1,0 +1,74 @@
+"""The loads that the actuators, rotors and feet of a robot can carry on its way."""
+
+from __future__ import annotations
+
+from dataclasses import replace
+
+import numpy as np
+import pinocchio as pin
+
+from impact_posture.arrays import Array
+from impact_posture.impact.objective import Objective
+from impact_posture.posture.load_cases import load_cases
+from impact_posture.posture.problem import Requirements
+
+# Least part of the weight that counts as a wrench on the base that the rotors cannot make.
+_UNREACHABLE = 1e-7
+
+
+class ActuatorLimits:
+    """Limits on the load ``M ν̇ + h`` of a motion, from what holds the robot at rest.
+
+    Motors, rotors and feet are those of :class:`~impact_posture.posture.equilibrium.Equilibrium`, which moves here.
+
+    Args:
+        objective: The objective, with the robot and its supports.
+        q: A posture with the feet in place, shape (nq,).
+        requirements: The friction of the feet.
+
+    Attributes:
+        names: Names of the actuators with a limit.
+        kinds: Kind of each: ``torque`` or ``thrust``.
+        missing: Why the limits of this robot are not known; empty if they are.
+    """
+
+    def __init__(self, objective: Objective, q: Array, requirements: Requirements) -> None:
+        robot = objective.robot
+        self._model = robot.model.copy()
+        # The rotors move with their joints, whatever an impact meets of them.
+        self._model.armature = np.where(np.isfinite(robot.armature), robot.armature, 0.0)
+        self._data = self._model.createData()
+        found = load_cases(objective, q, replace(requirements, hold_force=0.0))
+        self.missing = found.unknown
+        self.names: tuple[str, ...] = ()
+        self.kinds: tuple[str, ...] = ()
+        if found.cases:
+            self._held, unreachable = found.cases[0].equilibrium, found.cases[0].unreachable
+            self._unreachable = unreachable / self._held.weight
+            self.names, self.kinds = self._held.actuators, self._held.kinds
+
+    def load(self, q: Array, v: Array, a: Array) -> Array:
+        """Return the generalized forces of a motion, ``M ν̇ + h``, shape (nv,), by RNEA with gravity and armature."""
+        return np.array(pin.rnea(self._model, self._data, q, v, a))
+
+    def largest_rate(self, q: Array, rest: Array, dynamic: Array) -> float | None:
+        """Return the largest ``λ ≥ 0`` for which the limits allow the load ``rest + λ dynamic``; infinite if all do.
+
+        A motion that takes the time ``T`` has the load of gravity and ``1/T²`` times that of ``T = 1 s``.  So this is
+        the least duration at a posture.  ``None`` if the limits do not even allow the load at rest.
+        """
+        if self._out_of_reach(rest):
+            return None
+        return 0.0 if self._out_of_reach(rest + dynamic) else self._held.largest_rate(q, rest, dynamic)
+
+    def shares(self, q: Array, load: Array) -> Array | None:
+        """Return the signed shares of the limits that a load takes, the largest as small as possible, by name.
+
+        A share is 0 in the middle of the range of an actuator, and ±1 at its limits.  ``None`` if rotors or friction
+        do not allow the load.
+        """
+        return None if self._out_of_reach(load) else self._held.shares(q, load)
+
+    def _out_of_reach(self, load: Array) -> bool:
+        wrench = self._unreachable @ load[: self._unreachable.shape[1]] if len(self._unreachable) else np.zeros(0)
+        return bool(np.abs(wrench).max(initial=0.0) > _UNREACHABLE)

@@ -1,0 +1,70 @@
+"""A motion along a curve that is slow at corners, within limits everywhere."""
+
+from __future__ import annotations
+
+from itertools import pairwise
+
+import numpy as np
+
+from impact_posture.arrays import Array
+from impact_posture.path.actuator_limits import ActuatorLimits
+from impact_posture.path.curve import PathCurve
+from impact_posture.path.path_space import PathSpace
+from impact_posture.path.timed_curve import SAMPLE_TIME, TimedCurve, times
+
+# Share of the limits that speed and acceleration may take between them.
+_SHARE = 0.95
+# Parts between two knots of the curve, at corners and elsewhere.
+_AT_CORNERS, _BETWEEN = 8, 2
+
+
+def slowed(space: PathSpace, curve: PathCurve, limits: ActuatorLimits) -> TimedCurve | None:
+    """Return the motion whose speed at each place is one that the limits allow there; ``None`` if there is none.
+
+    With ``x = ṡ²``, the load is that of gravity, plus ``x`` times a load, plus ``s̈`` times another.  The limits are
+    convex, so ``x`` and ``s̈`` are allowed together if each is half of what is allowed alone.  The largest such
+    ``x(s)`` follows from one pass in each direction with ``dx/ds = 2 s̈`` (Bobrow et al. 1985).  Between two knots of
+    the curve, the curvature is straight, so a few places more are enough, most of them at corners.
+    """
+    s = _places(curve)
+    zero, speed = np.zeros(space.model.nv), space.problem.robot.velocity_limits
+    most, steep = np.empty((2, len(s)))
+    for k, place in enumerate(s):
+        q, v, a = curve.posture(place), curve.velocity(place), curve.acceleration(place)
+        rest = limits.load(q, zero, zero)
+        along = limits.load(q, zero, v) - rest
+        rates = [limits.largest_rate(q, rest, d) for d in (limits.load(q, v, a) - rest, along, -along)]
+        if not all(rates):
+            return None
+        bend, *drive = (_SHARE / 2 * rate for rate in rates if rate is not None)
+        with np.errstate(divide="ignore"):
+            fastest = float((speed / np.abs(v)).min())
+        most[k] = min(bend, _SHARE * fastest**2, SAMPLE_TIME**-2)
+        steep[k] = min(*drive, SAMPLE_TIME**-2)
+    x = most.copy()
+    x[0] = x[-1] = 0.0
+    reach = 2 * np.diff(s) * np.minimum(steep[1:], steep[:-1])
+    for k in range(1, len(x)):
+        x[k] = min(x[k], x[k - 1] + reach[k - 1])
+    for k in range(len(x) - 2, -1, -1):
+        x[k] = min(x[k], x[k + 1] + reach[k])
+    rate = np.sqrt(x)
+    passed = [2 * d / (a + b) for d, (a, b) in zip(np.diff(s), pairwise(rate), strict=True)]
+    ends = np.concatenate([[0.0], np.cumsum(passed)])
+    t = times(float(ends[-1]))
+    part = np.clip(np.searchsorted(ends, t, side="right") - 1, 0, len(s) - 2)
+    dds = (np.diff(x) / (2 * np.diff(s)))[part]
+    ds = rate[part] + dds * (t - ends[part])
+    at = np.minimum(s[part] + (rate[part] + ds) / 2 * (t - ends[part]), 1.0)
+    v = [curve.velocity(float(place)) for place in at]
+    a = [curve.acceleration(float(p)) * d**2 + u * dd for p, u, d, dd in zip(at, v, ds, dds, strict=True)]
+    return TimedCurve(t, curve.spline(at), np.array(v) * ds[:, None], np.array(a), "slowed")
+
+
+def _places(curve: PathCurve) -> Array:
+    """Return the knots of a curve and places between them, more where it bends."""
+    parts = [
+        np.linspace(a, b, _AT_CORNERS if corner else _BETWEEN, endpoint=False)
+        for (a, b), corner in zip(pairwise(curve.s), curve.corners, strict=True)
+    ]
+    return np.concatenate([*parts, [1.0]])
