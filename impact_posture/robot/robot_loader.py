@@ -21,7 +21,14 @@ from impact_posture.robot.model_joints import joint_index, movable_joints, q_sli
 from impact_posture.robot.named_postures import ignored_bases, named_postures
 from impact_posture.robot.robot import Robot
 from impact_posture.robot.spec import RobotSpec, read_spec
-from impact_posture.robot.urdf import EXAMPLE_PREFIX, build_model, example_models, resolve_path, robots_data
+from impact_posture.robot.urdf import (
+    EXAMPLE_PREFIX,
+    build_model,
+    example_models,
+    mimic_warnings,
+    resolve_path,
+    robots_data,
+)
 from impact_posture.settings import LoadOptions, RobotSettings, Root, Vector3
 from impact_posture.tables import validate
 
@@ -75,6 +82,7 @@ def build_robot(located: Located, options: LoadOptions) -> Robot:
     if locked:
         model, postures = _lock(model, locked, postures, default, name)
     check_moved_mass(model, source)
+    warnings = (*warnings, *mimic_warnings(urdf, model, spec.constraints.hold))
     if root == "fixed":
         warnings = (*warnings, *ignored_bases(spec, srdf, default))
     warnings = (*warnings, *armature_warning(model, armature_source, spec.constraints.hold))

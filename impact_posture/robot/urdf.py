@@ -6,7 +6,7 @@ import contextlib
 import os
 import tempfile
 import xml.etree.ElementTree as ET
-from collections.abc import Iterator
+from collections.abc import Collection, Iterator
 from functools import cache
 from importlib.resources import files
 from pathlib import Path
@@ -113,7 +113,7 @@ def build_model(path: Path, *, free_flyer: bool, accept_inertias: bool = False) 
             where=str(path),
             hint="fix joints in the URDF that hardly matter",
         )
-    return model, (*check_inertias(root, model, path, accept_inertias), *_lost_mimics(root))
+    return model, tuple(check_inertias(root, model, path, accept_inertias))
 
 
 def _check_depth(root: ET.Element, path: Path) -> None:
@@ -137,16 +137,33 @@ def _check_depth(root: ET.Element, path: Path) -> None:
             raise UrdfError(f"has a chain of more than {_DEEPEST} joints", where=str(path), hint=hint)
 
 
-def _lost_mimics(root: ET.Element) -> list[str]:
-    """Return a warning for each joint that mimics a joint that does not exist, nearest names included."""
+def mimic_warnings(path: Path, model: pin.Model, held: Collection[str]) -> tuple[str, ...]:
+    """Return a warning for each joint that mimics another and moves by itself here, or mimics a joint that is none.
+
+    Args:
+        path: The URDF.
+        model: The model, without the joints that are locked.
+        held: Joints that do not move on the way to an impact.
+    """
+    root = parse_urdf(path)
     joints = {joint.get("name", ""): joint.find("mimic") for joint in root.findall("joint")}
     followed = {name: mimic.get("joint", "") for name, mimic in joints.items() if mimic is not None}
-    return [
+    lost = [
         f"joint '{name}' mimics '{other}', which is no joint of the URDF (did you mean "
         f"{nearest(other, joints, 1)[0]}?): it moves by itself; correct its <mimic>"
         for name, other in followed.items()
         if other not in joints
     ]
+    free = [name for name, other in followed.items() if other in joints and model.existJointName(name)]
+    return (
+        *lost,
+        *(
+            f"joint '{name}' mimics '{followed[name]}' but moves by itself here, because the coupling is left out; "
+            f"lock it (`lock`) if that matters"
+            for name in free
+            if name not in held
+        ),
+    )
 
 
 def parse_urdf(path: Path) -> ET.Element:
