@@ -150,6 +150,7 @@ def result_view(prepared: Prepared, found: FoundPostures, motion: PosturePath | 
         tradeoff=_tradeoff_data(document.get("tradeoff", []), document.get("tradeoff_against", "distance")),
         collisions=_collisions(prepared, found.initial, found.optimal),
         depths=() if around is None else tuple(around.depth(c) for c in impact.objective.contacts),
+        pushed=prepared.problem.requirements.contact_pose == "free",
         motion=motion,
         self_motion=found.mapped,
     )

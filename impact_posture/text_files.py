@@ -17,7 +17,8 @@ def read_text(path: Path) -> str:
         OSError: The file cannot be read, or is larger than :data:`MOST_CHARACTERS`.
         UnicodeDecodeError: The file is not UTF-8.
     """
-    with path.open(encoding="utf-8") as file:
+    # Some editors put a byte-order mark first.
+    with path.open(encoding="utf-8-sig") as file:
         text = file.read(MOST_CHARACTERS + 1)
     if len(text) > MOST_CHARACTERS:
         raise OSError(errno.EFBIG, os.strerror(errno.EFBIG), str(path))

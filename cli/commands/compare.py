@@ -64,6 +64,8 @@ def compare(
         return
     page = Page(quiet=quiet)
     shown = "mean ± half of the 95 % interval" if seeds >= FEWEST else f"means (intervals from {FEWEST} seeds on)"
+    if seeds > 1 and all(one.alike for row in found.rows for one in row.metrics.values()):
+        shown = "all alike, because the scenario has no noise"
     page.title(found.rows[0].scenario, f"{seeds} seeds, {shown}" if seeds > 1 else "1 seed")
     rows_table(page, found.rows)
     if folder is not None:

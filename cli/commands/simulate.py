@@ -93,10 +93,12 @@ def simulate(
     from impact_posture.experiment.statistics import fate
     from impact_posture.output_folder import check_output
     from impact_posture.posture.ipopt import one_blas_thread
+    from impact_posture.simulation.controller_factory import check_gain
 
     if export_world is not None:
         _export_world(Page(quiet=quiet or json), given, Path(export_world), force)
         return
+    check_gain(controller, gain)
     only, code = None if sign is None else int(sign), worth_compiling(compile, 1)
     job = Job(scenario, controller, seed, mode, free, gain, only, code)
     folder = Path(out) if out else Path(file_name(f"{given.name}-{job.label.replace(':', '-')}"))

@@ -24,6 +24,14 @@ _METRICS = (
     ("peak_force", "N", "largest normal force in the impact windows"),
     ("slip", "m", "way that the contact slid in the impact windows"),
 )
+# What the same metrics are for pushes.
+_OF_PUSHES = {
+    "peak_jump": "largest ‖ν‖ from a push on until its window ends, mean of the pushes",
+    "peak_jump_max": "the largest of the pushes",
+    "peak_recovery": "as peak_jump, until 1 s after each push began",
+    "peak_force": "the push",
+    "slip": "way that the fastest foot slid in the impact windows",
+}
 _MOVES = (
     "The slider goes through time: every millisecond within the impact windows, every 25 ms elsewhere. Within a "
     "window, the orange arrows show the change of velocity since it began. H, V, S and the ellipsoid are those of "
@@ -42,7 +50,7 @@ def run_content(folder: Path, document: Document, view: RunView, job: Job) -> Co
     metrics, status = document["metrics"], document["status"]
     verdict = [f"{status}: its numbers are no result" if metrics is None else f"{status}: {_summary(metrics)}"]
     verdict += [f"t = {event['time']:.2f} s: {event['what']}" for event in document["events"]]
-    rows = [] if metrics is None else [(key, number(metrics[key]), unit, words) for key, unit, words in _METRICS]
+    rows = [] if metrics is None else [(key, number(metrics[key]), unit, words) for key, unit, words in _meant(view)]
     if document["prediction"] is not None:
         rows.append(
             ("H before", number(document["prediction"]["H"]), "jump²/(N·s)²", "jump² per impulse² at the impacts")
@@ -58,6 +66,11 @@ def run_content(folder: Path, document: Document, view: RunView, job: Job) -> Co
     )
 
 
+def _meant(view: RunView) -> list[tuple[str, str, str]]:
+    """Return key, unit and meaning of the metrics of a table."""
+    return [(key, unit, (_OF_PUSHES if view.pushed else {}).get(key, words)) for key, unit, words in _METRICS]
+
+
 def _summary(metrics: Mapping[str, Any]) -> str:
     jump, force = number(metrics["peak_jump"]), number(metrics["peak_force"])
     return f"the impacts change the velocity by up to {jump} (m/s and rad/s), with forces of up to {force} N"
@@ -68,7 +81,7 @@ def comparison_content(folder: Path, document: Document, view: RunView) -> Conte
     rows = document["rows"]
     labels = [str(row["controller"]) for row in rows]
     table = [("status", *(str(row["status"]) for row in rows), "", "")]
-    for key, unit, meaning in _METRICS:
+    for key, unit, meaning in _meant(view):
         table.append((key, *(_mean(row["metrics"].get(key)) for row in rows), unit, meaning))
     verdict = []
     for row in rows:
@@ -79,7 +92,9 @@ def comparison_content(folder: Path, document: Document, view: RunView) -> Conte
         f"Within the impact windows, against nominal: {'; '.join(verdict)}." if verdict else "No reduction is known."
     )
     seeds = len(document["seeds"])
+    alike = all(Interval(**found).alike for row in rows for found in row["metrics"].values())
     intervals = ", with 95 % intervals" if seeds >= FEWEST else ""
+    intervals = ", all alike, because the scenario has no noise" if alike else intervals
     means = "One seed" if seeds == 1 else f"Means of {seeds} seeds{intervals}"
     command = ["impact-posture", "compare", view.scenario, "--controllers", ",".join(labels), "--seeds", str(seeds)]
     return Content(

@@ -17,6 +17,8 @@ QUANTITIES = tuple(f.name for f in fields(Metrics) if f.name not in ("stops", "c
 
 # Fewest samples whose interval is shown.  That of two says nothing, because its quantile of Student's t is 12.7.
 FEWEST = 3
+# A relative half width below which the samples are the same but for rounding, as without noise.
+_SAME = 1e-12
 
 
 @dataclass(frozen=True)
@@ -35,8 +37,13 @@ class Interval:
 
     @property
     def shown(self) -> float | None:
-        """Half width that people see, ``None`` for fewer than :data:`FEWEST` samples."""
-        return self.half_width if self.samples >= FEWEST else None
+        """Half width that people see, ``None`` for fewer than :data:`FEWEST` samples, and for equal ones."""
+        return None if self.samples < FEWEST or self.alike else self.half_width
+
+    @property
+    def alike(self) -> bool:
+        """Whether all of several samples are the same but for rounding."""
+        return self.half_width is not None and self.half_width <= _SAME * abs(self.mean)
 
     @staticmethod
     def of(values: Sequence[float]) -> Interval:

@@ -25,6 +25,7 @@ STICKS = "Sticks join joint origins."
 _NO_SHAPES = "They do not show the shapes of the links."
 _ENDS = "The last stick of a chain ends at the last frame of its link, or at the center of mass of the link."
 _NORMAL = "n points out of the surface, towards the robot."
+_PUSHED = "n is the direction of the impulse on the robot, which strikes no surface."
 _BEHIND = "The surface lies behind the link of the contact where that reaches behind the contact point."
 _BODY = "The body is the box between the hips, of no true height."
 HATCH = "/////"
@@ -81,7 +82,8 @@ def postures_figure(view: ResultView) -> Figure:
     surfaces = surfaces_of(first, second, contact_letters(view), side, view.depths)
     plane = side_plane(first, second)
     states = ((first, BEFORE), (second, AFTER))
-    notes = [*stick_notes(first), _ENDS, _NORMAL, *([_BEHIND] if any(view.depths) else [])]
+    normal = _PUSHED if view.pushed else _NORMAL
+    notes = [*stick_notes(first), _ENDS, normal, *([_BEHIND] if any(view.depths) and not view.pushed else [])]
     low, high = _window([first, second], plane, surfaces)
     # As high as the view from the side needs, within the limits of a page.
     height = float(np.clip(3.1 * (high - low)[1] / (high - low)[0], 2.3, 3.6)) + 1.0
@@ -90,15 +92,15 @@ def postures_figure(view: ResultView) -> Figure:
         space, flat = body.add_subplot(grid[0, 0], axes_class=Space), body.add_subplot(grid[0, 1])
         _box(space, np.vstack([points, *[np.vstack([square(s.point, s.normal, s.side).T, s.tip]) for s in surfaces]]))
         for surface in surfaces:
-            _plane_3d(space, surface)
-            _plane_2d(flat, surface, plane)
+            _plane_3d(space, surface, matter=not view.pushed)
+            _plane_2d(flat, surface, plane, matter=not view.pushed)
         for state, line in states:
             draw_sticks(space, state, line, None)
             draw_sticks(flat, state, line, plane)
         frame_flat(flat, low, high, 6)
         flat.grid(True)
         flat.set(xlabel=f"{plane.right}  [m]", ylabel=f"{plane.up}  [m]", title="seen along " + depth_of(plane))
-        shared_legend(body, _handles(first, second, surfaces), "lower")
+        shared_legend(body, _handles(first, second, [] if view.pushed else surfaces), "lower")
     return figure
 
 
@@ -246,24 +248,26 @@ def _body(axes: Any, corners: Array, line: dict[str, Any], plane: Plane | None) 
         axes.plot(*corners[edge].T, **(line | {"linewidth": 1.1}))
 
 
-def _plane_3d(axes: Any, surface: Surface) -> None:
-    corners = square(surface.point, surface.normal, surface.side)
-    _fill(axes, [corners], None, surface.color, 1.0)
-    axes.plot(*corners, color=surface.color, linewidth=0.8)
+def _plane_3d(axes: Any, surface: Surface, *, matter: bool) -> None:
+    if matter:
+        corners = square(surface.point, surface.normal, surface.side)
+        _fill(axes, [corners], None, surface.color, 1.0)
+        axes.plot(*corners, color=surface.color, linewidth=0.8)
     color = INK if surface.color == GRAY else surface.color
     n = surface.tip - surface.contact
     axes.quiver(*surface.contact, *n, color=color, linewidth=1.2, arrow_length_ratio=0.2)
     axes.add_artist(Label(surface.name, surface.tip, color=color))
 
 
-def _plane_2d(axes: Any, surface: Surface, plane: Plane) -> None:
+def _plane_2d(axes: Any, surface: Surface, plane: Plane, *, matter: bool) -> None:
     color = INK if surface.color == GRAY else surface.color
     if np.linalg.norm(plane.axes @ surface.normal) < 0.05:
         draw_end_on(axes, surface.name, plane, surface.normal, plane.axes @ surface.contact, color)
         return
-    outline = surface.outline(plane)
-    axes.fill(*outline.T, facecolor="none", edgecolor=surface.color, hatch=HATCH, linewidth=0, zorder=1)
-    axes.plot(*outline[:2].T, color=color, linewidth=1.0, zorder=1)
+    if matter:
+        outline = surface.outline(plane)
+        axes.fill(*outline.T, facecolor="none", edgecolor=surface.color, hatch=HATCH, linewidth=0, zorder=1)
+        axes.plot(*outline[:2].T, color=color, linewidth=1.0, zorder=1)
     tip = plane.axes @ surface.tip
     draw_arrow(axes, plane.axes @ surface.contact, tip, 7, color=color, linewidth=1.2)
     axes.add_artist(Label(surface.name, tip, tuple(plane.axes @ surface.normal), color))

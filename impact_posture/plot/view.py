@@ -82,6 +82,7 @@ class ResultView:
         self_motion: The map of the self-motion manifold, if it was computed.
         collisions: Names of the shapes that collide, in pairs, before and after.
         depths: How far behind its contact point each surface lies, m; empty for none.
+        pushed: Whether the robot is pushed anywhere (a free contact pose) and strikes no surface.
     """
 
     objective: ImpactObjective
@@ -95,6 +96,7 @@ class ResultView:
     self_motion: SelfMotionMap | None = None
     collisions: tuple[Sequence[tuple[str, str]], Sequence[tuple[str, str]]] = ((), ())
     depths: tuple[float, ...] = ()
+    pushed: bool = False
 
     @property
     def robot(self) -> Robot:

@@ -165,8 +165,8 @@ def _largest_jump(settings: ProblemSettings) -> float:
     """Return the largest jump of a joint per approach speed, from ``max_joint_jump`` and ``max_torque``."""
     if (settings.max_torque is None) != (settings.velocity_gain is None):
         raise InputError(
-            "is gain times jump, so it needs the gain, and the gain it",
-            where="max_torque",
+            "bounds the velocity gain times the jump of a joint, so each of the two needs the other",
+            where="max_torque" if settings.velocity_gain is None else "velocity_gain",
             hint="give `max_torque` and `velocity_gain`, or none of them",
         )
     jumps = [] if settings.max_joint_jump is None else [settings.max_joint_jump]

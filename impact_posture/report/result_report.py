@@ -173,10 +173,15 @@ def _before_and_after(prepared: Prepared, document: dict[str, Any]) -> Iterator[
             named = quantities(prepared.impact.metric)
             rows = [QuantityRow(key, own[0][key], own[1][key], unit, words) for key, unit, words in named]
         yield Table(
-            f"Before and after{f', at {contact.frame}' if len(contacts) > 1 else ''}",
+            f"Before and after{_alone(contact.frame, k) if len(contacts) > 1 else ''}",
             ("", "before", "after", "unit", "meaning"),
             tuple((row.key, number(row.before), number(row.after), row.unit, row.meaning) for row in rows),
         )
+
+
+def _alone(frame: str, index: int) -> str:
+    """Say what a table of one of several contacts is about."""
+    return f", of an impact at {frame} alone" + ("; the objective is of all contacts" if index == 0 else "")
 
 
 def _moves(view: ResultView, document: dict[str, Any]) -> str:

@@ -94,6 +94,10 @@ class Scene:
         axes = (float(np.linalg.norm(one.ellipsoid, 2)) ** 0.5 for one in each)
         feet = [point_on(self.objective.robot, foot.frame, foot.offset) for foot in self.objective.supports]
         joints = zip(model.parents, model.inertias, strict=True)
+        jump = 0.3 * size / _largest(track["largest_jump"] for track in tracks)
+        # The camera sees the tips of the arrows, too.
+        tips = (track.pop("reach") for track in tracks)
+        radius = max(size / 2, *(_norm(centers + jump * arrows - center) for centers, arrows in tips))
         content = {
             "joints": [{"parent": int(parent), "center": inertia.lever} for parent, inertia in joints],
             "parts": [
@@ -107,11 +111,12 @@ class Scene:
             "tracks": tracks,
             "ghost": self.ghost,
             "size": size,
+            "radius": radius,
             "center": center,
             "eye": _EYES[np.argmin(slants)],
             "scale": {
                 "ellipsoid": 0.16 * size / _largest(axes),
-                "jump": 0.3 * size / _largest(track["largest_jump"] for track in tracks),
+                "jump": jump,
                 "force": 0.35 * size / _largest(_norm(t.forces) ** 0.5 for t in self.tracks if t.forces is not None),
             },
         }
@@ -121,7 +126,7 @@ class Scene:
         robot, frames, data = self.objective.robot, len(track.q), self.objective.robot.model.createData()
         points = [point_on(robot, contact.frame, contact.offset) for contact in self.objective.contacts]
         poses, at = np.empty((frames, robot.model.njoints - 1, 7)), np.empty((frames, len(points), 3))
-        arrows = np.zeros((frames, robot.model.njoints, 3))
+        arrows, centers = np.zeros((2, frames, robot.model.njoints, 3))
         for k, (q, jump) in enumerate(zip(track.q, track.jumps, strict=True)):
             pin.forwardKinematics(robot.model, data, q, jump)
             poses[k] = [pin.SE3ToXYZQUAT(placement) for placement in list(data.liMi)[1:]]
@@ -129,6 +134,7 @@ class Scene:
             for j in range(1, robot.model.njoints):
                 twist, lever = data.v[j], robot.model.inertias[j].lever
                 arrows[k, j] = data.oMi[j].rotation @ (twist.linear + np.cross(twist.angular, lever))
+                centers[k, j] = data.oMi[j].act(lever)
         # The viewer goes straight from frame to frame, so a quaternion takes the sign that is nearer to the last one.
         for before, now in pairwise(poses[:, :, 3:]):
             now[(before * now).sum(axis=-1) < 0] *= -1
@@ -143,6 +149,7 @@ class Scene:
             ),
             "jumps": _levels(arrows.reshape(frames, -1)),
             "largest_jump": _norm(arrows),
+            "reach": (centers[:, 1:], arrows[:, 1:]),
             "forces": None if track.forces is None else _levels(track.forces),
             "curves": [values.astype(np.float32) for _, _, values in track.curves],
         }

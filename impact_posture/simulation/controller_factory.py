@@ -81,6 +81,19 @@ _OFFLINE = ("posture", "posture-sticking", "path")
 GROUP = "impact_posture.controllers"
 
 
+def check_gain(name: str, gain: float | None) -> None:
+    """Refuse a gain for a controller of this package that has none.
+
+    Raises:
+        InputError: The controller has no gain.
+    """
+    has = name.startswith(("robust", "walker", "stiff")) and not name.startswith("robust-flow")
+    if gain is not None and name in CONTROLLERS and not (has or name.endswith(_STIFF)):
+        raise InputError(
+            f"'{name}' has no gain", where="gain", hint="robust, its variants, walker and stiff have one"
+        )
+
+
 @dataclass(eq=False)
 class ControllerFactory:
     """A scenario and the parts of its controllers.  Each part is made at its first use.

@@ -118,7 +118,7 @@ function stage(renderer) {
   const controls = new OrbitControls(camera, canvas);
   controls.listenToKeyEvents(canvas); controls.addEventListener('change', () => show());
   const look = (direction) => {
-    const far = 0.52 * data.size / Math.tan(Math.PI * camera.fov / 360) / Math.min(1, camera.aspect);
+    const far = 1.04 * data.radius / Math.tan(Math.PI * camera.fov / 360) / Math.min(1, camera.aspect);
     controls.target.set(...data.center);
     camera.position.copy(controls.target).addScaledVector(new Vector3(...direction).normalize(), far);
     controls.update();
