@@ -32,8 +32,8 @@ def slowed(space: PathSpace, curve: PathCurve, limits: ActuatorLimits) -> TimedC
     for k, place in enumerate(s):
         q, v, a = curve.posture(place), curve.velocity(place), curve.acceleration(place)
         rest = limits.load(q, zero, zero)
-        along = limits.load(q, zero, v) - rest
-        rates = [limits.largest_rate(q, rest, d) for d in (limits.load(q, v, a) - rest, along, -along)]
+        push = limits.load(q, zero, v) - rest
+        rates = [limits.largest_rate(q, rest, d) for d in (limits.load(q, v, a) - rest, push, -push)]
         if not all(rates):
             return None
         bend, *drive = (_SHARE / 2 * rate for rate in rates if rate is not None)
@@ -56,9 +56,10 @@ def slowed(space: PathSpace, curve: PathCurve, limits: ActuatorLimits) -> TimedC
     dds = (np.diff(x) / (2 * np.diff(s)))[part]
     ds = rate[part] + dds * (t - ends[part])
     at = np.minimum(s[part] + (rate[part] + ds) / 2 * (t - ends[part]), 1.0)
-    v = [curve.velocity(float(place)) for place in at]
-    a = [curve.acceleration(float(p)) * d**2 + u * dd for p, u, d, dd in zip(at, v, ds, dds, strict=True)]
-    return TimedCurve(t, curve.spline(at), np.array(v) * ds[:, None], np.array(a), "slowed")
+    along = np.array([curve.velocity(float(place)) for place in at])
+    bent = np.array([curve.acceleration(float(place)) for place in at])
+    v, a = along * ds[:, None], bent * ds[:, None] ** 2 + along * dds[:, None]
+    return TimedCurve(t, curve.spline(at), v, a, "slowed")
 
 
 def _places(curve: PathCurve) -> Array:
