@@ -31,7 +31,8 @@ def _names() -> set[str]:
 
     from impact_posture.settings import ProblemSettings
 
-    return {f.name for f in fields(ProblemSettings)} - {"robot", "schema", "q", "support_compliance"} | _OTHERS
+    keys = {"robot", "schema", "q", "support_compliance", "obstacles"}
+    return {f.name for f in fields(ProblemSettings)} - keys | _OTHERS
 
 
 def as_options(text: str) -> str:
