@@ -94,7 +94,8 @@ def test_resolved_settings_are_the_same_problem(more: dict[str, object], tmp_pat
     frame = {} if "contact" in more else {"frame": "tool0" if name == "ur5" else "ee", "normal": (0.3, 0.0, 2.0)}
     first = prepare(validate(ProblemSettings, {"robot": name, **frame, **more}, "test"))
     path = tmp_path / "problem.toml"
-    path.write_text(dump_settings(resolved_settings(first)), encoding="utf-8")
+    # Some editors put a byte-order mark first.
+    path.write_text(dump_settings(resolved_settings(first)), encoding="utf-8-sig" if more else "utf-8")
     again = prepare(read_settings(path))
     assert again.impact.to_dict() == first.impact.to_dict()
     assert again.problem.requirements == replace(first.problem.requirements, com_asked=True)

@@ -214,6 +214,7 @@ def test_reproduce(tmp_path: Path) -> None:
         (("simulate", "aerial-vertcal"), 1, "did you mean aerial-vertical"),
         (("simulate", "solo8-push", "--controller", "robst"), 1, "did you mean robust"),
         (("simulate", "solo8-push", "--controller", "nominal", "--mode", "held"), 1, "has no term to hold"),
+        (("simulate", "solo8-push", "--controller", "robust-flow", "--gain", "5"), 1, "'robust-flow' has no gain"),
         (("simulate", "aerial-lateral", "--sign", "-1"), 1, "leave --sign out"),
         (("simulate", "solo8-push", "--gain", "-1"), 2, "above zero"),
         (("compare", "solo8-push", "--controllers", "nominal,robust:hold"), 1, "no variant 'hold'"),
