@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import ctypes
 import re
 from pathlib import Path
 from typing import get_args
@@ -261,10 +262,47 @@ def test_a_moving_reference_leads_the_posture() -> None:
     assert posture is not None
     goal = np.asarray(pin.integrate(robot.model, q, np.full(robot.nv, 0.02)))
     posture._target[:], posture.target_velocity, posture.target_acceleration = goal, 0.3, -2.0
-    theirs.lead_posture(goal, 0.3, -2.0)
+    rate = np.ones(robot.nv)
+    theirs.lead_posture(goal, 0.3 * rate, -2.0 * rate)
     a, b = ours.tick(0.0, q, v), theirs.tick(0.0, q, v)
     assert difference(a, b) < 1e-9
     assert difference(a, theirs.reset(q, v)) > 1e-3
+
+
+def test_a_reset_forgets_a_led_posture() -> None:
+    _, theirs, q, v = both_at_rest("panda")
+    first = theirs.reset(q, v)
+    theirs.lead_posture(q, v + 0.5, v + 2.0)
+    # As a program in C resets it, without ip_init.
+    theirs._call("reset", *theirs._pointers[:2], ctypes.byref(theirs._command))
+    np.testing.assert_allclose(theirs._commanded().u, first.u, rtol=0, atol=1e-9)
+
+
+def test_shapes_are_those_of_the_robot() -> None:
+    _, theirs, q, v = both_at_rest("panda")
+    theirs.tick(0.0, q, v)
+    pose = next(iter(theirs.targets))
+    moves = [
+        lambda: theirs.tick(0.1, q, 0.1), lambda: theirs.tick(0.1, q, v[:1]), lambda: theirs.tick(0.1, q[None], v),
+        lambda: theirs.reset(0.3, v), lambda: theirs.move_to(0.3), lambda: theirs.lead_posture(q, 0.1, v),
+        lambda: theirs.set_target(pose, 0.5), lambda: theirs.set_target(pose, q[:3]),
+    ]  # fmt: skip
+    for move in moves:
+        with pytest.raises(ValueError):
+            move()
+    theirs.move_to(q + 0.1)
+    assert np.array_equal(theirs.measured[0], q)
+
+
+def test_a_rate_beyond_all_measurements_damps_nothing() -> None:
+    ours, theirs, q, v = both_at_rest("panda")
+    for controller in (ours, theirs):
+        good = controller.tick(0.0, q, v)
+        for rate in (2e8, -np.inf, np.nan):
+            glitch = v.copy()
+            glitch[0] = rate
+            held = controller.tick(0.01, q, glitch)
+            assert held.status is Status.NON_FINITE and np.array_equal(held.u, good.u)
 
 
 def test_the_library_is_used_by_many_at_once() -> None:

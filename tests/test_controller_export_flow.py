@@ -151,6 +151,32 @@ def test_a_flow_that_moves_ends_a_fade_of_the_posture() -> None:
     assert 1e-4 < np.abs(theirs.target - r.posture()).max() < 0.1
 
 
+def test_a_flow_that_stops_moves_on_from_elsewhere_and_is_reset_as_in_python() -> None:
+    r = robot("solo8")
+    ours, posture, theirs = both("solo8")
+    at_rest, other = np.zeros(r.nv), np.array(r.posture())
+    other[8] += 0.3
+    firsts = []
+    for _ in range(2):
+        first = [controller.reset(r.posture(), at_rest).u for controller in (ours, theirs)]
+        np.testing.assert_allclose(first[1], first[0], rtol=0, atol=1e-7)
+        firsts.append(first[1])
+        for k in range(500):
+            for target in (posture, theirs):
+                if k in (0, 250, 450):
+                    target.brace()
+                elif k == 60:
+                    target.contact()
+                elif k == 200:
+                    target.move_to(other, 0.2)
+            answers = [controller.tick(k * DT, r.posture(), at_rest) for controller in (ours, theirs)]
+            np.testing.assert_allclose(answers[1].u, answers[0].u, rtol=0, atol=1e-6)
+            if not 200 <= k < 250:
+                # In a fade, Python has its end and C its beginning.
+                np.testing.assert_allclose(theirs.target, posture.target, rtol=0, atol=1e-9)
+    np.testing.assert_allclose(firsts[1], firsts[0], rtol=0, atol=1e-9)
+
+
 def test_a_clock_that_stands_still_moves_nothing() -> None:
     r = robot("panda")
     ours, posture, theirs = both("panda", ELBOW)

@@ -60,8 +60,9 @@ def test_a_row_is_kept_where_its_limit_is(seed: int, name: str) -> None:
     made = robot(name)
     first, acceleration = (6 if made.floating else 0), 300 * rng(seed).normal(size=made.nv)
     A, lower, upper = limits.rows(state)
-    jump, impulse = (part @ (state.v + 1e-3 * acceleration) for part in limits.jump(state))
-    rates, torques = (state.v + jump)[first:], impulse[first:] / 4e-3
+    before = state.v + 1e-3 * acceleration
+    jump, impulse = (part @ before for part in limits.jump(state))
+    rates, torques = (before + jump)[first:], impulse[first:] / 4e-3
     speed, effort = made.model.velocityLimit[first:], made.model.effortLimit[first:]
     allowed = np.concatenate([np.where(speed > 0, speed, np.inf), np.where(effort > 0, effort, np.inf)])
     room = allowed - np.abs(np.concatenate([rates, torques]))

@@ -370,6 +370,93 @@ def test_contact_and_release_stop_it_and_a_reset_forgets_all() -> None:
     np.testing.assert_array_equal(torques(20), still)
 
 
+def test_a_flow_that_stops_leaves_no_acceleration() -> None:
+    r = robot("panda")
+    posture = ReferenceFlowPosture(r, well(r, goal_of(r, "stop", 0.6)))
+    controller = Controller(r, TaskFormulation(posture=posture))
+    q, v = r.posture(), np.zeros(r.nv)
+    controller.reset(q, v)
+    for k in range(2500):
+        if k in (20, 320):
+            (posture.brace if k == 20 else posture.contact)()
+        command = controller.tick(k * DT, q, v)
+        q, v = integrate(r, q, v, command)
+    assert 0.01 < np.abs(pin.difference(r.model, r.posture(), q)).max()
+    np.testing.assert_allclose(pin.difference(r.model, q, posture.target), 0.0, atol=1e-5)
+
+
+@pytest.mark.parametrize("name", ["solo8", "talos"])
+def test_a_reset_gives_led_tasks_their_present_output(name: str) -> None:
+    r = robot(name)
+    posture = ReferenceFlowPosture(r, well(r, goal_of(r, "reset", 0.6)))
+    formulation = formulation_for(r, posture)
+    controller = Controller(r, formulation)
+    q, v = r.posture(), np.zeros(r.nv)
+    first = controller.reset(q, v)
+    posture.brace()
+    for k in range(300):
+        q, v = integrate(r, q, v, controller.tick(k * DT, q, v))
+    assert all(np.abs(task.target_velocity).max() > 1e-3 for task in posture.flow.led)
+    np.testing.assert_allclose(controller.reset(r.posture(), np.zeros(r.nv)).u, first.u, rtol=0, atol=1e-9)
+
+
+def test_the_way_back_to_tasks_keeps_speed_and_acceleration() -> None:
+    """The end effector is led away before the flow goes."""
+    r = robot("panda")
+    flow = flow_of(r, well(r, goal_of(r, "back", 0.3)))
+    task = flow._tasks[0]
+    task.target = pin.SE3(task.target.rotation, task.target.translation + np.array([0.0, 0.0, -0.2]))  # type: ignore[attr-defined]
+    flow.on, before = True, flow.velocity.copy()
+    for _ in range(round(3.0 / DT)):
+        flow.advance(DT, flow.q)
+        # The flow itself has limits of the same size.
+        assert np.abs(flow.velocity).max() < 1.5 * flow.options.speed
+        assert np.abs(flow.velocity - before).max() < 2.1 * flow.options.acceleration * DT
+        before = flow.velocity.copy()
+    assert np.abs(flow.error).max() < 1e-4
+
+
+def test_a_flow_goes_on_from_where_the_posture_was_moved() -> None:
+    r = robot("panda")
+    posture = ReferenceFlowPosture(r, well(r, goal_of(r, "moved", 0.3)))
+    controller = Controller(r, TaskFormulation(posture=posture))
+    q, v, last, steps = r.posture(), np.zeros(r.nv), np.zeros(r.nv), []
+    other = np.array(q)
+    other[0] += 0.6
+    controller.reset(q, v)
+    posture.move_to(other)
+    for k in range(4000):
+        if k in (200, 3000):
+            # Once in the middle of the fade, and once at its end.
+            posture.brace()
+        if k == 400:
+            posture.contact()
+        if k == 1000:
+            posture.move_to(other)
+        command = controller.tick(k * DT, q, v)
+        steps.append(float(np.abs(command.acceleration - last).max()))
+        last = command.acceleration
+        if k == 2999:
+            np.testing.assert_allclose(q, other, atol=0.02)
+        q, v = integrate(r, q, v, command)
+    # The flow itself begins a few ticks later.
+    assert max(steps[200], steps[3000]) < 0.1
+
+
+def test_a_reset_forgets_a_reference_that_was_led() -> None:
+    r = robot("panda")
+    posture = JointPosture(r)
+    controller = Controller(r, TaskFormulation(posture=posture))
+    q, v = r.posture(), np.zeros(r.nv)
+    first = controller.reset(q, v)
+    posture.lead(q, 0.5 + v, 2.0 + v)
+    assert np.abs(controller.tick(0.0, q, v).acceleration).max() > 1.0
+    np.testing.assert_allclose(controller.reset(q, v).acceleration, first.acceleration, rtol=0, atol=1e-9)
+    posture.lead(q, 0.5 + v, 2.0 + v)
+    posture.move_to(q)
+    np.testing.assert_allclose(controller.tick(0.0, q, v).acceleration, first.acceleration, rtol=0, atol=1e-9)
+
+
 def test_a_gradient_that_fails_stops_the_flow_until_it_is_back() -> None:
     fails = [False]
 

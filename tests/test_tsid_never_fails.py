@@ -116,7 +116,7 @@ def test_measurements_that_are_none_are_held_and_forgotten(name: str, kind: str)
             held = controller.tick((k + 0.5) * DT, bad_q, bad_v, bad_force)
             assert held.status is Status.NON_FINITE and np.array_equal(posture.term, term)
             rotors = controller.actuators.rotors
-            known = np.where(np.isfinite(bad_v), bad_v, 0.0)[controller.actuators.base :]
+            known = np.where(np.abs(bad_v) < 1e8, bad_v, 0.0)[controller.actuators.base :]
             damped = good.u.copy()
             damped[rotors:] -= 10.0 * np.diag(controller.state.M)[controller.actuators.base :] * known
             expected = np.clip(damped, controller.actuators.lower, controller.actuators.upper)

@@ -64,7 +64,7 @@ class CompiledController:
         self._level = np.frombuffer(memory, dtype=float, count=1, offset=8 * TARGET * max(1, tasks))
         self.targets = {task.name: row for task, row in zip(manifest.tasks, targets, strict=True)}
         self._q, self._v, self._force = np.zeros(manifest.nq), np.zeros(manifest.nv), np.zeros(6)
-        self._pointers = [x.ctypes.data_as(ctypes.POINTER(ctypes.c_double)) for x in (self._q, self._v, self._force)]
+        self._pointers = [_pointer(x) for x in (self._q, self._v, self._force)]
         names = (*_FUNCTIONS, *(["brace_before"] if sizes.get("FLOW") else []))
         self._functions = {name: getattr(library, f"{prefix}_{name}") for name in names}
         getattr(library, f"{prefix}_default_params")(ctypes.byref(self._given))
@@ -105,9 +105,11 @@ class CompiledController:
         Raises:
             InputError: A parameter is out of range; names it.
             PostureError: ``q`` is no configuration of the robot, or ``v`` is no velocity.
+            ValueError: An array has another shape.
             MetricError: The gradient that the posture task follows does not exist there, or vanishes.
             ContactError: A sole stands on its edge.
         """
+        self._measure(q, v)
         targets = {name: row.copy() for name, row in self.targets.items()}
         self._ready = False
         refused = self._call("init", ctypes.byref(self._given))
@@ -119,7 +121,6 @@ class CompiledController:
             raise InputError(f"is out of range ({values})", where=f"parameter {name}", hint="see the header")
         for name, row in targets.items():
             self.targets[name][:] = row
-        self._q[:], self._v[:] = q, v
         code = self._call("reset", *self._pointers[:2], ctypes.byref(self._command))
         if code == 1:
             raise PostureError("no state of the robot", where="reset", hint="give finite numbers, unit quaternions")
@@ -139,7 +140,7 @@ class CompiledController:
         """
         if not self._ready:
             raise InputError("has not been reset", where="controller", hint="call reset(q, v) first")
-        self._q[:], self._v[:] = q, v
+        self._measure(q, v)
         q_at, v_at, force_at = self._pointers
         if force is not None:
             given = np.asarray(force, dtype=float)
@@ -150,6 +151,10 @@ class CompiledController:
         pushed = None if force is None else force_at
         self._call("tick", ctypes.c_double(t), q_at, v_at, pushed, ctypes.byref(self._command))
         return self._commanded()
+
+    def _measure(self, q: ArrayLike, v: ArrayLike) -> None:
+        q, v = _shaped(q, self._q.shape, "q"), _shaped(v, self._v.shape, "v")
+        self._q[:], self._v[:] = q, v
 
     @property
     def measured(self) -> tuple[Array, Array]:
@@ -180,14 +185,19 @@ class CompiledController:
 
         Raises:
             InputError: There is no such task.
+            ValueError: The target of a pose is no ``pin.SE3``, or that of another task has neither shape (3,) nor,
+                for an orientation, (3, 3).
         """
         row = self._target(task)
+        rows = next(t.rows for t in self._checked.tasks if t.name == task)
         if isinstance(target, pin.SE3):
             row[1:4], row[4:13] = target.translation, target.rotation.ravel()
         else:
             given = np.asarray(target, dtype=float)
+            if rows > 3 or given.shape not in ((3,), (3, 3)):
+                wanted = "a pin.SE3" if rows > 3 else "of shape (3,) or (3, 3)"
+                raise ValueError(f"the target of '{task}' is {wanted}")
             row[slice(1, 4) if given.size == 3 else slice(4, 13)] = given.ravel()
-        rows = next(t.rows for t in self._checked.tasks if t.name == task)
         row[0], row[13 : 13 + rows], row[19 : 19 + rows] = 1.0, velocity, acceleration
 
     def forget_target(self, task: str) -> None:
@@ -209,9 +219,10 @@ class CompiledController:
 
         Raises:
             InputError: The posture or the time is invalid, or ``reset`` has not been called.
+            ValueError: The posture has another shape.
         """
-        self._q[:] = q
-        if self._call("move_to", self._pointers[0], ctypes.c_double(over)):
+        q = _shaped(q, self._q.shape, "q")
+        if self._call("move_to", _pointer(q), ctypes.c_double(over)):
             raise InputError("is no posture or no time", where="move_to", hint="give finite numbers, seconds above 0")
 
     def lead_posture(self, q: ArrayLike, v: ArrayLike, a: ArrayLike) -> None:
@@ -219,11 +230,11 @@ class CompiledController:
 
         Raises:
             InputError: A number is invalid, or ``reset`` has not been called.
+            ValueError: An array has another shape.
         """
-        self._q[:], self._v[:] = q, v
-        acceleration = np.ascontiguousarray(a, dtype=float) + np.zeros(self._v.size)
-        pointer = acceleration.ctypes.data_as(ctypes.POINTER(ctypes.c_double))
-        if self._call("lead_posture", *self._pointers[:2], pointer):
+        n, nv = self._q.shape, self._v.shape
+        given = [_shaped(q, n, "q"), _shaped(v, nv, "v"), _shaped(a, nv, "a")]
+        if self._call("lead_posture", *map(_pointer, given)):
             raise InputError("is no reference", where="lead_posture", hint="give a posture and finite numbers")
 
     @property
@@ -283,6 +294,17 @@ class CompiledController:
         status = STATUSES[self._command.status]
         speeds, forces = out["rotor_speed"][:rotors].copy(), out["forces"][: sizes["FORCES"]].copy()
         return Command(u, u[rotors:], speeds, status, out["acceleration"].copy(), forces)
+
+
+def _shaped(given: ArrayLike, shape: tuple[int, ...], name: str) -> Array:
+    found = np.ascontiguousarray(given, dtype=float)
+    if found.shape != shape or np.ndim(given) == 0:
+        raise ValueError(f"{name} has shape {np.shape(given)}, not {shape}")
+    return found
+
+
+def _pointer(array: Array) -> Any:
+    return array.ctypes.data_as(ctypes.POINTER(ctypes.c_double))
 
 
 def _structure(arrays: list[tuple[str, int]], integers: list[str]) -> tuple[Any, dict[str, Array]]:

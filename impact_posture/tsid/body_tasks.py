@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import math
-from collections.abc import Iterable
+from collections.abc import Sequence
 
 import numpy as np
 import pinocchio as pin
@@ -119,18 +119,27 @@ class BodyTaskLead:
 
     def __init__(self, model: pin.Model) -> None:
         self._model, self._data = model, model.createData()
+        self._led: tuple[BaseOrientation | CenterOfMass, ...] = ()
         # Pinocchio writes here; asking it again takes longer than its computation.
         data = self._data
         self._com, self._rotation = (data.com[0], data.vcom[0], data.acom[0]), data.oMi[1].rotation
 
-    def lead(self, tasks: Iterable[BaseOrientation | CenterOfMass], q: Array, v: Array, a: Array) -> None:
+    def lead(self, tasks: Sequence[BaseOrientation | CenterOfMass], q: Array, v: Array, a: Array) -> None:
         """Set the targets at ``q``, ``ν`` and ``ν̇``."""
+        self._led = tuple(tasks)
         pin.centerOfMass(self._model, self._data, q, v, a, False)
         position, velocity, acceleration = self._com
-        for task in tasks:
+        for task in self._led:
             if isinstance(task, CenterOfMass):
                 task.target = position.copy()
                 task.target_velocity, task.target_acceleration = velocity, acceleration
             else:
                 task.target = self._rotation.copy()
                 task.target_velocity, task.target_acceleration = v[3:6], a[3:6]
+
+    def reset(self, state: State) -> None:
+        """Let the tasks that were led take their present output as target, at rest."""
+        for task in self._led:
+            task.target, task.target_velocity, task.target_acceleration = None, 0.0, 0.0
+            task.reset(state)
+        self._led = ()

@@ -281,12 +281,12 @@ class Controller:
         return False
 
     def _held(self, status: Status, v: Array) -> Command:
-        """Return the previous command, with damping of the joints whose rates are finite."""
+        """Return the previous command, with damping of the joints whose rates can be measured."""
         rotors, actuators = self.actuators.rotors, self.actuators
         self._status, self._outcome = status, Outcome(None)
         u = self._u.copy()
         rates = v[actuators.base :]
-        u[rotors:] -= self._damping * np.where(np.isfinite(rates), rates, 0.0)
+        u[rotors:] -= self._damping * np.where(np.abs(rates) < math.sqrt(_ABSURD), rates, 0.0)
         np.clip(u, actuators.lower, actuators.upper, out=u)
         return self._command(u, status, np.zeros(self.robot.nv), np.zeros(self.assembly.contacts.size))
 

@@ -35,7 +35,7 @@ class ImpactLimits:
     :func:`supported_inverse`, the contact gets the impulse ``λ = −(1 + e) (J M_c⁻¹Jᵀ)⁻¹ n nᵀJ ν⁻``, and the robot
     jumps by ``Δν = M_c⁻¹Jᵀ λ``.  Both are linear in ``ν̇``.  For each joint, the limits are
 
-    - ``|q̇ + Δq̇| ≤ q̇_max``, the rate after the impact;
+    - ``|q̇⁻ + Δq̇| ≤ q̇_max``, the rate after the impact;
     - ``|Jᵀλ|/δt ≤ τ_max``, the mean torque while the impact lasts ``δt``.
 
     A tick can obey them only by a slower approach.  A joint without a stated limit has none here.
@@ -88,9 +88,8 @@ class ImpactLimits:
         nothing = np.full(self.size, np.inf)
         if not self.active:
             return np.zeros((self.size, state.nv)), -nothing, nothing
-        rates, torques = (part[self._first :] for part in self.jump(state))
-        A = np.vstack([rates, torques / self.duration])
+        jumps, impulses = self.jump(state)
+        A = np.vstack([(np.eye(state.nv) + jumps)[self._first :], impulses[self._first :] / self.duration])
         now = A @ state.v
-        now[: self._rate.size] += state.v[self._first :]
         most = np.concatenate([self._rate, self._torque])
         return self._period * A, -most - now, most - now

@@ -91,9 +91,8 @@ class JointPosture(Task):
         return 0.0
 
     def reset(self, state: State) -> None:
-        """Take the target of the constructor, or the present posture if there is none."""
-        self._target[:] = state.q if self._given is None else self._given
-        self._blend = 1.0
+        """Take the target of the constructor, or the present posture if there is none, at rest."""
+        self.lead(state.q if self._given is None else self._given, 0.0, 0.0)
 
     @checked
     def move_to(self, target: ArrayLike, over: float = 0.5) -> None:
@@ -109,8 +108,11 @@ class JointPosture(Task):
             raise InputError("the time is not positive", where=self.name, hint="give seconds above zero")
         self._fade_to(self._robot.check_posture(np.asarray(target), limits=False), over)
 
-    def lead(self, q: Array, v: Array, a: Array) -> None:
-        """Set ``q_des`` with its velocity and acceleration in the tangent space, for this tick, without checks."""
+    def lead(self, q: Array, v: Array | float, a: Array | float) -> None:
+        """Set ``q_des`` with its velocity and acceleration in the tangent space, without checks.
+
+        They stay until the next call, :meth:`move_to` or ``reset``.
+        """
         self._target[:], self._blend = q, 1.0
         self._velocity[:], self._acceleration[:] = v, a
 
@@ -152,6 +154,11 @@ class JointPosture(Task):
 
     def _fade_to(self, target: Array, over: float) -> None:
         """Fade to a valid configuration without checks, because a tick must not raise."""
-        if self._blend < 1:
-            self._target[:] = pin.interpolate(self._model, self._target, self._next, smooth(self._blend))
+        self.lead(self._reached(), 0.0, 0.0)
         self._next[:], self._blend, self._over = target, 0.0, over
+
+    def _reached(self) -> Array:
+        """Return where a fade is, or ``q_des``, shape (nq,)."""
+        if self._blend < 1:
+            return np.asarray(pin.interpolate(self._model, self._target, self._next, smooth(self._blend)))
+        return self._target

@@ -36,6 +36,8 @@ _RETURN = 0.1
 _REACHED = 0.02
 # Speed below which a flow that is off stands still, rad/s (m/s).
 _STILL = 1e-5
+# Least divisor.
+_TINY = 1e-300
 # Length of a velocity below which the flow has no way to stop on.
 _SLOW = 1e-3
 
@@ -109,14 +111,13 @@ class ReferenceFlow:
             MetricError: The gradient does not exist there, or ``H`` vanishes.
         """
         state = self._state
-        self.q[:], self.velocity[:], self.acceleration[:] = q, 0.0, 0.0
         self._first, self._here = self.q.copy(), self.q.copy()
-        self._wanted, self._slope = np.zeros((2, self.velocity.size))
+        self._wanted, self._slope, self._returning = np.zeros((3, self.velocity.size))
         self._before = np.zeros_like(self._J)
         self.shares = np.zeros(self._static.limited.size)
-        self._phase, self._visited, self._elapsed, self._clock = 0, 0, 0.0, 0.0
+        self._visited, self._clock = 0, 0.0
         self.rest_at(np.inf)
-        self.on, self.resting, self.failed = False, False, False
+        self.on, self.failed = False, False
         self._ahead = False
         state.update(q, self.velocity)
         kinds = {3: FramePosition, 6: FramePose}
@@ -129,6 +130,7 @@ class ReferenceFlow:
         self._zmp = ZeroMomentPoint(self._edges, self._offsets, state, self._contacts)
         self.direction = FlowDirection(self.robot, self._edges, self._static.limited.size, self.options)
         self._governor = FlowGovernor(self.direction, self.options)
+        self._place_at(q)
         self.start = 1.0
         self.value, _ = self._evaluate(self.q)
         if not (np.isfinite(self.value) and self.value != 0):
@@ -149,6 +151,13 @@ class ReferenceFlow:
         PHASES[phase](self)
         self.velocity += dt * self.acceleration
         self.q[:] = pin.integrate(self._model, self.q, dt * self.velocity)
+        if not self.on and np.abs(self.velocity).max() <= _STILL:
+            self.velocity[:] = self.acceleration[:] = 0.0
+
+    def start_at(self, q: Array) -> None:
+        """Go on from another posture, at rest, with what was learnt."""
+        if not np.array_equal(q, self.q):
+            self._place_at(q)
 
     def rest_at(self, after: float) -> None:
         """Come to rest within ``after`` seconds from now, as far as the acceleration permits, and stay.
@@ -160,7 +169,7 @@ class ReferenceFlow:
     @property
     def moves(self) -> bool:
         """Whether :meth:`advance` has anything to do."""
-        return self.on or bool(np.abs(self.velocity).max() > _STILL)
+        return self.on or bool(self.velocity.any())
 
     # ---- the parts of an update, one a tick -----------------------------------------------------------------------
 
@@ -257,14 +266,11 @@ class ReferenceFlow:
         fastest = min(fastest, 0.4 * options.acceleration * max(self._remains, 0.0))
         if not self.on:
             fastest = 0.0
-        rate = self.error / _RETURN
-        for task, rows in zip(self._held, self._places, strict=True):
-            rate[rows] += task.target_velocity
         governor = self._governor
         governor.flow = self._space.project(governor.flow)
         descends = fastest > 0 and self._visited == len(self._path)
         slope = self._slope if descends else None
-        known = (governor.flow + self._space.back(rate, self._base) - self.velocity) / period
+        known = (governor.flow + self._back(period) - self.velocity) / period
         self._zmp.limit(self._state, known)
         change, brakes = governor.change(self._space, self._wanted, fastest, period, slope, self._zmp)
         # To stop within the limits counts more than to leave the actuators much.
@@ -272,8 +278,29 @@ class ReferenceFlow:
         part = self._static.permitted(self._state.M, known, change / period, self.shares, most)
         self.acceleration[:] = known + governor.take(change, part) / period
 
+    def _back(self, period: float) -> Array:
+        """Return the velocity back to contacts and tasks, within speed and acceleration, and along with tasks."""
+        options, space, rate = self.options, self._space, np.zeros(self.error.size)
+        way = space.back(self.error, self._base)
+        size = max(float(np.abs(way).max(initial=0.0)), _TINY)
+        # Two fifths of the acceleration stop a speed of sqrt(4/5 a d) on the way d.
+        pace = min(1.0 / _RETURN, math.sqrt(0.8 * options.acceleration / size), options.speed / size)
+        change = pace * way - self._returning
+        change *= min(options.acceleration * period / max(float(np.abs(change).max(initial=0.0)), _TINY), 1.0)
+        self._returning += change
+        for task, rows in zip(self._held, self._places, strict=True):
+            rate[rows] = task.target_velocity
+        return self._returning + space.back(rate, self._base) if rate.any() else self._returning
+
     def _coast(self) -> None:
         """Do nothing, because the controller in C spreads the parts over these ticks, so that none takes long."""
+
+    def _place_at(self, q: Array) -> None:
+        """Put ``q_r`` at rest at a posture, where the next update begins."""
+        self.q[:], self._first[:], self._here[:] = q, q, q
+        for moving in self.velocity, self.acceleration, self._governor.flow, self._returning:
+            moving[:] = 0.0
+        self._phase, self._elapsed, self.resting = 0, 0.0, False
 
     def _place(self, q: Array) -> None:
         """Evaluate the Jacobian of the constraints at a posture."""

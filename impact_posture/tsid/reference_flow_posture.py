@@ -28,7 +28,8 @@ class ReferenceFlowPosture(JointPosture):
 
     There is no gain for ``∇H``.  :class:`~impact_posture.tsid.reference_flow.ReferenceFlow` has a speed, an
     acceleration and a rule when to rest, which are the same for every robot.  Center of mass and base orientation of
-    a standing robot follow ``q_r`` too.
+    a standing robot follow ``q_r`` too.  A flow that rests may be taken elsewhere by :meth:`move_to`; the next
+    :meth:`brace` goes on from there.
 
     Attributes:
         settle: Time at rest before a known impact, s: four time constants ``1/√K_p``.
@@ -92,6 +93,8 @@ class ReferenceFlowPosture(JointPosture):
         """
         if t_impact is not None and not math.isfinite(t_impact):
             raise InputError("the time is not finite", where=f"{self.name}: t_impact", hint="give seconds from now")
+        if not self.flow.moves:
+            self.flow.start_at(self._reached())
         self.flow.on = True
         self.flow.rest_at(np.inf if t_impact is None else t_impact - self.settle)
 
@@ -108,6 +111,11 @@ class ReferenceFlowPosture(JointPosture):
         """Whether the flow may move: 0 or 1."""
         return 0.0 if self._flow is None else float(self._flow.on)
 
+    def reset(self, state: State) -> None:
+        """Take the present posture as target, and the present output as that of the tasks that the flow has led."""
+        super().reset(state)
+        self._lead.reset(state)
+
     def begin(self, state: State, formulation: TaskFormulation, actuators: Actuators) -> None:
         """Start the flow at a state; the controller calls this at ``reset``.
 
@@ -117,7 +125,6 @@ class ReferenceFlowPosture(JointPosture):
         flow = ReferenceFlow(self._robot, self._function, formulation, actuators, self.options, self._path)
         flow.reset(state.q)
         self._flow, self.value = flow, flow.value
-        self._velocity[:] = self._acceleration[:] = 0.0
 
     def advance(self, state: State, dt: float) -> None:
         """Advance the flow, and move the targets of the posture and of the tasks that it leads."""

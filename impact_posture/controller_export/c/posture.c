@@ -1,12 +1,21 @@
 /* The posture task: fades of q_des, and the impact-robust term with its phases. */
 
-static void ip_fade_to(ip_context *c, const double *q, double over)
+/* Take q_des where a fade is, at rest. */
+static void ip_stop_fade(ip_context *c)
 {
   double way[IP_NV];
   if (c->blend < 1.0) {
     ip_difference(c->posture, c->next, way);
     ip_integrate(c->posture, way, ip_smooth(c->blend), c->posture);
+    c->blend = 1.0;
   }
+  memset(c->posture_velocity, 0, sizeof c->posture_velocity);
+  memset(c->posture_acceleration, 0, sizeof c->posture_acceleration);
+}
+
+static void ip_fade_to(ip_context *c, const double *q, double over)
+{
+  ip_stop_fade(c);
   memcpy(c->next, q, sizeof c->next);
   c->blend = 0.0;
   c->over = over;
@@ -15,6 +24,8 @@ static void ip_fade_to(ip_context *c, const double *q, double over)
 #if IP_FLOW
 static double ip_flow_settle(const ip_params *p);
 static void ip_flow_lead(ip_context *c, double dt);
+static int ip_flow_moves(const ip_flow *f);
+static void ip_flow_start_at(ip_flow *f, const double *q);
 #endif
 
 #if IP_ROBUST
@@ -139,6 +150,7 @@ static void ip_reset_posture(ip_context *c)
   memcpy(c->posture, c->p.posture_given[0] > 0.0 ? c->p.posture_target : c->q, sizeof c->posture);
 #endif
   c->blend = 1.0;
+  ip_stop_fade(c);
   c->x = c->level = c->goal = 0.0;
   c->phase = IP_FREE;
   c->waiting = 0;
@@ -243,6 +255,12 @@ static int ip_announce(ip_context *c, int phase, double t)
 static void ip_enter(ip_context *c)
 {
 #if IP_FLOW
+  if (c->entering[0] == IP_BRACE && !ip_flow_moves(&c->flow)) {
+    ip_stop_fade(c);
+    if (memcmp(c->posture, c->flow.q, sizeof c->posture)) {
+      ip_flow_start_at(&c->flow, c->posture);
+    }
+  }
   c->flow.on = c->entering[0] == IP_BRACE;
   c->level = c->flow.on;
   if (c->flow.on) {

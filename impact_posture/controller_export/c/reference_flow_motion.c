@@ -23,25 +23,18 @@ static void ip_shorten(double *x, double most)
   }
 }
 
-/* The velocity that brings q_r back to contacts and tasks; of all such motions that of the base and not of the joints, by
+/* The motion that changes the constraints at a rate; of all such motions that of the base and not of the joints, by
  * ip_flow_still. */
-static void ip_flow_back(ip_context *c, double *back)
+static void ip_flow_moving(const ip_flow *f, const double *rate, double *back)
 {
-  ip_flow *f = &c->flow;
-  double rate[IP_LARGEST];
-  int i, k, row;
-  ip_scaled(f->error, 1.0 / IP_RETURN, rate, IP_HELD);
-  for (k = 0, row = IP_FORCES; k < IP_TASKS; ++k) {
-    for (i = 0; !ip_flow_led[k] && i < ip_task_row[k + 1] - ip_task_row[k]; ++i) {
-      rate[row++] += c->target[k].velocity[i];
-    }
-  }
+  int i;
   for (i = 0; i < IP_NV; ++i) {
     back[i] = ip_dot(f->inverse + i * IP_HELD, rate, IP_HELD);
   }
 #if IP_BASE
   if (f->stills) {
     double x[IP_NV];
+    int k;
     for (k = 0; k < f->left; ++k) {
       x[k] = ip_dot(f->Z[k] + IP_BASE, back + IP_BASE, IP_JOINTS_V);
     }
@@ -51,6 +44,31 @@ static void ip_flow_back(ip_context *c, double *back)
     }
   }
 #endif
+}
+
+/* The velocity back to contacts and tasks, within speed and acceleration, and along with tasks. */
+static void ip_flow_back(ip_context *c, double period, double *back)
+{
+  ip_flow *f = &c->flow;
+  const ip_params *p = &c->p;
+  double rate[IP_LARGEST] = {0}, change[IP_NV], size, pace;
+  int i, k, row;
+  ip_flow_moving(f, f->error, back);
+  size = fmax(ip_largest(back, 0), IP_TINY);
+  /* Two fifths of the acceleration stop a speed of sqrt(4/5 a d) on the way d. */
+  pace = fmin(fmin(1.0 / IP_RETURN, sqrt(0.8 * p->flow_acceleration[0] / size)), p->flow_speed[0] / size);
+  for (i = 0; i < IP_NV; ++i) {
+    change[i] = pace * back[i] - f->returning[i];
+  }
+  ip_shorten(change, p->flow_acceleration[0] * period);
+  ip_add(f->returning, 1.0, change, IP_NV);
+  for (k = 0, row = IP_FORCES; k < IP_TASKS; ++k) {
+    for (i = 0; !ip_flow_led[k] && i < ip_task_row[k + 1] - ip_task_row[k]; ++i) {
+      rate[row++] = c->target[k].velocity[i];
+    }
+  }
+  ip_flow_moving(f, rate, back);
+  ip_add(back, 1.0, f->returning, IP_NV);
 }
 
 /* Time for which the flow goes on if it changes by a step and then brakes, all entries evenly, as hard as it lately could. */
@@ -153,7 +171,7 @@ static void ip_flow_govern(ip_context *c)
   f->remains = fmin(f->deadline - f->clock, p->flow_duration[0] - f->moved) - 2.0 * period;
   fastest = fmin(fastest, 0.4 * p->flow_acceleration[0] * fmax(f->remains, 0.0));
   fastest = f->on ? fastest : 0.0;
-  ip_flow_back(c, back);
+  ip_flow_back(c, period, back);
   ip_flow_project(f, f->flow);
   for (i = 0; i < N; ++i) {
     known[i] = (f->flow[i] + back[i] - f->velocity[i]) / period;
@@ -182,17 +200,33 @@ static double ip_flow_settle(const ip_params *p)
   return slowest > 0.0 && isfinite(slowest) ? 4.0 / sqrt(slowest) : 0.0;
 }
 
+/* Whether the flow moves, or has to stop. */
+static int ip_flow_moves(const ip_flow *f)
+{
+  return f->on || ip_largest(f->velocity, 0) > 0.0;
+}
+
+/* Go on at rest from a posture, where the next update begins. */
+static void ip_flow_start_at(ip_flow *f, const double *q)
+{
+  memcpy(f->q, q, sizeof f->q);
+  memcpy(f->first, q, sizeof f->first);
+  memcpy(f->here, q, sizeof f->here);
+  memset(f->velocity, 0, sizeof f->velocity);
+  memset(f->acceleration, 0, sizeof f->acceleration);
+  memset(f->flow, 0, sizeof f->flow);
+  memset(f->returning, 0, sizeof f->returning);
+  f->elapsed = 0.0;
+  f->phase = f->resting = 0;
+}
+
 /* Begin at rest at the present posture, and measure the curvature there.  Return 0 where there is none. */
 static int ip_flow_begin(ip_context *c)
 {
   ip_flow *f = &c->flow;
   int i, k, row = IP_FORCES;
   memset(f, 0, sizeof *f);
-  memset(c->posture_velocity, 0, sizeof c->posture_velocity);
-  memset(c->posture_acceleration, 0, sizeof c->posture_acceleration);
-  memcpy(f->q, c->q, sizeof f->q);
-  memcpy(f->first, c->q, sizeof f->first);
-  memcpy(f->here, c->q, sizeof f->here);
+  ip_flow_start_at(f, c->q);
   f->deadline = f->remains = INFINITY;
   f->able = 1.0;
   IP_CONSTANTS(c, &f->m);
@@ -240,7 +274,7 @@ static void ip_flow_lead(ip_context *c, double dt)
   ip_flow *f = &c->flow;
   double position[3], J[3 * IP_NV], drift[3];
   int i, k;
-  if (!f->on && !(ip_largest(f->velocity, 0) > IP_STILL)) {
+  if (!ip_flow_moves(f)) {
     return;
   }
   f->clock += dt;
@@ -249,6 +283,10 @@ static void ip_flow_lead(ip_context *c, double dt)
   f->phase = (f->phase + 1) % IP_FLOW_PHASES;
   ip_add(f->velocity, dt, f->acceleration, IP_NV);
   ip_integrate(f->q, f->velocity, dt, f->q);
+  if (!f->on && ip_largest(f->velocity, 0) <= IP_STILL) {
+    memset(f->velocity, 0, sizeof f->velocity);
+    memset(f->acceleration, 0, sizeof f->acceleration);
+  }
   c->value = f->value;
   memcpy(c->posture, f->q, sizeof c->posture);
   c->blend = 1.0;
@@ -259,6 +297,8 @@ static void ip_flow_lead(ip_context *c, double dt)
     if (!ip_flow_led[k]) {
       continue;
     }
+    /* A reset takes the present output. */
+    target->set = -1.0;
     if (ip_flow_led[k] == 1) {
       /* The first of them: the others read the same. */
       ip_dynamics(f->q, f->velocity, &f->ahead);

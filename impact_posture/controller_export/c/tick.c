@@ -43,8 +43,9 @@ static void ip_hold(ip_context *c, int status, const double *v, ip_command *out)
   double u[IP_CONTROLS];
   int i;
   for (i = 0; i < IP_CONTROLS; ++i) {
-    const double rate = i < IP_ROTORS ? 0.0 : v[IP_BASE + i - IP_ROTORS];
-    u[i] = c->held[i] - (i < IP_ROTORS || !isfinite(rate) ? 0.0 : c->damping[IP_BASE + i - IP_ROTORS] * rate);
+    const int k = IP_BASE + i - IP_ROTORS;
+    /* What no joint reaches is no measurement. */
+    u[i] = c->held[i] - (i >= IP_ROTORS && fabs(v[k]) < sqrt(IP_ABSURD) ? c->damping[k] * v[k] : 0.0);
     u[i] = fmin(fmax(u[i], c->p.control_lower[i]), c->p.control_upper[i]);
   }
   c->held_now = 1;
@@ -132,6 +133,10 @@ int ip_reset(ip_context *c, const double q[IP_NQ], const double v[IP_NV], ip_com
   }
   for (k = 0; k < IP_TASKS; ++k) {
     ip_constant_rows(k, c->J[ip_task_row[k]]);
+    if (c->target[k].set < 0.0) {
+      /* A flow has led it. */
+      memset(&c->target[k], 0, sizeof c->target[k]);
+    }
     if (c->target[k].set <= 0.0) {
       ip_present(c, k, &c->target[k]);
     }
