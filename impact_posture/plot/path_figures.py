@@ -5,6 +5,7 @@ The trade-off is computed by :mod:`impact_posture.posture.pareto`.
 
 from __future__ import annotations
 
+import re
 from typing import TYPE_CHECKING, Any
 
 import numpy as np
@@ -231,6 +232,8 @@ _SHARES: dict[str, dict[str, Any]] = {
     "torque": {"color": VERMILLION, "linestyle": (0, (5, 2))},
     "thrust": {"color": GREEN, "linestyle": (0, (1, 1))},
 }
+# A velocity of the base, integrated.
+_MOVED = {"v": "base along ", "w": "base about "}
 _LEAST = "Torques, thrusts and forces on the feet that are not determined are those whose largest share is least."
 _NOTES = {
     "scaled": f"One time scale for the whole motion: its fastest instant just meets a limit. {_LEAST}",
@@ -260,7 +263,8 @@ def motion_figure(view: ResultView) -> Figure:
         for rank, k in enumerate(most):
             look: dict[str, Any] = {"color": GRAY, "linewidth": 0.6}
             if rank < _NAMED:
-                look = {"color": f"C{rank}", "linewidth": 1.3, "label": plot_label(view.robot.tangent_names[k])}
+                name = re.sub(r"^base ([vw])", lambda one: _MOVED[one[1]], view.robot.tangent_names[k])
+                look = {"color": f"C{rank}", "linewidth": 1.3, "label": plot_label(name)}
             joints.plot(motion.t, moved[:, k], **look)
         joints.set_ylabel("moved by  [rad or m]")
         joints.legend(loc="center left", bbox_to_anchor=(1.01, 0.5), handlelength=2.4)
