@@ -102,6 +102,7 @@ class ReferenceFlow:
         self.q, self.velocity, self.acceleration = robot.posture(), np.zeros(nv), np.zeros(nv)
         self.robot, self._path = robot, tuple(path)
         self._aside = ProbeDirections(nv)
+        self._phase, self._elapsed, self.resting = 0, 0.0, False
 
     def reset(self, q: Array) -> None:
         """Begin at rest at a posture, shape (nq,), and measure the curvature there.
@@ -119,7 +120,7 @@ class ReferenceFlow:
         self.rest_at(np.inf)
         self.on, self.failed = False, False
         self._ahead = False
-        state.update(q, self.velocity)
+        state.update(q, None)
         kinds = {3: FramePosition, 6: FramePose}
         self._held: list[Task] = [*(kinds[c.size](c.point) for c in self._contacts), *self._tasks]
         for task, rows in zip(self._held, self._places, strict=True):
