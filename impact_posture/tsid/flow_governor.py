@@ -21,6 +21,8 @@ _CAUTION = 1.5
 _RATE = 4.8
 # Least size of a step that the pace is divided by, rad (m).
 _TINY = 1e-12
+# Time constant with which the reference comes back to contacts and tasks, s.
+_RETURN = 0.1
 
 
 class FlowGovernor:
@@ -28,6 +30,7 @@ class FlowGovernor:
 
     Attributes:
         flow: ``u`` without the return to the constraints, rad/s (m/s), shape (nv,).
+        returning: Velocity of that return, shape (nv,).
     """
 
     def __init__(self, direction: FlowDirection, options: FlowOptions) -> None:
@@ -38,7 +41,17 @@ class FlowGovernor:
             options: Parameters.
         """
         self._direction, self._options, self._able = direction, options, 1.0
-        self.flow = np.zeros(direction.B.shape[0])
+        self.flow, self.returning = np.zeros((2, direction.B.shape[0]))
+
+    def back(self, way: Array, period: float) -> Array:
+        """Change the velocity of the return, which has a way to go, within speed and acceleration; return it."""
+        options, size = self._options, max(float(np.abs(way).max(initial=0.0)), _TINY)
+        # Two fifths of the acceleration stop a speed of sqrt(4/5 a d) on the way d.
+        pace = min(1.0 / _RETURN, math.sqrt(0.8 * options.acceleration / size), options.speed / size)
+        change = pace * way - self.returning
+        largest = max(float(np.abs(change).max(initial=0.0)), _TINY)
+        self.returning += min(options.acceleration * period / largest, 1.0) * change
+        return self.returning
 
     def stopping(self, flow: Array) -> float:
         """Return the time in which a flow stops evenly, s, which takes twice the way that braking takes."""

@@ -30,14 +30,10 @@ from impact_posture.tsid.zero_moment_point import ZeroMomentPoint
 _STEP = 1e-4
 # Way of the flow that is long enough to learn from, rad (m).
 _MOVED = 1e-6
-# Time constant with which the reference comes back to contacts and tasks, s.
-_RETURN = 0.1
 # Step below which a posture on the way is reached, or as near as the limits permit, rad (m).
 _REACHED = 0.02
 # Speed below which a flow that is off stands still, rad/s (m/s).
 _STILL = 1e-5
-# Least divisor.
-_TINY = 1e-300
 # Length of a velocity below which the flow has no way to stop on.
 _SLOW = 1e-3
 
@@ -113,7 +109,7 @@ class ReferenceFlow:
         """
         state = self._state
         self._first, self._here = self.q.copy(), self.q.copy()
-        self._wanted, self._slope, self._returning = np.zeros((3, self.velocity.size))
+        self._wanted, self._slope = np.zeros((2, self.velocity.size))
         self._before = np.zeros_like(self._J)
         self.shares = np.zeros(self._static.limited.size)
         self._visited, self._clock = 0, 0.0
@@ -271,7 +267,12 @@ class ReferenceFlow:
         governor.flow = self._space.project(governor.flow)
         descends = fastest > 0 and self._visited == len(self._path)
         slope = self._slope if descends else None
-        known = (governor.flow + self._back(period) - self.velocity) / period
+        back = governor.back(self._space.back(self.error, self._base), period)
+        rate = np.zeros(self.error.size)
+        for task, rows in zip(self._held, self._places, strict=True):
+            rate[rows] = task.target_velocity
+        along = self._space.back(rate, self._base) if rate.any() else 0.0
+        known = (governor.flow + back + along - self.velocity) / period
         self._zmp.limit(self._state, known)
         change, brakes = governor.change(self._space, self._wanted, fastest, period, slope, self._zmp)
         # To stop within the limits counts more than to leave the actuators much.
@@ -279,27 +280,13 @@ class ReferenceFlow:
         part = self._static.permitted(self._state.M, known, change / period, self.shares, most)
         self.acceleration[:] = known + governor.take(change, part) / period
 
-    def _back(self, period: float) -> Array:
-        """Return the velocity back to contacts and tasks, within speed and acceleration, and along with tasks."""
-        options, space, rate = self.options, self._space, np.zeros(self.error.size)
-        way = space.back(self.error, self._base)
-        size = max(float(np.abs(way).max(initial=0.0)), _TINY)
-        # Two fifths of the acceleration stop a speed of sqrt(4/5 a d) on the way d.
-        pace = min(1.0 / _RETURN, math.sqrt(0.8 * options.acceleration / size), options.speed / size)
-        change = pace * way - self._returning
-        change *= min(options.acceleration * period / max(float(np.abs(change).max(initial=0.0)), _TINY), 1.0)
-        self._returning += change
-        for task, rows in zip(self._held, self._places, strict=True):
-            rate[rows] = task.target_velocity
-        return self._returning + space.back(rate, self._base) if rate.any() else self._returning
-
     def _coast(self) -> None:
         """Do nothing, because the controller in C spreads the parts over these ticks, so that none takes long."""
 
     def _place_at(self, q: Array) -> None:
         """Put ``q_r`` at rest at a posture, where the next update begins."""
         self.q[:], self._first[:], self._here[:] = q, q, q
-        for moving in self.velocity, self.acceleration, self._governor.flow, self._returning:
+        for moving in self.velocity, self.acceleration, self._governor.flow, self._governor.returning:
             moving[:] = 0.0
         self._phase, self._elapsed, self.resting = 0, 0.0, False
 
