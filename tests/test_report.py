@@ -10,6 +10,7 @@ import re
 import shutil
 from html.parser import HTMLParser
 from pathlib import Path
+from types import SimpleNamespace
 from typing import Any
 
 import numpy as np
@@ -19,6 +20,7 @@ from hypothesis import given, settings
 from hypothesis import strategies as st
 
 import impact_posture as ip
+from impact_posture.experiment.run_report_content import _meant
 from impact_posture.experiment.run_reports import thin
 from impact_posture.impact.coulomb_contacts import coulomb_jump, coulomb_jumps
 from impact_posture.report.page import Content, Table, render
@@ -247,6 +249,8 @@ def test_the_viewer_gets_the_robot_where_it_is(folder: Path) -> None:
                 placed[packed["joints"][j]["parent"]] * pin.XYZQUATToSE3(np.r_[poses[k, j - 1, :3], quaternion])
             )
             assert np.allclose(placed[j].homogeneous, data.oMi[j].homogeneous, atol=2e-4)
+            tip = data.oMi[j].act(model.inertias[j].lever) + packed["scale"]["jump"] * jumps[k, j]
+            assert np.linalg.norm(tip - packed["center"]) < packed["radius"] + 1e-3
     # The arrow of a link is the velocity of its center of mass, by a difference along the predicted jump.
     jump, centers = coulomb_jump(view.objective, view.q_optimal, 1.0), []
     assert jump is not None
@@ -254,6 +258,13 @@ def test_the_viewer_gets_the_robot_where_it_is(folder: Path) -> None:
         pin.forwardKinematics(model, data, pin.integrate(model, view.q_optimal, sign * 1e-6 * jump.velocity))
         centers.append([data.oMi[j].act(model.inertias[j].lever) for j in range(1, model.njoints)])
     assert np.allclose(jumps[-1, 1:], (np.array(centers[1]) - centers[0]) / 2e-6, atol=1e-3)
+
+
+def test_metrics_of_a_push_are_explained_as_those_of_a_push() -> None:
+    views = {pushed: SimpleNamespace(pushed=pushed) for pushed in (True, False)}
+    words = {pushed: {key: word for key, _, word in _meant(view)} for pushed, view in views.items()}  # type: ignore[arg-type]
+    assert "15 ms of the touch" in words[False]["peak_jump"] and "push" in words[True]["peak_jump"]
+    assert list(words[True]) == list(words[False])
 
 
 def test_a_run_is_thinned_where_nothing_happens() -> None:

@@ -322,6 +322,9 @@ def test_each_contact_has_its_planes(
     still = dataclasses.replace(solo8, q_optimal=solo8.q_initial)
     (one,) = surfaces(still)
     assert one.name == "n" and "surface before" not in text_of(postures_figure(still))
+    # A push has a direction, and no surface.
+    text = text_of(postures_figure(dataclasses.replace(still, pushed=True)))
+    assert "surface |" in text_of(postures_figure(still)) and "surface |" not in text and "| n |" in text
     assert "impact at gripper_right_base_link (A), gripper_left_base_link (B)" in text_of(jump_figure(two_hands))
 
 
