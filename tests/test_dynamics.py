@@ -351,7 +351,7 @@ def write_urdf(path: Path, joints: list[tuple[str, str]]) -> Path:
     ],
 )
 def test_urdf_joints(tmp_path: Path, joints: list[tuple[str, str]], types: list[str], floating: bool) -> None:
-    model, _ = build_model(write_urdf(tmp_path / "chain.urdf", joints), free_flyer=floating)
+    model, _, _ = build_model(write_urdf(tmp_path / "chain.urdf", joints), free_flyer=floating)
     made = [joint.shortname().removeprefix("JointModel") for joint in list(model.joints)[1 + floating :]]
     assert made == types
     symbolic = build(model, model.getFrameId(f"l{len(joints)}"))

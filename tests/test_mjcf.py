@@ -176,7 +176,7 @@ def test_joints_numbered_across_branches() -> None:
 
 def test_urdf_joints_with_limits(tmp_path: Any) -> None:
     joints = [("revolute", "0 0 1"), ("continuous", "1 2 3"), ("prismatic", "1 1 0"), ("planar", "0 0 1")]
-    model, _ = build_model(write_urdf(tmp_path / "chain.urdf", joints), free_flyer=True)
+    model, _, _ = build_model(write_urdf(tmp_path / "chain.urdf", joints), free_flyer=True)
     found = InMujoco(model)
     (q,) = random_configurations(model, 1, "urdf")
     compare(model, found, q, rng("urdf"))

@@ -43,7 +43,7 @@ def compare(
         raise typer.BadParameter("name at least one controller", param_hint="--controllers")
     from impact_posture.experiment.folders import FORMATS, Output, store_beside, write_comparison
     from impact_posture.experiment.reproduction import reproduce
-    from impact_posture.experiment.statistics import FEWEST
+    from impact_posture.experiment.statistics import FEWEST, without_noise
     from impact_posture.output_folder import check_output
 
     plan = {scenario: list(dict.fromkeys(labels))}
@@ -64,7 +64,7 @@ def compare(
         return
     page = Page(quiet=quiet)
     shown = "mean ± half of the 95 % interval" if seeds >= FEWEST else f"means (intervals from {FEWEST} seeds on)"
-    if seeds > 1 and all(one.alike for row in found.rows for one in row.metrics.values()):
+    if without_noise(one for row in found.rows for one in row.metrics.values()):
         shown = "all alike, because the scenario has no noise"
     page.title(found.rows[0].scenario, f"{seeds} seeds, {shown}" if seeds > 1 else "1 seed")
     rows_table(page, found.rows)

@@ -297,9 +297,9 @@ class CompiledController:
 
 
 def _shaped(given: ArrayLike, shape: tuple[int, ...], name: str) -> Array:
-    found = np.ascontiguousarray(given, dtype=float)
-    if found.shape != shape or np.ndim(given) == 0:
-        raise ValueError(f"{name} has shape {np.shape(given)}, not {shape}")
+    found = np.asarray(given, dtype=float, order="C")
+    if found.shape != shape:
+        raise ValueError(f"{name} has shape {found.shape}, not {shape}")
     return found
 
 

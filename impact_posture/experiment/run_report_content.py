@@ -8,7 +8,7 @@ from pathlib import Path
 from typing import Any
 
 from impact_posture.experiment.jobs import Document, Job, controller_factory
-from impact_posture.experiment.statistics import FEWEST, Interval
+from impact_posture.experiment.statistics import FEWEST, Interval, without_noise
 from impact_posture.output_folder import typed_command
 from impact_posture.plot.run_view import RunView, run_header
 from impact_posture.plot.view import number
@@ -92,7 +92,7 @@ def comparison_content(folder: Path, document: Document, view: RunView) -> Conte
         f"Within the impact windows, against nominal: {'; '.join(verdict)}." if verdict else "No reduction is known."
     )
     seeds = len(document["seeds"])
-    alike = all(Interval(**found).alike for row in rows for found in row["metrics"].values())
+    alike = without_noise(Interval(**found) for row in rows for found in row["metrics"].values())
     intervals = ", with 95 % intervals" if seeds >= FEWEST else ""
     intervals = ", all alike, because the scenario has no noise" if alike else intervals
     means = "One seed" if seeds == 1 else f"Means of {seeds} seeds{intervals}"

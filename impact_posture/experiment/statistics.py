@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable, Mapping, Sequence
+from collections.abc import Callable, Iterable, Mapping, Sequence
 from dataclasses import dataclass, fields, replace
 
 import numpy as np
@@ -51,6 +51,12 @@ class Interval:
         n = len(values)
         half_width = float(stdtrit(n - 1, 0.975) * np.std(values, ddof=1) / np.sqrt(n)) if n > 1 else None
         return Interval(float(np.mean(values)), half_width, n)
+
+
+def without_noise(found: Iterable[Interval]) -> bool:
+    """Return whether there are intervals and the samples of each are alike, as without noise."""
+    known = list(found)
+    return bool(known) and all(one.alike for one in known)
 
 
 @dataclass(frozen=True)

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Sequence
+from itertools import pairwise
 
 import numpy as np
 import pinocchio as pin
@@ -19,6 +20,8 @@ _DOUBLINGS = 7
 _STEP = 1e-5
 # Between knots of a corner, the curve bends so many times more than at the median knot.
 _SHARP = 5.0
+# Parts between two knots of a curve whose limits are checked, at corners and elsewhere.
+_AT_CORNERS, _BETWEEN = 8, 2
 
 
 class PathCurve:
@@ -52,6 +55,15 @@ class PathCurve:
         """Whether the curve turns sharply between each knot and the next, shape (n − 1,)."""
         bend = np.abs(self.spline(self.s, 2)).max(axis=1)
         return np.asarray(np.maximum(bend[1:], bend[:-1]) > _SHARP * np.median(bend))
+
+    @property
+    def places(self) -> Array:
+        """The knots and places between them, more at corners, where limits are checked."""
+        parts = [
+            np.linspace(a, b, _AT_CORNERS if corner else _BETWEEN, endpoint=False)
+            for (a, b), corner in zip(pairwise(self.s), self.corners, strict=True)
+        ]
+        return np.concatenate([*parts, [1.0]])
 
     def at(self, z: Array) -> Array:
         """Return the posture of tangent coordinates, ``q₀ ⊕ z``, shape (nq,)."""

@@ -6,7 +6,6 @@ from itertools import pairwise
 
 import numpy as np
 
-from impact_posture.arrays import Array
 from impact_posture.path.actuator_limits import ActuatorLimits
 from impact_posture.path.curve import PathCurve
 from impact_posture.path.path_space import PathSpace
@@ -14,8 +13,6 @@ from impact_posture.path.timed_curve import SAMPLE_TIME, TimedCurve, times
 
 # Share of the limits that speed and acceleration may take between them.
 _SHARE = 0.95
-# Parts between two knots of the curve, at corners and elsewhere.
-_AT_CORNERS, _BETWEEN = 8, 2
 
 
 def slowed(space: PathSpace, curve: PathCurve, limits: ActuatorLimits) -> TimedCurve | None:
@@ -26,7 +23,7 @@ def slowed(space: PathSpace, curve: PathCurve, limits: ActuatorLimits) -> TimedC
     ``x(s)`` follows from one pass in each direction with ``dx/ds = 2 s̈`` (Bobrow et al. 1985).  Between two knots of
     the curve, the curvature is straight, so a few places more are enough, most of them at corners.
     """
-    s = _places(curve)
+    s = curve.places
     zero, speed = np.zeros(space.model.nv), space.problem.robot.velocity_limits
     most, steep = np.empty((2, len(s)))
     for k, place in enumerate(s):
@@ -60,12 +57,3 @@ def slowed(space: PathSpace, curve: PathCurve, limits: ActuatorLimits) -> TimedC
     bent = np.array([curve.acceleration(float(place)) for place in at])
     v, a = along * ds[:, None], bent * ds[:, None] ** 2 + along * dds[:, None]
     return TimedCurve(t, curve.spline(at), v, a, "slowed")
-
-
-def _places(curve: PathCurve) -> Array:
-    """Return the knots of a curve and places between them, more where it bends."""
-    parts = [
-        np.linspace(a, b, _AT_CORNERS if corner else _BETWEEN, endpoint=False)
-        for (a, b), corner in zip(pairwise(curve.s), curve.corners, strict=True)
-    ]
-    return np.concatenate([*parts, [1.0]])

@@ -16,7 +16,7 @@ from impact_posture.path.timed_curve import SAMPLE_TIME, TimedCurve, times
 
 # Intervals of the time-optimal parametrization, within which a limit may be exceeded by less than 1 %.
 _GRID = 400
-# Instants at which a scaled motion is checked, besides the knots of its curve; places of the table that finds these.
+# Instants at which a scaled motion is checked, besides places of its curve; places of the table that finds these.
 INSTANTS, _INVERSE = 61, 2001
 # Joint speed where the robot's data limit nothing, rad/s or m/s.
 _DEFAULT_SPEED = 1.0
@@ -76,12 +76,11 @@ def scaled(space: PathSpace, curve: PathCurve, limits: ActuatorLimits) -> TimedC
 
     The load of a motion is that of gravity and ``1/T²`` times a load that does not depend on ``T``.  So a linear
     program at each instant gives the least ``T`` there, and the largest of them counts.  Instants are spread evenly,
-    and at the knots of the curve and midway between them, because a spline around a corner bends most at a knot.
+    and at places of the curve, most of them at its corners.
     A curve with corners is slowed there alone if that takes less time.
     """
-    knots = np.concatenate([curve.s, (curve.s[1:] + curve.s[:-1]) / 2])
     fine = np.linspace(0.0, 1.0, _INVERSE)
-    notes, tau = [], np.concatenate([np.linspace(0.0, 1.0, INSTANTS), np.interp(knots, _law(fine)[0], fine)])
+    notes, tau = [], np.concatenate([np.linspace(0.0, 1.0, INSTANTS), np.interp(curve.places, _law(fine)[0], fine)])
     rates = [_rates(curve, float(x)) for x in tau]
     speed, known = space.problem.robot.velocity_limits, not limits.missing
     least = np.zeros(len(tau))

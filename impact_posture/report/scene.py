@@ -82,7 +82,8 @@ class Scene:
     @cached_property
     def packed(self) -> tuple[str, str]:
         """The scene as JSON, and its arrays as base64 of a gzipped buffer into which the JSON points."""
-        model, tracks = self.objective.robot.model, [self._track(track) for track in self.tracks]
+        model = self.objective.robot.model
+        tracks, arrows_of = zip(*map(self._track, self.tracks), strict=True)
         low, high = self._box()
         size, center = float(np.linalg.norm(high - low)), (low + high) / 2
         walls: list[dict[str, Any]] = [{"shape": len(self.drawn.solids) + k} for k in range(len(self.bodies))]
@@ -96,8 +97,7 @@ class Scene:
         joints = zip(model.parents, model.inertias, strict=True)
         jump = 0.3 * size / _largest(track["largest_jump"] for track in tracks)
         # The camera sees the tips of the arrows, too.
-        tips = (track.pop("reach") for track in tracks)
-        radius = max(size / 2, *(_norm(centers + jump * arrows - center) for centers, arrows in tips))
+        radius = max(size / 2, *(_norm(centers + jump * arrows - center) for centers, arrows in arrows_of))
         content = {
             "joints": [{"parent": int(parent), "center": inertia.lever} for parent, inertia in joints],
             "parts": [
@@ -122,7 +122,8 @@ class Scene:
         }
         return _packed(content)
 
-    def _track(self, track: Track) -> dict[str, Any]:
+    def _track(self, track: Track) -> tuple[dict[str, Any], tuple[Array, Array]]:
+        """Return the content of a track, and where its arrows begin and where to, shape (frames, links, 3) each."""
         robot, frames, data = self.objective.robot, len(track.q), self.objective.robot.model.createData()
         points = [point_on(robot, contact.frame, contact.offset) for contact in self.objective.contacts]
         poses, at = np.empty((frames, robot.model.njoints - 1, 7)), np.empty((frames, len(points), 3))
@@ -138,7 +139,7 @@ class Scene:
         # The viewer goes straight from frame to frame, so a quaternion takes the sign that is nearer to the last one.
         for before, now in pairwise(poses[:, :, 3:]):
             now[(before * now).sum(axis=-1) < 0] *= -1
-        return {
+        content = {
             "unit": track.unit,
             "times": track.times.astype(np.float32),
             "poses": _levels(poses.reshape(frames, -1)),
@@ -149,10 +150,10 @@ class Scene:
             ),
             "jumps": _levels(arrows.reshape(frames, -1)),
             "largest_jump": _norm(arrows),
-            "reach": (centers[:, 1:], arrows[:, 1:]),
             "forces": None if track.forces is None else _levels(track.forces),
             "curves": [values.astype(np.float32) for _, _, values in track.curves],
         }
+        return content, (centers[:, 1:], arrows[:, 1:])
 
     def _box(self) -> tuple[Array, Array]:
         """Return the corners of the box around the robot at the first and last frame of each track."""

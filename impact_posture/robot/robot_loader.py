@@ -21,14 +21,7 @@ from impact_posture.robot.model_joints import joint_index, movable_joints, q_sli
 from impact_posture.robot.named_postures import ignored_bases, named_postures
 from impact_posture.robot.robot import Robot
 from impact_posture.robot.spec import RobotSpec, read_spec
-from impact_posture.robot.urdf import (
-    EXAMPLE_PREFIX,
-    build_model,
-    example_models,
-    mimic_warnings,
-    resolve_path,
-    robots_data,
-)
+from impact_posture.robot.urdf import EXAMPLE_PREFIX, build_model, example_models, resolve_path, robots_data
 from impact_posture.settings import LoadOptions, RobotSettings, Root, Vector3
 from impact_posture.tables import validate
 
@@ -68,7 +61,9 @@ def build_robot(located: Located, options: LoadOptions) -> Robot:
     root: Root = options.root or spec.model.root
     _check_package_dirs(options.package_dir, Path(), "package_dir")
     _check_package_dirs(spec.model.package_dirs, base, f"{name} robot.toml [model] package_dirs")
-    model, warnings = build_model(urdf, free_flyer=root == "free-flyer", accept_inertias=spec.model.accept_inertias)
+    model, warnings, mimics = build_model(
+        urdf, free_flyer=root == "free-flyer", accept_inertias=spec.model.accept_inertias
+    )
     _remount(model, options.mounting, name)
     srdf = srdf_path(spec, options, base)
     _override_limits(model, spec, name)
@@ -82,7 +77,9 @@ def build_robot(located: Located, options: LoadOptions) -> Robot:
     if locked:
         model, postures = _lock(model, locked, postures, default, name)
     check_moved_mass(model, source)
-    warnings = (*warnings, *mimic_warnings(urdf, model, spec.constraints.hold))
+    free = [joint for joint in mimics if model.existJointName(joint) and joint not in spec.constraints.hold]
+    coupled = "but moves by itself here, because the coupling is left out; lock it (`lock`) if that matters"
+    warnings = (*warnings, *(f"joint '{joint}' mimics '{mimics[joint]}' {coupled}" for joint in free))
     if root == "fixed":
         warnings = (*warnings, *ignored_bases(spec, srdf, default))
     warnings = (*warnings, *armature_warning(model, armature_source, spec.constraints.hold))

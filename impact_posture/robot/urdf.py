@@ -6,7 +6,7 @@ import contextlib
 import os
 import tempfile
 import xml.etree.ElementTree as ET
-from collections.abc import Collection, Iterator
+from collections.abc import Iterator
 from functools import cache
 from importlib.resources import files
 from pathlib import Path
@@ -78,8 +78,10 @@ def example_models(suffix: str = ".urdf") -> list[str]:
     return [p.relative_to(root).as_posix() for p in sorted(root.rglob("*.[us]rdf")) if str(p).endswith(suffix)]
 
 
-def build_model(path: Path, *, free_flyer: bool, accept_inertias: bool = False) -> tuple[pin.Model, tuple[str, ...]]:
-    """Parse the URDF at ``path`` without opening meshes; return the model and warnings about its links.
+def build_model(
+    path: Path, *, free_flyer: bool, accept_inertias: bool = False
+) -> tuple[pin.Model, tuple[str, ...], dict[str, str]]:
+    """Parse the URDF at ``path`` without opening meshes; return the model, warnings and which joint mimics which.
 
     Args:
         path: The URDF.
@@ -113,7 +115,8 @@ def build_model(path: Path, *, free_flyer: bool, accept_inertias: bool = False) 
             where=str(path),
             hint="fix joints in the URDF that hardly matter",
         )
-    return model, tuple(check_inertias(root, model, path, accept_inertias))
+    mimics, lost = _mimics(root)
+    return model, (*check_inertias(root, model, path, accept_inertias), *lost), mimics
 
 
 def _check_depth(root: ET.Element, path: Path) -> None:
@@ -137,15 +140,8 @@ def _check_depth(root: ET.Element, path: Path) -> None:
             raise UrdfError(f"has a chain of more than {_DEEPEST} joints", where=str(path), hint=hint)
 
 
-def mimic_warnings(path: Path, model: pin.Model, held: Collection[str]) -> tuple[str, ...]:
-    """Return a warning for each joint that mimics another and moves by itself here, or mimics a joint that is none.
-
-    Args:
-        path: The URDF.
-        model: The model, without the joints that are locked.
-        held: Joints that do not move on the way to an impact.
-    """
-    root = parse_urdf(path)
+def _mimics(root: ET.Element) -> tuple[dict[str, str], list[str]]:
+    """Return the joints that mimic another, with it, and a warning for each that mimics what is no joint."""
     joints = {joint.get("name", ""): joint.find("mimic") for joint in root.findall("joint")}
     followed = {name: mimic.get("joint", "") for name, mimic in joints.items() if mimic is not None}
     lost = [
@@ -154,16 +150,7 @@ def mimic_warnings(path: Path, model: pin.Model, held: Collection[str]) -> tuple
         for name, other in followed.items()
         if other not in joints
     ]
-    free = [name for name, other in followed.items() if other in joints and model.existJointName(name)]
-    return (
-        *lost,
-        *(
-            f"joint '{name}' mimics '{followed[name]}' but moves by itself here, because the coupling is left out; "
-            f"lock it (`lock`) if that matters"
-            for name in free
-            if name not in held
-        ),
-    )
+    return {name: other for name, other in followed.items() if other in joints}, lost
 
 
 def parse_urdf(path: Path) -> ET.Element:

@@ -52,11 +52,8 @@ class Driver:
     def reset(self, q: Array) -> Command:
         """Begin at rest.  The tasks hold what is there, whatever an earlier run has moved."""
         task, self._followed = self._end_effector, None
-        if task is not None:
-            task.target = None
-            task.target_velocity = task.target_acceleration = np.zeros(task.size)
-        for body_task in self._body_tasks:
-            body_task.target = None
+        for one in (*([] if task is None else [task]), *self._body_tasks):
+            one.target, one.target_velocity, one.target_acceleration = None, 0.0, 0.0
         at_rest = np.zeros(self.setup.robot.nv)
         command = self.controller.reset(q, at_rest)
         self._home = None if task is None else task.target

@@ -23,7 +23,7 @@ from impact_posture.experiment.reproduction import (
     missed_targets,
 )
 from impact_posture.experiment.reproduction_summary import advice, remarks, scenario_table, summary, table_one
-from impact_posture.experiment.statistics import QUANTITIES, Interval, fate, row_of
+from impact_posture.experiment.statistics import QUANTITIES, Interval, fate, row_of, without_noise
 from impact_posture.simulation.controller_factory import CONTROLLERS, MEANING
 from impact_posture.simulation.metrics import Metrics
 from impact_posture.simulation.outcome import gravest
@@ -54,6 +54,7 @@ def test_interval_is_students() -> None:
     # Runs without noise are the same for every seed but for rounding.
     same = Interval.of([0.1 + 0.2, 0.3, 0.3])
     assert same.alike and same.shown is None and not found.alike
+    assert without_noise([same, same]) and not without_noise([same, found]) and not without_noise([])
 
 
 def test_reductions_are_paired_by_seed() -> None:
