@@ -65,13 +65,13 @@ test: $(VENV)/.installed-test
 	$(BIN)/python -m pytest -n $(JOBS) --dist worksteal -q
 
 wheel: $(VENV)/.installed-test
-	$(BIN)/python -m tests.installed_wheel
+	$(BIN)/python -m tests.support.installed_wheel
 
 test-wheel: $(VENV)/.installed-test
-	$(BIN)/python -m tests.installed_wheel --tests -n $(JOBS) --dist worksteal
+	$(BIN)/python -m tests.support.installed_wheel --tests -n $(JOBS) --dist worksteal
 
 lowest: $(VENV)/.installed-test
-	$(BIN)/python -m tests.installed_wheel --lowest --tests -n $(JOBS) --dist worksteal
+	$(BIN)/python -m tests.support.installed_wheel --lowest --tests -n $(JOBS) --dist worksteal
 
 lint: $(VENV)/.installed-test
 	$(BIN)/ruff check .
@@ -90,57 +90,57 @@ docs: $(VENV)/.installed-docs
 	@echo "docs/_build/html/index.html"
 
 bench: $(VENV)/.installed-test
-	$(BIN)/python -m tests.benchmarks solve loader tsid kernel
+	$(BIN)/python -m docs.studies solve loader tsid kernel
 
 coverage: $(VENV)/.installed-test
-	$(BIN)/python -m tests.coverage_report -n $(JOBS) --dist worksteal
+	$(BIN)/python -m tests.support.coverage_report -n $(JOBS) --dist worksteal
 
 study-impacts: $(VENV)/.installed-test
-	$(BIN)/python -m tests.benchmarks impacts --write
+	$(BIN)/python -m docs.studies impacts --write
 
 study-elastic: $(VENV)/.installed-test
-	$(BIN)/python -m tests.benchmarks elastic --write
+	$(BIN)/python -m docs.studies elastic --write
 
 study-global: $(VENV)/.installed-test
-	$(BIN)/python -m tests.benchmarks global --write
-	$(BIN)/python -m tests.benchmarks hops --write
+	$(BIN)/python -m docs.studies global --write
+	$(BIN)/python -m docs.studies hops --write
 
 study-feasible: $(VENV)/.installed-test
-	$(BIN)/python -m tests.benchmarks feasible --write
-	$(BIN)/python -m tests.benchmarks approach --write
+	$(BIN)/python -m docs.studies feasible --write
+	$(BIN)/python -m docs.studies approach --write
 
 study-flow: $(VENV)/.installed-test
-	$(BIN)/python -m tests.benchmarks flow --jobs $(JOBS) --write
+	$(BIN)/python -m docs.studies flow --jobs $(JOBS) --write
 
 study-controller: $(VENV)/.installed-test
-	$(BIN)/python -m tests.benchmarks.controller 10000 $(PART)
+	$(BIN)/python -m docs.studies.controller 10000 $(PART)
 
 study-sweep: $(VENV)/.installed-test
-	$(BIN)/python -m tests.benchmarks.sweep
-	$(BIN)/python -m tests.benchmarks.sweep_verdicts
+	$(BIN)/python -m docs.studies.sweep
+	$(BIN)/python -m docs.studies.sweep_verdicts
 
 reproduction: $(VENV)/.installed-test
-	$(BIN)/python -m tests.benchmarks reproduction --write
+	$(BIN)/python -m docs.studies reproduction --write
 
 study-robustness: $(VENV)/.installed-test
-	$(BIN)/python -m tests.benchmarks points --jobs $(JOBS)
-	$(BIN)/python -m tests.benchmarks robustness --write
-	$(BIN)/python -m tests.benchmarks envelope --write
+	$(BIN)/python -m docs.studies points --jobs $(JOBS)
+	$(BIN)/python -m docs.studies robustness --write
+	$(BIN)/python -m docs.studies envelope --write
 
 study-scan: $(VENV)/.installed-test
-	$(BIN)/python -m tests.benchmarks scan --write
+	$(BIN)/python -m docs.studies scan --write
 
 study-real-impacts: $(VENV)/.installed-test
-	$(BIN)/python -m tests.benchmarks real-impacts --jobs $(JOBS) --write
+	$(BIN)/python -m docs.studies real-impacts --jobs $(JOBS) --write
 
 calibration: $(VENV)/.installed-test
-	$(BIN)/python -m tests.benchmarks restitution --write
+	$(BIN)/python -m docs.studies restitution --write
 
 regression: $(VENV)/.installed
 	$(BIN)/python -m tests.regression.make
 
 # The script of report.html from npm's packages by their lock file, in a folder of its own; VIEWER_OUT= writes elsewhere.
-VIEWER := impact_posture/report/viewer
+VIEWER := impact_posture/output/report/viewer
 VIEWER_OUT ?= $(VIEWER)/viewer.min.js
 viewer:
 	@rm -rf build/viewer && mkdir -p build/viewer && cp $(VIEWER)/package.json $(VIEWER)/package-lock.json $(VIEWER)/viewer.js build/viewer

@@ -44,6 +44,6 @@ def _default(option: str) -> str:
     """Value of an option that is given without one."""
     if option != "--tradeoff":
         return ""
-    from impact_posture.settings import TRADEOFF_POINTS
+    from impact_posture.config.settings import TRADEOFF_POINTS
 
     return str(TRADEOFF_POINTS)

@@ -18,9 +18,8 @@ from typing import Any
 
 import typer
 
-from impact_posture.errors import ImpactPostureError, one_line
-from impact_posture.escape import printable
-from impact_posture.option_names import as_options, option_of
+from impact_posture.config.option_names import as_options, option_of
+from impact_posture.errors import ImpactPostureError, one_line, printable
 
 DEBUG_VARIABLE = "IMPACT_POSTURE_DEBUG"
 _INTERRUPTED = 130

@@ -10,7 +10,7 @@ from impact_posture_cli.options import CompileMode, option
 from impact_posture_cli.output import Page
 
 if TYPE_CHECKING:
-    from impact_posture.experiment.statistics import Row
+    from impact_posture.experiment.seed_statistics import ControllerRow
 
 RUN = "Run"
 Mode = Literal["live", "held"]
@@ -34,7 +34,7 @@ Compile = Annotated[
 Processes = Annotated[int, option("--jobs", panel=RUN, min=1, help="Number of processes that run at the same time.")]
 
 
-def rows_table(page: Page, rows: tuple[Row, ...] | list[Row]) -> None:
+def rows_table(page: Page, rows: tuple[ControllerRow, ...] | list[ControllerRow]) -> None:
     """Write a table with a row for each controller of a scenario."""
     from impact_posture.experiment.reproduction_summary import interval_text, percent
 

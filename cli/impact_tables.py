@@ -8,7 +8,7 @@ from typing import TYPE_CHECKING, Any
 from impact_posture_cli.output import Page, number, vector, worst_normal
 
 if TYPE_CHECKING:
-    from impact_posture.impact.contact import ImpactContact
+    from impact_posture.impact.impact_contact import ImpactContact
     from impact_posture.impact.resolved_impact import ResolvedImpact
 
 

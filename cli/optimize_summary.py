@@ -9,8 +9,8 @@ from impact_posture_cli.impact_tables import alone_line, contact_names, impact_r
 from impact_posture_cli.output import Page, number
 
 if TYPE_CHECKING:
-    from impact_posture.posture.problem_settings import Prepared
-    from impact_posture.posture.solve import PostureSolution
+    from impact_posture.posture.formulation.problem_file import Prepared
+    from impact_posture.posture.search.multistart import PostureSolution
 
 # Actuators in the table of what holding a posture takes.
 _TIGHTEST = 3
@@ -47,8 +47,8 @@ def announce(page: Page, prepared: Prepared) -> None:
 
 def summarize(page: Page, prepared: Prepared, solution: PostureSolution, document: dict[str, Any]) -> None:
     """Show the answer: verdict, table before and after, certificate, and what else was asked for."""
-    from impact_posture.impact.quantity_table import quantity_rows
-    from impact_posture.posture.caveats import percent
+    from impact_posture.output.quantity_table import quantity_rows
+    from impact_posture.posture.search.impact_notes import percent
 
     initial, optimal = document["initial"], document["optimal"]
     impact, blocks = prepared.impact, {"before": initial, "after": optimal}
@@ -125,7 +125,7 @@ def _holding(page: Page, before: dict[str, Any] | None, after: dict[str, Any] | 
 
 def _tradeoff(page: Page, document: dict[str, Any], notes: list[str]) -> None:
     """Show the trade-off between the objective and the distance or force."""
-    from impact_posture.posture.caveats import percent
+    from impact_posture.posture.search.impact_notes import percent
 
     points = document["tradeoff"]
     page.gap()

@@ -8,7 +8,7 @@ from typing import Annotated, Any, Literal
 
 import typer
 
-from impact_posture.setting import CONTACT, OUTPUT, SEARCH
+from impact_posture.config.demands import CONTACT, OUTPUT, SEARCH
 
 CompileMode = Literal["auto", "always", "never"]
 
@@ -34,7 +34,7 @@ def out_option(help: str, default: str = "") -> Any:
 
 
 def _check_prefix(prefix: str | None) -> str | None:
-    from impact_posture.codegen.naming import check_prefix
+    from impact_posture.codegen.c_names import check_prefix
     from impact_posture.errors import InputError
 
     try:

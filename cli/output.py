@@ -7,9 +7,8 @@ import sys
 from collections.abc import Iterable, Sequence
 from typing import TYPE_CHECKING, Any
 
-from impact_posture.errors import one_line
-from impact_posture.escape import printable
-from impact_posture.option_names import as_options
+from impact_posture.config.option_names import as_options
+from impact_posture.errors import one_line, printable
 
 if TYPE_CHECKING:
     from rich.console import Console

@@ -80,7 +80,7 @@ def _end(number: int, frame: object) -> None:
     A second signal skips the cleaning.
     """
     # A signal may come while the module is imported; then nothing has begun that would need cleaning.
-    end_early = getattr(sys.modules.get("impact_posture.processes"), "end_early", None)
+    end_early = getattr(sys.modules.get("impact_posture.system.processes"), "end_early", None)
     leave = partial(_leave, number)
     if end_early is None or _SEEN:
         leave()

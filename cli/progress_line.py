@@ -20,8 +20,8 @@ def progress(
 ) -> Iterator[Callable[[int, int], None] | None]:
     """Show what the program is doing while the block runs.
 
-    The line shows what the library tells (:func:`impact_posture.progress.tell`) and what the block counts.  Yield the
-    function that takes ``(done, all)``; ``None`` where nothing is shown.
+    The line shows what the library tells (:func:`impact_posture.system.progress.tell`) and what the block counts.
+    Yield the function that takes ``(done, all)``; ``None`` where nothing is shown.
 
     Args:
         doing: What is counted, as an activity.
@@ -37,9 +37,9 @@ def progress(
         return
     from rich.progress import BarColumn, Progress, TextColumn, TimeElapsedColumn
 
-    from impact_posture.escape import printable
-    from impact_posture.processes import undone
-    from impact_posture.progress import listening
+    from impact_posture.errors import printable
+    from impact_posture.system.processes import undone
+    from impact_posture.system.progress import listening
 
     # No thread redraws the line: worker processes are forked meanwhile, and long calls of C hold Python's lock.
     words = TextColumn("{task.description}", markup=False)

@@ -12,10 +12,10 @@ from typing import Annotated, Any, TypeVar, Union, get_args, get_origin, get_typ
 
 import typer
 
+from impact_posture.config.demands import CONTACT, METRIC, ROBOT, SEARCH, TASK, Setting
+from impact_posture.config.settings import ImpactSettings, RobotSettings
+from impact_posture.config.toml_tables import validate
 from impact_posture.errors import ImpactPostureError
-from impact_posture.setting import CONTACT, METRIC, ROBOT, SEARCH, TASK, Setting
-from impact_posture.settings import ImpactSettings, RobotSettings
-from impact_posture.tables import validate
 from impact_posture_cli.error_boundary import UsageError
 
 _PANELS = (CONTACT, METRIC, ROBOT, TASK, SEARCH)

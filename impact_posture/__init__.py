@@ -23,39 +23,39 @@ from impact_posture.version import __version__
 if TYPE_CHECKING:
     from impact_posture import sweep as sweep
     from impact_posture import tsid as tsid
+    from impact_posture.api.impact_objective import ImpactObjective as ImpactObjective
+    from impact_posture.api.posture_problem import PostureProblem as PostureProblem
+    from impact_posture.api.posture_result import PostureResult as PostureResult
+    from impact_posture.api.posture_result import optimize as optimize
     from impact_posture.codegen.export import Export as Export
     from impact_posture.codegen.impact_gradient import ImpactGradient as ImpactGradient
     from impact_posture.controller_export.compiled_controller import CompiledController as CompiledController
-    from impact_posture.controller_export.export import export_controller as export_controller
+    from impact_posture.controller_export.export_controller import export_controller as export_controller
     from impact_posture.errors import ImpactPostureError as ImpactPostureError
-    from impact_posture.front_door import PostureResult as PostureResult
-    from impact_posture.front_door import optimize as optimize
-    from impact_posture.front_door_problem import ImpactObjective as ImpactObjective
-    from impact_posture.front_door_problem import PostureProblem as PostureProblem
-    from impact_posture.impact.contact import ImpactContact as ImpactContact
-    from impact_posture.impact.metric import Metric as Metric
+    from impact_posture.impact.impact_contact import ImpactContact as ImpactContact
+    from impact_posture.impact.jump_metric import Metric as Metric
     from impact_posture.robot.robot import Robot as Robot
     from impact_posture.robot.robot_loader import known_robots as known_robots
     from impact_posture.robot.robot_loader import load_robot as load_robot
-    from impact_posture.robot.spec import Support as Support
+    from impact_posture.robot.robot_spec import Support as Support
 
 
 _HOMES = {
     "CompiledController": "controller_export.compiled_controller",
     "Export": "codegen.export",
-    "ImpactContact": "impact.contact",
+    "ImpactContact": "impact.impact_contact",
     "ImpactGradient": "codegen.impact_gradient",
-    "ImpactObjective": "front_door_problem",
+    "ImpactObjective": "api.impact_objective",
     "ImpactPostureError": "errors",
-    "Metric": "impact.metric",
-    "PostureProblem": "front_door_problem",
-    "PostureResult": "front_door",
+    "Metric": "impact.jump_metric",
+    "PostureProblem": "api.posture_problem",
+    "PostureResult": "api.posture_result",
     "Robot": "robot.robot",
-    "Support": "robot.spec",
-    "export_controller": "controller_export.export",
+    "Support": "robot.robot_spec",
+    "export_controller": "controller_export.export_controller",
     "known_robots": "robot.robot_loader",
     "load_robot": "robot.robot_loader",
-    "optimize": "front_door",
+    "optimize": "api.posture_result",
     "sweep": "",
     "tsid": "",
 }

@@ -7,15 +7,41 @@ from __future__ import annotations
 
 import difflib
 import reprlib
+import unicodedata
 from collections.abc import Iterable
 from typing import ClassVar
-
-from impact_posture.escape import printable
 
 # Longest name in a message.  A longer name loses its middle.
 _LONGEST_NAME = 200
 # Longest part of a message: it lists the 200 joints that a robot may have.
 _LONGEST_PART = 10_000
+
+
+def printable(text: str, *, keep: str = "", longest: int = 0) -> str:
+    r"""Return text without characters that control a terminal or change the writing direction.
+
+    Control and format characters, line separators and lone surrogates become escapes such as ``\x1b`` and ``\u202e``.
+
+    Args:
+        text: Any text.
+        keep: Characters that stay, such as line breaks.
+        longest: Longest result, which drops the middle of a longer text; 0 keeps all of it.
+    """
+    if longest and len(text) > longest:
+        half = longest // 2
+        text = f"{text[:half]}…{text[len(text) - half + 1 :]}"
+    if text.isprintable():
+        return text
+    return "".join(c if c in keep or is_visible(c) else _code_point(c) for c in text)
+
+
+def is_visible(character: str) -> bool:
+    """Return whether a character shows, or is a space."""
+    return character.isprintable() or unicodedata.category(character) == "Zs"
+
+
+def _code_point(character: str) -> str:
+    return character.encode("unicode_escape").decode("ascii")
 
 
 def nearest(name: str, known: Iterable[str], count: int = 5) -> list[str]:

@@ -23,10 +23,10 @@ for name in ("OMP_NUM_THREADS", "MKL_NUM_THREADS"):
 import pytest  # noqa: E402
 from hypothesis import HealthCheck, settings  # noqa: E402
 
-from impact_posture.impact.contact import ImpactContact  # noqa: E402
-from impact_posture.impact.objective import ImpactObjective  # noqa: E402
+from impact_posture.impact.impact_contact import ImpactContact  # noqa: E402
+from impact_posture.impact.worst_case_objective import WorstCaseObjective  # noqa: E402
 from impact_posture.robot.robot_loader import load_robot  # noqa: E402
-from tests.rounding import other_rounding  # noqa: E402
+from tests.support.rounding import other_rounding  # noqa: E402
 
 # The same examples on every run and on every worker; a slow machine is no failure.
 settings.register_profile(
@@ -85,9 +85,9 @@ PENDULUM = """<robot name="pendulum">
 
 
 @pytest.fixture(scope="module")
-def small() -> ImpactObjective:
+def small() -> WorstCaseObjective:
     robot = load_robot("tilthex_arm")
-    return ImpactObjective(
+    return WorstCaseObjective(
         robot, ImpactContact("ee", (1.0, 0.3, -0.2), (0.01, 0.02, 0.0), impulse=1.7), kind="sticking"
     )
 

@@ -10,7 +10,7 @@ from dataclasses import fields
 from pathlib import Path
 from typing import TYPE_CHECKING
 
-from impact_posture.settings import ImpactSettings, LoadOptions, RobotSettings
+from impact_posture.config.settings import ImpactSettings, LoadOptions, RobotSettings
 from impact_posture_cli import options
 from impact_posture_cli.error_boundary import UsageError
 from impact_posture_cli.output import Page, print_json
@@ -18,13 +18,13 @@ from impact_posture_cli.progress_line import progress
 from impact_posture_cli.settings_options import Given, with_settings
 
 if TYPE_CHECKING:
-    from impact_posture.arrays import Array
     from impact_posture.codegen.export import Export
-    from impact_posture.controller_export.builtin import ControllerKind
-    from impact_posture.controller_export.export import ControllerExport
-    from impact_posture.impact.contact_compression import Compression
-    from impact_posture.impact.objective import ImpactObjective
+    from impact_posture.controller_export.default_formulation import ControllerKind
+    from impact_posture.controller_export.export_controller import ControllerExport
+    from impact_posture.impact.elasticity.contact_compression import Compression
+    from impact_posture.impact.worst_case_objective import WorstCaseObjective
     from impact_posture.robot.robot import Robot
+    from impact_posture.system.arrays import Array
     from impact_posture.tsid.task_formulation import TaskFormulation
 
 _IMPACT = {"speed", "restitution", "posture"}
@@ -60,7 +60,7 @@ def codegen(
     written: ControllerExport | Export
     place = Path(out) if out else None
     if controller is not None:
-        from impact_posture.controller_export.export import export_controller
+        from impact_posture.controller_export.export_controller import export_controller
 
         made, formulation, objective = _controller_parts(given, robot, controller, flow, scenario)
         written = export_controller(
@@ -101,7 +101,7 @@ def codegen(
 def _check_problem(given: Given, robot: str) -> None:
     """Check that there is a contact. Without one, a folder or a path to one is meant as a result folder."""
     if not {"contact", "normal"} & given.values.keys() and (os.path.isdir(robot) or robot.endswith(os.sep)):
-        from impact_posture.result_view import load_view
+        from impact_posture.output.result_reader import load_view
         from impact_posture.robot.robot_loader import known_robots
 
         if robot not in known_robots():
@@ -111,14 +111,14 @@ def _check_problem(given: Given, robot: str) -> None:
 
 def _objectives(
     given: Given, robot: str, from_result: bool
-) -> tuple[list[ImpactObjective], Array | None, Compression | None, tuple[str, ...]]:
+) -> tuple[list[WorstCaseObjective], Array | None, Compression | None, tuple[str, ...]]:
     """Return objectives, the optimum of a result, the first known compression of a contact, and warnings."""
     if from_result:
-        from impact_posture.result_view import load_view
+        from impact_posture.output.result_reader import load_view
 
         view = load_view(Path(robot))
         return [view.objective], view.q_optimal, None, ()
-    from impact_posture.impact.contact_compression import compression
+    from impact_posture.impact.elasticity.contact_compression import compression
     from impact_posture.impact.resolved_impact import resolve
 
     frames = given.values.get("frame", (None,))
@@ -129,10 +129,10 @@ def _objectives(
 
 def _controller_parts(
     given: Given, robot: str, kind: ControllerKind, flow: bool, scenario: str | None
-) -> tuple[Robot, TaskFormulation, ImpactObjective | None]:
+) -> tuple[Robot, TaskFormulation, WorstCaseObjective | None]:
     """Return the robot, its tasks, and the objective that the posture task follows."""
     if scenario is not None:
-        from impact_posture.simulation.controller_factory import ControllerFactory
+        from impact_posture.simulation.controllers.controller_factory import ControllerFactory
         from impact_posture.simulation.scenario import set_up
         from impact_posture.simulation.scenario_file import read_scenario
         from impact_posture.simulation.scenario_objective import interpreted
@@ -146,7 +146,7 @@ def _controller_parts(
         factory = ControllerFactory(setup, gradient_of=interpreted)
         driver = factory.driver("robust-flow" if flow else "robust")
         return setup.robot, driver.controller.formulation, factory.objective()
-    from impact_posture.controller_export.builtin import default_formulation
+    from impact_posture.controller_export.default_formulation import default_formulation
 
     if "normal" in given.values:
         from impact_posture.impact.resolved_impact import resolve

@@ -41,10 +41,10 @@ def compare(
     labels = [text.strip() for text in controllers.split(",") if text.strip()]
     if not labels:
         raise typer.BadParameter("name at least one controller", param_hint="--controllers")
-    from impact_posture.experiment.folders import FORMATS, Output, store_beside, write_comparison
+    from impact_posture.experiment.experiment_folders import FORMATS, Output, store_beside, write_comparison
     from impact_posture.experiment.reproduction import reproduce
-    from impact_posture.experiment.statistics import FEWEST, without_noise
-    from impact_posture.output_folder import check_output
+    from impact_posture.experiment.seed_statistics import FEWEST, without_noise
+    from impact_posture.system.output_folder import check_output
 
     plan = {scenario: list(dict.fromkeys(labels))}
     folder = None if out is None else Path(out)

@@ -4,17 +4,17 @@ from __future__ import annotations
 
 from typing import TYPE_CHECKING
 
-from impact_posture.settings import ImpactSettings
+from impact_posture.config.settings import ImpactSettings
 from impact_posture_cli import options
 from impact_posture_cli.impact_tables import alone_line, contact_names, impact_rows, worst_lines, worst_tables
 from impact_posture_cli.output import Page, number, print_json, vector
 from impact_posture_cli.settings_options import Given, with_settings
 
 if TYPE_CHECKING:
-    from impact_posture.impact.classical_ellipsoids import Ellipsoid
-    from impact_posture.impact.coulomb_contacts import CoulombJump
-    from impact_posture.impact.elastic_joints import ElasticResponse
-    from impact_posture.impact.evaluation import Evaluation
+    from impact_posture.impact.elasticity.elastic_joints import ElasticResponse
+    from impact_posture.impact.evaluation.coulomb_jump import CoulombJump
+    from impact_posture.impact.evaluation.ellipsoids import Ellipsoid
+    from impact_posture.impact.evaluation.evaluation import Evaluation
     from impact_posture.impact.resolved_impact import ResolvedImpact
 
 
@@ -27,7 +27,7 @@ def evaluate(
 ) -> None:
     """Run ``impact-posture evaluate``."""
     given.check_contact()
-    from impact_posture.impact.classical_ellipsoids import classical_ellipsoids
+    from impact_posture.impact.evaluation.ellipsoids import classical_ellipsoids
     from impact_posture.impact.resolved_impact import resolve
 
     impact = resolve(given.fill(ImpactSettings, robot=robot))
@@ -66,7 +66,7 @@ def evaluate(
 
 
 def _scalars(page: Page, impact: ResolvedImpact, found: Evaluation) -> None:
-    from impact_posture.impact.quantity_table import quantities
+    from impact_posture.output.quantity_table import quantities
 
     shown = [scalars for scalars in (found.scalars, found.without_supports) if scalars is not None]
     blocks = [scalars.to_dict() for scalars in shown]
@@ -107,7 +107,7 @@ def _ellipsoids(page: Page, impact: ResolvedImpact, ellipsoids: dict[str, Ellips
 
 
 def _gradient(page: Page, impact: ResolvedImpact, found: Evaluation) -> None:
-    from impact_posture.impact.velocity_jump import largest_entries
+    from impact_posture.impact.evaluation.velocity_jump import largest_entries
 
     page.gap()
     rows = [
@@ -121,7 +121,7 @@ def _gradient(page: Page, impact: ResolvedImpact, found: Evaluation) -> None:
 
 
 def _jumps(page: Page, impact: ResolvedImpact, found: Evaluation) -> None:
-    from impact_posture.impact.velocity_jump import merged_entries
+    from impact_posture.impact.evaluation.velocity_jump import merged_entries
 
     jumps = (found.frictionless, found.coulomb, found.sticking)
     rows = [
@@ -150,7 +150,7 @@ def _slip(jump: CoulombJump) -> str:
 
 
 def _elastic(page: Page, impact: ResolvedImpact, found: ElasticResponse) -> None:
-    from impact_posture.impact.velocity_jump import largest_entries, tangent_units
+    from impact_posture.impact.evaluation.velocity_jump import largest_entries, tangent_units
 
     rows = [
         ("  ‖Δν‖ of the links at greatest compression", number(found.jump_norm), "jump"),

@@ -9,7 +9,7 @@ from typing import TYPE_CHECKING, Annotated
 
 import typer
 
-from impact_posture.settings import ProblemSettings
+from impact_posture.config.settings import ProblemSettings
 from impact_posture_cli import options
 from impact_posture_cli.optimize_summary import announce, summarize
 from impact_posture_cli.output import Page, print_json
@@ -17,7 +17,7 @@ from impact_posture_cli.progress_line import progress
 from impact_posture_cli.settings_options import Given, with_settings
 
 if TYPE_CHECKING:
-    from impact_posture.result_folder import Written
+    from impact_posture.output.result_folder import Written
 
 # Thresholds of the garbage collector.
 _RARELY = 200_000, 50, 100
@@ -50,14 +50,14 @@ def optimize(
     gc.set_threshold(*_RARELY)
     settings = _settings(robot, given)
     _refuse_idle(given, settings)
-    from impact_posture.early_writer import early_writer
+    from impact_posture.output.early_writer import early_writer
 
     with early_writer(settings, jobs, report=not no_report, meshes=meshes) as finish:
-        from impact_posture.front_door import optimize as solve
-        from impact_posture.front_door_problem import PostureProblem
-        from impact_posture.output_folder import check_output
-        from impact_posture.posture.problem_settings import prepare
-        from impact_posture.result_folder import FORMATS, default_out
+        from impact_posture.api.posture_problem import PostureProblem
+        from impact_posture.api.posture_result import optimize as solve
+        from impact_posture.output.result_folder import FORMATS, default_out
+        from impact_posture.posture.formulation.problem_file import prepare
+        from impact_posture.system.output_folder import check_output
 
         if settings.path:
             from impact_posture.path.posture_path import check_package
@@ -127,7 +127,7 @@ def _settings(robot: str, given: Given) -> ProblemSettings:
         given.check_contact()
     if not from_file:
         return given.fill(ProblemSettings, robot=robot)
-    from impact_posture.posture.problem_settings import read_settings
+    from impact_posture.posture.formulation.problem_file import read_settings
 
     return read_settings(Path(robot), given.values)
 

@@ -33,10 +33,10 @@ def plot(
     quiet: options.Quiet = False,
 ) -> None:
     """Run ``impact-posture plot``."""
-    from impact_posture.output_folder import add_to_record
-    from impact_posture.plot import draw_all
-    from impact_posture.result_folder import FORMATS
-    from impact_posture.result_view import load_view
+    from impact_posture.output.plot import draw_all
+    from impact_posture.output.result_folder import FORMATS
+    from impact_posture.output.result_reader import load_view
+    from impact_posture.system.output_folder import add_to_record
 
     folder = Path(result_dir)
     into = Path(out) if out else folder

@@ -9,7 +9,7 @@ from typing import Annotated
 
 import typer
 
-from impact_posture.escape import printable
+from impact_posture.errors import printable
 from impact_posture_cli import options
 from impact_posture_cli.output import print_json
 from impact_posture_cli.progress_line import progress
@@ -26,14 +26,14 @@ def report(
     quiet: options.Quiet = False,
 ) -> None:
     """Run ``impact-posture report``."""
-    from impact_posture.output_folder import add_to_record
+    from impact_posture.system.output_folder import add_to_record
 
     place = Path(folder)
     rewrite: Callable[..., Path]
     if any(os.path.isfile(place / name) for name in ("run.json", "comparison.json")):
         from impact_posture.experiment.run_reports import write_run_report as rewrite
     else:
-        from impact_posture.result_view import rewrite_report as rewrite
+        from impact_posture.output.result_reader import rewrite_report as rewrite
     with progress("writing", shown=not (quiet or json)):
         written = rewrite(place, meshes=meshes)
     add_to_record(place, [written])

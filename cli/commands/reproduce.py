@@ -38,11 +38,11 @@ def reproduce(
 ) -> None:
     """Run ``impact-posture reproduce``."""
     from impact_posture.errors import ScenarioNotFound
-    from impact_posture.experiment.folders import FORMATS, Output, store_beside, write_reproduction
+    from impact_posture.experiment.experiment_folders import FORMATS, Output, store_beside, write_reproduction
     from impact_posture.experiment.reproduction import PAPER, controllers_of
     from impact_posture.experiment.reproduction import reproduce as reproduce_all
     from impact_posture.experiment.reproduction_summary import advice
-    from impact_posture.output_folder import check_output
+    from impact_posture.system.output_folder import check_output
 
     scenarios = list(dict.fromkeys(scenario)) if scenario else list(PAPER)
     for name in scenarios:

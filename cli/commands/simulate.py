@@ -87,13 +87,13 @@ def simulate(
 
     # A name that is none is refused before all that takes long to import.
     given = read_scenario(scenario)
-    from impact_posture.escape import file_name
-    from impact_posture.experiment.folders import FORMATS, Output, write_simulation
+    from impact_posture.experiment.experiment_folders import FORMATS, Output, write_simulation
     from impact_posture.experiment.jobs import Job, execute, worth_compiling
-    from impact_posture.experiment.statistics import fate
-    from impact_posture.output_folder import check_output
-    from impact_posture.posture.ipopt import one_blas_thread
-    from impact_posture.simulation.controller_factory import check_gain
+    from impact_posture.experiment.seed_statistics import fate
+    from impact_posture.posture.program.ipopt import one_blas_thread
+    from impact_posture.simulation.controllers.controller_factory import check_gain
+    from impact_posture.system.escape import file_name
+    from impact_posture.system.output_folder import check_output
 
     if export_world is not None:
         _export_world(Page(quiet=quiet or json), given, Path(export_world), force)
@@ -121,9 +121,9 @@ def simulate(
 
 
 def _export_world(page: Page, scenario: Scenario, out: Path, force: bool) -> None:
-    from impact_posture.output_folder import check_output
     from impact_posture.simulation.scenario import set_up
     from impact_posture.simulation.world_export import export_world
+    from impact_posture.system.output_folder import check_output
 
     check_output(out, force=force, kind="world")
     export_world(set_up(scenario), out, force=force)

@@ -66,9 +66,9 @@ def sweep(
         raise UsageError("DIR goes with show alone: give --out to name the folder.")
     if sum((scheduler is not None, mpi, slurm is not None)) > 1:
         raise UsageError("--scheduler, --mpi and --slurm exclude each other: give one of them.")
-    from impact_posture.escape import file_name
-    from impact_posture.sweep.run import run_sweep
     from impact_posture.sweep.sweep_file import read_sweep
+    from impact_posture.sweep.sweep_run import run_sweep
+    from impact_posture.system.escape import file_name
 
     path = Path(target)
     asked = read_sweep(path)

@@ -8,8 +8,8 @@ from typing import TYPE_CHECKING, Annotated
 
 import typer
 
-from impact_posture.setting import CONTACT, OUTPUT
-from impact_posture.settings import ImpactSettings, Vector3
+from impact_posture.config.demands import CONTACT, OUTPUT
+from impact_posture.config.settings import ImpactSettings, Vector3
 from impact_posture_cli import options
 from impact_posture_cli.output import Page, complain, print_json
 from impact_posture_cli.progress_line import progress
@@ -17,7 +17,7 @@ from impact_posture_cli.settings_options import Given, check_direction, with_set
 
 if TYPE_CHECKING:
     from impact_posture.impact.resolved_impact import ResolvedImpact
-    from impact_posture.verification.verification import Row, VerificationReport
+    from impact_posture.verification.verification import VerificationReport, VerificationRow
 
 NormalOfFirst = Annotated[
     Vector3 | None,
@@ -80,7 +80,7 @@ def verify(
 def _of_result(folder: Path) -> ResolvedImpact:
     """Return the impact of a result folder at the optimal posture."""
     from impact_posture.impact.resolved_impact import ResolvedImpact
-    from impact_posture.result_view import load_view
+    from impact_posture.output.result_reader import load_view
 
     view = load_view(folder)
     return ResolvedImpact(view.objective, view.q_optimal, "the result's optimum", view.speed, view.restitution)
@@ -95,7 +95,7 @@ def _asked(title: Callable[[str, str], None], impact: ResolvedImpact, report: Ve
     )
 
 
-def _cells(row: Row) -> tuple[str, ...]:
+def _cells(row: VerificationRow) -> tuple[str, ...]:
     if row.tolerance is None:
         return row.source, "", "", "", row.verdict, row.note
     error = row.note if row.error is None else f"{row.error:.1e}"

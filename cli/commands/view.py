@@ -14,7 +14,7 @@ def view(folder: OutputFolder, json: options.Json = False, quiet: options.Quiet 
     import webbrowser
 
     from impact_posture.errors import InputError
-    from impact_posture.report import REPORT
+    from impact_posture.output.report import REPORT
 
     page = Path(folder) / REPORT
     if not os.path.isfile(page):

@@ -18,8 +18,9 @@ def modules(name: str) -> list[str]:
     package = import_module(full)
     if not hasattr(package, "__path__"):
         return [full]
-    inner = sorted(f"{full}.{m.name}" for m in pkgutil.iter_modules(package.__path__) if not m.name.startswith("_"))
-    return [full, *inner] if getattr(package, "__all__", ()) else inner
+    inner = sorted((module.name, module.ispkg) for module in pkgutil.walk_packages(package.__path__, f"{full}."))
+    public = [name for name, folder in inner if not folder or getattr(import_module(name), "__all__", ())]
+    return [full, *public] if getattr(package, "__all__", ()) else public
 
 
 def markdown(names: list[str]) -> str:

@@ -12,8 +12,8 @@ import pinocchio as pin
 from impact_posture.codegen.impact_gradient import ImpactGradient
 from impact_posture.robot.robot_loader import load_robot
 from impact_posture.tsid.controller import Controller
-from impact_posture.tsid.impact_robust import ImpactRobustPosture, gradient_of
 from impact_posture.tsid.task_formulation import aerial_formulation
+from impact_posture.tsid.tasks.impact_robust import ImpactRobustPosture, gradient_of
 
 robot = load_robot("tilthex_arm")
 export = ImpactGradient.load(sys.argv[1], robot=robot)

@@ -23,10 +23,10 @@ from pink.tasks import FrameTask, Task
 
 from impact_posture.codegen.export import export
 from impact_posture.codegen.impact_gradient import ImpactGradient
-from impact_posture.posture.problem_settings import Prepared, prepare
-from impact_posture.posture.solve import PostureSolution, solve
-from impact_posture.settings import ProblemSettings
-from impact_posture.tables import validate
+from impact_posture.config.settings import ProblemSettings
+from impact_posture.config.toml_tables import validate
+from impact_posture.posture.formulation.problem_file import Prepared, prepare
+from impact_posture.posture.search.multistart import PostureSolution, solve
 
 DT, DURATION, AT_REST = 0.01, 60.0, 1e-6  # s, s, and a norm of v
 

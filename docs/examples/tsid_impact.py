@@ -21,8 +21,8 @@ import tsid
 
 from impact_posture.codegen.export import export
 from impact_posture.codegen.impact_gradient import ImpactGradient
-from impact_posture.impact.contact import ImpactContact
-from impact_posture.impact.objective import ImpactObjective
+from impact_posture.impact.impact_contact import ImpactContact
+from impact_posture.impact.worst_case_objective import WorstCaseObjective
 from impact_posture.robot.robot_loader import load_robot
 
 DT, DURATION = 0.002, 20.0
@@ -46,7 +46,7 @@ def run() -> Outcome:
     robot = load_robot("ur5")
     model, q, v = robot.model, robot.posture().copy(), np.zeros(robot.nv)
     with tempfile.TemporaryDirectory() as folder:
-        objective = ImpactObjective(robot, ImpactContact(FRAME, NORMAL))
+        objective = WorstCaseObjective(robot, ImpactContact(FRAME, NORMAL))
         export(objective, Path(folder), prefix="ur5", check=False)
         gradient = ImpactGradient.load(folder, robot=robot)
     K = KD * SPEED / np.linalg.norm(gradient.value_and_gradient(q, NORMAL)[1])

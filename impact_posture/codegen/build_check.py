@@ -10,16 +10,16 @@ from pathlib import Path
 
 import numpy as np
 
-from impact_posture.arrays import Array
-from impact_posture.codegen.emitter import REALS, Real
-from impact_posture.codegen.functions import Reference, casadi_reference, named_objectives, oracle_reference
+from impact_posture.codegen.c_emitter import REALS, Real
+from impact_posture.codegen.export_functions import Reference, casadi_reference, named_objectives, oracle_reference
 from impact_posture.codegen.impact_gradient import ImpactGradient
 from impact_posture.codegen.manifest_builder import sample_postures
-from impact_posture.codegen.reader import read_manifest
+from impact_posture.codegen.manifest_reader import read_manifest
 from impact_posture.errors import CompilerError, OutputError
-from impact_posture.impact.contact import heavy_feet_rounding
-from impact_posture.impact.objective import ImpactObjective
-from impact_posture.libraries import (
+from impact_posture.impact.impact_contact import heavy_feet_rounding
+from impact_posture.impact.worst_case_objective import WorstCaseObjective
+from impact_posture.system.arrays import Array
+from impact_posture.system.libraries import (
     build_library,
     cache_folder,
     is_cached,
@@ -28,8 +28,8 @@ from impact_posture.libraries import (
     seal_path,
     source_key,
 )
-from impact_posture.scratch_folder import scratch_folder
-from impact_posture.toolchain import find_compiler, words_of
+from impact_posture.system.scratch_folder import scratch_folder
+from impact_posture.system.toolchain import find_compiler, words_of
 
 # The oracle factorizes another matrix.  Feet at compliance ε cost digits there (condition about 1/ε).
 _ORACLE_TOLERANCE = 1e-5
@@ -50,7 +50,7 @@ _LEAST = {"grad": "H", "objective_grad": "objective"}
 _SHARE = 1e-3
 
 
-def self_test_tolerance(objective: ImpactObjective, real: Real) -> float:
+def self_test_tolerance(objective: WorstCaseObjective, real: Real) -> float:
     """Return the largest relative difference from the numbers of CasADi that rounding explains.
 
     The C code divides by reciprocals, and a compiler may fuse sums with products.  In float the condition of the
@@ -64,7 +64,7 @@ def self_test_tolerance(objective: ImpactObjective, real: Real) -> float:
 def compile_and_check(
     export_dir: Path,
     prefix: str,
-    objectives: Sequence[ImpactObjective],
+    objectives: Sequence[WorstCaseObjective],
     *,
     keep: bool = False,
 ) -> float:
@@ -129,8 +129,8 @@ def _cached_library(export_dir: Path, prefix: str) -> Path | None:
 
 def largest_difference(
     gradient: ImpactGradient,
-    objective: ImpactObjective,
-    build_reference: Callable[[ImpactObjective], Reference],
+    objective: WorstCaseObjective,
+    build_reference: Callable[[WorstCaseObjective], Reference],
     samples: int,
 ) -> float:
     """Return the largest relative difference of a compiled export from a reference; infinite where a call fails.
@@ -138,7 +138,7 @@ def largest_difference(
     Args:
         gradient: The export.
         objective: The exported objective.
-        build_reference: :func:`~impact_posture.codegen.functions.casadi_reference` or ``oracle_reference``.
+        build_reference: :func:`~impact_posture.codegen.export_functions.casadi_reference` or ``oracle_reference``.
         samples: The number of random postures and normals.
     """
     reference = build_reference(objective)

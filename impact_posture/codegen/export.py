@@ -11,23 +11,23 @@ from typing import Any
 
 import numpy as np
 
-from impact_posture.argument_types import checked
-from impact_posture.arrays import Array
 from impact_posture.codegen.build_check import compile_and_check
-from impact_posture.codegen.code import Code, build_code
-from impact_posture.codegen.emitter import DOUBLE, FLOAT, Real
-from impact_posture.codegen.functions import NamedObjective, named_objectives
+from impact_posture.codegen.c_emitter import DOUBLE, FLOAT, Real
+from impact_posture.codegen.c_names import c_identifier, check_prefix, products
+from impact_posture.codegen.export_files import render
+from impact_posture.codegen.export_functions import NamedObjective, named_objectives
 from impact_posture.codegen.impact_gradient import ImpactGradient
 from impact_posture.codegen.manifest_builder import build_manifest
-from impact_posture.codegen.naming import c_identifier, check_prefix, products
-from impact_posture.codegen.render import render
+from impact_posture.codegen.source_blocks import Code, build_code
+from impact_posture.config.argument_types import checked
 from impact_posture.errors import CompilerError, InputError, OutputError
-from impact_posture.impact.contact_compression import Compression
-from impact_posture.impact.objective import ImpactObjective
-from impact_posture.libraries import library_path
-from impact_posture.output_folder import whole_folder, write_whole
+from impact_posture.impact.elasticity.contact_compression import Compression
+from impact_posture.impact.worst_case_objective import WorstCaseObjective
 from impact_posture.robot.robot import Robot
-from impact_posture.toolchain import GET_ONE, find_compiler
+from impact_posture.system.arrays import Array
+from impact_posture.system.libraries import library_path
+from impact_posture.system.output_folder import whole_folder, write_whole
+from impact_posture.system.toolchain import GET_ONE, find_compiler
 
 SCHEMA = "impact-posture/codegen-run/1"
 
@@ -111,7 +111,7 @@ class Export(WrittenCode):
 
 
 def export(
-    objective: ImpactObjective | Sequence[ImpactObjective],
+    objective: WorstCaseObjective | Sequence[WorstCaseObjective],
     out: Path,
     *,
     prefix: str | None = None,
@@ -177,7 +177,7 @@ def export(
 
 @lru_cache(maxsize=1)
 def cached_code(
-    objectives: tuple[ImpactObjective, ...], prefix: str, real: Real, portable: bool
+    objectives: tuple[WorstCaseObjective, ...], prefix: str, real: Real, portable: bool
 ) -> tuple[tuple[NamedObjective, ...], Code]:
     """Return the functions of an export, which take most of the time of :func:`export` and need no posture."""
     exported = named_objectives(objectives, prefix)
@@ -186,7 +186,7 @@ def cached_code(
 
 @checked
 def write_export(
-    objectives: Sequence[ImpactObjective],
+    objectives: Sequence[WorstCaseObjective],
     out: Path | None = None,
     *,
     prefix: str | None = None,
@@ -235,16 +235,16 @@ def write_export(
     return replace(made, out=out, files=files, agreement=agreement, library=library, requested=build)
 
 
-def default_prefix(objectives: Sequence[ImpactObjective]) -> str:
+def default_prefix(objectives: Sequence[WorstCaseObjective]) -> str:
     """Return robot and frame as a prefix; the robot alone where there are several frames."""
     first = objectives[0]
     alone = len(objectives) == 1 and not first.others
     return c_identifier(first.robot.name, first.contact.frame if alone else "")
 
 
-def _same_robot(objective: ImpactObjective | Sequence[ImpactObjective]) -> tuple[ImpactObjective, ...]:
+def _same_robot(objective: WorstCaseObjective | Sequence[WorstCaseObjective]) -> tuple[WorstCaseObjective, ...]:
     """Return the objectives as a tuple; refuse objectives that differ in more than the contact."""
-    objectives = (objective,) if isinstance(objective, ImpactObjective) else tuple(objective)
+    objectives = (objective,) if isinstance(objective, WorstCaseObjective) else tuple(objective)
     if not objectives:
         raise InputError("no objective is given", where="codegen", hint="give one for each frame")
     first = objectives[0]
@@ -258,6 +258,6 @@ def _same_robot(objective: ImpactObjective | Sequence[ImpactObjective]) -> tuple
     return objectives
 
 
-def _without_contact(o: ImpactObjective) -> tuple[object, ...]:
+def _without_contact(o: WorstCaseObjective) -> tuple[object, ...]:
     models = tuple(variant.robot.impact_sha256 for variant in o.model_variants)
     return o.robot.impact_sha256, o.metric, o.kind, o.supports, o.compliance, o.normal_cone_deg, models

@@ -11,11 +11,11 @@ from typing import TYPE_CHECKING, Any
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
-from impact_posture.argument_types import checked
-from impact_posture.codegen.naming import SIGNATURES, lengths
-from impact_posture.codegen.reader import check_library, check_robot, frame_block, read_manifest
+from impact_posture.codegen.c_names import SIGNATURES, lengths
+from impact_posture.codegen.manifest_reader import check_library, check_robot, frame_block, read_manifest
+from impact_posture.config.argument_types import checked
 from impact_posture.errors import InputError, ManifestMismatch, MetricError, PostureError, SpecError
-from impact_posture.libraries import build_library, library_path, load_library
+from impact_posture.system.libraries import build_library, library_path, load_library
 
 if TYPE_CHECKING:
     from impact_posture.robot.robot import Robot
@@ -135,7 +135,7 @@ class ImpactGradient:
         """Call a C function and return its code and views of its results, also when the code is not zero.
 
         Args:
-            name: A function of :data:`~impact_posture.codegen.naming.SIGNATURES`.
+            name: A function of :data:`~impact_posture.codegen.c_names.SIGNATURES`.
             q: Configuration, shape (nq,).
             n: Unit normal out of the surface, in the manifest's ``normal_frame``, shape (3,).
 

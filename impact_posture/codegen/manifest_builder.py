@@ -10,17 +10,17 @@ import casadi as ca
 import numpy as np
 import pinocchio as pin
 
-from impact_posture.arrays import Array
-from impact_posture.codegen.emitter import DOUBLE, Real
-from impact_posture.codegen.functions import casadi_reference, named_objectives
-from impact_posture.codegen.naming import FUNCTIONS
-from impact_posture.codegen.reader import SCHEMA
+from impact_posture.codegen.c_emitter import DOUBLE, Real
+from impact_posture.codegen.c_names import FUNCTIONS
+from impact_posture.codegen.export_functions import casadi_reference, named_objectives
+from impact_posture.codegen.manifest_reader import SCHEMA
 from impact_posture.dynamics.chart import Chart
 from impact_posture.errors import MetricError
-from impact_posture.impact.contact import ImpactContact
-from impact_posture.impact.contact_compression import Compression
-from impact_posture.impact.objective import ImpactObjective
+from impact_posture.impact.elasticity.contact_compression import Compression
+from impact_posture.impact.impact_contact import ImpactContact
+from impact_posture.impact.worst_case_objective import WorstCaseObjective
 from impact_posture.robot.robot import Robot
+from impact_posture.system.arrays import Array
 from impact_posture.version import __version__
 
 # A unit vector along no axis, so that no entry of a gradient vanishes.  It is exact enough in binary.
@@ -49,7 +49,7 @@ def sample_postures(robot: Robot, count: int, seed: int) -> list[Array]:
     return [np.asarray(pin.integrate(robot.model, start, rng.uniform(-0.5, 0.5, robot.nv))) for _ in range(count)]
 
 
-def self_test(objective: ImpactObjective, real: Real = DOUBLE) -> dict[str, Any]:
+def self_test(objective: WorstCaseObjective, real: Real = DOUBLE) -> dict[str, Any]:
     """Return reference values at one posture and normal, from CasADi: ``q, n, H, grad, objective, …``.
 
     Posture and normal are numbers of the type of the export, so that the call changes nothing.
@@ -70,7 +70,7 @@ def self_test(objective: ImpactObjective, real: Real = DOUBLE) -> dict[str, Any]
 
 
 def build_manifest(
-    objectives: Sequence[ImpactObjective],
+    objectives: Sequence[WorstCaseObjective],
     prefix: str,
     posture: Array | None,
     compression: Compression | None,
@@ -156,7 +156,7 @@ def _contact_block(contact: ImpactContact) -> dict[str, Any]:
     }
 
 
-def _joint_block(objective: ImpactObjective, stem: str, real: Real) -> dict[str, Any]:
+def _joint_block(objective: WorstCaseObjective, stem: str, real: Real) -> dict[str, Any]:
     return {
         "contacts": [_contact_block(contact) for contact in objective.contacts],
         "bilateral": objective.bilateral,
@@ -165,7 +165,7 @@ def _joint_block(objective: ImpactObjective, stem: str, real: Real) -> dict[str,
     }
 
 
-def _frame_block(objective: ImpactObjective, stem: str, real: Real) -> dict[str, Any]:
+def _frame_block(objective: WorstCaseObjective, stem: str, real: Real) -> dict[str, Any]:
     return {
         "frame": objective.contact.frame,
         "offset": list(objective.contact.offset),

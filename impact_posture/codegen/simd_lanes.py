@@ -9,7 +9,7 @@ from __future__ import annotations
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
 
-from impact_posture.codegen.graph import ARITHMETIC, COSINE, SINE, Graph, Node
+from impact_posture.codegen.expression_graph import ARITHMETIC, COSINE, SINE, Graph, Node
 
 # Identity of an operand in the key of an operation: the number of a node, or a place in a limb.
 Key = tuple[object, ...]

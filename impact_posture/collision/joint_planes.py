@@ -10,9 +10,9 @@ import numpy as np
 import pinocchio as pin
 from numpy.typing import NDArray
 
-from impact_posture.arrays import Array
+from impact_posture.config.cached_values import StoredArray
 from impact_posture.robot.robot import Robot
-from impact_posture.stored_text import StoredArray
+from impact_posture.system.arrays import Array
 
 # Positions of each joint at which shapes are tried.  More joints than this between two bodies are too many.
 _TRIED, _MOST_JOINTS = 25, 3

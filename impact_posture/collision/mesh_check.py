@@ -10,10 +10,10 @@ import coal
 import numpy as np
 import pinocchio as pin
 
-from impact_posture.arrays import Array
-from impact_posture.collision.shapes import RobotShapes
+from impact_posture.collision.robot_shapes import RobotShapes
 from impact_posture.collision.swept_hull import SweptHull, transform
 from impact_posture.robot.robot import Robot
+from impact_posture.system.arrays import Array
 
 TOLERANCE = 1e-6
 """Depth (m) up to which two shapes may be in each other, because a solver lets hulls touch within its tolerance."""

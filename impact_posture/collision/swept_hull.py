@@ -12,9 +12,9 @@ import coal
 import numpy as np
 import pinocchio as pin
 
-from impact_posture.arrays import Array
-from impact_posture.obstacle import Obstacle
-from impact_posture.stored_text import StoredArray
+from impact_posture.config.cached_values import StoredArray
+from impact_posture.config.obstacle import Obstacle
+from impact_posture.system.arrays import Array
 
 MOST_VERTICES = 40
 """Most vertices of a hull, because each one is a row of a separating plane."""

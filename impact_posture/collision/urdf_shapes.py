@@ -15,10 +15,10 @@ import coal
 import numpy as np
 import pinocchio as pin
 
-from impact_posture.collision.shape_points import Corrected, correct, mesh_points
+from impact_posture.collision.shape_corners import Corrected, correct, mesh_points
 from impact_posture.errors import UrdfError, one_line
 from impact_posture.robot.robot import Robot
-from impact_posture.robot.robot_loader import locate, srdf_path
+from impact_posture.robot.robot_loader import locate
 from impact_posture.robot.urdf import parse_urdf, quiet_stderr
 
 # A shape larger than this (m), and larger than so many times the robot, is in millimeters.
@@ -167,21 +167,6 @@ def read_urdf_shapes(robot: Robot, first: str = "collision") -> tuple[list[UrdfS
 def left_out(name: str, fault: UnusableShape) -> str:
     """Return the line about a shape that is left out."""
     return one_line(f"shape {name} is left out: {fault}")
-
-
-def disabled_links(robot: Robot) -> set[frozenset[str]]:
-    """Return the pairs of links that the SRDF allows to touch."""
-    if robot.settings is None:
-        return set()
-    located = locate(robot.settings.robot, robot.settings)
-    path = srdf_path(located.spec, robot.settings, located.folder)
-    if path is None:
-        return set()
-    try:
-        tags = ET.parse(path).getroot().iter("disable_collisions")
-    except (OSError, ET.ParseError) as error:
-        raise UrdfError(f"is no SRDF ({error})", where=str(path), hint="correct the SRDF") from None
-    return {frozenset((tag.get("link1", ""), tag.get("link2", ""))) for tag in tags}
 
 
 def _read(

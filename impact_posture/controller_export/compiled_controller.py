@@ -12,14 +12,14 @@ import numpy as np
 import pinocchio as pin
 from numpy.typing import ArrayLike
 
-from impact_posture.argument_types import checked
-from impact_posture.arrays import Array
-from impact_posture.codegen.reader import check_library, check_robot
+from impact_posture.codegen.manifest_reader import check_library, check_robot
+from impact_posture.config.argument_types import checked
 from impact_posture.controller_export.compiled_report import STATUSES, read_report
-from impact_posture.controller_export.manifest import Manifest, build_controller, read_controller
+from impact_posture.controller_export.controller_manifest import Manifest, build_controller, read_controller
 from impact_posture.errors import ContactError, InputError, MetricError, PostureError, SpecError
-from impact_posture.libraries import library_path, load_library
 from impact_posture.robot.robot import Robot
+from impact_posture.system.arrays import Array
+from impact_posture.system.libraries import library_path, load_library
 from impact_posture.tsid.controller import Command, Report
 
 _FUNCTIONS = ("init", "reset", "tick", "last_report", "move_to", "lead_posture", "brace", "contact", "release")

@@ -4,8 +4,8 @@ from __future__ import annotations
 
 from collections.abc import Mapping
 
-from impact_posture.arrays import Array
-from impact_posture.controller_export.manifest import Manifest
+from impact_posture.controller_export.controller_manifest import Manifest
+from impact_posture.system.arrays import Array
 from impact_posture.tsid.controller import Report, Status
 from impact_posture.tsid.relaxation import Relaxed
 

@@ -16,7 +16,7 @@ from collections.abc import Callable
 from pathlib import Path
 
 from impact_posture.errors import InputError
-from impact_posture.libraries import building, cache_folder, is_cached
+from impact_posture.system.libraries import building, cache_folder, is_cached
 
 VERSION = "0.11.0"
 SOURCES = ("auxiliary.c", "daqp.c", "factorization.c")

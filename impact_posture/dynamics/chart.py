@@ -9,9 +9,9 @@ import casadi as ca
 import numpy as np
 import pinocchio as pin
 
-from impact_posture.arrays import Array
 from impact_posture.dynamics.joints import JointKind, joint_kind
 from impact_posture.robot.model_joints import ENDLESS
+from impact_posture.system.arrays import Array
 
 # Joints whose last coordinate is an angle; their q has its cosine and sine.
 _ANGLES = ("continuous", "planar")

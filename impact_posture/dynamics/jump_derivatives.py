@@ -23,9 +23,9 @@ from functools import cached_property
 import casadi as ca
 import numpy as np
 
-from impact_posture.arrays import Array
 from impact_posture.dynamics.kinematics import ByJoint, Kinematics, PointOnLink
 from impact_posture.dynamics.spatial import constant, cross, motion_cross_force, skew, symmetric, template
+from impact_posture.system.arrays import Array
 
 # Families of joints with one degree of freedom, whose coordinate in the chart changes at their velocity.
 _ONE_AXIS = ("revolute", "continuous", "prismatic")

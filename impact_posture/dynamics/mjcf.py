@@ -14,12 +14,12 @@ from typing import Any, Literal
 import numpy as np
 import pinocchio as pin
 
-from impact_posture.arrays import Array
 from impact_posture.dynamics.chart import BOUNDED, Chart, JointSlot
 from impact_posture.dynamics.mjcf_layout import MjcfLayout
 from impact_posture.errors import InputError
-from impact_posture.escape import xml_name
 from impact_posture.robot.model_joints import ENDLESS
+from impact_posture.system.arrays import Array
+from impact_posture.system.escape import xml_name
 
 Geom = Literal["sphere", "box", "plane"]
 

@@ -18,8 +18,8 @@ import numpy as np
 import pinocchio as pin
 from numpy.typing import NDArray
 
-from impact_posture.arrays import Array
 from impact_posture.dynamics.chart import Chart, JointSlot
+from impact_posture.system.arrays import Array
 
 
 @dataclass(frozen=True)

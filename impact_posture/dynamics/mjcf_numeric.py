@@ -6,8 +6,8 @@ import numpy as np
 import pinocchio as pin
 from numpy.typing import ArrayLike
 
-from impact_posture.arrays import Array
 from impact_posture.dynamics.mjcf import build_mjcf, import_mujoco
+from impact_posture.system.arrays import Array
 
 
 class MujocoNumeric:

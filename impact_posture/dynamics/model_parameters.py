@@ -10,11 +10,11 @@ import numpy as np
 import pinocchio as pin
 from numpy.typing import ArrayLike
 
-from impact_posture.arrays import Array
 from impact_posture.dynamics.repeated_limbs import RepeatedLimbs
 from impact_posture.dynamics.spatial import constant, rounded
 from impact_posture.robot.model_joints import finite_armature
 from impact_posture.robot.robot import Robot
+from impact_posture.system.arrays import Array
 
 
 class ModelParameters(RepeatedLimbs):

@@ -8,9 +8,9 @@ import numpy as np
 import pinocchio as pin
 from numpy.typing import NDArray
 
-from impact_posture.arrays import Array
 from impact_posture.dynamics.tree import PointOnLink
 from impact_posture.robot.model_joints import finite_armature
+from impact_posture.system.arrays import Array
 
 
 class Numeric:

@@ -11,16 +11,16 @@ from pydantic_core import to_jsonable_python
 
 from impact_posture.dynamics.mjcf import import_mujoco
 from impact_posture.errors import InputError
-from impact_posture.escape import file_name
-from impact_posture.posture.compiled import CompileMode
-from impact_posture.posture.result import versions
-from impact_posture.simulation.controller_factory import ControllerFactory, Mode
+from impact_posture.posture.analysis.result_document import versions
+from impact_posture.posture.program.compiled_solver import CompileMode
+from impact_posture.simulation.controllers.controller_factory import ControllerFactory, Mode
 from impact_posture.simulation.metrics import Metrics, measure
 from impact_posture.simulation.outcome import gravest, judge, links_behind
 from impact_posture.simulation.prediction import predict
 from impact_posture.simulation.run import Run, run
 from impact_posture.simulation.scenario import set_up
 from impact_posture.simulation.scenario_file import read_scenario
+from impact_posture.system.escape import file_name
 
 Document = dict[str, Any]
 

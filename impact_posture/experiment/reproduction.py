@@ -6,11 +6,11 @@ from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass
 from typing import Any
 
-from impact_posture.experiment.batch import Progress, Store, run_batch
+from impact_posture.experiment.job_store import Progress, Store, run_batch
 from impact_posture.experiment.jobs import Document, Job, jsonable, parse_controller, worth_compiling
-from impact_posture.experiment.statistics import Interval, Row, row_of
-from impact_posture.posture.compiled import CompileMode
-from impact_posture.simulation.controller_factory import CONTROLLERS
+from impact_posture.experiment.seed_statistics import ControllerRow, Interval, row_of
+from impact_posture.posture.program.compiled_solver import CompileMode
+from impact_posture.simulation.controllers.controller_factory import CONTROLLERS
 
 SCHEMA, COMPARISON_SCHEMA = "impact-posture/reproduction/3", "impact-posture/comparison/3"
 # The first two show what the posture that a term reaches does on its own, the third the metric without the feet.
@@ -54,7 +54,7 @@ RECOMMENDED: dict[str, str] = {
 # Targets of a better controller, for the means over the runs of a row: whether a row misses them, given the reduction
 # of the paper, and what it then has.  A motion that only comes later, in the recovery, is no reduction.  Numbers of
 # ticks are whole, so a saturation that only differs in the last digits is the same.
-_TARGETS: dict[str, tuple[Callable[[Row, float], bool], str]] = {
+_TARGETS: dict[str, tuple[Callable[[ControllerRow, float], bool], str]] = {
     "reduction": (lambda row, paper: _mean(row.reduction) < paper, "less than the paper's reduction"),
     "recovery": (lambda row, _: _mean(row.recovery) <= 0, "no less motion than nominal over the recovery"),
     "peak_jump": (lambda row, _: _change(row, "peak_jump") > 0, "a higher peak jump than nominal"),
@@ -70,7 +70,7 @@ _TARGETS: dict[str, tuple[Callable[[Row, float], bool], str]] = {
 }  # fmt: skip
 
 
-def _change(row: Row, name: str) -> float:
+def _change(row: ControllerRow, name: str) -> float:
     return row.change[name].mean
 
 
@@ -78,7 +78,7 @@ def _mean(value: Interval | None) -> float:
     return value.mean if value else 0.0
 
 
-def missed_targets(row: Row) -> dict[str, str] | None:
+def missed_targets(row: ControllerRow) -> dict[str, str] | None:
     """Return the targets that a row misses, each with what the row has instead.
 
     The nominal controller and a row without reduction have ``None``.
@@ -89,7 +89,7 @@ def missed_targets(row: Row) -> dict[str, str] | None:
     return {name: instead for name, (misses, instead) in _TARGETS.items() if misses(row, paper)}
 
 
-def best_of(rows: Sequence[Row]) -> Row | None:
+def best_of(rows: Sequence[ControllerRow]) -> ControllerRow | None:
     """Return the row with the largest reduction, of those that meet every target, or else of all.
 
     The smaller of the two reductions counts, within the window and until the recovery ends.
@@ -116,7 +116,7 @@ def jobs_of(plan: Plan, seeds: int, compile: CompileMode = "auto") -> list[Job]:
     return found
 
 
-def gather(scenario: str, labels: Sequence[str], documents: Sequence[Document]) -> list[Row]:
+def gather(scenario: str, labels: Sequence[str], documents: Sequence[Document]) -> list[ControllerRow]:
     """Return the rows of a scenario from the documents of its jobs, in the order of :func:`jobs_of`."""
     count = len(documents) // len(labels)
     parts = {label: documents[k * count : (k + 1) * count] for k, label in enumerate(labels)}
@@ -135,7 +135,7 @@ class Reproduction:
     """
 
     seeds: int
-    rows: tuple[Row, ...]
+    rows: tuple[ControllerRow, ...]
     jobs: tuple[Job, ...] = ()
 
     @property
@@ -148,15 +148,15 @@ class Reproduction:
         """Names of the scenarios."""
         return tuple(dict.fromkeys(row.scenario for row in self.rows))
 
-    def of(self, scenario: str) -> tuple[Row, ...]:
+    def of(self, scenario: str) -> tuple[ControllerRow, ...]:
         """Return the rows of a scenario."""
         return tuple(row for row in self.rows if row.scenario == scenario)
 
-    def row(self, scenario: str, controller: str) -> Row | None:
+    def row(self, scenario: str, controller: str) -> ControllerRow | None:
         """Return the row of a controller in a scenario."""
         return next((row for row in self.of(scenario) if row.controller == controller), None)
 
-    def best(self, scenario: str) -> Row | None:
+    def best(self, scenario: str) -> ControllerRow | None:
         """Return the best row of a scenario (:func:`best_of`)."""
         return best_of(self.of(scenario))
 
@@ -202,7 +202,7 @@ def reproduce(
     """
     jobs = jobs_of(plan, seeds, compile)
     documents = run_batch(jobs, processes=processes, store=store, progress=progress)
-    rows: list[Row] = []
+    rows: list[ControllerRow] = []
     for scenario, labels in plan.items():
         count = len(labels) * seeds
         rows += gather(scenario, labels, documents[:count])

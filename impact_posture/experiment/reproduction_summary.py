@@ -6,10 +6,10 @@ from collections.abc import Sequence
 
 import numpy as np
 
-from impact_posture.escape import markdown
 from impact_posture.experiment.reproduction import PAPER, Reproduction, missed_targets
-from impact_posture.experiment.statistics import FEWEST, Interval, Row
-from impact_posture.simulation.controller_factory import MEANING
+from impact_posture.experiment.seed_statistics import FEWEST, ControllerRow, Interval
+from impact_posture.simulation.controllers.controller_factory import MEANING
+from impact_posture.system.escape import markdown
 
 # Most decimals of a number that is nearly zero.
 _DECIMALS = 4
@@ -42,7 +42,7 @@ def table_one(found: Reproduction) -> str:
     return _table(head, lines)
 
 
-def scenario_table(rows: Sequence[Row]) -> str:
+def scenario_table(rows: Sequence[ControllerRow]) -> str:
     """Return the table of all controllers of a scenario."""
     head = (
         "controller|status|q_total_impact|reduction|over the recovery|peak jump|in the recovery|saturated inside, s|"
@@ -124,7 +124,7 @@ def advice(found: Reproduction, beside: Reproduction | None = None) -> list[str]
     return lines
 
 
-def _force(best: Row, nominal: Row | None) -> str:
+def _force(best: ControllerRow, nominal: ControllerRow | None) -> str:
     """Return how much more force the contact has to bear."""
     if nominal is None:
         return ""
@@ -132,7 +132,7 @@ def _force(best: Row, nominal: Row | None) -> str:
     return f" The contact bears up to {after:.0f} N instead of {before:.0f} N." if after > 1.1 * before else ""
 
 
-def _held(best: Row, held: Row | None) -> str:
+def _held(best: ControllerRow, held: ControllerRow | None) -> str:
     """Return a warning if the reduction of a term is not due to its posture."""
     share = _share(held, best)
     if share is None or share > 0.5:
@@ -143,7 +143,7 @@ def _held(best: Row, held: Row | None) -> str:
     )
 
 
-def _share(part: Row | None, whole: Row | None) -> float | None:
+def _share(part: ControllerRow | None, whole: ControllerRow | None) -> float | None:
     """Return one reduction over another, 0 if the other is not positive, or ``None`` if there are not both."""
     if part is None or whole is None or part.reduction is None or whole.reduction is None:
         return None
@@ -198,12 +198,12 @@ def _plus_minus(value: Interval, decimals: int, factor: int = 1) -> str:
     return text if value.shown is None else f"{text} ± {factor * value.shown:.{decimals}f}"
 
 
-def reduction_text(row: Row | None) -> str:
+def reduction_text(row: ControllerRow | None) -> str:
     """Return the reduction of a row in percent."""
     return percent(None if row is None or row.controller == "nominal" else row.reduction)
 
 
-def targets_text(row: Row) -> str:
+def targets_text(row: ControllerRow) -> str:
     """Return whether the targets are met, or which are not."""
     missed = missed_targets(row)
     if missed is None:
@@ -211,10 +211,10 @@ def targets_text(row: Row) -> str:
     return "missed: " + ", ".join(missed) if missed else "met"
 
 
-def _missed(row: Row) -> str:
+def _missed(row: ControllerRow) -> str:
     """Return what the row has instead of the targets that it misses."""
     return ", ".join((missed_targets(row) or {}).values())
 
 
-def _total(row: Row | None) -> str:
+def _total(row: ControllerRow | None) -> str:
     return "–" if row is None or not row.metrics else interval_text(row.metrics["q_total_impact"])

@@ -8,11 +8,11 @@ from pathlib import Path
 from typing import Any
 
 from impact_posture.experiment.jobs import Document, Job, controller_factory
-from impact_posture.experiment.statistics import FEWEST, Interval, without_noise
-from impact_posture.output_folder import typed_command
-from impact_posture.plot.run_view import RunView, run_header
-from impact_posture.plot.view import number
-from impact_posture.report.page import Content, Table
+from impact_posture.experiment.seed_statistics import FEWEST, Interval, without_noise
+from impact_posture.output.plot.result_view import number
+from impact_posture.output.plot.run_view import RunView, run_header
+from impact_posture.output.report.report_page import Content, Table
+from impact_posture.system.output_folder import typed_command
 
 # Metrics of a table: key, unit and meaning.
 _METRICS = (

@@ -13,22 +13,22 @@ import numpy as np
 
 from impact_posture.dynamics.numeric import Numeric
 from impact_posture.errors import ImpactPostureError, InputError, SpecError, one_line, shown
-from impact_posture.escape import file_name
-from impact_posture.experiment.batch import Store
+from impact_posture.experiment.job_store import Store
 from impact_posture.experiment.jobs import SCHEMA as SIMULATION_SCHEMA
 from impact_posture.experiment.jobs import Document, Job, controller_factory
 from impact_posture.experiment.reproduction import COMPARISON_SCHEMA
 from impact_posture.experiment.run_report_content import comparison_content, run_content
-from impact_posture.impact.contact import point_on
-from impact_posture.impact.objective import ImpactObjective
-from impact_posture.output_folder import write_json
-from impact_posture.plot.run_view import RunView
-from impact_posture.report.page import write_page
-from impact_posture.report.scene import Scene, Track, impact_curves
-from impact_posture.report.shapes import draw_robot
+from impact_posture.impact.impact_contact import point_on
+from impact_posture.impact.worst_case_objective import WorstCaseObjective
+from impact_posture.output.plot.run_view import RunView
+from impact_posture.output.report.drawn_robot import draw_robot
+from impact_posture.output.report.report_page import write_page
+from impact_posture.output.report.report_scene import ReportScene, Track, impact_curves
 from impact_posture.simulation.scenario_file import known_scenarios, scenario_path
 from impact_posture.simulation.series import Series, Window
-from impact_posture.text_files import read_text
+from impact_posture.system.escape import file_name
+from impact_posture.system.output_folder import write_json
+from impact_posture.system.text_files import read_text
 
 SIMULATION, COMPARISON, RUNS = "run.json", "comparison.json", "runs"
 # Time between frames in impact windows and elsewhere, s.
@@ -160,7 +160,7 @@ def thin(series: Series, windows: Iterable[Window]) -> Series:
     return Series(**columns | {"force": series.force[strongest], "peak": peaks})
 
 
-def run_scene(runs: Sequence[tuple[RunView, ImpactObjective]], *, meshes: bool = False) -> Scene:
+def run_scene(runs: Sequence[tuple[RunView, WorstCaseObjective]], *, meshes: bool = False) -> ReportScene:
     """Return the scene of runs of one scenario.
 
     Args:
@@ -176,10 +176,10 @@ def run_scene(runs: Sequence[tuple[RunView, ImpactObjective]], *, meshes: bool =
         feet = [numeric.placement(point_on(first.robot, s.frame, s.offset)).translation for s in first.supports]
         planes.append(("ground", min(feet, key=lambda foot: float(foot[2])), np.array([0.0, 0.0, 1.0])))
     tracks = tuple(_track(view, one) for view, one in runs)
-    return Scene(draw_robot(first.robot, meshes), objective, tracks, tuple(planes), (), False)
+    return ReportScene(draw_robot(first.robot, meshes), objective, tracks, tuple(planes), (), False)
 
 
-def _track(view: RunView, objective: ImpactObjective) -> Track:
+def _track(view: RunView, objective: WorstCaseObjective) -> Track:
     jumps = np.zeros_like(view.v)
     for window in view.impacts:
         within = (view.t >= window.begin) & (view.t <= window.end)
@@ -219,7 +219,7 @@ def _job(document: Document, scenario: str) -> Job:
     return Job(place, document["controller"], document["seed"], document["mode"], document["free"], document["gain"])
 
 
-def _runs(document: Document, stem: Path, scenario: str, count: int) -> list[tuple[RunView, ImpactObjective]]:
+def _runs(document: Document, stem: Path, scenario: str, count: int) -> list[tuple[RunView, WorstCaseObjective]]:
     """Return the first runs of a document with their impact."""
     job, found = _job(document, scenario), []
     factory = controller_factory(job.scenario, job.free)

@@ -6,8 +6,8 @@ from dataclasses import dataclass, field
 from functools import cached_property
 
 from impact_posture.dynamics.tree import PointOnLink
-from impact_posture.impact.contact import ImpactContact, Support, default_compliance, point_on
-from impact_posture.impact.metric import Metric
+from impact_posture.impact.impact_contact import ImpactContact, Support, default_compliance, point_on
+from impact_posture.impact.jump_metric import Metric
 from impact_posture.robot.robot import Robot
 
 
@@ -20,7 +20,8 @@ class ImpactCase:
         contact: Point and normal of the impact.
         metric: Weight ``W`` of the squared norm of the jump.
         supports: Feet that stay on the ground; empty for a robot that flies or is bolted down.
-        compliance: ε of the supports, 1/kg; zero for :func:`~impact_posture.impact.contact.default_compliance`.
+        compliance: ε of the supports, 1/kg; zero for
+            :func:`~impact_posture.impact.impact_contact.default_compliance`.
     """
 
     robot: Robot

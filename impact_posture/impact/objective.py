@@ -1,38 +1,87 @@
-"""The ``Objective`` protocol, and the worst case of an impact that implements it.
+"""The :class:`Objective` protocol, and the protocols of its parts.
 
 The program, its starts, the solver and the certificate know nothing but :class:`Objective`.
-:class:`ImpactObjective` combines a kind (:mod:`impact_posture.impact.kinds`), a metric, supports, contacts, a cone of
-normals and model variants.  No combination is a class of its own.  Each shape of the inner maximum is a class
-(:mod:`impact_posture.impact.worst_case`).
 """
 
 from __future__ import annotations
 
-import math
-from dataclasses import dataclass, field, replace
-from functools import cached_property
+from dataclasses import dataclass
 from typing import Protocol
 
 import casadi as ca
 import numpy as np
 
-from impact_posture.arrays import Array
 from impact_posture.dynamics.tree import Tree
-from impact_posture.errors import InputError
-from impact_posture.impact.contact import ImpactContact, Support, default_compliance
-from impact_posture.impact.impact_case import ImpactCase
-from impact_posture.impact.impact_kind import ImpactKind, QuadraticKind
-from impact_posture.impact.impulse_box import ImpulseBox, check_contacts
-from impact_posture.impact.kernel import ImpactKernel
-from impact_posture.impact.kinds import KINDS
-from impact_posture.impact.lifted import Guess, Lifted
-from impact_posture.impact.metric import Metric
-from impact_posture.impact.normal_cone import NormalCone, check_cone
-from impact_posture.impact.oracle import ImpactOracle
-from impact_posture.impact.worst_case import Minimized, ModelSet, Subgradients, WorstCase
-from impact_posture.robot.model_variant import ModelVariant
+from impact_posture.impact.impact_contact import ImpactContact, Support
+from impact_posture.impact.quantities.impact_kernel import ImpactKernel
+from impact_posture.impact.quantities.impact_oracle import ImpactOracle
+from impact_posture.impact.quantities.lifted_form import Guess, Lifted
 from impact_posture.robot.robot import Robot
-from impact_posture.settings import ObjectiveKind
+from impact_posture.system.arrays import Array
+
+
+@dataclass(frozen=True, eq=False)
+class Subgradients:
+    """Points whose convex hull is a subdifferential, up to their gaps.
+
+    Attributes:
+        gradients: Tangent gradients, shape (k, nv).
+        gaps: Distance of the value of each member below the objective, shape (k,).
+    """
+
+    gradients: Array
+    gaps: Array
+
+    @property
+    def first(self) -> Array:
+        """The gradient of the leading member, shape (nv,)."""
+        return np.asarray(self.gradients[0])
+
+
+class Minimized(Protocol):
+    """A function of the posture with a numeric value, subgradients and a lifted form for the program."""
+
+    @property
+    def attempts(self) -> int:
+        """Number of guesses from which the lifted form may be tried."""
+        ...
+
+    def guess(self, q: Array, scale: float, attempt: int = 0) -> Guess:
+        """Return the initial auxiliaries of the lifted form at ``q``, and their bounds."""
+        ...
+
+    def value(self, q: Array) -> float:
+        """Return the value from Pinocchio's numbers, > 0.
+
+        Raises:
+            MetricError: The value does not exist at ``q``.
+        """
+        ...
+
+    def subgradients(self, q: Array, within: float = 0.0) -> Subgradients:
+        """Return vectors that span the subdifferential at ``q``, from Pinocchio's numbers.
+
+        There is one gradient where the value is smooth.  Members of a maximum count if they are at most ``within``
+        below it, the leading member first.
+        """
+        ...
+
+    def lift(self, tree: Tree, parameters: ca.SX, scale: ca.SX) -> Lifted:
+        """Return the value in terms of auxiliaries and equations at ``tree.q``; ``scale`` is a typical value."""
+        ...
+
+
+class WorstCase(Minimized, Protocol):
+    """The largest value that the impact may have at one posture; the parameters of ``lift`` are the normal."""
+
+    @property
+    def oracle(self) -> ImpactOracle:
+        """Pinocchio's numbers for the leading contact, on the robot as modeled."""
+        ...
+
+    def expressions(self, k: ImpactKernel) -> tuple[ca.SX, ca.SX]:
+        """Return value and tangent gradient (nv) in the symbols of a kernel of the objective's robot and contact."""
+        ...
 
 
 class Objective(Minimized, Protocol):
@@ -75,219 +124,3 @@ class Objective(Minimized, Protocol):
     def blind_motions(self) -> Array:
         """Return base twists that do not change the value, world axes, linear first, shape (k, 6)."""
         ...
-
-
-@dataclass(frozen=True)
-class ImpactObjective:
-    """Impulse ``λ̄²H``, speed ``V``, sticking ``S``, coulomb ``C`` or energy ``E`` of an impact, in its worst case.
-
-    Attributes:
-        robot: The robot.
-        contact: Point and normal of the impact.
-        metric: Weight of the jump.
-        kind: ``impulse``, ``speed``, ``sticking``, ``coulomb`` or ``energy``.
-        supports: Feet that stay on the ground.
-        compliance: ε of the supports, 1/kg.
-        normal_cone_deg: Half angle of the cone of normals whose worst counts, degrees; 0 for the contact's normal.
-        others: More contacts at the same time, each with its own bound on its impulse.
-        bilateral: Whether several contacts can pull as well as push.
-        model_variants: Robot models whose worst counts, the robot as modeled first; empty for that one alone.
-    """
-
-    robot: Robot
-    contact: ImpactContact
-    metric: Metric = field(default_factory=Metric)
-    kind: ObjectiveKind = "impulse"
-    supports: tuple[Support, ...] = ()
-    compliance: float = 0.0
-    normal_cone_deg: float = 0.0
-    others: tuple[ImpactContact, ...] = ()
-    bilateral: bool = False
-    model_variants: tuple[ModelVariant, ...] = ()
-
-    def __post_init__(self) -> None:
-        kind = KINDS[self.kind]
-        check_cone(kind, self.normal_cone_deg)
-        check_contacts(self.contacts, kind, bilateral=self.bilateral, cone=self.normal_cone_deg != 0)
-        if not 0 <= self.compliance < math.inf:
-            raise InputError(f"is {self.compliance:g}", where="compliance", hint="give 1/kg, zero or more")
-        if self.compliance == 0:
-            object.__setattr__(self, "compliance", default_compliance(self.robot))
-
-    @cached_property
-    def impact_kind(self) -> ImpactKind:
-        """Formulas of the kind for the leading contact, on the robot as modeled."""
-        return KINDS[self.kind](self.oracle)
-
-    @property
-    def name(self) -> str:
-        """Kind of the objective."""
-        return self.kind
-
-    @property
-    def units(self) -> str:
-        """Units in words."""
-        return self.impact_kind.units
-
-    @property
-    def scale(self) -> float:
-        """The value divided by H, V, S or E: λ̄² for ``impulse``, else 1."""
-        return self.impact_kind.factor
-
-    @property
-    def structure(self) -> str:
-        """See :class:`Objective`; the normal of the leading contact is a parameter."""
-        contact = self.contact
-        return repr(
-            (
-                (self.kind, self.metric, self.supports, self.compliance),
-                (self.normal_cone_deg, self.others, self.bilateral),
-                [variant.robot.impact_sha256 for variant in self.model_variants],
-                (contact.frame, contact.offset, contact.normal_frame),
-                (self.scale, contact.friction),
-            )
-        )
-
-    @property
-    def parameters(self) -> Array:
-        """Normal of the leading contact, shape (3,)."""
-        return np.array(self.contact.normal)
-
-    @property
-    def warnings(self) -> tuple[str, ...]:
-        """Messages about degenerate combinations."""
-        if self.metric.kind != "kinetic":
-            return ()
-        # With supports aᵀMa = G − ε‖f‖², with the impulse f of the feet.
-        rest = ", up to the compliance of the feet" if self.supports else ""
-        said = {
-            "speed": f"is 1/G{rest}: the exact opposite of 'impulse' (G) and twice 'energy'",
-            "impulse": f"is G = 1/m_eff{rest}: it only maximizes the effective mass",
-        }
-        return (f"with the kinetic metric '{self.kind}' {said[self.kind]}",) if self.kind in said else ()
-
-    @property
-    def contacts(self) -> tuple[ImpactContact, ...]:
-        """All contacts, the leading contact first."""
-        return (self.contact, *self.others)
-
-    @cached_property
-    def case(self) -> ImpactCase:
-        """The impact at the leading contact, on the robot as modeled."""
-        return ImpactCase(self.robot, self.contact, self.metric, self.supports, self.compliance)
-
-    @cached_property
-    def singles(self) -> tuple[ImpactObjective, ...]:
-        """The objective of each contact alone, on the robot as modeled."""
-        if not self.others:
-            return (replace(self, model_variants=()) if self.model_variants else self,)
-        return tuple(
-            replace(self, contact=contact, others=(), bilateral=False, model_variants=()) for contact in self.contacts
-        )
-
-    @cached_property
-    def by_variant(self) -> tuple[ImpactObjective, ...]:
-        """The objective on the robot of each model variant, or the objective itself if there is none."""
-        if not self.model_variants:
-            return (self,)
-        return tuple(replace(self, robot=variant.robot, model_variants=()) for variant in self.model_variants)
-
-    @cached_property
-    def worst_case(self) -> WorstCase:
-        """The inner maximum."""
-        if self.model_variants:
-            return ModelSet(tuple(member.worst_case for member in self.by_variant))
-        if self.others:
-            return ImpulseBox(tuple(single.oracle for single in self.singles), self.bilateral)
-        return self.normal_cone or self.impact_kind
-
-    @cached_property
-    def normal_cone(self) -> NormalCone | None:
-        """The cone around the normal of the leading contact, on the robot as modeled."""
-        kind = self.impact_kind
-        if not self.normal_cone_deg or not isinstance(kind, QuadraticKind):
-            return None
-        return NormalCone(kind, self.normal_cone_deg)
-
-    @property
-    def is_multiple_of_H(self) -> bool:
-        """Whether the objective is ``λ̄²H`` of the leading contact."""
-        return self.impact_kind.symbol == "H" and isinstance(self.worst_case, ImpactKind)
-
-    # ---- symbolic ---------------------------------------------------------------------------------------------
-
-    @cached_property
-    def kernel(self) -> ImpactKernel:
-        """The expressions on new symbols q and n."""
-        return ImpactKernel(self.case, ca.SX.sym("q", self.robot.nq), ca.SX.sym("n", 3))
-
-    def value_fun(self) -> ca.Function:
-        """Return ``(q, n) → value``, with ``n`` as in :meth:`gradient_fun`."""
-        general = self.gradient_fun()
-        q, n = general.sx_in()
-        return ca.Function("value", [q, n], [general(q, n)[0]], ["q", "n"], ["value"], {"cse": True})
-
-    def gradient_fun(self) -> ca.Function:
-        """Return ``(q, n) → value, gradient`` (nv), with ``n`` in the normal frame of the leading contact.
-
-        ``n`` is the axis of a cone of normals.  The gradient is a subgradient where the inner maximum is tied.
-        """
-        k = self.kernel
-        value, gradient = self.worst_case.expressions(k)
-        names = ["q", "n"], ["value", "gradient"]
-        return ca.Function("gradient", [k.q, k.n], [value, gradient], *names, {"cse": True})
-
-    def lift(self, tree: Tree, parameters: ca.SX, scale: ca.SX) -> Lifted:
-        """Return the objective with its linear solves as equations of the program."""
-        return self.worst_case.lift(tree, parameters, scale)
-
-    @property
-    def attempts(self) -> int:
-        """Number of guesses: one where the equations are linear in the auxiliaries."""
-        return self.worst_case.attempts
-
-    def guess(self, q: Array, scale: float, attempt: int = 0) -> Guess:
-        """Return the auxiliaries of :meth:`lift` that solve its equations at ``q``."""
-        return self.worst_case.guess(q, scale, attempt)
-
-    # ---- numeric ----------------------------------------------------------------------------------------------
-
-    @cached_property
-    def oracle(self) -> ImpactOracle:
-        """Pinocchio's numbers for the leading contact, on the robot as modeled."""
-        return ImpactOracle(self.case)
-
-    def value(self, q: Array) -> float:
-        """Return the objective at ``q`` from Pinocchio's numbers.
-
-        Raises:
-            MetricError: The kind is ``sticking`` or ``coulomb`` and has no value at ``q``.
-        """
-        return self.worst_case.value(q)
-
-    def gradient(self, q: Array) -> Array:
-        """Return the tangent gradient at ``q`` from Pinocchio's numbers, shape (nv,); a subgradient at a tie."""
-        return self.subgradients(q).first
-
-    def subgradients(self, q: Array, within: float = 0.0) -> Subgradients:
-        """Return the gradients of all members of the maximum that tie or lie at most ``within`` below."""
-        return self.worst_case.subgradients(q, within)
-
-    def movable(self, q: Array) -> bool:
-        """Return whether a contact can move along its normal at ``q``, or along another normal of its cone."""
-        if self.normal_cone_deg:
-            return True
-        return not all(single.oracle.quantities(q).blocked for single in self.singles)
-
-    def blind_motions(self) -> Array:
-        """Return the translations, and the turn about the normal, because the base enters through ``R_bᵀn`` alone.
-
-        All turns are blind if the normal turns with the robot.  No turn is blind if contacts have different normals.
-        """
-        n = np.array(self.contact.normal)
-        turns = n[None, :]
-        if self.contact.normal_frame == "contact":
-            turns = np.eye(3)
-        elif any(np.linalg.norm(np.cross(n, other.normal)) > 1e-9 for other in self.others):
-            turns = np.zeros((0, 3))
-        return np.vstack([np.eye(6)[:3], np.hstack([np.zeros_like(turns), turns])])

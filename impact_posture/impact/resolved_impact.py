@@ -8,22 +8,22 @@ from __future__ import annotations
 
 from dataclasses import dataclass
 
-from impact_posture.arrays import Array
+from impact_posture.config.option_values import parse_contact
+from impact_posture.config.settings import ImpactSettings, ObjectiveKind, Vector3
 from impact_posture.errors import ContactError, FrameNotFound
-from impact_posture.impact.contact import ImpactContact, Support, check_compliance, point_on
-from impact_posture.impact.contact_compression import ContactStiffness
-from impact_posture.impact.evaluation import Evaluation, evaluate
-from impact_posture.impact.metric import Metric, build_metric
-from impact_posture.impact.objective import ImpactObjective
+from impact_posture.impact.elasticity.contact_compression import ContactStiffness
+from impact_posture.impact.evaluation.evaluation import Evaluation, evaluate
+from impact_posture.impact.impact_contact import ImpactContact, Support, check_compliance, point_on
+from impact_posture.impact.jump_metric import Metric, build_metric
 from impact_posture.impact.supports import refuse_held, refuse_rigid, resolve_supports
-from impact_posture.parsing import parse_contact
-from impact_posture.robot.guess import feet, tips
+from impact_posture.impact.worst_case_objective import WorstCaseObjective
+from impact_posture.robot.guessed_parts import feet, tips
 from impact_posture.robot.joint_model import with_joint_model
 from impact_posture.robot.model_variant import Payload, build_model_variants
-from impact_posture.robot.postures import read_posture
+from impact_posture.robot.posture_files import read_posture
 from impact_posture.robot.robot import Robot
 from impact_posture.robot.robot_loader import load_robot
-from impact_posture.settings import ImpactSettings, ObjectiveKind, Vector3
+from impact_posture.system.arrays import Array
 
 FLOATS = "because its data name neither feet nor rotors"
 
@@ -45,7 +45,7 @@ def resolve(settings: ImpactSettings, robot: Robot | None = None) -> ResolvedImp
     if compliance is not None:
         check_compliance(robot, compliance)
     kind, choice = _choose(settings, several=bool(others))
-    objective = ImpactObjective(
+    objective = WorstCaseObjective(
         robot,
         leading,
         build_metric(robot, settings.metric, settings.weights),
@@ -126,7 +126,7 @@ class ResolvedImpact:
         choice: Why ``auto`` chose this objective; empty if the user did.
     """
 
-    objective: ImpactObjective
+    objective: WorstCaseObjective
     q: Array
     posture: str
     speed: float
@@ -195,7 +195,7 @@ class ResolvedImpact:
         }
 
 
-def _contact_block(single: ImpactObjective, q: Array) -> dict[str, object]:
+def _contact_block(single: WorstCaseObjective, q: Array) -> dict[str, object]:
     """The block of a contact, with its normal in world axes at ``q``."""
     contact = single.contact
     return {

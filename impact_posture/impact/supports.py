@@ -7,11 +7,11 @@ from typing import get_args
 
 import numpy as np
 
+from impact_posture.config.settings import SupportKind
 from impact_posture.errors import ContactError, FrameNotFound, InputError
-from impact_posture.impact.contact import ImpactContact, Support, point_on
-from impact_posture.robot.guess import feet
+from impact_posture.impact.impact_contact import ImpactContact, Support, point_on
+from impact_posture.robot.guessed_parts import feet
 from impact_posture.robot.robot import Robot
-from impact_posture.settings import SupportKind
 
 
 def resolve_supports(robot: Robot, texts: Sequence[str] | None) -> tuple[Support, ...]:

@@ -7,10 +7,10 @@ from dataclasses import replace
 import numpy as np
 import pinocchio as pin
 
-from impact_posture.arrays import Array
 from impact_posture.impact.objective import Objective
-from impact_posture.posture.load_cases import load_cases
-from impact_posture.posture.problem import Requirements
+from impact_posture.posture.loads.load_cases import load_cases
+from impact_posture.posture.program.constrained_problem import Requirements
+from impact_posture.system.arrays import Array
 
 # Least part of the weight that counts as a wrench on the base that the rotors cannot make.
 _UNREACHABLE = 1e-7
@@ -19,7 +19,8 @@ _UNREACHABLE = 1e-7
 class ActuatorLimits:
     """Limits on the load ``M ν̇ + h`` of a motion, from what holds the robot at rest.
 
-    Motors, rotors and feet are those of :class:`~impact_posture.posture.equilibrium.Equilibrium`, which moves here.
+    Motors, rotors and feet are those of :class:`~impact_posture.posture.loads.equilibrium.Equilibrium`, which moves
+    here.
 
     Args:
         objective: The objective, with the robot and its supports.

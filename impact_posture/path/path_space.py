@@ -8,10 +8,10 @@ from itertools import pairwise
 import numpy as np
 import pinocchio as pin
 
-from impact_posture.arrays import Array
 from impact_posture.dynamics.chart import Chart
-from impact_posture.posture.problem import PostureProblem
-from impact_posture.posture.starts import Projector
+from impact_posture.posture.manifold.feasible_start import Projector
+from impact_posture.posture.program.constrained_problem import ConstrainedProblem
+from impact_posture.system.arrays import Array
 
 # Largest violation of equalities and of inequalities at a valid posture (m, rad, or the unit of the constraint).
 EQUALITY, INEQUALITY = 1e-6, 1e-8
@@ -37,7 +37,7 @@ class PathSpace:
         pulls: Number of postures pulled onto the constraints so far, the measure of effort.
     """
 
-    def __init__(self, problem: PostureProblem) -> None:
+    def __init__(self, problem: ConstrainedProblem) -> None:
         self.problem, self.model = problem, problem.robot.model
         self.projector = Projector(problem)
         self.pulls = 0

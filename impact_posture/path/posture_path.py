@@ -7,16 +7,16 @@ from importlib.util import find_spec
 
 import numpy as np
 
-from impact_posture.arrays import Array
 from impact_posture.errors import InputError
 from impact_posture.impact.objective import Objective
 from impact_posture.path.actuator_limits import ActuatorLimits
-from impact_posture.path.curve import fitted_curve
-from impact_posture.path.own_component import OwnComponent
+from impact_posture.path.path_curve import fitted_curve
+from impact_posture.path.path_search import EFFORT, Connection, connect, shortened
 from impact_posture.path.path_space import PathSpace
-from impact_posture.path.search import EFFORT, Connection, connect, shortened
-from impact_posture.path.timing import LimitUse, limit_use, timed
-from impact_posture.posture.solve import PostureSolution
+from impact_posture.path.path_timing import LimitUse, limit_use, timed
+from impact_posture.path.reachable_curve import ReachableCurve
+from impact_posture.posture.search.multistart import PostureSolution
+from impact_posture.system.arrays import Array
 
 # Optima that are tried, best first.
 _OPTIMA = 5
@@ -153,7 +153,7 @@ def _still(space: PathSpace, objective: Objective, q: Array, reason: str) -> Pos
 def _reached(solution: PostureSolution, space: PathSpace, seed: int, effort: int) -> tuple[Connection, str]:
     """Return the path to the optimum, or to the best posture that is reached and why it ends there."""
     start, objective = solution.initial, solution.problem.objective
-    own = OwnComponent.of(space, start)
+    own = ReachableCurve.of(space, start)
     others = [o.q for o in solution.optima if not np.array_equal(o.q, solution.q)]
     stay = found = Connection([start], [start], "")
     end, proof, visited = "", "", [start]

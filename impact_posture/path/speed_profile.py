@@ -7,7 +7,7 @@ from itertools import pairwise
 import numpy as np
 
 from impact_posture.path.actuator_limits import ActuatorLimits
-from impact_posture.path.curve import PathCurve
+from impact_posture.path.path_curve import PathCurve
 from impact_posture.path.path_space import PathSpace
 from impact_posture.path.timed_curve import SAMPLE_TIME, TimedCurve, times
 

@@ -6,7 +6,7 @@ from dataclasses import dataclass
 
 import numpy as np
 
-from impact_posture.arrays import Array
+from impact_posture.system.arrays import Array
 
 # Largest time between two points of a trajectory, s, and the least number of points.
 SAMPLE_TIME, _LEAST_POINTS = 0.01, 21

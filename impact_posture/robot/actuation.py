@@ -14,10 +14,10 @@ import numpy as np
 import pinocchio as pin
 from numpy.typing import ArrayLike
 
-from impact_posture.arrays import Array
 from impact_posture.errors import FrameNotFound, PostureError, SpecError
 from impact_posture.robot.model_joints import finite_armature, is_free_flyer, joint_range
-from impact_posture.robot.spec import PropulsionSpec
+from impact_posture.robot.robot_spec import PropulsionSpec
+from impact_posture.system.arrays import Array
 
 _RESIDUAL = 1e-6
 """Largest unbalanced base force or moment (N, N·m) that still counts as equilibrium."""

@@ -5,7 +5,8 @@ from __future__ import annotations
 import textwrap
 from dataclasses import dataclass, field
 
-from impact_posture.escape import printable, toml
+from impact_posture.errors import printable
+from impact_posture.system.escape import toml
 
 _WIDTH = 100
 

@@ -13,12 +13,12 @@ import coal
 import numpy as np
 import pinocchio as pin
 
-from impact_posture.arrays import Array
-from impact_posture.robot.guess import joints_to, upright_frames
+from impact_posture.robot.guessed_parts import joints_to, upright_frames
 from impact_posture.robot.robot import Robot
-from impact_posture.robot.spec import Support
+from impact_posture.robot.robot_spec import Support
 from impact_posture.robot.support_polygon import polygon_edges
 from impact_posture.robot.urdf import quiet_stderr
+from impact_posture.system.arrays import Array
 
 # Points of a foot within this distance (m) of its lowest one touch the ground with it.
 _PATCH = 2e-3

@@ -14,13 +14,13 @@ import numpy as np
 import pinocchio as pin
 from numpy.typing import NDArray
 
-from impact_posture.arrays import Array
+from impact_posture.config.settings import JointModel
 from impact_posture.errors import InputError
 from impact_posture.robot.inertia_checks import check_mass_matrix
 from impact_posture.robot.model_joints import joint_index, v_slice
 from impact_posture.robot.robot import Robot
-from impact_posture.robot.spec import JointTransmissionSpec
-from impact_posture.settings import JointModel
+from impact_posture.robot.robot_spec import JointTransmissionSpec
+from impact_posture.system.arrays import Array
 
 Mask = NDArray[np.bool_]
 
@@ -78,7 +78,7 @@ def with_joint_model(robot: Robot, joint_model: JointModel) -> Robot:
     ``rigid``.  ``locked`` holds all joints, as position control with stiff gears does, so that only a floating base
     moves.  Joints whose transmission is ``locked`` move in no joint model.  ``elastic`` leaves the armature out at
     joints with springs of known stiffness, whose rotors then follow
-    (:mod:`impact_posture.impact.elastic_joints`); H, G, V, S and E are those of the first moment.
+    (:mod:`impact_posture.impact.elasticity.elastic_joints`); H, G, V, S and E are those of the first moment.
 
     Raises:
         InertiaError: The mass matrix is singular without the rotors.

@@ -9,7 +9,7 @@ from collections.abc import Mapping
 import numpy as np
 import pinocchio as pin
 
-from impact_posture.arrays import Array
+from impact_posture.system.arrays import Array
 
 # Rounding error of a zero in a rotation matrix or an inertia (SI units).
 _ROUNDING = 1e-14

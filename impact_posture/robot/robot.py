@@ -9,8 +9,8 @@ from functools import cached_property
 import numpy as np
 import pinocchio as pin
 
-from impact_posture.argument_types import checked
-from impact_posture.arrays import Array
+from impact_posture.config.argument_types import checked
+from impact_posture.config.settings import ContactPose, JointModel, RobotSettings, Root
 from impact_posture.errors import (
     FrameNotFound,
     JointLocked,
@@ -21,8 +21,8 @@ from impact_posture.errors import (
 )
 from impact_posture.robot.model_hash import dynamics_hash, hash_of, kinematics_hash, rounded
 from impact_posture.robot.model_joints import joint_range, q_slice
-from impact_posture.robot.spec import RobotSpec
-from impact_posture.settings import ContactPose, JointModel, RobotSettings, Root
+from impact_posture.robot.robot_spec import RobotSpec
+from impact_posture.system.arrays import Array
 
 CONVENTION = (
     "q = [x, y, z, qx, qy, qz, qw, joints]; v = [base linear, base angular, joint rates], base twist in the base "

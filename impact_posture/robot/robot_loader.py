@@ -12,18 +12,18 @@ from typing import Any, NamedTuple
 import numpy as np
 import pinocchio as pin
 
-from impact_posture.argument_types import checked
-from impact_posture.arrays import Array
+from impact_posture.config.argument_types import checked
+from impact_posture.config.settings import LoadOptions, RobotSettings, Root, Vector3
+from impact_posture.config.toml_tables import validate
 from impact_posture.errors import InputError, JointNotFound, PackageNotFound, RobotNotFound, SpecError, UrdfError
 from impact_posture.robot.armature import armature_warning, set_armature
 from impact_posture.robot.inertia_checks import check_mass_matrix, check_moved_mass, massless_joints
 from impact_posture.robot.model_joints import joint_index, movable_joints, q_slice, v_slice
 from impact_posture.robot.named_postures import ignored_bases, named_postures
 from impact_posture.robot.robot import Robot
-from impact_posture.robot.spec import RobotSpec, read_spec
+from impact_posture.robot.robot_spec import RobotSpec, read_spec
 from impact_posture.robot.urdf import EXAMPLE_PREFIX, build_model, example_models, resolve_path, robots_data
-from impact_posture.settings import LoadOptions, RobotSettings, Root, Vector3
-from impact_posture.tables import validate
+from impact_posture.system.arrays import Array
 
 
 def known_robots() -> tuple[str, ...]:
@@ -38,7 +38,7 @@ def load_robot(robot: str, options: LoadOptions | None = None, **settings: Any) 
     Args:
         robot: Name, path or URI.
         options: Options of loading.
-        settings: Fields of :class:`~impact_posture.settings.LoadOptions` in place of ``options``, such as
+        settings: Fields of :class:`~impact_posture.config.settings.LoadOptions` in place of ``options``, such as
             ``root="fixed"``.
 
     Raises:

@@ -13,7 +13,7 @@ from impact_posture.robot.actuation import allocation, hover, lateral_force_rang
 from impact_posture.robot.model_joints import ENDLESS
 from impact_posture.robot.robot import Robot
 from impact_posture.robot.robot_loader import known_robots
-from impact_posture.robot.spec import PropulsionSpec, read_spec
+from impact_posture.robot.robot_spec import PropulsionSpec, read_spec
 from impact_posture.robot.urdf import EXAMPLE_PREFIX, robots_data
 
 WAYS_TO_NAME = (

@@ -6,7 +6,7 @@ from collections.abc import Iterable
 
 import numpy as np
 
-from impact_posture.arrays import Array
+from impact_posture.system.arrays import Array
 
 # Points nearer to a line than this (m) lie on it, and places are rounded to it.
 _ROUNDING, _DIGITS = 1e-9, 12

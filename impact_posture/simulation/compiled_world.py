@@ -12,14 +12,21 @@ from typing import Any, NamedTuple
 
 import numpy as np
 
-from impact_posture.arrays import Array
 from impact_posture.dynamics.mjcf import import_mujoco, unwarned
 from impact_posture.errors import CompilerError
-from impact_posture.libraries import build_library, cache_folder, is_cached, library_path, load_library, source_key
-from impact_posture.simulation.actuator_command import ActuatorCommand, Trace
-from impact_posture.simulation.compiled_tick import CompiledTick
+from impact_posture.simulation.controllers.compiled_tick import CompiledTick
 from impact_posture.simulation.scenario_objective import locked
-from impact_posture.simulation.world import World
+from impact_posture.simulation.world.actuator_command import ActuatorCommand, Trace
+from impact_posture.simulation.world.world import World
+from impact_posture.system.arrays import Array
+from impact_posture.system.libraries import (
+    build_library,
+    cache_folder,
+    is_cached,
+    library_path,
+    load_library,
+    source_key,
+)
 
 _NAME = "world_ticks"
 # Most propellers, as in C.

@@ -10,11 +10,11 @@ import numpy as np
 import pinocchio as pin
 from scipy import ndimage
 
-from impact_posture.arrays import Array
 from impact_posture.simulation.recorder import feet_of
 from impact_posture.simulation.run import Run
 from impact_posture.simulation.scenario import Setup
 from impact_posture.simulation.series import Flags, Series
+from impact_posture.system.arrays import Array
 
 # Each is graver than the one before.
 Outcome = Literal["completed", "lost contact", "control lost", "fell"]

@@ -7,13 +7,13 @@ from dataclasses import dataclass
 import numpy as np
 
 from impact_posture.dynamics.numeric import Numeric
-from impact_posture.impact.contact import point_on
-from impact_posture.impact.kinds import KINDS
-from impact_posture.impact.objective import ImpactObjective
+from impact_posture.impact.impact_contact import point_on
+from impact_posture.impact.kinds.kinds_by_name import KINDS
+from impact_posture.impact.worst_case_objective import WorstCaseObjective
 from impact_posture.simulation.metrics import before, jump
 from impact_posture.simulation.run import Run
 from impact_posture.simulation.scenario import Setup
-from impact_posture.simulation.throw import thrown_jumps
+from impact_posture.simulation.world.throw import thrown_jumps
 
 
 @dataclass(frozen=True)
@@ -49,7 +49,7 @@ class Prediction:
     ratio: float | None
 
 
-def predict(setup: Setup, objective: ImpactObjective, run: Run) -> tuple[Prediction, ...]:
+def predict(setup: Setup, objective: WorstCaseObjective, run: Run) -> tuple[Prediction, ...]:
     """Predict the impacts of a run with the rigid model at the state before each."""
     scenario, found = setup.scenario, []
     numeric = Numeric(setup.robot.model)

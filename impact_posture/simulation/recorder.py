@@ -6,12 +6,12 @@ from collections.abc import Callable
 
 import numpy as np
 
-from impact_posture.arrays import Array
 from impact_posture.errors import ImpactPostureError
-from impact_posture.impact.contact import point_on
-from impact_posture.simulation.actuator_command import Trace
+from impact_posture.impact.impact_contact import point_on
 from impact_posture.simulation.scenario import Setup
 from impact_posture.simulation.series import STATUSES, Series
+from impact_posture.simulation.world.actuator_command import Trace
+from impact_posture.system.arrays import Array
 from impact_posture.tsid.controller import Command
 
 # Ticks from one evaluation of the metric to the next.  The metric is only drawn.

@@ -10,18 +10,18 @@ from functools import partial
 
 import numpy as np
 
-from impact_posture.arrays import Array
 from impact_posture.errors import InputError, SimulationDiverged
-from impact_posture.processes import fork_call
-from impact_posture.progress import tell
 from impact_posture.simulation.compiled_world import compiled_world
-from impact_posture.simulation.controller_factory import ControllerFactory, Mode
-from impact_posture.simulation.driver import Driver
+from impact_posture.simulation.controllers.contact_reference import Reference
+from impact_posture.simulation.controllers.controller_factory import ControllerFactory, Mode
+from impact_posture.simulation.controllers.driver import Driver
 from impact_posture.simulation.recorder import Recorder
-from impact_posture.simulation.reference import Reference
 from impact_posture.simulation.scenario import RepeatedContacts, SinglePush
 from impact_posture.simulation.series import RECOVERY, Series, Window
-from impact_posture.simulation.throw import FLIGHT, Throw
+from impact_posture.simulation.world.throw import FLIGHT, Throw
+from impact_posture.system.arrays import Array
+from impact_posture.system.processes import fork_call
+from impact_posture.system.progress import tell
 
 # Time when controllers begin to prepare, after the first reaction of sensors and motors, s.
 BRACE = 0.1

@@ -10,22 +10,22 @@ from typing import Annotated, Literal
 import numpy as np
 from pydantic import Field
 
-from impact_posture.arrays import Array
+from impact_posture.config.option_names import as_keys
+from impact_posture.config.settings import FRICTION, RobotSettings, Vector3
+from impact_posture.config.toml_tables import Checked
 from impact_posture.errors import ImpactPostureError, InputError, JointLocked, NameNotFound, SpecError
-from impact_posture.option_names import as_keys
-from impact_posture.progress import tell
 from impact_posture.robot.actuation import allocation
-from impact_posture.robot.postures import read_posture, set_joints
+from impact_posture.robot.posture_files import read_posture, set_joints
 from impact_posture.robot.robot import Robot
 from impact_posture.robot.robot_loader import load_robot
-from impact_posture.robot.spec import NonNegative, Positive
-from impact_posture.settings import FRICTION, RobotSettings, Vector3
-from impact_posture.simulation.actuator_command import Push
-from impact_posture.simulation.control import Control
-from impact_posture.simulation.scene import Finite, FiniteVector, Scene, Shape, Surface
-from impact_posture.simulation.throw import Settling, Throw
-from impact_posture.simulation.world import World, build_world
-from impact_posture.tables import Checked
+from impact_posture.robot.robot_spec import NonNegative, Positive
+from impact_posture.simulation.controller_gains import Control
+from impact_posture.simulation.world.actuator_command import Push
+from impact_posture.simulation.world.scene import Finite, FiniteVector, Scene, Shape, Surface
+from impact_posture.simulation.world.throw import Settling, Throw
+from impact_posture.simulation.world.world import World, build_world
+from impact_posture.system.arrays import Array
+from impact_posture.system.progress import tell
 
 SCHEMA = "impact-posture/scenario/1"
 
@@ -35,7 +35,8 @@ class RepeatedContacts(Checked):
     """The end effector flies into a surface and away again, several times.
 
     A reference starts where the shape is at the start.  It moves against the normal of the surface until it is
-    ``beyond`` behind the surface, stays there, and comes back (:mod:`impact_posture.simulation.reference`).
+    ``beyond`` behind the surface, stays there, and comes back
+    (:mod:`impact_posture.simulation.controllers.contact_reference`).
 
     Attributes:
         frame: Frame of the shape that touches.

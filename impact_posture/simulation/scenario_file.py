@@ -5,10 +5,10 @@ from __future__ import annotations
 import os
 from pathlib import Path
 
+from impact_posture.config.toml_tables import read_toml, validate
 from impact_posture.errors import InputError, ScenarioNotFound, SpecError, shown
 from impact_posture.robot.robot_loader import from_folder
 from impact_posture.simulation.scenario import SCHEMA, Scenario, ScenarioTable
-from impact_posture.tables import read_toml, validate
 
 SHIPPED = Path(__file__).parent / "scenarios"
 

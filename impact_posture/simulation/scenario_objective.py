@@ -11,24 +11,24 @@ from pathlib import Path
 import casadi as ca
 import numpy as np
 
-from impact_posture.arrays import Array
 from impact_posture.codegen.export import write_export
 from impact_posture.codegen.impact_gradient import ImpactGradient
+from impact_posture.config.settings import ObjectiveKind
 from impact_posture.errors import MetricError, OutputError
-from impact_posture.impact.contact import ImpactContact
-from impact_posture.impact.metric import Metric
-from impact_posture.impact.objective import ImpactObjective
+from impact_posture.impact.impact_contact import ImpactContact
+from impact_posture.impact.jump_metric import Metric
 from impact_posture.impact.supports import resolve_supports
-from impact_posture.libraries import cache_folder, is_cached, library_path, source_key
-from impact_posture.progress import tell
-from impact_posture.settings import ObjectiveKind
+from impact_posture.impact.worst_case_objective import WorstCaseObjective
 from impact_posture.simulation.scenario import Setup
-from impact_posture.toolchain import find_compiler, no_compiler
+from impact_posture.system.arrays import Array
+from impact_posture.system.libraries import cache_folder, is_cached, library_path, source_key
+from impact_posture.system.progress import tell
+from impact_posture.system.toolchain import find_compiler, no_compiler
 
 Gradient = Callable[[Array], tuple[float, Array]]
 
 
-def scenario_objective(setup: Setup, kind: ObjectiveKind = "impulse", *, free: bool = False) -> ImpactObjective:
+def scenario_objective(setup: Setup, kind: ObjectiveKind = "impulse", *, free: bool = False) -> WorstCaseObjective:
     """Return the objective for the impact of a scenario, at the shape that hits or at the frame that is pushed.
 
     Args:
@@ -42,10 +42,10 @@ def scenario_objective(setup: Setup, kind: ObjectiveKind = "impulse", *, free: b
     footing = scenario.control.footing
     supports = () if free or footing is None else resolve_supports(robot, None)
     supports = tuple(s for s in supports if footing is None or s.frame not in footing.lifted)
-    return ImpactObjective(robot, contact, Metric(), kind, supports)
+    return WorstCaseObjective(robot, contact, Metric(), kind, supports)
 
 
-def interpreted(objective: ImpactObjective) -> Gradient:
+def interpreted(objective: WorstCaseObjective) -> Gradient:
     """Return ``q → (objective, gradient)`` in the CasADi interpreter, which is ready at once, but slower than C."""
     function, normal = objective.gradient_fun(), np.array(objective.contact.normal, dtype=float)
 
@@ -58,7 +58,7 @@ def interpreted(objective: ImpactObjective) -> Gradient:
     return call
 
 
-def compiled(objective: ImpactObjective) -> Gradient:
+def compiled(objective: WorstCaseObjective) -> Gradient:
     """Return the same from the C export, which is built once and cached.
 
     Raises:
@@ -76,7 +76,7 @@ def compiled(objective: ImpactObjective) -> Gradient:
     return ImpactGradient.load(folder, robot=objective.robot).objective
 
 
-def objective_key(objective: ImpactObjective) -> str:
+def objective_key(objective: WorstCaseObjective) -> str:
     """Return a hash of everything that the C code depends on."""
     point = objective.robot.model.frames[objective.robot.frame_id(objective.contact.frame)]
     held = [objective.robot.model.frames[objective.robot.frame_id(s.frame)] for s in objective.supports]

@@ -10,7 +10,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from impact_posture.errors import SpecError
-from impact_posture.tables import read_arrays
+from impact_posture.system.npz_files import read_arrays
 from impact_posture.tsid.controller import Status
 
 Array = NDArray[Any]

@@ -16,13 +16,13 @@ import numpy as np
 
 from impact_posture.dynamics.mjcf import import_mujoco
 from impact_posture.errors import InputError
-from impact_posture.impact.contact import point_on
-from impact_posture.output_folder import whole_folder
+from impact_posture.impact.impact_contact import point_on
+from impact_posture.simulation.controllers.contact_reference import Reference
 from impact_posture.simulation.metrics import JUMP
-from impact_posture.simulation.reference import Reference
 from impact_posture.simulation.run import BRACE
 from impact_posture.simulation.scenario import RepeatedContacts, Setup, SinglePush
-from impact_posture.simulation.throw import Throw
+from impact_posture.simulation.world.throw import Throw
+from impact_posture.system.output_folder import whole_folder
 
 MODEL, PARAMETERS = "world.mjb", "world.txt"
 # Families of joints in the file, whose places in q and qpos differ in nothing, or as a floating base.

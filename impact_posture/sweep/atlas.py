@@ -12,15 +12,15 @@ from functools import lru_cache
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
-from impact_posture.argument_types import checked
+from impact_posture.config.argument_types import checked
 from impact_posture.errors import InputError, OutputError, SpecError
-from impact_posture.libraries import source_key
-from impact_posture.output_folder import check_output, is_ours, write_record, write_whole
-from impact_posture.posture.problem_settings import dump_settings
+from impact_posture.posture.formulation.problem_file import dump_settings
 from impact_posture.sweep.case_solver import CaseSolver
 from impact_posture.sweep.shard_table import passes_of, read_postures
 from impact_posture.sweep.sweep_file import Sweep
-from impact_posture.text_files import read_text
+from impact_posture.system.libraries import source_key
+from impact_posture.system.output_folder import check_output, is_ours, write_record, write_whole
+from impact_posture.system.text_files import read_text
 from impact_posture.version import __version__
 
 if TYPE_CHECKING:

@@ -10,18 +10,18 @@ from typing import Any, TypeVar
 
 import numpy as np
 
-from impact_posture.arrays import Array
 from impact_posture.dynamics.numeric import Numeric
-from impact_posture.impact.contact import point_on
+from impact_posture.impact.impact_contact import point_on
 from impact_posture.impact.resolved_impact import resolve
-from impact_posture.posture.attainable_speed import AttainableSpeed
-from impact_posture.posture.build_problem import retarget
-from impact_posture.posture.nlp import PostureNLP, build_nlp
-from impact_posture.posture.problem import PostureProblem
-from impact_posture.posture.problem_settings import Prepared, prepare
+from impact_posture.posture.approach.attainable_speed import AttainableSpeed
+from impact_posture.posture.formulation.build_problem import retarget
+from impact_posture.posture.formulation.problem_file import Prepared, prepare
+from impact_posture.posture.program.constrained_problem import ConstrainedProblem
+from impact_posture.posture.program.posture_nlp import PostureNLP, build_nlp
 from impact_posture.robot.robot_loader import load_robot
 from impact_posture.sweep.point_search import Place, Timer, Walk
 from impact_posture.sweep.sweep_file import OFFSETS, Case, Grid
+from impact_posture.system.arrays import Array
 
 # Problems and programs that a process keeps, and most problems if the speed varies.  Each takes about a MB, and all
 # but the speeds of one normal are done for good.
@@ -108,7 +108,7 @@ class CaseSolver:
                 prepared = self.template(*self.normal_and_speed({axis.name: value}))
                 retarget(prepared.problem, *self.target({axis.name: value}))
 
-    def walk(self, template: PostureProblem) -> Walk:
+    def walk(self, template: ConstrainedProblem) -> Walk:
         """Return the way of a template through a shard.
 
         Its program is built anew only if its expressions are new.  It grows on its own from here, so its rounding

@@ -13,8 +13,8 @@ from tempfile import TemporaryDirectory
 from typing import Any
 
 from impact_posture.errors import InputError
-from impact_posture.processes import depend, signals_held
 from impact_posture.sweep.atlas import check_package
+from impact_posture.system.processes import depend, signals_held
 
 
 @contextmanager

@@ -15,19 +15,19 @@ from matplotlib.lines import Line2D
 from matplotlib.patches import Patch, Rectangle
 from numpy.typing import NDArray
 
-from impact_posture.arrays import Array
+from impact_posture.config.settings import ProblemSettings
+from impact_posture.config.toml_tables import validate
 from impact_posture.errors import InputError, SpecError, nearest
-from impact_posture.escape import plot_label
-from impact_posture.plot.style import GRAY, INK, PALE, VERMILLION, framed, save, shared_legend
-from impact_posture.posture.problem import PostureProblem
-from impact_posture.posture.problem_settings import prepare
-from impact_posture.posture.solve import wrapped_difference
-from impact_posture.settings import ProblemSettings
+from impact_posture.output.plot.style import GRAY, INK, PALE, VERMILLION, framed, save, shared_legend
+from impact_posture.posture.formulation.problem_file import prepare
+from impact_posture.posture.program.constrained_problem import ConstrainedProblem
+from impact_posture.posture.search.multistart import wrapped_difference
 from impact_posture.sweep.atlas import open_atlas, read_manifest
 from impact_posture.sweep.point_search import SWITCH
 from impact_posture.sweep.shard_table import STATUS
 from impact_posture.sweep.sweep_file import Axis, Grid
-from impact_posture.tables import validate
+from impact_posture.system.arrays import Array
+from impact_posture.system.escape import plot_label
 
 # The best posture switches between neighbors that differ (tangent norm, without the place of the base) by more than
 # SWITCH, and by more than this many times what the closest quarter of all neighbors differ by at most: half of them
@@ -150,7 +150,7 @@ class _Slice:
         switches: Pairs of neighbors ``(row, column), (row, column)`` between which the best posture switches.
     """
 
-    def __init__(self, data: Any, points: NDArray[np.int64], problem: PostureProblem) -> None:
+    def __init__(self, data: Any, points: NDArray[np.int64], problem: ConstrainedProblem) -> None:
         from pyarrow import compute
 
         wanted = compute.field("point").isin(points.ravel().tolist())
@@ -164,7 +164,7 @@ class _Slice:
         self.switches = _switches(postures, problem)
 
 
-def _switches(postures: Sequence[Sequence[Array | None]], problem: PostureProblem) -> list[tuple[Any, Any]]:
+def _switches(postures: Sequence[Sequence[Array | None]], problem: ConstrainedProblem) -> list[tuple[Any, Any]]:
     steps = []
     # The base of a robot that floats follows the target, which is no switch.
     own = slice(3, None) if problem.robot.floating else slice(None)
@@ -202,7 +202,7 @@ def _draw(
     grid: Grid,
     axes: tuple[int, int | None],
     values: dict[str, Any],
-    problem: PostureProblem,
+    problem: ConstrainedProblem,
     path: Path,
     formats: Sequence[str],
 ) -> list[Path]:

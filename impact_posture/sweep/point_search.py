@@ -8,17 +8,17 @@ from typing import Any, NamedTuple
 
 import numpy as np
 
-from impact_posture.arrays import Array
+from impact_posture.config.settings import ProblemSettings
 from impact_posture.errors import ImpactPostureError, Infeasible, SolverFailed
-from impact_posture.posture.build_problem import retarget
-from impact_posture.posture.certificate import Certificate, certify
-from impact_posture.posture.elastic import ElasticAnswer, ElasticProgram, elastic
-from impact_posture.posture.nlp import SLACK_PRICE, PostureNLP, WarmStart
-from impact_posture.posture.problem import PostureProblem
-from impact_posture.posture.search import HIGH_PRICE
-from impact_posture.posture.solve import distinct, solve
-from impact_posture.posture.starts import FEASIBLE, Projector, random_posture
-from impact_posture.settings import ProblemSettings
+from impact_posture.posture.formulation.build_problem import retarget
+from impact_posture.posture.manifold.feasible_start import FEASIBLE, Projector, random_posture
+from impact_posture.posture.program.certificate import Certificate, certify
+from impact_posture.posture.program.constrained_problem import ConstrainedProblem
+from impact_posture.posture.program.posture_nlp import SLACK_PRICE, PostureNLP, WarmStart
+from impact_posture.posture.search.conflicts import ElasticAnswer, ElasticProgram, elastic
+from impact_posture.posture.search.multistart import distinct, solve
+from impact_posture.posture.search.solver_runs import HIGH_PRICE
+from impact_posture.system.arrays import Array
 
 # Most rounds in which the program of a point grows, and most of them before anything says that the point is feasible.
 _ROUNDS, _UNSURE = 8, 3
@@ -74,17 +74,19 @@ class Walk:
         timer: Where the time of the solver is added.
     """
 
-    def __init__(self, template: PostureProblem, settings: ProblemSettings, nlp: PostureNLP, timer: Timer) -> None:
+    def __init__(
+        self, template: ConstrainedProblem, settings: ProblemSettings, nlp: PostureNLP, timer: Timer
+    ) -> None:
         # The template is kept, because a shard knows it by its identity.
         self._template, self.settings, self.timer = template, settings, timer
         self.problem, self.nlp = template, nlp
         self._relaxed: ElasticProgram | None = None
 
-    def grow(self, problem: PostureProblem) -> None:
+    def grow(self, problem: ConstrainedProblem) -> None:
         """Go on with the parts that a point needed."""
         self.problem, self.nlp = problem, self.nlp.grown(problem, compile="never")
 
-    def at(self, problem: PostureProblem, place: Place) -> PostureProblem:
+    def at(self, problem: ConstrainedProblem, place: Place) -> ConstrainedProblem:
         """Return a problem with its target at a place."""
         return retarget(problem, *place, self.nlp.program.numeric)
 
@@ -258,13 +260,13 @@ class _End(NamedTuple):
     end: WarmStart
 
 
-def _optima(problem: PostureProblem, ends: Sequence[_End]) -> list[_End]:
+def _optima(problem: ConstrainedProblem, ends: Sequence[_End]) -> list[_End]:
     """Return one end for each distinct optimum, the best first."""
     known = {id(end.q): end for end in ends}
     return [known[id(one.q)] for one in distinct(problem, [(e.q, e.value) for e in ends if np.isfinite(e.value)])]
 
 
-def _agree(problem: PostureProblem, ends: Sequence[_End], home: _End) -> bool:
+def _agree(problem: ConstrainedProblem, ends: Sequence[_End], home: _End) -> bool:
     """Whether all neighbors lead to one optimum, and the given posture leads to no better one."""
     if not ends or not all(np.isfinite(end.value) for end in ends):
         return False

@@ -12,12 +12,12 @@ from typing import Any
 
 import numpy as np
 
-from impact_posture.arrays import Array
-from impact_posture.posture.ipopt import one_blas_thread
+from impact_posture.posture.program.ipopt import one_blas_thread
 from impact_posture.sweep.case_solver import CaseSolver, kept
 from impact_posture.sweep.point_search import Place, PointResult, Start, Walk, improve, search
 from impact_posture.sweep.shard_table import STATUS, read_shard, write_shard
 from impact_posture.sweep.sweep_file import Sweep
+from impact_posture.system.arrays import Array
 
 # MUMPS, within IPOPT, is not made for threads; a worker with several takes its shards one after the other.
 _ALONE = threading.Lock()

@@ -9,9 +9,9 @@ from typing import Any
 
 import numpy as np
 
-from impact_posture.arrays import Array
 from impact_posture.sweep.point_search import PointResult, Start
 from impact_posture.sweep.sweep_file import Axis, Sweep
+from impact_posture.system.arrays import Array
 
 STATUS = ("certified", "infeasible", "uncertified", "undefined")
 PREDICTED = ("predicted_impulse", "predicted_jump", "attainable_speed")

@@ -12,13 +12,12 @@ from typing import Any, ClassVar, Literal
 
 import numpy as np
 
-from impact_posture.errors import SpecError, nearest
-from impact_posture.escape import printable
-from impact_posture.impact.contact import LARGEST
+from impact_posture.config.demands import between, setting, with_demands
+from impact_posture.config.settings import ProblemSettings
+from impact_posture.config.toml_tables import STRICT, read_toml, validate
+from impact_posture.errors import SpecError, nearest, printable
+from impact_posture.impact.impact_contact import LARGEST
 from impact_posture.robot.robot_loader import from_folder
-from impact_posture.setting import between, setting, with_demands
-from impact_posture.settings import ProblemSettings
-from impact_posture.tables import STRICT, read_toml, validate
 
 # Axes that one program serves, from the slowest to the fastest.  ``x``, ``y`` and ``z`` are offsets of the target.
 OFFSETS = ("x", "y", "z")

@@ -4,9 +4,9 @@ from __future__ import annotations
 
 import numpy as np
 
-from impact_posture.arrays import Array
 from impact_posture.robot.actuation import actuation_matrix, thrust_limits
 from impact_posture.robot.robot import Robot
+from impact_posture.system.arrays import Array
 
 
 class Actuators:

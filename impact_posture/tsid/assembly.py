@@ -4,16 +4,16 @@ from __future__ import annotations
 
 import numpy as np
 
-from impact_posture.arrays import Array, null_space
 from impact_posture.robot.robot import Robot
+from impact_posture.system.arrays import Array, null_space
 from impact_posture.tsid.actuators import Actuators
-from impact_posture.tsid.contacts import ContactStack
-from impact_posture.tsid.limits import AccelerationBounds
-from impact_posture.tsid.qp import EQUALITY, QP, stacked_rows
-from impact_posture.tsid.rank import LevelRank
+from impact_posture.tsid.limits.acceleration_bounds import AccelerationBounds
+from impact_posture.tsid.qp.level_rank import LevelRank
+from impact_posture.tsid.qp.quadratic_program import EQUALITY, QP, stacked_rows
 from impact_posture.tsid.state import State
-from impact_posture.tsid.task import TaskStack
+from impact_posture.tsid.support_contact import ContactStack
 from impact_posture.tsid.task_formulation import TaskFormulation
+from impact_posture.tsid.tasks.task import TaskStack
 
 # Weight of an acceleration that no task weighs, because the cost always needs a minimum.
 _IDLE = 1e-8

@@ -9,20 +9,20 @@ from enum import Enum
 import numpy as np
 from numpy.typing import ArrayLike
 
-from impact_posture.argument_types import checked_class
-from impact_posture.arrays import Array
+from impact_posture.config.argument_types import checked_class
 from impact_posture.errors import InputError, PostureError
 from impact_posture.robot.robot import Robot
+from impact_posture.system.arrays import Array
 from impact_posture.tsid.actuators import Actuators
 from impact_posture.tsid.assembly import Assembly
-from impact_posture.tsid.daqp_solver import DaqpSolver, WhitenedSolver
-from impact_posture.tsid.impact_robust import ImpactRobustPosture
-from impact_posture.tsid.qp import EQUALITY
-from impact_posture.tsid.reference_flow_posture import ReferenceFlowPosture
+from impact_posture.tsid.flow.reference_flow_posture import ReferenceFlowPosture
+from impact_posture.tsid.qp.daqp_solver import DaqpSolver, WhitenedSolver
+from impact_posture.tsid.qp.quadratic_program import EQUALITY
 from impact_posture.tsid.relaxation import Outcome, Relaxed, missed, solve
 from impact_posture.tsid.state import State, checked_velocity
-from impact_posture.tsid.task import Task
 from impact_posture.tsid.task_formulation import TaskFormulation
+from impact_posture.tsid.tasks.impact_robust import ImpactRobustPosture
+from impact_posture.tsid.tasks.task import Task
 
 # Longest time step of ramps, in periods.  Longer pauses between ticks count as this.
 _LONGEST = 10

@@ -8,11 +8,11 @@ import daqp
 import numpy as np
 from numpy.typing import NDArray
 
-from impact_posture.arrays import Array, null_space
+from impact_posture.system.arrays import Array, null_space
 from impact_posture.tsid.assembly import Assembly
-from impact_posture.tsid.daqp_solver import SOLVED, DaqpSolver
-from impact_posture.tsid.hierarchy import Level, lexicographic
-from impact_posture.tsid.qp import EQUALITY, QP, Solved
+from impact_posture.tsid.qp.daqp_solver import SOLVED, DaqpSolver
+from impact_posture.tsid.qp.hierarchy import Level, lexicographic
+from impact_posture.tsid.qp.quadratic_program import EQUALITY, QP, Solved
 
 # Miss that counts, relative to the terms of a row.
 _OFF = 1e-6

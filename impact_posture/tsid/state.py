@@ -8,11 +8,11 @@ import numpy as np
 import pinocchio as pin
 from numpy.typing import ArrayLike
 
-from impact_posture.arrays import Array
 from impact_posture.errors import InputError, PostureError
 from impact_posture.robot.robot import Robot, unit_parts
-from impact_posture.tsid.points import Point, PointKinematics, PointState
-from impact_posture.tsid.ranges import JointRanges
+from impact_posture.system.arrays import Array
+from impact_posture.tsid.joint_ranges import JointRanges
+from impact_posture.tsid.point_kinematics import Point, PointKinematics, PointState
 
 
 class State:

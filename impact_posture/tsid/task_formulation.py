@@ -5,17 +5,17 @@ from __future__ import annotations
 from dataclasses import dataclass, field
 from typing import Literal
 
-from impact_posture.argument_types import checked, checked_class
+from impact_posture.config.argument_types import checked, checked_class
 from impact_posture.errors import InputError
 from impact_posture.robot.robot import Robot
-from impact_posture.tsid.body_tasks import BaseOrientation, CenterOfMass, Tilt
-from impact_posture.tsid.contacts import SupportContact, support_contacts
-from impact_posture.tsid.frame_tasks import EndEffector, FramePose
-from impact_posture.tsid.impact_limits import ImpactLimits
-from impact_posture.tsid.limits import LimitLaw
-from impact_posture.tsid.points import Point
-from impact_posture.tsid.posture_tasks import JointPosture
-from impact_posture.tsid.task import Task
+from impact_posture.tsid.limits.acceleration_bounds import LimitLaw
+from impact_posture.tsid.limits.impact_limits import ImpactLimits
+from impact_posture.tsid.point_kinematics import Point
+from impact_posture.tsid.support_contact import SupportContact, support_contacts
+from impact_posture.tsid.tasks.body_tasks import BaseOrientation, CenterOfMass, Tilt
+from impact_posture.tsid.tasks.frame_tasks import EndEffector, FramePose
+from impact_posture.tsid.tasks.joint_posture import JointPosture
+from impact_posture.tsid.tasks.task import Task
 
 Order = Literal["strict", "weighted"]
 # Stiffness of the end effector's task by default, 1/s².

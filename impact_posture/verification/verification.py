@@ -13,13 +13,13 @@ import numpy as np
 from impact_posture.codegen.build_check import Deviation, deviation
 from impact_posture.dynamics.mjcf import import_mujoco
 from impact_posture.errors import InputError
-from impact_posture.impact.objective import ImpactObjective
+from impact_posture.impact.worst_case_objective import WorstCaseObjective
 from impact_posture.robot.robot import Robot
-from impact_posture.toolchain import GET_ONE, find_compiler
-from impact_posture.verification.sources import (
+from impact_posture.system.toolchain import GET_ONE, find_compiler
+from impact_posture.verification.quantity_sources import (
     MujocoSource,
     Numbers,
-    Sample,
+    PostureSample,
     Source,
     casadi_source,
     compiled_source,
@@ -43,7 +43,7 @@ _ON_FEET = 1e-7, 1e-6
 
 
 @dataclass(frozen=True)
-class Row:
+class VerificationRow:
     """One quantity of one source, compared with the numbers of Pinocchio.
 
     Attributes:
@@ -77,8 +77,8 @@ class VerificationReport:
         seed: The seed of the samples.
     """
 
-    rows: tuple[Row, ...]
-    samples: tuple[Sample, ...]
+    rows: tuple[VerificationRow, ...]
+    samples: tuple[PostureSample, ...]
     seed: int
 
     @property
@@ -103,7 +103,7 @@ class VerificationReport:
 
 
 def verify(
-    objective: ImpactObjective,
+    objective: WorstCaseObjective,
     samples: int = 10,
     seed: int = 0,
     progress: Callable[[int, int], None] | None = None,
@@ -139,19 +139,19 @@ def verify(
     tolerances = {CASADI: values, COMPILED: values, DIFFERENCES: {"∇H": by_differences},
                   MUJOCO: {"M": _MODEL, "J": _MODEL, **values, "∇H": by_differences}}  # fmt: skip
     with ExitStack() as stack:
-        compiled: Source | Row = Row(COMPILED, "", "skipped", note=NO_COMPILER)
+        compiled: Source | VerificationRow = VerificationRow(COMPILED, "", "skipped", note=NO_COMPILER)
         if find_compiler() is not None:
             compiled = stack.enter_context(compiled_source(objective))
-        sources: dict[str, Source | Row] = {
+        sources: dict[str, Source | VerificationRow] = {
             CASADI: casadi_source(objective),
             COMPILED: compiled,
             DIFFERENCES: partial(pinocchio_differences, objective),
             MUJOCO: _mujoco(objective),
         }
-        compared, total = 0, sum(not isinstance(source, Row) for source in sources.values()) * len(drawn)
-        rows: list[Row] = []
+        compared, total = 0, sum(not isinstance(source, VerificationRow) for source in sources.values()) * len(drawn)
+        rows: list[VerificationRow] = []
         for name, source in sources.items():
-            if isinstance(source, Row):
+            if isinstance(source, VerificationRow):
                 rows.append(source)
                 continue
             found: list[Numbers] = []
@@ -167,22 +167,22 @@ def verify(
     return VerificationReport(tuple(rows), drawn, seed)
 
 
-def _mujoco(objective: ImpactObjective) -> Source | Row:
+def _mujoco(objective: WorstCaseObjective) -> Source | VerificationRow:
     """Return the source of MuJoCo, or the row that says why there is none."""
     try:
         import_mujoco()
     except InputError as error:
-        return Row(MUJOCO, "", "skipped", note=f"not installed: {error.hint}")
+        return VerificationRow(MUJOCO, "", "skipped", note=f"not installed: {error.hint}")
     try:
         return MujocoSource(objective)
     except InputError as error:
         # The other sources remain.
-        return Row(MUJOCO, "", "fail", note=error.line)
+        return VerificationRow(MUJOCO, "", "fail", note=error.line)
 
 
 def _row(
     robot: Robot, name: str, quantity: str, tolerance: float, found: Sequence[Numbers], expected: Sequence[Numbers]
-) -> Row:
+) -> VerificationRow:
     """Return the row of the worst sample of one quantity."""
     deviations = [
         deviation(mine.values[quantity], reference.values[quantity], reference.scales.get(quantity, 0.0))
@@ -191,7 +191,7 @@ def _row(
     worst = max(range(len(deviations)), key=lambda k: deviations[k].error)
     largest = deviations[worst]
     finite = bool(np.isfinite(largest.error))
-    return Row(
+    return VerificationRow(
         source=name,
         quantity=quantity,
         verdict="pass" if finite and largest.error <= tolerance else "fail",

@@ -17,7 +17,7 @@ from pathlib import Path
 
 from impact_posture_cli.argv import put_right
 from impact_posture_cli.error_boundary import run
-from tests.command import PARSER
+from tests.support.command import PARSER
 
 CODES = {0, 1, 2, 3, 4, 130, 143}
 # Of a usage error: how to call it, and what was wrong.

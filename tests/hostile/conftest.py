@@ -12,7 +12,7 @@ from tests.hostile.arena import SMALL, strike
 @pytest.fixture(scope="session")
 def sound(tmp_path_factory: pytest.TempPathFactory) -> None:
     """The small robot can be evaluated, with everything imported once: each attack then is a fork."""
-    import tests.command  # noqa: F401
+    import tests.support.command  # noqa: F401
 
     folder = tmp_path_factory.mktemp("sound")
     (folder / "small.urdf").write_text(SMALL)

@@ -14,15 +14,15 @@ from pathlib import Path
 import numpy as np
 import pytest
 
-from impact_posture import plot
-from impact_posture.front_door import PostureResult
-from impact_posture.front_door_problem import PostureProblem
-from impact_posture.posture.problem_settings import prepare
-from impact_posture.posture.solve import solve
+from impact_posture.api.posture_problem import PostureProblem
+from impact_posture.api.posture_result import PostureResult
+from impact_posture.output import plot
+from impact_posture.posture.formulation.problem_file import prepare
+from impact_posture.posture.search.multistart import solve
 from impact_posture.simulation.scenario_file import scenario_path
 from tests.hostile.arena import attack, strike
 from tests.hostile.values import TOML, spoiled
-from tests.settings import make_settings
+from tests.support.settings import make_settings
 
 PUSH = ("small.urdf", "--frame", "tip", "--normal", "0", "0", "1")
 STOP = ("--out", "precious", "--force")

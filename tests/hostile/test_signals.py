@@ -128,7 +128,7 @@ def test_a_signal_during_an_import_ends_the_process() -> None:
         "import os, signal, sys, types\n"
         "from impact_posture_cli.process import prepare\n"
         "prepare()\n"
-        "sys.modules['impact_posture.processes'] = types.ModuleType('impact_posture.processes')\n"
+        "sys.modules['impact_posture.system.processes'] = types.ModuleType('impact_posture.system.processes')\n"
         "os.kill(os.getpid(), signal.SIGTERM)\n"
     )
     done = subprocess.run([sys.executable, "-c", code], capture_output=True, text=True, timeout=60, check=False)

@@ -6,10 +6,10 @@ import shlex
 from dataclasses import dataclass
 from pathlib import Path
 
-from impact_posture.posture.problem_settings import Prepared, prepare
-from impact_posture.posture.solve import PostureSolution, solve
-from impact_posture.settings import ProblemSettings
-from tests.settings import make_settings
+from impact_posture.config.settings import ProblemSettings
+from impact_posture.posture.formulation.problem_file import Prepared, prepare
+from impact_posture.posture.search.multistart import PostureSolution, solve
+from tests.support.settings import make_settings
 
 ROOT = Path(__file__).parents[2]
 EXPECTED = Path(__file__).with_name("expected.json")

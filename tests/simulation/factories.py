@@ -10,7 +10,7 @@ from typing import Any
 import numpy as np
 import pytest
 
-from impact_posture.simulation.controller_factory import ControllerFactory, Mode
+from impact_posture.simulation.controllers.controller_factory import ControllerFactory, Mode
 from impact_posture.simulation.recorder import feet_of
 from impact_posture.simulation.run import Run, run
 from impact_posture.simulation.scenario import Setup, set_up

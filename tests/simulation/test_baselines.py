@@ -8,18 +8,23 @@ import numpy as np
 import pinocchio as pin
 import pytest
 
-from impact_posture.simulation.actuator_command import ActuatorCommand
-from impact_posture.simulation.baselines import ReleaseDriver, WalkerDriver, resting_posture, spring_of_term
-from impact_posture.simulation.controller_factory import ControllerFactory
-from impact_posture.simulation.driver import RobustDriver
-from impact_posture.simulation.impact_baselines import InvariantDriver
-from impact_posture.simulation.reference import Reference
+from impact_posture.simulation.controllers.baselines import (
+    ReleaseDriver,
+    WalkerDriver,
+    resting_posture,
+    spring_of_term,
+)
+from impact_posture.simulation.controllers.contact_reference import Reference
+from impact_posture.simulation.controllers.controller_factory import ControllerFactory
+from impact_posture.simulation.controllers.driver import RobustDriver
+from impact_posture.simulation.controllers.impact_baselines import InvariantDriver
 from impact_posture.simulation.scenario import RepeatedContacts, set_up
 from impact_posture.simulation.scenario_file import read_scenario
-from impact_posture.simulation.sensor_noise import Reading
-from impact_posture.tsid.task import Task
-from tests.helpers import Vector, central_gradient, frame_jacobian, mass_matrix, rng
+from impact_posture.simulation.world.actuator_command import ActuatorCommand
+from impact_posture.simulation.world.sensor_noise import Reading
+from impact_posture.tsid.tasks.task import Task
 from tests.simulation.factories import SHIPPED, factory, needs_mujoco
+from tests.support.helpers import Vector, central_gradient, frame_jacobian, mass_matrix, rng
 
 
 @pytest.fixture(scope="module", autouse=True)

@@ -9,19 +9,19 @@ from pathlib import Path
 
 import pytest
 
-from impact_posture.controller_export.export import export_controller
+from impact_posture.controller_export.export_controller import export_controller
 from impact_posture.errors import InputError
-from impact_posture.simulation.controller_factory import ControllerFactory
-from impact_posture.simulation.driver import Driver
+from impact_posture.simulation.controllers.controller_factory import ControllerFactory
+from impact_posture.simulation.controllers.driver import Driver
+from impact_posture.simulation.controllers.task_formulations import nominal_posture
 from impact_posture.simulation.metrics import measure
 from impact_posture.simulation.run import run
 from impact_posture.simulation.scenario import Setup, set_up
 from impact_posture.simulation.scenario_file import read_scenario
-from impact_posture.simulation.scene import Sensors
-from impact_posture.simulation.task_formulations import nominal_posture
+from impact_posture.simulation.world.scene import Sensors
 from impact_posture.simulation.world_export import export_world
 from tests.simulation.factories import needs_mujoco
-from tests.tools import need
+from tests.support.tools import need
 
 needs_mujoco()
 

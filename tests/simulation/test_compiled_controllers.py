@@ -12,16 +12,16 @@ import pytest
 
 from impact_posture.errors import CompilerError, InputError
 from impact_posture.experiment.jobs import Job, execute, worth_compiling
-from impact_posture.libraries import cache_path
-from impact_posture.simulation.compiled_tick import CompiledTick
-from impact_posture.simulation.controller_factory import ControllerFactory
+from impact_posture.simulation.controllers.compiled_tick import CompiledTick
+from impact_posture.simulation.controllers.controller_factory import ControllerFactory
 from impact_posture.simulation.metrics import measure
 from impact_posture.simulation.scenario import set_up
 from impact_posture.simulation.scenario_file import read_scenario
 from impact_posture.simulation.scenario_objective import interpreted
-from impact_posture.simulation.sensor_noise import Reading
-from tests.daqp import sources_or_skip
+from impact_posture.simulation.world.sensor_noise import Reading
+from impact_posture.system.libraries import cache_path
 from tests.simulation.factories import driven, factory, needs_mujoco
+from tests.support.daqp import sources_or_skip
 
 # Totals of Python's run and of C's: a wall amplifies the last digits, the ground does not.
 BANDS = {"solo8-push": 1e-6, "aerial-vertical": 2e-2}

@@ -13,14 +13,14 @@ import pytest
 
 from impact_posture.errors import InputError
 from impact_posture.simulation import compiled_world, run
-from impact_posture.simulation.actuator_command import ActuatorCommand
-from impact_posture.simulation.controller_factory import ControllerFactory
+from impact_posture.simulation.controllers.controller_factory import ControllerFactory
 from impact_posture.simulation.metrics import measure
 from impact_posture.simulation.outcome import judge
 from impact_posture.simulation.scenario import set_up
 from impact_posture.simulation.scenario_file import read_scenario
-from tests.daqp import sources_or_skip
+from impact_posture.simulation.world.actuator_command import ActuatorCommand
 from tests.simulation.factories import controller_factory, driven, factory, fields_of, near, needs_mujoco, shortened
+from tests.support.daqp import sources_or_skip
 
 # Largest difference of any column, relative to its largest number.  A wall amplifies rounding once an encoder counts
 # one step more, so only the run until the impact is compared there.

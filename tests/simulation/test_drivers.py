@@ -11,14 +11,14 @@ import pinocchio as pin
 import pytest
 
 from impact_posture.errors import SpecError
-from impact_posture.simulation.actuator_command import ActuatorCommand
-from impact_posture.simulation.control import EndEffectorGains, Gains
-from impact_posture.simulation.controller_factory import CONTROLLERS, ControllerFactory, Mode
-from impact_posture.simulation.driver import MOVE, Driver, PostureDriver
-from impact_posture.simulation.reference import ReferencePoint
-from impact_posture.simulation.task_formulations import nominal_posture
-from impact_posture.tsid.body_tasks import BaseOrientation, CenterOfMass
-from impact_posture.tsid.frame_tasks import FramePose
+from impact_posture.simulation.controller_gains import EndEffectorGains, Gains
+from impact_posture.simulation.controllers.contact_reference import ReferencePoint
+from impact_posture.simulation.controllers.controller_factory import CONTROLLERS, ControllerFactory, Mode
+from impact_posture.simulation.controllers.driver import MOVE, Driver, PostureDriver
+from impact_posture.simulation.controllers.task_formulations import nominal_posture
+from impact_posture.simulation.world.actuator_command import ActuatorCommand
+from impact_posture.tsid.tasks.body_tasks import BaseOrientation, CenterOfMass
+from impact_posture.tsid.tasks.frame_tasks import FramePose
 from tests.simulation.factories import AERIAL, PUSHES, SHIPPED, factory, needs_mujoco
 
 

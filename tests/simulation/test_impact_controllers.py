@@ -5,13 +5,13 @@ from __future__ import annotations
 import numpy as np
 import pytest
 
-from impact_posture.simulation.impact_baselines import ImpactAwareDriver, ReferenceSpreadingDriver
+from impact_posture.simulation.controllers.contact_reference import Reference
+from impact_posture.simulation.controllers.impact_baselines import ImpactAwareDriver, ReferenceSpreadingDriver
 from impact_posture.simulation.metrics import before
-from impact_posture.simulation.reference import Reference
 from impact_posture.simulation.scenario import RepeatedContacts
-from impact_posture.simulation.sensor_noise import Reading
-from tests.helpers import Vector, frame_jacobian, mass_matrix, rng
+from impact_posture.simulation.world.sensor_noise import Reading
 from tests.simulation.factories import factory, lived, needs_mujoco
+from tests.support.helpers import Vector, frame_jacobian, mass_matrix, rng
 
 NAME = "aerial-vertical"
 

@@ -8,17 +8,17 @@ import numpy as np
 import pinocchio as pin
 import pytest
 
-from impact_posture.posture.build_problem import build_problem
-from impact_posture.posture.load_cases import load_cases
-from impact_posture.posture.search import feasible
+from docs.studies.robustness.outcomes import is_held
+from impact_posture.posture.formulation.build_problem import build_problem
+from impact_posture.posture.loads.load_cases import load_cases
+from impact_posture.posture.search.solver_runs import feasible
 from impact_posture.robot.actuation import allocation_matrix, thrust_limits
-from impact_posture.simulation import offline
-from impact_posture.simulation.offline import SHARE, offline_posture, scenario_requirements
+from impact_posture.simulation import offline_posture as offline
+from impact_posture.simulation.offline_posture import SHARE, offline_posture, scenario_requirements
 from impact_posture.simulation.scenario import set_up
 from impact_posture.simulation.scenario_file import read_scenario
 from impact_posture.simulation.scenario_objective import scenario_objective
-from impact_posture.tsid.flow_direction import FlowOptions
-from tests.benchmarks.robustness.outcomes import is_held
+from impact_posture.tsid.flow.flow_direction import FlowOptions
 from tests.simulation.factories import needs_mujoco
 
 needs_mujoco()

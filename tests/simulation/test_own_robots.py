@@ -12,15 +12,15 @@ import pytest
 
 from impact_posture.dynamics.numeric import Numeric
 from impact_posture.errors import ImpactPostureError
-from impact_posture.impact.contact import point_on
-from impact_posture.simulation.controller_factory import CONTROLLERS, ControllerFactory
+from impact_posture.impact.impact_contact import point_on
+from impact_posture.simulation.controllers.controller_factory import CONTROLLERS, ControllerFactory
 from impact_posture.simulation.metrics import measure
 from impact_posture.simulation.prediction import predict
 from impact_posture.simulation.run import run
 from impact_posture.simulation.scenario import set_up
 from impact_posture.simulation.scenario_file import read_scenario
-from tests.helpers import robot
 from tests.simulation.factories import controller_factory, driven, fields_of, needs_mujoco
+from tests.support.helpers import robot
 
 RAIL = Path(__file__).parents[2] / "docs" / "examples" / "rail_arm"
 

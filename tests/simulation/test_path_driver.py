@@ -10,10 +10,10 @@ import pytest
 
 from impact_posture.errors import InputError
 from impact_posture.path import posture_path as module
-from impact_posture.simulation.controller_factory import ControllerFactory
-from impact_posture.simulation.driver import PathDriver
-from impact_posture.simulation.sensor_noise import Reading
-from impact_posture.tsid.body_tasks import CenterOfMass
+from impact_posture.simulation.controllers.controller_factory import ControllerFactory
+from impact_posture.simulation.controllers.driver import PathDriver
+from impact_posture.simulation.world.sensor_noise import Reading
+from impact_posture.tsid.tasks.body_tasks import CenterOfMass
 from tests.simulation.factories import controller_factory, driven, near
 
 pytest.importorskip("toppra", reason="toppra is not installed (the extra 'path')")

@@ -10,7 +10,6 @@ import pinocchio as pin
 import pytest
 
 from impact_posture.robot.robot import Robot
-from impact_posture.simulation.actuator_command import ActuatorCommand
 from impact_posture.simulation.metrics import JUMP, before, measure
 from impact_posture.simulation.prediction import Prediction, predict
 from impact_posture.simulation.recorder import Recorder
@@ -18,12 +17,13 @@ from impact_posture.simulation.run import Run
 from impact_posture.simulation.scenario import Setup
 from impact_posture.simulation.scenario_file import read_scenario
 from impact_posture.simulation.scenario_objective import scenario_objective
-from impact_posture.simulation.scene import ContactLaw, Physics, Scene, Sensors
 from impact_posture.simulation.series import Window
-from impact_posture.simulation.world import build_world
+from impact_posture.simulation.world.actuator_command import ActuatorCommand
+from impact_posture.simulation.world.scene import ContactLaw, Physics, Scene, Sensors
+from impact_posture.simulation.world.world import build_world
 from impact_posture.tsid.controller import Command, Status
-from tests.helpers import Vector, frame_jacobian, mass_matrix, rng, robot
 from tests.simulation.factories import driven, factory, needs_mujoco
+from tests.support.helpers import Vector, frame_jacobian, mass_matrix, rng, robot
 
 NONE = np.zeros(0)
 WEIGHTLESS = Physics(gravity=(0.0, 0.0, 0.0))
@@ -100,7 +100,7 @@ def test_a_drop_without_friction_jumps_as_predicted(k: int) -> None:
     assert found.approach == pytest.approx(0.5, rel=1e-6)
     e = restitution(setup, run, 0.5)
     assert 0.05 < e < 0.25
-    # Stated band: 5 %, for the 4 ms that the contact takes (tests/test_world.py has 3 % for the impact alone).
+    # Stated band: 5 %, for the 4 ms that the contact takes (tests/simulation/test_world.py has 3 % for the impact alone).
     assert found.measured == pytest.approx((1 + e) * 0.5 * np.sqrt(found.V), rel=0.05)
     assert found.frictionless == pytest.approx(0.5 * np.sqrt(found.V))
     assert found.coulomb == pytest.approx(found.frictionless)

@@ -9,9 +9,9 @@ import numpy as np
 import pytest
 
 from impact_posture.errors import MetricError
-from impact_posture.simulation.actuator_command import Trace
 from impact_posture.simulation.recorder import STATUSES, Recorder
 from impact_posture.simulation.scenario import Setup
+from impact_posture.simulation.world.actuator_command import Trace
 from impact_posture.tsid.controller import Command, Status
 from tests.simulation.factories import factory, needs_mujoco
 

@@ -9,15 +9,15 @@ import numpy as np
 import pytest
 
 from impact_posture.errors import ControllerNotFound, InputError
-from impact_posture.simulation.controller_factory import CONTROLLERS, ControllerFactory, Mode
+from impact_posture.simulation.controllers.contact_reference import Reference
+from impact_posture.simulation.controllers.controller_factory import CONTROLLERS, ControllerFactory, Mode
 from impact_posture.simulation.metrics import measure
 from impact_posture.simulation.outcome import judge
 from impact_posture.simulation.prediction import predict
-from impact_posture.simulation.reference import Reference
 from impact_posture.simulation.run import Run, run
 from impact_posture.simulation.scenario import RepeatedContacts, SinglePush, set_up
 from impact_posture.simulation.scenario_file import read_scenario
-from impact_posture.simulation.world import build_world
+from impact_posture.simulation.world.world import build_world
 from tests.simulation.factories import (
     AERIAL,
     PUSHES,

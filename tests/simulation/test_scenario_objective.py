@@ -16,22 +16,22 @@ import numpy as np
 import pinocchio as pin
 import pytest
 
+from impact_posture.config.settings import ObjectiveKind
 from impact_posture.errors import CompilerError, MetricError, OutputError
-from impact_posture.impact.contact import ImpactContact
-from impact_posture.impact.metric import Metric
-from impact_posture.impact.objective import ImpactObjective
+from impact_posture.impact.impact_contact import ImpactContact
+from impact_posture.impact.jump_metric import Metric
 from impact_posture.impact.supports import resolve_supports
-from impact_posture.libraries import seal_path
-from impact_posture.settings import ObjectiveKind
+from impact_posture.impact.worst_case_objective import WorstCaseObjective
 from impact_posture.simulation import scenario_objective as module
-from impact_posture.simulation.controller_factory import ControllerFactory
-from impact_posture.simulation.driver import RobustDriver
+from impact_posture.simulation.controllers.controller_factory import ControllerFactory
+from impact_posture.simulation.controllers.driver import RobustDriver
 from impact_posture.simulation.scenario import set_up
 from impact_posture.simulation.scenario_file import read_scenario
 from impact_posture.simulation.scenario_objective import compiled, interpreted, scenario_objective
-from tests.helpers import Vector, assert_close, central_gradient, frame_jacobian, mass_matrix, rng, robot
+from impact_posture.system.libraries import seal_path
 from tests.simulation.factories import factory, needs_mujoco
-from tests.tools import need_compiler
+from tests.support.helpers import Vector, assert_close, central_gradient, frame_jacobian, mass_matrix, rng, robot
+from tests.support.tools import need_compiler
 
 # Fixed and floating bases, joints of several numbers, with feet and without.
 OBJECTIVES: tuple[tuple[str, str, ObjectiveKind, bool], ...] = (
@@ -45,13 +45,13 @@ OBJECTIVES: tuple[tuple[str, str, ObjectiveKind, bool], ...] = (
 )
 
 
-def objective_of(name: str, frame: str, kind: ObjectiveKind, feet: bool) -> ImpactObjective:
+def objective_of(name: str, frame: str, kind: ObjectiveKind, feet: bool) -> WorstCaseObjective:
     found = robot(name)
     supports = resolve_supports(found, None) if feet else ()
-    return ImpactObjective(found, ImpactContact(frame, (1.0, -0.5, 2.0)), Metric(), kind, supports)
+    return WorstCaseObjective(found, ImpactContact(frame, (1.0, -0.5, 2.0)), Metric(), kind, supports)
 
 
-def near(objective: ImpactObjective, *key: object) -> Vector:
+def near(objective: WorstCaseObjective, *key: object) -> Vector:
     """A posture near the robot's own."""
     step = 0.1 * rng(*key).normal(size=objective.robot.nv)
     return np.array(pin.integrate(objective.robot.model, objective.robot.posture(), step))
@@ -276,14 +276,14 @@ def test_two_processes_that_build_at_once_do_it_once(tmp_path: Path) -> None:
     need_compiler()
     program = (
         "import sys; from impact_posture.robot.robot_loader import load_robot\n"
-        "from impact_posture.impact.contact import ImpactContact\n"
-        "from impact_posture.impact.metric import Metric\n"
-        "from impact_posture.impact.objective import ImpactObjective\n"
+        "from impact_posture.impact.impact_contact import ImpactContact\n"
+        "from impact_posture.impact.jump_metric import Metric\n"
+        "from impact_posture.impact.worst_case_objective import WorstCaseObjective\n"
         "from impact_posture.simulation import scenario_objective\n"
         "write = scenario_objective.write_export\n"
         "def told(*a, **k):\n    print('built'); return write(*a, **k)\n"
         "scenario_objective.write_export = told\n"
-        "o = ImpactObjective(load_robot('ur5'), ImpactContact('tool0', (0, 0, 1)), Metric(), 'impulse', ())\n"
+        "o = WorstCaseObjective(load_robot('ur5'), ImpactContact('tool0', (0, 0, 1)), Metric(), 'impulse', ())\n"
         "print(repr(scenario_objective.compiled(o)(o.robot.posture())[0]))\n"
     )
     environment = {**os.environ, "IMPACT_POSTURE_CACHE": str(tmp_path)}

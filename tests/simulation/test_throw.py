@@ -11,8 +11,7 @@ import pinocchio as pin
 import pytest
 
 from impact_posture.errors import ImpactPostureError, InputError, SpecError
-from impact_posture.simulation.actuator_command import ActuatorCommand
-from impact_posture.simulation.controller_factory import ControllerFactory
+from impact_posture.simulation.controllers.controller_factory import ControllerFactory
 from impact_posture.simulation.metrics import measure
 from impact_posture.simulation.outcome import judge
 from impact_posture.simulation.prediction import predict
@@ -20,11 +19,12 @@ from impact_posture.simulation.recorder import feet_of
 from impact_posture.simulation.run import run
 from impact_posture.simulation.scenario import Setup, set_up
 from impact_posture.simulation.scenario_file import SHIPPED, read_scenario
-from impact_posture.simulation.throw import FLIGHT, Throw, thrown_jumps
-from impact_posture.simulation.world import World, build_world
-from tests.helpers import Vector, frame_jacobian, mass_matrix
+from impact_posture.simulation.world.actuator_command import ActuatorCommand
+from impact_posture.simulation.world.throw import FLIGHT, Throw, thrown_jumps
+from impact_posture.simulation.world.world import World, build_world
 from tests.simulation.factories import controller_factory, needs_mujoco
-from tests.test_scenario_files import REAL
+from tests.simulation.test_scenario_files import REAL
+from tests.support.helpers import Vector, frame_jacobian, mass_matrix
 
 # Ways of flight, off the axes too.
 WAYS = ((-1, 0, 0), (0.5, 1.0, 0.0), (0.3, -0.4, -1.0))

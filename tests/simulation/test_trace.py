@@ -6,11 +6,11 @@ import numpy as np
 import pytest
 
 from impact_posture.errors import InputError
-from impact_posture.simulation import contact_forces
-from impact_posture.simulation.actuator_command import ActuatorCommand
-from impact_posture.simulation.world import World
-from tests.helpers import rng
+from impact_posture.simulation.world import contact_forces
+from impact_posture.simulation.world.actuator_command import ActuatorCommand
+from impact_posture.simulation.world.world import World
 from tests.simulation.factories import factory
+from tests.support.helpers import rng
 
 mujoco = pytest.importorskip("mujoco", reason="mujoco is not installed (the extra 'sim')")
 

@@ -9,10 +9,10 @@ from numpy.typing import NDArray
 
 import impact_posture as ip
 from impact_posture.robot.robot import Robot
-from impact_posture.simulation.controller_factory import ControllerFactory, Mode
-from impact_posture.simulation.driver import Driver
+from impact_posture.simulation.controllers.controller_factory import ControllerFactory, Mode
+from impact_posture.simulation.controllers.driver import Driver
+from impact_posture.simulation.controllers.task_formulations import nominal_posture
 from impact_posture.simulation.scenario import Setup
-from impact_posture.simulation.task_formulations import nominal_posture
 from impact_posture.tsid.state import State
 
 Vector = NDArray[np.float64]

@@ -1,6 +1,6 @@
 /* The reference flow: a posture q_r that goes down the gradient on contacts and tasks, limited in speed and acceleration,
  * before the posture task follows it.  An update takes IP_FLOW_PHASES ticks, so that none takes much longer than without it.
- * The formulas are in impact_posture/tsid/reference_flow.py. */
+ * The formulas are in impact_posture/tsid/flow/reference_flow.py. */
 
 /* Ticks of an update, from its look to the change of the motion, and from the last change to the look. */
 #define IP_FLOW_PHASES 14

@@ -1,5 +1,5 @@
 /* Direction of the reference flow: a saddle-free Newton step on the constraints, as a QP with limits.  The formulas are
- * in impact_posture/tsid/flow_direction.py. */
+ * in impact_posture/tsid/flow/flow_direction.py. */
 
 /* Least H/H0 whose root counts. */
 #define IP_LEAST_VALUE 1e-8

@@ -1,5 +1,5 @@
 /* Limits of the reference flow: how much room each has, and steps without what crosses it.  The formulas are in
- * impact_posture/tsid/flow_direction.py. */
+ * impact_posture/tsid/flow/flow_direction.py. */
 
 /* What of IP_NEAR the flow takes where a limit is missed by so much already: along it, the flow would creep across. */
 #define IP_SPENT 9.9e-4

@@ -1,5 +1,5 @@
 /* What contacts and tasks leave to the reference flow, and what the actuators need to hold it, as
- * impact_posture/tsid/flow_direction.py (Redundancy) and static_controls.py have them. */
+ * impact_posture/tsid/flow/flow_direction.py (Redundancy) and static_controls.py have them. */
 
 /* Singular value of the constraints, relative to the largest, below which they are springs, and their stiffness relative
  * to H0, 1/m2. */

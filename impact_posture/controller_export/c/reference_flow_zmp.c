@@ -1,5 +1,5 @@
 /* Bounds of the acceleration that keep the zero moment point of a robot that stands within the polygon of its feet.  The
- * formulas are in impact_posture/tsid/zero_moment_point.py. */
+ * formulas are in impact_posture/tsid/flow/zero_moment_point.py. */
 
 /* Share of the way from the center of mass to an edge that accelerations may take, and the least distance that counts, m. */
 #define IP_ZMP_SHARE 0.8

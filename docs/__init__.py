@@ -1,0 +1,1 @@
+"""The documentation, a package so that tests import the studies as ``docs.studies``."""

@@ -1,0 +1,65 @@
+"""Run benchmarks and studies: ``python -m docs.studies NAME … [--only TEXT] [--count N] [--write]``."""
+
+# ruff: noqa: E402 - BLAS counts its threads when numpy is loaded
+
+from __future__ import annotations
+
+import os
+
+for _name in ("OPENBLAS_NUM_THREADS", "OMP_NUM_THREADS", "MKL_NUM_THREADS"):
+    os.environ[_name] = "1"
+
+import argparse
+import sys
+
+from docs.studies.core import STUDIES, Request, Study, page_of
+from impact_posture.errors import ImpactPostureError
+from impact_posture.posture.program.ipopt import one_blas_thread
+
+
+@one_blas_thread()
+def main() -> int:
+    """Print what each study finds; with ``--write`` also renew its page of the documentation."""
+    listed = "\n".join(f"  {study.name:13}{study.about}" for study in STUDIES.values())
+    parser = argparse.ArgumentParser(
+        prog="python -m docs.studies", description=f"benchmarks and studies:\n{listed}",
+        formatter_class=argparse.RawDescriptionHelpFormatter,
+    )  # fmt: skip
+    parser.add_argument("names", nargs="+", choices=list(STUDIES), metavar="NAME")
+    parser.add_argument("--only", default="", metavar="TEXT", help="cases whose name has this in it")
+    parser.add_argument("--count", type=int, help="how many of what the study counts")
+    parser.add_argument("--seed", type=int, default=0, help="of impacts and points; the first of four of flow")
+    parser.add_argument("--number", type=int, help="points: print this one alone, run anew")
+    parser.add_argument("--jobs", type=int, default=2, help="processes of points and reproduction")
+    parser.add_argument("--against", default="", metavar="PROGRAM", help="answer: another impact-posture")
+    parser.add_argument("--write", action="store_true", help="also write the page in docs/generated")
+    asked = parser.parse_args()
+    wanted = [STUDIES[name] for name in asked.names]
+    if asked.write and (asked.only or asked.number is not None or not all(study.page for study in wanted)):
+        parser.error("--write is for studies that have a page, and for all of their cases: leave --only away")
+    if asked.count is not None and asked.count < 1:
+        parser.error("--count: one or more")
+    return max([_run(study, asked) for study in wanted])
+
+
+def _run(study: Study, asked: argparse.Namespace) -> int:
+    request = Request(
+        asked.only, asked.count or study.count, asked.seed, asked.number, asked.jobs, asked.write, asked.against
+    )
+    lines = [study.head, ""]
+    try:
+        for line in study.lines(request):
+            print(line, flush=True)
+            lines.append(line)
+    except ImpactPostureError as error:
+        print(error, file=sys.stderr)
+        return 1
+    if asked.write:
+        page_of(study.name).write_text("\n".join([*lines, ""]), encoding="utf-8")
+    for word in request.missed:
+        print(f"missed: {word}", file=sys.stderr)
+    return int(bool(request.missed))
+
+
+if __name__ == "__main__":
+    sys.exit(main())

@@ -1,0 +1,54 @@
+"""How fast robots arrive in their optima, and what it costs to arrive as fast as in the start."""
+
+from __future__ import annotations
+
+from collections.abc import Iterator
+
+from docs.studies.cases import BACK, DOWN
+from docs.studies.core import Request, machine, say, table
+from docs.studies.feasible import STARTS, solved
+from impact_posture.posture.approach.attainable_speed import AttainableSpeed
+from impact_posture.posture.formulation.problem_file import prepare
+from impact_posture.posture.search.multistart import PostureSolution
+from impact_posture.robot.robot_loader import known_robots
+from tests.support.settings import make_settings
+
+_HEAD = ("robot", "normal", "start, m/s", "optimum, m/s", "asked, m/s", "loss", "certified", "a start")
+_SHARE = 0.9
+
+
+def lines(request: Request) -> Iterator[str]:
+    """A row for each robot whose joints bring its contact to the surface, and each normal."""
+    yield f"The fastest approach at the start and at the best of {STARTS} starts, clear of collisions and held by"
+    yield f"the motors; then the optimum with {_SHARE:.0%} of the speed at the start demanded. *loss*: how much the"
+    yield "objective rises. *a start*: median time of a start against the one without the demand. Robots that fly and"
+    yield "contacts on the trunk have no bound; where no posture is clear of collisions, there is no row."
+    yield machine()
+    yield ""
+    cases = [(robot, normal) for robot in known_robots() if request.only in robot for normal in (DOWN, BACK)]
+    yield from table(_HEAD, (row for case in cases if (row := _row(*case, request.seed))))
+
+
+def _row(robot: str, normal: tuple[float, float, float], seed: int) -> list[str]:
+    say(f"{robot} {normal}")
+    asked = {"robot": robot, "normal": normal, "collision": True, "holdable": True, "seed": seed}
+    problem = prepare(make_settings(asked)).problem
+    attainable = AttainableSpeed(problem.robot, problem.objective, problem.requirements)
+    if attainable.unknown:
+        return []
+    found, (apart, _) = solved(asked)
+    if not isinstance(found, PostureSolution):
+        return []
+    start, optimum = (attainable.reached(q) for q in (found.initial, found.q))
+    cells = [robot, "down" if normal == DOWN else "ahead", _digits(start), _digits(optimum)]
+    if not start:
+        return [*cells, *["–"] * 4]
+    speed = float(f"{_SHARE * start:.2g}")
+    again, (took, _) = solved(asked | {"approach": True, "speed": speed})
+    assert isinstance(again, PostureSolution), again
+    loss = again.optima[0].objective / found.optima[0].objective - 1
+    return [*cells, f"{speed:g}", f"{100 * loss:.1f} %", f"{again.certified_starts}", f"{took / apart:.1f}×"]
+
+
+def _digits(speed: float | None) -> str:
+    return "unbounded" if speed is None else f"{speed:.2g}"

@@ -1,0 +1,182 @@
+"""The exported controller beside the one in Python, in three parts: equal answers, growth, and what a tick takes.
+
+``python -m docs.studies.controller [TICKS] [equality|growth|times]`` writes a part, or all of them, into pages of
+the documentation.  Times need a quiet machine, the others do not.
+"""
+
+from __future__ import annotations
+
+import subprocess
+import sys
+import tempfile
+import time
+from collections.abc import Iterator
+from contextlib import ExitStack
+from pathlib import Path
+
+import numpy as np
+import pinocchio as pin
+
+from docs.studies import controller_equality, controller_peer
+from docs.studies.controller_equality import objective_of
+from docs.studies.core import Vector, machine, one_core, page_of, table
+from impact_posture.controller_export.compiled_controller import CompiledController
+from impact_posture.controller_export.controller_manifest import read_controller
+from impact_posture.system.toolchain import find_compiler
+from impact_posture.tsid.controller import Controller
+from tests.support.exported_controller import KINDS, exported, formulation_of, impact_of
+
+HARNESS = Path(__file__).with_name("controller_times.c")
+# A repetition is interrupted by other programs; the least of some is the tick's own.
+REPETITIONS = 7
+# Ticks that are timed, and random ticks in which the memory must not grow.
+TIMED, RANDOM = 1000, 1_000_000
+# Frames of the impacts with which the impact-robust term is timed.
+IMPACTS = {"tilthex_arm": "ee", "panda": "panda_hand_tcp", "solo8": "base_link", "talos": "torso_2_link"}
+BUILDS = {"-O2": ["-O2"], "native": ["-O3", "-march=native"]}
+_HEAD = "<!-- Written by `make study-controller`; do not edit. -->"
+
+
+def quiet(name: str, ticks: int) -> tuple[list[Vector], list[float]]:
+    """Return the states of a robot that Python's controller holds, and what its ticks took, µs."""
+    robot, formulation = formulation_of(name)
+    controller, recorded, taken = Controller(robot, formulation), list[Vector](), list[float]()
+    q, v = robot.posture(), np.zeros(robot.nv)
+    controller.reset(q, v)
+    for k in range(ticks):
+        before = time.process_time_ns()
+        command = controller.tick(1e-3 * k, q, v)
+        taken.append((time.process_time_ns() - before) / 1e3)
+        recorded.append(np.concatenate([q, v]))
+        v = v + 1e-3 * command.acceleration
+        q = np.asarray(pin.integrate(robot.model, q, 1e-3 * v))
+    return recorded, taken
+
+
+def flowing(name: str, ticks: int) -> tuple[Path, list[Vector]]:
+    """Return the folder of a controller with a reference flow, and the states of a robot that follows the flow."""
+    objective = objective_of(name)
+    folder, robot = exported(name, objective, path=()), objective.robot
+    controller, recorded = CompiledController.load(folder), list[Vector]()
+    q, v = robot.posture(), np.zeros(robot.nv)
+    controller.reset(q, v)
+    controller.brace()
+    for k in range(ticks):
+        recorded.append(np.concatenate([q, v]))
+        v = v + 1e-3 * controller.tick(1e-3 * k, q, v).acceleration
+        q = np.asarray(pin.integrate(robot.model, q, 1e-3 * v))
+    return folder, recorded
+
+
+def times(folder: Path, recorded: list[Vector], flags: list[str], cold: bool) -> tuple[float, float]:
+    """Return median and 99th percentile of the ticks, each the least of its repetitions, µs."""
+    least = _least(folder, recorded, flags, [["cold"] if cold else []])[0][:, 0]
+    return float(np.median(least)), float(np.percentile(least, 99))
+
+
+def robust_over_nominal(name: str, frame: str, recorded: list[Vector]) -> list[str]:
+    """Return a row: how much longer ticks are with the impact-robust term, every fifth tick and every tick."""
+    robot = formulation_of(name)[0]
+    folder = exported(name, impact_of(robot, frame, (0.0, 0.0, 1.0)))
+    nominal, fifth, every = _least(folder, recorded, ["-O2"], [[], ["5"], ["1"]])
+    alone = float(np.mean(every[:, 1]))
+    more = float(np.mean(every[:, 0] - nominal[:, 0]))
+    share = float(np.mean(fifth[:, 0]) / np.mean(nominal[:, 0]))
+    return [name, f"{np.mean(nominal[:, 0]):.2f}", f"{alone:.2f}", f"{share:.3f}", f"{more / alone:.2f}"]
+
+
+def _least(folder: Path, recorded: list[Vector], flags: list[str], variants: list[list[str]]) -> list[Vector]:
+    """Return, for each list of arguments, the least time of each tick and of its gradient, µs, shape (ticks, 2)."""
+    with tempfile.TemporaryDirectory() as scratch:
+        program, data = Path(scratch) / "times", Path(scratch) / "ticks.bin"
+        np.array([recorded[0], *recorded]).tofile(data)
+        sources = ["ctl.c", *read_controller(folder)[1].sources, str(HARNESS)]
+        command = [*(find_compiler() or ["cc"]), "-std=c99", "-ffp-contract=fast", "-isystem", "daqp", "-I.", *flags]
+        subprocess.run([*command, *sources, "-o", str(program), "-lm"], cwd=folder, check=True)
+        least = [np.full((len(recorded), 2), np.inf) for _ in variants]
+        for found, words in REPETITIONS * list(zip(least, variants, strict=True)):
+            ran = subprocess.run([program, data, *words], capture_output=True, check=True)
+            numbers = [[int(line.split()[k]) for k in (0, 3)] for line in ran.stdout.splitlines()]
+            np.minimum(found, np.array(numbers) / 1e3, out=found)
+    return least
+
+
+def equality(ticks: int) -> Iterator[str]:
+    """Yield what differs between both controllers over the same states."""
+    some, most = controller_equality.SOME, controller_equality.MOST
+    yield (
+        f"{ticks} ticks of each kind of states. Controls are compared relative to the largest. *Its own*: largest "
+        "change of Python's controls, in ticks over 1e-9, where each number of the program moves by its last digit. "
+        f"Where answers differ (the first {most}), and of every {some}th relaxed tick: largest violation of what "
+        "always holds, and largest residual of optimality, by a certificate that neither controller shares."
+    )
+    yield ""
+    yield from table(controller_equality.HEAD, controller_equality.equality(ticks))
+
+
+def growth(_: int) -> Iterator[str]:
+    """Yield what random ticks take of memory."""
+    head = ["robot", "random ticks", "growth", "statuses: solved, relaxed, infeasible, unsolved, not finite"]
+    yield from table(head, controller_equality.growth(RANDOM))
+
+
+def times_of_ticks(_: int) -> Iterator[str]:
+    """Yield what a tick takes in Python, in C, and by hand in C++, each row as soon as it is known."""
+    ratios = list[list[str]]()
+    yield f"Median / p99 of {TIMED} quiet states, µs; each tick of C and C++ is the least of {REPETITIONS}."
+    yield ""
+    with ExitStack() as stack:
+        try:
+            peer, why = stack.enter_context(controller_peer.peer()), ""
+        except controller_peer.Missing as missing:
+            peer, why = None, str(missing)
+        theirs = f"Pinocchio and DAQP, C++ {why}".strip()
+        head = [
+            "robot",
+            "Python",
+            "C -O2",
+            "C native",
+            "C -O2, caches flushed",
+            "on the way of a flow, C -O2",
+            theirs,
+        ]
+        yield from table(head, _speeds(peer, ratios))
+    yield from ("", "With the impact-robust term, means over quiet states.", "")
+    ratio = ["robot", "nominal, µs", "gradient", "every fifth tick, over nominal", "every tick: more, over gradient"]
+    yield from table(ratio, ratios)
+
+
+def _speeds(peer: Path | None, ratios: list[list[str]]) -> Iterator[list[str]]:
+    for name in KINDS:
+        recorded, python = quiet(name, TIMED)
+        row = [name, f"{np.median(python):.0f} / {np.percentile(python, 99):.0f}"]
+        for flags, cold in ((BUILDS["-O2"], False), (BUILDS["native"], False), (BUILDS["-O2"], True)):
+            row.append("{:.1f} / {:.1f}".format(*times(exported(name), recorded, flags, cold)))
+        row.append("{:.1f} / {:.1f}".format(*times(*flowing(name, 3 * TIMED), BUILDS["-O2"], False)))
+        found = None if peer is None else controller_peer.times(peer, name, recorded)
+        row.append("–" if found is None else "{:.1f} / {:.1f}".format(*found))
+        if name in IMPACTS:
+            ratios.append(robust_over_nominal(name, IMPACTS[name], recorded))
+        yield row
+
+
+PARTS = {"equality": equality, "growth": growth, "times": times_of_ticks}
+
+
+def main(ticks: int, parts: list[str]) -> None:
+    """Write parts, each into its page."""
+    for part in parts:
+        lines = [_HEAD, "", machine("daqp"), ""]
+        for line in PARTS[part](ticks):
+            print(line, flush=True)
+            lines.append(line)
+        page_of(f"controller-{part}").write_text("\n".join([*lines, ""]), encoding="utf-8")
+
+
+if __name__ == "__main__":
+    words = sys.argv[1:]
+    fits = all(word.isdecimal() for word in words[:1]) and words[1:] in ([], *([part] for part in PARTS))
+    if not fits:
+        sys.exit(f"usage: python -m docs.studies.controller [TICKS] [{'|'.join(PARTS)}]")
+    with one_core():
+        main(int(words[0]) if words else 10_000, words[1:] or list(PARTS))

@@ -1,0 +1,221 @@
+"""Whether the exported controller answers as the one in Python: the same statuses and controls over the same states.
+
+Where they differ, a certificate that neither shares (:mod:`tests.support.relaxation_in_c`) says which of them is
+right.
+"""
+
+from __future__ import annotations
+
+import subprocess
+import tempfile
+from collections import Counter
+from collections.abc import Iterator
+from dataclasses import dataclass, field
+from pathlib import Path
+
+import numpy as np
+import pinocchio as pin
+
+from docs.studies.core import Vector
+from docs.studies.flow import CASES
+from impact_posture.codegen.impact_gradient import ImpactGradient
+from impact_posture.codegen.manifest_reader import read_manifest
+from impact_posture.controller_export.compiled_controller import CompiledController
+from impact_posture.controller_export.default_formulation import default_formulation
+from impact_posture.impact.worst_case_objective import WorstCaseObjective
+from impact_posture.robot.robot_loader import load_robot
+from impact_posture.system.libraries import library_path, load_library
+from impact_posture.tsid.controller import Command, Controller, Status
+from impact_posture.tsid.flow.reference_flow_posture import ReferenceFlowPosture
+from impact_posture.tsid.qp.daqp_solver import DaqpSolver
+from impact_posture.tsid.qp.quadratic_program import QP
+from impact_posture.tsid.tasks.impact_robust import ImpactRobustPosture, gradient_of
+from tests.support.exported_controller import KINDS, abuse_program, exported, random_state
+from tests.support.relaxation_in_c import missed, stationarity
+from tests.support.relaxed_ticks import problem_of
+
+HEAD = (
+    "robot|states|solved|largest difference of u|over 1e-9|its own|relaxed|status differs (Python/C)|"
+    "C: violation, optimality|Python's|held (C)|difference of q_r"
+).split("|")
+# Largest violation of what always holds, and largest residual of optimality, of a right answer.
+HOLDS, OPTIMAL = 1e-9, 1e-7
+# Of so many relaxed ticks, one is certified, and of solved ticks that differ, at most so many.
+SOME, MOST = 20, 500
+# Robots that tick a million times.
+GROWTH = ("tilthex_arm", "panda", "solo8", "talos")
+
+
+@dataclass(frozen=True)
+class States:
+    """A kind of states.
+
+    Attributes:
+        push: Acceleration of each joint that pushes the robot in half of the time, relative.
+        size: Size of random states, which follow each other unrelated; 0 for those of a robot that moves.
+        follows: Whether a ``term`` or a ``flow`` follows the gradient of an impact, through all phases.
+        again: Ticks after which the robot is set up again, because it may have fallen.
+    """
+
+    push: float = 0.0
+    size: float = 0.0
+    follows: str = ""
+    again: int = 1000
+
+
+STATES = {
+    "quiet": States(),
+    "braced": States(push=3.0, follows="term"),
+    "flowing": States(follows="flow", again=2500),
+    "pushed": States(push=3.0),
+    "saturated": States(push=30.0),
+    "random": States(size=0.05),
+    "far": States(size=0.3),
+}
+
+
+@dataclass
+class Agreement:
+    """Ticks of one kind of states.
+
+    Attributes:
+        solved: Ticks that both solved.
+        worst: Largest relative difference of their controls.
+        differ: Solved ticks whose controls differ by more than 1e-9.
+        own: Largest relative difference, in those, of Python's controls from its own with the last digits moved.
+        relaxed: Ticks that both relaxed.
+        other: Ticks with different statuses, as ``Python/C``.
+        held: Ticks in which C found no answer.
+        off: Largest violation and residual of optimality, of C and of Python, where answers differ or were relaxed.
+        wrong: Differences, and certified relaxed ticks, in which the answer of C, or of Python, is not right.
+        reference: Largest difference of the postures that flows have reached, rad or m.
+    """
+
+    solved: int = 0
+    worst: float = 0.0
+    differ: int = 0
+    own: float = 0.0
+    relaxed: int = 0
+    other: Counter[str] = field(default_factory=Counter)
+    held: int = 0
+    off: Vector = field(default_factory=lambda: np.zeros((2, 2)))
+    wrong: Vector = field(default_factory=lambda: np.zeros(2, dtype=int))
+    reference: float = 0.0
+
+    def row(self, name: str, kind: str) -> list[str]:
+        """Return a row of the table."""
+        other = ", ".join(f"{count} {pair}" for pair, count in sorted(self.other.items())) or "none"
+        ours, theirs = (
+            f"{violation:.0e}, {optimality:.0e}" + (f" ({wrong} not right)" if wrong else "")
+            for (violation, optimality), wrong in zip(self.off, self.wrong, strict=True)
+        )
+        return [name, kind, str(self.solved), f"{self.worst:.0e}", str(self.differ), f"{self.own:.0e}",
+                str(self.relaxed), other, ours, theirs, str(self.held), f"{self.reference:.0e}"]  # fmt: skip
+
+
+def objective_of(name: str) -> WorstCaseObjective:
+    """Return the objective of the impact with which a robot flows in the studies."""
+    return next(case for case in CASES if case.robot == name).problem().objective
+
+
+def pair(name: str, follows: str) -> tuple[Controller, CompiledController]:
+    """Return a robot's controllers in Python and in C; both follow the same compiled gradient, if any."""
+    objective = objective_of(name) if follows else None
+    folder = exported(name, objective, "-O2", () if follows == "flow" else None)
+    robot = load_robot(name) if objective is None else objective.robot
+    formulation = default_formulation(robot, KINDS[name], objective, flow=follows == "flow")
+    if isinstance(posture := formulation.posture, ImpactRobustPosture | ReferenceFlowPosture):
+        metric = read_manifest(folder / "ctl_metric.json")[0]
+        posture._function = gradient_of(ImpactGradient(load_library(library_path(folder, "ctl")), metric))
+    return Controller(robot, formulation), CompiledController.load(folder, robot=robot)
+
+
+def agreement(name: str, kind: str, ticks: int) -> Agreement:
+    """Run both controllers over the same states: random ones, or those of a robot that follows the one in Python."""
+    states, found = STATES[kind], Agreement()
+    (ours, theirs), rng = pair(name, states.follows), np.random.default_rng(7)
+    robot, posture, push = ours.robot, ours.formulation.posture, np.zeros(ours.robot.nv)
+    q, v = robot.posture(), np.zeros(robot.nv)
+    phases = {0: "brace", 7 * states.again // 10: "contact", 9 * states.again // 10: "release"}
+    for k in range(ticks):
+        if states.size:
+            q, v = random_state(robot, rng, states.size)
+        elif k % states.again == 0:
+            q, v = robot.posture(), np.zeros(robot.nv)
+        if k == 0 or (states.follows and k % states.again == 0):
+            for controller in (ours, theirs):
+                controller.reset(robot.posture(), np.zeros(robot.nv))
+        if states.follows and (phase := phases.get(k % states.again)):
+            getattr(posture, phase)()
+            getattr(theirs, phase)()
+        a, b = ours.tick(1e-3 * k, q, v), theirs.tick(1e-3 * k, q, v)
+        _compare(found, ours, a, b)
+        if isinstance(posture, ReferenceFlowPosture):
+            away = pin.difference(robot.model, posture.target, theirs.target)
+            found.reference = max(found.reference, float(np.max(np.abs(away))))
+        if k % 50 == 0:
+            push = states.push * rng.normal(size=robot.nv) * (k % 100 == 0)
+        v = v + 1e-3 * (a.acceleration + push)
+        q = np.asarray(pin.integrate(robot.model, q, 1e-3 * v))
+    return found
+
+
+def _compare(found: Agreement, ours: Controller, a: Command, b: Command) -> None:
+    """Count a tick, and certify both answers where they differ, or in some relaxed ticks."""
+    answered, certify = (Status.SOLVED, Status.RELAXED), a.status is not b.status
+    found.held += b.status not in answered
+    if certify:
+        found.other[f"{a.status.value}/{b.status.value}"] += 1
+    elif a.status is Status.SOLVED:
+        found.solved += 1
+        difference = _difference(a.u, b.u)
+        found.worst, certify = max(found.worst, difference), difference > 1e-9
+        found.differ += certify
+        certify &= found.differ <= MOST
+        if certify:
+            found.own = max(found.own, _difference(a.u, _moved(ours)))
+    elif a.status is Status.RELAXED:
+        found.relaxed += 1
+        certify = found.relaxed % SOME == 1
+    for i, command in enumerate((b, a) if certify else ()):
+        if command.status in answered:
+            z = np.concatenate([command.acceleration, command.forces])
+            program = problem_of(ours.assembly, z)
+            off = missed(program, z)[0], max(stationarity(program, z))
+            found.off[i] = np.maximum(found.off[i], off)
+            found.wrong[i] += not (off[0] <= HOLDS and off[1] <= OPTIMAL)
+
+
+def _difference(u: Vector, other: Vector) -> float:
+    return float(np.max(np.abs(u - other)) / max(1.0, float(np.max(np.abs(u)))))
+
+
+def _moved(controller: Controller) -> Vector:
+    """Return the controls of the last program, each number of which is moved by a last digit."""
+    qp, rng = controller.assembly.rank.qp, np.random.default_rng(0)
+    digits = np.finfo(float).eps * rng.choice([-1.0, 1.0], size=(qp.n, qp.n))
+    bounds = 1.0 + np.finfo(float).eps * rng.choice([-1.0, 1.0], size=qp.n + qp.m)
+    H, A = qp.H * (1.0 + np.tril(digits) + np.tril(digits, -1).T), qp.A * (1.0 + digits[0])
+    moved = QP(H, qp.g * (1.0 + digits[0]), A, bounds * qp.lower, bounds * qp.upper, qp.sense)
+    solved = DaqpSolver(qp.n, qp.m).solve(moved)
+    return (
+        np.full(controller.actuators.controls, np.nan)
+        if solved is None
+        else (controller.assembly.controls(controller.state, solved.z))
+    )
+
+
+def equality(ticks: int) -> Iterator[list[str]]:
+    """Yield a row for each robot and kind of states."""
+    for name in KINDS:
+        for kind in STATES:
+            yield agreement(name, kind, ticks).row(name, kind)
+
+
+def growth(ticks: int) -> Iterator[list[str]]:
+    """Yield what random ticks, half of them with limits that permit nearly nothing, take of each robot's memory."""
+    for name in GROWTH:
+        with tempfile.TemporaryDirectory() as scratch:
+            program = abuse_program(exported(name, flags="-O2"), Path(scratch))
+            ran = subprocess.run([program, str(ticks)], capture_output=True, text=True, check=True)
+        yield [name, str(ticks), *ran.stdout.strip().removeprefix("growth ").split("; statuses ")]

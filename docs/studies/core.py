@@ -1,0 +1,180 @@
+"""What all benchmarks share: the list of studies, the machine, clocks, starts, tables."""
+
+from __future__ import annotations
+
+import os
+import platform
+import statistics
+import sys
+import time
+from collections.abc import Callable, Iterator, Sequence
+from contextlib import contextmanager
+from dataclasses import dataclass, field
+from importlib import import_module
+from importlib.metadata import version
+from pathlib import Path
+from typing import TypeVar
+
+import numpy as np
+import pinocchio as pin
+from numpy.typing import NDArray
+
+from docs.studies.build import compiler_version, processor
+from impact_posture.posture.manifold.feasible_start import feasible_start
+from impact_posture.posture.program.constrained_problem import ConstrainedProblem
+from impact_posture.system.processes import fork_map
+from impact_posture.system.toolchain import find_compiler
+
+Vector = NDArray[np.float64]
+_T = TypeVar("_T")
+
+ROOT = Path(__file__).parents[2]
+CRBA_CALLS = 2000
+
+
+@dataclass(frozen=True)
+class Study:
+    """A generator ``lines(request)`` of a module here, or another one by ``module:name``."""
+
+    name: str
+    source: str
+    about: str
+    count: int = 1
+    page: bool = True
+    target: str = ""  # of make, which writes its page
+
+    def lines(self, request: Request) -> Iterator[str]:
+        """Lines of its page, or of what it prints."""
+        module, _, function = self.source.partition(":")
+        return getattr(import_module(f"docs.studies.{module}"), function or "lines")(request)
+
+    @property
+    def head(self) -> str:
+        """First line of its page."""
+        command = f"make {self.target}" if self.target else f"python -m docs.studies {self.name} --write"
+        return f"<!-- Written by `{command}`; do not edit. -->"
+
+
+STUDIES = {
+    study.name: study
+    for study in (
+        Study("solve", "solve", "solve and build times, and the exported gradient with feet; random starts", 20),
+        Study("optima", "solve:optima", "whether 16 starts find what many starts find", 500, page=False),
+        Study(
+            "answer", "answer", "optimize until its answer and until its end, beside another program", 5, page=False
+        ),
+        Study("formulations", "formulations", "the linear solve inside the program or its objective", 12, page=False),
+        Study("kernel", "kernel.times", "H and ∇H beside Pinocchio C++, ADAM and CasADi; passes", 101),
+        Study("loader", "exported:loader", "a call of exported code from Python; passes", 100, page=False),
+        Study("tsid", "tsid", "a tick of the online controllers; ticks", 2000),
+        Study("relaxed", "relaxed", "relaxed ticks in C of pushed robots; budget of iterations", 100, page=False),
+        Study("digits", "digits", "the digits that double precision keeps with feet; random postures", 3),
+        Study("shapes", "shapes", "the collision shapes of the catalogue, fitted anew"),
+        Study("feasible", "feasible", "what feasibility costs; seeds", 3, target="study-feasible"),
+        Study("approach", "approach", "how fast robots arrive in their optima", target="study-feasible"),
+        Study("restitution", "restitution", "rebound of each contact law", target="calibration"),
+        Study("impacts", "impact.page", "objectives against impacts in MuJoCo; postures", 30, target="study-impacts"),
+        Study("elastic", "elastic.study", "arms with elastic joints in MuJoCo; postures", 20, target="study-elastic"),
+        Study("global", "global_search:maps", "self-motions and their bounds; seeds", 10, target="study-global"),
+        Study("hops", "global_search:hops", "basin hopping beside multi-start; seeds", 10, target="study-global"),
+        Study("flow", "flow", "where the reference flow rests, from random starts", 1000, target="study-flow"),
+        Study("real-impacts", "real_impacts", "balls, strikes, taps, as predicted", target="study-real-impacts"),
+        Study("points", "robustness.study:points", "runs the points of the next two; random draws", 40, page=False),
+        Study("robustness", "robustness.study", "where each controller helps", target="study-robustness"),
+        Study("envelope", "robustness.study:kept_targets", "targets that are kept", target="study-robustness"),
+        Study("scan", "scan", "what decides along the redundancy; postures of each robot", 11, target="study-scan"),
+        Study("reproduction", "reproduction", "the experiments of the paper; seeds", 10, target="reproduction"),
+    )
+}
+
+
+@dataclass(frozen=True)
+class Request:
+    """What the command line asks of a study; ``missed`` takes the goals that it misses."""
+
+    only: str = ""
+    count: int = 1
+    seed: int = 0
+    number: int | None = None
+    jobs: int = 1
+    write: bool = False
+    against: str = ""
+    missed: list[str] = field(default_factory=list)
+
+
+def page_of(name: str) -> Path:
+    """The page of a study in the documentation."""
+    return ROOT / "docs" / "generated" / f"{name}.md"
+
+
+def say(words: str, end: str = "\n") -> None:
+    """Tell the progress, beside the page."""
+    print(words, end=end, file=sys.stderr, flush=True)
+
+
+def collected(work: Callable[[int], _T], count: int, jobs: int, what: str) -> list[_T]:
+    """Return ``work(0)`` to ``work(count - 1)`` from several processes, and tell the progress."""
+    found: dict[int, _T] = {}
+    with fork_map(work, count, jobs) as results:
+        for index, result in results:
+            found[index] = result
+            say(f"\r{what}: {len(found)} of {count}", end="")
+    say("")
+    return [found[k] for k in range(count)]
+
+
+def table(head: Sequence[str], rows: Iterator[Sequence[str]] | Sequence[Sequence[str]]) -> Iterator[str]:
+    """Lines of a Markdown table, each as soon as its row is there."""
+    yield f"| {' | '.join(head)} |"
+    yield "|" + "---|" * len(head)
+    yield from (f"| {' | '.join(row)} |" for row in rows)
+
+
+def cell(value: float | None, digits: int) -> str:
+    """A number of a table."""
+    return "–" if value is None else f"{value:.{digits}f}"
+
+
+def machine(*packages: str) -> str:
+    """What this runs on and with: the processor, the compiler, and versions of packages."""
+    compiler = find_compiler()
+    versions = ", ".join(f"{name} {version(name)}" for name in ("casadi", "pin", "numpy", *packages))
+    return (
+        f"{processor()['name']} ({platform.machine()}), {os.cpu_count()} cores, load {os.getloadavg()[0]:.2f}; "
+        f"{compiler_version(compiler) if compiler else 'no compiler'}; Python {platform.python_version()}, {versions}"
+    )
+
+
+@contextmanager
+def one_core() -> Iterator[None]:
+    """Keep this process on one core, where the system can."""
+    allowed = os.sched_getaffinity(0) if hasattr(os, "sched_setaffinity") else set()
+    if allowed:
+        os.sched_setaffinity(0, {max(allowed)})
+    try:
+        yield
+    finally:
+        if allowed:
+            os.sched_setaffinity(0, allowed)
+
+
+def median_time(call: Callable[[], object], repeats: int) -> float:
+    """Median processor time of a call, seconds: what other programs take of a busy machine does not count."""
+    times = []
+    for _ in range(repeats):
+        began = time.thread_time()
+        call()
+        times.append(time.thread_time() - began)
+    return statistics.median(times)
+
+
+def crba_time(model: pin.Model) -> float:
+    """Median processor time of one Pinocchio ``crba`` from Python, seconds: the yardstick of a machine."""
+    data, q = model.createData(), pin.randomConfiguration(model, -np.ones(model.nq), np.ones(model.nq))
+    return median_time(lambda: pin.crba(model, data, q), CRBA_CALLS)
+
+
+def feasible_starts(problem: ConstrainedProblem, count: int, seed: int) -> list[Vector]:
+    """The first feasible of random postures, ``count`` of them."""
+    found = (feasible_start(problem, index, seed) for index in range(1, 4 * count))
+    return [start for start in found if start is not None][:count]

@@ -1,0 +1,144 @@
+"""What feasibility costs: the optimum without demands, clear of collisions, and also held by the motors."""
+
+from __future__ import annotations
+
+import statistics
+import time
+from collections.abc import Iterator, Sequence
+from typing import NamedTuple
+
+from docs.studies.cases import BACK, DOWN
+from docs.studies.core import Request, machine, say, table
+from impact_posture.errors import ImpactPostureError
+from impact_posture.posture.constraints.surroundings import Surroundings
+from impact_posture.posture.formulation.problem_file import prepare
+from impact_posture.posture.search.multistart import PostureSolution, solve
+from impact_posture.robot.robot_loader import known_robots
+from tests.support.settings import make_settings
+
+_HEAD = ("robot", "normal", "free: objective", "certified", "collide", "ms", "clear: loss", "certified", "a start",
+         "search", "all: loss", "certified", "left out", "a start", "search", "left", "above", "time")  # fmt: skip
+_NORMALS = {"down": DOWN, "ahead": BACK}
+STARTS = 16
+
+
+class Cost(NamedTuple):
+    """Searches with demands, one for each seed.
+
+    Attributes:
+        found: The solutions.
+        start: Median time of a start, against that of a free search just before; the median over the seeds.
+        search: Time of the whole search, in the same way.
+        took: Time of the first search, s.
+    """
+
+    found: tuple[PostureSolution, ...]
+    start: float
+    search: float
+    took: float
+
+    @property
+    def certified(self) -> str:
+        """Least number of certified ends of a seed."""
+        return f"{min(one.certified_starts for one in self.found)}"
+
+
+def lines(request: Request) -> Iterator[str]:
+    """A row for each robot and normal."""
+    yield "Each robot of the catalogue at its own contact frame, striking a floor (*down*) and a wall (*ahead*),"
+    yield f"from {STARTS} starts: *free* of demands, *clear* of collisions, and with *all*, also held by the motors."
+    yield "*collide*: of the distinct optima of the free problem, those at which shapes touch each other, the surface"
+    yield "or the ground. *loss*: how much the objective of the best posture rises. *left out*: certified ends that"
+    yield "the check on the original shapes refused. *ms*: median time of a start. *a start*: that median against the"
+    yield "one of a free search just before. *search*: the same of the whole search, where some starts run several"
+    yield f"times. One seed is luck: both are medians over {request.count} seeds, *certified* is the least of these,"
+    yield "and *left out* the sum. All of these finish every start. The default leaves starts that can no longer"
+    yield "become the best: *left* is their number, *above* how far its best posture lies above that of all starts,"
+    yield "and *time* the share of the time that it takes. A dash: no posture meets the demands, and the last column"
+    yield "says what conflicts."
+    yield machine()
+    yield ""
+    ends, left = list[int](), list[int]()
+    cases = [(robot, name) for robot in known_robots() if request.only in robot for name in _NORMALS]
+    yield from table((*_HEAD, "conflict"), (_row(robot, name, request, ends, left) for robot, name in cases))
+    yield ""
+    yield f"Certified ends with all demands, from {request.count} seeds: {sum(ends)}.  At {sum(left)} of them"
+    yield "original shapes touch, and these were left out."
+
+
+def _row(robot: str, name: str, request: Request, ends: list[int], left: list[int]) -> list[str]:
+    say(f"{robot} {name}")
+    asked = {"robot": robot, "normal": _NORMALS[name], "seed": request.seed}
+    clear: dict[str, object] = {"collision": True}
+    everything = clear | {"holdable": True}
+    free, apart = solved(asked)
+    around = _surroundings(asked | clear)
+    if not isinstance(free, PostureSolution):
+        return [robot, name, *["–"] * (len(_HEAD) - 2), free]
+    collide = sum(bool(around.collisions(optimum.q)) for optimum in free.optima)
+    best = free.optima[0].objective
+    cells = [
+        robot,
+        name,
+        f"{best:.4g}",
+        f"{free.certified_starts}",
+        f"{collide} of {len(free.optima)}",
+        f"{1e3 * apart[0]:.0f}",
+    ]
+    conflict = ""
+    for demands in (clear, everything):
+        cost = _cost(asked, demands, range(request.seed, request.seed + request.count))
+        if isinstance(cost, str):
+            cells += ["–"] * (4 if demands is clear else 8)
+            conflict = cost
+            continue
+        first = cost.found[0].optima[0].objective
+        cells += [f"{100 * (first / best - 1):.1f} %", cost.certified]
+        if demands is everything:
+            touching = [one.colliding_starts for one in cost.found]
+            cells.append(f"{sum(touching)}")
+            ends += [one.certified_starts + one.colliding_starts for one in cost.found]
+            left += touching
+        cells += [f"{cost.start:.1f}×", f"{cost.search:.1f}×"]
+        if demands is everything:
+            quick, less = solved(asked | demands, finish_all=False)
+            assert isinstance(quick, PostureSolution)
+            above = quick.optima[0].objective / first - 1
+            dominated = quick.dominated_starts
+            share = f"{100 * less[1] / cost.took:.0f} %"
+            cells += [f"{dominated}", f"{100 * above:.1f} %", share] if dominated else ["0", "", ""]
+    return [*cells, conflict]
+
+
+def _cost(asked: dict[str, object], demands: dict[str, object], seeds: Sequence[int]) -> Cost | str:
+    """Search with demands from several seeds; return why there is no posture where one of them finds none."""
+    found, starts, searches, times = list[PostureSolution](), list[float](), list[float](), list[float]()
+    for seed in seeds:
+        # Other work on the machine changes the speed, so each ratio has a free search of its own.
+        apart = solved(asked | {"seed": seed})[1]
+        solution, took = solved(asked | demands | {"seed": seed})
+        if not isinstance(solution, PostureSolution):
+            return solution
+        found.append(solution)
+        starts.append(took[0] / apart[0])
+        searches.append(took[1] / apart[1])
+        times.append(took[1])
+    return Cost(tuple(found), statistics.median(starts), statistics.median(searches), times[0])
+
+
+def solved(asked: dict[str, object], finish_all: bool = True) -> tuple[PostureSolution | str, tuple[float, float]]:
+    """The solution, or why there is none, and the median time of a start and the time of the search, s."""
+    try:
+        problem = prepare(make_settings(asked)).problem
+        began = time.perf_counter()
+        seed = int(str(asked["seed"]))
+        solution = solve(problem, starts=STARTS, seed=seed, jobs=1, compile="never", finish_all=finish_all)
+        return solution, (solution.start_time_s, time.perf_counter() - began)
+    except ImpactPostureError as error:
+        return error.what, (0.0, 0.0)
+
+
+def _surroundings(asked: dict[str, object]) -> Surroundings:
+    around = prepare(make_settings(asked)).problem.surroundings
+    assert around is not None
+    return around

@@ -1,0 +1,170 @@
+"""Points of the envelope of a shipped scenario, and how each becomes a setup."""
+
+from __future__ import annotations
+
+import math
+import zlib
+from collections.abc import Mapping
+from dataclasses import dataclass, field, replace
+
+import numpy as np
+import pinocchio as pin
+
+from docs.studies.core import Vector
+from docs.studies.robustness.variations import RANGES, URDF_X, URDF_Z, VARIATIONS
+from impact_posture.errors import Infeasible, InputError
+from impact_posture.posture.formulation.build_problem import build_problem
+from impact_posture.posture.manifold.feasible_start import Projector
+from impact_posture.posture.program.constrained_problem import Requirements
+from impact_posture.robot.robot_loader import load_robot
+from impact_posture.simulation.controller_gains import Gains, StanceGains
+from impact_posture.simulation.scenario import RepeatedContacts, Scenario, Setup, SinglePush, set_up
+from impact_posture.simulation.scenario_file import read_scenario
+from impact_posture.simulation.scenario_objective import scenario_objective
+from impact_posture.simulation.world.world import build_world
+
+# To bound the time, the same for every point and less than in the scenarios' files: contacts, seconds behind the
+# surface and between contacts; seconds for which a push waits for a robot that does not come to rest.
+COUNT, DWELL, PAUSE = 2, 0.4, 0.6
+PATIENCE = 5.0
+# A pyramid inside the cone, with a tenth to spare: as in the scenarios' files.
+_TRUST = 0.9 / math.sqrt(2)
+# Least distance of the center of mass of a robot that stands from the edges of its support polygon, m.
+_COM_MARGIN = 0.02
+# Of a base's own tilt and way, the share of what joints are stirred by.
+_BASE = 0.2
+
+
+@dataclass(frozen=True)
+class Draw:
+    """One point of the envelope of a scenario.
+
+    Attributes:
+        scenario: The scenario.
+        number: Number among the variations, then among the random draws.
+        attempt: Number of random draws before that were not admissible.
+        seed: Seed of the study.
+        name: Name of the variation, empty for a random draw.
+        values: Values by the names of :data:`RANGES`.  What is not there is as shipped.
+    """
+
+    scenario: str
+    number: int
+    attempt: int = 0
+    seed: int = 0
+    name: str = ""
+    values: Mapping[str, float] = field(default_factory=dict)
+
+
+def _generator(scenario: str, number: int, attempt: int, seed: int, what: int = 0) -> np.random.Generator:
+    return np.random.default_rng([seed, zlib.crc32(scenario.encode()), number, attempt, what])
+
+
+def draw(scenario: str, number: int, attempt: int = 0, seed: int = 0) -> Draw:
+    """Return a point of the envelope, the same every time: a variation, or after those a random draw."""
+    named = list(VARIATIONS[scenario].items())
+    if number < len(named):
+        name, values = named[number]
+        return Draw(scenario, number, 0, seed, name, values)
+    rng = _generator(scenario, number - len(named), attempt, seed)
+    return Draw(scenario, number, attempt, seed, "", {each.name: each.draw(rng) for each in RANGES[scenario]})
+
+
+def prepare(chosen: Draw) -> Setup:
+    """Build what was chosen.
+
+    Raises:
+        ImpactPostureError: A start that is none: outside the limits, or not on the feet.
+    """
+    scenario, v = read_scenario(chosen.scenario), chosen.values
+    control = scenario.control
+    robust = replace(control.robust, gain=v.get("gain", 1.0) * control.robust.gain)
+    # The stiffness of a contact goes with the inverse square of its time constant.
+    law = v.get("contact", 1.0) ** -0.5
+    surfaces = tuple(
+        replace(s, friction=v.get("friction", s.friction), solref=(law * s.solref[0], *s.solref[1:]))
+        for s in scenario.surfaces
+    )
+    scenario = replace(
+        scenario,
+        armature=_armature(scenario, v["armature"]) if "armature" in v else scenario.armature,
+        surfaces=surfaces,
+        control=replace(control, robust=robust),
+    )
+    if isinstance(scenario.task, RepeatedContacts):
+        return set_up(_contacts(scenario, scenario.task, v))
+    pushed = _push(scenario, scenario.task, v)
+    shipped = set_up(pushed)
+    if "stir" not in v:
+        return shipped
+    q = _start(shipped, chosen)
+    return Setup(pushed, shipped.robot, q, build_world(shipped.robot, pushed, q))
+
+
+def _armature(scenario: Scenario, factor: float) -> dict[str, float]:
+    """By joint; those that have none stay without."""
+    model = load_robot(scenario.robot, scenario).model
+    own = {str(name): float(model.armature[k]) for name, k in zip(model.names, model.idx_vs, strict=True) if k >= 0}
+    return {name: factor * value for name, value in own.items() if value > 0}
+
+
+def _contacts(scenario: Scenario, task: RepeatedContacts, v: Mapping[str, float]) -> Scenario:
+    tilt, roll = math.radians(v.get("tilt", 0.0)), math.radians(v.get("roll", 0.0))
+    joints = dict(scenario.joints)
+    if "shoulder" in v:
+        # The tool looks at the wall, plus its tilt.
+        joints |= {"shoulder_pitch": v["shoulder"], "elbow_pitch": tilt - math.pi / 2 - v["shoulder"]}
+    elif "elbow" in v:
+        elbow = v.get("fold", 1.0) * v["elbow"]
+        joints |= {"shoulder_pitch": tilt - elbow, "elbow_pitch": elbow}
+    x, y, z = scenario.mounting.get("shoulder_roll", (0.0, 0.0, 0.0))
+    x, z = v.get("x", URDF_X + x) - URDF_X, v.get("z", URDF_Z + z) - URDF_Z
+    return replace(
+        scenario,
+        joints={**joints, "shoulder_roll": roll},
+        mounting={**scenario.mounting, "shoulder_roll": (x, y, z)},
+        contacts=replace(task, speed=v.get("speed", task.speed), count=COUNT, dwell=DWELL, pause=PAUSE),
+    )
+
+
+def _push(scenario: Scenario, task: SinglePush, v: Mapping[str, float]) -> Scenario:
+    control, stiffer = scenario.control, v.get("stiffness", 1.0)
+    footing = control.footing or StanceGains()
+    if "friction" in v:
+        footing = replace(footing, friction=_TRUST * v["friction"])
+    x, y, z = (v.get("force", 1.0) * value for value in task.force)
+    return replace(
+        scenario,
+        push=replace(task, force=(x, y, z), patience=PATIENCE),
+        control=replace(
+            control,
+            footing=footing,
+            posture=_stiffer(control.posture, stiffer),
+            center_of_mass=control.center_of_mass and _stiffer(control.center_of_mass, stiffer),
+            base=control.base and _stiffer(control.base, stiffer),
+        ),
+    )
+
+
+def _stiffer(gains: Gains, factor: float) -> Gains:
+    """The shipped pushes have one stiffness a task, critically damped."""
+    if isinstance(gains.kp, tuple) or gains.kd is not None:
+        raise InputError("a task with a damping of its own", where="robustness study", hint="scale it too")
+    return replace(gains, kp=factor * gains.kp)
+
+
+def _start(setup: Setup, chosen: Draw) -> Vector:
+    """The scenario's posture, stirred and put back on its feet."""
+    robot = setup.robot
+    rng = _generator(chosen.scenario, chosen.number, chosen.attempt, chosen.seed, what=1)
+    hold = tuple(j for j in robot.spec.constraints.hold if j not in robot.locked)
+    requirements = Requirements(
+        contact_pose="free", hold=hold, com_over_feet=True, com_margin=_COM_MARGIN, com_asked=False
+    )
+    problem = build_problem(robot, scenario_objective(setup), setup.q, requirements)
+    step = chosen.values["stir"] * rng.normal(size=robot.nv)
+    step[:6] *= _BASE
+    found = Projector(problem).project(np.asarray(pin.integrate(robot.model, setup.q, step)))
+    if found.violation > 1e-8:
+        raise Infeasible({"feet": found.violation}, where=f"{chosen.scenario} {chosen.number}")
+    return robot.check_posture(found.q, where=chosen.scenario)

@@ -1,0 +1,211 @@
+"""What becomes of one point of the envelope: every controller runs through it, and a failure is an outcome too."""
+
+from __future__ import annotations
+
+import json
+import math
+from collections.abc import Callable, Mapping
+from dataclasses import asdict, dataclass, field, replace
+from typing import Any
+
+import numpy as np
+import pinocchio as pin
+
+from docs.studies.robustness.draws import COUNT, DWELL, PATIENCE, PAUSE, Draw, draw, prepare
+from docs.studies.robustness.variations import RANGES
+from impact_posture.dynamics.numeric import Numeric
+from impact_posture.errors import ImpactPostureError
+from impact_posture.experiment.jobs import Document, Job, execute, lost, parse_controller
+from impact_posture.experiment.reproduction import missed_targets
+from impact_posture.experiment.seed_statistics import ControllerRow, row_of
+from impact_posture.impact.impact_contact import point_on
+from impact_posture.impact.worst_case_objective import WorstCaseObjective
+from impact_posture.posture.loads.load_cases import load_cases
+from impact_posture.simulation.controllers.controller_factory import ControllerFactory
+from impact_posture.simulation.metrics import before
+from impact_posture.simulation.offline_posture import SHARE, OfflinePosture, offline_posture, scenario_requirements
+from impact_posture.simulation.run import Run
+from impact_posture.simulation.scenario import Setup
+from impact_posture.simulation.scenario_objective import interpreted
+
+SCHEMA = 3
+NOMINAL = "nominal"
+# Nominal first.
+COMPARED = (NOMINAL, "robust", "robust-flow", "posture", "stiff")
+# Share of a nominal run's ticks outside the windows that may be at a limit in a random draw.
+SATURATED = 0.05
+# Random draws of a point before it is given up.
+ATTEMPTS = 40
+# What a record does not keep of a document.
+_LEFT_OUT = ("windows", "versions", "runs")
+# Offline postures that this process has found last, and how many it keeps: those of some points of each scenario.
+_KEPT = 16
+_FOUND: dict[str, OfflinePosture] = {}
+_Play = Callable[[Job, ControllerFactory], tuple[tuple[Run, ...], Document]]
+
+
+@dataclass(frozen=True)
+class Record:
+    """One point of the envelope.
+
+    Attributes:
+        draw: The point.
+        rejected: Why each draw before was rejected, or why this variation cannot be tried.
+        q: Start posture, empty for a variation that cannot be tried.
+        documents: Documents of the runs, by label of the controller.  With ``offset``, the distance of the center of
+            mass from the line of the first impact, m.
+    """
+
+    draw: Draw
+    rejected: tuple[str, ...] = ()
+    q: tuple[float, ...] = ()
+    documents: Mapping[str, Document] = field(default_factory=dict)
+
+    def row(self, controller: str) -> ControllerRow:
+        """Return the results of a controller against nominal at this point."""
+        own, nominal = self.documents[controller], self.documents[NOMINAL]
+        return row_of(self.draw.scenario, controller, [own], [nominal])
+
+    def missed(self, controller: str) -> dict[str, str]:
+        """Return the targets that a controller misses here, ``completed`` among them."""
+        missed = missed_targets(self.row(controller))
+        return {"completed": "no completed run"} if missed is None else missed
+
+    def failure(self, controller: str) -> str:
+        """Return the status of a run that did not complete, else nothing."""
+        status = str(self.documents[controller]["status"])
+        return "" if status == "completed" else status
+
+    def to_json(self) -> str:
+        """The record as text."""
+        return json.dumps({"key": key(self.draw.scenario), **asdict(self)}, indent=1)
+
+    @classmethod
+    def from_json(cls, text: str) -> Record | None:
+        """Back again; ``None`` where the study has changed since."""
+        found = json.loads(text)
+        chosen = Draw(**found["draw"])
+        same = chosen.scenario in RANGES and found["key"] == key(chosen.scenario)
+        # A variation that was renumbered is another one.
+        if not same or (chosen.name and draw(chosen.scenario, chosen.number, seed=chosen.seed) != chosen):
+            return None
+        return cls(chosen, tuple(found["rejected"]), tuple(found["q"]), found["documents"])
+
+
+def key(scenario: str) -> str:
+    """What a kept record must have in common with this code."""
+    ranges = tuple((r.name, r.low, r.high, r.scale) for r in RANGES[scenario])
+    return repr((SCHEMA, SHARE, SATURATED, ranges, COUNT, DWELL, PATIENCE, PAUSE))
+
+
+class NotAdmissible(Exception):
+    """A point that makes no experiment: the nominal controller itself does not get through it."""
+
+
+def point(scenario: str, number: int, seed: int, known: Record | None = None, play: _Play = execute) -> Record:
+    """Return one point, with what is known of it and the runs that it lacks.
+
+    A random draw is repeated until the nominal controller gets through.  A variation is not.
+
+    Raises:
+        NotAdmissible: No draw was.
+    """
+    if known is not None and (known.documents or known.draw.name):
+        return _complete(known, _factory(prepare(known.draw)), play)
+    rejected: list[str] = []
+    for attempt in range(ATTEMPTS):
+        chosen = draw(scenario, number, attempt, seed)
+        try:
+            factory, nominal = _admit(chosen, play)
+        except NotAdmissible as error:
+            rejected.append(str(error))
+            if chosen.name:
+                return Record(chosen, tuple(rejected))
+            continue
+        q = tuple(float(x) for x in factory.setup.q)
+        return _complete(Record(chosen, tuple(rejected), q, {NOMINAL: nominal}), factory, play)
+    raise NotAdmissible(f"{scenario} {number}: none of {ATTEMPTS} draws is admissible: {sorted(set(rejected))}")
+
+
+def _complete(record: Record, factory: ControllerFactory, play: _Play) -> Record:
+    documents = dict(record.documents)
+    for label in COMPARED:
+        if label not in documents:
+            documents[label] = _document(factory, record.draw, label, play)
+    return replace(record, documents=documents)
+
+
+def is_complete(record: Record | None) -> bool:
+    """Whether a record has every controller, or is of a variation that cannot be tried."""
+    return record is not None and (not record.documents or set(COMPARED) <= set(record.documents))
+
+
+def is_held(setup: Setup, objective: WorstCaseObjective) -> bool:
+    """Whether at most :data:`SHARE` of the limits holds the start of a scenario, as far as the robot's data say."""
+    holding = load_cases(objective, setup.q, scenario_requirements(setup, objective)).holding(setup.q)
+    return holding is None or holding.feasible
+
+
+def _factory(setup: Setup) -> ControllerFactory:
+    """Return controllers for runs that no one draws."""
+    # What Python still evaluates is less than compiling the gradient anew for every armature and mounting.
+    factory = ControllerFactory(setup, gradient_of=interpreted, offline_of=_offline)
+    # The metric over time is only drawn.
+    factory.metric = lambda q: math.nan
+    return factory
+
+
+def _offline(setup: Setup, objective: WorstCaseObjective, **options: Any) -> OfflinePosture:
+    """Optimize each problem once: gains, pushes and laws of contact leave it as it is."""
+    demands = scenario_requirements(setup, objective, at_contact=options["at_contact"])
+    impact = objective.contact, objective.metric, objective.kind, objective.supports, objective.compliance
+    key = repr((setup.robot.source, setup.robot.data_sha256, setup.q.tobytes(), impact, demands, options))
+    found = _FOUND[key] = _FOUND.pop(key, None) or offline_posture(setup, objective, **options)
+    if len(_FOUND) > _KEPT:
+        del _FOUND[next(iter(_FOUND))]
+    return found
+
+
+def _admit(chosen: Draw, play: _Play) -> tuple[ControllerFactory, Document]:
+    try:
+        setup = prepare(chosen)
+    except ImpactPostureError as error:
+        raise NotAdmissible(f"no start ({type(error).__name__})") from None
+    factory = _factory(setup)
+    if not is_held(setup, factory.objective()):
+        raise NotAdmissible(f"the motors do not hold the start with {100 * SHARE:.0f} % of their limits")
+    nominal = _document(factory, chosen, NOMINAL, play)
+    if nominal["status"] != "completed":
+        raise NotAdmissible(f"nominal {nominal['status']}")
+    metrics = nominal["metrics"]
+    if not metrics["rested"]:
+        raise NotAdmissible("nominal did not come to rest")
+    if not chosen.name and metrics["saturation_s"]["outside"] > SATURATED * nominal["duration"]:
+        raise NotAdmissible(f"nominal is at a limit for over {100 * SATURATED:.0f} % of the time between the impacts")
+    return factory, nominal
+
+
+def _document(factory: ControllerFactory, chosen: Draw, label: str, play: _Play) -> Document:
+    """Let a controller run with the noise of seed 0; what it raises is what becomes of it."""
+    name, mode, free = parse_controller(label)
+    job = Job(chosen.scenario, name, 0, mode, free, compile="auto")
+    try:
+        runs, found = play(job, factory)
+    except (ImpactPostureError, np.linalg.LinAlgError) as error:
+        return {**lost(job, error), "runs": [], "duration": 0.0, "offset": None}
+    signs = [{"sign": part["sign"]} for part in found["runs"]]
+    kept = {name: value for name, value in found.items() if name not in _LEFT_OUT}
+    duration = max(float(run.series.t[-1]) for run in runs)
+    return {**kept, "runs": signs, "duration": duration, "offset": _offset(factory, runs[0])}
+
+
+def _offset(factory: ControllerFactory, found: Run) -> float | None:
+    """Distance of the center of mass from the line along which the first impact acts."""
+    if not found.of("impact"):
+        return None
+    robot, contact = factory.setup.robot, factory.objective().contact
+    q = found.series.q[before(found.series, found.of("impact")[0])]
+    place = Numeric(robot.model).at(q).placement(point_on(robot, contact.frame, contact.offset)).translation
+    arm = np.array(pin.centerOfMass(robot.model, robot.model.createData(), q)) - place
+    n = factory.setup.scenario.normal
+    return float(np.linalg.norm(arm - n * (n @ arm)))

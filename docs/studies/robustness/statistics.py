@@ -1,0 +1,199 @@
+"""How often a controller helps, which targets it keeps, and what goes with it."""
+
+from __future__ import annotations
+
+import math
+from collections import Counter
+from collections.abc import Callable, Mapping, Sequence
+from dataclasses import dataclass
+
+import numpy as np
+from scipy.stats import spearmanr
+
+from docs.studies.robustness.outcomes import NOMINAL, Record
+from impact_posture.experiment.seed_statistics import value_of
+
+# What may predict a jump, and the number of a document's prediction that says it: the impulse of a contact is
+# not known before, so H counts as √H alone.
+PREDICTORS: dict[str, Callable[[Mapping[str, float | None]], float | None]] = {
+    "H": lambda p: None if p["H"] is None else math.sqrt(p["H"]),
+    "V": lambda p: p["frictionless"],
+    "S": lambda p: p["sticking"],
+    "C": lambda p: p["coulomb"],
+}
+
+
+@dataclass(frozen=True)
+class Summary:
+    """Results of one controller at all points of a scenario.
+
+    A controller that failed (raised, lost a contact, fell …) helped in nothing.  In medians and quartiles it counts
+    as worse than any that did not.
+
+    Attributes:
+        controller: The controller.
+        count: Number of points.
+        helps: Points with less motion in the impact windows than nominal.
+        gentler: Points with a lower peak jump.
+        kept: Points at which it keeps every target.
+        missed: Number of points at which it misses a target, by target.
+        motion: Quartiles of the relative change of the motion in the windows, infinite for failed.
+        recovery: Quartiles of that over the recovery.
+        jump: Median relative change of the peak jump.
+        force: Median and largest ratio of the peak force to that of nominal.
+        saturation: Seconds at a limit of all runs that did not fail, inside and outside the windows.
+        failures: Number of points at which it failed, by status.
+    """
+
+    controller: str
+    count: int
+    helps: int
+    gentler: int
+    kept: int
+    missed: Mapping[str, int]
+    motion: tuple[float, ...]
+    recovery: tuple[float, ...]
+    jump: float
+    force: tuple[float, float]
+    saturation: tuple[float, float]
+    failures: Mapping[str, int]
+
+
+def tried(records: Sequence[Record]) -> list[Record]:
+    """Return the points at which the controllers ran."""
+    return [record for record in records if record.documents]
+
+
+def change(record: Record, controller: str, metric: str = "q_total_impact") -> float:
+    """Return a metric against nominal: −0.3 is 30 % less, and ``inf`` is that of a controller that failed."""
+    if record.failure(controller):
+        return math.inf
+    own, before = (value_of(record.documents[c], metric) for c in (controller, NOMINAL))
+    return own / before - 1 if before > 0 else (math.inf if own > 0 else 0.0)
+
+
+def summarize(records: Sequence[Record], controller: str) -> Summary:
+    """Count and rank."""
+    records = tried(records)
+    fine = [record for record in records if not record.failure(controller)]
+    motion, recovery, jumps = (
+        [change(r, controller, metric) for r in records]
+        for metric in ("q_total_impact", "q_total_recovery", "peak_jump")
+    )
+    force = [change(r, controller, "peak_force") + 1 for r in fine] or [math.nan]
+    missed = Counter[str]() if controller == NOMINAL else Counter(t for r in records for t in r.missed(controller))
+    kept = 0 if controller == NOMINAL else sum(not r.missed(controller) for r in records)
+    inside, outside = (
+        sum(value_of(r.documents[controller], f"saturation_{where}") for r in fine) for where in ("inside", "outside")
+    )
+    return Summary(
+        controller,
+        len(records),
+        helps=sum(m < 0 for m in motion),
+        gentler=sum(j < 0 for j in jumps),
+        kept=kept,
+        missed=missed,
+        motion=quartiles(motion),
+        recovery=quartiles(recovery),
+        jump=quantile(jumps, 0.5),
+        force=(quantile(force, 0.5), max(force)),
+        saturation=(inside, outside),
+        failures=Counter(failure for r in records if (failure := r.failure(controller))),
+    )
+
+
+def quartiles(values: Sequence[float]) -> tuple[float, ...]:
+    """Return the lower quartile, the median and the upper quartile."""
+    return tuple(quantile(values, p) for p in (0.25, 0.5, 0.75))
+
+
+def quantile(values: Sequence[float], p: float) -> float:
+    """Linear between neighbors, of which the upper may be infinite."""
+    ordered = sorted(values)
+    place = p * (len(ordered) - 1)
+    low = math.floor(place)
+    share = place - low
+    if share == 0 or ordered[low] == math.inf:
+        return ordered[low]
+    return ordered[low] + share * (ordered[low + 1] - ordered[low])
+
+
+@dataclass(frozen=True)
+class Split:
+    """How often a controller helped among some points, and how much: median change of the motion."""
+
+    count: int
+    helps: int
+    median: float
+
+
+def split(records: Sequence[Record], controller: str, choose: Callable[[Record], bool]) -> tuple[Split, Split]:
+    """Those that are chosen, and the others."""
+    parts = [[change(r, controller) for r in records if choose(r) is wanted] for wanted in (True, False)]
+    chosen, others = (Split(len(m), sum(x < 0 for x in m), quantile(m, 0.5) if m else math.nan) for m in parts)
+    return chosen, others
+
+
+def predicted(record: Record, controller: str, name: str) -> float | None:
+    """Return what H, V, S or C says about the jump, ``None`` where nothing is known."""
+    prediction = record.documents[controller]["prediction"]
+    return None if prediction is None or not prediction["impacts"] else PREDICTORS[name](prediction)
+
+
+def ranks_of_jumps(records: Sequence[Record], names: Sequence[str]) -> dict[str, float]:
+    """Return Spearman's correlation of the measured jumps of all runs with each predictor, and their number as ``n``.
+
+    Only the runs for which every predictor is known count.
+    """
+    runs = [(r, c) for r in tried(records) for c in r.documents if not r.failure(c)]
+    rows = [[value_of(r.documents[c], "peak_jump"), *(predicted(r, c, name) for name in names)] for r, c in runs]
+    known = np.array([row for row in rows if None not in row], dtype=float).reshape(-1, 1 + len(names))
+    found = {"n": float(len(known))}
+    for k, name in enumerate(names, 1):
+        pair = known[:, [0, k]]
+        constant = len(pair) < 3 or np.ptp(pair, axis=0).min() == 0
+        found[name] = math.nan if constant else float(spearmanr(pair).statistic)
+    return found
+
+
+def fall(record: Record, controller: str, name: str) -> float | None:
+    """How much lower a predictor (as ln of the ratio) or the offset (m) is before the impact than nominal's."""
+    if name == "offset":
+        before, after = (record.documents[c]["offset"] for c in (NOMINAL, controller))
+        return None if before is None or after is None else float(before - after)
+    before, after = (predicted(record, c, name) for c in (NOMINAL, controller))
+    return math.log(before / after) if before and after else None
+
+
+def agreement(records: Sequence[Record], names: Sequence[str], of: str, metric: str) -> tuple[int, int]:
+    """In how many runs that did not fail a metric fell where a predictor did, and rose where it rose; of how many."""
+    same = [
+        (fallen > 0) == (change(r, c, metric) < 0)
+        for r in records
+        for c in names
+        if not r.failure(c) and (fallen := fall(r, c, of)) is not None
+    ]
+    return sum(same), len(same)
+
+
+def rank(records: Sequence[Record], controller: str, of: Callable[[Record], float | None]) -> float:
+    """Spearman's correlation of a number with the *reduction* of the motion, among those that did not fail."""
+    pairs = [(of(r), -change(r, controller)) for r in records if not r.failure(controller)]
+    known = np.array([pair for pair in pairs if pair[0] is not None], dtype=float).reshape(-1, 2)
+    if len(known) < 3 or np.ptp(known, axis=0).min() == 0:
+        return math.nan
+    return float(spearmanr(known).statistic)
+
+
+def worst(records: Sequence[Record], controller: str) -> Record | None:
+    """With the largest change of the motion among those that did not fail."""
+    fine = [r for r in records if not r.failure(controller)]
+    return max(fine, key=lambda r: change(r, controller), default=None)
+
+
+def misled(records: Sequence[Record], controller: str) -> Record | None:
+    """Where H fell most though the jump rose."""
+    fine = [r for r in records if not r.failure(controller) and change(r, controller, "peak_jump") > 0]
+    fallen = {k: fall(r, controller, "H") or 0.0 for k, r in enumerate(fine)}
+    most = max(fallen, key=lambda k: fallen[k], default=None)
+    return None if most is None or fallen[most] <= 0 else fine[most]

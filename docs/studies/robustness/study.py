@@ -1,0 +1,115 @@
+"""Where does each controller help?  Variations of the shipped experiments, every controller in each.
+
+Each point that is done stays in build/robustness; a run that was interrupted goes on from there.
+"""
+
+from __future__ import annotations
+
+import os
+import time
+from collections.abc import Callable, Iterator, Sequence
+from pathlib import Path
+
+from docs.studies.core import ROOT, Request, machine, say
+from docs.studies.robustness import envelope, page
+from docs.studies.robustness.outcomes import NotAdmissible, Record, is_complete, point
+from docs.studies.robustness.variations import RANGES, VARIATIONS
+from impact_posture.dynamics.mjcf import import_mujoco
+from impact_posture.posture.program.ipopt import one_blas_thread
+from impact_posture.system.processes import fork_map
+
+
+def points(request: Request) -> Iterator[str]:
+    """Run the points that are not kept yet; or one point anew."""
+    import_mujoco()
+    # Every armature and mounting has libraries of its own, which are not for the user's cache.
+    os.environ["IMPACT_POSTURE_CACHE"] = str(ROOT / "build" / "robustness" / "cache")
+    scenarios = [name for name in RANGES if request.only in name]
+    began = time.perf_counter()
+    try:
+        if request.number is not None:
+            yield from (point(name, request.number, request.seed).to_json() for name in scenarios)
+            return
+        wanted = {name: len(VARIATIONS[name]) + request.count for name in scenarios}
+        study(wanted, request.seed, request.jobs, _store(request))
+    except NotAdmissible as error:
+        raise SystemExit(str(error)) from None
+    kept = _store(request).complete(scenarios)
+    yield ", ".join(f"{name}: {len(own)} points" for name, own in kept.items())
+    say(f"{machine('mujoco')}; {time.perf_counter() - began:.0f} s")
+
+
+def lines(request: Request) -> Iterator[str]:
+    """The page of where controllers help, from the points that are kept."""
+    yield from page.page(_store(request).complete([n for n in RANGES if request.only in n]), request.seed)
+
+
+def kept_targets(request: Request) -> Iterator[str]:
+    """The page of the targets that controllers keep, from the points that are kept."""
+    yield from envelope.page(_store(request).complete([n for n in RANGES if request.only in n]))
+
+
+def _store(request: Request) -> Store:
+    return Store(ROOT / "build" / "robustness", request.seed)
+
+
+def study(
+    points: dict[str, int],
+    seed: int,
+    jobs: int,
+    store: Store,
+    run: Callable[..., Record] = point,
+    tell: Callable[[str], None] = say,
+) -> None:
+    """Run the points that the store lacks.
+
+    The scenarios take turns and every controller runs through a point before the next one, so that a study that is
+    cut short has the same points of all controllers.
+    """
+    wanted = [(name, number) for number in range(max(points.values())) for name in points if number < points[name]]
+    missing = [each for each in wanted if not is_complete(store.get(*each))]
+
+    def one(index: int) -> str:
+        name, number = missing[index]
+        began = time.process_time()
+        # Kept by the process that ran it: nothing that is done is lost when the others are stopped.
+        with one_blas_thread():
+            store.keep(run(name, number, seed, store.get(name, number)))
+        return f"{name} {number}: {time.process_time() - began:.0f} s"
+
+    with fork_map(one, len(missing), jobs) as done:
+        for count, (_, words) in enumerate(done, 1):
+            tell(f"{count}/{len(missing)} {words}")
+
+
+class Store:
+    """Finished points of a study, a file each: an interrupted study goes on where it was."""
+
+    def __init__(self, folder: Path, seed: int) -> None:
+        self._folder, self._seed = folder, seed
+
+    def _file(self, scenario: str, number: int) -> Path:
+        return self._folder / f"seed-{self._seed}" / scenario / f"{number:03d}.json"
+
+    def get(self, scenario: str, number: int) -> Record | None:
+        """What was kept of a point, if it still holds."""
+        file = self._file(scenario, number)
+        return Record.from_json(file.read_text(encoding="utf-8")) if file.is_file() else None
+
+    def keep(self, record: Record) -> None:
+        """Write it down, whole or not at all."""
+        file = self._file(record.draw.scenario, record.draw.number)
+        file.parent.mkdir(parents=True, exist_ok=True)
+        beside = file.with_suffix(f".{os.getpid()}")
+        beside.write_text(record.to_json() + "\n", encoding="utf-8")
+        beside.replace(file)
+
+    def complete(self, scenarios: Sequence[str]) -> dict[str, list[Record]]:
+        """Return the points of each scenario up to the first that is not complete."""
+        found: dict[str, list[Record]] = {}
+        for name in scenarios:
+            found[name] = []
+            while is_complete(record := self.get(name, len(found[name]))):
+                assert record is not None
+                found[name].append(record)
+        return found

@@ -1,0 +1,202 @@
+"""What decides: one scan along the redundancy of the arm over a floor, and one of the humanoid towards its optimum.
+
+The nominal controller holds each posture and is hit there.  Nothing else changes from posture to posture.
+"""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Iterator, Mapping, Sequence
+from dataclasses import dataclass, replace
+from typing import Any
+
+import numpy as np
+import pinocchio as pin
+
+from docs.studies.core import ROOT, Request, Vector, cell, collected, table
+from docs.studies.robustness.draws import Draw, prepare
+from docs.studies.robustness.envelope import percent
+from docs.studies.robustness.page import MARK
+from impact_posture.experiment.jobs import Job, execute
+from impact_posture.output.plot.style import AFTER, BEFORE, FREE_BEFORE, GRAY, GREEN, WIDTH, style
+from impact_posture.posture.formulation.build_problem import build_problem
+from impact_posture.posture.manifold.feasible_start import Projector
+from impact_posture.simulation.controllers.controller_factory import ControllerFactory
+from impact_posture.simulation.offline_posture import offline_posture, scenario_requirements
+from impact_posture.simulation.scenario import Setup, SinglePush
+from impact_posture.simulation.scenario_objective import interpreted, scenario_objective
+from impact_posture.simulation.world.world import build_world
+
+ARM, HUMANOID = "aerial-vertical", "talos-push"
+PICTURE = ROOT / "docs" / "images" / "where-bracing-helps.png"
+# The elbow's bend at the start of the shipped scenario, and the largest one, rad.
+_SHIPPED, _LARGEST = 0.9, 1.5
+# Time that the humanoid settles.  It holds its posture from the start, s.
+_SETTLE = 1.0
+# The jump lies on the motion of a push, whose line shows in the gaps.
+_JUMP = {"color": GREEN, "linestyle": (0, (2, 2)), "linewidth": 1.6, "zorder": 3.2}
+
+
+@dataclass(frozen=True)
+class Place:
+    """Results at one posture of a scan.
+
+    Attributes:
+        at: Place along the scan.
+        H: Squared jump per squared impulse before the impact.
+        V: The same per squared approach speed, without friction.
+        S: The same where the contact sticks, or ``None``.
+        motion: Motion in the impact windows, ``q_total_impact``.
+        jump: Largest velocity jump, ``peak_jump``.
+        force: Largest normal force, N.
+        status: Status of the run.
+    """
+
+    at: float
+    H: float
+    V: float
+    S: float | None
+    motion: float
+    jump: float
+    force: float
+    status: str
+
+
+def lines(request: Request) -> Iterator[str]:
+    """Run both scans, draw them where the page is written, and print their tables."""
+    scans = {name: _scan(name, request) for name in (ARM, HUMANOID) if request.only in name}
+    yield " ".join(_caption(scans))
+    yield from ("", MARK, "")
+    for name, places in scans.items():
+        yield from _told(name, places)
+    if request.write:
+        draw(scans[ARM], scans[HUMANOID])
+
+
+def _caption(scans: Mapping[str, Sequence[Place]]) -> Iterator[str]:
+    """What the picture shows, in words."""
+    if ARM in scans:
+        fine = [p for p in scans[ARM] if p.status == "completed"]
+        start = min(fine, key=lambda p: abs(p.at - _SHIPPED))
+        best, last = min(fine, key=lambda p: p.H), fine[-1]
+        most = max((p for p in fine if p.at < start.at), key=lambda p: p.motion)
+        yield (
+            "Left, the arm over the floor, whose one redundancy is the bend of the elbow. H is lowest at "
+            f"{best.at:g} rad, where {_against(best, start)}. On the way there from the shipped "
+            f"{start.at:g} rad, the motion at first changes by {percent(most.motion / start.motion - 1)} (at "
+            f"{most.at:g} rad). The other way, at {last.at:g} rad, H rises from {start.H:.0f} to {last.H:.0f}, and "
+            f"{_against(last, start)}."
+        )
+    if HUMANOID in scans:
+        fine = [p for p in scans[HUMANOID] if p.status == "completed"]
+        start, end, most = fine[0], fine[-1], max(fine, key=lambda p: p.V)
+        yield (
+            f"Right, the straight way of the humanoid from its start to the offline optimum, on its feet. √H falls "
+            f"to {math.sqrt(end.H / start.H):.2f} and the motion to {end.motion / start.motion:.2f}, while √V first "
+            f"rises to {math.sqrt(most.V / start.V):.2f}: a push has an impulse, not a speed."
+        )
+
+
+def _against(one: Place, other: Place) -> str:
+    motion, jump = (percent(getattr(one, name) / getattr(other, name) - 1) for name in ("motion", "jump"))
+    force = one.force / other.force
+    return f"the motion changes by {motion}, the jump by {jump} and the force by a factor of {force:.2g}"
+
+
+def _scan(name: str, request: Request) -> list[Place]:
+    setups = dict(zip(_places(name, request.count), _setups(name, request.count), strict=True))
+    steps = list(setups)
+
+    def one(index: int) -> Place:
+        return _place(steps[index], setups[steps[index]])
+
+    return collected(one, len(steps), request.jobs, name)
+
+
+def _places(name: str, count: int) -> Vector:
+    """The shipped start is among them: elbows from stretched to the largest, and shares of the way."""
+    if name == HUMANOID:
+        return np.linspace(0.0, 1.0, count)
+    return np.unique(np.append(np.linspace(0.0, _LARGEST, count), _SHIPPED).round(6))
+
+
+def _setups(name: str, count: int) -> Iterator[Setup]:
+    places = _places(name, count)
+    if name == ARM:
+        yield from (prepare(Draw(ARM, 0, values={"elbow": float(bend)})) for bend in places)
+        return
+    shipped = prepare(Draw(HUMANOID, 0))
+    objective = scenario_objective(shipped)
+    robot, optimum = shipped.robot, offline_posture(shipped, objective).q
+    problem = build_problem(robot, objective, shipped.q, replace(
+        scenario_requirements(shipped, objective), collision=False, holdable=False,
+    ))  # fmt: skip
+    task = shipped.scenario.task
+    assert isinstance(task, SinglePush)
+    scenario = replace(shipped.scenario, push=replace(task, settle=_SETTLE))
+    way = pin.difference(robot.model, shipped.q, optimum)
+    for share in places:
+        # Straight from the start to the optimum, and back onto the feet.
+        q = Projector(problem).project(np.asarray(pin.integrate(robot.model, shipped.q, share * way))).q
+        yield Setup(scenario, robot, q, build_world(robot, scenario, q))
+
+
+def _place(at: float, setup: Setup) -> Place:
+    factory = ControllerFactory(setup, gradient_of=interpreted)
+    _, document = execute(Job(setup.scenario.name, "nominal"), factory)
+    here = factory.objective().oracle.quantities(setup.q)
+    metrics: Mapping[str, Any] = document["metrics"] or {}
+    nothing = math.nan
+    return Place(
+        float(at), here.H, here.V, here.S, metrics.get("q_total_impact", nothing), metrics.get("peak_jump", nothing),
+        metrics.get("peak_force", nothing), document["status"],
+    )  # fmt: skip
+
+
+def _told(name: str, places: Sequence[Place]) -> Iterator[str]:
+    what = "elbow, rad" if name == ARM else "share of the way to the optimum"
+    yield from (f"`{name}`, the nominal controller in each posture:", "")
+    head = (what, "H", "V", "S", "motion", "jump", "force, N", "status")
+    body = [
+        [f"{p.at:.3g}", *(f"{v:.3g}" if v is not None else "–" for v in (p.H, p.V, p.S, p.motion, p.jump)),
+         cell(p.force, 0), p.status]
+        for p in places
+    ]  # fmt: skip
+    yield from table(head, body)
+    yield ""
+
+
+def draw(arm: Sequence[Place], humanoid: Sequence[Place]) -> None:
+    """Draw what the model says above what was measured, one column a scan."""
+    from matplotlib.figure import Figure
+
+    with style():
+        figure = Figure(figsize=(WIDTH, 4.6), layout="constrained")
+        axes: Any = figure.subplots(2, 2, sharex="col")
+        _column(axes[:, 0], arm, _SHIPPED)
+        _column(axes[:, 1], humanoid, 0.0)
+        axes[0, 0].set_title("an arm that comes down on a floor")
+        axes[0, 1].set_title("a humanoid that is pushed")
+        axes[1, 0].set_xlabel("bend of the elbow, rad (0: stretched)")
+        axes[1, 1].set_xlabel("share of the way from the start to the optimum")
+        axes[0, 0].set_ylabel("the model says (shipped start = 1)")
+        axes[1, 0].set_ylabel("measured (shipped start = 1)")
+        PICTURE.parent.mkdir(parents=True, exist_ok=True)
+        figure.savefig(PICTURE, dpi=200)
+
+
+def _column(axes: Any, places: Sequence[Place], start: float) -> None:
+    fine = [p for p in places if p.status == "completed"]
+    first = min(fine, key=lambda p: abs(p.at - start))
+    model = {"√H: per impulse": ("H", BEFORE), "√V: per speed, sliding": ("V", {**FREE_BEFORE, "color": GRAY}),
+             "√S: per speed, sticking": ("S", {**AFTER, "color": GREEN})}  # fmt: skip
+    measured = {"motion": ("motion", AFTER), "velocity jump": ("jump", _JUMP),
+                "peak force": ("force", BEFORE)}  # fmt: skip
+    for axis, curves, power in ((axes[0], model, 0.5), (axes[1], measured, 1.0)):
+        for label, (name, look) in curves.items():
+            values = np.array([getattr(p, name) for p in fine], dtype=float) / float(getattr(first, name))
+            axis.plot([p.at for p in fine], values**power, label=label, marker="o", markersize=2.5, **look)
+        axis.axvline(first.at, color=GRAY, linewidth=0.8, label="shipped start")
+        axis.set_ylim(bottom=0.0)
+        axis.legend(loc="best", handlelength=2.6, frameon=True, framealpha=1, edgecolor="none")
+        axis.grid(visible=True)

@@ -1,0 +1,1 @@
+"""The objective, the problem and the result behind ``import impact_posture as ip``."""

@@ -1,0 +1,137 @@
+"""The objective behind ``ip.ImpactObjective``, with the defaults of the robot."""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from dataclasses import replace
+from pathlib import Path
+from typing import TYPE_CHECKING, Any
+
+import numpy as np
+from numpy.typing import ArrayLike
+
+from impact_posture.config.argument_types import checked, checked_class
+from impact_posture.config.settings import (
+    JointModel,
+    MetricKind,
+    ObjectiveKind,
+)
+from impact_posture.errors import InputError
+from impact_posture.impact.evaluation.evaluation import Evaluation, evaluate
+from impact_posture.impact.impact_contact import ImpactContact, check_compliance
+from impact_posture.impact.jump_metric import Metric, build_metric, check_weights
+from impact_posture.impact.resolved_impact import missing_support
+from impact_posture.impact.supports import refuse_held, refuse_rigid, resolve_supports
+from impact_posture.impact.worst_case_objective import WorstCaseObjective
+from impact_posture.robot.joint_model import with_joint_model
+from impact_posture.robot.model_variant import ModelVariant, Payload, build_model_variants
+from impact_posture.robot.robot import Robot
+from impact_posture.robot.robot_spec import Support
+
+# The C export is imported where it is used, because that takes longer than a small problem.
+if TYPE_CHECKING:
+    from impact_posture.codegen.export import Export
+
+
+@checked_class
+class ImpactObjective(WorstCaseObjective):
+    """The objective of one or several impacts, by default with the supports of the robot.
+
+    Args:
+        robot: The robot.
+        contact: Contact of the impact, or several contacts that act at once.  A contact without an offset at the
+            contact frame of robot.toml takes the offset from there.
+        metric: ``euclidean``, ``kinetic`` or ``weighted``, or a :class:`~impact_posture.impact.jump_metric.Metric`.
+        kind: ``impulse`` (λ̄²H), ``speed`` (V), ``sticking`` (S), ``coulomb`` (C) or ``energy`` (E).
+        supports: Feet that stay, as ``FRAME[:point|surface]``; ``None`` for those of robot.toml, ``()`` for none.
+        compliance: ε of the supports, 1/kg; 0 for 1e-4 over the robot's mass.
+        normal_cone_deg: Half angle of the cone of normals whose worst counts, degrees.
+        others: More contacts that act at the same time.
+        bilateral: Whether several contacts can pull as well as push.
+        model_variants: Robot models whose worst counts, the robot as modeled first.
+        weights: Weights of the weighted metric: nv numbers, a TOML file, or ``velocity-limits``.
+        armature_range: Lowest and highest factor on the armature; the worst counts.
+        payloads: Frame and mass in kg of payloads that the robot may carry, one at a time; the worst counts.
+        joint_model: Inertia at the joints: ``reflected``, ``link`` or ``locked``
+            (:func:`~impact_posture.robot.joint_model.with_joint_model`); ``None`` for that of the robot.
+
+    Raises:
+        ImpactPostureError: An argument does not fit the robot.
+    """
+
+    def __init__(
+        self,
+        robot: Robot,
+        contact: ImpactContact | Sequence[ImpactContact],
+        metric: MetricKind | Metric = "euclidean",
+        kind: ObjectiveKind = "impulse",
+        supports: Sequence[str | Support] | None = None,
+        compliance: float = 0.0,
+        normal_cone_deg: float = 0.0,
+        others: Sequence[ImpactContact] = (),
+        bilateral: bool = False,
+        model_variants: Sequence[ModelVariant] = (),
+        *,
+        weights: str | Sequence[float] | None = None,
+        armature_range: tuple[float, float] | None = None,
+        payloads: Sequence[tuple[str, float]] = (),
+        joint_model: JointModel | None = None,
+    ) -> None:
+        robot = with_joint_model(robot, joint_model or robot.joint_model)
+        given = [contact] if isinstance(contact, ImpactContact) else list(contact)
+        if not given:
+            raise InputError("names no contact", where="contact", hint="give an ImpactContact")
+        leading, *more = (_at_own_frame(robot, one) for one in (*given, *others))
+        feet = _supports(robot, supports)
+        for one in (leading, *more):
+            refuse_held(robot, one, feet)
+        refuse_rigid(robot, feet)
+        if not isinstance(metric, Metric):
+            values = weights if weights is None or isinstance(weights, str) else tuple(weights)
+            metric = build_metric(robot, metric, values)
+        check_weights(robot, metric.weights)
+        if compliance:
+            check_compliance(robot, compliance)
+        loads = [Payload(*payload) for payload in payloads]
+        variants = tuple(model_variants) or build_model_variants(robot, armature_range, loads)
+        super().__init__(
+            robot, leading, metric, kind, feet, compliance, normal_cone_deg, tuple(more), bilateral, variants
+        )
+        # This is a hint and no error, because evaluating an impact needs no support.
+        object.__setattr__(self, "_missing", missing_support(robot) if supports is None and not feet else "")
+
+    @checked
+    def evaluate(self, q: ArrayLike, speed: float = 1.0, restitution: float = 0.0) -> Evaluation:
+        """Compute H, G, V, S, E, the ellipsoid and the predicted jump at ``q``; see :func:`evaluate`."""
+        return evaluate(self, self.robot.check_posture(np.asarray(q, dtype=float), limits=False), speed, restitution)
+
+    @checked
+    def export(self, out: str | Path, *, build: bool = True, **options: Any) -> Export:
+        """Write the C code of H, its gradient and this objective into a folder, and build its library.
+
+        A folder that holds this code already, such as ``c/`` of a result, is used as it is.
+
+        Args:
+            out: The folder.
+            build: Whether to build and check the library, if a C compiler is installed.
+            options: Options ``prefix``, ``posture``, ``single``, ``portable`` and ``force`` of :func:`write_export`.
+        """
+        from impact_posture.codegen.existing_export import kept_export
+        from impact_posture.codegen.export import write_export
+
+        kept = None if options else kept_export(self, Path(out), build=build)
+        return kept or write_export([self], Path(out), build=build, **options)
+
+
+def _at_own_frame(robot: Robot, contact: ImpactContact) -> ImpactContact:
+    own = robot.spec.contact
+    if contact.frame != own.frame or any(contact.offset) or not any(own.offset):
+        return contact
+    return replace(contact, offset=own.offset)
+
+
+def _supports(robot: Robot, supports: Sequence[str | Support] | None) -> tuple[Support, ...]:
+    if supports is None:
+        return resolve_supports(robot, None)
+    texts = tuple(support for support in supports if isinstance(support, str))
+    return (*resolve_supports(robot, texts), *(support for support in supports if isinstance(support, Support)))

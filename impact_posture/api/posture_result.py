@@ -1,0 +1,273 @@
+"""The result behind ``import impact_posture as ip``, and :func:`optimize`, which finds it."""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from dataclasses import dataclass, replace
+from functools import cached_property, partial
+from pathlib import Path
+from typing import TYPE_CHECKING, Any
+
+import numpy as np
+
+from impact_posture.api.posture_problem import PostureProblem
+from impact_posture.config.argument_types import checked
+from impact_posture.config.settings import Against, Search
+from impact_posture.errors import InputError
+from impact_posture.output.result_folder import FORMATS, Finish, FinishRequest, Written, finish_result
+from impact_posture.output.result_reader import SolvedPostures, result_view
+from impact_posture.posture.analysis.pareto_front import pareto_front
+from impact_posture.posture.analysis.result_document import result_arrays, result_document
+from impact_posture.posture.analysis.robustness import Robustness, compare_variants, solve_robustly
+from impact_posture.posture.analysis.trade_off import TradeOff
+from impact_posture.posture.formulation.problem_file import Prepared, dump_settings, resolved_settings
+from impact_posture.posture.manifold.null_space_path import null_space_path
+from impact_posture.posture.program.certificate import Certificate
+from impact_posture.posture.program.compiled_solver import CompileMode
+from impact_posture.posture.search.global_search import GlobalSearch, check_searchable, search_globally
+from impact_posture.posture.search.multistart import PostureSolution
+from impact_posture.posture.search.solver_runs import Progress
+from impact_posture.robot.posture_files import write_posture
+from impact_posture.system.arrays import Array
+from impact_posture.system.output_folder import whole_folder, write_json
+
+# The C export and the pictures are imported where they are used, because that takes longer than a small problem.
+if TYPE_CHECKING:
+    from impact_posture.codegen.export import Export
+    from impact_posture.path.posture_path import PosturePath
+
+
+@dataclass(frozen=True, eq=False)
+class PostureResult:
+    """An optimized posture with its certificate, which can be saved, drawn and exported.
+
+    Attributes:
+        problem: The solved problem.
+        solution: Result of the search.
+        robustness: Cost and gain of the model variants; ``None`` without model variants.
+        tradeoff: The best objective within each distance from the start; ``None`` before :meth:`trade_off`.
+        motion: The path from the start to the optimum; ``None`` before :meth:`path`.
+        global_search: Finding of the search ``global``; ``None`` without it.
+    """
+
+    problem: PostureProblem
+    solution: PostureSolution
+    robustness: Robustness | None = None
+    tradeoff: TradeOff | None = None
+    motion: PosturePath | None = None
+    global_search: GlobalSearch | None = None
+
+    @property
+    def q(self) -> Array:
+        """The best certified posture, shape (nq,)."""
+        return self.solution.q
+
+    @property
+    def initial(self) -> Array:
+        """The start, moved to the constraints if it did not satisfy them, shape (nq,)."""
+        return self.solution.initial
+
+    @property
+    def reduction(self) -> float:
+        """``1 − objective(q)/objective(initial)``."""
+        return self.solution.reduction
+
+    @property
+    def certificate(self) -> Certificate:
+        """Stationarity, violation and multipliers, recomputed from Pinocchio's numbers."""
+        return self.solution.certificate
+
+    @cached_property
+    def document(self) -> dict[str, Any]:
+        """The content of ``result.json``.
+
+        Raises:
+            InputError: The objective is not that of an impact.
+        """
+        path = None if self.motion is None else self.motion.to_dict()
+        extras = self.robustness, self.tradeoff, path, self.global_search
+        return result_document(self._prepared, self.solution, *extras)
+
+    @cached_property
+    def _found(self) -> SolvedPostures:
+        solution, mapped = self.solution, None if self.global_search is None else self.global_search.map
+        path = null_space_path(solution.problem, solution.initial, solution.q)
+        return SolvedPostures(solution.initial, solution.q, path, self.document, mapped)
+
+    @property
+    def _prepared(self) -> Prepared:
+        if self.problem.prepared is None:
+            # This raises an error that names the remedy.
+            _ = self.problem.problem.impact
+            raise AssertionError
+        return self.problem.prepared
+
+    @checked
+    def trade_off(
+        self,
+        points: int = 16,
+        against: Against = "distance",
+        *,
+        compile: CompileMode = "auto",
+        progress: Progress | None = None,
+    ) -> PostureResult:
+        """Return the same result with the best objective within each of ``points`` prices.
+
+        Args:
+            points: Number of points.
+            against: The price: the ``distance`` from the start, or the peak ``force`` of the impact.
+            compile: Whether to compile the program.
+            progress: Called with the solves done and planned.
+
+        Raises:
+            InputError: The force is asked for, but the elasticity of the contact is not known.
+        """
+        force = None
+        if against == "force":
+            impact = self._prepared.impact
+            if impact.contact_stiffness is None:
+                raise InputError(
+                    "force needs the elasticity of the contact",
+                    where="tradeoff_against",
+                    hint="add `contact_stiffness` (N/m, or a material) or `contact_duration`",
+                )
+            force = impact.contact_stiffness, impact.speed
+        curve = pareto_front(self.solution, points, force=force, compile=compile, progress=progress)
+        return replace(self, tradeoff=curve)
+
+    @checked
+    def path(self, *, seed: int = 0) -> PostureResult:
+        """Return the same result with a path from the start to the optimum, timed within the robot's limits.
+
+        See :func:`~impact_posture.path.posture_path.posture_path`.  Where it does not reach the optimum, it tries the
+        others, of which a large program has all only if the search was to ``finish_all``.
+
+        Args:
+            seed: Seed of the sampling planner.
+
+        Raises:
+            InputError: The package of the extra ``path`` is not installed.
+        """
+        from impact_posture.path.posture_path import posture_path
+
+        return replace(self, motion=posture_path(self.solution, seed=seed))
+
+    @checked
+    def save(
+        self,
+        out: str | Path,
+        *,
+        force: bool = False,
+        codegen: bool = True,
+        formats: Sequence[str] = FORMATS,
+        report: bool = True,
+        meshes: bool = False,
+        jobs: int = 2,
+        progress: Progress | None = None,
+        finish: Finish | None = None,
+    ) -> Written:
+        """Write the result folder: result.json, problem.toml, posture.json, pictures and C code; whole or not at all.
+
+        Args:
+            out: The folder.
+            force: Replace an earlier result.
+            codegen: Whether to export, build and check the C code as well.
+            formats: Formats of the pictures: ``png``, ``svg``, ``pdf``.
+            report: Whether to write ``report.html``, a page with all of it and the robot in 3-D.
+            meshes: Whether the page may hold the meshes of the user's own URDF, which it then passes on.
+            jobs: Processes that draw and compile side by side.
+            progress: Called after each figure, the C code and the report with the numbers done and in all.
+            finish: What draws and compiles; :func:`~impact_posture.output.early_writer.early_writer` by the command
+                line.
+
+        Returns:
+            The folder, the export in it, and the reason if its C code could not be built.
+
+        Raises:
+            OutputError: The folder exists without ``force``, or cannot be written.
+        """
+        prepared, found = self._prepared, self._found
+        export: Export | None = None
+        compiler_error = report_error = ""
+        with whole_folder(Path(out), force=force, kind="result") as folder:
+            write_json(folder / "result.json", self.document)
+            arrays = result_arrays(self.solution, found.path, self.tradeoff, found.mapped)
+            np.savez_compressed(folder / "result.npz", **arrays)  # type: ignore[arg-type]
+            write_json(folder / "posture.json", write_posture(prepared.impact.robot, found.optimal))
+            (folder / "problem.toml").write_text(dump_settings(resolved_settings(prepared)), encoding="utf-8")
+            if self.motion is not None:
+                from impact_posture.path.path_files import write_path
+
+                write_path(folder, prepared.impact.robot, self.motion)
+            request = FinishRequest(folder, found, codegen, formats, report, meshes, jobs)
+            for done, count, result in (finish or partial(finish_result, prepared))(request):
+                if isinstance(result, str):
+                    report_error = result
+                elif result is not None:
+                    export, compiler_error = result
+                if progress:
+                    progress(done, count)
+        return Written(Path(out), export, compiler_error, report_error)
+
+    @checked
+    def plot(
+        self, out: str | Path, formats: Sequence[str] = FORMATS, only: Sequence[str] | None = None
+    ) -> list[Path]:
+        """Draw the figures into a folder; return their paths."""
+        from impact_posture.output.plot import draw_all
+
+        return draw_all(result_view(self._prepared, self._found, self.motion), Path(out), formats, only)
+
+    @checked
+    def export(self, out: str | Path, *, build: bool = True, **options: Any) -> Export:
+        """Write the C code as :meth:`ImpactObjective.export` does, with the optimal posture as a constant."""
+        from impact_posture.codegen.export import write_export
+
+        objective = self.problem.problem.impact
+        return write_export([objective], Path(out), posture=self.q, build=build, **options)
+
+
+@checked
+def optimize(
+    problem: PostureProblem,
+    *,
+    starts: int = 16,
+    seed: int = 0,
+    jobs: int = 2,
+    compile: CompileMode = "auto",
+    search: Search = "multistart",
+    progress: Progress | None = None,
+    finish_all: bool = False,
+) -> PostureResult:
+    """Find the posture with the least objective, from many starts, and certify it.
+
+    Args:
+        problem: The problem.
+        starts: Number of starts: the given posture, then random feasible postures.
+        seed: Seed of the random starts.
+        jobs: Processes that search side by side.
+        compile: Whether the program is compiled: ``auto`` (if it pays), ``always`` or ``never``.
+        search: ``multistart``, or ``global`` (:func:`~impact_posture.posture.search.global_search.search_globally`).
+        progress: Called after each start with the numbers done and in all.
+        finish_all: Finish starts that can no longer become the best, too.  The search ``global`` always does.
+
+    Raises:
+        InputError: There is no start, or the problem is none for the search ``global``.
+        Infeasible: No posture satisfies the constraints; the error names the conflicting constraints.
+        SolverFailed: No run ended at a certified posture.
+    """
+    if starts < 1:
+        raise InputError(f"is {starts}", where="starts", hint="give 1 or more")
+    if search == "global":
+        check_searchable(problem.problem)
+    found = solve_robustly(
+        problem.problem, starts=starts, seed=seed, jobs=jobs, compile=compile, progress=progress,
+        finish_all=finish_all or search == "global",
+    )  # fmt: skip
+    if search == "multistart":
+        return PostureResult(problem, found.solution, found.robustness)
+    best = search_globally(found.solution, seed=seed, jobs=jobs, compile=compile, progress=progress)
+    robustness = found.robustness and compare_variants(
+        best.solution, [variant.q for variant in found.robustness.model_variants], seed
+    )
+    return PostureResult(problem, best.solution, robustness, global_search=best.search)

@@ -1,0 +1,206 @@
+"""Divide a graph among C functions: blocks that compute a part each, and exported functions that call them."""
+
+from __future__ import annotations
+
+import heapq
+from collections import Counter
+from collections.abc import Mapping, Sequence, Set
+from dataclasses import dataclass
+
+from impact_posture.codegen.expression_graph import ARITHMETIC, COSINE, SINE, Graph
+
+# Most statements of a block.  The time of a compiler grows faster than the length of a function.
+_BLOCK = 300
+# Most operations in one statement.
+_STATEMENT = 12
+
+
+@dataclass(frozen=True)
+class Block:
+    """A C function that computes a part of the graph.
+
+    Attributes:
+        functions: Numbers of the exported functions that need it.
+        nodes: The nodes that it computes, in order, each by a statement of its own.
+    """
+
+    functions: frozenset[int]
+    nodes: tuple[int, ...]
+
+
+@dataclass(frozen=True)
+class Layout:
+    """Blocks in the order of their calls, and the values that they hand on.
+
+    Attributes:
+        graph: The operations.
+        blocks: The blocks.
+        inlined: Nodes that the statement of their only user computes.
+        slots: Node → its place in the work array of its width.
+        sizes: Width → length of the work array.
+        angles: Inputs whose sine and cosine are taken, in the order of the array of sines.
+        trig: Sine or cosine node → its first place in that array.
+        leaves: Nodes that every block has at hand, so that they need no statement.
+    """
+
+    graph: Graph
+    blocks: tuple[Block, ...]
+    inlined: frozenset[int]
+    slots: Mapping[int, int]
+    sizes: Mapping[int, int]
+    angles: tuple[int, ...]
+    trig: Mapping[int, int]
+    leaves: frozenset[int]
+
+
+def lay_out(graph: Graph, functions: Sequence[Sequence[str]], block: int = _BLOCK) -> Layout:
+    """Divide a graph.
+
+    Args:
+        graph: The operations.
+        functions: For each exported function the outputs that it returns.
+        block: Most statements of a block.
+    """
+    order = _depth_first(graph, [k for names in functions for name in names for k in graph.outputs[name]])
+    angles, trig = _trig(graph, order)
+    leaves = frozenset(k for k in order if graph.nodes[k].op in ("const", "in", "lane") or k in trig)
+    needed = _needed(graph, functions, leaves)
+    # A node that only the array of sines uses has no statement.
+    order = [k for k in order if k in needed]
+    users: dict[int, list[int]] = {}
+    for k in order:
+        for a in set(_sources(graph, leaves, k)):
+            users.setdefault(a, []).append(k)
+    outputs = {_source(graph, k) for names in functions for name in names for k in graph.outputs[name]}
+    inlined = _inlined(graph, [k for k in order if k not in leaves], users, outputs, needed)
+    groups: dict[frozenset[int], list[int]] = {}
+    for k in order:
+        if k not in inlined and k not in leaves:
+            groups.setdefault(needed[k], []).append(k)
+    blocks = [
+        Block(mask, tuple(nodes[at : at + block]))
+        for mask, nodes in sorted(groups.items(), key=lambda item: (-len(item[0]), sorted(item[0])))
+        for at in range(0, len(nodes), block)
+    ]
+    at = {k: number for number, part in enumerate(blocks) for k in part.nodes}
+
+    def home(k: int) -> int:
+        """The block of the statement that computes node k."""
+        while k in inlined:
+            (k,) = users[k]
+        return at[k]
+
+    last = {k: len(blocks) if k in outputs else max((home(u) for u in users.get(k, ())), default=-1) for k in at}
+    slots, sizes = _slots(graph, blocks, last)
+    return Layout(graph, tuple(blocks), frozenset(inlined), slots, sizes, angles, trig, leaves)
+
+
+def _slots(graph: Graph, blocks: Sequence[Block], last: Mapping[int, int]) -> tuple[dict[int, int], dict[int, int]]:
+    """Places in the work arrays for values that later blocks use, and the lengths of the arrays.
+
+    Every function calls its blocks in one order.  So a place is free after the ``last`` block that uses its value.
+    """
+    slots: dict[int, int] = {}
+    sizes: dict[int, int] = {}
+    free: dict[int, list[int]] = {}
+    ending: dict[int, list[int]] = {}
+    for number, block in enumerate(blocks):
+        for k in ending.pop(number - 1, ()):
+            heapq.heappush(free.setdefault(graph.nodes[k].width, []), slots[k])
+        for k in block.nodes:
+            if last[k] <= number:
+                continue
+            width = graph.nodes[k].width
+            if free.get(width):
+                slots[k] = heapq.heappop(free[width])
+            else:
+                slots[k] = sizes.get(width, 0)
+                sizes[width] = slots[k] + 1
+            ending.setdefault(last[k], []).append(k)
+    return slots, sizes
+
+
+def _source(graph: Graph, k: int) -> int:
+    """Return the vector of a lane, and any other node itself."""
+    return graph.nodes[k].args[0] if graph.nodes[k].op == "lane" else k
+
+
+def _sources(graph: Graph, leaves: Set[int], k: int) -> list[int]:
+    return [] if k in leaves else [_source(graph, a) for a in graph.nodes[k].operands]
+
+
+def _depth_first(graph: Graph, roots: Sequence[int]) -> list[int]:
+    """The nodes that the roots need, operands first, close to where they are used.
+
+    The operand with the longest chain comes first, so that the other operands wait for less time.
+    """
+    depth: list[int] = []
+    for node in graph.nodes:
+        own = 1 if node.op in ARITHMETIC else 0
+        depth.append(own + max((depth[a] for a in node.operands), default=0))
+    seen: set[int] = set()
+    order: list[int] = []
+    for root in roots:
+        stack = [(root, False)]
+        while stack:
+            k, ready = stack.pop()
+            if ready:
+                order.append(k)
+            elif k not in seen:
+                seen.add(k)
+                stack.append((k, True))
+                operands = sorted(graph.nodes[k].operands, key=lambda a: -depth[a])
+                stack += [(a, False) for a in operands if a not in seen]
+    return order
+
+
+def _trig(graph: Graph, order: Sequence[int]) -> tuple[tuple[int, ...], dict[int, int]]:
+    """Sines and cosines of inputs, vectors first, so that each vector starts at a multiple of its width."""
+    found = [k for k in order if graph.nodes[k].op in (SINE, COSINE)]
+    starts: dict[int, int] = {}
+    angles: list[int] = []
+    trig: dict[int, int] = {}
+    for k in sorted(found, key=lambda k: -graph.nodes[k].width):
+        argument = graph.nodes[k].args[0]
+        members = graph.nodes[argument].args if graph.nodes[argument].op == "gather" else (argument,)
+        if all(graph.nodes[m].op == "in" for m in members):
+            if argument not in starts:
+                starts[argument] = len(angles)
+                angles += members
+            trig[k] = starts[argument]
+    return tuple(angles), trig
+
+
+def _needed(graph: Graph, functions: Sequence[Sequence[str]], leaves: Set[int]) -> dict[int, frozenset[int]]:
+    """Node → numbers of the exported functions that need it."""
+    found: dict[int, set[int]] = {}
+    for number, names in enumerate(functions):
+        waiting = [_source(graph, k) for name in names for k in graph.outputs[name]]
+        while waiting:
+            k = waiting.pop()
+            if number not in found.setdefault(k, set()):
+                found[k].add(number)
+                waiting += _sources(graph, leaves, k)
+    return {k: frozenset(v) for k, v in found.items()}
+
+
+def _inlined(
+    graph: Graph,
+    order: Sequence[int],
+    users: Mapping[int, list[int]],
+    outputs: set[int],
+    needed: Mapping[int, frozenset[int]],
+) -> set[int]:
+    """Arithmetic that one other operation of the same functions uses, once."""
+    size: dict[int, int] = {}
+    inlined: set[int] = set()
+    for k in order:
+        node, own = graph.nodes[k], users.get(k, ())
+        size[k] = 1 + sum(size[a] for a in node.operands if a in inlined)
+        if len(own) != 1 or k in outputs or node.op not in ARITHMETIC or size[k] >= _STATEMENT:
+            continue
+        user = graph.nodes[own[0]]
+        times = Counter(_source(graph, a) for a in user.operands)[k]
+        if times == 1 and k in user.operands and needed[own[0]] == needed[k] and user.op in ARITHMETIC:
+            inlined.add(k)
+    return inlined

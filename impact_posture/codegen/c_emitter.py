@@ -1,0 +1,287 @@
+"""C99 from a laid-out graph: straight-line blocks of local variables, and work arrays for values that blocks hand on.
+
+Blocks are terse because a humanoid has ten thousand operations.  Vectors are the extension of GCC and Clang, so their
+arithmetic is written as that of numbers.
+"""
+
+from __future__ import annotations
+
+import math
+import re
+from collections.abc import Mapping
+from dataclasses import dataclass
+from typing import Any
+
+import numpy as np
+from numpy.typing import ArrayLike, NDArray
+
+from impact_posture.codegen.block_layout import Block, Layout
+from impact_posture.codegen.expression_graph import COSINE, Node
+
+# Approximate number of characters in the place of a constant.
+_PLACE = 7
+SHORT_NAMES = ("APART", "K", "K2", "K4", "V2", "V2u", "V4", "V4u", "VN")
+"""Macros of the emitted text; its end undefines them."""
+
+# Arrays that a block may receive beside the inputs.
+_SHARED = ("s", "c", "w", "w2", "w4")
+# The compiler splits a vector that is wider than the processor's.  Without optimization the parts and the whole have
+# a place each.
+_HALVES = 2
+_MATH = re.compile(r"\b(exp|log|pow|sqrt|a?sin|a?cos|a?tan|atan2|tanh|hypot|fabs|fmin|fmax)\(")
+
+
+@dataclass(frozen=True)
+class Real:
+    """The C type that an export computes in.
+
+    Attributes:
+        name: ``double`` or ``float``.
+        size: Bytes of a number.
+        unit_tolerance: Largest distance of the norm of a quaternion from one.
+    """
+
+    name: str
+    size: int
+    unit_tolerance: float
+
+    @property
+    def dtype(self) -> np.dtype[np.floating[Any]]:
+        """The same type in numpy."""
+        return np.dtype(np.float64 if self.name == "double" else np.float32)
+
+    def rounded(self, values: ArrayLike) -> NDArray[np.float64]:
+        """Return the nearest numbers of this type, as doubles."""
+        return np.array(values, dtype=self.dtype).astype(np.float64)
+
+    def literal(self, value: float) -> str:
+        """Return a literal that reads back as the nearest number; a negative one is in parentheses."""
+        if self.name == "double" or not math.isfinite(value):
+            return c_double(value)
+        with np.errstate(over="ignore", under="ignore"):
+            nearest = np.float32(value)
+        text = c_double(float(str(nearest)))
+        if not np.isfinite(nearest):
+            return text
+        return f"{text[:-1]}f)" if text.endswith(")") else f"{text}f"
+
+    def spelled(self, operation: str) -> str:
+        """Return the C of an operation on doubles in this type: ``sinf`` for ``sin``, ``1.0f`` for ``1.0``."""
+        if self.name == "double":
+            return operation
+        text = _MATH.sub(r"\1f(", operation).replace("(double)", "(float)")
+        return re.sub(r"\b\d+\.\d+", r"\g<0>f", text)
+
+
+DOUBLE = Real("double", 8, 1e-6)
+FLOAT = Real("float", 4, 1e-5)
+REALS = {real.name: real for real in (DOUBLE, FLOAT)}
+
+
+def c_double(value: float) -> str:
+    """Return a double literal that reads back exactly; a negative one is in parentheses."""
+    if math.isnan(value):
+        return "NAN"
+    text = "INFINITY" if math.isinf(value) else repr(abs(value))
+    return f"(-{text})" if math.copysign(1.0, value) < 0 else text
+
+
+@dataclass(frozen=True)
+class BlockText:
+    """The C of a block.
+
+    Attributes:
+        text: The function.
+        call: Its call with the caller's names: inputs, ``m.s``, ``m.w`` and so on.
+        local_bytes: Most bytes of its variables.
+        wide_bytes: Most bytes of the parts of vectors that are wider than the processor's.
+    """
+
+    text: str
+    call: str
+    local_bytes: int
+    wide_bytes: int
+
+
+class Constants:
+    """Tables of the numbers in the blocks of a library.  The place of a number is shorter than its seventeen digits.
+
+    Args:
+        prefix: Beginning of the names of the tables.
+        real: The type of the numbers.
+    """
+
+    def __init__(self, prefix: str, real: Real) -> None:
+        self._prefix, self._real = prefix, real
+        self._tables: dict[int, dict[tuple[float, ...], int]] = {}
+
+    def place(self, node: Node) -> str:
+        """Return the C of a constant: a short number as it is, another by its place."""
+        if node.width == 1:
+            text = self._real.literal(node.value[0])
+            if len(text) < _PLACE:
+                return text
+        known = self._tables.setdefault(node.width, {})
+        return f"{_short(node.width)}[{known.setdefault(node.value, len(known))}]"
+
+    def text(self, types: Mapping[int, str]) -> str:
+        """Return the C of the tables, with the type of each width, and of their short names."""
+        lines = []
+        for width, known in sorted(self._tables.items()):
+            rows = [", ".join(self._real.literal(v).strip("()") for v in value) for value in known]
+            if width > 1:
+                rows = ["{" + row + "}" for row in rows]
+            body = ",\n".join(f"  {row}" for row in rows)
+            name = f"{self._prefix}_{_short(width).lower()}"
+            lines.append(f"static const {types[width]} {name}[{len(known)}] = {{\n{body}\n}};")
+            lines.append(f"#define {_short(width)} {name}")
+        return "\n".join([*lines, ""])
+
+
+def _short(width: int) -> str:
+    return f"K{width if width > 1 else ''}"
+
+
+class Emitter:
+    """The C of one laid-out graph.
+
+    Args:
+        layout: Blocks and the values that they hand on.
+        prefix: Beginning of the names of the blocks.
+        real: The type of literals.
+        types: Width → C type of a number or vector of that width.
+        constants: Tables that receive the numbers.
+        size: Bytes of the type of width one, if it is not ``real``.
+        work: Name of the structure with inputs and work arrays; empty where inputs are arguments of their own.
+    """
+
+    def __init__(
+        self,
+        layout: Layout,
+        prefix: str,
+        real: Real,
+        types: Mapping[int, str],
+        constants: Constants,
+        size: int = 0,
+        work: str = "",
+    ) -> None:
+        self.layout, self._prefix, self._real, self._types = layout, prefix, real, types
+        self._constants, self._size, self._work = constants, size or real.size, work
+        self._graph = layout.graph
+        at = {k: number for number, block in enumerate(layout.blocks) for k in block.nodes}
+        # Nodes that their own block uses again, so that they need a name there.
+        self._reused: set[int] = set()
+        for k, number in at.items():
+            waiting = list(self._graph.nodes[k].operands)
+            while waiting:
+                a = waiting.pop()
+                a = self._graph.nodes[a].args[0] if self._graph.nodes[a].op == "lane" else a
+                if a in layout.inlined:
+                    waiting += self._graph.nodes[a].operands
+                elif at.get(a) == number:
+                    self._reused.add(a)
+        self.blocks = [self._block(number, block) for number, block in enumerate(layout.blocks)]
+
+    def output(self, k: int, work: str = "m.") -> str:
+        """Return the C of an output after the calls of the blocks."""
+        node = self._graph.nodes[k]
+        if node.op == "const":
+            return self._real.literal(node.value[0])
+        if node.op == "lane":
+            return f"{self.output(node.args[0], work)}[{node.args[1]}]"
+        if node.op == "in":
+            return f"{work if self._work else ''}{self._graph.inputs[node.args[0]]}[{node.args[1]}]"
+        if k in self.layout.trig:
+            return f"{work}{'c' if node.op == COSINE else 's'}[{self.layout.trig[k]}]"
+        return f"{work}{self._slot(k)}"
+
+    # ---- one block --------------------------------------------------------------------------------------------
+
+    def _block(self, number: int, block: Block) -> BlockText:
+        names: dict[int, str] = {}
+        lines: list[str] = []
+        for k in block.nodes:
+            node = self._graph.nodes[k]
+            text = self._expression(k, number, names, lines, top=True)
+            names[k] = f"v{len(names)}"
+            kept = f"{self._slot(k)}=" if k in self.layout.slots else ""
+            if kept and k not in self._reused:
+                lines.append(f"{kept}{text};")
+            elif node.op == "gather":
+                lines.append(f"{self._types[node.width]} {names[k]}={text};")
+                lines += [f"{kept}{names[k]};"] if kept else []
+            else:
+                lines.append(f"{self._types[node.width]} {names[k]}={kept}{text};")
+        body = "\n".join(lines)
+        used = set(re.findall(r"\b([a-z]\w*)\[|\((\w) \+", body))
+        present = {name for pair in used for name in pair if name}
+        scalar = self._types[1]
+        parameters, arguments = [], []
+        for name in self._graph.inputs:
+            if name in present:
+                parameters.append(f"const {scalar} *{name}")
+                arguments.append(f"{self._work}.{name}" if self._work else name)
+        for name in _SHARED:
+            if name in present:
+                constant = "const " if name in "sc" else ""
+                kind = self._types[int(name[1:] or 1)]
+                parameters.append(f"{constant}{kind} *{name}")
+                arguments.append(f"{self._work or 'm'}.{name}")
+        title = f"{self._prefix}_block{number}"
+        local = sum(self._graph.nodes[k].width for k in names) * self._size
+        return BlockText(
+            f"APART static void {title}({', '.join(parameters)})\n{{\n{body}\n}}\n",
+            f"{title}({', '.join(arguments)});",
+            local,
+            _HALVES * self._vector_bytes(block),
+        )
+
+    def _vector_bytes(self, block: Block) -> int:
+        """Bytes of all vectors that a block computes, also within statements."""
+        total, waiting = 0, list(block.nodes)
+        while waiting:
+            node = self._graph.nodes[waiting.pop()]
+            total += node.width * self._size if node.width > 1 else 0
+            waiting += [a for a in node.operands if a in self.layout.inlined]
+        return total
+
+    def _expression(self, k: int, number: int, names: dict[int, str], lines: list[str], *, top: bool = False) -> str:
+        """Return a name, a place in an array, or the operation itself, in parentheses unless on ``top``."""
+        node = self._graph.nodes[k]
+        if not top and k in names:
+            return names[k]
+        if k in self.layout.leaves:
+            return self._leaf(k, node, number, names, lines)
+        if not top and k not in self.layout.inlined:
+            return self._slot(k)
+        operands = [self._expression(a, number, names, lines) for a in node.operands]
+        if node.op == "gather":
+            return "{" + ", ".join(operands) + "}"
+        if node.op in ("+", "-", "*"):
+            text = f"{operands[0]}{node.op}{operands[1]}"
+        elif node.op == "neg":
+            text = f"-{operands[0]}"
+        elif node.op == "inv":
+            text = self._real.spelled("1.0") + f"/{operands[0]}"
+        else:
+            return self._real.spelled(node.op).format(*operands)
+        return text if top else f"({text})"
+
+    def _leaf(self, k: int, node: Node, number: int, names: dict[int, str], lines: list[str]) -> str:
+        if node.op == "const":
+            return self._constants.place(node)
+        if node.op == "in":
+            return f"{self._graph.inputs[node.args[0]]}[{node.args[1]}]"
+        if node.op == "lane":
+            return f"{self._expression(node.args[0], number, names, lines)}[{node.args[1]}]"
+        array = "c" if node.op == COSINE else "s"
+        if node.width == 1:
+            return f"{array}[{self.layout.trig[k]}]"
+        names[k] = f"v{len(names)}"
+        kind = self._types[node.width]
+        lines.append(f"const {kind} {names[k]} = *(const {kind}u *)({array} + {self.layout.trig[k]});")
+        return names[k]
+
+    def _slot(self, k: int) -> str:
+        width = self._graph.nodes[k].width
+        return f"w{width if width > 1 else ''}[{self.layout.slots[k]}]"

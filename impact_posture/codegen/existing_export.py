@@ -1,0 +1,58 @@
+"""The export of an objective that a folder holds already."""
+
+from __future__ import annotations
+
+import json
+from dataclasses import replace
+from pathlib import Path
+from typing import Any
+
+from impact_posture.codegen.build_check import compile_and_check
+from impact_posture.codegen.export import Export, default_prefix
+from impact_posture.codegen.manifest_builder import build_manifest
+from impact_posture.impact.worst_case_objective import WorstCaseObjective
+from impact_posture.system.libraries import library_path
+from impact_posture.system.output_folder import own_files
+from impact_posture.system.toolchain import find_compiler
+
+# Keys of a manifest that depend on more than the objective.
+_OTHERS = ("posture", "compression", "stack_bytes")
+
+
+def kept_export(objective: WorstCaseObjective, out: Path, *, build: bool) -> Export | None:
+    """Return the export of an objective that a folder holds already, such as ``c/`` of a result; else ``None``.
+
+    The manifest may also state a posture and the compression of the impact.  All else must be what
+    :func:`~impact_posture.codegen.export.export` would write.
+
+    Args:
+        objective: The objective.
+        out: The folder.
+        build: As :func:`~impact_posture.codegen.export.write_export`.
+
+    Raises:
+        CompilerError: The compiler failed, or its code computes other numbers.
+    """
+    prefix = default_prefix([objective])
+    files = own_files(out, "export")
+    if f"{prefix}.json" not in files or not all((out / name).is_file() for name in files):
+        return None
+    try:
+        manifest = json.loads((out / f"{prefix}.json").read_text(encoding="utf-8"))
+        found = _comparable(manifest)
+    except (OSError, LookupError, ValueError, TypeError, AttributeError, RecursionError):
+        return None
+    # What has been written and read has lists in place of tuples.
+    if found != _comparable(json.loads(json.dumps(build_manifest([objective], prefix, None, None)))):
+        return None
+    made = Export(out, objective.robot, tuple(out / name for name in files), manifest, requested=build)
+    if not build or find_compiler() is None:
+        return made
+    agreement = compile_and_check(out, prefix, [objective], keep=True)
+    return replace(made, agreement=agreement, library=library_path(out, prefix))
+
+
+def _comparable(manifest: dict[str, Any]) -> dict[str, Any]:
+    """Return what the objective alone determines."""
+    rest = {key: value for key, value in manifest.items() if key not in _OTHERS}
+    return rest | {"symbols": {name: symbol for name, symbol in rest["symbols"].items() if name != "posture"}}

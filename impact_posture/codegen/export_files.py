@@ -1,0 +1,219 @@
+"""Files of an export, written from the templates in ``templates/``.
+
+Each file has its language.  Every text that a template inserts is escaped for it, because the names of robots, joints
+and frames are data.  Text that is in the language already has the type :class:`Verbatim`.  A name that no one gave
+fails (``StrictUndefined``).
+"""
+
+from __future__ import annotations
+
+from collections.abc import Callable, Iterable, Mapping, Sequence
+from functools import cache, partial
+from typing import Any
+
+from jinja2 import Environment, PackageLoader, StrictUndefined, Template
+
+from impact_posture.codegen.build_check import self_test_tolerance
+from impact_posture.codegen.c_emitter import DOUBLE, SHORT_NAMES, Real
+from impact_posture.codegen.c_names import SIGNATURES, lengths
+from impact_posture.codegen.export_functions import NamedObjective
+from impact_posture.codegen.manifest_reader import identity
+from impact_posture.codegen.source_blocks import Code
+from impact_posture.impact.worst_case_objective import WorstCaseObjective
+from impact_posture.robot.robot import unit_parts
+from impact_posture.system.escape import c_comment, markdown
+from impact_posture.version import __version__
+
+_WIDTH = 112
+
+
+class Verbatim(str):
+    """Text that a template inserts as it is."""
+
+    __slots__ = ()
+
+
+def render(
+    exported: Sequence[NamedObjective], prefix: str, manifest: dict[str, Any], code: Code, real: Real
+) -> dict[str, str]:
+    """Return file name → text of every file but the manifest."""
+    context = _context(exported, prefix, manifest, code, real)
+    return {name: template.render(context) for name, template in load_templates(prefix).items()}
+
+
+def load_templates(prefix: str = "") -> dict[str, Template]:
+    """Return file name → template, which takes long for the first time."""
+    names = {
+        f"{prefix}.h": "header.h", f"{prefix}.c": "source.c",
+        **{name: name for name in ("example.c", "example.cpp", "Makefile", "CMakeLists.txt", "README.md")},
+    }  # fmt: skip
+    package = "impact_posture.codegen"
+    languages = {name: environment(package, markdown if name.endswith(".md") else c_comment) for name in names}
+    return {name: languages[name].get_template(f"{template}.jinja") for name, template in names.items()}
+
+
+@cache
+def environment(package: str, escape: Callable[[str], str]) -> Environment:
+    """Return the templates of a package, for one language."""
+
+    def insert(value: object) -> str:
+        return value if isinstance(value, Verbatim) else escape(str(value))
+
+    found = Environment(
+        loader=PackageLoader(package),
+        undefined=StrictUndefined,
+        trim_blocks=True,
+        lstrip_blocks=True,
+        keep_trailing_newline=True,
+        finalize=insert,
+    )
+    filters: dict[str, Callable[..., str]] = {
+        "verbatim": str,
+        "c_comment": c_comment,
+        "numbers": lambda values: ", ".join(f"{v:.9g}" for v in values),
+        "double": lambda value: _plain(DOUBLE, value),
+        "doubles": partial(_initializer, DOUBLE, indent="  "),
+        "places": lambda values: _rows([str(v) for v in values], 20, "  "),
+        "wrapped": lambda words, indent: wrapped(map(escape, words), indent),
+        "lines": lambda parts, between: between.join(map(escape, parts)),
+    }
+    found.filters |= {name: _verbatim(function) for name, function in filters.items()}
+    return found
+
+
+def _verbatim(function: Callable[..., str]) -> Callable[..., Verbatim]:
+    return lambda *arguments: Verbatim(function(*arguments))
+
+
+def wrapped(words: Iterable[str], indent: str) -> str:
+    """Return comma-separated words over several lines of a comment."""
+    lines, line = [], ""
+    *first, last = words
+    for piece in (*[f"{word}," for word in first], last):
+        if line and len(line) + len(piece) + 1 > _WIDTH - len(indent):
+            lines.append(line)
+            line = ""
+        line = f"{line} {piece}" if line else piece
+    return f"\n{indent}".join([*lines, line])
+
+
+def _plain(real: Real, value: float) -> str:
+    """A literal without the parentheses of negative numbers, which an initializer does not need."""
+    return real.literal(float(value)).strip("()")
+
+
+def _initializer(real: Real, values: Sequence[float], indent: str = "") -> str:
+    """A brace initializer with four numbers a line."""
+    return _rows([_plain(real, v) for v in values], 4, indent)
+
+
+def _rows(texts: Sequence[str], count: int, indent: str) -> str:
+    rows = [", ".join(texts[k : k + count]) for k in range(0, len(texts), count)]
+    return "{\n" + ",\n".join(f"{indent}  {row}" for row in rows) + f"\n{indent}}}"
+
+
+def _parameters(real: Real, sizes: Mapping[str, int], function: str) -> str:
+    """C parameters of an exported function."""
+    inputs, results = SIGNATURES[function]
+    parameters = [f"const {real.name} {name}[{sizes[name]}]" for name in inputs]
+    parameters += [
+        f"{real.name} {name}[{sizes[name]}]" if name in sizes else f"{real.name} *{name}" for name in results
+    ]
+    return ", ".join(parameters)
+
+
+# ---- what the templates know --------------------------------------------------------------------------------------
+
+
+def _context(
+    exported: Sequence[NamedObjective], prefix: str, manifest: dict[str, Any], code: Code, real: Real
+) -> dict[str, Any]:
+    single = [v for v in exported if not v.joint]
+    joint = next((v for v in exported if v.joint), None)
+    objectives = [v.objective for v in single if not v.free]
+    objective, metric = objectives[0], objectives[0].metric
+    names = [o.contact.frame for o in objectives]
+    supports = ", ".join(f"{s.frame} ({s.kind})" for s in objective.supports)
+    weights = {"euclidean": "W = I", "kinetic": "W = M", "weighted": f"W diagonal, {metric.source or 'given'}"}
+    units = [part for _, part in unit_parts(objective.robot.model)]
+    tests = [block["self_test"] for f in manifest["frames"] for block in (f, f["free"]) if block is not None]
+    alone = len(objectives) == 1 and joint is None
+    return {
+        "manifest": manifest,
+        "code": code,
+        "version": __version__,
+        "prefix": Verbatim(prefix),
+        "upper": Verbatim(prefix.upper()),
+        "real": real.name,
+        "size": real.size,
+        "suffix": "" if real.name == "double" else "f",
+        "nq": manifest["nq"],
+        "nv": manifest["nv"],
+        "title": f"Impact-robustness metric of {objective.robot.name} at {', '.join(names)}",
+        "frames_text": ("frame " if len(names) == 1 else "frames ") + ", ".join(names),
+        "identity": identity(manifest),
+        "tolerance": f"{self_test_tolerance(objective, real):g}",
+        "metric": f"{metric.kind} ({weights[metric.kind]})",
+        "joint_note": f"; {found['line']}" if (found := manifest["compression"]) and found["line"] else "",
+        "supports": (
+            f"{supports}; M stands for M + Js'Js/c with c = {objective.compliance:.6g} 1/kg"
+            if supports
+            else "none (the free robot)"
+        ),
+        "unit_rule": (
+            f"a quaternion or a cosine-sine pair in q is not of unit norm (to {real.unit_tolerance:g})"
+            if units
+            else "never (this robot's q holds no quaternion and no cosine-sine pair)"
+        ),
+        "units": units,
+        "unit_bounds": [real.literal(float(f"{(1 + sign * real.unit_tolerance) ** 2:.12f}")) for sign in (-1, 1)],
+        "macros": SHORT_NAMES,
+        "parameters": _verbatim(partial(_parameters, real, lengths(manifest["nq"], manifest["nv"]))),
+        "reals": _verbatim(partial(_initializer, real)),
+        "literals": _verbatim(lambda values: ", ".join(map(real.literal, values))),
+        "frames": [_frame(v, test, alone) for v, test in zip(single, tests, strict=True)],
+        "several": None if joint is None else _several(joint, manifest["several"]["self_test"]),
+    }
+
+
+def _frame(v: NamedObjective, test: dict[str, Any], alone: bool) -> dict[str, Any]:
+    objective, stem = v.objective, Verbatim(v.stem)
+    contact, cone = objective.contact, objective.normal_cone_deg
+    return {
+        "stem": stem,
+        "free": v.free,
+        "test": test,
+        "contact": contact,
+        "at": ("" if alone else f" at {contact.frame}") + (", the robot without its supports" if v.free else ""),
+        "stem_note": "" if alone else f": {stem}_...",
+        "cone": f"the worst normal within {cone:g} degrees of" if cone else "the normal",
+        "note": _worst_note(objective),
+        "axes": "world axes" if contact.normal_frame == "world" else f"the axes of contact frame {contact.frame}",
+    }
+
+
+def _worst_note(objective: WorstCaseObjective) -> str:
+    """Say what the objective is the worst of, and which gradient it has where several are as bad."""
+    note = ""
+    if objective.model_variants:
+        note = "; the worst of " + "; ".join(model.name for model in objective.model_variants)
+    if objective.normal_cone_deg or objective.model_variants:
+        note += ".  Where several are as bad, grad is the subgradient at one of them"
+    if objective.kind == "coulomb":
+        note += f", friction {objective.contact.friction:.9g}; {objective.impact_kind.kink}"
+    return note
+
+
+def _several(joint: NamedObjective, test: dict[str, Any]) -> dict[str, Any]:
+    """The objective of several contacts at once."""
+    objective = joint.objective
+    names = [f"({model.name})" for model in objective.model_variants]
+    return {
+        "stem": Verbatim(joint.stem),
+        "test": test,
+        "box": "|impulse| up to" if objective.bilateral else "impulses from 0 to",
+        "contacts": [
+            f"{c.frame} ({', '.join(f'{v:.9g}' for v in c.normal)}) {c.impulse:g} N s" for c in objective.contacts
+        ],
+        "models": ["The worst of the models", *names] if names else [],
+    }

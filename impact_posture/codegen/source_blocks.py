@@ -1,0 +1,168 @@
+"""Data for ``templates/source.c.jinja``: the functions of an export, the blocks that they share, and the batch."""
+
+from __future__ import annotations
+
+from collections.abc import Iterator, Sequence
+from dataclasses import dataclass
+from typing import Any
+
+import casadi as ca
+
+from impact_posture.codegen.block_layout import Layout, lay_out
+from impact_posture.codegen.c_emitter import BlockText, Constants, Emitter, Real
+from impact_posture.codegen.c_names import SIGNATURES, lengths
+from impact_posture.codegen.export_functions import Exported, Library, NamedObjective, library
+from impact_posture.codegen.expression_graph import ARITHMETIC, Graph
+from impact_posture.codegen.sum_order import rebuilt
+from impact_posture.config.cached_values import read_stored, write_stored
+from impact_posture.system.libraries import source_key
+
+LARGEST_VECTOR = 64
+"""Bytes of the widest vectors that the source uses, and of the widest group of narrower vectors in a batch."""
+
+# Blocks have frames of their own (APART), so one of them is on the stack at a time, and a compiler stores no more in
+# it than the variables of the block.  Where a compiler joins functions, the variables of all of them may get places.
+# This covers return addresses, saved registers, alignment and the variables of the small functions.
+_FRAMES = 2048
+# With -march=native a compiler makes vectors of neighboring numbers, and may store a number in several vectors.
+_SPILL = 2
+
+# So few statements of a block of the batch stay in the first cache of the processor from group to group.
+_BATCH_BLOCK = 60
+
+
+@dataclass(frozen=True)
+class Code:
+    """Functions of an export.
+
+    Attributes:
+        portable: Whether the code is plain C99 without vectors.
+        constants: Tables of numbers.
+        blocks: Blocks that the functions share.
+        angles: Index in ``q`` of each angle whose sine and cosine are computed.
+        room: Length of the arrays of sines and cosines.
+        work: C type, name and length of each work array.
+        functions: Each function of one configuration: its ``stem``, ``name``, constant ``normal`` if it has no
+            parameter for one, ``calls`` of blocks, ``outputs`` (target, value, whether it is constant), and
+            ``finite``, the name and length of each result.
+        batches: Each objective: its ``stem``, ``normal``, the literal ``scale`` of its objective over ``H`` (empty if
+            it is no multiple), and the ``blocks``, ``angles``, ``room``, ``work`` and ``outputs`` of its batch on
+            vectors.  Without blocks the batch is a loop.
+        stack_bytes: Upper bound on the stack of a call, without that of the C library.
+    """
+
+    portable: bool
+    constants: str
+    blocks: tuple[BlockText, ...]
+    angles: tuple[int, ...]
+    room: int
+    work: tuple[tuple[str, str, int], ...]
+    functions: tuple[dict[str, Any], ...]
+    batches: tuple[dict[str, Any], ...]
+    stack_bytes: int
+
+
+def build_code(exported: Sequence[NamedObjective], prefix: str, real: Real, *, portable: bool = False) -> Code:
+    """Generate the functions of each objective, or take them from the cache of the user by what they compute.
+
+    Args:
+        exported: The objectives, all of one robot.
+        prefix: Beginning of the names of everything that functions share.
+        real: The C type to compute in.
+        portable: Use no vectors, for compilers that have none.
+    """
+    found = library(exported)
+    models = [
+        (v.stem, v.joint, v.free, v.objective.contact, v.objective.scale, v.objective.is_multiple_of_H)
+        for v in exported
+    ]
+    content = (ca.CasadiMeta.version(), found.constants, found.seeds, found.functions, models, prefix, real, portable)
+    key = source_key([repr(content), found.function.serialize()], "codegen")
+    code = read_stored("code", key, Code)
+    if code is None:
+        code = _generate(exported, found, prefix, real, portable=portable)
+        write_stored("code", key, code)
+    return code
+
+
+def _generate(exported: Sequence[NamedObjective], found: Library, prefix: str, real: Real, *, portable: bool) -> Code:
+    single = [v for v in exported if not v.joint]
+    contacts = {v.stem: v.objective.contact for v in single}
+    robot = single[0].objective.robot
+    scalars = found.graph()
+    # A single call waits for results more than for arithmetic units.  A batch has other lanes to go on with.
+    graph = rebuilt(scalars if portable else found.vector_graph())
+    layout = lay_out(graph, [f.outputs for f in found.functions])
+    constants = Constants(prefix, real)
+    # The names of types stand in thousands of places, so they are short.  The source undefines them at its end.
+    types = {1: real.name, 2: "V2", 4: "V4"}
+    emitter = Emitter(layout, prefix, real, types, constants)
+    angles = _angles(layout)
+    whole = 1 if portable else LARGEST_VECTOR // real.size
+    room = max(1, -(-len(angles) // whole)) * whole
+    functions = []
+    for number, function in enumerate(found.functions):
+        inputs, results = SIGNATURES[function.name]
+        sizes = [len(graph.outputs[output]) for output in function.outputs]
+        blocks = zip(layout.blocks, emitter.blocks, strict=True)
+        functions.append({
+            "stem": function.stem,
+            "name": function.name,
+            # The objective of several contacts at once takes the normal of the leading contact.
+            "normal": None if "n" in inputs else contacts.get(function.stem, single[0].objective.contact).normal,
+            "calls": [text.call for block, text in blocks if number in block.functions],
+            "outputs": [*_outputs(function, emitter, "m.")],
+            "finite": [*zip(results, sizes, strict=True)],
+        })  # fmt: skip
+    numbers = sum(width * count for width, count in layout.sizes.items()) + 3 * room
+    frames = [max(_SPILL * b.local_bytes, b.local_bytes + b.wide_bytes) for b in emitter.blocks]
+    largest = real.size * numbers + max(frames, default=0)
+    batches = []
+    for v in single:
+        scale = real.literal(v.objective.scale) if v.objective.is_multiple_of_H else ""
+        batch = {"stem": v.stem, "normal": v.objective.contact.normal, "scale": scale, "blocks": ()}
+        function = next(f for f in found.functions if (f.stem, f.name) == (v.stem, "eval"))
+        # A batch of the free robot beside one that stands would be another third of the source, so it is a loop.
+        if not portable and not v.free and (lanes := _lanes(function, scalars, real, constants)):
+            held = 2 * lanes["room"] + lanes["work"] + robot.nq + 3 + 2 * (1 + robot.nv)
+            frame = max((block.local_bytes for block in lanes["blocks"]), default=0)
+            largest = max(largest, LARGEST_VECTOR * held + frame)
+            batch |= lanes
+        batches.append(batch)
+    work = [(types[width], f"w{width if width > 1 else ''}", count) for width, count in sorted(layout.sizes.items())]
+    stack_bytes = -(-(largest + _FRAMES) // 64) * 64
+    return Code(
+        portable, constants.text(types), tuple(emitter.blocks), angles, room, tuple(work), tuple(functions),
+        tuple(batches), stack_bytes,
+    )  # fmt: skip
+
+
+def _lanes(function: Exported, scalars: Graph, real: Real, constants: Constants) -> dict[str, Any]:
+    """The batch on vectors of configurations; empty where C has no vector form of an operation."""
+    layout = lay_out(scalars, [function.outputs], _BATCH_BLOCK)
+    computed = {k for block in layout.blocks for k in block.nodes} | layout.inlined
+    if not all(k in layout.trig or scalars.nodes[k].op in ARITHMETIC for k in computed):
+        return {}
+    emitter = Emitter(layout, f"{function.stem}_lanes", real, {1: "VN"}, constants, LARGEST_VECTOR, "work[g]")
+    return {
+        "blocks": emitter.blocks,
+        "angles": _angles(layout),
+        # C has no arrays of length zero.
+        "room": max(1, len(layout.angles)),
+        "work": layout.sizes.get(1, 1),
+        "outputs": [*_outputs(function, emitter, "m->")],
+    }
+
+
+def _angles(layout: Layout) -> tuple[int, ...]:
+    """Index in ``q`` of each angle."""
+    return tuple(layout.graph.nodes[k].args[1] for k in layout.angles)
+
+
+def _outputs(function: Exported, emitter: Emitter, work: str) -> Iterator[dict[str, Any]]:
+    """The assignments of a function's results, from the work arrays of the structure ``work``."""
+    graph, arrays = emitter.layout.graph, lengths(0, 0)
+    for name, output in zip(SIGNATURES[function.name][1], function.outputs, strict=True):
+        for k, node in enumerate(graph.outputs[output]):
+            target, value = f"{name}[{k}]" if name in arrays else f"*{name}", emitter.output(node, work)
+            yield {"target": target, "value": value, "constant": graph.nodes[node].op == "const"}

@@ -1,0 +1,100 @@
+"""Rebuild sums so that they add first the terms that are ready first, and wait for their last term only."""
+
+from __future__ import annotations
+
+from collections import Counter
+from collections.abc import Callable
+
+from impact_posture.codegen.expression_graph import Graph, Node
+
+# Approximate cycles until a result can be used, on current processors; and those of a sine or cosine.
+_LATENCY = {"+": 4, "-": 4, "*": 4, "inv": 15, "neg": 1, "lane": 2, "const": 0, "in": 0, "gather": 1}
+_TRIG = 40
+# A pair that is added apart costs an addition that no product can absorb.  It must save so many cycles.
+_WORTH = 8
+
+
+def rebuilt(graph: Graph) -> Graph:
+    """Return the same computation with every sum in the order in which its terms become ready."""
+    found = Graph(graph.inputs)
+    ready: list[int] = []
+    made: dict[int, int] = {}
+    inner = _inner(graph)
+
+    def add(node: Node) -> int:
+        k = found.add(node)
+        while len(ready) < len(found.nodes):
+            new = found.nodes[len(ready)]
+            ready.append(max((ready[a] for a in new.operands), default=0) + _LATENCY.get(new.op, _TRIG))
+        return k
+
+    for k, node in enumerate(graph.nodes):
+        if k in inner:
+            continue
+        if node.op in ("+", "-"):
+            terms = [(sign, made[t]) for sign, t in _terms(graph, k, inner)]
+            made[k] = _sum(found, add, ready, terms)
+        else:
+            operands = tuple(made[a] for a in node.operands)
+            args = (operands[0], node.args[1]) if node.op == "lane" else operands if operands else node.args
+            made[k] = add(Node(node.op, args, node.width, node.value))
+    found.outputs = {name: [made[k] for k in nodes] for name, nodes in graph.outputs.items()}
+    return found
+
+
+def _inner(graph: Graph) -> set[int]:
+    """Return the sums whose only use is as a term of one other sum of their width."""
+    users: dict[int, set[int]] = {}
+    times: Counter[int] = Counter()
+    for k, node in enumerate(graph.nodes):
+        for a in node.operands:
+            users.setdefault(a, set()).add(k)
+            times[a] += 1
+    for nodes in graph.outputs.values():
+        times.update(nodes)
+    return {
+        k
+        for k, node in enumerate(graph.nodes)
+        if node.op in ("+", "-")
+        and times[k] == 1
+        and k in users
+        and all(graph.nodes[u].op in ("+", "-") and graph.nodes[u].width == node.width for u in users[k])
+    }
+
+
+def _terms(graph: Graph, root: int, inner: set[int]) -> list[tuple[int, int]]:
+    """Return sign and node of each term of a sum."""
+    terms: list[tuple[int, int]] = []
+    waiting = [(1, root)]
+    while waiting:
+        sign, k = waiting.pop()
+        node = graph.nodes[k]
+        if k == root or k in inner:
+            second = sign if node.op == "+" else -sign
+            waiting += [(second, node.args[1]), (sign, node.args[0])]
+        else:
+            terms.append((sign, k))
+    return terms
+
+
+def _sum(found: Graph, add: Callable[[Node], int], ready: list[int], terms: list[tuple[int, int]]) -> int:
+    """Return the sum of signed nodes, the latest last."""
+    queue = sorted(terms, key=lambda term: (ready[term[1]], term[1]))
+
+    def plus(one: tuple[int, int], other: tuple[int, int]) -> tuple[int, int]:
+        # A single number that all lanes add stays single until a vector joins it.
+        width = max(found.nodes[one[1]].width, found.nodes[other[1]].width)
+        if one[0] == other[0]:
+            return one[0], add(Node("+", (one[1], other[1]), width))
+        positive, negative = (one, other) if one[0] > 0 else (other, one)
+        return 1, add(Node("-", (positive[1], negative[1]), width))
+
+    total = queue.pop(0)
+    while queue:
+        term = queue.pop(0)
+        if queue and ready[total[1]] >= ready[queue[0][1]] + _WORTH:
+            # Two terms wait while the sum is on its way.
+            other = queue.pop(0)
+            term = plus(term, other)
+        total = plus(total, term)
+    return total[1] if total[0] > 0 else add(Node("neg", (total[1],), found.nodes[total[1]].width))

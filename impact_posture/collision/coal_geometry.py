@@ -1,0 +1,113 @@
+"""The shapes of a robot as Pinocchio and coal take them."""
+
+from __future__ import annotations
+
+import hashlib
+from typing import Any, NamedTuple
+
+import coal
+import numpy as np
+import pinocchio as pin
+from numpy.typing import NDArray
+
+from impact_posture.collision.shape_corners import Corrected, shape_points
+from impact_posture.collision.shape_pairs import disabled_links, pairs_apart
+from impact_posture.collision.urdf_shapes import UnusableShape, UrdfShape, largest_extent, left_out
+from impact_posture.errors import one_line
+from impact_posture.robot.robot import Robot
+from impact_posture.system.arrays import Array
+from impact_posture.system.libraries import source_key
+
+# Turns the y axis of a mesh up.
+_UPRIGHT = pin.SE3(pin.rpy.rpyToMatrix(np.pi / 2, 0.0, 0.0), np.zeros(3))
+
+
+class Geometry(NamedTuple):
+    """The shapes of a robot.
+
+    Attributes:
+        model: The shapes at their joints, without pairs.
+        links: Link of each shape.
+        apart: Whether two shapes have to keep apart by the joints and the SRDF, shape (n, n).
+        warnings: Shapes left out, one line each.
+    """
+
+    model: pin.GeometryModel
+    links: tuple[str, ...]
+    apart: NDArray[np.bool_]
+    warnings: tuple[str, ...]
+
+
+def load_geometry(robot: Robot, described: list[UrdfShape]) -> Geometry:
+    """Load the shapes that a URDF describes; a mesh that cannot be used is left out with a warning."""
+    model, largest = robot.model, largest_extent(robot)
+    kept, solids, warnings = [], [], []
+    # Limbs share meshes, and loading one may take a tenth of a second.
+    loaded: dict[object, Corrected] = {}
+    for shape in described:
+        try:
+            key = (shape.kind, shape.sizes, shape.mesh)
+            if key not in loaded:
+                loaded[key] = shape.load(largest)
+            solids.append(loaded[key].mesh)
+            kept.append(shape)
+            if not loaded[key].exact:
+                why = f"the parts of {shape.mesh} cannot be told apart; export it as one part"
+                warnings.append(one_line(f"shape {shape.name} is its convex hull: {why}"))
+        except UnusableShape as fault:
+            warnings.append(left_out(shape.name, fault))
+    objects = _placed(model, kept, solids, turned=False)
+    if any(shape.y_up for shape in kept):
+        turned = _placed(model, kept, solids, turned=True)
+        if _gaps(model, turned) < _gaps(model, objects) / 2:
+            objects = turned
+            warnings.append("meshes with y up are turned to z up, because only then do the links reach their joints")
+    geometry = pin.GeometryModel()
+    for solid in objects:
+        geometry.addGeometryObject(solid)
+    links = tuple(shape.link for shape in kept)
+    apart = pairs_apart(model, [int(solid.parentJoint) for solid in objects], links, disabled_links(robot))
+    return Geometry(geometry, links, apart, tuple(warnings))
+
+
+def _placed(
+    model: pin.Model, shapes: list[UrdfShape], solids: list[Any], *, turned: bool
+) -> list[pin.GeometryObject]:
+    """Return the shapes at their joints; ``turned`` obeys the files that say that y is up.
+
+    ROS ignores what COLLADA files say about it, so most URDFs are written for meshes as they are.
+    """
+    found = []
+    for shape, solid in zip(shapes, solids, strict=True):
+        index = model.getFrameId(shape.link, pin.FrameType.BODY)
+        frame = model.frames[index]
+        placement = frame.placement * shape.placement * (_UPRIGHT if turned and shape.y_up else pin.SE3.Identity())
+        found.append(pin.GeometryObject(shape.name, frame.parentJoint, index, placement, solid))
+    return found
+
+
+def _gaps(model: pin.Model, objects: list[pin.GeometryObject]) -> float:
+    """Return the sum of the distances between joints and the boxes around the shapes of the links before them, m."""
+    boxes: dict[int, list[Array]] = {}
+    for solid in objects:
+        points = shape_points(solid.geometry) @ solid.placement.rotation.T + solid.placement.translation
+        boxes.setdefault(int(solid.parentJoint), []).append(np.array([points.min(axis=0), points.max(axis=0)]))
+    total = 0.0
+    for parent, placement in zip(model.parents, model.jointPlacements, strict=True):
+        point = np.array(placement.translation)
+        total += min(
+            (float(np.linalg.norm(point - np.clip(point, *box))) for box in boxes.get(int(parent), [])), default=0
+        )
+    return total
+
+
+def geometry_key(robot: Robot, described: list[UrdfShape]) -> str:
+    """Return a hash of everything that shapes the swept hulls of a robot and their pairs."""
+    content = [coal.__version__, robot.kinematics_sha256]
+    for shape in described:
+        content.append(repr((shape.name, shape.link, shape.kind, shape.sizes, shape.placement.homogeneous.tolist())))
+        if shape.mesh is not None:
+            with shape.mesh.open("rb") as file:
+                content.append(hashlib.file_digest(file, "sha256").hexdigest())
+    content += sorted(" ".join(sorted(pair)) for pair in disabled_links(robot))
+    return source_key(content, "collision")

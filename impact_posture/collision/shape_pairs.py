@@ -1,0 +1,137 @@
+"""Pairs of shapes that have to keep apart, and those that touch at the postures sampled."""
+
+from __future__ import annotations
+
+import xml.etree.ElementTree as ET
+from collections.abc import Callable, Iterator, Sequence
+
+import coal
+import numpy as np
+import pinocchio as pin
+from numpy.typing import NDArray
+
+from impact_posture.collision.swept_hull import SweptHull, separation, transform
+from impact_posture.errors import UrdfError
+from impact_posture.robot.robot import Robot
+from impact_posture.robot.robot_loader import locate, srdf_path
+from impact_posture.system.arrays import Array
+
+# Random postures at which shapes are tried, and hulls, of which far more pairs touch.
+_POSTURES = 1000
+_COUNTED = 100
+_SEED = 0
+
+Pair = tuple[int, int]
+
+
+def pairs_apart(
+    model: pin.Model, joints: Sequence[int], links: Sequence[str], disabled: set[frozenset[str]]
+) -> NDArray[np.bool_]:
+    """Return whether two shapes have to keep apart, shape (n, n).
+
+    Shapes that move with one joint or with two joints in a row do not, nor do links that the SRDF allows to touch.
+
+    Args:
+        model: The model.
+        joints: The joint of each shape, n indices.
+        links: The link of each shape, n names.
+        disabled: Pairs of links that the SRDF allows to touch.
+    """
+    joint = np.array(joints, dtype=int)
+    parent = np.array(model.parents, dtype=int)[joint]
+    apart = (joint[:, None] != joint) & (parent[:, None] != joint) & (joint[:, None] != parent)
+    allowed = np.array([[frozenset((a, b)) in disabled for b in links] for a in links], dtype=bool)
+    return np.asarray(apart & ~allowed.reshape(apart.shape))
+
+
+def pairs_of(apart: NDArray[np.bool_]) -> list[Pair]:
+    """Return the pairs that have to keep apart, the smaller index first."""
+    return [(int(i), int(j)) for i, j in np.argwhere(np.triu(apart))]
+
+
+def mostly_touching(robot: Robot, shapes: Sequence[pin.GeometryObject], pairs: list[Pair]) -> list[Pair]:
+    """Return the pairs of shapes that touch at the default posture and at most of 1,000 random ones.
+
+    Such shapes overlap by design, as the covers of a wrist.
+    """
+    data, touch = robot.model.createData(), touch_of(shapes)
+    pin.forwardKinematics(robot.model, data, robot.posture())
+    count = {pair: 0 for pair in pairs if touch(pair, data)}
+    for q in random_postures(robot, _POSTURES) if count else ():
+        pin.forwardKinematics(robot.model, data, q)
+        for pair in count:
+            count[pair] += touch(pair, data)
+    return [pair for pair, touched in count.items() if touched > _POSTURES / 2]
+
+
+def hindered(
+    robot: Robot,
+    bodies: Sequence[SweptHull],
+    pairs: list[Pair],
+    touch: Callable[[Pair, pin.Data], bool],
+) -> list[Pair]:
+    """Return the pairs of bodies whose hulls touch at most of the postures at which their shapes do not.
+
+    Such bodies lie in each other's hollows, as a shaft in its fork.  To keep their hulls apart would forbid most of
+    the postures that the robot has.
+
+    Args:
+        robot: The robot.
+        bodies: The swept hulls.
+        pairs: The pairs to try.
+        touch: Whether shapes of two bodies touch at the placements in the data.
+    """
+    data = robot.model.createData()
+    apart, forbidden = np.zeros((2, len(pairs)), dtype=int)
+    first, second = np.array(pairs, dtype=int).reshape(-1, 2).T
+    reach = np.array([body.reach for body in bodies])
+    for q in [robot.posture(), *random_postures(robot, _COUNTED)]:
+        pin.forwardKinematics(robot.model, data, q)
+        center = np.array([data.oMi[body.joint].act(body.center) for body in bodies]).reshape(-1, 3)
+        far = np.linalg.norm(center[first] - center[second], axis=1) > reach[first] + reach[second]
+        apart += far
+        for k in np.flatnonzero(~far):
+            a, b = (bodies[i] for i in pairs[k])
+            if separation(a, data.oMi[a.joint], b, data.oMi[b.joint]).distance > 0:
+                apart[k] += 1
+            elif not touch(pairs[k], data):
+                forbidden[k] += 1
+    return [pair for pair, more, less in zip(pairs, forbidden, apart, strict=True) if more >= less]
+
+
+def touch_of(shapes: Sequence[pin.GeometryObject]) -> Callable[[Pair, pin.Data], bool]:
+    """Return the function that tells whether two shapes touch at the placements in the data."""
+
+    def touch(pair: Pair, data: pin.Data) -> bool:
+        a, b = (shapes[k] for k in pair)
+        at_a, at_b = (transform(data.oMi[shape.parentJoint] * shape.placement) for shape in (a, b))
+        return bool(coal.collide(a.geometry, at_a, b.geometry, at_b, coal.CollisionRequest(), coal.CollisionResult()))
+
+    return touch
+
+
+def random_postures(robot: Robot, count: int) -> Iterator[Array]:
+    """Yield random postures within the limits; a joint without limits turns by up to half a turn."""
+    model, random, start = robot.model, np.random.default_rng(_SEED), robot.posture()
+    low = np.maximum(model.lowerPositionLimit, start - np.pi)
+    high = np.minimum(model.upperPositionLimit, start + np.pi)
+    bounded = [model.idx_qs[i] for i in range(1, model.njoints) if model.nqs[i] == model.nvs[i] == 1]
+    for _ in range(count):
+        q = np.array(pin.integrate(model, start, random.uniform(-np.pi, np.pi, model.nv)))
+        q[bounded] = random.uniform(np.minimum(low, high), high)[bounded]
+        yield q
+
+
+def disabled_links(robot: Robot) -> set[frozenset[str]]:
+    """Return the pairs of links that the SRDF allows to touch."""
+    if robot.settings is None:
+        return set()
+    located = locate(robot.settings.robot, robot.settings)
+    path = srdf_path(located.spec, robot.settings, located.folder)
+    if path is None:
+        return set()
+    try:
+        tags = ET.parse(path).getroot().iter("disable_collisions")
+    except (OSError, ET.ParseError) as error:
+        raise UrdfError(f"is no SRDF ({error})", where=str(path), hint="correct the SRDF") from None
+    return {frozenset((tag.get("link1", ""), tag.get("link2", ""))) for tag in tags}

@@ -1,0 +1,65 @@
+"""Values in the cache of the user.  One that is damaged, or that another user may write, is not used."""
+
+from __future__ import annotations
+
+import hashlib
+from base64 import b64decode, b64encode
+from collections.abc import Hashable
+from contextlib import suppress
+from pathlib import Path
+from typing import Annotated, Any, TypeVar
+
+import numpy as np
+from numpy.typing import NDArray
+from pydantic import PlainSerializer, PlainValidator
+
+from impact_posture.config.toml_tables import adapter
+from impact_posture.errors import OutputError
+from impact_posture.system.libraries import cache_folder, check_private
+from impact_posture.system.output_folder import write_whole
+
+_Value = TypeVar("_Value", bound=Hashable)
+
+# The longest text that is read, bytes.  The longest one of the catalogue needs a third of it.
+_LONGEST = 10_000_000
+
+
+def _packed(array: NDArray[Any]) -> tuple[str, tuple[int, ...], str]:
+    return array.dtype.str, array.shape, b64encode(np.ascontiguousarray(array).tobytes()).decode("ascii")
+
+
+def _unpacked(stored: tuple[str, tuple[int, ...], str]) -> NDArray[Any]:
+    kind, shape, text = stored
+    return np.frombuffer(b64decode(text), kind).reshape(shape).copy()
+
+
+StoredArray = Annotated[NDArray[Any], PlainValidator(_unpacked), PlainSerializer(_packed)]
+"""Annotation of an array in a dataclass that is stored."""
+
+
+def read_stored(kind: str, key: str, cls: type[_Value]) -> _Value | None:
+    """Return the dataclass of a kind and key; ``None`` where no file can be used."""
+    with suppress(OSError, OutputError, TypeError, ValueError):
+        path = _path(kind, key)
+        check_private(path)
+        if path.stat().st_size <= _LONGEST:
+            seal, text = path.read_text(encoding="utf-8").split("\n", 1)
+            if seal == _seal(text):
+                value: _Value = adapter(cls).validate_json(text)
+                return value
+    return None
+
+
+def write_stored(kind: str, key: str, value: Hashable) -> None:
+    """Store a dataclass by kind and key, if the cache can be written."""
+    text = adapter(type(value)).dump_json(value).decode()
+    with suppress(OSError, OutputError):
+        write_whole(_path(kind, key), f"{_seal(text)}\n{text}")
+
+
+def _path(kind: str, key: str) -> Path:
+    return cache_folder(kind) / f"{key}.json"
+
+
+def _seal(text: str) -> str:
+    return hashlib.sha256(text.encode()).hexdigest()

@@ -1,0 +1,287 @@
+"""Settings of a problem, described once for the command line, ``problem.toml`` and Python.
+
+A setting is a field of :class:`RobotSettings`, :class:`ImpactSettings` or :class:`ProblemSettings`.  It carries its
+type, allowed values, meaning and spelling as an option.  The command line makes its options from these fields,
+``problem.toml`` its keys, and Python its keyword arguments.
+
+Nothing heavy is imported here, because ``--help`` reads this module.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Mapping
+from dataclasses import dataclass, field
+from typing import Any, ClassVar, Literal, get_args
+
+from impact_posture.config import demands as demand
+from impact_posture.config.demands import CONTACT, METRIC, ROBOT, SEARCH, TASK, setting, with_demands
+from impact_posture.config.obstacle import Obstacle
+from impact_posture.config.option_values import parse_armature, parse_number_or_name, parse_payloads
+from impact_posture.config.toml_tables import STRICT
+
+Vector3 = tuple[float, float, float]
+Root = Literal["free-flyer", "fixed"]
+NormalFrame = Literal["world", "contact"]
+MetricKind = Literal["euclidean", "kinetic", "weighted"]
+ObjectiveKind = Literal["impulse", "speed", "sticking", "coulomb", "energy"]
+ObjectiveChoice = Literal[ObjectiveKind, "auto"]
+ContactPose = Literal["full", "position", "aligned", "free", "box"]
+BaseMode = Literal["free", "level", "fixed", "box"]
+SupportKind = Literal["point", "surface"]
+Against = Literal["distance", "force"]
+Search = Literal["multistart", "global"]
+JointModel = Literal["reflected", "link", "locked", "elastic"]
+TransmissionKind = Literal["rigid", "elastic", "locked"]
+
+# Young's modulus (Pa) and Poisson's ratio of what a contact may touch: the middle of the ranges in J. M. Gere,
+# Mechanics of Materials, 5th ed. (steel; oak in bending; concrete).  The rubber is stiff (0.01 to 0.1 GPa); Gere has
+# 0.0007 to 0.004 GPa.
+MATERIALS = {"steel": (200e9, 0.28), "wood": (11.5e9, 0.3), "rubber": (0.03e9, 0.48), "ground": (24e9, 0.15)}
+
+# Least distance (m) of links that stay apart, and edge length (m) of a surface that ends before the robot's stand.
+CLEARANCE, PATCH = 0.001, 0.3
+# Coulomb coefficient of an ordinary surface.
+FRICTION = 0.7
+# Number of distances of --tradeoff without a number.
+TRADEOFF_POINTS = 16
+
+
+@dataclass(frozen=True, kw_only=True)
+@with_demands
+class LoadOptions:
+    """Options of loading a robot; the ``robot.toml`` provides a value for ``None``.
+
+    Attributes:
+        lock: Joints made rigid at the default posture: names, or patterns such as ``gripper_*``.
+        lock_massless: Whether all joints that move no mass are also made rigid.
+        root: ``free-flyer`` puts the robot on a floating base, ``fixed`` welds it to the world.
+        armature: ``"none"``, path of a TOML file, or values by joint, kg·m² (kg if prismatic).  ``None`` takes
+            the values of robot.toml, else the rotor data of the SRDF, else zero.
+        config: Path of a robot.toml that replaces the one beside the URDF.
+        srdf: SRDF: a path, or ``example-robot-data:<path below robots/>``.
+        package_dir: Folders of ``package://`` paths.  Dynamics need none, but pictures may.
+        mounting: Displacement of joints from their place in the URDF, by joint, meters, in the parent joint's axes.
+    """
+
+    __pydantic_config__: ClassVar[dict[str, Any]] = STRICT
+
+    lock: tuple[str, ...] = setting(
+        (), "Make a joint rigid, or all that fit a pattern such as 'gripper_*' (in quotes); repeatable.", ROBOT,
+        "JOINT", repeatable=True,
+    )  # fmt: skip
+    lock_massless: bool = setting(False, "Make all joints that move no mass rigid.", ROBOT)
+    root: Root | None = setting(None, "Joint between the world and the base.", ROBOT, words="robot.toml's")
+    armature: str | Mapping[str, float] | None = setting(
+        None, "Rotor inertia at the joint, kg·m²; JOINT=VALUE is repeatable.", ROBOT, "none|FILE|JOINT=VALUE",
+        "robot.toml's, else the SRDF's", parse=parse_armature, repeatable=True,
+    )  # fmt: skip
+    config: str | None = setting(
+        None, "File of data that the URDF cannot hold.", ROBOT, "ROBOT.TOML", "beside the URDF"
+    )
+    srdf: str | None = setting(
+        None, "Named postures and rotor data: a path, or example-robot-data:PATH.", ROBOT, "FILE", "robot.toml's"
+    )
+    package_dir: tuple[str, ...] = setting(
+        (), "Folder of package:// paths; repeatable.", ROBOT, "DIR", repeatable=True
+    )
+    mounting: Mapping[str, Vector3] = field(default_factory=dict)
+
+
+@dataclass(frozen=True, kw_only=True)
+class RobotSettings(LoadOptions):
+    """The robot, and the options of loading it.
+
+    Attributes:
+        robot: Known name, path to a ``.urdf``, or ``example-robot-data:<path>``.
+    """
+
+    robot: str
+
+
+@dataclass(frozen=True, kw_only=True)
+@with_demands
+class ImpactSettings(RobotSettings):
+    """An impact of a robot; the robot provides a value for ``None``."""
+
+    frame: str | None = setting(None, "Contact frame.", CONTACT, "F", "the robot's")
+    normal: Vector3 | None = setting(
+        None, "Direction out of the surface, towards the robot, of any length. Required unless --contact is given.",
+        CONTACT, "X Y Z", **demand.DIRECTION,
+    )  # fmt: skip
+    offset: Vector3 | None = setting(
+        None, "Contact point from the frame's origin, in the frame, m.", CONTACT, "X Y Z", "0 0 0", **demand.NUMBERS
+    )
+    normal_frame: NormalFrame = setting("world", "Axes in which the normal is given.", CONTACT)
+    contact: str | tuple[str, ...] | None = setting(
+        None, "Contact, in place of --frame and --normal; repeatable for up to 6 contacts at once.", CONTACT,
+        "FRAME:NX,NY,NZ[:IMPULSE]", **demand.CONTACTS, repeatable=True,
+    )  # fmt: skip
+    bilateral: bool = setting(False, "Contacts can also pull, as in a grasp.", CONTACT)
+    impulse: float = setting(1.0, "Bound on the impulse, N·s.", CONTACT, **demand.ABOVE_ZERO)
+    speed: float = setting(1.0, "Approach speed, m/s.", CONTACT, **demand.ZERO_OR_MORE)
+    restitution: float = setting(
+        0.0, "Coefficient of restitution, 0 (plastic) to 1 (elastic).", CONTACT, **demand.SHARE
+    )
+    contact_stiffness: str | float | None = setting(
+        None, f"Stiffness of the contact, or the material that a steel tip touches: {', '.join(MATERIALS)}.",
+        CONTACT, "N/M|MATERIAL", "not known", parse=parse_number_or_name,
+        **demand.between(1.0, 1e12, "N/m", tuple(MATERIALS)),
+    )  # fmt: skip
+    contact_duration: float | None = setting(
+        None, "Time from touch to greatest compression, s.", CONTACT, words="not known",
+        **demand.between(1e-7, 100.0, "s"),
+    )  # fmt: skip
+    friction: float = setting(
+        FRICTION, "Friction coefficient at the impact and at the feet.", CONTACT, **demand.ZERO_OR_MORE
+    )
+    metric: MetricKind = setting(
+        "euclidean", "Norm of the velocity jump: euclidean, kinetic or weighted.", METRIC, "KIND"
+    )
+    weights: str | tuple[float, ...] | None = setting(
+        None, "Weights of the weighted metric: TOML of joint = weight, or 1/limit².", METRIC, "FILE|velocity-limits"
+    )
+    objective: ObjectiveChoice = setting(
+        "impulse",
+        "impulse (jump per impulse, H), speed (jump per approach speed without friction, V), sticking (without "
+        "slip, S), coulomb (with --friction: sticks or slips, C), energy (E), or auto (by speed and friction).",
+        METRIC, "KIND",
+    )  # fmt: skip
+    joint_model: JointModel = setting(
+        "reflected",
+        "Inertia at the joints: reflected (links and rotors), link (without the rotors behind elastic "
+        "transmissions), locked (rigid joints) or elastic (rotors on springs; evaluate only).",
+        METRIC, "KIND",
+    )  # fmt: skip
+    normal_cone: float = setting(
+        0.0, "Half angle of the cone of normals that are possible; the worst normal counts.", METRIC, "DEG",
+        **demand.HALF_ANGLE,
+    )  # fmt: skip
+    armature_range: tuple[float, float] | None = setting(
+        None, "Lowest and highest factor on the armature that are possible; the worst case counts.", METRIC,
+        "LOW HIGH", "as stated", **demand.FACTORS,
+    )  # fmt: skip
+    payload: tuple[tuple[str, float], ...] = setting(
+        (), "Mass in kg that the robot may carry at the frame; repeatable; the worst case counts.", METRIC,
+        "FRAME MASS", parse=parse_payloads, repeatable=True, **demand.MASSES,
+    )  # fmt: skip
+    posture: str | None = setting(
+        None, "Named posture, posture.json, or a JointState as .yaml.", ROBOT, "NAME|FILE", "the robot's"
+    )
+    support: tuple[str, ...] | None = setting(
+        None, "Foot that stays on the ground; repeatable.", ROBOT, "FRAME[:point|surface]", "the robot's",
+        repeatable=True,
+    )  # fmt: skip
+    support_compliance: float | None = None
+
+
+@dataclass(frozen=True, kw_only=True)
+@with_demands
+class ProblemSettings(ImpactSettings):
+    """Content of a ``problem.toml``; the robot or the default of the option provides a value for ``None``."""
+
+    schema: Literal["impact-posture/problem/1"] = "impact-posture/problem/1"
+    q: tuple[float, ...] | None = None
+    target_position: Vector3 | None = setting(
+        None, "Contact frame's position, world, m.", TASK, "X Y Z", "where it is", **demand.NUMBERS
+    )
+    target_quaternion: tuple[float, float, float, float] | None = setting(
+        None, "Contact frame's orientation, scalar last.", TASK, "X Y Z W", "as it is", **demand.UNIT
+    )
+    contact_pose: str | None = setting(
+        None,
+        "Constraint on the contact frame: full, position, aligned (spin free), aligned:DEG (and tilted by up to "
+        "DEG), free or box.",
+        TASK, "KIND", "robot.toml's, else full", **demand.kind_or_tilt(get_args(ContactPose), "aligned"),
+    )  # fmt: skip
+    box: Vector3 = setting(
+        (0.05, 0.05, 0.05), "Half extents of --contact-pose box, m.", TASK, "X Y Z", **demand.LENGTHS
+    )
+    keep: tuple[str, ...] = setting((), "Hold the pose of another frame; repeatable.", TASK, "FRAME", repeatable=True)
+    hold: tuple[str, ...] | None = setting(
+        None, "Keep a joint at its value, in place of robot.toml's; repeatable.", TASK, "JOINT", "robot.toml's",
+        repeatable=True,
+    )  # fmt: skip
+    base: str | None = setting(
+        None,
+        "Constraint on a floating base: free, level (yaw free), level:DEG (and tilted by up to DEG), fixed or "
+        "box.",
+        TASK, "KIND", "robot.toml's, else free", **demand.kind_or_tilt(get_args(BaseMode), "level"),
+    )  # fmt: skip
+    base_box: Vector3 = setting((0.2, 0.2, 0.2), "Half extents of --base box, m.", TASK, "X Y Z", **demand.LENGTHS)
+    com: bool | None = setting(
+        None, "Keep the center of mass above the feet.", TASK, words="robot.toml's", option="--com/--no-com"
+    )
+    com_margin: float | None = setting(
+        None, "Distance of the center of mass from the support polygon's edges, m.", TASK, words="robot.toml's",
+        **demand.ZERO_OR_MORE,
+    )  # fmt: skip
+    keep_contacts: bool = setting(False, "The impact must neither lift nor slide a foot.", TASK)
+    holdable: bool = setting(
+        True,
+        "Keep joint torques, rotor thrusts and forces of the feet within their limits at rest, where the robot's "
+        "data say them.",
+        TASK, option="--holdable/--no-holdable",
+    )  # fmt: skip
+    approach: bool = setting(
+        False, "The joints can bring the contact to the surface at --speed within their velocity limits.", TASK
+    )
+    hold_force: float = setting(
+        0.0, "Force along the normal that the robot also has to hold after the impact, N.", TASK, "N",
+        **demand.between(0.0, 1e6, "N"),
+    )  # fmt: skip
+    max_force: float | None = setting(
+        None, "Largest allowed peak force, N, without friction; needs --contact-stiffness or --contact-duration.",
+        TASK, words="no bound", **demand.between(1e-6, 1e9, "N"),
+    )  # fmt: skip
+    max_joint_jump: float | None = setting(
+        None, "Largest allowed velocity jump of a joint without friction, rad/s or m/s.", TASK, words="no bound",
+        **demand.between(1e-6, 1e9, "rad/s or m/s"),
+    )  # fmt: skip
+    max_torque: float | None = setting(
+        None, "Largest torque with which the controller may answer the jump, N·m; needs --velocity-gain.", TASK,
+        words="no bound", **demand.between(1e-6, 1e9, "N·m"),
+    )  # fmt: skip
+    velocity_gain: float | None = setting(
+        None, "Gain K_d of the controller for --max-torque, N·m·s/rad.", TASK, words="not known",
+        **demand.between(1e-6, 1e9, "N·m·s/rad"),
+    )  # fmt: skip
+    collision: bool = setting(
+        True, "Keep the links clear of each other, the surface, the ground and obstacles.", TASK,
+        option="--collision/--no-collision",
+    )  # fmt: skip
+    clearance: float = setting(
+        CLEARANCE, "Least distance of links that stay apart, m.", TASK, **demand.between(1e-4, 1.0, "m")
+    )
+    surface: str | float | None = setting(
+        None, "Surface at the contact: an endless plane, none, or a square of this edge length, m.", TASK,
+        "plane|none|M", f"the plane, or {PATCH:g} where the robot stands behind it", parse=parse_number_or_name,
+        **demand.between(1e-3, 1e3, "m", ("plane", "none")),
+    )  # fmt: skip
+    obstacles: tuple[Obstacle, ...] = ()
+    limit_margin: float | None = setting(
+        None, "Distance from the joint limits, rad or m.", TASK, words="robot.toml's", **demand.ZERO_OR_MORE
+    )
+    regularization: float = setting(0.0, "Weight of the distance from the start.", TASK, **demand.ZERO_OR_MORE)
+    tradeoff: int = setting(
+        0,
+        "Also find the best posture within each of K distances from the start, which shows what a smaller change "
+        f"gains; {TRADEOFF_POINTS} distances without K, none for 0.",
+        TASK, "[K]", **demand.ZERO_OR_MORE,
+    )  # fmt: skip
+    tradeoff_against: Against = setting(
+        "distance", "What --tradeoff bounds: the distance from the start, or the peak force of the impact.", TASK,
+        "WHAT",
+    )  # fmt: skip
+    path: bool = setting(
+        False, "Also find and time a path from the start to the optimum on which all constraints hold.", TASK
+    )
+    search: Search = setting(
+        "multistart",
+        "multistart, or global: maps self-motions of 1 or 2 degrees of freedom, else hops from the best optimum.",
+        SEARCH, "HOW",
+    )  # fmt: skip
+    starts: int = setting(16, "Number of starting points of the search.", SEARCH, **demand.ONE_OR_MORE)
+    finish_all: bool = setting(
+        False, "Finish starts of large programs that can no longer be the best: lists all optima.", SEARCH
+    )
+    seed: int = setting(0, "Seed of the random starts.", SEARCH, **demand.ZERO_OR_MORE)

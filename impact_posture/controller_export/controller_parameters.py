@@ -1,0 +1,132 @@
+"""Run-time parameters of an exported controller: their places in the C structure, rules, and values in Python."""
+
+from __future__ import annotations
+
+from collections.abc import Iterator
+from typing import Literal, NamedTuple
+
+import numpy as np
+from numpy.typing import ArrayLike
+
+from impact_posture.controller_export.controller_structure import Structure
+from impact_posture.system.arrays import Array
+from impact_posture.tsid.joint_ranges import JointRanges
+from impact_posture.tsid.limits.acceleration_bounds import LimitLaw
+from impact_posture.tsid.tasks.frame_tasks import FrameTask
+
+Rule = Literal["finite", "nonnegative", "positive", "limit", "amount", "share"]
+# Numbers of the rules in C: 1 finite, 2 not negative, 4 not zero, 8 at most one.
+RULES: dict[Rule, int] = {"finite": 1, "nonnegative": 3, "positive": 6, "limit": 0, "amount": 7, "share": 14}
+
+
+class Field(NamedTuple):
+    """Parameter of a controller.
+
+    Attributes:
+        name: Name in the C structure.
+        rule: What ``init`` accepts; ``limit`` and ``positive`` may be infinite, and a ``share`` is at most 1.
+        text: Meaning, with the unit.
+        value: Value in the exported formulation, flat.
+    """
+
+    name: str
+    rule: Rule
+    text: str
+    value: Array
+
+
+def parameters(s: Structure, period: float) -> Iterator[Field]:
+    """Yield the parameters of a formulation with their values, in the order of the C structure.
+
+    Args:
+        s: Structure of the formulation.
+        period: Expected time between ticks, s.
+    """
+    formulation, actuators, ranges = s.formulation, s.actuators, JointRanges(s.robot)
+    posture, robust, contacts = formulation.posture, s.robust, formulation.contacts
+    law = formulation.law or LimitLaw()
+    nv = s.robot.nv
+
+    def field(name: str, rule: Rule, text: str, value: ArrayLike) -> Field:
+        values = np.array(value, dtype=float).ravel()
+        # C has no arrays of length zero.
+        return Field(name, rule, text, values if values.size else np.ones(1))
+
+    yield field("period", "positive", "expected time between ticks, s", period)
+    for name, text in (("kp", "stiffness, 1/s2"), ("kd", "damping, 1/s"), ("weight", "weight in the cost")):
+        rows = [getattr(task, name) for task in s.tasks]
+        yield field(
+            f"task_{name}", "nonnegative", f"{text}, of each row of the tasks", np.hstack([np.zeros(0), *rows])
+        )
+    soft = [t._soften if isinstance(t, FrameTask) and t._soften is not None else np.zeros(6) for t in s.tasks]
+    yield field("task_softness", "nonnegative", "inverse apparent inertia of each task, 1/kg and 1/(kg m2)", soft)
+    for name, text in (("kp", "stiffness, 1/s2"), ("kd", "damping, 1/s"), ("weight", "weight in the cost")):
+        value = np.zeros(nv) if posture is None else getattr(posture, name)
+        yield field(f"posture_{name}", "nonnegative", f"{text}, of the posture task", value)
+    if posture is not None and posture.stiffness is not None and posture.damping is not None:
+        yield field("stiffness", "finite", "K_p of the posture task as a matrix, 1/s2", posture.stiffness)
+        yield field("damping", "finite", "K_d that belongs to it, 1/s", posture.damping)
+    given = None if posture is None else posture._given
+    yield field(
+        "posture_given", "nonnegative", "1: reset takes posture_target; 0: the present posture", given is not None
+    )
+    yield field("posture_target", "finite", "q_des at reset", s.robot.posture() if given is None else given)
+    for name, rule, text in (
+        ("kp", "nonnegative", "stiffness, 1/s2"),
+        ("kd", "nonnegative", "damping, 1/s"),
+        ("friction", "positive", "Coulomb coefficient"),
+        ("least", "finite", "least normal force, N"),
+        ("normal", "finite", "unit normal out of the ground, world"),
+        ("half", "nonnegative", "half extents x, y of a sole, m"),
+    ):
+        yield field(f"contact_{name}", rule, f"{text}, of each contact", [getattr(c, name) for c in contacts])  # type: ignore[arg-type]
+    weights = [1.0 if c.weight is None else c.weight for c in contacts]
+    yield field("contact_weight", "positive", "weight in the cost of each contact that is not hard", weights)
+    yield field("force_weight", "positive", "weight of contact forces, 1/N2", formulation.force_weight)
+    yield field(
+        "spare_weight", "positive", "weight of the choice of redundant rotors, 1/N2", formulation.spare_weight
+    )
+    for name in ("lower", "upper"):
+        yield field(f"control_{name}", "limit", "thrusts, N, and torques, N m", getattr(actuators, name))
+    for name in ("lower", "upper"):
+        yield field(f"joint_{name}", "limit", "position of each entry of v, rad or m", getattr(ranges, name))
+    yield field("joint_velocity", "positive", "largest rate of each entry of v; may be infinite", ranges.velocity)
+    propulsion = s.robot.spec.propulsion
+    thrust = 1.0 if propulsion is None else propulsion.thrust_coefficient
+    yield field("thrust_coefficient", "positive", "thrust per squared rotor speed", thrust)
+    for name in ("approach", "rate", "deceleration", "acceleration"):
+        yield field(f"law_{name}", "positive", f"{name} of the law of the joint limits", getattr(law, name))
+    yield field("law_margin", "nonnegative", "distance kept from the position limits", law.margin)
+    if s.flow is not None:
+        for name, rule, text in (
+            ("speed", "amount", "largest speed of an entry of q_r, rad/s or m/s"),
+            ("acceleration", "amount", "largest acceleration, rad/s2 or m/s2"),
+            ("rho", "nonnegative", "pull of the joints towards the start, 1/rad2"),
+            ("mu", "amount", "least curvature, 1/rad2"),
+            ("epsilon", "amount", "predicted decrease of H/H0 below which the flow rests"),
+            ("duration", "amount", "longest time that it moves after a brace, without that on a path and at rest, s"),
+            ("joint_margin", "nonnegative", "distance from the joint limits, rad or m"),
+            ("com_margin", "nonnegative", "distance of the center of mass from the edges of the support polygon, m"),
+            ("tilt", "amount", "largest tilt of the base from the default posture, rad"),
+            ("share", "share", "share of the limits of the actuators that rest may take"),
+            ("haste", "share", "share of what is left of them for accelerating; braking may take (1 + haste)/2"),
+            ("tracking", "amount", "error of the joints at which the flow waits, rad or m"),
+        ):
+            yield field(f"flow_{name}", rule, f"{text}, of the flow", getattr(s.flow.options, name))  # type: ignore[arg-type]
+        if s.flow._path:
+            yield field("flow_path", "finite", "postures that the flow visits first", s.flow._path)
+    if robust is not None:
+        springs = ("keep", "release", "follow")
+        yield field("robust_gain", "nonnegative", "K, 1/s2", robust.K)
+        yield field(
+            "robust_scale", "nonnegative", "lambda; 0: measured at reset", 0 if robust._measure else robust.scale
+        )
+        yield field("robust_reach", "positive", "bound of the term over K, rad", robust.reach)
+        yield field("robust_near", "nonnegative", "distance of each joint where the term is gone", robust._near)
+        yield field("robust_band", "positive", "width of the fade of each joint; may be infinite", robust._band)
+        yield field("robust_far", "positive", "distance from which joints are looked at, rad", robust._farthest)
+        yield field("robust_every", "positive", "ticks between evaluations of the gradient", robust.every)
+        yield field("robust_ramp", "positive", "time from level 0 to 1, s", robust.activation.ramp)
+        yield field("robust_live", "nonnegative", "1: the term stays on during the contact", robust.activation.live)
+        yield field("robust_follow", "positive", "time constant of the spring 2, s", robust._follow)
+        yield field("robust_spring", "nonnegative", "0 keep, 1 release, 2 follow", springs.index(robust.spring))

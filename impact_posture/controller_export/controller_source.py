@@ -1,0 +1,250 @@
+"""C text of a controller: generated dynamics, the tables of its structure, and the files of ``c/`` around them."""
+
+from __future__ import annotations
+
+import re
+from collections.abc import Sequence
+from dataclasses import dataclass
+from functools import lru_cache
+from importlib import resources
+from typing import Any
+
+import casadi as ca
+import numpy as np
+
+from impact_posture.codegen.block_layout import lay_out
+from impact_posture.codegen.c_emitter import DOUBLE, BlockText, Constants, Emitter, c_double
+from impact_posture.codegen.export_files import environment
+from impact_posture.codegen.expression_graph import graph_of
+from impact_posture.codegen.manifest_builder import configuration_names
+from impact_posture.codegen.sum_order import rebuilt
+from impact_posture.config.settings import Vector3
+from impact_posture.controller_export.controller_parameters import RULES, Field
+from impact_posture.controller_export.controller_structure import Structure
+from impact_posture.controller_export.moving_tree import MovingTree
+from impact_posture.dynamics.model_parameters import ModelParameters
+from impact_posture.impact.impact_contact import point_on
+from impact_posture.impact.quantities.impact_kernel import ImpactKernel
+from impact_posture.impact.worst_case_objective import WorstCaseObjective
+from impact_posture.robot.robot import Robot
+from impact_posture.system.arrays import Array
+from impact_posture.system.escape import c_comment
+from impact_posture.version import __version__
+
+# Files in c/, in the order in which one source has them.
+_CORE = (
+    "vector.c", "eigen.c", "algebra.c", "tasks.c", "contacts.c", "posture.c", "qp.c", "rank.c", "solve.c",
+    "give_way.c", "reference_flow_space.c", "reference_flow_limits.c", "reference_flow_zmp.c",
+    "reference_flow_direction.c", "reference_flow.c", "reference_flow_motion.c", "init.c", "tick.c", "report.c",
+)  # fmt: skip
+_RELAXATION = (
+    "relaxation_memory.c", "vector.c", "relaxation_rows.c", "relaxation_elimination.c", "relaxation_level.c",
+    "relaxation_cost.c", "relaxation.c",
+)  # fmt: skip
+# Parameters that init compares with others.
+_NAMED = ("control_upper", "joint_upper", "contact_normal", "law_rate", "posture_weight", "task_weight")
+# Bytes of variables, saved registers and return addresses of all functions below a tick, beside the arrays.
+_FRAMES = 4096
+
+
+@dataclass(frozen=True)
+class GeneratedCode:
+    """C of quantities of the robot: those in ``ip_model``, or its objective.
+
+    Attributes:
+        constants: Tables of numbers.
+        blocks: Functions that compute parts.
+        angles: Entries of ``q`` whose sine and cosine are taken.
+        work: Length of the work array.
+        outputs: Assignments after the blocks, target and value.
+        constant_outputs: Assignments that do not depend on the state.
+        stack_bytes: Upper bound on the stack.
+    """
+
+    constants: str
+    blocks: Sequence[BlockText]
+    angles: tuple[int, ...]
+    work: int
+    outputs: list[tuple[str, str]]
+    constant_outputs: list[tuple[str, str]]
+    stack_bytes: int
+
+
+@lru_cache(maxsize=2)
+def dynamics_code(
+    robot: Robot, points: tuple[tuple[str, Vector3, bool], ...], *, shared: bool = False
+) -> GeneratedCode:
+    """Generate the dynamics of points of a robot: frame, offset, and whether a rotation is needed.
+
+    ``shared`` code reads the numbers of :class:`~impact_posture.dynamics.model_parameters.ModelParameters`.
+    """
+    q, v = ca.SX.sym("q", robot.nq), ca.SX.sym("v", robot.nv)
+    numbers = ModelParameters(robot.model) if shared else None
+    tree = MovingTree(robot.model, q, v, numbers)
+    found: dict[str, ca.SX] = {"M": tree.mass_matrix(), "h": tree.bias()}
+    if robot.floating:
+        found["base"] = tree.rotations[1]
+    for k, (frame, offset, turns) in enumerate(points):
+        on, rows = point_on(robot, frame, offset), 6 if turns else 3
+        spatial, velocity = tree.spatial_drift(on), tree.velocity(on)
+        drift = spatial + ca.vertcat(ca.cross(velocity[3:], velocity[:3]), ca.SX(3, 1))
+        found[f"position[{k}]"] = tree.position(on)
+        found[f"jacobian[{k}]"] = tree.jacobian(on)[:rows, :]
+        found[f"velocity[{k}]"], found[f"drift[{k}]"] = velocity[:rows], drift[:rows]
+        if rows == 6:
+            found[f"rotation[{k}]"], found[f"spatial[{k}]"] = tree.rotation(on), spatial
+    # C has matrices row by row, and CasADi column by column.
+    targets = {f"d->{name}[{{}}]": x.T for name, x in found.items()}
+    return _generated({"q": q, "v": v} | ({} if numbers is None else {"numbers": numbers.symbol}), targets)
+
+
+@lru_cache(maxsize=2)
+def objective_code(objective: WorstCaseObjective) -> GeneratedCode:
+    """Generate an objective and its gradient, of numbers as in shared :func:`dynamics_code`."""
+    q, numbers = ca.SX.sym("q", objective.robot.nq), ModelParameters(objective.robot.model)
+    kernel = ImpactKernel(objective.case, q, ca.SX(ca.DM(objective.contact.normal)), numbers)
+    targets = dict(zip(("value[{}]", "gradient[{}]"), objective.worst_case.expressions(kernel), strict=True))
+    return _generated({"q": q, "numbers": numbers.symbol}, targets)
+
+
+def _generated(inputs: dict[str, ca.SX], found: dict[str, ca.SX]) -> GeneratedCode:
+    """Generate C for the entries of outputs, by their targets in C."""
+    names = [f"o{k}" for k in range(len(found))]
+    function = ca.Function("code", [*inputs.values()], [*found.values()], [*inputs], names, {"cse": True})
+    graph = rebuilt(graph_of(function))
+    layout = lay_out(graph, [names])
+    constants = Constants("ip", DOUBLE)
+    emitter = Emitter(layout, "ip", DOUBLE, {1: "double"}, constants)
+    outputs: list[tuple[str, str]] = []
+    fixed: list[tuple[str, str]] = []
+    for name, target in zip(names, found, strict=True):
+        for k, node in enumerate(graph.outputs[name]):
+            known = graph.nodes[node].op == "const"
+            (fixed if known else outputs).append((target.format(k), emitter.output(node)))
+    angles = tuple(graph.nodes[k].args[1] for k in layout.angles)
+    work = layout.sizes.get(1, 1)
+    largest = max((block.local_bytes for block in emitter.blocks), default=0)
+    stack = 8 * (work + 2 * len(angles)) + largest
+    text = constants.text({1: "double"})
+    return GeneratedCode(text, emitter.blocks, angles or (0,), work, outputs, fixed, stack)
+
+
+def render(
+    s: Structure,
+    fields: Sequence[Field],
+    prefix: str,
+    identity: str,
+    metric: str | None,
+    objective: WorstCaseObjective | None = None,
+    *,
+    shared: bool = False,
+) -> dict[str, str]:
+    """Return file name → text of the header and the source.
+
+    Args:
+        s: Structure of the controller.
+        fields: Parameters.
+        prefix: Beginning of the C names.
+        identity: Words of the library about its manifest.
+        metric: Prefix of the export of the gradient, if the controller has one.
+        objective: The objective, where its code is :func:`objective_code` and not an export of its own.
+        shared: Whether the last parameter is ``numbers``, which models with the same code do not share.
+    """
+    points, robot = tuple((p.frame, p.offset, p in s.turning) for p in s.points), s.robot
+    code = dynamics_code(robot, points, shared=shared)
+    sizes = s.sizes
+    bounds = sizes["SIMPLE"] + sizes["GENERAL"]
+    nv, equations = sizes["NV"], sizes["EQUATIONS"]
+    n, m = sizes["VARIABLES"], sizes["GENERAL"] - sizes["BOUNDED"]
+    more = {
+        "SCRATCH": max(3 * nv * nv, 2 * n * (n + equations) + 2 * equations * equations),
+        "BOUNDS": bounds,
+        "GAVE": 1 + sizes["LEVELS"],
+        "RELAXATION": _relaxation_room(n, m, 1 + sizes["LEVELS"]),
+    }
+    held, rows = sizes["HELD"], sizes["FLOW_ROWS"]
+    more["FLOW_WORK"] = max(3 * held * held + held * nv, 2 * nv * nv, rows * nv)
+    room = {name: max(1, value) for name, value in (sizes | more).items()}
+    n += 1
+    solver = 8 * (n * (n + 1) // 2 + 12 * n + 2 * max(bounds, 2 * rows)) + 2048
+    tables = [(name, *_table(values)) for name, values in s.tables.items()]
+    tables.append(("gravity", *_table(np.array(robot.model.gravity.linear, dtype=float))))
+    allocation = s.actuators.G[: sizes["BASE"], : sizes["ROTORS"]]
+    tables.append(("allocation", *_table(allocation)))
+    named_fields = [(field.name, k) for k, field in enumerate(fields, 1) if field.name in _NAMED]
+    context: dict[str, Any] = {
+        "robot": robot.name, "version": __version__, "prefix": prefix, "sizes": sizes, "room": room, "fields": fields,
+        "q_names": configuration_names(robot), "v_names": robot.tangent_names, "u_names": s.actuators.names,
+        "convention": robot.convention, "tasks": [t.name for t in s.tasks] or ["none"], "metric": metric,
+        "shared": fields[-1].value.size if shared else 0,
+        "stack_bytes": -(-max(code.stack_bytes, solver + 16 * nv * 8) // 64) * 64 + _FRAMES,
+        "identity": identity, "tables": tables, "named": named_fields, "literals": _initializer,
+        "rules": _braced(str(x) for f in fields for x in (f.value.size, RULES[f.rule])),
+        "core": "\n".join(_own(name) for name in _files(sizes)),
+    }  # fmt: skip
+    templates = environment("impact_posture.controller_export", c_comment)
+    files = [
+        (f"{prefix}.h", "controller.h", None),
+        (f"{prefix}.c", "controller.c", None),
+        (f"{prefix}_defaults.c", "defaults.c", None),
+        (f"{prefix}_dynamics.h", "dynamics.h", None),
+        (f"{prefix}_dynamics.c", "dynamics.c", code),
+        *([] if objective is None else [(f"{metric}.c", "dynamics.c", objective_code(objective))]),
+    ]
+    texts = {}
+    for name, template, own in files:
+        generated: dict[str, Any] = {"objective": own is not code}
+        generated |= {} if own is None else {"code": own, "places": _braced(map(str, own.angles))}
+        texts[name] = templates.get_template(f"{template}.jinja").render(context | generated)
+    return {name: named(text, prefix) for name, text in texts.items()} | _relaxation(prefix)
+
+
+def _files(sizes: dict[str, int]) -> list[str]:
+    """Return the files of ``c/`` that a structure needs."""
+    needed = {"eigen.c": sizes["ROBUST"] or sizes["FLOW"]}
+    needed |= {name: sizes["FLOW"] for name in _CORE if name.startswith("reference_flow")}
+    return [name for name in _CORE if needed.get(name, True)]
+
+
+def _relaxation_room(n: int, m: int, levels: int) -> int:
+    """Return a bound on the doubles in the memory of the relaxation, which ``init`` checks."""
+    entries, active = n + m, 2 * n + m + 2
+    matrices = 2 * n * n + m * n + 3 * entries * n + active * (active + 1) // 2
+    return matrices + 16 * n + 7 * active + (20 + levels) * entries + 64
+
+
+def relaxation() -> dict[str, str]:
+    """Return file name → text of the relaxation, before its names have a prefix."""
+    return {"relaxation.h": _own("relaxation.h"), "relaxation.c": "\n".join(_own(name) for name in _RELAXATION)}
+
+
+def _relaxation(prefix: str) -> dict[str, str]:
+    """Return the files of the relaxation, with names that another controller in the program does not have."""
+    texts = {name: re.sub(r"\b(daqp\.h|relaxation\.h)", rf"{prefix}_\1", text) for name, text in relaxation().items()}
+    return {f"{prefix}_{name}": named(text, prefix) for name, text in texts.items()}
+
+
+def named(text: str, prefix: str) -> str:
+    """Return C text in which all names begin with the prefix."""
+    text = re.sub(r"\brelaxation_([a-z])", rf"{prefix}_relaxation_\1", text)
+    return re.sub(r"\bip_", f"{prefix}_", re.sub(r"\bIP_", f"{prefix.upper()}_", text))
+
+
+def _own(name: str) -> str:
+    return (resources.files(__package__) / "c" / name).read_text(encoding="utf-8")
+
+
+def _braced(texts: Any) -> str:
+    return "{" + ", ".join(texts) + "}"
+
+
+def _initializer(values: Array) -> str:
+    return _braced(c_double(float(x)).strip("()") for x in values)
+
+
+def _table(values: Array) -> tuple[str, str, str]:
+    """Return C type, initializer with at least one number, and length."""
+    values = values.ravel() if values.size else np.zeros(1, dtype=values.dtype)
+    if values.dtype == np.int64:
+        return "int", str(values.size), _braced(str(x) for x in values.tolist())
+    return "double", str(values.size), _initializer(values)

@@ -1,0 +1,231 @@
+"""Write the C of a controller into a folder: source, header, DAQP, the gradient it needs, and a manifest."""
+
+from __future__ import annotations
+
+import json
+from collections.abc import Sequence
+from dataclasses import dataclass
+from functools import lru_cache
+from pathlib import Path
+from tempfile import TemporaryDirectory
+from typing import Any
+
+import casadi as ca
+
+from impact_posture.codegen.c_names import c_identifier, check_prefix
+from impact_posture.codegen.export import WrittenCode
+from impact_posture.codegen.export import export as export_gradient
+from impact_posture.codegen.manifest_builder import configuration_names
+from impact_posture.codegen.manifest_reader import identity
+from impact_posture.config.argument_types import checked
+from impact_posture.controller_export.compiled_controller import CompiledController
+from impact_posture.controller_export.controller_manifest import SCHEMA, build_controller
+from impact_posture.controller_export.controller_parameters import Field, parameters
+from impact_posture.controller_export.controller_source import render
+from impact_posture.controller_export.controller_structure import Structure, structure_of
+from impact_posture.controller_export.daqp_sources import FILES, VERSION, daqp_sources, renamed
+from impact_posture.dynamics.model_parameters import ModelParameters
+from impact_posture.errors import InputError
+from impact_posture.impact.worst_case_objective import WorstCaseObjective
+from impact_posture.robot.robot import Robot
+from impact_posture.system.libraries import library_path
+from impact_posture.system.output_folder import whole_folder, write_whole
+from impact_posture.system.toolchain import find_compiler
+from impact_posture.tsid.task_formulation import TaskFormulation
+from impact_posture.version import __version__
+
+RUN_SCHEMA = "impact-posture/controller-run/1"
+
+
+@dataclass(frozen=True)
+class ControllerExport(WrittenCode):
+    """Written C of a controller."""
+
+    @property
+    def verdict(self) -> str:
+        """The outcome, on one line."""
+        if self.library is not None:
+            return f"{self.library.name}: built"
+        return f"build: make -C {self.out} (or codegen --compile)"
+
+    def to_dict(self) -> dict[str, Any]:
+        """Return the document of ``codegen --controller --json``."""
+        return {
+            "schema": RUN_SCHEMA,
+            "out": str(self.out),
+            "prefix": self.prefix,
+            "files": [path.relative_to(self.out).as_posix() for path in self.files],
+            "library": None if self.library is None else self.library.name,
+            "tasks": self.manifest["tasks"],
+            "parameters": self.manifest["parameters"],
+            "verdict": self.verdict,
+        }
+
+    def load(self) -> CompiledController:
+        """Load the library, which runs its code; build it where it is missing."""
+        return CompiledController.load(self.out, robot=self.robot)
+
+
+@checked
+def export_controller(
+    robot: Robot,
+    formulation: TaskFormulation,
+    out: str | Path | None = None,
+    *,
+    objective: WorstCaseObjective | None = None,
+    prefix: str | None = None,
+    period: float = 1e-3,
+    daqp: str | Path | None = None,
+    build: bool = False,
+    force: bool = False,
+    generated: Sequence[str] = (),
+    shared: bool = False,
+) -> ControllerExport:
+    """Write the controller of a formulation as C99 into a folder, whole or not at all.
+
+    The structure of the formulation is compiled in.  Its gains, weights, limits and targets are the defaults of
+    parameters that a program can set.
+
+    Args:
+        robot: The robot.
+        formulation: Tasks of this package, contacts and limits.
+        out: The folder; ``./<prefix>-c`` by default.
+        objective: The objective whose gradient an impact-robust posture task or a reference flow follows.
+        prefix: Beginning of the C names; by default, the robot and ``controller``.
+        period: Expected time between ticks, s.
+        daqp: Folder of the sources of DAQP, where they cannot be downloaded.
+        build: Leave ``lib<prefix>.so`` in the folder.
+        force: Replace an earlier export.
+        generated: Further flags of the compiler for what is generated from the model.
+        shared: Make the armature and the places of the joints a parameter, ``numbers``, so that robots which differ
+            in them have the same code.  Its gradient is no export of its own.
+
+    Raises:
+        InputError: A task or joint has no C code, the gradient is missing, or there are no sources of DAQP.
+        OutputError: The folder exists without ``force``, is no export, or cannot be written.
+        CompilerError: The compiler failed.
+    """
+    prefix = c_identifier(robot.name, "controller") if prefix is None else check_prefix(prefix)
+    structure = structure_of(robot, formulation)
+    if (structure.robust is None and structure.flow is None) != (objective is None):
+        what = "the posture task has no objective" if objective is None else "no task uses the objective"
+        hint = "give the objective of its gradient" if objective is None else "give a posture task that follows one"
+        raise InputError(what, where="controller export", hint=hint)
+    sources = daqp_sources(Path(daqp) if daqp else None)
+    fields = tuple(parameters(structure, period))
+    if shared:
+        numbers = ModelParameters(robot.model).values
+        fields = (*fields, Field("numbers", "finite", "armature and places of the joints", numbers))
+    manifest = _manifest(structure, fields, prefix)
+    metric = f"{prefix}_metric" if objective is not None else None
+    own = [
+        *(f"{prefix}_{name}.c" for name in ("defaults", "dynamics", "relaxation")),
+        *([] if metric is None else [f"{metric}.c"]),
+    ]
+    manifest["sources"] = [*own, f"{prefix}_daqp.c"]
+    lean = objective if shared else None
+    texts = render(structure, fields, prefix, identity(manifest), metric, lean, shared=shared)
+    texts |= renamed(sources, prefix)
+    texts[f"{prefix}.json"] = json.dumps(manifest, indent=2, allow_nan=False) + "\n"
+    texts |= {} if objective is None or metric is None or shared else _metric(objective, metric)
+    texts["Makefile"], texts["CMakeLists.txt"] = _makefile(manifest), _cmake(manifest)
+    out = Path(out or f"{prefix}-c")
+    library = library_path(out, prefix)
+    products = (library.name, f"{library.name}.sha256")
+    with whole_folder(out, force=force, kind="export", products=products) as folder:
+        for name, text in texts.items():
+            write_whole(folder / name, text)
+        (folder / "daqp").mkdir()
+        for name in FILES:
+            (folder / "daqp" / name).write_bytes(sources[name])
+        if build and find_compiler() is not None:
+            build_controller(folder, manifest, generated)
+        names = sorted(path.relative_to(folder) for path in folder.rglob("*") if path.is_file())
+    built = library if library.is_file() else None
+    return ControllerExport(out, robot, tuple(out / name for name in names), manifest, built)
+
+
+@lru_cache(maxsize=2)
+def _metric(objective: WorstCaseObjective, prefix: str) -> dict[str, str]:
+    """Return file name → text of the gradient, without the examples that a gradient alone has."""
+    with TemporaryDirectory() as folder:
+        export_gradient(objective, Path(folder), prefix=prefix, check=False)
+        names = [f"{prefix}.{ending}" for ending in ("c", "h", "json")]
+        return {name: (Path(folder) / name).read_text(encoding="utf-8") for name in names}
+
+
+def _manifest(s: Structure, fields: Sequence[Field], prefix: str) -> dict[str, Any]:
+    """Return all that a loader needs to size buffers and to name what is in them."""
+    robot = s.robot
+    return {
+        "schema": SCHEMA,
+        "prefix": prefix,
+        "real": "double",
+        "robot": robot.name,
+        "model_sha256": robot.model_sha256,
+        "joint_names": list(robot.joint_names),
+        "convention": robot.convention,
+        "armature": robot.armature.tolist(),
+        "nq": robot.nq,
+        "nv": robot.nv,
+        "q_names": configuration_names(robot),
+        "v_names": list(robot.tangent_names),
+        "u_names": list(s.actuators.names),
+        "sizes": s.sizes,
+        "parameters": {f.name: int(f.value.size) for f in fields},
+        "tasks": [{"name": t.name, "rows": t.size} for t in s.tasks],
+        "levels": [[name, int(rows)] for name, rows in zip(s.levels, s.tables["level_rows"], strict=True)],
+        "posture": None if s.formulation.posture is None else s.formulation.posture.name,
+        "bounds": list(s.bounds),
+        "versions": {"impact_posture": __version__, "casadi": str(ca.CasadiMeta.version()), "daqp": VERSION},
+    }
+
+
+def _makefile(manifest: dict[str, Any]) -> str:
+    prefix = manifest["prefix"]
+    return f"""# make: a library to link or to load at run time.
+CC ?= cc
+CFLAGS ?= -O2
+# Strict C forbids fused multiply-adds by default.  For this very machine: CFLAGS="-O3 -march=native".
+ALL_CFLAGS = -std=c99 -ffp-contract=fast -fPIC -isystem daqp $(CFLAGS)
+
+lib{prefix}.so: {prefix}.c {prefix}.h
+\trm -f $@.sha256
+\t$(CC) $(ALL_CFLAGS) -shared {prefix}.c {" ".join(manifest["sources"])} -o $@ -lm
+
+clean:
+\trm -f lib{prefix}.so lib{prefix}.so.sha256
+
+.PHONY: clean
+"""
+
+
+def _cmake(manifest: dict[str, Any]) -> str:
+    prefix = manifest["prefix"]
+    here = [name for name in manifest["sources"] if name != f"{prefix}_daqp.c"]
+    return f"""# add_subdirectory(<this folder>), then target_link_libraries(<program> PRIVATE {prefix}::{prefix})
+cmake_minimum_required(VERSION 3.16)
+project({prefix} LANGUAGES C)
+
+if(NOT CMAKE_BUILD_TYPE AND NOT CMAKE_CONFIGURATION_TYPES)
+  set(CMAKE_BUILD_TYPE Release)
+endif()
+
+# CMake reserves names like test, all and install, so the target and its file have different names.
+add_library({prefix}_library {" ".join([f"{prefix}.c", *here])})
+add_library({prefix}::{prefix} ALIAS {prefix}_library)
+set({prefix}_DAQP "" CACHE STRING "installed library of DAQP {VERSION}; empty: the sources here")
+if({prefix}_DAQP)
+  target_link_libraries({prefix}_library PUBLIC ${{{prefix}_DAQP}})
+  target_compile_definitions({prefix}_library PRIVATE {prefix.upper()}_INSTALLED_DAQP)
+else()
+  target_sources({prefix}_library PRIVATE {prefix}_daqp.c)
+endif()
+target_include_directories({prefix}_library PUBLIC "${{CMAKE_CURRENT_SOURCE_DIR}}")
+target_include_directories({prefix}_library SYSTEM PRIVATE "${{CMAKE_CURRENT_SOURCE_DIR}}/daqp")
+set_target_properties({prefix}_library PROPERTIES OUTPUT_NAME {prefix}
+  C_STANDARD 99 C_STANDARD_REQUIRED ON POSITION_INDEPENDENT_CODE ON)
+if(UNIX)
+  target_link_libraries({prefix}_library PUBLIC m)
+endif()
+"""

@@ -1,0 +1,141 @@
+"""Output folders of runs, comparisons and reproductions, with their figures.  Each is written whole or not at all."""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from contextlib import AbstractContextManager
+from dataclasses import dataclass
+from pathlib import Path
+
+import numpy as np
+
+from impact_posture.experiment.job_store import Store
+from impact_posture.experiment.jobs import Document, Job
+from impact_posture.experiment.reproduction import PAPER, Reproduction
+from impact_posture.experiment.reproduction_summary import summary
+from impact_posture.experiment.run_reports import COMPARISON, SIMULATION, keep_runs, kept_run, run_view, try_report
+from impact_posture.output.plot import Bar, bars_figure, figures_of_comparison, figures_of_run, save, save_all
+from impact_posture.simulation.run import Run
+from impact_posture.system.output_folder import whole_folder, write_json
+from impact_posture.system.progress import tell
+
+REPRODUCTION = "reproduction.json"
+FORMATS = ("png",)
+
+
+@dataclass(frozen=True)
+class Output:
+    """Where results are written, and what beside the numbers.
+
+    Attributes:
+        folder: The folder.
+        force: Whether an earlier result there may be replaced.
+        formats: Formats of the figures.
+        report: Whether ``report.html`` is written.
+        meshes: Whether it shows the meshes of the robot.
+    """
+
+    folder: Path
+    force: bool = False
+    formats: Sequence[str] = FORMATS
+    report: bool = True
+    meshes: bool = False
+
+
+def write_simulation(output: Output, job: Job, runs: Sequence[Run], document: Document) -> str:
+    """Write ``run.json``, ``series.npz`` (``series-minus.npz`` for a push with sign -1), figures and ``report.html``.
+
+    Returns:
+        Why there is no report; empty if there is one, or if none was wanted.
+
+    Raises:
+        OutputError: The folder exists without ``force``, is not ours, or cannot be written.
+    """
+    with whole_folder(output.folder, force=output.force, kind="run") as folder:
+        write_json(folder / SIMULATION, document)
+        for one in runs:
+            one.series.save(folder / f"series{'' if one.sign > 0 else '-minus'}.npz")
+        draw_runs(job, runs, document, folder, output.formats)
+        return try_report(folder, job.scenario, meshes=output.meshes) if output.report else ""
+
+
+def write_comparison(output: Output, found: Reproduction, store: Store) -> str:
+    """Write ``comparison.json``, figures, ``runs/`` and ``report.html`` of the first seed, and remove the store.
+
+    Returns:
+        Why there is no report; empty if there is one, or if none was wanted.
+
+    Raises:
+        OutputError: As :func:`write_simulation`.
+    """
+    with whole_folder(output.folder, force=output.force, kind="comparison") as folder:
+        write_json(folder / COMPARISON, found.comparison())
+        draw_side_by_side(found.shown, store, folder, output.formats)
+        keep_runs(folder, found.shown, store)
+        scenario = found.shown[0].scenario
+        failure = try_report(folder, scenario, meshes=output.meshes) if output.report else ""
+    store.remove()
+    return failure
+
+
+def write_reproduction(output: Output, found: Reproduction, store: Store) -> Document:
+    """Write ``reproduction.json``, ``SUMMARY.md``, all documents in ``runs/``, and figures, and remove the store.
+
+    Returns:
+        The content of ``reproduction.json``.
+
+    Raises:
+        OutputError: As :func:`write_simulation`.
+    """
+    document = {**found.to_dict(), "summary": summary(found)}
+    with whole_folder(output.folder, force=output.force, kind="reproduction") as folder:
+        write_json(folder / REPRODUCTION, document)
+        (folder / "SUMMARY.md").write_text(document["summary"], encoding="utf-8")
+        (folder / "runs").mkdir()
+        for job in found.jobs:
+            write_json(folder / "runs" / f"{job.name}.json", store.finished(job))
+        draw_reproduction(found, store, folder, output.formats)
+    store.remove()
+    return document
+
+
+def store_beside(out: Path) -> AbstractContextManager[Store]:
+    """Take the store that keeps the runs of an output folder until it is written.
+
+    Raises:
+        OutputError: As :meth:`Store.taken`.
+    """
+    return Store(out.absolute().parent / f".{out.name}.runs").taken()
+
+
+def draw_runs(job: Job, runs: Sequence[Run], document: Document, folder: Path, formats: Sequence[str]) -> None:
+    """Draw the figures of a job.  Those of the push with sign -1 are in ``minus/``."""
+    for one, part in zip(runs, document["runs"], strict=True):
+        into = folder if one is runs[0] else folder / "minus"
+        tell("drawing")
+        save_all(figures_of_run(run_view(job, part, one.series)), into, formats)
+
+
+def draw_side_by_side(jobs: Sequence[Job], store: Store, folder: Path, formats: Sequence[str]) -> None:
+    """Draw several controllers in one scenario, with the first sign of a push."""
+    tell("drawing")
+    kept = [(job, kept_run(job, store)) for job in jobs]
+    views = [run_view(job, found[0]["runs"][0], found[1]) for job, found in kept if found is not None]
+    if views:
+        save_all(figures_of_comparison(views), folder, formats)
+
+
+def draw_reproduction(found: Reproduction, store: Store, folder: Path, formats: Sequence[str]) -> None:
+    """Draw ``bars``, and for each scenario a folder with nominal, robust and the best controller side by side."""
+    bars = []
+    for row in found.rows:
+        paper, total = PAPER.get(row.scenario), row.metrics.get("q_total_impact")
+        mean, half = (np.nan, 0.0) if total is None else (total.mean, total.shown or 0.0)
+        # The paper has the nominal and the robust controller.
+        bars.append(Bar(row.scenario, row.controller, mean, half, getattr(paper, row.controller, None)))
+    save(bars_figure(bars), folder, "bars", formats)
+    for scenario in found.scenarios:
+        best = found.best(scenario)
+        shown = dict.fromkeys(("nominal", "robust", *(() if best is None else (best.controller,))))
+        labels = {job.label: job for job in found.shown if job.scenario == scenario}
+        draw_side_by_side([labels[label] for label in shown if label in labels], store, folder / scenario, formats)

@@ -1,0 +1,284 @@
+"""Velocity jump of a robot whose rotors hang on springs, in a contact of known stiffness.
+
+A short contact meets the links alone, and a long one takes the rotors along.  Between the two, links ``x``, rotors
+``y`` and contact answer as a linear system about the configuration ``q``, in increments over free flight:
+
+    M ẍ = jᵀf − Eᵀτ,   B ÿ = τ,   s = Ex − y,   τ = K s + D ṡ,
+    δ̇ = v − jẋ,   f = k δ,   j = nᵀJ,
+
+with the elastic joints in the rows of ``E`` (m×nv) and their rotors in ``B`` (m×m, diagonal).  ``M`` (nv×nv) holds
+the links, and the rotors of all joints without a spring of known stiffness.  Supports enter as ``M + J_sᵀJ_s/ε``, and
+locked joints do not move.  The compression ends at the first time ``T`` with ``δ̇ = 0`` (plastic impact, e = 0).
+
+The system is no larger than its springs.  With ``c = (s, δ)``, ``C = [E; −j]``, ``κ = (K, k)`` and ``d = (D, 0)``,
+
+    c̈ = −A (κc + dċ),   A = C M⁻¹ Cᵀ + diag(B⁻¹, 0),   c(0) = 0,   ċ(0) = (0, v),
+
+and the impulses ``I = ∫(τ, f)dt = A⁻¹(ċ(0) − ċ)`` move the links by ``ẋ = −M⁻¹CᵀI``.  The state ``(κ^½c, L⁻¹ċ)`` with
+``A = LLᵀ`` holds the potential and the kinetic energy, so that its generator is skew but for the dampers.
+"""
+
+from __future__ import annotations
+
+import math
+from dataclasses import dataclass, replace
+
+import numpy as np
+import scipy
+
+from impact_posture.config.toml_tables import json_block
+from impact_posture.errors import ContactError, InputError
+from impact_posture.impact.impact_case import ImpactCase
+from impact_posture.impact.impact_contact import LARGEST
+from impact_posture.impact.quantities.impact_oracle import ImpactOracle
+from impact_posture.impact.quantities.sticking_point import Answer
+from impact_posture.robot.joint_model import transmissions, with_joint_model
+from impact_posture.system.arrays import Array
+
+# Contact stiffness, N/m: from below foam to above steel on steel.
+_SOFTEST, _STIFFEST = 1.0, 1e12
+# Oscillations of the stiffest spring in a contact, in rad, that leave seven digits.
+_LONGEST = 1e8
+# Stiffness of held feet, relative to the stiffest spring.
+_HELD = 1e8
+# Step of the samples for the peaks, in rad of the stiffest spring, and the least and largest number of them.
+_SAMPLE, _FEWEST, _MOST = 0.1, 100, 20_000
+
+
+@dataclass(frozen=True, eq=False)
+class ElasticResponse:
+    """Response of links, rotors and springs to a contact, until its greatest compression at the time ``T``.
+
+    All quantities but ``duration``, ``compliance_ratio`` and ``value`` are proportional to ``speed``.
+
+    Attributes:
+        stiffness: ``k`` of the contact, N/m.
+        speed: Approach speed ``v``, m/s.
+        duration: ``T``, s.
+        compliance_ratio: ``T√(G/C)`` with ``G = jM⁻¹jᵀ`` and the compliance ``C = jK⁻¹jᵀ`` of the contact point on
+            the springs.  The links alone answer where it is small, links and rotors where it is large.  Infinite if
+            no spring gives way to the contact.
+        force: ``kδ(T)``, the largest force of the contact, N.
+        impulse: ``∫f`` until ``T``, N·s.
+        jump: ``ẋ(T)``, velocity jump of base and links, shape (nv,), with ``jump_norm`` ``‖ẋ(T)‖_W``.
+        value: ``‖ẋ(T)‖²_W/v²``, which is V where the joints are rigid.
+        peak_jump_norm: The largest ``‖ẋ(t)‖_W`` until ``T``.
+        rotor_jump: ``ẏ(T)``, shape (nv,); that of the link without a spring.
+        torque: ``τ(T)`` of the springs and dampers, N·m (N if prismatic), shape (nv,); zero without a spring.
+        peak_torque: The largest ``|τ(t)|`` until ``T``, shape (nv,).
+    """
+
+    stiffness: float
+    speed: float
+    duration: float
+    compliance_ratio: float
+    force: float
+    impulse: float
+    jump: Array
+    jump_norm: float
+    value: float
+    peak_jump_norm: float
+    rotor_jump: Array
+    torque: Array
+    peak_torque: Array
+
+    def to_dict(self) -> dict[str, object]:
+        """Return JSON content; ``None`` for a compliance ratio without a bound."""
+        ratio = self.compliance_ratio if math.isfinite(self.compliance_ratio) else None
+        return json_block(self) | {"compliance_ratio": ratio}
+
+
+class ElasticImpact:
+    """Response to a contact of given stiffness, and its tangent gradient, by the matrix exponential.
+
+    The armature is that stated for the robot, whatever its joint model, and the springs are those of robot.toml
+    ``[transmission]``.  A metric W = M weighs the links and the rotors of rigid joints.
+
+    Raises:
+        InputError: No joint has a rotor on a spring of known stiffness.
+        InertiaError: The mass matrix is singular without the rotors on springs.
+    """
+
+    def __init__(self, case: ImpactCase) -> None:
+        robot, found = with_joint_model(case.robot, "elastic"), transmissions(case.robot)
+        self.joints = np.flatnonzero(found.elastic & (robot.armature > 0))
+        self.rotors = robot.armature[self.joints]
+        self.kappa, self.d = found.stiffness[self.joints], found.damping[self.joints]
+        self.oracle = ImpactOracle(replace(case, robot=robot))
+
+    def response(self, q: Array, stiffness: float, speed: float = 1.0) -> ElasticResponse:
+        """Return the response at ``q``, shape (nq,), to a contact of ``stiffness`` in N/m at ``speed`` in m/s.
+
+        Raises:
+            InputError: Stiffness (1 to 1e12 N/m) or speed is out of range, or springs are too stiff for the contact.
+            ContactError: The contact cannot move along its normal.
+        """
+        if not 0 < speed <= LARGEST:
+            raise InputError(f"is {speed:g}", where="approach speed", hint=f"give m/s above zero, to {LARGEST:g}")
+        c = self._compression(q, stiffness)
+        oracle, m, nv = self.oracle, len(self.joints), len(c.columns.a)
+        force, impulse = c.force(c.state), c.impulse(c.state)
+        x, torque, peak = c.columns.a @ impulse, np.zeros(nv), np.zeros(nv)
+        rotor = x.copy()
+        rotor[self.joints], torque[self.joints] = impulse[:m] / self.rotors, force[:m]
+        peak_square, peak[self.joints] = c.peaks()
+        square, softness = float(x @ oracle.weigh(x)), self.compliance(q)
+        return ElasticResponse(
+            stiffness=float(stiffness),
+            speed=float(speed),
+            duration=c.duration,
+            compliance_ratio=c.duration * math.sqrt(c.mobility[-1, -1] / softness) if softness else math.inf,
+            force=float(force[-1]) * speed,
+            impulse=float(impulse[-1]) * speed,
+            jump=x * speed,
+            jump_norm=math.sqrt(square) * speed,
+            value=square,
+            peak_jump_norm=math.sqrt(peak_square) * speed,
+            rotor_jump=rotor * speed,
+            torque=torque * speed,
+            peak_torque=peak * speed,
+        )
+
+    def value(self, q: Array, stiffness: float) -> float:
+        """Return ``‖ẋ(T)‖²_W/v²``."""
+        c = self._compression(q, stiffness)
+        x = c.columns.a @ c.impulse(c.state)
+        return float(x @ self.oracle.weigh(x))
+
+    def gradient(self, q: Array, stiffness: float) -> Array:
+        """Return the tangent gradient of :meth:`value`, shape (nv,).
+
+        ``T`` moves with ``q`` so that ``δ̇(T) = 0``.  The gradient does not exist where ``δ̇`` touches zero without
+        changing sign, because ``T`` jumps there.  With ``P = −M⁻¹Cᵀ`` and the adjoint ``X`` of ``A``, it is that of
+        ``⟨X, A⟩ + 2 bᵀ(jᵀI_f − Mẋ)`` with ``b = M⁻¹Wẋ``, all but ``M`` and ``j`` held.
+        """
+        c = self._compression(q, stiffness)
+        oracle, P, impulse = self.oracle, c.columns, c.impulse(c.state)
+        x = Answer(P.a @ impulse, P.f @ impulse)
+        weighed = oracle.weigh(x.a)
+        b = oracle.answer(weighed)
+        X = c.adjoint(P.a.T @ (2 * weighed))
+        own, pushed = np.array(oracle.contact.normal), 2 * (P.a @ X[:, -1] + impulse[-1] * b.a)
+        gradient = oracle.coupling(own, pushed, oracle.case.in_contact_frame) - 2 * oracle.inertial(b, x)
+        weights, axes = np.linalg.eigh(X)
+        for weight, axis in zip(weights, axes.T, strict=True):
+            mode = Answer(P.a @ axis, P.f @ axis)
+            gradient = gradient - weight * oracle.inertial(mode, mode)
+        return np.asarray(gradient + oracle.metric_gradient(x.a))
+
+    def _compression(self, q: Array, stiffness: float) -> _Compression:
+        """Check the stiffness, and solve for a unit approach speed."""
+        if not _SOFTEST <= stiffness <= _STIFFEST:
+            hint = f"give {_SOFTEST:g} to {_STIFFEST:g} N/m"
+            raise InputError(f"is {stiffness:g} N/m", where="contact_stiffness", hint=hint)
+        oracle = self.oracle.at(q)
+        rows = np.vstack([np.eye(oracle.robot.nv)[self.joints], -oracle.n @ oracle.J])
+        if oracle.quantities(q).blocked:
+            where, hint = f"frame {oracle.contact.frame}", "choose another frame, normal or posture"
+            raise ContactError("the contact cannot move along its normal", where=where, hint=hint)
+        columns = oracle.answer(-rows.T)
+        A = np.diag(np.append(1 / self.rotors, 0.0)) - rows @ columns.a
+        kappa, d = np.append(self.kappa, float(stiffness)), np.append(self.d, 0.0)
+        return _Compression((A + A.T) / 2, columns, kappa, d, oracle)
+
+    def compliance(self, q: Array) -> float:
+        """Return ``C`` at ``q``, m/N: rotors and feet held, the base too unless it stands on feet."""
+        oracle = self.oracle.at(q)
+        feet = oracle.Js
+        moving = np.append(np.arange(6 if len(feet) else 0), self.joints)
+        j, held = (oracle.n @ oracle.J)[moving], feet[:, moving]
+        K = np.append(np.zeros(len(moving) - len(self.joints)), self.kappa)
+        stiffness = np.diag(K) + _HELD * self.kappa.max() * held.T @ held
+        return float(j @ np.linalg.lstsq(stiffness, j, rcond=None)[0])
+
+
+class _Compression:
+    """Springs and contact from touch to greatest compression, at unit approach speed.
+
+    Args:
+        mobility: ``A``, shape (m+1, m+1).
+        columns: ``P = −M⁻¹Cᵀ``, shape (nv, m+1), with its support impulses.
+        kappa: Stiffness of springs and contact, shape (m+1,).
+        d: Damping of the same.
+        oracle: Weighs velocities.
+    """
+
+    def __init__(self, mobility: Array, columns: Answer, kappa: Array, d: Array, oracle: ImpactOracle) -> None:
+        self.mobility, self.columns, self.kappa, self.d, self._oracle = mobility, columns, kappa, d, oracle
+        try:
+            self._L = np.linalg.cholesky(mobility)
+        except np.linalg.LinAlgError:
+            hint = "correct [armature] of robot.toml"
+            raise InputError("rotors are too heavy for their links", where="elastic joints", hint=hint) from None
+        R = np.sqrt(kappa)[:, None] * self._L
+        self._generator = np.block([[np.zeros_like(R), R], [-R.T, -(self._L.T * d) @ self._L]])
+        self._fastest = float(np.linalg.norm(self._generator, 2))
+        # Only the contact moves at touch, and the last row of L is its speed.
+        self._row, self._start = np.append(np.zeros(len(R)), self._L[-1]), np.zeros(2 * len(R))
+        self._start[-1] = 1 / self._L[-1, -1]
+        self.duration, self.state = self._greatest_compression()
+
+    def impulse(self, states: Array) -> Array:
+        """Return ``I`` of one state or of columns, springs first, shape (m+1, …)."""
+        moved = (self._start - states.T).T[len(self.kappa) :]
+        return np.asarray(scipy.linalg.solve_triangular(self._L, moved, trans=1, lower=True))
+
+    def force(self, states: Array) -> Array:
+        """Return ``κc + dċ`` of one state or of columns, springs first."""
+        r = len(self.kappa)
+        return np.asarray((np.sqrt(self.kappa) * states[:r].T + self.d * (self._L @ states[r:]).T).T)
+
+    def _greatest_compression(self) -> tuple[float, Array]:
+        """Return the first root ``T`` of ``p = δ̇/v``, and the state there.
+
+        ``|p̈| ≤ kG``, because the energy of the second derivative of ``c`` starts at ``k²v²G/2`` and never grows.  So
+        ``p(t+h) ≥ p + ṗh − kGh²/2``.  Steps to its root pass no root of ``p`` and converge quadratically.
+        """
+        bound = float(self.kappa[-1] * self.mobility[-1, -1])
+        row, t, state = self._row, 0.0, self._start
+        while (p := float(row @ state)) > 0:
+            rate = float(row @ self._generator @ state)
+            root = math.sqrt(rate**2 + 2 * bound * p)
+            step = 2 * p / (root - rate) if rate < 0 else (root + rate) / bound
+            if step <= 1e-15 * t:
+                break
+            t += step
+            if t * self._fastest > _LONGEST:
+                what = "joints are too stiff or too damped for a contact as soft as this one"
+                raise InputError(what, where="contact_stiffness", hint="raise it, or state a rigid transmission")
+            state = scipy.linalg.expm(step * self._generator) @ state
+        return t, state
+
+    def peaks(self) -> tuple[float, Array]:
+        """Return the largest ``‖ẋ‖²_W`` and the largest ``|τ|`` of each spring, by cubics between exact samples."""
+        count = int(np.clip(self.duration * self._fastest / _SAMPLE, _FEWEST, _MOST))
+        step, states = scipy.linalg.expm(self.duration / count * self._generator), [self._start]
+        for _ in range(count - 1):
+            states.append(step @ states[-1])
+        Y, times = np.array([*states, self.state]).T, np.linspace(0.0, self.duration, count + 1)
+        x, torques, rates = self.columns.a @ self.impulse(Y), self.force(Y), self.force(self._generator @ Y)
+        weighed = self._oracle.weigh(x)
+        slope = 2 * np.sum(weighed * (self.columns.a @ torques), axis=0)
+        largest = [_peak(times, *curve) for curve in zip(torques[:-1], rates[:-1], strict=True)]
+        return _peak(times, np.sum(x * weighed, axis=0), slope), np.array(largest)
+
+    def adjoint(self, g: Array) -> Array:
+        """Return the symmetric ``X`` with ``⟨X, dA⟩ = gᵀdI(T)``, shape (m+1, m+1), where ``T`` moves with ``A``."""
+        r, L, T = len(self.kappa), self._L, self.duration
+        weighed, rate = scipy.linalg.cho_solve((L, True), g), self._generator @ self.state
+        seed = np.append(np.zeros(r), -L.T @ weighed)
+        seed = seed - self._row * (seed @ rate) / (self._row @ rate)
+        moved = T * scipy.linalg.expm_frechet(T * self._generator.T, np.outer(seed, self._start), compute_expm=False)
+        # In fixed coordinates, A enters the generator by the rows −L⁻¹A [κ^½, d L].
+        inner = moved[r:, :r] * np.sqrt(self.kappa) + (moved[r:, r:] @ L.T) * self.d
+        X = scipy.linalg.solve_triangular(L, inner, trans=1, lower=True) + np.outer(weighed, self.impulse(self.state))
+        return np.asarray(-(X + X.T) / 2)
+
+
+def _peak(times: Array, values: Array, slopes: Array) -> float:
+    """Return the largest size of the piecewise cubic through values and slopes."""
+    # Imported here, because that takes a quarter of a second and few robots have elastic joints.
+    from scipy.interpolate import CubicHermiteSpline
+
+    cubic = CubicHermiteSpline(times, values, slopes)
+    return float(np.nanmax(np.abs([*values, *cubic(cubic.derivative().roots(extrapolate=False))])))

@@ -1,0 +1,1 @@
+"""All quantities of one impact at one posture."""

@@ -1,0 +1,113 @@
+"""Velocity jumps with Coulomb friction, at one contact and at several contacts at once.
+
+Several contacts obey ``0 ≤ p_n ⊥ u_n ≥ 0``, ``‖p_t‖ ≤ μ p_n``, ``u_t = −κ p_t``, ``0 ≤ κ ⊥ μ p_n − ‖p_t‖ ≥ 0`` each,
+with impulses ``p_i`` and the velocities ``u = u⁻ + Bp`` after the impact.  Block Gauss–Seidel iterates their fixed
+point ``p_i = P(p_i − ρ(u_i + μ‖u_t‖n_i))``, with ``P`` the projection onto the friction cone.
+"""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+
+import numpy as np
+
+from impact_posture.errors import MetricError
+from impact_posture.impact.evaluation.velocity_jump import Jump, weighed_jump
+from impact_posture.impact.friction.coulomb_impulse import coulomb_impact
+from impact_posture.impact.worst_case_objective import WorstCaseObjective
+from impact_posture.system.arrays import Array
+
+# Sweeps over the contacts, steps at one contact in a sweep, and the error of an impulse that ends them, relative.
+_SWEEPS, _STEPS, _TOLERANCE = 5000, 20, 1e-11
+# Slip below this share of the approach speed is rounding.
+_SLIP = 1e-9
+
+
+@dataclass(frozen=True, eq=False)
+class CoulombJump(Jump):
+    """A predicted velocity jump with friction.
+
+    Attributes:
+        friction: Coulomb coefficient.
+        sticks: Whether the contact point sticks.
+        slip_direction: Direction of the slip, world, unit, shape (3,); ``None`` if the contact point sticks.
+    """
+
+    friction: float
+    sticks: bool
+    slip_direction: Array | None
+
+    @staticmethod
+    def of(jump: Jump, impulse: Array, friction: float, slip: Array) -> CoulombJump:
+        """Return a jump with the impulse of a contact and its slip per approach speed, both of shape (3,)."""
+        size = float(np.linalg.norm(slip))
+        direction = None if size <= _SLIP else slip / size
+        return CoulombJump(
+            **vars(jump) | {"impulse": impulse}, friction=friction, sticks=direction is None, slip_direction=direction
+        )
+
+
+def coulomb_jump(objective: WorstCaseObjective, q: Array, rebound: float) -> CoulombJump | None:
+    """Return the jump of the leading contact with friction for ``rebound = (1 + e) v_n``, m/s; ``None`` for none."""
+    try:
+        found = coulomb_impact(objective.oracle, q)
+    except MetricError:
+        return None
+    impulse = found.impulse * rebound
+    jump = weighed_jump(objective, found.jump * rebound, impulse)
+    return CoulombJump.of(jump, impulse, objective.contact.friction, found.slip)
+
+
+def coulomb_jumps(objective: WorstCaseObjective, q: Array, speed: float) -> tuple[CoulombJump, ...] | None:
+    """Return the jump of the plastic impact of several contacts at once, each with its own impulse and slip.
+
+    Every contact point approaches along its own normal at ``speed``, m/s.  The jump and its norm are those of all
+    contacts together.  ``None`` if contacts can pull, or if the iteration does not converge.
+    """
+    if objective.bilateral:
+        return None
+    oracles = [single.oracle.at(q) for single in objective.singles]
+    J, normals = np.vstack([oracle.J for oracle in oracles]), np.array([oracle.n for oracle in oracles])
+    friction = np.array([oracle.contact.friction for oracle in oracles])
+    responses = objective.oracle.at(q).solve(J.T)
+    B = J @ responses
+    p = contact_impulses((B + B.T) / 2, normals, friction)
+    if p is None:
+        return None
+    after = (B @ p.ravel()).reshape(p.shape) - normals
+    slips = after - normals * (after * normals).sum(1, keepdims=True)
+    found = weighed_jump(objective, speed * (responses @ p.ravel()), speed * p[0])
+    each = zip(speed * p, friction, slips, strict=True)
+    return tuple(CoulombJump.of(found, impulse, float(mu), slip) for impulse, mu, slip in each)
+
+
+def contact_impulses(B: Array, normals: Array, friction: Array) -> Array | None:
+    """Return the impulses per unit approach speed, world, shape (m, 3); ``None`` if they do not converge.
+
+    ``B`` has shape (3m, 3m), the world unit ``normals`` have shape (m, 3), and the coefficients shape (m,).
+    """
+    count = len(normals)
+    blocks, p = B.reshape(count, 3, count, 3), np.zeros((count, 3))
+    for _ in range(_SWEEPS):
+        before = p.copy()
+        for i, (n, mu) in enumerate(zip(normals, friction, strict=True)):
+            own = blocks[i, :, i]
+            others = np.einsum("ajb,jb->a", blocks[i], p) - own @ p[i] - n
+            for _ in range(_STEPS):
+                u = own @ p[i] + others
+                slip = np.linalg.norm(u - (n @ u) * n)
+                p[i] = _on_cone(p[i] - (u + mu * slip * n) / max(np.linalg.norm(own), 1e-300), n, mu)
+        if np.abs(p - before).max() <= _TOLERANCE * np.abs(p).max():
+            return p
+    return None
+
+
+def _on_cone(p: Array, n: Array, mu: float) -> Array:
+    """Return the nearest impulse with ``‖p_t‖ ≤ μ p_n``."""
+    along = float(n @ p)
+    across = p - along * n
+    size = float(np.linalg.norm(across))
+    if along < 0 or size > mu * along:
+        along = max(along + mu * size, 0.0) / (1 + mu**2)
+        across = across * (mu * along / max(size, 1e-300))
+    return np.asarray(along * n + across)

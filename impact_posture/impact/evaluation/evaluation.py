@@ -1,0 +1,281 @@
+"""All quantities of one impact at one posture, as ``evaluate`` and ``result.json`` show them."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass, replace
+from operator import attrgetter
+
+import numpy as np
+import pinocchio as pin
+
+from impact_posture.config.toml_tables import json_block
+from impact_posture.errors import InputError, MetricError
+from impact_posture.impact.elasticity.contact_compression import (
+    Compression,
+    ContactStiffness,
+    both_models,
+    compression,
+)
+from impact_posture.impact.elasticity.elastic_joints import ElasticImpact, ElasticResponse
+from impact_posture.impact.evaluation.coulomb_jump import CoulombJump, coulomb_jump, coulomb_jumps
+from impact_posture.impact.evaluation.ellipsoids import Ellipsoid, ellipsoid_of
+from impact_posture.impact.evaluation.scalars import (
+    Scalars,
+    VariantValue,
+    objective_gradient,
+    objective_value,
+    variant_values,
+    worst_variant,
+)
+from impact_posture.impact.evaluation.velocity_jump import Dominance, Jump, find_dominance, weighed_jump
+from impact_posture.impact.friction.contact_stability import ContactStability, contact_stability
+from impact_posture.impact.impact_contact import LARGEST, point_on
+from impact_posture.impact.quantities.impact_oracle import ImpactOracle
+from impact_posture.impact.worst_case.impulse_box import ImpulseBox, WorstImpulses
+from impact_posture.impact.worst_case.worst_normal import WorstNormal
+from impact_posture.impact.worst_case_objective import WorstCaseObjective
+from impact_posture.system.arrays import Array
+
+# A relative change of H above this share, with supports ten times as stiff, gets a warning.
+_SOFT = 0.01
+
+
+@dataclass(frozen=True, eq=False)
+class Evaluation:
+    """One impact at one posture.
+
+    Attributes:
+        q: Configuration, shape (nq,).
+        scalars: H, G, V, S, E, contact-consistent if there are supports; also attributes of the evaluation itself.
+        objective: The objective's value, λ̄² included; ``None`` where it does not exist.
+        gradient: Tangent gradient of H, shape (nv,).
+        objective_gradient: Tangent gradient of the objective, shape (nv,); ``None`` where it does not exist.
+        normal: World unit normal of H, G, V, S, E and the jumps, shape (3,).
+        worst_normal: World unit normal of the objective, which is ``normal`` or the worst in the cone around it.
+        cone: The worst normal of the cone, world; ``None`` without a cone, or where the objective does not exist.
+        ellipsoid: Dynamic impact ellipsoid ``Λ_c``.
+        pose: World placement of the contact frame.
+        speed: Approach speed of the predicted jumps, m/s.
+        restitution: Coefficient of restitution of the predicted jumps.
+        frictionless: Jump without friction; ``None`` if the contact is blocked along the normal.
+        sticking: Jump of a contact point that sticks; ``None`` where it does not exist.
+        coulomb: Jump with the friction of the contact, sticking or sliding; ``None`` where it does not exist.
+        together: Jump with friction of the plastic impact of several contacts at once, with the impulse and slip of
+            each contact; ``None`` for one contact, for contacts that can pull, or where it was not found.
+        energy_loss: Energy that the frictionless impact dissipates, J; ``None`` if the contact is blocked.
+        compression: Compression time, peak force and the number x; ``None`` if nothing is known of them.
+        elastic: Response of links, rotors and springs to the contact; only with the joint model ``elastic``.
+        dominance: Whether one light joint makes up most of H.
+        without_supports: H, G, V, S, E of the same robot without its supports; ``None`` if it has none.
+        compliance_effect: Relative change of H with a tenth of the compliance; ``None`` without supports.
+        contact_stability: Whether the feet stay under the impact; ``None`` without supports.
+        contacts: Evaluation of each of several contacts alone, the leading contact first; empty for one contact.
+        impulses: The worst impulses of several contacts; ``None`` for one contact.
+        model_variants: Objective and scalars for each model variant; empty if there is none.
+        warnings: Limits of these numbers, one line each.
+    """
+
+    q: Array
+    scalars: Scalars
+    objective: float | None
+    gradient: Array
+    objective_gradient: Array | None
+    normal: Array
+    worst_normal: Array
+    cone: WorstNormal | None
+    ellipsoid: Ellipsoid
+    pose: pin.SE3
+    speed: float
+    restitution: float
+    frictionless: Jump | None
+    sticking: Jump | None
+    coulomb: CoulombJump | None
+    together: tuple[CoulombJump, ...] | None
+    energy_loss: float | None
+    compression: Compression | None
+    elastic: ElasticResponse | None
+    dominance: Dominance
+    without_supports: Scalars | None
+    compliance_effect: float | None
+    contact_stability: ContactStability | None
+    contacts: tuple[Evaluation, ...]
+    impulses: WorstImpulses | None
+    model_variants: tuple[VariantValue, ...]
+    warnings: tuple[str, ...]
+
+    H = property(attrgetter("scalars.H"), doc="Squared jump per squared impulse.")
+    G = property(attrgetter("scalars.G"), doc="Inverse effective mass along the normal, 1/kg.")
+    V = property(
+        attrgetter("scalars.V"), doc="Squared jump per squared approach speed without friction, or ``None``."
+    )
+    S = property(attrgetter("scalars.S"), doc="Squared jump per squared approach speed if sticking, or ``None``.")
+    E = property(attrgetter("scalars.E"), doc="Energy lost per squared approach speed, kg, or ``None``.")
+
+    def to_dict(self) -> dict[str, object]:
+        """Return the ``initial`` or ``optimal`` block of ``result.json``; a value that does not exist is ``None``."""
+        found, quaternion = json_block(self), pin.Quaternion(self.pose.rotation)
+        block: dict[str, object] = {
+            **{key: found[key] for key in ("q", "objective")},
+            **found["scalars"],
+            "effective_mass": self.scalars.effective_mass,
+            **{key: found[key] for key in ("gradient", "objective_gradient", "worst_normal", "ellipsoid")},
+            "pose": {"position": self.pose.translation.tolist(), "quaternion_xyzw": quaternion.coeffs().tolist()},
+            "jump": {key: found[key] for key in _JUMP},
+            **{key: found[key] for key in ("compression", "elastic", "dominance")},
+        }
+        if self.cone is not None:
+            block["cone"] = found["cone"]
+        if self.without_supports is not None:
+            block |= {"free": found["without_supports"], "compliance_effect": self.compliance_effect}
+        if self.contact_stability is not None:
+            block["footing"] = found["contact_stability"]
+        if self.impulses is not None:
+            block |= {"worst_impulses": found["impulses"], "coulomb_together": found["together"]}
+            block["by_contact"] = [{key: one[key] for key in _OWN if key in one} for one in found["contacts"]]
+        if self.model_variants:
+            block["by_scenario"] = found["model_variants"]
+            block["worst_scenario"] = self.model_variants[worst_variant(self.model_variants)].name
+        return block
+
+
+_JUMP = ("speed", "restitution", "frictionless", "sticking", "coulomb", "energy_loss")
+# Keys of one contact among several, without those of the posture and of the objective.
+_OWN = ("H", "G", "V", "S", "E", "effective_mass", "gradient", "ellipsoid", "pose", "free", "footing")
+
+
+def evaluate(
+    objective: WorstCaseObjective,
+    q: Array,
+    speed: float = 1.0,
+    restitution: float = 0.0,
+    contact_stiffness: ContactStiffness | None = None,
+) -> Evaluation:
+    """Compute all impact quantities at ``q`` from Pinocchio's numbers, and predict the jump of one impact.
+
+    The frictionless jump is ``Δν = a (1+e) v_n / G``, with the impulse ``(1+e) v_n / G`` along n.  The jump of a
+    contact that sticks is ``Δν = (1+e) v_n M⁻¹Jᵀ(JM⁻¹Jᵀ)⁻¹ n``.
+    :mod:`impact_posture.impact.friction.coulomb_impulse` has that with the friction of the contact.
+
+    Args:
+        objective: Robot, contact, metric, kind and supports.
+        q: Configuration, shape (nq,).
+        speed: Approach speed ``v_n``, m/s.
+        restitution: Coefficient of restitution ``e``.
+        contact_stiffness: Elasticity of the contact, if it is known.
+
+    Raises:
+        InputError: The speed is negative or not finite, or the restitution lies outside [0, 1].
+    """
+    if not 0 <= speed <= LARGEST:
+        raise InputError(f"the approach speed is {speed:g}", where="speed", hint=f"give m/s, 0 to {LARGEST:g}")
+    if not 0 <= restitution <= 1:
+        raise InputError(f"the restitution is {restitution:g}", where="restitution", hint="give 0 to 1")
+    robot, oracle = objective.robot, objective.oracle
+    found = oracle.quantities(q)
+    scalars = Scalars.of(found)
+    rebound = (1 + restitution) * speed
+    without_supports, effect = _without_supports(objective, q, found.H)
+    model_variants = variant_values(objective, q)
+    member = objective.by_variant[worst_variant(model_variants)] if model_variants else objective
+    value = objective_value(member, q)
+    cone = _worst(member, q)
+    singles = objective.singles if objective.others else ()
+    squeezed = compression(objective, q, speed, contact_stiffness)
+    return Evaluation(
+        q=np.array(q, dtype=float),
+        scalars=scalars,
+        objective=value,
+        gradient=oracle.gradient_H(q),
+        objective_gradient=objective_gradient(member, q, value),
+        normal=found.normal,
+        worst_normal=found.normal if cone is None else cone.normal,
+        cone=cone,
+        ellipsoid=ellipsoid_of(found.ellipsoid),
+        pose=oracle.numeric.at(q).placement(point_on(robot, objective.contact.frame)),
+        speed=speed,
+        restitution=restitution,
+        frictionless=(
+            None if scalars.E is None
+            else weighed_jump(objective, found.jump * rebound / found.G, found.normal * rebound / found.G)
+        ),
+        sticking=(
+            None if found.sticking_jump is None or found.sticking_impulse is None
+            else weighed_jump(objective, found.sticking_jump * rebound, found.sticking_impulse * rebound)
+        ),
+        coulomb=None if scalars.E is None else coulomb_jump(objective, q, rebound),
+        together=coulomb_jumps(objective, q, speed) if objective.others else None,
+        energy_loss=None if scalars.E is None else scalars.E * speed**2 * (1 - restitution**2),
+        compression=squeezed,
+        elastic=_elastic(objective, q, speed, contact_stiffness),
+        dominance=find_dominance(objective, found),
+        without_supports=without_supports,
+        compliance_effect=effect,
+        contact_stability=contact_stability(oracle, objective.supports, q) if objective.supports else None,
+        contacts=tuple(evaluate(single, q, speed, restitution, contact_stiffness) for single in singles),
+        impulses=member.worst_case.worst(q) if isinstance(member.worst_case, ImpulseBox) else None,
+        model_variants=model_variants,
+        warnings=(*_warnings(scalars, effect), *_joint_model_warning(objective, q, squeezed)),
+    )  # fmt: skip
+
+
+def _worst(objective: WorstCaseObjective, q: Array) -> WorstNormal | None:
+    if objective.normal_cone is None:
+        return None
+    try:
+        return objective.normal_cone.worst_in_world(q)
+    except MetricError:
+        return None
+
+
+def _without_supports(objective: WorstCaseObjective, q: Array, H: float) -> tuple[Scalars | None, float | None]:
+    if not objective.supports:
+        return None, None
+    case = objective.case
+    alone = Scalars.of(ImpactOracle(replace(case, supports=())).quantities(q))
+    stiffer = ImpactOracle(replace(case, compliance=case.compliance / 10)).quantities(q).H
+    return alone, abs(stiffer - H) / H if H > 0 else 0.0
+
+
+def _elastic(
+    objective: WorstCaseObjective, q: Array, speed: float, contact: ContactStiffness | None
+) -> ElasticResponse | None:
+    """Return the response of elastic joints to the stated contact, if the joint model asks for it."""
+    if objective.robot.joint_model != "elastic":
+        return None
+    if contact is None:
+        raise InputError(
+            "elastic needs the elasticity of the contact",
+            where="joint_model",
+            hint="add `contact_stiffness` (N/m, or a material) or `contact_duration`",
+        )
+    G = objective.oracle.quantities(q).G
+    return ElasticImpact(objective.case).response(q, contact.linear_stiffness(G, speed), speed)
+
+
+def _joint_model_warning(objective: WorstCaseObjective, q: Array, found: Compression | None) -> tuple[str, ...]:
+    """Warn where the joint model does not fit x, with the answers of both models."""
+    if found is None or found.x is None or objective.robot.joint_model in (found.fitting, "locked", "elastic"):
+        return ()
+    values = {name: objective_value(other, q) for name, other in both_models(objective).items()}
+    listed = ", ".join(f"{value:.4g} with '{name}'" for name, value in values.items() if value is not None)
+    advice = f"`joint_model='{found.fitting}'` fits" if found.fitting else "expect a value between the two"
+    return (f"{found.line}; the objective is {listed}: {advice}",)
+
+
+def _warnings(scalars: Scalars, effect: float | None) -> tuple[str, ...]:
+    lines = []
+    if scalars.E is None:
+        lines.append(
+            "the contact point cannot move along the normal in this posture, so its effective mass is unbounded, "
+            "and V and E are undefined: choose another posture"
+        )
+    if scalars.S is None:
+        lines.append(
+            "S is undefined: the normal has a part along which the contact point cannot move in this posture"
+        )
+    if effect is not None and effect > _SOFT:
+        lines.append(
+            f"H changes by {100 * effect:.2g} % when the supports' compliance is a tenth: along this normal the "
+            "supports hold by their compliance"
+        )
+    return tuple(lines)

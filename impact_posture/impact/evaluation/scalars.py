@@ -1,0 +1,108 @@
+"""The numbers H, G, V, S, E of an impact and the objective made of them, where they exist."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+
+import numpy as np
+
+from impact_posture.errors import MetricError
+from impact_posture.impact.kinds.impact_kind import ImpactKind
+from impact_posture.impact.quantities.impact_oracle import ImpactQuantities
+from impact_posture.impact.quantities.sticking_point import SINGULAR
+from impact_posture.impact.worst_case_objective import WorstCaseObjective
+from impact_posture.system.arrays import Array
+
+
+@dataclass(frozen=True)
+class Scalars:
+    """The five numbers of an impact; ``None`` where one does not exist.
+
+    Attributes:
+        H: Squared jump per squared impulse.
+        G: Inverse effective mass along the normal, 1/kg.
+        V: Squared jump per squared approach speed, frictionless, e = 0.
+        S: The same if the contact point sticks.
+        E: Energy dissipated per squared approach speed, e = 0, which is half the effective mass, kg.
+    """
+
+    H: float
+    G: float
+    V: float | None
+    S: float | None
+    E: float | None
+
+    @staticmethod
+    def of(found: ImpactQuantities) -> Scalars:
+        """Return the numbers; ``V`` and ``E`` do not exist if the contact cannot move along the normal."""
+        if found.blocked:
+            return Scalars(found.H, found.G, None, found.S, None)
+        return Scalars(found.H, found.G, found.V, found.S, found.E)
+
+    @property
+    def effective_mass(self) -> float | None:
+        """``1/G``, kg; ``None`` where unbounded."""
+        return None if self.E is None else 1 / self.G
+
+    def to_dict(self) -> dict[str, float | None]:
+        """Return JSON content."""
+        return {"H": self.H, "G": self.G, "V": self.V, "S": self.S, "E": self.E}
+
+
+@dataclass(frozen=True)
+class VariantValue:
+    """The impact on one model variant.
+
+    Attributes:
+        name: Name of the model variant.
+        objective: The objective on it; ``None`` where it does not exist.
+        scalars: H, G, V, S, E of the leading contact on it.
+    """
+
+    name: str
+    objective: float | None
+    scalars: Scalars
+
+    def to_dict(self) -> dict[str, object]:
+        """Return JSON content."""
+        return {"name": self.name, "objective": self.objective, **self.scalars.to_dict()}
+
+
+def variant_values(objective: WorstCaseObjective, q: Array) -> tuple[VariantValue, ...]:
+    """Return the objective and its parts on each model variant; empty if there is none."""
+    pairs = zip(objective.model_variants, objective.by_variant, strict=True) if objective.model_variants else ()
+    return tuple(
+        VariantValue(variant.name, objective_value(member, q), Scalars.of(member.oracle.quantities(q)))
+        for variant, member in pairs
+    )
+
+
+def worst_variant(variants: tuple[VariantValue, ...]) -> int:
+    """Return the index of the worst model variant; one without a value comes before all others."""
+    return int(np.argmax([np.inf if variant.objective is None else variant.objective for variant in variants]))
+
+
+def objective_value(objective: WorstCaseObjective, q: Array) -> float | None:
+    """Return the objective; ``None`` if it does not exist for a model variant or a normal of the cone."""
+    if objective.model_variants:
+        values = [objective_value(member, q) for member in objective.by_variant]
+        return None if None in values else max(v for v in values if v is not None)
+    if isinstance(objective.worst_case, ImpactKind) and objective.kind != "coulomb":
+        scalars = Scalars.of(objective.oracle.quantities(q))
+        alone: float | None = getattr(scalars, objective.impact_kind.symbol)
+        return None if alone is None else objective.scale * alone
+    try:
+        value = objective.value(q)
+    except MetricError:
+        return None
+    return value if np.isfinite(value) else None
+
+
+def objective_gradient(objective: WorstCaseObjective, q: Array, value: float | None) -> Array | None:
+    """Return the tangent gradient where the objective has ``value``, shape (nv,); a subgradient at a tie.
+
+    It is ``None`` where it does not exist.
+    """
+    values = np.linalg.eigvalsh(objective.oracle.quantities(q).mobility)
+    singular = objective.kind == "sticking" and values[0] <= SINGULAR * values[-1]
+    return None if singular or value is None else objective.gradient(q)

@@ -1,0 +1,1 @@
+"""Coulomb friction at the contact and at the feet."""

@@ -1,0 +1,198 @@
+"""Check whether support impulses within the friction cones can hold the feet during an impact.
+
+The metric holds the feet by any impulse, even a pull.  The impulses are not unique where ``J_s`` lacks rank.  They
+form the set ``f + N z``, where ``N`` is a basis of ``{f: J_sᵀ f = 0}``, impulses by which feet press against each
+other.  Weight has no effect within an impact.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from dataclasses import dataclass
+
+import numpy as np
+import scipy
+
+from impact_posture.config.toml_tables import json_block
+from impact_posture.impact.impact_contact import Support
+from impact_posture.impact.quantities.impact_oracle import ImpactOracle
+from impact_posture.system.arrays import Array
+
+# A singular value of J_s below this share of the largest one is rounding.
+_RANK = 1e-9
+# An impulse below this share of the largest one is zero.
+_NONE = 1e-6
+# Sides of the pyramid that stands for a friction cone.  It lies inside the cone.
+_SIDES = 16
+_MOST_FRICTION = 10.0
+
+
+@dataclass(frozen=True, eq=False)
+class FootImpulse:
+    """Support impulse on one foot per unit impulse of the impact.
+
+    Attributes:
+        frame: Frame of the foot.
+        impulse: World axes, shape (3,); positive z pushes the robot up.
+        moment: Moment about its contact point, world axes, shape (3,); zero for a point.
+        lifts: Whether the ground would have to pull.
+    """
+
+    frame: str
+    impulse: Array
+    moment: Array
+    lifts: bool
+
+    def to_dict(self) -> dict[str, object]:
+        """Return JSON content."""
+        return json_block(self)
+
+
+@dataclass(frozen=True)
+class ContactStability:
+    """Whether the feet can stay.
+
+    Attributes:
+        friction: Least friction coefficient with which all feet stay; infinite above ten; ``None`` if a foot lifts or
+            a sole tips at any friction.
+        feet: Impulse on each foot: within the cones if possible, else with the least pull.
+        freedom: Dimension of the set of impulses; zero if they are unique.
+    """
+
+    friction: float | None
+    feet: tuple[FootImpulse, ...]
+    freedom: int
+
+    @property
+    def line(self) -> str:
+        """The verdict in words."""
+        lifting = [foot.frame for foot in self.feet if foot.lifts]
+        if lifting:
+            return f"the impact lifts {', '.join(lifting)}, although the metric assumes that all feet stay"
+        if self.friction is None:
+            return "a sole tips over its edge, although the metric assumes that all feet stay"
+        if self.friction > _MOST_FRICTION:
+            return f"the feet slide at any friction below {_MOST_FRICTION:g}"
+        return f"the feet stay with a friction coefficient of {self.friction:.2f} or more"
+
+    def to_dict(self) -> dict[str, object]:
+        """Return JSON content."""
+        finite = self.friction is not None and np.isfinite(self.friction)
+        friction = self.friction if finite else None
+        return json_block(self) | {"friction": friction, "stays": bool(finite), "verdict": self.line}
+
+
+def contact_stability(oracle: ImpactOracle, supports: tuple[Support, ...], q: Array) -> ContactStability:
+    """Find impulses within the friction cones at ``q``, shape (nq,), or impulses with the least pull.
+
+    The ground is level, so the axis of the cones is world z.  A sole with a ``size`` bears moments up to its edges.
+    """
+    particular = oracle.quantities(q).support_impulse
+    values, vectors = np.linalg.eigh(oracle.Js @ oracle.Js.T)
+    basis = vectors[:, values <= _RANK**2 * max(float(values[-1]), 1e-300)]
+    cones = FrictionCones(supports, [oracle.numeric.placement(foot.point).rotation for foot in oracle.feet])
+    none = _NONE * max(float(np.abs(particular).max(initial=0.0)), 1e-300)
+
+    def verdict(friction: float | None, impulse: Array) -> ContactStability:
+        return ContactStability(friction, cones.feet(impulse, none), basis.shape[1])
+
+    lifting = cones.least_pull(particular, basis)
+    if cones.pull(lifting) > none:
+        return verdict(None, lifting)
+    found = cones.within(particular, basis, _MOST_FRICTION)
+    if found is None:
+        # At this friction no row limits sliding, so only a sole that tips is left as a reason.
+        tips = cones.within(particular, basis, 1e6) is None
+        return verdict(None if tips else float("inf"), lifting)
+    low, high = 0.0, _MOST_FRICTION
+    while high - low > 1e-4:
+        middle = (low + high) / 2
+        tried = cones.within(particular, basis, middle)
+        low, high, found = (middle, high, found) if tried is None else (low, middle, tried)
+    return verdict(high, found)
+
+
+class FrictionCones:
+    """The friction cones as inequalities ``A f ≤ 0`` on the stacked impulses.
+
+    Args:
+        supports: Feet that stay on the ground.
+        axes: World axes of the frame of each foot, along which its sole has a size, shape (3, 3).
+    """
+
+    def __init__(self, supports: tuple[Support, ...], axes: Sequence[Array]) -> None:
+        starts = np.cumsum([0, *[s.rows for s in supports]])
+        self._size = int(starts[-1])
+        self._feet = [(int(k), s, np.asarray(R)) for k, s, R in zip(starts, supports, axes, strict=False)]
+
+    def matrix(self, friction: float) -> tuple[Array, list[str]]:
+        """Return ``A``, shape (rows, impulses), for a friction coefficient, and the name of each row.
+
+        The rows are ``−f_z ≤ 0``, for soles ``|τ_x| ≤ Y f_z`` and ``|τ_y| ≤ X f_z`` in the axes of the foot, then
+        ``|f_t| ≤ μ f_z``, and for soles ``|τ_z| ≤ μ (X+Y)/2 f_z``.
+        """
+        names, rows = [f"{s.frame} lifts" for _, s, _ in self._feet], [*self._lifts()]
+
+        def add(name: str, start: int, entries: Array) -> None:
+            names.append(name)
+            rows.append(np.zeros(self._size))
+            rows[-1][start : start + len(entries)] = entries
+
+        for start, support, R in (foot for foot in self._feet if foot[1].has_sole):
+            for axis, reach in ((0, support.size[1]), (1, support.size[0])):
+                for sign in (1.0, -1.0):
+                    add(f"{support.frame} tips", start, np.array([0.0, 0.0, -reach, *(sign * R[:, axis])]))
+        inner = friction * np.cos(np.pi / _SIDES)
+        for start, support, _ in self._feet:
+            for angle in 2 * np.pi * np.arange(_SIDES) / _SIDES:
+                add(f"{support.frame} slides", start, np.array([np.cos(angle), np.sin(angle), -inner]))
+            if support.has_sole:
+                twist = friction * sum(support.size) / 2
+                for sign in (1.0, -1.0):
+                    add(f"{support.frame} turns", start, np.array([0.0, 0.0, -twist, 0.0, 0.0, sign]))
+        return np.array(rows), names
+
+    def _lifts(self) -> Array:
+        rows = np.zeros((len(self._feet), self._size))
+        for row, (start, _, _) in zip(rows, self._feet, strict=True):
+            row[start + 2] = -1.0
+        return rows
+
+    def pull(self, impulse: Array) -> float:
+        """Return the largest pull of the ground on a foot; zero if it pushes all feet."""
+        return float(np.max(self._lifts() @ impulse, initial=0.0))
+
+    def least_pull(self, particular: Array, basis: Array) -> Array:
+        """Return the impulses whose largest pull is least."""
+        up, count = self._lifts(), basis.shape[1]
+        if not count:
+            return particular
+        # min t: -f_z ≤ t, t ≥ 0.
+        cost = np.concatenate([np.zeros(count), [1.0]])
+        A = np.hstack([up @ basis, -np.ones((len(up), 1))])
+        bounds = [(None, None)] * count + [(0.0, None)]
+        found = scipy.optimize.linprog(cost, A_ub=A, b_ub=-up @ particular, bounds=bounds)
+        return particular if found.status != 0 else particular + basis @ found.x[:-1]
+
+    def within(self, particular: Array, basis: Array, friction: float) -> Array | None:
+        """Return the impulses within the cones whose largest entry is least, or ``None``."""
+        A, _ = self.matrix(friction)
+        slack = 1e-9 * max(float(np.abs(particular).max(initial=0.0)), 1e-300)
+        if not basis.shape[1]:
+            return particular if (A @ particular <= _NONE * np.abs(particular).max(initial=1e-300)).all() else None
+        size = basis.shape[1]
+        cost = np.concatenate([np.zeros(size), [1.0]])
+        limits = np.vstack([np.hstack([sign * basis, -np.ones((len(particular), 1))]) for sign in (1.0, -1.0)])
+        rows = np.vstack([np.hstack([A @ basis, np.zeros((len(A), 1))]), limits])
+        right = np.concatenate([slack - A @ particular, -particular, particular])
+        found = scipy.optimize.linprog(cost, A_ub=rows, b_ub=right, bounds=[(None, None)] * (size + 1))
+        return particular + basis @ found.x[:-1] if found.status == 0 else None
+
+    def feet(self, impulse: Array, none: float) -> tuple[FootImpulse, ...]:
+        """Return the impulse on each foot; a pull above ``none`` lifts it."""
+        found = []
+        for start, support, _ in self._feet:
+            own = impulse[start : start + support.rows]
+            moment = own[3:] if support.rows == 6 else np.zeros(3)
+            found.append(FootImpulse(support.frame, own[:3].copy(), moment.copy(), bool(own[2] < -none)))
+        return tuple(found)

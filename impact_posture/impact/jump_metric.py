@@ -1,0 +1,135 @@
+"""The metric ``‖Δν‖²_W`` of a velocity jump."""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from dataclasses import dataclass
+from pathlib import Path
+from typing import get_args
+
+import numpy as np
+
+from impact_posture.config.argument_types import check_types
+from impact_posture.config.settings import MetricKind
+from impact_posture.config.toml_tables import read_toml
+from impact_posture.errors import MetricError
+from impact_posture.robot.model_joints import v_slice
+from impact_posture.robot.robot import Robot
+from impact_posture.system.arrays import Array
+
+
+@dataclass(frozen=True)
+class Metric:
+    """The weight ``W`` of ``‖Δν‖²_W``.
+
+    Attributes:
+        kind: ``euclidean`` (W = I), ``kinetic`` (W = M) or ``weighted`` (diagonal).
+        weights: Diagonal of the weighted metric, shape (nv,); else ``None``.
+        source: Origin of the weights.
+
+    Raises:
+        InputError: The kind is none of them.
+        MetricError: The weights do not belong to the kind, or are not all above zero.
+    """
+
+    kind: MetricKind = "euclidean"
+    weights: tuple[float, ...] | None = None
+    source: str = ""
+
+    def __post_init__(self) -> None:
+        check_types(type(self).__init__, vars(self))
+        if (self.kind == "weighted") != (self.weights is not None):
+            what = "needs weights" if self.weights is None else "takes no weights"
+            raise MetricError(f"the {self.kind} metric {what}", where="metric", hint="see build_metric")
+        if self.weights is not None:
+            # An array has neither truth value nor hash.
+            object.__setattr__(self, "weights", tuple(float(weight) for weight in self.weights))
+        for value in self.weights or ():
+            if not (np.isfinite(value) and value > 0):
+                raise MetricError(
+                    f"a weight is {value:g}", where=self.source or "weights", hint="every weight must be above zero"
+                )
+
+    def diagonal(self, nv: int) -> Array:
+        """Return the diagonal of ``W`` of a constant metric, shape (nv,)."""
+        return np.ones(nv) if self.weights is None else np.array(self.weights)
+
+
+def build_metric(robot: Robot, kind: MetricKind, weights: str | tuple[float, ...] | None = None) -> Metric:
+    """Build a metric.
+
+    The weighted metric takes ``weights``: nv numbers, ``velocity-limits``, or a TOML file of joint = weight
+    (``base = [6 numbers]``).
+
+    Raises:
+        MetricError: Weights are missing, zero or negative.
+    """
+    if kind != "weighted":
+        if weights is not None and kind in get_args(MetricKind):
+            raise MetricError(
+                f"are given, but the metric is {kind}", where="weights", hint="remove them or add `metric='weighted'`"
+            )
+        return Metric(kind)
+    if weights is None:
+        raise MetricError(
+            "the weighted metric needs weights",
+            where="metric",
+            hint="add `weights=FILE` or `weights='velocity-limits'`",
+        )
+    source = weights if isinstance(weights, str) else "numbers"
+    if not isinstance(weights, str):
+        check_weights(robot, weights)
+        values = np.array(weights, dtype=float)
+    elif weights == "velocity-limits":
+        values = _from_limits(robot)
+    else:
+        values = _from_file(robot, Path(weights))
+    for name, value in zip(robot.tangent_names, values, strict=True):
+        if not (np.isfinite(value) and value > 0):
+            raise MetricError(
+                f"the weight of '{name}' is {value:g}", where=source, hint="every weight must be above zero"
+            )
+    return Metric("weighted", tuple(float(v) for v in values), source)
+
+
+def check_weights(robot: Robot, weights: Sequence[float] | None) -> None:
+    """Refuse weights that are not one number for each of the nv velocities.
+
+    Raises:
+        MetricError: The number of weights differs from nv.
+    """
+    if weights is not None and np.shape(weights) != (robot.nv,):
+        hint = f"give {robot.nv} numbers above zero"
+        raise MetricError(f"has {np.size(weights)} entries", where="weights", hint=hint)
+
+
+def _from_limits(robot: Robot) -> Array:
+    limits = robot.velocity_limits
+    base = 6 if robot.floating else 0
+    # A base has no velocity limits.  1 m/s and 1 rad/s keep it in the sum.
+    limits[:base] = 1.0
+    for name, limit in zip(robot.tangent_names[base:], limits[base:], strict=True):
+        if not limit < 1e6:
+            raise MetricError(
+                f"joint '{name}' has no velocity limit",
+                where="weights",
+                hint="add it to robot.toml [limits.velocity] or give a file",
+            )
+    return np.asarray(1.0 / limits**2)
+
+
+def _from_file(robot: Robot, path: Path) -> Array:
+    table = read_toml(path)
+    values = np.ones(robot.nv)
+    base = 6 if robot.floating else 0
+    for key, value in table.items():
+        try:
+            if key == "base" and base:
+                values[:6] = np.array(value, dtype=float)
+            else:
+                values[v_slice(robot.model, robot.joint_id(key))] = float(value)  # type: ignore[arg-type]
+        except (TypeError, ValueError, OverflowError):
+            raise MetricError(
+                f"key '{key}' holds no number", where=str(path), hint="joint = weight; base = [6 numbers]"
+            ) from None
+    return values

@@ -1,0 +1,1 @@
+"""The kinds of objective: impulse, speed, sticking, coulomb and energy."""

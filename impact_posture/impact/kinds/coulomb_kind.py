@@ -1,0 +1,107 @@
+"""The kind ``coulomb``: the squared jump at a given approach speed with friction, sticking or sliding."""
+
+from __future__ import annotations
+
+from contextlib import suppress
+
+import casadi as ca
+import numpy as np
+
+from impact_posture.dynamics.tree import Tree
+from impact_posture.errors import MetricError
+from impact_posture.impact.friction.coulomb_impulse import (
+    NO_FRICTION,
+    coulomb_direction,
+    coulomb_gradient,
+    coulomb_impact,
+)
+from impact_posture.impact.kinds.impact_kind import ImpactKind
+from impact_posture.impact.objective import Subgradients
+from impact_posture.impact.quantities.impact_kernel import ImpactKernel
+from impact_posture.impact.quantities.lifted_form import Guess, Lifted, UnknownJump, impact_at, in_world, unknown_jump
+from impact_posture.system.arrays import Array
+
+# Slip times distance from the edge of the cone is zero, and at most this in the program, which needs an inside.
+_CORNER = 1e-10
+
+
+class CoulombKind(ImpactKind):
+    """``C = ‖M⁻¹Jᵀp‖²_W/v²``: the squared jump at a given approach speed with the friction ``μ`` of the contact.
+
+    The impulse ``p`` is that of :mod:`impact_posture.impact.friction.coulomb_impulse`.  ``C`` is ``S`` where the
+    contact point sticks,
+    and ``V`` without friction.  It is continuous, with a kink where the contact point begins to slip.
+    """
+
+    name, symbol = "coulomb", "C"
+    units = "jump² per (m/s)² of approach, with friction"
+    kink = "where the contact point begins to slip, grad is that of sticking"
+    no_cone = "coulomb is no quadratic form of the normal: the exact worst case over a cone is not known for it"
+
+    def value(self, q: Array) -> float:
+        """Return the value from Pinocchio's numbers; see the base for errors."""
+        jump = coulomb_impact(self.oracle, q).jump
+        return float(jump @ self.oracle.weigh(jump))
+
+    def subgradients(self, q: Array, within: float = 0.0) -> Subgradients:
+        """Return the gradient, and that of the other branch where both nearly tie and the value is the larger.
+
+        The first is that of sticking at the kink.  Where the value is the smaller of both, no optimum lies there.
+        """
+        oracle, sides = self.oracle, [coulomb_impact(self.oracle, q)]
+        if within > 0:
+            with suppress(MetricError):
+                sides.append(coulomb_impact(oracle, q, other=True))
+        values = np.array([side.jump @ oracle.weigh(side.jump) for side in sides])
+        gaps = values[0] - values
+        near = [k for k, gap in enumerate(gaps) if k == 0 or 0 <= gap <= within]
+        return Subgradients(np.array([coulomb_gradient(oracle, q, sides[k]) for k in near]), gaps[near])
+
+    def expressions(self, k: ImpactKernel) -> tuple[ca.SX, ca.SX]:
+        """Return value and tangent gradient (nv) in the symbols of a kernel; at the kink, that of sticking."""
+        case, n = self.case, k.n
+        if case.contact.friction <= NO_FRICTION:
+            return k.V, k.grad_V
+        R = in_world(case, k.tree, ca.SX.eye(3))
+        B = R.T @ k.mobility @ R
+        direction, K = coulomb_direction(B, n, case.contact.friction)
+        x = k.answer([impact_at(case, direction / ca.dot(B @ n, direction))])
+        value = k.product(x, x)
+        r = -value * n - K @ (R.T @ k.adjoint_velocity(x) - value * (B @ n))
+        return value, k.size_gradient(x, impact_at(case, r))
+
+    def unknowns(self, tree: Tree, n: ca.SX, label: str = "") -> UnknownJump:
+        """Return the jump under ``λ(n − μd)``; the last unknowns are ``λ``, ``d``, ``κ`` (slip) and ``o = 1 − ‖d‖²``.
+
+        ``M a − J_sᵀf − λJᵀ(n − μd) = 0``, ``J_s a + εf = 0``, ``nᵀJa = 1``, ``(Ja)_t = κd``.
+        """
+        case, size, d = self.case, ca.SX.sym(f"lam{label}"), ca.SX.sym(f"d{label}", 3)
+        slip, inside = ca.SX.sym(f"kappa{label}"), ca.SX.sym(f"o{label}")
+        jump = unknown_jump(case, tree, impact_at(case, size * (n - case.contact.friction * d)), label)
+        axes = in_world(case, tree, ca.SX.eye(3))
+        moved = axes.T @ jump.contact_velocity
+        along, out = ca.dot(n, moved), ca.dot(n, d)
+        slides = moved - along * n - slip * (d - n * out) - n * out
+        equations = ca.vertcat(along - 1, slides, inside + ca.dot(d, d) - 1)
+        return jump.with_impulse(ca.vertcat(size, d, slip, inside), equations)
+
+    def lift(self, tree: Tree, parameters: ca.SX, scale: ca.SX) -> Lifted:
+        """Return the value under the equations of :meth:`unknowns` and ``κ ≥ 0``, ``o ≥ 0``, ``κo = 0``."""
+        jump = self.unknowns(tree, parameters)
+        slip, inside = jump.variables[-2], jump.variables[-1]
+        return Lifted.of([jump], self.lifted_value(jump), inequalities=[slip * inside - _CORNER])
+
+    def jump(self, q: Array) -> tuple[Array, Array]:
+        """Return the jump with friction, and ``λ``, ``d``, ``κ`` and ``o``."""
+        oracle, friction = self.oracle, self.oracle.contact.friction
+        found = coulomb_impact(oracle, q)
+        n, p = oracle.n, found.impulse
+        size, slip = float(n @ p), float(np.linalg.norm(found.slip))
+        d = (n - p / size) / friction if found.sticks and friction > NO_FRICTION else found.slip / max(slip, 1e-300)
+        return found.jump, np.array([size, *(oracle.axes.T @ d), slip, max(1 - float(d @ d), 0.0)])
+
+    def guess(self, q: Array, scale: float, attempt: int = 0) -> Guess:
+        """Return the unknowns of :meth:`lift` that solve its equations at ``q``; ``κ`` and ``o`` are ≥ 0."""
+        guess = super().guess(q, scale, attempt)
+        guess.lower[-2:] = 0.0
+        return guess

@@ -1,0 +1,19 @@
+"""The kinds of objective by name."""
+
+from __future__ import annotations
+
+from impact_posture.config.settings import ObjectiveKind
+from impact_posture.impact.kinds.coulomb_kind import CoulombKind
+from impact_posture.impact.kinds.energy_kind import EnergyKind
+from impact_posture.impact.kinds.impact_kind import ImpactKind
+from impact_posture.impact.kinds.impulse_kind import ImpulseKind
+from impact_posture.impact.kinds.speed_kind import SpeedKind
+from impact_posture.impact.kinds.sticking_kind import StickingKind
+
+KINDS: dict[ObjectiveKind, type[ImpactKind]] = {
+    "impulse": ImpulseKind,
+    "speed": SpeedKind,
+    "sticking": StickingKind,
+    "coulomb": CoulombKind,
+    "energy": EnergyKind,
+}

@@ -1,0 +1,13 @@
+"""The kind ``speed``: the squared jump at a given approach speed without friction."""
+
+from __future__ import annotations
+
+from impact_posture.impact.kinds.impact_kind import FrictionlessKind
+
+
+class SpeedKind(FrictionlessKind):
+    """``V = H/G²``: the squared jump at a given approach speed without friction."""
+
+    name, symbol = "speed", "V"
+    units = "jump² per (m/s)² of approach, frictionless"
+    no_cone = "speed is H/G², no quadratic form of the normal: the exact worst case over a cone is not known for it"

@@ -1,0 +1,53 @@
+"""The kind ``sticking``: the squared jump at a given approach speed of a contact point that sticks."""
+
+from __future__ import annotations
+
+import casadi as ca
+import numpy as np
+
+from impact_posture.dynamics.tree import Tree, Wrench
+from impact_posture.impact.kinds.impact_kind import QuadraticKind
+from impact_posture.impact.quantities.impact_kernel import ImpactKernel
+from impact_posture.impact.quantities.impact_oracle import no_sticking
+from impact_posture.impact.quantities.lifted_form import UnknownJump, in_world, unknown_jump
+from impact_posture.impact.quantities.sticking_point import SINGULAR
+from impact_posture.system.arrays import Array
+
+
+class StickingKind(QuadraticKind):
+    """``S = ‖M⁻¹Jᵀ(JM⁻¹Jᵀ)⁻¹n‖²_W``: the squared jump at a given approach speed of a contact point that sticks.
+
+    The form is ``K = B⁻¹Λ_cB⁻¹`` with ``B = JM⁻¹Jᵀ``.
+    """
+
+    name, symbol = "sticking", "S"
+    units = "jump² per (m/s)² of approach, no slip"
+    unknown_impulse = True
+
+    def unknowns(self, tree: Tree, n: ca.SX, label: str = "") -> UnknownJump:
+        """Return ``M a − J_sᵀf − Jᵀs = 0``, ``J_s a + εf = 0``, ``J a = n``; ``s`` are the last unknowns."""
+        impulse = ca.SX.sym(f"s{label}", 3)
+        jump = unknown_jump(self.case, tree, Wrench(self.case.point, impulse, ca.SX.zeros(3)), label)
+        return jump.with_impulse(impulse, jump.contact_velocity - in_world(self.case, tree, n))
+
+    def jump(self, q: Array) -> tuple[Array, Array]:
+        """Return jump and impulse ``s``; without friction where ``S`` does not exist."""
+        found = self.oracle.quantities(q)
+        if found.sticking_jump is None or found.sticking_impulse is None:
+            return found.jump / found.G, found.normal / found.G
+        return found.sticking_jump, found.sticking_impulse
+
+    def directions(self, mobility: Array, world: Array) -> Array:
+        """Return ``B⁻¹`` times the directions."""
+        sizes = np.linalg.eigvalsh((mobility + mobility.T) / 2)
+        if sizes[0] <= SINGULAR * sizes[-1]:
+            raise no_sticking()
+        return np.asarray(np.linalg.solve(mobility, world))
+
+    def form_gradient(self, q: Array, n: Array) -> Array:
+        """Return ``∇S`` along ``n``."""
+        return self.oracle.gradient_S(q, n)
+
+    def form_expression(self, k: ImpactKernel) -> ca.SX:
+        """Return ``B⁻¹Λ_cB⁻¹``."""
+        return k.sticking_form

@@ -1,0 +1,224 @@
+"""The impact quantities and their tangent gradients as expressions, by the adjoints of the theory page.
+
+With feet held at compliance ε every formula below holds with ``M + J_sᵀJ_s/ε`` for ``M``, the mass matrix of a robot
+whose feet carry the point mass 1/ε.  So there is one code path with and without supports.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from functools import cached_property
+
+import casadi as ca
+import numpy as np
+import pinocchio as pin
+
+from impact_posture.dynamics.numeric import Numeric
+from impact_posture.dynamics.repeated_limbs import RepeatedLimbs
+from impact_posture.dynamics.tree import ByJoint, PointOnLink, Response, Tree, Wrench
+from impact_posture.impact.impact_case import ImpactCase
+from impact_posture.impact.impact_contact import support_inertia
+from impact_posture.impact.quantities.lifted_form import impact_at, in_world
+from impact_posture.robot.robot import Robot
+from impact_posture.system.arrays import Array, null_space
+
+# Singular values of stacked Jacobians below this part of the largest are rounding.
+_FROZEN = 1e-9
+
+
+class ImpactKernel:
+    """Symbolic ``H, G, V, S, E, Λ_c`` and gradients of one impact.
+
+    Args:
+        case: Robot, contact, metric and supports.
+        q: Configuration symbols, shape (nq, 1).
+        n: Normal symbols, shape (3, 1), in the axes of the contact's normal.
+        limbs: Repeated limbs whose expressions get one form
+            (:class:`~impact_posture.dynamics.repeated_limbs.RepeatedLimbs`).
+    """
+
+    def __init__(self, case: ImpactCase, q: ca.SX, n: ca.SX, limbs: RepeatedLimbs | None = None) -> None:
+        self.case, self.metric, self.q, self.n = case, case.metric, q, n
+        extra = support_inertia(case.robot, case.supports, case.compliance)
+        self.tree = Tree(case.robot.model, q, extra_inertia=extra, limbs=limbs)
+        self.point = case.point
+        self._supported = bool(case.supports)
+
+    @cached_property
+    def impact(self) -> Wrench:
+        """The unit impulse along the normal."""
+        return impact_at(self.case, self.n)
+
+    @cached_property
+    def world_normal(self) -> ca.SX:
+        """The normal in world axes, shape (3,)."""
+        return in_world(self.case, self.tree, self.n)
+
+    @cached_property
+    def jump(self) -> Response:
+        """Response of the robot to the impact; its ``a`` is ``M⁻¹Jᵀn``."""
+        return self.answer([self.impact])
+
+    def _alike(self, wrench: Wrench) -> list[Wrench]:
+        """Return the wrench, or for a repeated limb a wrench on each limb of the group, zero on all but its own."""
+        limbs, joint = self.tree.limbs, wrench.point.joint
+        if limbs is None or joint not in limbs.places:
+            return [wrench]
+        point = wrench.point
+        return [
+            Wrench(
+                PointOnLink(link, point.position, point.rotation),
+                wrench.force * (on := limbs.indicator(link, joint)),
+                wrench.moment * on,
+                wrench.in_frame,
+            )
+            for link in limbs.counterparts(joint)
+        ]
+
+    # ---- H, G and what follows from them ----------------------------------------------------------------------
+
+    @cached_property
+    def H(self) -> ca.SX:
+        """``aᵀWa``: squared jump per squared impulse."""
+        return self.product(self.jump, self.jump)
+
+    @cached_property
+    def G(self) -> ca.SX:
+        """``nᵀJM⁻¹Jᵀn = 1/m_eff``, 1/kg."""
+        return ca.dot(self.tree.link_force(self.impact), self.jump.velocities[self.point.joint])
+
+    @cached_property
+    def grad_H(self) -> ca.SX:
+        """``2 ∂_q[nᵀJb − bᵀMa]`` with ``Mb = Wa`` (plus ``∂_q aᵀMa`` where W = M), shape (nv,)."""
+        return self.grad_G if self.metric.kind == "kinetic" and not self._supported else self.size_gradient(self.jump)
+
+    def answer(self, impacts: Sequence[Wrench]) -> Response:
+        """Return the response of the robot to several impulses at once, at any points."""
+        return self.tree.respond(wrenches=[part for impact in impacts for part in self._alike(impact)])
+
+    def product(self, one: Response, other: Response) -> ca.SX:
+        """Return ``a₁ᵀWa₂`` of two responses."""
+        return ca.dot(one.a, self._weigh(other.a, other.velocities))
+
+    def size_gradient(self, jump: Response, r: Wrench | None = None) -> ca.SX:
+        """Return the tangent gradient of ``aᵀWa`` of a response, shape (nv,).
+
+        Its impulses are fixed, or there is one impulse ``p`` with ``∂pᵀJM⁻¹Wa = rᵀ∂B p``.
+        """
+        if self.metric.kind == "kinetic" and not self._supported and r is None:
+            return self.tree.pair_gradient(jump, jump)
+        adjoint = self.tree.respond(self._weigh(jump.a, jump.velocities), [] if r is None else self._alike(r))
+        gradient = 2 * self.tree.pair_gradient(jump, adjoint)
+        if self.metric.kind == "kinetic":
+            gradient = gradient + self.tree.energy_gradient(jump.velocities)
+        return gradient
+
+    def adjoint_velocity(self, x: Response) -> ca.SX:
+        """Return ``JM⁻¹Wa`` of a response, world, shape (3,)."""
+        free = self.tree.respond(tau=self._weigh(x.a, x.velocities))
+        return self.tree.point_velocity(self.point, free.velocities)[:3]
+
+    @cached_property
+    def grad_G(self) -> ca.SX:
+        """``∂_q[2nᵀJa − aᵀMa]``, shape (nv,)."""
+        return self.tree.pair_gradient(self.jump, self.jump)
+
+    @cached_property
+    def V(self) -> ca.SX:
+        """``H/G²``: squared jump per squared approach speed."""
+        return self.H / self.G**2
+
+    @cached_property
+    def grad_V(self) -> ca.SX:
+        """Tangent gradient of V, shape (nv,)."""
+        return self.grad_H / self.G**2 - 2 * self.H / self.G**3 * self.grad_G
+
+    @cached_property
+    def E(self) -> ca.SX:
+        """``1/(2G) = m_eff/2``, kg."""
+        return 1 / (2 * self.G)
+
+    @cached_property
+    def grad_E(self) -> ca.SX:
+        """Tangent gradient of E, shape (nv,)."""
+        return -self.grad_G / (2 * self.G**2)
+
+    # ---- three directions: the ellipsoid and sticking ---------------------------------------------------------
+
+    @cached_property
+    def _axes(self) -> list[Response]:
+        """``M⁻¹Jᵀe_k`` for the three world directions."""
+        eye = np.eye(3)
+        return [self.answer([self._force(ca.SX(eye[k]))]) for k in range(3)]
+
+    @cached_property
+    def ellipsoid(self) -> ca.SX:
+        """``Λ_c = J M⁻¹ W M⁻¹ Jᵀ``, shape (3, 3)."""
+        columns = [self._weigh(x.a, x.velocities) for x in self._axes]
+        return ca.blockcat([[ca.dot(self._axes[i].a, columns[j]) for j in range(3)] for i in range(3)])
+
+    @cached_property
+    def mobility(self) -> ca.SX:
+        """``J M⁻¹ Jᵀ``, shape (3, 3), 1/kg."""
+        return ca.horzcat(*[self.tree.point_velocity(self.point, x.velocities)[:3] for x in self._axes])
+
+    @cached_property
+    def _mobility_inverse(self) -> ca.SX:
+        """``(JM⁻¹Jᵀ)⁻¹``, or the pseudo-inverse for a planar robot."""
+        frozen = frozen_directions(self.case.robot, self.point)
+        return _inverse3(self.mobility + frozen if frozen.any() else self.mobility)
+
+    @cached_property
+    def sticking_form(self) -> ca.SX:
+        """``(JM⁻¹Jᵀ)⁻¹Λ_c(JM⁻¹Jᵀ)⁻¹``, shape (3, 3): ``S`` as a quadratic form of the world normal."""
+        return self._mobility_inverse.T @ self.ellipsoid @ self._mobility_inverse
+
+    @cached_property
+    def _sticking(self) -> Response:
+        """Response to the impulse ``s = (JM⁻¹Jᵀ)⁻¹n`` per unit approach speed."""
+        return self.answer([self._force(self._mobility_inverse @ self.world_normal)])
+
+    @cached_property
+    def S(self) -> ca.SX:
+        """``‖M⁻¹Jᵀ(JM⁻¹Jᵀ)⁻¹n‖²_W``: as V if the contact point sticks."""
+        return self.product(self._sticking, self._sticking)
+
+    @cached_property
+    def grad_S(self) -> ca.SX:
+        """``2 ∂_q[sᵀJb + rᵀJa − bᵀMa]`` (and ``−2rᵀn(q)`` for a normal that turns with the robot), shape (nv,)."""
+        x = self._sticking
+        r = -self._mobility_inverse @ self.adjoint_velocity(x)
+        gradient = self.size_gradient(x, self._force(r))
+        if self.case.in_contact_frame:
+            gradient = gradient - 2 * self.tree.turning_gradient(self.point, self.world_normal, r)
+        return gradient
+
+    # ---- parts ------------------------------------------------------------------------------------------------
+
+    def _weigh(self, a: ca.SX, velocities: ByJoint) -> ca.SX:
+        if self.metric.kind == "kinetic":
+            return self.tree.mass_times(a, velocities, extra=False)
+        if self.metric.weights is None:
+            return a
+        return self.tree.by_joint("weight", self.metric.diagonal(self.tree.nv)) * a
+
+    def _force(self, impulse: ca.SX) -> Wrench:
+        return Wrench(self.point, impulse, ca.SX.zeros(3))
+
+
+def frozen_directions(robot: Robot, point: PointOnLink) -> Array:
+    """Return the projector on the world directions in which a point can never move, shape (3, 3).
+
+    It is zero except for planar robots.  Added to ``JM⁻¹Jᵀ``, it makes the inverse act as the pseudo-inverse.
+    """
+    numeric, generator = Numeric(robot.model), np.random.default_rng(0)
+    drawn = [pin.integrate(robot.model, pin.neutral(robot.model), generator.normal(size=robot.nv)) for _ in range(3)]
+    missing = null_space(np.vstack([numeric.at(q).jacobian(point)[:3].T for q in drawn]), _FROZEN)
+    return np.asarray(missing @ missing.T)
+
+
+def _inverse3(A: ca.SX) -> ca.SX:
+    """Inverse of a symmetric 3×3 by cofactors."""
+    rows = [A[k, :].T for k in range(3)]
+    cofactors = ca.horzcat(ca.cross(rows[1], rows[2]), ca.cross(rows[2], rows[0]), ca.cross(rows[0], rows[1]))
+    return cofactors / ca.dot(rows[0], cofactors[:, 0])

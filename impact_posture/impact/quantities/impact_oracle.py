@@ -1,0 +1,291 @@
+"""The impact quantities from Pinocchio's numbers by dense linear algebra, independent of the symbolic kernel.
+
+Feet enter through the KKT system ``[M, −J_sᵀ; J_s, εI]``, not through the heavy feet of the symbolic kernel.  The
+support impulses ``f`` remain unknowns, because ``−J_s a/ε`` loses as many digits as ε has zeros.
+"""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+
+import numpy as np
+
+from impact_posture.dynamics.jump_derivatives import Foot
+from impact_posture.dynamics.numeric import Numeric, hold_locked
+from impact_posture.errors import MetricError
+from impact_posture.impact.impact_case import ImpactCase
+from impact_posture.impact.impact_contact import point_on
+from impact_posture.impact.quantities.sticking_point import Answer, StickingPoint
+from impact_posture.system.arrays import Array
+
+# A contact whose 1/m_eff along the normal is below this share of the largest mobility cannot move along it.
+_BLOCKED = 1e-12
+# Postures whose factorization is kept, because a search comes back to its starts.
+_KEPT = 32
+
+
+@dataclass(frozen=True)
+class ImpactQuantities:
+    """The impact quantities of one contact at one posture.
+
+    Attributes:
+        H: ``nᵀΛ_c n``, squared jump per squared impulse.
+        G: ``nᵀJM⁻¹Jᵀn = 1/m_eff``, 1/kg.
+        V: ``H/G²``, squared jump per squared approach speed (frictionless, e = 0).
+        S: The same if the contact sticks; ``None`` where it does not exist.
+        E: ``1/(2G)``, energy dissipated per squared approach speed, kg.
+        jump: ``a = M⁻¹Jᵀn``, shape (nv,).
+        sticking_jump: Jump per unit approach speed of a contact that sticks, shape (nv,), or ``None``.
+        sticking_impulse: Impulse per unit approach speed of a contact that sticks, world, shape (3,), or ``None``.
+        ellipsoid: ``Λ_c``, shape (3, 3).
+        mobility: ``JM⁻¹Jᵀ``, shape (3, 3), 1/kg.
+        normal: World unit normal, shape (3,).
+        support_impulse: ``f`` per unit impulse, stacked rows of the supports.
+    """
+
+    H: float
+    G: float
+    V: float
+    S: float | None
+    E: float
+    jump: Array
+    sticking_jump: Array | None
+    sticking_impulse: Array | None
+    ellipsoid: Array
+    mobility: Array
+    normal: Array
+    support_impulse: Array
+
+    @property
+    def blocked(self) -> bool:
+        """Whether the contact cannot move along the normal."""
+        return self.G <= _BLOCKED * float(np.linalg.eigvalsh(self.mobility)[-1])
+
+
+@dataclass(eq=False)
+class _Factorized:
+    """What an oracle knows of a posture; the quantities follow when they are needed."""
+
+    M: Array
+    J: Array
+    Js: Array
+    kkt: Array
+    n: Array
+    quantities: ImpactQuantities | None = None
+
+
+class ImpactOracle:
+    """Numeric ``H, G, V, S, E, Λ_c`` and tangent gradients of one impact."""
+
+    def __init__(self, case: ImpactCase) -> None:
+        self.case, self.robot, self.contact, self.metric = case, case.robot, case.contact, case.metric
+        self.numeric = Numeric(case.robot.model)
+        self.point = case.point
+        self.feet = [Foot(point_on(case.robot, s.frame, s.offset), s.rows) for s in case.supports]
+        self.compliance = case.compliance
+        self._nv = case.robot.nv
+        self._key = b""
+        self._known: dict[bytes, _Factorized] = {}
+
+    def at(self, q: Array) -> ImpactOracle:
+        """Move to ``q`` and factorize there, unless it is one of the last postures."""
+        q = np.array(q, dtype=float)
+        if (key := q.tobytes()) != self._key:
+            self.numeric.at(q)
+            # The newest posture stands last.
+            self._known[key] = known = self._known.pop(key, None) or self._factorized()
+            if len(self._known) > _KEPT:
+                del self._known[next(iter(self._known))]
+            self.M, self.J, self.Js, self._kkt, self.n = known.M, known.J, known.Js, known.kkt, known.n
+            self._key = key
+        return self
+
+    def _factorized(self) -> _Factorized:
+        num = self.numeric
+        parts = [num.jacobian(foot.point)[: foot.rows] for foot in self.feet]
+        Js = np.vstack(parts) if parts else np.zeros((0, self._nv))
+        M, J, Js = hold_locked(num.locked, num.mass_matrix(), num.jacobian(self.point)[:3], Js)
+        kkt = np.zeros((self._nv + len(Js),) * 2)
+        kkt[: self._nv, : self._nv], kkt[: self._nv, self._nv :], kkt[self._nv :, : self._nv] = M, -Js.T, Js
+        np.fill_diagonal(kkt[self._nv :, self._nv :], self.compliance)
+        return _Factorized(M, J, Js, kkt, self._normals(None)[1])
+
+    def answer(self, tau: Array, slip: Array | None = None) -> Answer:
+        """Solve ``M a − J_sᵀf = τ, J_s a + εf = slip`` for vectors or columns; the slip is zero by default."""
+        rhs: Array = np.zeros((len(self._kkt), *tau.shape[1:]))
+        rhs[: self._nv] = (tau.T * ~self.numeric.locked).T
+        if slip is not None:
+            rhs[self._nv :] = slip
+        found = np.asarray(np.linalg.solve(self._kkt, rhs), dtype=np.float64)
+        return Answer(found[: self._nv], found[self._nv :])
+
+    def solve(self, tau: Array) -> Array:
+        """Return ``(M + J_sᵀJ_s/ε)⁻¹ τ`` for a vector or columns."""
+        return self.answer(tau).a
+
+    def weigh(self, a: Array) -> Array:
+        """Return ``W a``."""
+        if self.metric.kind == "kinetic":
+            return np.asarray(self.M @ a)
+        return np.asarray((self.metric.diagonal(self._nv) * a.T).T)
+
+    def quantities(self, q: Array) -> ImpactQuantities:
+        """Return all quantities at ``q``, computed once for each of the last postures."""
+        known = self.at(q)._known[self._key]
+        if known.quantities is not None:
+            return known.quantities
+        answers = self.answer(self.J.T)
+        A = answers.a
+        mobility = self.J @ A
+        mobility = (mobility + mobility.T) / 2
+        ellipsoid = A.T @ self.weigh(A)
+        a = A @ self.n
+        H, G = float(a @ self.weigh(a)), float(self.n @ mobility @ self.n)
+        held = StickingPoint.of(self._kkt, self.J, mobility, ~self.numeric.locked)
+        stuck, s = None, None
+        if held.can_move(self.n):
+            found, s = held.answer(velocity=self.n)
+            stuck = found.a
+        known.quantities = ImpactQuantities(
+            H=H,
+            G=G,
+            V=H / G**2 if G > 0 else float("inf"),
+            S=None if stuck is None else float(stuck @ self.weigh(stuck)),
+            E=1 / (2 * G) if G > 0 else float("inf"),
+            jump=a,
+            sticking_jump=stuck,
+            sticking_impulse=s,
+            ellipsoid=(ellipsoid + ellipsoid.T) / 2,
+            mobility=mobility,
+            normal=self.n.copy(),
+            support_impulse=np.asarray(answers.f @ self.n),
+        )
+        return known.quantities
+
+    def with_support_impulses(self, a: Array) -> Array:
+        """Return ``a`` and its support impulses ``−J_s a/ε``, in the axes of the feet at the last posture."""
+        f = -self.Js @ a / self.compliance
+        parts, start = [a], 0
+        for foot in self.feet:
+            R = np.array(self.numeric.placement(foot.point).rotation)
+            parts += [R.T @ f[k : k + 3] for k in range(start, start + foot.rows, 3)]
+            start += foot.rows
+        return np.concatenate(parts)
+
+    # ---- gradients --------------------------------------------------------------------------------------------
+
+    def gradient_H(self, q: Array, normal: Array | None = None) -> Array:
+        """Return the tangent gradient of H, shape (nv,).
+
+        Args:
+            q: Configuration, shape (nq,).
+            normal: Another normal than that of the contact, in the same axes, shape (3,).
+        """
+        self.at(q)
+        own, n = self._normals(normal)
+        x = self.answer(self.J.T @ n)
+        y = self.answer(self.weigh(x.a))
+        gradient = 2 * (self.coupling(own, y.a, self.case.in_contact_frame) - self.inertial(y, x))
+        return gradient + self.metric_gradient(x.a)
+
+    def gradient_G(self, q: Array, normal: Array | None = None) -> Array:
+        """Return the tangent gradient of G, shape (nv,), with ``normal`` as in :meth:`gradient_H`."""
+        self.at(q)
+        own, n = self._normals(normal)
+        x = self.answer(self.J.T @ n)
+        return 2 * self.coupling(own, x.a, self.case.in_contact_frame) - self.inertial(x, x)
+
+    def gradient_S(self, q: Array, normal: Array | None = None) -> Array:
+        """Return the tangent gradient of S, shape (nv,), with ``normal`` as in :meth:`gradient_H`.
+
+        Where ``JM⁻¹Jᵀ`` is singular, the point is held in its range.  That is right if the directions in which the
+        contact can move stay the same, as in a planar robot.
+
+        Raises:
+            MetricError: S does not exist here.
+        """
+        self.at(q)
+        _, n = self._normals(normal)
+        held = StickingPoint.of(self._kkt, self.J, self.J @ self.solve(self.J.T), ~self.numeric.locked)
+        if not held.can_move(n):
+            raise no_sticking()
+        x, s = held.answer(velocity=n)
+        y, r = held.answer(tau=self.weigh(x.a))
+        gradient = 2 * (self.coupling(s, y.a, False) + self.coupling(r, x.a, False) - self.inertial(y, x))
+        if self.case.in_contact_frame:
+            gradient = gradient - 2 * self.numeric.turning_gradient(self.point, n, r)
+        return gradient + self.metric_gradient(x.a)
+
+    def gradient_V(self, q: Array) -> Array:
+        """Return the tangent gradient of V, ``∇H/G² − 2H/G³ ∇G``, shape (nv,)."""
+        found = self.quantities(q)
+        return self.gradient_H(q) / found.G**2 - 2 * found.H / found.G**3 * self.gradient_G(q)
+
+    def gradient_E(self, q: Array) -> Array:
+        """Return the tangent gradient of E, ``−∇G/(2G²)``, shape (nv,)."""
+        return -self.gradient_G(q) / (2 * self.quantities(q).G ** 2)
+
+    @property
+    def axes(self) -> Array:
+        """World axes in which the contact's normal is given, at the last posture, as columns, shape (3, 3)."""
+        return np.asarray(self.numeric.placement(self.point).rotation) if self.case.in_contact_frame else np.eye(3)
+
+    def _normals(self, given: Array | None) -> tuple[Array, Array]:
+        """A normal (by default that of the contact) in the axes of the contact's normal, and in world axes."""
+        own = np.array(self.contact.normal) if given is None else given
+        return own, self.axes @ own if self.case.in_contact_frame else own
+
+    def support_gradient(self, q: Array) -> Array:
+        """Return the tangent Jacobian of the support impulses ``f``, shape (rows, nv).
+
+        Row k uses the adjoint ``M p − J_sᵀr = 0, J_s p + εr = −e_k``: ``∂f_k = pᵀ∂(Jᵀn + J_sᵀf − M a) + rᵀ∂(J_s a)``.
+        """
+        rows = len(self.at(q).Js)
+        return self._adjoint_rows(self.answer(np.zeros((self._nv, rows)), -np.eye(rows)))
+
+    def jump_gradient(self, q: Array) -> Array:
+        """Return the tangent Jacobian of ``a = M⁻¹Jᵀn``, shape (nv, nv).
+
+        Row k is ``∂a_k = p_kᵀ∂(Jᵀn − M a)`` with ``M p_k = e_k``.
+        """
+        self.at(q)
+        return self._adjoint_rows(self.answer(np.eye(self._nv)))
+
+    def _adjoint_rows(self, adjoints: Answer) -> Array:
+        """Return ``pᵀ∂(Jᵀn + J_sᵀf − M a) + rᵀ∂(J_s a)`` for each adjoint ``p, r``, shape (k, nv)."""
+        own, x = np.array(self.contact.normal), self.answer(self.J.T @ self.n)
+        rows = [
+            self.coupling(own, p, self.case.in_contact_frame) - self.inertial(Answer(p, r), x)
+            for p, r in zip(adjoints.a.T, adjoints.f.T, strict=True)
+        ]
+        return np.array(rows).reshape(-1, self._nv)
+
+    def coupling(self, direction: Array, v: Array, in_frame: bool) -> Array:
+        """Return ``∂_q directionᵀJ v``, shape (nv,), for a direction in world axes or fixed in the frame."""
+        wrench = np.concatenate([direction, np.zeros(3)])
+        return self.numeric.coupling_gradient(self.point, wrench, v, in_frame=in_frame)
+
+    def inertial(self, left: Answer, right: Answer) -> Array:
+        """Return ``∂_q [lᵀMr − f_lᵀJ_s r − f_rᵀJ_s l]`` with all four letters held: ``∂_q lᵀ(M + J_sᵀJ_s/ε)r``."""
+        gradient = self.numeric.inertial_gradient(left.a, right.a)
+        first = 0
+        for foot in self.feet:
+            for one, other in ((left, right), (right, left)):
+                wrench = np.zeros(6)
+                wrench[: foot.rows] = one.f[first : first + foot.rows]
+                gradient = gradient - self.numeric.coupling_gradient(foot.point, wrench, other.a)
+            first += foot.rows
+        return gradient
+
+    def metric_gradient(self, a: Array) -> Array:
+        """Return ``∂_q aᵀWa`` with ``a`` held fixed, shape (nv,); zero unless W = M."""
+        return self.numeric.inertial_gradient(a, a) if self.metric.kind == "kinetic" else np.zeros(self._nv)
+
+
+def no_sticking() -> MetricError:
+    """Build the error for a posture where S does not exist."""
+    return MetricError(
+        "S does not exist here: the normal has a part along which the contact point cannot move",
+        where="objective sticking",
+        hint="choose `objective='speed'`, or another frame, normal or posture",
+    )

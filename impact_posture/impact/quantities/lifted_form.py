@@ -1,0 +1,219 @@
+"""The lifted form of an objective, which leaves linear solves to the program as unknowns and equations."""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from dataclasses import dataclass, field, replace
+from typing import NamedTuple
+
+import casadi as ca
+import numpy as np
+
+from impact_posture.dynamics.jump_derivatives import Foot, JumpDerivatives
+from impact_posture.dynamics.tree import Tree, Wrench
+from impact_posture.impact.impact_case import ImpactCase
+from impact_posture.impact.impact_contact import point_on
+from impact_posture.impact.jump_metric import Metric
+from impact_posture.system.arrays import Array
+
+# Start of t above its bounds by attempt, in units of the scale.  A barrier is finite inside only.
+ABOVE = (0.01, 1.0, 0.1)
+
+
+@dataclass(frozen=True)
+class Lifted:
+    """An objective with its inner linear solve left to the program.
+
+    Attributes:
+        variables: Auxiliary unknowns, shape (k, 1).
+        residual: Equations that fix them, ``= 0``, shape (r, 1).
+        value: The objective in terms of configuration and auxiliaries.
+        inequalities: Rows ``≤ 0`` that bound it from below, shape (i, 1).
+        jumps: Unknown jumps whose derivatives are known.
+    """
+
+    variables: ca.SX
+    residual: ca.SX
+    value: ca.SX
+    inequalities: ca.SX = field(default_factory=lambda: ca.SX(0, 1))
+    jumps: tuple[PlacedJump, ...] = ()
+
+    @staticmethod
+    def of(
+        parts: Sequence[Lifted | UnknownJump],
+        value: ca.SX,
+        *,
+        others: Sequence[ca.SX] = (),
+        equations: Sequence[ca.SX] = (),
+        inequalities: Sequence[ca.SX] = (),
+    ) -> Lifted:
+        """Return a form over the unknowns, equations and inequalities of all parts, and more of each."""
+        row, column, placed = 0, 0, list[PlacedJump]()
+        for part in parts:
+            placed += [PlacedJump(jump, row + below, column + right) for jump, below, right in part.jumps]
+            row, column = row + part.residual.numel(), column + part.variables.numel()
+        bounds = [part.inequalities for part in parts if isinstance(part, Lifted)]
+        return Lifted(
+            ca.vertcat(*[part.variables for part in parts], *others),
+            ca.vertcat(*[part.residual for part in parts], *equations),
+            value,
+            ca.vertcat(ca.SX(0, 1), *bounds, *inequalities),
+            tuple(placed),
+        )
+
+    @property
+    def rest(self) -> ca.SX:
+        """The residual less the parts whose derivatives are known, shape (r, 1)."""
+        found = ca.SX(self.residual)
+        for jump, row, _ in self.jumps:
+            found[row : row + jump.rest.numel()] = jump.rest
+        return found
+
+
+@dataclass(frozen=True, eq=False)
+class Guess:
+    """Initial auxiliaries of a lifted form.
+
+    Attributes:
+        values: Values, shape (k,).
+        lower: Lower bounds, shape (k,); minus infinity where there is none.
+        upper: Upper bounds, shape (k,); ``None`` for none.
+    """
+
+    values: Array
+    lower: Array
+    upper: Array | None = None
+
+    @staticmethod
+    def unbounded(values: Array) -> Guess:
+        """Return a guess without lower bounds."""
+        return Guess(values, np.full(values.size, -np.inf))
+
+    @property
+    def above(self) -> Array:
+        """Upper bounds, infinite where there are none, shape (k,)."""
+        return np.full(self.values.size, np.inf) if self.upper is None else self.upper
+
+    @staticmethod
+    def joined(parts: Sequence[Guess]) -> Guess:
+        """Return the auxiliaries of several parts as one."""
+        keys = ("values", "lower", "above")
+        return Guess(*(np.concatenate([np.zeros(0), *[getattr(part, key) for part in parts]]) for key in keys))
+
+
+@dataclass(frozen=True, eq=False)
+class UnknownJump:
+    """A jump ``a`` and the support impulses as unknowns.
+
+    Attributes:
+        a: Unknown jump, shape (nv,).
+        f: Support impulses, in the axes of the feet.
+        variables: ``a``, the support impulses, and an unknown impulse of the impact if there is one.
+        residual: ``M a − J_sᵀf − (the impact)`` and ``J_s a + εf``, and equations that fix the unknown impulse.
+        rest: What :attr:`derivatives` leave of the residual: the impact, and the rows of locked joints.
+        derivatives: Derivatives of the equations.
+        compliance: ε, 1/kg.
+        tree: The tree, whose locked joints have the equations ``a_k = 0``.
+        contact_velocity: ``J a``, world, shape (3,).
+    """
+
+    a: ca.SX
+    f: ca.SX
+    variables: ca.SX
+    residual: ca.SX
+    rest: ca.SX
+    derivatives: JumpDerivatives
+    compliance: float
+    tree: Tree
+    contact_velocity: ca.SX
+
+    @property
+    def jumps(self) -> tuple[PlacedJump, ...]:
+        """Itself, as a part of a :class:`Lifted`, if its derivatives are known."""
+        return (PlacedJump(self, 0, 0),) if self.derivatives.exist else ()
+
+    @property
+    def mass_a(self) -> ca.SX:
+        """``M a``."""
+        return self.tree.mass_times(self.a)
+
+    def with_impulse(self, impulse: ca.SX, fixing: ca.SX) -> UnknownJump:
+        """Return the same jump with the impulse of the impact as an unknown, and the equations that fix it."""
+        residual, rest = (ca.vertcat(rows, fixing) for rows in (self.residual, self.rest))
+        return replace(self, variables=ca.vertcat(self.variables, impulse), residual=residual, rest=rest)
+
+    def known_derivatives(self, multipliers: ca.SX) -> tuple[ca.SX, ca.SX]:
+        """Return Jacobian and Hessian of the residual less :attr:`rest`, over chart coordinates, ``a`` and ``f``."""
+        count, locked = self.a.numel(), list(self.tree.locked)
+        moving = ca.SX.ones(count)
+        moving[locked] = 0
+        b, of_feet = moving * multipliers[:count], multipliers[count : count + self.f.numel()]
+        jacobian, hessian = self.derivatives.of(self.a, self.f, b, of_feet, self.compliance)
+        jacobian[locked, :] = 0
+        return ca.sparsify(jacobian), hessian
+
+
+class PlacedJump(NamedTuple):
+    """An unknown jump, and where its rows and its unknowns begin in a lifted form."""
+
+    jump: UnknownJump
+    row: int
+    column: int
+
+
+def unknown_jump(case: ImpactCase, tree: Tree, impact: Wrench, label: str = "") -> UnknownJump:
+    """Return unknowns and equations of the velocity jump under one impulse."""
+    a = ca.SX.sym(f"a{label}", tree.nv)
+    velocities = tree.velocities(a)
+    feet = [Foot(point_on(case.robot, s.frame, s.offset), s.rows) for s in case.supports]
+    wrenches, held, f = list[Wrench](), list[ca.SX](), ca.SX(0, 1)
+    for k, foot in enumerate(feet):
+        f_k = ca.SX.sym(f"f{label}_{k}", foot.rows)
+        full = ca.vertcat(f_k, ca.SX.zeros(6 - foot.rows))
+        wrenches.append(Wrench(foot.point, full[:3], full[3:], in_frame=True))
+        held.append(tree.own_velocity(foot.point, velocities)[: foot.rows] + case.compliance * f_k)
+        f = ca.vertcat(f, f_k)
+    pushed = -tree.generalized_force([impact])
+    momentum = tree.mass_times(a, velocities, less=wrenches) + pushed
+    for k in tree.locked:
+        momentum[k] = pushed[k] = a[k]
+    return UnknownJump(
+        a=a,
+        f=f,
+        variables=ca.vertcat(a, f),
+        residual=ca.vertcat(momentum, *held),
+        rest=ca.vertcat(pushed, ca.SX(f.numel(), 1)),
+        derivatives=JumpDerivatives(tree, feet),
+        compliance=case.compliance,
+        tree=tree,
+        contact_velocity=tree.point_velocity(impact.point, velocities)[:3],
+    )
+
+
+def impact_at(case: ImpactCase, impulse: ca.SX) -> Wrench:
+    """Return an impulse at the contact point, in the axes of the contact's normal."""
+    return Wrench(case.point, impulse, ca.SX.zeros(3), in_frame=case.in_contact_frame)
+
+
+def in_world(case: ImpactCase, tree: Tree, directions: ca.SX) -> ca.SX:
+    """Turn directions (columns) from the axes of the contact's normal to world axes."""
+    return tree.rotation(case.point) @ directions if case.in_contact_frame else directions
+
+
+def weighed(metric: Metric, one: UnknownJump, other: UnknownJump) -> ca.SX:
+    """Return ``a₁ᵀWa₂``."""
+    if metric.kind == "kinetic":
+        # sᵀJa − ε|f|² is equal on the equations, but a small difference of large numbers if the feet are stiff.
+        return ca.dot(one.a, other.mass_a)
+    return ca.dot(one.a, ca.SX(metric.diagonal(one.a.numel())) * other.a)
+
+
+def worst_of(parts: Sequence[Lifted | UnknownJump], values: Sequence[ca.SX], scale: ca.SX) -> Lifted:
+    """Return ``t`` with ``values[k] ≤ t · scale``, over the unknowns and equations of all parts."""
+    t = ca.SX.sym("t")
+    return Lifted.of(parts, t * scale, others=[t], inequalities=[v / scale - t for v in values])
+
+
+def worst_of_guesses(parts: Sequence[Guess], largest: float, attempt: int) -> Guess:
+    """Return the start of :func:`worst_of`, with ``t`` above the largest value (in units of the scale)."""
+    return Guess.joined([*parts, Guess.unbounded(np.array([largest + ABOVE[attempt]]))])

@@ -1,0 +1,75 @@
+"""The contact point held beside the feet: the jump and the impulse of a contact that sticks."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+
+import numpy as np
+from numpy.typing import NDArray
+
+from impact_posture.system.arrays import Array
+
+# Relative size of an eigenvalue of JM⁻¹Jᵀ, and of the part of n outside its range, that counts as zero.
+SINGULAR = 1e-9
+
+
+@dataclass(frozen=True, eq=False)
+class Answer:
+    """Jump of the robot under a generalized impulse, or under several.
+
+    Attributes:
+        a: ``(M + J_sᵀJ_s/ε)⁻¹ τ``, shape (nv,) or (nv, k).
+        f: Support impulses ``−J_s a/ε``, shape (rows,) or (rows, k).
+    """
+
+    a: Array
+    f: Array
+
+
+@dataclass(frozen=True, eq=False)
+class StickingPoint:
+    """The contact point held beside the feet, in the directions in which it can move.
+
+    ``M a − J_sᵀf − Jᵀs = τ, J_s a + εf = 0, J a = v`` is factorized as it stands.  Through ``(JM⁻¹Jᵀ)⁻¹`` the adjoint
+    of ∇S would be a small difference of large numbers, with an error of the square of that matrix's condition.
+    """
+
+    system: Array
+    axes: Array
+    outside: Array
+    mobile: NDArray[np.bool_]
+
+    @staticmethod
+    def of(kkt: Array, J: Array, mobility: Array, mobile: NDArray[np.bool_]) -> StickingPoint:
+        """Hold a point beside the feet.
+
+        Args:
+            kkt: ``[M, −J_sᵀ; J_s, εI]``.
+            J: Jacobian of the point, world, shape (3, nv).
+            mobility: ``JM⁻¹Jᵀ``, 1/kg, shape (3, 3).
+            mobile: Velocities whose joints are not locked, shape (nv,).
+        """
+        values, vectors = np.linalg.eigh((mobility + mobility.T) / 2)
+        kept = values > SINGULAR * max(float(values[-1]), 1e-300)
+        axes = np.eye(3) if kept.all() else vectors[:, kept]
+        size, nv = len(kkt), J.shape[1]
+        system = np.zeros((size + axes.shape[1],) * 2)
+        system[:size, :size] = kkt
+        system[size:, :nv] = axes.T @ J
+        system[:nv, size:] = -system[size:, :nv].T
+        return StickingPoint(system, axes, vectors[:, ~kept], mobile)
+
+    def can_move(self, n: Array) -> bool:
+        """Return whether the point can move along ``n``."""
+        return bool(np.linalg.norm(self.outside.T @ n) <= np.sqrt(SINGULAR))
+
+    def answer(self, *, tau: Array | None = None, velocity: Array | None = None) -> tuple[Answer, Array]:
+        """Return the jump under ``τ`` with the point moving at ``v``, and the impulse ``s`` of the point."""
+        right, nv = np.zeros(len(self.system)), len(self.mobile)
+        size = len(right) - self.axes.shape[1]
+        if tau is not None:
+            right[:nv] = tau * self.mobile
+        if velocity is not None:
+            right[size:] = self.axes.T @ velocity
+        found = np.asarray(np.linalg.solve(self.system, right), dtype=np.float64)
+        return Answer(found[:nv], found[nv:size]), np.asarray(self.axes @ found[size:])

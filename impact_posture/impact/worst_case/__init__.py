@@ -1,0 +1,1 @@
+"""The inner maximum over normals, impulses or models."""

@@ -1,0 +1,213 @@
+"""Several contacts at once: the largest jump under impulses within a box.
+
+``‖Σ λ_i a_i‖²_W`` with ``a_i = M⁻¹J_iᵀn_i`` is a convex quadratic ``λᵀKλ`` of the impulses, ``K_ij = a_iᵀWa_j``, so
+its maximum over ``0 ≤ λ_i ≤ λ̄_i`` (``|λ_i| ≤ λ̄_i`` where contacts can pull) is at one of the ``2^m − 1`` corners of
+the box (``2^(m−1)``, up to sign).  The program is ``min t`` with ``t ≥ λᵀKλ`` at every corner.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Callable, Sequence
+from dataclasses import dataclass
+from functools import cached_property
+from itertools import product
+
+import casadi as ca
+import numpy as np
+
+from impact_posture.dynamics.tree import Tree, Wrench
+from impact_posture.errors import ContactError, MetricError
+from impact_posture.impact.impact_contact import ImpactContact
+from impact_posture.impact.kinds.impact_kind import ImpactKind
+from impact_posture.impact.objective import Subgradients
+from impact_posture.impact.quantities.impact_kernel import ImpactKernel
+from impact_posture.impact.quantities.impact_oracle import ImpactOracle
+from impact_posture.impact.quantities.lifted_form import (
+    ABOVE,
+    Guess,
+    Lifted,
+    impact_at,
+    unknown_jump,
+    weighed,
+    worst_of,
+    worst_of_guesses,
+)
+from impact_posture.impact.worst_case.model_set import finite_maximum, first_of_largest
+from impact_posture.system.arrays import Array
+
+# Six contacts have 63 corners.  Each additional contact doubles the rows of the program.
+MOST_CONTACTS = 6
+
+
+@dataclass(frozen=True, eq=False)
+class WorstImpulses:
+    """The corner of the box of impulses with the largest jump.
+
+    Attributes:
+        value: ``λᵀKλ`` at the corner, which is the objective.
+        impulses: λ of each contact, N·s, shape (m,).
+        tied: All corners with the same value, this corner first, shape (k, m).
+        jump: ``Δν`` at the corner, shape (nv,).
+    """
+
+    value: float
+    impulses: Array
+    tied: Array
+    jump: Array
+
+    def to_dict(self) -> dict[str, object]:
+        """Return the ``worst_impulses`` block of an evaluation."""
+        return {
+            "impulses": self.impulses.tolist(),
+            "tied": len(self.tied) > 1,
+            "corners": self.tied.tolist(),
+            "jump_norm": float(np.sqrt(max(self.value, 0.0))),
+        }
+
+
+def check_contacts(contacts: Sequence[ImpactContact], kind: type[ImpactKind], *, bilateral: bool, cone: bool) -> None:
+    """Refuse contacts that have no worst case over a box of impulses.
+
+    Raises:
+        ContactError: There are too many contacts, or two have the same point and normal.
+        MetricError: The kind is per approach speed, or there is a cone of normals.
+    """
+    if len(contacts) == 1:
+        if bilateral:
+            raise ContactError(
+                "there is one contact: pulling is as bad as pushing", where="bilateral", hint="leave it out"
+            )
+        return
+    if len(contacts) > MOST_CONTACTS:
+        raise ContactError(f"{len(contacts)} contacts", where="contact", hint=f"give up to {MOST_CONTACTS}")
+    for i, one in enumerate(contacts):
+        for other in contacts[:i]:
+            if (one.frame, one.offset, one.normal) == (other.frame, other.offset, other.normal):
+                raise ContactError(f"'{one.frame}' is given twice", where="contact", hint="remove one")
+    if not kind.adds_up:
+        raise MetricError(
+            f"{kind.name} is per approach speed of one contact: of several at once the impulses are not known "
+            "from it",
+            where="objective",
+            hint="choose impulse, whose bounds are given, or one `contact`",
+        )
+    if cone:
+        raise MetricError(
+            "the worst case over a cone of normals is exact for one contact only",
+            where="normal_cone",
+            hint="give one `contact`, or leave the cone out",
+        )
+
+
+def corners(count: int, bilateral: bool) -> Array:
+    """Return the corners of the unit box as rows, shape (k, count).
+
+    The entries are 0 and 1, without the origin.  They are ±1 (up to sign) if the contacts are bilateral.
+    """
+    if bilateral:
+        return np.array([[1.0, *rest] for rest in product((1.0, -1.0), repeat=count - 1)])
+    # The corner of all contacts comes first, because a user expects it where corners tie.
+    found = sorted(product((1.0, 0.0), repeat=count), key=lambda corner: -sum(corner))
+    return np.array(found[:-1])
+
+
+@dataclass(frozen=True)
+class ImpulseBox:
+    """The worst corner of ``0 ≤ λ_i ≤ λ̄_i``, or of ``|λ_i| ≤ λ̄_i``.
+
+    Attributes:
+        oracles: Pinocchio's numbers for each contact, the leading contact first.
+        bilateral: Whether the contacts can pull as well as push.
+        attempts: Guesses of the lifted form.
+    """
+
+    oracles: tuple[ImpactOracle, ...]
+    bilateral: bool = False
+    attempts: int = len(ABOVE)
+
+    @property
+    def oracle(self) -> ImpactOracle:
+        """See :class:`~impact_posture.impact.objective.WorstCase`."""
+        return self.oracles[0]
+
+    @cached_property
+    def corners(self) -> Array:
+        """Impulses at the corners, N·s, shape (k, m)."""
+        bounds = np.array([oracle.contact.impulse for oracle in self.oracles])
+        return np.asarray(corners(len(bounds), self.bilateral) * bounds)
+
+    def worst(self, q: Array) -> WorstImpulses:
+        """Return the worst corner at ``q``, from Pinocchio's numbers."""
+        jumps, values = self._jumps_and_values(q)
+        tied = finite_maximum(values)[0]
+        impulses = self.corners[tied[0]]
+        return WorstImpulses(float(values[tied[0]]), impulses, self.corners[tied], jumps @ impulses)
+
+    def value(self, q: Array) -> float:
+        """See :class:`~impact_posture.impact.objective.WorstCase`."""
+        return float(self._jumps_and_values(q)[1].max())
+
+    def subgradients(self, q: Array, within: float = 0.0) -> Subgradients:
+        """See :class:`~impact_posture.impact.objective.Minimized`; all corners that tie contribute."""
+        tied, gaps = finite_maximum(self._jumps_and_values(q)[1], within)
+        return Subgradients(np.array([self._gradient(q, self.corners[k]) for k in tied]), gaps)
+
+    def _jumps_and_values(self, q: Array) -> tuple[Array, Array]:
+        """``a_i`` as columns, shape (nv, m), and ``λᵀKλ`` at every corner, shape (k,)."""
+        jumps = np.stack([oracle.quantities(q).jump for oracle in self.oracles], axis=1)
+        K = jumps.T @ self.oracle.at(q).weigh(jumps)
+        return jumps, np.asarray(np.einsum("ki,ij,kj->k", self.corners, K, self.corners))
+
+    def _gradient(self, q: Array, impulses: Array) -> Array:
+        """``∂_q‖Σ λ_i a_i‖²_W = 2 ∂_q[Σ λ_i n_iᵀJ_i b − bᵀMa]``, shape (nv,)."""
+        oracles = [oracle.at(q) for oracle in self.oracles]
+        first = oracles[0]
+        forces = np.stack([oracle.J.T @ oracle.n for oracle in oracles], axis=1)
+        x = first.answer(forces @ impulses)
+        y = first.answer(first.weigh(x.a))
+        gradient = -first.inertial(y, x)
+        for weight, oracle in zip(impulses, oracles, strict=True):
+            own = np.array(oracle.contact.normal)
+            gradient = gradient + weight * oracle.coupling(own, y.a, oracle.case.in_contact_frame)
+        return np.asarray(2 * gradient + first.metric_gradient(x.a))
+
+    def expressions(self, k: ImpactKernel) -> tuple[ca.SX, ca.SX]:
+        """See :class:`~impact_posture.impact.objective.WorstCase`; the gradient is that of the worst corner."""
+        impacts = self._impacts(k.n)
+        jumps = [k.answer([impact]) for impact in impacts]
+        K = _gram(len(jumps), lambda i, j: k.product(jumps[i], jumps[j]))
+        rows = [ca.DM(corner) for corner in self.corners]
+        _, impulses = first_of_largest([_form(K, row) for row in rows], [ca.SX(row) for row in rows])
+        worst = k.answer([
+            Wrench(one.point, one.force * impulses[i], one.moment, one.in_frame) for i, one in enumerate(impacts)
+        ])  # fmt: skip
+        return k.product(worst, worst), k.size_gradient(worst)
+
+    def lift(self, tree: Tree, parameters: ca.SX, scale: ca.SX) -> Lifted:
+        """See :class:`~impact_posture.impact.objective.Minimized`; ``t`` bounds the value at each corner."""
+        case = self.oracle.case
+        jumps = [unknown_jump(case, tree, impact, f"{i}_") for i, impact in enumerate(self._impacts(parameters))]
+        K = _gram(len(jumps), lambda i, j: weighed(case.metric, jumps[i], jumps[j]))
+        return worst_of(jumps, [_form(K, ca.DM(corner)) for corner in self.corners], scale)
+
+    def guess(self, q: Array, scale: float, attempt: int = 0) -> Guess:
+        """See :class:`~impact_posture.impact.objective.WorstCase`."""
+        parts = [Guess.unbounded(one.with_support_impulses(one.quantities(q).jump)) for one in self.oracles]
+        return worst_of_guesses(parts, self.value(q) / scale, attempt)
+
+    def _impacts(self, n: ca.SX) -> list[Wrench]:
+        """Unit impulses of all contacts; the leading normal is an input, the other normals are constants."""
+        leading, *others = [oracle.case for oracle in self.oracles]
+        return [impact_at(leading, n), *[impact_at(c, ca.SX(np.array(c.contact.normal))) for c in others]]
+
+
+def _gram(count: int, entry: Callable[[int, int], ca.SX]) -> ca.SX:
+    K = ca.SX.zeros(count, count)
+    for i in range(count):
+        for j in range(i, count):
+            K[i, j] = K[j, i] = entry(i, j)
+    return K
+
+
+def _form(K: ca.SX, row: ca.DM) -> ca.SX:
+    return ca.bilin(K, ca.SX(row), ca.SX(row))

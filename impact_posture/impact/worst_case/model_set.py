@@ -1,0 +1,113 @@
+"""The worst of several robot models, and the maximum of finitely many values.
+
+Each shape of the maximum has an exact form of its own.  One protocol hides which shape it is from the program, the
+C export and the certificate.  This module has the protocol, and the shape that needs no mathematics of its own:
+:class:`ModelSet` (the worst of several robot models).  No maximum at all is an
+:class:`~impact_posture.impact.kinds.impact_kind.ImpactKind`.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from dataclasses import dataclass
+
+import casadi as ca
+import numpy as np
+from numpy.typing import NDArray
+
+from impact_posture.dynamics.tree import Tree
+from impact_posture.impact.objective import Subgradients, WorstCase
+from impact_posture.impact.quantities.impact_kernel import ImpactKernel
+from impact_posture.impact.quantities.impact_oracle import ImpactOracle
+from impact_posture.impact.quantities.lifted_form import ABOVE, Guess, Lifted, worst_of, worst_of_guesses
+from impact_posture.system.arrays import Array
+
+# A member of a finite maximum is active if its value is within this share of the largest value.
+ACTIVE = 1e-6
+
+
+@dataclass(frozen=True)
+class ModelSet:
+    """The worst of the same worst case on several robot models.
+
+    ``min_q max_k f_k(q)``, where ``f_k`` is the objective on the k-th model, becomes ``min t`` with ``t ≥ f_k(q)``.
+    Models between the variants do not count.  :mod:`impact_posture.posture.analysis.robustness` samples them.
+
+    Attributes:
+        members: The worst case on each model, the robot as modeled first.
+    """
+
+    members: tuple[WorstCase, ...]
+
+    @property
+    def oracle(self) -> ImpactOracle:
+        """See :class:`WorstCase`."""
+        return self.members[0].oracle
+
+    @property
+    def attempts(self) -> int:
+        """See :class:`Minimized`."""
+        return max(len(ABOVE), *[member.attempts for member in self.members])
+
+    def values(self, q: Array) -> Array:
+        """Return the value on each model, from Pinocchio's numbers, shape (k,)."""
+        return np.array([member.value(q) for member in self.members])
+
+    def value(self, q: Array) -> float:
+        """See :class:`Minimized`."""
+        return float(self.values(q).max())
+
+    def subgradients(self, q: Array, within: float = 0.0) -> Subgradients:
+        """See :class:`Minimized`; all models that tie contribute."""
+        tied, gaps = finite_maximum(self.values(q), within)
+        # The gap of a model below the worst model uses up that much of ``within``.
+        parts = [self.members[k].subgradients(q, max(within - gap, 0.0)) for k, gap in zip(tied, gaps, strict=True)]
+        return Subgradients(
+            np.vstack([part.gradients for part in parts]),
+            np.concatenate([part.gaps + gap for part, gap in zip(parts, gaps, strict=True)]),
+        )
+
+    def expressions(self, k: ImpactKernel) -> tuple[ca.SX, ca.SX]:
+        """See :class:`WorstCase`; the gradient is that of the worst model."""
+        pairs = []
+        for member in self.members:
+            # Limbs repeat in the model as it stands.  A payload on one limb makes them differ.
+            case = member.oracle.case
+            pairs.append(member.expressions(k if case.robot is k.case.robot else ImpactKernel(case, k.q, k.n)))
+        return first_of_largest([value for value, _ in pairs], [gradient for _, gradient in pairs])
+
+    def lift(self, tree: Tree, parameters: ca.SX, scale: ca.SX) -> Lifted:
+        """See :class:`Minimized`; each model has unknowns of its own, and ``t`` bounds all values."""
+        parts = []
+        for member in self.members:
+            model = member.oracle.robot.model
+            parts.append(member.lift(tree if model is tree.model else Tree(model, tree.q), parameters, scale))
+        return worst_of(parts, [part.value for part in parts], scale)
+
+    def guess(self, q: Array, scale: float, attempt: int = 0) -> Guess:
+        """See :class:`Minimized`."""
+        parts = [member.guess(q, scale, min(attempt, member.attempts - 1)) for member in self.members]
+        return worst_of_guesses(parts, self.value(q) / scale, attempt)
+
+
+def finite_maximum(values: Array, within: float = 0.0) -> tuple[NDArray[np.int_], Array]:
+    """Return the indices of the values that tie with the largest, the leading index first, and their gaps.
+
+    A value ties if it is at most a share :data:`ACTIVE`, or ``within``, below the largest value.
+    """
+    largest = float(values.max())
+    near = np.flatnonzero(values >= largest - max(ACTIVE * abs(largest), within))
+    # The leading index must not depend on rounding, so it is the first of those that differ by rounding alone.
+    leading = int(np.flatnonzero(values >= largest - 1e-12 * abs(largest))[0])
+    order = np.concatenate([[leading], near[near != leading]])
+    return order, np.asarray(largest - values[order])
+
+
+def first_of_largest(values: Sequence[ca.SX], choices: Sequence[ca.SX]) -> tuple[ca.SX, ca.SX]:
+    """Return the largest expression and the choice that belongs to it, the first one at a tie."""
+    best, choice = values[0], choices[0]
+    for value, other in zip(values[1:], choices[1:], strict=True):
+        larger = value > best
+        best = ca.if_else(larger, value, best)
+        choice = choice + larger * (other - choice)
+    return best, choice

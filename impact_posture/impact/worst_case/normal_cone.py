@@ -1,0 +1,213 @@
+"""The worst normal within a cone: value, gradients, expressions and lifted form.
+
+``impulse``, ``sticking`` and ``energy`` depend on the normal through one quadratic form ``nᵀK(q)n``
+(:class:`~impact_posture.impact.kinds.impact_kind.QuadraticKind`).  Its largest value over a cone is known exactly
+(:mod:`impact_posture.impact.worst_case.worst_normal`).  ``speed`` is no quadratic form and has no such dual.
+
+In the program the dual replaces the inner maximum.  In the axes of the cone (half angle α), with the quadratic form
+``P(q) = [a, bᵀ; b, C]``, ``c = cos α``, ``s = sin α`` and everything divided by the first value of the form::
+
+    min t,   t = a + sτ,   Z = [τ − ρ, −bᵀ; −b, (st + ρc²) I − sC] = L²,   ρ ≥ 0
+
+``Z`` is ``tI − P − μ(n₀n₀ᵀ − c²I)`` between two factors ``diag(s^-½, s^½, s^½)`` with ``μ = ρ/s``, which stays
+bounded as α goes to zero.  The symmetric root ``L`` keeps its gradient where eigenvalues of ``Z`` vanish together, as
+they do at mirror-symmetric postures.  ``det Z`` has no gradient there.
+"""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+
+import casadi as ca
+import numpy as np
+
+from impact_posture.dynamics.tree import Tree
+from impact_posture.errors import InputError, MetricError
+from impact_posture.impact.kinds.impact_kind import ImpactKind, QuadraticKind
+from impact_posture.impact.objective import Subgradients
+from impact_posture.impact.quantities.impact_kernel import ImpactKernel
+from impact_posture.impact.quantities.impact_oracle import ImpactOracle
+from impact_posture.impact.quantities.lifted_form import Guess, Lifted, in_world
+from impact_posture.impact.worst_case.worst_normal import WorstNormal, cone_axes, tied_normals, worst_normal
+from impact_posture.impact.worst_case.worst_normal_symbolic import cone_axes_symbolic, worst_normal_symbolic
+from impact_posture.system.arrays import Array
+
+# Normals whose value is within this share of the largest value are worst normals in a subdifferential.
+_ACTIVE = 1e-7
+# Start of τ and ρ above their solution at the first posture, by attempt.  A root with a zero eigenvalue, on the
+# boundary, is a saddle point for Newton's method.
+_INSIDE = ((0.03, 0.01), (0.3, 0.1), (0.003, 0.001))
+_UPPER = ((0, 0), (0, 1), (0, 2), (1, 1), (1, 2), (2, 2))
+
+
+def check_cone(kind: type[ImpactKind], degrees: float) -> None:
+    """Refuse an angle that is no cone, and a kind without an exact worst case over a cone.
+
+    Raises:
+        InputError: The angle is no half angle of a cone.
+        MetricError: The kind is no quadratic form of the normal.
+    """
+    if not 0 <= degrees < 90:
+        raise InputError(f"the half angle is {degrees:g}°", where="normal_cone", hint="give 0 to below 90 degrees")
+    if degrees and not issubclass(kind, QuadraticKind):
+        raise MetricError(
+            kind.no_cone,
+            where="normal_cone",
+            hint="choose `objective='impulse'`, sticking or energy, or `normal_cone=0`",
+        )
+
+
+@dataclass(frozen=True)
+class NormalCone:
+    """The worst normal within ``degrees`` of the contact's own normal.
+
+    Attributes:
+        kind: The scalar that is minimized.
+        degrees: Half angle of the cone.
+        attempts: Guesses of the lifted form.
+    """
+
+    kind: QuadraticKind
+    degrees: float
+    attempts: int = len(_INSIDE)
+
+    @property
+    def oracle(self) -> ImpactOracle:
+        """See :class:`~impact_posture.impact.objective.WorstCase`."""
+        return self.kind.oracle
+
+    @property
+    def axis(self) -> Array:
+        """The contact's own normal, shape (3,)."""
+        return np.array(self.oracle.contact.normal)
+
+    def worst(self, q: Array) -> WorstNormal:
+        """Return the worst normal at ``q``, in the axes of the contact's normal.
+
+        Its ``value`` is that of the form ``nᵀKn``.  :meth:`value` is that of the objective.
+
+        Raises:
+            MetricError: The kind is ``sticking`` and the contact point cannot move in every direction.
+        """
+        return worst_normal(self._form(q)[0], self.axis, self.degrees)
+
+    def worst_in_world(self, q: Array) -> WorstNormal:
+        """Return :meth:`worst` with its normals in world axes."""
+        return self.worst(q).turned(self.oracle.at(q).axes)
+
+    def value(self, q: Array) -> float:
+        """See :class:`~impact_posture.impact.objective.Minimized`."""
+        return float(self.kind.of_form(np.array(self.worst(q).value)))
+
+    def subgradients(self, q: Array, within: float = 0.0) -> Subgradients:
+        """Return the gradients at all worst normals, each held fixed (Danskin), the leading normal first.
+
+        An arc or a circle of worst normals gives a dense sample.  A normal counts if its objective is at most
+        ``within`` below the maximum.
+        """
+        kind, axis = self.kind, self.axis
+        form = self._form(q)[0]
+        found = worst_normal(form, axis, self.degrees)
+        size = max(float(np.abs(form).max() * kind.of_form_slope(np.array(found.value))), 1e-300)
+        normals = tied_normals(form, axis, self.degrees, found, max(_ACTIVE, within / size))
+        values = np.einsum("ki,ij,kj->k", normals, form, normals)
+        slopes = kind.of_form_slope(values)
+        gaps = np.maximum(kind.of_form(np.array(found.value)) - kind.of_form(values), 0.0)
+        if len(normals) <= 2:
+            gradients = np.array([kind.form_gradient(q, n) for n in normals])
+        else:
+            gradients = np.einsum("ki,ijv,kj->kv", normals, self._form_tensor(q), normals)
+        return Subgradients(slopes[:, None] * gradients, gaps)
+
+    def expressions(self, k: ImpactKernel) -> tuple[ca.SX, ca.SX]:
+        """Return the expressions of a single impact along the worst normal, which is held fixed (Danskin)."""
+        worst = ImpactKernel(k.case, k.q, self.worst_normal_expression(k), k.tree.limbs)
+        return self.kind.expressions(worst)
+
+    def worst_normal_expression(self, k: ImpactKernel) -> ca.SX:
+        """Return the worst normal for the symbols of a kernel in closed form, in the axes of ``n``, shape (3,)."""
+        R = in_world(k.case, k.tree, ca.SX.eye(3))
+        K = R.T @ self.kind.form_expression(k) @ R
+        return worst_normal_symbolic((K + K.T) / 2, k.n, self.degrees)
+
+    def lift(self, tree: Tree, parameters: ca.SX, scale: ca.SX) -> Lifted:
+        """Return the dual over the cone: the unknowns are three jumps, ``τ``, ``ρ`` and the six entries of ``L``."""
+        kind, local = self.kind, cone_axes_symbolic(parameters)
+        world = in_world(kind.case, tree, local)
+        jumps = [kind.lift_direction(tree, local[:, k], str(k)) for k in range(3)]
+        unit = kind.form_unit(scale)
+        form = ca.SX.zeros(3, 3)
+        for i, j in _UPPER:
+            form[i, j] = form[j, i] = kind.lift_entry(world[:, i], jumps[i], jumps[j]) / unit
+        tau, rho, root = ca.SX.sym("tau"), ca.SX.sym("rho"), ca.SX.sym("root", 6)
+        c, s = self._cosine_sine
+        t = form[0, 0] + s * tau
+        block = (s * t + rho * c * c) * ca.SX.eye(2) - s * form[1:, 1:]
+        L = ca.SX.zeros(3, 3)
+        for k, (i, j) in enumerate(_UPPER):
+            L[i, j] = L[j, i] = root[k]
+        gap = ca.blockcat([[tau - rho, -form[0, 1:]], [-form[1:, 0], block]]) - L @ L
+        return Lifted.of(
+            jumps,
+            kind.of_form_expression(unit * t),
+            others=[tau, rho, root],
+            equations=[gap[i, j] for i, j in _UPPER],
+        )
+
+    def guess(self, q: Array, scale: float, attempt: int = 0) -> Guess:
+        """Return the auxiliaries of :meth:`lift` at ``q``, with ``Z`` inside the cone that it must stay in."""
+        form, jumps, impulses = self._form(q, cone_axes(self.axis))
+        form = form / self.kind.form_unit(scale)
+        parts: list[Array] = []
+        for jump, impulse in zip(jumps.T, impulses.T, strict=True):
+            parts.append(self.oracle.with_support_impulses(jump))
+            if self.kind.unknown_impulse:
+                parts.append(impulse)
+        c, s = self._cosine_sine
+        worst = worst_normal(form, np.eye(3)[0], self.degrees)
+        above, beyond = _INSIDE[attempt]
+        tau, rho = (worst.value - form[0, 0]) / s + above + beyond, worst.multiplier * s + beyond
+        Z = -s * form
+        Z[0, :] = Z[:, 0] = Z[:, 0] / s
+        Z[0, 0] = tau - rho
+        Z[1:, 1:] += (s * (form[0, 0] + s * tau) + rho * c * c) * np.eye(2)
+        values, vectors = np.linalg.eigh(Z)
+        root = (vectors * np.sqrt(np.maximum(values, 1e-6))) @ vectors.T
+        guess = Guess.unbounded(np.concatenate([*parts, [tau, rho], [root[i, j] for i, j in _UPPER]]))
+        guess.lower[-1 - len(_UPPER)] = 0.0
+        return guess
+
+    @property
+    def _cosine_sine(self) -> tuple[float, float]:
+        alpha = np.deg2rad(self.degrees)
+        return float(np.cos(alpha)), float(np.sin(alpha))
+
+    def _form(self, q: Array, directions: Array | None = None) -> tuple[Array, Array, Array]:
+        """``K`` along three directions (columns in the axes of the normal, those axes by default), shape (3, 3).
+
+        Returns:
+            The form, the velocity jumps along the directions (columns, shape (nv, 3)), and the impulses that cause
+            them (columns, world axes, shape (3, 3)).
+
+        Raises:
+            MetricError: The form does not exist at ``q``.
+        """
+        world = self.oracle.at(q).axes
+        if directions is not None:
+            world = world @ directions
+        responses = self.oracle.solve(self.oracle.J.T)
+        mobility = self.oracle.J @ responses
+        impulses = self.kind.directions(mobility, world)
+        jumps = responses @ impulses
+        K = self.kind.form(mobility, world, jumps)
+        return (K + K.T) / 2, jumps, impulses
+
+    def _form_tensor(self, q: Array) -> Array:
+        """``∂K``, shape (3, 3, nv), from the gradients along six directions."""
+        axes = np.eye(3)
+        tensor = np.zeros((3, 3, self.oracle.robot.nv))
+        # The diagonal comes first in the order of i, because the other entries need it.
+        for i, j in sorted(_UPPER, key=lambda entry: entry[0] != entry[1]):
+            both = self.kind.form_gradient(q, axes[i] if i == j else axes[i] + axes[j])
+            tensor[i, j] = tensor[j, i] = both if i == j else (both - tensor[i, i] - tensor[j, j]) / 2
+        return tensor

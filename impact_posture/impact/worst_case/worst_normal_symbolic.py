@@ -1,0 +1,92 @@
+"""The worst normal of a cone in closed form, as the expression that the C export evaluates.
+
+With ``A`` in the cone's axes as ``[a, bᵀ; b, diag(d₁, d₂)]`` (the last two turned to the principal axes, ``d₁ ≥ d₂``)
+the normal follows from the root of a function.  Newton's method climbs to it from the left without passing it:
+
+- on the edge ``n = (c, s w)``, ``|w| = 1``: ``w_i = p_i/(ν − d_i)`` with ``p = b c/s`` (a trust-region problem in the
+  plane; Moré and Sorensen 1983), solved for ``1/|w| = 1``;
+- inside: ``n ∝ (1, b_i/(λ − d_i))`` with the secular equation ``λ − a = Σ b_i²/(λ − d_i)`` of the top eigenvalue,
+  which lies above ``ν`` exactly if its eigenvector is inside.
+"""
+
+from __future__ import annotations
+
+import casadi as ca
+import numpy as np
+
+# These steps of Newton's method give full precision over 16 decades of p, gap and a, and up to 89.9°.
+_EDGE_STEPS, _INSIDE_STEPS = 8, 14
+# Smaller than every number that matters, in single precision as well.
+_TINY = 1e-30
+
+
+def cone_axes_symbolic(n: ca.SX) -> ca.SX:
+    """Return :func:`~impact_posture.impact.worst_case.worst_normal.cone_axes` of an expression."""
+    x, y, z = n[0], n[1], n[2]
+    side = ca.if_else(z >= 0, 1.0, -1.0)
+    a = -1 / (side + z)
+    b = x * y * a
+    return ca.horzcat(n, ca.vertcat(1 + side * x * x * a, side * b, -side * x), ca.vertcat(b, side + y * y * a, -y))
+
+
+def worst_normal_symbolic(A: ca.SX, axis: ca.SX, cone_deg: float) -> ca.SX:
+    """Return the normal, shape (3,), that maximizes ``nᵀAn`` within ``cone_deg`` of ``axis``; one normal at a tie.
+
+    The gradient of the maximum is that of ``nᵀA(q)n`` with this ``n`` held fixed (Danskin).  Do not differentiate the
+    expression itself.
+    """
+    alpha = np.deg2rad(cone_deg)
+    c, s = float(np.cos(alpha)), float(np.sin(alpha))
+    axes = cone_axes_symbolic(axis)
+    P = axes.T @ A @ axes
+    h, k = (P[1, 1] - P[2, 2]) / 2, P[1, 2]
+    radius = ca.hypot(h, k)
+    turn = ca.atan2(k, h) / 2
+    turned = ca.blockcat([[ca.cos(turn), -ca.sin(turn)], [ca.sin(turn), ca.cos(turn)]])
+    b = turned.T @ P[1:, 0]
+    gap, above = 2 * radius, (P[1, 1] + P[2, 2]) / 2 + radius - P[0, 0]
+    eta = _edge_root(b * (c / s), gap)
+    w = _on_circle(b * (c / s), eta, gap)
+    # Above the root of the edge the secular function rises through zero only if the eigenvector is inside.
+    is_edge = _secular(eta, above, b, gap)[0] >= 0
+    xi = eta
+    for _ in range(_INSIDE_STEPS):
+        value, slope = _secular(xi, above, b, gap)
+        xi = xi - ca.fmin(value, 0) / slope
+    inside = ca.vertcat(1, b[0] / ca.fmax(xi, _TINY), b[1] / ca.fmax(xi + gap, _TINY))
+    inside = inside / ca.norm_2(inside)
+    edge = ca.vertcat(c, s * w)
+    local = ca.vertcat(*[ca.if_else(is_edge, edge[i], inside[i]) for i in range(3)])
+    return axes @ ca.vertcat(local[0], turned @ local[1:])
+
+
+def _edge_root(p: ca.SX, gap: ca.SX) -> ca.SX:
+    """``η = ν − d₁ ≥ 0`` with ``p₁²/η² + p₂²/(η + gap)² = 1``; zero in the hard case."""
+    # Bounds from below; the last bound is for the corner where p₁ vanishes and |p₂| nears the gap (η ~ p₁^⅔ there).
+    x, y = ca.fabs(p[0]), ca.fabs(p[1])
+    corner = ca.fmin((x * x * gap / 4) ** (1 / 3), x * ca.sqrt(gap / (4 * ca.fmax(gap - y, 0) + _TINY)))
+    eta = ca.fmax(ca.fmax(ca.fmax(x, y - gap), corner), _TINY)
+    for _ in range(_EDGE_STEPS):
+        x, y = p[0] / eta, p[1] / (eta + gap)
+        square = x * x + y * y
+        # Newton on 1/|w| − 1, concave and rising: from the left it never passes the root.
+        slope = x * x / eta + y * y / (eta + gap)
+        step = square * (ca.sqrt(square) - 1) / ca.fmax(slope, _TINY)
+        eta = eta + ca.fmax(step, 0)
+    return eta
+
+
+def _on_circle(p: ca.SX, eta: ca.SX, gap: ca.SX) -> ca.SX:
+    """``w`` of length one; in the hard case ``p₁ = 0`` both signs are right and plus is chosen."""
+    y = ca.fmin(ca.fmax(p[1] / ca.fmax(eta + gap, _TINY), -1), 1)
+    rest = 1 - y * y
+    # Use the sine where it is large, and the quotient where a root would lose its digits.
+    x = ca.if_else(rest > 1e-6, ca.if_else(p[0] >= 0, 1.0, -1.0) * ca.sqrt(rest), p[0] / eta)
+    return ca.vertcat(x, y) / ca.hypot(x, y)
+
+
+def _secular(xi: ca.SX, above: ca.SX, b: ca.SX, gap: ca.SX) -> tuple[ca.SX, ca.SX]:
+    """``λ − a − Σ b_i²/(λ − d_i)`` at ``λ = d₁ + ξ``, and its slope."""
+    one, other = ca.fmax(xi, _TINY), ca.fmax(xi + gap, _TINY)
+    x, y = b[0] / one, b[1] / other
+    return xi + above - b[0] * x - b[1] * y, 1 + x * x + y * y

@@ -1,0 +1,1 @@
+"""The result folder: files, figures and the report."""

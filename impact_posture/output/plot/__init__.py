@@ -1,0 +1,103 @@
+"""Figures of a result: :func:`draw_all` writes them, the ``*_figure`` functions return matplotlib figures.
+
+Figures of simulated runs: :func:`figures_of_run`, :func:`figures_of_comparison` and :func:`bars_figure`.
+
+The package does not change the global state of pyplot and shows no window.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Callable, Collection, Iterable
+from pathlib import Path
+
+from matplotlib.figure import Figure
+
+from impact_posture.errors import NameNotFound
+from impact_posture.output.plot import (
+    classical_figure,
+    ellipsoid_figure,
+    jump_figure,
+    path_figures,
+    self_motion_figure,
+)
+from impact_posture.output.plot.bars import Bar, bars_figure
+from impact_posture.output.plot.postures_figure import postures_figure
+from impact_posture.output.plot.result_view import ResultView, TradeOffData
+from impact_posture.output.plot.run_figures import figures_of_comparison, figures_of_run
+from impact_posture.output.plot.run_view import RunView
+from impact_posture.output.plot.style import DEFAULT_FORMATS, FORMATS, check_formats, save, save_all
+
+__all__ = [
+    "FIGURES",
+    "FORMATS",
+    "Bar",
+    "FigureNotFound",
+    "ResultView",
+    "RunView",
+    "TradeOffData",
+    "bars_figure",
+    "draw_all",
+    "drawable",
+    "figures_of_comparison",
+    "figures_of_run",
+    "save",
+    "save_all",
+]
+
+# What takes longest comes first, so that processes that draw side by side end together.
+FIGURES: dict[str, Callable[[ResultView], Figure]] = {
+    "jump": jump_figure.jump_figure,
+    "ellipsoid": ellipsoid_figure.ellipsoid_figure,
+    "classical": classical_figure.classical_figure,
+    "postures": postures_figure,
+    "tradeoff": path_figures.tradeoff_figure,
+    "path": path_figures.motion_figure,
+    "self_motion": self_motion_figure.self_motion_figure,
+    "nullspace": path_figures.path_figure,
+}
+
+# Figures that are drawn only if the view has this field.
+_NEEDED = {"nullspace": "path", "tradeoff": "tradeoff", "self_motion": "self_motion"}
+
+
+def drawable(view: ResultView) -> list[str]:
+    """Return the names of the figures that the view has data for.
+
+    ``nullspace`` needs a path, ``tradeoff`` a trade-off, ``path`` a motion, and ``self_motion`` a map.
+    """
+    lacking = {name: getattr(view, field) is None for name, field in _NEEDED.items()}
+    lacking["path"] = view.motion is None or view.motion.use is None
+    return [name for name in FIGURES if not lacking.get(name)]
+
+
+class FigureNotFound(NameNotFound):
+    """The name of a figure is unknown."""
+
+    kind = "figure"
+
+
+def draw_all(
+    view: ResultView,
+    out: Path,
+    formats: Iterable[str] = DEFAULT_FORMATS,
+    only: Collection[str] | None = None,
+) -> list[Path]:
+    """Write the figures of ``view`` into ``out`` as ``<name>.<format>``; return the paths.
+
+    Args:
+        view: The result.
+        out: Folder, made if missing; files of the same name are replaced.
+        formats: Some of ``png``, ``svg`` and ``pdf``.
+        only: Names of :data:`FIGURES` to draw; all of :func:`drawable` if ``None``.
+
+    Raises:
+        FigureNotFound: An unknown name in ``only``.
+        InputError: An unknown format, or a figure in ``only`` that the view has no data for.
+        OutputError: The folder or a file cannot be written.
+    """
+    wanted = check_formats(formats)
+    names = drawable(view) if only is None else list(dict.fromkeys(only))
+    for name in names:
+        if name not in FIGURES:
+            raise FigureNotFound(name, FIGURES, where="plot")
+    return [path for name in names for path in save(FIGURES[name](view), out, name, wanted)]

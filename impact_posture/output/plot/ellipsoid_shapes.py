@@ -1,0 +1,164 @@
+"""Ellipsoids as points and lines: shadows on planes, half-widths, surfaces.  No drawing here."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+
+import numpy as np
+
+from impact_posture.robot.support_polygon import convex_ring
+from impact_posture.system.arrays import Array
+
+# A direction within 1° of a plane counts as in it: its half-width differs there by less than 2e-4 of itself.
+IN_PLANE = float(np.cos(np.radians(1.0)))
+# A semi-axis this much shorter than the longest is a rounding error (or cannot be seen).
+_NEGLIGIBLE = 1e-6
+# Directions around a point of the plane, in which a hull has its extreme points, shape (16, 2).
+_AROUND = np.array([[np.cos(angle), np.sin(angle)] for angle in np.arange(16) * np.pi / 8])
+
+
+@dataclass(frozen=True, eq=False)
+class Plane:
+    """A picture plane.
+
+    Attributes:
+        axes: Rows are the orthonormal world directions drawn to the right and up, shape (2, 3).
+        right: Name of the first.
+        up: Name of the second.
+    """
+
+    axes: Array
+    right: str
+    up: str
+
+    @property
+    def name(self) -> str:
+        """``xy`` and the like."""
+        return f"{self.right}{self.up}" if len(self.right + self.up) == 2 else "plane of n and z"
+
+    def contains(self, direction: Array) -> bool:
+        """Return whether a unit direction lies in the plane, up to a degree."""
+        return bool(np.linalg.norm(self.axes @ direction) >= IN_PLANE)
+
+
+_X, _Y, _Z = np.eye(3)
+XY = Plane(np.array([_X, _Y]), "x", "y")
+XZ = Plane(np.array([_X, _Z]), "x", "z")
+YZ = Plane(np.array([_Y, _Z]), "y", "z")
+COORDINATE_PLANES = (XY, XZ, YZ)
+
+
+def upright_plane(n: Array) -> Plane:
+    """Return the plane of the vertical and a unit vector that is not vertical."""
+    across = np.array([n[0], n[1], 0.0]) / np.hypot(n[0], n[1])
+    name = f"along ({across[0]:.2f}, {across[1]:.2f}, 0)".replace("-", "−")
+    return Plane(np.array([across, _Z]), name, "z")
+
+
+def root(matrix: Array) -> Array:
+    """Return the symmetric square root of a positive semidefinite matrix, with negative eigenvalues set to zero."""
+    values, vectors = np.linalg.eigh((matrix + matrix.T) / 2)
+    return np.asarray((vectors * np.sqrt(np.maximum(values, 0.0))) @ vectors.T)
+
+
+def half_width(matrix: Array, direction: Array) -> float:
+    """Half-width ``√(dᵀΛd)`` of ``{x: xᵀΛ⁻¹x ≤ 1}`` along a unit ``d``, the distance of its tangent planes."""
+    return float(np.sqrt(max(float(direction @ matrix @ direction), 0.0)))
+
+
+def shadow(matrix: Array, axes: Array, points: int = 181) -> Array:
+    """Edge of the projection of ``{x: xᵀΛ⁻¹x ≤ 1}`` on the plane of ``axes`` (rows, orthonormal), shape (2, points).
+
+    The projection is the ellipse of ``P Λ Pᵀ``; a degenerate one is a segment from end to end, or a point.
+    """
+    return _ring(_semi_axes(axes @ matrix @ axes.T), points)
+
+
+def surface(matrix: Array, rings: int = 25) -> Array:
+    """Return points of the surface of the ellipsoid on a grid, shape (3, rings, 2·rings)."""
+    across, around = np.meshgrid(np.linspace(0, np.pi, rings), np.linspace(0, 2 * np.pi, 2 * rings), indexing="ij")
+    sphere = np.array([np.sin(across) * np.cos(around), np.sin(across) * np.sin(around), np.cos(across)])
+    return np.asarray(np.einsum("ij,jkl->ikl", root(matrix), sphere))
+
+
+def principal_sections(matrix: Array, points: int = 121) -> list[Array]:
+    """Return the ellipses through two principal axes each, shape (3, points), without those that are a point."""
+    axes = _semi_axes(matrix)
+    flat = _NEGLIGIBLE * np.linalg.norm(axes[:, 2])
+    pairs = [pair for pair in ([0, 1], [0, 2], [1, 2]) if np.linalg.norm(axes[:, pair[1]]) > flat]
+    # The two long sections of a rod are the same segment.
+    pairs = pairs[1:] if len(pairs) == 2 and np.linalg.norm(axes[:, 1]) <= flat else pairs
+    return [_ring(axes[:, pair], points) for pair in pairs]
+
+
+def _semi_axes(matrix: Array) -> Array:
+    """Semi-axes as columns, the longest last."""
+    values, vectors = np.linalg.eigh((matrix + matrix.T) / 2)
+    return np.asarray(vectors * np.sqrt(np.maximum(values, 0.0)))
+
+
+def _ring(axes: Array, points: int) -> Array:
+    """The ellipse with two semi-axes (columns, the longer last); a segment if the shorter is negligible.
+
+    There and back would put the gaps of a dashed line under its dashes.
+    """
+    angle = np.linspace(0.0, 2 * np.pi, points)
+    if np.linalg.norm(axes[:, 0]) <= _NEGLIGIBLE * np.linalg.norm(axes[:, 1]):
+        angle = np.linspace(0.0, np.pi, points)
+        return np.asarray(axes[:, 1:] * np.cos(angle))
+    return np.asarray(axes[:, ::-1] @ np.array([np.cos(angle), np.sin(angle)]))
+
+
+def polar(matrix: Array, infinite: float) -> tuple[Array, Array]:
+    """The matrix of the polar dual ``{f: fᵀAf ≤ 1}`` of ``{x: xᵀA⁻¹x ≤ 1}``, and where it has no end.
+
+    Args:
+        matrix: ``A``, positive semidefinite, shape (3, 3).
+        infinite: Half-length to draw in the directions in which the dual is unbounded.
+
+    Returns:
+        ``A⁻¹`` with those directions cut at ``infinite``, and the unbounded directions as columns, shape (3, k).
+    """
+    values, vectors = np.linalg.eigh((matrix + matrix.T) / 2)
+    bounded = values > 1e-10 * max(float(values[-1]), 1e-300)
+    inverse = np.where(bounded, 1 / np.where(bounded, values, 1.0), infinite**2)
+    return np.asarray((vectors * inverse) @ vectors.T), np.asarray(vectors[:, ~bounded])
+
+
+def cone_rim(axis: Array, degrees: float, length: float, points: int = 73) -> Array:
+    """Ends of the lines of ``length`` at ``degrees`` from a unit ``axis``, a closed circle, shape (3, points)."""
+    across = np.linalg.svd(axis[None])[2][1:]
+    angle, tilt = np.linspace(0.0, 2 * np.pi, points), np.radians(degrees)
+    around = across.T @ np.array([np.cos(angle), np.sin(angle)])
+    return np.asarray(length * (np.cos(tilt) * axis[:, None] + np.sin(tilt) * around))
+
+
+def cone_shadow(axis: Array, degrees: float, length: float, axes: Array) -> Array:
+    """Outline of the projection of the cone from the origin to :func:`cone_rim`, closed, shape (2, k)."""
+    flat = np.column_stack([np.zeros(2), axes @ cone_rim(axis, degrees, length)[:, :-1]])
+    return outline(flat)
+
+
+def outline(points: Array) -> Array:
+    """Return the convex hull of points of shape (2, k), closed."""
+    extreme = points[:, (_AROUND @ points).argmax(axis=1)]
+    steps = np.roll(extreme, -1, axis=1) - extreme
+    sides = np.flatnonzero(steps.any(axis=0))
+    # Most points are inside of the polygon of the extreme ones.
+    left = steps[0, sides, None] * (points[1] - extreme[1, sides, None]) - steps[1, sides, None] * (
+        points[0] - extreme[0, sides, None]
+    )
+    points = points[:, (left <= 0).any(axis=0) | (sides.size == 0)]
+    edge = convex_ring(points.T)
+    return np.asarray(points[:, [*edge, edge[0]]])
+
+
+def square(center: Array, n: Array, side: float) -> Array:
+    """Corners of a square perpendicular to the unit vector ``n``, closed, shape (3, 5)."""
+    # The edges follow the world axis that n is farthest from.
+    first = np.eye(3)[int(np.argmin(np.abs(n)))]
+    first = first - (first @ n) * n
+    first = first / np.linalg.norm(first)
+    second = np.cross(n, first)
+    corners = np.array([[1, 1, -1, -1, 1], [1, -1, -1, 1, 1]]) * side / 2
+    return np.asarray(center[:, None] + np.outer(first, corners[0]) + np.outer(second, corners[1]))

@@ -1,0 +1,239 @@
+"""Data of the figures of a result: an impact, two postures, an approach, the path and the trade-off between them."""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from dataclasses import dataclass, replace
+from functools import cached_property
+from typing import TYPE_CHECKING
+
+import numpy as np
+from numpy.typing import NDArray
+
+from impact_posture.config.settings import Against
+from impact_posture.errors import MetricError
+from impact_posture.impact.evaluation.scalars import objective_value
+from impact_posture.impact.evaluation.velocity_jump import tangent_units
+from impact_posture.impact.impact_contact import point_on
+from impact_posture.impact.kinds.impact_kind import ImpactKind
+from impact_posture.impact.quantities.impact_oracle import ImpactOracle, ImpactQuantities
+from impact_posture.impact.worst_case.worst_normal import WorstNormal
+from impact_posture.impact.worst_case_objective import WorstCaseObjective
+from impact_posture.robot.robot import Robot
+from impact_posture.system.arrays import Array
+
+# Imported for its name alone, because the figures need no solver.
+if TYPE_CHECKING:
+    from impact_posture.path.posture_path import PosturePath
+    from impact_posture.posture.manifold.null_space_path import NullSpacePath
+    from impact_posture.posture.search.global_search import SelfMotionMap
+
+ALONE = "numbers and ellipsoids"
+"""Begin of the fact that says which of several contacts the figures show."""
+
+SEPARATOR = "  ·  "
+"""Separator of the facts in a header line."""
+
+_UNITS = {"H": "‖Δν‖²/(N·s)²", "G": "1/kg", "V": "‖Δν‖²/(m/s)²", "S": "‖Δν‖²/(m/s)²", "E": "kg"}
+
+
+@dataclass(frozen=True, eq=False)
+class TradeOffData:
+    """Best posture within each distance from the initial posture, which comes first, or within each peak force.
+
+    Attributes:
+        within: The bounds on the distance (rad mixed with m) or force (N), increasing, shape (k,).
+        distance: Distance or force of each posture, at most ``within``, shape (k,).
+        objective: Objective of each posture, shape (k,).
+        H: ``nᵀΛ_c n``, shape (k,).
+        G: ``1/m_eff`` along the normal, 1/kg, shape (k,).
+        V: ``H/G²``, shape (k,).
+        S: The sticking counterpart of V, shape (k,); NaN where it does not exist.
+        certified: Whether the certificate of each posture holds, shape (k,).
+        knee: Index of the knee, if there is one.
+        against: What the points bound.
+    """
+
+    within: Array
+    distance: Array
+    objective: Array
+    H: Array
+    G: Array
+    V: Array
+    S: Array
+    certified: NDArray[np.bool_]
+    knee: int | None = None
+    against: Against = "distance"
+
+
+@dataclass(frozen=True, eq=False)
+class ResultView:
+    """Data that the figures of a result need.
+
+    Attributes:
+        objective: Robot, contact, metric, kind and supports; its oracle gives the numbers.
+        q_initial: Posture before, shape (nq,).
+        q_optimal: Posture after, shape (nq,).
+        speed: Approach speed along the normal, m/s.
+        restitution: Coefficient of restitution e, in [0, 1].
+        path: Quantities along the null-space path between them, if known.
+        tradeoff: The trade-off of objective against distance, if it was computed.
+        motion: The path to the optimum over time, if it was searched.
+        self_motion: The map of the self-motion manifold, if it was computed.
+        collisions: Names of the shapes that collide, in pairs, before and after.
+        depths: How far behind its contact point each surface lies, m; empty for none.
+        pushed: Whether the robot is pushed anywhere (a free contact pose) and strikes no surface.
+    """
+
+    objective: WorstCaseObjective
+    q_initial: Array
+    q_optimal: Array
+    speed: float = 1.0
+    restitution: float = 0.0
+    path: NullSpacePath | None = None
+    tradeoff: TradeOffData | None = None
+    motion: PosturePath | None = None
+    self_motion: SelfMotionMap | None = None
+    collisions: tuple[Sequence[tuple[str, str]], Sequence[tuple[str, str]]] = ((), ())
+    depths: tuple[float, ...] = ()
+    pushed: bool = False
+
+    @property
+    def robot(self) -> Robot:
+        """The robot."""
+        return self.objective.robot
+
+    @cached_property
+    def before(self) -> ImpactQuantities:
+        """Quantities at ``q_initial``."""
+        return self.objective.oracle.quantities(self.q_initial)
+
+    @cached_property
+    def after(self) -> ImpactQuantities:
+        """Quantities at ``q_optimal``."""
+        return self.objective.oracle.quantities(self.q_optimal)
+
+    @cached_property
+    def free(self) -> tuple[ImpactQuantities, ...]:
+        """Quantities before and after without the supports; empty for a robot that has no supports."""
+        if not self.objective.supports:
+            return ()
+        oracle = ImpactOracle(replace(self.objective.case, supports=()))
+        return oracle.quantities(self.q_initial), oracle.quantities(self.q_optimal)
+
+    @cached_property
+    def worst(self) -> tuple[WorstNormal | None, WorstNormal | None]:
+        """World worst normals of the cone before and after; ``None`` without a cone or where none exists."""
+        return self._worst(self.q_initial), self._worst(self.q_optimal)
+
+    def _worst(self, q: Array) -> WorstNormal | None:
+        cone = self.objective.normal_cone
+        if cone is None:
+            return None
+        try:
+            return cone.worst_in_world(q)
+        except MetricError:
+            return None
+
+    def jacobian(self, q: Array) -> Array:
+        """Return ``J(q)``, shape (3, nv), of the world velocity of the contact point without supports."""
+        contact = self.objective.contact
+        point = point_on(self.robot, contact.frame, contact.offset)
+        return np.array(self.objective.oracle.numeric.at(q).jacobian(point)[:3])
+
+
+def jump_unit(view: ResultView) -> str:
+    """Return the unit of ``‖Δν‖_W`` in the metric of the view."""
+    metric = view.objective.metric
+    if metric.kind == "kinetic":
+        return "√J"
+    if metric.kind == "weighted":
+        return "weighted"
+    return mixed_unit(view.robot)
+
+
+def objective_unit(view: ResultView) -> str:
+    """Return the unit of the objective."""
+    jump = jump_unit(view)
+    square = "J" if jump == "√J" else f"({jump})²" if "/" in jump and jump[0] != "(" else f"{jump}²"
+    return {"impulse": square, "energy": "kg"}.get(view.objective.kind, f"{square}/(m/s)²")
+
+
+def mixed_unit(robot: Robot) -> str:
+    """Return the unit of the Euclidean ``‖ν‖``, which is both units where it mixes them."""
+    kinds = [u for u in ("m/s", "rad/s") if u in tangent_units(robot)]
+    return kinds[0] if len(kinds) == 1 else f"({', '.join(kinds)})"
+
+
+def contact_letters(view: ResultView) -> list[str]:
+    """Return a letter for each contact of a figure; an empty text for a single contact."""
+    count = len(view.objective.contacts)
+    return [f" {letter}" for letter in "ABCDEFGHIJKLMNOPQRSTUVWXYZ"[:count]] if count > 1 else [""]
+
+
+def header_lines(view: ResultView) -> tuple[str, list[str]]:
+    """Return the title and the small lines below it: robot, contact, settings and all five quantities.
+
+    H never stands alone: G, V, S and E stand beside it.
+    """
+    contact, metric, robot = view.objective.contact, view.objective.metric, view.robot
+    named = zip(view.objective.contacts, contact_letters(view), strict=True)
+    frames = ", ".join(f"{one.frame}{letter and f' ({letter.strip()})'}" for one, letter in named)
+    normal = ", ".join(number(v) for v in contact.normal)
+    axes = "world" if contact.normal_frame == "world" else "contact frame"
+    facts = [f"offset ({', '.join(number(v) for v in contact.offset)}) m"] if any(contact.offset) else []
+    cone = view.objective.normal_cone_deg
+    source = f" ({_short(metric.source)})" if metric.kind == "weighted" and metric.source else ""
+    facts += [
+        f"n = ({normal}) in {axes}" + (f", worst within {cone:g}°" if cone else ""),
+        f"objective {view.objective.name}" + _worst_values(view),
+        f"metric {metric.kind}{source}",
+        f"armature {_armature(robot)}",
+    ]
+    if view.objective.others:
+        facts.insert(0, f"{ALONE}: {contact.frame} alone; objective: all contacts together")
+    if count := len(view.objective.model_variants):
+        facts.insert(0, f"drawn and in numbers: the model as it stands; objective the worst of {count}")
+    feet = [s.frame for s in view.objective.supports]
+    facts.append(f"contact-consistent, on {', '.join(feet)}" if feet else "no supports")
+    numbers = []
+    for name, unit in _UNITS.items():
+        first, second = getattr(view.before, name), getattr(view.after, name)
+        shown = f" {unit}" if (first, second) != (None, None) else ""
+        numbers.append(f"{name} {number(first)} → {number(second)}{shown}")
+    return f"{robot.name}, impact at {frames}", [SEPARATOR.join(facts), SEPARATOR.join(numbers)]
+
+
+def _worst_values(view: ResultView) -> str:
+    """Return the objective before and after, where it is the worst of several impacts."""
+    if isinstance(view.objective.worst_case, ImpactKind):
+        return ""
+    found = [objective_value(view.objective, q) for q in (view.q_initial, view.q_optimal)]
+    return " " + " → ".join(number(value) for value in found)
+
+
+def number(value: float | None) -> str:
+    """Format a number with three digits and a true minus sign; ``undefined`` for ``None``."""
+    if value is None or np.isnan(value):
+        return "undefined"
+    if np.isinf(value):
+        return "∞" if value > 0 else "−∞"
+    rounded = float(f"{value:.3g}") + 0.0
+    text = f"{rounded:g}" if abs(rounded) < 1e5 else f"{rounded:.3g}"
+    mantissa, _, exponent = text.partition("e")
+    return (f"{mantissa}e{int(exponent)}" if exponent else mantissa).replace("-", "−")
+
+
+def _short(source: str) -> str:
+    """Return a source without its explanation in parentheses, and a path without its folders."""
+    return source.split(" (")[0].rsplit("/", 1)[-1]
+
+
+def _armature(robot: Robot) -> str:
+    source = _short(robot.armature_source)
+    joints = robot.armature[6 if robot.floating else 0 :]
+    if not joints.size or not joints.any():
+        return "zero" if source == "none" else f"zero ({source})"
+    low, high = f"{joints.min():.2g}", f"{joints.max():.2g}"
+    felt = "" if robot.joint_model == "reflected" else f", joint model {robot.joint_model}"
+    return f"{low if low == high else f'{low}–{high}'} kg·m² ({source}){felt}"

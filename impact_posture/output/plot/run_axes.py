@@ -1,0 +1,225 @@
+"""Axes over time of the figures of runs: shaded windows, limits, curves, a legend."""
+
+from __future__ import annotations
+
+from collections.abc import Mapping, Sequence
+from dataclasses import dataclass
+from typing import Any
+
+import numpy as np
+from matplotlib.figure import Figure
+from matplotlib.lines import Line2D
+from matplotlib.patches import Patch
+from matplotlib.ticker import LogLocator
+
+from impact_posture.output.plot.path_figures import log_axis, spreads
+from impact_posture.output.plot.run_panels import LINES, RUNS, Clip, Panel
+from impact_posture.output.plot.run_view import RunView, run_header
+from impact_posture.output.plot.style import GRAY, INK, framed, shared_legend
+from impact_posture.system.arrays import Array
+from impact_posture.system.escape import plot_label
+
+# Pink and light gray differ in a gray print as well.
+SHADES: dict[str, dict[str, Any]] = {
+    "dwell": {"facecolor": "#f0f0f0", "edgecolor": "none", "zorder": 0.1},
+    "impact": {"facecolor": "#edc3d6", "edgecolor": "none", "zorder": 0.2},
+}
+LIMIT: dict[str, Any] = {"color": INK, "linestyle": (0, (6, 3)), "linewidth": 0.8, "zorder": 1.5}
+STOP: dict[str, Any] = {"color": INK, "linewidth": 3.6, "alpha": 0.35, "zorder": 2.0, "solid_capstyle": "butt"}
+AT_LIMIT: dict[str, Any] = {
+    "linestyle": "", "marker": "D", "markersize": 3.2, "color": INK, "markeredgecolor": "white",
+    "markeredgewidth": 0.4, "zorder": 5,
+}  # fmt: skip
+BAND: dict[str, Any] = {"facecolor": "#dcdcdc", "edgecolor": "none", "zorder": 1.2}
+# Bins across the width of a page.
+_BINS = 1000
+
+
+@dataclass(frozen=True)
+class Cell:
+    """Panel in a place of a figure.
+
+    Attributes:
+        panel: Its curves.
+        clips: Stretch of time that is drawn of each run, by the index of the run.
+        frame: The run whose windows are shaded, and the stretch of time of the axis.
+        title: Line above it.
+    """
+
+    panel: Panel
+    clips: Mapping[int, Clip]
+    frame: tuple[int, Clip]
+    title: str = ""
+
+    @classmethod
+    def of(cls, panel: Panel, which: int, clip: Clip, title: str = "") -> Cell:
+        """Cell of a single run."""
+        return cls(panel, {which: clip}, (which, clip), title)
+
+
+def time_figure(
+    views: Sequence[RunView],
+    cells: Sequence[Sequence[Cell | None]],
+    height: float,
+    notes: Sequence[str],
+    *,
+    widths: Sequence[float] = (),
+    title_at: str = "center",
+    air: float = 0.75,
+) -> Figure:
+    """Draw rows of cells with the header of the runs above and the only legend beside them.
+
+    Cells of the same panel share their upright axis.  An axis of time is named where the next cell below has another.
+
+    Args:
+        views: The runs.
+        cells: Rows of equal length; ``None`` leaves a place blank.
+        height: Height of a row, inches.
+        notes: Sentences below the figure.
+        widths: Ratios of the widths of the columns; equal if empty.
+        title_at: Where titles stand: ``center`` or ``left``.
+        air: Additional height, inches.
+    """
+    columns = len(cells[0])
+    shown: dict[Panel, list[Any]] = {}
+    with framed(*run_header(views), height * len(cells) + air, notes) as (figure, body):
+        ratios = list(widths[:columns]) or None
+        axes = body.subplots(len(cells), columns, squeeze=False, width_ratios=ratios)
+        for row, column in np.ndindex(*axes.shape):
+            cell, own = cells[row][column], axes[row, column]
+            if cell is None:
+                # The place stays free for the legend.
+                own.set_axis_off()
+                continue
+            _draw(own, cell, views)
+            shown.setdefault(cell.panel, []).append(own)
+            own.set_title(cell.title, loc=title_at, fontweight="bold")
+            below = cells[row + 1][column] if row + 1 < len(cells) else None
+            if below is None or below.frame != cell.frame:
+                own.set_xlabel(cell.frame[1].label)
+            else:
+                own.tick_params(labelbottom=False)
+            if column == 0:
+                own.set_ylabel(cell.panel.label)
+            else:
+                own.tick_params(labelleft=False)
+        for same in shown.values():
+            limits = np.array([own.get_ylim() for own in same])
+            for own in same:
+                own.set_ylim(limits.min(), limits.max())
+        body.align_ylabels(list(axes[:, 0]))
+        heads = [(panel.label.split("  [")[0] + ":", same[0]) for panel, same in shown.items()]
+        _legend(body, _common_handles(views, list(shown)), heads)
+    return figure
+
+
+def _draw(axes: Any, cell: Cell, views: Sequence[RunView]) -> None:
+    """Draw the shaded windows, limits and curves of a cell."""
+    panel, (shown, frame) = cell.panel, cell.frame
+    _shade(axes, views[shown], frame)
+    axes.set_xlim(frame.x(frame.begin), frame.x(frame.end))
+    axes.grid(True, axis="y")
+    for limit in panel.limits:
+        axes.axhline(limit, **LIMIT)
+    for which, clip in cell.clips.items():
+        view = views[which]
+        _saturation(axes, panel, which, view, clip)
+        if panel.ranges is not None:
+            _band(axes, view, panel.ranges[which], clip)
+        for k, values in enumerate(panel.values[which].T):
+            looks, entry = (RUNS, which) if panel.overlay else (LINES, k)
+            # Commands carry the noise of the sensors, of which dashes make a blot.
+            look = looks[entry % len(looks)] | ({"linestyle": "-", "linewidth": 0.7} if panel.noisy else {})
+            name = panel.names[entry] if panel.names else ""
+            _curve(axes, view, values, clip, label=plot_label(name) if name else None, **look)
+            if panel.stopped is not None and panel.stopped[which][:, k].any():
+                axes.plot(clip.x(view.t), np.where(panel.stopped[which][:, k], values, np.nan), **STOP)
+    if panel.scale == "metric":
+        _scale_metric(axes, panel.values)
+    elif panel.scale == "from zero":
+        axes.set_ylim(bottom=0.0)
+
+
+def _shade(axes: Any, view: RunView, clip: Clip) -> None:
+    """Shade the windows that overlap a clip, impacts over dwells."""
+    for kind, look in SHADES.items():
+        for span in view.windows:
+            if span.kind == kind and span.end > clip.begin and span.begin < clip.end:
+                axes.axvspan(clip.x(span.begin), clip.x(span.end), **look)
+
+
+def _curve(axes: Any, view: RunView, values: Array, clip: Clip, **look: Any) -> None:
+    """Draw a curve within a clip, straight across gaps (NaN)."""
+    inside = (view.t >= clip.begin) & (view.t <= clip.end) & np.isfinite(values)
+    axes.plot(clip.x(view.t[inside]), values[inside], **look)
+
+
+def _saturation(axes: Any, panel: Panel, which: int, view: RunView, clip: Clip) -> None:
+    """Mark on a limit when a command was at it, because a single tick is too short to be seen."""
+    for limit, flags in zip(panel.limits, panel.saturated(which), strict=True):
+        times = view.t[flags & (view.t >= clip.begin) & (view.t <= clip.end)]
+        # Closer marks would cover each other.
+        places = np.floor(_BINS / 8 * (times - clip.begin) / (clip.end - clip.begin))
+        seen = times[np.unique(places, return_index=True)[1]]
+        axes.plot(clip.x(seen), np.full(len(seen), limit), **AT_LIMIT)
+
+
+def _band(axes: Any, view: RunView, bounds: Array, clip: Clip) -> None:
+    """Fill between the lowest lower bound and the highest upper bound of each bin of ticks."""
+    inside = (view.t >= clip.begin) & (view.t <= clip.end)
+    t, bounds = view.t[inside], bounds[inside]
+    starts = np.arange(0, len(t), max(len(t) // _BINS, 1))
+    low, high = np.minimum.reduceat(bounds[:, 0], starts), np.maximum.reduceat(bounds[:, 1], starts)
+    axes.fill_between(clip.x(t[starts]), low, high, **BAND)
+
+
+def _scale_metric(axes: Any, values: Sequence[Array]) -> None:
+    """Make the axis of H logarithmic where H spans more than a decade; else let it begin at zero."""
+    every = np.concatenate([value[np.isfinite(value)] for value in values])
+    if every.size and (every > 0).all() and spreads(every, 10.0):
+        log_axis(axes)
+        if not spreads(every, 100.0):
+            axes.yaxis.set_major_locator(LogLocator(subs=(1.0, 2.0, 5.0)))
+    elif every.size:
+        axes.set_ylim(min(0.0, 1.1 * float(every.min())), 1.1 * float(every.max()) or 1.0)
+    else:
+        axes.text(0.5, 0.5, "H was not evaluated", ha="center", va="center", transform=axes.transAxes, color=GRAY)
+
+
+def _common_handles(views: Sequence[RunView], panels: Sequence[Panel]) -> list[Any]:
+    """Return the legend entries of what all panels share: shades, limits, stops."""
+    words = {"impact": "impact window" if not views[0].pushed else "push", "dwell": "dwell"}
+    kinds = {span.kind for view in views for span in view.windows}
+    handles: list[Any] = [Patch(label=words[kind], **SHADES[kind]) for kind in words if kind in kinds]
+    if any(panel.limits for panel in panels):
+        handles.append(Line2D([], [], label="limit", **LIMIT))
+    if any(flags.any() for panel in panels for k in range(len(views)) for flags in panel.saturated(k)):
+        handles.append(Line2D([], [], label="command at a limit", **AT_LIMIT))
+    if any(panel.ranges for panel in panels):
+        handles.append(Patch(label="range of commands", **BAND))
+    stopped = [flags for panel in panels if panel.stopped is not None for flags in panel.stopped]
+    if any(flags.any() for flags in stopped):
+        handles.append(Line2D([], [], label="joint at its stop", **STOP))
+    return handles
+
+
+def _legend(body: Any, shared: Sequence[Any], named: Sequence[tuple[str, Any]]) -> None:
+    """Put the only legend right of the panels, or below them where no curve has a name.
+
+    Args:
+        body: The part of the figure that the panels are in.
+        shared: Legend entries of what all panels share.
+        named: Heading of curves, and axes that have them; a single kind of curves needs no heading.
+    """
+    groups = [(what, handles) for what, axes in named if (handles := axes.get_legend_handles_labels()[0])]
+    if not groups:
+        if shared:
+            shared_legend(body, shared, "lower")
+        return
+    entries: list[Any] = []
+    if len(groups) == 1:
+        entries = [*groups[0][1], *shared]
+    else:
+        for what, handles in [*groups, ("", shared)]:
+            entries += [Line2D([], [], linestyle="", label=what or " "), *handles]
+    body.legend(handles=entries, loc="outside right center", handlelength=2.6, fontsize=7)

@@ -1,0 +1,207 @@
+"""Data of the figures of a simulated run: the robot, the impact, and arrays with a row for each tick."""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from dataclasses import dataclass
+from functools import cached_property
+from typing import TYPE_CHECKING, Any
+
+import numpy as np
+from numpy.typing import NDArray
+
+from impact_posture.errors import InputError
+from impact_posture.impact.evaluation.velocity_jump import tangent_units
+from impact_posture.impact.impact_contact import ImpactContact, Support
+from impact_posture.output.plot.result_view import SEPARATOR, number
+from impact_posture.robot.robot import Robot
+from impact_posture.system.arrays import Array
+
+# Imported for its name alone, because the figures need no simulation.
+if TYPE_CHECKING:
+    from impact_posture.simulation.series import Window
+
+Flags = NDArray[np.bool_]
+
+
+@dataclass(frozen=True, eq=False)
+class RunView:
+    """Run of a controller in a scenario, with n ticks and the states at the end of each tick.
+
+    The robot holds the limits of the commands: ``model.effortLimit`` and the rotor speeds of its propulsion.
+
+    Attributes:
+        scenario: Name of the scenario.
+        controller: Name of the controller.
+        robot: The robot.
+        contact: Impact contact: frame, offset, and the world normal out of the surface (or along the push).
+        t: s, increasing, shape (n,).
+        q: Configuration, shape (n, nq).
+        v: ν, shape (n, nv).
+        torque: Joint torques as commanded, N·m (N for sliding joints), shape (n, joints).
+        rotor_command: Rotor speeds as commanded, shape (n, rotors).
+        rotor_speed: Rotor speeds as measured, shape (n, rotors).
+        force: Force of the surface on the robot, or of the push, world, N, shape (n, 3).
+        peak: Largest normal force within each tick, N, shape (n,).
+        objective: H of the impact, shape (n,); NaN where it was not evaluated.
+        level: Level of the impact-robust term, 0 to 1, shape (n,).
+        at_stop: Whether a joint is at a position limit, shape (n, nv).
+        windows: Windows of time, of which those of kind ``impact`` and ``dwell`` are shaded.
+        surface: A point on the surface that is hit, world, m, shape (3,); ``None`` for a push.
+        supports: Feet that stay.
+        label: Name of the run beside others; the name of the controller if empty.
+        facts: Facts for the small print below the title, for example the seed and the sign of the push.
+    """
+
+    scenario: str
+    controller: str
+    robot: Robot
+    contact: ImpactContact
+    t: Array
+    q: Array
+    v: Array
+    torque: Array
+    rotor_command: Array
+    rotor_speed: Array
+    force: Array
+    peak: Array
+    objective: Array
+    level: Array
+    at_stop: Flags
+    windows: tuple[Window, ...] = ()
+    surface: Array | None = None
+    supports: tuple[Support, ...] = ()
+    label: str = ""
+    facts: tuple[str, ...] = ()
+
+    def __post_init__(self) -> None:
+        """Refuse arrays that do not fit together.
+
+        Raises:
+            InputError: A wrong shape, fewer than two ticks, or times that do not increase.
+        """
+        n, nv = len(self.t), self.robot.nv
+        rotors = np.shape(self.rotor_command)[1:]
+        wanted: dict[str, tuple[int, ...]] = {
+            "t": (n,), "q": (n, self.robot.nq), "v": (n, nv), "torque": (n, nv - self.first_joint),
+            "rotor_command": (n, *rotors), "rotor_speed": (n, *rotors), "force": (n, 3), "peak": (n,),
+            "objective": (n,), "level": (n,), "at_stop": (n, nv),
+        }  # fmt: skip
+        for name, shape in wanted.items():
+            if np.shape(getattr(self, name)) != shape:
+                raise self._wrong(f"{name} has the shape {np.shape(getattr(self, name))}", f"give {shape}")
+        if len(rotors) != 1 or n < 2 or not (np.diff(self.t) > 0).all():
+            raise self._wrong("there is no course of time", "give at least two ticks at increasing times")
+
+    def _wrong(self, what: str, hint: str) -> InputError:
+        return InputError(what, where=f"run view {self.scenario}, {self.controller}", hint=hint)
+
+    @property
+    def name(self) -> str:
+        """Name of the run beside others."""
+        return self.label or self.controller
+
+    @property
+    def first_joint(self) -> int:
+        """Index of the first joint in ν."""
+        return 6 if self.robot.floating else 0
+
+    @property
+    def impacts(self) -> tuple[Window, ...]:
+        """Impact windows in the order of time."""
+        return tuple(sorted((w for w in self.windows if w.kind == "impact"), key=lambda w: w.begin))
+
+    @property
+    def pushed(self) -> bool:
+        """Whether the impact is a push, without a surface."""
+        return self.surface is None
+
+    @cached_property
+    def speed(self) -> Array:
+        """``‖ν‖``, shape (n,)."""
+        return np.asarray(np.linalg.norm(self.v, axis=1))
+
+    @property
+    def joint_names(self) -> tuple[str, ...]:
+        """Names of the entries of ν that belong to joints."""
+        return self.robot.tangent_names[self.first_joint :]
+
+    @cached_property
+    def joint_units(self) -> tuple[str, ...]:
+        """Unit of each joint position, ``rad`` or ``m``."""
+        return tuple(unit.removesuffix("/s") for unit in tangent_units(self.robot)[self.first_joint :])
+
+    @cached_property
+    def positions(self) -> Array:
+        """Position of each joint, shape (n, joints): rad (of endless joints unwrapped) or m.
+
+        NaN for the entries of joints of several degrees of freedom, which have no angle of their own.
+        """
+        model, q = self.robot.model, np.asarray(self.q)
+        found = np.full((len(self.t), self.robot.nv), np.nan)
+        for joint in range(1, model.njoints):
+            at, size, entry = int(model.idx_qs[joint]), int(model.nqs[joint]), int(model.idx_vs[joint])
+            if int(model.nvs[joint]) != 1:
+                continue
+            # Pinocchio stores cosine and sine of an endless joint.
+            found[:, entry] = q[:, at] if size == 1 else np.unwrap(np.arctan2(q[:, at + 1], q[:, at]))
+        return found[:, self.first_joint :]
+
+    @property
+    def torque_limits(self) -> Array:
+        """Torque limit of each joint, N·m (N), shape (joints,); infinite without a limit."""
+        effort = np.array(self.robot.model.effortLimit, dtype=float)[self.first_joint :]
+        return np.where(effort > 0, effort, np.inf)
+
+    @property
+    def rotor_limits(self) -> tuple[float, float] | None:
+        """Lowest and highest rotor speed; ``None`` without rotors."""
+        propulsion = self.robot.spec.propulsion
+        return None if propulsion is None else (propulsion.speed_min, propulsion.speed_max)
+
+    def index(self, time: float) -> int:
+        """Return the last tick that has ended by ``time`` (s), or the first tick."""
+        return max(int(np.searchsorted(self.t, time, side="right")) - 1, 0)
+
+
+def run_header(views: Sequence[RunView]) -> tuple[str, list[str]]:
+    """Return title and small print of a figure of runs of a scenario."""
+    one = views[0]
+    names = ", ".join(view.name for view in views) if len(views) < 5 else f"{len(views)} controllers"
+    n = ", ".join(number(value) for value in one.contact.normal)
+    facts = [f"robot {one.robot.name}"]
+    if one.pushed:
+        facts += [f"pushed at {one.contact.frame}", f"H along ({n})"]
+    else:
+        touched = [sum(w.touched for w in view.impacts) for view in views]
+        counts = ", ".join(str(count) for count in (touched if len(set(touched)) > 1 else touched[:1]))
+        facts += [f"contact {one.contact.frame}", f"n = ({n})", f"contacts {counts} of {len(one.impacts)}"]
+    facts.append(f"on {', '.join(s.frame for s in one.supports)}" if one.supports else "no supports")
+    shared = [fact for fact in one.facts if all(fact in view.facts for view in views)]
+    return f"{one.scenario}: {names}", [SEPARATOR.join([*facts, *shared])]
+
+
+def check_same(views: Sequence[RunView], where: str) -> tuple[RunView, ...]:
+    """Return the views of a scenario and robot, the nominal controller first.
+
+    Raises:
+        InputError: No view, or views of different scenarios or robots.
+    """
+    if not views:
+        raise InputError("there is no run to draw", where=where, hint="give at least one view")
+    first = views[0]
+    for view in views:
+        other: dict[str, Any] = {
+            "scenario": (view.scenario, first.scenario),
+            "robot": (view.robot.name, first.robot.name),
+            "number of joint speeds": (view.robot.nv, first.robot.nv),
+            "number of rotors": (view.rotor_command.shape[1], first.rotor_command.shape[1]),
+        }
+        for what, (own, theirs) in other.items():
+            if own != theirs:
+                raise InputError(
+                    f"the {what} of {view.name} is {own}, of {first.name} {theirs}",
+                    where=where,
+                    hint="compare runs of the same scenario",
+                )
+    return tuple(sorted(views, key=lambda view: view.controller != "nominal"))

@@ -1,0 +1,119 @@
+"""Silhouettes of the collision shapes of a robot, behind its sticks."""
+
+from __future__ import annotations
+
+from collections.abc import Callable, Iterable, Sequence
+from dataclasses import dataclass
+from typing import Any
+
+import numpy as np
+import pinocchio as pin
+from matplotlib.patches import Patch, PathPatch
+from matplotlib.path import Path
+from mpl_toolkits.mplot3d import proj3d
+
+from impact_posture.collision.robot_shapes import load_shapes
+from impact_posture.output.plot.ellipsoid_shapes import Plane, outline
+from impact_posture.output.plot.style import ORANGE
+from impact_posture.robot.robot import Robot
+from impact_posture.system.arrays import Array
+
+NOTE = "Light areas show the collision shapes, each with the hull around it."
+_FILL: dict[str, Any] = {"alpha": 0.14, "linewidth": 0.3, "zorder": 1.2}
+_HIT: dict[str, Any] = {"facecolor": ORANGE, "edgecolor": ORANGE, "alpha": 0.55, "linewidth": 0.8, "zorder": 1.4}
+# A sweep smaller than this (m) is drawn with a few directions, a larger one as round.
+_ROUND = 0.01
+# Least sweep drawn (m), because a point or a line has no outline.
+_LEAST = 1e-4
+
+
+@dataclass(frozen=True, eq=False)
+class PlacedHull:
+    """A swept hull in the world.
+
+    Attributes:
+        vertices: Its corners, shape (k, 3), m.
+        radius: Sweep radius, m.
+        hit: Whether it is in a collision.
+    """
+
+    vertices: Array
+    radius: float
+    hit: bool
+
+
+class _Silhouette(PathPatch):
+    """A patch in the coordinates of the picture, which 3-D axes draw behind all else."""
+
+    def do_3d_projection(self) -> float:
+        """Return the depth by which 3-D axes sort."""
+        return float("inf")
+
+
+def place_hulls(robot: Robot, data: pin.Data, collisions: Iterable[tuple[str, str]] = ()) -> tuple[PlacedHull, ...]:
+    """Place the hulls of a robot at the joint placements in the data; none for a robot without shapes.
+
+    Args:
+        robot: The robot.
+        data: Data with the placements of the joints.
+        collisions: Pairs of names of shapes or bodies in a collision; other names are ignored.
+    """
+    shapes = load_shapes(robot)
+    links = {name.partition("[")[0] for pair in collisions for name in pair}
+    joints = {robot.model.frames[robot.frame_id(link)].parentJoint for link in links if robot.model.existFrame(link)}
+    # The shape of a link may be part of another link's hull, which moves with it.
+    alone = {body.joint for body in shapes.bodies if body.link in links}
+    return tuple(
+        PlacedHull(
+            body.vertices @ data.oMi[body.joint].rotation.T + data.oMi[body.joint].translation,
+            body.radius,
+            body.link in links or (body.joint in joints and body.joint not in alone),
+        )
+        for body in shapes.bodies
+    )
+
+
+def draw_silhouettes(axes: Any, hulls: Iterable[PlacedHull], color: str, plane: Plane | None) -> None:
+    """Draw the outlines of hulls; in 3-D, or projected where there is a plane."""
+    if plane is None:
+        across, up, project = _view(axes)
+    else:
+        (across, up), project = plane.axes, lambda points: points @ plane.axes.T
+    screen = np.array([across, up])
+    for hit, look in ((False, {"facecolor": color, "edgecolor": color} | _FILL), (True, _HIT)):
+        rings = [
+            outline(project((hull.vertices[:, None] + _circle(hull.radius) @ screen).reshape(-1, 3)).T).T
+            for hull in hulls
+            if hull.hit is hit
+        ]
+        if rings:
+            # As one path, because areas that lie on each other would get darker.
+            patch = _Silhouette(Path.make_compound_path(*[Path(ring, closed=True) for ring in rings]), **look)
+            # The layout would measure it for long, and the panel has its limits.
+            patch.set_in_layout(False)
+            axes.add_artist(patch)
+
+
+def _circle(radius: float) -> Array:
+    """Return points on a circle, shape (k, 2)."""
+    angles = np.linspace(0, 2 * np.pi, 6 if radius < _ROUND else 24, endpoint=False)
+    return max(radius, _LEAST) * np.array([np.cos(angles), np.sin(angles)]).T
+
+
+def _view(axes: Any) -> tuple[Array, Array, Callable[[Array], Array]]:
+    """Return the world directions to the right and up of 3-D axes, and the projection of points to their picture."""
+    azimuth, elevation = np.radians([axes.azim, axes.elev])
+    across = np.array([-np.sin(azimuth), np.cos(azimuth), 0.0])
+    toward = np.array([np.cos(elevation) * np.cos(azimuth), np.cos(elevation) * np.sin(azimuth), np.sin(elevation)])
+    matrix = axes.get_proj()
+
+    def project(points: Array) -> Array:
+        return np.array(proj3d.proj_transform(*points.T, matrix)[:2]).T
+
+    return across, np.cross(toward, across), project
+
+
+def silhouette_handles(hulls: Sequence[PlacedHull], color: str) -> list[Any]:
+    """Return the legend entries of shapes, and of those in a collision."""
+    handles = [Patch(label="shapes", facecolor=color, edgecolor=color, **_FILL)] if hulls else []
+    return [*handles, *([Patch(label="in collision", **_HIT)] if any(hull.hit for hull in hulls) else [])]

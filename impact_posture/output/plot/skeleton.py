@@ -1,0 +1,187 @@
+"""Sticks of the robot from the model alone, and the hulls of its shapes where it has any."""
+
+from __future__ import annotations
+
+from collections.abc import Iterable, Sequence
+from dataclasses import dataclass
+
+import numpy as np
+import pinocchio as pin
+
+from impact_posture.dynamics.tree import PointOnLink
+from impact_posture.impact.impact_contact import ImpactContact, Support, point_on
+from impact_posture.output.plot.ellipsoid_shapes import cone_rim
+from impact_posture.output.plot.silhouette import PlacedHull, place_hulls
+from impact_posture.robot.robot import Robot
+from impact_posture.system.arrays import Array
+
+# Least height of a body, as a part of its shorter side.
+_LEAST_HEIGHT = 0.35
+# Sine of the angle between axes that count as parallel.
+_PARALLEL = 1e-3
+_AROUND = np.array([[0, 0], [1, 0], [1, 1], [0, 1]])
+
+
+@dataclass(frozen=True, eq=False)
+class Skeleton:
+    """Sticks of a robot in a posture, world, meters.
+
+    Attributes:
+        bones: Pairs of points to join, shape (k, 2, 3).
+        joints: Origins of the moving joints, shape (j, 3).
+        base: Placement of the base: the free-flyer, or the world for a fixed root.
+        body: Corners of the box between the hips, low corners first, shape (8, 3); (0, 3) without a box.
+        contacts: The contact points, shape (c, 3).
+        normals: World unit normals, shape (c, 3).
+        feet: Contact points of the supports, shape (f, 3).
+        rotors: Circles of the propellers, shape (r, 3, points).
+        hulls: Hulls of the collision shapes; empty for a robot without shapes.
+        across: Unit direction across the plane in which a planar robot moves, shape (3,); ``None`` for another robot.
+    """
+
+    bones: Array
+    joints: Array
+    base: pin.SE3
+    body: Array
+    contacts: Array
+    normals: Array
+    feet: Array
+    rotors: Array
+    hulls: tuple[PlacedHull, ...] = ()
+    across: Array | None = None
+
+    @property
+    def contact(self) -> Array:
+        """The first contact point, shape (3,)."""
+        return np.asarray(self.contacts[0])
+
+    @property
+    def normal(self) -> Array:
+        """Normal of the first contact, shape (3,)."""
+        return np.asarray(self.normals[0])
+
+    @property
+    def arms(self) -> Array:
+        """Lines from the base to the centers of the rotors, shape (r, 2, 3)."""
+        centers = self.rotors.mean(axis=2)
+        return np.stack([np.broadcast_to(np.asarray(self.base.translation), centers.shape), centers], axis=1)
+
+    @property
+    def points(self) -> Array:
+        """All points that the figure has to show, shape (m, 3)."""
+        circles = self.rotors.transpose(0, 2, 1).reshape(-1, 3)
+        origin = np.asarray(self.base.translation)[None]
+        shapes = [hull.vertices for hull in self.hulls] or [self.body]
+        return np.vstack([self.bones.reshape(-1, 3), origin, *shapes, self.contacts, self.feet, circles])
+
+
+def build_skeleton(
+    robot: Robot,
+    q: Array,
+    contacts: Sequence[ImpactContact],
+    supports: Sequence[Support] = (),
+    collisions: Iterable[tuple[str, str]] = (),
+) -> Skeleton:
+    """Place the sticks at ``q``, shape (nq,).
+
+    A bone joins a joint's origin to its parent's; a base that carries four joints or more is a box instead.  Contacts
+    and feet hang on their links; the last link of a chain without one goes on to its farthest frame, or to its center
+    of mass where it has none.  Shapes in ``collisions``, pairs of names, are marked.
+    """
+    model = robot.model
+    data = model.createData()
+    pin.forwardKinematics(model, data, q)
+    places = data.oMi
+    first = 2 if robot.floating else 1
+    base = pin.SE3(places[1]) if robot.floating else pin.SE3.Identity()
+    origins = [np.zeros(3), *(np.array(places[i].translation) for i in range(1, model.njoints))]
+    body = _body(model, base) if robot.floating else np.zeros((0, 3))
+    bones = [
+        (origins[model.parents[i]], origins[i])
+        for i in range(first, model.njoints)
+        if model.parents[i] >= first or not len(body)
+    ]
+    held: list[ImpactContact | Support] = [*contacts, *supports]
+    hanging = [point_on(robot, one.frame, one.offset) for one in held]
+    frames = [_placed(places, point) for point in hanging]
+    ends = [np.array(frame.translation) for frame in frames]
+    normals = [
+        (np.asarray(frame.rotation) if contact.normal_frame == "contact" else np.eye(3)) @ np.array(contact.normal)
+        for contact, frame in zip(contacts, frames, strict=False)
+    ]
+    bones += [
+        (origins[point.joint], end)
+        for point, end in zip(hanging, ends, strict=True)
+        if point.joint >= first or not len(body)
+    ]
+    # A link with a stick to its foot or contact needs no other tip.
+    done = {int(model.parents[i]) for i in range(1, model.njoints)}
+    done |= {point.joint for point in hanging if np.linalg.norm(point.position) > 1e-3}
+    for leaf in range(first, model.njoints):
+        if leaf not in done:
+            bones.append((origins[leaf], np.array(places[leaf].act(link_tip(model, leaf)))))
+    return Skeleton(
+        bones=np.array(bones),
+        joints=np.array(origins[first:]).reshape(-1, 3),
+        base=base,
+        body=body,
+        contacts=np.array(ends[: len(contacts)]),
+        normals=np.array(normals),
+        feet=np.array(ends[len(contacts) :]).reshape(-1, 3),
+        rotors=_rotors(robot, places),
+        hulls=place_hulls(robot, data, collisions),
+        across=_across(model, q),
+    )
+
+
+def _across(model: pin.Model, q: Array) -> Array | None:
+    """Return the direction about which all joints turn and along which none slides; ``None`` if there is none."""
+    # Of a single joint, Pinocchio returns a vector.
+    linear, angular = np.split(pin.computeJointJacobians(model, model.createData(), q).reshape(6, -1), 2)
+    _, sizes, directions = np.linalg.svd(angular.T)
+    across = np.asarray(directions[0])
+    turns = sizes[0] > _PARALLEL and not (sizes[1:] > _PARALLEL).any()
+    return across if turns and np.abs(across @ linear).max() < _PARALLEL else None
+
+
+def _body(model: pin.Model, base: pin.SE3) -> Array:
+    """Return the corners of the box between the joints on the base; none for fewer than four joints."""
+    hips = np.array([model.jointPlacements[i].translation for i in range(2, model.njoints) if model.parents[i] == 1])
+    if len(hips) < 4:
+        return np.zeros((0, 3))
+    low, high = hips.min(axis=0), hips.max(axis=0)
+    # Hips at the same height span no box, and the model does not contain the height of the body.
+    lacking = max(_LEAST_HEIGHT * float((high - low)[:2].min()) - float((high - low)[2]), 0.0)
+    low[2], high[2] = low[2] - lacking / 2, high[2] + lacking / 2
+    corners = [(x, y, z) for z in (low[2], high[2]) for x, y in _AROUND * (high - low)[:2] + low[:2]]
+    return np.array([base.act(np.array(corner)) for corner in corners])
+
+
+def _placed(places: Sequence[pin.SE3], point: PointOnLink) -> pin.SE3:
+    """Return the world placement of the frame of a point."""
+    return places[point.joint] * pin.SE3(point.rotation, point.position)
+
+
+def link_tip(model: pin.Model, joint: int) -> Array:
+    """Return the frame of a link that is farthest from its joint, in joint axes; else the center of mass."""
+    places = [np.array(f.placement.translation) for f in model.frames if f.parentJoint == joint]
+    tip = max(places, key=lambda place: float(np.linalg.norm(place)), default=np.zeros(3))
+    return tip if np.linalg.norm(tip) > 1e-3 else np.array(model.inertias[joint].lever)
+
+
+def _rotors(robot: Robot, places: list[pin.SE3]) -> Array:
+    """Return circles across the thrust directions, as large as the spacing of the rotors allows."""
+    propulsion = robot.spec.propulsion
+    if propulsion is None:
+        return np.zeros((0, 3, 24))
+    frame = robot.model.frames[robot.frame_id(propulsion.frame)]
+    place = places[frame.parentJoint] * frame.placement
+    centers = [np.array(rotor.position) for rotor in propulsion.rotors]
+    gaps = [float(np.linalg.norm(a - b)) for k, a in enumerate(centers) for b in centers[:k]]
+    radius = 0.4 * min(gaps, default=0.5)
+    circles = []
+    for center, rotor in zip(centers, propulsion.rotors, strict=True):
+        # Across the thrust; the last point is the first one again.
+        ring = cone_rim(np.array(rotor.direction) / np.linalg.norm(rotor.direction), 90.0, radius, 25)[:, :-1]
+        circles.append(place.rotation @ (center[:, None] + ring) + np.asarray(place.translation)[:, None])
+    return np.array(circles)

@@ -1,0 +1,155 @@
+"""Figure ``snapshots``: sticks and shapes of the robot at three instants of a run, a row for each controller."""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from typing import Any
+
+import numpy as np
+from matplotlib.figure import Figure
+from matplotlib.lines import Line2D
+from matplotlib.patches import Patch
+
+from impact_posture.output.plot.ellipsoid_shapes import Plane
+from impact_posture.output.plot.labels import draw_arrow
+from impact_posture.output.plot.postures_figure import (
+    HATCH,
+    depth_of,
+    draw_sticks,
+    frame_flat,
+    padded,
+    robot_handles,
+    side_plane,
+    stick_notes,
+)
+from impact_posture.output.plot.run_view import RunView, check_same, run_header
+from impact_posture.output.plot.silhouette import silhouette_handles
+from impact_posture.output.plot.skeleton import Skeleton, build_skeleton
+from impact_posture.output.plot.style import BLUE, GRAY, INK, PALE, VERMILLION, framed, shared_legend
+from impact_posture.system.arrays import Array
+from impact_posture.system.escape import plot_label
+
+_START_NOTE = "Gray sticks show the robot at the start of the run."
+_NOW: dict[str, Any] = {"color": BLUE, "linestyle": "-", "linewidth": 1.5, "zorder": 3.0}
+_START: dict[str, Any] = {"color": "#a9a9a9", "linestyle": "-", "linewidth": 1.0, "zorder": 2.0}
+# Time before the impact at which no tick contains it, s.
+_BEFORE = 0.005
+
+
+def instants(view: RunView) -> list[tuple[str, float]]:
+    """Return the start, the moment before the first impact and the end of its window: name and time in s.
+
+    Without an impact these are the start and the end of the run.
+    """
+    start = ("start", float(view.t[0]))
+    if not view.impacts:
+        return [start, ("half of the run", float(view.t[len(view.t) // 2])), ("end", float(view.t[-1]))]
+    first = view.impacts[0]
+    word = "push" if view.pushed else "impact window"
+    return [start, ("just before the first impact", first.begin - _BEFORE), (f"end of the {word}", first.end)]
+
+
+def snapshots_figure(views: Sequence[RunView]) -> Figure:
+    """Draw the robot from the side that shows n and most of the motion; all panels to one scale, in meters.
+
+    With the surface that is hit, or the push as an arrow, the contact point, feet and rotors.
+
+    Raises:
+        InputError: No view, or views of different scenarios or robots.
+    """
+    views = check_same(views, "figure snapshots")
+    rows = [[_skeleton(view, view.index(time)) for _, time in instants(view)] for view in views]
+    plane = side_plane(rows[-1][0], rows[-1][1])
+    every = np.hstack([plane.axes @ state.points.T for row in rows for state in row])
+    low, high = every.min(axis=1), every.max(axis=1)
+    reach = 0.22 * float((high - low).max())
+    arrows = [_arrow(view, row[0], plane, reach) for view, row in zip(views, rows, strict=True)]
+    for arrow, row in zip(arrows, rows, strict=True):
+        if arrow is None:
+            continue
+        for state in row[1:]:
+            tails = np.stack([plane.axes @ state.contact - arrow, plane.axes @ state.contact], axis=1)
+            low, high = np.minimum(low, tails.min(axis=1)), np.maximum(high, tails.max(axis=1))
+    low, high = _window(low, high, views[0], plane)
+    # As high as the robot needs, within the limits of a page.
+    highest = float(np.clip(8.5 / len(views), 1.2, 3.0))
+    height = float(np.clip(2.1 * (high - low)[1] / (high - low)[0], 1.2, highest)) + 0.2
+    with framed(*run_header(views), height * len(views) + 0.85, [*stick_notes(rows[0][0]), _START_NOTE]) as (
+        figure,
+        body,
+    ):
+        panels = body.subplots(len(views), 3, squeeze=False, sharex=True, sharey=True)
+        for axes_row, row, view, arrow in zip(panels, rows, views, arrows, strict=True):
+            for column, (axes, state, (word, time)) in enumerate(zip(axes_row, row, instants(view), strict=True)):
+                _surface(axes, view, plane, low, high)
+                if column:
+                    draw_sticks(axes, row[0], _START, plane)
+                draw_sticks(axes, state, _NOW, plane)
+                if arrow is not None and column:
+                    _push(axes, plane.axes @ state.contact, arrow, acting=column == 2)
+                frame_flat(axes, low, high, 5)
+                first = f"{word}\n" * (view is views[0])
+                axes.set_title(f"{first}t = {max(time, 0.0):.2f} s", fontsize=8)
+            axes_row[0].set_ylabel(f"{plot_label(view.name)}\n{plane.up}  [m]")
+        for axes in panels[-1]:
+            axes.set_xlabel(f"{plane.right}  [m]")
+        # The lowest panels name the viewing direction.
+        panels[-1][1].set_xlabel(f"{plane.right}  [m]\nseen along {depth_of(plane)}")
+        shared_legend(body, _handles(rows[0][0], views[0]), "lower")
+    return figure
+
+
+def _skeleton(view: RunView, tick: int) -> Skeleton:
+    return build_skeleton(view.robot, view.q[tick], [view.contact], view.supports)
+
+
+def _window(low: Array, high: Array, view: RunView, plane: Plane) -> tuple[Array, Array]:
+    """Return the corners of a panel, which shows all sticks, and the surface where it is seen from its edge."""
+    if view.surface is not None:
+        touched = plane.axes @ view.surface
+        n = plane.axes @ np.array(view.contact.normal)
+        # Only the place of the surface along its normal counts, because it has no end across.
+        edge = touched - 0.05 * float((high - low).max()) * n
+        for axis in range(2):
+            if abs(n[axis]) > 0.5:
+                low[axis], high[axis] = min(low[axis], edge[axis]), max(high[axis], edge[axis])
+    return padded(low, high)
+
+
+def _surface(axes: Any, view: RunView, plane: Plane, low: Array, high: Array) -> None:
+    """Draw the surface as seen from its edge, hatched behind it."""
+    if view.surface is None:
+        return
+    n = plane.axes @ np.array(view.contact.normal)
+    if np.linalg.norm(n) < 1e-6:
+        return
+    n = n / np.linalg.norm(n)
+    size = 2 * float((high - low).max())
+    point, along = plane.axes @ view.surface, size * np.array([-n[1], n[0]])
+    # The strip begins next to the middle of the panel.
+    point = point + along * float(along @ ((low + high) / 2 - point)) / size**2
+    corners = np.array([point + along, point - along, point - along - size * n, point + along - size * n])
+    axes.fill(*corners.T, facecolor="white", edgecolor=GRAY, hatch=HATCH, linewidth=0, zorder=0.5)
+    axes.plot(*corners[:2].T, color=INK, linewidth=1.0, zorder=1)
+
+
+def _arrow(view: RunView, state: Skeleton, plane: Plane, reach: float) -> Array | None:
+    """Return the push from tail to tip in the figure; ``None`` without a push."""
+    largest = view.force[int(np.argmax(np.linalg.norm(view.force, axis=1)))]
+    size = float(np.linalg.norm(largest))
+    if not view.pushed or size == 0:
+        return None
+    return np.asarray(plane.axes @ largest / size * reach)
+
+
+def _push(axes: Any, contact: Array, arrow: Array, *, acting: bool) -> None:
+    look = {"linewidth": 1.8} if acting else {"linestyle": (0, (2, 1.5)), "linewidth": 1.2}
+    draw_arrow(axes, contact - arrow, contact, 7, color=VERMILLION, shrinkB=3, **look)
+
+
+def _handles(state: Skeleton, view: RunView) -> list[Any]:
+    handles = [*robot_handles(state, {"now": _NOW, "start": _START}, BLUE), *silhouette_handles(state.hulls, BLUE)]
+    if view.surface is not None:
+        return [*handles, Patch(facecolor=PALE, edgecolor=GRAY, hatch=HATCH, linewidth=0, label="surface")]
+    arrow: dict[str, Any] = {"linestyle": "", "marker": r"$\rightarrow$", "markersize": 11, "color": VERMILLION}
+    return [*handles, Line2D([], [], label="push (dashed: to come)", **arrow)]

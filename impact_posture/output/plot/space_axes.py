@@ -1,0 +1,53 @@
+"""3-D axes with equal scales, and with ticks and names that do not overlap."""
+
+from __future__ import annotations
+
+from typing import Any
+
+import numpy as np
+from matplotlib.ticker import MaxNLocator
+from mpl_toolkits.mplot3d import Axes3D
+
+from impact_posture.output.plot.style import text_width
+from impact_posture.system.arrays import Array
+
+_TICKS = 6.5
+# Part of an axis without ticks at each end, where two axes meet.
+_CORNER = 0.07
+
+
+class Space(Axes3D):  # type: ignore[misc]
+    """3-D axes whose names the layout leaves room for."""
+
+    def get_tightbbox(self, renderer: Any = None, **more: Any) -> Any:
+        """Return the box of all that is drawn, with the names, which matplotlib leaves out for the layout."""
+        return super().get_tightbbox(renderer, **(more | {"for_layout_only": False}))
+
+
+def frame_space(axes: Any, low: Array, high: Array, unit: str, bins: int, *, azimuth: float) -> None:
+    """Give 3-D axes the limits ``low`` to ``high``, one scale, few ticks, and names with the unit."""
+    size = high - low
+    axes.set_box_aspect(tuple(size))
+    axes.view_init(elev=21, azim=azimuth)
+    for k, name in enumerate("xyz"):
+        getattr(axes, f"set_{name}lim")(low[k], high[k])
+        axis = getattr(axes, f"{name}axis")
+        share = float(size[k] / size.max())
+        longest = _set_ticks(axis, low[k], high[k], round(bins * share), room=np.inf if name == "z" else 95 * share)
+        # Matplotlib centers numbers 8 and names 21 points off their axis in a cube, and nearer in a flat box.
+        scale = max(float(np.delete(size, k).mean() / size.max()), 0.25)
+        axes.tick_params(axis=name, pad=(8 if name == "z" else 6) / scale - 8, labelsize=_TICKS)
+        getattr(axes, f"set_{name}label")(f"{name}  [{unit}]", labelpad=(longest / 2 + 4) / scale - 13, fontsize=7.0)
+
+
+def _set_ticks(axis: Any, low: float, high: float, bins: int, room: float) -> float:
+    """Set few ticks whose numbers fit ``room`` (points), none at the ends; return the width of the longest number."""
+    air = _CORNER * (high - low)
+    for count in range(max(bins, 3), 0, -1):
+        ticks = np.asarray(MaxNLocator(count, steps=[1, 2, 2.5, 5, 10]).tick_values(low, high))
+        ticks = ticks[(low + air <= ticks) & (ticks <= high - air)]
+        axis.set_ticks(ticks)
+        longest = max((text_width(t, _TICKS) for t in axis.get_major_formatter().format_ticks(ticks)), default=0.0)
+        if len(ticks) * longest <= room or len(ticks) < 2:
+            break
+    return longest

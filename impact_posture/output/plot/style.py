@@ -1,0 +1,254 @@
+"""Style of all figures: a color-blind-safe palette that works in gray, print sizes, header, legend, saving."""
+
+from __future__ import annotations
+
+import os
+import warnings
+from collections.abc import Iterable, Iterator, Mapping, Sequence
+from contextlib import contextmanager
+from functools import lru_cache
+from pathlib import Path
+from typing import Any
+
+import matplotlib
+import numpy as np
+from matplotlib.backends.backend_agg import FigureCanvasAgg
+from matplotlib.figure import Figure
+from matplotlib.font_manager import FontProperties
+from matplotlib.textpath import text_to_path
+from matplotlib.transforms import Bbox
+from PIL import Image
+
+from impact_posture.errors import InputError, OutputError, printable
+from impact_posture.output.plot.labels import draw_with_labels
+from impact_posture.output.plot.result_view import SEPARATOR
+from impact_posture.system.output_folder import check_name
+from impact_posture.system.scratch_folder import scratch_folder
+
+# Okabe and Ito's palette, "Color Universal Design", 2008.
+VERMILLION, BLUE, GREEN, SKY, PURPLE, ORANGE = "#D55E00", "#0072B2", "#009E73", "#56B4E9", "#CC79A7", "#E69F00"
+INK, GRAY, PALE = "#000000", "#6b6b6b", "#d9d9d9"
+
+# Before and after differ by line and hatch as well, so that a gray print tells them apart.
+# The dashes lie on top, so that the solid line shows in their gaps where both coincide.
+BEFORE: dict[str, Any] = {"color": VERMILLION, "linestyle": (0, (4, 2)), "linewidth": 1.4, "zorder": 3.5}
+AFTER: dict[str, Any] = {"color": BLUE, "linestyle": "-", "linewidth": 1.6, "zorder": 3.0}
+# Lines of the robot without supports are thinner and have other dashes.
+FREE_BEFORE: dict[str, Any] = {"color": VERMILLION, "linestyle": (0, (1, 1.6)), "linewidth": 1.0, "zorder": 2.8}
+FREE_AFTER: dict[str, Any] = {"color": BLUE, "linestyle": (0, (6, 1.6, 1, 1.6)), "linewidth": 0.9, "zorder": 2.6}
+# Arrows of the worst normals of a cone.
+WORST_BEFORE: dict[str, Any] = {"color": VERMILLION, "linestyle": (0, (3, 1.5)), "linewidth": 1.1}
+WORST_AFTER: dict[str, Any] = {"color": BLUE, "linestyle": "-", "linewidth": 1.1}
+BEFORE_BAR: dict[str, Any] = {"facecolor": "#fbe3d3", "edgecolor": VERMILLION, "hatch": "//////", "linewidth": 0.6}
+AFTER_BAR: dict[str, Any] = {"facecolor": BLUE, "edgecolor": BLUE, "linewidth": 0.6}
+
+FORMATS = ("png", "svg", "pdf")
+# A PDF takes as long as three PNG files.
+DEFAULT_FORMATS = ("png",)
+# Width of a two-column page, inches.
+WIDTH = 7.2
+_SMALL = 7.0
+_LONGEST_TITLE = 85
+_LINE = 0.15
+_RC: dict[str, Any] = {
+    "font.family": "DejaVu Sans",
+    "font.size": 8.0,
+    "axes.titlesize": 8.5,
+    "axes.labelsize": 8.0,
+    "xtick.labelsize": 7.0,
+    "ytick.labelsize": 7.0,
+    "legend.fontsize": 7.5,
+    "axes.linewidth": 0.7,
+    "axes.grid": False,
+    "axes.axisbelow": True,
+    # No ticks are above a panel.  By default matplotlib looks for them each time that it measures or draws a panel.
+    "axes.titley": 1.0,
+    "grid.color": PALE,
+    "grid.linewidth": 0.5,
+    "hatch.linewidth": 0.5,
+    "legend.frameon": False,
+    "figure.dpi": 200,
+    # At this resolution letters need no fitting to the pixels, which takes a third of the time to draw them.
+    "text.hinting": "none",
+    # TrueType in the PDF (publishers refuse Type 3), and files that do not change when nothing changed.
+    "pdf.fonttype": 42,
+    "svg.hashsalt": "impact-posture",
+}
+
+
+@contextmanager
+def style() -> Iterator[None]:
+    """Draw and save with these settings, and restore the settings of the user afterwards."""
+    with matplotlib.rc_context(), warnings.catch_warnings():
+        # Matplotlib draws a box for a letter that the font lacks.
+        warnings.filterwarnings("ignore", "Glyph .* missing from font")
+        matplotlib.rcdefaults()
+        matplotlib.rcParams.update(_RC)
+        yield
+
+
+@contextmanager
+def framed(
+    title: str, lines: Sequence[str], height: float, notes: Sequence[str] = ()
+) -> Iterator[tuple[Figure, Any]]:
+    """Yield a figure with the header above and ``notes`` below, and the part to draw in; apply :func:`style`.
+
+    Args:
+        title: First line.
+        lines: Small print below the title, broken between its facts where a line is too long.
+        height: Height of the part to draw in, inches.
+        notes: Sentences of the paragraph below.
+    """
+    title = printable(title, longest=_LONGEST_TITLE)
+    small = [part for line in lines for part in wrap(printable(line), SEPARATOR)]
+    below = wrap(" ".join(notes), " ")
+    head, foot = 0.26 + _LINE * len(small), 0.06 + _LINE * len(below)
+    with style():
+        figure = Figure(figsize=(WIDTH, head + height + foot), layout="constrained")
+        parts: Any = figure.subfigures(3, 1, height_ratios=[head, height, foot])
+        top, body, bottom = parts
+        look = {"fontsize": _SMALL, "va": "top", "linespacing": 1.4}
+        top.text(0.012, 1 - 0.06 / head, title, fontsize=10, fontweight="bold", va="top", parse_math=False)
+        top.text(0.012, 1 - 0.26 / head, "\n".join(small), parse_math=False, **look)
+        bottom.text(0.012, 1, "\n".join(below), color="#333333", **look)
+        yield figure, body
+
+
+def wrap(line: str, separator: str) -> list[str]:
+    """Break a line of small print at separators so that it fits the page, by the widths of the font."""
+    parts, room, used = [""], 72 * WIDTH * 0.975, 0.0
+    for piece in line.split(separator):
+        # Pieces are measured one by one, because most of them come again.
+        width = text_width(f"{separator}{piece}".replace("$", ""), _SMALL)
+        if parts[-1] and used + width > room:
+            parts.append("")
+            used = 0.0
+        parts[-1] += f"{separator}{piece}" if parts[-1] else piece
+        used += width
+    return [part for part in parts if part]
+
+
+@lru_cache(maxsize=4096)
+def text_width(text: str, size: float) -> float:
+    """Return the width of a text, points."""
+    font = FontProperties(family="DejaVu Sans", size=size)
+    return float(text_to_path.get_text_width_height_descent(text, font, ismath=False)[0])
+
+
+def shared_legend(body: Any, handles: Sequence[Any], place: str) -> None:
+    """Put the legend of a figure above (``upper``) or below (``lower``) its panels, as wide as the page."""
+    size, handle, gap, room = float(_RC["legend.fontsize"]), 2.2, 1.4, 72 * WIDTH * 0.96
+    widths = [text_width(str(h.get_label()).replace("$", ""), size) + size * (handle + 0.8 + gap) for h in handles]
+
+    def width(columns: int) -> float:
+        # Entries fill column by column.
+        rows = -(-len(widths) // columns)
+        return sum(max(widths[k : k + rows]) for k in range(0, len(widths), rows))
+
+    columns = next((n for n in range(len(handles), 1, -1) if width(n) <= room), 1)
+    # Rows of equal length, as few as possible.
+    columns = -(-len(handles) // -(-len(handles) // columns))
+    look = {"ncols": columns, "handlelength": handle, "columnspacing": gap}
+    body.legend(handles=list(handles), loc=f"outside {place} center", **look)
+
+
+def lay_out(figure: Figure) -> FigureCanvasAgg:
+    """Lay out a figure once, so that every format shows the same figure; return its image."""
+    engine: Any = figure.get_layout_engine()
+    if engine is not None:
+        # Panels with equal axes change their size in the first round and are placed in the others.
+        equal = [axes for axes in figure.axes if axes.name == "3d" or axes.get_aspect() != "auto"]
+        for axes in equal:
+            _measure_once(axes)
+        for _ in range(3 if equal else 1):
+            engine.execute(figure)
+        for axes in equal:
+            del axes.get_tightbbox
+        # With an engine, even one that does nothing, `savefig` would draw twice.
+        figure.set_layout_engine(None)
+        # Rounded, because the solver of the layout differs in the last digits from run to run.
+        for part in figure.subfigs:
+            box = part.bbox_relative
+            box.p0, box.p1 = np.round(box.p0, 6), np.round(box.p1, 6)
+        for axes in figure.axes:
+            axes.set_position(np.round(axes.get_position(original=True).bounds, 6))
+    return draw_with_labels(figure)
+
+
+def _measure_once(axes: Any) -> None:
+    """Let the layout measure the texts around a panel in its first round only, because that is what takes long.
+
+    The space around a flat panel depends on its ticks, which stay as they are after the first round.
+    """
+    measure = axes.get_tightbbox
+    around: list[Any] = []
+
+    def get_tightbbox(renderer: Any = None, **more: Any) -> Any:
+        if axes.name != "3d" and len(around) == 2:
+            axes.apply_aspect()
+            return Bbox.from_extents(*(axes.bbox.extents + around[-1]))
+        found = measure(renderer, **more)
+        around.append(found.extents - axes.bbox.extents)
+        return found
+
+    axes.get_tightbbox = get_tightbbox
+
+
+def check_formats(formats: Iterable[str]) -> tuple[str, ...]:
+    """Return the formats in order, once each.
+
+    Raises:
+        InputError: An unknown format.
+    """
+    wanted = tuple(dict.fromkeys(f.lower().lstrip(".") for f in formats))
+    for one in wanted:
+        if one not in FORMATS:
+            raise InputError(f"no format '{one}'", where="plot", hint=f"choose from {', '.join(FORMATS)}")
+    return wanted
+
+
+def save_all(figures: Mapping[str, Figure], out_dir: Path, formats: Iterable[str] = DEFAULT_FORMATS) -> list[Path]:
+    """Write each figure under its name; return the paths.
+
+    Raises:
+        InputError: As :func:`save`.
+        OutputError: As :func:`save`.
+    """
+    return [path for name, figure in figures.items() for path in save(figure, out_dir, name, formats)]
+
+
+def save(figure: Figure, out_dir: Path, name: str, formats: Iterable[str] = DEFAULT_FORMATS) -> list[Path]:
+    """Write ``figure`` as ``out_dir/name.<format>`` for each format, each file completely or not at all.
+
+    Return the paths.
+
+    Raises:
+        InputError: An unknown format.
+        OutputError: The folder or a file cannot be written.
+    """
+    paths = []
+    wanted = check_formats(formats)
+    check_name(Path(out_dir))
+    with style():
+        canvas = lay_out(figure)
+    for extension in wanted:
+        path = Path(out_dir) / f"{name}.{extension}"
+        try:
+            path.parent.mkdir(parents=True, exist_ok=True)
+            with scratch_folder(path.parent) as beside, style():
+                if extension == "png":
+                    # It is drawn already, and `savefig` would draw it twice.  A higher level takes long for 3 %.
+                    # Nothing shows through, and three channels take a quarter less time to write and to read.
+                    picture = Image.fromarray(np.asarray(canvas.buffer_rgba())).convert("RGB")
+                    picture.save(beside / path.name, compress_level=3, dpi=(figure.dpi, figure.dpi))
+                else:
+                    # Without a date, so that the same result gives the same file.
+                    metadata = {"Date" if extension == "svg" else "CreationDate": None}
+                    figure.savefig(beside / path.name, metadata=metadata)
+                os.replace(beside / path.name, path)
+        except OSError as error:
+            raise OutputError(
+                f"cannot be written ({error.strerror or error})", where=str(path), hint="choose another folder"
+            ) from None
+        paths.append(path)
+    return paths

@@ -1,0 +1,259 @@
+"""The shapes of a robot as the page draws them: small meshes, each stored once, and the terms of their authors."""
+
+from __future__ import annotations
+
+import re
+from dataclasses import dataclass
+from functools import cache, lru_cache
+from pathlib import Path
+from typing import Annotated
+
+import coal
+import numpy as np
+import pinocchio as pin
+from pydantic import PlainSerializer, PlainValidator
+
+from impact_posture.collision.coal_geometry import geometry_key, load_geometry
+from impact_posture.collision.shape_corners import Triangles, hull_surface, shape_points, surface_of
+from impact_posture.collision.urdf_shapes import UrdfShape, read_urdf_shapes
+from impact_posture.config.cached_values import StoredArray, read_stored, write_stored
+from impact_posture.errors import PackageNotFound
+from impact_posture.output.plot.skeleton import link_tip
+from impact_posture.robot.robot import Robot
+from impact_posture.robot.urdf import example_robot_data
+from impact_posture.system.arrays import Array
+from impact_posture.system.libraries import source_key
+
+# Most triangles of all meshes of a page, which bounds its size and the time to draw it in software.
+_MOST_TRIANGLES = 150_000
+# Corners of a mesh are whole multiples of its extent over this.
+_LEVELS = 65535
+_GRAY = (0.72, 0.74, 0.77, 1.0)
+# Darker colors would hide the form.
+_DARKEST = 0.2
+# Triangles of a box whose corner k has the upper end of an axis where that bit of k is set.
+_BOX_FACES = np.array(
+    [[0, 2, 1, 1, 2, 3, 4, 5, 6, 5, 7, 6, 0, 1, 4, 1, 5, 4], [2, 6, 3, 3, 6, 7, 0, 4, 2, 2, 4, 6, 1, 3, 5, 3, 7, 5]],
+    dtype=np.uint32,
+).reshape(-1, 3)
+# Bytes of a COLLADA file in which its colors are sought.
+_HEAD = 200_000
+
+Color = tuple[float, ...]
+_Placement = Annotated[
+    pin.SE3,
+    PlainValidator(lambda rows: pin.SE3(np.array(rows))),
+    PlainSerializer(lambda at: at.homogeneous.tolist()),
+]
+
+
+@dataclass(frozen=True, eq=False)
+class Solid:
+    """A triangle mesh with whole coordinates.
+
+    Attributes:
+        corners: Corners as multiples of ``step`` from ``low``, shape (k, 3).
+        faces: Triangles as indices, shape (n, 3).
+        low: Least coordinates, m, shape (3,).
+        step: Length of a unit, m.
+    """
+
+    corners: StoredArray
+    faces: StoredArray
+    low: StoredArray
+    step: float
+
+    @property
+    def points(self) -> Array:
+        """Corners, m, shape (k, 3)."""
+        return self.low + self.step * self.corners
+
+
+@dataclass(frozen=True, eq=False)
+class PlacedSolids:
+    """Meshes, and where they are.
+
+    Attributes:
+        solids: The meshes.
+        places: Name of a shape, joint, index of its mesh, and placement in the axes of the joint.
+        warnings: Shapes that are left out, one line each.
+    """
+
+    solids: tuple[Solid, ...]
+    places: tuple[tuple[str, int, int, _Placement], ...]
+    warnings: tuple[str, ...]
+
+
+@dataclass(frozen=True)
+class MeshLicense:
+    """The terms of the meshes of a package.
+
+    Attributes:
+        package: Folder of the package in example-robot-data.
+        license: Name of the license, as the package states it; empty if it states none.
+        upstream: Address of the original.
+        text: Text of the license, if the package holds it.
+    """
+
+    package: str
+    license: str
+    upstream: str
+    text: str
+
+    @property
+    def allows(self) -> bool:
+        """Whether simplified meshes may be passed on: a license is stated, and permits changed copies."""
+        return bool(self.license) and "-ND" not in self.license.upper()
+
+
+@dataclass(frozen=True, eq=False)
+class DrawnRobot:
+    """The shapes of a robot.
+
+    Attributes:
+        solids: The meshes.
+        parts: Joint, index of a mesh, placement in the axes of the joint, and color (red, green, blue, opacity).
+        licenses: Where meshes of others come from, and on what terms.
+        notes: What is drawn in place of something else, one line each.
+    """
+
+    solids: tuple[Solid, ...]
+    parts: tuple[tuple[int, int, pin.SE3, Color], ...]
+    licenses: tuple[MeshLicense, ...]
+    notes: tuple[str, ...]
+
+
+@lru_cache(maxsize=4)
+def draw_robot(robot: Robot, meshes: bool = False) -> DrawnRobot:
+    """Return the visual shapes of a robot; hulls for meshes that may not be passed on; sticks where nothing is there.
+
+    Args:
+        robot: The robot.
+        meshes: Pass on the meshes of the user's own URDF, too.
+    """
+    described, warnings = read_urdf_shapes(robot, "visual")
+    by_name = {shape.name: shape for shape in described}
+    known = {shape.name: license_of(shape.mesh) for shape in described if shape.mesh is not None}
+    hulls = {name for name, terms in known.items() if not (meshes or (terms and terms.allows))}
+    key = source_key([geometry_key(robot, described), repr(sorted(hulls))], "report")
+    found = read_stored("solids", key, PlacedSolids)
+    if found is None:
+        found = _placed_solids(robot, described, hulls)
+        write_stored("solids", key, found)
+    parts = [(joint, k, at, _color(by_name[name])) for name, joint, k, at in found.places]
+    drawn = {name for name, *_ in found.places}
+    licenses = {terms.package: terms for name, terms in known.items() if terms and name in drawn - hulls}
+    notes = [*warnings, *found.warnings]
+    if hulls & drawn:
+        notes.append("meshes are drawn as their convex hulls, because a page passes them on (`meshes`)")
+    solids = list(found.solids)
+    if not parts:
+        solids, parts = _sticks(robot)
+        notes.append("the robot has no shapes that can be drawn: sticks join its joints")
+    return DrawnRobot(tuple(solids), tuple(parts), tuple(licenses.values()), tuple(notes))
+
+
+def _placed_solids(robot: Robot, described: list[UrdfShape], hulls: set[str]) -> PlacedSolids:
+    """Return the meshes of shapes, or their hulls, where they can be loaded."""
+    loaded = load_geometry(robot, described)
+    by_name = {shape.name: shape for shape in described}
+    solids: dict[tuple[object, ...], Solid] = {}
+    places = []
+    for placed in loaded.model.geometryObjects:
+        shape, hull = by_name[placed.name], placed.name in hulls
+        # The same file at the same scale is the same mesh; an address in memory would name another one later.
+        key = (shape.kind, shape.sizes, shape.mesh, hull)
+        if key not in solids:
+            solids[key] = hull_of(shape_points(placed.geometry)) if hull else _quantized(*surface_of(placed.geometry))
+        places.append((placed.name, int(placed.parentJoint), list(solids).index(key), placed.placement))
+    return PlacedSolids(tuple(_reduced(list(solids.values()))), tuple(places), loaded.warnings)
+
+
+def hull_of(points: Array) -> Solid:
+    """Return the convex hull of points."""
+    return _quantized(*hull_surface(points))
+
+
+def _quantized(points: Array, faces: Triangles) -> Solid:
+    low = points.min(axis=0)
+    step = max(float(np.ptp(points, axis=0).max()), 1e-9) / _LEVELS
+    return _welded(Solid(np.round((points - low) / step).astype(np.uint16), faces, low, step), 0)
+
+
+def _welded(solid: Solid, bits: int) -> Solid:
+    """Join the corners that agree but for their last ``bits``, and drop the triangles that vanish."""
+    keys = (solid.corners >> bits).astype(np.int64) @ (1 << np.array([32, 16, 0]))
+    _, first, merged = np.unique(keys, return_index=True, return_inverse=True)
+    faces = merged[solid.faces]
+    faces = faces[(faces[:, 0] != faces[:, 1]) & (faces[:, 1] != faces[:, 2]) & (faces[:, 2] != faces[:, 0])]
+    # In the order of their first use corners differ little from the last ones, so that they compress well.
+    used, at = np.unique(faces, return_index=True)
+    order = used[np.argsort(at)]
+    renamed = np.empty(len(first), dtype=np.uint32)
+    renamed[order] = np.arange(len(order))
+    return Solid(solid.corners[first[order]], renamed[faces], solid.low, solid.step)
+
+
+def _reduced(solids: list[Solid]) -> list[Solid]:
+    """Weld the corners within a length that grows until all meshes together have few enough triangles."""
+    length = max((solid.step for solid in solids), default=0.0)
+    while sum(len(solid.faces) for solid in solids) > _MOST_TRIANGLES:
+        length *= 2
+        bits = [max(int(np.log2(length / solid.step)), 0) for solid in solids]
+        solids = [_coarser(solid, k) if k else solid for solid, k in zip(solids, bits, strict=True)]
+    return solids
+
+
+def _coarser(solid: Solid, bits: int) -> Solid:
+    """Return a mesh without the last ``bits`` of its corners, or its bounding box if all triangles would vanish."""
+    welded = _welded(solid, bits)
+    if len(welded.faces):
+        return welded
+    ends = np.stack([solid.corners.min(axis=0), solid.corners.max(axis=0)])
+    corners = np.stack([ends[np.arange(8) >> axis & 1, axis] for axis in range(3)], axis=1)
+    return Solid(corners, _BOX_FACES, solid.low, solid.step)
+
+
+def _sticks(robot: Robot) -> tuple[list[Solid], list[tuple[int, int, pin.SE3, Color]]]:
+    """Return rods from each joint to the next ones, and from the last joint of each chain to the tip of its link."""
+    model = robot.model
+    spans = [(int(model.parents[k]), np.array(model.jointPlacements[k].translation)) for k in range(1, model.njoints)]
+    inner = {parent for parent, _ in spans}
+    tips = [(k, link_tip(model, k)) for k in range(1, model.njoints) if k not in inner]
+    spans += [(k, tip) for k, tip in tips if np.any(tip)]
+    ball = shape_points(coal.Sphere(0.02 * max(0.1, *(float(np.linalg.norm(span)) for _, span in spans))))
+    rods = [hull_of(np.vstack([ball, ball + span])) for _, span in spans]
+    return rods, [(parent, k, pin.SE3.Identity(), _GRAY) for k, (parent, _) in enumerate(spans)]
+
+
+def _color(shape: UrdfShape) -> Color:
+    """Return the color of a shape: that of the URDF, the mean of a COLLADA file (which coal drops), or gray."""
+    *color, opacity = shape.color or _GRAY
+    if shape.color is None and shape.mesh is not None and shape.mesh.suffix.lower() == ".dae":
+        with shape.mesh.open("rb") as file:
+            head = file.read(_HEAD)
+        found = re.findall(rb"<diffuse>\s*<color[^>]*>\s*([\d.eE+-]+)\s+([\d.eE+-]+)\s+([\d.eE+-]+)\s", head)
+        color = np.mean([[float(v) for v in one] for one in found] or [color], axis=0).tolist()
+    return (*np.clip(color, _DARKEST, 1.0).tolist(), opacity)
+
+
+def license_of(mesh: Path) -> MeshLicense | None:
+    """Return the terms of a mesh of example-robot-data; ``None`` for a mesh of another origin."""
+    try:
+        root = example_robot_data().resolve()
+    except PackageNotFound:
+        return None
+    path = mesh.resolve()
+    return _read_license(root / path.relative_to(root).parts[0]) if path.is_relative_to(root) else None
+
+
+@cache
+def _read_license(folder: Path) -> MeshLicense:
+    """Read the README of a package, which states ``license:`` and ``upstream:``, and its LICENSE."""
+    readme, text = (
+        path.read_text(encoding="utf-8", errors="replace") if path.is_file() else ""
+        for path in (folder / "README.md", folder / "LICENSE")
+    )
+    found = (re.search(rf"^{key}:\s*(\S.*)$", readme, re.I | re.M) for key in ("license", "upstream"))
+    license, upstream = ("" if match is None else match[1].strip() for match in found)
+    return MeshLicense(folder.name, license, upstream, text)

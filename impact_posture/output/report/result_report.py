@@ -1,0 +1,199 @@
+"""The report of a posture optimization: the robot on its way from the initial posture to the optimum."""
+
+from __future__ import annotations
+
+from collections.abc import Iterator, Sequence
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+
+from impact_posture.dynamics.numeric import Numeric
+from impact_posture.impact.evaluation.coulomb_jump import coulomb_jump, coulomb_jumps
+from impact_posture.impact.impact_contact import point_on
+from impact_posture.output.plot.result_view import ALONE, SEPARATOR, ResultView, header_lines, number
+from impact_posture.output.quantity_table import QuantityRow, quantities, quantity_rows
+from impact_posture.output.report.drawn_robot import draw_robot
+from impact_posture.output.report.report_page import Content, Table, write_page
+from impact_posture.output.report.report_scene import Curve, ReportScene, Track, impact_curves
+from impact_posture.posture.formulation.problem_file import Prepared
+from impact_posture.system.arrays import Array
+from impact_posture.system.output_folder import typed_command
+
+# Most frames of a way: more are not seen.
+_MOST = 121
+
+
+def write_result_report(
+    folder: Path,
+    prepared: Prepared,
+    view: ResultView,
+    document: dict[str, Any],
+    *,
+    meshes: bool = False,
+    scene: ReportScene | None = None,
+    pictures: Sequence[tuple[str, str]] | None = None,
+) -> Path:
+    """Write ``report.html`` of a result into its folder; return its path.
+
+    Args:
+        folder: The folder, with ``problem.toml`` and the figures.
+        prepared: The problem.
+        view: Its solution.
+        document: The content of ``result.json``.
+        meshes: Pass on the meshes of the user's own URDF, too.
+        scene: What :func:`result_scene` returns, if it is known.
+        pictures: What :func:`~impact_posture.output.report.report_page.figures` returns, if it is known.
+
+    Raises:
+        OutputError: It cannot be written.
+    """
+    scene = scene or result_scene(prepared, view, meshes)
+    return write_page(folder, _content(folder, prepared, view, document), scene, pictures)
+
+
+def result_scene(prepared: Prepared, view: ResultView, meshes: bool = False) -> ReportScene:
+    """Return the scene of a result, with the surface where the problem has it: behind the link that touches it."""
+    around, q = prepared.problem.surroundings, view.q_initial
+    if around is not None:
+        walls, solids = around.walls_at(q)
+        planes = [("ground" if wall.name == "ground" else "surface", wall.point, wall.normal) for wall in walls]
+    else:
+        numeric, planes, solids = Numeric(view.robot.model).at(q), [], []
+        for one in view.objective.contacts:
+            at = numeric.placement(point_on(view.robot, one.frame, one.offset))
+            turn = at.rotation if one.normal_frame == "contact" else np.eye(3)
+            planes.append(("surface", at.translation, turn @ one.normal))
+    bodies = tuple(hull.vertices @ at.rotation.T + at.translation for hull, at, _ in solids)
+    return ReportScene(
+        draw_robot(view.robot, meshes), view.objective, (_track(prepared, view),), tuple(planes), bodies, True
+    )
+
+
+def _track(prepared: Prepared, view: ResultView) -> Track:
+    times, unit, q = _way(view)
+    objective, stiffness = view.objective, prepared.impact.contact_stiffness
+    found = [[single.oracle.quantities(at) for at in q] for single in objective.singles]
+    jumps, impulses = _jumps(view, q)
+    curves: list[Curve] = []
+    for contact, own, sizes in zip(objective.contacts, found, impulses.T, strict=True):
+        where = f" at {contact.frame}" if objective.others else ""
+        curves += [*impact_curves(own, prepared.impact.metric, where), (f"impulse{where}", "N·s", sizes)]
+        if stiffness is not None:
+            peaks = np.array([stiffness.peak_force(one.G, view.speed) for one in own])
+            curves.append((f"peak force{where}", "N", peaks))
+    return Track("", times, unit, q, found, jumps, tuple(curves))
+
+
+def _jumps(view: ResultView, postures: Array) -> tuple[Array, Array]:
+    """Return the jumps at postures, shape (n, nv), and the impulse of each contact, N·s, shape (n, contacts).
+
+    They are those of all contacts at once, or else of the leading contact alone.  What is unknown is a jump of zero
+    and an impulse of NaN.
+    """
+    objective, rebound, together = view.objective, (1 + view.restitution) * view.speed, _together(view)
+    jumps = np.zeros((len(postures), objective.robot.nv))
+    impulses = np.full((len(postures), len(objective.contacts)), np.nan)
+    for k, q in enumerate(postures):
+        if together:
+            several = coulomb_jumps(objective, q, view.speed) or ()
+            for i, one in enumerate(several):
+                jumps[k], impulses[k, i] = one.velocity, one.impulse_size
+        elif (jump := coulomb_jump(objective, q, rebound)) is not None:
+            jumps[k], impulses[k, 0] = jump.velocity, jump.impulse_size
+        elif (alone := objective.oracle.quantities(q)).G > 0:
+            jumps[k], impulses[k, 0] = rebound / alone.G * alone.jump, rebound / alone.G
+    return jumps, impulses
+
+
+def _together(view: ResultView) -> bool:
+    """Tell whether the jump of several contacts at once is known at the first and the last posture."""
+    ends = (view.q_initial, view.q_optimal)
+    return bool(view.objective.others) and all(coulomb_jumps(view.objective, q, view.speed) for q in ends)
+
+
+def _way(view: ResultView) -> tuple[Array, str, Array]:
+    """Return the places on the way that the slider takes, their unit, and the postures there."""
+    if view.motion is not None and len(view.motion.t) > 1:
+        kept = np.unique(np.linspace(0, len(view.motion.t) - 1, _MOST).astype(int))
+        return view.motion.t[kept], "s", view.motion.q[kept]
+    if view.path is not None and view.path.s[-1] > 0:
+        # Points that fall on one another would have no order.
+        kept = np.flatnonzero(np.diff(view.path.s, prepend=-1.0) > 0)
+        return view.path.s[kept], "", view.path.q[kept]
+    return np.array([0.0, 1.0]), "", np.array([view.q_initial, view.q_optimal])
+
+
+def _content(folder: Path, prepared: Prepared, view: ResultView, document: dict[str, Any]) -> Content:
+    title, small = header_lines(view)
+    facts = [fact for fact in small[0].split(SEPARATOR) if not fact.startswith(ALONE)]
+    certificate, solver = document["certificate"], document["solver"]
+    # Results of former versions have no such number.
+    left = solver.get("dominated_starts", 0)
+    checks = [
+        ("stationarity", certificate["stationarity"], ""),
+        ("violation of the constraints", certificate["primal"], ""),
+        ("complementarity", certificate["complementarity"], ""),
+        ("pose error", certificate["pose_error_m"], "m"),
+        ("pose error", certificate["pose_error_rad"], "rad"),
+    ]
+    active = [f"active: {one['constraint']}, {one['side']}" for one in document["active"]]
+    return Content(
+        title=title,
+        command=typed_command(folder) or "impact-posture optimize problem.toml",
+        facts=tuple(facts),
+        verdict=(document["verdict"]["line"], *document["verdict"]["advice"]),
+        tables=(
+            *_before_and_after(prepared, document),
+            Table(
+                f"Certificate, recomputed with {certificate['recomputed_with']}",
+                ("", "value", "unit"),
+                tuple((name, f"{value:.1e}", unit) for name, value, unit in checks),
+            ),
+        ),
+        moves=_moves(view, document),
+        notes=(
+            f"{solver['certified_starts']} of {solver['starts']} starts ended at a certified posture."
+            + (f" {left} were left on the way, because they could not become the best." if left else ""),
+            f"{document['redundancy']} degrees of freedom are left by the constraints at the optimum.",
+            *document["constraints"], *active, *document["notes"], *document["warnings"],
+        ),
+        sources=(("problem.toml", (folder / "problem.toml").read_text(encoding="utf-8")),),
+    )  # fmt: skip
+
+
+def _before_and_after(prepared: Prepared, document: dict[str, Any]) -> Iterator[Table]:
+    """Yield the table of the impact, and that of each further contact."""
+    blocks, contacts = [document[key] for key in ("initial", "optimal")], prepared.impact.objective.contacts
+    for k, contact in enumerate(contacts):
+        if k == 0:
+            rows = quantity_rows(prepared.impact, *blocks)
+        else:
+            own = [block["by_contact"][k] for block in blocks]
+            named = quantities(prepared.impact.metric)
+            rows = [QuantityRow(key, own[0][key], own[1][key], unit, words) for key, unit, words in named]
+        yield Table(
+            f"Before and after{_alone(contact.frame, k) if len(contacts) > 1 else ''}",
+            ("", "before", "after", "unit", "meaning"),
+            tuple((row.key, number(row.before), number(row.after), row.unit, row.meaning) for row in rows),
+        )
+
+
+def _alone(frame: str, index: int) -> str:
+    """Say what a table of one of several contacts is about."""
+    return f", of an impact at {frame} alone" + ("; the objective is of all contacts" if index == 0 else "")
+
+
+def _moves(view: ResultView, document: dict[str, Any]) -> str:
+    arrows = "The orange arrows show the predicted velocity jump at the stated speed and friction"
+    if view.objective.others:
+        alone = f"of the impact at {view.objective.contact.frame} alone"
+        arrows += f", {'of the plastic impact at all contacts at once' if _together(view) else alone}"
+    if view.motion is not None and len(view.motion.t) > 1:
+        end = "the optimum" if document["path"]["found"] else "the best posture that was reached"
+        return f"The slider follows the motion of --path from the initial posture to {end}, over time. {arrows}."
+    return (
+        "The slider follows the straight line between the two postures, each point pulled onto the constraints. "
+        "It is no motion plan: limits of speed and collisions on the way are not checked (--path does that). "
+        f"{arrows}."
+    )

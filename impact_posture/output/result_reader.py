@@ -1,0 +1,180 @@
+"""Read a result folder, and make the view of a result from which figures and report are drawn."""
+
+from __future__ import annotations
+
+import json
+import os
+from collections.abc import Sequence
+from dataclasses import dataclass, fields
+from pathlib import Path
+from typing import TYPE_CHECKING, Any
+
+import numpy as np
+
+from impact_posture.config.settings import Against
+from impact_posture.errors import SpecError, shown
+from impact_posture.posture.analysis.result_document import SCHEMA
+from impact_posture.posture.formulation.problem_file import Prepared, prepare, read_settings
+from impact_posture.posture.manifold.null_space_path import NullSpacePath
+from impact_posture.posture.search.global_search import SelfMotionMap
+from impact_posture.system.arrays import Array
+from impact_posture.system.npz_files import read_arrays
+from impact_posture.system.text_files import read_text
+
+# Matplotlib is imported where it is used, because that takes longer than a small problem.
+if TYPE_CHECKING:
+    from impact_posture.output.plot import ResultView, TradeOffData
+    from impact_posture.path.posture_path import PosturePath
+    from impact_posture.robot.robot import Robot
+
+# Exceptions from reading a changed or incomplete result.
+_BROKEN = (LookupError, ValueError, TypeError, AttributeError, OSError, RecursionError)
+
+
+@dataclass(frozen=True, eq=False)
+class SolvedPostures:
+    """What a result folder holds of a solved problem.  It can be sent to a process.
+
+    Attributes:
+        initial: Posture before, shape (nq,).
+        optimal: Posture after, shape (nq,).
+        path: The null-space path between them.
+        document: The content of ``result.json``.
+        mapped: The self-motion map, if it was computed.
+    """
+
+    initial: Array
+    optimal: Array
+    path: NullSpacePath
+    document: dict[str, Any]
+    mapped: SelfMotionMap | None
+
+
+def load_view(folder: Path) -> ResultView:
+    """Read the view of a result folder, from which its figures are drawn.
+
+    Raises:
+        SpecError: The folder is no result folder, or was made with another robot model.
+    """
+    return load_result(folder)[1]
+
+
+def rewrite_report(folder: Path, *, meshes: bool = False) -> Path:
+    """Write ``report.html`` of a result folder again; return its path.
+
+    Raises:
+        SpecError: As :func:`load_view`.
+        OutputError: It cannot be written.
+    """
+    from impact_posture.output.report.result_report import write_result_report
+
+    loaded = load_result(folder)
+    try:
+        return write_result_report(folder, *loaded, meshes=meshes)
+    except _BROKEN as error:
+        raise _broken(folder, error) from None
+
+
+def load_result(folder: Path) -> tuple[Prepared, ResultView, dict[str, Any]]:
+    """Read problem, view and ``result.json`` of a result folder.
+
+    Raises:
+        SpecError: As :func:`load_view`.
+    """
+    if not os.path.isfile(folder / "result.json"):
+        raise SpecError("holds no result.json", where=str(folder), hint="name a folder that optimize wrote")
+    try:
+        document = json.loads(read_text(folder / "result.json"), parse_constant=_refuse_constant)
+        if document["schema"] != SCHEMA:
+            raise SpecError(
+                f"schema '{shown(document['schema'])}'", where=str(folder / "result.json"), hint="run optimize again"
+            )
+        prepared = prepare(read_settings(folder / "problem.toml"))
+        arrays = read_arrays(folder / "result.npz")
+        path = NullSpacePath(**{key: arrays[f"path_{key}"] for key in ("q", "s", "H", "G", "V", "S", "objective")})
+        names = [field.name for field in fields(SelfMotionMap)] if "self_motion_q" in arrays else []
+        mapped = SelfMotionMap(**{name: arrays[f"self_motion_{name}"] for name in names}) if names else None
+        robot, recorded = prepared.impact.robot, str(document["robot"]["model_sha256"])
+        if recorded != robot.model_sha256:
+            raise SpecError(
+                f"was made with another model of {robot.name} (sha256 {recorded[:12]}…)",
+                where=str(folder),
+                hint="run optimize again, or use the URDF and armature of that result",
+            )
+        initial, optimal = (
+            robot.check_posture(document[key]["q"], limits=False, where=f"{folder / 'result.json'}: {key}.q")
+            for key in ("initial", "optimal")
+        )
+        found = SolvedPostures(initial, optimal, path, document, mapped)
+        return prepared, result_view(prepared, found, motion_of(folder, document, robot)), document
+    except _BROKEN as error:
+        raise _broken(folder, error) from None
+
+
+def _refuse_constant(text: str) -> None:
+    raise ValueError(f"{text} is no number of JSON")
+
+
+def _broken(folder: Path, error: Exception) -> SpecError:
+    what = f"is no whole result ({type(error).__name__}: {error})"
+    return SpecError(what, where=str(folder), hint="run optimize again")
+
+
+def motion_of(folder: Path, document: dict[str, Any], robot: Robot) -> PosturePath | None:
+    """Read the path to the optimum from a result folder, if it has one."""
+    if "path" not in document:
+        return None
+    from impact_posture.path.path_files import read_path
+
+    return read_path(folder, document["path"], robot)
+
+
+def result_view(prepared: Prepared, found: SolvedPostures, motion: PosturePath | None) -> ResultView:
+    """Return the view of a result, from which its figures and its report are drawn.
+
+    Args:
+        prepared: The problem.
+        found: Its solution.
+        motion: The path to the optimum, if it was searched.
+    """
+    from impact_posture.output.plot import ResultView
+
+    impact, around, document = prepared.impact, prepared.problem.surroundings, found.document
+    return ResultView(
+        objective=impact.objective,
+        q_initial=found.initial,
+        q_optimal=found.optimal,
+        speed=impact.speed,
+        restitution=impact.restitution,
+        path=found.path,
+        tradeoff=_tradeoff_data(document.get("tradeoff", []), document.get("tradeoff_against", "distance")),
+        collisions=_collisions(prepared, found.initial, found.optimal),
+        depths=() if around is None else tuple(around.depth(c) for c in impact.objective.contacts),
+        pushed=prepared.problem.requirements.contact_pose == "free",
+        motion=motion,
+        self_motion=found.mapped,
+    )
+
+
+def _collisions(prepared: Prepared, *postures: Array) -> Any:
+    """Shapes that touch at each of two postures, for an optimization that does not keep them apart."""
+    if prepared.problem.surroundings is not None:
+        return (), ()
+    from impact_posture.collision.mesh_check import mesh_collisions
+    from impact_posture.collision.robot_shapes import load_shapes
+
+    shapes = load_shapes(prepared.impact.robot)
+    return tuple(mesh_collisions(prepared.impact.robot, shapes, q) for q in postures)
+
+
+def _tradeoff_data(points: Sequence[dict[str, Any]], against: Against) -> TradeOffData | None:
+    """Return the ``tradeoff`` of a ``result.json`` as arrays; ``None`` for fewer than two points."""
+    from impact_posture.output.plot import TradeOffData
+
+    if len(points) < 2:
+        return None
+    keys = ("within", "distance", "objective", "H", "G", "V", "S")
+    columns = {key: np.array([np.nan if p[key] is None else p[key] for p in points], dtype=float) for key in keys}
+    knee = next((k for k, p in enumerate(points) if p["knee"]), None)
+    certified = np.array([bool(p["certified"]) for p in points])
+    return TradeOffData(**columns, certified=certified, knee=knee, against=against)

@@ -1,0 +1,114 @@
+"""A smooth curve through postures on the constraints."""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from itertools import pairwise
+
+import numpy as np
+import pinocchio as pin
+
+from impact_posture.path.path_search import even
+from impact_posture.path.path_space import STEP, PathSpace
+from impact_posture.system.arrays import Array
+
+# The curve leaves the constraints by no more than this tangent length; its samples are pulled onto them.
+DEVIATION = 1e-5
+# How often the number of knots is doubled to get there; at the corners of a path along bodies that halves the rest.
+_DOUBLINGS = 7
+# Step of central differences along the curve, whose length is 1.
+_STEP = 1e-5
+# Between knots of a corner, the curve bends so many times more than at the median knot.
+_SHARP = 5.0
+# Parts between two knots of a curve whose limits are checked, at corners and elsewhere.
+_AT_CORNERS, _BETWEEN = 8, 2
+
+
+class PathCurve:
+    """The cubic spline ``q(s) = q₀ ⊕ z(s)``, ``0 ≤ s ≤ 1``, through postures.
+
+    Args:
+        space: The postures that the constraints allow.
+        postures: At least two, in order.
+
+    Attributes:
+        s: Places of the postures on the curve, evenly by path length, shape (n,).
+        z: Tangent coordinates of the postures at the first one, shape (n, nv).
+        spline: The function ``z(s)``.
+    """
+
+    def __init__(self, space: PathSpace, postures: Sequence[Array]) -> None:
+        from scipy.interpolate import CubicSpline
+
+        self._space, self._start = space, postures[0]
+        self.s = np.linspace(0.0, 1.0, len(postures))
+        z = np.array([space.difference(self._start, q) for q in postures])
+        for slot in space.projector.chart.slots:
+            # A continuous joint may turn more than once.
+            if slot.kind.family == "continuous":
+                z[:, slot.v] = np.unwrap(z[:, slot.v], axis=0)
+        self.z = z
+        self.spline = CubicSpline(self.s, z)
+
+    @property
+    def corners(self) -> Array:
+        """Whether the curve turns sharply between each knot and the next, shape (n − 1,)."""
+        bend = np.abs(self.spline(self.s, 2)).max(axis=1)
+        return np.asarray(np.maximum(bend[1:], bend[:-1]) > _SHARP * np.median(bend))
+
+    @property
+    def places(self) -> Array:
+        """The knots and places between them, more at corners, where limits are checked."""
+        parts = [
+            np.linspace(a, b, _AT_CORNERS if corner else _BETWEEN, endpoint=False)
+            for (a, b), corner in zip(pairwise(self.s), self.corners, strict=True)
+        ]
+        return np.concatenate([*parts, [1.0]])
+
+    def at(self, z: Array) -> Array:
+        """Return the posture of tangent coordinates, ``q₀ ⊕ z``, shape (nq,)."""
+        return np.asarray(pin.integrate(self._space.model, self._start, z))
+
+    def posture(self, s: float) -> Array:
+        """Return ``q(s)``, shape (nq,)."""
+        return self.at(self.spline(s))
+
+    def velocity(self, s: float) -> Array:
+        """Return ``ν = dq/ds`` in the tangent space at ``q(s)``, shape (nv,)."""
+        turn = pin.dIntegrate(self._space.model, self._start, self.spline(s), pin.ARG1)
+        return np.asarray(turn @ self.spline(s, 1))
+
+    def acceleration(self, s: float) -> Array:
+        """Return ``dν/ds``, shape (nv,)."""
+        low, high = max(s - _STEP, 0.0), min(s + _STEP, 1.0)
+        return (self.velocity(high) - self.velocity(low)) / (high - low)
+
+    def deviation(self) -> float:
+        """Return the largest tangent distance of the curve to the constraints; infinite where it is not valid there.
+
+        The first distance above the one that is allowed is returned, because such a curve needs more knots anyway.
+        It is taken at so many places that no frame moves more than the check distance between two of them.
+        """
+        worst, before = 0.0, self.at(self.z[0])
+        # The knots themselves are on the constraints.
+        parts = max(2, self._space.checks(np.abs(np.diff(self.z, axis=0)).max(axis=0)))
+        for s in np.linspace(0.0, 1.0, parts * (len(self.s) - 1) + 1):
+            off = self.posture(float(s))
+            q = self._space.pulled(off)
+            if q is None or self._space.size(self._space.difference(before, q)) > 1:
+                return float("inf")
+            worst, before = max(worst, self._space.distance(off, q)), q
+            if worst > DEVIATION:
+                break
+        return worst
+
+
+def fitted_curve(space: PathSpace, postures: Sequence[Array]) -> PathCurve | None:
+    """Return the curve through a path, with so many knots that it stays on the constraints; ``None`` if it cannot."""
+    count = max(5, int(np.ceil(space.length(postures) / (2 * STEP))) + 1)
+    for _ in range(_DOUBLINGS + 1):
+        curve = PathCurve(space, even(space, postures, count))
+        if curve.deviation() <= DEVIATION:
+            return curve
+        count = 2 * count - 1
+    return None

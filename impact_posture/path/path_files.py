@@ -1,0 +1,113 @@
+"""Files of a path: CSV, NumPy arrays and a ROS ``JointTrajectory``."""
+
+from __future__ import annotations
+
+import csv
+from collections.abc import Mapping
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+import yaml
+
+from impact_posture.dynamics.chart import Chart
+from impact_posture.errors import printable
+from impact_posture.path.path_timing import LimitUse
+from impact_posture.path.posture_path import PosturePath
+from impact_posture.robot.robot import Robot
+from impact_posture.system.arrays import Array
+from impact_posture.system.npz_files import read_arrays
+
+_SHARES = ("at", "velocity", "torque", "thrust")
+# Fields of a path that result.json has.
+_BLOCK = ("found", "reason", "method", "timing", "objective", "length", "max_violation")
+_BASE = ("x", "y", "z", "qx", "qy", "qz", "qw")
+
+
+def write_path(folder: Path, robot: Robot, path: PosturePath) -> None:
+    """Write ``path.csv``, ``path.npz`` and ``path.yaml`` into a folder.
+
+    The CSV has a row a time: ``t`` (s), positions ``q:…``, velocities ``v:…`` and accelerations ``a:…`` by name.  A
+    continuous joint is one angle without jumps.  The YAML is a ``trajectory_msgs/JointTrajectory`` of the joints.
+    """
+    names, angles = positions(robot, path.q)
+    columns = [printable(name) for name in robot.tangent_names]
+    with (folder / "path.csv").open("w", newline="", encoding="utf-8") as file:
+        writer = csv.writer(file)
+        head = [f"{kind}:{name}" for kind, each in (("q", names), ("v", columns), ("a", columns)) for name in each]
+        writer.writerow(["t", *head])
+        writer.writerows(np.column_stack([path.t, angles, path.v, path.a]).tolist())
+    use = {} if path.use is None else {name: getattr(path.use, name) for name in _SHARES}
+    np.savez_compressed(
+        folder / "path.npz", t=path.t, q=path.q, v=path.v, a=path.a, objective=path.objectives,
+        **{f"share_{name}": values for name, values in use.items()},
+    )  # fmt: skip
+    (folder / "path.yaml").write_text(_trajectory(robot, path, angles), encoding="utf-8")
+
+
+# Numbers above this are none of a path.
+_HUGE = 1e9
+
+
+def read_path(folder: Path, block: Mapping[str, Any], robot: Robot) -> PosturePath:
+    """Read a path of a robot from ``path.npz`` and the block ``path`` of ``result.json``.
+
+    Raises:
+        ValueError: The arrays do not fit each other or the robot.
+    """
+    arrays = {key: np.asarray(found, dtype=float) for key, found in read_arrays(folder / "path.npz").items()}
+    shares = {key.removeprefix("share_"): found for key, found in arrays.items() if key.startswith("share_")}
+    count, samples = arrays["t"].size, arrays["objective"].size
+    wanted = {"t": (count,), "q": (count, robot.nq), "v": (count, robot.nv), "a": (count, robot.nv)}
+    wanted |= {"objective": (samples,), **{f"share_{name}": (samples,) for name in shares}}
+    for key, shape in wanted.items():
+        known = key in ("share_torque", "share_thrust") or np.isfinite(arrays[key]).all()
+        if arrays[key].shape != shape or not known or (np.abs(arrays[key]) > _HUGE).any():
+            raise ValueError(f"'{key}' of path.npz does not fit the path of {robot.name}")
+    if count == 0 or (np.diff(arrays["t"]) <= 0).any():
+        raise ValueError("the times of path.npz do not rise")
+    return PosturePath(
+        **{key: block[key] for key in _BLOCK},
+        t=arrays["t"], q=arrays["q"], v=arrays["v"], a=arrays["a"],
+        use=LimitUse(**shares, largest=block["limits"]) if shares else None,
+        objectives=arrays["objective"],
+    )  # fmt: skip
+
+
+def positions(robot: Robot, q: Array) -> tuple[list[str], Array]:
+    """Return names and values of the position coordinates along a path, shape (n, nx); a turning joint is one angle.
+
+    The base of a floating robot has its position (m) and its quaternion, scalar last.
+    """
+    chart, names = Chart(robot.model), []
+    x = np.array([chart.to_x(one) for one in q])
+    for slot in chart.slots:
+        width = slot.x.stop - slot.x.start
+        if slot.kind.family == "free-flyer":
+            names += [f"base {letter}" for letter in _BASE]
+        else:
+            names += [slot.name] if width == 1 else [f"{slot.name}[{k}]" for k in range(width)]
+        if slot.kind.family in ("continuous", "planar"):
+            x[:, slot.x.stop - 1] = np.unwrap(x[:, slot.x.stop - 1])
+    return [printable(name) for name in names], x
+
+
+def _trajectory(robot: Robot, path: PosturePath, angles: Array) -> str:
+    """Return the ``JointTrajectory`` of all joints of one axis as YAML."""
+    slots = [s for s in Chart(robot.model).slots if s.x.stop - s.x.start == 1]
+    x, v = [s.x.start for s in slots], [s.v.start for s in slots]
+    points = []
+    for k, t in enumerate(path.t):
+        whole, part = divmod(round(float(t) * 1e9), 10**9)
+        points.append({
+            "positions": angles[k, x].tolist(),
+            "velocities": path.v[k, v].tolist(),
+            "accelerations": path.a[k, v].tolist(),
+            "time_from_start": {"sec": whole, "nanosec": part},
+        })  # fmt: skip
+    message = {"header": {"frame_id": ""}, "joint_names": [s.name for s in slots], "points": points}
+    lines = ["# trajectory_msgs/JointTrajectory"]
+    if robot.floating:
+        lines.append("# The base floats: its pose over time is in path.csv (q:base ...).")
+    lines.append(yaml.safe_dump(message, sort_keys=False, default_flow_style=None, width=10**6))
+    return "\n".join(lines)

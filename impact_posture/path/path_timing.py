@@ -1,0 +1,225 @@
+"""The time that a robot needs along a path, within the limits of velocity, torque, thrust and friction."""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from dataclasses import dataclass
+
+import numpy as np
+
+from impact_posture.path.actuator_limits import ActuatorLimits
+from impact_posture.path.path_curve import PathCurve
+from impact_posture.path.path_space import PathSpace
+from impact_posture.path.speed_profile import slowed
+from impact_posture.path.timed_curve import SAMPLE_TIME, TimedCurve, times
+from impact_posture.system.arrays import Array
+
+# Intervals of the time-optimal parametrization, within which a limit may be exceeded by less than 1 %.
+_GRID = 400
+# Instants at which a scaled motion is checked, besides places of its curve; places of the table that finds these.
+INSTANTS, _INVERSE = 61, 2001
+# Joint speed where the robot's data limit nothing, rad/s or m/s.
+_DEFAULT_SPEED = 1.0
+# From this share on, a limit is active.
+_ACTIVE = 0.98
+_ONE_AXIS = ("revolute", "continuous", "prismatic")
+# A time-optimal motion that takes a larger share of a limit at one of its points has corners, too.
+_EXCEEDED = 1.01
+
+
+def time_optimal(space: PathSpace, curve: PathCurve, limits: ActuatorLimits) -> TimedCurve | None:
+    """Return the fastest motion within velocities and torques (TOPP-RA, Pham and Pham 2018), ``None`` if none exists.
+
+    For a fixed base with joints of one axis, whose torque limits are known.
+    """
+    from toppra import SplineInterpolator
+    from toppra.algorithm import TOPPRA
+    from toppra.constraint import DiscretizationType, JointTorqueConstraint, JointVelocityConstraint
+
+    speed = space.problem.robot.velocity_limits
+    # Joints without a limit get a bound that nothing reaches; the solver takes no infinities.
+    bound = np.where(np.isfinite(speed), speed, 1e6)
+
+    # TOPP-RA needs a torque for every joint.  That of a joint without a limit stays zero.
+    count, limited = space.model.nv, len(limits.names)
+
+    def used(z: Array, v: Array, a: Array) -> Array:
+        q = curve.at(z)
+        found = limits.shares(q, limits.load(q, v, a))
+        assert found is not None  # noqa: S101 (a fixed base balances every load)
+        return np.concatenate([found, np.zeros(count - limited)])
+
+    constraints = [
+        JointVelocityConstraint(np.column_stack([-bound, bound])),
+        JointTorqueConstraint(
+            used, np.tile([-1.0, 1.0], (count, 1)), np.zeros(count),
+            discretization_scheme=DiscretizationType.Interpolation,
+        ),
+    ]  # fmt: skip
+    # By path length, because TOPP-RA loses digits where the speed along the path is far from 1.
+    size = space.length([curve.at(z) for z in curve.z])
+    planner = TOPPRA(
+        constraints, SplineInterpolator(size * curve.s, curve.z), gridpoints=np.linspace(0.0, size, _GRID + 1),
+        # The default, a spline over time, exceeds the torques by a quarter where they switch.
+        parametrizer="ParametrizeConstAccel",
+    )  # fmt: skip
+    found = planner.compute_trajectory()
+    if found is None:
+        return None
+    t = times(float(found.duration))
+    z, v, a = (np.asarray(found(t, order)) for order in range(3))
+    return TimedCurve(t, z, v, a, "time-optimal")
+
+
+def scaled(space: PathSpace, curve: PathCurve, limits: ActuatorLimits) -> TimedCurve:
+    """Return the fastest motion of the form ``s(t) = 10 τ³ − 15 τ⁴ + 6 τ⁵``, ``τ = t/T``, within all known limits.
+
+    The load of a motion is that of gravity and ``1/T²`` times a load that does not depend on ``T``.  So a linear
+    program at each instant gives the least ``T`` there, and the largest of them counts.  Instants are spread evenly,
+    and at places of the curve, most of them at its corners.
+    A curve with corners is slowed there alone if that takes less time.
+    """
+    fine = np.linspace(0.0, 1.0, _INVERSE)
+    notes, tau = [], np.concatenate([np.linspace(0.0, 1.0, INSTANTS), np.interp(curve.places, _law(fine)[0], fine)])
+    rates = [_rates(curve, float(x)) for x in tau]
+    speed, known = space.problem.robot.velocity_limits, not limits.missing
+    least = np.zeros(len(tau))
+    if known:
+        zero = np.zeros(space.model.nv)
+        rests = [(q, limits.load(q, zero, zero)) for q, _, _ in rates]
+        found = [
+            limits.largest_rate(q, rest, limits.load(q, v, a) - rest)
+            for (q, v, a), (_, rest) in zip(rates, rests, strict=True)
+        ]
+        known = all(found)
+        least = np.array([rate**-0.5 if rate else 0.0 for rate in found])
+    if not known:
+        why = limits.missing or _cannot_move(space, limits, rests)
+        notes.append(f"{why}: timed by velocities alone")
+        least[:] = 0.0
+        speed = np.where(np.isfinite(speed), speed, _DEFAULT_SPEED)
+        if not np.isfinite(space.problem.robot.velocity_limits).all():
+            notes.append(f"where no velocity limit is known, {_DEFAULT_SPEED:g} rad/s or m/s counts")
+    least = np.maximum(least, [float((np.abs(v) / speed).max()) for _, v, _ in rates])
+    duration = max(float(least.max()), SAMPLE_TIME)
+    if known and curve.corners.any():
+        slower = slowed(space, curve, limits)
+        if slower is not None and slower.t[-1] < duration:
+            return slower
+    t = times(duration)
+    motion = [_rates(curve, float(x)) for x in t / duration]
+    return TimedCurve(
+        t,
+        curve.spline(_law(t / duration)[0]),
+        np.array([v for _, v, _ in motion]) / duration,
+        np.array([a for _, _, a in motion]) / duration**2,
+        "scaled",
+        tuple(notes),
+    )
+
+
+def _cannot_move(space: PathSpace, limits: ActuatorLimits, loads: Sequence[tuple[Array, Array]]) -> str:
+    """Say why the limits allow no speed on a path, from its postures and their loads at rest."""
+    shares = [limits.shares(q, load) for q, load in loads]
+    held = [share for share in shares if share is not None]
+    if len(held) < len(shares):
+        return "rotors or friction cannot hold all postures of the path at rest"
+    worst = np.abs(held).max(axis=0)
+    if worst.max() <= 1:
+        return "rotors or friction cannot accelerate the robot along the path at any speed"
+    return f"{limits.names[int(worst.argmax())]} would need {worst.max():.3g} times its limit at rest on the path"
+
+
+def timed(space: PathSpace, curve: PathCurve, limits: ActuatorLimits) -> TimedCurve:
+    """Return the motion along a curve: time-optimal for a fixed base with known torques, else scaled.
+
+    A time-optimal motion that exceeds limits between the points of its grid gives way to one that does not.
+    """
+    axes = all(slot.kind.family in _ONE_AXIS for slot in space.projector.chart.slots)
+    if not limits.missing and axes and not space.problem.robot.floating:
+        fastest = time_optimal(space, curve, limits)
+        if fastest is not None and _exceeded(space, curve, fastest, limits) <= _EXCEEDED:
+            return fastest
+        slower = slowed(space, curve, limits)
+        if slower is not None:
+            return slower
+    return scaled(space, curve, limits)
+
+
+def _exceeded(space: PathSpace, curve: PathCurve, motion: TimedCurve, limits: ActuatorLimits) -> float:
+    """Return the largest share of a limit that a motion of a fixed base takes."""
+    largest = float((np.abs(motion.v) / space.problem.robot.velocity_limits).max())
+    for z, v, a in zip(motion.z, motion.v, motion.a, strict=True):
+        q = curve.at(z)
+        used = limits.shares(q, limits.load(q, v, a))
+        largest = max(largest, float(np.abs(used).max(initial=0.0)) if used is not None else np.inf)
+    return largest
+
+
+@dataclass(frozen=True, eq=False)
+class LimitUse:
+    """The shares of the limits that a motion takes over time; 1 is at a limit.
+
+    Attributes:
+        at: Times, s, shape (m,).
+        velocity: Largest share of a velocity limit at each time, shape (m,).
+        torque: Largest share of a torque limit, NaN where not known, shape (m,).
+        thrust: Largest share of half of a thrust's range, from its middle, NaN where not known, shape (m,).
+        largest: Largest shares, whose they are, and the active limit, as in ``result.json``.
+    """
+
+    at: Array
+    velocity: Array
+    torque: Array
+    thrust: Array
+    largest: dict[str, object]
+
+
+def limit_use(space: PathSpace, motion: TimedCurve, postures: Array, limits: ActuatorLimits) -> LimitUse:
+    """Return the shares of the limits along a motion with its postures on the constraints, shape (n, nq).
+
+    Forces of feet and of more than six rotors are not determined: those count whose largest share is least.
+    """
+    robot, count = space.problem.robot, len(motion.t)
+    # A floating robot takes a linear program an instant.  Where it bends most, it may need most.
+    even = [round(k) for k in np.linspace(0, count - 1, INSTANTS)]
+    bent = np.argsort(-np.abs(motion.a).max(axis=1), kind="stable")[:INSTANTS].tolist()
+    every = sorted({*even, *bent}) if robot.floating else list(range(count))
+    shares = np.full((len(every), len(limits.names)), np.nan)
+    for row, k in enumerate([] if limits.missing else every):
+        found = limits.shares(postures[k], limits.load(postures[k], motion.v[k], motion.a[k]))
+        shares[row] = np.nan if found is None else found
+    groups = {"velocity": (np.abs(motion.v[every]) / space.problem.robot.velocity_limits, robot.tangent_names)}
+    for kind in ("torque", "thrust"):
+        own = [k for k, other in enumerate(limits.kinds) if other == kind]
+        groups[kind] = np.abs(shares[:, own]), tuple(limits.names[k] for k in own)
+    largest: dict[str, object] = {}
+    sizes: dict[str, float] = {}
+    for name, (used, names) in groups.items():
+        known = bool(np.isfinite(used).any())
+        place = int(np.nanargmax(used)) % used.shape[1] if known else 0
+        sizes[name] = float(np.nanmax(used)) if known else 0.0
+        largest |= {name: sizes[name] if known else None, f"{name}_of": names[place] if known else None}
+    most = max(sizes, key=lambda name: sizes[name])
+    standing = bool(space.problem.objective.supports) and not motion.notes
+    largest["active"] = most if sizes[most] > _ACTIVE else "friction" if standing else None
+    velocity, torque, thrust = (
+        used.max(axis=1) if used.shape[1] else np.full(len(every), np.nan) for used, _ in groups.values()
+    )
+    return LimitUse(motion.t[every], velocity, torque, thrust, largest)
+
+
+def _law(tau: Array) -> tuple[Array, Array, Array]:
+    """Return ``s(τ)`` and its two derivatives: at rest without acceleration at both ends."""
+    return (
+        tau**3 * (10 - 15 * tau + 6 * tau**2),
+        30 * tau**2 * (1 - tau) ** 2,
+        60 * tau * (1 - tau) * (1 - 2 * tau),
+    )
+
+
+def _rates(curve: PathCurve, tau: float) -> tuple[Array, Array, Array]:
+    """Return posture, velocity and acceleration of the motion that takes 1 s."""
+    s, ds, dds = (float(x) for x in _law(np.array(tau)))
+    v = curve.velocity(s)
+    return curve.posture(s), v * ds, curve.acceleration(s) * ds**2 + v * dds

@@ -1,0 +1,1 @@
+"""Verdict, caveats, trade-off, robustness and the result document."""

@@ -1,0 +1,105 @@
+"""Notes and warnings about an optimal posture that its numbers alone do not show."""
+
+from __future__ import annotations
+
+from impact_posture.dynamics.numeric import Numeric
+from impact_posture.impact.impact_contact import point_on
+from impact_posture.posture.formulation.problem_file import Prepared
+from impact_posture.posture.loads.actuator_loads import Holding
+from impact_posture.system.arrays import Array
+
+# Share of the approach speed that three digits do not show.
+_REACHED = 5e-3
+# A joint further than this behind a surface gets a warning, meters.
+_BEHIND = 0.01
+
+
+def caveats(
+    prepared: Prepared, initial: Array, q: Array, holding: Holding | None, attainable: float | None
+) -> list[str]:
+    """Return warnings about holding, approach, surface and ground, for the initial and the optimal posture.
+
+    Args:
+        prepared: The problem.
+        initial: Initial posture, shape (nq,).
+        q: Optimal posture, shape (nq,).
+        holding: What holds the optimal posture, if it is known.
+        attainable: Speed at which the joints can arrive in it, m/s, if it is bounded.
+    """
+    verb = "hold" if prepared.impact.robot.spec.propulsion is None else "hover in"
+    loads = holding.violations() if holding else []
+    held = [f"the robot cannot {verb} the optimal posture: {violation}" for violation in loads]
+    demanded = prepared.problem.requirements.approach_speed > 0
+    if attainable is not None and attainable < (1 - _REACHED) * prepared.impact.speed and not demanded:
+        held.append(
+            f"the joints can bring the contact to the surface at no more than {attainable:.3g} m/s in the optimal "
+            f"posture, not at {prepared.impact.speed:g} m/s: add `approach=True`, or give the `speed` that is meant"
+        )
+    around = prepared.problem.surroundings
+    if around is not None and around.shapes.bodies:
+        return held
+    return [*held, *_surface_warnings(prepared, initial, q), *_ground_warnings(prepared, q)]
+
+
+def _surface_warnings(prepared: Prepared, initial: Array, q: Array) -> list[str]:
+    """Links whose origin lies behind the plane of the contact; no constraint keeps them on the side of the normal.
+
+    A push (a free contact pose) has no surface.
+    """
+    if prepared.problem.requirements.contact_pose == "free":
+        return []
+    before, after = (_joints_behind(prepared, posture) for posture in (initial, q))
+    lines = []
+    if before:
+        lines.append(
+            f"the initial posture has {_named(before)} behind the surface: the normal points out of it, "
+            "towards the robot; check its sign"
+        )
+    new = [name for name in after if name not in before]
+    if new:
+        lines.append(
+            f"the optimal posture brings {_named(new)} behind the plane of the surface: it is not kept out of it; "
+            "bound the base or the joints if the surface reaches that far"
+        )
+    return lines
+
+
+def _joints_behind(prepared: Prepared, q: Array) -> list[str]:
+    """Joints whose origin lies behind the plane of the contact, except the joint of the link that touches."""
+    oracle = prepared.impact.objective.oracle.at(q)
+    contact = oracle.numeric.placement(oracle.point).translation
+    n, touching = oracle.n.copy(), oracle.point.joint
+    return [
+        name
+        for joint, name, origin in _origins(prepared, oracle.numeric)
+        if joint != touching and n @ (origin - contact) < -_BEHIND
+    ]
+
+
+def _ground_warnings(prepared: Prepared, q: Array) -> list[str]:
+    """Joints below the lowest foot, where level ground would be; no constraint keeps them above it."""
+    robot, supports = prepared.impact.robot, prepared.impact.supports
+    if not supports:
+        return []
+    numeric = Numeric(robot.model).at(q)
+    ground = min(numeric.placement(point_on(robot, s.frame, s.offset)).translation[2] for s in supports)
+    below = [name for _, name, origin in _origins(prepared, numeric) if origin[2] < ground - _BEHIND]
+    if not below:
+        return []
+    return [
+        f"the optimal posture has {_named(below)} below the lowest foot: nothing keeps them above the ground; narrow "
+        "their limits (robot.toml [limits.position]) or stay nearer with `regularization`"
+    ]
+
+
+def _origins(prepared: Prepared, numeric: Numeric) -> list[tuple[int, str, Array]]:
+    """Index, name and world origin of every joint at the posture of ``numeric``."""
+    model = prepared.impact.robot.model
+    return [
+        (i, "the base" if model.names[i] == "root_joint" else str(model.names[i]), numeric.data.oMi[i].translation)
+        for i in range(1, model.njoints)
+    ]
+
+
+def _named(names: list[str]) -> str:
+    return ", ".join(names[:3]) + (f" and {len(names) - 3} more joints" if len(names) > 3 else "")

@@ -1,0 +1,276 @@
+"""The Pareto front of objective and distance from the initial posture, or of objective and peak force.
+
+::
+
+    f(d) = min over q  objective(q)    subject to the problem's constraints and price(q) ≤ d
+
+for a series of prices d from the least to that of the optimum.  The price is the distance ‖q ⊖ q₀‖ of
+:func:`~impact_posture.posture.constraints.posture_distance.distance_squared`, or the peak force of the impact.  It
+is a bound and
+not a penalty, because the minimizers of ``objective + w·price`` reach the convex hull of the curve only.
+
+One program, with the price as the bound of a row, is solved along two paths: outward from the posture at the least
+price and inward from the optimum.  Each solve starts at the end of the previous solve, with its multipliers if this
+end is within the bound.  The best certified end at
+each price counts.  If the end at the next price was found on another path, that path is tried here as well.  So the
+curve is the lower envelope of the paths.  It falls only because better postures were found.
+"""
+
+from __future__ import annotations
+
+import time
+from dataclasses import dataclass, replace
+from itertools import pairwise
+
+import numpy as np
+
+from impact_posture.errors import InputError, MetricError
+from impact_posture.impact.elasticity.contact_compression import ContactStiffness
+from impact_posture.posture.analysis.price_rulers import DistanceRuler, ForceRuler, Ruler
+from impact_posture.posture.analysis.trade_off import TradeOff, TradePoint, find_knee
+from impact_posture.posture.program.certificate import Certificate, certify
+from impact_posture.posture.program.compiled_solver import CompileMode
+from impact_posture.posture.program.constrained_problem import ConstrainedProblem
+from impact_posture.posture.program.posture_nlp import PostureNLP, WarmStart, build_nlp
+from impact_posture.posture.search.multistart import PostureSolution, solve
+from impact_posture.posture.search.solver_runs import Progress, run_start
+from impact_posture.system.arrays import Array
+
+# A move below this (rad, m) is zero.
+_STILL = 1e-6
+# A posture is better only by more than this share of the initial objective.
+_EQUAL = 1e-9
+# A rise of the curve above this share of the initial objective is reported.
+_RISE = 1e-6
+# Number of other optima with a path of their own, and rounds of trying the paths of neighbors.
+_PATHS, _ROUNDS = 3, 3
+# Most times that the program of one point grows.
+_GROWTH = 8
+# Starts of the search for the posture with the least force.
+_FORCE_STARTS = 8
+
+
+def pareto_front(
+    solution: PostureSolution,
+    points: int = 16,
+    *,
+    force: tuple[ContactStiffness, float] | None = None,
+    compile: CompileMode = "auto",
+    progress: Progress | None = None,
+) -> TradeOff:
+    """Follow the curve in ``points`` equal steps from the least price to that of the optimum.
+
+    The regularization is left out, because it is a price on the distance that is bounded here.
+
+    Args:
+        solution: The solved problem.
+        points: Number of steps.
+        force: Contact and approach speed (m/s) whose peak force is the price; ``None`` for the distance.
+        compile: Whether to compile the program.
+        progress: Called with the solves done and planned.
+
+    Raises:
+        InputError: The number of points is below 1, or there are several contacts whose forces would compete.
+    """
+    if points < 1:
+        raise InputError(f"the number of points is {points}", where="tradeoff", hint="give 1 or more")
+    problem = solution.problem
+    ruler = _ruler(solution, force, compile)
+    least, most = ruler.measure(ruler.nearest), ruler.measure(solution.q)
+    bounded = _bounded(problem, ruler)
+    if most - least < _STILL * max(1.0, least):
+        curve = _Curve(bounded, None, ruler, [least])
+        return curve.finish(solution, 0.0, 0.0, [f"trade-off: {ruler.nothing}, nothing to trade"])
+    nlp = build_nlp(bounded, compile=compile, starts=2 * points)
+    began = time.perf_counter()
+    levels = [float(v) for v in least + (most - least) * np.arange(points + 1) / points]
+    curve = _Curve(bounded, nlp, ruler, levels, compile)
+    curve.follow(solution, progress)
+    return curve.finish(solution, time.perf_counter() - began, nlp.build_time_s, [])
+
+
+def _ruler(solution: PostureSolution, force: tuple[ContactStiffness, float] | None, compile: CompileMode) -> Ruler:
+    problem = solution.problem
+    if force is None:
+        return DistanceRuler(problem.robot.model, solution.initial)
+    objective, (contact, speed) = problem.impact, force
+    if objective.others:
+        raise InputError(
+            "is of one contact, and there are several", where="tradeoff_against", hint="give one `contact`"
+        )
+    # E = 1/(2G), and the force falls as G rises.
+    lightest = replace(objective, kind="energy", normal_cone_deg=0.0, model_variants=())
+    found = solve(replace(problem, objective=lightest), starts=_FORCE_STARTS, compile=compile, guesses=[solution.q])
+    return ForceRuler(objective, contact, speed, found.q)
+
+
+def _bounded(problem: ConstrainedProblem, ruler: Ruler) -> ConstrainedProblem:
+    """The problem with the bound as its last constraint, and without its regularization."""
+    row = ruler.bound(1.0)
+    return replace(
+        problem,
+        requirements=replace(problem.requirements, regularization=0.0),
+        constraints=(*problem.constraints, row),
+        rows=(*problem.rows, (0,)) if problem.rows else (),
+    )
+
+
+@dataclass(frozen=True, eq=False)
+class _Found:
+    """The end of a solve: the path on which it was found, and the point."""
+
+    path: str
+    point: TradePoint
+
+    @property
+    def rank(self) -> tuple[bool, float]:
+        """Sort key: certified points first, then by objective."""
+        return not self.point.certified, self.point.objective
+
+
+class _Curve:
+    """The curve during the search."""
+
+    def __init__(
+        self,
+        problem: ConstrainedProblem,
+        nlp: PostureNLP | None,
+        ruler: Ruler,
+        levels: list[float],
+        compile: CompileMode = "auto",
+    ) -> None:
+        self._problem, self._nlp, self._ruler, self._levels, self._compile = problem, nlp, ruler, levels, compile
+        self._scale = problem.objective.value(ruler.nearest)
+        self._best: list[_Found | None] = [None] * len(levels)
+        self._tried: set[tuple[int, bytes]] = set()
+        # Ends of solves by their postures.
+        self._ends: dict[bytes, WarmStart] = {}
+        self.solves = 0
+        self._take(0, "outward", ruler.nearest)
+
+    def follow(self, solution: PostureSolution, progress: Progress | None) -> None:
+        """Solve outward from the least price, and inward from the optimum and from cheaper optima."""
+        last = len(self._levels) - 1
+        planned = 2 * last
+        self._take(last, "inward", solution.q)
+        paths = [("inward", last, solution.q)]
+        for number, optimum in enumerate(solution.optima[1 : 1 + _PATHS]):
+            price = self._ruler.measure(optimum.q)
+            if price <= self._levels[last]:
+                k = int(np.searchsorted(self._levels, price))
+                paths.append((f"optimum {number}", k, optimum.q))
+                self._take(k, paths[-1][0], optimum.q)
+                planned += k - 1
+
+        def step() -> None:
+            if progress:
+                progress(min(self.solves, planned), planned)
+
+        for path, k, q in paths:
+            for inner in range(k - 1, 0, -1):
+                q = self._solve(inner, path, q)
+                step()
+        q = self._ruler.nearest
+        for k in range(1, last + 1):
+            q = self._solve(k, "outward", q)
+            step()
+        for _ in range(_ROUNDS):
+            if not (self._try_neighbors(range(1, last + 1), -1) | self._try_neighbors(range(last - 1, 0, -1), +1)):
+                break
+
+    def _try_neighbors(self, order: range, neighbor: int) -> bool:
+        """Try the path of each neighbor if it differs or does better; return whether a point improved."""
+        better = False
+        for k in order:
+            own, other = self._best[k], self._best[k + neighbor]
+            if other is None:
+                continue
+            rises = own is not None and neighbor < 0 and other.point.objective < own.point.objective
+            if own is None or own.path != other.path or rises:
+                self._solve(k, other.path, other.point.q)
+                better |= self._best[k] is not own
+        return better
+
+    def _solve(self, k: int, path: str, start: Array) -> Array:
+        """Solve within level ``k``, from ``start`` or from a posture nearby that is within it."""
+        level = self._levels[k]
+        key = (k, start.tobytes())
+        if self._nlp is None or key in self._tried:
+            return start
+        self._tried.add(key)
+        start = self._ruler.within(start, level)
+        try:
+            for _ in range(_GROWTH):
+                nlp, warm = self._nlp.bounded(self._at(level)), self._ends.get(start.tobytes())
+                first = nlp.solve(start, scale=self._scale, warm=warm)
+                record, certificate = run_start(nlp, start, self._scale, first=first)
+                self._ends[record.q.tobytes()] = record.end
+                grown = self._problem.grown([record.q], auxiliaries=[record.auxiliaries])
+                if grown is self._problem:
+                    break
+                self._problem, self._nlp = grown, self._nlp.grown(grown, compile=self._compile)
+                start = record.q
+            self._take(k, path, record.q, certificate)
+        except MetricError:
+            # This path led to a posture where the objective does not exist.
+            return start
+        finally:
+            self.solves += 1
+        return record.q if certificate.holds() else start
+
+    def _at(self, level: float) -> ConstrainedProblem:
+        bound = self._ruler.bound(level)
+        return replace(self._problem, constraints=(*self._problem.constraints[:-1], bound))
+
+    def _take(self, k: int, path: str, q: Array, certificate: Certificate | None = None) -> None:
+        """Keep a posture if it satisfies the constraints and is the best within level ``k``."""
+        found = _Found(path, self._point(k, q, certificate))
+        feasible = replace(found.point.certificate, stationarity=0.0, complementarity=0.0).holds()
+        own = self._best[k]
+        margin = _EQUAL * self._scale
+        if feasible and (own is None or (found.rank[0], found.rank[1] + margin) < own.rank):
+            self._best[k] = found
+
+    def _point(self, k: int, q: Array, certificate: Certificate | None = None) -> TradePoint:
+        problem = self._at(self._levels[k])
+        found = problem.impact.oracle.quantities(q)
+        return TradePoint(
+            within=self._levels[k],
+            distance=self._ruler.measure(q),
+            q=q,
+            objective=problem.objective.value(q),
+            H=found.H,
+            G=found.G,
+            V=found.V,
+            S=found.S,
+            certificate=certificate or certify(problem, q, self._scale),
+            first=k == 0,
+        )
+
+    def finish(self, solution: PostureSolution, solve: float, build: float, notes: list[str]) -> TradeOff:
+        """Return the curve as it is now."""
+        points: list[TradePoint] = []
+        for k, found in enumerate(self._best):
+            # If no solve ended on the constraints, the posture of the previous level satisfies them.
+            before = points[-1].q if points else self._ruler.nearest
+            points.append(self._point(k, before) if found is None else found.point)
+        best = solution.problem.objective.value(solution.q)
+        open_ = [f"{p.within:.3g}" for p in points if not p.certified]
+        if open_:
+            notes.append(
+                f"trade-off: {len(open_)} of {len(points)} points are not certified, within {', '.join(open_)}"
+            )
+        risen = [b for a, b in pairwise(points) if b.objective > a.objective + _RISE * self._scale]
+        if risen:
+            notes.append(
+                f"trade-off: within {', '.join(f'{p.within:.3g}' for p in risen)} a worse posture was found than "
+                "within less: it is not the best there"
+            )
+        lowest = min(p.objective for p in points)
+        if lowest < best - _RISE * self._scale and not solution.problem.requirements.regularization:
+            notes.append(
+                f"trade-off: it found a better posture ({lowest:.4g}) than the starts did ({best:.4g}); "
+                "more `starts` may find it, too"
+            )
+        knee = find_knee(np.array([p.distance for p in points]), np.array([p.objective for p in points]))
+        return TradeOff(tuple(points), knee, self.solves, solve, build, tuple(notes), self._ruler.against)

@@ -1,0 +1,74 @@
+"""What a trade-off bounds: the distance from the initial posture, or the peak force of the impact."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+
+import numpy as np
+import pinocchio as pin
+
+from impact_posture.config.settings import Against
+from impact_posture.dynamics.chart import Chart
+from impact_posture.impact.elasticity.contact_compression import ContactStiffness
+from impact_posture.impact.worst_case_objective import WorstCaseObjective
+from impact_posture.posture.constraints.constraint import Constraint
+from impact_posture.posture.constraints.impact_bounds import ImpactBounds
+from impact_posture.posture.constraints.posture_distance import WithinDistance, distance
+from impact_posture.system.arrays import Array
+
+
+@dataclass(frozen=True, eq=False)
+class DistanceRuler:
+    """The distance from the initial posture, rad mixed with m.
+
+    Attributes:
+        model: The robot.
+        nearest: The posture at the least price, shape (nq,).
+        against: Name of the price in options and files.
+        nothing: What to say if the optimum has the least price.
+    """
+
+    model: pin.Model
+    nearest: Array
+    against: Against = "distance"
+    nothing: str = "the optimum is the initial posture"
+
+    def measure(self, q: Array) -> float:
+        """Return the price of ``q``."""
+        return distance(Chart(self.model), q, self.nearest)
+
+    def bound(self, level: float) -> Constraint:
+        """Return the constraint that the price is at most ``level``; one program serves all levels."""
+        return WithinDistance(Chart(self.model), self.nearest, level)
+
+    def within(self, q: Array, level: float) -> Array:
+        """Return a start for the program with this bound, from a posture that may exceed it."""
+        away = self.measure(q)
+        return q if away <= level else np.array(pin.interpolate(self.model, self.nearest, q, level / away))
+
+
+@dataclass(frozen=True, eq=False)
+class ForceRuler:
+    """The peak force of the impact without friction, N, which falls as G rises."""
+
+    objective: WorstCaseObjective
+    contact: ContactStiffness
+    speed: float
+    nearest: Array
+    against: Against = "force"
+    nothing: str = "the optimum has the least force"
+
+    def measure(self, q: Array) -> float:
+        """See :class:`DistanceRuler`."""
+        return self.contact.peak_force(self.objective.oracle.quantities(q).G, self.speed)
+
+    def bound(self, level: float) -> Constraint:
+        """See :class:`DistanceRuler`."""
+        return ImpactBounds(self.objective, self.contact.least_mobility(level, self.speed), float("inf"))
+
+    def within(self, q: Array, level: float) -> Array:
+        """See :class:`DistanceRuler`."""
+        return q
+
+
+Ruler = DistanceRuler | ForceRuler

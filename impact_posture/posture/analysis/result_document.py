@@ -1,0 +1,138 @@
+"""The result of an optimization as the document ``result.json`` and as arrays."""
+
+from __future__ import annotations
+
+import platform
+from functools import cache
+from importlib import metadata
+from typing import Any
+
+import casadi as ca
+import numpy as np
+import pinocchio as pin
+from numpy.typing import NDArray
+
+from impact_posture.config.toml_tables import json_block
+from impact_posture.impact.evaluation.evaluation import Evaluation
+from impact_posture.posture.analysis.caveats import caveats
+from impact_posture.posture.analysis.robustness import Robustness
+from impact_posture.posture.analysis.trade_off import TradeOff
+from impact_posture.posture.analysis.verdict import verdict
+from impact_posture.posture.approach.attainable_speed import AttainableSpeed
+from impact_posture.posture.formulation.problem_file import Prepared
+from impact_posture.posture.loads.load_cases import load_cases
+from impact_posture.posture.manifold.null_space_path import NullSpacePath
+from impact_posture.posture.search.global_search import GlobalSearch, SelfMotionMap
+from impact_posture.posture.search.multistart import PostureSolution
+from impact_posture.version import __version__
+
+SCHEMA = "impact-posture/result/1"
+
+# Attributes of a solution in the block ``solver``.
+_SOLVER = (
+    "status", "iterations", "solve_time_s", "build_time_s", "compiled",
+    "starts", "feasible_starts", "certified_starts", "colliding_starts", "dominated_starts",
+)  # fmt: skip
+
+
+def evaluations(prepared: Prepared, solution: PostureSolution) -> tuple[Evaluation, Evaluation]:
+    """Evaluate the impact at the initial (feasible) and at the optimal posture."""
+    impact = prepared.impact
+    return impact.evaluate(solution.initial), impact.evaluate(solution.q)
+
+
+def result_document(
+    prepared: Prepared,
+    solution: PostureSolution,
+    robustness: Robustness | None = None,
+    tradeoff: TradeOff | None = None,
+    path: dict[str, object] | None = None,
+    global_search: GlobalSearch | None = None,
+) -> dict[str, object]:
+    """Return the content of ``result.json``; the last four arguments are keys only if they are given."""
+    initial, optimal = evaluations(prepared, solution)
+    impact, around = prepared.impact, prepared.problem.surroundings
+    loads = load_cases(impact.objective, solution.initial, prepared.problem.requirements)
+    before, after = (loads.holding(q) for q in (solution.initial, solution.q))
+    approach = AttainableSpeed(impact.robot, impact.objective, prepared.problem.requirements)
+    attainable = [approach.reached(q) for q in (solution.initial, solution.q)]
+    fault = [solution.compiler_fault] if solution.compiler_fault else []
+    found = caveats(prepared, solution.initial, solution.q, after, attainable[1])
+    warnings = (*impact.warnings, *initial.warnings, *optimal.warnings, *fault, *found)
+    curve = {} if tradeoff is None else {"tradeoff": tradeoff.to_list(), "tradeoff_against": tradeoff.against}
+    return {
+        "schema": SCHEMA,
+        "verdict": verdict(impact, initial, optimal).to_dict(),
+        **impact.to_dict(solution.initial),
+        "constraints": prepared.problem.describe(),
+        "initial": {
+            "given_q": prepared.problem.given.tolist(),
+            "moved": solution.moved,
+            **initial.to_dict(),
+            "holding": before and before.to_dict(),
+            "attainable_speed": attainable[0],
+        },
+        "optimal": {
+            **optimal.to_dict(),
+            "holding": after and after.to_dict(),
+            "attainable_speed": attainable[1],
+        },
+        "reduction": solution.reduction,
+        **({} if robustness is None else {"robustness": robustness.to_dict()}),
+        "redundancy": solution.redundancy,
+        "certificate": solution.certificate.to_dict(),
+        **({"collision": around.to_dict(solution.initial, solution.q)} if around and around.constraints else {}),
+        "active": [json_block(active) for active in solution.certificate.active],
+        "solver": {
+            **{key: getattr(solution, key) for key in _SOLVER},
+            "seed": prepared.settings.seed,
+            "optima": [json_block(optimum) for optimum in solution.optima],
+        },
+        **({} if global_search is None else {"global": global_search.to_dict()}),
+        **curve,
+        **({} if path is None else {"path": path}),
+        "notes": [*filter(None, [impact.choice]), *solution.notes, *(tradeoff.notes if tradeoff else ())],
+        "warnings": list(dict.fromkeys(warnings)),
+        "versions": versions(),
+    }
+
+
+def versions() -> dict[str, str]:
+    """Return the versions of all software that a result depends on."""
+    found = {"impact-posture": __version__, "python": platform.python_version()}
+    found |= {"casadi": ca.CasadiMeta.version(), "pinocchio": pin.__version__, "numpy": np.__version__}
+    data = _version_of("example-robot-data")
+    return found | ({} if data is None else {"example-robot-data": data})
+
+
+@cache
+def _version_of(package: str) -> str | None:
+    """Return the version of an installed package, which takes milliseconds to find."""
+    try:
+        return metadata.version(package)
+    except metadata.PackageNotFoundError:
+        return None
+
+
+def result_arrays(
+    solution: PostureSolution,
+    path: NullSpacePath,
+    tradeoff: TradeOff | None = None,
+    mapped: SelfMotionMap | None = None,
+) -> dict[str, NDArray[Any]]:
+    """Return the content of ``result.npz``: postures, ellipsoids, jumps, path, trade-off and self-motion map."""
+    oracle = solution.problem.impact.oracle
+    arrays: dict[str, NDArray[Any]] = {}
+    for name, q in (("initial", solution.initial), ("optimal", solution.q)):
+        found = oracle.quantities(q)
+        arrays |= {
+            f"{name}_q": q,
+            f"{name}_jump": found.jump,
+            f"{name}_ellipsoid": found.ellipsoid,
+            f"{name}_mobility": found.mobility,
+            f"{name}_gradient": oracle.gradient_H(q),
+        }
+    arrays |= {f"path_{key}": getattr(path, key) for key in ("q", "s", "H", "G", "V", "S", "objective")}
+    if mapped is not None:
+        arrays |= {f"self_motion_{key}": value for key, value in vars(mapped).items()}
+    return arrays if tradeoff is None else arrays | tradeoff.arrays()

@@ -1,0 +1,227 @@
+"""Robustness against model variants: how far the optimum moves, what it costs and what it gains."""
+
+from __future__ import annotations
+
+from collections.abc import Callable, Sequence
+from dataclasses import dataclass, replace
+from functools import partial
+
+import numpy as np
+
+from impact_posture.config.toml_tables import json_block
+from impact_posture.dynamics.numeric import Numeric
+from impact_posture.errors import Infeasible, SolverFailed
+from impact_posture.impact.worst_case_objective import WorstCaseObjective
+from impact_posture.posture.formulation.build_problem import build_problem
+from impact_posture.posture.program.compiled_solver import CompileMode
+from impact_posture.posture.program.constrained_problem import ConstrainedProblem
+from impact_posture.posture.search.impact_notes import percent
+from impact_posture.posture.search.multistart import SAME_POSTURE, PostureSolution, solve, wrapped_difference
+from impact_posture.posture.search.solver_runs import Progress
+from impact_posture.robot.model_variant import between
+from impact_posture.system.arrays import Array
+
+# Number of models drawn between the variants, to check whether one is worse than all variants.
+_BETWEEN = 60
+# A share below this is an error of the solver, and a constraint within this (m, rad) is satisfied.
+_NOISE = 1e-6
+
+
+@dataclass(frozen=True, eq=False)
+class VariantOptimum:
+    """One model variant, and the best posture for it alone.
+
+    Attributes:
+        name: Name of the model variant.
+        at_robust: Its objective at the robust optimum.
+        own: Its objective at its own optimum; ``None`` if no start certified.
+        q: Its own optimum, shape (nq,), or ``None``.
+        moved: Tangent distance of its own optimum from the robust optimum, or ``None``.
+    """
+
+    name: str
+    at_robust: float
+    own: float | None
+    q: Array | None
+    moved: float | None
+
+    def to_dict(self) -> dict[str, object]:
+        """Return JSON content."""
+        keys = {"own": "own_optimum", "q": "own_q"}
+        return {keys.get(key, key): value for key, value in json_block(self).items()}
+
+
+@dataclass(frozen=True, eq=False)
+class Robustness:
+    """Comparison of the robust optimum with the optimum of the model as it stands.
+
+    Attributes:
+        model_variants: All model variants, the model as it stands first.
+        worst_robust: Worst objective over the model variants at the robust optimum.
+        worst_nominal: The same at the optimum of the model as it stands; ``None`` if that does not exist, or violates
+            a constraint for another model variant.
+        broken: The violated constraints.
+        between: Largest objective at the robust optimum among models drawn between the model variants.
+        drawn: Number of drawn models.
+    """
+
+    model_variants: tuple[VariantOptimum, ...]
+    worst_robust: float
+    worst_nominal: float | None
+    broken: tuple[str, ...]
+    between: float
+    drawn: int
+
+    @property
+    def moved(self) -> float | None:
+        """Distance of the robust optimum from that of the model as it stands, tangent norm."""
+        return self.model_variants[0].moved
+
+    @property
+    def price(self) -> float | None:
+        """Share by which the objective of the model as it stands is above its own optimum."""
+        own = self.model_variants[0].own
+        return None if own is None else self.model_variants[0].at_robust / own - 1
+
+    @property
+    def gain(self) -> float | None:
+        """Share by which the worst case is below that at the optimum of the model as it stands."""
+        return None if self.worst_nominal is None else 1 - self.worst_robust / self.worst_nominal
+
+    @property
+    def line(self) -> str:
+        """The finding in words."""
+        if self.moved is None or self.price is None:
+            return "the model as it stands has no certified optimum of its own to compare with"
+        parts = [f"the optimum moves by {self.moved:.3g} rad (m)"]
+        here = "at the optimum of the model as it stands"
+        if self.gain is None:
+            parts.append(f"the optimum of the model as it stands breaks {', '.join(self.broken)}")
+        elif self.gain < -_NOISE:
+            parts.append(
+                f"the worst case is {percent(-self.gain)} higher than {here}: more `starts` will find a better one"
+            )
+        else:
+            parts.append(f"the worst case is {percent(max(self.gain, 0.0))} lower than {here}")
+        lower = self.price < -_NOISE
+        parts.append(
+            f"the model as it stands is {percent(abs(self.price))} {'below' if lower else 'above'} its own optimum"
+        )
+        if self.between > self.worst_robust * (1 + _NOISE):
+            parts.append(f"between the model variants it reaches {self.between:.4g}, above the worst of them")
+        return "; ".join(parts)
+
+    def to_dict(self) -> dict[str, object]:
+        """Return the ``robustness`` block of ``result.json``."""
+        keys = ("moved", "price", "gain", "worst_robust", "worst_nominal", "line")
+        return {key: getattr(self, key) for key in keys} | {
+            "broken": list(self.broken),
+            "between": {"drawn": self.drawn, "largest": self.between},
+            "scenarios": [variant.to_dict() for variant in self.model_variants],
+        }
+
+
+@dataclass(frozen=True, eq=False)
+class RobustSolution:
+    """A solution, and its robustness; ``None`` without model variants."""
+
+    solution: PostureSolution
+    robustness: Robustness | None
+
+
+def solve_robustly(
+    problem: ConstrainedProblem,
+    *,
+    starts: int = 16,
+    seed: int = 0,
+    jobs: int = 2,
+    compile: CompileMode = "auto",
+    progress: Progress | None = None,
+    finish_all: bool = False,
+) -> RobustSolution:
+    """Solve a problem; with model variants solve each variant alone first.
+
+    The optima of the variants are starts of the robust problem, besides ``starts`` other starts.
+
+    Raises:
+        Infeasible, SolverFailed: See :func:`~impact_posture.posture.search.multistart.solve`.
+    """
+    given, wanted = problem.given, problem.requirements
+    if not (isinstance(problem.objective, WorstCaseObjective) and problem.objective.model_variants):
+        found = solve(
+            problem, starts=starts, seed=seed, jobs=jobs, compile=compile, progress=progress, finish_all=finish_all
+        )
+        return RobustSolution(found, None)
+    # Build each problem anew, because support impulses and the center of mass depend on the model.
+    alone = [
+        build_problem(variant.robot, member, given, wanted)
+        for variant, member in zip(problem.impact.model_variants, problem.impact.by_variant, strict=True)
+    ]
+    total = starts * (len(alone) + 1)
+
+    def run(one: ConstrainedProblem, guesses: Sequence[Array], number: int) -> PostureSolution:
+        def advance(done: int, _: int) -> None:
+            if progress is not None:
+                progress(min(number * starts + done, total), total)
+
+        count = starts + len(guesses)
+        return solve(
+            one, starts=count, seed=seed, jobs=jobs, compile=compile, progress=advance, guesses=guesses,
+            finish_all=finish_all,
+        )  # fmt: skip
+
+    optima = [_optimum(partial(run, one, (), k)) for k, one in enumerate(alone)]
+    solution = run(
+        problem, _apart(problem, [q for q in optima if q is not None and not _broken(problem, q)]), len(alone)
+    )
+    for k, (one, q) in enumerate(zip(alone, optima, strict=True)):
+        # If the robust optimum is better for a variant than its own optimum, that one was not its best.
+        if q is None or one.objective.value(solution.q) < one.objective.value(q) * (1 - _NOISE):
+            optima[k] = _optimum(partial(run, one, (solution.q,), len(alone)))
+    return RobustSolution(solution, compare_variants(solution, optima, seed))
+
+
+def compare_variants(solution: PostureSolution, optima: Sequence[Array | None], seed: int = 0) -> Robustness:
+    """Compare the robust optimum with the optima of the variants, and with models drawn between the variants."""
+    problem, objective = solution.problem, solution.problem.impact
+    found: list[VariantOptimum] = []
+    for variant, q in zip(objective.model_variants, optima, strict=True):
+        member = replace(objective, robot=variant.robot, model_variants=())
+        own = None if q is None else member.value(q)
+        step = None if q is None else float(np.linalg.norm(wrapped_difference(problem, solution.q, q)))
+        found.append(VariantOptimum(variant.name, member.value(solution.q), own, q, step))
+    nominal = optima[0]
+    broken = () if nominal is None else tuple(_broken(problem, nominal))
+    drawn = between(objective.model_variants, _BETWEEN, seed)
+    values = [replace(objective, robot=robot, model_variants=()).value(solution.q) for robot in drawn]
+    return Robustness(
+        model_variants=tuple(found),
+        worst_robust=objective.value(solution.q),
+        worst_nominal=None if nominal is None or broken else objective.value(nominal),
+        broken=broken,
+        between=max(values),
+        drawn=len(values),
+    )
+
+
+def _apart(problem: ConstrainedProblem, postures: Sequence[Array]) -> list[Array]:
+    """The postures without those that are nearly equal to an earlier posture."""
+    found: list[Array] = []
+    for q in postures:
+        if all(np.linalg.norm(wrapped_difference(problem, one, q)) > SAME_POSTURE for one in found):
+            found.append(q)
+    return found
+
+
+def _broken(problem: ConstrainedProblem, q: Array) -> list[str]:
+    """Names of the constraints that a posture does not satisfy."""
+    violations = problem.violations(Numeric(problem.robot.model).at(q))
+    pairs = zip(problem.constraints, violations, strict=True)
+    return [constraint.name for constraint, excess in pairs if np.abs(excess).max(initial=0.0) > _NOISE]
+
+
+def _optimum(run: Callable[[], PostureSolution]) -> Array | None:
+    try:
+        return run().q
+    except (Infeasible, SolverFailed):
+        return None

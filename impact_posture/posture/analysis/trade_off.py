@@ -1,0 +1,103 @@
+"""The trade-off of objective against distance from the initial posture, or against force: its points and its knee."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass, replace
+
+import numpy as np
+
+from impact_posture.config.settings import Against
+from impact_posture.config.toml_tables import json_block
+from impact_posture.posture.program.certificate import Certificate
+from impact_posture.system.arrays import Array
+
+# Least excess of the share of the gain over the share of the distance at a knee.  A parabola, the shape around every
+# smooth optimum, reaches 1/4.
+KNEE = 1 / 3
+
+
+@dataclass(frozen=True, eq=False)
+class TradePoint:
+    """The best posture found within one bound.
+
+    Attributes:
+        within: The bound on the distance from the initial posture (rad mixed with m), or on the peak force (N).
+        distance: Distance or force of the posture, less than ``within`` if more gains nothing.
+        q: Posture, shape (nq,).
+        objective: Objective at the posture.
+        H: Squared jump per squared impulse.
+        G: Inverse effective mass, 1/kg.
+        V: Squared jump per squared approach speed.
+        S: The same if the contact sticks, ``None`` where undefined.
+        certificate: Certificate of the problem with the bound; its stationarity has no meaning at the first point.
+        first: Whether this is the one posture at the least distance or force.
+    """
+
+    within: float
+    distance: float
+    q: Array
+    objective: float
+    H: float
+    G: float
+    V: float
+    S: float | None
+    certificate: Certificate
+    first: bool = False
+
+    @property
+    def certified(self) -> bool:
+        """Whether the certificate holds; of the first point, whether the posture satisfies the constraints."""
+        found = self.certificate
+        return replace(found, stationarity=0.0, complementarity=0.0).holds() if self.first else found.holds()
+
+    def to_dict(self) -> dict[str, object]:
+        """Return JSON content."""
+        finite = self.V if np.isfinite(self.V) else None
+        values = json_block(self) | {"V": finite, "certified": self.certified}
+        return {key: value for key, value in values.items() if key not in ("certificate", "first")}
+
+
+@dataclass(frozen=True, eq=False)
+class TradeOff:
+    """The best objective within each distance from the initial posture, or within each peak force.
+
+    Attributes:
+        points: Points by distance or force, the posture with the least first.
+        knee: Index of the point at the knee (:func:`find_knee`), or ``None``.
+        solves: Runs of the solver.
+        solve_time_s: Wall time of these runs.
+        build_time_s: Time to build the program.
+        notes: Notes for the user about the curve.
+        against: What the points bound.
+    """
+
+    points: tuple[TradePoint, ...]
+    knee: int | None
+    solves: int
+    solve_time_s: float
+    build_time_s: float
+    notes: tuple[str, ...]
+    against: Against = "distance"
+
+    def to_list(self) -> list[dict[str, object]]:
+        """Return the ``tradeoff`` block of ``result.json``."""
+        return [{**point.to_dict(), "knee": k == self.knee} for k, point in enumerate(self.points)]
+
+    def arrays(self) -> dict[str, Array]:
+        """Return entries of ``result.npz``: ``tradeoff_q`` (k, nq) and arrays (k,), with NaN for a missing S."""
+        names = ("within", "distance", "objective", "H", "G", "V", "q", "certified")
+        found = {f"tradeoff_{name}": np.array([getattr(p, name) for p in self.points]) for name in names}
+        return found | {"tradeoff_S": np.array([np.nan if p.S is None else p.S for p in self.points])}
+
+
+def find_knee(distances: Array, objectives: Array) -> int | None:
+    """Return the point whose share of the gain exceeds its share of the distance most.
+
+    It is ``None`` if the excess is below :data:`KNEE`, or if there is no gain.
+    """
+    far, gain = distances[-1] - distances[0], objectives[0] - objectives[-1]
+    if not (far > 0 and gain > 0):
+        return None
+    excess = (objectives[0] - objectives) / gain - (distances - distances[0]) / far
+    best = int(np.argmax(excess))
+    return best if excess[best] >= KNEE else None

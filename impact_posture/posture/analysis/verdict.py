@@ -1,0 +1,208 @@
+"""The verdict on an optimal posture: what happens to jump, impulse and force at the stated speed, in words."""
+
+from __future__ import annotations
+
+from collections.abc import Iterator
+from dataclasses import dataclass
+from math import sqrt
+from typing import Literal
+
+from impact_posture.config.toml_tables import json_block
+from impact_posture.impact.elasticity.contact_compression import both_models
+from impact_posture.impact.evaluation.coulomb_jump import CoulombJump, coulomb_jump
+from impact_posture.impact.evaluation.evaluation import Evaluation
+from impact_posture.impact.evaluation.velocity_jump import Jump
+from impact_posture.impact.resolved_impact import ResolvedImpact
+
+Outcome = Literal[
+    "better", "better at the price of force", "better at the price of impulse", "no better", "worse", "unknown"
+]
+
+# A change below this share is none.
+_SAME = 0.01
+
+
+@dataclass(frozen=True)
+class PredictedImpact:
+    """What the impact at the stated approach speed does in a posture.
+
+    Attributes:
+        jump: ``‖Δν‖_W``.
+        impulse: Size of the impulse, N·s; that of the first contact where several come at once.
+        peak_force: Peak force without friction, N; ``None`` where no contact is stated or several come at once.
+        sticks: Whether the contact point sticks, the first one of several; ``None`` for a jump without friction.
+    """
+
+    jump: float
+    impulse: float
+    peak_force: float | None
+    sticks: bool | None
+
+    def to_dict(self) -> dict[str, object]:
+        """Return JSON content."""
+        return json_block(self)
+
+
+@dataclass(frozen=True)
+class Verdict:
+    """What the optimal posture changes at the stated approach speed, with the stated friction.
+
+    Attributes:
+        outcome: The verdict in a few words.
+        line: The verdict in a sentence.
+        jump: Relative change of ``‖Δν‖_W``; ``None`` where it is not known.
+        impulse: Relative change of the size of the impulse.
+        peak_force: Relative change of the peak force without friction.
+        advice: The jump without friction, what would do better, or which joint model fits; one line each.
+        before: The impact in the initial posture; ``None`` where it is not known.
+        after: The impact in the optimal posture.
+        assumptions: What the numbers assume, one line each.
+    """
+
+    outcome: Outcome
+    line: str
+    jump: float | None
+    impulse: float | None
+    peak_force: float | None
+    advice: tuple[str, ...]
+    before: PredictedImpact | None = None
+    after: PredictedImpact | None = None
+    assumptions: tuple[str, ...] = ()
+
+    def to_dict(self) -> dict[str, object]:
+        """Return JSON content."""
+        return json_block(self)
+
+
+def verdict(impact: ResolvedImpact, before: Evaluation, after: Evaluation) -> Verdict:
+    """Compare the predicted jumps of the initial and the optimal posture.
+
+    The jump is that with the friction of the contact.  The peak force is that of the stated contact, or that of a
+    linear contact of any stiffness, ``F ∝ √m``.  Of several contacts, the jump is that of all at once, or that of the
+    first contact alone where the former is not known at both postures.
+    """
+    together = bool(before.together and after.together)
+    pair = _jump(before, together), _jump(after, together)
+    if impact.speed <= 0 or pair[0] is None or pair[1] is None:
+        why = "there is no approach speed" if impact.speed <= 0 else "the contact cannot move along the normal"
+        return Verdict("unknown", f"no verdict: {why}.", None, None, None, ())
+    jump, impulse = _change(pair[0].norm, pair[1].norm), _change(pair[0].impulse_size, pair[1].impulse_size)
+    force = _force_change(before, after)
+    outcome: Outcome = "better at the price of impulse" if impulse > _SAME else "better"
+    if (force or 0.0) > _SAME:
+        outcome = "better at the price of force"
+    if jump > _SAME:
+        outcome = "worse"
+    elif jump > -_SAME:
+        outcome = "no better"
+    parts = [f"the jump {_words(jump)} ({pair[0].norm:.3g} to {pair[1].norm:.3g}{_slip(pair[1])})"]
+    where = f" at {impact.contact.frame}" if together else ""
+    parts.append(
+        f"the impulse{where} {_words(impulse)} ({pair[0].impulse_size:.3g} to {pair[1].impulse_size:.3g} N·s)"
+    )
+    if force is not None:
+        parts.append(f"the peak force {_words(force)}{_newtons(before, after)}")
+    contact = f"with friction {impact.contact.friction:g}" if isinstance(pair[1], CoulombJump) else "without friction"
+    if impact.objective.others:
+        contact += ", all contacts at once," if together else f", at {impact.contact.frame} alone,"
+    line = f"verdict: {outcome}. At {impact.speed:g} m/s {contact} {', '.join(parts[:-1])} and {parts[-1]}."
+    advice = (
+        *_without_friction(before, after, jump),
+        *_better_objective(impact, outcome, (pair[0], pair[1])),
+        *_other_joint_model(impact, before, after),
+    )
+    sides = _predicted(before, pair[0]), _predicted(after, pair[1])
+    assumptions = _assumptions(impact, pair[1], together, force)
+    return Verdict(outcome, line, jump, impulse, force, advice, *sides, assumptions)
+
+
+def _predicted(found: Evaluation, jump: Jump) -> PredictedImpact:
+    # The force of several contacts at once is not known.
+    peak = None if found.contacts or found.compression is None else found.compression.peak_force
+    return PredictedImpact(jump.norm, jump.impulse_size, peak, jump.sticks if isinstance(jump, CoulombJump) else None)
+
+
+def _assumptions(impact: ResolvedImpact, jump: Jump, together: bool, force: float | None) -> tuple[str, ...]:
+    friction = f"friction {impact.contact.friction:g}" if isinstance(jump, CoulombJump) else "no friction"
+    # Of several contacts at once, the impact is plastic.
+    restitution = 0.0 if together else impact.restitution
+    stated = "the stated contact" if impact.contact_stiffness else "a linear contact, the same before and after"
+    return (
+        f"rigid impact at {impact.speed:g} m/s with restitution {restitution:g} and {friction}",
+        f"jump in the {impact.objective.metric.kind} metric, with joint model '{impact.robot.joint_model}'",
+        *(("the feet stay on the ground",) if impact.objective.supports else ()),
+        *((f"peak force of {stated}, without friction",) if force is not None else ()),
+    )
+
+
+def _jump(found: Evaluation, together: bool) -> Jump | None:
+    return found.together[0] if found.together and together else found.coulomb or found.frictionless
+
+
+def _change(before: float, after: float) -> float:
+    return after / before - 1 if before > 0 else 0.0
+
+
+def _words(change: float) -> str:
+    if abs(change) <= _SAME:
+        return "stays"
+    size = f"{100 * abs(change):.0f} %" if change < 1 else f"a factor of {1 + change:.3g}"
+    return f"{'falls' if change < 0 else 'grows'} by {size}"
+
+
+def _slip(jump: Jump) -> str:
+    return "" if not isinstance(jump, CoulombJump) else ", sticking" if jump.sticks else ", slipping"
+
+
+def _force_change(before: Evaluation, after: Evaluation) -> float | None:
+    if before.contacts or before.scalars.E is None or after.scalars.E is None:
+        return None
+    first, second = before.compression, after.compression
+    if first and second and first.peak_force is not None and second.peak_force is not None:
+        return _change(first.peak_force, second.peak_force)
+    return sqrt(before.scalars.G / after.scalars.G) - 1
+
+
+def _newtons(before: Evaluation, after: Evaluation) -> str:
+    first, second = before.compression, after.compression
+    if not (first and second) or first.peak_force is None or second.peak_force is None:
+        return " (linear contact)"
+    return f" ({first.peak_force:.3g} to {second.peak_force:.3g} N)"
+
+
+def _without_friction(before: Evaluation, after: Evaluation, jump: float) -> Iterator[str]:
+    """Say the jump without friction where it changes the other way."""
+    if before.frictionless is None or after.frictionless is None or before.contacts:
+        return
+    change = _change(before.frictionless.norm, after.frictionless.norm)
+    if abs(change) > _SAME and (change > 0) != (jump > 0):
+        yield f"without friction the jump {_words(change)}"
+
+
+def _better_objective(impact: ResolvedImpact, outcome: Outcome, jumps: tuple[Jump, Jump]) -> Iterator[str]:
+    objective = impact.objective
+    if outcome in ("worse", "no better") and objective.kind != "coulomb" and not objective.others:
+        kind = "sticking" if objective.normal_cone_deg else "coulomb"
+        # The jump with friction is that of S where the contact sticks at both postures, and that of V at friction 0.
+        slides = impact.contact.friction == 0
+        sticks = all(isinstance(jump, CoulombJump) and jump.sticks for jump in jumps)
+        same = (kind, "speed" if slides else "", "sticking" if sticks else "")
+        if objective.kind not in same and not (slides and kind == "sticking"):
+            yield f"`objective='{kind}'` minimizes this jump; '{objective.kind}' minimizes another quantity"
+    if outcome == "better at the price of force":
+        yield "`max_force` bounds the force"
+
+
+def _other_joint_model(impact: ResolvedImpact, before: Evaluation, after: Evaluation) -> Iterator[str]:
+    """Say what the joint models make of it that fit x better than the one chosen."""
+    found = after.compression
+    if found is None or found.x is None or impact.robot.joint_model in (found.fitting, "locked", "elastic"):
+        return
+    rebound = (1 + impact.restitution) * impact.speed
+    for name, objective in both_models(impact.objective).items():
+        if name == impact.robot.joint_model or found.fitting not in (None, name):
+            continue
+        jumps = [coulomb_jump(objective, one.q, rebound) for one in (before, after)]
+        if jumps[0] is not None and jumps[1] is not None:
+            change = _words(_change(jumps[0].norm, jumps[1].norm))
+            yield f"with joint model '{name}' (x = {found.x:.2g}) the jump {change}"

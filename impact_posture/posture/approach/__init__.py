@@ -1,0 +1,1 @@
+"""The speed at which the joints can bring the contact to the surface."""

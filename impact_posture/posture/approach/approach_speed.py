@@ -1,0 +1,120 @@
+"""The constraint that the joints can bring the contact to the surface at the speed of the impact."""
+
+from __future__ import annotations
+
+import hashlib
+
+import casadi as ca
+import numpy as np
+
+from impact_posture.dynamics.numeric import Numeric
+from impact_posture.dynamics.tree import Tree
+from impact_posture.errors import InputError
+from impact_posture.impact.quantities.lifted_form import Guess
+from impact_posture.posture.approach.attainable_speed import FASTEST, AttainableSpeed
+from impact_posture.posture.constraints.constraint import Constraint, LiftedRows, Linearization
+from impact_posture.system.arrays import Array
+
+# A speed that the joints lack is not a meter: where a pose cannot be held, the pose is the reason.
+_PRICE = 1e-3
+
+
+class ApproachSpeed(Constraint):
+    """``s − σ(q) ≤ 0``: the joints can bring the contact to the surface at the speed s.
+
+    In the program the velocities are unknowns, in shares of their limits.
+
+    Args:
+        attainable: The attainable speed ``σ``.
+        speed: ``s``, m/s.
+
+    Raises:
+        InputError: The joints are too few to move the contact along the normal.
+    """
+
+    price = _PRICE
+    # As for holding: starts that are pulled onto it are less diverse.
+    projected = False
+
+    def __init__(self, attainable: AttainableSpeed, speed: float) -> None:
+        self.name = f"approach at {speed:g} m/s"
+        self._attainable, self._speed, self._kept = attainable, speed, attainable.independent
+        if len(self._kept) > len(attainable.free):
+            what = f"{len(attainable.free)} joints cannot move {' and '.join(p.name for p in attainable.points)} so"
+            raise InputError(what, where="approach", hint="leave it out, or hold fewer joints and frames")
+        self._coming = [point for point in attainable.points if point.comes]
+        self.parameters = np.concatenate([[speed], *[point.axes.ravel() for point in self._coming]])
+        self.lower, self.upper = np.array([-np.inf]), np.zeros(1)
+
+    @property
+    def structure(self) -> str:
+        """See :class:`Constraint`."""
+        own = self._attainable
+        parts = [np.array([*self.parameters.shape, *self._kept]), own.free, own.scale]
+        for moved in own.points:
+            parts += [moved.point.position, moved.point.rotation, np.array([moved.point.joint, *moved.rows])]
+            parts.append(np.array([moved.comes, moved.in_frame]))
+        digest = hashlib.sha256(b"".join(np.ascontiguousarray(part).tobytes() for part in parts)).hexdigest()[:16]
+        return f"{type(self).__name__}:{digest}"
+
+    def describe(self) -> str:
+        """See :class:`Constraint`."""
+        return f"{self.name} within the velocity limits of the joints"
+
+    def evaluate(self, model: Numeric) -> tuple[Array, Array]:
+        """See :class:`Constraint`."""
+        found = self._attainable.at(model)
+        # Where nothing bounds it, twice the speed will do.
+        speed = found.speed if np.isfinite(found.speed) else 2 * self._speed
+        return np.array([self._speed - speed]), -found.gradient[None, :]
+
+    # ---- lifted form ------------------------------------------------------------------------------------------
+
+    @property
+    def lifted_bounds(self) -> tuple[Array, Array]:
+        """See :class:`Constraint`."""
+        zero = np.zeros(len(self._kept))
+        return zero, zero
+
+    def lift(self, tree: Tree, parameters: ca.SX) -> LiftedRows:
+        """See :class:`Constraint`."""
+        own = self._attainable
+        z = ca.SX.sym("w", len(own.free))
+        v = ca.SX(tree.model.nv, 1)
+        v[own.free.tolist()] = own.scale * z
+        velocities, rows, start = tree.velocities(v), [], 1
+        for moved in own.points:
+            axes = ca.SX(moved.axes)
+            if moved.comes:
+                axes = ca.reshape(parameters[start : start + 9], 3, 3).T
+                start += 9
+            rows.append(moved.symbolic(tree, velocities, axes) + moved.arrives * parameters[0])
+        return LiftedRows(ca.densify(ca.vertcat(*rows)[self._kept]), z)
+
+    @property
+    def unknowns(self) -> int:
+        """See :class:`Constraint`."""
+        return len(self._attainable.free)
+
+    def guess(self, model: Numeric) -> Guess:
+        """See :class:`Constraint`; the fastest approach, slowed down to the speed."""
+        own = self._attainable
+        found = own.at(model)
+        slower = min(1.0, self._speed / min(found.speed, FASTEST)) if found.speed > 0 else 1.0
+        return Guess(slower * found.velocities, -own.upper, own.upper)
+
+    def linearize(self, model: Numeric, auxiliaries: Array) -> Linearization:
+        """See :class:`Constraint`; the limits of the joints are rows as well."""
+        own = self._attainable
+        names = [f"motion of {moved.name} in the {self.name}" for moved in own.points for _ in moved.rows]
+        by_posture = [own.by_posture(model, auxiliaries, row) for row in np.eye(len(names))]
+        A, limited = own.jacobian(model), np.flatnonzero(np.isfinite(own.upper))
+        bounds, zero = own.upper[limited], np.zeros(len(A))
+        return Linearization(
+            [*names, *(f"velocity limit of {own.names[k]}" for k in limited)],
+            np.concatenate([A @ auxiliaries + own.arrives * self._speed, auxiliaries[limited]]),
+            np.concatenate([zero, -bounds]),
+            np.concatenate([zero, bounds]),
+            np.vstack([np.array(by_posture), np.zeros((len(limited), model.model.nv))]),
+            np.vstack([A, np.eye(len(auxiliaries))[limited]]),
+        )

@@ -1,0 +1,209 @@
+"""The fastest motion with which the joints bring the contact to the surface.
+
+An impact-robust arm is often stretched along the normal, and a stretched arm cannot move along itself: the posture
+takes the impact well, but no joint motion arrives in it at speed.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from dataclasses import dataclass, replace
+
+import casadi as ca
+import numpy as np
+import pinocchio as pin
+from numpy.typing import NDArray
+
+from impact_posture.dynamics.numeric import Numeric
+from impact_posture.dynamics.tree import PointOnLink, Tree
+from impact_posture.impact.impact_contact import point_on
+from impact_posture.impact.objective import Objective
+from impact_posture.posture.program.constrained_problem import RANK_TOLERANCE, Requirements, held_rows
+from impact_posture.posture.program.linear_program import solve_linear
+from impact_posture.robot.robot import Robot
+from impact_posture.system.arrays import Array, independent_rows
+
+# A speed that no contact has, m/s, and a limit that no joint has, rad/s or m/s: what reaches them is not bounded.
+FASTEST = 1e3
+
+
+@dataclass(frozen=True, eq=False)
+class MovingPoint:
+    """What a point must do while the contact approaches: rows of ``D v`` and ``D ω`` that are ``−σ d`` or zero.
+
+    Attributes:
+        name: Name of the frame.
+        point: The point.
+        axes: ``D``, shape (3, 3): the normal and two tangents, or the axes of the world.
+        rows: Rows of ``(D v, D ω)`` that are held.
+        comes: Whether the first row is the approach, ``nᵀv = −σ``; else it is zero as the others.
+        in_frame: Whether the axes turn with the frame.
+    """
+
+    name: str
+    point: PointOnLink
+    axes: Array
+    rows: tuple[int, ...]
+    comes: bool = False
+    in_frame: bool = False
+
+    @property
+    def arrives(self) -> Array:
+        """``d`` of the rows, shape (k,)."""
+        return np.array([float(self.comes and row == 0) for row in self.rows])
+
+    def wrench(self, weights: Array) -> Array:
+        """Return the force and moment whose power is the sum of the rows with these weights, shape (6,)."""
+        whole = np.zeros(6)
+        whole[list(self.rows)] = weights
+        return np.concatenate([self.axes.T @ whole[:3], self.axes.T @ whole[3:]])
+
+    def jacobian(self, model: Numeric) -> Array:
+        """Return the rows over the generalized velocity, shape (k, nv)."""
+        J = model.jacobian(self.point)
+        D = self.axes @ model.placement(self.point).rotation.T if self.in_frame else self.axes
+        return np.vstack([D @ J[:3], D @ J[3:]])[list(self.rows)]
+
+    def symbolic(self, tree: Tree, velocities: dict[int, ca.SX], axes: ca.SX) -> ca.SX:
+        """Return the rows as an expression, shape (k, 1)."""
+        twist = tree.point_velocity(self.point, velocities)
+        if self.in_frame:
+            R = tree.rotations[self.point.joint] @ ca.SX(self.point.rotation)
+            axes = axes @ R.T
+        return ca.vertcat(axes @ twist[:3], axes @ twist[3:])[list(self.rows)]
+
+
+@dataclass(frozen=True, eq=False)
+class Attained:
+    """The fastest approach at a posture.
+
+    Attributes:
+        speed: ``σ``, m/s; infinite where nothing bounds it.
+        velocities: Each free entry of the velocity at ``min(σ, FASTEST)``, in units of its scale, shape (k,).
+        gradient: Tangent gradient of the speed, shape (nv,).
+    """
+
+    speed: float
+    velocities: Array
+    gradient: Array
+
+
+class AttainableSpeed:
+    """``σ(q) = max σ`` such that a generalized velocity ``|ν_i| ≤ ν̄_i`` brings the contact in at ``nᵀJν = −σ``.
+
+    The contact point moves along the normal alone, frames that are kept do not move, and the contact frame turns only
+    where its pose leaves it free, or where the joints are too few to hold it.  Several contacts all arrive at ``σ``,
+    and may slide.  The base of a robot that stands keeps still, and its feet with it; that of a robot without feet
+    moves at any speed.  A contact whose pose is free is one where something hits the robot, at any speed.
+
+    Args:
+        robot: The robot, with the velocity limits of its URDF.
+        objective: Its contacts and supports.
+        requirements: What of the base, of the contact's pose and of other frames is held.
+
+    Attributes:
+        unknown: Why there is no such speed; empty if there is one, which may still be infinite at some postures.
+        scale: Unit of each free entry of the velocity, rad/s or m/s, shape (k,).
+        upper: Its limit in this unit, infinite where it has none, shape (k,).
+    """
+
+    def __init__(self, robot: Robot, objective: Objective, requirements: Requirements) -> None:
+        self._model = robot.model
+        self.points = _moving_points(robot, objective, requirements)
+        flies = robot.floating and not objective.supports and requirements.base != "fixed"
+        joints = np.arange(robot.nv) >= (0 if flies or not robot.floating else 6)
+        bringing = joints & self._chain([moved.point for moved in self.points if moved.comes])
+        standing = self._chain([point_on(robot, support.frame) for support in objective.supports])
+        free = joints & self._chain([moved.point for moved in self.points])
+        free &= ~held_rows(robot, requirements.hold).any(axis=0)
+        self.free = np.flatnonzero(free)
+        limit = robot.velocity_limits[self.free]
+        stated = limit < FASTEST
+        self.scale, self.upper = np.where(stated, limit, 1.0), np.where(stated, 1.0, np.inf)
+        self.names = [robot.tangent_names[k] for k in self.free]
+        self.unknown = ""
+        if robot.floating and not flies and self.points and ((bringing & standing).any() or not bringing.any()):
+            self.unknown = "the legs move the contact, and how fast they do is not computed"
+        elif not self.points or flies or (free.any() and not stated.any()):
+            self.unknown = "nothing bounds it: no joint velocity with a limit decides it"
+        if len(self.independent) > len(self.free):
+            self.points = [replace(moved, rows=moved.rows[:3]) if moved.comes else moved for moved in self.points]
+
+    def _chain(self, points: Sequence[PointOnLink]) -> NDArray[np.bool_]:
+        """Return which entries of the velocity move some of the points, shape (nv,)."""
+        found, model = np.zeros(self._model.nv, dtype=bool), self._model
+        for point in points:
+            for joint in model.supports[point.joint].tolist()[1:]:
+                found[model.idx_vs[joint] : model.idx_vs[joint] + model.nvs[joint]] = True
+        return found
+
+    @property
+    def independent(self) -> list[int]:
+        """Rows that are no sums of other rows at all postures: a planar robot does not leave its plane anyway."""
+        if not self.points:
+            return []
+        rng, model, blocks = np.random.default_rng(0), Numeric(self._model), []
+        for _ in range(2):
+            q = pin.integrate(self._model, pin.neutral(self._model), rng.normal(size=self._model.nv))
+            blocks.append(self.jacobian(model.at(q)) / self.scale)
+        return independent_rows(np.column_stack([*blocks, self.arrives]), RANK_TOLERANCE)
+
+    @property
+    def arrives(self) -> Array:
+        """Rows that are the approach, shape (m,)."""
+        return np.concatenate([point.arrives for point in self.points])
+
+    def jacobian(self, model: Numeric) -> Array:
+        """Return the rows over the free velocities in their scales, shape (m, k)."""
+        whole = np.vstack([point.jacobian(model) for point in self.points])
+        return np.asarray(whole[:, self.free] * self.scale)
+
+    def by_posture(self, model: Numeric, velocities: Array, weights: Array) -> Array:
+        """Return the tangent gradient of the rows summed with ``weights``, shape (m,), as shape (nv,)."""
+        v = np.zeros(model.model.nv)
+        v[self.free] = self.scale * velocities
+        gradient = np.zeros(len(v))
+        ends = np.cumsum([len(moved.rows) for moved in self.points])[:-1]
+        for moved, own in zip(self.points, np.split(weights, ends), strict=True):
+            gradient += model.coupling_gradient(moved.point, moved.wrench(own), v, in_frame=moved.in_frame)
+        return gradient
+
+    def at(self, model: Numeric) -> Attained:
+        """Return the fastest approach at ``model.q``."""
+        A = np.column_stack([self.jacobian(model), self.arrives])
+        rows, cost = np.zeros(len(A)), np.zeros(A.shape[1])
+        cost[-1] = -1.0
+        high = np.append(self.upper, FASTEST)
+        found = solve_linear(cost, A, rows, rows, np.append(-self.upper, 0.0), high)
+        if found is None:
+            return Attained(0.0, np.zeros(len(self.free)), np.zeros(model.model.nv))
+        if -found.value > (1 - 1e-9) * FASTEST:
+            return Attained(float("inf"), found.x[:-1], np.zeros(model.model.nv))
+        gradient = -self.by_posture(model, found.x[:-1], found.multipliers)
+        return Attained(max(0.0, -found.value), found.x[:-1], gradient)
+
+    def reached(self, q: Array) -> float | None:
+        """Return the speed at ``q``, shape (nq,), in m/s; ``None`` where it is not known or bounded."""
+        speed = float("inf") if self.unknown else self.at(Numeric(self._model).at(q)).speed
+        return speed if np.isfinite(speed) else None
+
+
+def _moving_points(robot: Robot, objective: Objective, requirements: Requirements) -> list[MovingPoint]:
+    found: list[MovingPoint] = []
+    poses = (requirements.contact_pose, *requirements.other_poses)
+    alone = len(objective.contacts) == 1
+    for contact, pose in zip(objective.contacts, poses, strict=False):
+        # What hits a robot that is free there comes at a speed of its own.
+        if pose == "free":
+            continue
+        turning = {"full": (3, 4, 5), "aligned": (4, 5)}.get(pose, ())
+        n = np.array(contact.normal)
+        axes = np.vstack([n, np.linalg.svd(n[None, :])[2][1:]])
+        point = point_on(robot, contact.frame, contact.offset)
+        rows = (0, 1, 2, *turning) if alone else (0,)
+        found.append(MovingPoint(contact.frame, point, axes, rows, True, contact.normal_frame == "contact"))
+    struck = {contact.frame for contact in objective.contacts}
+    for frame in dict.fromkeys(requirements.keep):
+        if found and frame not in struck:
+            found.append(MovingPoint(frame, point_on(robot, frame), np.eye(3), tuple(range(6))))
+    return found

@@ -1,0 +1,261 @@
+"""Constraints on poses of frames, on the base and on the center of mass."""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+
+import casadi as ca
+import numpy as np
+import pinocchio as pin
+
+from impact_posture.dynamics.numeric import Numeric
+from impact_posture.dynamics.spatial import quaternion_product
+from impact_posture.dynamics.tree import PointOnLink, Tree
+from impact_posture.posture.constraints.constraint import ExpressionConstraint
+from impact_posture.system.arrays import Array
+
+
+class HeldPosition(ExpressionConstraint):
+    """The point stays at ``p*``: ``p(q) − p* = 0``, world axes, meters."""
+
+    def __init__(self, name: str, point: PointOnLink, target: Array) -> None:
+        self.name, self.point = name, point
+        self.parameters = np.array(target, dtype=float)
+        self.lower = self.upper = np.zeros(3)
+
+    def symbolic(self, tree: Tree, parameters: ca.SX) -> ca.SX:
+        """See :class:`Constraint`."""
+        return tree.position(self.point) - parameters
+
+    def evaluate(self, model: Numeric) -> tuple[Array, Array]:
+        """See :class:`Constraint`."""
+        return self.value(model), model.jacobian(self.point)[:3]
+
+    def value(self, model: Numeric) -> Array:
+        """See :class:`Constraint`."""
+        return np.asarray(model.placement(self.point).translation - self.parameters)
+
+    def pose_error(self, value: Array) -> tuple[float, float]:
+        """See :class:`Constraint`; outside a box it is the distance from the box."""
+        return float(np.linalg.norm(self.excess(value))), 0.0
+
+
+class PositionBox(HeldPosition):
+    """The point stays within a box around ``p*``: ``|p(q) − p*| ≤ half``, world axes, meters."""
+
+    def __init__(self, name: str, point: PointOnLink, target: Array, half: Sequence[float]) -> None:
+        super().__init__(name, point, target)
+        self.upper = np.array(half, dtype=float)
+        self.lower = -self.upper
+
+    def describe(self) -> str:
+        """See :class:`Constraint`."""
+        return f"{super().describe()} (" + " × ".join(f"±{v:g}" for v in self.upper) + " m)"
+
+    def row_name(self, row: int) -> str:
+        """See :class:`Constraint`."""
+        return f"{self.name} along {'xyz'[row]}"
+
+
+class HeldOrientation(ExpressionConstraint):
+    """The frame keeps its orientation, or the direction of one of its axes.
+
+    ``2 vec(Q_left* ⊗ Q(q) ⊗ Q_right)`` is the vector part of the error quaternion, polynomial in half angles.  It is
+    smooth, and the rotation vector in radians to first order.  It is zero at the target only, and largest at 180°,
+    where a skew-symmetric error is zero again.  The first two components alone hold the direction of ``axis``.
+
+    Args:
+        name: Name of the constraint.
+        point: Point on the link whose orientation is held.
+        target: Desired world rotation, shape (3, 3).
+        axis: Axis in the frame whose direction is held and about which it may turn; ``None`` holds all three.
+    """
+
+    def __init__(self, name: str, point: PointOnLink, target: Array, axis: Array | None = None) -> None:
+        self.name, self.point, target = name, point, np.array(target, dtype=float)
+        self.axis = axis
+        width = 3 if axis is None else 2
+        right = np.eye(3) if axis is None else _rotation_to(axis)
+        left = target @ right
+        self.parameters = np.concatenate([_coefficients(left.T), _coefficients(right)])
+        self._left, self._right = pin.Quaternion(self.parameters[:4]), pin.Quaternion(self.parameters[4:8])
+        self._axes = self._right.matrix()
+        self.lower = self.upper = np.zeros(width)
+
+    def describe(self) -> str:
+        """See :class:`Constraint`."""
+        return super().describe() + ("" if self.axis is None else " (tilt zero, yaw free)")
+
+    def symbolic(self, tree: Tree, parameters: ca.SX) -> ca.SX:
+        """See :class:`Constraint`."""
+        error = quaternion_product(quaternion_product(parameters[:4], tree.quaternion(self.point)), parameters[4:8])
+        return 2 * error[: self.rows]
+
+    def evaluate(self, model: Numeric) -> tuple[Array, Array]:
+        """See :class:`Constraint`."""
+        return self.error(model.placement(self.point).rotation, model.jacobian(self.point)[3:])
+
+    def error(self, rotation: Array, jacobian: Array) -> tuple[Array, Array]:
+        """Return the rows and their tangent Jacobian for a frame with an angular Jacobian, shape (3, nv)."""
+        error = (self._left * pin.Quaternion(rotation) * self._right).coeffs()
+        x, y, z, w = (error if error[3] >= 0 else -error).tolist()
+        # d(2 vec(Q)) = (w I + [v]×) ω in the axes that Q turns: those of the frame times `right`.
+        turn = np.array([[w, -z, y], [z, w, -x], [-y, x, w]])[: self.rows] @ (rotation @ self._axes).T
+        return 2 * np.array([x, y, z])[: self.rows], turn @ jacobian
+
+    def pose_error(self, value: Array) -> tuple[float, float]:
+        """See :class:`Constraint`; the rows are ``2 sin(θ/2)`` along the axis of a rotation by θ, or of a tilt."""
+        return 0.0, 2 * float(np.arcsin(min(1.0, float(np.linalg.norm(value)) / 2)))
+
+
+class HeldPose(ExpressionConstraint):
+    """The frame keeps position and orientation: six rows, or five with a free spin."""
+
+    def __init__(self, name: str, point: PointOnLink, target: pin.SE3, axis: Array | None = None) -> None:
+        self.name = name
+        self._parts = (
+            HeldPosition(name, point, target.translation),
+            HeldOrientation(name, point, target.rotation, axis),
+        )
+        self.parameters = np.concatenate([p.parameters for p in self._parts])
+        self.lower = self.upper = np.zeros(sum(p.rows for p in self._parts))
+
+    def describe(self) -> str:
+        """See :class:`Constraint`."""
+        return super().describe() + ("" if self.rows == 6 else " (position and normal; spin free)")
+
+    def symbolic(self, tree: Tree, parameters: ca.SX) -> ca.SX:
+        """See :class:`Constraint`."""
+        position, orientation = self._parts
+        return ca.vertcat(position.symbolic(tree, parameters[:3]), orientation.symbolic(tree, parameters[3:]))
+
+    def evaluate(self, model: Numeric) -> tuple[Array, Array]:
+        """See :class:`Constraint`."""
+        position, orientation = self._parts
+        at, jacobian = model.placement(position.point), model.jacobian(position.point)
+        turned, turning = orientation.error(at.rotation, jacobian[3:])
+        return (
+            np.concatenate([at.translation - position.parameters, turned]),
+            np.concatenate([jacobian[:3], turning]),
+        )
+
+    def pose_error(self, value: Array) -> tuple[float, float]:
+        """See :class:`Constraint`."""
+        position, orientation = self._parts
+        return position.pose_error(value[:3])[0], orientation.pose_error(value[3:])[1]
+
+
+class AxisInCone(ExpressionConstraint):
+    """An axis of the frame stays within a cone: ``−dᵀR(q)c ≤ −cos α``; the frame may turn about the axis.
+
+    Args:
+        name: Name of the constraint.
+        point: Point on the link that the frame belongs to.
+        axis: Unit axis ``c`` in the frame, shape (3,).
+        direction: Axis ``d`` of the cone, world, shape (3,).
+        degrees: Half angle α of the cone, degrees.
+    """
+
+    def __init__(self, name: str, point: PointOnLink, axis: Array, direction: Array, degrees: float) -> None:
+        self.name, self.point, self._degrees = name, point, degrees
+        self.parameters = np.concatenate([axis, direction])
+        self.lower, self.upper = np.array([-np.inf]), np.array([-np.cos(np.deg2rad(degrees))])
+
+    def describe(self) -> str:
+        """See :class:`Constraint`."""
+        return f"{self.name} at most {self._degrees:g}°, spin free"
+
+    def symbolic(self, tree: Tree, parameters: ca.SX) -> ca.SX:
+        """See :class:`Constraint`."""
+        return -ca.dot(tree.rotation(self.point) @ parameters[:3], parameters[3:])
+
+    def evaluate(self, model: Numeric) -> tuple[Array, Array]:
+        """See :class:`Constraint`."""
+        axis, direction = self.parameters[:3], self.parameters[3:]
+        now = model.placement(self.point).rotation @ axis
+        return -np.array([now @ direction]), (model.jacobian(self.point)[3:].T @ np.cross(direction, now))[None, :]
+
+
+class HeldTurn(ExpressionConstraint):
+    """The base does not turn about one of its axes: ``2 axis·vec(Q*⁻¹ ⊗ Q(q)) = 0``.
+
+    Args:
+        point: Origin of the base.
+        target: Orientation without a turn, shape (3, 3).
+        axis: Unit axis in the base, shape (3,).
+        name: Name of the constraint.
+    """
+
+    def __init__(self, point: PointOnLink, target: Array, axis: Array, name: str) -> None:
+        self.name = name
+        self._whole = HeldOrientation(name, point, target)
+        self._axis = np.array(axis, dtype=float)
+        self.parameters = np.concatenate([self._whole.parameters, self._axis])
+        self.lower = self.upper = np.zeros(1)
+
+    def symbolic(self, tree: Tree, parameters: ca.SX) -> ca.SX:
+        """See :class:`Constraint`."""
+        return ca.dot(parameters[8:], self._whole.symbolic(tree, parameters[:8]))
+
+    def evaluate(self, model: Numeric) -> tuple[Array, Array]:
+        """See :class:`Constraint`."""
+        value, jacobian = self._whole.evaluate(model)
+        return np.array([self._axis @ value]), (self._axis @ jacobian)[None, :]
+
+
+class CenterOfMassOverFeet(ExpressionConstraint):
+    """The center of mass stays above the feet: ``A xy − b ≤ −margin``, meters.
+
+    Args:
+        normals: Outward unit normals of the support polygon's edges, shape (k, 2).
+        offsets: ``b``, shape (k,).
+        margin: Least distance from the edges.
+        loaded: Another model and its name, whose center of mass counts; ``None`` for the model of the problem.
+    """
+
+    def __init__(
+        self, normals: Array, offsets: Array, margin: float, loaded: tuple[pin.Model, str] | None = None
+    ) -> None:
+        self.name = "center of mass over the feet" + (f" with {loaded[1]}" if loaded else "")
+        self.normals, self.offsets, self.margin = normals, offsets, margin
+        self._model = loaded[0] if loaded else None
+        self._k = len(offsets)
+        self.parameters = np.concatenate([normals.T.reshape(-1), offsets])
+        self.lower = np.full(self._k, -np.inf)
+        self.upper = np.full(self._k, -margin)
+
+    def describe(self) -> str:
+        """See :class:`Constraint`."""
+        return f"{self.name}, {self.margin:g} m inside the support polygon"
+
+    def symbolic(self, tree: Tree, parameters: ca.SX) -> ca.SX:
+        """See :class:`Constraint`."""
+        k, own = self._k, tree if self._model is None else Tree(self._model, tree.q)
+        center = own.center_of_mass()
+        return parameters[:k] * center[0] + parameters[k : 2 * k] * center[1] - parameters[2 * k :]
+
+    def evaluate(self, model: Numeric) -> tuple[Array, Array]:
+        """See :class:`Constraint`."""
+        k = self._k
+        normals = self.parameters[: 2 * k].reshape(2, k).T
+        own = model if self._model is None else Numeric(self._model).at(model.q)
+        center, jacobian = own.center_of_mass()
+        return normals @ center[:2] - self.parameters[2 * k :], normals @ jacobian[:2]
+
+    def row_name(self, row: int) -> str:
+        """See :class:`Constraint`."""
+        return f"{self.name} (edge {row})"
+
+
+def base_point() -> PointOnLink:
+    """Return the origin of the link of a floating base."""
+    return PointOnLink(1, np.zeros(3), np.eye(3))
+
+
+def _coefficients(rotation: Array) -> Array:
+    return np.array(pin.Quaternion(np.asarray(rotation)).coeffs())
+
+
+def _rotation_to(axis: Array) -> Array:
+    """A rotation that takes e_z to ``axis``."""
+    return np.array(pin.Quaternion.FromTwoVectors(np.array([0.0, 0.0, 1.0]), np.array(axis, dtype=float)).matrix())

@@ -1,0 +1,88 @@
+"""The distance between two postures, its tangent gradient, and a bound on it as a constraint."""
+
+from __future__ import annotations
+
+from typing import Any
+
+import casadi as ca
+import numpy as np
+import pinocchio as pin
+
+from impact_posture.dynamics.chart import Chart
+from impact_posture.dynamics.numeric import Numeric
+from impact_posture.dynamics.tree import Tree
+from impact_posture.posture.constraints.constraint import ExpressionConstraint
+from impact_posture.system.arrays import Array
+
+
+def distance_squared(chart: Chart, q: Any, reference: Any) -> Any:
+    """Return the squared distance of two configurations, ``SX`` or ``DM``: about ``‖q ⊖ reference‖²`` in rad and m.
+
+    It is smooth everywhere.  A turn by Δ counts ``4 (1 − (quaternion·quaternion)²) = 4 sin²(Δ/2)``, which equals the
+    ``2 (1 − cos Δ)`` of a continuous joint.  Revolute and sliding joints and positions count Δ².
+    """
+    parts = []
+    for slot in chart.slots:
+        one, other = q[slot.q], reference[slot.q]
+        if slot.kind.family in ("free-flyer", "spherical"):
+            parts.append(4 * (1 - ca.dot(one[-4:], other[-4:]) ** 2))
+            one, other = one[:-4], other[:-4]
+        # For a cosine and a sine this is 2 (1 − cos Δ).
+        parts.append(ca.sumsqr(one - other))
+    return ca.sum1(ca.vertcat(*parts))
+
+
+def distance(chart: Chart, q: Array, reference: Array) -> float:
+    """Return the root of :func:`distance_squared` of two configurations, shape (nq,)."""
+    return float(np.sqrt(max(float(distance_squared(chart, ca.DM(q), ca.DM(reference))), 0.0)))
+
+
+def distance_gradient(chart: Chart, q: Array, reference: Array) -> Array:
+    """Return the tangent gradient of :func:`distance_squared` at ``q``, shape (nv,)."""
+    gradient = np.zeros(chart.nv)
+    for slot in chart.slots:
+        one, other, family = q[slot.q], reference[slot.q], slot.kind.family
+        if family in ("free-flyer", "spherical"):
+            R = pin.Quaternion(one[-4:]).matrix()
+            relative = pin.Quaternion(other[-4:]).inverse() * pin.Quaternion(one[-4:])
+            # d(4 (1 − w²)) = −8 w dw with dw = −½ v·ω.
+            gradient[slot.v][-3:] = 4 * float(relative.w) * np.array(relative.coeffs()[:3])
+            if family == "free-flyer":
+                gradient[slot.v][:3] = 2 * R.T @ (one[:3] - other[:3])
+        elif family in ("continuous", "planar"):
+            c, s = one[-2:]
+            d = 2 * (one[:-2] - other[:-2])
+            gradient[slot.v.stop - 1] = 2 * (s * other[-2] - c * other[-1])
+            if family == "planar":
+                gradient[slot.v][:2] = c * d[0] + s * d[1], -s * d[0] + c * d[1]
+        else:
+            gradient[slot.v] = 2 * (one - other)
+    return gradient
+
+
+class WithinDistance(ExpressionConstraint):
+    """The posture stays in a ball: ``distance_squared(q, reference) ≤ radius²``.
+
+    The radius is a bound and the reference a parameter, so one program serves all radii.
+
+    Args:
+        chart: Coordinates of the robot.
+        reference: Center of the ball, shape (nq,).
+        radius: Radius, about ``‖q ⊖ reference‖``, > 0.
+    """
+
+    def __init__(self, chart: Chart, reference: Array, radius: float) -> None:
+        self.name = "distance from the initial posture"
+        self._chart = chart
+        self.parameters = np.array(reference, dtype=float)
+        self.lower, self.upper = np.array([-np.inf]), np.array([radius**2])
+
+    def symbolic(self, tree: Tree, parameters: ca.SX) -> ca.SX:
+        """See :class:`Constraint`."""
+        value: ca.SX = distance_squared(self._chart, tree.q, parameters)
+        return value
+
+    def evaluate(self, model: Numeric) -> tuple[Array, Array]:
+        """See :class:`Constraint`."""
+        value = distance(self._chart, model.q, self.parameters) ** 2
+        return np.array([value]), distance_gradient(self._chart, model.q, self.parameters)[None, :]

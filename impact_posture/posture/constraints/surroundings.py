@@ -1,0 +1,284 @@
+"""What the robot must stay clear of: itself, the surface that it strikes, the ground under its feet, obstacles."""
+
+from __future__ import annotations
+
+from collections.abc import Iterable, Sequence
+from dataclasses import dataclass, replace
+from functools import cached_property
+
+import numpy as np
+import pinocchio as pin
+
+from impact_posture.collision.mesh_check import HalfSpace, MeshCheck
+from impact_posture.collision.robot_shapes import load_shapes
+from impact_posture.collision.swept_hull import SweptHull, obstacle_hull
+from impact_posture.config.obstacle import Obstacle
+from impact_posture.config.settings import PATCH
+from impact_posture.dynamics.numeric import Numeric
+from impact_posture.dynamics.tree import PointOnLink
+from impact_posture.errors import InputError
+from impact_posture.impact.impact_contact import ImpactContact, Support, point_on
+from impact_posture.posture.constraints.clearance import Clearance
+from impact_posture.posture.constraints.nested_links import NestedLinks
+from impact_posture.posture.constraints.pair_distances import PairDistances
+from impact_posture.posture.constraints.separator import ConvexBody, Separator
+from impact_posture.robot.robot import Robot
+from impact_posture.system.arrays import Array
+
+# A contact point this near (m) to a plane lies in it.
+_BESIDE = 0.03
+# Least cosine between the normals of contacts at the same surface.
+_PARALLEL = 0.999
+# A body that cannot move and lies this far (m) behind the plane of the surface shows that the surface ends before it.
+_BEHIND = 1e-3
+
+
+@dataclass(frozen=True, eq=False)
+class _Wall:
+    """A plane or a body that the links must stay clear of, but those that are exempt."""
+
+    body: ConvexBody
+    exempt: frozenset[int]
+
+
+class Surroundings:
+    """The bodies around a robot at a given posture, and the constraints that keep it clear of them.
+
+    Args:
+        robot: The robot.
+        numeric: The model at the given posture.
+        held: Joints that do not move.
+        clearance: Least distance of all pairs, m.
+    """
+
+    def __init__(self, robot: Robot, numeric: Numeric, held: Sequence[str], clearance: float) -> None:
+        self.robot, self.shapes = robot, load_shapes(robot)
+        self._clearance, self._numeric = clearance, numeric
+        self._bodies = [ConvexBody.of_link(hull) for hull in self.shapes.bodies]
+        self._group = _rigid_groups(robot, held)
+        self._walls: list[_Wall] = []
+        self._still = {0}
+        self._depths: dict[ImpactContact, float] = {}
+        self.notes: list[str] = list(self.shapes.warnings)
+        if touching := self.shapes.always_touching:
+            self.notes.append(
+                f"{len(touching)} pairs of shapes may touch, because they do so at most postures: "
+                + ", ".join(" / ".join(pair) for pair in touching[:3])
+                + (", …" if len(touching) > 3 else "")
+            )
+
+    # ---- what is there ----------------------------------------------------------------------------------------
+
+    def add_ground(self, supports: Sequence[Support], struck: Sequence[ImpactContact]) -> None:
+        """Put level ground under the lowest foot; the feet and the links that are struck may touch it."""
+        if not supports:
+            return
+        feet = [point_on(self.robot, s.frame, s.offset) for s in supports]
+        height = min(float(self._numeric.placement(foot).translation[2]) for foot in feet)
+        self._still |= self._rigid(foot.joint for foot in feet)
+        touching = [foot.joint for foot in feet] + [point_on(self.robot, c.frame).joint for c in struck]
+        exempt = self._rigid([0, *touching])
+        up = np.array([0.0, 0.0, 1.0])
+        body = ConvexBody("ground", None, PointOnLink(0, np.array([0.0, 0.0, height]), np.eye(3)), normal=up)
+        self._walls.append(_Wall(body, exempt))
+
+    def add_surface(
+        self,
+        contact: ImpactContact,
+        width: float | None,
+        feet: Sequence[PointOnLink] = (),
+        contacts: Sequence[ImpactContact] = (),
+    ) -> None:
+        """Put the surface behind a contact: the whole plane, or a square patch of it.
+
+        The plane passes through the contact point, or behind the link of the contact (with what held joints fix to
+        it) if that reaches farther at the given posture.  This link may touch it, and so may a link whose own contact
+        lies in the plane, such as a foot beside the one that is struck, or that meets the same surface, such as the
+        other hand at a wall.  The surface is a patch as well if a foot or a fixed base lies behind the plane, because
+        then it ends before it reaches there.
+
+        Args:
+            contact: The contact.
+            width: Edge length of the patch, m; infinite for the plane, ``None`` to decide.
+            feet: Contact points of the feet.
+            contacts: Contacts that act at the same time.
+        """
+        point = point_on(self.robot, contact.frame, contact.offset)
+        turns = contact.normal_frame == "contact"
+        n = np.array(contact.normal)
+        name = f"surface at {contact.frame}"
+        exempt = self._rigid([point.joint])
+        own = [b for b in self._bodies if b.point.joint in exempt]
+        through = ConvexBody(name, None, point, turns, n)
+        depth = max([0.0, *[-self._height(body, through) for body in own]])
+        self._depths[contact] = depth
+        plane = replace(through, offset=-depth)
+        beside = [foot for foot in feet if abs(self._above(foot, plane)) < _BESIDE]
+        for other in contacts:
+            # Links of the same kind reach equally far behind their contact points, where the surface is.
+            facing = self._world_normal(contact) @ self._world_normal(other) > _PARALLEL
+            at = point_on(self.robot, other.frame, other.offset)
+            if any(abs(self._above(at, one)) < _BESIDE for one in ((plane, through) if facing else (plane,))):
+                beside.append(at)
+        exempt |= self._rigid(at.joint for at in beside)
+        behind = self._stands_behind(plane, exempt)
+        if width is None and behind:
+            width = PATCH
+            self.notes.append(
+                f"{behind} lies behind the plane of the {name}, so the surface is taken as a patch of "
+                f"{width:g} m × {width:g} m (`surface`)"
+            )
+        if width is None or not np.isfinite(width):
+            self._walls.append(_Wall(plane, exempt))
+            return
+        corners = _box_behind(n, width) - depth * n
+        hull = SweptHull(name, name, point.joint, corners, 0.0)
+        self._walls.append(_Wall(ConvexBody(name, hull, point, turns), exempt))
+
+    def add_obstacles(self, obstacles: Sequence[Obstacle]) -> None:
+        """Add bodies that stand in the world; links that cannot move either may touch them.
+
+        Raises:
+            InputError: Two bodies have one name, which messages could not tell apart.
+        """
+        taken = {body.name for body in self._bodies} | {wall.body.name for wall in self._walls}
+        for obstacle in obstacles:
+            if obstacle.name in taken:
+                raise InputError(
+                    f"'{obstacle.name}' is the name of another body", where="obstacles", hint="give it another name"
+                )
+            taken.add(obstacle.name)
+            self._walls.append(_Wall(ConvexBody.of_link(obstacle_hull(obstacle)), self._rigid([0])))
+
+    def depth(self, contact: ImpactContact) -> float:
+        """Return how far behind the contact point the surface lies, m; zero where a contact has no surface."""
+        return self._depths.get(contact, 0.0)
+
+    # ---- what follows -----------------------------------------------------------------------------------------
+
+    @cached_property
+    def nested(self) -> list[NestedLinks]:
+        """Return the constraints of links in each other's hollows."""
+        return [NestedLinks(self.robot, planes) for planes in self.shapes.joint_planes if len(planes.bounds)]
+
+    @cached_property
+    def constraints(self) -> list[Clearance]:
+        """Return one constraint for the links among themselves, and one for each wall."""
+        near = f"at least {1e3 * self._clearance:g} mm apart"
+        pairs = [Separator(self._bodies[i], self._bodies[j], self._clearance) for i, j in self.shapes.pairs]
+        groups = [("self-collision", pairs, f"links {near} ({len(pairs)} pairs)")]
+        for wall in self._walls:
+            apart = [
+                Separator(body, wall.body, self._clearance)
+                for body in self._bodies
+                if body.point.joint not in wall.exempt
+            ]
+            groups.append((wall.body.name, apart, f"links and {wall.body.name} {near}"))
+        # All are needed at each posture that one is needed at.
+        distances, first, found = PairDistances([one for _, own, _ in groups for one in own]), 0, []
+        for name, own, words in groups:
+            if own:
+                found.append(Clearance(name, own, words, distances=(distances, range(first, first + len(own)))))
+                first += len(own)
+        return found
+
+    def closest(self, q: Array) -> dict[str, object]:
+        """Return the bodies that are closest at ``q``, and their distance, m."""
+        numeric = self._moving.at(q)
+        name, value = min((c.closest(numeric) for c in self.constraints), key=lambda pair: pair[1])
+        return {"closest": name, "distance": value + self._clearance}
+
+    def to_dict(self, initial: Array, optimal: Array) -> dict[str, object]:
+        """Return the ``collision`` block of ``result.json``."""
+        shapes = self.shapes
+        return {
+            "shapes": len(shapes.bodies),
+            "clearance": self._clearance,
+            "always_touching": [list(pair) for pair in shapes.always_touching],
+            "hulls_touching": [list(pair) for pair in shapes.hulls_touching],
+            "initial": self.closest(initial),
+            "optimal": self.closest(optimal),
+        }
+
+    def collisions(self, q: Array) -> list[tuple[str, str]]:
+        """Return the original shapes that touch each other, the surface, the ground or an obstacle at ``q``."""
+        planes, solids = self.walls_at(q)
+        return self._meshes.collisions(q, solids, planes)
+
+    @cached_property
+    def _moving(self) -> Numeric:
+        """The model at the posture that is looked at last, because the other one stays at the given posture."""
+        return Numeric(self.robot.model)
+
+    @cached_property
+    def _meshes(self) -> MeshCheck:
+        return MeshCheck(self.robot, self.shapes)
+
+    def walls_at(self, q: Array) -> tuple[list[HalfSpace], list[tuple[SweptHull, pin.SE3, frozenset[int]]]]:
+        """Return the planes and the bodies, with their placements, that the links stay clear of at ``q``.
+
+        Each comes with its exempt joints.
+        """
+        numeric, planes, solids = self._moving.at(q), [], []
+        for wall in self._walls:
+            at = wall.body.placement(numeric)
+            if wall.body.normal is not None:
+                n = at.rotation @ wall.body.normal
+                planes.append(HalfSpace(wall.body.name, at.translation + wall.body.offset * n, n, wall.exempt))
+            elif wall.body.hull is not None:
+                solids.append((wall.body.hull, at, wall.exempt))
+        return planes, solids
+
+    def _stands_behind(self, plane: ConvexBody, exempt: frozenset[int]) -> str:
+        """Name something that cannot move and lies behind a plane: a foot, or the place of a fixed base."""
+        still = (b for b in self._bodies if self._is_still(b) and b.point.joint not in exempt)
+        behind = [b.name for b in still if self._height(b, plane) < -_BEHIND]
+        if not behind and not self.robot.floating:
+            root = SweptHull("the base", "", 0, np.array([self.robot.model.jointPlacements[1].translation]), 0.0)
+            behind = ["the base"] if self._height(ConvexBody.of_link(root), plane) < -_BEHIND else []
+        return behind[0] if behind else ""
+
+    # ---- helpers ----------------------------------------------------------------------------------------------
+
+    def _rigid(self, joints: Iterable[int]) -> frozenset[int]:
+        """The joints whose links do not move relative to one of these."""
+        groups = {self._group[joint] for joint in joints}
+        return frozenset(k for k, group in enumerate(self._group) if group in groups)
+
+    def _is_fixed(self, body: ConvexBody) -> bool:
+        return self._group[body.point.joint] == self._group[0]
+
+    def _is_still(self, body: ConvexBody) -> bool:
+        return self._is_fixed(body) or body.point.joint in self._still
+
+    def _world_normal(self, contact: ImpactContact) -> Array:
+        """Normal of a contact at the given posture, world, shape (3,)."""
+        n = np.array(contact.normal)
+        if contact.normal_frame == "world":
+            return n
+        return np.asarray(self._numeric.placement(point_on(self.robot, contact.frame, contact.offset)).rotation @ n)
+
+    def _above(self, point: PointOnLink, plane: ConvexBody) -> float:
+        """Height of a point above a plane."""
+        hull = SweptHull("", "", point.joint, np.array([point.position]), 0.0)
+        return self._height(ConvexBody.of_link(hull), plane)
+
+    def _height(self, body: ConvexBody, plane: ConvexBody) -> float:
+        return Separator(body, plane, 0.0).distance(self._numeric)[0]
+
+
+def _rigid_groups(robot: Robot, held: Sequence[str]) -> list[int]:
+    """The group of each joint of the model; links of one group do not move relative to each other."""
+    fixed = {robot.joint_id(joint) for joint in held}
+    group = list(range(robot.model.njoints))
+    for joint in range(1, robot.model.njoints):
+        if joint in fixed:
+            group[joint] = group[int(robot.model.parents[joint])]
+    return group
+
+
+def _box_behind(n: Array, width: float) -> Array:
+    """Corners of a box behind a plane, one face of which is a square of the plane around the origin, shape (8, 3)."""
+    turn = pin.Quaternion.FromTwoVectors(np.array([0.0, 0.0, 1.0]), n).matrix()
+    signs = np.array([[x, y, z] for x in (-1, 1) for y in (-1, 1) for z in (-2, 0)]) * width / 2
+    return np.asarray(signs @ turn.T)

@@ -1,0 +1,1 @@
+"""From settings and requirements to a constrained problem."""

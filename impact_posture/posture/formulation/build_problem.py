@@ -1,0 +1,287 @@
+"""Turn the requirements of a task into the constraints of a posture problem, before any solver sees it."""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from dataclasses import replace
+
+import numpy as np
+import pinocchio as pin
+
+from impact_posture.config.demands import tilt_of
+from impact_posture.config.settings import Vector3
+from impact_posture.dynamics.chart import Chart
+from impact_posture.dynamics.numeric import Numeric
+from impact_posture.errors import InputError
+from impact_posture.impact.impact_contact import ImpactContact, Support, point_on
+from impact_posture.impact.objective import Objective
+from impact_posture.impact.worst_case_objective import WorstCaseObjective
+from impact_posture.posture.approach.approach_speed import ApproachSpeed
+from impact_posture.posture.approach.attainable_speed import AttainableSpeed
+from impact_posture.posture.constraints.constraint import Constraint
+from impact_posture.posture.constraints.impact_constraints import in_every_variant, kept_feet, limits
+from impact_posture.posture.constraints.pose_constraints import (
+    AxisInCone,
+    CenterOfMassOverFeet,
+    HeldOrientation,
+    HeldPose,
+    HeldPosition,
+    PositionBox,
+    base_point,
+)
+from impact_posture.posture.constraints.surroundings import Surroundings
+from impact_posture.posture.formulation.well_posed import pin_undetermined, regularize
+from impact_posture.posture.loads.load_cases import LoadCases, load_cases
+from impact_posture.posture.program.constrained_problem import ConstrainedProblem, Requirements
+from impact_posture.robot.robot import Robot
+from impact_posture.robot.support_polygon import polygon_edges
+from impact_posture.system.arrays import Array
+
+
+def build_problem(robot: Robot, objective: Objective, given: Array, requirements: Requirements) -> ConstrainedProblem:
+    """Turn requirements into constraints; nothing is solved yet.
+
+    Raises:
+        InputError: The requirements contradict each other or the robot.
+    """
+    _check(robot, requirements)
+    numeric = Numeric(robot.model).at(given)
+    chart = Chart(robot.model)
+    constraints: list[Constraint] = []
+    for support in objective.supports:
+        constraints.append(_held_support(robot, numeric, support))
+    held = {s.frame for s in objective.supports}
+    poses = (requirements.contact_pose, *requirements.other_poses)
+    # Two impacts at one frame along two normals hold the frame once.
+    struck: dict[str, tuple[ImpactContact, str]] = {}
+    # An objective without contacts leaves the contact pose unused.
+    for contact, mode in zip(objective.contacts, poses, strict=bool(objective.contacts)):
+        struck.setdefault(contact.frame, (contact, mode))
+    for contact, mode in struck.values():
+        constraints += _contact_constraints(robot, contact, numeric, requirements, mode)
+    for frame in dict.fromkeys(requirements.keep):
+        if frame not in held:
+            point = point_on(robot, frame)
+            constraints.append(HeldPose(f"pose of {frame}", point, numeric.placement(point)))
+    constraints += _base_constraints(robot, numeric, requirements)
+    decided: list[str] = []
+    if requirements.com_over_feet:
+        try:
+            constraints.append(_com_constraint(robot, objective.supports, numeric, requirements.com_margin))
+        except InputError:
+            if requirements.com_asked:
+                raise
+            decided.append("center of mass left free: the feet span no area to keep it above")
+    if isinstance(objective, WorstCaseObjective):
+        bounds = requirements.least_mobility, requirements.largest_jump
+        if requirements.keep_contacts:
+            constraints += kept_feet(objective, numeric, requirements.friction)
+        constraints += limits(objective, bounds)
+        constraints += in_every_variant(objective, numeric, requirements.friction, bounds, constraints)
+    if requirements.approach_speed > 0:
+        attainable = AttainableSpeed(robot, objective, requirements)
+        if attainable.unknown:
+            decided.append(f"the speed of the approach is not demanded: {attainable.unknown}")
+        else:
+            constraints.append(ApproachSpeed(attainable, requirements.approach_speed))
+    lower, upper = _bounds(robot, chart, given, requirements)
+    held_up = load_cases(objective, given, requirements) if requirements.holdable else LoadCases()
+    decided += held_up.notes
+    loads = [constraint for case in held_up.cases for constraint in case.constraints()]
+    more, notes = pin_undetermined(robot, objective, numeric, requirements, constraints)
+    clear, around = [], None
+    if requirements.collision:
+        around = _surroundings(objective, numeric, requirements, list(struck.values()))
+        clear, notes = [*around.nested, *around.constraints], [*notes, *around.notes]
+    problem = ConstrainedProblem(
+        robot, objective, requirements, given, (*constraints, *more, *clear, *loads), lower, upper,
+        notes=(*decided, *notes), surroundings=around,
+    )  # fmt: skip
+    return regularize(problem)
+
+
+def retarget(
+    problem: ConstrainedProblem,
+    position: Vector3 | None,
+    quaternion: tuple[float, float, float, float] | None,
+    numeric: Numeric | None = None,
+) -> ConstrainedProblem:
+    """Return the problem with another target of its only contact; all else stays, so its program fits as it is.
+
+    Args:
+        problem: A problem with one contact.
+        position: Position of the contact frame, world, meters; ``None`` for its initial position.
+        quaternion: Its orientation, x y z w; ``None`` for its initial orientation.
+        numeric: The model, if the caller has it; it is moved to the given posture.
+
+    Raises:
+        InputError: The contact pose takes no target, or the quaternion has no unit length.
+    """
+    requirements = replace(problem.requirements, target_position=position, target_quaternion=quaternion)
+    _check_target(requirements)
+    (contact,) = problem.objective.contacts
+    numeric = (numeric or Numeric(problem.robot.model)).at(problem.given)
+    made = _contact_constraints(problem.robot, contact, numeric, requirements, requirements.contact_pose)
+    # The constraints of the contact follow those of the feet.
+    first = len(problem.objective.supports)
+    kept = problem.constraints[:first], problem.constraints[first + len(made) :]
+    return replace(problem, requirements=requirements, constraints=(*kept[0], *made, *kept[1]))
+
+
+def _surroundings(
+    objective: Objective,
+    numeric: Numeric,
+    requirements: Requirements,
+    struck: Sequence[tuple[ImpactContact, str]],
+) -> Surroundings:
+    """What the links stay clear of; a push (a free contact pose) has no surface."""
+    found = Surroundings(objective.robot, numeric, requirements.hold, requirements.clearance)
+    touching = [(contact, mode) for contact, mode in struck if mode != "free"]
+    found.add_ground(objective.supports, [contact for contact, _ in touching])
+    for contact, _ in touching:
+        if requirements.surface != "none":
+            width = float("inf") if requirements.surface == "plane" else requirements.surface
+            feet = [point_on(objective.robot, foot.frame, foot.offset) for foot in objective.supports]
+            found.add_surface(contact, width if width is None else float(width), feet, objective.contacts)
+    found.add_obstacles(requirements.obstacles)
+    return found
+
+
+def _check(robot: Robot, requirements: Requirements) -> None:
+    if not robot.floating and requirements.base != "free":
+        raise InputError(
+            f"base '{requirements.base}' does not fit a robot whose root is fixed",
+            where="base",
+            hint="leave it out or use `root='free-flyer'`",
+        )
+    for name, values in (("box", requirements.box), ("base_box", requirements.base_box)):
+        if not all(np.isfinite(v) and v > 0 for v in values):
+            raise InputError(f"half extents {values}", where=name, hint="give three lengths above zero")
+    for name in ("com_margin", "limit_margin", "regularization"):
+        value = getattr(requirements, name)
+        if not (np.isfinite(value) and value >= 0):
+            raise InputError(f"is {value:g}", where=name, hint="give a number ≥ 0")
+    if requirements.keep_contacts and not (np.isfinite(requirements.friction) and requirements.friction > 0):
+        raise InputError(f"is {requirements.friction:g}", where="friction", hint="give a coefficient above zero")
+    if requirements.hold_force and not requirements.holdable:
+        raise InputError("does nothing without `holdable=True`", where="hold_force", hint="leave out one of them")
+    for joint in requirements.hold:
+        robot.joint_id(joint)
+    _check_target(requirements)
+
+
+def _check_target(requirements: Requirements) -> None:
+    quaternion = requirements.target_quaternion
+    if requirements.other_poses and (quaternion is not None or requirements.target_position is not None):
+        raise InputError(
+            "is one target for several contacts",
+            where="target_quaternion" if quaternion is not None else "target_position",
+            hint="leave it out and start from a `posture` that has the contacts in place",
+        )
+    if quaternion is not None and not abs(np.linalg.norm(quaternion) - 1) < 1e-3:
+        raise InputError(
+            f"has norm {np.linalg.norm(quaternion):.4g}", where="target_quaternion", hint="give a unit x y z w"
+        )
+    if requirements.target_position is not None and not np.isfinite(requirements.target_position).all():
+        raise InputError("is not finite", where="target_position", hint="give three numbers")
+
+
+def _held_support(robot: Robot, numeric: Numeric, support: Support) -> Constraint:
+    point = point_on(robot, support.frame, support.offset)
+    placement = numeric.placement(point)
+    if support.kind == "point":
+        return HeldPosition(f"foot {support.frame}", point, placement.translation)
+    return HeldPose(f"foot {support.frame}", point, placement)
+
+
+def contact_target(robot: Robot, contact: ImpactContact, numeric: Numeric, requirements: Requirements) -> pin.SE3:
+    """Return the target pose of a contact frame, by default its pose at ``numeric.q``."""
+    placement = numeric.placement(point_on(robot, contact.frame)).copy()
+    if requirements.target_position is not None:
+        placement.translation = np.array(requirements.target_position)
+    if requirements.target_quaternion is not None:
+        quaternion = pin.Quaternion(np.array(requirements.target_quaternion))
+        placement.rotation = quaternion.normalized().matrix()
+    return placement
+
+
+def _contact_constraints(
+    robot: Robot, contact: ImpactContact, numeric: Numeric, requirements: Requirements, mode: str
+) -> list[Constraint]:
+    point = point_on(robot, contact.frame)
+    target = contact_target(robot, contact, numeric, requirements)
+    name = f"pose of {contact.frame}"
+    if mode == "free":
+        if requirements.target_position is not None or requirements.target_quaternion is not None:
+            raise InputError(
+                "a target is given but the contact pose is free",
+                where="contact_pose",
+                hint="use full, position, aligned or box",
+            )
+        return []
+    if mode == "full":
+        return [HeldPose(name, point, target)]
+    n = np.array(contact.normal)
+    axis = n if contact.normal_frame == "contact" else target.rotation.T @ n
+    if mode == "aligned":
+        return [HeldPose(name, point, target, axis)]
+    if (degrees := tilt_of(mode)) is not None:
+        held = HeldPosition(f"position of {contact.frame}", point, target.translation)
+        return [held, AxisInCone(f"tilt of {contact.frame}", point, axis, target.rotation @ axis, degrees)]
+    if mode == "box":
+        return [PositionBox(f"position of {contact.frame}", point, target.translation, requirements.box)]
+    return [HeldPosition(f"position of {contact.frame}", point, target.translation)]
+
+
+def _base_constraints(robot: Robot, numeric: Numeric, requirements: Requirements) -> list[Constraint]:
+    if not robot.floating:
+        return []
+    base = base_point()
+    placement, vertical = numeric.placement(base), np.array([0.0, 0.0, 1.0])
+    if requirements.base == "level":
+        return [HeldOrientation("level base", base, np.eye(3), vertical)]
+    if (degrees := tilt_of(requirements.base)) is not None:
+        assert robot.upright is not None  # noqa: S101 (narrows a type)
+        return [AxisInCone("tilt of the base", base, robot.upright, vertical, degrees)]
+    if requirements.base == "fixed":
+        return [HeldPose("base", base, placement)]
+    if requirements.base == "box":
+        return [PositionBox("base position", base, placement.translation, requirements.base_box)]
+    return []
+
+
+def _com_constraint(
+    robot: Robot, supports: Sequence[Support], numeric: Numeric, margin: float
+) -> CenterOfMassOverFeet:
+    corners = []
+    for support in supports:
+        placement = numeric.placement(point_on(robot, support.frame, support.offset))
+        for sx in (-1, 1):
+            for sy in (-1, 1):
+                corner = placement.act(np.array([sx * support.size[0], sy * support.size[1], 0.0]))
+                corners.append(corner[:2])
+    edges = polygon_edges(corners)
+    if edges is None:
+        raise InputError(
+            "the feet span no area to keep the center of mass above",
+            where="com_over_feet",
+            hint="give three feet or soles with a size, or set com_over_feet = false, or `com=False`",
+        )
+    return CenterOfMassOverFeet(*edges, margin)
+
+
+def _bounds(robot: Robot, chart: Chart, given: Array, requirements: Requirements) -> tuple[Array, Array]:
+    lower, upper = chart.bounds()
+    x = chart.to_x(given)
+    margin = requirements.limit_margin
+    lower, upper = lower + margin, upper - margin
+    for slot in chart.slots:
+        if slot.name in requirements.hold:
+            lower[slot.x] = upper[slot.x] = x[slot.x]
+        elif (lower[slot.x] > upper[slot.x]).any():
+            raise InputError(
+                f"a margin of {margin:g} leaves joint '{slot.name}' no room",
+                where="limit_margin",
+                hint="give a smaller one",
+            )
+    return lower, upper

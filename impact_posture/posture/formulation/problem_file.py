@@ -1,0 +1,264 @@
+"""``problem.toml``: an optimization as a file.  Each key is the option of the same name with ``_`` for ``-``."""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from dataclasses import dataclass, fields, replace
+from pathlib import Path
+
+import numpy as np
+
+from impact_posture.config.settings import ProblemSettings
+from impact_posture.config.toml_tables import read_toml, validate
+from impact_posture.errors import InputError, SpecError
+from impact_posture.impact.elasticity.contact_compression import ContactStiffness
+from impact_posture.impact.objective import Objective
+from impact_posture.impact.resolved_impact import FLOATS, ResolvedImpact, resolve
+from impact_posture.posture.approach.attainable_speed import FASTEST
+from impact_posture.posture.constraints.pose_constraints import CenterOfMassOverFeet
+from impact_posture.posture.formulation.build_problem import build_problem
+from impact_posture.posture.program.constrained_problem import ConstrainedProblem, Requirements
+from impact_posture.robot.model_variant import ModelVariant
+from impact_posture.robot.robot import Robot
+from impact_posture.robot.robot_loader import from_folder, names_a_path
+from impact_posture.robot.urdf import EXAMPLE_PREFIX
+from impact_posture.system.escape import toml
+
+_FILES = ("srdf", "config")
+# Settings with the name of a requirement that is worked out from them and from the robot.
+_WORKED_OUT = {"contact_pose", "base", "hold", "com_margin", "limit_margin"}
+
+
+@dataclass(frozen=True)
+class Prepared:
+    """A problem ready to be solved.
+
+    Attributes:
+        settings: Settings of file and command line together.
+        impact: Robot, contact, metric, supports and given posture.
+        problem: The posture problem.
+    """
+
+    settings: ProblemSettings
+    impact: ResolvedImpact
+    problem: ConstrainedProblem
+
+
+def read_settings(path: Path, over: dict[str, object] | None = None) -> ProblemSettings:
+    """Read a ``problem.toml``, whose paths are relative to its folder; options in ``over`` replace its keys."""
+    data = from_folder(read_toml(path), path.resolve().parent, (*_FILES, "weights", "armature", "posture"))
+    over = over or {}
+    # An option also replaces keys that state the same thing in another form.
+    if over.get("metric", "weighted") != "weighted" and "weights" not in over:
+        data.pop("weights", None)
+    if "frame" in over or "normal" in over:
+        data.pop("contact", None)
+    if "contact" in over:
+        data.pop("frame", None)
+        data.pop("normal", None)
+    if "contact_duration" in over:
+        data.pop("contact_stiffness", None)
+    if "contact_stiffness" in over:
+        data.pop("contact_duration", None)
+    if "posture" in over:
+        data.pop("q", None)
+    return validate(ProblemSettings, data | over, str(path))
+
+
+def prepare(settings: ProblemSettings, impact: ResolvedImpact | None = None) -> Prepared:
+    """Resolve all defaults and build the problem; nothing is solved yet.
+
+    Args:
+        settings: The problem.
+        impact: The impact, if it is built already; by default that of the settings.
+
+    Raises:
+        ImpactPostureError: A setting is wrong; the first fault, in one line.
+    """
+    impact = resolve(settings) if impact is None else impact
+    if impact.robot.joint_model == "elastic":
+        raise InputError(
+            "elastic predicts the impact at one posture",
+            where="joint_model",
+            hint="optimize with link or reflected, as the number x says, and evaluate the optimum with elastic",
+        )
+    if settings.q is not None:
+        impact = replace(impact, q=impact.robot.check_posture(np.array(settings.q), where="q"))
+    if impact.missing_support:
+        if settings.base is None:
+            what = f"nothing says what holds {impact.robot.name} up, {FLOATS}"
+            raise InputError(what, where=settings.robot, hint=impact.missing_support)
+        impact = replace(impact, missing_support="")
+    problem = build_problem(impact.robot, impact.objective, impact.q, requirements(settings, impact.objective))
+    released = [joint for joint in _held_by_default(impact.robot) if joint not in problem.requirements.hold]
+    if released:
+        note = f"robot.toml also holds {', '.join(released)}; your `hold` replaces its list, so they are free"
+        problem = replace(problem, notes=(note, *problem.notes))
+    return Prepared(settings, impact, problem)
+
+
+def _held_by_default(robot: Robot) -> tuple[str, ...]:
+    return tuple(joint for joint in robot.spec.constraints.hold if joint not in robot.locked)
+
+
+def requirements(settings: ProblemSettings, objective: Objective) -> Requirements:
+    """Return the demands of the task on the posture; a setting that is ``None`` comes from the robot.
+
+    A setting with the name of a requirement becomes that requirement, unless it is worked out here.
+
+    Raises:
+        InputError: A setting is about feet, but there are no supports.
+    """
+    robot, spec = objective.robot, objective.robot.spec.constraints
+    poses = [settings.contact_pose or robot.contact_pose(contact.frame) for contact in objective.contacts]
+    base = "level" if spec.level_base and robot.floating else "free"
+    com = spec.com_over_feet and bool(objective.supports) if settings.com is None else settings.com
+    if settings.obstacles and not settings.collision:
+        raise InputError("do nothing without `collision`", where="obstacles", hint="leave one of them out")
+    if com and not objective.supports:
+        raise InputError(
+            "there are no feet to keep the center of mass over", where="com", hint="add `support` or `com=False`"
+        )
+    if settings.keep_contacts and not objective.supports:
+        raise InputError("there are no feet to keep", where="keep_contacts", hint="add `support` or leave it out")
+    if settings.approach and not 0 < settings.speed <= FASTEST:
+        what = "needs an approach speed above zero"
+        raise InputError(what, where="approach", hint=f"give `speed`, up to {FASTEST:g} m/s")
+    worked_out = Requirements(
+        approach_speed=settings.speed if settings.approach else 0.0,
+        contact_pose=poses[0] if poses else "free",
+        other_poses=tuple(poses[1:]),
+        base=settings.base or base,
+        hold=_held_by_default(robot) if settings.hold is None else settings.hold,
+        com_over_feet=com,
+        com_asked=settings.com is not None,
+        com_margin=spec.com_margin if settings.com_margin is None else settings.com_margin,
+        least_mobility=_least_mobility(settings),
+        largest_jump=_largest_jump(settings),
+        limit_margin=spec.limit_margin if settings.limit_margin is None else settings.limit_margin,
+    )
+    shared = {f.name for f in fields(Requirements)} & {f.name for f in fields(ProblemSettings)} - _WORKED_OUT
+    return replace(worked_out, **{key: getattr(settings, key) for key in shared})
+
+
+def _least_mobility(settings: ProblemSettings) -> float:
+    """Return the least G, 1/kg, with which the peak force stays within ``max_force``; 0 for no bound."""
+    for name, asked in (
+        ("max_force", settings.max_force is not None),
+        ("tradeoff_against", settings.tradeoff > 0 and settings.tradeoff_against == "force"),
+    ):
+        if asked and settings.contact_stiffness is None and settings.contact_duration is None:
+            raise InputError(
+                "needs the elasticity of the contact",
+                where=name,
+                hint="add `contact_stiffness` (N/m, or a material) or `contact_duration`",
+            )
+        if asked and settings.speed == 0:
+            raise InputError("needs an approach speed", where=name, hint="give `speed` above zero")
+    contact = ContactStiffness.of(settings.contact_stiffness, settings.contact_duration)
+    if settings.max_force is None or contact is None:
+        return 0.0
+    return contact.least_mobility(settings.max_force, settings.speed)
+
+
+def _largest_jump(settings: ProblemSettings) -> float:
+    """Return the largest jump of a joint per approach speed, from ``max_joint_jump`` and ``max_torque``."""
+    if (settings.max_torque is None) != (settings.velocity_gain is None):
+        raise InputError(
+            "bounds the velocity gain times the jump of a joint, so each of the two needs the other",
+            where="max_torque" if settings.velocity_gain is None else "velocity_gain",
+            hint="give `max_torque` and `velocity_gain`, or none of them",
+        )
+    jumps = [] if settings.max_joint_jump is None else [settings.max_joint_jump]
+    if settings.max_torque is not None and settings.velocity_gain is not None:
+        jumps.append(settings.max_torque / settings.velocity_gain)
+    speed = (1 + settings.restitution) * settings.speed
+    return min(jumps) / speed if jumps and speed > 0 else float("inf")
+
+
+def resolved_settings(prepared: Prepared) -> ProblemSettings:
+    """Return the settings with all defaults written out, which give the same result again."""
+    settings, impact, wanted = prepared.settings, prepared.impact, prepared.problem.requirements
+    robot = settings.robot
+    if names_a_path(robot, Path()):
+        robot = str(Path(robot).expanduser().resolve())
+    changes: dict[str, object] = {
+        "robot": robot,
+        "root": impact.robot.root,
+        "package_dir": tuple(str(Path(p).expanduser().resolve()) for p in settings.package_dir),
+        **_resolved_contacts(impact),
+        "posture": None,
+        "q": tuple(float(v) for v in impact.q),
+        # One key holds for all contacts, so several contacts keep the key as it was given.
+        "contact_pose": settings.contact_pose if wanted.other_poses else wanted.contact_pose,
+        "support": tuple(f"{s.frame}:{s.kind}" for s in impact.supports),
+        "support_compliance": impact.objective.compliance if impact.supports else None,
+        **{key: getattr(wanted, key) for key in ("hold", "base", "com_margin", "limit_margin")},
+        "com": any(isinstance(c, CenterOfMassOverFeet) for c in prepared.problem.constraints),
+        "metric": impact.metric.kind,
+        "weights": impact.metric.weights,
+        "objective": impact.objective.kind,
+        "normal_cone": impact.objective.normal_cone_deg,
+        "bilateral": impact.objective.bilateral,
+        "normal_frame": impact.contact.normal_frame,
+        "joint_model": impact.robot.joint_model,
+        "speed": impact.speed,
+        "restitution": impact.restitution,
+        **_resolved_variants(impact.objective.model_variants),
+    }
+    for key in _FILES:
+        value = getattr(settings, key)
+        in_package = value is None or value.startswith(EXAMPLE_PREFIX)
+        changes[key] = value if in_package else str(Path(value).expanduser().resolve())
+    if settings.armature is not None:
+        changes["armature"] = _armature_by_joint(impact)
+    return replace(settings, **changes)  # type: ignore[arg-type]
+
+
+def _resolved_contacts(impact: ResolvedImpact) -> dict[str, object]:
+    contact = impact.contact
+    if not impact.objective.others:
+        keys = ("frame", "normal", "offset", "friction", "impulse")
+        return {key: getattr(contact, key) for key in keys} | {"contact": None}
+    texts = tuple(f"{c.frame}:{','.join(map(repr, c.normal))}:{c.impulse!r}" for c in impact.objective.contacts)
+    return {"frame": None, "normal": None, "offset": None, "contact": texts, "friction": contact.friction}
+
+
+def _resolved_variants(variants: Sequence[ModelVariant]) -> dict[str, object]:
+    """The settings that give these model variants."""
+    # The model as stated is always among them.
+    factors = {variant.armature_factor for variant in variants} - {1.0}
+    if len(factors) == 1:
+        factors.add(1.0)
+    payloads = dict.fromkeys(v.payload for v in variants if v.payload is not None)
+    return {
+        "armature_range": (min(factors), max(factors)) if factors else None,
+        "payload": tuple((payload.frame, payload.mass) for payload in payloads),
+    }
+
+
+def _armature_by_joint(impact: ResolvedImpact) -> str | dict[str, float]:
+    robot = impact.robot
+    first = {name: robot.model.idx_vs[robot.joint_id(name)] for name in robot.joint_names}
+    values = {name: float(robot.armature[k]) for name, k in first.items()}
+    return values if any(values.values()) else "none"
+
+
+def dump_settings(settings: ProblemSettings) -> str:
+    """Write settings as TOML, in the order of the fields and without those that are ``None``.
+
+    Raises:
+        SpecError: The path of a file is not UTF-8.
+    """
+    lines = [f"schema = {toml(settings.schema)}"]
+    # The robot comes first, because a reader looks for it.
+    for key in sorted((field.name for field in fields(ProblemSettings)), key=lambda name: name != "robot"):
+        value = getattr(settings, key)
+        if key != "schema" and value is not None and value != {}:
+            try:
+                lines.append(f"{key} = {toml(value)}")
+            except UnicodeEncodeError:
+                raise SpecError(
+                    f"'{value}' is not UTF-8, as TOML has to be", where=key, hint="rename the file or folder"
+                ) from None
+    return "\n".join(lines) + "\n"

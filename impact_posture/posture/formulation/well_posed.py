@@ -1,0 +1,151 @@
+"""Make a problem well-posed: fix undetermined motions, leave out repeated equalities, hold apparent freedoms."""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from dataclasses import replace
+
+import numpy as np
+import pinocchio as pin
+
+from impact_posture.dynamics.numeric import Numeric
+from impact_posture.impact.objective import Objective
+from impact_posture.posture.constraints.constraint import Constraint
+from impact_posture.posture.constraints.pose_constraints import HeldPosition, HeldTurn, base_point
+from impact_posture.posture.manifold.feasible_start import Projector, feasible_start
+from impact_posture.posture.program.constrained_problem import (
+    RANK_TOLERANCE,
+    ConstrainedProblem,
+    Requirements,
+    equality_jacobian,
+    held_rows,
+    rank,
+)
+from impact_posture.robot.robot import Robot
+from impact_posture.system.arrays import Array, independent_rows, null_space
+
+# Size of the trial turn (rad), and the share of it that must survive for the turn to be possible.
+_TRIAL, _SURVIVES = 0.05, 0.1
+# Random feasible postures at which ranks are compared.
+_SAMPLES = 4
+
+
+def pin_undetermined(
+    robot: Robot,
+    objective: Objective,
+    numeric: Numeric,
+    requirements: Requirements,
+    constraints: Sequence[Constraint],
+) -> tuple[list[Constraint], list[str]]:
+    """Return constraints that fix the base where nothing else does, and notes for the user.
+
+    The value does not change if the whole robot moves, or turns about an axis that the objective does not see.  Such
+    motions are fixed at their initial value if the constraints allow them.  A free contact pose also fixes yaw,
+    because a turn of the whole robot towards the impact is no change of posture.
+    """
+    if not robot.floating:
+        return [], []
+    base = base_point()
+    placement = numeric.placement(base)
+    move = np.linalg.pinv(numeric.jacobian(base))
+    blind = objective.blind_motions()
+    turns = [motion[3:] for motion in blind if motion[3:].any()]
+    if objective.contacts and requirements.contact_pose == "free" and not objective.supports:
+        blind = np.vstack([blind, np.eye(6)[5]])
+    basis, values, _ = np.linalg.svd(blind.T, full_matrices=False)
+    motions = move @ basis[:, values > 6 * np.finfo(float).eps * values[0]]
+    added: list[Constraint] = []
+    notes: list[str] = []
+
+    def free() -> Array:
+        """Base twists that are still allowed, world axes, shape (6, k)."""
+        rows = [c.evaluate(numeric)[1] @ motions for c in (*constraints, *added)]
+        if not rows:
+            return np.asarray(numeric.jacobian(base) @ motions)
+        allowed = null_space(np.vstack(rows), RANK_TOLERANCE)
+        return np.asarray(numeric.jacobian(base) @ motions @ allowed)
+
+    # A turn about another point moves the base as well, so turns are fixed before positions.
+    candidates = [("yaw", np.array([0.0, 0.0, 1.0]))]
+    if len(turns) == 1:
+        candidates.append(("turn about the normal", placement.rotation.T @ turns[0]))
+    candidates += [("roll", np.eye(3)[0]), ("pitch", np.eye(3)[1])]
+    for name, axis in candidates:
+        held = HeldTurn(base, placement.rotation, axis, f"base {name}")
+        if np.abs(held.evaluate(numeric)[1] @ move @ free()).max(initial=0.0) > 1e-3:
+            added.append(held)
+            notes.append(f"base {name} fixed at its initial value: nothing else determines it")
+    if np.abs(free()[:3]).max(initial=0.0) > 1e-3:
+        added.append(HeldPosition("base position", base, placement.translation))
+        notes.append("base position fixed at its initial value: nothing else determines it")
+    return added, notes
+
+
+def regularize(problem: ConstrainedProblem) -> ConstrainedProblem:
+    """Choose independent equality rows for the program, and hold turns that exist to first order only.
+
+    Four point feet on planar legs (solo8) give 12 equations of rank 10.  Two equations repeat others, and the base
+    may roll to first order although any finite roll would spread the feet.  A program can handle neither.  It leaves
+    out the repeated rows, which the certificate still checks, and holds the turn explicitly.
+    """
+    numeric = Numeric(problem.robot.model)
+    jacobian = equality_jacobian(problem, numeric.at(problem.given))
+    if rank(jacobian) == len(jacobian):
+        return problem
+    # The given posture pulled onto the constraints, and a few random feasible postures.
+    postures = [Projector(problem).project(problem.given).q]
+    postures += [q for k in range(1, _SAMPLES + 1) if (q := feasible_start(problem, k, seed=0)) is not None]
+    added, notes = [], []
+    if problem.robot.floating:
+        rotation = numeric.at(postures[0]).placement(base_point()).rotation.copy()
+        for name, axis in zip(("roll", "pitch", "yaw"), np.eye(3), strict=True):
+            turn = HeldTurn(base_point(), rotation, axis, f"base {name}")
+            if _only_to_first_order(problem, numeric, turn, postures[0]):
+                added.append(turn)
+                notes.append(f"{turn.name} held: the feet block it, although their linearization allows it")
+    problem = replace(problem, constraints=(*problem.constraints, *added), notes=(*problem.notes, *notes))
+    # A posture may be singular by chance (a straight arm), so the most regular posture decides what repeats.
+    generic = max(postures, key=lambda q: rank(equality_jacobian(problem, numeric.at(q))))
+    jacobian = equality_jacobian(problem, numeric.at(generic))
+    if rank(jacobian) == len(jacobian):
+        return problem
+    return replace(problem, rows=_independent_rows(problem, numeric.at(generic)))
+
+
+def _only_to_first_order(problem: ConstrainedProblem, numeric: Numeric, turn: HeldTurn, q: Array) -> bool:
+    """Whether the linearized equalities at ``q`` allow a turn that the equalities themselves undo."""
+    model = problem.robot.model
+    jacobian = equality_jacobian(problem, numeric.at(q))
+    free = null_space(jacobian, RANK_TOLERANCE)
+    along = free @ (free.T @ turn.evaluate(numeric)[1][0])
+    size = float(turn.evaluate(numeric)[1][0] @ along)
+    if size < 1e-3:
+        return False
+    equalities = [c for c in problem.constraints if c.equality]
+    start = [c.evaluate(numeric)[0] for c in equalities]
+    held = np.zeros(len(held_rows(problem.robot, problem.requirements.hold)))
+    q = pin.integrate(model, q, along * (_TRIAL / size))
+    for _ in range(60):
+        numeric.at(q)
+        residual = [c.evaluate(numeric)[0] - s for c, s in zip(equalities, start, strict=True)]
+        step = -np.linalg.pinv(equality_jacobian(problem, numeric), rcond=1e-9) @ np.concatenate([held, *residual])
+        q = pin.integrate(model, q, step)
+        if np.abs(step).max() < 1e-12:
+            break
+    turned = float(turn.evaluate(numeric.at(q))[0][0])
+    return abs(turned) < _SURVIVES * _TRIAL
+
+
+def _independent_rows(problem: ConstrainedProblem, numeric: Numeric) -> tuple[tuple[int, ...], ...]:
+    """The rows of each constraint that the program carries: all inequalities, and independent equalities."""
+    held = held_rows(problem.robot, problem.requirements.hold).sum(axis=0) > 0
+    equalities = [(index, c) for index, c in enumerate(problem.constraints) if c.equality]
+    labels = [(index, row) for index, c in equalities for row in range(c.rows)]
+    # Of rows that repeat each other, those of the cheaper constraint are left out.
+    stacked = np.vstack([c.price * c.evaluate(numeric)[1] for _, c in equalities])
+    stacked[:, held] = 0.0
+    chosen = {labels[k] for k in independent_rows(stacked, RANK_TOLERANCE)}
+    return tuple(
+        tuple(row for row in range(len(c.lifted_bounds[0])) if not c.equality or (index, row) in chosen)
+        for index, c in enumerate(problem.constraints)
+    )

@@ -1,0 +1,1 @@
+"""Torques, thrusts and contact forces that hold a posture."""

@@ -1,0 +1,246 @@
+"""Distribution of the forces that hold a robot at rest, with the least share of its limits."""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from dataclasses import dataclass, field
+
+import numpy as np
+import pinocchio as pin
+
+from impact_posture.posture.loads.static_load import ForceSource, StaticLoad
+from impact_posture.posture.program.linear_program import solve_linear
+from impact_posture.system.arrays import Array
+
+# Shares closer to the largest than this are as large.
+_TIED = 1e-9
+# Times that forces near even ones leave out feet that would have to pull.
+_TURNS = 4
+# Rate above which a load meets no limit.
+_MOST = 1e6
+
+
+@dataclass(frozen=True, eq=False)
+class Distribution:
+    """Forces and torques that hold one posture.
+
+    Attributes:
+        forces: ``z`` of rotors and feet, shape (k,).
+        shares: Signed share of its limit that each actuator uses, 0 in the middle of its range, shape (actuators,).
+        unbalanced: Sum of the absolute entries of the wrench on the base that nothing bears, in weights (moments
+            over one meter); zero if the posture can be balanced.
+        jacobian: Tangent Jacobian of ``unbalanced`` and the absolute shares, shape (1 + actuators, nv).  Where the
+            forces are not unique, it is that of the largest share or of ``unbalanced``, and other rows are zero.
+    """
+
+    forces: Array
+    shares: Array
+    unbalanced: float
+    jacobian: Array
+
+    @property
+    def largest(self) -> float:
+        """The largest share."""
+        return float(np.abs(self.shares).max(initial=0.0))
+
+
+@dataclass(frozen=True, eq=False)
+class Thrusts:
+    """Thrusts that the wrench on the base determines alone, ``u = P τ_base``.
+
+    Attributes:
+        names: Name of each rotor.
+        matrix: ``P``, N per N and N·m, shape (k, 6).
+        lower: Least thrusts, N, shape (k,).
+        upper: Largest thrusts, N, shape (k,).
+    """
+
+    names: tuple[str, ...] = ()
+    matrix: Array = field(default_factory=lambda: np.zeros((0, 6)))
+    lower: Array = field(default_factory=lambda: np.zeros(0))
+    upper: Array = field(default_factory=lambda: np.zeros(0))
+
+
+class Equilibrium:
+    """A robot at rest: rows ``R τ(q, z) + r``, first the balance of the base (= 0), then shares of limits.
+
+    A share is 0 in the middle of the range of an actuator, and ±1 at its limits.
+
+    Args:
+        model: The robot, with gravity.
+        sources: Wrenches of rotors and feet in weights, and of what pushes on it, N.
+        weight: The weight of the robot, N.
+        limits: Largest torques, infinite where unknown, shape (nv,).
+        balance: Combinations of the base wrench that the sources balance, shape (b, 6); none on a fixed base.
+        thrusts: Thrusts that are not among the sources.
+        names: Names of the entries of ``ν``.
+    """
+
+    def __init__(
+        self,
+        model: pin.Model,
+        sources: Sequence[ForceSource],
+        weight: float,
+        limits: Array,
+        balance: Array,
+        thrusts: Thrusts,
+        names: Sequence[str],
+    ) -> None:
+        self.load, self.weight, self.balanced = StaticLoad(model, sources), weight, len(balance)
+        bounded = [k for k, limit in enumerate(limits) if np.isfinite(limit)]
+        # An entry of z with two limits is a thrust; feet can push as hard as it takes.
+        self._free = np.flatnonzero(np.isfinite(self.load.upper))
+        half, middle = (thrusts.upper - thrusts.lower) / 2, (thrusts.upper + thrusts.lower) / 2
+        base = np.vstack([balance / weight, thrusts.matrix / half[:, None]])
+        torque = np.diag(1 / limits)[bounded]
+        self.rows = np.vstack([np.zeros((len(base), model.nv)), torque])
+        self.rows[: len(base), :6] = base[:, : model.nv]
+        self.offset = np.zeros(len(self.rows))
+        self.offset[self.balanced : len(base)] = -middle / half
+        free = [self.load.names[k] for k in self._free]
+        self.kinds = ("thrust",) * len(half) + ("torque",) * len(bounded) + ("thrust",) * len(free)
+        self.actuators = (*thrusts.names, *(names[k] for k in bounded), *free)
+        ends = [
+            (np.append(thrusts.lower, -limits[bounded]), np.append(thrusts.upper, limits[bounded])),
+            (weight * self.load.lower[self._free], weight * self.load.upper[self._free]),
+        ]
+        self.lower, self.upper = (np.concatenate(parts) for parts in zip(*ends, strict=True))
+        # What was found last, because one posture is looked at several times.
+        self._even: tuple[bytes, float] | None = None
+        self._found: tuple[bytes, Distribution] | None = None
+
+    def _affine(self, load: Array, by_force: Array) -> tuple[Array, Array, Array, Array]:
+        """``A, b, S, c`` of the balance ``A z + b`` and the shares ``S z + c``, from the load at ``z = 0``."""
+        every, start = self.rows @ by_force, self.rows @ load + self.offset
+        half = (self.load.upper - self.load.lower)[self._free, None] / 2
+        middle = (self.load.upper + self.load.lower)[self._free] / 2
+        S = np.vstack([every[self.balanced :], np.eye(self.load.count)[self._free] / half])
+        return (
+            every[: self.balanced],
+            start[: self.balanced],
+            S,
+            np.append(start[self.balanced :], -middle / half[:, 0]),
+        )
+
+    def spares(self, q: Array, room: float) -> bool:
+        """Return whether forces near even ones balance the base and keep ``room`` from every limit.
+
+        This proves without a linear program that the posture can be held.  It says nothing if they do not.
+        """
+        key = q.tobytes()
+        if self._even is None or self._even[0] != key:
+            self._even = key, self._even_share(q)
+        return self._even[1] <= 1 - room
+
+    def _even_share(self, q: Array) -> float:
+        """Return the largest share of a limit at forces near even ones; infinite if they do not balance the base."""
+        still = self.load.torque(q, np.zeros(self.load.count), by_posture=False)
+        A, b, S, c = self._affine(still.value, still.by_force)
+        lower, upper = self.load.lower, self.load.upper
+        pushing = np.isfinite(lower) & np.isinf(upper)
+        even = np.where(pushing, 1 / max(pushing.sum(), 1), 0.0)
+        even[self._free] = (lower + upper)[self._free] / 2
+        z, used = even, np.ones(len(even), dtype=bool)
+        for _ in range(_TURNS if len(A) else 0):
+            z = np.where(used, even, 0.0)
+            z[used] -= np.linalg.pinv(A[:, used]) @ (A @ z + b)
+            pulling = pushing & (z < 0)
+            if not pulling.any():
+                break
+            # What would have to pull does nothing, and the rest carries the load.
+            used &= ~pulling
+        balanced = np.abs(A @ z + b).max(initial=0.0) < _TIED and (z[pushing] >= 0).all()
+        return float(np.abs(S @ z + c).max(initial=0.0)) if balanced else np.inf
+
+    def distribute(self, q: Array) -> Distribution:
+        """Return the forces that balance the base with the least largest share, or with the least imbalance."""
+        key = q.tobytes()
+        if self._found is None or self._found[0] != key:
+            self._found = key, self._distribute(q)
+        return self._found[1]
+
+    def _distribute(self, q: Array) -> Distribution:
+        count = self.load.count
+        still = self.load.torque(q, np.zeros(count))
+        A, b, S, c = self._affine(still.value, still.by_force)
+        jacobian = np.zeros((1 + c.size, self.load.model.nv))
+        if not count:
+            jacobian[1:] = np.sign(c)[:, None] * (self.rows @ still.by_posture)
+            return Distribution(np.zeros(0), c, 0.0, jacobian)
+        z, unbalanced, duals = self._least_share(A, b, S, c) or self._least_imbalance(A, b)
+        shares = S @ z + c
+        # The value moves with R τ at fixed z, by the multipliers of its rows.
+        gradient = duals @ self.rows @ self.load.torque(q, z).by_posture
+        worst = np.abs(shares) > np.abs(shares).max(initial=0.0) - _TIED
+        jacobian[np.append(unbalanced > 0, worst & (unbalanced == 0))] = gradient
+        return Distribution(z, shares, unbalanced, jacobian)
+
+    def shares(self, q: Array, load: Array) -> Array | None:
+        """Return the signed shares for another load than that of rest, such as ``M ν̇ + h``, shape (actuators,).
+
+        The largest is as small as possible.  ``None`` if the feet cannot balance the load.
+        """
+        A, b, S, c = self._affine(load, self._by_force(q))
+        if not self.load.count:
+            return c
+        found = self._least_share(A, b, S, c)
+        return None if found is None else S @ found[0] + c
+
+    def largest_rate(self, q: Array, rest: Array, dynamic: Array) -> float | None:
+        """Return the largest ``λ ≥ 0`` for which the limits allow the load ``rest + λ dynamic``; infinite if all do.
+
+        ``None`` if they do not even allow ``rest``.
+        """
+        A, b, S, c = self._affine(rest, self._by_force(q))
+        rate = self.rows @ dynamic
+        into = np.append(rate[self.balanced :], np.zeros(len(self._free)))
+        found = solve_linear(
+            np.append(np.zeros(self.load.count), -1.0),
+            np.vstack([np.column_stack([A, rate[: self.balanced]]), np.column_stack([S, into])]),
+            np.concatenate([-b, -1 - c]),
+            np.concatenate([-b, 1 - c]),
+            np.append(self.load.lower, 0.0),
+            np.append(self.load.upper, _MOST),
+        )
+        if found is None:
+            return None
+        return float("inf") if found.x[-1] > _MOST * (1 - 1e-9) else float(found.x[-1])
+
+    def _by_force(self, q: Array) -> Array:
+        return self.load.torque(q, np.zeros(self.load.count)).by_force
+
+    def _least_share(self, A: Array, b: Array, S: Array, c: Array) -> tuple[Array, float, Array] | None:
+        """``min s`` with ``A z + b = 0`` and ``|S z + c| ≤ s``; ``None`` if the feet cannot balance the robot."""
+        count, one, infinite = self.load.count, np.ones((len(S), 1)), np.full(2 * len(S), np.inf)
+        low, high = np.append(self.load.lower, 0.0), np.append(self.load.upper, np.inf)
+        # A thrust beyond its limits shows as a share above one.
+        low[self._free], high[self._free] = -np.inf, np.inf
+        found = solve_linear(
+            np.append(np.zeros(count), 1.0),
+            np.vstack([np.block([[S, -one], [-S, -one]]), np.column_stack([A, np.zeros(len(A))])]),
+            np.concatenate([-infinite, -b]),
+            np.concatenate([-c, c, -b]),
+            low,
+            high,
+        )
+        if found is None:
+            return None
+        above, below, balance = np.split(found.multipliers, [len(S), 2 * len(S)])
+        duals = np.concatenate([balance, above - below])
+        return found.x[:count], 0.0, duals[: len(self.rows)]
+
+    def _least_imbalance(self, A: Array, b: Array) -> tuple[Array, float, Array]:
+        """``min Σ|A z + b|`` within the limits of thrusts and feet."""
+        one, apart = np.eye(len(A)), np.zeros(2 * len(A))
+        found = solve_linear(
+            np.concatenate([np.zeros(self.load.count), apart + 1]),
+            np.hstack([A, -one, one]),
+            -b,
+            -b,
+            np.append(self.load.lower, apart),
+            np.append(self.load.upper, apart + np.inf),
+        )
+        assert found is not None  # noqa: S101 (narrows a type: any imbalance is allowed)
+        duals = np.zeros(len(self.rows))
+        duals[: len(A)] = found.multipliers
+        return found.x[: self.load.count], found.value, duals

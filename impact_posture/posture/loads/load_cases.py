@@ -1,0 +1,186 @@
+"""Load cases in which a robot has to hold its posture: at rest before the impact, and while it pushes after it."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass, replace
+
+import numpy as np
+import pinocchio as pin
+
+from impact_posture.dynamics.tree import PointOnLink
+from impact_posture.errors import InputError
+from impact_posture.impact.impact_contact import ImpactContact, point_on
+from impact_posture.impact.objective import Objective
+from impact_posture.impact.worst_case_objective import WorstCaseObjective
+from impact_posture.posture.constraints.constraint import Constraint
+from impact_posture.posture.loads.actuator_loads import Holding
+from impact_posture.posture.loads.equilibrium import Equilibrium, Thrusts
+from impact_posture.posture.loads.holdable import Holdable, ReachableWrench
+from impact_posture.posture.loads.static_load import ForceSource, StaticLoad
+from impact_posture.posture.program.constrained_problem import Requirements
+from impact_posture.robot.actuation import allocation_matrix, thrust_limits, torque_limits
+from impact_posture.robot.robot import Robot
+from impact_posture.system.arrays import Array
+
+# Edges of the pyramid that stands for a friction cone.  It lies inside the cone.
+_EDGES = 4
+# Beyond this friction a pyramid is so flat that its edges no longer carry weight.
+_MOST_FRICTION = 10.0
+# A singular value of the map from forces to the base wrench below this share of the largest one is rounding.
+_RANK = 1e-9
+
+
+@dataclass(frozen=True, eq=False)
+class LoadCase:
+    """One load that the robot has to hold.
+
+    Attributes:
+        name: The load in words, such as ``at rest``.
+        words: Description of the constraint in one line.
+        equilibrium: The robot at rest under this load.
+        unreachable: Combinations of the base wrench that the rotors cannot make, shape (6 − r, 6).
+    """
+
+    name: str
+    words: str
+    equilibrium: Equilibrium
+    unreachable: Array
+
+    def constraints(self) -> list[Constraint]:
+        """Return the constraints of this case."""
+        rest, made = self.equilibrium, list[Constraint]()
+        if len(self.unreachable):
+            pushes = [source for source in rest.load.sources if not source.lower.size]
+            load = StaticLoad(rest.load.model, pushes)
+            made.append(ReachableWrench(self.name, load, self.unreachable / rest.weight))
+        return [*made, Holdable(self.name, rest, self.words)]
+
+
+@dataclass(frozen=True, eq=False)
+class LoadCases:
+    """The load cases of a problem.
+
+    Attributes:
+        cases: The load cases; none where the data of the robot do not allow a statement.
+        notes: Notes for the user about what is not known.
+        unknown: Why there are no load cases; empty if there are.
+    """
+
+    cases: tuple[LoadCase, ...] = ()
+    notes: tuple[str, ...] = ()
+    unknown: str = ""
+
+    def holding(self, q: Array) -> Holding | None:
+        """Return what holds ``q``, at rest and in the other cases; ``None`` if the data do not say."""
+        if not self.cases:
+            return None
+        found = [Holding.of(case.name, case.equilibrium, case.unreachable, q) for case in self.cases]
+        return replace(found[0], other_loads=tuple(found[1:]))
+
+
+def load_cases(objective: Objective, q: Array, requirements: Requirements) -> LoadCases:
+    """Return the load cases for which the data of the robot allow a statement.
+
+    Before the impact the contact bears nothing.  With a ``hold_force`` the robot must also hold that force along the
+    normal of every contact after it.  A payload that the robot may carry makes further cases.
+
+    Args:
+        objective: What is minimized, with its contacts, supports and model variants.
+        q: A posture with the feet in place, shape (nq,).
+        requirements: The friction of the feet, the force to hold, and the share of the limits that it may take.
+
+    Raises:
+        InputError: A force is to be held, but nothing is known about what holds the robot.
+    """
+    robot, force, share = objective.robot, requirements.hold_force, requirements.limit_share
+    weight = robot.mass * float(np.linalg.norm(robot.model.gravity.linear))
+    rotors = _rotors(robot, weight, share) if robot.floating else []
+    feet = _feet(objective, weight, requirements.friction) if robot.floating else []
+    limits = share * torque_limits(robot.model)
+    reach, rank = _reach(StaticLoad(robot.model, [*rotors, *feet]), q) if robot.floating else (np.zeros((0, 6)), 0)
+    unknown = ""
+    if robot.floating and not (rotors or feet):
+        unknown = "there are neither rotors nor feet that could hold it up"
+    elif feet and rank < 6:
+        unknown = f"feet with friction {requirements.friction:g} at these points cannot balance it at rest"
+    elif not robot.floating and not np.isfinite(limits).any():
+        unknown = "no effort limit of a joint is known"
+    if unknown and force:
+        raise InputError(f"{force:g} N cannot be checked: {unknown}", where="hold_force", hint="leave it out")
+    if unknown:
+        return LoadCases((), (f"whether the robot can hold the posture is not checked: {unknown}",), unknown)
+    free = [s.frame for s in objective.supports if feet and s.kind == "surface" and not s.has_sole]
+    notes = [f"the moments that {', '.join(free)} can bear are not checked: the sole has no size"] if free else []
+    kinds = ["joint torques", *["rotor thrusts"] * bool(rotors), *["forces of the feet"] * bool(feet)]
+    what = " and ".join([", ".join(kinds[:-1]), kinds[-1]] if kinds[1:] else kinds)
+    sources, balance, thrusts = [*rotors, *feet], reach[:rank], Thrusts()
+    if rotors and not feet and rank == rotors[0].lower.size:
+        # The base determines independent rotors, which then need no unknowns.
+        limit = weight * rotors[0].lower, weight * rotors[0].upper
+        thrusts = Thrusts(rotors[0].names, np.asarray(np.linalg.pinv(rotors[0].columns / weight)), *limit)
+        sources, balance = [], balance[:0]
+    within = "limits" if share == 1 else f"{100 * share:g} % of their limits"
+    cases = []
+    for model, variant in _models(objective):
+        for pushed in (0.0, force) if force else (0.0,):
+            pushes = [_push(robot, contact, pushed) for contact in objective.contacts] if pushed else []
+            names = robot.tangent_names
+            rest = Equilibrium(model, [*sources, *pushes], weight, limits, balance, thrusts, names)
+            name = (f"while it pushes with {pushed:g} N" if pushed else "at rest") + variant
+            cases.append(LoadCase(name, f"{what} within {within} {name}", rest, reach[rank:]))
+    return LoadCases(tuple(cases), tuple(notes))
+
+
+def _reach(load: StaticLoad, q: Array) -> tuple[Array, int]:
+    """Orthonormal combinations of the base wrench, first those that the forces determine, and their number."""
+    vectors, values, _ = np.linalg.svd(load.torque(q, np.zeros(load.count)).by_force[:6])
+    return vectors.T, int((values > _RANK * values.max(initial=0.0)).sum())
+
+
+def _models(objective: Objective) -> list[tuple[pin.Model, str]]:
+    """The model of the robot, and those of its payloads, with their names."""
+    found = [(objective.robot.model, "")]
+    if isinstance(objective, WorstCaseObjective):
+        for variant in objective.model_variants[1:]:
+            # The armature does not change the weight.
+            if variant.payload is not None and variant.armature_factor == 1:
+                found.append((variant.robot.model, f" ({variant.name})"))
+    return found
+
+
+def _rotors(robot: Robot, weight: float, share: float) -> list[ForceSource]:
+    propulsion = robot.spec.propulsion
+    if propulsion is None:
+        return []
+    least, most = thrust_limits(propulsion)
+    middle, half = (most + least) / 2, share * (most - least) / 2
+    low, high = (np.full(len(propulsion.rotors), limit / weight) for limit in (middle - half, middle + half))
+    columns = weight * allocation_matrix(robot.model, propulsion)
+    names = tuple(rotor.name for rotor in propulsion.rotors)
+    return [ForceSource(PointOnLink(1, np.zeros(3), np.eye(3)), columns, low, high, names, in_frame=True)]
+
+
+def _feet(objective: Objective, weight: float, friction: float) -> list[ForceSource]:
+    """Forces at the contact points, or the corners of soles: edges of pyramids about world z, in weights."""
+    angles = 2 * np.pi * np.arange(_EDGES) / _EDGES
+    slope = min(friction, _MOST_FRICTION)
+    edges = np.array([slope * np.cos(angles), slope * np.sin(angles), np.ones(_EDGES)])
+    found = []
+    for support in objective.supports:
+        signs = [(x, y) for x in (-1, 1) for y in (-1, 1)] if support.has_sole else [(0, 0)]
+        columns, lower = np.vstack([edges, np.zeros_like(edges)]), np.zeros(_EDGES)
+        if support.kind == "surface" and not support.has_sole:
+            columns, lower = np.hstack([columns, np.eye(6)[:, 3:]]), np.append(lower, np.full(3, -np.inf))
+        for x, y in signs:
+            offset = np.array(support.offset) + np.array([x * support.size[0], y * support.size[1], 0.0])
+            point = point_on(objective.robot, support.frame, (float(offset[0]), float(offset[1]), float(offset[2])))
+            names = (support.frame,) * lower.size
+            found.append(ForceSource(point, weight * columns, lower, np.full(lower.size, np.inf), names))
+    return found
+
+
+def _push(robot: Robot, contact: ImpactContact, force: float) -> ForceSource:
+    """The force of the surface on the robot, along the normal."""
+    point = point_on(robot, contact.frame, contact.offset)
+    wrench = np.append(force * np.array(contact.normal), np.zeros(3))
+    return ForceSource(point, in_frame=contact.normal_frame == "contact", constant=wrench)

@@ -1,0 +1,125 @@
+"""Joint torques of a robot at rest, as an expression and in Pinocchio's numbers.
+
+A robot at rest under gravity satisfies ``τ = h(q) − Σ J_kᵀ w_k``, with the generalized gravity ``h`` and the wrenches
+``w_k = W_k z_k + p_k`` of rotors, feet and what pushes on the robot.  ``τ`` is dual to ``ν``.  Its first six entries
+are the unbalanced wrench of a floating base, which nothing bears.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from dataclasses import dataclass, field
+
+import casadi as ca
+import numpy as np
+import pinocchio as pin
+
+from impact_posture.dynamics.spatial import constant
+from impact_posture.dynamics.tree import PointOnLink, Tree, Wrench
+from impact_posture.system.arrays import Array
+
+
+@dataclass(frozen=True, eq=False)
+class ForceSource:
+    """A wrench ``W z + p`` on a link, in the axes of the world, or in those of the frame.
+
+    Attributes:
+        point: Point of the link.
+        columns: ``W``, force (N) above moment (N·m) about the point per unit z, shape (6, k).
+        lower: Lower bounds of z, shape (k,).
+        upper: Upper bounds of z, shape (k,).
+        names: Name of each entry of z.
+        in_frame: Whether the wrench turns with the link.
+        constant: ``p``, shape (6,).
+    """
+
+    point: PointOnLink
+    columns: Array = field(default_factory=lambda: np.zeros((6, 0)))
+    lower: Array = field(default_factory=lambda: np.zeros(0))
+    upper: Array = field(default_factory=lambda: np.zeros(0))
+    names: tuple[str, ...] = ()
+    in_frame: bool = False
+    constant: Array = field(default_factory=lambda: np.zeros(6))
+
+
+@dataclass(frozen=True, eq=False)
+class StaticTorque:
+    """``τ(q, z)`` at one posture.
+
+    Attributes:
+        value: ``τ``, shape (nv,).
+        by_posture: Tangent Jacobian ``∂τ/∂q``, shape (nv, nv); zero if it was left out.
+        by_force: ``∂τ/∂z``, shape (nv, k).
+    """
+
+    value: Array
+    by_posture: Array
+    by_force: Array
+
+
+class StaticLoad:
+    """Torques ``τ(q, z)`` of a robot at rest.
+
+    Args:
+        model: The robot, with gravity.
+        sources: Wrenches on its links.
+    """
+
+    def __init__(self, model: pin.Model, sources: Sequence[ForceSource]) -> None:
+        self.model, self.sources = model, tuple(sources)
+        self._data = model.createData()
+        self._parts = np.cumsum([0, *[len(source.lower) for source in self.sources]])
+        self.lower, self.upper = (
+            np.concatenate([np.zeros(0), *[getattr(source, side) for source in self.sources]])
+            for side in ("lower", "upper")
+        )
+        self.names = tuple(name for source in self.sources for name in source.names)
+
+    @property
+    def count(self) -> int:
+        """Number of entries of z."""
+        return len(self.lower)
+
+    def split(self, z: Array) -> list[Array]:
+        """Return the part of z of each source."""
+        return np.split(z, self._parts[1:-1]) if self.sources else []
+
+    def symbolic(self, tree: Tree, z: ca.SX) -> ca.SX:
+        """Return ``τ(q, z)`` as an expression, shape (nv, 1)."""
+        wrenches = []
+        for source, start, stop in zip(self.sources, self._parts, self._parts[1:], strict=False):
+            w = ca.SX(source.columns) @ z[int(start) : int(stop)] + ca.SX(source.constant)
+            wrenches.append(Wrench(source.point, w[:3], w[3:], source.in_frame))
+        return -tree.generalized_force(wrenches, constant(self.model.gravity.linear))
+
+    def torque(self, q: Array, z: Array, *, by_posture: bool = True) -> StaticTorque:
+        """Return ``τ`` and its derivatives at a posture, or ``τ`` and ``∂τ/∂z`` alone, which takes less time.
+
+        Pinocchio holds forces constant in the link.  A force in world axes turns back as its link turns by δ, and
+        becomes ``f + f × δ`` there.
+        """
+        model, data = self.model, self._data
+        pin.computeJointJacobians(model, data, q)
+        forces = [pin.Force.Zero() for _ in range(model.njoints)]
+        by_force = np.zeros((model.nv, self.count))
+        turning = np.zeros((model.nv, model.nv))
+        for source, own, start in zip(self.sources, self.split(z), self._parts, strict=False):
+            point, joint = source.point, source.point.joint
+            axes = point.rotation if source.in_frame else np.array(data.oMi[joint].rotation).T
+            arm = pin.skew(point.position)
+            local = np.zeros((6, 6))
+            local[:3, :3], local[3:, :3], local[3:, 3:] = axes, arm @ axes, axes
+            jacobian = np.array(pin.getJointJacobian(model, data, joint, pin.LOCAL)).reshape(6, -1)
+            by_force[:, start : start + own.size] = -jacobian.T @ local @ source.columns
+            wrench = source.columns @ own + source.constant
+            forces[joint] = forces[joint] + pin.Force(local @ wrench)
+            if by_posture and not source.in_frame:
+                force, moment = pin.skew(axes @ wrench[:3]), pin.skew(axes @ wrench[3:])
+                turning += jacobian.T @ np.vstack([force, moment + arm @ force]) @ jacobian[3:]
+        external = pin.StdVec_Force()
+        external.extend(forces)
+        derivative = turning
+        if by_posture:
+            derivative = np.array(pin.computeStaticTorqueDerivatives(model, data, q, external))
+        value = np.array(pin.rnea(model, data, q, np.zeros(model.nv), np.zeros(model.nv), external))
+        return StaticTorque(value, derivative - turning, by_force)

@@ -1,0 +1,1 @@
+"""The constraint manifold: feasible starts, self-motion and bounds."""

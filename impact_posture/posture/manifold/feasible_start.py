@@ -1,0 +1,223 @@
+"""Feasible starts, which are random postures pulled onto the constraint manifold."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+
+import numpy as np
+import pinocchio as pin
+from numpy.typing import NDArray
+
+from impact_posture.dynamics.chart import Chart
+from impact_posture.dynamics.numeric import Numeric
+from impact_posture.posture.program.constrained_problem import ConstrainedProblem, held_rows
+from impact_posture.system.arrays import Array
+
+# A constraint with a violation up to this (m, rad) is satisfied.
+FEASIBLE = 1e-8
+# Postures that one start tries to pull onto the constraints.
+ATTEMPTS = 20
+_STEPS = 80
+# A posture whose violation has not fallen by a fifth in so many steps hardly ever reaches the constraints.
+_PATIENCE = 16
+# Most postures on the projected constraints that one start chooses from.
+CANDIDATES = 3
+# This share of the size of a singular matrix makes it regular.
+_ROUNDING = 1e-13
+
+
+@dataclass(frozen=True)
+class Projection:
+    """A posture pulled towards the constraints.
+
+    Attributes:
+        q: Configuration, shape (nq,).
+        violation: Largest violation (m, rad, or the unit of the constraint).
+    """
+
+    q: Array
+    violation: float
+
+
+class Projector:
+    """Levenberg–Marquardt onto the projected constraints within the limits; held joints do not move.
+
+    Args:
+        problem: The posture problem.
+    """
+
+    def __init__(self, problem: ConstrainedProblem) -> None:
+        self.problem = problem
+        self.numeric = Numeric(problem.robot.model)
+        self.chart = Chart.of(problem.robot.model)
+        self._held = held_rows(problem.robot, problem.requirements.hold).sum(axis=0) > 0
+        self._in_v, self._in_x = (np.array(places, dtype=int) for places in self.chart.bounded)
+        self._low, self._high = problem.lower[self._in_x], problem.upper[self._in_x]
+        self._projected = [(c, c.equality) for c in problem.constraints if c.projected]
+        self._free = [c for c in problem.constraints if not c.projected]
+
+    def clip(self, q: Array) -> Array:
+        """Clamp ``q`` to the bounds."""
+        return self.chart.to_q(self._clipped(q))
+
+    def _clipped(self, q: Array) -> Array:
+        """Return the chart coordinates of ``q`` within the bounds, shape (nx,)."""
+        return np.minimum(np.maximum(self.chart.to_x(q), self.problem.lower), self.problem.upper)
+
+    def residual(self, q: Array) -> tuple[Array, Array]:
+        """Return the violations of all rows at ``q``, zero where an inequality holds, and their Jacobian."""
+        self.numeric.at(q)
+        values, jacobians = [np.zeros(0)], [np.zeros((0, self.problem.robot.nv))]
+        for constraint, equality in self._projected:
+            value, jacobian = constraint.evaluate(self.numeric)
+            violation = value - constraint.lower if equality else constraint.excess(value)
+            values.append(violation)
+            if not equality:
+                jacobian = np.where((violation != 0)[:, None], jacobian, 0.0)
+            jacobians.append(jacobian)
+        return np.concatenate(values), np.concatenate(jacobians)
+
+    def outside(self, q: Array, most: float = np.inf) -> float:
+        """Return the violation of the constraints that are not projected, summed until it reaches ``most``."""
+        self.numeric.at(q)
+        total = 0.0
+        for constraint in self._free:
+            if total >= most:
+                break
+            total += float(np.abs(constraint.excess(constraint.value(self.numeric))).sum())
+        return total
+
+    def project(self, q: Array, tolerance: float = 1e-9) -> Projection:
+        """Pull ``q`` onto the constraints.  The result may still violate them."""
+        x = self._clipped(q)
+        q = self.chart.to_q(x)
+        value, jacobian = self.residual(q)
+        squared = float(value @ value)
+        damping, norms, moved = 1e-3, list[float](), True
+        for _ in range(_STEPS):
+            size = float(np.abs(value).max(initial=0.0))
+            norms.append(squared**0.5)
+            stuck = len(norms) > _PATIENCE and norms[-1] > 0.8 * norms[-1 - _PATIENCE]
+            if size < tolerance or damping > 1e6 or stuck:
+                break
+            if moved:
+                free = jacobian.copy()
+                free[:, self._held | self._blocked(x, -jacobian.T @ value)] = 0.0
+                gram = free @ free.T
+                diagonal = gram.reshape(-1)[:: len(gram) + 1]
+                plain = diagonal.copy()
+                # Rows may repeat others (two frames on one link), so the damping must not fall below rounding.
+                least = _ROUNDING * max(1.0, float(plain.sum()))
+            diagonal[:] = plain + (damping * min(1.0, size) + least)
+            step = -free.T @ np.linalg.solve(gram, value)
+            step *= min(1.0, 1.0 / max(float(np.abs(step).max()), 1e-12))
+            new_x = self._clipped(pin.integrate(self.problem.robot.model, q, step))
+            candidate = self.chart.to_q(new_x)
+            new_value, new_jacobian = self.residual(candidate)
+            new_squared = float(new_value @ new_value)
+            moved = new_squared < squared
+            if moved:
+                x, q, value, jacobian, squared = new_x, candidate, new_value, new_jacobian, new_squared
+                damping = max(damping / 5, 1e-9)
+            else:
+                damping = max(damping * 10, 1e-6)
+        return Projection(q, float(np.abs(value).max(initial=0.0)))
+
+    def _blocked(self, x: Array, direction: Array) -> NDArray[np.bool_]:
+        """Joints on a limit that the descent direction would violate, at the chart coordinates of a posture."""
+        at, along = x[self._in_x], direction[self._in_v]
+        at_low = (at <= self._low + 1e-12) & (along < 0)
+        at_high = (at >= self._high - 1e-12) & (along > 0)
+        blocked = np.zeros(self.problem.robot.nv, dtype=bool)
+        blocked[self._in_v] = at_low | at_high
+        return blocked
+
+
+def feasible_start(
+    problem: ConstrainedProblem,
+    index: int,
+    seed: int,
+    candidates: int = CANDIDATES,
+    around: Array | None = None,
+    projector: Projector | None = None,
+) -> Array | None:
+    """Return the ``index``-th feasible start of a seed; ``None`` if no attempt reached the constraints.
+
+    Start 0 is the given posture, pulled onto the constraints.  Odd starts lie near ``around``, by default the given
+    posture, and even starts anywhere within the limits.  Near starts reach the constraints more often, far starts
+    find other optima.  Of ``candidates`` postures that reach them, the first counts that satisfies the constraints
+    without projection too, else the one that violates them least.
+
+    Args:
+        problem: The posture problem.
+        index: Index of the start.
+        seed: Seed of all starts.
+        candidates: Most postures on the projected constraints to choose from.
+        around: Posture that odd starts are near, shape (nq,).
+        projector: That of the problem, or of one that grew into it, if the caller has it.
+    """
+    if index == 0:
+        found = (projector or Projector(problem)).project(problem.given)
+        return found.q if found.violation <= FEASIBLE else None
+    return StartDraw(problem, index, seed, around, projector).choose(candidates)
+
+
+class StartDraw:
+    """The random postures of one start, which are drawn as far as they are needed; see :func:`feasible_start`."""
+
+    def __init__(
+        self,
+        problem: ConstrainedProblem,
+        index: int,
+        seed: int,
+        around: Array | None = None,
+        projector: Projector | None = None,
+    ) -> None:
+        self._problem, self._index = problem, index
+        self._around = problem.given if around is None else around
+        self._projector = projector or Projector(problem)
+        self._rng = np.random.default_rng([seed, index])
+        self._attempts = self._tried = 0
+        self._best: Array | None = None
+        self._least = np.inf
+
+    def choose(self, candidates: int) -> Array | None:
+        """Return the best of so many postures on the projected constraints, those of the last call among them."""
+        while self._attempts < ATTEMPTS and self._tried < candidates and self._least > FEASIBLE:
+            near = self._around if (self._index + self._attempts) % 2 else None
+            self._attempts += 1
+            posture = random_posture(self._problem, self._projector.chart, self._rng, near)
+            found = self._projector.project(posture)
+            if found.violation <= FEASIBLE:
+                outside = self._projector.outside(found.q, self._least)
+                self._tried += 1
+                if outside < self._least:
+                    self._best, self._least = found.q, outside
+        return self._best
+
+
+def random_posture(
+    problem: ConstrainedProblem, chart: Chart, rng: np.random.Generator, near: Array | None = None
+) -> Array:
+    """Return a random posture near a given one, or anywhere within the bounds, not yet on the constraints."""
+    model = problem.robot.model
+    base = 6 if problem.robot.floating else 0
+    if near is not None:
+        step = rng.normal(size=model.nv) * rng.uniform(0.1, 0.8)
+        step[:base] *= 0.2
+        return np.asarray(pin.integrate(model, near, step))
+    x = chart.to_x(problem.given)
+    for slot in chart.slots:
+        low, high = problem.lower[slot.x], problem.upper[slot.x]
+        if slot.kind.family in ("revolute", "prismatic", "translation"):
+            span = np.pi if slot.kind.family == "revolute" else 1.0
+            low, high = np.where(np.isfinite(low), low, -span), np.where(np.isfinite(high), high, span)
+            x[slot.x] = rng.uniform(np.minimum(low, high), high)
+        elif slot.kind.family in ("continuous", "planar"):
+            x[slot.x.stop - 1] = rng.uniform(-np.pi, np.pi)
+    q = chart.to_q(x)
+    if base:
+        step = np.zeros(model.nv)
+        step[:base] = rng.normal(size=base) * np.array([0.15] * 3 + [0.15, 0.15, 0.6])
+        q = pin.integrate(model, q, step)
+    return np.asarray(q)

@@ -1,0 +1,56 @@
+"""The path from the initial posture to the optimum along the constraints."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+from itertools import pairwise
+
+import numpy as np
+import pinocchio as pin
+
+from impact_posture.posture.manifold.feasible_start import Projector
+from impact_posture.posture.program.constrained_problem import ConstrainedProblem
+from impact_posture.system.arrays import Array
+
+
+@dataclass(frozen=True)
+class NullSpacePath:
+    """Postures that satisfy the constraints, and the impact along them.
+
+    Attributes:
+        q: Postures, shape (N, nq).
+        s: Path length, tangent norm, shape (N,).
+        H: Squared jump per squared impulse, shape (N,).
+        G: Inverse effective mass, shape (N,).
+        V: Squared jump per squared approach speed, shape (N,).
+        S: The same if the contact sticks, NaN where undefined, shape (N,).
+        objective: The objective, shape (N,).
+    """
+
+    q: Array
+    s: Array
+    H: Array
+    G: Array
+    V: Array
+    S: Array
+    objective: Array
+
+
+def null_space_path(problem: ConstrainedProblem, start: Array, end: Array, points: int = 61) -> NullSpacePath:
+    """Interpolate from ``start`` to ``end`` on the manifold and pull every point onto the constraints."""
+    projector, model = Projector(problem), problem.robot.model
+    postures = [start]
+    for t in np.linspace(0, 1, points)[1:-1]:
+        postures.append(projector.project(pin.interpolate(model, start, end, float(t))).q)
+    postures.append(end)
+    steps = [np.linalg.norm(pin.difference(model, a, b)) for a, b in pairwise(postures)]
+    found = [problem.impact.oracle.quantities(q) for q in postures]
+    return NullSpacePath(
+        q=np.array(postures),
+        s=np.concatenate([[0.0], np.cumsum(steps)]),
+        H=np.array([f.H for f in found]),
+        G=np.array([f.G for f in found]),
+        V=np.array([f.V for f in found]),
+        S=np.array([np.nan if f.S is None else f.S for f in found]),
+        objective=np.array([problem.objective.value(q) for q in postures]),
+    )

@@ -1,0 +1,155 @@
+"""A lower bound on the objective over a mapped self-motion manifold, by branch and bound on patches.
+
+A patch is the part of the manifold within a radius r of its center.  With ``φ = ln f``, its gradient g along the
+manifold and a bound M on the curvature of φ, the patch has ``φ ≥ φ(center) − ‖g‖ r − M r²/2``.  M is estimated from
+the gradients of neighbors, so the result is an estimate, too: it is called *bounded* and not proved.  The logarithm
+makes the bound relative, and keeps it useful beside the poles of V and S.
+"""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+
+import numpy as np
+from numpy.typing import NDArray
+
+from impact_posture.posture.manifold.constraint_manifold import ConstraintManifold
+from impact_posture.posture.manifold.self_motion import SelfMotion
+from impact_posture.system.arrays import Array
+
+# Factor on the largest curvature that was seen nearby.
+_SAFETY = 2.0
+# A feasible posture satisfies limits and inequalities to this distance.
+_FEASIBLE = 1e-7
+# A patch is left out if the feasible set is farther, to first order, than this share of its radius.
+_BEYOND = 1.5
+_MOST = 200_000
+# A disc of radius 1 is covered by seven of half the radius, one in the middle; a segment by two.
+_RING = [[np.sqrt(0.75) * np.cos(a), np.sqrt(0.75) * np.sin(a)] for a in np.pi / 3 * np.arange(6)]
+_PARTS = {1: np.array([[-0.5], [0.5]]), 2: np.array([[0.0, 0.0], *_RING])}
+# Parts overlap a little, because the manifold is curved.
+_HALF = 0.52
+
+
+@dataclass(frozen=True, eq=False)
+class OptimalityBound:
+    """The best posture on the mapped components, and a bound below all of them.
+
+    Attributes:
+        best: Least objective of a feasible posture.
+        lower: Estimated lower bound on the objective.
+        x: Posture of ``best`` if a patch has it, chart coordinates, shape (nx,); ``None`` for the known posture.
+        patches: Patches that were evaluated.
+        finished: Whether every patch reached the wanted gap.
+    """
+
+    best: float
+    lower: float
+    x: Array | None
+    patches: int
+    finished: bool
+
+    @property
+    def gap(self) -> float:
+        """``1 − lower/best``."""
+        return max(0.0, 1 - self.lower / self.best)
+
+
+@dataclass(frozen=True, eq=False)
+class _Patches:
+    """Patches: center (N, nx), radius (N,), φ (N,), gradient along the manifold (N, nv), curvature (N,)."""
+
+    x: Array
+    radius: Array
+    value: Array
+    gradient: Array
+    curvature: Array
+
+    @property
+    def lower(self) -> Array:
+        """Bound on φ in each patch; −∞ where the center has no objective."""
+        slope = np.linalg.norm(self.gradient, axis=1)
+        found = self.value - slope * self.radius - self.curvature * self.radius**2 / 2
+        return np.where(np.isfinite(found), found, -np.inf)
+
+    def where(self, mask: NDArray[np.bool_]) -> _Patches:
+        return _Patches(*(getattr(self, name)[mask] for name in ("x", "radius", "value", "gradient", "curvature")))
+
+
+def bound_objective(motion: SelfMotion, best: float, gap: float = 0.01) -> OptimalityBound:
+    """Split patches until none can hold a feasible posture that is better than ``(1 − gap) best``.
+
+    Args:
+        motion: The mapped manifold.
+        best: Objective of a known feasible posture; infinite for none.
+        gap: The wanted gap.
+    """
+    manifold, dimension = motion.manifold, motion.dimension
+    active = _initial(motion)
+    count, retired, found = len(active.x), np.inf, None
+    while len(active.x):
+        retired, active = _retire(active, retired, best * (1 - gap))
+        # Feasibility takes longest, so only patches that may hold a better posture are asked.
+        distance = manifold.distance_to_feasible(active.x)
+        values = np.where((distance <= _FEASIBLE) & np.isfinite(active.value), active.value, np.inf)
+        if values.size and np.exp(values.min()) < best * (1 - 1e-9):
+            best, found = float(np.exp(values.min())), active.x[int(values.argmin())]
+        retired, active = _retire(active.where(distance <= _BEYOND * active.radius), retired, best * (1 - gap))
+        if not len(active.x) or count + len(active.x) * len(_PARTS[dimension]) > _MOST:
+            break
+        active = _split(manifold, dimension, active)
+        count += len(active.x)
+    lower = min(retired, float(active.lower.min(initial=np.inf)))
+    return OptimalityBound(best, min(float(np.exp(lower)), best), found, count, not len(active.x))
+
+
+def _retire(active: _Patches, retired: float, threshold: float) -> tuple[float, _Patches]:
+    """Return the least bound on φ of all retired patches, and the patches that may lie below a threshold."""
+    open_ = active.lower < np.log(threshold)
+    return min(retired, float(active.lower[~open_].min(initial=np.inf))), active.where(open_)
+
+
+def _initial(motion: SelfMotion) -> _Patches:
+    """Patches around the nodes of all components, which cover them."""
+    x = np.concatenate([component.x for component in motion.components])
+    value, gradient = _along(motion.manifold, x, motion.dimension)
+    radius = np.concatenate([component.radius for component in motion.components])
+    return _Patches(x, radius, value, gradient, _curvature(motion.manifold, x, gradient))
+
+
+def _curvature(manifold: ConstraintManifold, x: Array, gradient: Array) -> Array:
+    """Return the largest change of the gradient per distance to near centers, with the safety factor, shape (N,)."""
+    from scipy.spatial import cKDTree
+
+    points = manifold.embed(x)
+    near = min(6, len(x))
+    distance, place = cKDTree(points).query(points, near)
+    change = np.linalg.norm(gradient[place.reshape(-1, near)] - gradient[:, None], axis=2)
+    rate = np.where(distance.reshape(-1, near) > 0, change / np.maximum(distance.reshape(-1, near), 1e-12), 0.0)
+    return np.asarray(_SAFETY * np.where(np.isfinite(rate), rate, 0.0).max(axis=1, initial=0.0))
+
+
+def _split(manifold: ConstraintManifold, dimension: int, parents: _Patches) -> _Patches:
+    parts = _PARTS[dimension]
+    basis = manifold.tangents(parents.x, dimension)
+    steps = np.einsum("n,pd,ndv->npv", parents.radius, parts, basis)
+    before = np.repeat(parents.x, len(parts), axis=0)
+    x = manifold.project(manifold.move(before, steps.reshape(-1, steps.shape[2]))).x
+    value, gradient = _along(manifold, x, dimension)
+    shape = (len(parents.x), len(parts))
+    change = np.linalg.norm(gradient.reshape(*shape, -1) - parents.gradient[:, None], axis=2)
+    length = np.linalg.norm(steps, axis=2)
+    rate = np.where(length > 0, change / np.maximum(length, 1e-300), 0.0)
+    rate = _SAFETY * np.where(np.isfinite(rate), rate, 0.0).max(axis=1)
+    curvature = np.maximum(rate, parents.curvature / 2)
+    radius = np.repeat(_HALF * parents.radius, len(parts))
+    return _Patches(x, radius, value, gradient, np.repeat(curvature, len(parts)))
+
+
+def _along(manifold: ConstraintManifold, x: Array, dimension: int) -> tuple[Array, Array]:
+    """Return ``φ = ln f``, shape (N,), and its gradient along the manifold, shape (N, nv)."""
+    value, gradient = manifold.objective(x)
+    basis = manifold.tangents(x, dimension)
+    along = np.einsum("ndv,nd->nv", basis, np.einsum("ndv,nv->nd", basis, gradient))
+    with np.errstate(invalid="ignore", divide="ignore"):
+        return np.log(value), np.asarray(along / value[:, None])

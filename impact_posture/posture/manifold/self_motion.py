@@ -1,0 +1,264 @@
+"""The self-motion manifold of a problem with one or two degrees of freedom left, mapped by continuation.
+
+A self-motion moves the robot while all equalities hold (J. W. Burdick, "On the inverse kinematics of redundant
+manipulators: characterization of the self-motion manifolds", ICRA 1989).  Its components are the pieces between which
+no motion within the joint limits exists.  One degree of freedom gives curves, two give surfaces.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Callable
+from dataclasses import dataclass
+
+import numpy as np
+
+from impact_posture.errors import InputError
+from impact_posture.posture.manifold.constraint_manifold import ConstraintManifold
+from impact_posture.posture.manifold.feasible_start import random_posture
+from impact_posture.system.arrays import Array
+
+# Steps along a curve, rad or m: the first, the longest, and one so short that the curve is singular.
+_FIRST, LONGEST_STEP, _SINGULAR = 0.02, 0.08, 1e-7
+# Cosine of the largest turn of the tangent in a step, and of a turn that lets the steps grow.
+_TURN, _STRAIGHT = 0.98, 0.995
+# A posture belongs to a node if it leaves the node's tangent space by at most this share of its distance.
+_FLAT = 0.2
+# The points of a curve are at most about half a step from a node: a little more, because the curve bends.
+_HALF = 0.52
+# Longest curve, in nodes, and largest surface.
+_NODES = 20_000
+# Step of a surface; new nodes keep this share of it from all others; number of directions of a step.
+_STEP, _APART, _DIRECTIONS = 0.16, 0.7, 8
+# A point of a circle of one step around a node is half a direction from a tried point, which is near a node.
+COVERED = _APART + 2 * np.sin(np.pi / _DIRECTIONS / 2)
+_BATCH = 100
+
+
+@dataclass(frozen=True, eq=False)
+class Component:
+    """One connected piece of the self-motion manifold.
+
+    Attributes:
+        x: Nodes in chart coordinates, along the curve for one degree of freedom, shape (N, nx).
+        s: Path length to each node, rad mixed with m, shape (N,); zeros for a surface.
+        radius: Each point of the component is within this distance of a node.
+        ends: What ends the curve: ``closed`` alone, or ``limit``, ``singular`` or ``unfinished`` (too long) for each
+            of both ends; empty for a surface.
+    """
+
+    x: Array
+    s: Array
+    radius: Array
+    ends: tuple[str, ...]
+
+    @property
+    def closed(self) -> bool:
+        """Whether the curve returns to its start."""
+        return self.ends == ("closed",)
+
+
+@dataclass(frozen=True, eq=False)
+class SelfMotion:
+    """The mapped self-motion manifold.
+
+    Attributes:
+        manifold: The manifold of the problem.
+        dimension: Degrees of freedom, 1 or 2.
+        components: The components found.
+        starts: Random postures that reached the manifold within the limits.
+        unsuccessful: The last of them, none of which was on a new component.
+    """
+
+    manifold: ConstraintManifold
+    dimension: int
+    components: tuple[Component, ...]
+    starts: int
+    unsuccessful: int
+
+    def component_of(self, x: Array) -> Array:
+        """Return the index of the component of each posture, shape (N,); −1 for none."""
+        return _component_of(self.manifold, self.dimension, self.components, x)
+
+
+def map_self_motion(
+    manifold: ConstraintManifold, dimension: int, known: Array, *, patience: int = 1000, seed: int = 0
+) -> SelfMotion:
+    """Follow every component that random starts reach, until ``patience`` starts in a row reach no new one.
+
+    Args:
+        manifold: The manifold of the problem.
+        dimension: Degrees of freedom, 1 or 2.
+        known: Postures on the manifold whose components come first, shape (N, nx).
+        patience: Number of starts.
+        seed: Seed of the starts.
+
+    Raises:
+        InputError: There are not one or two degrees of freedom.
+    """
+    if dimension not in (1, 2):
+        raise InputError(
+            f"{dimension} degrees of freedom are left", where="search", hint="a map needs 1 or 2: add constraints"
+        )
+    trace: Callable[[ConstraintManifold, Array], Component] = _curve if dimension == 1 else _surface
+    rng, found = np.random.default_rng(seed), [*_missing(manifold, dimension, (), known, trace)]
+    starts = unsuccessful = idle = 0
+    # A tenth of the postures reaches the manifold at least, or the limits leave next to nothing of it.
+    while unsuccessful < patience and idle < 10 * patience:
+        x = _random(manifold, rng)
+        new = _missing(manifold, dimension, found, x, trace)
+        found += new
+        starts += len(x)
+        idle = 0 if len(x) else idle + _BATCH
+        unsuccessful = 0 if new else unsuccessful + len(x)
+    return SelfMotion(manifold, dimension, tuple(found), starts, unsuccessful)
+
+
+def component_through(manifold: ConstraintManifold, x: Array) -> SelfMotion:
+    """Follow the curve through one posture, shape (nx,), of a manifold with one degree of freedom."""
+    return SelfMotion(manifold, 1, (_curve(manifold, x),), 0, 0)
+
+
+def _random(manifold: ConstraintManifold, rng: np.random.Generator) -> Array:
+    """Return random postures on the manifold within the limits; inequalities need not hold."""
+    problem = manifold.problem
+    drawn = [random_posture(problem, manifold.chart, rng, None if k % 4 else problem.given) for k in range(_BATCH)]
+    found = manifold.project(np.array([manifold.chart.to_x(q) for q in drawn]), within=True)
+    return found.x[found.converged]
+
+
+def _missing(
+    manifold: ConstraintManifold,
+    dimension: int,
+    known: tuple[Component, ...] | list[Component],
+    x: Array,
+    trace: Callable[[ConstraintManifold, Array], Component],
+) -> list[Component]:
+    """Return the components of postures that are on none of the known ones."""
+    new: list[Component] = []
+    left = x[_component_of(manifold, dimension, known, x) < 0]
+    while len(left):
+        new.append(trace(manifold, left[0]))
+        rest = left[1:]
+        left = rest[_component_of(manifold, dimension, new[-1:], rest) < 0]
+    return new
+
+
+def _component_of(
+    manifold: ConstraintManifold, dimension: int, components: tuple[Component, ...] | list[Component], x: Array
+) -> Array:
+    from scipy.spatial import cKDTree
+
+    found = np.full(len(x), -1)
+    points = manifold.embed(x)
+    for index, component in enumerate(components):
+        nodes = manifold.embed(component.x)
+        near = min(8, len(nodes))
+        distances, places = cKDTree(nodes).query(points, near)
+        for distance, place in zip(distances.reshape(-1, near).T, places.reshape(-1, near).T, strict=True):
+            chosen = np.flatnonzero((found < 0) & (distance <= 1.1 * component.radius[place] + 1e-6))
+            if not chosen.size:
+                continue
+            basis = manifold.tangents(component.x[place[chosen]], dimension)
+            step = points[chosen] - nodes[place[chosen]]
+            along = _embedded(manifold, component.x[place[chosen]], basis)
+            share = np.einsum("nk,ndk->nd", step, along)
+            off = np.linalg.norm(step - np.einsum("nd,ndk->nk", share, along), axis=1)
+            found[chosen[off <= _FLAT * distance[chosen] + 1e-6]] = index
+    return found
+
+
+def _embedded(manifold: ConstraintManifold, x: Array, basis: Array) -> Array:
+    """Return the tangent vectors of a basis as motions of the embedded point, of unit length, shape (N, d, k)."""
+    size = 1e-6
+    here = manifold.embed(x)
+    moved = [(manifold.embed(manifold.move(x, size * v)) - here) / size for v in basis.transpose(1, 0, 2)]
+    found = np.stack(moved, axis=1)
+    return np.asarray(found / np.linalg.norm(found, axis=2, keepdims=True))
+
+
+# ---- one degree of freedom -----------------------------------------------------------------------------------
+
+
+def _curve(manifold: ConstraintManifold, x: Array) -> Component:
+    """Follow the curve through a posture in both directions."""
+    tangent = manifold.tangents(x[None], 1)[0, 0]
+    nodes, lengths, end = _branch(manifold, x, tangent)
+    ends = [end]
+    if end != "closed":
+        back, steps, end = _branch(manifold, x, -tangent)
+        nodes, lengths, ends = [*back[:0:-1], *nodes], [*steps[::-1], *lengths], [end, *ends]
+    taken = np.array([0.0, *lengths])
+    reach = _HALF * np.maximum(taken, np.append(taken[1:], 0.0))
+    return Component(np.array(nodes), np.cumsum(taken), reach, tuple(ends))
+
+
+def _branch(manifold: ConstraintManifold, start: Array, tangent: Array) -> tuple[list[Array], list[float], str]:
+    """Follow a curve in one direction, by predictor and corrector.
+
+    Return the nodes from the start on, the lengths of the steps, and what ended it.
+    """
+    nodes, x, direction, step = [start], start, tangent, _FIRST
+    lengths: list[float] = []
+    home, first = manifold.embed(start[None])[0], tangent
+    while len(nodes) < _NODES:
+        moved = manifold.project(manifold.move(x[None], step * direction[None]), steps=6)
+        ahead = manifold.tangents(moved.x, 1)[0, 0]
+        ahead = ahead * (1.0 if ahead @ direction >= 0 else -1.0)
+        point = manifold.embed(np.array([x, moved.x[0]]))
+        length, turn = float(np.linalg.norm(point[1] - point[0])), float(ahead @ direction)
+        if not (moved.converged[0] and turn > _TURN and 0.7 * step < length < 1.3 * step):
+            step /= 2
+            if step < _SINGULAR:
+                return nodes, lengths, "singular"
+            continue
+        beyond = np.maximum(manifold.lower - moved.x[0], moved.x[0] - manifold.upper).max(initial=-np.inf)
+        if beyond > 1e-9:
+            # The limit lies within the step.
+            if step < 10 * _SINGULAR:
+                return nodes, lengths, "limit"
+            step /= 2
+            continue
+        # The start lies between the two nodes if it is ahead of the first and behind the second.
+        gap = home - point[0]
+        if len(nodes) > 2 and np.linalg.norm(gap) <= 1.05 * length and ahead @ first > _TURN**2:
+            behind = (point[1] - point[0]) @ (home - point[1]) <= 0
+            if (point[1] - point[0]) @ gap > 0 and behind:
+                return [*nodes, start], [*lengths, float(np.linalg.norm(gap))], "closed"
+        nodes.append(moved.x[0])
+        lengths.append(length)
+        x, direction = moved.x[0], ahead
+        step = min(step * (1.5 if turn > _STRAIGHT else 1.0), LONGEST_STEP)
+    return nodes, lengths, "unfinished"
+
+
+# ---- two degrees of freedom ----------------------------------------------------------------------------------
+
+
+def _surface(manifold: ConstraintManifold, x: Array) -> Component:
+    """Cover the surface through a posture with nodes, from an advancing front.
+
+    Each node tries points one step away in all directions of its tangent plane.  A point that is near no node becomes
+    one.  Nodes beyond the limits by less than a step cover the rim, and the front stops there.
+    """
+    from scipy.spatial import cKDTree
+
+    angles = 2 * np.pi * np.arange(_DIRECTIONS) / _DIRECTIONS
+    directions = _STEP * np.stack([np.cos(angles), np.sin(angles)], axis=1)
+    nodes, front = x[None], x[None]
+    while len(front) and len(nodes) < _NODES:
+        steps = np.einsum("kd,ndv->nkv", directions, manifold.tangents(front, 2)).reshape(-1, manifold.chart.nv)
+        before = np.repeat(front, _DIRECTIONS, axis=0)
+        tried = manifold.project(manifold.move(before, steps), steps=6)
+        length = np.linalg.norm(manifold.embed(tried.x) - manifold.embed(before), axis=1)
+        tried_x = tried.x[tried.converged & (length < 1.5 * _STEP)]
+        outside = np.maximum(manifold.lower - tried_x, tried_x - manifold.upper).max(axis=1, initial=-np.inf)
+        tried_x, outside = tried_x[outside < _STEP], outside[outside < _STEP]
+        points = manifold.embed(tried_x)
+        far = cKDTree(manifold.embed(nodes)).query(points, 1)[0] > _APART * _STEP if len(points) else np.zeros(0)
+        chosen: list[int] = []
+        for k in np.flatnonzero(far):
+            if not chosen or np.linalg.norm(points[chosen] - points[k], axis=1).min() > _APART * _STEP:
+                chosen.append(int(k))
+        nodes = np.concatenate([nodes, tried_x[chosen]])
+        front = tried_x[chosen][outside[chosen] <= 1e-9]
+    return Component(nodes, np.zeros(len(nodes)), np.full(len(nodes), COVERED * _STEP), ())

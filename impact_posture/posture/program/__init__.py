@@ -1,0 +1,1 @@
+"""The nonlinear program, its solver and its certificate."""

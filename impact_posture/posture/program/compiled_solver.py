@@ -1,0 +1,147 @@
+"""Machine code for the functions of the program where it pays, in a cache by content.
+
+CasADi interprets an operation in a few nanoseconds.  Machine code needs a few tenths of a nanosecond, but compiling
+takes about 100 µs for each operation.  So one optimization of a small robot is interpreted, and a study of thousands
+compiles once.
+"""
+
+from __future__ import annotations
+
+import platform
+from collections.abc import Mapping
+from pathlib import Path
+from typing import Any, Literal, NamedTuple, get_args
+
+import casadi as ca
+
+from impact_posture.errors import CompilerError, InputError, OutputError
+from impact_posture.posture.program.constrained_problem import ConstrainedProblem
+from impact_posture.system.libraries import building, cache_folder, cache_path, is_cached, source_key
+from impact_posture.system.toolchain import find_compiler, no_compiler, run_compiler, run_compilers
+
+CompileMode = Literal["auto", "always", "never"]
+
+# From what docs/studies/solve.py prints for talos: 170,000 operations take about 20 s to compile, and each
+# start of some 25 iterations is about 30 ms faster for it.  Orders of magnitude are enough to decide.
+_COMPILE_S_PER_OPERATION = 1.2e-4
+_SAVED_S_PER_OPERATION = 6e-9
+_ITERATIONS = 35
+# A function with more operations is not optimized.  The compiler would take three times as long for code three times
+# as fast, and the solve no longer waits for that code.
+_OPTIMIZED = 100_000
+
+
+class BuiltSolver(NamedTuple):
+    """``nlpsol``, whether it runs as machine code, and the reason why a compilation failed, else empty."""
+
+    solver: ca.Function
+    compiled: bool
+    fault: str = ""
+
+
+def compiled_solver(
+    problem: ConstrainedProblem,
+    symbols: dict[str, ca.SX],
+    options: dict[str, Any],
+    mode: CompileMode,
+    starts: int,
+    derivatives: Mapping[str, ca.Function],
+) -> BuiltSolver:
+    """Build ``nlpsol`` on the expressions, compiled or interpreted.
+
+    Args:
+        problem: The problem.
+        symbols: The expressions ``x``, ``p``, ``f`` and ``g``.
+        options: Options of IPOPT.
+        mode: Whether to compile.
+        starts: Number of runs that compiling has to pay for.
+        derivatives: Options of ``nlpsol`` with the derivatives that are known.
+
+    Raises:
+        InputError: There is no such mode.
+        CompilerError: The mode is ``always``, and there is no compiler or it fails.
+        OutputError: The mode is ``always``, and the cache cannot be written or others can write to it.
+    """
+    if mode not in (modes := get_args(CompileMode)):
+        raise InputError(f"no mode '{mode}'", where="compile", hint=f"choose from {', '.join(modes)}")
+    interpreted: ca.Function | None = None
+    try:
+        if mode != "never" and (found := _cached(problem, options)) is not None:
+            return BuiltSolver(found, True)
+        interpreted = ca.nlpsol("posture", "ipopt", symbols, {**options, **derivatives})
+        compiler = find_compiler()
+        if mode == "always" and compiler is None:
+            raise no_compiler("compile")
+        if mode == "never" or compiler is None or (mode == "auto" and not _pays(interpreted, starts)):
+            return BuiltSolver(interpreted, False)
+        _compile(interpreted, compiler, f"{_key(problem)}.so")
+        if (found := _cached(problem, options)) is None:
+            raise CompilerError("what was built cannot be loaded", where="compile", hint="set CC to another compiler")
+        return BuiltSolver(found, True)
+    except (CompilerError, OutputError) as error:
+        if mode == "always":
+            raise
+        if interpreted is None:
+            interpreted = ca.nlpsol("posture", "ipopt", symbols, {**options, **derivatives})
+        return BuiltSolver(interpreted, False, f"interpreted, not compiled: {error.line}")
+
+
+def _cached(problem: ConstrainedProblem, options: dict[str, Any]) -> ca.Function | None:
+    library = cache_path() / f"{_key(problem)}.so"
+    if not is_cached(library):
+        return None
+    try:
+        return ca.nlpsol("posture", "ipopt", str(library), options)
+    except RuntimeError:
+        # Another machine that shares the folder built it.
+        library.unlink(missing_ok=True)
+        return None
+
+
+def _pays(solver: ca.Function, starts: int) -> bool:
+    operations = sum(solver.get_function(name).n_instructions() for name in ("nlp_hess_l", "nlp_jac_g"))
+    return bool(operations * _ITERATIONS * starts * _SAVED_S_PER_OPERATION > operations * _COMPILE_S_PER_OPERATION)
+
+
+def _key(problem: ConstrainedProblem) -> str:
+    """Hash of everything that shapes the functions; targets, limits and the leading normal are parameters."""
+    content = [
+        ca.CasadiMeta.version(),
+        f"{platform.system()} {platform.machine()}",
+        problem.robot.impact_sha256,
+        # Placements of frames on links are no part of the dynamics, but of every expression of a point.
+        *[f"{f.name} {f.parentJoint} {f.placement.homogeneous.tolist()}" for f in problem.robot.model.frames],
+        problem.objective.structure,
+        problem.structure,
+    ]
+    return source_key(content, "dynamics", "impact", "posture")
+
+
+def _compile(solver: ca.Function, compiler: list[str], name: str) -> None:
+    """Compile into the cache, each function in a file of its own, with one compiler for each core."""
+    library = cache_folder() / name
+    with building(library) as folder:
+        functions = [solver.oracle(), *[_shared(solver.get_function(name)) for name in solver.get_function()]]
+        # The largest function comes first, so that nothing waits for it at the end.
+        functions.sort(key=lambda function: -int(function.n_instructions()))
+        commands = [_command(function, compiler, folder) for function in functions]
+        run_compilers(commands, folder)
+        objects = [f"{function.name()}.o" for function in functions]
+        run_compiler([*compiler, "-shared", *objects, "-o", library.name, "-lm"], folder)
+
+
+def _shared(function: ca.Function) -> ca.Function:
+    """The same function with equal subexpressions computed once.  Differentiation leaves many of them."""
+    inputs = function.sx_in()
+    names = (function.name_in(), function.name_out())
+    return ca.Function(function.name(), inputs, function.call(inputs), *names, {"cse": True})
+
+
+def _command(function: ca.Function, compiler: list[str], folder: Path) -> list[str]:
+    """Write the C code of a function, and return the command that compiles it."""
+    name = function.name()
+    generator = ca.CodeGenerator(f"{name}.c")
+    generator.add(function)
+    (folder / f"{name}.c").write_text(generator.dump(), encoding="utf-8")
+    level = "-O1" if function.n_instructions() <= _OPTIMIZED else "-O0"
+    return [*compiler, level, "-fPIC", "-c", f"{name}.c", "-o", f"{name}.o"]

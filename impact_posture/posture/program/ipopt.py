@@ -1,0 +1,106 @@
+"""How IPOPT is called: its options, one thread for its linear algebra, and Ctrl-C.
+
+NumPy, SciPy and CasADi (for MUMPS, within IPOPT) each bring a BLAS that uses all cores.  The systems here have about
+a hundred unknowns, so these threads only wait for each other and block the cores of parallel starts.
+:func:`one_blas_thread` stops that.
+"""
+
+from __future__ import annotations
+
+import signal
+import threading
+from collections.abc import Iterator
+from contextlib import contextmanager
+from functools import cache
+from typing import Any
+
+import casadi as ca
+import threadpoolctl
+
+from impact_posture.system.arrays import Array
+
+IPOPT_OPTIONS: dict[str, Any] = {
+    "ipopt.print_level": 0,
+    "ipopt.sb": "yes",
+    "ipopt.tol": 1e-9,
+    "ipopt.constr_viol_tol": 1e-10,
+    "ipopt.dual_inf_tol": 1e-7,
+    "ipopt.compl_inf_tol": 1e-9,
+    # Bounds are limits of the robot, which the solver must not relax.
+    "ipopt.bound_relax_factor": 0.0,
+    "ipopt.honor_original_bounds": "yes",
+    "ipopt.mu_strategy": "adaptive",
+    # The rows of a program are of like size.  To scale and permute each matrix takes MUMPS longer than it saves.
+    "ipopt.mumps_scaling": 0,
+    "ipopt.mumps_permuting_scaling": 0,
+    "ipopt.max_iter": 300,
+    "print_time": False,
+    "calc_lam_p": False,
+    # Nothing uses sensitivities.
+    "no_nlp_grad": True,
+    "error_on_fail": False,
+}
+# The equations of the dual of a cone are quadratic, and violated equations let the bound ``t`` fall.  A step that
+# violates them strongly to lower the objective never comes back.
+WORST_OPTIONS = {"ipopt.theta_max_fact": 1.0}
+CONVERGED = ("Solve_Succeeded", "Solved_To_Acceptable_Level")
+# A warm start keeps what is on a bound there.  By default IPOPT moves it inside and has to find the way back.
+WARM_OPTIONS = {"ipopt.warm_start_init_point": "yes"} | {
+    f"ipopt.warm_start_{name}": 1e-8
+    for name in ("bound_push", "bound_frac", "slack_bound_push", "slack_bound_frac", "mult_bound_push")
+}
+
+
+class _CasadiOpenBLAS(threadpoolctl.OpenBLASController):  # type: ignore[misc]
+    """The OpenBLAS of the CasADi wheels, under its name there."""
+
+    internal_api = "casadi_openblas"
+    filename_prefixes = ("libcasadi-tp-openblas",)
+
+
+threadpoolctl.register(_CasadiOpenBLAS)
+
+
+@contextmanager
+def one_blas_thread() -> Iterator[None]:
+    """Limit every BLAS of this process, and of processes forked within, to one thread."""
+    with _libraries().limit(limits=1):
+        yield
+
+
+@cache
+def _libraries() -> threadpoolctl.ThreadpoolController:
+    ca.has_nlpsol("ipopt")  # This loads IPOPT and its BLAS, because the controller finds loaded libraries only.
+    return threadpoolctl.ThreadpoolController()
+
+
+def run_solver(solver: ca.Function, **arguments: Array) -> dict[str, ca.DM]:
+    """Call an ``nlpsol``, and raise the Ctrl-C that IPOPT may catch."""
+    with _noticing_interrupts():
+        answer: dict[str, ca.DM] = solver(**arguments)
+    return answer
+
+
+@contextmanager
+def _noticing_interrupts() -> Iterator[None]:
+    """Raise a Ctrl-C after the solver, because the solver may take it for a failed evaluation and go on."""
+    in_charge = (
+        threading.current_thread() is threading.main_thread()
+        and signal.getsignal(signal.SIGINT) is signal.default_int_handler
+    )
+    if not in_charge:
+        yield
+        return
+    seen: list[int] = []
+
+    def note(number: int, frame: object) -> None:
+        seen.append(number)
+        raise KeyboardInterrupt
+
+    signal.signal(signal.SIGINT, note)
+    try:
+        yield
+    finally:
+        signal.signal(signal.SIGINT, signal.default_int_handler)
+    if seen:
+        raise KeyboardInterrupt

@@ -1,0 +1,238 @@
+"""The nonlinear program, which is built once and solved for many starts, normals and targets."""
+
+from __future__ import annotations
+
+import time
+from dataclasses import dataclass, field, replace
+from functools import cached_property
+from itertools import count
+from typing import Any
+
+import casadi as ca
+import numpy as np
+
+from impact_posture.dynamics.chart import Chart
+from impact_posture.posture.program.compiled_solver import CompileMode, compiled_solver
+from impact_posture.posture.program.constrained_problem import ConstrainedProblem
+from impact_posture.posture.program.ipopt import CONVERGED, IPOPT_OPTIONS, WARM_OPTIONS, WORST_OPTIONS, run_solver
+from impact_posture.posture.program.program_expressions import Program, parameters
+from impact_posture.posture.program.program_rows import ProgramRows
+from impact_posture.system.arrays import Array
+
+# Price of a meter of slack in units of the scale.  It has to exceed what a meter of freedom is worth, and 2 did not.
+SLACK_PRICE = 50.0
+# Numbers of the programs of this process.
+_NUMBERS = count()
+
+
+@dataclass(frozen=True, eq=False)
+class WarmStart:
+    """End of a run, from which a run of the same program with another target goes on.
+
+    Attributes:
+        program: Number of the program.
+        x: All unknowns, shape (n,).
+        lower: Their lower bounds, shape (n,).
+        upper: Their upper bounds, shape (n,).
+        of_bounds: Multipliers of these bounds, shape (n,).
+        of_rows: Multipliers of the rows, shape (m,).
+        scale: Divisor of the objective, to which the multipliers belong.
+    """
+
+    program: int
+    x: Array
+    lower: Array
+    upper: Array
+    of_bounds: Array
+    of_rows: Array
+    scale: float
+
+
+@dataclass(frozen=True)
+class SolveRecord:
+    """Result of one run of the solver.
+
+    Attributes:
+        q: Final configuration, shape (nq,).
+        status: Return status of IPOPT.
+        iterations: Iterations of IPOPT.
+        time_s: Wall time of the call.
+        auxiliaries: Final auxiliaries of the constraints, shape (k,).
+        minimized: Value that the solver minimized, in units of the scale.
+        end: The end, to go on from.
+    """
+
+    q: Array
+    status: str
+    iterations: int
+    time_s: float
+    auxiliaries: Array
+    minimized: float
+    end: WarmStart
+
+    @property
+    def converged(self) -> bool:
+        """Whether IPOPT reports convergence.  The certificate is the proof."""
+        return self.status in CONVERGED
+
+
+@dataclass(frozen=True)
+class PostureNLP:
+    """A built program.
+
+    Attributes:
+        problem: The posture problem.
+        program: Its expressions.
+        solver: ``nlpsol`` of CasADi.
+        build_time_s: Time to build and compile the program.
+        compiled: Whether its functions run as machine code.
+        compiler_fault: Reason why a compilation failed; empty else.
+        number: Number of the program, the same with another target.
+    """
+
+    problem: ConstrainedProblem
+    program: Program
+    solver: ca.Function
+    build_time_s: float
+    compiled: bool
+    compiler_fault: str = ""
+    number: int = field(default_factory=_NUMBERS.__next__)
+
+    @property
+    def chart(self) -> Chart:
+        """Coordinates of the robot."""
+        return self.program.chart
+
+    def at(self, problem: ConstrainedProblem) -> PostureNLP:
+        """Return the program with another target, whose expressions and bounds of rows are the same."""
+        found = self.bounded(problem)
+        vars(found)["_row_bounds"] = self._row_bounds
+        return found
+
+    def bounded(self, problem: ConstrainedProblem) -> PostureNLP:
+        """Return the program with other bounds of its rows."""
+        found = replace(self, problem=problem)
+        vars(found)["_warm_solver"] = self._warm_solver
+        return found
+
+    def grown(self, problem: ConstrainedProblem, *, compile: CompileMode = "auto") -> PostureNLP:
+        """Build the program of a problem that this one grew into."""
+        return build_nlp(problem, compile=compile, program=self.program)
+
+    def solve(
+        self,
+        start: Array,
+        *,
+        scale: float | None = None,
+        attempt: int = 0,
+        price: float = SLACK_PRICE,
+        warm: WarmStart | None = None,
+    ) -> SolveRecord:
+        """Solve from ``start``.
+
+        Args:
+            start: Configuration, shape (nq,).
+            scale: Divisor of the objective; by default its value at ``start``.
+            attempt: Index of the guess of the objective.
+            price: Price of a meter of slack.
+            warm: End at ``start`` of a run with another target, of which only an end of the same program is used.
+        """
+        scale = scale or self.problem.objective.value(start)
+        if warm is None or warm.program != self.number:
+            return self._run(self.solver, self._cold(start, scale, attempt), price)
+        ratio = warm.scale / scale
+        warm = replace(warm, scale=scale, of_bounds=ratio * warm.of_bounds, of_rows=ratio * warm.of_rows)
+        found = self._run(self._warm_solver, warm, price)
+        if found.converged:
+            return found
+        again = self._run(self.solver, self._cold(start, scale, attempt), price)
+        return replace(again, iterations=found.iterations + again.iterations, time_s=found.time_s + again.time_s)
+
+    def _cold(self, start: Array, scale: float, attempt: int) -> WarmStart:
+        """Return the start of a run without multipliers."""
+        problem, given = self.problem, self.chart.to_x(start)
+        x = np.clip(given, problem.lower, problem.upper)
+        # The quantities at a posture within its limits are known as a rule.
+        q = start if np.array_equal(x, given) else self.chart.to_q(x)
+        guess = problem.objective.guess(q, scale, attempt)
+        own = problem.guess(self.program.numeric.at(q))
+        return WarmStart(
+            program=self.number,
+            x=np.concatenate([x, guess.values, own.values]),
+            lower=np.concatenate([problem.lower, guess.lower, own.lower]),
+            upper=np.concatenate([problem.upper, guess.above, own.above]),
+            of_bounds=np.zeros(0),
+            of_rows=np.zeros(0),
+            scale=scale,
+        )
+
+    def _run(self, solver: ca.Function, start: WarmStart, price: float) -> SolveRecord:
+        p = parameters(self.problem, self.chart, start.scale, price)
+        multipliers = {"lam_x0": start.of_bounds, "lam_g0": start.of_rows} if start.of_rows.size else {}
+        began = time.perf_counter()
+        answer = run_solver(
+            solver, x0=start.x, lbx=start.lower, ubx=start.upper, p=p, **self._row_bounds, **multipliers
+        )
+        stats = solver.stats()
+        elapsed = time.perf_counter() - began
+        x, of_bounds, of_rows = (np.array(answer[key].nonzeros()) for key in ("x", "lam_x", "lam_g"))
+        return SolveRecord(
+            q=self.chart.to_q(x[: self.chart.nx]),
+            status=str(stats["return_status"]),
+            iterations=int(stats["iter_count"]),
+            time_s=elapsed,
+            auxiliaries=x[x.size - sum(c.unknowns for c in self.problem.constraints) :],
+            minimized=float(answer["f"]),
+            end=replace(start, x=x, of_bounds=of_bounds, of_rows=of_rows),
+        )
+
+    @cached_property
+    def _warm_solver(self) -> ca.Function:
+        """The solver that goes on from unknowns and multipliers."""
+        names = {"grad_f": "nlp_grad_f", "jac_g": "nlp_jac_g", "hess_lag": "nlp_hess_l"}
+        known = {option: self.solver.get_function(name) for option, name in names.items()}
+        options = _options(self.problem) | WARM_OPTIONS | known
+        return ca.nlpsol("warm", "ipopt", self.solver.oracle(), options)
+
+    @cached_property
+    def _row_bounds(self) -> dict[str, Array]:
+        norms = np.zeros(len(self.chart.quaternion_slices()))
+        lower, upper = (np.concatenate([norms, bounds]) for bounds in self.problem.row_bounds)
+        # The other rows belong to the objective: first equations, then inequalities that bound it from below.
+        lifted = np.zeros(self.solver.size1_in("lbg") - len(lower))
+        below = lifted.copy()
+        below[lifted.size - self.program.bounded :] = -np.inf
+        return {"lbg": np.concatenate([lower, below]), "ubg": np.concatenate([upper, lifted])}
+
+
+def build_nlp(
+    problem: ConstrainedProblem,
+    *,
+    compile: CompileMode = "auto",
+    starts: int = 1,
+    program: Program | None = None,
+    rows: ProgramRows | None = None,
+) -> PostureNLP:
+    """Build the program; the number of ``starts`` decides whether compiling pays.
+
+    Args:
+        problem: The posture problem.
+        compile: Whether to compile.
+        starts: Number of runs.
+        program: The expressions of a problem that grew into this one.
+        rows: The rows of the constraints of such a problem, if another program has them.
+
+    Raises:
+        CompilerError, OutputError: As :func:`impact_posture.posture.program.compiled_solver.compiled_solver`.
+    """
+    began = time.perf_counter()
+    program = program or Program(problem, rows)
+    symbols, derivatives = program.symbols(problem)
+    # A program that grows is soon another one, so it is not worth compiling.
+    built = compiled_solver(problem, symbols, _options(problem), compile, 1 if problem.grows else starts, derivatives)
+    took = time.perf_counter() - began
+    return PostureNLP(problem, program, built.solver, took, built.compiled, built.fault)
+
+
+def _options(problem: ConstrainedProblem) -> dict[str, Any]:
+    return IPOPT_OPTIONS | (WORST_OPTIONS if problem.objective.attempts > 1 else {})

@@ -1,0 +1,101 @@
+"""The expressions of the nonlinear program.
+
+The lifted formulation leaves the linear solve of the impact to IPOPT::
+
+    min over x, a, f, s   aᵀWa        (or λ/2)
+    subject to            M(q)a − J_sᵀf − Jᵀs = 0,  J_s a + εf = 0,  equations of s and n,
+                          c(q) within bounds,  |quaternions| = 1,  limits,
+
+Every function is then linear or quadratic in the auxiliaries, and the exact Hessian stays small
+(``docs/studies/formulations.py`` measures both forms).  An inner maximum adds a form of its own
+(:mod:`impact_posture.impact.worst_case.model_set`).
+"""
+
+from __future__ import annotations
+
+from copy import copy
+from functools import cached_property
+
+import casadi as ca
+import numpy as np
+
+from impact_posture.dynamics.chart import Chart
+from impact_posture.dynamics.numeric import Numeric
+from impact_posture.posture.program.constrained_problem import ConstrainedProblem
+from impact_posture.posture.program.program_rows import Derivatives, ProgramRows, joined
+from impact_posture.system.arrays import Array
+
+
+class Program:
+    """The expressions of a program, most of which stay while the problem grows.
+
+    Args:
+        problem: The problem before it grows.
+        rows: The rows of its constraints, if another program of the problem has them.
+
+    Attributes:
+        rows: The rows of the constraints.
+        chart: Coordinates of the robot.
+        numeric: The model in numbers, made once for all runs.
+        bounded: Number of last rows that are inequalities ``≤ 0`` of the objective.
+    """
+
+    def __init__(self, problem: ConstrainedProblem, rows: ProgramRows | None = None) -> None:
+        self.rows = rows = rows or ProgramRows(problem)
+        self.chart, self.numeric = rows.chart, Numeric(problem.robot.model)
+        own = ca.SX.sym("own", len(problem.objective.parameters))
+        scale, weight, self._price = ca.SX.sym("scale"), ca.SX.sym("weight"), ca.SX.sym("price")
+        self.lifted = lifted = problem.objective.lift(rows.tree, own, scale)
+        self.bounded = int(lifted.inequalities.numel())
+        self.value = lifted.value / scale + weight * rows.away
+        self.parameters = ca.vertcat(own, scale, weight, self._price, rows.reference, *rows.parameters)
+
+    def branch(self) -> Program:
+        """Return a program that grows on its own from here."""
+        made = copy(self)
+        made.rows = self.rows.branch()
+        return made
+
+    def symbols(self, problem: ConstrainedProblem) -> tuple[dict[str, ca.SX], dict[str, ca.Function]]:
+        """Return the expressions of a problem, and the derivatives of one that grows as options of ``nlpsol``.
+
+        The expressions are ``x`` (unknowns), ``p`` (parameters), ``f`` and ``g``.
+        """
+        rows, objective = self.rows.lift(problem), self.lifted
+        x = ca.vertcat(self.rows.x, objective.variables, rows.variables)
+        g = ca.vertcat(self.rows.norms, rows.rows, objective.residual, objective.inequalities)
+        symbols = {"x": x, "p": self.parameters, "f": self.value + self._price * rows.slack, "g": g}
+        if not problem.grows:
+            return symbols, {}
+        found = joined(self.own, self.rows.derivatives(rows), self.chart.nx)
+        # Own rows are the value, the norms and the rows of the objective, with the constraints between the latter.
+        norms, count, own = self.rows.norms.numel(), rows.rows.numel(), self.own.multipliers.numel()
+        order = [*range(1, 1 + norms), *range(own, own + count), *range(1 + norms, own)]
+        placed = Derivatives(found.multipliers[order], found.jacobian[order, :], found.hessian)
+        return symbols, placed.options(x, self.parameters, found.multipliers[0], g)
+
+    @cached_property
+    def own(self) -> Derivatives:
+        """Derivatives of the value and of all rows but those of constraints."""
+        objective, nx, norms = self.lifted, self.chart.nx, self.rows.norms
+        rows = ca.vertcat(self.value, norms, objective.rest, objective.inequalities)
+        found = Derivatives.of(rows, ca.vertcat(self.rows.x, objective.variables))
+        for jump, row, column in objective.jumps:
+            first = 1 + norms.numel() + row
+            jacobian, hessian = jump.known_derivatives(found.multipliers[first:])
+            own, size = [*range(nx), *range(nx + column, column + jacobian.shape[1])], jacobian.shape[0]
+            found.jacobian[first : first + size, own] += jacobian
+            found.hessian[own, own] += hessian
+        return found
+
+
+def parameters(problem: ConstrainedProblem, chart: Chart, scale: float, price: float) -> Array:
+    """Return the values of the parameters of the program."""
+    return np.concatenate(
+        [
+            problem.objective.parameters,
+            [scale, problem.requirements.regularization, price],
+            chart.to_x(problem.given),
+            *[c.parameters for c in problem.constraints],
+        ]
+    )

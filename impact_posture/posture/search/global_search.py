@@ -1,0 +1,299 @@
+"""The search beyond multi-start: a complete map for one or two degrees of freedom, basin hopping for all others.
+
+The map (:mod:`impact_posture.posture.manifold.self_motion`) states how far the best posture can be from optimal.
+Basin hopping starts again from the best posture with some joints drawn anew (D. J. Wales and J. P. K. Doye, "Global
+optimization by basin-hopping", J. Phys. Chem. A 1997), because many optima differ in a few joints only.  The value at
+a start says little about the optimum that it leads to, so starts are not chosen by value (``make study-global``).
+"""
+
+from __future__ import annotations
+
+from collections.abc import Callable, Sequence
+from dataclasses import dataclass, replace
+from functools import partial
+
+import numpy as np
+from numpy.typing import NDArray
+
+from impact_posture.dynamics.numeric import Numeric
+from impact_posture.errors import InputError, SolverFailed
+from impact_posture.posture.manifold.constraint_manifold import ConstraintManifold
+from impact_posture.posture.manifold.feasible_start import Projector, random_posture
+from impact_posture.posture.manifold.optimality_bound import OptimalityBound, bound_objective
+from impact_posture.posture.manifold.self_motion import SelfMotion, map_self_motion
+from impact_posture.posture.program.compiled_solver import CompileMode
+from impact_posture.posture.program.constrained_problem import ConstrainedProblem, equality_jacobian, rank
+from impact_posture.posture.program.ipopt import one_blas_thread
+from impact_posture.posture.search.multistart import PostureSolution, solve
+from impact_posture.posture.search.solver_runs import Progress
+from impact_posture.system.arrays import Array
+
+# Hops for each start of the multi-start search, and so rounds of as many hops as starts.
+HOPS_PER_START = 3
+# Shares of the joints that a hop draws anew.
+_REDRAWN = (0.1, 0.25, 0.5)
+# A value is better if it is lower by more than this share.
+_BETTER = 1e-6
+# A start missed the best posture if it ended more than this share above.
+_MISSED = 1e-3
+_KEYS = ("redundancy", "improvement", "missed_rate", "unseen_share", "estimated_optima", "hops", "word", "line")
+# Attributes of a solution that tell of the multi-start search.
+_OF_THE_STARTS = (
+    "optima", "starts", "feasible_starts", "certified_starts", "dominated_starts", "solve_time_s", "build_time_s",
+)  # fmt: skip
+# Largest violation of a start on the constraints.
+_ON = 1e-8
+
+
+@dataclass(frozen=True, eq=False)
+class SelfMotionMap:
+    """The nodes of a mapped self-motion manifold, to be drawn.
+
+    Attributes:
+        q: Nodes, component after component, along the curve for one degree of freedom, shape (N, nq).
+        component: Index of the component of each node, shape (N,).
+        s: Path length along the component, rad mixed with m, shape (N,); zeros for two degrees of freedom.
+        objective: The objective, shape (N,).
+        feasible: Whether limits and inequalities hold, shape (N,).
+        start: Index of the node nearest to the initial posture, shape (1,).
+        optimum: Index of the node nearest to the best posture, shape (1,).
+        ends: Index of the node nearest to each optimum of the multi-start search, shape (M,).
+    """
+
+    q: Array
+    component: NDArray[np.int_]
+    s: Array
+    objective: Array
+    feasible: NDArray[np.bool_]
+    start: NDArray[np.int_]
+    optimum: NDArray[np.int_]
+    ends: NDArray[np.int_]
+
+
+@dataclass(frozen=True, eq=False)
+class GlobalSearch:
+    """Finding of the search beyond multi-start.
+
+    Attributes:
+        redundancy: Degrees of freedom that the equalities leave.
+        improvement: Share by which the best posture is below the best one of the multi-start search.
+        missed_rate: Share of the certified starts that ended more than 0.1 % above the best posture.
+        unseen_share: Estimated share of further starts that would end in an optimum not seen yet.
+        estimated_optima: Estimated number of optima.
+        hops: Hops of basin hopping; 0 with a map.
+        motion: The map, or ``None``.
+        bound: The bound on the map, or ``None``.
+        map: The map as drawn, or ``None``.
+    """
+
+    redundancy: int
+    improvement: float
+    missed_rate: float
+    unseen_share: float
+    estimated_optima: float
+    hops: int
+    motion: SelfMotion | None = None
+    bound: OptimalityBound | None = None
+    map: SelfMotionMap | None = None
+
+    @property
+    def line(self) -> str:
+        """The finding in words."""
+        missed = f"{100 * self.missed_rate:.0f} % of the starts"
+        if self.motion is None or self.bound is None:
+            return (
+                f"{self.hops} hops from the best posture lower the objective by {100 * self.improvement:.2g} %; "
+                f"{missed} missed it, about {100 * self.unseen_share:.0f} % of further starts would find an "
+                f"optimum not seen yet, of about {self.estimated_optima:.0f}"
+            )
+        count = len(self.motion.components)
+        pieces = "1 component" if count == 1 else f"{count} components"
+        return (
+            f"self-motion followed on {pieces}: no posture there is better by more than {100 * self.bound.gap:.2g} % "
+            f"({self.word}); {missed} missed this one; the last {self.motion.unsuccessful} of {self.motion.starts} "
+            "random postures found no new component"
+        )
+
+    @property
+    def word(self) -> str | None:
+        """How far the bound can be trusted: ``bounded``, because it rests on estimates; ``None`` without a map."""
+        return None if self.bound is None else "bounded"
+
+    def to_dict(self) -> dict[str, object]:
+        """Return the ``global`` block of ``result.json``."""
+        block: dict[str, object] = {"method": "basin-hopping" if self.motion is None else "self-motion"}
+        block |= {key: getattr(self, key) for key in _KEYS}
+        if self.motion is not None and self.bound is not None and self.map is not None:
+            block |= {key: getattr(self.bound, key) for key in ("lower", "gap", "patches", "finished")}
+            block |= {key: getattr(self.motion, key) for key in ("starts", "unsuccessful")}
+            block["components"] = [self._component(index) for index in range(len(self.motion.components))]
+        return block
+
+    def _component(self, index: int) -> dict[str, object]:
+        assert self.motion is not None and self.map is not None  # noqa: S101 (narrows types)
+        component, mine = self.motion.components[index], self.map.component == index
+        values = self.map.objective[mine & self.map.feasible & np.isfinite(self.map.objective)]
+        return {
+            "length": float(component.s[-1]) if self.motion.dimension == 1 else None,
+            "ends": list(component.ends),
+            "feasible": float(self.map.feasible[mine].mean()),
+            "objective": float(values.min()) if values.size else None,
+        }
+
+
+@dataclass(frozen=True, eq=False)
+class GlobalSolution:
+    """The better one of a given solution and the postures found beyond it, with the finding."""
+
+    solution: PostureSolution
+    search: GlobalSearch
+
+
+def check_searchable(problem: ConstrainedProblem) -> None:
+    """Refuse a problem that :func:`search_globally` cannot search.
+
+    Raises:
+        InputError: The objective is not that of an impact, or the distance from the start counts, too.
+    """
+    _ = problem.impact
+    if problem.requirements.regularization:
+        raise InputError(
+            "bounds the objective alone, but `regularization` adds the distance from the start",
+            where="search global",
+            hint="leave `regularization` away, or use the search multistart",
+        )
+
+
+@one_blas_thread()
+def search_globally(
+    solution: PostureSolution,
+    *,
+    seed: int = 0,
+    jobs: int = 2,
+    compile: CompileMode = "auto",
+    progress: Progress | None = None,
+) -> GlobalSolution:
+    """Search on from the solution of the multi-start search.
+
+    Args:
+        solution: The solution of a problem that passes :func:`check_searchable`.
+        seed: Seed of the random postures.
+        jobs: Processes that search side by side.
+        compile: Whether the program is compiled.
+        progress: Called with the solves done and planned.
+    """
+    problem = solution.problem
+    # A singular posture has more freedom than the manifold.
+    numeric = Numeric(problem.robot.model)
+    ranks = [rank(equality_jacobian(problem, numeric.at(q))) for q in (solution.initial, solution.q)]
+    redundancy = problem.robot.nv - max(ranks)
+    solve_from = partial(_improved, seed=seed, jobs=jobs, compile=compile)
+    if redundancy in (1, 2):
+        better, motion, bound, drawn = _mapped(solution, redundancy, seed, solve_from)
+        return GlobalSolution(better, GlobalSearch(redundancy, *_compared(solution, better), 0, motion, bound, drawn))
+    better, hops = solution, HOPS_PER_START * solution.starts
+    projector, rng = Projector(problem), np.random.default_rng([seed, 1])
+    for number in range(HOPS_PER_START):
+        better = solve_from(better, [_redrawn(projector, better.q, rng) for _ in range(solution.starts)])
+        if progress is not None:
+            progress((number + 1) * solution.starts, hops)
+    return GlobalSolution(better, GlobalSearch(redundancy, *_compared(solution, better), hops))
+
+
+def _compared(before: PostureSolution, after: PostureSolution) -> tuple[float, float, float, float]:
+    """Return improvement, missed rate, unseen share and estimated number of optima."""
+    value, hits = before.problem.objective.value, [optimum.hits for optimum in before.optima]
+    best = value(after.q)
+    near = sum(optimum.hits for optimum in before.optima if optimum.objective <= best * (1 + _MISSED))
+    return max(0.0, 1 - best / value(before.q)), 1 - near / sum(hits), unseen_share(hits), estimated_optima(hits)
+
+
+def _improved(
+    before: PostureSolution, guesses: Sequence[Array | None], *, seed: int, jobs: int, compile: CompileMode
+) -> PostureSolution:
+    """Solve from guesses, and return the better one of both solutions with the starts of the given one."""
+    known = [q for q in guesses if q is not None]
+    try:
+        count = 1 + len(known)
+        found = solve(before.problem, starts=count, seed=seed, jobs=jobs, compile=compile, guesses=known)
+    except SolverFailed:
+        return before
+    value = before.problem.objective.value
+    if not value(found.q) < value(before.q) * (1 - _BETTER):
+        return before
+    return replace(found, **{key: getattr(before, key) for key in _OF_THE_STARTS})
+
+
+def _redrawn(projector: Projector, q: Array, rng: np.random.Generator) -> Array | None:
+    """Return the posture with some joints drawn anew, pulled onto the constraints; ``None`` if it does not reach."""
+    chart = projector.chart
+    x, other = chart.to_x(q), chart.to_x(random_posture(projector.problem, chart, rng))
+    share = rng.choice(_REDRAWN)
+    for slot in chart.slots:
+        if slot.kind.family != "free-flyer" and rng.random() < share:
+            x[slot.x] = other[slot.x]
+    found = projector.project(chart.to_q(x))
+    return found.q if found.violation <= _ON else None
+
+
+def _mapped(
+    solution: PostureSolution, redundancy: int, seed: int, solve_from: Callable[..., PostureSolution]
+) -> tuple[PostureSolution, SelfMotion, OptimalityBound, SelfMotionMap]:
+    """Map the manifold, polish the best node of each component, and bound what is left."""
+    manifold = ConstraintManifold(solution.problem)
+    chart, ends = manifold.chart, [optimum.q for optimum in solution.optima]
+    known = np.array([chart.to_x(q) for q in (solution.initial, *ends)])
+    motion = map_self_motion(manifold, redundancy, known, seed=seed)
+    x = np.concatenate([component.x for component in motion.components])
+    component = np.repeat(np.arange(len(motion.components)), [len(part.x) for part in motion.components])
+    objective, feasible = manifold.objective(x)[0], manifold.distance_to_feasible(x) <= _ON
+    usable = feasible & np.isfinite(objective)
+    leading = [np.flatnonzero(usable & (component == k)) for k in range(len(motion.components))]
+    nodes = [places[objective[places].argmin()] for places in leading if places.size]
+    better = solve_from(solution, [manifold.to_q(x[node]) for node in nodes])
+    bound = bound_objective(motion, solution.problem.objective.value(better.q))
+    if bound.x is not None:
+        better = solve_from(better, [manifold.to_q(bound.x)])
+    points = manifold.embed(x)
+
+    def nearest(*postures: Array) -> NDArray[np.int_]:
+        targets = manifold.embed(np.array([chart.to_x(q) for q in postures]))
+        return np.array([np.linalg.norm(points - target, axis=1).argmin() for target in targets])
+
+    drawn = SelfMotionMap(
+        q=np.array([manifold.to_q(one) for one in x]),
+        component=component,
+        s=np.concatenate([part.s for part in motion.components]),
+        objective=objective,
+        feasible=feasible,
+        start=nearest(solution.initial),
+        optimum=nearest(better.q),
+        ends=nearest(*ends),
+    )
+    best = solution.problem.objective.value(better.q)
+    return better, motion, replace(bound, best=best, lower=min(bound.lower, best)), drawn
+
+
+def unseen_share(hits: Sequence[int]) -> float:
+    """Return the share of further starts that would end in an optimum not seen yet.
+
+    This is Good–Turing's estimate, the share of starts that ended in an optimum found once (I. J. Good, "The
+    population frequencies of species and the estimation of population parameters", Biometrika 1953).
+
+    Args:
+        hits: Starts that ended in each optimum, at least one.
+    """
+    return sum(count == 1 for count in hits) / sum(hits)
+
+
+def estimated_optima(hits: Sequence[int]) -> float:
+    """Return an estimate of the number of optima, seen and unseen, that tends to be low.
+
+    This is Chao1 without bias, ``n + f₁(f₁ − 1)/(2(f₂ + 1))`` with the numbers ``f_k`` of optima found k times
+    (A. Chao, "Nonparametric estimation of the number of classes in a population", Scand. J. Statist. 1984).
+
+    Args:
+        hits: Starts that ended in each optimum.
+    """
+    once, twice = (sum(count == k for count in hits) for k in (1, 2))
+    return len(hits) + once * (once - 1) / (2 * (twice + 1))

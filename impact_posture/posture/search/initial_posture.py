@@ -1,0 +1,85 @@
+"""The posture that a search begins from: the given one on the constraints, or which constraints conflict."""
+
+from __future__ import annotations
+
+from dataclasses import replace
+
+import numpy as np
+
+from impact_posture.errors import ContactError, ImpactPostureError, Infeasible, SolverFailed
+from impact_posture.posture.formulation.build_problem import build_problem
+from impact_posture.posture.manifold.feasible_start import Projector, feasible_start
+from impact_posture.posture.program.constrained_problem import ConstrainedProblem
+from impact_posture.posture.program.program_rows import ProgramRows
+from impact_posture.posture.search.conflicts import ElasticProgram, elastic
+from impact_posture.posture.search.solver_runs import feasible
+from impact_posture.system.arrays import Array
+
+# A violation so small that the relaxed constraints stop after the first few postures.
+_QUICK = 1e-9
+
+
+def initial_posture(problem: ConstrainedProblem, seed: int, rows: ProgramRows) -> tuple[ConstrainedProblem, Array]:
+    """Return the given posture moved onto the constraints, or the first other start that reaches them.
+
+    Constraints without projection need the elastic program, and the returned problem has the parts that it needed.
+
+    Raises:
+        Infeasible: No posture satisfies the constraints; the error names the conflicting constraints.
+        SolverFailed: A posture near the constraints was found, and none on them.
+    """
+    starts = (feasible_start(problem, index, seed) for index in range(5))
+    start = next((q for q in starts if q is not None), None)
+    if start is not None and feasible(problem, start):
+        return problem, start
+    given, problem = problem.given, problem if start is None else replace(problem, given=start)
+    answer = elastic(problem, seed, ElasticProgram(problem, rows))
+    if answer.conflicts:
+        limits = f"; there {', '.join(answer.at_limits[:4])}" if answer.at_limits else ""
+        sign = "; check the sign of the normal, which points towards the robot, and how far the `surface` reaches"
+        struck = sign if any(" / surface at " in name for name in answer.conflicts) else ""
+        raise Infeasible(
+            answer.conflicts,
+            hint=f"{_way_out(problem, seed)}relax one of them, move the target, or start from another `posture`"
+            f"{struck}{limits}",
+        )
+    found = Projector(problem).project(answer.q)
+    if found.violation > 1e-8:
+        raise SolverFailed(
+            f"a posture within {found.violation:.1e} of the constraints was found, but none on them",
+            where="problem",
+            hint="start from a `posture` nearer to the target",
+        )
+    return replace(answer.problem, given=given), found.q
+
+
+def _way_out(problem: ConstrainedProblem, seed: int) -> str:
+    """Say whether there is a posture if the contact frame may turn."""
+    if not problem.objective.contacts or problem.requirements.contact_pose in ("position", "box", "free"):
+        return ""
+    freed = replace(problem.requirements, contact_pose="position", target_quaternion=None)
+    try:
+        turned = build_problem(problem.robot, problem.objective, problem.given, freed)
+        found = elastic(turned, seed, beside=_QUICK)
+    except ImpactPostureError:
+        return ""
+    return "" if found.conflicts else "let the contact frame turn (`contact_pose='position'`), which is possible; or "
+
+
+def initial_objective(problem: ConstrainedProblem, initial: Array) -> float:
+    """Return the objective at the start, which scales the program and so must exist.
+
+    Raises:
+        ContactError: The contact point cannot move along the normal there.
+    """
+    objective = problem.objective
+    # The value is rounding if nothing can move along the normal.
+    value = objective.value(initial) if objective.movable(initial) else 0.0
+    if not (np.isfinite(value) and value > 0):
+        frames = ", ".join(f"'{contact.frame}'" for contact in objective.contacts)
+        raise ContactError(
+            f"the contact point at {frames} cannot move along the normal",
+            where="normal",
+            hint="choose another frame, normal or posture: an impact along it moves nothing",
+        )
+    return value

@@ -1,0 +1,256 @@
+"""Multi-start search: many feasible starts, one program, distinct optima, and the best certified posture."""
+
+from __future__ import annotations
+
+import time
+from collections.abc import Sequence
+from dataclasses import dataclass
+
+import numpy as np
+import pinocchio as pin
+
+from impact_posture.dynamics.chart import Chart
+from impact_posture.dynamics.numeric import Numeric
+from impact_posture.errors import SolverFailed
+from impact_posture.posture.program.certificate import Certificate
+from impact_posture.posture.program.compiled_solver import CompileMode
+from impact_posture.posture.program.constrained_problem import ConstrainedProblem, equality_jacobian, rank
+from impact_posture.posture.program.ipopt import one_blas_thread
+from impact_posture.posture.program.program_rows import ProgramRows
+from impact_posture.posture.search.impact_notes import notes_on_impacts
+from impact_posture.posture.search.initial_posture import initial_objective, initial_posture
+from impact_posture.posture.search.solver_runs import FIRST, FORK, Progress, Search, SolverRun
+from impact_posture.posture.search.start_draws import StartDraws
+from impact_posture.system.arrays import Array
+
+# Optima closer than this in posture (tangent norm) and in objective (relative) are the same optimum.
+SAME_POSTURE, _SAME_OBJECTIVE = 1e-2, 1e-4
+# A reduction below this share is no gain: the jump, a square root, changes by less than 0.05 %.
+_NO_GAIN = 1e-3
+# From this number of starts on, a single hit of the best optimum gets a note.
+_MANY = 8
+
+
+@dataclass(frozen=True)
+class Optimum:
+    """A distinct local optimum.
+
+    Attributes:
+        q: Posture, shape (nq,).
+        objective: Value of the objective.
+        hits: Number of starts that ended there.
+    """
+
+    q: Array
+    objective: float
+    hits: int
+
+
+@dataclass(frozen=True)
+class PostureSolution:
+    """The solution of a posture problem.
+
+    Attributes:
+        problem: The posture problem.
+        initial: The given posture, moved to the constraints if it did not satisfy them.
+        moved: Length of that move, tangent norm.
+        q: The best certified posture.
+        certificate: Certificate of ``q``.
+        redundancy: Degrees of freedom that the equalities leave at ``q``.
+        optima: Distinct optima, best first.
+        starts: Number of starts.
+        feasible_starts: Starts that reached the constraints.
+        certified_starts: Starts that ended at a certified posture at which no original shapes touch.
+        colliding_starts: Starts that ended at another certified posture.
+        dominated_starts: Starts that were left on the way, because they could not become the best.
+        status: Return status of IPOPT for the best run.
+        iterations: Iterations of the best run.
+        solve_time_s: Wall time of all runs together.
+        start_time_s: Median wall time of the runs from one start.
+        build_time_s: Time to build the program.
+        compiled: Whether it ran as machine code.
+        notes: Notes for the user about the solution.
+        compiler_fault: Reason why a compilation failed; empty else.
+    """
+
+    problem: ConstrainedProblem
+    initial: Array
+    moved: float
+    q: Array
+    certificate: Certificate
+    redundancy: int
+    optima: tuple[Optimum, ...]
+    starts: int
+    feasible_starts: int
+    certified_starts: int
+    colliding_starts: int
+    dominated_starts: int
+    status: str
+    iterations: int
+    solve_time_s: float
+    start_time_s: float
+    build_time_s: float
+    compiled: bool
+    notes: tuple[str, ...]
+    compiler_fault: str = ""
+
+    @property
+    def reduction(self) -> float:
+        """``1 − objective(q)/objective(initial)``."""
+        objective = self.problem.objective
+        return 1 - objective.value(self.q) / objective.value(self.initial)
+
+
+@one_blas_thread()
+def solve(
+    problem: ConstrainedProblem,
+    *,
+    starts: int = 16,
+    seed: int = 0,
+    jobs: int = 2,
+    compile: CompileMode = "auto",
+    progress: Progress | None = None,
+    guesses: Sequence[Array] = (),
+    finish_all: bool = False,
+) -> PostureSolution:
+    """Solve from the given posture, from feasible ``guesses`` and from random feasible ones: ``starts`` in all.
+
+    Unless ``finish_all``, a start is left where it can no longer become the best.
+
+    Raises:
+        Infeasible: No posture satisfies the constraints; the error names the conflicting constraints.
+        SolverFailed: No run ended at a certified posture.
+    """
+    rows = ProgramRows(problem)
+    problem, initial = initial_posture(problem, seed, rows)
+    scale = initial_objective(problem, initial)
+    began = time.perf_counter()
+    draws = StartDraws(problem, (initial, *guesses), starts, seed)
+    # The other core has time for this while the program is built.
+    early = problem.grows and jobs > 1 and starts * initial.size > FORK
+    with draws.ahead(FIRST if early else starts):
+        search = Search(problem, draws, scale, compile=compile, finish_all=finish_all, rows=rows)
+        runs = search.run(jobs, progress)
+    problem, nlp = search.problem, search.nlp
+    certified = [r for r in runs if r.good]
+    if not certified:
+        raise _failure(runs)
+    good, touching = _last_word(problem, certified)
+    if not good:
+        raise SolverFailed(
+            f"original shapes touch at all {len(certified)} certified postures: {touching}",
+            where="solver",
+            hint="try more `starts`, another `posture`, or a larger `clearance`",
+        )
+    # Of equally good runs the first counts, so that the solution does not depend on the speed of processes.
+    best = min(good, key=lambda r: round(r.minimized, 9))
+    assert best.record is not None and best.certificate is not None  # noqa: S101 (narrows types)
+    q, certificate, notes = best.record.q, best.certificate, []
+    numeric = Numeric(problem.robot.model)
+    redundancy = problem.robot.nv - rank(equality_jacobian(problem, numeric.at(q)))
+    if redundancy == 0 and best.objective > scale * (1 - 1e-6):
+        notes.append("no redundancy left: the constraints alone determine the posture, there is nothing to optimize")
+    elif redundancy == 0:
+        notes.append("no redundancy left: this is the best of separate postures that the constraints allow")
+    elif best.objective > scale * (1 - _NO_GAIN):
+        note = "no better posture found: the initial one is already optimal for this impact, or nearly so"
+        other = np.linalg.norm(wrapped_difference(problem, initial, q)) > SAME_POSTURE
+        notes.append(f"{note}; the posture shown is another one of equal objective" if other else note)
+    optima = distinct(problem, [(r.record.q, r.objective) for r in good if r.record is not None])
+    notes += notes_on_impacts(problem.objective, initial, q)
+    if touching:
+        count = len(certified) - len(good)
+        notes.append(f"{count} certified postures left out, because original shapes touch there: {touching}")
+    dominated = sum(r.dominated for r in runs)
+    if hits_of_best(optima) == 1 and dominated + sum(o.hits for o in optima) >= _MANY:
+        notes.append("only one start ended at the best optimum: more `starts` may find a better one")
+    return PostureSolution(
+        problem=problem,
+        initial=initial,
+        moved=float(np.linalg.norm(pin.difference(problem.robot.model, problem.given, initial))),
+        q=q,
+        certificate=certificate,
+        redundancy=redundancy,
+        optima=optima,
+        starts=starts,
+        feasible_starts=sum(r.start is not None for r in runs),
+        certified_starts=len(good),
+        colliding_starts=len(certified) - len(good),
+        dominated_starts=dominated,
+        status=best.record.status,
+        iterations=best.record.iterations,
+        solve_time_s=time.perf_counter() - began - search.build_time_s,
+        start_time_s=float(np.median([r.time_s for r in runs])),
+        build_time_s=search.build_time_s,
+        compiled=nlp.compiled,
+        notes=(*problem.notes, *notes),
+        compiler_fault=nlp.compiler_fault,
+    )
+
+
+def _last_word(problem: ConstrainedProblem, runs: list[SolverRun]) -> tuple[list[SolverRun], str]:
+    """The runs at whose ends no original shapes touch, and two shapes that do at another end."""
+    if problem.surroundings is None:
+        return runs, ""
+    good: list[SolverRun] = []
+    touching, known = "", list[tuple[Array, list[tuple[str, str]]]]()
+    for run in runs:
+        assert run.record is not None  # noqa: S101 (narrows a type)
+        q = run.record.q
+        # The verdict on one end of a group of equal ones is that on all.
+        found = next(
+            (hits for other, hits in known if np.linalg.norm(wrapped_difference(problem, other, q)) < 1e-6), None
+        )
+        if found is None:
+            found = problem.surroundings.collisions(q)
+            known.append((q, found))
+        if found:
+            touching = " / ".join(found[0])
+        else:
+            good.append(run)
+    return good, touching
+
+
+def distinct(problem: ConstrainedProblem, ends: list[tuple[Array, float]]) -> tuple[Optimum, ...]:
+    """Group ends at the same posture, best objective first."""
+    found: list[Optimum] = []
+    for q, objective in sorted(ends, key=lambda end: end[1]):
+        for k, known in enumerate(found):
+            near = abs(objective - known.objective) <= _SAME_OBJECTIVE * max(abs(known.objective), 1e-300)
+            if near and np.linalg.norm(wrapped_difference(problem, known.q, q)) < SAME_POSTURE:
+                found[k] = Optimum(known.q, known.objective, known.hits + 1)
+                break
+        else:
+            found.append(Optimum(q, objective, 1))
+    return tuple(found)
+
+
+def hits_of_best(optima: Sequence[Optimum]) -> int:
+    """Return how many starts reached the best objective, at any posture: ends on a flat optimum are distinct."""
+    best = optima[0].objective
+    return sum(o.hits for o in optima if o.objective - best <= _SAME_OBJECTIVE * abs(best))
+
+
+def wrapped_difference(problem: ConstrainedProblem, one: Array, other: Array) -> Array:
+    """Return ``other ⊖ one`` without full turns of revolute joints."""
+    step = np.array(pin.difference(problem.robot.model, one, other))
+    for slot in Chart.of(problem.robot.model).slots:
+        if slot.kind.family == "revolute":
+            step[slot.v] = (step[slot.v] + np.pi) % (2 * np.pi) - np.pi
+    return step
+
+
+def _failure(runs: list[SolverRun]) -> SolverFailed:
+    solved = [r for r in runs if r.record is not None and r.certificate is not None]
+    words = sorted({r.record.status for r in solved if r.record is not None})
+    if not solved:
+        return SolverFailed(
+            "the objective does not exist where the starts ended", where="solver", hint="choose another `objective`"
+        )
+    nearest = min((r.certificate for r in solved if r.certificate), key=lambda c: c.stationarity)
+    return SolverFailed(
+        f"none of {len(solved)} feasible starts ended at a certified posture (solver: {', '.join(words)}; best "
+        f"stationarity {nearest.stationarity:.1e}, violation {nearest.primal:.1e})",
+        where="solver",
+        hint="try more `starts`, another `seed` or `posture`, or a small `regularization`",
+    )

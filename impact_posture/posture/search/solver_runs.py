@@ -1,0 +1,284 @@
+"""The runs of the solver from all starts, with a program that grows by what their ends lack."""
+
+from __future__ import annotations
+
+import time
+from collections import Counter
+from collections.abc import Callable, Iterator
+from dataclasses import dataclass, replace
+
+import numpy as np
+
+from impact_posture.dynamics.numeric import Numeric
+from impact_posture.errors import MetricError
+from impact_posture.posture.constraints.posture_distance import distance
+from impact_posture.posture.manifold.feasible_start import FEASIBLE
+from impact_posture.posture.program.certificate import Certificate, certify
+from impact_posture.posture.program.compiled_solver import CompileMode
+from impact_posture.posture.program.constrained_problem import ConstrainedProblem
+from impact_posture.posture.program.ipopt import one_blas_thread
+from impact_posture.posture.program.posture_nlp import SLACK_PRICE, PostureNLP, SolveRecord, build_nlp
+from impact_posture.posture.program.program_rows import ProgramRows
+from impact_posture.posture.search.start_draws import StartDraws
+from impact_posture.system.arrays import Array
+from impact_posture.system.processes import fork_map
+
+Progress = Callable[[int, int], None]
+
+# Starts that run before the others in a program that grows.
+FIRST = 2
+# Most runs from one start, each with a program that has grown.
+_ROUNDS = 10
+# Unknowns of all starts together up to which every start is finished, because that takes no longer.
+_SMALL = 1000
+# Where only the best counts: unknowns of the starts that go on together, their least number, and the share above the
+# best from which a bound dominates.  With more starts, the program gets what none of the best needs; with fewer, it
+# is built more often.  A run that ended in a trap may end below its bound.
+_BATCH, _LEAST, _FAR = 600, 2, 0.05
+# A fork takes as long as the runs of programs with so many unknowns in all.
+FORK = 200
+# Starts that go on from postures this close (rad, m) share one run, which would end at the same posture.
+_SAME = 1e-6
+# Price of a meter of slack for runs that ended in a trap, and how often they begin anew, each time ten times as dear:
+# where the objective falls steeply, as that of a stretched ur10 does, any fixed price leaves some slack.
+HIGH_PRICE, _ANEW, _DEARER = 20 * SLACK_PRICE, 4, 10
+
+
+@dataclass(frozen=True)
+class SolverRun:
+    """A run of the solver from one start.
+
+    Attributes:
+        start: The start; ``None`` if none reached the constraints.
+        record: Result of the solver; ``None`` if the objective does not exist at its end.
+        objective: Objective at the end.
+        minimized: Objective in units of the initial one, with the regularization.
+        certificate: Certificate of the end; ``None`` while the program lacks parts.
+        lacks: Whether the program lacks parts at the end.
+        dominated: Whether it was left there, because it could not become the best.
+        trapped: Whether the end violates something although the program lacks nothing, or because that pays.  The run
+            begins anew, at a higher price.
+        time_s: Wall time of this run and of those before it from the same start; an even share of shared runs.
+    """
+
+    start: Array | None = None
+    record: SolveRecord | None = None
+    objective: float = np.inf
+    minimized: float = np.inf
+    certificate: Certificate | None = None
+    lacks: bool = False
+    dominated: bool = False
+    trapped: bool = False
+    time_s: float = 0.0
+
+    @property
+    def good(self) -> bool:
+        """Whether the end is certified."""
+        return self.certificate is not None and self.certificate.holds()
+
+
+@one_blas_thread()
+def run_start(
+    nlp: PostureNLP, start: Array, scale: float, price: float = SLACK_PRICE, first: SolveRecord | None = None
+) -> tuple[SolveRecord, Certificate]:
+    """Solve from a feasible start and certify the end; try the other guesses of the objective if it fails.
+
+    Args:
+        nlp: The program.
+        start: The start, shape (nq,).
+        scale: The initial objective.
+        price: Price of a meter of slack.
+        first: Result of the first guess, if it is known.
+    """
+    record = first or nlp.solve(start, scale=scale, price=price)
+    certificate = certify(nlp.problem, record.q, scale, record.auxiliaries, nlp.program.numeric)
+    for attempt in range(1, nlp.problem.objective.attempts):
+        if certificate.holds():
+            break
+        again = nlp.solve(start, scale=scale, attempt=attempt, price=price)
+        certificate = certify(nlp.problem, again.q, scale, again.auxiliaries, nlp.program.numeric)
+        iterations, time_s = record.iterations + again.iterations, record.time_s + again.time_s
+        record = replace(again, iterations=iterations, time_s=time_s)
+    return record, certificate
+
+
+class Search:
+    """The runs from all starts, whose program gets what it lacks until no end of a run lacks anything.
+
+    Args:
+        problem: The posture problem.
+        draws: The starts.
+        scale: The initial objective.
+        compile: Whether to compile the program.
+        finish_all: Whether starts go on that cannot become the best; in small programs they always do.
+        rows: The rows of the constraints, if another program of the problem has them.
+    """
+
+    def __init__(
+        self,
+        problem: ConstrainedProblem,
+        draws: StartDraws,
+        scale: float,
+        *,
+        compile: CompileMode,
+        finish_all: bool,
+        rows: ProgramRows | None = None,
+    ) -> None:
+        self.problem, self._draws, self._scale, self._compile = problem, draws, scale, compile
+        self.nlp = build_nlp(problem, compile=compile, starts=draws.count, rows=rows)
+        self._small = draws.count * self._unknowns <= _SMALL
+        self._finish_all = finish_all or self._small
+        self.build_time_s = self.nlp.build_time_s
+        # A run goes on from where it ended without what the program lacked.
+        self._ends: dict[int, Array] = {}
+        # Price of a meter of slack for starts that did not end in a trap.
+        self._price = SLACK_PRICE
+        # Times that each start ended in a trap.
+        self._trapped: Counter[int] = Counter()
+
+    def run(self, jobs: int, progress: Progress | None) -> list[SolverRun]:
+        """Run all starts; those whose ends the program did not keep feasible run again with what it lacked.
+
+        A program without all rows bounds what the start can still reach, because with more rows the objective rises.
+        The starts with the lowest bounds go on first, and those whose bound is well above a certified end not at all.
+        """
+        runs: dict[int, SolverRun] = {}
+        starts, best = self._draws.count, np.inf
+        waiting, counts = list(range(starts)), [0] * starts
+        # Ends that lack something, with the problem of their run: what starts lack that go on later waits with them.
+        owed: dict[int, tuple[SolveRecord, ConstrainedProblem]] = {}
+        while waiting:
+            batch = self._next(waiting, runs)
+            self._grow([owed.pop(k) for k in batch if k in owed])
+            if runs:
+                self._draws.collect()
+            shared = self._shared(batch)
+            last = {k for own in shared.values() if max(counts[j] for j in own) >= _ROUNDS - 1 for k in own}
+            for leader, run in self._round(list(shared), jobs, last):
+                own = run.time_s / len(shared[leader])
+                for k in shared[leader]:
+                    runs[k] = replace(run, time_s=own + (runs[k].time_s if k in runs else 0.0))
+                    counts[k] += 1
+                if progress:
+                    progress(min(len(runs), starts), starts)
+                if run.good and run.minimized < best and self._clear(run):
+                    best = run.minimized
+            lacking = {k: r for k in batch if (r := runs[k].record) is not None and runs[k].lacks and k not in last}
+            # A run without all rows goes through bodies and may end between them.  With the rows and a higher price
+            # it keeps what its start satisfies.
+            trapped = {k for k in batch if runs[k].trapped and k not in last}
+            if len(runs) < starts and trapped == {*range(FIRST)}:
+                # Passing through something is worth more than the price to each of the first starts.
+                self._price = HIGH_PRICE
+            self._trapped.update(trapped)
+            owed |= {k: (r, self.problem) for k, r in lacking.items()}
+            ends = self._ends | {k: r.q for k, r in lacking.items()}
+            self._ends = {k: q for k, q in ends.items() if k not in trapped}
+            waiting = sorted({*waiting} - {*batch} | {*lacking, *trapped})
+            if not self._finish_all:
+                dominated = {k for k in waiting if k in runs and runs[k].minimized > best + _FAR * abs(best)}
+                runs |= {k: replace(runs[k], dominated=True) for k in dominated}
+                waiting = [k for k in waiting if k not in dominated]
+        return [runs[index] for index in range(starts)]
+
+    def _grow(self, owed: list[tuple[SolveRecord, ConstrainedProblem]]) -> None:
+        """Give the program what it lacks at ends of runs, each with the problem of its run."""
+        # The auxiliaries of another program say nothing.
+        now = [record for record, problem in owed if problem is self.problem]
+        before = [record.q for record, problem in owed if problem is not self.problem]
+        numeric = self.nlp.program.numeric
+        grown = self.problem.grown([r.q for r in now], numeric, [r.auxiliaries for r in now]).grown(before, numeric)
+        if grown is not self.problem:
+            self.problem, self.nlp = grown, self.nlp.grown(grown, compile=self._compile)
+            self.build_time_s += self.nlp.build_time_s
+
+    @property
+    def _unknowns(self) -> int:
+        return int(self.nlp.solver.size1_in("x0"))
+
+    def _next(self, waiting: list[int], runs: dict[int, SolverRun]) -> list[int]:
+        """Return the starts to run next."""
+        if not runs and self.problem.grows:
+            # What the first starts lack is what most others will.
+            return waiting[:FIRST]
+        if self._small and len(runs) == FIRST and waiting[0] < FIRST:
+            # A little more in a small program costs the others less than another run.
+            return [k for k in waiting if k < FIRST]
+        if self._finish_all or not all(k in runs for k in waiting):
+            return waiting
+        groups = self._shared(sorted(waiting, key=lambda k: runs[k].minimized))
+        count = max(_BATCH // self._unknowns, _LEAST)
+        return sorted(k for group in list(groups.values())[:count] for k in group)
+
+    def _clear(self, run: SolverRun) -> bool:
+        """Whether no original shapes touch at the end of a run."""
+        around = self.problem.surroundings
+        return around is None or run.record is None or not around.collisions(run.record.q)
+
+    def _shared(self, waiting: list[int]) -> dict[int, list[int]]:
+        """Group starts that go on from the same posture: the first of each group runs for all."""
+        groups: dict[int, list[int]] = {}
+        for index in waiting:
+            end = self._ends.get(index)
+            same = (k for k in groups if end is not None and k in self._ends and _near(end, self._ends[k]))
+            groups.setdefault(next(same, index), []).append(index)
+        return groups
+
+    def _round(self, waiting: list[int], jobs: int, last: set[int]) -> Iterator[tuple[int, SolverRun]]:
+        jobs = jobs if len(waiting) * self._unknowns > FORK else 1
+        with fork_map(lambda k: self._timed(waiting[k], last=waiting[k] in last), len(waiting), jobs) as results:
+            if around := self.problem.surroundings:
+                # The last word needs the shapes themselves, and this process would only wait.
+                _ = around.shapes.geometry
+            for k, run in results:
+                yield waiting[k], run
+
+    def _timed(self, index: int, *, last: bool) -> SolverRun:
+        began = time.perf_counter()
+        return replace(self._run(index, last=last), time_s=time.perf_counter() - began)
+
+    @one_blas_thread()
+    def _run(self, index: int, *, last: bool) -> SolverRun:
+        """Run one start; an end that the program lacks parts for is certified in its last round only."""
+        nlp, scale, problem = self.nlp, self._scale, self.problem
+        numeric = nlp.program.numeric
+        trapped, start = self._trapped[index], self._ends.get(index)
+        if start is None:
+            start = self._draws.choose(index, trapped)
+        if start is None:
+            return SolverRun()
+        price = HIGH_PRICE * _DEARER ** (trapped - 1) if trapped else self._price
+        try:
+            record, certificate = nlp.solve(start, scale=scale, price=price), None
+            lacks = record.converged and problem.grown([record.q], numeric, [record.auxiliaries]) is not problem
+            if last or not lacks:
+                record, certificate = run_start(nlp, start, scale, price, record)
+            objective = problem.objective.value(record.q)
+        except MetricError:
+            # This start led to a posture where the objective does not exist.  The other starts go on.
+            return SolverRun(start)
+        minimized = objective / scale
+        if problem.requirements.regularization:
+            minimized += problem.requirements.regularization * distance(nlp.chart, record.q, problem.given) ** 2
+        certified = certificate is not None and certificate.holds()
+        # More rows do not help where a violation pays.
+        pays = record.converged and problem.slack(record.auxiliaries) > FEASIBLE
+        anew = record.converged and (pays or not lacks) and not certified and trapped < _ANEW
+        anew = anew and not feasible(problem, record.q, numeric)
+        return SolverRun(start, record, objective, minimized, certificate, lacks, trapped=anew)
+
+
+def _near(one: Array, other: Array) -> bool:
+    return bool(np.abs(one - other).max() < _SAME)
+
+
+def feasible(problem: ConstrainedProblem, q: Array, numeric: Numeric | None = None) -> bool:
+    """Return whether ``q`` satisfies all constraints, those of the program and others.
+
+    Args:
+        problem: The posture problem.
+        q: The posture, shape (nq,).
+        numeric: The model, if the caller has it; it is moved.
+    """
+    violations = problem.violations((numeric or Numeric(problem.robot.model)).at(q))
+    return all(float(np.abs(excess).max(initial=0.0)) <= FEASIBLE for excess in violations)

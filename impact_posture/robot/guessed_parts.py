@@ -1,0 +1,203 @@
+"""Guesses from names and geometry of a robot: feet, tips, fingers, wheels."""
+
+from __future__ import annotations
+
+import re
+import xml.etree.ElementTree as ET
+from collections.abc import Mapping, Sequence
+from pathlib import Path
+
+import pinocchio as pin
+
+from impact_posture.config.settings import Root
+from impact_posture.errors import PostureError
+from impact_posture.robot.model_joints import joint_range
+from impact_posture.robot.named_postures import states_with_base
+from impact_posture.robot.robot import Robot
+
+# Common names of parts, collected from URDFs such as those of example-robot-data.
+_FOOT = re.compile(r"sole|foot|feet|hoof|paw|toe|ankle", re.I)
+_ARM = re.compile(r"(?<!h)arm(?!ature)|shoulder|elbow|wrist|hand|gripper|head|neck", re.I)
+_WHEEL = re.compile(r"wheel|caster|track", re.I)
+_ROTOR = re.compile(r"rotor|propeller|motor", re.I)
+_FINGER = re.compile(r"finger|thumb|gripper|jaw|knuckle|pinky|(?:^|_)(?:index|middle|ring|little|mrl)(?:_|$)", re.I)
+_TOOL = re.compile(r"tcp|tool|(?:^|_)ee(?:f|$|_)|end_?effector|grasp|tip$", re.I)
+_HAND = re.compile(r"gripper|hand|palm|flange", re.I)
+_SENSOR = re.compile(
+    r"imu|camera|optical|laser|lidar|radar|sensor|sonar|range|accelero|gyro|fsr|touch|_itb|_led|dh_frame|visual", re.I
+)
+_FLYING = re.compile(r"fly|copter|drone|uav|aerial|quadrotor|hexarotor|propeller", re.I)
+
+# Parts of the names of start postures, best first.
+_STARTS = ("stand", "half_sitting", "home", "ready", "default", "homing", "up")
+# Greatest height of feet above the lowest point, as a share of the robot's height.
+_LEVEL = 0.1
+
+
+def chain(robot: Robot, joint: int) -> list[int]:
+    """Return the joint and its ancestors, without the free-flyer."""
+    return [int(i) for i in robot.model.supports[joint] if i in joint_range(robot.model)][::-1]
+
+
+def joints_to(robot: Robot, frame: str) -> list[str]:
+    """Return the joints that move a frame, the nearest first."""
+    joint = int(robot.model.frames[robot.frame_id(frame)].parentJoint)
+    return [str(robot.model.names[i]) for i in chain(robot, joint)]
+
+
+def _links(robot: Robot, joint: int) -> list[str]:
+    """Return the names of the link frames that move with a joint."""
+    return [str(f.name) for f in robot.model.frames if f.parentJoint == joint and f.type == pin.FrameType.BODY]
+
+
+def _leaves(robot: Robot) -> list[int]:
+    return [i for i in joint_range(robot.model) if not len(robot.model.children[i])]
+
+
+def upright_frames(robot: Robot) -> pin.Data:
+    """Return the frames at the default posture with the base at the world origin."""
+    q, data = robot.posture(), robot.model.createData()
+    if robot.floating:
+        q[:7] = (0, 0, 0, 0, 0, 0, 1)
+    pin.framesForwardKinematics(robot.model, data, q)
+    return data
+
+
+def feet(robot: Robot, named: Sequence[str] = ()) -> tuple[str, ...]:
+    """Return frames that look like feet: ends of legs that reach the lowest level of the default posture.
+
+    Feet that the SRDF names as end effectors (``named``) replace the guess.
+    """
+    known = tuple(name for name in named if name in robot.frame_names)
+    if known:
+        return known
+    model, data = robot.model, upright_frames(robot)
+    height = {str(f.name): float(data.oMf[i].translation[2]) for i, f in enumerate(model.frames)}
+    found: dict[str, bool] = {}
+    for joint in _leaves(robot):
+        line = chain(robot, joint)
+        words = [str(model.names[i]) for i in line] + [n for i in line for n in _links(robot, i)]
+        own = [n for n in _links(robot, joint) if not _SENSOR.search(n) and not _ROTOR.search(n)]
+        by_name = [n for n in own if _FOOT.search(n)]
+        other = (_WHEEL, _FINGER) if by_name else (_WHEEL, _FINGER, _ARM)
+        if len(line) < 2 or not own or any(part.search(word) for part in other for word in words):
+            continue
+        # A sole is part of a foot, and an ankle lies above it.
+        best = min(by_name or own, key=lambda n: ("sole" not in n.lower(), round(height[n], 3), own.index(n)))
+        found[best] = bool(by_name)
+    if any(found.values()):
+        found = {name: True for name, named_so in found.items() if named_so}
+    else:
+        ground = min(height.values())
+        level = ground + _LEVEL * (max(height.values()) - ground)
+        found = {name: False for name in found if height[name] <= level}
+        if len(found) < 2:
+            return ()
+    return tuple(found)
+
+
+def tips(robot: Robot, feet: Sequence[str] = ()) -> tuple[str, ...]:
+    """Return all moving frames, likely contact frames first: tools, hands, ends of limbs, feet, frames of joints."""
+    model = robot.model
+    leaves = set(_leaves(robot))
+    fingers = {i for i in range(1, model.njoints) if _FINGER.search(str(model.names[i]))}
+    legs = {int(model.frames[robot.frame_id(foot)].parentJoint) for foot in feet}
+    last = (leaves | {int(model.parents[i]) for i in fingers}) - fingers - legs
+
+    def rank(frame: pin.Frame) -> tuple[int, int]:
+        name, joint = str(frame.name), int(frame.parentJoint)
+        depth = -len(chain(robot, joint))
+        if frame.type != pin.FrameType.BODY:
+            return 9, depth
+        if _SENSOR.search(name) or _WHEEL.search(name) or _ROTOR.search(name):
+            return 8, depth
+        if name in feet:
+            return 4, depth
+        if joint not in last or not depth:
+            return (5 if joint in fingers else 6), depth
+        if _TOOL.search(name):
+            return 1, depth
+        return (2 if _HAND.search(name) else 3), depth
+
+    # Of the frames on a link, the outer ones come later in the URDF.
+    moving = [(i, f) for i, f in enumerate(model.frames) if f.parentJoint > 0 and f.name != "root_joint"]
+    ordered = sorted(moving, key=lambda entry: (*rank(entry[1]), -entry[0]))
+    return tuple(dict.fromkeys(str(frame.name) for _, frame in ordered))
+
+
+def fingers(robot: Robot) -> tuple[str, ...]:
+    """Return the joints whose name, or whose ancestor's name, is that of a gripper or hand."""
+    names = robot.model.names
+    return tuple(
+        joint
+        for joint in robot.joint_names
+        if any(_FINGER.search(str(names[i])) for i in chain(robot, robot.joint_id(joint)))
+    )
+
+
+def base_frame(robot: Robot) -> str:
+    """Return the frame of the root link."""
+    joint = 1 if robot.floating else 0
+    return str(next(f.name for f in robot.model.frames if f.parentJoint == joint and f.type == pin.FrameType.BODY))
+
+
+def wheels(robot: Robot) -> tuple[str, ...]:
+    """Return the joints with names of wheels and casters."""
+    return tuple(name for name in robot.joint_names if _WHEEL.search(name))
+
+
+def flies(robot: Robot) -> bool:
+    """Tell whether a name indicates that the robot flies."""
+    return any(_FLYING.search(name) for name in (robot.name, *robot.frame_names))
+
+
+def srdf_near(urdf: Path) -> Path | None:
+    """Return the SRDF beside the URDF or in ``../srdf`` whose name begins that of the URDF, or the only one there."""
+    folders = (urdf.parent, urdf.parent.parent / "srdf")
+    near = [path for folder in folders for path in sorted(folder.glob("*.srdf"))]
+    fitting = [path for path in near if urdf.stem.startswith(path.stem)]
+    if fitting:
+        return max(fitting, key=lambda path: len(path.stem)).resolve()
+    return near[0].resolve() if len(near) == 1 else None
+
+
+def srdf_end_effectors(srdf: Path | None) -> Mapping[str, str]:
+    """Return the links that the SRDF names as end effectors, each with all its attributes."""
+    tags = ET.parse(srdf).getroot().iter("end_effector") if srdf is not None else ()
+    return {tag.get("parent_link", ""): " ".join(tag.attrib.values()).lower() for tag in tags}
+
+
+def likely_root(robot: Robot, feet: Sequence[str], srdf: Path | None) -> tuple[Root, str]:
+    """Return the likely root joint and the reason."""
+    if states := states_with_base(srdf):
+        return "free-flyer", f"the SRDF's posture {states[0]} has a base pose"
+    if feet:
+        return "free-flyer", f"it has feet: {', '.join(feet)}"
+    if flies(robot):
+        return "free-flyer", "its names say that it flies"
+    return "fixed", 'nothing says that its base moves; "free-flyer" if it does'
+
+
+def likely_kind(robot: Robot, feet: Sequence[str]) -> tuple[str, str]:
+    """Return the likely kind of the robot and the reason."""
+    if len(feet) in (2, 4):
+        return ("quadruped", "four feet") if len(feet) == 4 else ("humanoid", "two feet")
+    if robot.floating:
+        return ("aerial", "its names say that it flies") if flies(robot) else ("other", "nothing tells")
+    return ("mobile", "it has wheels") if wheels(robot) else ("arm", "a fixed root")
+
+
+def start_posture(robot: Robot) -> str:
+    """Return a named posture within the limits, preferably for standing or starting."""
+    able = []
+    for name in robot.postures:
+        try:
+            robot.check_posture(robot.posture(name))
+        except PostureError:
+            continue
+        able.append(name)
+
+    def rank(name: str) -> int:
+        return next((k for k, word in enumerate(_STARTS) if word in name.lower()), len(_STARTS))
+
+    return min((name for name in able if name != "neutral"), key=rank, default="neutral")

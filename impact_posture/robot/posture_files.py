@@ -1,0 +1,225 @@
+"""Postures as users write them: a name, ``posture.json``, joints by name, or a ``sensor_msgs/JointState`` in YAML."""
+
+from __future__ import annotations
+
+import json
+import math
+import os
+import re
+from collections import Counter
+from collections.abc import Mapping, Sequence
+from pathlib import Path
+
+import numpy as np
+
+from impact_posture.errors import JointLocked, JointNotFound, PostureError, PostureNotFound, nearest, shown
+from impact_posture.robot.model_joints import q_slice, scalar_entries
+from impact_posture.robot.robot import Robot
+from impact_posture.system.arrays import Array
+from impact_posture.system.text_files import read_text
+
+SCHEMA = "impact-posture/posture/1"
+
+_OUR_KEYS = ("schema", "robot", "convention", "joint_names", "q")
+_BY_NAME_KEYS = ("schema", "robot", "base", "joints")
+_SHAPES = "q with joint_names, joints by name, or a JointState's name and position"
+
+_FIXED = ", but the root is fixed, with the root link at the world's origin along its axes"
+_NO_BASE = "remove the base and give `normal` in those axes, or use `root='free-flyer'`"
+
+
+def read_posture(robot: Robot, text: str | None, where: str = "posture") -> Array:
+    """Return the configuration that ``text`` names, shape (nq,), with its length, quaternion and limits checked.
+
+    Args:
+        robot: The robot.
+        text: Name of one of its postures, or a file: ``posture.json`` (``q`` in the order of ``joint_names``),
+            ``{"base": [x, y, z, qx, qy, qz, qw], "joints": {name: value}}``, or a ``sensor_msgs/JointState`` in YAML
+            (``name: [...]``, ``position: [...]``).  By name, a continuous joint is one angle in rad, and joints
+            that are not named stay as in the default posture.  ``None`` means the default posture.
+        where: Option or file to name in errors.
+
+    Raises:
+        PostureNotFound: ``text`` is neither a posture nor a file; carries the nearest names.
+        JointNotFound: A file names a joint that the robot lacks; carries the nearest names.
+        PostureError: The file cannot be read, or its numbers are no posture of this robot.
+    """
+    if text is None or text in robot.postures:
+        return robot.check_posture(robot.posture(text), where=f"{where} {text or robot.default_posture}")
+    path = posture_path(text)
+    if path is None:
+        raise PostureNotFound(text, robot.postures, where=where, hint="(or give a .json or .yaml file)")
+    data = _load(path)
+    return robot.check_posture(_configuration(robot, data, str(path)), where=str(path))
+
+
+def write_posture(robot: Robot, q: Array) -> dict[str, object]:
+    """Return the content of ``posture.json`` for ``q``, shape (nq,); :func:`read_posture` reads it back.
+
+    Raises:
+        PostureError: ``q`` is no posture of this robot.
+    """
+    q = robot.check_posture(q, limits=False)
+    return {
+        "schema": SCHEMA,
+        "robot": robot.name,
+        "convention": robot.convention,
+        "joint_names": list(robot.joint_names),
+        "q": [float(v) for v in q],
+    }
+
+
+def posture_path(text: str) -> Path | None:
+    """Return the path if ``text`` names a posture file, else ``None``."""
+    path = Path(text).expanduser()
+    return path if path.suffix in (".json", ".yaml", ".yml") or os.path.isfile(path) else None
+
+
+def _load(path: Path) -> Mapping[str, object]:
+    # Imported here, because few postures come from files.
+    import yaml
+
+    kind = "JSON" if path.suffix == ".json" else "YAML"
+    try:
+        text = read_text(path)
+        # `ros2 topic echo` ends every message with `---`, hence the first document is read.  The base loader keeps
+        # every scalar as text: others read 1:30 as 90 and a joint called `on` as true, and fail on bad tags.
+        data = json.loads(text) if kind == "JSON" else next(yaml.load_all(text, yaml.BaseLoader), None)
+    except FileNotFoundError:
+        raise PostureError("no such file", where=str(path), hint="check the path") from None
+    except OSError as error:
+        raise PostureError(f"cannot be read ({error.strerror})", where=str(path), hint="check the file") from None
+    except (ValueError, yaml.YAMLError, RecursionError) as error:
+        raise PostureError(f"is not valid {kind} ({error})", where=str(path), hint="correct the syntax") from None
+    if not isinstance(data, dict):
+        raise PostureError("holds no posture", where=str(path), hint=f"give {_SHAPES}")
+    return {str(key): value for key, value in data.items()}
+
+
+def _configuration(robot: Robot, data: Mapping[str, object], where: str) -> Array:
+    """Read one of the three shapes, which differ in their keys."""
+    schema = data.get("schema", SCHEMA)
+    if schema != SCHEMA:
+        raise PostureError(f"schema '{shown(schema)}' is no posture", where=where, hint=f'give a file of "{SCHEMA}"')
+    if "q" in data:
+        _only(data, _OUR_KEYS, where)
+        return _in_order(robot, data, where)
+    if "joints" in data or "base" in data:
+        _only(data, _BY_NAME_KEYS, where)
+        joints = data.get("joints", {})
+        if not isinstance(joints, dict):
+            raise PostureError("'joints' is no table", where=where, hint='write "joints": {"name": value}')
+        return _by_name(robot, {str(k): v for k, v in joints.items()}, data.get("base"), where)
+    if "name" in data and "position" in data:
+        return _by_name(robot, _joint_state(data["name"], data["position"], where), None, where)
+    raise PostureError("holds no posture", where=where, hint=f"give {_SHAPES}")
+
+
+def _only(data: Mapping[str, object], known: Sequence[str], where: str) -> None:
+    for key in data:
+        if key not in known:
+            close = ", ".join(nearest(key, known))
+            raise PostureError(f"unknown key '{shown(key)}'", where=where, hint=f"did you mean {close}?")
+
+
+def _in_order(robot: Robot, data: Mapping[str, object], where: str) -> Array:
+    if "joint_names" in data:
+        names = _names(data["joint_names"], "joint_names", where)
+        for name in names:
+            if name in robot.locked:
+                raise JointLocked(name, where=where)
+            if name not in robot.joint_names:
+                raise JointNotFound(name, robot.joint_names, where=where)
+        if tuple(names) != robot.joint_names:
+            missing = [name for name in robot.joint_names if name not in names]
+            fault = f"leaves out joint '{missing[0]}'" if missing else "has the joints in another order"
+            raise PostureError(
+                f"{fault}, so that q cannot be read", where=where, hint='give them by name: "joints": {"name": value}'
+            )
+    q = _numbers(data["q"], "q", where)
+    if not robot.floating and len(q) == robot.nq + 7:
+        raise PostureError("begins with a base pose" + _FIXED, where=where, hint=_NO_BASE)
+    return np.array(q)
+
+
+def _by_name(robot: Robot, joints: Mapping[str, object], base: object, where: str) -> Array:
+    q = robot.posture()
+    if base is not None:
+        if not robot.floating:
+            raise PostureError("gives a base pose" + _FIXED, where=where, hint=_NO_BASE)
+        pose = _numbers(base, "base", where)
+        if len(pose) != 7:
+            raise PostureError(f"'base' has {len(pose)} numbers", where=where, hint="give [x, y, z, qx, qy, qz, qw]")
+        q[:7] = pose
+    return set_joints(robot, q, joints, where)
+
+
+def set_joints(robot: Robot, q: Array, joints: Mapping[str, object], where: str) -> Array:
+    """Return a configuration with the given joints at other values, otherwise unchecked.
+
+    Args:
+        robot: The robot.
+        q: Configuration, shape (nq,); not changed.
+        joints: Values by name: one number for a joint of one degree of freedom, its entries of q for others.
+        where: Option or file to name in errors.
+
+    Raises:
+        JointNotFound: The robot lacks a joint; carries the nearest names.
+        PostureError: A value is invalid.
+    """
+    q = q.copy()
+    for name, value in joints.items():
+        if name in robot.locked:
+            continue  # Messages of a robot name all its joints, and a rigid one has no entry in q.
+        if name not in robot.joint_names:
+            raise JointNotFound(name, robot.joint_names, where=where)
+        index = robot.joint_id(name)
+        entries = q_slice(robot.model, index)
+        if robot.model.nvs[index] == 1:
+            angle = _number(value, f"joint '{name}'", where)
+            # Cosine and sine of a continuous joint would hide a value that is not finite.
+            if not math.isfinite(angle):
+                raise PostureError(f"joint '{name}' is not finite", where=where, hint="correct it")
+            q[entries] = scalar_entries(robot.model, index, angle)
+        else:
+            numbers, nq = _numbers(value, f"joint '{name}'", where), int(robot.model.nqs[index])
+            if len(numbers) != nq:
+                raise PostureError(
+                    f"joint '{name}' takes {nq} numbers, not {len(numbers)}", where=where, hint="correct it"
+                )
+            q[entries] = numbers
+    return q
+
+
+def _joint_state(name: object, position: object, where: str) -> dict[str, object]:
+    names, positions = _names(name, "name", where), _numbers(position, "position", where)
+    if len(names) != len(positions):
+        raise PostureError(
+            f"{len(names)} names but {len(positions)} positions", where=where, hint="give one position per name"
+        )
+    return dict(zip(names, positions, strict=True))
+
+
+def _names(value: object, key: str, where: str) -> list[str]:
+    if not isinstance(value, list) or not all(isinstance(v, str) for v in value):
+        raise PostureError(f"'{key}' is no list of names", where=where, hint="correct it")
+    twice = next((name for name, count in Counter(value).items() if count > 1), None)
+    if twice is not None:
+        raise PostureError(f"'{key}' names '{shown(twice)}' twice", where=where, hint="remove one of them")
+    return value
+
+
+def _numbers(value: object, key: str, where: str) -> list[float]:
+    if not isinstance(value, list):
+        raise PostureError(f"'{key}' is no list of numbers", where=where, hint="correct it")
+    return [_number(item, f"'{key}' entry {k}", where) for k, item in enumerate(value)]
+
+
+def _number(value: object, key: str, where: str) -> float:
+    # Every number from YAML is text, with a dot before inf and nan.
+    if isinstance(value, (int, float, str)) and not isinstance(value, bool):
+        try:
+            return float(re.sub(r"\.(?=(inf|nan)$)", "", value, flags=re.I) if isinstance(value, str) else value)
+        except (ValueError, OverflowError):
+            pass
+    raise PostureError(f"{key} is '{shown(value)}', no number", where=where, hint="correct it")

@@ -1,0 +1,221 @@
+"""``robot.toml``: the data of a robot that URDF and SRDF cannot hold, checked as it is read."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass, field
+from pathlib import Path
+from typing import Annotated, Any, ClassVar, Literal
+
+from pydantic import Field
+
+from impact_posture.config.argument_types import checked_class
+from impact_posture.config.settings import ContactPose, Root, SupportKind, TransmissionKind, Vector3
+from impact_posture.config.toml_tables import read_toml, validate
+from impact_posture.errors import SpecError, shown
+
+SCHEMA = "impact-posture/robot/1"
+
+Positive = Annotated[float, Field(gt=0, allow_inf_nan=False)]
+NonNegative = Annotated[float, Field(ge=0, allow_inf_nan=False)]
+
+
+class _Table:
+    __pydantic_config__: ClassVar[dict[str, Any]] = {"extra": "forbid"}
+
+
+@dataclass(frozen=True)
+class ModelSpec(_Table):
+    """Files of the model: paths relative to robot.toml, or ``example-robot-data:<path>``."""
+
+    urdf: str | None = None
+    srdf: str | None = None
+    root: Root = "fixed"
+    package_dirs: tuple[str, ...] = ()
+    lock: tuple[str, ...] = ()
+    lock_massless: bool = False
+    # A user may accept the impossible inertias of a published URDF.
+    accept_inertias: bool = False
+
+
+@dataclass(frozen=True)
+class PostureSpec(_Table):
+    """A named posture: joints by name (the others are neutral), base pose ``[x, y, z, qx, qy, qz, qw]``."""
+
+    base: tuple[float, float, float, float, float, float, float] | None = None
+    joints: dict[str, float] = field(default_factory=dict)
+
+
+@dataclass(frozen=True)
+class ContactSpec(_Table):
+    """The default contact frame, and the pose mode of contact frames while the posture moves."""
+
+    frame: str | None = None
+    offset: Vector3 = (0.0, 0.0, 0.0)
+    pose: ContactPose = "full"
+    frames: dict[str, ContactPose] = field(default_factory=dict)
+
+
+@checked_class
+@dataclass(frozen=True)
+class Support(_Table):
+    """A foot that stays on the ground; its velocities are zero up to the compliance.
+
+    Attributes:
+        frame: Frame of the foot.
+        kind: ``point`` holds the three velocities of the contact point, ``surface`` also those of rotation.
+        offset: Contact point from the frame's origin, in the frame, meters.
+        size: Half extents (x, y) of the sole around the contact point, in the frame, meters.
+    """
+
+    frame: str
+    kind: SupportKind = "point"
+    offset: Vector3 = (0.0, 0.0, 0.0)
+    size: tuple[NonNegative, NonNegative] = (0.0, 0.0)
+
+    @property
+    def rows(self) -> int:
+        """Number of velocities that it holds."""
+        return 3 if self.kind == "point" else 6
+
+    @property
+    def has_sole(self) -> bool:
+        """Whether it is a surface of known size."""
+        return self.kind == "surface" and min(self.size) > 0
+
+
+@dataclass(frozen=True)
+class ConstraintSpec(_Table):
+    """Default constraints of optimizations with this robot."""
+
+    hold: tuple[str, ...] = ()
+    level_base: bool = False
+    com_over_feet: bool = False
+    com_margin: NonNegative = 0.0
+    limit_margin: NonNegative = 0.0
+
+
+@dataclass(frozen=True)
+class LimitSpec(_Table):
+    """Limits that replace those of the URDF: rad or m, rad/s or m/s, N·m or N."""
+
+    position: dict[str, tuple[float, float]] = field(default_factory=dict)
+    velocity: dict[str, Positive] = field(default_factory=dict)
+    effort: dict[str, Positive] = field(default_factory=dict)
+
+
+@dataclass(frozen=True)
+class ArmatureSpec(_Table):
+    """Rotor inertia reflected to the joint (gear ratio² × rotor inertia), kg·m² (kg for prismatic joints)."""
+
+    default: NonNegative | None = None
+    joints: dict[str, NonNegative] = field(default_factory=dict)
+    source: str = ""
+
+
+@dataclass(frozen=True)
+class JointTransmissionSpec(_Table):
+    """Transmission of one joint; a missing value is that of the whole robot."""
+
+    kind: TransmissionKind | None = None
+    stiffness: Positive | None = None
+    damping: NonNegative | None = None
+
+
+@dataclass(frozen=True)
+class TransmissionSpec(_Table):
+    """What lies between a rotor and its link; the rotor's inertia is in :class:`ArmatureSpec`.
+
+    A ``rigid`` transmission moves the rotor with the link.  An ``elastic`` one has a spring of ``stiffness`` and a
+    damper of ``damping`` between the two, N·m/rad and N·m·s/rad at the joint (N/m and N·s/m if prismatic).  A
+    ``locked`` joint cannot be driven from its link, as a worm gear.
+    """
+
+    kind: TransmissionKind | None = None
+    stiffness: Positive | None = None
+    damping: NonNegative = 0.0
+    joints: dict[str, JointTransmissionSpec] = field(default_factory=dict)
+    source: str = ""
+
+
+@dataclass(frozen=True)
+class RotorSpec(_Table):
+    """A propeller: position, thrust direction, and direction of rotation (seen against the thrust)."""
+
+    name: str
+    position: Vector3
+    direction: Vector3
+    spin: Literal[-1, 1]
+
+
+@dataclass(frozen=True)
+class PropulsionSpec(_Table):
+    """The propellers of an aerial robot: thrust ``c_f ω²``, drag moment ``-spin · drag_ratio · thrust``."""
+
+    frame: str
+    thrust_coefficient: Positive
+    drag_ratio: NonNegative
+    speed_min: NonNegative
+    speed_max: Positive
+    time_constant_up: Positive
+    time_constant_down: Positive
+    rotors: tuple[RotorSpec, ...]
+    source: str = ""
+
+
+@dataclass(frozen=True)
+class RobotSpec(_Table):
+    """The whole ``robot.toml``."""
+
+    schema: str = SCHEMA
+    name: str | None = None
+    kind: Literal["aerial", "arm", "quadruped", "humanoid", "mobile", "other"] = "other"
+    description: str = ""
+    model: ModelSpec = ModelSpec()
+    default_posture: str | None = None
+    postures: dict[str, PostureSpec] = field(default_factory=dict)
+    contact: ContactSpec = ContactSpec()
+    supports: tuple[Support, ...] = ()
+    constraints: ConstraintSpec = ConstraintSpec()
+    limits: LimitSpec = LimitSpec()
+    armature: ArmatureSpec = ArmatureSpec()
+    transmission: TransmissionSpec = TransmissionSpec()
+    propulsion: PropulsionSpec | None = None
+    sources: tuple[str, ...] = ()
+
+
+def read_spec(path: Path, over: Path | None = None) -> RobotSpec:
+    """Read and check a ``robot.toml``; ``over`` provides missing values, with paths relative to its own folder.
+
+    A file that names another URDF describes another robot and takes nothing from ``over``.
+    """
+    data = read_toml(path)
+    model = data.get("model", {})
+    if over is not None and not (isinstance(model, dict) and "urdf" in model):
+        data = _overlay(_absolute_paths(read_toml(over), over.parent), data)
+    # Checked before the keys, because those of another schema are not misspelt.
+    schema = data.get("schema", SCHEMA)
+    if schema != SCHEMA:
+        raise SpecError(f"schema '{shown(schema)}'", where=str(path), hint=f'write schema = "{SCHEMA}"')
+    return validate(RobotSpec, data, str(path))
+
+
+def _overlay(below: dict[str, object], above: dict[str, object]) -> dict[str, object]:
+    """Merge tables; replace lists, values, and armature and transmission as a whole."""
+    merged = dict(below)
+    for key, value in above.items():
+        old = merged.get(key)
+        if isinstance(old, dict) and isinstance(value, dict) and key not in ("armature", "transmission"):
+            merged[key] = _overlay(old, value)
+        else:
+            merged[key] = value
+    return merged
+
+
+def _absolute_paths(data: dict[str, object], folder: Path) -> dict[str, object]:
+    model = data.get("model")
+    if isinstance(model, dict):
+        for key in ("urdf", "srdf"):
+            text = model.get(key)
+            if isinstance(text, str) and ":" not in text:
+                model[key] = str(folder / text)
+    return data

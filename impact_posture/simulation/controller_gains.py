@@ -1,0 +1,100 @@
+"""Gains that all controllers of an experiment share."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+from typing import Annotated, Literal
+
+from pydantic import Field
+
+from impact_posture.config.toml_tables import Checked
+from impact_posture.robot.robot_spec import NonNegative, Positive
+
+EndEffectorPose = Literal["full", "position", "aligned"]
+OneOrEach = Positive | Annotated[tuple[Positive, ...], Field(min_length=1)]
+
+
+@dataclass(frozen=True)
+class Gains(Checked):
+    """Gains of one task.
+
+    Attributes:
+        kp: Stiffness, 1/s², one number or one for each row of the task.
+        kd: Damping, 1/s.  ``None`` is critical, ``2√kp``.
+        weight: Weight in the cost, if the task has no level of its own.
+    """
+
+    kp: OneOrEach
+    kd: OneOrEach | None = None
+    weight: Positive = 1.0
+
+
+@dataclass(frozen=True)
+class EndEffectorGains(Gains):
+    """Gains of the end effector task.
+
+    Attributes:
+        pose: What the task controls.  ``full`` is the pose of the frame, ``position`` its position.  ``aligned`` is
+            its position and the direction that is the normal of the surface at the start, with free spin about it.
+    """
+
+    pose: EndEffectorPose = "full"
+
+
+@dataclass(frozen=True)
+class RobustTerm(Checked):
+    """The impact-robust term of the posture task.
+
+    Attributes:
+        gain: K of the term, scaled by the curvature of the objective, 1/s².  It compares to ``kp`` of the posture.
+        ramp: Time from off to on, s.
+        fade: Distances from a position limit between which the term fades out, rad (m).
+    """
+
+    gain: Positive
+    ramp: Positive = 0.3
+    fade: tuple[NonNegative, Positive] = (0.05, 0.2)
+
+
+@dataclass(frozen=True)
+class StanceGains(Checked):
+    """Contact constraints of a controller for a standing robot.
+
+    Attributes:
+        friction: Coulomb coefficient that the controller assumes.
+        least: Least normal force of a contact (for a sole, of the whole sole), N.
+        force_weight: Weight of contact forces in the cost, 1/N².
+        lifted: Frames of supports that do not stand, for example the foot that hits the ground.
+    """
+
+    friction: Positive = 0.5
+    least: Positive = 1.0
+    force_weight: Positive = 1e-5
+    lifted: tuple[str, ...] = ()
+
+
+@dataclass(frozen=True)
+class Control(Checked):
+    """Gains that all controllers of an experiment share.  A task without gains is not there.
+
+    Attributes:
+        posture: Gains of the posture task.
+        robust: The impact-robust term.
+        period: Time from tick to tick, s, up to an hour.
+        tilt: Gains of the level base, first priority.
+        end_effector: Gains of the end effector, second priority, linear rows first.
+        apparent_mass: M_d of ``F̂/M_d`` in the law of the end effector, kg.  ``None`` leaves the force out.
+        center_of_mass: Gains of the center of mass.
+        base: Gains of the base orientation.
+        footing: Contact constraints of a standing robot.
+    """
+
+    posture: Gains
+    robust: RobustTerm
+    period: Annotated[float, Field(gt=0, le=3600)] = 1e-3
+    tilt: Gains | None = None
+    end_effector: EndEffectorGains | None = None
+    apparent_mass: Positive | None = None
+    center_of_mass: Gains | None = None
+    base: Gains | None = None
+    footing: StanceGains | None = None

@@ -1,0 +1,151 @@
+"""The controller of a driver as machine code, built once for each formulation."""
+
+from __future__ import annotations
+
+from collections.abc import Callable, Sequence
+from dataclasses import replace
+from typing import Any
+
+import numpy as np
+
+from impact_posture.controller_export.compiled_controller import TARGET, CompiledController
+from impact_posture.controller_export.controller_parameters import parameters
+from impact_posture.controller_export.controller_structure import Structure
+from impact_posture.controller_export.daqp_sources import VERSION
+from impact_posture.controller_export.export_controller import export_controller
+from impact_posture.dynamics.model_parameters import ModelParameters, without_parameters
+from impact_posture.errors import CompilerError
+from impact_posture.impact.worst_case_objective import WorstCaseObjective
+from impact_posture.simulation.scenario_objective import locked, objective_key
+from impact_posture.simulation.world.sensor_noise import Reading
+from impact_posture.system.arrays import Array
+from impact_posture.system.libraries import cache_folder, is_cached, library_path, source_key
+from impact_posture.system.progress import tell
+from impact_posture.system.toolchain import find_compiler, no_compiler
+from impact_posture.tsid.controller import Command, Controller
+from impact_posture.tsid.tasks.task import TargetTask
+
+_PREFIX = "controller"
+# Compilers take long to optimize what is generated from the model.  Robots that differ in armature and mounting share
+# it, so a little of that pays: ticks of a humanoid take 10 % less for 2 s.
+_QUICK = ("-O1",)
+
+
+class CompiledTick:
+    """Ticks in C with the tasks of a controller in Python, which keep the targets.
+
+    Attributes:
+        library: The controller in C.
+    """
+
+    def __init__(self, controller: Controller, structure: Structure, library: CompiledController) -> None:
+        """Take a library of the formulation of the controller."""
+        self.library, self._controller, self._structure = library, controller, structure
+        self._tasks = [t for t in controller.formulation.tasks if isinstance(t, TargetTask)]
+        self._sent: dict[str, tuple[object, bytes, bytes]] = {}
+        self._numbers = ModelParameters(structure.robot.model).values
+
+    def reset(self, q: Array, v: Array) -> Command:
+        """Start at a state at which the controller in Python has just been reset, with its gains and targets."""
+        for field in parameters(self._structure, self._controller.period):
+            self.library.parameters[field.name][:] = field.value
+        self.library.parameters["numbers"][:] = self._numbers
+        if self._structure.robust is not None:
+            # Measured by the controller in Python, so that both have the same digits.
+            self.library.parameters["robust_scale"][:] = self._structure.robust.scale
+        self._sent.clear()
+        self._lead()
+        return self.library.reset(q, v)
+
+    def tick(self, reading: Reading) -> Command:
+        """Return the command at a reading, with the targets that have been moved."""
+        self._lead()
+        return self.library.tick(reading.t, reading.q, reading.v, reading.force)
+
+    def plan(self, times: Sequence[float], lead: Callable[[float], None]) -> tuple[Array, Array]:
+        """Return which targets a function moves before the ticks at n times, and where to.
+
+        Returns:
+            Whether a target is moved, shape (n, targets), and its numbers, shape (n, targets, 25).
+        """
+        targets = self.library.targets
+        before = {name: row.copy() for name, row in targets.items()}
+        led, leads = np.zeros((len(times), len(targets))), np.zeros((len(times), len(targets), TARGET))
+        places = {name: k for k, name in enumerate(targets)}
+        for tick, t in enumerate(times):
+            lead(t)
+            for name in self._lead():
+                led[tick, places[name]], leads[tick, places[name]] = 1, targets[name]
+        for name, row in before.items():
+            targets[name][:] = row
+        return led, leads
+
+    def catch_up(self) -> None:
+        """Bring the state of the controller in Python to that of the last tick."""
+        self._controller.state.update(*self.library.measured)
+
+    def _lead(self) -> list[str]:
+        """Send the targets that have been moved, and return the names of their tasks."""
+        moved = []
+        for task in self._tasks:
+            # A target is replaced as a whole.  What C moves by itself stays as it is.
+            rates = task.target_velocity, task.target_acceleration
+            now = (task.target, rates[0].tobytes(), rates[1].tobytes())
+            sent = self._sent.get(task.name)
+            if sent is None or sent[0] is not now[0] or sent[1:] != now[1:]:
+                self.library.set_target(task.name, task.required_target(), *rates)
+                self._sent[task.name] = now
+                moved.append(task.name)
+        return moved
+
+
+def compiled_tick(controller: Controller, structure: Structure, objective: WorstCaseObjective | None) -> CompiledTick:
+    """Return the controller as machine code, which is built once and cached.
+
+    Args:
+        controller: The controller in Python.
+        structure: Structure of its formulation.
+        objective: The objective of its impact-robust posture task, if it has one.
+
+    Raises:
+        InputError: There are no sources of DAQP.
+        CompilerError: There is no compiler, or it failed.
+        OutputError: The cache cannot be written, or other users can write it.
+    """
+    folder = cache_folder("controllers") / _key(structure, objective)
+    with locked(folder.with_suffix(".lock")):
+        if not is_cached(library_path(folder, _PREFIX)):
+            if find_compiler() is None:
+                raise no_compiler("controller")
+            tell("compiling the controller")
+            given: dict[str, Any] = {"objective": objective, "prefix": _PREFIX, "build": True, "force": True}
+            given |= {"generated": _QUICK, "shared": True}
+            if export_controller(controller.robot, controller.formulation, folder, **given).library is None:
+                raise CompilerError("left no library", where=str(folder), hint="set CC to another compiler")
+    # The manifest may be that of another robot with the same code.
+    return CompiledTick(controller, structure, CompiledController.load(folder))
+
+
+def _key(structure: Structure, objective: WorstCaseObjective | None) -> str:
+    """Return a hash of everything that is compiled in; gains, limits, targets and some numbers are parameters."""
+    robot = without_parameters(structure.robot)
+    if objective is not None:
+        # Only one kind depends on the friction of the impact.
+        friction = objective.contact.friction if objective.kind == "coulomb" else 0.0
+        objective = replace(objective, robot=robot, contact=replace(objective.contact, friction=friction))
+    frames = [robot.model.frames[robot.frame_id(point.frame)] for point in structure.points]
+    content = [
+        VERSION,
+        repr(_QUICK),
+        robot.model_sha256,
+        repr(structure.sizes),
+        repr({name: table.tolist() for name, table in structure.tables.items()}),
+        repr((structure.actuators.G.tolist(), robot.model.gravity.vector.tolist())),
+        repr([(task.name, type(task).__name__) for task in structure.formulation.tasks]),
+        *[
+            repr((f.parentJoint, f.placement.homogeneous.tolist(), p))
+            for f, p in zip(frames, structure.points, strict=True)
+        ],
+        "" if objective is None else objective_key(objective),
+    ]
+    return source_key(content, "dynamics", "impact", "codegen", "controller_export", "tsid")

@@ -1,0 +1,293 @@
+"""The controllers that are compared.  Each name makes one driver."""
+
+from __future__ import annotations
+
+from collections.abc import Callable
+from dataclasses import dataclass, field
+from functools import cached_property
+from importlib import metadata
+from typing import Literal, get_args
+
+import numpy as np
+
+from impact_posture.config.settings import ObjectiveKind
+from impact_posture.controller_export.controller_structure import structure_of
+from impact_posture.errors import ControllerNotFound, ImpactPostureError, InputError
+from impact_posture.impact.worst_case_objective import WorstCaseObjective
+from impact_posture.path.posture_path import PosturePath, check_package, posture_path
+from impact_posture.posture.program.compiled_solver import CompileMode
+from impact_posture.simulation.controllers.baselines import (
+    FlowPosture,
+    ReleaseDriver,
+    WalkerDriver,
+    resting_posture,
+    spring_of_term,
+)
+from impact_posture.simulation.controllers.compiled_tick import CompiledTick, compiled_tick
+from impact_posture.simulation.controllers.driver import Driver, FlowDriver, PathDriver, PostureDriver, RobustDriver
+from impact_posture.simulation.controllers.impact_baselines import (
+    ImpactAwareDriver,
+    InvariantDriver,
+    ReferenceSpreadingDriver,
+)
+from impact_posture.simulation.controllers.task_formulations import nominal_posture, posture_options
+from impact_posture.simulation.offline_posture import OfflinePosture, offline_posture
+from impact_posture.simulation.scenario import Setup
+from impact_posture.simulation.scenario_objective import Gradient, compiled, interpreted, scenario_objective
+from impact_posture.system.arrays import Array
+from impact_posture.system.progress import tell
+from impact_posture.system.toolchain import find_compiler
+from impact_posture.tsid.flow.reference_flow_posture import ReferenceFlowPosture
+from impact_posture.tsid.tasks.activation import Activation
+from impact_posture.tsid.tasks.impact_robust import ImpactRobustPosture
+from impact_posture.tsid.tasks.joint_posture import JointPosture
+
+Mode = Literal["live", "held"]
+# Descriptions for tables and help.
+MEANING: dict[str, str] = {
+    "nominal": "TSID with the start posture",
+    "robust": "its posture task with -K grad H, the paper's",
+    "robust-speed": "the same with the gradient of V, the jump per approach speed",
+    "robust-sticking": "the same with the gradient of S, the jump where the contact sticks",
+    "robust-release": "robust without the nominal spring, until the metric falls no more",
+    "robust-flow": "the posture flows to lower H before the impact, without a gain",
+    "robust-flow-sticking": "the same to lower S, for impacts at a given speed",
+    "posture": "the offline optimum as posture, no gradient",
+    "posture-sticking": "the offline optimum of S as posture, for impacts at a given speed",
+    "path": "the offline optimum, along a timed path without collisions",
+    "stiff": "the start posture, as stiff as the term is where robust rests",
+    "posture-stiff": "the offline optimum, as stiff as the term is there",
+    "invariant": "nominal, feedback projected on the impact-invariant subspace around the impact",
+    "reference-spreading": "nominal, references before and after the impact, none of velocity between",
+    "impact-aware": "nominal, rates and torques after an impact limited before it",
+    "walker": "the gradient's flow as reference of the posture task",
+}
+CONTROLLERS = tuple(MEANING)
+# A controller with this at the end of its name is also as stiff as the term is in its posture.
+_STIFF = "-stiff"
+_PLAIN = {
+    "nominal": Driver,
+    "invariant": InvariantDriver,
+    "reference-spreading": ReferenceSpreadingDriver,
+    "impact-aware": ImpactAwareDriver,
+}
+# Drivers that a controller in C can serve.
+_IN_C = (Driver, RobustDriver, FlowDriver, PostureDriver)
+_KINDS: dict[str, ObjectiveKind] = {
+    "robust-speed": "speed",
+    "robust-sticking": "sticking",
+    "robust-flow-sticking": "sticking",
+    "posture-sticking": "sticking",
+}
+# Controllers that go to a posture found offline.
+_OFFLINE = ("posture", "posture-sticking", "path")
+# Entry points by which other installed packages add controllers.
+GROUP = "impact_posture.controllers"
+
+
+def check_gain(name: str, gain: float | None) -> None:
+    """Refuse a gain for a controller of this package that has none.
+
+    Raises:
+        InputError: The controller has no gain.
+    """
+    has = name.startswith(("robust", "walker", "stiff")) and not name.startswith("robust-flow")
+    if gain is not None and name in CONTROLLERS and not (has or name.endswith(_STIFF)):
+        raise InputError(
+            f"'{name}' has no gain", where="gain", hint="robust, its variants, walker and stiff have one"
+        )
+
+
+@dataclass(eq=False)
+class ControllerFactory:
+    """A scenario and the parts of its controllers.  Each part is made at its first use.
+
+    Attributes:
+        setup: The experiment.
+        free: Whether gradients and the offline optimum ignore the feet.
+        gradient_of: Makes the gradient of an objective, compiled or interpreted.
+        offline_of: Finds the offline posture, as :func:`~impact_posture.simulation.offline_posture.offline_posture`
+            does.
+        compile: Whether controllers run as machine code: ``auto`` where they can, always, or never.
+        starts: Number of starts of the optimizer for offline postures.
+        in_c: Whether the last driver does.
+        warnings: What of the last driver is not compiled although it should have been, and why.
+    """
+
+    setup: Setup
+    free: bool = False
+    gradient_of: Callable[[WorstCaseObjective], Gradient] = compiled
+    offline_of: Callable[..., OfflinePosture] = offline_posture
+    compile: CompileMode = "never"
+    starts: int = 8
+    in_c: bool = False
+    warnings: list[str] = field(default_factory=list)
+    _fault: str = ""
+    _objectives: dict[ObjectiveKind, WorstCaseObjective] = field(default_factory=dict)
+    _gradients: dict[ObjectiveKind, tuple[Gradient, tuple[str, ...]]] = field(default_factory=dict)
+    _offline: dict[tuple[ObjectiveKind, bool], OfflinePosture] = field(default_factory=dict)
+
+    def objective(self, kind: ObjectiveKind = "impulse") -> WorstCaseObjective:
+        """Return an objective for the impact of the scenario."""
+        if kind not in self._objectives:
+            self._objectives[kind] = scenario_objective(self.setup, kind, free=self.free)
+        return self._objectives[kind]
+
+    def gradient(self, kind: ObjectiveKind = "impulse") -> Gradient:
+        """Return the gradient of an objective, interpreted if it cannot be compiled or loaded (:attr:`warnings`)."""
+        if kind not in self._gradients:
+            try:
+                self._gradients[kind] = self.gradient_of(self.objective(kind)), ()
+            except InputError as error:
+                # A fault of the objective itself is raised again.
+                warning = f"the gradient is interpreted, not compiled, which is slower: {error.line}"
+                self._gradients[kind] = interpreted(self.objective(kind)), (warning,)
+        found, warnings = self._gradients[kind]
+        self.warnings += [warning for warning in warnings if warning not in self.warnings]
+        return found
+
+    @cached_property
+    def metric(self) -> Callable[[Array], float]:
+        """``q → H``, the objective in the CasADi interpreter, which is ready at once."""
+        tell("building the expressions")
+        function, normal = self.objective().value_fun(), np.array(self.objective().contact.normal, dtype=float)
+        return lambda q: float(function(q, normal))
+
+    def offline(self, name: str = "posture") -> OfflinePosture | None:
+        """Return the offline posture of a controller, or ``None`` for one that goes to none."""
+        name = name.removesuffix(_STIFF)
+        return self._optimum(name) if name in _OFFLINE else None
+
+    def _optimum(self, name: str) -> OfflinePosture:
+        # A path begins where the robot starts, so its end holds the end effector there.
+        kind, at_contact = _KINDS.get(name, "impulse"), name != "path"
+        if (kind, at_contact) not in self._offline:
+            self._offline[kind, at_contact] = self.offline_of(
+                self.setup, self.objective(kind), starts=self.starts, at_contact=at_contact
+            )
+        return self._offline[kind, at_contact]
+
+    @cached_property
+    def path(self) -> PosturePath:
+        """The path of the ``path`` controller."""
+        check_package()
+        solution = self._optimum("path").solution
+        tell("looking for a path to the offline posture")
+        return posture_path(solution)
+
+    def driver(self, name: str, mode: Mode = "live", gain: float | None = None) -> Driver:
+        """Make a controller.
+
+        A name that is not of this package is looked up among the entry points :data:`GROUP` of the installed
+        packages.  Such a controller is made by a function of this factory, the mode and the gain; the name runs it.
+
+        Args:
+            name: Name of the controller.
+            mode: ``live`` keeps the impact-robust term on through the impact, ``held`` holds the reached posture.
+            gain: K instead of that of the scenario, 1/s².
+
+        Raises:
+            ControllerNotFound: There is no such controller.
+            InputError: There is no such mode, the controller has no term to hold, or another package fails.
+        """
+        self.warnings.clear()
+        self.in_c = False
+        modes = get_args(Mode)
+        if mode not in modes:
+            raise InputError(f"there is no mode '{mode}'", where="mode", hint=f"one of: {', '.join(modes)}")
+        if self.compile not in (choices := get_args(CompileMode)):
+            raise InputError(f"no mode '{self.compile}'", where="compile", hint=f"choose from {', '.join(choices)}")
+        if name.removesuffix(_STIFF) not in CONTROLLERS:
+            return self._driver_from_outside(name, mode, gain)
+        if mode == "held" and not (name.startswith("robust") or name == "walker"):
+            raise InputError(f"'{name}' has no term to hold", where="mode", hint="only robust… and walker have one")
+        driver = self._made(name, mode, gain)
+        driver.compiled = self._compiled(driver, name)
+        self.in_c = driver.compiled is not None
+        return driver
+
+    def _made(self, name: str, mode: Mode, gain: float | None) -> Driver:
+        """Make a controller of this package."""
+        setup, robot = self.setup, self.setup.robot
+        if name == "stiff":
+            return self._stiffened("nominal", "robust", gain)
+        if name.endswith(_STIFF):
+            return self._stiffened(name.removesuffix(_STIFF), name.removesuffix(_STIFF), gain)
+        if name == "path":
+            return PathDriver(setup, nominal_posture(setup), self.path)
+        if name in _OFFLINE:
+            return PostureDriver(setup, nominal_posture(setup), self._optimum(name).q)
+        if name in _PLAIN:
+            return _PLAIN[name](setup, nominal_posture(setup))
+        term, gradient = setup.scenario.control.robust, self.gradient(_KINDS.get(name, "impulse"))
+        K, options = term.gain if gain is None else gain, posture_options(setup)
+        if name.startswith("robust-flow"):
+            return FlowDriver(setup, ReferenceFlowPosture(robot, gradient, **options))
+        if name == "robust-release":
+            once = Activation(ramp=term.ramp, live=False)
+            released = ImpactRobustPosture(
+                robot, gradient, K=K, fade=term.fade, activation=once, spring="release", **options
+            )
+            return ReleaseDriver(setup, released, gradient, self._optimum(name).q)
+        activation = Activation(ramp=term.ramp, live=mode == "live")
+        driver, task = (WalkerDriver, FlowPosture) if name == "walker" else (RobustDriver, ImpactRobustPosture)
+        return driver(setup, task(robot, gradient, K=K, fade=term.fade, activation=activation, **options))
+
+    def _compiled(self, driver: Driver, name: str) -> CompiledTick | None:
+        """Return the controller of a driver as machine code, or ``None`` where Python runs it.
+
+        Other drivers look into their controller, and only Python has one to look into.
+        """
+        always, controller = self.compile == "always", driver.controller
+        if not always and (self.compile == "never" or self._fault or find_compiler() is None):
+            return None
+        try:
+            if type(driver) not in _IN_C:
+                raise InputError(f"'{name}' has no C code", where="compile", hint="run it with auto or never")
+            structure = structure_of(controller.robot, controller.formulation)
+        except InputError:
+            if always:
+                raise
+            return None
+        plain = type(controller.formulation.posture) is JointPosture
+        objective = None if plain else self.objective(_KINDS.get(name.removesuffix(_STIFF), "impulse"))
+        try:
+            return compiled_tick(controller, structure, objective)
+        except InputError as error:
+            if always:
+                raise
+            # What fails once, such as a download, is not tried again for each run.
+            self._fault = f"the controller runs in Python, not in C, which is slower: {error.line}"
+            self.warnings.append(self._fault)
+            return None
+
+    def _stiffened(self, name: str, at: str, gain: float | None) -> Driver:
+        """Make a controller with the spring that the term of ``robust`` is in the posture that ``at`` braces to."""
+        robust = self.driver("robust", gain=gain)
+        assert isinstance(robust, RobustDriver)  # noqa: S101 (the name says it)
+        seconds = self.setup.scenario.task.settle
+        reached = resting_posture(robust, seconds)
+        if at != "robust":
+            reached = resting_posture(self.driver(at), seconds)
+        driver, strength = self._made(name, "live", None), robust.posture.K / robust.posture.scale
+        driver.posture.stiffen(spring_of_term(self.setup.robot, self.gradient(), reached, strength))
+        return driver
+
+    def _driver_from_outside(self, name: str, mode: Mode, gain: float | None) -> Driver:
+        """Make a controller of another installed package."""
+        added = metadata.entry_points(group=GROUP)
+        if name not in added.names:
+            known = (*CONTROLLERS, *sorted(added.names))
+            raise ControllerNotFound(name, known, hint=f"one of: {', '.join(known)}")
+        where = f"controller '{name}' ({added[name].value})"
+        try:
+            driver = added[name].load()(self, mode, gain)
+        except ImpactPostureError:
+            raise
+        except Exception as error:
+            # The code of another package may raise anything.
+            words = f"cannot be made: {type(error).__name__}: {error}"
+            raise InputError(words, where=where, hint="correct or remove the package that adds it") from error
+        if not isinstance(driver, Driver):
+            raise InputError(f"makes a {type(driver).__name__}", where=where, hint="return a Driver")
+        return driver

@@ -1,0 +1,242 @@
+"""A controller in a scenario: its references, its preparation for the impact, and the posture that it holds."""
+
+from __future__ import annotations
+
+from typing import Any
+
+import numpy as np
+import pinocchio as pin
+
+from impact_posture.path.posture_path import PosturePath
+from impact_posture.simulation.controllers.compiled_tick import CompiledTick
+from impact_posture.simulation.controllers.contact_reference import ReferencePoint
+from impact_posture.simulation.controllers.task_formulations import build_formulation, end_effector_task
+from impact_posture.simulation.scenario import Setup
+from impact_posture.simulation.world.sensor_noise import Reading
+from impact_posture.system.arrays import Array
+from impact_posture.tsid.controller import Command, Controller
+from impact_posture.tsid.flow.reference_flow_posture import ReferenceFlowPosture
+from impact_posture.tsid.smooth_step import smooth
+from impact_posture.tsid.tasks.body_tasks import BaseOrientation, BodyTaskLead, CenterOfMass
+from impact_posture.tsid.tasks.impact_robust import ImpactRobustPosture
+from impact_posture.tsid.tasks.joint_posture import JointPosture
+
+# Time in which references move to a new posture, s.
+MOVE = 1.0
+
+
+class Driver:
+    """Task-space inverse dynamics with a posture task.  This class is the nominal controller.
+
+    Attributes:
+        setup: The experiment.
+        posture: The posture task.
+        controller: The controller.
+        compiled: The same controller as machine code, which then gives the commands.
+    """
+
+    compiled: CompiledTick | None = None
+
+    def __init__(self, setup: Setup, posture: JointPosture) -> None:
+        """Build the tasks of the scenario around a posture task."""
+        self.setup, self.posture = setup, posture
+        self._end_effector = end_effector_task(setup)
+        formulation = build_formulation(setup, posture, self._end_effector)
+        self._body_tasks = [t for t in formulation.weighted if isinstance(t, CenterOfMass | BaseOrientation)]
+        self.controller = Controller(setup.robot, formulation, period=setup.scenario.control.period)
+        self._inward = np.zeros(3 if self._end_effector is None else self._end_effector.size)
+        self._inward[:3] = -setup.scenario.normal
+        self._home: pin.SE3 | Array | None = None
+        self._followed: ReferencePoint | None = None
+
+    def reset(self, q: Array) -> Command:
+        """Begin at rest.  The tasks hold what is there, whatever an earlier run has moved."""
+        task, self._followed = self._end_effector, None
+        for one in (*([] if task is None else [task]), *self._body_tasks):
+            one.target, one.target_velocity, one.target_acceleration = None, 0.0, 0.0
+        at_rest = np.zeros(self.setup.robot.nv)
+        command = self.controller.reset(q, at_rest)
+        self._home = None if task is None else task.target
+        return command if self.compiled is None else self.compiled.reset(q, at_rest)
+
+    def tick(self, reading: Reading, reference: ReferencePoint | None = None) -> Command:
+        """Return the command, where ``reference`` is the target of the end effector along its way in."""
+        self.lead(reading.t, reference)
+        if self.compiled is not None:
+            return self.compiled.tick(reading)
+        return self.controller.tick(reading.t, reading.q, reading.v, reading.force)
+
+    def lead(self, t: float, reference: ReferencePoint | None = None) -> None:
+        """Move the targets of the tasks for a tick at a time, s."""
+        if reference != self._followed and reference is not None:
+            self._follow(reference)
+            self._followed = reference
+
+    def brace(self) -> None:
+        """Prepare for impacts from now on.  The nominal controller does nothing."""
+
+    def hold(self) -> None:
+        """Hold the posture that was reached.  The nominal controller does nothing."""
+
+    def expect(self, t: float) -> None:
+        """Expect an impact at a time, s.  The nominal controller does nothing."""
+
+    @property
+    def level(self) -> float:
+        """Level of the term that prepares for the impact, 0 to 1."""
+        return self.posture.level if self.compiled is None else self.compiled.library.level
+
+    def _tell(self, method: str, *given: Any, **named: Any) -> None:
+        """Call a method of the posture task, or that of its counterpart in C."""
+        getattr(self.posture if self.compiled is None else self.compiled.library, method)(*given, **named)
+
+    def _follow(self, reference: ReferencePoint) -> None:
+        task, home = self._end_effector, self._home
+        if task is None or home is None:
+            return
+        way = reference.distance * self._inward[:3]
+        task.target = home + way if isinstance(home, np.ndarray) else pin.SE3(home.rotation, home.translation + way)
+        task.target_velocity = reference.speed * self._inward
+        task.target_acceleration = reference.acceleration * self._inward
+
+
+class RobustDriver(Driver):
+    """Impact-robust controller, which uses the impact-robust term of its posture task from :meth:`brace` on."""
+
+    posture: ImpactRobustPosture
+
+    def brace(self) -> None:
+        """Switch the term on."""
+        self._tell("brace")
+
+    def hold(self) -> None:
+        """Hold the present posture, center of mass and base orientation, and switch the term off."""
+        self._tell("contact")
+        if self.compiled is not None:
+            self.compiled.catch_up()
+        for task in self._body_tasks:
+            task.target = None
+            task.reset(self.controller.state)
+
+
+class FlowDriver(Driver):
+    """Controller whose posture flows to lower impacts, from :meth:`brace` on."""
+
+    posture: ReferenceFlowPosture
+    _now = 0.0
+
+    def lead(self, t: float, reference: ReferencePoint | None = None) -> None:
+        """Keep the time."""
+        self._now = t
+        super().lead(t, reference)
+
+    def brace(self) -> None:
+        """Let the posture flow."""
+        self._tell("brace")
+
+    def hold(self) -> None:
+        """Hold the posture that the flow has reached."""
+        self._tell("contact")
+
+    def expect(self, t: float) -> None:
+        """Rest early enough before an impact at a time, s."""
+        if self.level > 0:
+            self._tell("brace", t_impact=t - self._now)
+
+
+class PostureDriver(Driver):
+    """Nominal controller that goes to a posture found offline, from :meth:`brace` on."""
+
+    def __init__(self, setup: Setup, posture: JointPosture, target: Array) -> None:
+        """Set the posture to go to, shape (nq,)."""
+        super().__init__(setup, posture)
+        self._goal = target
+        self._since: float | None = None
+        # Body tasks with their targets before and after.
+        self._moves: list[tuple[CenterOfMass | BaseOrientation, Any, Any]] = []
+
+    def reset(self, q: Array) -> Command:
+        """Begin at rest."""
+        self._since, self._moves = None, []
+        return super().reset(q)
+
+    def brace(self) -> None:
+        """Move posture, center of mass and base orientation to the goal within :data:`MOVE`."""
+        self._tell("move_to", self._goal, MOVE)
+        model = self.setup.robot.model
+        for task in self._body_tasks:
+            # The feet stay in place, because the goal was found with them there.
+            if isinstance(task, CenterOfMass):
+                end = np.array(pin.centerOfMass(model, model.createData(), self._goal))
+            else:
+                end = pin.Quaternion(self._goal[3:7]).matrix()
+            self._moves.append((task, task.target, end))
+        self._since = 0.0
+
+    def lead(self, t: float, reference: ReferencePoint | None = None) -> None:
+        """Move the targets of the body tasks."""
+        if self._since is not None and self._since < MOVE:
+            self._since = min(MOVE, self._since + self.controller.period)
+            for task, begin, end in self._moves:
+                if isinstance(task, CenterOfMass):
+                    task.target = begin + self.level * (end - begin)
+                else:
+                    task.target = begin @ pin.exp3(self.level * pin.log3(begin.T @ end))
+        super().lead(t, reference)
+
+    @property
+    def level(self) -> float:
+        """Share of the way to the goal, 0 to 1."""
+        return 0.0 if self._since is None else smooth(self._since / MOVE)
+
+
+class PathDriver(Driver):
+    """Nominal controller whose posture follows a timed path, from :meth:`brace` on.
+
+    Between two points of the path, the posture is interpolated on the manifold, velocity and acceleration linearly.
+    Center of mass and base orientation follow too.
+
+    Attributes:
+        path: The path, which begins at the start of the scenario, as far as that satisfies the constraints.
+    """
+
+    def __init__(self, setup: Setup, posture: JointPosture, path: PosturePath) -> None:
+        """Set the path."""
+        super().__init__(setup, posture)
+        self.path = path
+        self._since: float | None = None
+        self._body = BodyTaskLead(setup.robot.model)
+
+    def reset(self, q: Array) -> Command:
+        """Begin at rest."""
+        self._since = None
+        rest = np.zeros(self.setup.robot.nv)
+        self.posture.lead(q, rest, rest)
+        return super().reset(q)
+
+    def brace(self) -> None:
+        """Start the path."""
+        self._since = 0.0
+
+    def lead(self, t: float, reference: ReferencePoint | None = None) -> None:
+        """Move posture and body tasks along the path."""
+        if self._since is not None and self.level < 1:
+            self._since += self.controller.period
+            path, model = self.path, self.setup.robot.model
+            if self._since >= path.duration:
+                q, v, a = path.q[-1], np.zeros(model.nv), np.zeros(model.nv)
+            else:
+                k = int(np.searchsorted(path.t, self._since, side="right")) - 1
+                share = (self._since - path.t[k]) / (path.t[k + 1] - path.t[k])
+                q = np.asarray(pin.interpolate(model, path.q[k], path.q[k + 1], share))
+                v, a = ((1 - share) * x[k] + share * x[k + 1] for x in (path.v, path.a))
+            self.posture.lead(q, v, a)
+            self._body.lead(self._body_tasks, q, v, a)
+        super().lead(t, reference)
+
+    @property
+    def level(self) -> float:
+        """Share of the duration of the path that has passed, 0 to 1."""
+        if self._since is None:
+            return 0.0
+        return min(1.0, self._since / self.path.duration) if self.path.duration else 1.0

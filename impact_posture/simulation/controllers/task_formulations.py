@@ -1,0 +1,125 @@
+"""Tasks of a controller from the gains of a scenario.  All controllers have the same tasks except for the posture."""
+
+from __future__ import annotations
+
+from dataclasses import replace
+from typing import Any
+
+import numpy as np
+
+from impact_posture.dynamics.numeric import Numeric
+from impact_posture.errors import FrameNotFound, SpecError
+from impact_posture.impact.impact_contact import point_on
+from impact_posture.simulation.controller_gains import StanceGains
+from impact_posture.simulation.scenario import Setup
+from impact_posture.tsid.point_kinematics import Point
+from impact_posture.tsid.support_contact import SupportContact, support_contacts
+from impact_posture.tsid.task_formulation import TaskFormulation
+from impact_posture.tsid.tasks.body_tasks import BaseOrientation, CenterOfMass, Tilt
+from impact_posture.tsid.tasks.frame_tasks import EndEffector, Impedance, pose_task
+from impact_posture.tsid.tasks.joint_posture import JointPosture
+from impact_posture.tsid.tasks.task import Task
+
+
+def end_effector_task(setup: Setup) -> EndEffector | None:
+    """Return the task of the end effector, if the scenario has contacts.
+
+    Raises:
+        SpecError: A push has gains for an end effector, or contacts have none.
+    """
+    scenario, gains = setup.scenario, setup.scenario.control.end_effector
+    if scenario.contacts is None and gains is not None:
+        what = "has [control.end_effector], but a " + ("push" if scenario.push else "throw")
+        raise SpecError(what, where=scenario.source, hint="remove [control.end_effector]")
+    if scenario.contacts is None:
+        return None
+    if gains is None:
+        raise SpecError(
+            "has contacts, but nothing that leads the frame there",
+            where=scenario.source,
+            hint="add [control.end_effector]",
+        )
+    mass, frame = scenario.control.apparent_mass, scenario.shape.frame
+    impedance = None if mass is None else Impedance(mass)
+    point = Point(frame, scenario.shape.offset)
+    placed = Numeric(setup.robot.model).at(setup.q).placement(point_on(setup.robot, frame))
+    return pose_task(
+        point,
+        gains.pose,
+        placed.rotation.T @ scenario.normal,
+        kp=gains.kp,
+        kd=gains.kd,
+        weight=gains.weight,
+        impedance=impedance,
+        name="end effector",
+    )
+
+
+def build_formulation(setup: Setup, posture: JointPosture, end_effector: EndEffector | None) -> TaskFormulation:
+    """Build the tasks of a scenario around a posture task.
+
+    A robot with ``[control.footing]`` stands.  Contacts and friction are constraints, and center of mass, base
+    orientation, end effector and posture are weighted.  Any other robot has strict levels: level base, end effector,
+    and the posture in the cost.
+
+    Raises:
+        SpecError: There are gains for a task that the robot cannot have.
+    """
+    control, scenario = setup.scenario.control, setup.scenario
+    _check_gains(setup)
+    felt = None if end_effector is None or scenario.sensors.force_frame is None else end_effector.point
+    tasks = () if end_effector is None else (end_effector,)
+    if control.footing is None:
+        tilt = () if control.tilt is None else ((Tilt(kp=control.tilt.kp, kd=control.tilt.kd),),)
+        return TaskFormulation((*tilt, *((task,) for task in tasks)), (), posture, force_point=felt)
+    weighted: list[Task] = [
+        task(kp=gains.kp, kd=gains.kd, weight=gains.weight)
+        for task, gains in ((CenterOfMass, control.center_of_mass), (BaseOrientation, control.base))
+        if gains is not None
+    ]
+    contacts, cost = _contacts(setup, control.footing), control.footing.force_weight
+    return TaskFormulation((), (*weighted, *tasks), posture, contacts, force_point=felt, force_weight=cost)
+
+
+def posture_options(setup: Setup) -> dict[str, Any]:
+    """Return the options of the posture task, with the same damping for all controllers.
+
+    The base of a floating robot has no weight in this task, because other tasks control it.
+    """
+    gains, base = setup.scenario.control.posture, 0.0 if setup.robot.floating else None
+    kd = 2 * np.sqrt(gains.kp) if gains.kd is None else gains.kd
+    return {"kp": gains.kp, "kd": kd, "weight": gains.weight, "base_weight": base}
+
+
+def nominal_posture(setup: Setup) -> JointPosture:
+    """Return the posture task that holds the start posture."""
+    return JointPosture(setup.robot, **posture_options(setup))
+
+
+def _check_gains(setup: Setup) -> None:
+    """Refuse gains that no task would use."""
+    control, source = setup.scenario.control, setup.scenario.source
+    stands, flies = control.footing is not None, setup.robot.floating
+    for key, given, fits, why in (
+        ("footing", control.footing, flies, "a base that is fixed"),
+        ("tilt", control.tilt, flies and not stands, "feet" if stands else "a base that is fixed"),
+        ("center_of_mass", control.center_of_mass, stands, "no [control.footing]"),
+        ("base", control.base, stands, "no [control.footing]"),
+    ):
+        if given is not None and not fits:
+            raise SpecError(f"has [control.{key}], but {why}", where=source, hint=f"remove [control.{key}]")
+
+
+def _contacts(setup: Setup, footing: StanceGains) -> tuple[SupportContact, ...]:
+    contacts = support_contacts(setup.robot, friction=footing.friction)
+    for name in footing.lifted:
+        if name not in [c.point.frame for c in contacts]:
+            raise FrameNotFound(name, [c.point.frame for c in contacts], where="control.footing.lifted")
+    contacts = tuple(c for c in contacts if c.point.frame not in footing.lifted)
+    if not contacts:
+        raise SpecError(
+            "has [control.footing], but the robot has no supports",
+            where=setup.scenario.source,
+            hint="name [[supports]] in robot.toml",
+        )
+    return tuple(replace(contact, least=footing.least) for contact in contacts)

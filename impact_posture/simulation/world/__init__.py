@@ -1,0 +1,1 @@
+"""The MuJoCo world: scene, rotors, sensors, contact forces."""

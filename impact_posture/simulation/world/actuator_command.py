@@ -1,0 +1,193 @@
+"""Input and output of a simulated world: commands within their limits, pushes, joint stops, and the true state."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+from typing import Any, NamedTuple
+
+import numpy as np
+
+from impact_posture.config.settings import Vector3
+from impact_posture.dynamics.mjcf import import_mujoco
+from impact_posture.errors import InputError
+from impact_posture.robot.robot import Robot
+from impact_posture.simulation.world.contact_forces import ShapeTruth
+from impact_posture.simulation.world.rotors import Rotors
+from impact_posture.system.arrays import Array
+from impact_posture.tsid.controller import Command
+
+# No robot is so far away or so fast, m, m/s, rad/s, and no torque so large, N·m.
+RUNAWAY = 1e6
+
+
+@dataclass(frozen=True, eq=False)
+class ActuatorCommand:
+    """Joint torques and rotor speeds, without what else the command of a controller holds.
+
+    Attributes:
+        torque: Joint torques, N·m (N for prismatic joints), shape (joints,), in the order of ν.
+        rotor_speed: Rotor speeds in the unit of ``speed_max`` in robot.toml, shape (rotors,).
+    """
+
+    torque: Array
+    rotor_speed: Array
+
+
+class CommandLimits:
+    """Limits of joint torques and rotor speeds.
+
+    Attributes:
+        effort: Largest torques, N·m or N, shape (joints,); infinite where the model states none.
+    """
+
+    def __init__(self, robot: Robot, rotors: Rotors | None) -> None:
+        propulsion = robot.spec.propulsion
+        self._rotors, self._count = rotors, 0 if propulsion is None else len(propulsion.rotors)
+        effort = np.asarray(robot.model.effortLimit, dtype=float)[6 if robot.floating else 0 :]
+        # An effort limit of zero means that none is stated.
+        self.effort: Array = np.where(effort > 0, effort, np.inf)
+
+    def within(self, command: Command | ActuatorCommand) -> tuple[Array, Array]:
+        """Return rotor speeds, shape (rotors,), and joint torques, shape (joints,), within their limits.
+
+        Raises:
+            InputError: The command has other sizes, is not finite, or has a torque without end.
+        """
+        speed, torque = np.asarray(command.rotor_speed, dtype=float), np.asarray(command.torque, dtype=float)
+        if speed.shape != (self._count,) or torque.shape != self.effort.shape:
+            sizes = f"give {self._count} and {self.effort.size}"
+            raise InputError(f"{speed.size} rotor speeds and {torque.size} torques", where="command", hint=sizes)
+        # A sum of squares that is not absurd settles it.
+        with np.errstate(over="ignore"):
+            usual = speed.dot(speed) + torque.dot(torque) < RUNAWAY**2
+        if not usual and not (np.isfinite(speed).all() and np.isfinite(torque).all()):
+            raise InputError("is not finite", where="command", hint="hold the last one instead")
+        torque = np.minimum(np.maximum(torque, -self.effort), self.effort)
+        if not usual and not np.abs(torque).max(initial=0.0) < RUNAWAY:
+            raise InputError("has an endless torque", where="command", hint="give the joints effort limits")
+        return speed if self._rotors is None else self._rotors.within(speed), torque
+
+
+@dataclass(frozen=True)
+class Push:
+    """Force at a point of the robot, constant in the world.
+
+    Attributes:
+        frame: The frame that carries the point.
+        force: Force, world, N.
+        duration: Duration, s, rounded to physics steps.
+        offset: The point from the origin of the frame, in the frame, m.
+    """
+
+    frame: str
+    force: Vector3
+    duration: float
+    offset: Vector3 = (0.0, 0.0, 0.0)
+
+
+class ActivePushes:
+    """Pushes that act on a world.
+
+    Attributes:
+        active: For each push, its body, its point in the axes of the body, its force, and its last step.
+
+    Args:
+        model: The MuJoCo model.
+    """
+
+    def __init__(self, model: Any) -> None:
+        self._model, self._apply = model, import_mujoco().mj_applyFT
+        self.active: list[tuple[int, Array, Array, int]] = []
+
+    def in_c(self) -> dict[str, Any]:
+        """Return the members of ``c/world_ticks.c`` that are of these pushes."""
+        bodies, points, forces, ends = zip(*self.active, strict=True) if self.active else ((), (), (), ())
+        return {"pushes": len(bodies), "push_body": bodies, "push_end": ends,
+                "push": [[*point, *force] for point, force in zip(points, forces, strict=True)]}  # fmt: skip
+
+    def begin(self, push: Push, body: int, point: Array, step: int) -> None:
+        """Begin a push at a step, on a body, at a point in its axes.
+
+        Raises:
+            InputError: The force is not finite, or the duration is shorter than a time step.
+        """
+        count = round(push.duration / self._model.opt.timestep) if np.isfinite(push.duration) else 0
+        if count < 1 or not np.isfinite(push.force).all():
+            raise InputError("has no force or no duration", where=f"push at '{push.frame}'",
+                             hint="give newtons, and seconds of at least a time step")  # fmt: skip
+        self.active.append((body, point, np.array(push.force, dtype=float), step + count))
+
+    def apply(self, data: Any, step: int) -> None:
+        """Add the forces to a step, and forget the pushes that have ended."""
+        data.qfrc_applied[:] = 0.0
+        self.active = [push for push in self.active if push[-1] > step]
+        for body, point, force, _ in self.active:
+            place = data.xpos[body] + data.xmat[body].reshape(3, 3) @ point
+            self._apply(self._model, data, force, np.zeros(3), place, body, data.qfrc_applied)
+
+
+class JointStops:
+    """Position limits of joints.
+
+    Attributes:
+        names: The joints with limits, in the order of :class:`Trace`.
+
+    Args:
+        model: The MuJoCo model.
+    """
+
+    def __init__(self, model: Any) -> None:
+        limited = np.array(model.jnt_limited, dtype=bool)
+        self._places = np.array(model.jnt_qposadr)[limited]
+        self._low, self._high = np.array(model.jnt_range)[limited].T
+        self.names = tuple(model.joint(int(k)).name for k in np.flatnonzero(limited))
+
+    def reached(self, qpos: Array) -> Array:
+        """Return the joints that are at a limit, shape (n, joints), for ``qpos`` of shape (n, numbers)."""
+        values = qpos[:, self._places]
+        return np.asarray((values <= self._low) | (values >= self._high))
+
+
+class Truth(NamedTuple):
+    """True state of a world.
+
+    Attributes:
+        t: Time since the reset, s.
+        q: Configuration, shape (nq,).
+        v: ν, shape (nv,).
+        rotor_speeds: Rotor speeds in the unit of ``speed_max``, shape (rotors,).
+        thrusts: Thrusts, N, shape (rotors,).
+        torques: Joint torques of the last step, within the limits, shape (joints,).
+        shapes: Contact of each shape with the surfaces, in the order of the scene.
+        at_stops: Joints at or beyond a position limit.
+    """
+
+    t: float
+    q: Array
+    v: Array
+    rotor_speeds: Array
+    thrusts: Array
+    torques: Array
+    shapes: tuple[ShapeTruth, ...]
+    at_stops: tuple[str, ...]
+
+
+class Trace(NamedTuple):
+    """True states of a world at n marks, in the words of :class:`Truth` and :class:`ShapeTruth`.
+
+    The first axis is that of the marks.  The second one is that of the joints with limits for ``stopped``, and of the
+    shapes for what follows.
+    """
+
+    t: Array
+    q: Array
+    v: Array
+    rotor_speeds: Array
+    torques: Array
+    stopped: Array
+    touching: Array
+    force: Array
+    impulse: Array
+    peak: Array
+    began: Array
+    slip: Array

@@ -1,0 +1,129 @@
+"""Propellers: their speeds, thrusts, and the vibration that they cause."""
+
+from __future__ import annotations
+
+from typing import Any
+
+import numpy as np
+import pinocchio as pin
+from numpy.typing import ArrayLike
+
+from impact_posture.errors import InputError
+from impact_posture.robot.actuation import thrust_limits
+from impact_posture.robot.robot_spec import PropulsionSpec
+from impact_posture.system.arrays import Array
+
+
+class Rotors:
+    """Speeds ω of the propellers, in the unit of ``speed_max``.
+
+    A speed follows its command ω*, cut to ``[speed_min, speed_max]``, with ``ω̇ = (ω* − ω)/τ``.  τ is the time
+    constant up (ω* > ω) or down, and a step integrates exactly.  The thrust is ``c_f ω²`` along the direction of the
+    rotor, and the drag moment is ``κ`` times the thrust against its spin.  There is no gyroscopic moment, because the
+    inertia of the propellers is not in the model.
+
+    Args:
+        propulsion: Data of the rotors.
+        timestep: Time step, s.
+
+    Raises:
+        SpecError: The limits are wrong.
+    """
+
+    def __init__(self, propulsion: PropulsionSpec, timestep: float) -> None:
+        thrust_limits(propulsion)
+        self._lowest, self._highest = propulsion.speed_min, propulsion.speed_max
+        self._up, self._down = -timestep / propulsion.time_constant_up, -timestep / propulsion.time_constant_down
+        self._coefficient = propulsion.thrust_coefficient
+        self.speeds: Array = np.full(len(propulsion.rotors), self._lowest)
+        # The part of the way to its command that a speed goes in 1, 2, ... steps, up and down, by their number.
+        self._gone: dict[int, tuple[Array, Array]] = {}
+
+    def reset(self, speeds: ArrayLike) -> None:
+        """Set the speeds, cut to the limits.
+
+        Raises:
+            InputError: There is not one finite number for each rotor.
+        """
+        speeds = np.asarray(speeds, dtype=float)
+        if speeds.shape != self.speeds.shape or not np.isfinite(speeds).all():
+            raise InputError("no speeds of the rotors", where="reset", hint=f"give {self.speeds.size} finite numbers")
+        self.speeds = self.within(speeds)
+
+    def within(self, command: Array) -> Array:
+        """Return a command cut to the limits."""
+        return np.asarray(np.minimum(np.maximum(command, self._lowest), self._highest))
+
+    def steps(self, command: Array, count: int) -> Array:
+        """Take time steps under one command within the limits.  Return the speeds, shape (count, rotors)."""
+        away = command - self.speeds
+        # A speed never passes its command, so its time constant does not change in between.
+        speeds = self.speeds - np.where(away > 0, *self._ways(count)) * away
+        self.speeds = speeds[-1]
+        return np.asarray(speeds)
+
+    def _ways(self, count: int) -> tuple[Array, Array]:
+        if count not in self._gone:
+            passed = np.arange(1.0, count + 1)[:, None]
+            self._gone[count] = np.expm1(self._up * passed), np.expm1(self._down * passed)
+        return self._gone[count]
+
+    def in_c(self, count: int) -> dict[str, Any]:
+        """Return the members of ``c/world_ticks.c`` that are of these rotors, for a number of steps in a tick."""
+        up, down = self._ways(count)
+        return {"rotors": self.speeds.size, "speeds": self.speeds, "phases": 0 * self.speeds, "up": up, "down": down,
+                "lowest": self._lowest, "highest": self._highest, "thrust": self._coefficient}  # fmt: skip
+
+    def thrusts(self, speeds: Array) -> Array:
+        """Return thrusts ``c_f ω²``, N, in the shape of the speeds."""
+        return np.asarray(self._coefficient * speeds**2)
+
+
+class Vibration:
+    """Vibration of unbalanced propellers in the measured twist of the base.  The body itself does not vibrate.
+
+    Propeller i at ``p_i`` with unbalance U (kg·m) turns with ω_i about ``d_i`` and pulls with ``U(2πω_i)² e_i``.  In
+    its disc, ``e_i = cos φ_i x_i + s_i sin φ_i y_i`` turns with its spin ``s_i`` and ``φ̇_i = 2πω_i``.  The integral
+    over time, with the joints held, is the twist ``Σ I⁻¹ [f_i; p_i × f_i]``.  The momentum is
+    ``f_i = 2πω_i U (sin φ_i x_i − s_i cos φ_i y_i)``, and I (6 × 6) is the inertia of the robot at the base.
+
+    Args:
+        model: The model of the robot.
+        propulsion: Data of the rotors, with speeds in Hz.
+        unbalance: U, kg·m.
+    """
+
+    def __init__(self, model: pin.Model, propulsion: PropulsionSpec, unbalance: float) -> None:
+        frame = model.frames[model.getFrameId(propulsion.frame)].placement
+        x: list[Array] = []
+        y: list[Array] = []
+        for rotor in propulsion.rotors:
+            turn = pin.Quaternion.FromTwoVectors(np.array([0.0, 0, 1]), np.array(rotor.direction)).matrix()
+            for axis, columns, sign in ((turn[:, 0], x, 1), (turn[:, 1], y, -rotor.spin)):
+                force = sign * unbalance * axis
+                columns.append(frame.act(pin.Force(force, np.cross(rotor.position, force))).vector)
+        self._x, self._y = np.column_stack(x), np.column_stack(y)
+        self._model, self._data = model, model.createData()
+        self._inverse = np.zeros((6, 6))
+        self.phases: Array = np.zeros(len(propulsion.rotors))
+
+    def reset(self, q: Array, phases: Array) -> None:
+        """Set the inertia of a configuration, shape (nq,), and the angles of the propellers, shape (rotors,), rad."""
+        M = np.triu(pin.crba(self._model, self._data, q)[:6, :6])
+        self._inverse = np.linalg.inv(M + np.triu(M, 1).T)
+        self.phases = np.array(phases)
+
+    def steps(self, speeds: Array, timestep: float) -> Array:
+        """Turn the propellers for time steps, with speeds and angles of shape (count, rotors)."""
+        phases = self.phases + 2 * np.pi * timestep * speeds.cumsum(axis=0)
+        self.phases = phases[-1]
+        return np.asarray(phases)
+
+    def in_c(self) -> dict[str, Any]:
+        """Return the members of ``c/world_ticks.c`` that are of this vibration."""
+        return {"vibrates": 1, "phases": self.phases, "along": self._x, "across": self._y, "inverse": self._inverse}
+
+    def twist(self, speeds: Array, phases: Array) -> Array:
+        """Return the error of the measured base twist, base axes, shape (6,)."""
+        rates = 2 * np.pi * speeds
+        return np.asarray(self._inverse @ (self._x @ (rates * np.sin(phases)) + self._y @ (rates * np.cos(phases))))

@@ -1,0 +1,220 @@
+"""Surroundings of a simulated robot: surfaces, the shapes that touch them, physics, sensors."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+from typing import Annotated, Literal
+
+import numpy as np
+from pydantic import Field
+
+from impact_posture.config.toml_tables import Checked
+from impact_posture.errors import InputError
+from impact_posture.impact.impact_contact import LARGEST
+from impact_posture.robot.robot_spec import NonNegative, Positive
+
+ShapeKind = Literal["sphere", "box"]
+Finite = Annotated[float, Field(allow_inf_nan=False)]
+FiniteVector = tuple[Finite, Finite, Finite]
+
+
+@dataclass(frozen=True, kw_only=True)
+class ContactLaw(Checked):
+    """Spring and damper with which MuJoCo lets a surface push, scaled by the mass that the contact feels.
+
+    At distance r (negative inside) the contact wants the acceleration ``r* = −b r' − k r`` with ``b = 2/(d₁T)`` and
+    ``k = d/(d₁Tζ)²`` of ``solref = (T, ζ)``.  If both numbers are negative, they are ``(−k, −b)``.  The contact gets
+    the share d of it, ``r'' = d r* + (1 − d) r''₀``, where ``r''₀`` is the acceleration without contact.  With
+    ``solimp = (d₀, d₁, width)``, d rises from ``d₀`` at depth 0 to ``d₁`` at depth ``width`` (m).
+    The page on simulation has the measured restitution of many laws (``make calibration``).
+
+    Attributes:
+        solref: Time constant T in s and damping ratio ζ.
+        solimp: ``d₀``, ``d₁`` and the width in m.
+        friction: Coulomb coefficient, 0 for no friction.
+    """
+
+    solref: tuple[Finite, Finite] = (0.002, 1.0)
+    solimp: FiniteVector = (0.95, 0.99, 0.001)
+    friction: NonNegative = 0.7
+
+    def __post_init__(self) -> None:
+        """Refuse numbers that MuJoCo would silently change."""
+        super().__post_init__()
+        a, b = self.solref
+        if not ((a > 0 and b > 0) or (a < 0 and b <= 0)):
+            raise _wrong("solref", self.solref, "give a time and a damping ratio above zero, or both numbers below")
+        low, high, width = self.solimp
+        if not (0.0001 <= low <= high <= 0.9999 and width > 0):
+            raise _wrong("solimp", self.solimp, "give 0.0001 ≤ d₀ ≤ d₁ ≤ 0.9999 and a width above zero (m)")
+
+
+@dataclass(frozen=True)
+class Surface(ContactLaw):
+    """Endless plane that pushes with its contact law.
+
+    Attributes:
+        name: Name of the surface.
+        normal: Direction out of the surface, towards the robot, world, any length.
+        point: A point on the surface, world, m.  If there is none, ``gap`` places the surface.
+        gap: Distance from the nearest shape of the robot in the start posture, m.
+    """
+
+    name: str
+    normal: FiniteVector
+    point: FiniteVector | None = None
+    gap: Finite = 0.0
+
+    def __post_init__(self) -> None:
+        """Refuse a normal without direction."""
+        super().__post_init__()
+        if not 1e-9 < np.abs(self.normal).max() <= LARGEST:
+            hint = f"give three numbers, not all zero, up to {LARGEST:g}"
+            raise InputError("the normal has no direction", where=f"surface '{self.name}'", hint=hint)
+
+
+@dataclass(frozen=True)
+class Shape(Checked):
+    """Massless shape on the robot, which surfaces push.
+
+    Attributes:
+        frame: Frame that carries the shape, and name of the shape.
+        size: Radius, or three half extents, m.
+        kind: ``sphere`` or ``box`` (along the axes of the frame).
+        offset: The point that touches, from the origin of the frame, in the frame, m.
+        center: Center of the shape, in the frame, m.  By default, ``offset`` is the lowest point of a sphere, or the
+            middle of the lowest face of a box, against the first surface in the start posture.
+    """
+
+    frame: str
+    size: tuple[Positive, ...]
+    kind: ShapeKind = "sphere"
+    offset: FiniteVector = (0.0, 0.0, 0.0)
+    center: FiniteVector | None = None
+
+    def __post_init__(self) -> None:
+        """Refuse a size of another kind."""
+        super().__post_init__()
+        count, words = (1, "a radius") if self.kind == "sphere" else (3, "three half extents")
+        if len(self.size) != count:
+            raise InputError(
+                f"size {list(self.size)} is not {words}",
+                where=f"{self.kind} at '{self.frame}'",
+                hint=f"give {words} above zero (m)",
+            )
+
+
+@dataclass(frozen=True)
+class Physics(Checked):
+    """Time step, gravity, and the stops of the joints.
+
+    Attributes:
+        timestep: Time step, s, a picosecond or more.
+        gravity: Gravity, world, m/s².  ``None`` takes that of the robot model.
+        stop_solref: ``solref`` of the joint stops, as in :class:`ContactLaw`.
+        stop_solimp: ``solimp`` of the joint stops.
+    """
+
+    timestep: Annotated[float, Field(ge=1e-12, allow_inf_nan=False)] = 2.5e-4
+    gravity: FiniteVector | None = None
+    stop_solref: tuple[Finite, Finite] = (0.005, 1.0)
+    stop_solimp: FiniteVector = (0.95, 0.99, 0.001)
+
+    def __post_init__(self) -> None:
+        """Refuse stops that MuJoCo would silently change."""
+        super().__post_init__()
+        ContactLaw(solref=self.stop_solref, solimp=self.stop_solimp)
+
+
+@dataclass(frozen=True)
+class Sensors(Checked):
+    """Errors of what a controller measures.  By default all sensors are perfect.
+
+    Noise is white and normal, and every reading draws it anew.  Numbers are standard deviations.
+
+    Attributes:
+        base_position: m, each axis.
+        base_angle: rad, each axis.
+        base_velocity: m/s, each axis.
+        base_rate: rad/s, each axis (gyroscope).
+        joint_angle: rad (m).
+        joint_resolution: Step of the encoders, rad (m), 0 for none.
+        joint_rate: rad/s (m/s).
+        unbalance: Mass times eccentricity of each propeller, kg·m.  It makes the measured twist of the base vibrate
+            at the frequency of each propeller.  Rotor speeds must be in Hz.
+        force_frame: Shape whose contact force is measured, or ``None`` for no force sensor.
+        force: N, each axis.
+        force_cutoff: Cutoff frequency of the low-pass filter of the force, Hz.
+        delay: Age of a reading, s, up to an hour, rounded to physics steps.
+    """
+
+    base_position: NonNegative = 0.0
+    base_angle: NonNegative = 0.0
+    base_velocity: NonNegative = 0.0
+    base_rate: NonNegative = 0.0
+    joint_angle: NonNegative = 0.0
+    joint_resolution: NonNegative = 0.0
+    joint_rate: NonNegative = 0.0
+    unbalance: NonNegative = 0.0
+    force_frame: str | None = None
+    force: NonNegative = 0.0
+    force_cutoff: Positive = 100.0
+    delay: Annotated[float, Field(ge=0, le=3600)] = 0.0
+
+
+@dataclass(frozen=True)
+class Scene(Checked):
+    """Surroundings of a robot.
+
+    Every shape can touch every surface, and nothing else touches.
+
+    Attributes:
+        surfaces: Surfaces around the robot.
+        shapes: Shapes on the robot.
+        physics: Time step, gravity, and the stops of the joints.
+        sensors: Errors of the sensors.
+    """
+
+    surfaces: tuple[Surface, ...] = ()
+    shapes: tuple[Shape, ...] = ()
+    physics: Physics = Physics()
+    sensors: Sensors = Sensors()
+
+    @property
+    def laws(self) -> tuple[tuple[str, tuple[float, float]], ...]:
+        """Name and ``solref`` of all contact laws."""
+        return (("stops", self.physics.stop_solref), *((s.name, s.solref) for s in self.surfaces))
+
+    def __post_init__(self) -> None:
+        """Refuse a name that is used twice, a law that is too fast for the time step, and an unknown force sensor."""
+        super().__post_init__()
+        for words, names in (
+            ("surfaces are called", [s.name for s in self.surfaces]),
+            ("shapes are at", [s.frame for s in self.shapes]),
+        ):
+            twice = sorted({name for name in names if names.count(name) > 1})
+            if twice:
+                raise InputError(f"two {words} '{twice[0]}'", where="scene", hint="have one of each")
+        step = self.physics.timestep
+        for name, (a, b) in self.laws:
+            # MuJoCo silently applies the first two rules (refsafe).  A spring whose 1/√k is below the time step
+            # gives more energy than it took (measured, docs/generated/restitution.md).
+            slow = (("the time constant", a, 2), ("its product with the damping ratio", a * b, 1))
+            for words, value, least in slow if a > 0 else (("1/√k", (-a) ** -0.5, 1),):
+                if value < least * step * (1 - 1e-9):
+                    raise InputError(
+                        f"solref {[a, b]}: {words} is {value:.3g} s, below {least} × the time step of {step:g} s",
+                        where=name,
+                        hint="raise it, or lower the time step",
+                    )
+        frame, frames = self.sensors.force_frame, [s.frame for s in self.shapes]
+        if frame is not None and frame not in frames:
+            raise InputError(
+                f"force_frame '{frame}' carries no shape",
+                where="sensors",
+                hint=f"one of: {', '.join(frames)}" if frames else "add a shape",
+            )
+
+
+def _wrong(key: str, value: object, hint: str) -> InputError:
+    return InputError(f"{key} is {value}", where="scene", hint=hint)

@@ -1,0 +1,136 @@
+"""Readings of imperfect sensors."""
+
+from __future__ import annotations
+
+import math
+from dataclasses import dataclass, field
+from typing import Any, NamedTuple
+
+import numpy as np
+import pinocchio as pin
+
+from impact_posture.dynamics.chart import Chart
+from impact_posture.dynamics.mjcf_layout import MjcfLayout
+from impact_posture.robot.robot import Robot
+from impact_posture.simulation.world.scene import Sensors
+from impact_posture.system.arrays import Array
+
+# Readings whose noise is drawn at once.
+_DRAWS = 64
+
+
+class Reading(NamedTuple):
+    """Measured state.
+
+    Attributes:
+        t: Time of the reading, s.  What is measured may be older (``Sensors.delay``).
+        q: Configuration, shape (nq,).
+        v: ν, shape (nv,).
+        force: Force of the surfaces on the robot at the frame of the sensor, world axes, N, shape (3,), after the
+            low-pass filter.  ``None`` without a force sensor.
+    """
+
+    t: float
+    q: Array
+    v: Array
+    force: Array | None
+
+
+NO_FORCE = [0.0, 0.0, 0.0]
+
+
+class ForceFilter:
+    """Low-pass filter of a force sensor.
+
+    Attributes:
+        force: The filtered force, N, three numbers.
+
+    Args:
+        turns: Cutoff frequency times the time step.
+    """
+
+    def __init__(self, turns: float) -> None:
+        self._share, self.force = -math.expm1(-2 * math.pi * turns), NO_FORCE
+
+    def in_c(self) -> dict[str, Any]:
+        """Return the members of ``c/world_ticks.c`` that are of this filter."""
+        return {"share": self._share, "filtered": self.force}
+
+    def feel(self, force: list[float]) -> None:
+        """Take the force of a step."""
+        if force is not NO_FORCE or any(self.force):
+            self.force = [old + self._share * (new - old) for old, new in zip(self.force, force, strict=True)]
+
+
+@dataclass(eq=False, slots=True)
+class Sample:
+    """True state after a step, which the sensors see, with speeds and angles of the propellers and the felt force."""
+
+    layout: MjcfLayout
+    qpos: Array
+    qvel: Array
+    speeds: Array
+    phases: Array
+    force: list[float]
+    _state: tuple[Array, Array] | None = field(default=None, init=False)
+
+    @property
+    def state(self) -> tuple[Array, Array]:
+        """The Pinocchio ``(q, ν)``, which callers must copy."""
+        if self._state is None:
+            self._state = self.layout.state(self.qpos, self.qvel)
+        return self._state
+
+
+class SensorNoise:
+    """White noise in the tangent space, and the steps of the encoders.
+
+    Args:
+        robot: The robot.
+        sensors: Errors of its sensors.
+    """
+
+    def __init__(self, robot: Robot, sensors: Sensors) -> None:
+        self._model, self._sensors = robot.model, sensors
+        angles, rates = (np.full(robot.nv, value) for value in (sensors.joint_angle, sensors.joint_rate))
+        if robot.floating:
+            angles[:6] = [sensors.base_position] * 3 + [sensors.base_angle] * 3
+            rates[:6] = [sensors.base_velocity] * 3 + [sensors.base_rate] * 3
+        # What has no noise draws none.
+        force = np.full(0 if sensors.force_frame is None else 3, sensors.force)
+        parts = [scale if scale.any() else scale[:0] for scale in (angles, rates, force)]
+        self._scales = np.concatenate(parts)
+        self._ends = np.cumsum([part.size for part in parts]).tolist()
+        # Only joints with one number have an encoder.
+        slots = Chart(robot.model).slots
+        self._counted = np.array([s.q.start for s in slots if s.kind.family in ("revolute", "prismatic")], dtype=int)
+        self.reset(np.random.default_rng(0))
+
+    def reset(self, generator: np.random.Generator) -> None:
+        """Draw all noise from a generator from now on, which nobody else may use."""
+        self._generator, self._drawn = generator, iter(np.zeros((0, 0)))
+
+    def draw(self, n: int) -> Array:
+        """Return the noise of the next n readings, the numbers that single draws would give, shape (n, numbers)."""
+        return np.asarray(self._scales * self._generator.standard_normal((n, self._ends[-1])))
+
+    def in_c(self) -> dict[str, Any]:
+        """Return the members of ``c/world_ticks.c`` that are of these sensors."""
+        first, second, third = self._ends
+        return {"noises": third, "noisy_q": int(first > 0), "noisy_v": int(second > first),
+                "noisy_force": int(third > second), "resolution": self._sensors.joint_resolution}  # fmt: skip
+
+    def read(self, t: float, q: Array, v: Array, force: Array | None) -> Reading:
+        """Add noise to the true state.  The given arrays are not changed."""
+        sensors, (first, second, third) = self._sensors, self._ends
+        drawn = next(self._drawn, None)
+        if drawn is None:
+            self._drawn = iter(self.draw(_DRAWS))
+            drawn = next(self._drawn)
+        q = pin.integrate(self._model, q, drawn[:first]) if first else q.copy()
+        if sensors.joint_resolution:
+            q[self._counted] = np.rint(q[self._counted] / sensors.joint_resolution) * sensors.joint_resolution
+        v = v + drawn[first:second] if second > first else v.copy()
+        if force is not None and third > second:
+            force = force + drawn[second:]
+        return Reading(t, q, v, force)

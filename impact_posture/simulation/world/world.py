@@ -1,0 +1,299 @@
+"""A robot in MuJoCo under rotor and motor commands, with readings of its sensors and the true state."""
+
+from __future__ import annotations
+
+import math
+from collections import deque
+from typing import Any
+
+import numpy as np
+from numpy.typing import ArrayLike
+
+from impact_posture.dynamics.mjcf import import_mujoco, unwarned
+from impact_posture.errors import InputError, SimulationDiverged
+from impact_posture.impact.impact_contact import point_on
+from impact_posture.robot.actuation import hover
+from impact_posture.robot.robot import Robot
+from impact_posture.simulation.world.actuator_command import (
+    RUNAWAY,
+    ActivePushes,
+    ActuatorCommand,
+    CommandLimits,
+    JointStops,
+    Push,
+    Trace,
+    Truth,
+)
+from impact_posture.simulation.world.contact_forces import ContactLog, ShapeTruth
+from impact_posture.simulation.world.rotors import Rotors, Vibration
+from impact_posture.simulation.world.scene import Scene
+from impact_posture.simulation.world.sensor_noise import NO_FORCE, ForceFilter, Reading, Sample, SensorNoise
+from impact_posture.simulation.world.throw import Ball, Throw
+from impact_posture.simulation.world.world_builder import BuiltScene, build_scene
+from impact_posture.system.arrays import Array
+from impact_posture.tsid.controller import Command
+from impact_posture.tsid.state import checked_velocity
+
+_NOTHING = np.zeros(0)
+
+
+class World:
+    """A robot in its surroundings, which :func:`build_world` makes.
+
+    Call :meth:`reset` first.  All coordinates are those of Pinocchio.
+
+    Attributes:
+        robot: The robot.
+        scene: Its surroundings.
+        built: The MuJoCo model, and where the surfaces are.
+        timestep: Time step of the physics, s.
+        limits: Limits of the commands.
+        stops: The joints with position limits.
+    """
+
+    def __init__(self, robot: Robot, scene: Scene, built: BuiltScene) -> None:
+        """Compile the model.
+
+        Raises:
+            InputError: MuJoCo is not installed or refuses the model.
+        """
+        self._mujoco = import_mujoco()
+        self.robot, self.scene, self.built = robot, scene, built
+        self.timestep = scene.physics.timestep
+        self._layout = built.mjcf.layout
+        self._model = built.mjcf.compile()
+        self._data = self._mujoco.MjData(self._model)
+        frames, sensors, propulsion = tuple(s.frame for s in scene.shapes), scene.sensors, robot.spec.propulsion
+        self.ball = None if built.throw is None else Ball(self._model, built.throw)
+        self._frames, self._log = frames, ContactLog(self._model, built.shape_geoms)
+        self._noise = SensorNoise(robot, sensors)
+        self._rotors = None if propulsion is None else Rotors(propulsion, self.timestep)
+        self._vibration = None
+        if propulsion is not None and sensors.unbalance:
+            self._vibration = Vibration(robot.model, propulsion, sensors.unbalance)
+        self._count = 0 if propulsion is None else len(propulsion.rotors)
+        self.limits = CommandLimits(robot, self._rotors)
+        self._torques: Array = np.zeros(self.limits.effort.size)
+        self._felt = None if sensors.force_frame is None else frames.index(sensors.force_frame)
+        self._filter = ForceFilter(sensors.force_cutoff * self.timestep)
+        self._marks: list[tuple[float, Sample, Array, Array]] = []
+        self._past: deque[Sample] = deque(maxlen=1 + round(sensors.delay / self.timestep))
+        self._pushes = ActivePushes(self._model)
+        self._steps = 0
+        self.stops = JointStops(self._model)
+
+    def reset(
+        self, q: ArrayLike, v: ArrayLike | None = None, seed: int = 0, *, rotor_speed: ArrayLike | None = None
+    ) -> None:
+        """Begin again.
+
+        Args:
+            q: Configuration, shape (nq,).
+            v: ν, shape (nv,).  At rest by default.
+            seed: Seed of all noise.
+            rotor_speed: Speeds of the propellers, shape (rotors,).  Those of hovering at ``q`` by default.
+
+        Raises:
+            PostureError: The configuration or the velocity does not fit the robot.
+            InputError: The rotor speeds do not fit the robot.
+        """
+        q = self.robot.check_posture(np.asarray(q, dtype=float), limits=False, where="reset")
+        v = checked_velocity(self.robot, np.zeros(self.robot.nv) if v is None else v)
+        self._mujoco.mj_resetData(self._model, self._data)
+        self._data.qpos[: self._layout.nqpos] = self._layout.qpos(q)
+        self._data.qvel[: self._layout.nv] = self._layout.qvel(q, v)
+        generator = np.random.default_rng(seed)
+        if self._rotors is not None and (propulsion := self.robot.spec.propulsion) is not None:
+            self._rotors.reset(hover(self.robot.model, propulsion, q).speeds if rotor_speed is None else rotor_speed)
+        if self._vibration is not None:
+            self._vibration.reset(q, generator.uniform(0, 2 * np.pi, self._count))
+        self._noise.reset(generator)
+        self._log.reset()
+        self._marks.clear()
+        self._filter.force = NO_FORCE
+        self._torques = np.zeros(self.limits.effort.size)
+        self._pushes.active.clear()
+        self._steps = 0
+        self._mujoco.mj_step1(self._model, self._data)
+        self._past.clear()
+        speeds = _NOTHING if self._rotors is None else self._rotors.speeds
+        self._past.append(self._sample(speeds, _NOTHING if self._vibration is None else self._vibration.phases))
+
+    @property
+    def speed(self) -> float:
+        """``‖ν‖``."""
+        rates = self._past[-1].qvel
+        return math.sqrt(rates.dot(rates))
+
+    @property
+    def time(self) -> float:
+        """Time since the reset, s."""
+        return self._steps * self.timestep
+
+    def push(self, push: Push) -> None:
+        """Begin a push now.  Several pushes add up.
+
+        Raises:
+            FrameNotFound: There is no such frame.
+            InputError: The force is not finite, or the duration is shorter than a time step.
+        """
+        point = point_on(self.robot, push.frame, push.offset)
+        body = int(self._model.body(self.built.mjcf.bodies[point.joint]).id)
+        self._pushes.begin(push, body, point.position, self._steps)
+
+    def throw(self, sign: int = 1) -> None:
+        """Throw the ball of the scenario now.
+
+        Raises:
+            InputError: The scenario has no ball.
+        """
+        if self.ball is None:
+            raise InputError("has no ball", where="world", hint="take a scenario with [throw]")
+        self.ball.throw(self._data, sign)
+        self._mujoco.mj_step1(self._model, self._data)
+
+    def step(self, command: Command | ActuatorCommand, count: int = 1) -> None:
+        """Take physics steps under one command.
+
+        Args:
+            command: Rotor speeds and joint torques, which are cut to their limits.
+            count: Number of steps.
+
+        Raises:
+            InputError: There was no reset, or the command has other sizes or is not finite.
+            SimulationDiverged: The state ran away.
+        """
+        self._check_ready()
+        speed, self._torques = self.limits.within(command)
+        self._data.ctrl[self._count :] = self._torques
+        if not count:
+            return
+        with unwarned():
+            self._advance(speed, count)
+        state = self._data.qpos, self._data.qvel
+        # The largest number is computed only where the sum of squares does not settle it.
+        usual = state[0].dot(state[0]) + state[1].dot(state[1]) < RUNAWAY**2
+        if not usual and not all(np.abs(part).max() < RUNAWAY for part in state):
+            raise SimulationDiverged(self.time, where=self.robot.name)
+
+    def _advance(self, command: Array, count: int) -> None:
+        """Take physics steps under rotor speeds within the limits."""
+        model, data, first, second = self._model, self._data, self._mujoco.mj_step1, self._mujoco.mj_step2
+        rotors, vibration, speeds, phases = self._rotors, self._vibration, np.zeros((count, 0)), np.zeros((count, 0))
+        if rotors is not None:
+            # Propellers feel nothing of the robot, so all their steps are taken at once.
+            speeds = rotors.steps(command, count)
+            thrusts = rotors.thrusts(speeds)
+            phases = phases if vibration is None else vibration.steps(speeds, self.timestep)
+        control, log, delayed = data.ctrl[: self._count], self._log, self._past.maxlen != 1
+        log.fold(self._steps)
+        for k in range(count):
+            if rotors is not None:
+                control[:] = thrusts[k]
+            if self._pushes.active:
+                self._pushes.apply(data, self._steps)
+            second(model, data)
+            self._steps += 1
+            if data.ncon:
+                log.step(data, self._steps)
+            if self._felt is not None:
+                self._filter.feel(log.force(self._felt) if data.ncon else NO_FORCE)
+            # Now positions, contacts and velocities are those of the new state, and forces those of the step.
+            first(model, data)
+            if delayed or k == count - 1:
+                self._past.append(self._sample(speeds[k], phases[k]))
+
+    def _sample(self, speeds: Array, phases: Array) -> Sample:
+        data, layout = self._data, self._layout
+        qpos, qvel = data.qpos[: layout.nqpos].copy(), data.qvel[: layout.nv].copy()
+        return Sample(layout, qpos, qvel, speeds, phases, self._filter.force)
+
+    def read(self) -> Reading:
+        """Return what the sensors measure now.  Every call draws new noise."""
+        self._check_ready()
+        sample = self._past[0]
+        q, v = sample.state
+        if self._vibration is not None:
+            v = v.copy()
+            v[:6] += self._vibration.twist(sample.speeds, sample.phases)
+        return self._noise.read(self.time, q, v, None if self._felt is None else np.array(sample.force))
+
+    def mark(self) -> None:
+        """Let the present state be one of those that the next :meth:`trace` returns."""
+        self._check_ready()
+        speeds = _NOTHING if self._rotors is None else self._rotors.speeds
+        self._marks.append((self.time, self._past[-1], self._torques, speeds))
+        self._log.mark(self._data, self._steps)
+
+    def trace(self) -> Trace:
+        """Return the true states at all marks, of which there must be some, and begin again."""
+        if not self._marks:
+            raise InputError("has no marks", where="world", hint="call mark() first")
+        times, samples, torques, speeds = zip(*self._marks, strict=True)
+        self._marks = []
+        q, v = zip(*(sample.state for sample in samples), strict=True)
+        stopped = self.stops.reached(np.array([sample.qpos for sample in samples]))
+        parts = [np.array(column) for column in (times, q, v, speeds, torques)]
+        return Trace._make([*parts, stopped, *self._log.look()])
+
+    def truth(self) -> Truth:
+        """Return the true state.  The peak force and the first touch of each shape begin again, as do all marks."""
+        self.mark()
+        t, q, v, speeds, torques, stopped, *contacts = (column[-1] for column in self.trace())
+        shapes = tuple(
+            ShapeTruth(frame, bool(on), force, impulse, float(peak), None if np.isnan(began) else float(began), slip)
+            for frame, on, force, impulse, peak, began, slip in zip(self._frames, *contacts, strict=True)
+        )
+        thrusts = speeds if self._rotors is None else self._rotors.thrusts(speeds)
+        stops = tuple(name for name, there in zip(self.stops.names, stopped, strict=True) if there)
+        return Truth(float(t), q, v, speeds, thrusts, torques, shapes, stops)
+
+    def in_c(self, count: int) -> dict[str, Any] | None:
+        """Return the members of ``c/world_ticks.c`` that are of this world, for a number of steps in a tick.
+
+        It is ``None`` where C has no such world: for delayed readings, and for joints other than a floating base,
+        hinges and slides.
+        """
+        self._check_ready()
+        places, sample, floating = self._layout.places, self._past[-1], self.robot.floating
+        if places is None or self._past.maxlen != 1:
+            return None
+        q, v = sample.state
+        found = {"model": self._model._address, "data": self._data._address, "runaway": RUNAWAY**2,
+                 "nq": q.size, "nv": v.size, "nqpos": self._data.qpos.size, "floating": int(floating),
+                 "q_at": places[0], "v_at": places[1], "true_q": q, "true_v": v, "joints": self.limits.effort.size,
+                 "effort": self.limits.effort, "torque": self._torques, "steps": self._steps, "count": count,
+                 "timestep": self.timestep, "rotors": 0, "vibrates": 0, "refused": 0,
+                 "felt": -1 if self._felt is None else self._felt}  # fmt: skip
+        parts = [self._filter.in_c(), self._noise.in_c(), self._log.in_c()]
+        parts += [] if self._rotors is None else [self._rotors.in_c(count)]
+        parts += [] if self._vibration is None else [self._vibration.in_c()]
+        return {key: value for part in (found, *parts) for key, value in part.items()}
+
+    def next_in_c(self, n: int) -> dict[str, Any]:
+        """Return the members that change from call to call: the noise of n readings, and the pushes."""
+        return {"noise": self._noise.draw(n), **self._pushes.in_c()}
+
+    def go_to(self, steps: int) -> None:
+        """Take note that C has gone to a number of steps since the reset."""
+        self._steps = steps
+
+    def _check_ready(self) -> None:
+        if not self._past:
+            raise InputError("has not been reset", where="world", hint="call reset(q) first")
+
+
+def build_world(robot: Robot, scene: Scene, q: ArrayLike | None = None, throw: Throw | None = None) -> World:
+    """Build the simulation of a robot in its surroundings.
+
+    Args:
+        robot: The robot.
+        scene: Its surroundings.
+        q: Posture at which surfaces with a gap are placed, shape (nq,).  The default posture of the robot by default.
+        throw: The ball that is thrown.
+
+    Raises:
+        InputError: MuJoCo is not installed, or the scene does not fit the robot.
+    """
+    start = robot.posture() if q is None else robot.check_posture(np.asarray(q, dtype=float), where="start posture")
+    return World(robot, scene, build_scene(robot, scene, start, throw))

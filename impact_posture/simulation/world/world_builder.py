@@ -1,0 +1,190 @@
+"""One MuJoCo model of a robot and its surroundings."""
+
+from __future__ import annotations
+
+from collections.abc import Mapping
+from dataclasses import dataclass
+from typing import Any
+
+import numpy as np
+import pinocchio as pin
+
+from impact_posture.dynamics.chart import Chart
+from impact_posture.dynamics.mjcf import Mjcf, build_mjcf, import_mujoco
+from impact_posture.dynamics.numeric import Numeric
+from impact_posture.errors import InputError, UnsupportedJoint
+from impact_posture.impact.impact_contact import point_on
+from impact_posture.robot.actuation import actuation_matrix
+from impact_posture.robot.robot import Robot
+from impact_posture.simulation.world.scene import ContactLaw, Physics, Scene, Shape, Surface
+from impact_posture.simulation.world.throw import BALL, Throw, add_ball
+from impact_posture.system.arrays import Array
+from impact_posture.system.escape import xml_name
+
+# Families with the same velocities, in the same axes, in Pinocchio and MuJoCo.
+_DRIVEN = ("revolute", "continuous", "prismatic", "translation", "spherical")
+# Where in the width of solimp the share d is halfway, and the power of its rise (MuJoCo defaults).
+_SOLIMP_SHAPE = (0.5, 2.0)
+
+
+@dataclass(frozen=True, eq=False)
+class BuiltScene:
+    """Model of a scene before MuJoCo compiles it.
+
+    Attributes:
+        mjcf: The model.  Its actuators are the rotors (thrust, N), then the joints (N·m or N), in the order of ``u``.
+        normals: Unit normal of each surface, by name.
+        points: A point on each surface, world, m, by name.
+        gaps: Distance of each shape from each surface in the start posture, m, by surface and shape.
+        shape_geoms: Name of the geom of each shape, in the order of the scene.
+        throw: The ball that is thrown, or ``None``.
+    """
+
+    mjcf: Mjcf
+    normals: Mapping[str, Array]
+    points: Mapping[str, Array]
+    gaps: Mapping[tuple[str, str], float]
+    shape_geoms: tuple[str, ...]
+    throw: Throw | None = None
+
+
+def build_scene(robot: Robot, scene: Scene, q: Array, throw: Throw | None = None) -> BuiltScene:
+    """Build the model of a robot in its surroundings.
+
+    Args:
+        robot: The robot.
+        scene: Its surroundings.
+        q: Start posture, shape (nq,), which defines the gaps and the default centers of the shapes.
+        throw: The ball that is thrown.
+
+    Raises:
+        FrameNotFound: The frame of a shape does not exist.
+        ContactError: The frame of a shape is welded to the world.
+        InputError: MuJoCo is not installed, a shape has no center and there is no surface, or a surface has no point
+            and there is no shape.
+        UnsupportedJoint: No motor can drive a joint.
+    """
+    numeric = Numeric(robot.model).at(q)
+    mjcf = build_mjcf(robot.model, robot.name)
+    _set_physics(mjcf.spec, scene.physics)
+    normals = {s.name: np.array(s.normal, dtype=float) / np.linalg.norm(s.normal) for s in scene.surfaces}
+    first = next(iter(normals.values()), None)
+    geoms, placed = [], []
+    for shape in scene.shapes:
+        place = _placement(robot, numeric, shape, first)
+        joint = point_on(robot, shape.frame).joint
+        geoms.append(xml_name(f"shape {shape.frame}"))
+        mjcf.add_geom(joint, geoms[-1], shape.kind, shape.size, place)
+        placed.append((shape, numeric.data.oMi[joint] * place))
+    points = {s.name: _point(s, normals[s.name], placed) for s in scene.surfaces}
+    gaps = {
+        (name, shape.frame): float(normals[name] @ (_lowest(shape, place, normals[name]) - point))
+        for name, point in points.items()
+        for shape, place in placed
+    }
+    for surface in scene.surfaces:
+        name = xml_name(f"surface {surface.name}")
+        mjcf.add_plane(name, points[surface.name], normals[surface.name])
+        for geom in geoms:
+            _add_pair(mjcf, name, geom, surface)
+    if throw is not None:
+        add_ball(mjcf, throw)
+        _add_pair(mjcf, BALL, xml_name(f"shape {throw.frame}"), throw)
+    _add_rotors(mjcf, robot)
+    _add_motors(mjcf, robot)
+    return BuiltScene(mjcf, normals, points, gaps, tuple(geoms), throw)
+
+
+def _add_pair(mjcf: Mjcf, first: str, second: str, law: ContactLaw) -> None:
+    """Let two geoms touch."""
+    mjcf.spec.add_pair(
+        geomname1=first,
+        geomname2=second,
+        condim=3 if law.friction else 1,
+        friction=(law.friction, law.friction, 0.0, 0.0, 0.0),
+        solref=law.solref,
+        solimp=(*law.solimp, *_SOLIMP_SHAPE),
+    )
+
+
+def _set_physics(spec: Any, physics: Physics) -> None:
+    """Set the time step, the solver, gravity, and how the joint stops push."""
+    mujoco = import_mujoco()
+    spec.option.timestep = physics.timestep
+    spec.option.integrator = mujoco.mjtIntegrator.mjINT_IMPLICITFAST
+    spec.option.cone = mujoco.mjtCone.mjCONE_ELLIPTIC
+    # A simulation that diverges must not silently restart.
+    spec.option.disableflags |= mujoco.mjtDisableBit.mjDSBL_AUTORESET
+    if physics.gravity is not None:
+        spec.option.gravity = physics.gravity
+    for joint in spec.joints:
+        joint.solref_limit, joint.solimp_limit = physics.stop_solref, (*physics.stop_solimp, *_SOLIMP_SHAPE)
+
+
+def _placement(robot: Robot, numeric: Numeric, shape: Shape, normal: Array | None) -> pin.SE3:
+    """Return the pose of a shape in the frame of its joint."""
+    point = point_on(robot, shape.frame)
+    frame = pin.SE3(point.rotation, point.position)
+    if shape.center is not None:
+        return frame * pin.SE3(np.eye(3), np.array(shape.center, dtype=float))
+    if normal is None:
+        raise InputError("has no center and no surface to be put against", where=f"shape at '{shape.frame}'",
+                         hint="give a center")  # fmt: skip
+    up = (numeric.data.oMi[point.joint] * frame).rotation.T @ normal
+    if shape.kind == "sphere":
+        rise = shape.size[0] * up
+    else:
+        axis = int(np.argmax(np.abs(up)))
+        rise = np.sign(up[axis]) * shape.size[axis] * np.eye(3)[axis]
+    return frame * pin.SE3(np.eye(3), np.array(shape.offset, dtype=float) + rise)
+
+
+def _point(surface: Surface, normal: Array, placed: list[tuple[Shape, pin.SE3]]) -> Array:
+    """Return the given point on a surface, or the one below the nearest shape."""
+    if surface.point is not None:
+        return np.array(surface.point, dtype=float)
+    if not placed:
+        raise InputError("there is no shape that it has a gap to", where=f"surface '{surface.name}'",
+                         hint="give a point, or a shape")  # fmt: skip
+    lowest = min((_lowest(shape, place, normal) for shape, place in placed), key=lambda p: float(normal @ p))
+    return np.asarray(lowest - surface.gap * normal)
+
+
+def _lowest(shape: Shape, place: pin.SE3, normal: Array) -> Array:
+    """Return the point below the center of a shape on its lowest plane along a normal."""
+    reach = shape.size[0]
+    if shape.kind == "box":
+        reach = float(np.abs(place.rotation.T @ normal) @ np.array(shape.size))
+    return np.asarray(place.translation - reach * normal)
+
+
+def _add_rotors(mjcf: Mjcf, robot: Robot) -> None:
+    """Add a motor for each rotor, whose control is the thrust and whose wrench acts on the base."""
+    propulsion = robot.spec.propulsion
+    if propulsion is None:
+        return
+    wrenches = actuation_matrix(robot.model, propulsion)[:6, : len(propulsion.rotors)]
+    site, transmission = "base of the rotors", import_mujoco().mjtTrn.mjTRN_SITE
+    mjcf.body(1).add_site(name=site)
+    for rotor, wrench in zip(propulsion.rotors, wrenches.T, strict=True):
+        name = xml_name(f"rotor {rotor.name}")
+        mjcf.spec.add_actuator(name=name, gear=wrench, target=site, trntype=transmission)
+
+
+def _add_motors(mjcf: Mjcf, robot: Robot) -> None:
+    """Add a motor for each entry of ν behind the base."""
+    transmission = import_mujoco().mjtTrn.mjTRN_JOINT
+    for slot in Chart(robot.model).slots[1 if robot.floating else 0 :]:
+        if slot.kind.family not in _DRIVEN:
+            raise UnsupportedJoint(
+                f"no motor drives joint '{slot.name}' ({slot.kind.family})",
+                where="simulation",
+                hint="lock it (`lock`), or model it as slides and hinges",
+            )
+        targets = mjcf.joints[slot.index]
+        motors = [(f"motor {name}", name, np.eye(3)[0]) for name in targets]
+        if slot.kind.family == "spherical":
+            motors = [(xml_name(f"motor {slot.name}[{k}]"), targets[0], axis) for k, axis in enumerate(np.eye(3))]
+        for name, target, axis in motors:
+            gear = (*axis, 0.0, 0.0, 0.0)
+            mjcf.spec.add_actuator(name=name, gear=gear, target=target, trntype=transmission)

@@ -1,0 +1,1 @@
+"""Processes, files, folders, the compiler and the cache."""

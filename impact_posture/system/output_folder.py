@@ -1,0 +1,283 @@
+"""Output folders: written whole or not at all, and never over the files of others.
+
+Each output folder holds a record, ``.impact-posture.json``, of the files that were written into it.  ``--force``
+replaces a folder only if the record names every file in it.
+"""
+
+from __future__ import annotations
+
+import errno
+import json
+import os
+import secrets
+from collections.abc import Iterable, Iterator, Sequence
+from contextlib import contextmanager, suppress
+from pathlib import Path
+from typing import Any, Literal
+
+from impact_posture.errors import OutputError
+from impact_posture.system.processes import signals_held, undone
+from impact_posture.system.scratch_folder import RECORD, SCHEMA, SCRATCH, made_by, remove_scratch, scratch_folder
+from impact_posture.system.text_files import read_text
+
+_SHOWN = 3
+
+Kind = Literal["result", "export", "run", "comparison", "reproduction", "sweep", "world"]
+
+
+def check_output(out: Path, *, force: bool, kind: Kind) -> None:
+    """Refuse an output folder early, before hours of work.
+
+    Args:
+        out: The folder to be written.
+        force: Whether an existing folder of the same kind may be replaced.
+        kind: The kind of content.
+
+    Raises:
+        OutputError: The folder exists, is no folder, holds foreign files, cannot be replaced, or its parent cannot be
+            written.
+    """
+    check_name(out)
+    if out.is_symlink():
+        raise OutputError("is a symbolic link", where=str(out), hint="name the folder that it leads to, or another")
+    if os.path.lexists(out) and not out.is_dir():
+        raise OutputError("exists and is no folder", where=str(out), hint="choose another `out`")
+    if Path(os.path.realpath(out)) in (Path.cwd(), *Path.cwd().parents):
+        raise OutputError(
+            "is the current folder or one around it", where=str(out), hint="choose a new folder, such as ./result"
+        )
+    if os.path.ismount(out):
+        raise OutputError("is a mount point", where=str(out), hint="choose a folder in it")
+    if out.is_dir() and any(out.iterdir()):
+        if not force:
+            raise OutputError("exists", where=str(out), hint="choose another `out`, or `force=True` to replace it")
+        _check_ours(out, kind)
+    parent = next(folder for folder in out.absolute().parents if folder.exists())
+    if not parent.is_dir() or not os.access(parent, os.W_OK | os.X_OK):
+        raise OutputError("cannot be written", where=str(parent), hint="choose another `out`")
+
+
+def check_name(out: Path) -> None:
+    """Refuse a name that no file or folder can have, and one that cannot be looked up.
+
+    Raises:
+        OutputError: The system refuses the name.
+    """
+    try:
+        os.lstat(out)
+    except (FileNotFoundError, NotADirectoryError):
+        pass
+    except (OSError, ValueError) as error:
+        words = f"cannot be written ({getattr(error, 'strerror', None) or error})"
+        raise OutputError(words, where=str(out), hint="choose another `out`") from None
+
+
+@contextmanager
+def whole_folder(out: Path, *, force: bool, kind: Kind, products: Sequence[str] = ()) -> Iterator[Path]:
+    """Yield a folder beside ``out`` to write into.  On success it takes the place of ``out``, else nothing remains.
+
+    Args:
+        out: The folder to be written.
+        force: Whether an existing folder of the same kind may be replaced.
+        kind: The kind of content.
+        products: Files that the content may make there later, such as libraries; they count as ours.
+
+    Raises:
+        OutputError: As :func:`check_output`, or the disk is full or not writable.
+    """
+    check_output(out, force=force, kind=kind)
+    out = out.absolute()
+    try:
+        with parents_of(out), scratch_folder(out.parent, 0o777) as beside:
+            try:
+                yield beside
+            except OutputError as error:
+                # The user knows the folder by its own name.
+                raise OutputError(
+                    error.what, where=error.where.replace(str(beside), str(out)), hint=error.hint
+                ) from None
+            write_record(beside, kind, products)
+            with signals_held():
+                _replace(beside, out, force, kind)
+    except OSError as error:
+        words = error.strerror or str(error)
+        if isinstance(error, FileNotFoundError) and error.filename:
+            # What is missing may be another file than those of the folder.
+            words = f"{words}: {error.filename}"
+        raise OutputError(
+            f"cannot be written ({words})", where=str(out), hint="free space or choose another `out`"
+        ) from error
+
+
+def write_record(folder: Path, kind: Kind, products: Sequence[str] = ()) -> None:
+    """Record every file in a folder as ours, and ``products`` that may be made there later.
+
+    Raises:
+        OSError: The record cannot be written.
+    """
+    files = sorted(path.relative_to(folder).as_posix() for path in folder.rglob("*") if not path.is_dir())
+    content = {"schema": SCHEMA, "kind": kind, "files": files, "products": sorted(products), **made_by()}
+    write_json(folder / RECORD, content)
+
+
+def typed_command(folder: Path) -> str:
+    """Return the words with which a user made an output folder; empty where no command line made it."""
+    try:
+        return str(json.loads(read_text(folder / RECORD)).get("command", ""))
+    except (OSError, ValueError, AttributeError, RecursionError):
+        return ""
+
+
+def is_ours(folder: Path, kind: Kind) -> bool:
+    """Return whether a folder has a record of this kind; it may hold other files too."""
+    content = _read_record(folder)
+    return content is not None and content["kind"] == kind
+
+
+def own_files(folder: Path, kind: Kind) -> list[str]:
+    """Return the files that the record of a folder of this kind lists, without itself; none without such a record."""
+    content = _read_record(folder)
+    return [] if content is None or content["kind"] != kind else [name for name in content["files"] if name != RECORD]
+
+
+def add_to_record(folder: Path, paths: Iterable[Path]) -> None:
+    """Record more files as ours in a folder that has a record; do nothing in another folder.
+
+    Raises:
+        OutputError: The record cannot be written.
+    """
+    content = _read_record(folder)
+    if content is None:
+        return
+    added = {path.absolute().relative_to(folder.absolute()).as_posix() for path in paths}
+    content["files"] = sorted(added.union(content["files"]))
+    write_whole(folder / RECORD, json.dumps(content, indent=1) + "\n")
+
+
+def write_json(path: Path, document: object) -> None:
+    """Write a document; NaN fails here and not in the program that reads it."""
+    path.write_text(json.dumps(document, indent=1, allow_nan=False) + "\n", encoding="utf-8")
+
+
+def write_whole(path: Path, content: str | bytes) -> None:
+    """Write a file that appears whole or not at all.
+
+    Raises:
+        OutputError: The file cannot be written.
+    """
+    beside = path.with_name(f".{path.name}.{os.getpid()}.part")
+
+    def remove() -> None:
+        with suppress(OSError):
+            beside.unlink()
+
+    try:
+        with undone(remove):
+            beside.unlink(missing_ok=True)
+            # This follows no link that somebody put there.
+            with beside.open("xb") as file:
+                file.write(content.encode() if isinstance(content, str) else content)
+            os.replace(beside, path)
+    except OSError as error:
+        hint = "check the disk and permissions"
+        raise OutputError(f"cannot be written ({error.strerror})", where=str(path), hint=hint) from None
+
+
+# ---- ownership -----------------------------------------------------------------------------------------------------
+
+
+def _check_ours(out: Path, kind: Kind) -> None:
+    content = _read_record(out)
+    if content is not None and content["kind"] != kind:
+        raise OutputError(
+            f"holds another command's results ({content['kind']})", where=str(out), hint="choose another `out`"
+        )
+    foreign = _foreign(out, set())
+    if foreign:
+        more = f" and {len(foreign) - _SHOWN} more" if len(foreign) > _SHOWN else ""
+        raise OutputError(
+            f"holds {', '.join(foreign[:_SHOWN])}{more}, which this command did not write",
+            where=str(out),
+            hint="choose another `out`, or move that away: `force=True` replaces earlier results only",
+        )
+
+
+def _foreign(folder: Path, ours: set[str], below: str = "") -> list[str]:
+    """Return the names in a folder that neither ``ours`` nor its own record has, sorted."""
+    content = _read_record(folder)
+    names = [] if content is None else [RECORD, *content["files"], *content["products"]]
+    ours = ours.union(below + name for name in names)
+    found = []
+    for entry in sorted(os.scandir(folder), key=lambda e: e.name):
+        name = below + entry.name
+        if entry.is_dir(follow_symlinks=False):
+            inside = any(one.startswith(f"{name}/") for one in ours) and not os.path.ismount(entry.path)
+            found += _foreign(Path(entry.path), ours, f"{name}/") if inside else [f"{name}/"]
+        elif name not in ours or not entry.is_file(follow_symlinks=False):
+            found.append(name)
+    return found
+
+
+def _read_record(folder: Path) -> dict[str, Any] | None:
+    try:
+        content = json.loads(read_text(folder / RECORD)) if (folder / RECORD).is_file() else None
+    except (OSError, ValueError, RecursionError):
+        return None
+    if not isinstance(content, dict) or content.get("schema") != SCHEMA:
+        return None
+    lists = [content.get("files"), content.get("products")]
+    sound = all(isinstance(names, list) and all(isinstance(name, str) for name in names) for names in lists)
+    return content if sound and isinstance(content.get("kind"), str) else None
+
+
+# ---- taking a place ------------------------------------------------------------------------------------------------
+
+
+def _replace(beside: Path, out: Path, force: bool, kind: Kind) -> None:
+    """Put ``beside`` in the place of ``out``.  After any interruption one of the two results is there."""
+    if not force or not out.exists():
+        try:
+            # This is atomic, and fails on a folder that somebody filled meanwhile.
+            os.rename(beside, out)
+        except OSError as error:
+            if error.errno in (errno.ENOTEMPTY, errno.EEXIST):
+                raise OutputError(
+                    "exists", where=str(out), hint="choose another `out`, or `force=True` to replace it"
+                ) from None
+            raise
+        return
+    # Nobody sweeps this name.  If the process is killed between the two renames, the user finds the old result there.
+    old = out.with_name(f"{out.name}.old-{secrets.token_hex(4)}")
+    os.rename(out, old)
+    try:
+        # Check again, because nobody else writes there any more.
+        if any(old.iterdir()):
+            _check_ours(old, kind)
+        os.rename(beside, out)
+    except BaseException:
+        os.rename(old, out)
+        raise
+    swept = out.with_name(f"{SCRATCH}{secrets.token_hex(4)}")
+    os.rename(old, swept)
+    remove_scratch(swept)
+
+
+@contextmanager
+def parents_of(out: Path) -> Iterator[None]:
+    """Make the folders above ``out``, and remove those that stay empty."""
+    missing = [folder for folder in out.parents if not folder.exists()]
+
+    def remove() -> None:
+        for folder in missing:
+            with suppress(OSError):
+                folder.rmdir()
+
+    with undone(remove):
+        try:
+            for folder in reversed(missing):
+                folder.mkdir(exist_ok=True)
+        except OSError as error:
+            raise OutputError(
+                f"cannot be made ({error.strerror})", where=str(error.filename), hint="choose another `out`"
+            ) from None
+        yield

@@ -1,0 +1,123 @@
+"""The C compiler of the user: find it and run it."""
+
+from __future__ import annotations
+
+import os
+import shlex
+import shutil
+import signal
+import subprocess
+from collections.abc import Sequence
+from contextlib import suppress
+from pathlib import Path
+
+from impact_posture.errors import CompilerError
+from impact_posture.system.processes import undone
+
+GET_ONE = "install gcc or clang, or set CC"
+
+# A compiler is several processes.  The shell makes them one group and kills it when the pipe on standard input ends,
+# which happens when this process closes the pipe and when this process is killed.
+_GUARD = (
+    "exec 3<&0 </dev/null; { read -r _ <&3; kill -KILL 0; } >/dev/null 2>&1 & "
+    '"$@" 3<&-; code=$?; kill -KILL $!; exit $code'
+)
+
+
+def find_compiler() -> list[str] | None:
+    """Return the C compiler as the head of a command: ``$CC`` (with its options), cc, gcc or clang; else ``None``.
+
+    Raises:
+        CompilerError: ``$CC`` has an open quote.
+    """
+    for command in (words_of("CC"), ["cc"], ["gcc"], ["clang"]):
+        if command and shutil.which(command[0]):
+            return command
+    return None
+
+
+def no_compiler(where: str) -> CompilerError:
+    """Build the error for a machine without a C compiler."""
+    return CompilerError("no C compiler found", where=where, hint=GET_ONE)
+
+
+def words_of(variable: str) -> list[str]:
+    """Return the words of an environment variable, split as a shell does.
+
+    Raises:
+        CompilerError: The variable has an open quote.
+    """
+    text = os.environ.get(variable, "")
+    try:
+        return shlex.split(text)
+    except ValueError as error:
+        raise CompilerError(
+            f"{text!r} cannot be split into words ({str(error).lower()})", where=variable, hint="close the quote"
+        ) from None
+
+
+def run_compiler(command: list[str], folder: Path) -> None:
+    """Run one compiler command in ``folder``.
+
+    Raises:
+        CompilerError: The command failed; with the first error line of the compiler.
+    """
+    run_compilers([command], folder)
+
+
+def run_compilers(commands: Sequence[list[str]], folder: Path) -> None:
+    """Run compiler commands in ``folder``, as many at once as there are cores, in this order.
+
+    Raises:
+        CompilerError: A command failed; with the first error line of the first failure.
+    """
+    waiting, running = list(commands), list[tuple[list[str], subprocess.Popen[str]]]()
+    reader, writer = os.pipe()
+
+    def stop() -> None:
+        """Kill every compiler and the processes that it has started."""
+        for _, process in running:
+            with suppress(ProcessLookupError):
+                os.killpg(process.pid, signal.SIGKILL)
+            with suppress(ChildProcessError):
+                os.waitid(os.P_PID, process.pid, os.WEXITED | os.WNOWAIT)
+
+    try:
+        with os.fdopen(reader), os.fdopen(writer, "w"), undone(stop):
+            while waiting or running:
+                while waiting and len(running) < (os.cpu_count() or 1):
+                    command = waiting.pop(0)
+                    running.append((command, _start(command, folder, reader)))
+                command, process = running[0]
+                output = "".join(reversed(process.communicate()))
+                running.pop(0)
+                _check(command, folder, process.returncode, output)
+    finally:
+        for _, process in running:
+            process.communicate()
+
+
+def _start(command: list[str], folder: Path, tied_to: int) -> subprocess.Popen[str]:
+    pipe = subprocess.PIPE
+    # The temporary files of a killed compiler go with the folder of its result.
+    beside = (folder / command[command.index("-o") + 1]).absolute().parent
+    try:
+        return subprocess.Popen(
+            ["sh", "-c", _GUARD, "sh", *command], cwd=folder, stdin=tied_to, stdout=pipe, stderr=pipe, text=True,
+            errors="replace", start_new_session=True, env=os.environ | {"TMPDIR": str(beside)},
+        )  # fmt: skip
+    except OSError as error:
+        raise CompilerError(f"{error.strerror} ({shlex.join(command)})", where="C compiler", hint="set CC") from None
+
+
+def _check(command: list[str], folder: Path, code: int, output: str) -> None:
+    """Refuse a command that failed; ``output`` is its standard error, then its standard output."""
+    if code == 0 and (folder / command[command.index("-o") + 1]).is_file():
+        return
+    lines = [line for line in output.splitlines() if line.strip()]
+    first = next((line for line in lines if "error" in line.lower()), lines[0] if lines else None)
+    raise CompilerError(
+        f"{first or f'it said nothing, exit code {code}'} (command: {shlex.join(command)}, in {folder})",
+        where="the C compiler failed",
+        hint="check the compiler or set CC to another",
+    )

@@ -1,0 +1,1 @@
+"""The reference flow to postures with lower impacts."""

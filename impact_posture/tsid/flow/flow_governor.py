@@ -1,0 +1,115 @@
+"""Changes of the velocity of the reference flow, limited in speed and acceleration, downhill and within limits."""
+
+from __future__ import annotations
+
+import math
+
+import numpy as np
+
+from impact_posture.system.arrays import Array
+from impact_posture.tsid.flow.flow_direction import FlowDirection, FlowOptions
+from impact_posture.tsid.flow.redundancy import Redundancy
+from impact_posture.tsid.flow.zero_moment_point import ZeroMomentPoint
+
+# How often a change of the flow is tried: as it is, and twice without what crosses limits.
+_TIMES = 3
+# Least share of the acceleration with which the flow counts on braking, and its growth with each change.
+_ABLE = 0.1
+# Factor of the time of braking, because the slopes of the limits change on the way.
+_CAUTION = 1.5
+# Largest ratio of the speed of the flow to its step, 1/s.
+_RATE = 4.8
+# Least size of a step that the pace is divided by, rad (m).
+_TINY = 1e-12
+# Time constant with which the reference comes back to contacts and tasks, s.
+_RETURN = 0.1
+
+
+class FlowGovernor:
+    """Velocity of the reference flow on the constraints, and its changes.
+
+    Attributes:
+        flow: ``u`` without the return to the constraints, rad/s (m/s), shape (nv,).
+        returning: Velocity of that return, shape (nv,).
+    """
+
+    def __init__(self, direction: FlowDirection, options: FlowOptions) -> None:
+        """Begin at rest.
+
+        Args:
+            direction: Limits and learned curvature.
+            options: Parameters.
+        """
+        self._direction, self._options, self._able = direction, options, 1.0
+        self.flow, self.returning = np.zeros((2, direction.B.shape[0]))
+
+    def back(self, way: Array, period: float) -> Array:
+        """Change the velocity of the return, which has a way to go, within speed and acceleration; return it."""
+        options, size = self._options, max(float(np.abs(way).max(initial=0.0)), _TINY)
+        # Two fifths of the acceleration stop a speed of sqrt(4/5 a d) on the way d.
+        pace = min(1.0 / _RETURN, math.sqrt(0.8 * options.acceleration / size), options.speed / size)
+        change = pace * way - self.returning
+        largest = max(float(np.abs(change).max(initial=0.0)), _TINY)
+        self.returning += min(options.acceleration * period / largest, 1.0) * change
+        return self.returning
+
+    def stopping(self, flow: Array) -> float:
+        """Return the time in which a flow stops evenly, s, which takes twice the way that braking takes."""
+        return float(np.abs(flow).max()) / self._options.acceleration
+
+    def change(
+        self, space: Redundancy, step: Array, fastest: float, period: float, slope: Array | None, zmp: ZeroMomentPoint
+    ) -> tuple[Array, bool]:
+        """Return the change of the flow towards a step, shape (nv,), and whether it only brakes.
+
+        Each joint turns as fast as it can, and then all stay on the constraints; or all change evenly; or all brake
+        evenly.  The first two count twice more without what crosses limits, and the first, unless it slows down,
+        without what moves the zero moment point too far.  The first change counts from which the
+        flow can stop within the limits by braking evenly, as hard as it lately could.
+
+        Args:
+            space: The redundancy.
+            step: ``δ``, shape (nv,).
+            fastest: Largest speed of an entry, rad/s (m/s).
+            period: Time in which the flow changes, s.
+            slope: ``∇H/H₀``, shape (nv,), of which the flow goes down; none while it may climb.
+            zmp: Bounds of the acceleration beside what is known of it.
+        """
+        options, direction, Z, flow = self._options, self._direction, space.basis, self.flow
+        most = options.acceleration * period
+        # Two fifths of the acceleration stop a speed of √(4/5 a δ) on the step δ.
+        pace = min(math.sqrt(0.8 * options.acceleration / max(np.abs(step).max(), _TINY)), _RATE)
+        away = limited(pace * step, fastest) - flow
+        # Twice the way on which it stops, because the curvature may grow on it.
+        stop = flow * self.stopping(flow)
+        fast = space.project(np.minimum(np.maximum(away, -most), most))
+        for change, keeps in ((fast, True), (away, False)):
+            change = limited(change, most)
+            for again in range(_TIMES):
+                if keeps and float(change @ flow) >= 0:
+                    change = zmp.keep(space, period, change)
+                if again:
+                    change = direction.along(Z, flow, self._braking(change, period), change)
+                if slope is not None:
+                    change = direction.downhill(Z, slope, flow, stop, change)
+                change = limited(change, most)
+                if direction.stops(flow + change, self._braking(change, period)):
+                    return change, False
+        return limited(-flow, most), True
+
+    def take(self, change: Array, part: float) -> Array:
+        """Change the flow by the part of a change that the actuators permit, and return that, shape (nv,)."""
+        self._able = min(max(part, _ABLE), self._able + _ABLE)
+        change = change * part
+        self.flow = self.flow + change
+        return change
+
+    def _braking(self, change: Array, period: float) -> float:
+        """Return the time for which the flow goes on if it changes and then brakes evenly, s."""
+        return _CAUTION * self.stopping(self.flow + change) / 2 / self._able + period
+
+
+def limited(vector: Array, largest: float) -> Array:
+    """Return the vector, shortened so that no entry exceeds ``largest``."""
+    size = float(np.abs(vector).max(initial=0.0))
+    return vector * (largest / size) if size > largest else vector

@@ -1,0 +1,323 @@
+"""Flow of a reference posture to lower impacts, on contacts and tasks, limited in speed and acceleration."""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Callable, Sequence
+
+import numpy as np
+import pinocchio as pin
+
+from impact_posture.errors import MetricError
+from impact_posture.robot.robot import Robot
+from impact_posture.system.arrays import Array
+from impact_posture.tsid.actuators import Actuators
+from impact_posture.tsid.flow.flow_direction import FlowDirection, FlowOptions
+from impact_posture.tsid.flow.flow_governor import FlowGovernor
+from impact_posture.tsid.flow.flow_probes import ProbeDirections
+from impact_posture.tsid.flow.redundancy import Redundancy
+from impact_posture.tsid.flow.static_controls import StaticControls, support_edges
+from impact_posture.tsid.flow.zero_moment_point import ZeroMomentPoint
+from impact_posture.tsid.qp.quadratic_program import stacked_rows
+from impact_posture.tsid.state import State
+from impact_posture.tsid.task_formulation import TaskFormulation
+from impact_posture.tsid.tasks.body_tasks import BaseOrientation, CenterOfMass
+from impact_posture.tsid.tasks.frame_tasks import FramePose, FramePosition
+from impact_posture.tsid.tasks.impact_robust import Gradient
+from impact_posture.tsid.tasks.task import Task
+
+# Step of the differences along the redundancy, rad.
+_STEP = 1e-4
+# Way of the flow that is long enough to learn from, rad (m).
+_MOVED = 1e-6
+# Step below which a posture on the way is reached, or as near as the limits permit, rad (m).
+_REACHED = 0.02
+# Speed below which a flow that is off stands still, rad/s (m/s).
+_STILL = 1e-5
+# Length of a velocity below which the flow has no way to stop on.
+_SLOW = 1e-3
+
+
+class ReferenceFlow:
+    """Saddle-free Newton flow of a reference posture ``q_r`` in the null space of contacts and tasks.
+
+    ``H`` and ``∇H`` are evaluated at ``q_r`` and not at the measured posture, so that noise, tracking errors and the
+    impact itself do not enter.  An update takes as many ticks as :data:`PHASES` has parts.  The controller in C
+    spreads the work of a part over the empty ticks beside it.  All memory is in arrays whose sizes do not change,
+    except for the basis of the redundancy.
+
+    Contacts stay at their places, and tasks of the strict levels and weighted tasks at their targets.  Only the
+    ``led`` tasks (center of mass, base orientation) follow the flow.  Joints that ``robot.toml`` holds do not move.
+
+    Attributes:
+        robot: The robot.
+        q: ``q_r``, shape (nq,).
+        velocity: ``u`` with ``q̇_r = u``, rad/s (m/s), shape (nv,).
+        acceleration: ``u̇``, shape (nv,).
+        value: ``H(q_r)`` at the last update.
+        start: ``H₀``, its value at the reset.
+        on: Whether the flow may move.
+        resting: Whether no step promises a decrease of more than ε, or the flow has moved as long as it may.
+        failed: Whether the last evaluation raised or was not finite.  The flow then brakes.
+        led: Tasks that follow the flow.
+        error: Distance from contacts and tasks at the last update, m and rad, and zeros for held joints.
+        shares: Static controls there, within ±1 where the posture can be held (:class:`StaticControls`).
+    """
+
+    def __init__(
+        self,
+        robot: Robot,
+        gradient: Gradient,
+        formulation: TaskFormulation,
+        actuators: Actuators,
+        options: FlowOptions,
+        path: Sequence[Array] = (),
+    ) -> None:
+        """Size the buffers.
+
+        Args:
+            robot: The robot.
+            gradient: ``q → (H, ∇H)``.
+            formulation: Tasks and contacts.
+            actuators: Rotors and motors.
+            options: Parameters.
+            path: Postures to visit first, each of shape (nq,); the last may be an optimum that was found offline.
+        """
+        self._model, self._gradient, self.options = robot.model, gradient, options
+        self._contacts = formulation.contacts
+        self._state = State(robot, formulation.points)
+        self.led = tuple(t for t in formulation.weighted if isinstance(t, CenterOfMass | BaseOrientation))
+        weighted = [t for t in formulation.weighted if t not in self.led]
+        self._tasks = [task for level in formulation.levels for task in level] + weighted
+        self._base, nv = actuators.base, robot.nv
+        fixed = [robot.tangent_names.index(j) for j in robot.spec.constraints.hold if j in robot.tangent_names]
+        self._places, count = stacked_rows([c.size for c in self._contacts] + [t.size for t in self._tasks])
+        self._J, self.error = np.zeros((count + len(fixed), nv)), np.zeros(count + len(fixed))
+        self._J[np.arange(count, count + len(fixed)), fixed] = 1.0
+        self._static = StaticControls(actuators, self._contacts, options.share)
+        self.q, self.velocity, self.acceleration = robot.posture(), np.zeros(nv), np.zeros(nv)
+        self.robot, self._path = robot, tuple(path)
+        self._aside = ProbeDirections(nv)
+        self._phase, self._elapsed, self.resting = 0, 0.0, False
+
+    def reset(self, q: Array) -> None:
+        """Begin at rest at a posture, shape (nq,), and measure the curvature there.
+
+        Raises:
+            InputError: The robot has feet and a fixed base.
+            MetricError: The gradient does not exist there, or ``H`` vanishes.
+        """
+        state = self._state
+        self._first, self._here = self.q.copy(), self.q.copy()
+        self._wanted, self._slope = np.zeros((2, self.velocity.size))
+        self._before = np.zeros_like(self._J)
+        self.shares = np.zeros(self._static.limited.size)
+        self._visited, self._clock = 0, 0.0
+        self.rest_at(np.inf)
+        self.on, self.failed = False, False
+        self._ahead = False
+        state.update(q, None)
+        kinds = {3: FramePosition, 6: FramePose}
+        self._held: list[Task] = [*(kinds[c.size](c.point) for c in self._contacts), *self._tasks]
+        for task, rows in zip(self._held, self._places, strict=True):
+            task.reset(state)
+            self._J[rows] = task.jacobian(state)
+        self._turning = [(t, self._J[r]) for t, r in zip(self._held, self._places, strict=True) if not t.constant]
+        self._edges, self._offsets = support_edges(state, self._contacts)
+        self._zmp = ZeroMomentPoint(self._edges, self._offsets, state, self._contacts)
+        self.direction = FlowDirection(self.robot, self._edges, self._static.limited.size, self.options)
+        self._governor = FlowGovernor(self.direction, self.options)
+        self._place_at(q)
+        self.start = 1.0
+        self.value, _ = self._evaluate(self.q)
+        if not (np.isfinite(self.value) and self.value != 0):
+            raise MetricError("the objective vanishes or does not exist", where="reset", hint="start elsewhere")
+        self.start = abs(self.value)
+        self._look()
+        self._aside.count = 0
+        for _ in range(self._space.basis.shape[1]):
+            self._probe()
+        self._aside.count = 0
+
+    def advance(self, dt: float, measured: Array) -> None:
+        """Advance by ``dt`` seconds; ``measured`` is the configuration of the robot that follows, shape (nq,)."""
+        self._clock += dt
+        self._elapsed += dt
+        self._measured = measured
+        phase, self._phase = self._phase, (self._phase + 1) % len(PHASES)
+        PHASES[phase](self)
+        self.velocity += dt * self.acceleration
+        self.q[:] = pin.integrate(self._model, self.q, dt * self.velocity)
+        if not self.on and np.abs(self.velocity).max() <= _STILL:
+            self.velocity[:] = self.acceleration[:] = 0.0
+
+    def start_at(self, q: Array) -> None:
+        """Go on from another posture, at rest, with what was learnt."""
+        if not np.array_equal(q, self.q):
+            self._place_at(q)
+
+    def rest_at(self, after: float) -> None:
+        """Come to rest within ``after`` seconds from now, as far as the acceleration permits, and stay.
+
+        The time that the flow may move is counted anew from now.
+        """
+        self._deadline, self._moved, self._remains = self._clock + after, 0.0, np.inf
+
+    @property
+    def moves(self) -> bool:
+        """Whether :meth:`advance` has anything to do."""
+        return self.on or bool(self.velocity.any())
+
+    # ---- the parts of an update, one a tick -----------------------------------------------------------------------
+
+    def _look(self) -> None:
+        """Evaluate objective, constraints and limits, and learn from the way since the last look.
+
+        The motion changes in a later tick.  The look is at where ``q_r`` will be then.
+        """
+        state, direction = self._state, self.direction
+        dt = self._elapsed / _SINCE
+        way = _UNTIL * dt * (self.velocity + (_UNTIL + 1) / 2 * dt * self.acceleration)
+        ahead = pin.integrate(self._model, self.q, way)
+        way, slope, shares = pin.difference(self._model, ahead, self._here), self._slope, self.shares
+        self._place(ahead)
+        self._here[:] = ahead
+        for task, rows in zip(self._held, self._places, strict=True):
+            self.error[rows] = task.error(state)
+        self.value, self._slope = self._evaluate(ahead)
+        self._space = space = Redundancy.of(self._J)
+        self._multipliers = space.inverse.T @ self._slope
+        self._reduced = self._slope - self._J.T @ self._multipliers
+        self.shares = self._static.shares(state, self._J)
+        length = math.sqrt(float(way @ way))
+        # A look that failed has no slope.
+        if length > _MOVED and not self.failed and slope.any():
+            self._compare(way / length, length, slope - self._before.T @ self._multipliers, shares)
+        self._before[:] = self._J
+        rooms = self._offsets
+        if rooms.size:
+            rooms = -rooms - self.options.com_margin - self._edges @ state.center_of_mass()[0][:2]
+        coasting = self._governor.flow * (self.options.speed / self.options.acceleration / 2)
+        direction.limit(state, rooms, self.shares, coasting)
+
+    def _probe(self) -> None:
+        """Evaluate the reduced gradient and the static controls beside the posture of the last look, and learn."""
+        if self.failed or not self._space.basis.shape[1]:
+            return
+        self._ahead = not self._ahead
+        flow = self._governor.flow
+        size = math.sqrt(float(flow @ flow))
+        if self._ahead and size > _SLOW:
+            # Where the flow stops: what it learns there is what it needs to know.
+            z, length = flow / size, max(size * self._governor.stopping(flow), _STEP)
+            self._beside(z, length)
+            return
+        if self._beside(self._aside.next(self._space), _STEP):
+            self._aside.count += 1
+
+    def _beside(self, z: Array, length: float) -> bool:
+        """Learn from the end of a way ``z · length`` from the last look; return whether ``H`` exists there."""
+        q = pin.integrate(self._model, self._here, length * z)
+        _, slope = self._evaluate(q)
+        self._place(q)
+        if not self.failed:
+            reduced = slope - self._J.T @ self._multipliers
+            self._compare(z, length, reduced, self._static.shares(self._state, self._J))
+        return not self.failed
+
+    def _compare(self, z: Array, length: float, reduced: Array, shares: Array) -> None:
+        """Learn from reduced gradient and static controls at the end of a way ``z · length`` from the last look."""
+        self.direction.learn(z, (reduced - self._reduced) / length, (shares - self.shares) / length)
+
+    def _direct(self) -> None:
+        """Find the step, and whether it is worth moving."""
+        self._wanted[:] = 0.0
+        if self.failed:
+            return
+        if self._visited < len(self._path):
+            way, before = pin.difference(self._model, self.q, self._path[self._visited]), self.direction.failures
+            self._wanted[:] = self.direction.towards(self._space.basis, way)
+            self._visited += int(self.direction.failures == before and np.abs(self._wanted).max() < _REACHED)
+            return
+        offset = pin.difference(self._model, self._first, self._here)
+        self._wanted[:] = self.direction.newton(self._space, self._slope, self.value / self.start, offset, self.error)
+        gain, least = self.direction.gain, self.options.epsilon
+        self.resting = gain < (4 * least if self.resting else least) or self._remains <= 0.0
+        if self.resting:
+            # It brakes as it turns, downhill.
+            self._wanted[:] = 0.0
+
+    def _govern(self) -> None:
+        """Limit speed and acceleration, and return to contacts and tasks."""
+        options = self.options
+        period, self._elapsed = self._elapsed, 0.0
+        if not period > 0:
+            # A clock that stands still.
+            return
+        error = np.abs(pin.difference(self._model, self._measured, self.q)[self._base :]).max(initial=0.0)
+        fastest = options.speed * max(1.0 - error / options.tracking, 0.0)
+        if self.on and not self.resting and self._visited == len(self._path):
+            self._moved += period
+        # The speed is that at the next change, and rest comes with the one after, on two fifths of the acceleration.
+        self._remains = min(self._deadline - self._clock, options.duration - self._moved) - 2 * period
+        fastest = min(fastest, 0.4 * options.acceleration * max(self._remains, 0.0))
+        if not self.on:
+            fastest = 0.0
+        governor = self._governor
+        governor.flow = self._space.project(governor.flow)
+        descends = fastest > 0 and self._visited == len(self._path)
+        slope = self._slope if descends else None
+        back = governor.back(self._space.back(self.error, self._base), period)
+        rate = np.zeros(self.error.size)
+        for task, rows in zip(self._held, self._places, strict=True):
+            rate[rows] = task.target_velocity
+        along = self._space.back(rate, self._base) if rate.any() else 0.0
+        known = (governor.flow + back + along - self.velocity) / period
+        self._zmp.limit(self._state, known)
+        change, brakes = governor.change(self._space, self._wanted, fastest, period, slope, self._zmp)
+        # To stop within the limits counts more than to leave the actuators much.
+        most = (1 + options.haste) / 2 if brakes else options.haste
+        part = self._static.permitted(self._state.M, known, change / period, self.shares, most)
+        self.acceleration[:] = known + governor.take(change, part) / period
+
+    def _coast(self) -> None:
+        """Do nothing, because the controller in C spreads the parts over these ticks, so that none takes long."""
+
+    def _place_at(self, q: Array) -> None:
+        """Put ``q_r`` at rest at a posture, where the next update begins."""
+        self.q[:], self._first[:], self._here[:] = q, q, q
+        for moving in self.velocity, self.acceleration, self._governor.flow, self._governor.returning:
+            moving[:] = 0.0
+        self._phase, self._elapsed, self.resting = 0, 0.0, False
+
+    def _place(self, q: Array) -> None:
+        """Evaluate the Jacobian of the constraints at a posture."""
+        state = self._state.update(q, None)
+        for task, J in self._turning:
+            J[:] = task.jacobian(state)
+
+    def _evaluate(self, q: Array) -> tuple[float, Array]:
+        """Return ``H`` and a copy of ``∇H/H₀``, zero where they do not exist."""
+        try:
+            value, gradient = self._gradient(q)
+            found = np.array(gradient, dtype=float) / self.start
+            self.failed = not np.isfinite(found).all()
+        except Exception:
+            # A user's function may raise anything, but the tick must go on.  `failed` reports it.
+            self.failed = True
+        return (np.nan, np.zeros(self.velocity.size)) if self.failed else (float(value), found)
+
+
+PHASES: tuple[Callable[[ReferenceFlow], None], ...] = (
+    ReferenceFlow._look,
+    *3 * (ReferenceFlow._coast,),
+    ReferenceFlow._govern,
+    ReferenceFlow._probe,
+    *5 * (ReferenceFlow._coast,),
+    ReferenceFlow._govern,
+    ReferenceFlow._coast,
+    ReferenceFlow._direct,
+)
+# Ticks from a look to the change of the motion, and those since the last change that the flow has counted at a look.
+_UNTIL = PHASES.index(ReferenceFlow._govern)
+_SINCE = PHASES[::-1].index(ReferenceFlow._govern) + 1

@@ -1,0 +1,139 @@
+"""Posture task whose target flows to a posture with lower impacts."""
+
+from __future__ import annotations
+
+import math
+from typing import Any
+
+import numpy as np
+from numpy.typing import ArrayLike
+
+from impact_posture.codegen.impact_gradient import ImpactGradient
+from impact_posture.config.argument_types import checked_class
+from impact_posture.errors import InputError
+from impact_posture.robot.robot import Robot
+from impact_posture.tsid.actuators import Actuators
+from impact_posture.tsid.flow.flow_direction import FlowOptions
+from impact_posture.tsid.flow.reference_flow import ReferenceFlow
+from impact_posture.tsid.state import State
+from impact_posture.tsid.task_formulation import TaskFormulation
+from impact_posture.tsid.tasks.body_tasks import BodyTaskLead
+from impact_posture.tsid.tasks.impact_robust import Gradient, fitting_gradient
+from impact_posture.tsid.tasks.joint_posture import JointPosture
+
+
+@checked_class
+class ReferenceFlowPosture(JointPosture):
+    """``ν̇* = K_p (q_r ⊖ q) + K_d (u − ν) + u̇``, where ``q_r`` follows the reference flow.
+
+    There is no gain for ``∇H``.  :class:`~impact_posture.tsid.flow.reference_flow.ReferenceFlow` has a speed, an
+    acceleration and a rule when to rest, which are the same for every robot.  Center of mass and base orientation of
+    a standing robot follow ``q_r`` too.  A flow that rests may be taken elsewhere by :meth:`move_to`; the next
+    :meth:`brace` goes on from there.
+
+    Attributes:
+        settle: Time at rest before a known impact, s: four time constants ``1/√K_p``.
+    """
+
+    def __init__(
+        self,
+        robot: Robot,
+        gradient: Gradient | ImpactGradient,
+        *,
+        options: FlowOptions | None = None,
+        path: ArrayLike | None = None,
+        name: str = "flow posture",
+        **gains: Any,
+    ) -> None:
+        """Set gains and options.
+
+        Args:
+            robot: The robot.
+            gradient: ``q → (H, ∇H)``, or a compiled export, whose own objective is then used.
+            options: Parameters of the flow.
+            path: Posture to visit first, shape (nq,), or several, shape (k, nq).  The flow walks to an optimum that
+                was found offline, or along its path, and goes on from there.
+            name: Name in reports.
+            gains: As of :class:`~impact_posture.tsid.tasks.joint_posture.JointPosture`.
+
+        Raises:
+            PostureError: A posture of the path is no configuration of the robot.
+            ManifestMismatch: The export is of another robot.
+        """
+        super().__init__(robot, name=name, **gains)
+        self._function = fitting_gradient(robot, gradient)
+        self.options = options or FlowOptions()
+        visited = np.zeros((0, robot.nq)) if path is None else np.atleast_2d(np.asarray(path, dtype=float))
+        self._path = [robot.check_posture(q, limits=False) for q in visited]
+        self._flow: ReferenceFlow | None = None
+        self._lead = BodyTaskLead(robot.model)
+        slowest = float(self.kp[6 if robot.floating else 0 :].min(initial=np.inf))
+        self.settle = 4.0 / np.sqrt(slowest) if 0 < slowest < np.inf else 0.0
+
+    @property
+    def flow(self) -> ReferenceFlow:
+        """The flow.
+
+        Raises:
+            InputError: No controller with this task has been reset.
+        """
+        if self._flow is None:
+            raise InputError("has no posture to flow from", where=self.name, hint="reset the controller first")
+        return self._flow
+
+    def brace(self, t_impact: float | None = None) -> None:
+        """Let the flow go, for ``duration`` of its options at most, because an impact is coming.
+
+        Args:
+            t_impact: Time until the impact, s.  The flow then rests :attr:`settle` earlier and stays, as far as its
+                acceleration permits.
+
+        Raises:
+            InputError: The time is not finite, or no controller with this task has been reset.
+        """
+        if t_impact is not None and not math.isfinite(t_impact):
+            raise InputError("the time is not finite", where=f"{self.name}: t_impact", hint="give seconds from now")
+        if not self.flow.moves:
+            self.flow.start_at(self._reached())
+        self.flow.on = True
+        self.flow.rest_at(np.inf if t_impact is None else t_impact - self.settle)
+
+    def contact(self) -> None:
+        """Stop the flow and hold what it has reached."""
+        self.flow.on = False
+
+    def release(self) -> None:
+        """Stop the flow and hold what it has reached, as :meth:`contact` does."""
+        self.contact()
+
+    @property
+    def level(self) -> float:
+        """Whether the flow may move: 0 or 1."""
+        return 0.0 if self._flow is None else float(self._flow.on)
+
+    def reset(self, state: State) -> None:
+        """Take the present posture as target, and the present output as that of the tasks that the flow has led."""
+        super().reset(state)
+        self._lead.reset(state)
+
+    def begin(self, state: State, formulation: TaskFormulation, actuators: Actuators) -> None:
+        """Start the flow at a state; the controller calls this at ``reset``.
+
+        Raises:
+            MetricError: The gradient does not exist there, or ``H`` vanishes.
+        """
+        flow = ReferenceFlow(self._robot, self._function, formulation, actuators, self.options, self._path)
+        flow.reset(state.q)
+        self._flow, self.value = flow, flow.value
+
+    def advance(self, state: State, dt: float) -> None:
+        """Advance the flow, and move the targets of the posture and of the tasks that it leads."""
+        super().advance(state, dt)
+        flow = self.flow
+        if not flow.moves:
+            return
+        flow.advance(dt, state.q)
+        self.value = flow.value
+        self.lead(flow.q, flow.velocity, flow.acceleration)
+        if flow.led:
+            self._lead.lead(flow.led, flow.q, flow.velocity, flow.acceleration)

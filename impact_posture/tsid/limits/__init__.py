@@ -1,0 +1,1 @@
+"""Limits of joints and of impacts, as bounds on accelerations."""

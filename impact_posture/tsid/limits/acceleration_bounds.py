@@ -1,0 +1,98 @@
+"""Joint position and velocity limits as bounds on the joint accelerations of one tick."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+
+import numpy as np
+
+from impact_posture.config.argument_types import checked_class
+from impact_posture.errors import InputError
+from impact_posture.robot.robot import Robot
+from impact_posture.system.arrays import Array
+from impact_posture.tsid.joint_ranges import JointRanges
+from impact_posture.tsid.state import State
+
+
+@checked_class
+@dataclass(frozen=True)
+class LimitLaw:
+    """Law that stops joints at their limits.
+
+    A joint at distance ``x`` from a limit may move towards it with at most ``φ(x) = min(approach·x,
+    √(2·deceleration·x), velocity limit)``.  Beyond the limit it must come back with ``φ``.  The acceleration brings
+    the joint to that speed at ``rate``: ``rate·(−φ(q − q_min) − q̇) ≤ q̈ ≤ rate·(φ(q_max − q) − q̇)``.  ``φ`` is odd
+    and increasing, hence the lower bound never exceeds the upper one, inside the limits or outside.
+
+    Attributes:
+        approach: Speed towards a limit per distance, 1/s.
+        rate: Gain of the speed error, 1/s; below ``4·approach`` a joint could swing through its limit.
+        deceleration: Deceleration available for braking, rad/s² (m/s²).
+        acceleration: Largest acceleration of a joint, rad/s² (m/s²); infinite means no bound.
+        margin: Distance kept from the position limits, rad (m); at most a quarter of the joint's range.
+    """
+
+    approach: float = 10.0
+    rate: float = 50.0
+    deceleration: float = 50.0
+    acceleration: float = np.inf
+    margin: float = 0.0
+
+    def __post_init__(self) -> None:
+        """Refuse a law that does not stop the joints."""
+        if not (self.approach > 0 and self.deceleration > 0 and self.acceleration > 0 and self.margin >= 0):
+            raise InputError("a number is not positive", where="limit law", hint="give positive numbers")
+        if not self.rate >= 4 * self.approach:
+            raise InputError(
+                f"rate {self.rate:g} is below four times approach {self.approach:g}",
+                where="limit law",
+                hint="raise rate or lower approach",
+            )
+
+
+class AccelerationBounds:
+    """Bounds that a :class:`LimitLaw` sets at each state.
+
+    Attributes:
+        lower: rad/s² (m/s²), shape (nv,); minus infinity where nothing is limited.
+        upper: As ``lower``.
+    """
+
+    def __init__(self, robot: Robot, law: LimitLaw, lower: Array | None = None, upper: Array | None = None) -> None:
+        """Size the buffers, or take the given ones."""
+        ranges, nv = JointRanges(robot), robot.nv
+        self.law = law
+        self.lower = np.full(nv, -np.inf) if lower is None else lower
+        self.upper = np.full(nv, np.inf) if upper is None else upper
+        self._fastest = ranges.velocity
+        self._size, self._speed, self._signed = np.zeros((3, 2, nv))
+        self._braking, self._margin = np.zeros(nv), np.minimum(law.margin, (ranges.upper - ranges.lower) / 4)
+        self._to_upper, self._to_lower = self._speed
+        self._twice = np.sqrt(2 * law.deceleration)
+        # The base has no limits.
+        self._largest = np.full(nv, law.acceleration)
+        self._largest[: 6 if robot.floating else 0] = np.inf
+
+    def update(self, state: State) -> None:
+        """Move to the present state."""
+        law, size, speed, signed = self.law, self._size, self._speed, state.room
+        if law.margin:
+            signed = np.subtract(signed, self._margin, out=self._signed)
+        inside = state.least_room >= law.margin
+        room = signed if inside else np.abs(signed)
+        np.sqrt(room, out=speed)
+        speed *= self._twice
+        np.multiply(room, law.approach, out=size)
+        np.minimum(speed, size, out=speed)
+        np.minimum(speed, self._fastest, out=speed)
+        if not inside:
+            np.copysign(speed, signed, out=speed)
+        speed *= law.rate
+        np.multiply(state.v, law.rate, out=self._braking)
+        self._to_upper -= self._braking
+        self._to_lower += self._braking
+        if law.acceleration < np.inf:
+            np.minimum(speed, self._largest, out=speed)
+            np.maximum(speed, -self._largest, out=speed)
+        self.upper[:] = self._to_upper
+        np.negative(self._to_lower, out=self.lower)

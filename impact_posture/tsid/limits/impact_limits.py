@@ -1,0 +1,95 @@
+"""Limits of what an impact at the next tick would do to joint rates and torques."""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+
+import numpy as np
+from numpy.typing import ArrayLike
+
+from impact_posture.robot.robot import Robot
+from impact_posture.system.arrays import Array
+from impact_posture.tsid.joint_ranges import JointRanges
+from impact_posture.tsid.point_kinematics import Point
+from impact_posture.tsid.state import State
+from impact_posture.tsid.support_contact import SupportContact
+
+# Singular values of a contact Jacobian that count, relative to the largest.
+_RANK = 1e-6
+
+
+def supported_inverse(state: State, contacts: Sequence[SupportContact]) -> Array:
+    """Return ``M⁻¹``, or ``M⁻¹ − M⁻¹J_sᵀ(J_s M⁻¹J_sᵀ)⁺J_s M⁻¹`` for contacts that stay, shape (nv, nv)."""
+    inverse = np.linalg.inv(state.M)
+    if not contacts:
+        return np.asarray(inverse)
+    held = np.vstack([state.at(c.point).jacobian[: c.size] for c in contacts])
+    back = held @ inverse
+    return np.asarray(inverse - back.T @ np.linalg.pinv(back @ held.T, rcond=_RANK, hermitian=True) @ back)
+
+
+class ImpactLimits:
+    """Limit what an impact at the next tick would do (Wang et al. 2020, impact-aware constraints).
+
+    The impact takes the velocity ``ν⁻ = ν + ν̇ dt`` of the next tick.  With restitution ``e`` and ``M_c⁻¹`` of
+    :func:`supported_inverse`, the contact gets the impulse ``λ = −(1 + e) (J M_c⁻¹Jᵀ)⁻¹ n nᵀJ ν⁻``, and the robot
+    jumps by ``Δν = M_c⁻¹Jᵀ λ``.  Both are linear in ``ν̇``.  For each joint, the limits are
+
+    - ``|q̇⁻ + Δq̇| ≤ q̇_max``, the rate after the impact;
+    - ``|Jᵀλ|/δt ≤ τ_max``, the mean torque while the impact lasts ``δt``.
+
+    A tick can obey them only by a slower approach.  A joint without a stated limit has none here.
+
+    Attributes:
+        active: Whether an impact may come.  Otherwise nothing is limited.
+        restitution: ``e``.
+        duration: ``δt``, s.
+        size: Number of rows.
+        points: Points of the robot whose kinematics the limits read from the state.
+
+    Args:
+        robot: The robot.
+        point: The point that hits.
+        normal: Unit normal out of the surface, world, shape (3,).
+        contacts: Contacts that stay through the impact.
+        period: Time to the next tick ``dt``, s.
+    """
+
+    name = "impact limits"
+    restitution = 0.0
+    duration = 5e-3
+
+    def __init__(
+        self,
+        robot: Robot,
+        point: Point,
+        normal: ArrayLike,
+        contacts: Sequence[SupportContact] = (),
+        period: float = 1e-3,
+    ) -> None:
+        self._first = 6 if robot.floating else 0
+        effort = np.asarray(robot.model.effortLimit, dtype=float)[self._first :]
+        self._torque = np.where(effort > 0, effort, np.inf)
+        self._rate = JointRanges(robot).velocity[self._first :]
+        self._contacts, self._point, self.points = tuple(contacts), point, (point, *(c.point for c in contacts))
+        self._normal, self._period = np.array(normal, dtype=float), period
+        self.size, self.active = 2 * self._rate.size, False
+
+    def jump(self, state: State) -> tuple[Array, Array]:
+        """Return the maps from ``ν⁻`` to ``Δν`` and to the generalized impulse ``Jᵀλ``, shape (nv, nv) each."""
+        J = state.at(self._point).jacobian[:3]
+        spread = supported_inverse(state, self._contacts) @ J.T
+        mass = np.linalg.pinv(J @ spread, rcond=_RANK, hermitian=True)
+        impulse = -(1 + self.restitution) * np.outer(mass @ self._normal, self._normal @ J)
+        return spread @ impulse, J.T @ impulse
+
+    def rows(self, state: State) -> tuple[Array, Array, Array]:
+        """Return the rows for post-impact rates, then for impulsive torques, with their bounds."""
+        nothing = np.full(self.size, np.inf)
+        if not self.active:
+            return np.zeros((self.size, state.nv)), -nothing, nothing
+        jumps, impulses = self.jump(state)
+        A = np.vstack([(np.eye(state.nv) + jumps)[self._first :], impulses[self._first :] / self.duration])
+        now = A @ state.v
+        most = np.concatenate([self._rate, self._torque])
+        return self._period * A, -most - now, most - now

@@ -1,0 +1,146 @@
+"""Kinematics of a few points of the robot, all at once, from the joint Jacobians of Pinocchio."""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from dataclasses import dataclass
+
+import numpy as np
+import pinocchio as pin
+
+from impact_posture.config.argument_types import checked_class
+from impact_posture.robot.robot import Robot
+from impact_posture.system.arrays import Array
+
+# p @ _SHIFT, shape (6, 6), holds -[p]x upper right, which shifts a body's velocity from the origin to p.
+_SHIFT = np.zeros((3, 6, 6))
+_SHIFT[[2, 0, 1], [0, 1, 2], [4, 5, 3]] = 1.0
+_SHIFT[[1, 2, 0], [0, 1, 2], [5, 3, 4]] = -1.0
+_FLAT, _EYE = _SHIFT.reshape(3, 36), np.eye(6).reshape(36)
+
+
+@checked_class
+@dataclass(frozen=True, eq=False)
+class Point:
+    """A point that moves with a frame of the robot.
+
+    Attributes:
+        frame: Name of the frame.
+        offset: Point from the origin of the frame, in the frame, meters.
+    """
+
+    frame: str
+    offset: tuple[float, float, float] = (0.0, 0.0, 0.0)
+
+
+@dataclass(frozen=True, eq=False)
+class PointState:
+    """Kinematics of a point in views on the buffers of the state, which its next update overwrites.
+
+    Attributes:
+        position: World, meters, shape (3,).
+        rotation: Rotation of the frame, world from frame, shape (3, 3).
+        jacobian: Jacobian of the linear and angular velocity of the point, world axes, shape (6, nv).
+        velocity: ``Jν``, shape (6,).
+        drift: ``J̇ν``, shape (6,), the classical and the angular acceleration at ``ν̇ = 0``.
+        spatial_drift: Spatial acceleration ``v̇ − ω × v``, which is the rate of the body twist in world axes.
+    """
+
+    position: Array
+    rotation: Array
+    jacobian: Array
+    velocity: Array
+    drift: Array
+    spatial_drift: Array
+
+
+class PointKinematics:
+    """Position, rotation, Jacobian, velocity and drift of points, in buffers that are allocated once."""
+
+    def __init__(self, robot: Robot, data: pin.Data, points: Sequence[Point]) -> None:
+        """Size the buffers.
+
+        Args:
+            robot: The robot.
+            data: Data on which the caller runs ``pin.computeJointJacobiansTimeVariation`` before each update.
+            points: The points.
+
+        Raises:
+            FrameNotFound: The robot has no such frame; carries the nearest names.
+        """
+        model, nv, count = robot.model, robot.nv, len(points)
+        frames = [model.frames[robot.frame_id(point.frame)] for point in points]
+        # Pinocchio gives vectors for a robot with one degree of freedom.
+        self._J, self._dJ_transposed = data.J.reshape(6, nv), data.dJ.reshape(6, nv).T
+        mask = np.zeros((count, nv))
+        for k, frame in enumerate(frames):
+            for joint in model.supports[frame.parentJoint]:
+                mask[k, model.idx_vs[joint] : model.idx_vs[joint] + model.nvs[joint]] = 1.0
+        self._mask, self._rows_mask = mask, np.repeat(mask, 6, axis=0)
+        self._position, rotation = np.zeros((count, 3)), np.zeros((count, 3, 3))
+        # Views on the same memory in the shapes of the products.
+        self._shift, self._turn = np.zeros((count, 36)), np.zeros((count, 36))
+        self._shift_rows = self._shift.reshape(6 * count, 6)
+        self._shifts, self._turns = self._shift.reshape(count, 6, 6), self._turn.reshape(count, 6, 6)
+        self._jacobian, self._velocity = np.zeros((6 * count, nv)), np.zeros(6 * count)
+        twists = self._velocity.reshape(count, 6)
+        self._linear, self._twists = twists[:, :3], twists[:, :, None]
+        self._masked, world = np.zeros((count, nv)), np.zeros((count, 6))
+        self._world, self._worlds = world, world[:, :, None]
+        self._spatial, self._drift = np.zeros((count, 6)), np.zeros((count, 6))
+        self._spatials, self._drifts = self._spatial[:, :, None], self._drift[:, :, None]
+        self._moving = []
+        for k, (frame, point) in enumerate(zip(frames, points, strict=True)):
+            body, offset, turn = data.oMi[frame.parentJoint], *_fixed(frame, point)
+            self._moving.append((body.rotation, body.translation, offset, turn, self._position[k], rotation[k]))
+        self.points = {
+            point: PointState(
+                self._position[k],
+                rotation[k],
+                self._jacobian[6 * k : 6 * k + 6],
+                self._velocity[6 * k : 6 * k + 6],
+                self._drift[k],
+                self._spatial[k],
+            )
+            for k, point in enumerate(points)
+        }
+
+    def update(self, v: Array | None) -> None:
+        """Move to the configuration of the data and to ν, shape (nv,); ``None`` for zero, which is faster."""
+        if not self._moving:
+            return
+        for R, t, offset, turn, position, rotation in self._moving:
+            if offset is None:
+                position[:] = t
+            else:
+                np.dot(R, offset, out=position)
+                position += t
+            if turn is None:
+                rotation[:] = R
+            else:
+                np.dot(R, turn, out=rotation)
+        # Pinocchio gives J for the body's point at the world origin: v_p = v + ω × p.
+        np.matmul(self._position, _FLAT, out=self._shift)
+        self._shift += _EYE
+        np.matmul(self._shift_rows, self._J, out=self._jacobian)
+        self._jacobian *= self._rows_mask
+        if v is None:
+            for part in (self._velocity, self._spatial, self._drift):
+                part.fill(0.0)
+            return
+        np.matmul(self._jacobian, v, out=self._velocity)
+        np.multiply(self._mask, v, out=self._masked)
+        np.matmul(self._masked, self._dJ_transposed, out=self._world)
+        np.matmul(self._shifts, self._worlds, out=self._spatials)
+        # ω × v_p by the same operator, applied to v_p.
+        np.matmul(self._linear, _FLAT, out=self._turn)
+        np.matmul(self._turns, self._twists, out=self._drifts)
+        self._drift += self._spatial
+
+
+def _fixed(frame: pin.Frame, point: Point) -> tuple[Array | None, Array | None]:
+    """Return offset and rotation on the joint's body; ``None`` for zero and for the identity."""
+    placement = frame.placement
+    offset = placement.act(np.array(point.offset, dtype=float))
+    turn = np.array(placement.rotation)
+    return (offset if np.any(offset) else None), (None if np.array_equal(turn, np.eye(3)) else turn)

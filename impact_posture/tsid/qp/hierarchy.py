@@ -1,0 +1,190 @@
+"""Lexicographic least squares: each level comes as near to its bounds as the levels above permit."""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from dataclasses import dataclass
+
+import daqp
+import numpy as np
+
+from impact_posture.system.arrays import Array
+from impact_posture.tsid.qp.quadratic_program import EQUALITY, INEQUALITY
+
+# Bounds are scaled below this, because the tolerances of DAQP are absolute.
+_LARGEST = 1e4
+# A row that is this near to its bound may be at it, relative to the length of the row times the size of the point.
+# The answer is refined with the first of these that does not make it worse.
+_AT = (1e-9, 1e-8, 1e-7, 1e-6, 1e-5, 1e-4)
+# Rank of rows, relative to the longest.
+_RANK = 1e-9
+
+
+@dataclass(frozen=True, eq=False)
+class Level:
+    """Rows ``lower ≤ A z ≤ upper`` of one level; equal bounds make equations.
+
+    Attributes:
+        A: Shape (k, n).
+        lower: Shape (k,); may be minus infinity.
+        upper: Shape (k,); may be infinity.
+    """
+
+    A: Array
+    lower: Array
+    upper: Array
+
+
+def lexicographic(levels: Sequence[Level], units: Array | float = 1.0) -> Array | None:
+    """Return the ``z`` that violates the first level least, then the second, and so on (least squares).
+
+    DAQP finds which rows are missed and which bounds are met.  With these as equations, the answer is refined to the
+    last digits.
+
+    Args:
+        levels: The levels, the most important first.
+        units: Value of each variable that compares with 1, shape (n,).
+
+    Returns:
+        Shape (n,); ``None`` if the solver gave up.
+    """
+    given = [level for level in levels if level.lower.size]
+    z = _nearest(given)
+    if z is None:
+        return None
+    y, scaled = z / units, [Level(level.A * units, level.lower, level.upper) for level in given]
+    refined = (_refined(scaled, y, at) for at in _AT)
+    best = next((one for one in refined if _no_worse(scaled, one, y)), None)
+    y = _onto(scaled[0], y) if best is None else best
+    missed = next((k for k, level in enumerate(scaled) if k and not _holds(level, y)), 0)
+    if missed:
+        whole = _stacked(scaled[: missed + 1])
+        if _holds(whole, _onto(whole, y)):
+            # DAQP gave up a level that can hold.
+            return lexicographic([_stacked(given[: missed + 1]), *given[missed + 1 :]], units)
+    return np.asarray(units * y)
+
+
+def _stacked(levels: Sequence[Level]) -> Level:
+    """Return one level with the rows of all."""
+    return Level(*(np.concatenate([getattr(level, key) for level in levels]) for key in ("A", "lower", "upper")))
+
+
+def _holds(level: Level, y: Array) -> bool:
+    return bool((np.abs(_violation(level, y)) <= _AT[0] * _size(y) * _lengths(level)).all())
+
+
+def _violation(level: Level, y: Array) -> Array:
+    values = level.A @ y
+    return np.asarray(values - np.clip(values, level.lower, level.upper))
+
+
+def _size(y: Array) -> float:
+    return max(1.0, float(np.max(np.abs(y))))
+
+
+def _lengths(level: Level) -> Array:
+    lengths = np.linalg.norm(level.A, axis=1)
+    return np.where(lengths > 0.0, lengths, 1.0)
+
+
+def _refined(levels: Sequence[Level], y: Array, near: float) -> Array:
+    """Return the answer of the rows that are equations, missed or at a bound at ``y``, level by level.
+
+    A bound that is met holds for all levels: the answer of each of them lies on it.
+    """
+    exact, targets, missed = list[Array](), list[Array](), list[tuple[Array, Array]]()
+    for k, level in enumerate(levels):
+        lengths, values, equal = _lengths(level), level.A @ y, level.lower == level.upper
+        at = near * _size(y) * lengths
+        low, high = values < level.lower + at, values > level.upper - at
+        target = np.where(low, level.lower, level.upper)
+        # What always holds is not missed but by rounding.
+        off = equal | ((low | high) & (np.abs(values - target) > at)) if k else np.zeros_like(equal)
+        met = (equal | low | high) & ~off
+        exact.append(level.A[met] / lengths[met, None])
+        targets.append(target[met] / lengths[met])
+        missed.append((level.A[off], target[off]))
+    free = np.eye(y.size)
+    for A, b in [(np.vstack(exact), np.concatenate(targets)), *missed]:
+        if not b.size or not free.shape[1]:
+            continue
+        U, s, V = np.linalg.svd(A @ free)
+        rank = int((s > _RANK * max(1.0, float(np.linalg.norm(A, 2)))).sum())
+        y = y + free @ (V[:rank].T @ (U[:, :rank].T @ (b - A @ y) / s[:rank]))
+        free = free @ V[rank:].T
+    return y
+
+
+def _no_worse(levels: Sequence[Level], new: Array, old: Array) -> bool:
+    """Whether no level is violated more at ``new``, unless one above it is violated less."""
+    for level in levels:
+        now, before = (float(np.linalg.norm(_violation(level, y))) for y in (new, old))
+        if abs(now - before) > 1e-6 * before + 1e-10 * _size(old) * float(_lengths(level).max()):
+            return now < before
+    return True
+
+
+def _onto(level: Level, y: Array) -> Array:
+    """Return the point nearest to ``y`` at which a level holds; ``y`` itself if the solver finds none."""
+    lengths, size = _lengths(level), _size(y)
+    A = np.ascontiguousarray(level.A / lengths[:, None])
+    high, low = (np.clip((bound / lengths - A @ y) / size, -1e30, 1e30) for bound in (level.upper, level.lower))
+    sense = np.where(level.lower == level.upper, EQUALITY, INEQUALITY).astype(np.int32)
+    way, _, flag, _ = daqp.solve(np.eye(y.size), np.zeros(y.size), A, high, low, sense, primal_tol=1e-12)
+    return y + size * np.asarray(way) if flag > 0 else y
+
+
+def _nearest(given: Sequence[Level]) -> Array | None:
+    """Return the answer of the hierarchical programs of DAQP, which have one for all bounds, to about six digits.
+
+    DAQP measures a violation in units of the row's length.  The equations of a level are therefore rotated among
+    themselves (:func:`balanced`) until all its rows have the same length, which does not change the sum of squares.
+    """
+    blocks = []
+    for level in given:
+        equal, rows, low, high = level.lower == level.upper, level.A, level.lower, level.upper
+        if equal.all():
+            rows, low = balanced(rows, low)
+            high = low
+        blocks.append((rows, low, high, np.where(equal, EQUALITY, INEQUALITY).astype(np.int32)))
+    A, low, high, sense = (np.concatenate(parts) for parts in zip(*blocks, strict=True))
+    bounds = np.abs(np.concatenate([low, high]))
+    scale = max(1.0, float(np.max(bounds, where=np.isfinite(bounds), initial=0.0)) / _LARGEST)
+    ends = np.cumsum([level.lower.size for level in given], dtype=np.int32)
+    z, _, flag, _ = daqp.solve(
+        None,
+        None,
+        np.ascontiguousarray(A),
+        np.clip(high / scale, -1e30, 1e30),
+        np.clip(low / scale, -1e30, 1e30),
+        sense,
+        ends,
+    )
+    z = scale * np.asarray(z)
+    return z if flag > 0 and np.isfinite(z).all() else None
+
+
+def balanced(A: Array, b: Array) -> tuple[Array, Array]:
+    """Return ``QA`` and ``Qb`` with an orthogonal ``Q`` that makes all rows of ``QA`` equally long.
+
+    Each rotation combines the shortest and the longest row and gives the shortest row the mean length
+    (Bendel and Mickey 1978, "Population correlation matrices for sampling experiments").
+
+    Args:
+        A: Shape (k, n).
+        b: Shape (k,).
+    """
+    A, b = A.copy(), b.copy()
+    mean = float(np.sum(A * A)) / max(b.size, 1)
+    for _ in range(b.size - 1):
+        excess = np.sum(A * A, axis=1) - mean
+        i, j = int(excess.argmin()), int(excess.argmax())
+        if not (excess[i] < -1e-12 * mean and excess[j] > 1e-12 * mean):
+            break
+        along = A[i] @ A[j]
+        t = (-along + np.sqrt(along * along - excess[i] * excess[j])) / excess[j]
+        c, s = 1.0 / np.hypot(1.0, t), t / np.hypot(1.0, t)
+        turn = np.array([[c, s], [-s, c]])
+        A[[i, j]], b[[i, j]] = turn @ A[[i, j]], turn @ b[[i, j]]
+    return A, b

@@ -1,0 +1,151 @@
+"""Strict levels of any rank: dependent rows leave the QP of a tick, nearly dependent rows are damped."""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+
+import numpy as np
+from numpy.typing import NDArray
+
+from impact_posture.system.arrays import Array
+from impact_posture.tsid.qp.quadratic_program import EQUALITY, INEQUALITY, QP
+from impact_posture.tsid.smooth_step import smooth
+
+# Singular value of a level's rows, over the length of its longest row, below which a direction is damped.  The
+# shipped robots stay above 0.03 in their postures.
+SINGULAR = 2e-2
+# Share of SINGULAR below which a direction is dropped: far above rounding, far below a visible effect.
+_NOTHING = 1e-9
+# Least 1 − α, which keeps the weight of a damped row within the digits of the solver.
+_LEAST = 1e-8
+
+
+class LevelRank:
+    """Keep the strict levels of a QP independent of each other and of the dynamics.
+
+    A level with rows ``J`` acts in the space that the levels above leave, with the basis ``Z``: ``J Z = U S Vᵀ``.
+    ``Uᵀ`` rotates its rows, which does not change the sum of squares.  Each row then belongs to one singular value
+    ``s``.  With ``x = s/s₀``, where ``s₀`` is :data:`SINGULAR` times the length of the level's longest row:
+
+    - ``x ≥ 1``: the row is an equation.
+    - ``x = 0``: the levels above determine the row, or it contradicts its own level.  It leaves the QP.  The others
+      then give the least-squares answer of the level, which is exact where the rows agree.
+    - Otherwise, the row is damped.  It moves into the cost as ``α/(1 − α) (q·ν̇ − c/s)²`` with ``α = x²(3 − 2x)`` and
+      its direction of motion ``q``, together with ``x (q·ν̇)²``.  Both have the mean weight of the cost.  The row
+      fades from an equation to nothing, so that accelerations are continuous through a singular posture.  They are at
+      most ``3/s₀`` times the row's demand ``c``.  The levels below have ``√(1 − α)`` of the direction.
+
+    The result is a function of the present rows and of their lengths at reset, without hysteresis.  While all rows
+    are independent, the QP is the given one.  This needs no decomposition per tick, because no singular value moves
+    further than the matrix does (Weyl 1912).
+
+    Attributes:
+        qp: The QP to solve.
+        wanted: Right-hand sides of the first rows of ``qp.A``, also of rows that are no equations.
+        units: Value of each variable that compares with an acceleration of 1, shape (n,).
+        changed: Whether the set of equations differs from that before the last :meth:`update`.
+    """
+
+    def __init__(self, qp: QP, always: int, levels: Sequence[slice], accelerations: int, units: Array) -> None:
+        """Size the buffers.
+
+        Args:
+            qp: The given QP in its buffers.
+            always: Number of rows that always hold; they come first.
+            levels: Rows of each level; they follow in order.
+            accelerations: Number of variables in the levels; they come first.
+            units: Value of each variable that compares with an acceleration of 1, shape (n,).
+        """
+        self._given, self._always, self._levels = qp, always, tuple(levels)
+        self._accelerations, self.units = accelerations, units
+        self._count = self._levels[-1].stop if levels else 0
+        self._rows = qp.A[: self._count]
+        self._reference, self._way = np.zeros(self._rows.shape), np.zeros(self._rows.shape)
+        self._flat = self._way.reshape(-1)
+        self._asked = qp.lower[qp.n : qp.n + self._count]
+        self.qp, self.changed, self.wanted = qp, False, self._asked
+        self.reset()
+
+    def reset(self) -> None:
+        """Measure the lengths of the rows again at the next :meth:`update`."""
+        self._begun = False
+
+    def update(self) -> None:
+        """Determine the QP for the present rows."""
+        if not self._count:
+            return
+        if not self._begun:
+            self._begin()
+        way = self._way
+        np.subtract(self._rows, self._reference, out=way)
+        way *= self._scale
+        # Not ">=", which is false for a NaN.
+        if not self._flat.dot(self._flat) < self._room:
+            self._measure()
+        before = self.qp
+        if self._independent:
+            self.qp, self.wanted = self._given, self._asked
+        else:
+            self.qp = self._reduced()
+        self.changed = self.qp is not before and not np.array_equal(self.qp.sense, before.sense)
+
+    def rows(self, rows: slice, equations: bool) -> NDArray[np.intp]:
+        """Return the rows of a level that are equations, or those that are not."""
+        n = self._given.n
+        held = self.qp.sense[n + rows.start : n + rows.stop] == EQUALITY
+        return np.asarray(np.arange(rows.start, rows.stop)[held == equations])
+
+    def _begin(self) -> None:
+        lengths = np.linalg.norm(self._rows * self.units, axis=1)
+        for level in self._levels:
+            lengths[level] = lengths[level].max()
+        lengths[lengths == 0.0] = 1.0
+        self._lengths, self._scale, self._begun = lengths, self.units / lengths[:, None], True
+        self._measure()
+
+    def _measure(self) -> None:
+        """Measure the least singular value of all rows, which bounds those of each level from below."""
+        self._reference[:] = self._rows
+        self._independent, self._room = True, 0.0
+        if np.isfinite(self._rows).all():
+            values = np.linalg.svd(self._rows * self._scale, compute_uv=False)
+            least = float(values[-1]) if self._count <= self._given.n else 0.0
+            self._independent, self._room = least >= SINGULAR, (least - SINGULAR) ** 2
+
+    def _reduced(self) -> QP:
+        given, lengths = self._given, self._lengths
+        n = given.n
+        qp = given.copy()
+        self.wanted = self._asked.copy()
+        Z = np.diag(self.units)
+        if self._always:
+            Z = Z @ np.linalg.svd((self._rows * self._scale)[: self._always])[2][self._always :].T
+        for rows in self._levels:
+            U, s, Vt = np.linalg.svd(given.A[rows] @ Z)
+            qp.A[rows], self.wanted[rows] = U.T @ given.A[rows], U.T @ self.wanted[rows]
+            x = np.zeros(max(U.shape[0], Vt.shape[0]))
+            x[: s.size] = np.minimum(s / (SINGULAR * lengths[rows.start]), 1.0)
+            held = x[: U.shape[0]] == 1.0
+            at = slice(n + rows.start, n + rows.stop)
+            qp.sense[at] = np.where(held, EQUALITY, INEQUALITY)
+            qp.lower[at] = np.where(held, self.wanted[rows], -np.inf)
+            qp.upper[at] = np.where(held, self.wanted[rows], np.inf)
+            alpha = smooth(x)
+            directions = Z @ Vt.T
+            damped = np.flatnonzero((x > _NOTHING) & (x < 1.0))
+            if damped.size:
+                weight = _mean_weight(given.H, Z, self._accelerations)
+                strength = weight * alpha[damped] / np.maximum(1.0 - alpha[damped], _LEAST) / s[damped] ** 2
+                J, c = qp.A[rows][damped], self.wanted[rows][damped]
+                q = np.zeros((n, damped.size))
+                q[: self._accelerations] = directions[: self._accelerations, damped]
+                H = qp.H + (J.T * strength) @ J + (q * (weight * x[damped])) @ q.T
+                qp = QP(H, qp.g - (strength * c) @ J, qp.A, qp.lower, qp.upper, qp.sense)
+            Z = (directions * np.sqrt(1.0 - alpha[: Z.shape[1]]))[:, x[: Z.shape[1]] < 1.0]
+        return qp
+
+
+def _mean_weight(H: Array, Z: Array, count: int) -> float:
+    """Return the mean weight of the cost over the directions ``Z``."""
+    Z = Z[:count]
+    return float(np.sum(Z * (H[:count, :count] @ Z)) / np.sum(Z * Z))

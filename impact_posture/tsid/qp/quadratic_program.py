@@ -1,0 +1,98 @@
+"""A quadratic program in buffers that are sized once."""
+
+from __future__ import annotations
+
+from collections.abc import Iterable
+from dataclasses import dataclass, fields
+from itertools import accumulate, pairwise
+
+import numpy as np
+from numpy.typing import NDArray
+
+from impact_posture.system.arrays import Array
+
+# Codes of DAQP for the types of constraints.
+INEQUALITY, EQUALITY = 0, 5
+
+
+@dataclass(frozen=True, eq=False)
+class QP:
+    """``min ½ zᵀHz + gᵀz`` subject to ``lower ≤ [z; A z] ≤ upper``.
+
+    Attributes:
+        H: Shape (n, n), symmetric positive definite.
+        g: Shape (n,).
+        A: Shape (m, n).
+        lower: Bounds of the n variables, then of the m rows, shape (n + m,).
+        upper: As ``lower``.
+        sense: :data:`INEQUALITY` or :data:`EQUALITY` for each of them, shape (n + m,).
+    """
+
+    H: Array
+    g: Array
+    A: Array
+    lower: Array
+    upper: Array
+    sense: NDArray[np.int32]
+
+    @classmethod
+    def empty(cls, n: int, m: int) -> QP:
+        """Return a program without cost or bounds."""
+        return cls(
+            np.eye(n),
+            np.zeros(n),
+            np.zeros((m, n)),
+            np.full(n + m, -np.inf),
+            np.full(n + m, np.inf),
+            np.zeros(n + m, dtype=np.int32),
+        )
+
+    @property
+    def n(self) -> int:
+        """Number of variables."""
+        return self.g.size
+
+    @property
+    def m(self) -> int:
+        """Number of rows."""
+        return int(self.A.shape[0])
+
+    @property
+    def finite(self) -> bool:
+        """Whether cost and rows are finite and no bound is NaN."""
+        sums = self.H.sum() + self.g.sum() + self.A.sum()
+        return bool(np.isfinite(sums) and not np.isnan(self.lower).any() and not np.isnan(self.upper).any())
+
+    def copy(self) -> QP:
+        """Return a deep copy."""
+        return QP(*(getattr(self, field.name).copy() for field in fields(self)))
+
+    def values(self, z: Array) -> Array:
+        """Return ``[z; A z]``, shape (n + m,)."""
+        return np.concatenate([z, self.A @ z])
+
+    def violation(self, z: Array) -> float:
+        """Return the largest violation of a bound at ``z``."""
+        values = self.values(z)
+        return float(max(np.max(self.lower - values), np.max(values - self.upper), 0.0))
+
+
+@dataclass(frozen=True, eq=False)
+class Solved:
+    """Answer of a solver.
+
+    Attributes:
+        z: Shape (n,).
+        multipliers: Multipliers of the variables' bounds, then of the rows; positive at upper bounds, shape (n + m,).
+        iterations: Number of iterations, as the solver counts them.
+    """
+
+    z: Array
+    multipliers: Array
+    iterations: int
+
+
+def stacked_rows(sizes: Iterable[int]) -> tuple[tuple[slice, ...], int]:
+    """Return the rows of blocks that stand one below the other, and the number of all rows."""
+    ends = list(accumulate(sizes, initial=0))
+    return tuple(slice(start, stop) for start, stop in pairwise(ends)), ends[-1]

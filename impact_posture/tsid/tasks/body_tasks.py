@@ -1,0 +1,145 @@
+"""Tasks of the whole body: tilt and orientation of a floating base, center of mass."""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Sequence
+
+import numpy as np
+import pinocchio as pin
+
+from impact_posture.errors import InputError
+from impact_posture.system.arrays import Array
+from impact_posture.tsid.state import State
+from impact_posture.tsid.tasks.task import TargetTask
+
+
+class _BaseTurn(TargetTask[Array]):
+    """Base of the tasks that turn the base: ``J`` selects rows of ω from ν, in base axes, and ``J̇ν = 0``."""
+
+    constant = True
+
+    def jacobian(self, state: State) -> Array:
+        """Return the rows of the base's ω, shape (size, nv)."""
+        return np.eye(self.size, state.nv, 3)
+
+
+class Tilt(_BaseTurn):
+    """Regulate the reduced attitude of the base, the direction of its z axis; yaw stays free (2 × nv).
+
+    ``e`` holds the x and y components, in base axes, of the shortest rotation that takes the base's z axis to
+    ``target`` (Brescianini and D'Andrea 2018).  ``J`` selects ``ω_x, ω_y`` from ν, hence ``J̇ν = 0``.
+
+    Attributes:
+        target: World unit vector to which the base's z axis is taken, shape (3,); up by default.
+    """
+
+    title, rows = "tilt", 2
+
+    def default_target(self) -> Array:
+        """Return the vertical axis."""
+        return np.array([0.0, 0.0, 1.0])
+
+    def present(self, state: State) -> Array:
+        """Return the base's z axis in the world, shape (3,)."""
+        return state.base_rotation[:, 2].copy()
+
+    def reset(self, state: State) -> None:
+        """Check the length of the target.
+
+        Raises:
+            InputError: The target is no unit vector, or the base is fixed.
+        """
+        super().reset(state)
+        length = float(np.linalg.norm(state.base_rotation.T @ self.required_target()))
+        if not abs(length - 1.0) < 1e-9:
+            raise InputError("the target is no unit vector", where=self.name, hint="normalize it")
+
+    def error(self, state: State) -> Array:
+        """Return angle (rad) times axis."""
+        x, y, z = (state.base_rotation.T @ self.required_target()).tolist()
+        sine = math.hypot(x, y)
+        if sine < 1e-12:
+            # Aligned, or upside down, where rotations about all horizontal axes are equally short.
+            return np.array([0.0 if z > 0 else math.pi, 0.0])
+        scale = math.atan2(sine, z) / sine
+        return np.array([-scale * y, scale * x])
+
+
+class BaseOrientation(_BaseTurn):
+    """Regulate the orientation of the base: ``e = log₃(RᵀR_des)`` in base axes, ``J`` selects ω from ν (3 × nv).
+
+    Attributes:
+        target: ``R_des``, world from base, shape (3, 3); by default, the orientation at ``reset``.
+    """
+
+    title, rows = "base orientation", 3
+
+    def present(self, state: State) -> Array:
+        """Return the present rotation, shape (3, 3)."""
+        return np.array(state.base_rotation)
+
+    def error(self, state: State) -> Array:
+        """Return ``log₃(RᵀR_des)``."""
+        return np.asarray(pin.log3(state.base_rotation.T @ self.required_target()))
+
+
+class CenterOfMass(TargetTask[Array]):
+    """Regulate the world position of the center of mass of a floating robot (3 × nv).
+
+    Attributes:
+        target: Meters, shape (3,); by default, the position at ``reset``.
+    """
+
+    title, rows = "center of mass", 3
+
+    def present(self, state: State) -> Array:
+        """Return the present position, shape (3,)."""
+        return state.center_of_mass()[0]
+
+    def error(self, state: State) -> Array:
+        """Return ``c_des − c``."""
+        return np.asarray(self.required_target() - state.center_of_mass()[0])
+
+    def jacobian(self, state: State) -> Array:
+        """Return ``∂c/∂ν``."""
+        return state.center_of_mass()[1]
+
+    def drift(self, state: State) -> Array:
+        """Return ``J̇ν``."""
+        return state.center_of_mass()[2]
+
+
+class BodyTaskLead:
+    """Sets the targets of body tasks to what they are in a motion.
+
+    Args:
+        model: The robot's model.
+    """
+
+    def __init__(self, model: pin.Model) -> None:
+        self._model, self._data = model, model.createData()
+        self._led: tuple[BaseOrientation | CenterOfMass, ...] = ()
+        # Pinocchio writes here; asking it again takes longer than its computation.
+        data = self._data
+        self._com, self._rotation = (data.com[0], data.vcom[0], data.acom[0]), data.oMi[1].rotation
+
+    def lead(self, tasks: Sequence[BaseOrientation | CenterOfMass], q: Array, v: Array, a: Array) -> None:
+        """Set the targets at ``q``, ``ν`` and ``ν̇``."""
+        self._led = tuple(tasks)
+        pin.centerOfMass(self._model, self._data, q, v, a, False)
+        position, velocity, acceleration = self._com
+        for task in self._led:
+            if isinstance(task, CenterOfMass):
+                task.target = position.copy()
+                task.target_velocity, task.target_acceleration = velocity, acceleration
+            else:
+                task.target = self._rotation.copy()
+                task.target_velocity, task.target_acceleration = v[3:6], a[3:6]
+
+    def reset(self, state: State) -> None:
+        """Let the tasks that were led take their present output as target, at rest."""
+        for task in self._led:
+            task.target, task.target_velocity, task.target_acceleration = None, 0.0, 0.0
+            task.reset(state)
+        self._led = ()

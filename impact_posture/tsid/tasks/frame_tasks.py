@@ -1,0 +1,240 @@
+"""Tasks of a frame: its position, its pose on SE(3), or its position with the direction of an axis."""
+
+from __future__ import annotations
+
+import math
+from abc import abstractmethod
+from dataclasses import dataclass
+from typing import Any
+
+import numpy as np
+import pinocchio as pin
+from numpy.typing import ArrayLike
+
+from impact_posture.config.argument_types import checked_class
+from impact_posture.errors import InputError
+from impact_posture.system.arrays import Array
+from impact_posture.tsid.point_kinematics import Point, PointState
+from impact_posture.tsid.state import State
+from impact_posture.tsid.tasks.task import Target, TargetTask
+
+
+@checked_class
+@dataclass(frozen=True)
+class Impedance:
+    """Apparent inertia by which a measured force accelerates a frame: ``M_d⁻¹ F̂``.
+
+    If a force enters the dynamics but not this law, the controller compensates it and pushes against the wall with a
+    growing force.
+
+    Attributes:
+        mass: Apparent mass, kg.
+        inertia: Apparent rotational inertia, kg·m²; with ``None``, measured moments do not turn the frame.
+    """
+
+    mass: float
+    inertia: float | None = None
+
+    def __post_init__(self) -> None:
+        """Refuse masses that are not positive."""
+        if not self.mass > 0 or (self.inertia is not None and not self.inertia > 0):
+            raise InputError(
+                "apparent mass or inertia is not positive", where="impedance", hint="give positive numbers"
+            )
+
+    def inverse(self) -> Array:
+        """Return the diagonal of ``M_d⁻¹`` for force and moment, shape (6,)."""
+        turn = 0.0 if self.inertia is None else 1.0 / self.inertia
+        return np.array([1.0 / self.mass] * 3 + [turn] * 3)
+
+
+@checked_class
+class FrameTask(TargetTask[Target]):
+    """Base of the tasks of a point that moves with a frame.
+
+    Attributes:
+        target: Target of the point, world; by default, its place at ``reset``.
+        point: The point.
+    """
+
+    def __init__(
+        self,
+        point: Point,
+        *,
+        name: str | None = None,
+        kp: ArrayLike = 100.0,
+        kd: ArrayLike | None = None,
+        weight: ArrayLike = 1.0,
+        impedance: Impedance | None = None,
+    ) -> None:
+        """Set the point and the gains; see :class:`~impact_posture.tsid.tasks.task.Task`.
+
+        Args:
+            point: The point.
+            name: Name in reports.
+            kp: Stiffness, 1/s².
+            kd: Damping, 1/s; critical by default.
+            weight: Weight in the cost of a weighted formulation.
+            impedance: Law by which a measured force accelerates the frame; ``None`` ignores the force.
+
+        Raises:
+            InputError: A gain or weight is negative, is not finite, or has another shape.
+        """
+        super().__init__(name=name or f"{point.frame} {self.title}", kp=kp, kd=kd, weight=weight)
+        self.point, self.points = point, (point,)
+        self._soften = None if impedance is None else impedance.inverse()
+
+    @abstractmethod
+    def select(self, here: PointState, six: Array) -> Array:
+        """Select the task's rows of a linear and an angular part in world axes, shape (6,) or (6, nv)."""
+
+    def jacobian(self, state: State) -> Array:
+        """Return the task's rows of the point's Jacobian."""
+        here = state.at(self.point)
+        return self.select(here, here.jacobian)
+
+    def drift(self, state: State) -> Array:
+        """Return the task's rows of the point's acceleration at ``ν̇ = 0``."""
+        here = state.at(self.point)
+        return self.select(here, here.drift)
+
+    def feedforward(self, state: State) -> Array | None:
+        """Return ``M_d⁻¹ F̂`` if there are an impedance and a measured force."""
+        if self._soften is None or not state.pushed:
+            return None
+        return self.select(state.at(self.point), self._soften * state.force)
+
+
+class FramePosition(FrameTask[Array]):
+    """Regulate the world position of a point: ``e = p_des − p``, ``J`` is its linear Jacobian (3 × nv).
+
+    Attributes:
+        target: ``p_des``, world, meters, shape (3,); by default, the position at ``reset``.
+    """
+
+    title, rows = "position", 3
+
+    def present(self, state: State) -> Array:
+        """Return the present position, shape (3,)."""
+        return state.at(self.point).position.copy()
+
+    def error(self, state: State) -> Array:
+        """Return ``p_des − p``."""
+        return np.asarray(self.required_target() - state.at(self.point).position)
+
+    def select(self, here: PointState, six: Array) -> Array:
+        """Select the linear rows."""
+        return six[:3]
+
+
+class FramePose(FrameTask[pin.SE3]):
+    """Regulate the pose of a frame at one of its points: ``e = log₆(T⁻¹ T_des)`` in world axes (6 × nv).
+
+    The twist is the twist of the frame at the point in world axes.  ``ẏ`` is the frame's body twist, also turned
+    into world axes.  With an impedance, the law is ``M_d(ÿ − ÿ_des) + … = F̂``.
+
+    Attributes:
+        target: ``T_des``, world from frame, with its origin at the point; by default, the pose at ``reset``.
+    """
+
+    title, rows = "pose", 6
+
+    def present(self, state: State) -> pin.SE3:
+        """Return the present pose."""
+        return placement(state.at(self.point))
+
+    def error(self, state: State) -> Array:
+        """Return ``log₆`` of the way to the target, linear part first, in world axes; a fresh array."""
+        here, error = state.at(self.point), np.empty(6)
+        way = pin.log6(placement(here).actInv(self.required_target()))
+        # One product turns the linear and the angular part, which are the rows of a matrix.
+        np.matmul(way.vector.reshape(2, 3), here.rotation.T, out=error.reshape(2, 3))
+        return error
+
+    def drift(self, state: State) -> Array:
+        """Return the spatial acceleration at the point at ``ν̇ = 0``: the classical acceleration minus ``ω × v``."""
+        return state.at(self.point).spatial_drift
+
+    def select(self, here: PointState, six: Array) -> Array:
+        """Select all rows."""
+        return six
+
+
+@checked_class
+class FrameAligned(FrameTask[pin.SE3]):
+    """Regulate the world position of a point and the direction of an axis; spin about the axis is free (5 × nv).
+
+    The first three rows are those of :class:`FramePosition`.  The other two are the shortest rotation that takes the
+    axis to its target direction, along two directions of the frame that are orthogonal to the axis.  ``J`` selects
+    the same two components of the frame's angular velocity.
+
+    Attributes:
+        target: ``T_des``, world from frame, with its origin at the point; by default, the pose at ``reset``.
+    """
+
+    title, rows = "axis", 5
+
+    def __init__(self, point: Point, axis: ArrayLike = (0.0, 0.0, 1.0), **gains: Any) -> None:
+        """Set the axis, in the frame and of any length.
+
+        Args:
+            point: The point.
+            axis: The axis.
+            gains: As of :class:`FrameTask`.
+
+        Raises:
+            InputError: The axis has no direction, or a gain is invalid.
+        """
+        super().__init__(point, **gains)
+        self._axis = np.array(axis, dtype=float)
+        length = float(np.linalg.norm(self._axis))
+        if self._axis.shape != (3,) or not 0 < length < math.inf:
+            raise InputError("the axis has no direction", where=self.name, hint="give three numbers, not all zero")
+        self._axis /= length
+        # The last two right singular vectors of a row vector are orthogonal to it.
+        self._across = np.linalg.svd(self._axis[None])[2][1:]
+
+    def present(self, state: State) -> pin.SE3:
+        """Return the present pose."""
+        return placement(state.at(self.point))
+
+    def error(self, state: State) -> Array:
+        """Return ``p_des − p``, then angle (rad) times axis of the shortest rotation."""
+        here, target = state.at(self.point), self.required_target()
+        wanted = here.rotation.T @ (target.rotation @ self._axis)
+        turn = self._across @ np.cross(self._axis, wanted)
+        sine, cosine = math.hypot(*turn), float(self._axis @ wanted)
+        if sine >= 1e-12:
+            turn *= math.atan2(sine, cosine) / sine
+        elif cosine < 0:
+            # The axis points the opposite way, and rotations about all orthogonal axes are equally short.
+            turn[0] = math.pi
+        return np.concatenate([target.translation - here.position, turn])
+
+    def select(self, here: PointState, six: Array) -> Array:
+        """Select the linear rows and the angular part across the axis; ``d(Rᵀω)/dt = Rᵀω̇``."""
+        return np.concatenate([six[:3], self._across @ (here.rotation.T @ six[3:])])
+
+
+EndEffector = FramePose | FramePosition | FrameAligned
+
+
+def pose_task(point: Point, pose: str, axis: Array | None, **options: Any) -> EndEffector:
+    """Return the task that holds of a point what a pose mode holds.
+
+    Args:
+        point: The point.
+        pose: The pose mode.  ``box`` holds the position, as ``position`` does.
+        axis: Unit vector of ``aligned`` in the axes of the frame, shape (3,); without one, it is the whole pose.
+        options: Gains, weight and name of the task.
+    """
+    if pose in ("position", "box"):
+        return FramePosition(point, **options)
+    if pose == "aligned" and axis is not None:
+        return FrameAligned(point, axis, **options)
+    return FramePose(point, **options)
+
+
+def placement(point: PointState) -> pin.SE3:
+    """Return the world placement of a point with the rotation of its frame."""
+    return pin.SE3(point.rotation, point.position)

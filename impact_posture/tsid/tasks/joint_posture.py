@@ -1,0 +1,164 @@
+"""The posture task on the configuration manifold."""
+
+from __future__ import annotations
+
+import numpy as np
+import pinocchio as pin
+from numpy.typing import ArrayLike
+
+from impact_posture.config.argument_types import checked, checked_class
+from impact_posture.errors import InputError
+from impact_posture.robot.robot import Robot
+from impact_posture.system.arrays import Array
+from impact_posture.tsid.smooth_step import smooth
+from impact_posture.tsid.state import State
+from impact_posture.tsid.tasks.task import Task, gain
+
+
+@checked_class
+class JointPosture(Task):
+    """Regulate the posture by ``ν̇* = K_p (q_des ⊖ q) − K_d ν`` (Afifi et al. 2026, nominal posture).
+
+    ``⊖`` is the difference on the manifold, in the tangent space at ``q``, and includes the base.  If other tasks
+    lead the base, give its six entries no weight (``base_weight = 0``).
+
+    A new ``q_des`` is faded in (:meth:`move_to`), hence ``ν̇*`` does not jump.
+
+    Attributes:
+        value: Objective at the last evaluation, if the task has one; else NaN.
+        stiffness: Matrix ``K_p`` of :meth:`stiffen`, 1/s², shape (nv, nv), or ``None``.
+        damping: Matrix ``K_d`` that belongs to it, 1/s, shape (nv, nv), or ``None``.
+    """
+
+    constant = True
+    value = float("nan")
+
+    def __init__(
+        self,
+        robot: Robot,
+        target: ArrayLike | None = None,
+        *,
+        name: str = "posture",
+        kp: ArrayLike = 10.0,
+        kd: ArrayLike | None = None,
+        weight: ArrayLike = 1.0,
+        base_weight: float | None = None,
+    ) -> None:
+        """Set gains and target.
+
+        Args:
+            robot: The robot.
+            target: ``q_des``, shape (nq,); the posture at ``reset`` by default.
+            name: Name in reports.
+            kp: Stiffness, 1/s², one number or (nv,).
+            kd: Damping, 1/s; critical by default.
+            weight: Weight in the cost, one number or (nv,).
+            base_weight: Weight of the six base entries, if it differs.
+
+        Raises:
+            PostureError: The target is no configuration of the robot.
+            InputError: A gain or weight is negative, is not finite, or has another shape.
+        """
+        super().__init__(name, robot.nv, kp=kp, kd=kd, weight=weight)
+        if base_weight is not None and robot.floating:
+            self.weight[:6] = gain(base_weight, 1, f"{name}: base_weight")
+        self._model, self._robot = robot.model, robot
+        self._given = None if target is None else robot.check_posture(np.asarray(target), limits=False)
+        self._target = robot.posture() if self._given is None else self._given.copy()
+        self._next, self._blend, self._over = self._target.copy(), 1.0, 1.0
+        self._eye = np.eye(robot.nv)
+        self.stiffness: Array | None = None
+        self.damping: Array | None = None
+
+    def stiffen(self, added: Array) -> None:
+        """Use ``K = K_p + added`` and the critical ``D = 2 K^½`` as gains from now on.
+
+        Args:
+            added: Symmetric positive semidefinite stiffness, 1/s², shape (nv, nv).
+        """
+        self.stiffness = np.diag(self.kp) + added
+        values, vectors = np.linalg.eigh(self.stiffness)
+        self.damping = (vectors * (2 * np.sqrt(np.maximum(values, 0.0)))) @ vectors.T
+
+    @property
+    def target(self) -> Array:
+        """``q_des``, shape (nq,); during a fade, the new one.  Change it by :meth:`move_to`."""
+        return self._next if self._blend < 1 else self._target
+
+    @property
+    def level(self) -> float:
+        """Level at which the task prepares for an impact, 0 to 1; this one does not."""
+        return 0.0
+
+    def reset(self, state: State) -> None:
+        """Take the target of the constructor, or the present posture if there is none, at rest."""
+        self.lead(state.q if self._given is None else self._given, 0.0, 0.0)
+
+    @checked
+    def move_to(self, target: ArrayLike, over: float = 0.5) -> None:
+        """Fade ``q_des`` to another posture within ``over`` seconds.
+
+        A running fade stops where it is, and the new one starts there.
+
+        Raises:
+            PostureError: The target is no configuration of the robot.
+            InputError: The time is not positive.
+        """
+        if not over > 0:
+            raise InputError("the time is not positive", where=self.name, hint="give seconds above zero")
+        self._fade_to(self._robot.check_posture(np.asarray(target), limits=False), over)
+
+    def lead(self, q: Array, v: Array | float, a: Array | float) -> None:
+        """Set ``q_des`` with its velocity and acceleration in the tangent space, without checks.
+
+        They stay until the next call, :meth:`move_to` or ``reset``.
+        """
+        self._target[:], self._blend = q, 1.0
+        self._velocity[:], self._acceleration[:] = v, a
+
+    def advance(self, state: State, dt: float) -> None:
+        """Advance a fade by ``dt`` seconds."""
+        if self._blend < 1:
+            self._blend += dt / self._over
+            if self._blend >= 1:
+                self._target[:], self._blend = self._next, 1.0
+
+    def error(self, state: State) -> Array:
+        """Return ``q_des ⊖ q``, shape (nv,)."""
+        error = np.asarray(pin.difference(self._model, state.q, self._target))
+        if self._blend < 1:
+            share = smooth(self._blend)
+            ahead = pin.difference(self._model, state.q, self._next)
+            error = (1 - share) * error + share * ahead
+        return error
+
+    def jacobian(self, state: State) -> Array:
+        """Return the identity."""
+        return self._eye
+
+    def pull(self, state: State) -> Array:
+        """Return ``K_p (q_des ⊖ q)``, shape (nv,); a fresh array."""
+        error = self.error(state)
+        return np.asarray(self.kp * error if self.stiffness is None else self.stiffness @ error)
+
+    def desired(self, state: State) -> Array:
+        """Return ``ν̇*``, shape (nv,), without the product of ``J``, which is the identity."""
+        wanted = self.pull(state)
+        wanted += self._acceleration
+        slow = self._velocity - state.v
+        wanted += self.kd * slow if self.damping is None else self.damping @ slow
+        more = self.feedforward(state)
+        if more is not None:
+            wanted += more
+        return wanted
+
+    def _fade_to(self, target: Array, over: float) -> None:
+        """Fade to a valid configuration without checks, because a tick must not raise."""
+        self.lead(self._reached(), 0.0, 0.0)
+        self._next[:], self._blend, self._over = target, 0.0, over
+
+    def _reached(self) -> Array:
+        """Return where a fade is, or ``q_des``, shape (nq,)."""
+        if self._blend < 1:
+            return np.asarray(pin.interpolate(self._model, self._target, self._next, smooth(self._blend)))
+        return self._target

@@ -1,0 +1,246 @@
+"""Base classes of tasks: a task defines an error and a Jacobian, and everything else is derived here."""
+
+from __future__ import annotations
+
+from abc import ABC, abstractmethod
+from collections.abc import Sequence
+from typing import Generic, TypeVar
+
+import numpy as np
+from numpy.typing import ArrayLike
+
+from impact_posture.config.argument_types import checked_class
+from impact_posture.errors import InputError
+from impact_posture.system.arrays import Array
+from impact_posture.tsid.point_kinematics import Point
+from impact_posture.tsid.qp.quadratic_program import stacked_rows
+from impact_posture.tsid.state import State
+
+Target = TypeVar("Target")
+
+# Time step of central differences along the motion, s.  Truncation and rounding stay far below a tick's tolerance.
+_STEP = 1e-4
+
+
+@checked_class
+class Task(ABC):
+    """Accelerate an output ``y(q)`` with ``ÿ* = ÿ_des + K_p e + K_d (ẏ_des − Jν)``.
+
+    A task defines two methods, :meth:`error` and :meth:`jacobian`.  By default, :meth:`drift` computes ``J̇ν`` by
+    central differences of the Jacobian along the motion, which costs two more evaluations of the kinematics.
+    Override it to save them.  A controller reads gains and weights at ``reset``, and targets at every tick.
+
+    Attributes:
+        name: Name in reports.
+        size: Number of rows k.
+        points: Points of the robot whose kinematics the task reads from the state.
+        kp: Stiffness, 1/s², shape (k,).
+        kd: Damping, 1/s, shape (k,).
+        weight: Weight in the cost of a weighted formulation, shape (k,).
+    """
+
+    points: Sequence[Point] = ()
+    constant = False
+    """Whether ``J`` never changes and ``J̇ν`` is zero.  A stack then evaluates ``J`` only once."""
+
+    def __init__(
+        self, name: str, size: int, *, kp: ArrayLike = 0.0, kd: ArrayLike | None = None, weight: ArrayLike = 1.0
+    ) -> None:
+        """Set gains and weight; each is one number, or one number per row.
+
+        Args:
+            name: Name in reports.
+            size: Number of rows k.
+            kp: Stiffness, 1/s².
+            kd: Damping, 1/s; critical damping ``2√kp`` by default.
+            weight: Weight in the cost of a weighted formulation.
+
+        Raises:
+            InputError: A gain or weight is negative, is not finite, or has another shape.
+        """
+        self.name, self.size = name, size
+        self.kp = gain(kp, size, f"{name}: kp")
+        self.kd = 2.0 * np.sqrt(self.kp) if kd is None else gain(kd, size, f"{name}: kd")
+        self.weight = gain(weight, size, f"{name}: weight")
+        self._velocity, self._acceleration = np.zeros(size), np.zeros(size)
+
+    @abstractmethod
+    def error(self, state: State) -> Array:
+        """Return ``e``, shape (k,): the way from ``y`` to its target, so that ``ė = ẏ_des − Jν`` to first order."""
+
+    @abstractmethod
+    def jacobian(self, state: State) -> Array:
+        """Return ``J`` with ``ẏ = Jν``, shape (k, nv)."""
+
+    def drift(self, state: State) -> Array:
+        """Return ``J̇ν``, shape (k,)."""
+        if self.constant:
+            return np.zeros(self.size)
+        ahead = np.array(self.jacobian(state.displaced(_STEP)))
+        behind = np.array(self.jacobian(state.displaced(-_STEP)))
+        return np.asarray((ahead - behind) @ state.v / (2 * _STEP))
+
+    def feedforward(self, state: State) -> Array | None:
+        """Return a term that is added to ``ÿ*``, shape (k,); ``None`` by default."""
+        return None
+
+    @property
+    def target_velocity(self) -> Array:
+        """``ẏ_des``, shape (k,); zero unless set."""
+        return self._velocity
+
+    @target_velocity.setter
+    def target_velocity(self, value: ArrayLike) -> None:
+        self._velocity[:] = value
+
+    @property
+    def target_acceleration(self) -> Array:
+        """``ÿ_des``, shape (k,); zero unless set."""
+        return self._acceleration
+
+    @target_acceleration.setter
+    def target_acceleration(self, value: ArrayLike) -> None:
+        self._acceleration[:] = value
+
+    def desired(self, state: State) -> Array:
+        """Return ``ÿ*``, shape (k,)."""
+        wanted = self._acceleration + self.kp * self.error(state)
+        wanted += self.kd * (self._velocity - self.jacobian(state) @ state.v)
+        more = self.feedforward(state)
+        return wanted if more is None else wanted + more
+
+    def reset(self, state: State) -> None:  # noqa: B027 - many tasks have nothing to reset
+        """Start again at ``state``.  A task without a target takes the present output as its target."""
+
+    def advance(self, state: State, dt: float) -> None:  # noqa: B027 - many tasks keep no memory
+        """Advance internal memory, such as ramps, by ``dt`` seconds; does nothing by default."""
+
+    def bind(self, velocity: Array, acceleration: Array) -> None:
+        """Move the targets into the buffers of a stack, so that a tick copies nothing."""
+        velocity[:], acceleration[:] = self._velocity, self._acceleration
+        self._velocity, self._acceleration = velocity, acceleration
+
+
+@checked_class
+class TargetTask(Task, Generic[Target]):
+    """Base of the tasks that lead an output to a target, by default to the output at ``reset``.
+
+    A subclass defines ``title`` and ``rows``, its default name and its size.
+
+    Attributes:
+        target: Target of the output.
+    """
+
+    title: str
+    rows: int
+
+    def __init__(
+        self, *, name: str | None = None, kp: ArrayLike = 100.0, kd: ArrayLike | None = None, weight: ArrayLike = 1.0
+    ) -> None:
+        super().__init__(name or self.title, self.rows, kp=kp, kd=kd, weight=weight)
+        self.target: Target | None = self.default_target()
+
+    def default_target(self) -> Target | None:
+        """Return the target before any ``reset``; ``None`` by default."""
+        return None
+
+    @abstractmethod
+    def present(self, state: State) -> Target:
+        """Return the output at ``state`` as a target that does not change with the state."""
+
+    def reset(self, state: State) -> None:
+        """Take the present output as target, unless a target is set.
+
+        Raises:
+            InputError: The task needs a floating base, and the base is fixed.
+        """
+        if self.target is None:
+            self.target = self.present(state)
+
+    def required_target(self) -> Target:
+        """Return the target.
+
+        Raises:
+            InputError: There is none yet.
+        """
+        if self.target is None:
+            raise InputError("has no target", where=self.name, hint="set `target`, or reset the controller first")
+        return self.target
+
+
+class TaskStack:
+    """Stack tasks to ``J ν̇ = a`` with ``a = ÿ* − J̇ν``, updated once a tick.
+
+    Attributes:
+        tasks: Tasks from top to bottom.
+        rows: Rows of each task.
+        size: Number of all rows.
+        J: Shape (size, nv); may be a view on a larger matrix.
+        a: Shape (size,).
+        weight: Shape (size,).
+    """
+
+    def __init__(self, tasks: Sequence[Task], nv: int, J: Array | None = None) -> None:
+        self.tasks = tuple(tasks)
+        self.rows, self.size = stacked_rows(task.size for task in tasks)
+        self.J = np.zeros((self.size, nv)) if J is None else J
+        self.a, self._e, self._drift, self._work, self._yd, self._ydd = np.zeros((6, self.size))
+        for task, rows in zip(self.tasks, self.rows, strict=True):
+            task.bind(self._yd[rows], self._ydd[rows])
+        # Views that the loop over the tasks writes into, sliced only once.
+        self._parts = [
+            (task, self.J[rows], self._e[rows], self._drift[rows], self.a[rows])
+            for task, rows in zip(self.tasks, self.rows, strict=True)
+        ]
+        self.refresh()
+
+    def refresh(self, state: State | None = None) -> None:
+        """Read gains and weights of the tasks, and evaluate the Jacobians at ``state`` if it is given."""
+        if state is not None:
+            for task, J, *_ in self._parts:
+                J[:] = task.jacobian(state)
+        self.kp, self.kd, self.weight = (
+            np.concatenate([np.zeros(0), *(getattr(task, key) for task in self.tasks)])
+            for key in ("kp", "kd", "weight")
+        )
+
+    def update(self, state: State) -> None:
+        """Evaluate all tasks at ``state``."""
+        if not self._parts:
+            return
+        for task, J, e, drift, _ in self._parts:
+            e[:] = task.error(state)
+            if not task.constant:
+                J[:] = task.jacobian(state)
+                drift[:] = task.drift(state)
+        a, work = self.a, self._work
+        np.matmul(self.J, state.v, out=work)
+        np.subtract(self._yd, work, out=work)
+        work *= self.kd
+        np.multiply(self.kp, self._e, out=a)
+        a += work
+        a += self._ydd
+        a -= self._drift
+        for task, _, _, _, part in self._parts:
+            more = task.feedforward(state)
+            if more is not None:
+                part += more
+
+    def residuals(self, acceleration: Array) -> dict[str, Array]:
+        """Return ``ÿ − ÿ*`` of each task at ``ν̇``, by task name."""
+        left = self.J @ acceleration - self.a
+        return {task.name: left[rows] for task, rows in zip(self.tasks, self.rows, strict=True)}
+
+
+def gain(value: ArrayLike, size: int, where: str) -> Array:
+    """Return one number, or one number per row, as an array of ``size`` finite and non-negative numbers.
+
+    Raises:
+        InputError: The value has another shape, is negative, or is not finite.
+    """
+    given = np.asarray(value, dtype=float)
+    if given.shape not in ((), (size,)):
+        raise InputError(f"has shape {given.shape}", where=where, hint=f"give one number or {size}")
+    if not (np.isfinite(given).all() and (given >= 0).all()):
+        raise InputError("is negative or not finite", where=where, hint="give finite numbers from zero up")
+    return np.array(np.broadcast_to(given, (size,)))

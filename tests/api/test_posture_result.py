@@ -1,0 +1,342 @@
+"""``import impact_posture as ip``: the main job from Python, with the defaults of the command line."""
+
+from __future__ import annotations
+
+import json
+import re
+import subprocess
+import sys
+from dataclasses import replace
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+import pytest
+
+import impact_posture as ip
+from impact_posture.errors import ContactError, InputError, MetricError, OutputError, PostureError, SpecError
+from impact_posture.impact.evaluation.evaluation import Evaluation
+from impact_posture.output import plot
+from impact_posture.posture.formulation.problem_file import prepare
+from impact_posture.system.toolchain import find_compiler
+from tests.api.test_extension import JointDistance
+from tests.support.command import ALL_PICTURES, blank, run
+from tests.support.settings import make_settings
+
+UP = (0.0, 0.0, 1.0)
+WEIGHTED = {"metric": "weighted", "weights": "velocity-limits"}
+
+
+def arm(**more: Any) -> ip.ImpactObjective:
+    return ip.ImpactObjective(ip.load_robot("tilthex_arm"), ip.ImpactContact("ee", normal=(0, 0, 2)), **more)
+
+
+@pytest.fixture(scope="module")
+def result() -> ip.PostureResult:
+    return ip.optimize(ip.PostureProblem(arm(), base="level"), starts=2, jobs=1)
+
+
+def test_every_name_is_there() -> None:
+    assert {"load_robot", "ImpactContact", "ImpactObjective", "PostureProblem", "optimize", "tsid"} <= set(dir(ip))
+    for name in ip.__all__:
+        assert getattr(ip, name) is not None
+    for name in ip.tsid.__all__:
+        assert getattr(ip.tsid, name) is not None
+    for package in (ip, ip.tsid):
+        with pytest.raises(AttributeError, match="nothing"):
+            package.nothing  # noqa: B018
+
+
+def test_the_online_part_loads_no_casadi() -> None:
+    code = (
+        "import sys, impact_posture as ip; ip.load_robot('ur5'); ip.ImpactGradient; "
+        "[getattr(ip.tsid, name) for name in ip.tsid.__all__]; sys.exit('casadi' in sys.modules)"
+    )
+    assert subprocess.run([sys.executable, "-c", code], check=False).returncode == 0
+
+
+def test_objects_check_themselves() -> None:
+    assert ip.ImpactContact("ee", (0, 0, 2)).normal == UP
+    contact = ip.ImpactContact("ee", (0.3, -0.2, 0.7))
+    assert replace(contact, impulse=2.0).normal == contact.normal
+    with pytest.raises(ContactError, match="no direction"):
+        ip.ImpactContact("ee", (0, 0, 0))
+    with pytest.raises(SpecError, match="unknown key 'roots'; did you mean root"):
+        ip.load_robot("ur5", roots="fixed")
+    with pytest.raises(MetricError, match="needs weights"):
+        arm(metric="weighted")
+    with pytest.raises(SpecError, match="unknown key 'basis'"):
+        ip.PostureProblem(arm(), basis="level")
+    with pytest.raises(PostureError):
+        ip.PostureProblem(arm(), posture=[0.0, 1.0])
+    with pytest.raises(InputError, match="no contact"):
+        ip.ImpactObjective(ip.load_robot("ur5"), [])
+
+
+@pytest.mark.parametrize(
+    ("robot", "frame", "settings", "objective"),
+    [
+        ("tilthex_arm", "ee", {}, {}),
+        ("talos", "torso_2_link", {}, {}),
+        ("talos", "torso_2_link", {"support": ()}, {"supports": ()}),
+        ("solo8", "base_link", {"support": ("FL_FOOT",)}, {"supports": ("FL_FOOT",)}),
+        (
+            "panda", "panda_hand_tcp",
+            {"objective": "sticking", "normal_cone": 5.0}, {"kind": "sticking", "normal_cone_deg": 5.0},
+        ),
+        ("ur5", "tool0", WEIGHTED, WEIGHTED),
+        (
+            "tilthex_arm", "ee",
+            {"armature_range": (0.5, 2.0), "payload": (("ee", 0.3),)},
+            {"armature_range": (0.5, 2.0), "payloads": [("ee", 0.3)]},
+        ),
+    ],
+)  # fmt: skip
+def test_defaults_are_those_of_the_command_line(
+    robot: str, frame: str, settings: dict[str, object], objective: dict[str, Any]
+) -> None:
+    theirs = prepare(
+        make_settings(
+            {
+                "robot": robot,
+                "frame": frame,
+                "normal": (0.1, 0.2, 1.0),
+                "collision": True,
+                "holdable": True,
+                **settings,
+            }
+        )
+    )
+    made = ip.ImpactObjective(ip.load_robot(robot), ip.ImpactContact(frame, (0.1, 0.2, 1.0)), **objective)
+    ours = ip.PostureProblem(made)
+    assert ours.prepared is not None
+    assert ours.prepared.impact.to_dict() == theirs.impact.to_dict()
+    assert ours.problem.requirements == theirs.problem.requirements
+    assert ours.describe() == theirs.problem.describe()
+    assert np.array_equal(ours.problem.given, theirs.problem.given)
+
+
+def test_a_robot_that_floats_without_anything_to_hold_it_is_refused() -> None:
+    robot = ip.load_robot("example-robot-data:b1_description/urdf/b1-z1.urdf", root="free-flyer")
+    contact = ip.ImpactContact("link06", (0, 0, 1))
+    with pytest.raises(InputError, match=r"nothing says what holds.*support=\['FL_foot'"):
+        ip.PostureProblem(ip.ImpactObjective(robot, contact))
+    assert ip.PostureProblem(ip.ImpactObjective(robot, contact, supports=())).problem.objective.supports == ()
+
+
+def test_evaluation_has_its_numbers() -> None:
+    objective = arm()
+    found: Evaluation = objective.evaluate(objective.robot.posture(), speed=2.0)
+    assert pytest.approx(objective.value(objective.robot.posture())) == found.H
+    assert found.E is not None and pytest.approx(0.5 / found.G) == found.E
+    assert found.V is not None and found.S is not None and found.speed == 2.0
+
+
+def test_a_result_saves_what_the_command_line_writes(
+    result: ip.PostureResult, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    # The same files, and on them nothing, as the command has them here.
+    for name in ALL_PICTURES:
+        monkeypatch.setitem(plot.FIGURES, name, blank)
+    written = result.save(tmp_path / "python", codegen=False, report=False, jobs=1)
+    options = ("--normal", 0, 0, 2, "--base", "level", "--starts", 2, "--jobs", 1, "--no-codegen", "--out", "cli")
+    done = run("optimize", "tilthex_arm", "--frame", "ee", *options, cwd=tmp_path)
+    assert done.returncode == 0, done.stderr
+    theirs = tmp_path / "cli"
+    assert {p.name for p in written.out.iterdir()} == {p.name for p in theirs.iterdir()}
+    python, cli = (json.loads((folder / "result.json").read_text()) for folder in (written.out, theirs))
+    for document in (python, cli):
+        for key in ("solve_time_s", "build_time_s"):
+            document["solver"].pop(key)
+    assert python == cli
+    toml = [(folder / "problem.toml").read_text().splitlines() for folder in (written.out, theirs)]
+    # How many starts is no part of a problem in Python.
+    assert [a for a, b in zip(*toml, strict=True) if a != b] == ["starts = 16"]
+    assert run("optimize", written.out / "problem.toml", "--out", "again", "--starts", 2, "--no-codegen",
+               cwd=tmp_path).returncode == 0  # fmt: skip
+
+
+def test_a_result_draws_and_exports_itself(result: ip.PostureResult, tmp_path: Path) -> None:
+    assert 0.5 < result.reduction < 1 and result.certificate.stationarity < 1e-6
+    assert result.initial.shape == result.q.shape == (10,)
+    (path,) = result.plot(tmp_path, only=["jump"])
+    assert path.read_bytes().startswith(b"\x89PNG")
+    if find_compiler() is None:
+        pytest.skip("no C compiler")
+    gradient = result.export(tmp_path / "c").load()
+    value, slope = gradient.objective(result.q)
+    assert value == pytest.approx(result.problem.problem.objective.value(result.q), rel=1e-9)
+    for q, n in ((0.1, UP), ([0.1], UP), (result.q, 1.0), (result.q, [1.0]), (result.q[None], UP), (result.q, None)):
+        # Spread over all joints, one number would give an answer.
+        with pytest.raises((TypeError, ValueError)):
+            gradient.value_and_gradient(q, n)
+    robot = result.problem.problem.robot
+    posture = ip.tsid.ImpactRobustPosture(robot, gradient)
+    controller = ip.tsid.Controller(robot, ip.tsid.aerial_formulation(robot, posture))
+    q, v = robot.posture(), np.zeros(robot.nv)
+    controller.reset(q, v)
+    assert controller.tick(0.0, q, v).status is ip.tsid.Status.SOLVED and slope.shape == (robot.nv,)
+
+
+def test_the_code_of_a_result_is_that_of_its_objective(result: ip.PostureResult, tmp_path: Path) -> None:
+    result.save(tmp_path / "out", formats=("png",), report=False, jobs=1)
+    folder = tmp_path / "out" / "c"
+    before = {path.name: path.read_bytes() for path in folder.iterdir()}
+    objective = arm()
+    written = objective.export(folder)
+    apart = objective.export(tmp_path / "apart", build=False)
+    assert sorted(path.name for path in written.files) == sorted(path.name for path in apart.files)
+    assert {path: path.read_bytes() for path in written.files} == {
+        folder / p.name: before[p.name] for p in written.files
+    }
+    assert written.compiled == (find_compiler() is not None) and written.manifest["posture"] == result.q.tolist()
+    if written.compiled:
+        assert written.library is not None and written.library.is_file()
+        value, _ = written.load().objective(result.q)
+        assert value == pytest.approx(objective.value(result.q), rel=1e-9)
+    others = (
+        ip.ImpactObjective(objective.robot, objective.contact, kind="speed"),
+        ip.ImpactObjective(objective.robot, ip.ImpactContact("ee", (0, 1, 0))),
+    )
+    for other in others:
+        with pytest.raises(OutputError, match="`force=True` to replace it"):
+            other.export(folder)
+    portable = objective.export(tmp_path / "portable", portable=True, build=False).out
+    with pytest.raises(OutputError, match="`force=True` to replace it"):
+        objective.export(portable)
+    # What asks for more than the defaults is never taken as it is.
+    with pytest.raises(OutputError, match="choose another `out`"):
+        objective.export(folder, prefix="arm")
+    manifest = folder / "tilthex_arm_ee.json"
+    for text in ("{}", "[]", "[" * 100_000):
+        manifest.write_text(text)
+        with pytest.raises(OutputError, match="exists"):
+            objective.export(folder)
+    manifest.write_bytes(before[manifest.name])
+    (folder / "tilthex_arm_ee.c").unlink()
+    with pytest.raises(OutputError, match="exists"):
+        objective.export(folder)
+
+
+def test_the_entrance_lists_its_names_only() -> None:
+    assert dir(ip) == sorted(ip.__all__) and {"load_robot", "optimize", "PostureProblem", "tsid"} < set(dir(ip))
+
+
+def test_a_trade_off_is_added_to_a_result(result: ip.PostureResult) -> None:
+    curve = result.trade_off(2).tradeoff
+    assert curve is not None and result.tradeoff is None
+    assert "tradeoff" in result.trade_off(2).document
+
+
+def test_an_objective_from_outside_is_optimized_and_cannot_be_saved(tmp_path: Path) -> None:
+    found = ip.optimize(
+        ip.PostureProblem(JointDistance(ip.load_robot("ur5"), (0.3, -1.0, 1.0, 0.2, 0.1, 0.0))), starts=2, jobs=1
+    )
+    assert found.reduction > 0
+    with pytest.raises(InputError, match="not that of an impact"):
+        found.save(tmp_path / "out")
+    assert not (tmp_path / "out").exists()
+
+
+@pytest.mark.parametrize("page", ["README.md", "docs/api/index.md"])
+def test_the_shown_lines_run(page: str, tmp_path: Path) -> None:
+    text = (Path(__file__).parents[2] / page).read_text(encoding="utf-8")
+    blocks = re.findall(r"^```python\n(.*?)^```", text, re.MULTILINE | re.DOTALL)
+    # One figure stands for all: other tests draw them.
+    code = "import impact_posture.output.plot as p; p.drawable = lambda view: ['jump']\n" + "\n".join(blocks)
+    done = subprocess.run([sys.executable, "-c", code], cwd=tmp_path, capture_output=True, text=True, check=False)
+    assert done.returncode == 0, done.stderr
+    assert (tmp_path / "out" / "result.json").is_file() and "Certificate" in done.stdout
+
+
+def test_friction_is_that_of_the_contact_and_is_saved(tmp_path: Path) -> None:
+    robot = ip.load_robot("tilthex_arm")
+    objective = ip.ImpactObjective(robot, ip.ImpactContact("ee", (0, 0, 1), friction=0.3), kind="coulomb")
+    problem = ip.PostureProblem(objective, base="level")
+    ip.optimize(problem, starts=1).save(tmp_path / "out", codegen=False, formats=("png",), report=False)
+    assert "friction = 0.3" in (tmp_path / "out" / "problem.toml").read_text()
+    assert problem.problem.requirements.friction == 0.3
+
+
+@pytest.mark.parametrize(
+    ("arguments", "task", "words"),
+    [
+        ({"joint_model": "foo"}, {}, "joint_model.*reflected"),
+        ({"kind": "auto"}, {}, "kind.*impulse"),
+        ({}, {"friction": 0.1}, "friction.*ImpactContact"),
+        ({}, {"joint_model": "link"}, "joint_model.*ImpactObjective"),
+    ],
+)
+def test_what_the_objective_holds_is_said_there(arguments: dict[str, Any], task: dict[str, Any], words: str) -> None:
+    robot = ip.load_robot("tilthex_arm")
+    with pytest.raises(ip.ImpactPostureError, match=words):
+        ip.PostureProblem(ip.ImpactObjective(robot, ip.ImpactContact("ee", (0, 0, 1)), **arguments), **task)
+
+
+@pytest.mark.parametrize(
+    ("arguments", "words"),
+    [
+        # An unknown metric was taken as euclidean, without a word.
+        ({"metric": "Kinetic"}, "'Kinetic' is none of euclidean.*did you mean kinetic"),
+        ({"metric": None}, "None.*is none of"),
+        ({"metric": "foo", "weights": (1.0,) * 9}, "'foo' is none of"),
+        ({"compliance": -1.0}, "compliance is -1"),
+        ({"compliance": float("nan")}, "compliance is nan"),
+        ({"metric": ip.Metric("weighted", (1.0, 2.0))}, "weights: has 2 entries; give 9"),
+    ],
+)
+def test_arguments_of_an_objective_that_do_not_fit(arguments: dict[str, Any], words: str) -> None:
+    with pytest.raises(InputError, match=words):
+        arm(**arguments)
+
+
+@pytest.mark.parametrize(
+    ("arguments", "words"),
+    [
+        (("foo",), "'foo' is none of"),
+        (("weighted",), "needs weights"),
+        (("kinetic", (1.0,) * 9), "takes no weights"),
+        (("weighted", (1.0, -1.0)), "a weight is -1"),
+        (("weighted", (1.0, float("nan"))), "a weight is nan"),
+    ],
+)
+def test_a_metric_that_is_none(arguments: tuple[Any, ...], words: str) -> None:
+    with pytest.raises(InputError, match=words):
+        ip.Metric(*arguments)
+
+
+def test_a_normal_frame_that_is_none() -> None:
+    with pytest.raises(InputError, match="'body' is none of world, contact"):
+        ip.ImpactContact("ee", (0, 0, 1), normal_frame="body")  # type: ignore[arg-type]
+
+
+@pytest.mark.parametrize("friction", ["0.3", None, -1.0, float("nan")])
+def test_a_friction_that_is_none(friction: Any) -> None:
+    with pytest.raises(ip.ImpactPostureError, match="friction"):
+        ip.ImpactContact("ee", (0, 0, 1), friction=friction)
+
+
+@pytest.mark.parametrize(
+    "arguments",
+    [
+        {"metric": "Kinetic"}, {"metric": "mass"}, {"metric": None}, {"kind": "Speed"}, {"supports": [3]},
+        {"supports": ["root", None]}, {"compliance": -1.0}, {"compliance": float("nan")}, {"others": ["ee"]},
+        {"others": [None]},
+    ],
+)  # fmt: skip
+def test_a_choice_that_is_none_changes_no_answer(arguments: dict[str, Any]) -> None:
+    """The objective would be that of a default otherwise, without a word."""
+    with pytest.raises(ip.ImpactPostureError):
+        arm(**arguments)
+
+
+def test_parts_of_an_objective_check_their_words() -> None:
+    for frame in ("World", "local", None, True):
+        with pytest.raises(InputError, match="normal_frame"):
+            ip.ImpactContact("ee", UP, normal_frame=frame)
+    with pytest.raises(ContactError, match="is no name"):
+        ip.ImpactContact(3, UP)
+    with pytest.raises(InputError, match="none of euclidean"):
+        ip.Metric("mass")
+    with pytest.raises(MetricError, match="needs weights"):
+        ip.Metric("weighted")

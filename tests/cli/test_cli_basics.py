@@ -1,0 +1,346 @@
+"""The installed ``impact-posture``: commands, JSON, exit codes, one-line errors, and how soon it answers."""
+
+from __future__ import annotations
+
+import errno
+import functools
+import json
+import resource
+import subprocess
+import sys
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+import pytest
+
+from impact_posture import __version__
+from impact_posture.errors import Infeasible, SolverFailed
+from impact_posture.robot.robot_loader import known_robots
+from impact_posture_cli import error_boundary as boundary
+from tests.support.command import run as start
+from tests.support.helpers import frame_jacobian, mass_matrix, relative, robot
+
+COMMAND = Path(sys.executable).parent / "impact-posture"
+HEAVY = ("numpy", "casadi", "pinocchio", "matplotlib", "pydantic", "scipy", "yaml")
+INSPECT = ("inspect", "tilthex_arm")
+PUSH = ("evaluate", "tilthex_arm", "--normal", "0", "0", "1")
+
+
+@functools.cache
+def document(*arguments: str) -> dict[str, Any]:
+    """The one JSON document of a run that went well, strictly parsed."""
+
+    def refuse(constant: str) -> None:
+        raise AssertionError(f"{constant} is no JSON")
+
+    done = start(*arguments, "--json")
+    assert (done.returncode, done.stderr) == (0, "")
+    parsed = json.loads(done.stdout, parse_constant=refuse)
+    assert isinstance(parsed, dict)
+    return parsed
+
+
+# ---- what it shows ----------------------------------------------------------------------------------------------
+
+
+def test_help_comes_at_once_and_names_the_commands() -> None:
+    times = []
+    for _ in range(3):
+        before = resource.getrusage(resource.RUSAGE_CHILDREN)
+        done = subprocess.run([str(COMMAND), "--help"], capture_output=True, text=True, timeout=60)
+        after = resource.getrusage(resource.RUSAGE_CHILDREN)
+        # The processor's time: a loaded machine makes a program wait.
+        times.append(after.ru_utime - before.ru_utime + after.ru_stime - before.ru_stime)
+        assert done.returncode == 0
+        if times[-1] < 1.0:
+            break
+    for name in ("robots", "inspect", "evaluate", "optimize", "plot"):
+        assert f" {name} " in done.stdout
+    # The design asks for 0.3 s; processors differ.
+    assert min(times) < 1.0
+
+
+def test_help_imports_nothing_heavy() -> None:
+    code = (
+        "import sys\nfrom impact_posture_cli.main import main\n"
+        "sys.argv = ['impact-posture', '--help']\n"
+        "try:\n    main()\nexcept SystemExit:\n    pass\n"
+        f"sys.stderr.write(' '.join(m for m in {HEAVY} if m in sys.modules))\n"
+    )
+    done = subprocess.run([sys.executable, "-c", code], capture_output=True, text=True, timeout=60)
+    assert "evaluate" in done.stdout
+    assert done.stderr == ""
+
+
+def test_what_others_have_to_do_at_the_end_is_done() -> None:
+    code = (
+        "import atexit, sys\nfrom impact_posture_cli import main, process\n"
+        "begin = process.prepare\n"
+        "def prepare():\n    begin()\n    atexit.register(print, 'the end')\n"
+        "main.prepare = prepare\n"
+        "sys.argv = ['impact-posture', *sys.argv[1:]]\nmain.main()\n"
+    )
+    for argument, expected in (("--version", 0), ("--nonsense", 2)):
+        done = subprocess.run([sys.executable, "-c", code, argument], capture_output=True, text=True, timeout=60)
+        assert (done.returncode, done.stdout.splitlines()[-1]) == (expected, "the end")
+
+
+def test_version() -> None:
+    done = start("--version")
+    assert (done.returncode, done.stdout) == (0, f"impact-posture {__version__}\n")
+
+
+def test_robots() -> None:
+    listed = document("robots")
+    assert [entry["name"] for entry in listed["robots"]] == list(known_robots())
+    assert any("example-robot-data:" in way for way in listed["ways_to_name"])
+    page = start("robots")
+    assert page.returncode == 0 and page.stderr == ""
+    assert all(name in page.stdout for name in known_robots())
+    assert max(len(line) for line in page.stdout.splitlines()) <= 80
+
+
+def test_inspect_has_it_all() -> None:
+    found, loaded = document("inspect", "tilthex_arm"), robot("tilthex_arm")
+    assert [j["name"] for j in found["joints"]] == list(loaded.joint_names)
+    elbow = found["joints"][2]
+    assert (elbow["lower"], elbow["upper"]) == (-2.4, 2.4)
+    assert (elbow["effort"], elbow["armature"]) == (3.0, 0.01)
+    assert found["mass"] == pytest.approx(loaded.mass)
+    assert "ee" in [f["name"] for f in found["frames"] if f["link"]]
+    assert {p["name"] for p in found["postures"]} >= {"home", "tucked"}
+    assert found["contact"]["frame"] == "ee"
+    assert found["actuation"]["rank"] == 6
+    assert all(at["feasible"] for at in found["actuation"]["postures"])
+    assert 0 < found["actuation"]["postures"][0]["lateral_force"]["left"] < 10
+
+
+def test_inspect_pages_fit_the_terminal() -> None:
+    for name in ("panda", "tilthex_arm", "talos"):
+        page = start("inspect", name)
+        assert page.returncode == 0
+        assert ("fixed to the world" in page.stdout) == (name == "panda")
+        assert max(len(line) for line in page.stdout.splitlines()) <= 80
+    assert "left_sole_link (surface)" in page.stdout
+    assert "half_sitting" in page.stdout
+
+
+def test_evaluate_numbers_against_pinocchio() -> None:
+    found = document(*PUSH, "--speed", "0.5", "--restitution", "0.2", "--offset", "0", "0", "0.02")
+    loaded = robot("tilthex_arm")
+    q, n = loaded.posture(), np.array([0.0, 0.0, 1.0])
+    M = mass_matrix(loaded.model, q)
+    J = frame_jacobian(loaded.model, q, loaded.frame_id("ee"), (0, 0, 0.02))[:3]
+    A = np.linalg.inv(M) @ J.T
+    a, G = A @ n, n @ J @ A @ n
+    stuck = A @ np.linalg.inv(J @ A) @ n
+    block = found["evaluation"]
+    H, S = a @ a, stuck @ stuck
+    expected = {"H": H, "G": G, "V": H / G**2, "S": S, "E": 0.5 / G, "effective_mass": 1 / G, "objective": H}
+    for key, value in expected.items():
+        assert block[key] == pytest.approx(value, rel=1e-9), key
+    assert relative(block["jump"]["frictionless"]["velocity"], a * 0.6 / G) < 1e-9
+    assert relative(block["jump"]["sticking"]["velocity"], stuck * 0.6) < 1e-9
+    axes, radii = np.array(block["ellipsoid"]["axes"]), np.array(block["ellipsoid"]["radii"])
+    assert relative(axes @ np.diag(radii**2) @ axes.T, A.T @ A) < 1e-9
+    assert found["posture"] == "home" and found["robot"]["armature"][6:] == [0.01] * 3
+    assert set(found["classical"]) == {"velocity", "force"}
+
+
+def test_evaluate_prints_all_of_it() -> None:
+    page = start("evaluate", "talos", "--frame", "torso_2_link", "--normal", "-1", "0", "0", "--speed", "0.5")
+    assert page.returncode == 0 and page.stderr == ""
+    assert max(len(line) for line in page.stdout.splitlines()) <= 80
+    for words in (
+        "torso_2_link", "-1.000  0.000  0.000", "left_sole_link (surface)", "compliance", "standing", "free", "1/kg",
+        "effective mass", "ellipsoid", "gradient of H", "sticking", "N·s", "rad/s", "dominates H", "SRDF",
+    ):  # fmt: skip
+        assert words in page.stdout, words
+
+
+def test_quiet_leaves_the_result_alone() -> None:
+    arguments = ("evaluate", "hextilt", "--normal", "1", "0", "0")
+    loud, quiet = start(*arguments), start(*arguments, "--quiet")
+    assert loud.stderr.startswith("warning: armature is zero")
+    assert loud.stderr.count("\n") == 1
+    assert (quiet.stderr, quiet.stdout) == ("", loud.stdout)
+
+
+def test_undefined_is_said_and_null() -> None:
+    arguments = ("evaluate", "ur5", "--frame", "upper_arm_link", "--normal", "1", "1", "1", "--objective", "sticking")
+    found = document(*arguments)
+    assert found["evaluation"]["S"] is None and found["evaluation"]["objective"] is None
+    assert any("S is undefined" in line for line in found["warnings"])
+    page = start(*arguments)
+    assert page.returncode == 0 and "undefined" in page.stdout and "S is undefined" in page.stderr
+
+
+def test_options_reach_the_library(tmp_path: Path) -> None:
+    state = tmp_path / "state.yaml"
+    state.write_text("name: [elbow_pitch]\nposition: [0.5]\n")
+    weights = tmp_path / "weights.toml"
+    weights.write_text("elbow_pitch = 0.25\n")
+    found = document(
+        "evaluate", "tilthex_arm", "--contact", "ee:0,0,-1:2", "--normal-frame", "contact", "--posture", str(state),
+        "--metric", "weighted", "--weights", str(weights), "--armature", "elbow_pitch=0.02",
+        "--lock", "shoulder_roll",
+    )  # fmt: skip
+    assert found["robot"]["locked"] == ["shoulder_roll"]
+    assert found["robot"]["armature"][6:] == [0.01, 0.02]
+    assert found["evaluation"]["q"][8] == 0.5
+    assert found["metric"]["weights"] == [1.0] * 7 + [0.25]
+    assert found["contacts"][0]["normal_frame"] == "contact"
+    assert found["evaluation"]["objective"] == pytest.approx(4 * found["evaluation"]["H"])
+
+
+def test_supports_given_taken_away_and_by_default() -> None:
+    push = ("evaluate", "solo8", "--normal", "1", "0", "0")
+    assert len(document(*push)["supports"]) == 4
+    bare = document(*push, "--no-support")
+    assert bare["supports"] == [] and bare["support_compliance"] is None and "free" not in bare["evaluation"]
+    two = document(*push, "--support", "FL_FOOT", "--support", "HR_FOOT:point")
+    assert [s["frame"] for s in two["supports"]] == ["FL_FOOT", "HR_FOOT"]
+    assert two["evaluation"]["free"]["H"] == pytest.approx(bare["evaluation"]["H"], rel=1e-12)
+
+
+# ---- what it refuses --------------------------------------------------------------------------------------------
+
+USAGE = [
+    (("evaluate", "tilthex_arm", "--normal", "0", "0", "0"), "--normal"),
+    (("evaluate", "tilthex_arm", "--normal", "nan", "0", "1"), "--normal"),
+    (("evaluate", "tilthex_arm", "--normal", "0", "1"), "--normal"),
+    (("evaluate", "tilthex_arm"), "Missing option '--normal"),
+    (("evaluate", "tilthex_arm", "--contact", "ee:0,0,0"), "--contact"),
+    ((*PUSH, "--contact", "ee:0,0,1"), "instead of"),
+    ((*PUSH, "--support", "ee", "--no-support"), "--no-support"),
+    ((*PUSH, "--restitution", "1.5"), "--restitution"),
+    ((*PUSH, "--impulse", "0"), "--impulse"),
+    ((*PUSH, "--offset", "0", "inf", "0"), "--offset"),
+    ((*PUSH, "--metric", "manhattan"), "euclidean"),
+    (("optimize", *PUSH[1:], "--target-quaternion", "0", "0", "0", "0"), "norm 0"),
+    (("optimize", *PUSH[1:], "--target-quaternion", "0", "nan", "0", "1"), "norm nan"),
+    (("evalute",), "evalute"),
+]
+
+
+def test_codegen_of_a_folder_without_a_result_says_so(tmp_path: Path) -> None:
+    done = start("codegen", str(tmp_path), "--json")
+    assert done.returncode == 1 and json.loads(done.stdout)["error"]["what"] == "holds no result.json"
+
+
+@pytest.mark.parametrize(("arguments", "words"), USAGE, ids=[" ".join(a) for a, _ in USAGE])
+def test_a_wrong_command_line_is_exit_2(arguments: tuple[str, ...], words: str) -> None:
+    done = start(*arguments, "--json")
+    assert done.returncode == 2
+    assert done.stderr.startswith("Usage: impact-posture") and words in done.stderr
+    error = json.loads(done.stdout)["error"]
+    assert set(error) == {"code", "kind", "what", "where", "hint"}
+    assert error["code"] == 2 and words in error["what"]
+
+
+ERRORS = [
+    (("inspect", "tilthexarm"), "RobotNotFound", "did you mean tilthex_arm"),
+    ((*PUSH, "--frame", "upperarm"), "FrameNotFound", "upper_arm"),
+    ((*INSPECT, "--lock", "elbow"), "JointNotFound", "did you mean elbow_pitch"),
+    ((*INSPECT, "--armature", "shoulder_rol=1"), "JointNotFound", "did you mean shoulder_roll"),
+    ((*PUSH, "--posture", "hom"), "PostureNotFound", "did you mean home"),
+    ((*PUSH, "--posture", "nowhere.json"), "PostureError", "nowhere.json: no such file"),
+    ((*PUSH, "--support", "tipp"), "FrameNotFound", "did you mean tip"),
+    ((*PUSH, "--weights", "velocity-limits"), "MetricError", "add --metric weighted"),
+    (("inspect", "nowhere/arm.urdf"), "UrdfError", "nowhere/arm.urdf: no such file"),
+    (
+        ("inspect", "example-robot-data:panda_description/urdf/pnda.urdf"),
+        "PackageNotFound",
+        "panda_description/urdf/panda.urdf",
+    ),
+]
+
+
+@pytest.mark.parametrize(("arguments", "kind", "words"), ERRORS, ids=[" ".join(a[0][1:]) for a in ERRORS])
+def test_an_error_is_one_line_and_exit_1(arguments: tuple[str, ...], kind: str, words: str) -> None:
+    done = start(*arguments, "--json")
+    assert done.returncode == 1
+    assert done.stderr.startswith("error: ") and done.stderr.count("\n") == 1
+    assert words in done.stderr
+    error = json.loads(done.stdout)["error"]
+    assert (error["code"], error["kind"]) == (1, kind)
+    line = f"{error['where']}: {error['what']}" if error["where"] else error["what"]
+    assert done.stderr == f"error: {line}; {error['hint']}\n"
+
+
+def test_a_package_folder_is_looked_for_where_the_user_is(tmp_path: Path) -> None:
+    (tmp_path / "meshes").mkdir()
+    done = start(*INSPECT, "--package-dir", "mesh", cwd=tmp_path)
+    assert done.returncode == 1 and "did you mean meshes?" in done.stderr and done.stdout == ""
+    assert start(*INSPECT, "--package-dir", "meshes", cwd=tmp_path).returncode == 0
+
+
+@pytest.mark.skipif(not Path("/dev/full").exists(), reason="there is no /dev/full here")
+def test_a_full_disk_is_one_line() -> None:
+    with open("/dev/full", "w") as full:
+        done = subprocess.run([str(COMMAND), "robots"], stdout=full, stderr=subprocess.PIPE, text=True, timeout=60)
+    assert (done.returncode, done.stderr) == (1, "error: No space left on device; free some space\n")
+
+
+def test_a_reader_that_leaves_makes_no_noise() -> None:
+    process = subprocess.Popen(
+        [str(COMMAND), "inspect", "talos", "--json"], stdout=subprocess.PIPE, stderr=subprocess.PIPE, text=True
+    )
+    assert process.stdout is not None and process.stderr is not None
+    process.stdout.close()
+    assert process.stderr.read() == ""
+    process.stderr.close()
+    assert process.wait(timeout=60) == 1
+
+
+# ---- the boundary alone -----------------------------------------------------------------------------------------
+
+
+class Raises:
+    """A command that ends in one way."""
+
+    def __init__(self, error: BaseException) -> None:
+        self.error = error
+
+    def main(self, **_: object) -> None:
+        raise self.error
+
+
+BOUNDARY = [
+    (Infeasible({"elbow": 0.25}), 3, "error: problem: the constraints conflict: elbow (off by 0.25); relax"),
+    (SolverFailed("no start converged", hint="more --starts"), 4, "error: no start converged; more --starts"),
+    (KeyboardInterrupt(), 130, "error: interrupted\n"),
+    (OSError(errno.ENOSPC, "No space left on device", "out"), 1, "error: out: No space left on device; free some"),
+    (PermissionError(errno.EACCES, "Permission denied", "out"), 1, "error: out: Permission denied; check the path"),
+    (ValueError("two\nlines"), 1, "error: internal error: ValueError: two lines; please report it"),
+]
+
+
+@pytest.mark.parametrize(("error", "code", "line"), BOUNDARY, ids=[type(e).__name__ for e, _, _ in BOUNDARY])
+def test_exceptions_become_one_line(
+    error: BaseException, code: int, line: str, capsys: pytest.CaptureFixture[str], monkeypatch: pytest.MonkeyPatch
+) -> None:
+    monkeypatch.delenv(boundary.DEBUG_VARIABLE, raising=False)
+    assert boundary.run(Raises(error), ["optimize", "--json"]) == code
+    out, err = capsys.readouterr()
+    assert err.startswith(line) and err.count("\n") == 1
+    assert json.loads(out)["error"]["code"] == code
+    assert boundary.run(Raises(error), ["optimize"]) == code
+    assert capsys.readouterr().out == ""
+
+
+def test_a_traceback_comes_only_when_asked_for(
+    capsys: pytest.CaptureFixture[str], monkeypatch: pytest.MonkeyPatch
+) -> None:
+    monkeypatch.setenv(boundary.DEBUG_VARIABLE, "1")
+    assert boundary.run(Raises(ValueError("wrong")), []) == 1
+    assert "Traceback" in capsys.readouterr().err
+
+
+def test_a_long_wait_is_estimated_from_the_pace_so_far() -> None:
+    from impact_posture_cli.progress_line import _time_left
+
+    assert _time_left(30.0, 10, 20) == ", 0:01:00 left"
+    # No pace yet, and nothing left.
+    assert [_time_left(1.0, 10, 20), _time_left(30.0, 0, 20), _time_left(30.0, 30, 0)] == ["", "", ""]

@@ -1,0 +1,151 @@
+"""Arguments of a wrong type from Python: one line that names the parameter, from every public function and class."""
+
+from __future__ import annotations
+
+import inspect
+from collections.abc import Callable
+from typing import Any
+
+import numpy as np
+import pytest
+
+import impact_posture as ip
+from impact_posture import tsid
+from impact_posture.config.argument_types import checked
+from impact_posture.errors import InputError
+from impact_posture.posture.search.multistart import PostureSolution
+
+ROBOT = ip.load_robot("tilthex_arm")
+CONTACT = ip.ImpactContact("ee", (0, 0, 1))
+OBJECTIVE = ip.ImpactObjective(ROBOT, CONTACT)
+PROBLEM = ip.PostureProblem(OBJECTIVE, base="level")
+RESULT = ip.PostureResult(PROBLEM, object.__new__(PostureSolution))
+POSTURE = tsid.JointPosture(ROBOT)
+POINT = tsid.Point("ee")
+FORMULATION = tsid.aerial_formulation(ROBOT, POSTURE)
+
+GOOD: list[tuple[Callable[..., Any], dict[str, Any]]] = [
+    (ip.load_robot, {"robot": "ur5"}),
+    (ip.ImpactContact, {"frame": "ee", "normal": (0, 0, 1)}),
+    (ip.Metric, {}),
+    (ip.Support, {"frame": "ee"}),
+    (ip.ImpactObjective, {"robot": ROBOT, "contact": CONTACT}),
+    (OBJECTIVE.evaluate, {"q": ROBOT.posture()}),
+    (OBJECTIVE.export, {"out": "out"}),
+    (ip.PostureProblem, {"objective": OBJECTIVE}),
+    (ip.optimize, {"problem": PROBLEM}),
+    (RESULT.trade_off, {}),
+    (RESULT.path, {}),
+    (RESULT.save, {"out": "out"}),
+    (RESULT.plot, {"out": "out"}),
+    (RESULT.export, {"out": "out"}),
+    *[(getattr(ROBOT, name), {"name": "ee"}) for name in ("frame_id", "joint_id", "posture")],
+    (ROBOT.contact_pose, {"frame": "ee"}),
+    *[(getattr(ROBOT, name), {"q": ROBOT.posture()}) for name in ("check_posture", "check_limits")],
+    (ip.ImpactGradient.load, {"path": "out"}),
+    (ip.CompiledController.load, {"path": "out"}),
+    (ip.export_controller, {"robot": ROBOT, "formulation": FORMULATION}),
+    (ip.sweep.open, {"folder": "out"}),
+    *[(task, {}) for task in (tsid.BaseOrientation, tsid.CenterOfMass, tsid.Tilt)],
+    *[(task, {"point": POINT}) for task in (tsid.FrameAligned, tsid.FramePose, tsid.FramePosition)],
+    (tsid.JointPosture, {"robot": ROBOT}),
+    (POSTURE.move_to, {"target": ROBOT.posture()}),
+    *[
+        (task, {"robot": ROBOT, "gradient": lambda q, n: (0.0, q)})
+        for task in (tsid.ImpactRobustPosture, tsid.ReferenceFlowPosture)
+    ],
+    (tsid.Controller, {"robot": ROBOT, "formulation": FORMULATION}),
+    (tsid.FlowOptions, {}),
+    (tsid.Impedance, {"mass": 1.0}),
+    (tsid.LimitLaw, {}),
+    (tsid.Point, {"frame": "ee"}),
+    (tsid.SupportContact, {"point": POINT}),
+    (tsid.TaskFormulation, {}),
+    *[
+        (made, {"robot": ROBOT, "posture": POSTURE})
+        for made in (tsid.aerial_formulation, tsid.arm_formulation, tsid.legged_formulation)
+    ],
+    (tsid.support_contacts, {"robot": ROBOT}),
+]
+# ReferenceFlow is made by its posture task, and Task, a base, by its subclasses.  The others are results.
+OTHERS = {
+    "Export", "ImpactPostureError", "PostureResult", "Robot", "__version__", "known_robots", "sweep", "tsid",
+    "ImpactGradient", "CompiledController",
+    "Command", "Phase", "ReferenceFlow", "Report", "Status", "Task",
+}  # fmt: skip
+
+
+class Odd:
+    """A value that fits no parameter."""
+
+
+def _parameters() -> list[Any]:
+    found = []
+    for function, good in GOOD:
+        for name, parameter in inspect.signature(function).parameters.items():
+            if parameter.kind is not parameter.VAR_KEYWORD:
+                found.append(pytest.param(function, good, name, id=f"{function.__qualname__}-{name}"))
+    return found
+
+
+def test_every_public_name_is_tried() -> None:
+    tried = {function.__name__ for function, _ in GOOD} | {"sweep"}
+    assert {*ip.__all__, *tsid.__all__} <= tried | OTHERS
+
+
+@pytest.mark.parametrize(("function", "good", "name"), _parameters())
+def test_no_parameter_takes_an_odd_value(function: Callable[..., Any], good: dict[str, Any], name: str) -> None:
+    for odd in (Odd(), [Odd()], {"a": 1}, b"x"):
+        with pytest.raises(ip.ImpactPostureError) as caught:
+            function(**{**good, name: odd})
+        assert "\n" not in caught.value.line
+        assert caught.value.hint
+        assert caught.value.where == name, caught.value.line
+
+
+@pytest.mark.parametrize(
+    ("call", "line"),
+    [
+        (lambda: ip.load_robot(5), "robot: is 5; give text"),  # type: ignore[arg-type]
+        (lambda: ip.optimize(PROBLEM, starts="a"), "starts: is 'a'; give a whole number"),  # type: ignore[arg-type]
+        (lambda: ip.optimize(PROBLEM, starts=True), "starts: is True; give a whole number"),
+        (lambda: ip.optimize(PROBLEM, compile="alwys"), "did you mean always?"),  # type: ignore[arg-type]
+        (lambda: ip.ImpactContact("ee", "x"), "normal: the normal x has no direction; give three numbers"),  # type: ignore[arg-type]
+        (lambda: ip.ImpactContact("ee", (0, 0, 1), (0, 0)), "offset: is (0, 0); give (a number, a number, a number)"),  # type: ignore[arg-type]
+        (lambda: RESULT.save(3), "out: is 3; give text or Path"),  # type: ignore[arg-type]
+        (lambda: RESULT.save("out", force="no"), "force: is 'no'; give True or False"),  # type: ignore[arg-type]
+        (lambda: ip.ImpactObjective(ROBOT, CONTACT, supports="ee"), "a list of text or Support or None"),
+        (lambda: ip.PostureProblem(OBJECTIVE, starts="a"), "PostureProblem: key 'starts'"),
+        (lambda: ip.optimize(PROBLEM, starts=0), "starts: is 0; give 1 or more"),
+        (lambda: ip.ImpactContact("ee", (0, 0, 1), np.array(0.5)), "give (a number, a number, a number)"),  # type: ignore[arg-type]
+        (lambda: ip.ImpactContact("ee", (10**400, 0, 1)), "has no direction"),
+        (lambda: OBJECTIVE.evaluate(ROBOT.posture(), speed=10**400), "speed: is "),
+        (lambda: ip.PostureProblem(OBJECTIVE, posture=np.array(0.5)), "posture: is "),
+        (lambda: ip.PostureProblem(OBJECTIVE, posture={0.1, 0.2}), "posture: is "),  # type: ignore[arg-type]
+        (lambda: ip.Metric("weighted", np.array([1.0, -2.0])), "a weight is -2"),  # type: ignore[arg-type]
+    ],
+)
+def test_the_line_says_what_to_give(call: Callable[[], Any], line: str) -> None:
+    with pytest.raises(ip.ImpactPostureError) as caught:
+        call()
+    assert line in caught.value.line
+
+
+def test_what_fits_passes() -> None:
+    """NumPy's numbers and arrays, and names of classes that only type checkers import."""
+
+    @checked
+    def function(
+        count: int, share: float, on: bool, pair: tuple[float, float], names: dict[str, int], late: PostureSolution
+    ) -> int:
+        return count
+
+    late = object.__new__(PostureSolution)
+    assert function(np.int64(3), np.float32(1), np.True_, np.zeros(2), {}, late) == 3  # type: ignore[arg-type]
+    with pytest.raises(InputError, match=r"late: is .*; give PostureSolution"):
+        function(1, 1, True, (1, 2), {}, "x")  # type: ignore[arg-type]
+    with pytest.raises(TypeError, match=r"missing a required argument|missing 1 required"):
+        function(1, 1, True, (1, 2), {})  # type: ignore[call-arg]
+    objective = ip.ImpactObjective(ROBOT, [CONTACT], compliance=np.float64(0), supports=np.array([], dtype=str))  # type: ignore[arg-type]
+    assert ip.Metric("weighted", np.ones(2)) == ip.Metric("weighted", (1.0, 1.0))  # type: ignore[arg-type]
+    assert ip.PostureProblem(objective, posture=list(ROBOT.posture())).problem.given.shape == (ROBOT.nq,)

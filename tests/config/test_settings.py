@@ -1,0 +1,125 @@
+"""The settings of a problem: the same on the command line, in problem.toml and in Python."""
+
+from __future__ import annotations
+
+from dataclasses import fields, replace
+from pathlib import Path
+from typing import Any
+
+import pytest
+
+from impact_posture.config.demands import Setting
+from impact_posture.config.option_names import as_keys, as_options, option_of
+from impact_posture.config.settings import ProblemSettings
+from impact_posture.config.toml_tables import validate
+from impact_posture.errors import ImpactPostureError, SpecError
+from impact_posture.posture.formulation.problem_file import dump_settings, prepare, read_settings, resolved_settings
+from impact_posture_cli.app import build
+from impact_posture_cli.settings_options import _settings_of
+from tests.support.command import run
+
+# What a problem.toml alone can say.
+NO_OPTION = {"robot", "schema", "q", "support_compliance", "mounting", "obstacles"}
+
+
+def test_every_setting_is_an_option_of_optimize() -> None:
+    command = build("optimize")
+    options = {parameter.name for parameter in command.params}
+    assert {field.name for field in fields(ProblemSettings)} - NO_OPTION <= options
+
+
+@pytest.mark.parametrize("name", sorted(_settings_of(ProblemSettings)))
+def test_every_setting_says_what_it_means(name: str) -> None:
+    _, setting = _settings_of(ProblemSettings)[name]
+    assert len(setting.help) > 8 and (setting.holds is None) == (setting.demand == "" and name != "contact")
+
+
+WRONG: list[tuple[str, object, str]] = [
+    ("impulse", -1.0, "above zero"),
+    ("impulse", float("nan"), "above zero"),
+    ("speed", -0.1, "zero or more"),
+    ("restitution", 1.5, "from 0 to 1"),
+    ("normal", (0.0, 0.0, 0.0), "not all zero"),
+    ("normal", (0.0, float("inf"), 0.0), "not all zero"),
+    ("offset", (0.0, float("nan"), 0.0), "finite"),
+    ("normal_cone", 90.0, "below 90"),
+    ("target_quaternion", (0.0, 0.0, 0.0, 2.0), "norm 2; give a unit quaternion"),
+    ("armature_range", (2.0, 0.5), "the lower first"),
+    ("box", (0.1, 0.0, 0.1), "above zero"),
+    ("friction", -0.1, "zero or more"),
+    ("starts", 0, "1 or more"),
+    ("seed", -1, "zero or more"),
+    ("tradeoff", -1, "zero or more"),
+]
+
+
+@pytest.mark.parametrize(("name", "value", "words"), WRONG)
+def test_a_wrong_value_meets_the_same_demand_everywhere(name: str, value: Any, words: str, tmp_path: Path) -> None:
+    given = {"robot": "tilthex_arm", "normal": (0, 0, 1)} | {name: value}
+    with pytest.raises(SpecError, match=words):
+        validate(ProblemSettings, given, "Python")
+    lines = [f"{key} = {list(v) if isinstance(v, tuple) else v!r}" for key, v in given.items()]
+    path = tmp_path / "p.toml"
+    path.write_text("\n".join(lines), encoding="utf-8")
+    with pytest.raises(SpecError, match=words) as caught:
+        read_settings(path)
+    assert f"'{name}'" in caught.value.line
+    words_of = [str(v) for v in value] if isinstance(value, tuple) else [str(value)]
+    option = f"--{name.replace('_', '-')}"
+    normal = () if name == "normal" else ("--normal", 0, 0, 1)
+    done = run("optimize", "tilthex_arm", *normal, option, *words_of, cwd=tmp_path)
+    assert done.returncode == 2 and option in done.stderr and words in " ".join(done.stderr.split())
+
+
+@pytest.mark.parametrize("value", ["1.0", True])
+def test_a_slip_of_type_is_no_value(value: object) -> None:
+    with pytest.raises(SpecError, match="key 'impulse'"):
+        validate(ProblemSettings, {"robot": "panda", "impulse": value}, "Python")
+
+
+@pytest.mark.parametrize(
+    "more",
+    [
+        {},
+        {"metric": "weighted", "weights": "velocity-limits", "objective": "sticking"},
+        {"armature_range": (1.0, 2.0), "payload": (("ee", 0.5),)},
+        {"armature_range": (3.0, 4.0), "objective": "speed"},
+        {"contact": ("ee:0,0,1", "base_link:1,0,0:2"), "bilateral": True},
+        {"normal_cone": 5.0, "normal_frame": "contact", "speed": 0.5, "restitution": 0.25},
+    ],
+    ids=lambda more: "-".join(more) or "plain",
+)
+def test_resolved_settings_are_the_same_problem(more: dict[str, object], tmp_path: Path) -> None:
+    name = "ur5" if more.get("metric") == "weighted" else "tilthex_arm"
+    frame = {} if "contact" in more else {"frame": "tool0" if name == "ur5" else "ee", "normal": (0.3, 0.0, 2.0)}
+    first = prepare(validate(ProblemSettings, {"robot": name, **frame, **more}, "test"))
+    path = tmp_path / "problem.toml"
+    # Some editors put a byte-order mark first.
+    path.write_text(dump_settings(resolved_settings(first)), encoding="utf-8-sig" if more else "utf-8")
+    again = prepare(read_settings(path))
+    assert again.impact.to_dict() == first.impact.to_dict()
+    assert again.problem.requirements == replace(first.problem.requirements, com_asked=True)
+    q = first.impact.robot.posture()
+    assert again.problem.objective.value(q) == first.problem.objective.value(q)
+
+
+def test_options_are_named_where_the_library_names_settings() -> None:
+    assert as_options("give `support=['a', 'b']`, or `support=[]`") == "give --support a --support b, or --no-support"
+    assert as_options("`root='free-flyer'`, `force=True`, `com=False`, `seed`, `jobs=1`") == (
+        "--root free-flyer, --force, --no-com, --seed, --jobs 1"
+    )
+    assert as_options("`build=True`, `kind='legged'`, `daqp`") == "--compile, --controller legged, --daqp"
+    assert as_options("`kind='speed'`, `kind`") == "--objective speed, --objective"
+    keys = as_keys("`srdf`, `contact_pose='position'`, `lock`", {"contact_pose": "control.end_effector.pose"})
+    assert keys == "srdf, control.end_effector.pose = 'position', lock"
+    assert option_of("normal_cone") == "--normal-cone" and option_of("panda") == "panda"
+    assert option_of("scheduler tcp://a:1") == "--scheduler tcp://a:1"
+    assert option_of("posture p.json") == "--posture p.json"
+
+
+def test_a_setting_refuses_by_its_demand() -> None:
+    setting = Setting("A number.", holds=lambda value: value > 0, demand="give more")
+    assert setting.check(None) is None and setting.check(1) == 1
+    with pytest.raises(ValueError, match="give more"):
+        setting.check(0)
+    assert not issubclass(ValueError, ImpactPostureError)

@@ -1,0 +1,118 @@
+"""The sources of DAQP: found, checked, and refused in one line."""
+
+from __future__ import annotations
+
+import io
+import shutil
+import subprocess
+import tarfile
+from pathlib import Path
+
+import pytest
+
+from impact_posture.controller_export import daqp_sources as module
+from impact_posture.controller_export.daqp_sources import FILES, SOURCES, VERSION, daqp_sources
+from impact_posture.errors import InputError
+from impact_posture.system.libraries import building, seal_path
+from tests.support.daqp import sources_or_skip
+
+
+@pytest.fixture
+def cache(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> Path:
+    """An empty cache, without a network."""
+    monkeypatch.setenv("IMPACT_POSTURE_CACHE", str(tmp_path / "cache"))
+    monkeypatch.setenv("PIP_NO_INDEX", "1")
+    monkeypatch.setenv("PIP_FIND_LINKS", str(tmp_path / "nothing"))
+    return tmp_path / "cache"
+
+
+def archive(path: Path, **members: tarfile.TarInfo | bytes) -> None:
+    """Write a distribution in which members replace files with a byte of content; a name has _ for its dot."""
+    with tarfile.open(path, "w:gz") as tar:
+        for name, place in FILES.items():
+            entry = members.get(name.replace(".", "_"), b"?")
+            info = entry if isinstance(entry, tarfile.TarInfo) else tarfile.TarInfo()
+            info.name = f"daqp-{VERSION}/{place}"
+            if isinstance(entry, bytes):
+                info.size = len(entry)
+            tar.addfile(info, io.BytesIO(entry if isinstance(entry, bytes) else b""))
+
+
+def in_cache(cache: Path, **members: tarfile.TarInfo | bytes) -> None:
+    cache.mkdir(mode=0o700)
+    with building(cache / f"daqp-{VERSION}.tar.gz") as folder:
+        archive(folder / f"daqp-{VERSION}.tar.gz", **members)
+
+
+def test_no_network_is_one_line(cache: Path) -> None:
+    with pytest.raises(InputError) as caught:
+        daqp_sources()
+    assert "cannot be downloaded" in caught.value.line and "`daqp`" in caught.value.hint
+    assert "\n" not in caught.value.line
+    assert not list(cache.iterdir())
+
+
+def test_no_pip_is_one_line(cache: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setattr("importlib.util.find_spec", lambda name: None)
+    with pytest.raises(InputError, match="pip is missing"):
+        daqp_sources()
+
+
+def test_other_contents_are_refused(cache: Path) -> None:
+    in_cache(cache)
+    with pytest.raises(InputError, match="is not DAQP"):
+        daqp_sources()
+
+
+def test_a_link_for_a_file_is_refused(cache: Path) -> None:
+    link = tarfile.TarInfo()
+    link.type, link.linkname = tarfile.SYMTYPE, "/etc/passwd"
+    in_cache(cache, daqp_c=link)
+    with pytest.raises(InputError, match=r"has no file csrc/src/daqp\.c"):
+        daqp_sources()
+
+
+def test_a_huge_member_is_refused(cache: Path) -> None:
+    in_cache(cache, types_h=bytes(2 << 20))
+    with pytest.raises(InputError, match=r"has no file csrc/include/types\.h"):
+        daqp_sources()
+
+
+def test_a_sealed_file_that_is_no_archive(cache: Path) -> None:
+    cache.mkdir(mode=0o700)
+    with building(cache / f"daqp-{VERSION}.tar.gz") as folder:
+        (folder / f"daqp-{VERSION}.tar.gz").write_bytes(b"no archive")
+    with pytest.raises(InputError, match=r"cannot be read.*delete it"):
+        daqp_sources()
+
+
+def test_an_archive_without_its_seal_is_loaded_again(cache: Path) -> None:
+    in_cache(cache)
+    seal_path(cache / f"daqp-{VERSION}.tar.gz").write_text("0" * 64)
+    with pytest.raises(InputError, match="cannot be downloaded"):
+        daqp_sources()
+
+
+def test_given_folders(tmp_path: Path) -> None:
+    with pytest.raises(InputError, match="has no file"):
+        daqp_sources(tmp_path / "nowhere")
+    sources = sources_or_skip()
+    for name, content in sources.items():
+        (tmp_path / name).write_bytes(content)
+    assert daqp_sources(tmp_path) == sources
+    (tmp_path / "daqp.c").write_bytes(sources["daqp.c"] + b"\n")
+    with pytest.raises(InputError, match="is not DAQP"):
+        daqp_sources(tmp_path)
+    (tmp_path / "LICENSE").unlink()
+    with pytest.raises(InputError, match="has no file LICENSE"):
+        daqp_sources(tmp_path)
+
+
+def test_the_sources_link_on_their_own(tmp_path: Path) -> None:
+    for name, content in sources_or_skip().items():
+        (tmp_path / name).write_bytes(content)
+    if not shutil.which("cc"):
+        pytest.skip("no C compiler")
+    command = ["cc", "-std=c99", "-O0", "-fPIC", "-shared", "-Wl,--no-undefined", *SOURCES, "-o", "daqp.so", "-lm"]
+    subprocess.run(command, cwd=tmp_path, check=True)
+    assert module.SOURCES == tuple(sorted(module.SOURCES))

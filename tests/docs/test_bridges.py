@@ -1,0 +1,255 @@
+"""The examples of docs/bridges.md: the term inside pink, inside TSID and in C++, against numbers from elsewhere."""
+
+from __future__ import annotations
+
+import contextlib
+import importlib.util
+import io
+import re
+import subprocess
+import sys
+from dataclasses import dataclass
+from pathlib import Path
+from types import ModuleType
+from typing import Any
+
+import numpy as np
+import pinocchio as pin
+import pytest
+
+from impact_posture.codegen.c_emitter import DOUBLE, FLOAT, Real
+from impact_posture.codegen.export import export
+from impact_posture.errors import CompilerError
+from impact_posture.impact.impact_contact import ImpactContact
+from impact_posture.impact.worst_case_objective import WorstCaseObjective
+from impact_posture.system.toolchain import run_compiler
+from tests.support.helpers import Vector, assert_close, central_gradient, frame_placement, robot, unit
+from tests.support.tools import cxx_compiler, eigen_headers, need_compiler
+
+DOCS = Path(__file__).parents[2] / "docs"
+EXAMPLES = DOCS / "examples"
+
+
+def shown_output() -> dict[str, list[str]]:
+    """The lines that the page shows of pink's output, by the contact that they are about."""
+    page = (DOCS / "bridges.md").read_text(encoding="utf-8")
+    found: dict[str, list[str]] = {}
+    for line in re.findall(r"^```text\n(.*?)^```", page, re.MULTILINE | re.DOTALL)[0].splitlines():
+        if line.startswith(" "):
+            found[list(found)[-1]].append(line.strip())
+        else:
+            found[line] = []
+    return found
+
+
+@pytest.mark.parametrize("file", sorted(EXAMPLES.rglob("*.py")), ids=lambda p: p.stem)
+def test_examples_need_no_file_of_the_checkout(file: Path) -> None:
+    """Readers download the examples; the package ``tests`` is not installed."""
+    assert not re.search(r"^\s*(from|import) tests\b", file.read_text(encoding="utf-8"), re.MULTILINE)
+
+
+# ---- pink ---------------------------------------------------------------------------------------------------------
+
+
+@pytest.fixture(scope="module")
+def example() -> ModuleType:
+    pytest.importorskip("pink", reason="needs pink: pip install pin-pink")
+    spec = importlib.util.spec_from_file_location("pink_impact", EXAMPLES / "pink_impact.py")
+    assert spec is not None and spec.loader is not None
+    module = importlib.util.module_from_spec(spec)
+    # Where dataclasses look their module up.
+    sys.modules[spec.name] = module
+    spec.loader.exec_module(module)
+    return module
+
+
+@dataclass(frozen=True)
+class PinkRun:
+    outcomes: dict[str, Any]
+    printed: str
+
+
+@pytest.fixture(scope="module")
+def pink_run(example: ModuleType) -> PinkRun:
+    need_compiler()
+    with contextlib.redirect_stdout(io.StringIO()) as printed:
+        outcomes = example.main()
+    return PinkRun({o.contact.name: o for o in outcomes}, printed.getvalue())
+
+
+FLOOR, WALL, TABLE = "tilthex_arm on a floor", "tilthex_arm against a wall", "ur5, ball tip on a table"
+
+
+@pytest.mark.parametrize(("name", "fall"), [(FLOOR, 0.65), (WALL, 0.40), (TABLE, 0.43)])
+def test_pink_lowers_H_at_every_tick(pink_run: PinkRun, name: str, fall: float) -> None:
+    outcome = pink_run.outcomes[name]
+    H, oracle = outcome.H, outcome.prepared.impact.objective.oracle
+    assert H[0] == pytest.approx(oracle.quantities(outcome.offline.initial).H, rel=1e-9)
+    assert H[-1] == pytest.approx(oracle.quantities(outcome.q).H, rel=1e-9)
+    assert H[-1] <= (1 - fall) * H[0]
+    assert np.diff(H).max() <= 1e-9 * H[0]
+
+
+@pytest.mark.parametrize("name", [FLOOR, WALL, TABLE])
+def test_pink_holds_the_frame(pink_run: PinkRun, name: str) -> None:
+    outcome = pink_run.outcomes[name]
+    found, start = outcome.prepared.impact.robot, outcome.offline.initial
+    model, frame = found.model, found.frame_id(outcome.prepared.impact.contact.frame)
+    before, after = (frame_placement(model, q, frame) for q in (start, outcome.q))
+    turned = np.linalg.norm(pin.log3(before.rotation.T @ after.rotation))
+    assert np.abs(after.translation - before.translation).max() <= 1e-9
+    # Between: what one tick of linearization leaves.
+    assert 0 < outcome.errors.max() <= 1e-5
+    if name == TABLE:
+        assert turned > 0.5, "the ball tip turns: that is the redundancy"
+    else:
+        assert turned <= 1e-9
+        tilt = frame_placement(model, outcome.q, found.frame_id("base_link")).rotation[:, 2]
+        np.testing.assert_allclose(tilt, [0, 0, 1], rtol=0, atol=1e-9)
+    joints = slice(7 if found.floating else 0, None)
+    margin = outcome.prepared.problem.requirements.limit_margin - 1e-6
+    assert (outcome.q[joints] >= model.lowerPositionLimit[joints] + margin).all()
+    assert (outcome.q[joints] <= model.upperPositionLimit[joints] - margin).all()
+
+
+@pytest.mark.parametrize(("name", "rad"), [(FLOOR, 1e-5), (WALL, 1e-5), (TABLE, 1e-2)])
+def test_pink_rests_at_an_offline_optimum(pink_run: PinkRun, name: str, rad: float) -> None:
+    outcome = pink_run.outcomes[name]
+    distances, optima = outcome.distances(), outcome.offline.optima
+    k = int(np.argmin(distances))
+    assert distances[k] <= rad
+    assert outcome.H[-1] == pytest.approx(optima[k].objective, rel=1e-5)
+    moved = np.linalg.norm(pin.difference(outcome.prepared.impact.robot.model, outcome.offline.initial, outcome.q))
+    assert moved > 1, "a posture that was optimal all along shows nothing"
+    if name == TABLE:
+        assert optima[0].objective < 0.5 * outcome.H[-1], "the page says that it is a local one"
+    else:
+        assert k == 0
+        assert outcome.speed < 1e-6
+
+
+def test_pink_stays_without_the_term(example: ModuleType) -> None:
+    need_compiler()
+    outcome = example.follow(example.CONTACTS[0], speed=0.0)
+    assert len(outcome.H) == 2
+    np.testing.assert_allclose(outcome.q, outcome.offline.initial, rtol=0, atol=1e-9)
+
+
+def test_pink_prints_what_the_page_shows(pink_run: PinkRun) -> None:
+    shown = shown_output()
+    assert list(shown) == [FLOOR, WALL, TABLE]
+    blocks = re.split(r"^(?=\S)", pink_run.printed, flags=re.MULTILINE)[1:]
+    for block, (name, lines) in zip(blocks, shown.items(), strict=True):
+        assert block.startswith(name)
+        assert len(lines) == 2
+        assert all(line in block for line in lines), f"the page shows {lines}, printed is\n{block}"
+
+
+def test_held_tasks_have_the_jacobian_of_their_error(example: ModuleType) -> None:
+    """pink asks for ``J Δq = −e``: J is the derivative of e on the manifold."""
+    found = robot("tilthex_arm")
+    model = found.model.copy()
+    pink = importlib.import_module("pink")
+    q = np.array(pin.integrate(model, found.posture(), np.random.default_rng(3).uniform(-0.5, 0.5, model.nv)))
+    configuration = pink.Configuration(model, model.createData(), q)
+    for task in (example.PointTask("ee", configuration), example.LevelTask("base_link")):
+
+        def error(at: Vector, task: Any = task) -> Vector:
+            return np.array(task.compute_error(pink.Configuration(model, model.createData(), at)))
+
+        assert_close(task.compute_jacobian(configuration), central_gradient(error, model, q, 1e-3), 1e-9, repr(task))
+
+
+# ---- C++ ----------------------------------------------------------------------------------------------------------
+
+
+def eigen_program(folder: Path, floating: bool) -> Path:
+    """The C++ example, built against the export in ``folder``; skips where a compiler or Eigen is missing."""
+    compiler, eigen = cxx_compiler(), eigen_headers()
+    if compiler is None or eigen is None:
+        pytest.skip("no C++ compiler (g++, clang++, $CXX), or no Eigen headers (cmeel-eigen, $EIGEN3_INCLUDE_DIR)")
+    target = folder / "posture_acceleration"
+    flags = ["-std=c++17", "-O0", "-Wall", "-Wextra", "-Werror", f"-DFLOATING_BASE={int(floating)}"]
+    headers = ["-I", str(folder), "-isystem", str(eigen)]
+    objects = [str(p) for p in folder.glob("*.o")]
+    main = str(EXAMPLES / "cpp" / "main.cpp")
+    run_compiler([*compiler, *flags, *headers, main, *objects, "-o", str(target), "-lm"], folder)
+    return target
+
+
+def accelerations(program: Path, states: list[tuple[Vector, ...]]) -> list[str]:
+    text = "\n".join(" ".join(f"{x:.17g}" for part in state for x in part) for state in states)
+    return subprocess.run([str(program)], input=text, capture_output=True, text=True, check=True).stdout.splitlines()
+
+
+def exported(name: str, frame: str, folder: Path, real: Real) -> WorstCaseObjective:
+    objective = WorstCaseObjective(robot(name), ImpactContact(frame, (0, 0, 1)))
+    export(objective, folder, prefix="arm", real=real, check=False)
+    run_compiler([*need_compiler(), "-std=c99", "-O0", "-c", "arm.c", "-o", "arm.o"], folder)
+    return objective
+
+
+def pairs(model: pin.Model, floating: bool) -> list[tuple[Vector, Vector]]:
+    """``(q, q_des)``, with every branch of the logarithm among the bases."""
+    rng = np.random.default_rng(11)
+
+    def step(q: Vector, angle: float) -> Vector:
+        v = rng.uniform(-1, 1, model.nv)
+        if floating:
+            v[3:6] = angle * unit(rng)
+        return np.array(pin.integrate(model, q, v))
+
+    found = []
+    for angle in (0.0, 1e-12, 1e-6, 0.0499, 0.0501, 1.0, 3.0, 3.14159):
+        q = step(pin.neutral(model), 2.0)
+        found.append((q, step(q, angle)))
+    q, q_des = found[5]
+    if floating:
+        other = q_des.copy()
+        other[3:7] *= -1
+        found.append((q, other))
+    return [*found, (q, q)]
+
+
+@pytest.mark.parametrize(
+    ("name", "frame", "real", "tolerance"),
+    [
+        ("tilthex_arm", "ee", DOUBLE, 1e-10),
+        ("panda", "panda_hand_tcp", FLOAT, 1e-4),
+    ],
+    ids=["floating base, double", "fixed base, float"],
+)
+def test_cpp_computes_the_posture_acceleration(
+    name: str, frame: str, real: Real, tolerance: float, tmp_path: Path
+) -> None:
+    objective = exported(name, frame, tmp_path, real)
+    found, rng = objective.robot, np.random.default_rng(12)
+    program = eigen_program(tmp_path, found.floating)
+    n, gains = np.array([0.0, 0.0, 1.0]), np.array([20.0, 9.0, 0.3])
+    states = [(q, rng.normal(size=found.nv), q_des) for q, q_des in pairs(found.model, found.floating)]
+    printed = accelerations(program, [(*state, n, gains) for state in states])
+    assert len(printed) == len(states)
+    for (q, v, q_des), line in zip(states, printed, strict=True):
+        expected = gains[0] * pin.difference(found.model, q, q_des) - gains[1] * v
+        # Pinocchio's gradient, not the export's.
+        expected -= gains[2] * objective.oracle.gradient_H(q)
+        assert_close(np.array(line.split(), dtype=float), expected, tolerance, f"{name}, {line}")
+    if found.floating:
+        broken = states[0][0].copy()
+        broken[3:7] *= 1.1
+        assert accelerations(program, [(broken, *states[0][1:], n, gains)]) == ["code 2"]
+    if found.floating and real is DOUBLE:
+        with pytest.raises(CompilerError, match="FLOATING_BASE does not fit"):
+            eigen_program(tmp_path, floating=False)
+
+
+def test_cpp_goes_on_without_a_gradient_that_does_not_exist(tmp_path: Path) -> None:
+    (tmp_path / "arm.h").write_text(
+        "#define ARM_NQ 2\n#define ARM_NV 2\ntypedef double arm_real;\n"
+        "static inline int arm_eval(const double *, const double *, double *H, double *grad)\n"
+        "{ *H = grad[0] = grad[1] = 0.0 / 0.0; return 3; }\n"
+    )
+    program = eigen_program(tmp_path, floating=False)
+    state = tuple(np.array(x, dtype=float) for x in ([0.1, 0.2], [1, 2], [0.4, 0.1], [0, 0, 1], [10, 3, 5]))
+    (line,) = accelerations(program, [state])
+    np.testing.assert_allclose(np.array(line.split(), dtype=float), [0.0, -7.0], rtol=0, atol=1e-12)

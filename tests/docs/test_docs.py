@@ -1,0 +1,157 @@
+"""The documentation: every command that it shows runs as it says.  ``make docs`` builds the site."""
+
+from __future__ import annotations
+
+import importlib
+import json
+import re
+import shlex
+import shutil
+from collections.abc import Iterator
+from dataclasses import dataclass
+from pathlib import Path
+
+import pytest
+import typer.main
+
+import impact_posture
+from impact_posture_cli.app import app
+from tests.support.command import run
+
+ROOT = Path(__file__).parents[2]
+DOCS = ROOT / "docs"
+PAGES = [ROOT / "README.md", *sorted(p for p in DOCS.rglob("*.md") if not {"generated", "_build"} & set(p.parts))]
+
+_BLOCK = re.compile(r"^```console\n(.*?)^```", re.MULTILINE | re.DOTALL)
+_PROMPT = "$ impact-posture "
+_EXIT = re.compile(r"\s+# exit (\d+)\s*$")
+_EXAMPLE = re.compile(r"[\w./-]*examples/[\w./-]+")
+
+
+@dataclass(frozen=True)
+class Shown:
+    """A command of a page: its arguments, exit code, and output lines that the page shows."""
+
+    arguments: tuple[str, ...]
+    code: int
+    output: tuple[str, ...]
+
+
+def shown_commands(page: Path) -> list[Shown]:
+    """The commands of a page's ``console`` blocks, in order."""
+    found: list[Shown] = []
+    for block in _BLOCK.findall(page.read_text(encoding="utf-8")):
+        current: Shown | None = None
+        for line in block.replace("\\\n", " ").splitlines():
+            if line.startswith("$"):
+                current = None
+                if line.startswith(_PROMPT):
+                    stated = _EXIT.search(line)
+                    words = shlex.split(_EXIT.sub("", line))[2:]
+                    current = Shown(tuple(words), int(stated[1]) if stated else 0, ())
+                    found.append(current)
+            elif current is not None and line.strip():
+                current = Shown(current.arguments, current.code, (*current.output, line))
+                found[-1] = current
+    return found
+
+
+def example_files(page: Path) -> Iterator[Path]:
+    """Files of ``docs/examples`` that a page shows or offers."""
+    for text in dict.fromkeys(_EXAMPLE.findall(page.read_text(encoding="utf-8"))):
+        path = (page.parent / text).resolve()
+        if path.is_file() and path.is_relative_to(DOCS / "examples"):
+            yield from sorted(p for p in path.parent.iterdir() if p.is_file())
+
+
+def squeezed(text: str) -> str:
+    return " ".join(text.split())
+
+
+@dataclass(frozen=True)
+class Ran:
+    """A shown command, what came of it, and the words for a failure."""
+
+    shown: Shown
+    code: int
+    printed: str
+    errors: str
+
+    def __str__(self) -> str:
+        return f"impact-posture {shlex.join(self.shown.arguments)}\n{self.printed}\n{self.errors}"
+
+
+def run_page(page: Path, folder: Path) -> Iterator[Ran]:
+    """Run a page's commands in ``folder``, one after the other."""
+    for file in dict.fromkeys(example_files(page)):
+        shutil.copy(file, folder / file.name)
+    for shown in shown_commands(page):
+        done = run(*shown.arguments, cwd=folder, env={"COLUMNS": "300"})
+        yield Ran(shown, done.returncode, done.stdout, done.stderr)
+
+
+@pytest.mark.parametrize("page", [p for p in PAGES if p.is_file() and shown_commands(p)], ids=lambda p: p.stem)
+def test_shown_commands_run(page: Path, tmp_path: Path) -> None:
+    for ran in run_page(page, tmp_path):
+        assert ran.code == ran.shown.code, f"{page.name}: exit code {ran.code}, not {ran.shown.code}: {ran}"
+        assert "Traceback" not in ran.errors, f"{page.name}: {ran}"
+        if "--json" in ran.shown.arguments:
+            json.loads(ran.printed)
+        printed = squeezed(ran.printed + " " + ran.errors)
+        for line in ran.shown.output:
+            assert squeezed(line) in printed, f"{page.name} shows '{line.strip()}', which is not printed: {ran}"
+    for result, falls, rises in CLAIMS.get(page.stem, ()):
+        document = json.loads((tmp_path / result / "result.json").read_text(encoding="utf-8"))
+        change = {k: document["optimal"][k] / document["initial"][k] for k in "HGVS"}
+        assert all(change[k] < 0.99 for k in falls), f"{page.name}: {result} {change}"
+        assert all(change[k] > 1.01 for k in rises), f"{page.name}: {result} {change}"
+
+
+# What the tutorials say of their results in words: result folder, what falls, what rises.
+CLAIMS: dict[str, list[tuple[str, str, str]]] = {
+    "aerial": [("floor", "HVS", "G"), ("wall", "HV", "S"), ("wall-sticking", "S", "")],
+    "arm": [("box", "HGV", "S")],
+    # Which optimum of the hand is found depends on rounding, and V with it.
+    "humanoid": [("hand", "H", "S")],
+}
+
+
+def test_claims_are_about_results_of_shown_commands() -> None:
+    for stem, claims in CLAIMS.items():
+        page = next(p for p in PAGES if p.stem == stem)
+        commands = [s.arguments for s in shown_commands(page) if "--out" in s.arguments]
+        assert {c[0] for c in claims} <= {a[a.index("--out") + 1] for a in commands}, stem
+
+
+def test_commands_are_shown_at_all() -> None:
+    """The extraction finds what a reader sees: each tutorial has commands, and each command of the app is shown."""
+    tutorials = [p for p in PAGES if p.parent.name == "tutorials"]
+    assert len(tutorials) >= 5
+    assert all(shown_commands(p) for p in tutorials)
+    used = {s.arguments[0] for p in PAGES for s in shown_commands(p)}
+    assert used == set(typer.main.get_command(app).commands), "commands of the app that no page shows, or the reverse"
+
+
+def test_no_command_escapes_the_convention() -> None:
+    """A command in a block of another kind, or after another prompt, would never be run."""
+    fence = re.compile(r"^```(\{?[\w-]*\}?)[^\n]*\n(.*?)^```", re.MULTILINE | re.DOTALL)
+    for page in PAGES:
+        for kind, body in fence.findall(page.read_text(encoding="utf-8")):
+            for line in body.splitlines():
+                if kind != "console" and re.match(r"\s*[$>%]\s*impact-posture\b", line):
+                    pytest.fail(f"{page.name}: '{line.strip()}' stands in a block '{kind}': make it console")
+                if kind in ("bash", "sh", "shell"):
+                    assert not line.strip().startswith("impact-posture "), f"{page.name}: '{line}': make it console"
+
+
+def test_every_module_has_its_api_page(monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.syspath_prepend(str(DOCS / "_ext"))
+    markdown = importlib.import_module("api_reference").markdown
+    shown: set[str] = set()
+    for page in (DOCS / "api").glob("*.md"):
+        for names in re.findall(r"^```{api-reference} (.+)$", page.read_text(encoding="utf-8"), re.MULTILINE):
+            shown |= set(re.findall(r"automodule:: (\S+)", markdown(names.split())))
+    package = Path(impact_posture.__path__[0])
+    files = {p.relative_to(package.parent).with_suffix("") for p in package.rglob("*.py")}
+    modules = {".".join(p.parts) for p in files if not p.name.startswith("_")}
+    assert modules <= shown, f"no API page: {sorted(modules - shown)}"

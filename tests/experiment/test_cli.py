@@ -1,0 +1,233 @@
+"""``simulate``, ``compare``, ``reproduce`` as a user runs them."""
+
+from __future__ import annotations
+
+import json
+import os
+import re
+import subprocess
+import sys
+from collections.abc import Callable
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+import pytest
+
+from impact_posture.simulation import scenario_file
+from impact_posture.simulation.series import Series
+from impact_posture_cli.commands.simulate import _show
+from impact_posture_cli.output import Page
+from tests.experiment.conftest import shortened
+from tests.support.command import on_terminal, read_terminal
+from tests.support.command import run as start
+
+COMMAND = Path(sys.executable).parent / "impact-posture"
+
+
+def document(*arguments: str, cwd: Path, prepare: Callable[[], None] | None = None) -> dict[str, Any]:
+    done = start(*arguments, "--json", cwd=cwd, prepare=prepare)
+    assert (done.returncode, done.stderr) == (0, "")
+    found = json.loads(done.stdout)
+    assert isinstance(found, dict)
+    return found
+
+
+def test_simulate(aerial: Path, tmp_path: Path) -> None:
+    asked = ("simulate", str(aerial), *"--controller robust --seed 3 --out run --format png".split())
+    found = document(*asked, cwd=tmp_path)
+    assert (found["scenario"], found["controller"], found["seed"]) == ("aerial-lateral", "robust", 3)
+    for key in ("q_total_impact", "q_total_dwell", "peak_jump", "peak_force", "relaxed_ticks"):
+        assert isinstance(found["metrics"][key], int | float)
+    assert json.loads((tmp_path / "run" / "run.json").read_text()) == found
+    series = Series.load(tmp_path / "run" / "series.npz")
+    window = found["windows"][0]
+    speed = np.linalg.norm(series.v[series.slice(window["begin"], window["end"])], axis=1)
+    assert speed.sum() * 1e-3 == pytest.approx(found["metrics"]["q_total_impact"])
+    assert list((tmp_path / "run").glob("*.png")) and not list((tmp_path / "run").glob("*.pdf"))
+    # Never over what is there; the same again is the same.
+    refused = start("simulate", str(aerial), "--controller", "robust", "--out", "run", cwd=tmp_path)
+    assert refused.returncode == 1 and "--force" in refused.stderr
+    again = document(*asked, "--force", cwd=tmp_path)
+    assert again == found
+    # Time that stands still is no run, and its report says so.
+    columns = vars(series) | {"t": np.zeros_like(series.t)}
+    Series(**columns).save(tmp_path / "run" / "series.npz")
+    refused = start("report", "run", cwd=tmp_path)
+    assert refused.returncode == 1 and "run: holds no whole run" in refused.stderr
+
+
+def test_simulate_without_a_compiler(aerial: Path, tmp_path: Path) -> None:
+    """One warning, and the numbers that the compiled gradient gives."""
+    asked = ("simulate", aerial, "--controller", "robust", "--format", "png", "--out")
+    bare = {"PATH": str(tmp_path), "CC": "", "IMPACT_POSTURE_CACHE": str(tmp_path / "cache")}
+    done = start(*asked, "bare", cwd=tmp_path, env=bare)
+    assert done.returncode == 0
+    (line,) = done.stderr.splitlines()
+    assert line.startswith("warning: the gradient is interpreted, not compiled, which is slower: ")
+    assert "no C compiler found" in line
+    assert start(*asked, "quiet", "--quiet", cwd=tmp_path, env=bare).stderr == ""
+    assert start(*asked, "whole", cwd=tmp_path).returncode == 0
+    totals = []
+    for folder, warnings in (("bare", 1), ("quiet", 1), ("whole", 0)):
+        found = json.loads((tmp_path / folder / "run.json").read_text())
+        assert len(found["warnings"]) == warnings
+        totals.append(found["metrics"]["q_total_impact"])
+    assert totals[0] == totals[1] == pytest.approx(totals[2], rel=1e-3)
+
+
+def test_simulate_for_people(push: Path, tmp_path: Path) -> None:
+    done = start("simulate", str(push), "--controller", "robust", "--mode", "held", "--format", "png", cwd=tmp_path)
+    assert (done.returncode, done.stderr) == (0, "")
+    assert "solo8-push, robust:held" in done.stdout and "pushed after" in done.stdout
+    assert max(len(line) for line in done.stdout.splitlines()) <= 80
+    assert (tmp_path / "solo8-push-robust-held" / "series-minus.npz").is_file()
+
+
+@pytest.fixture(scope="session")
+def falls(push: Path, tmp_path_factory: pytest.TempPathFactory) -> Path:
+    """A push that no controller stands."""
+    path = tmp_path_factory.mktemp("scenarios") / "falls.toml"
+    text, count = re.subn(r"(?m)^force = \[6.5, 0, 0\]", "force = [60, 0, 0]", push.read_text(encoding="utf-8"))
+    assert count == 1
+    path.write_text(text, encoding="utf-8")
+    return path
+
+
+def test_simulate_a_robot_that_falls(falls: Path, tmp_path: Path) -> None:
+    done = start("simulate", str(falls), *"--sign +1 --out fell --format png".split(), cwd=tmp_path)
+    assert done.returncode == 4 and len(done.stderr.splitlines()) == 1
+    assert "solo8-push, nominal: fell: the base" in done.stderr and "at t = " in done.stderr
+    assert "q_total" not in done.stdout and "peak jump" not in done.stdout
+    assert "limits made a task give way" in done.stdout and "the last one was kept" in done.stdout
+    assert max(len(line) for line in done.stdout.splitlines()) <= 80
+    assert list((tmp_path / "fell").glob("*.png")) and (tmp_path / "fell" / "series.npz").is_file()
+    again = start("simulate", str(falls), *"--sign +1 --out fell --format png --force --json".split(), cwd=tmp_path)
+    found = json.loads(again.stdout)
+    assert again.returncode == 4 and found == json.loads((tmp_path / "fell" / "run.json").read_text())
+    assert (found["status"], found["metrics"], found["prediction"]) == ("fell", None, None)
+    assert {"status", "time", "what", "sign"} == set(found["events"][0])
+
+
+def test_compare_robots_that_fall(falls: Path, tmp_path: Path) -> None:
+    options = "--controllers nominal,stiff --seeds 1 --out both --format png --quiet --no-report".split()
+    done = start("compare", str(falls), *options, cwd=tmp_path)
+    assert (done.returncode, done.stderr) == (0, "")
+    rows = [line.split() for line in done.stdout.splitlines()]
+    assert ["nominal", "fell", "1/1"] in rows and ["stiff", "fell", "1/1"] in rows
+    assert "no reduction if a run of either controller did not complete" in done.stdout
+    assert "seed 0: fell: the base" in done.stdout
+    found = json.loads((tmp_path / "both" / "comparison.json").read_text())
+    for row in found["rows"]:
+        assert (row["status"], row["runs"], row["completed"]) == ("fell", 1, 0)
+        assert row["metrics"] == {} and row["reduction"] is None and len(row["failed"]) == 1
+    # The page can be written later.
+    assert not (tmp_path / "both" / "report.html").exists()
+    done = start("report", "both", "--quiet", cwd=tmp_path)
+    assert (done.returncode, done.stderr) == (0, "") and "(fell)" in (tmp_path / "both" / "report.html").read_text()
+    for path in (tmp_path / "both" / "runs").iterdir():
+        path.unlink()
+    done = start("report", "both", cwd=tmp_path)
+    assert done.returncode == 1 and "both: holds no run to show" in done.stderr
+
+
+def test_contacts_are_counted_against_what_was_asked_for(capsys: pytest.CaptureFixture[str]) -> None:
+    numbers = {"relaxed_ticks": 7, "failed_ticks": 2, "contacts": 3, "contacts_asked": 5}
+    event = {"status": "lost contact", "time": 1.25, "what": "2 of 5 contacts were never made", "sign": 1}
+    found = {"scenario": "mine", "seed": 0, "status": "lost contact", "metrics": None, "events": [event],
+             "windows": [{"kind": "dwell"}], "runs": [{"ticks": 900, "metrics": numbers}],
+             "offline": None, "path": None, "warnings": []}  # fmt: skip
+    _show(Page(), found, "nominal", Path("there"))
+    said = " ".join(capsys.readouterr().out.split())
+    assert "contacts 3 of 5" in said and "relaxed 7 of 900 ticks" in said and "held 2 ticks" in said
+    assert "t = 1.25 s: lost contact: 2 of 5 contacts were never made" in said and "q_total" not in said
+
+
+def test_progress_is_for_terminals(aerial: Path, tmp_path: Path) -> None:
+    asked = ("simulate", str(aerial), "--out", "run", "--force", "--format", "png", "--no-report")
+    ours, theirs = os.openpty()
+    with subprocess.Popen(
+        [COMMAND, *asked], stdout=subprocess.DEVNULL, stderr=theirs, cwd=tmp_path, env={**os.environ, "TERM": "xterm"}
+    ) as process:
+        os.close(theirs)
+        said = read_terminal(ours)
+    assert process.returncode == 0
+    for words in ("loading", "building the expressions", "simulating, t = ", "drawing"):
+        assert words in said, words
+    assert on_terminal(*asked, "--quiet", cwd=tmp_path) == ""
+
+
+def test_compare(aerial: Path, tmp_path: Path) -> None:
+    done = start("compare", str(aerial), "--controllers", "nominal,robust", "--seeds", "1", "--quiet", cwd=tmp_path)
+    assert (done.returncode, done.stderr) == (0, "")
+    assert max(len(line) for line in done.stdout.splitlines()) <= 80
+    assert not list(tmp_path.iterdir())
+    found = document(
+        "compare",
+        str(aerial),
+        "--controllers",
+        "nominal,robust",
+        "--seeds",
+        "2",
+        "--out",
+        "both",
+        "--format",
+        "png",
+        cwd=tmp_path,
+    )
+    assert [row["controller"] for row in found["rows"]] == ["nominal", "robust"]
+    nominal, robust = (row["metrics"]["q_total_impact"] for row in found["rows"])
+    assert nominal["samples"] == 2 and nominal["half_width"] > 0
+    assert found["rows"][1]["reduction"]["mean"] == pytest.approx(1 - robust["mean"] / nominal["mean"], abs=0.05)
+    assert json.loads((tmp_path / "both" / "comparison.json").read_text()) == found
+    assert sorted(path.name for path in tmp_path.iterdir()) == ["both"], "the runs' folder has gone"
+    # Its page has both runs, from what the folder keeps of them.
+    assert start("report", "both", "--quiet", cwd=tmp_path).returncode == 0
+    page = (tmp_path / "both" / "report.html").read_text()
+    assert "default-src 'none'" in page and len(page) < 2e6
+    assert all(f'<option value="{k}">{name}</option>' in page for k, name in enumerate(("nominal", "robust")))
+    assert "Means of 2 seeds</caption>" in page and "±" not in page, "intervals from 3 seeds on, as on the terminal"
+
+
+def test_reproduce(tmp_path: Path) -> None:
+    pytest.importorskip("mujoco", reason="mujoco is not installed (the extra 'sim')")
+    # The scenario as shipped, with less time to settle in and none to recover in.
+    shipped = tmp_path / "scenarios"
+    shipped.mkdir()
+    (shipped / "solo8-push.toml").write_text(shortened("solo8-push", settle=1.0, patience=1.0, after=0.1))
+    asked = "reproduce --scenario solo8-push --seeds 1 --out all --format png".split()
+    found = document(*asked, cwd=tmp_path, prepare=lambda: setattr(scenario_file, "SHIPPED", shipped))
+    rows = {row["controller"]: row for row in found["rows"]}
+    assert {"nominal", "robust"} < set(rows) and all(row["scenario"] == "solo8-push" for row in found["rows"])
+    assert rows["robust"]["paper"] == {"nominal": 0.411, "robust": 0.342, "reduction": 0.168}
+    assert rows["robust"]["reduction"]["mean"] > 0
+    assert sum(row["best"] for row in found["rows"]) == 1
+    text = (tmp_path / "all" / "SUMMARY.md").read_text()
+    assert text == found["summary"] and "## What to choose" in text
+    assert len(list((tmp_path / "all" / "runs").glob("*.json"))) == len(rows)
+    assert list((tmp_path / "all").rglob("*.png"))
+
+
+@pytest.mark.parametrize(
+    ("arguments", "code", "said"),
+    [
+        (("simulate", "aerial-vertcal"), 1, "did you mean aerial-vertical"),
+        (("simulate", "solo8-push", "--controller", "robst"), 1, "did you mean robust"),
+        (("simulate", "solo8-push", "--controller", "nominal", "--mode", "held"), 1, "has no term to hold"),
+        (("simulate", "solo8-push", "--controller", "robust-flow", "--gain", "5"), 1, "'robust-flow' has no gain"),
+        (("simulate", "aerial-lateral", "--sign", "-1"), 1, "leave --sign out"),
+        (("simulate", "solo8-push", "--gain", "-1"), 2, "above zero"),
+        (("compare", "solo8-push", "--controllers", "nominal,robust:hold"), 1, "no variant 'hold'"),
+        (("compare", "solo8-push", "--controllers", " , "), 2, "at least one"),
+        (("reproduce", "--scenario", "mine.toml"), 1, "simulate and compare"),
+        (("simulate", "missing.toml"), 1, "missing.toml"),
+    ],
+)
+def test_one_line_says_what_is_wrong(arguments: tuple[str, ...], code: int, said: str, tmp_path: Path) -> None:
+    pytest.importorskip("mujoco", reason="mujoco is not installed (the extra 'sim')")
+    done = start(*arguments, cwd=tmp_path)
+    assert done.returncode == code
+    assert said in " ".join(done.stderr.replace("│", " ").split())
+    assert "Traceback" not in done.stderr and not list(tmp_path.iterdir())
+    if code == 1:
+        assert len(done.stderr.strip().splitlines()) == 1

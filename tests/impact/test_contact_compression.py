@@ -1,0 +1,331 @@
+"""Compression time, peak force and x, against integrated contacts; bounds on force and jump in a search."""
+
+from __future__ import annotations
+
+import json
+from dataclasses import replace
+from functools import partial
+from pathlib import Path
+
+import numpy as np
+import pytest
+import scipy.integrate
+from hypothesis import given, settings
+from hypothesis import strategies as st
+from numpy.typing import NDArray
+
+from impact_posture.config.settings import MATERIALS
+from impact_posture.dynamics.numeric import Numeric
+from impact_posture.errors import Infeasible, InputError, SpecError
+from impact_posture.impact.elasticity.contact_compression import (
+    HERTZ_TIME,
+    ContactStiffness,
+    compression,
+    hertz_stiffness,
+    springs_along,
+)
+from impact_posture.impact.elasticity.elastic_joints import ElasticImpact
+from impact_posture.impact.evaluation.evaluation import evaluate
+from impact_posture.impact.impact_contact import ImpactContact
+from impact_posture.impact.worst_case_objective import WorstCaseObjective
+from impact_posture.posture.analysis.pareto_front import pareto_front
+from impact_posture.posture.constraints.impact_bounds import ImpactBounds
+from impact_posture.posture.constraints.pose_constraints import AxisInCone
+from impact_posture.posture.formulation.problem_file import prepare, read_settings
+from impact_posture.posture.search.multistart import solve
+from impact_posture.robot.joint_model import with_joint_model
+from impact_posture.robot.robot import Robot
+from impact_posture.robot.robot_spec import TransmissionSpec
+from tests.support.command import run
+from tests.support.helpers import central_gradient, random_configurations, relative, robot
+from tests.support.settings import make_settings
+
+masses, speeds = st.floats(0.05, 500.0), st.floats(0.01, 20.0)
+
+
+def touch(power: float, stiffness: float, mass: float, speed: float) -> tuple[float, float]:
+    """Integrate ``m δ̈ = −k δ^p`` from touch to rest: T and the force there."""
+    # In units of the greatest compression and of the time to cross it.
+    depth = ((power + 1) * mass * speed**2 / (2 * stiffness)) ** (1 / (power + 1))
+    ratio = stiffness * depth**power * depth / (mass * speed**2)
+
+    def rest(t: float, y: np.ndarray) -> float:
+        return float(y[1])
+
+    rest.terminal = True  # type: ignore[attr-defined]
+    run_ = scipy.integrate.solve_ivp(
+        lambda t, y: [y[1], -ratio * max(y[0], 0.0) ** power],
+        (0, 10),
+        [0.0, 1.0],
+        events=rest,
+        rtol=1e-10,
+        atol=1e-12,
+    )
+    return float(run_.t[-1]) * depth / speed, stiffness * (float(run_.y[0, -1]) * depth) ** power
+
+
+@settings(max_examples=20, deadline=None)
+@given(mass=masses, speed=speeds, stiffness=st.floats(1e2, 1e8))
+def test_time_and_force_are_those_of_an_integrated_contact(mass: float, speed: float, stiffness: float) -> None:
+    for contact, power in ((ContactStiffness(linear=stiffness), 1.0), (ContactStiffness(hertz=stiffness), 1.5)):
+        time, force = touch(power, stiffness, mass, speed)
+        assert contact.compression_time(1 / mass, speed) == pytest.approx(time, rel=1e-6)
+        assert contact.peak_force(1 / mass, speed) == pytest.approx(force, rel=1e-6)
+        # A contact of that T and G has the impulse mv, whatever its law.
+        alike = ContactStiffness(duration=time)
+        assert alike.peak_force(1 / mass, speed) == pytest.approx(np.pi / 2 * mass * speed / time)
+        for one in (contact, alike):
+            least = one.least_mobility(force, speed)
+            assert one.peak_force(least, speed) == pytest.approx(force, rel=1e-9)
+
+
+def test_the_constant_of_hertz_and_the_materials() -> None:
+    assert pytest.approx(scipy.integrate.quad(lambda z: 1 / np.sqrt(1 - z**2.5), 0, 1)[0], rel=1e-9) == HERTZ_TIME
+    # Two steel bodies: E* is half the plane-strain modulus of one.
+    E, nu = MATERIALS["steel"]
+    assert hertz_stiffness("steel") == pytest.approx(4 / 3 * E / (2 * (1 - nu**2)) * 0.1)
+    order = sorted(MATERIALS, key=hertz_stiffness)
+    assert order == ["rubber", "wood", "ground", "steel"]
+
+
+def elastic(name: str, stiffness: float = 12000.0) -> Robot:
+    found = robot(name)
+    return replace(found, spec=replace(found.spec, transmission=TransmissionSpec("elastic", stiffness)))
+
+
+@pytest.mark.parametrize(
+    ("name", "frame"), [("panda", "panda_hand_tcp"), ("tilthex_arm", "ee"), ("talos", "gripper_right_base_link")]
+)
+def test_x_from_plain_matrices(name: str, frame: str) -> None:
+    found = elastic(name)
+    objective = WorstCaseObjective(found, ImpactContact(frame, (0.3, 0.1, 1.0)))
+    contact = ContactStiffness(linear=3e5)
+    for q in random_configurations(found.model, 2, name, "x"):
+        oracle = objective.oracle.at(q)
+        joints = slice(6 if found.floating else 0, None)
+        M = oracle.M - np.diag(found.armature) + oracle.Js.T @ oracle.Js / objective.compliance
+        j = oracle.n @ oracle.J
+        G, C = j @ np.linalg.solve(M, j), np.sum(j[joints] ** 2) / 12000.0
+        made = springs_along(objective.case, q)
+        assert made is not None and made == pytest.approx((G, C), rel=1e-6)
+        told = compression(objective, q, 0.7, contact)
+        assert told is not None and told.x == pytest.approx(np.pi / 2 / np.sqrt(3e5 * G) * np.sqrt(G / C), rel=1e-6)
+        assert told.peak_force == pytest.approx(0.7 * np.sqrt(3e5 / objective.oracle.quantities(q).G))
+        table = compression(objective, q, 0.7, None)
+        assert table is not None and table.x is None and list(table.by_material) == list(MATERIALS)
+
+
+def test_x_of_a_robot_on_its_feet_is_that_of_the_elastic_response() -> None:
+    found = elastic("talos", 2000.0)
+    supports = found.spec.supports
+    for frame in ("torso_2_link", "gripper_right_base_link"):
+        objective = WorstCaseObjective(found, ImpactContact(frame, (-1, 0, 0)), supports=supports)
+        q = found.posture()
+        G, _ = springs_along(objective.case, q) or (0.0, 0.0)
+        told = compression(objective, q, 1.0, ContactStiffness(linear=1e9))
+        response = ElasticImpact(objective.case).response(q, 1e9)
+        assert told is not None and told.x is not None and G > 0
+        # A very short contact: T is that of the links alone.
+        assert told.x == pytest.approx(response.compliance_ratio, rel=0.02)
+
+
+@pytest.mark.parametrize(
+    ("stiffness", "fits"), [(1e8, "link"), (1e6, None), (1e3, "reflected")]
+)  # fmt: skip
+def test_a_joint_model_that_does_not_fit_is_named_with_both_answers(stiffness: float, fits: str | None) -> None:
+    found = elastic("panda")
+    contact = ImpactContact("panda_hand_tcp", (0, 0, 1))
+    values = {
+        name: WorstCaseObjective(with_joint_model(found, name), contact).oracle.quantities(found.posture()).H  # type: ignore[arg-type]
+        for name in ("link", "reflected")
+    }
+    for name in values:
+        objective = WorstCaseObjective(with_joint_model(found, name), contact)  # type: ignore[arg-type]
+        told = evaluate(objective, found.posture(), contact_stiffness=ContactStiffness(linear=stiffness))
+        assert told.compression is not None and told.compression.fitting == fits
+        lines = [line for line in told.warnings if line.startswith("x =")]
+        assert len(lines) == (fits != name)
+        if lines:
+            assert all(f"{value:.4g} with '{other}'" in lines[0] for other, value in values.items())
+
+
+def test_nothing_is_told_where_nothing_is_known() -> None:
+    found = robot("tilthex_arm")
+    objective = WorstCaseObjective(found, ImpactContact("ee", (0, 0, 1)))
+    assert evaluate(objective, found.posture()).compression is None
+    told = evaluate(objective, found.posture(), contact_stiffness=ContactStiffness(linear=1e5)).compression
+    assert told is not None and told.x is None and told.peak_force is not None and not told.line
+
+
+# ---- bounds in a search -----------------------------------------------------------------------------------------
+
+
+@pytest.mark.parametrize(
+    ("name", "more"),
+    [("tilthex_arm", {}), ("solo12", {"frame": "base_link"}), ("panda", {"contact_pose": "aligned:25"})],
+)
+def test_the_bounds_hold_and_cost(name: str, more: dict[str, object]) -> None:
+    asked = {"robot": name, "normal": (0.0, 0.0, 1.0), "contact_stiffness": 1e5, "speed": 0.8, "starts": 3, **more}
+    plain = prepare(make_settings(asked))
+    free = solve(plain.problem, starts=3, compile="never")
+    before, after = plain.impact.evaluate(free.initial), plain.impact.evaluate(free.q)
+    assert before.compression is not None and after.compression is not None
+    assert (
+        after.compression.peak_force is not None
+        and before.frictionless is not None
+        and after.frictionless is not None
+    )
+    joints = slice(6 if plain.impact.robot.floating else 0, None)
+    force, jump = 0.97 * after.compression.peak_force, 0.97 * np.abs(after.frictionless.velocity[joints]).max()
+    bounded = prepare(make_settings({**asked, "max_force": force, "max_torque": 3.0 * jump, "velocity_gain": 3.0}))
+    (limits,) = (c for c in bounded.problem.constraints if isinstance(c, ImpactBounds))
+    model, numeric = plain.impact.robot.model, Numeric(plain.impact.robot.model)
+    _, jacobian = limits.evaluate(numeric.at(free.q))
+    measured = central_gradient(lambda q: limits.evaluate(numeric.at(q))[0], model, free.q, 1e-4)
+    assert relative(jacobian, measured) < 1e-5
+    found = solve(bounded.problem, starts=3, compile="never")
+    told = bounded.impact.evaluate(found.q)
+    assert found.certificate.holds()
+    assert told.compression is not None and told.compression.peak_force is not None and told.frictionless is not None
+    assert told.compression.peak_force <= force * (1 + 1e-6)
+    assert np.abs(told.frictionless.velocity[joints]).max() <= jump * (1 + 1e-6)
+    assert told.H >= after.H * (1 - 1e-9), "a bound never helps"
+
+
+def _value_at(constraint: AxisInCone, numeric: Numeric, q: NDArray[np.float64]) -> NDArray[np.float64]:
+    return constraint.evaluate(numeric.at(q))[0]
+
+
+@pytest.mark.parametrize(
+    ("name", "key", "kind"), [("panda", "contact_pose", "aligned"), ("tilthex_arm", "base", "level")]
+)
+def test_what_may_tilt_does_at_least_as_well(name: str, key: str, kind: str) -> None:
+    asked = {"robot": name, "normal": (0.0, 0.0, 1.0), "starts": 4}
+    values = []
+    for tilted in (kind, f"{kind}:10", f"{kind}:30"):
+        prepared = prepare(make_settings({**asked, key: tilted}))
+        found = solve(prepared.problem, starts=4, compile="never")
+        assert found.certificate.holds()
+        values.append(prepared.problem.objective.value(found.q))
+        for constraint in prepared.problem.constraints:
+            if isinstance(constraint, AxisInCone):
+                degrees = float(tilted.partition(":")[2])
+                numeric = Numeric(prepared.problem.robot.model)
+                assert -constraint.evaluate(numeric.at(found.q))[0][0] >= np.cos(np.deg2rad(degrees)) - 1e-9
+                jacobian = constraint.evaluate(numeric.at(found.q))[1]
+                tilt = partial(_value_at, constraint, numeric)
+                measured = central_gradient(tilt, prepared.problem.robot.model, found.q, 1e-4)
+                assert relative(jacobian, measured, scale=1.0) < 1e-9
+    assert values[0] * (1 + 1e-9) >= values[1] >= values[2] * (1 - 1e-9)
+
+
+@pytest.mark.parametrize("name", ["tilthex_arm", "panda"])
+def test_the_front_of_jump_and_force_is_that_of_searches_with_a_bound(name: str) -> None:
+    asked = {"robot": name, "normal": (0.0, 0.0, 1.0), "objective": "speed", "contact_stiffness": 1e5, "speed": 0.6}
+    more = {"contact_pose": "aligned:30"} if name == "panda" else {}
+    prepared = prepare(make_settings({**asked, **more}))
+    found = solve(prepared.problem, starts=4, compile="never")
+    contact = ContactStiffness(linear=1e5)
+    curve = pareto_front(found, 4, force=(contact, 0.6), compile="never")
+    assert curve.against == "force" and all(point.certified for point in curve.points)
+    forces, values = ([getattr(p, key) for p in curve.points] for key in ("distance", "objective"))
+    assert forces == sorted(forces) and values == sorted(values, reverse=True)
+    for point in curve.points:
+        assert point.distance == pytest.approx(0.6 * np.sqrt(1e5 / point.G)) and point.distance <= point.within + 1e-6
+    assert values[-1] == pytest.approx(prepared.problem.objective.value(found.q), rel=1e-6)
+    middle = curve.points[2]
+    bounded = prepare(make_settings({**asked, **more, "max_force": middle.within}))
+    again = solve(bounded.problem, starts=4, compile="never")
+    assert middle.objective <= bounded.problem.objective.value(again.q) * (1 + 1e-6), (
+        "another search finds nothing better"
+    )
+
+
+@pytest.mark.parametrize(
+    ("values", "error", "words"),
+    [
+        ({"tradeoff": 3, "tradeoff_against": "force"}, InputError, "needs the elasticity"),
+        ({"max_force": 10.0}, InputError, "needs the elasticity"),
+        ({"max_torque": 1.0}, InputError, "gain"),
+        ({"velocity_gain": 1.0}, InputError, "gain"),
+        ({"contact_stiffness": "iron"}, SpecError, "steel, wood"),
+        ({"contact_stiffness": -1.0}, SpecError, "1 to 1e"),
+        ({"max_force": 1e-300, "contact_stiffness": 1e5}, SpecError, "to 1e"),
+        ({"max_force": 5.0, "contact_stiffness": 1e5, "speed": 0.0}, InputError, "approach speed"),
+        ({"tradeoff": 3, "tradeoff_against": "force", "contact_duration": 0.01, "speed": 0.0}, InputError, "speed"),
+        ({"contact_stiffness": 1e5, "contact_duration": 0.1}, InputError, "one of the two"),
+        ({"contact_duration": 0.0}, SpecError, "1e-07 to 100 s"),
+        ({"contact_pose": "aligned:90"}, SpecError, "aligned:DEG"),
+        ({"contact_pose": "aligned:nan"}, SpecError, "aligned:DEG"),
+        ({"base": "level:90"}, SpecError, "level:DEG"),
+        ({"base": "level:0.01"}, SpecError, "0.1 degrees or more"),
+        ({"base": "aligned:20"}, SpecError, "level:DEG"),
+        (
+            {"max_force": 1.0, "contact_stiffness": "steel"},
+            Infeasible,
+            r"bounds on the impact: peak force, in kg of effective mass \(off by",
+        ),
+        (
+            {"robot": "xarm7", "max_joint_jump": 1e-3},
+            Infeasible,
+            r"bounds on the impact: jump of .+, in rad/s \(m/s\) per m/s of approach \(off by",
+        ),
+    ],
+)
+def test_refusals(values: dict[str, object], error: type[Exception], words: str) -> None:
+    with pytest.raises(error, match=words):
+        solve(prepare(make_settings({"robot": "tilthex_arm", "normal": (0.0, 0.0, 1.0), **values})).problem, starts=1)
+
+
+def test_edges_of_speed_and_of_locked_joints(tmp_path: Path) -> None:
+    """A material at rest has no T, and a robot without moving joints no jump of a joint to bound."""
+    still = ("evaluate", "panda", "--normal", 0, 0, 1, "--speed", 0, "--contact-stiffness", "steel", "--json")
+    told = json.loads(run(*still).stdout)["evaluation"]["compression"]
+    assert told["compression_time"] is None and told["peak_force"] == 0 and told["x"] is None
+    rigid = prepare(
+        make_settings({"robot": "tilthex_arm", "normal": (0, 0, 1), "joint_model": "locked", "max_joint_jump": 2.0})
+    )
+    assert not any(isinstance(c, ImpactBounds) for c in rigid.problem.constraints)
+
+
+def test_an_option_stands_for_the_other_key_of_a_file(tmp_path: Path) -> None:
+    path = tmp_path / "p.toml"
+    path.write_text('robot = "panda"\nnormal = [0.0, 0.0, 1.0]\ncontact_stiffness = 1e5\n')
+    assert read_settings(path, {"contact_duration": 0.01}).contact_stiffness is None
+
+
+def test_the_commands(tmp_path: Path) -> None:
+    config = tmp_path / "robot.toml"
+    config.write_text(
+        'schema = "impact-posture/robot/1"\n[transmission]\nkind = "elastic"\nstiffness = 14000\nsource = "assumed"\n'
+    )
+    told = run("evaluate", "panda", "--normal", 0, 0, 1, "--config", config, "--contact-stiffness", "wood")
+    assert "peak force" in told.stdout and "x = 0.06" in told.stdout and "--joint-model link fits" in told.stderr
+    between = ("panda", "--normal", 0, 0, 1, "--config", config, "--joint-model", "elastic")
+    document = json.loads(run("evaluate", *between, "--contact-stiffness", 1e6, "--json").stdout)["evaluation"]
+    alone = {
+        name: json.loads(run("evaluate", *between[:-1], name, "--json").stdout)["evaluation"]["V"]
+        for name in ("link", "reflected")
+    }
+    assert alone["reflected"] < document["elastic"]["value"] < alone["link"]
+    shown = run("evaluate", *between, "--contact-stiffness", 1e6)
+    assert "elastic joints on 1e+06 N/m" in shown.stdout and "largest torque of panda_joint4" in shown.stdout
+    for asked, words in (
+        (("evaluate", *between), "add --contact-stiffness"),
+        (("optimize", *between, "--contact-stiffness", 1e6), "evaluate the optimum with elastic"),
+        (("evaluate", "ur5", *between[1:5], "--joint-model", "elastic", "--contact-stiffness", 1e6), "spring"),
+    ):
+        failed = run(*asked)
+        assert failed.returncode == 1 and words in failed.stderr and "Traceback" not in failed.stderr
+    out = tmp_path / "out"
+    asked = ("--contact-stiffness", 1e5, "--max-force", 180, "--max-joint-jump", 3, "--starts", 2, "--no-codegen")
+    asked = (*asked, "--tradeoff", 2, "--tradeoff-against", "force")
+    done = run("optimize", "tilthex_arm", "--normal", 0, 0, 1, *asked, "--out", out)
+    assert done.returncode == 0, done.stderr
+    assert "effective mass at most" in done.stdout and "the best posture within a peak force (N)" in done.stdout
+    document = json.loads((out / "result.json").read_text())
+    assert document["optimal"]["compression"]["peak_force"] <= 180 * (1 + 1e-6)
+    assert document["tradeoff_against"] == "force" and document["tradeoff"][-1]["distance"] <= 180 * (1 + 1e-6)
+    again = read_settings(out / "problem.toml")
+    assert (again.contact_stiffness, again.max_force, again.max_joint_jump) == (1e5, 180, 3)
+    assert (again.tradeoff, again.tradeoff_against) == (2, "force")

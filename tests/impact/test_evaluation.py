@@ -1,0 +1,331 @@
+"""``evaluate``: its numbers against dense Pinocchio algebra, its predictions against the physics of an impact."""
+
+from __future__ import annotations
+
+import json
+from pathlib import Path
+
+import numpy as np
+import pytest
+
+from impact_posture.config.option_values import parse_armature, parse_contact
+from impact_posture.config.settings import ImpactSettings
+from impact_posture.errors import ContactError, FrameNotFound, InputError
+from impact_posture.impact.evaluation.ellipsoids import classical_ellipsoids, ellipsoid_of, force_ellipsoid
+from impact_posture.impact.evaluation.evaluation import Evaluation, evaluate
+from impact_posture.impact.evaluation.velocity_jump import tangent_units
+from impact_posture.impact.impact_contact import Support, default_compliance
+from impact_posture.impact.resolved_impact import resolve
+from impact_posture.impact.worst_case_objective import WorstCaseObjective
+from impact_posture.robot.robot import Robot
+from tests.support.helpers import (
+    assert_close,
+    central_gradient,
+    frame_jacobian,
+    frame_placement,
+    mass_matrix,
+    rng,
+    robot,
+    unit,
+)
+
+DESIGN_KEYS = {
+    "q", "objective", "H", "G", "V", "S", "E", "effective_mass", "gradient", "objective_gradient", "worst_normal",
+    "ellipsoid", "pose",
+}  # fmt: skip
+
+PLANAR = """<robot name="planar">
+  <link name="base"/>
+  {links}
+  <joint name="j1" type="revolute"><parent link="base"/><child link="l1"/><axis xyz="0 0 1"/>
+    <limit lower="-3" upper="3" velocity="2" effort="10"/></joint>
+  <joint name="j2" type="revolute"><parent link="l1"/><child link="l2"/><origin xyz="0.5 0 0"/><axis xyz="0 0 1"/>
+    <limit lower="-3" upper="3" velocity="2" effort="10"/></joint>
+  <joint name="jt" type="fixed"><parent link="l2"/><child link="tip"/><origin xyz="0.5 0 0"/></joint>
+</robot>"""
+LINK = """<link name="{0}"><inertial><origin xyz="0.25 0 0"/><mass value="{1}"/>
+  <inertia ixx="0.01" iyy="0.02" izz="{2}" ixy="0" ixz="0" iyz="0"/></inertial></link>"""
+
+
+@pytest.fixture
+def planar(tmp_path: Path) -> str:
+    """A two-link arm that moves in the xy plane alone."""
+    links = LINK.format("l1", 2.0, 0.02) + LINK.format("l2", 1.0, 0.015) + '<link name="tip"/>'
+    path = tmp_path / "planar.urdf"
+    path.write_text(PLANAR.format(links=links))
+    return str(path)
+
+
+def dense(loaded: Robot, frame: str, q: np.ndarray, n: np.ndarray, W: np.ndarray | None, feet: tuple[Support, ...]):
+    """H, G, V, S, Λ_c, a and the sticking jump by inverting ``M + J_sᵀJ_s/ε`` outright."""
+    M = mass_matrix(loaded.model, q)
+    J = frame_jacobian(loaded.model, q, loaded.frame_id(frame))[:3]
+    inertia = M.copy()
+    for foot in feet:
+        Js = frame_jacobian(loaded.model, q, loaded.frame_id(foot.frame), foot.offset)[: foot.rows]
+        inertia += Js.T @ Js / default_compliance(loaded)
+    weight = np.eye(loaded.nv) if W is None else W
+    A = np.linalg.inv(inertia) @ J.T
+    mobility = J @ A
+    a, G = A @ n, n @ mobility @ n
+    stuck = A @ np.linalg.solve(mobility, n)
+    H = a @ weight @ a
+    return {
+        "H": H, "G": G, "V": H / G**2, "S": stuck @ weight @ stuck, "E": 1 / (2 * G), "ellipsoid": A.T @ weight @ A,
+        "a": a, "stuck": stuck, "J": J, "M": M,
+    }  # fmt: skip
+
+
+CASES = [
+    ("tilthex_arm", "ee", "euclidean"),
+    ("tilthex_arm", "ee", "kinetic"),
+    ("panda", "panda_hand_tcp", "euclidean"),
+    ("solo8", "base_link", "euclidean"),
+    ("talos", "gripper_right_base_link", "kinetic"),
+]
+
+
+@pytest.mark.parametrize(("name", "frame", "metric"), CASES)
+def test_numbers_against_dense_algebra(name: str, frame: str, metric: str) -> None:
+    loaded = robot(name)
+    n = unit(rng("normal", name))
+    impact = resolve(ImpactSettings(robot=name, frame=frame, normal=tuple(n), metric=metric, impulse=3.0))  # type: ignore[arg-type]
+    found = evaluate(impact.objective, impact.q, 0.7, 0.3)
+    W = mass_matrix(loaded.model, impact.q) if metric == "kinetic" else None
+    expected = dense(loaded, frame, impact.q, n, W, impact.supports)
+    # The feet's 1/ε beside the links' masses costs the plain inverse digits.
+    tolerance = 1e-6 if impact.supports else 1e-10
+    for key in ("H", "G", "V", "S", "E"):
+        assert_close(found.to_dict()[key], expected[key], tolerance, key)  # type: ignore[arg-type]
+    assert found.objective == pytest.approx(9.0 * found.scalars.H, rel=1e-14)
+    assert found.scalars.effective_mass == pytest.approx(1 / expected["G"], rel=tolerance)
+    axes, radii = found.ellipsoid.axes, found.ellipsoid.radii
+    assert_close(axes @ np.diag(radii**2) @ axes.T, expected["ellipsoid"], tolerance, "ellipsoid")
+    assert_close(axes @ axes.T, np.eye(3), 1e-12, "axes")
+    assert np.linalg.det(axes) > 0 and (np.diff(radii) <= 0).all()
+    assert found.frictionless is not None and found.sticking is not None
+    assert_close(found.frictionless.velocity, expected["a"] * 1.3 * 0.7 / expected["G"], tolerance, "frictionless")
+    assert_close(found.sticking.velocity, expected["stuck"] * 1.3 * 0.7, tolerance, "sticking")
+    assert found.frictionless.norm == pytest.approx(1.3 * 0.7 * np.sqrt(expected["V"]), rel=tolerance)
+    assert found.sticking.norm == pytest.approx(1.3 * 0.7 * np.sqrt(expected["S"]), rel=tolerance)
+    pose = frame_placement(loaded.model, impact.q, loaded.frame_id(frame))
+    assert_close(found.pose.homogeneous, pose.homogeneous, 1e-12, "pose")
+
+
+def test_free_values_stand_beside_the_supported_ones() -> None:
+    loaded, n = robot("talos"), np.array([-1.0, 0.0, 0.0])
+    impact = resolve(ImpactSettings(robot="talos", frame="torso_2_link", normal=(-2.0, 0.0, 0.0)))
+    found = evaluate(impact.objective, impact.q)
+    assert [s.frame for s in impact.supports] == ["left_sole_link", "right_sole_link"]
+    expected = dense(loaded, "torso_2_link", impact.q, n, None, ())
+    assert found.without_supports is not None
+    for key in ("H", "G", "V", "S", "E"):
+        assert_close(found.without_supports.to_dict()[key], expected[key], 1e-10, key)  # type: ignore[arg-type]
+    assert found.to_dict()["free"] == found.without_supports.to_dict()
+    assert found.contact_stability is not None
+    assert found.to_dict()["footing"] == found.contact_stability.to_dict()
+    # Two flat feet have full rank: their compliance hardly matters.
+    assert found.compliance_effect is not None and 0 < found.compliance_effect < 1e-2
+    without = resolve(ImpactSettings(robot="talos", frame="torso_2_link", normal=(-1.0, 0.0, 0.0), support=()))
+    alone = evaluate(without.objective, without.q)
+    assert alone.without_supports is None and "free" not in alone.to_dict()
+    assert alone.contact_stability is None and "footing" not in alone.to_dict()
+    assert alone.scalars.H == pytest.approx(found.without_supports.H, rel=1e-14)
+
+
+def test_the_predicted_jumps_obey_the_impact() -> None:
+    impact = resolve(ImpactSettings(robot="tilthex_arm", normal=(0.3, -0.2, 1.0)))
+    speed, e = 0.8, 0.4
+    found = evaluate(impact.objective, impact.q, speed, e)
+    assert found.frictionless is not None and found.sticking is not None and found.energy_loss is not None
+    n = found.worst_normal
+    parts = dense(robot("tilthex_arm"), "ee", impact.q, n, None, ())
+    J, M = parts["J"], parts["M"]
+    before = rng("approach").normal(size=9)
+    along = n @ J
+    before -= along * (along @ before + speed) / (along @ along)
+    assert n @ J @ before == pytest.approx(-speed)
+    after = before + found.frictionless.velocity
+    assert n @ J @ after == pytest.approx(e * speed)
+    assert_close(M @ found.frictionless.velocity, J.T @ found.frictionless.impulse, 1e-10, "momentum")
+    assert_close(M @ found.sticking.velocity, J.T @ found.sticking.impulse, 1e-10, "momentum")
+    assert_close(J @ found.sticking.velocity, (1 + e) * speed * n, 1e-10, "no slip")
+    assert found.energy_loss == pytest.approx((before @ M @ before - after @ M @ after) / 2)
+    assert found.frictionless.impulse_size == pytest.approx((1 + e) * speed / parts["G"])
+    names = [name for name, _, _ in found.frictionless.largest]
+    order = np.argsort(-np.abs(found.frictionless.velocity))
+    assert names[:3] == [impact.robot.tangent_names[k] for k in order[:3]]
+
+
+@pytest.mark.parametrize("kind", ["impulse", "speed", "sticking", "energy"])
+def test_gradients_against_central_differences(kind: str) -> None:
+    impact = resolve(ImpactSettings(robot="tilthex_arm", normal=(0.0, 0.3, 1.0), posture="tucked", objective=kind))  # type: ignore[arg-type]
+    found = evaluate(impact.objective, impact.q)
+    model, oracle = impact.robot.model, impact.objective.oracle
+    H = central_gradient(lambda q: oracle.quantities(q).H, model, impact.q, 1e-4)
+    assert_close(found.gradient, H, 1e-6, "gradient of H")
+    assert found.objective_gradient is not None
+    value = central_gradient(impact.objective.value, model, impact.q, 1e-4)
+    assert_close(found.objective_gradient, value, 1e-6, "gradient of the objective")
+
+
+def strict(found: Evaluation) -> dict[str, object]:
+    block = json.loads(json.dumps(found.to_dict(), allow_nan=False))
+    assert set(block) >= DESIGN_KEYS
+    return block
+
+
+def test_the_block_has_the_keys_of_result_json() -> None:
+    impact = resolve(ImpactSettings(robot="panda", normal=(0.0, 0.0, 1.0)))
+    block = strict(evaluate(impact.objective, impact.q))
+    assert set(block["ellipsoid"]) == {"axes", "radii"}  # type: ignore[call-overload]
+    assert set(block["pose"]) == {"position", "quaternion_xyzw"}  # type: ignore[call-overload]
+    assert len(block["gradient"]) == 9 and len(block["q"]) == 9  # type: ignore[arg-type]
+    asked = impact.to_dict()
+    assert set(asked) == {"robot", "contacts", "scenarios", "supports", "support_compliance", "metric"}
+    robot_keys = "name source model_sha256 nq nv joint_names root convention armature locked"
+    assert set(asked["robot"]) >= set(robot_keys.split())  # type: ignore[call-overload]
+
+
+def test_where_S_does_not_exist(planar: str) -> None:
+    impact = resolve(ImpactSettings(robot=planar, frame="tip", normal=(1.0, 0.0, 0.5), objective="sticking"))
+    q = np.array([0.3, 0.9])
+    found = evaluate(impact.objective, q)
+    block = strict(found)
+    assert block["S"] is None and block["objective"] is None and block["objective_gradient"] is None
+    assert found.sticking is None and found.scalars.V is not None
+    assert any("S is undefined" in line for line in found.warnings)
+
+
+def test_S_by_the_pseudo_inverse_inside_the_range(planar: str) -> None:
+    impact = resolve(ImpactSettings(robot=planar, frame="tip", normal=(1.0, 0.4, 0.0), objective="sticking"))
+    q = np.array([0.3, 0.9])
+    found = evaluate(impact.objective, q)
+    n = found.worst_normal
+    J = frame_jacobian(impact.robot.model, q, impact.robot.frame_id("tip"))[:3]
+    A = np.linalg.solve(mass_matrix(impact.robot.model, q), J.T)
+    expected = A @ np.linalg.pinv(J @ A, rcond=1e-9) @ n
+    assert found.scalars.S == pytest.approx(expected @ expected, rel=1e-9)
+    assert found.sticking is not None
+    assert_close(J @ found.sticking.velocity, n, 1e-9, "no slip")
+
+
+def test_where_the_contact_cannot_move_along_the_normal(planar: str) -> None:
+    impact = resolve(ImpactSettings(robot=planar, frame="tip", normal=(0.0, 0.0, 1.0), objective="speed"))
+    found = evaluate(impact.objective, np.array([0.3, 0.9]))
+    block = strict(found)
+    assert [block[key] for key in ("V", "S", "E", "effective_mass", "objective")] == [None] * 5
+    assert found.frictionless is None and found.energy_loss is None
+    assert found.scalars.H == pytest.approx(0.0, abs=1e-20)
+    assert any("unbounded" in line for line in found.warnings)
+
+
+def test_one_joint_dominates_or_none_does(planar: str) -> None:
+    found = evaluate(*_impact(planar, (0.0, 1.0, 0.0), [0.0, 0.0]))
+    joint = found.dominance
+    a = np.linalg.solve(
+        mass_matrix(_impact(planar, (0.0, 1.0, 0.0), [0.0, 0.0])[0].robot.model, np.zeros(2)), [1.0, 0.5]
+    )
+    assert joint.joint == "j2" and joint.dominates
+    assert joint.share == pytest.approx(a[1] ** 2 / (a @ a), rel=1e-10)
+    assert joint.line.startswith(f"joint 'j2' carries {100 * joint.share:.0f} % of H")
+    even = resolve(ImpactSettings(robot="talos", frame="torso_2_link", normal=(-1.0, 0.0, 0.0)))
+    verdict = evaluate(even.objective, even.q).dominance
+    assert not verdict.dominates and verdict.line.startswith("no single joint dominates H")
+
+
+def _impact(urdf: str, normal: tuple[float, float, float], q: list[float]) -> tuple[WorstCaseObjective, np.ndarray]:
+    return resolve(ImpactSettings(robot=urdf, frame="tip", normal=normal)).objective, np.array(q)
+
+
+def test_units_of_the_tangent_entries() -> None:
+    assert tangent_units(robot("tilthex_arm")) == ("m/s",) * 3 + ("rad/s",) * 6
+    assert tangent_units(robot("panda")) == ("rad/s",) * 7 + ("m/s",) * 2
+
+
+@pytest.mark.parametrize(
+    ("speed", "restitution"), [(-1.0, 0.0), (np.nan, 0.0), (1.0, -0.1), (1.0, 1.1), (1.0, np.nan)]
+)
+def test_an_impossible_approach_is_refused(speed: float, restitution: float) -> None:
+    impact = resolve(ImpactSettings(robot="ur5", normal=(0.0, 0.0, 1.0)))
+    with pytest.raises(InputError, match=r"^speed: |^restitution: "):
+        evaluate(impact.objective, impact.q, speed, restitution)
+
+
+def test_classical_ellipsoids() -> None:
+    impact = resolve(ImpactSettings(robot="panda", normal=(0.0, 0.0, 1.0)))
+    J = frame_jacobian(impact.robot.model, impact.q, impact.robot.frame_id("panda_hand_tcp"))[:3]
+    found = classical_ellipsoids(impact.objective, impact.q)
+    for name, matrix in (("velocity", J @ J.T), ("force", np.linalg.inv(J @ J.T))):
+        axes, radii = found[name].axes, found[name].radii
+        assert_close(axes @ np.diag(radii**2) @ axes.T, matrix, 1e-9, name)
+        assert (np.diff(radii) <= 0).all()
+
+
+def test_a_force_without_bound_is_null() -> None:
+    J = np.array([[1.0, 0.0], [0.0, 2.0], [0.0, 0.0]])
+    assert force_ellipsoid(J).to_dict()["radii"] == [None, 1.0, 0.5]
+    assert np.allclose(np.abs(force_ellipsoid(J).axes[:, 0]), [0, 0, 1])
+    assert ellipsoid_of(J @ J.T).to_dict()["radii"] == [2.0, 1.0, 0.0]
+
+
+@pytest.mark.parametrize(
+    ("text", "expected"),
+    [
+        ("ee:0,0,1", ("ee", (0.0, 0.0, 1.0), None)),
+        ("ee:-1,0,1e-3:2.5", ("ee", (-1.0, 0.0, 1e-3), 2.5)),
+        ("arm::ee:0,0,1", ("arm::ee", (0.0, 0.0, 1.0), None)),
+    ],
+)
+def test_contacts_as_text(text: str, expected: object) -> None:
+    assert parse_contact(text) == expected
+
+
+@pytest.mark.parametrize("text", ["ee", "ee:0,0", ":0,0,1", "ee:a,b,c", "0,0,1"])
+def test_contacts_that_are_none(text: str) -> None:
+    with pytest.raises(ContactError, match=r"^contact: "):
+        parse_contact(text)
+
+
+def test_armature_as_text() -> None:
+    assert parse_armature([]) is None
+    assert parse_armature(["none"]) == "none"
+    assert parse_armature(["motors.toml"]) == "motors.toml"
+    assert parse_armature(["a=0.1", "b=2e-3"]) == {"a": 0.1, "b": 2e-3}
+    for texts in (["a=0.1", "motors.toml"], ["a=much"], ["none", "a=1"]):
+        with pytest.raises(InputError, match=r"^armature: "):
+            parse_armature(texts)
+
+
+def test_supports_as_text() -> None:
+    def supports(*texts: str) -> tuple[Support, ...]:
+        return resolve(ImpactSettings(robot="solo8", normal=(1.0, 0.0, 0.0), support=texts)).supports
+
+    known = {s.frame: s for s in robot("solo8").spec.supports}
+    assert supports("FL_FOOT") == (known["FL_FOOT"],)
+    assert supports("FL_FOOT:surface")[0].kind == "surface"
+    assert supports("FL_FOOT:surface")[0].offset == known["FL_FOOT"].offset
+    assert supports("FL_LOWER_LEG:point")[0] == Support("FL_LOWER_LEG")
+    with pytest.raises(FrameNotFound, match="FL_FOOT"):
+        supports("FL_FOT")
+    with pytest.raises(InputError, match="given twice"):
+        supports("FL_FOOT", "FL_FOOT:surface")
+
+
+def test_an_impact_at_a_held_point_is_refused() -> None:
+    with pytest.raises(ContactError, match="held by the support at 'FL_FOOT'"):
+        resolve(ImpactSettings(robot="solo8", frame="FL_FOOT", normal=(1.0, 0.0, 0.0)))
+
+
+def test_a_robot_without_a_default_frame_names_some(planar: str) -> None:
+    with pytest.raises(ContactError, match="frame: planar has no default contact frame; give one, for example tip"):
+        resolve(ImpactSettings(robot=planar, normal=(1.0, 0.0, 0.0)))
+
+
+def test_impulse_of_the_contact_text_and_the_default_offset() -> None:
+    assert resolve(ImpactSettings(robot="panda", contact=("panda_hand_tcp:0,0,2:4",))).contact.impulse == 4.0
+    assert (
+        resolve(ImpactSettings(robot="panda", contact=("panda_hand_tcp:0,0,2",), impulse=5.0)).contact.impulse == 5.0
+    )
+    with pytest.raises(ContactError, match="instead of"):
+        resolve(ImpactSettings(robot="panda", contact=("panda_hand_tcp:0,0,2",), normal=(0.0, 0.0, 1.0)))

@@ -1,0 +1,244 @@
+"""``H, G, V, S, E, Λ_c``, their gradients and lifted form: symbolic, from Pinocchio's numbers, by differences."""
+
+from __future__ import annotations
+
+import itertools
+from collections.abc import Iterator
+from dataclasses import replace
+
+import casadi as ca
+import numpy as np
+import pinocchio as pin
+import pytest
+
+import impact_posture as ip
+from impact_posture.config.settings import ObjectiveKind
+from impact_posture.dynamics.tree import Tree
+from impact_posture.impact.impact_case import ImpactCase
+from impact_posture.impact.impact_contact import ImpactContact, Support, default_compliance
+from impact_posture.impact.jump_metric import Metric, build_metric
+from impact_posture.impact.quantities.impact_kernel import ImpactKernel
+from impact_posture.impact.quantities.impact_oracle import ImpactOracle
+from impact_posture.impact.supports import resolve_supports
+from impact_posture.impact.worst_case_objective import WorstCaseObjective
+from impact_posture.robot.robot import Robot
+from tests.support.helpers import (
+    NAMES,
+    Vector,
+    assert_close,
+    central_gradient,
+    frame_jacobian,
+    frame_placement,
+    mass_matrix,
+    random_configurations,
+    rng,
+    robot,
+    unit,
+)
+
+KINDS: tuple[ObjectiveKind, ...] = ("impulse", "speed", "sticking", "energy")
+OFFSET = (0.01, -0.02, 0.03)
+VALUE, GRADIENT = 1e-9, 1e-6
+# Differences of a value that is good to 1e-11 (stiff feet) are best at about this step, 1e-9 relative.
+STEP = 2e-4
+
+
+def supports_of(found: Robot) -> tuple[Support, ...]:
+    """The robot's feet; where it has none, a point brace a third of the way to the contact."""
+    if found.spec.supports:
+        return found.spec.supports
+    assert found.spec.contact.frame is not None
+    path = list(found.model.supports[found.model.frames[found.frame_id(found.spec.contact.frame)].parentJoint])[1:]
+    braced = path[len(path) // 3]
+    frame = next(f for f in found.model.frames if f.parentJoint == braced and f.type == pin.FrameType.BODY)
+    return (Support(str(frame.name), "point", (0.02, 0.03, -0.01)),)
+
+
+# Robots that go through all combinations; every other goes through three.
+WHOLE = ("solo8", "panda", "tilthex_arm")
+
+
+def combinations(name: str) -> Iterator[tuple[Robot, ImpactContact, Metric, tuple[Support, ...]]]:
+    """Metric × supports × frame of the normal: all twelve, or each metric once.
+
+    Which supports and frame a metric then goes with differs from robot to robot: a quarter of them meets each of the
+    twelve.
+    """
+    found, generator = robot(name), rng(name, "combinations")
+    assert found.spec.contact.frame is not None
+    weights = tuple(float(w) for w in generator.uniform(0.5, 2.0, found.nv))
+    metrics = (Metric(), Metric("kinetic"), Metric("weighted", weights))
+    pairs = list(itertools.product(((), supports_of(found)), ("world", "contact")))
+    for (i, metric), (k, (supports, axes)) in itertools.product(enumerate(metrics), enumerate(pairs)):
+        if name in WHOLE or k == (NAMES.index(name) + i) % 4:
+            normal = unit(generator)
+            yield found, ImpactContact(found.spec.contact.frame, tuple(normal), OFFSET, axes, 3.0), metric, supports
+
+
+def describe(contact: ImpactContact, metric: Metric, supports: tuple[Support, ...]) -> str:
+    return f"{metric.kind}, normal in {contact.normal_frame}, {len(supports)} supports"
+
+
+@pytest.mark.parametrize("name", NAMES)
+def test_symbolic_oracle_and_differences_agree(name: str) -> None:
+    for found, contact, metric, supports in combinations(name):
+        compliance = default_compliance(found)
+        q, n = ca.SX.sym("q", found.nq), ca.SX.sym("n", 3)
+        k = ImpactKernel(ImpactCase(found, contact, metric, supports, compliance), q, n)
+        kernel_fun = ca.Function(
+            "kernel", [q, n],
+            [k.H, k.G, k.V, k.S, k.E, k.ellipsoid, k.mobility, k.jump.a, k.world_normal,
+             k.grad_H, k.grad_G, k.grad_V, k.grad_S, k.grad_E],
+        )  # fmt: skip
+        oracle = ImpactOracle(ImpactCase(found, contact, metric, supports, compliance))
+
+        def values(at: Vector, oracle: ImpactOracle = oracle) -> Vector:
+            o = oracle.quantities(at)
+            assert o.S is not None
+            return np.array([o.H, o.G, o.V, o.S, o.E])
+
+        where = describe(contact, metric, supports)
+        (at,) = random_configurations(found.model, 1, name, where)
+        out = [np.array(value) for value in kernel_fun(at, contact.normal)]
+        o = oracle.quantities(at)
+        expected = [o.H, o.G, o.V, o.S, o.E, o.ellipsoid, o.mobility, o.jump, o.normal]
+        words = ["H", "G", "V", "S", "E", "ellipsoid", "mobility", "jump", "normal"]
+        for what, value, numbers in zip(words, out, expected, strict=False):
+            assert_close(value, np.asarray(numbers), VALUE, f"{what} ({where})")
+        gradients = dict(zip("HGVSE", (g.reshape(-1) for g in out[9:]), strict=True))
+        differences = dict(zip("HGVSE", central_gradient(values, found.model, at, STEP), strict=True))
+        for what, gradient in gradients.items():
+            assert_close(gradient, differences[what], GRADIENT, f"grad {what} ({where})")
+        for what, gradient in {
+            "H": oracle.gradient_H(at), "G": oracle.gradient_G(at), "S": oracle.gradient_S(at)
+        }.items():  # fmt: skip
+            assert_close(gradient, differences[what], GRADIENT, f"oracle's grad {what} ({where})")
+
+
+@pytest.mark.parametrize("name", NAMES)
+def test_oracle_by_its_definition(name: str) -> None:
+    """Inverses written out, from Pinocchio's matrices and nothing else."""
+    for found, contact, metric, supports in combinations(name):
+        if metric.kind == "weighted":
+            continue
+        model, where = found.model, describe(contact, metric, supports)
+        (q,) = random_configurations(model, 1, name, where, "definition")
+        frame, epsilon = found.frame_id(contact.frame), default_compliance(found)
+        M, J = mass_matrix(model, q), frame_jacobian(model, q, frame, contact.offset)[:3]
+        held = M.copy()
+        for support in supports:
+            J_s = frame_jacobian(model, q, found.frame_id(support.frame), support.offset)[: support.rows]
+            held += J_s.T @ J_s / epsilon
+        n = np.array(contact.normal)
+        if contact.normal_frame == "contact":
+            n = frame_placement(model, q, frame).rotation @ n
+        W = M if metric.kind == "kinetic" else np.eye(found.nv)
+        A = np.linalg.solve(held, J.T)
+        ellipsoid, mobility = A.T @ W @ A, J @ A
+        s = np.linalg.solve(mobility, n)
+        G = n @ mobility @ n
+        o = ImpactOracle(ImpactCase(found, contact, metric, supports, epsilon)).quantities(q)
+        # Forming M + JᵀJ/ε loses what the oracle's own system keeps.
+        tolerance = 1e-8 if supports else 1e-10
+        assert o.S is not None
+        for what, value, expected in (
+            ("H", o.H, n @ ellipsoid @ n), ("G", o.G, G), ("V", o.V, n @ ellipsoid @ n / G**2),
+            ("S", o.S, s @ ellipsoid @ s), ("E", o.E, 0.5 / G),
+        ):  # fmt: skip
+            assert_close(value, expected, tolerance, f"{what} ({where})")
+        assert_close(o.ellipsoid, ellipsoid, tolerance, f"ellipsoid ({where})")
+
+
+@pytest.mark.parametrize("name", NAMES)
+def test_lifted_form(name: str) -> None:
+    """At the guess the equations hold and the value is the oracle's; the equations fix the unknowns."""
+    for k, (found, contact, metric, supports) in enumerate(combinations(name)):
+        # A robot that goes through all combinations goes through them with each kind, every other with three kinds.
+        for kind in KINDS if name in WHOLE else [KINDS[(NAMES.index(name) + k) % len(KINDS)]]:
+            objective = WorstCaseObjective(found, contact, metric, kind, supports)
+            q, n = ca.SX.sym("q", found.nq), ca.SX.sym("n", 3)
+            lifted = objective.lift(Tree(found.model, q), n, ca.SX(1))
+            assert lifted.variables.shape == lifted.residual.shape
+            lifted_fun = ca.Function("lifted", [q, n, lifted.variables], [lifted.residual, lifted.value])
+            where = f"{kind}, {describe(contact, metric, supports)}"
+            (at,) = random_configurations(found.model, 1, name, where)
+            guess = objective.guess(at, 1.0).values
+            residual, value = (np.array(o) for o in lifted_fun(at, contact.normal, guess))
+            assert np.abs(residual).max() < 1e-9 * max(1.0, np.abs(guess).max()), where
+            assert_close(value, objective.value(at), VALUE, where)
+            if metric.kind == "euclidean":
+                system = ca.Function("J", [q, n, lifted.variables], [ca.jacobian(lifted.residual, lifted.variables)])
+                assert np.linalg.matrix_rank(np.array(system(at, contact.normal, guess)), tol=1e-12) == guess.size
+
+
+@pytest.mark.parametrize("kind", (*KINDS, "coulomb"))
+@pytest.mark.parametrize("name", WHOLE)
+def test_objective_functions_agree_with_its_own_numbers(name: str, kind: ObjectiveKind) -> None:
+    all_of_them = list(combinations(name))
+    # All metrics, both frames, with and without supports; CasADi's subexpression search is slow.
+    for found, contact, metric, supports in (all_of_them[k] for k in (0, 5, 7, 10)):
+        objective = WorstCaseObjective(found, contact, metric, kind, supports)
+        where = describe(contact, metric, supports)
+        (q,) = random_configurations(found.model, 1, name, kind, where)
+        value, gradient = (np.array(o) for o in objective.gradient_fun()(q, contact.normal))
+        assert_close(value, objective.value(q), VALUE, f"value ({where})")
+        if metric.kind == "euclidean":
+            assert_close(objective.value_fun()(q, contact.normal), objective.value(q), VALUE, f"value_fun ({where})")
+        # Stiff feet cost digits where the contact can hardly move, and the inverse of its mobility is large.
+        agreed = GRADIENT if supports else 1e-8
+        assert_close(gradient, objective.gradient(q), agreed, f"gradient ({where})")
+        differences = central_gradient(lambda at, o=objective: o.value(at), found.model, q, STEP)
+        assert_close(objective.gradient(q), differences, GRADIENT, f"differences ({where})")
+        if kind == "impulse":
+            assert objective.scale == 9.0
+            assert_close(value, 9.0 * objective.oracle.quantities(q).H, VALUE, f"bound squared ({where})")
+        assert objective.name == kind
+        assert objective.units
+
+
+@pytest.mark.parametrize("name", ["panda", "talos"])
+def test_an_oracle_that_comes_back_to_a_posture_knows_it(name: str) -> None:
+    """Also after more postures than it keeps, and with its model moved to each."""
+    robot, rng = ip.load_robot(name), np.random.default_rng(3)
+    contact = ImpactContact(
+        {"panda": "panda_hand_tcp", "talos": "gripper_right_base_link"}[name], normal=(0, 0.6, 0.8)
+    )
+    postures = [pin.integrate(robot.model, robot.posture(), 0.2 * rng.normal(size=robot.nv)) for _ in range(36)]
+    kept = WorstCaseObjective(robot, contact, kind="speed", supports=resolve_supports(robot, None))
+    for k in [*range(36), 35, 34, 0, 0, 35, 10, 11]:
+        q = postures[k]
+        fresh = WorstCaseObjective(robot, contact, kind="speed", supports=kept.supports)
+        assert kept.value(q) == fresh.value(q)
+        if k % 5 == 0:
+            np.testing.assert_array_equal(kept.gradient(q), fresh.gradient(q))
+            at = [one.oracle.numeric.placement(one.oracle.point).translation for one in (kept, fresh)]
+            np.testing.assert_array_equal(*at)
+
+
+def test_degenerate_combinations_are_named() -> None:
+    found = robot("panda")
+    contact = ImpactContact("panda_hand", (0.0, 0.0, 1.0))
+    said = {kind: WorstCaseObjective(found, contact, Metric("kinetic"), kind).warnings for kind in KINDS}
+    assert "opposite" in said["speed"][0]
+    assert "effective mass" in said["impulse"][0]
+    assert WorstCaseObjective(found, contact, Metric(), "speed").warnings == ()
+
+
+def test_degenerate_combinations_are_named_with_supports() -> None:
+    found = robot("solo8")
+    contact, feet = ImpactContact("base_link", (1.0, 0.0, 0.2)), resolve_supports(found, None)
+    impulse = WorstCaseObjective(found, contact, Metric("kinetic"), "impulse", feet)
+    at = impulse.oracle.quantities(found.posture())
+    assert abs(at.H - at.G) / at.G < 1e-4
+    speed = replace(impulse, kind="speed")
+    assert "effective mass" in impulse.warnings[0] and "opposite" in speed.warnings[0]
+    assert replace(impulse, kind="sticking").warnings == ()
+
+
+def test_velocity_limit_weights_are_inverse_squares() -> None:
+    found = robot("panda")
+    metric = build_metric(found, "weighted", "velocity-limits")
+    np.testing.assert_allclose(metric.diagonal(found.nv), 1 / np.array(found.model.upperVelocityLimit) ** 2)
+    floating = build_metric(robot("solo8"), "weighted", "velocity-limits").diagonal(14)
+    np.testing.assert_array_equal(floating[:6], np.ones(6))
+    np.testing.assert_allclose(floating[6:], 80.0**-2)

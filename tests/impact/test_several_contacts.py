@@ -1,0 +1,401 @@
+"""Several contacts at once: against enumeration and samples of the box, at ties, solved."""
+
+from __future__ import annotations
+
+import itertools
+from dataclasses import replace
+from pathlib import Path
+
+import numpy as np
+import pinocchio as pin
+import pytest
+from hypothesis import given, settings
+from hypothesis import strategies as st
+
+from impact_posture.codegen.manifest_builder import sample_postures
+from impact_posture.errors import ContactError, ImpactPostureError, InputError, MetricError, SpecError
+from impact_posture.impact.evaluation.evaluation import evaluate
+from impact_posture.impact.impact_contact import ImpactContact, Support
+from impact_posture.impact.jump_metric import Metric
+from impact_posture.impact.worst_case.impulse_box import ImpulseBox, WorstImpulses, corners
+from impact_posture.impact.worst_case_objective import WorstCaseObjective
+from impact_posture.posture.constraints.clearance import Clearance
+from impact_posture.posture.constraints.kept_contacts import KeptContacts
+from impact_posture.posture.formulation.problem_file import dump_settings, prepare, read_settings, resolved_settings
+from impact_posture.posture.manifold.feasible_start import feasible_start
+from impact_posture.posture.program.constrained_problem import ConstrainedProblem
+from impact_posture.posture.search.multistart import solve
+from impact_posture.robot.robot import Robot
+from impact_posture.robot.robot_spec import RobotSpec
+from tests.dynamics.test_dynamics import random_tree
+from tests.support.helpers import (
+    assert_close,
+    central_gradient,
+    frame_jacobian,
+    frame_placement,
+    mass_matrix,
+    random_configurations,
+    relative,
+    rng,
+    robot,
+    unit,
+)
+from tests.support.settings import make_settings
+
+HANDS = ("gripper_right_base_link", "gripper_left_base_link")
+
+
+def random_robot(generator: np.random.Generator, *, floating: bool) -> Robot:
+    """A random branching tree of five joints with six frames somewhere on it."""
+    kinds = [*(["FreeFlyer"] if floating else []), *generator.choice(["RX", "RUBY", "PZ", "RevoluteUnaligned"], 5)]
+    climbs = [int(v) for v in generator.integers(0, 3, len(kinds))]
+    model = random_tree([str(k) for k in kinds], climbs, int(generator.integers(1000)), armature=True)
+    for k in range(6):
+        joint = int(generator.integers(2 if floating else 3, model.njoints))
+        model.addFrame(pin.Frame(f"f{k}", joint, 0, pin.SE3.Random(), pin.FrameType.OP_FRAME))
+    root = "free-flyer" if floating else "fixed"
+    return Robot("tree", "", model, root, {"neutral": pin.neutral(model)}, "neutral", RobotSpec())  # type: ignore[arg-type]
+
+
+def box_of(objective: WorstCaseObjective) -> ImpulseBox:
+    assert isinstance(objective.worst_case, ImpulseBox)
+    return objective.worst_case
+
+
+def jumps_of(objective: WorstCaseObjective, q: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
+    """Unit impacts' jumps as columns and the weight matrix W, by dense algebra on Pinocchio's M and J."""
+    model = objective.robot.model
+    M = mass_matrix(model, q)
+    impacts = []
+    for contact in objective.contacts:
+        frame = objective.robot.frame_id(contact.frame)
+        n = np.array(contact.normal)
+        n = frame_placement(model, q, frame).rotation @ n if contact.normal_frame == "contact" else n
+        impacts.append(frame_jacobian(model, q, frame, contact.offset)[:3].T @ n)
+    rows = [
+        frame_jacobian(model, q, objective.robot.frame_id(s.frame), s.offset)[: s.rows] for s in objective.supports
+    ]
+    Js = np.vstack(rows) if rows else np.zeros((0, model.nv))
+    kkt = np.block([[M, -Js.T], [Js, objective.compliance * np.eye(len(Js))]])
+    right = np.vstack([np.array(impacts).T, np.zeros((len(Js), len(impacts)))])
+    metric = objective.metric
+    W = {"euclidean": np.eye(model.nv), "kinetic": M}.get(metric.kind)
+    return np.linalg.solve(kkt, right)[: model.nv], np.diag(metric.diagonal(model.nv)) if W is None else W
+
+
+def enumerated(objective: WorstCaseObjective, q: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
+    """All corners of the box, the origin among them, and ``‖Σ λ_i a_i‖²_W`` there."""
+    jumps, W = jumps_of(objective, q)
+    ends = [(-c.impulse if objective.bilateral else 0.0, c.impulse) for c in objective.contacts]
+    found = np.array(list(itertools.product(*ends)))
+    return found, np.einsum("ki,ij,kj->k", found, jumps.T @ W @ jumps, found)
+
+
+# ---- against enumeration, samples and finite differences ----------------------------------------------------------
+
+
+@settings(max_examples=25)
+@given(
+    floating=st.booleans(),
+    count=st.integers(2, 4),
+    feet=st.integers(0, 2),
+    metric=st.sampled_from(["euclidean", "kinetic", "weighted"]),
+    axes=st.sampled_from(["world", "contact"]),
+    bilateral=st.booleans(),
+    seed=st.integers(0, 10_000),
+)
+def test_every_box(floating: bool, count: int, feet: int, metric: str, axes: str, bilateral: bool, seed: int) -> None:
+    generator = rng(seed, "box")
+    found = random_robot(generator, floating=floating)
+    contacts = [
+        ImpactContact(f"f{k}", tuple(unit(generator)), tuple(0.1 * generator.normal(size=3)), axes, impulse)  # type: ignore[arg-type]
+        for k, impulse in enumerate(generator.uniform(0.3, 3.0, count))
+    ]
+    weights = tuple(generator.uniform(0.2, 5.0, found.nv)) if metric == "weighted" else None
+    objective = WorstCaseObjective(
+        found,
+        contacts[0],
+        Metric(metric, weights),  # type: ignore[arg-type]
+        supports=tuple(Support(f"f{5 - k}", "point") for k in range(feet)),
+        compliance=1e-3,
+        others=tuple(contacts[1:]),
+        bilateral=bilateral,
+    )
+    (q,) = random_configurations(found.model, 1, seed, "box", spread=0.6)
+    jumps, W = jumps_of(objective, q)
+    box, values = enumerated(objective, q)
+    value = objective.value(q)
+    assert_close(value, values.max(), 1e-9, "the largest of all corners")
+
+    low = -1.0 if bilateral else 0.0
+    bounds = np.array([c.impulse for c in contacts])
+    inside = generator.uniform(low, 1.0, (10_000, count)) * bounds
+    assert np.einsum("ki,ij,kj->k", inside, jumps.T @ W @ jumps, inside).max() <= value * (1 + 1e-9)
+
+    worst = box_of(objective).worst(q)
+    assert any(np.array_equal(worst.impulses, corner) for corner in box), "a corner of the box"
+    assert_close(worst.impulses @ jumps.T @ W @ jumps @ worst.impulses, value, 1e-9, "attained there")
+    assert_close(worst.jump, jumps @ worst.impulses, 1e-8, "its jump")
+
+    # With both signs every corner is as bad as its opposite: the second best is another pair.
+    best = np.sort(values)[::-1]
+    if best[2 if bilateral else 1] < value * (1 - 1e-3):
+        gradient = objective.gradient(q)
+        differences = central_gradient(objective.value, found.model, q, 1e-4)
+        assert_close(gradient, differences, 3e-6, "gradient", scale=value)
+        symbolic = [np.array(v).ravel() for v in objective.gradient_fun()(q, objective.contact.normal)]
+        assert_close(symbolic[0], value, 1e-9, "CasADi's value")
+        assert_close(symbolic[1], gradient, 1e-7, "CasADi's gradient", scale=value)
+        assert_close(objective.subgradients(q).gradients, [gradient], 1e-12, "one gradient", scale=value)
+
+
+@pytest.mark.parametrize(("name", "frames"), [("solo12", ("FL_SHOULDER", "FR_SHOULDER")),
+                                              ("solo8", ("FL_UPPER_LEG", "FR_UPPER_LEG"))])  # fmt: skip
+def test_subgradients_at_a_mirror_symmetric_posture(name: str, frames: tuple[str, str]) -> None:
+    """Squeezed from both sides: either impact alone is as bad, and the objective rises like the larger of the two."""
+    found = robot(name)
+    one, other = (ImpactContact(f, (0.0, side, 0.0)) for f, side in zip(frames, (1.0, -1.0), strict=True))
+    objective = WorstCaseObjective(found, one, others=(other,))
+    q = found.posture()
+    worst, points = box_of(objective).worst(q), objective.subgradients(q)
+    assert np.array_equal(worst.tied, [[1, 0], [0, 1]]) and worst.to_dict()["tied"] is True
+    assert len(points.gradients) == 2 and relative(*points.gradients) > 0.5
+    assert np.all(points.gaps <= 1e-6 * objective.value(q))
+    step = 1e-6
+    for index in range(20):
+        direction = unit(rng("kink", name, index), found.nv)
+        there = np.array(pin.integrate(found.model, q, step * direction))
+        rise = (objective.value(there) - objective.value(q)) / step
+        slopes = points.gradients @ direction
+        # Within the hull, and at its far end: the maximum of smooth functions.
+        assert rise == pytest.approx(slopes.max(), rel=1e-3, abs=1e-3 * objective.value(q))
+        assert slopes.min() < rise + 1e-3 * objective.value(q)
+    # The compiled gradient is one of them.
+    value, gradient = (np.array(v).ravel() for v in objective.gradient_fun()(q, one.normal))
+    assert value[0] == pytest.approx(objective.value(q), rel=1e-9)
+    assert min(relative(gradient, g) for g in points.gradients) < 1e-6
+
+
+def test_both_hands_of_talos_by_hand() -> None:
+    found = robot("talos")
+    feet = found.spec.supports
+    right, left = (
+        ImpactContact(frame, (-1.0, 0.0, 0.2), impulse=i) for frame, i in zip(HANDS, (1.0, 2.0), strict=True)
+    )
+    objective = WorstCaseObjective(found, right, supports=feet, others=(left,))
+    assert [single.contact for single in objective.singles] == [right, left]
+    for q in (found.posture(), *sample_postures(found, 2, 3)):
+        _, values = enumerated(objective, q)
+        assert_close(objective.value(q), values.max(), 1e-7, "talos")
+        assert_close(replace(objective, bilateral=True).value(q), max(values.max(), _opposed(objective, q)), 1e-7, "")
+        assert objective.value(q) >= max(single.value(q) for single in objective.singles) * (1 - 1e-12)
+    seen = evaluate(objective, found.posture())
+    assert [one.objective for one in seen.contacts] == [s.value(found.posture()) for s in objective.singles]
+    assert seen.impulses is not None and seen.objective == pytest.approx(seen.impulses.value, rel=1e-12)
+
+
+def _opposed(objective: WorstCaseObjective, q: np.ndarray) -> float:
+    """``‖λ̄₁a₁ − λ̄₂a₂‖²``."""
+    jumps, W = jumps_of(objective, q)
+    a = jumps @ np.array([objective.contacts[0].impulse, -objective.contacts[1].impulse])
+    return float(a @ W @ a)
+
+
+def test_corners() -> None:
+    for count in range(2, 7):
+        one_sided, both = corners(count, False), corners(count, True)
+        assert one_sided.shape == (2**count - 1, count) and both.shape == (2 ** (count - 1), count)
+        assert len({tuple(c) for c in one_sided}) == len(one_sided) and one_sided.any(axis=1).all()
+        assert len({tuple(c) for c in (*both, *-both)}) == 2**count
+        assert one_sided[0].all(), "all at once comes first: what a user expects of equally bad ones"
+    assert isinstance(
+        box_of(WorstCaseObjective(robot("panda"), *_pair())).worst(robot("panda").posture()), WorstImpulses
+    )
+
+
+def _pair() -> tuple[ImpactContact, Metric, str, tuple[Support, ...], float, float, tuple[ImpactContact, ...]]:
+    hand, elbow = ImpactContact("panda_hand_tcp", (0, 0, 1)), ImpactContact("panda_link4", (1, 0, 0))
+    return hand, Metric(), "impulse", (), 0.0, 0.0, (elbow,)  # type: ignore[return-value]
+
+
+# ---- solving ------------------------------------------------------------------------------------------------------
+
+ELBOW = {"robot": "panda", "contact": ("panda_hand_tcp:0,0,1", "panda_link4:1,0,0:2"), "contact_pose": "position"}
+TASKS = {
+    "talos' hands": {"robot": "talos", "contact": tuple(f"{hand}:-1,0,0" for hand in HANDS)},
+    "two feet": {
+        "robot": "solo12", "contact": ("FL_FOOT:0,0,1", "FR_FOOT:0,0,1"), "contact_pose": "free", "com": False,
+        "support": ("HL_FOOT", "HR_FOOT"),
+    },
+    "hand and elbow": ELBOW,
+    "hand and elbow, free": ELBOW | {"contact_pose": "free"},
+    "six": {
+        "robot": "panda", "contact_pose": "free",
+        "contact": ("panda_hand:1,1,0", *[f"panda_link{k}:{k % 2},{k % 3},-1:0.{k}" for k in range(3, 8)]),
+    },
+}  # fmt: skip
+
+
+def problem_of(task: dict[str, object], **more: object) -> ConstrainedProblem:
+    return prepare(make_settings(task | more)).problem
+
+
+@pytest.mark.parametrize("name", TASKS)
+def test_every_start_certifies(name: str) -> None:
+    problem = problem_of(TASKS[name])
+    solution = solve(problem, starts=3, jobs=1, compile="never")
+    assert solution.certified_starts == solution.feasible_starts == 3
+    assert solution.reduction > 0 and solution.certificate.holds()
+    # What one contact alone would do at its own best is a bound from below.
+    first = problem.impact.singles[0]
+    alone = solve(replace(problem, objective=first), starts=3, jobs=1, compile="never", guesses=(solution.q,))
+    assert problem.objective.value(solution.q) >= first.value(alone.q) * (1 - 1e-9)
+    assert problem.objective.value(solution.q) <= problem.objective.value(alone.q) * (1 + 1e-6)
+    assert len({c.frame for c in problem.objective.contacts}) == len(problem.objective.contacts)
+
+
+def test_no_feasible_posture_is_better() -> None:
+    """Hand and elbow in place leave two degrees of freedom: random feasible postures cover them."""
+    problem = problem_of(ELBOW)
+    solution = solve(problem, starts=8, jobs=1, compile="never")
+    assert solution.redundancy == 2
+    found = [feasible_start(problem, k, seed=5) for k in range(1, 60)]
+    values = [problem.objective.value(q) for q in found if q is not None]
+    assert len(values) > 40
+    best = problem.objective.value(solution.q)
+    assert min(values) >= best * (1 - 1e-7)
+    assert min(values) < best * 1.5, "and some come near"
+
+
+def test_an_optimum_at_a_kink_certifies_by_a_mixture() -> None:
+    """Where two corners are as bad neither gradient vanishes on what the constraints leave, a mixture does."""
+    problem = problem_of(TASKS["two feet"], bilateral=True)
+    solution = solve(problem, starts=6, jobs=1, compile="never")
+    points = problem.objective.subgradients(solution.q)
+    assert len(points.gradients) > 1 and relative(*points.gradients[:2]) > 0.01
+    assert solution.certificate.stationarity < 1e-7
+    smooth = replace(problem, objective=_Frozen(problem.objective))  # type: ignore[arg-type]
+    from impact_posture.posture.program.certificate import certify
+
+    assert not certify(smooth, solution.q, problem.objective.value(solution.initial)).holds()
+
+
+def test_optima_far_below_their_start_certify() -> None:
+    """Where the objective falls ten-thousandfold the corners tie to the solver's digits, not to their own."""
+    task = {"robot": "icub", "contact_pose": "free", "com": False, "contact": (
+        "r_gripper_joint:-0.033,-0.472,-0.830:0.92", "l_gripper_joint:-0.983,-1.982,0.553:2.89",
+        "root_joint:0.586,-0.165,1.748:2.53", "l_leg_ft_sensor:0.826,2.150,0.821:2.87")}  # fmt: skip
+    solution = solve(problem_of(task), starts=2, seed=3, jobs=1, compile="never")
+    assert solution.certified_starts == 2 and solution.reduction > 0.9995
+
+
+class _Frozen:
+    """An objective that forgets its other subgradients."""
+
+    def __init__(self, objective: WorstCaseObjective) -> None:
+        self._objective = objective
+
+    def subgradients(self, q: np.ndarray, within: float = 0.0) -> object:
+        whole = self._objective.subgradients(q, within)
+        return replace(whole, gradients=whole.gradients[:1], gaps=whole.gaps[:1])
+
+
+def test_pulling_is_never_milder() -> None:
+    pushing, both = problem_of(ELBOW), problem_of(ELBOW, bilateral=True)
+    for q in random_configurations(pushing.robot.model, 10, "pull"):
+        assert both.objective.value(q) >= pushing.objective.value(q) * (1 - 1e-12)
+    one, two = (solve(p, starts=6, jobs=1, compile="never") for p in (pushing, both))
+    assert both.objective.value(two.q) >= pushing.objective.value(one.q) * (1 - 1e-9)
+
+
+def test_two_frames_of_one_link_are_held_once() -> None:
+    """Their poses repeat each other: the search for starts and the program must both live with it."""
+    problem = problem_of({"robot": "ur5", "contact": ("tool0:1,0,0", "wrist_3_link-tool0_fixed_joint:0,1,0")})
+    assert problem.rows, "rows that repeat others are left out"
+    assert sum(feasible_start(problem, k, seed=0) is not None for k in range(12)) == 12
+    solution = solve(problem, starts=4, jobs=1, compile="never")
+    assert solution.certified_starts == solution.feasible_starts == 4
+
+
+def test_struck_feet_that_are_balls_are_held_in_place_only() -> None:
+    problem = problem_of({k: v for k, v in TASKS["two feet"].items() if k != "contact_pose"})
+    names = [c.name for c in problem.constraints]
+    assert "position of FL_FOOT" in names and "pose of FL_FOOT" not in names
+
+
+HANDS = ("gripper_right_base_link", "gripper_left_base_link")
+
+
+@pytest.mark.parametrize("normal_frame", ["world", "contact"])
+@pytest.mark.parametrize(
+    ("normals", "stops"),
+    [
+        (((-1, 0, 0), (-1, 0, 0)), False),
+        # The left hand meets another surface, and stays clear of that of the right one.
+        (((-1, 0, 0), (0, 1, 0)), True),
+    ],
+)
+def test_two_hands_at_one_wall_may_both_touch_it(
+    normals: tuple[tuple[int, int, int], ...], stops: bool, normal_frame: str
+) -> None:
+    talos, contacts = robot("talos"), []
+    for hand, normal in zip(HANDS, normals, strict=True):
+        turned = frame_placement(talos.model, talos.posture(), talos.frame_id(hand)).rotation.T @ np.array(normal)
+        x, y, z = normal if normal_frame == "world" else turned
+        contacts.append(f"{hand}:{x},{y},{z}")
+    task = {"robot": "talos", "contact": tuple(contacts), "normal_frame": normal_frame, "collision": True}
+    problem = problem_of(task)
+    (wall,) = [c for c in problem.constraints if c.name == f"surface at {HANDS[0]}"]
+    assert isinstance(wall, Clearance)
+    bodies = [wall.row_name(k).split(" / ")[0] for k in range(len(wall.lower))]
+    assert "torso_2_link" in bodies and any("arm_left_5" in name for name in bodies)
+    assert not any("gripper_right" in name for name in bodies)
+    assert any("gripper_left" in name for name in bodies) == stops
+
+
+def test_kept_feet_of_each_impact() -> None:
+    task = {"robot": "bolt", "contact": ("base_link:0,0.1,-1", "base_link:0.1,0,-1"), "contact_pose": "free",
+            "keep_contacts": True, "friction": 2.0}  # fmt: skip
+    problem = problem_of(task)
+    kept = [c for c in problem.constraints if isinstance(c, KeptContacts)]
+    assert [tuple(c.parameters) for c in kept] == [c.normal for c in problem.objective.contacts]
+    solution = solve(problem, starts=1, jobs=1, compile="never")
+    for one in evaluate(problem.objective, solution.q).contacts:
+        found = one.contact_stability
+        assert found is not None and found.friction is not None and found.friction <= 2.02
+    with pytest.raises(InputError, match="pull as well as push"):
+        problem_of(task, bilateral=True)
+
+
+def test_a_resolved_problem_gives_the_same_again(tmp_path: Path) -> None:
+    prepared = prepare(make_settings({**ELBOW, "contact": ("panda_hand_tcp:1,2,3:0.7", "panda_link4:1,0,-0.3"),
+                                      "bilateral": True, "impulse": 2.0, "starts": 2, "seed": 3}))  # fmt: skip
+    (tmp_path / "problem.toml").write_text(dump_settings(resolved_settings(prepared)))
+    again = prepare(read_settings(tmp_path / "problem.toml"))
+    assert again.problem.objective.contacts == prepared.problem.objective.contacts
+    assert again.problem.impact.bilateral and again.problem.impact.contact.impulse == 0.7
+    one, two = (solve(p.problem, starts=2, seed=3, jobs=1, compile="never") for p in (prepared, again))
+    np.testing.assert_array_equal(one.q, two.q)
+
+
+@pytest.mark.parametrize(
+    ("settings_", "kind", "words"),
+    [
+        ({"target_position": (0.4, 0.0, 0.4)}, InputError, "one target for several contacts"),
+        ({"target_quaternion": (0.0, 0.0, 0.0, 1.0)}, InputError, "one target for several contacts"),
+        ({"objective": "speed"}, MetricError, "approach speed of one contact"),
+        ({"normal_cone": 5.0}, MetricError, "exact for one contact only"),
+        ({"offset": (0.0, 0.0, 0.1)}, ContactError, "one offset for several contacts"),
+        ({"frame": "panda_hand_tcp"}, ContactError, "instead of `frame`"),
+        ({"contact": ("panda_hand:1,0,0", "panda_hand:2,0,0")}, ContactError, "given twice"),
+        ({"contact": tuple(f"panda_link{k}:0,0,1" for k in range(1, 8))}, ContactError, "7 contacts"),
+        ({"contact": ("panda_hand_tcp:0,0,1",), "bilateral": True}, ContactError, "one contact"),
+        ({"contact": ("panda_hand_tcp:0,0,1", "panda_hnd:0,0,1")}, ImpactPostureError, "panda_hand"),
+        ({"contact": ("panda_hand_tcp:0,0,1", "panda_link4:0,0,0")}, SpecError, "with a direction"),
+        ({"contact": ("panda_hand_tcp:0,0,1", "panda_link4:0,0,1:-2")}, SpecError, "impulse above zero"),
+    ],
+)
+def test_refusals(settings_: dict[str, object], kind: type[ImpactPostureError], words: str) -> None:
+    with pytest.raises(kind, match=words) as caught:
+        problem_of(ELBOW, **settings_)
+    assert "\n" not in caught.value.line and caught.value.hint

@@ -1,0 +1,119 @@
+"""What can be wrong with a page, found without looking at it."""
+
+from __future__ import annotations
+
+import re
+from dataclasses import dataclass
+from itertools import combinations
+
+import numpy as np
+from matplotlib.backends.backend_agg import FigureCanvasAgg
+from matplotlib.figure import Figure
+from matplotlib.text import Text
+from mpl_toolkits.mplot3d import Axes3D
+
+from impact_posture.output.plot.style import lay_out
+
+# Darker than this in some color is a line; grids, walls and faint fills are lighter.
+_INK = 0.6
+_NUMBER = re.compile("[−0-9.e]+")
+
+
+@dataclass(frozen=True)
+class Words:
+    """A text as it stands on the page: the middle of its box, half of its sides and its turn, pixels."""
+
+    text: str
+    center: np.ndarray
+    half: np.ndarray
+    turn: np.ndarray
+
+    @classmethod
+    def of(cls, text: Text) -> Words:
+        box, angle = text.get_window_extent(), np.radians(text.get_rotation())
+        c, s = abs(np.cos(angle)), abs(np.sin(angle))
+        size = text.get_fontsize() * text.figure.get_dpi() / 72 * (1 + 1.3 * text.get_text().count("\n"))
+        # A slanted text is smaller than the upright box around it.
+        width = (box.width - size * s) / c if c > s else (box.height - size * c) / s
+        height = box.height if s < 0.01 else box.width if c < 0.01 else size
+        center = np.array([box.x0 + box.width / 2, box.y0 + box.height / 2])
+        turn = np.array([[np.cos(angle), np.sin(angle)], [-np.sin(angle), np.cos(angle)]])
+        return cls(text.get_text(), center, np.array([width, height]) / 2, turn)
+
+    def holds(self, points: np.ndarray, less: float = 1.0) -> np.ndarray:
+        """Which points, shape (n, 2), lie in it, ``less`` pixels from its edge."""
+        return (np.abs((points - self.center) @ self.turn.T) < self.half - less).all(axis=1)
+
+    @property
+    def points(self) -> np.ndarray:
+        """Points all over it, shape (n, 2)."""
+        x, y = (np.linspace(-h + 1, h - 1, max(int(h), 3)) for h in self.half)
+        return np.stack(np.meshgrid(x, y), axis=-1).reshape(-1, 2) @ self.turn + self.center
+
+
+def defects(figure: Figure) -> list[str]:
+    """What is wrong with a figure: texts on each other, on lines or off the page, axes without units, legends."""
+    figure.set_dpi(100)
+    canvas = FigureCanvasAgg(figure)
+    # It draws everything as well, so that texts know where they stand.
+    lay_out(figure)
+    texts = [t for t in figure.findobj(Text) if t.get_visible() and t.get_text().strip() and _shown(t, figure)]
+    words = [Words.of(text) for text in texts]
+    found = [
+        f"'{one.text}' stands on '{other.text}'"
+        for one, other in combinations(words, 2)
+        if np.linalg.norm(one.center - other.center) < np.linalg.norm(one.half) + np.linalg.norm(other.half)
+        and other.holds(one.points).any()
+    ]
+    for text in texts:
+        # With the plate behind it, which would only hide the line that it stands on.
+        text.set_visible(False)
+    canvas.draw()
+    image = np.asarray(canvas.buffer_rgba())[::-1, :, :3].min(axis=2) / 255
+    dark = np.argwhere(image < _INK)[:, ::-1] + 0.5
+    for text in texts:
+        text.set_visible(True)
+    height, width = image.shape
+    for one in words:
+        if one.holds(dark).any():
+            found.append(f"'{one.text}' stands on a line")
+        corners = one.center + (np.array([[1, 1], [1, -1], [-1, 1], [-1, -1]]) * one.half) @ one.turn
+        if (corners < -1).any() or (corners > np.array([width, height]) + 1).any():
+            found.append(f"'{one.text}' is off the page")
+    legends = [legend for part in figure.subfigs for legend in part.legends]
+    legends += [axes.get_legend() for axes in figure.axes if axes.get_legend() is not None]
+    if len(legends) > 1:
+        found.append(f"{len(legends)} legends")
+    return found + [f"no unit on an axis '{label}'" for label in labels(figure) if "[" not in label]
+
+
+def _shown(text: Text, figure: Figure) -> bool:
+    """Whether a text is drawn: ticks beyond an axis' end are not."""
+    for axes in figure.axes:
+        for axis in _axes(axes):
+            every = [t.label1 for t in axis.majorTicks + axis.minorTicks] + [t.label2 for t in axis.majorTicks]
+            if text in every:
+                if not (axes.get_visible() and axes.axison):
+                    return False
+                low, high = sorted(axis.get_view_interval())
+                slack = 1e-9 * (high - low)
+                drawn = [t for t in axis.get_major_ticks() if low - slack <= t.get_loc() <= high + slack]
+                return any(text in (t.label1, t.label2) for t in drawn)
+            if text is axis.label:
+                return bool(axes.get_visible() and axes.axison)
+    return True
+
+
+def _axes(axes: object) -> list[object]:
+    return [getattr(axes, f"{name}axis") for name in ("xyz" if isinstance(axes, Axes3D) else "xy")]
+
+
+def labels(figure: Figure) -> list[str]:
+    """Names of all axes that show numbers."""
+    found = []
+    for axes in figure.axes:
+        for axis in _axes(axes) if axes.axison and axes.get_visible() else ():
+            numbers = [t.label1 for t in axis.get_major_ticks()] + [t.label2 for t in axis.get_major_ticks()]
+            if axis.get_visible() and any(t.get_visible() and _NUMBER.fullmatch(t.get_text()) for t in numbers):
+                found.append(axis.label.get_text())
+    return found

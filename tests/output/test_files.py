@@ -1,0 +1,191 @@
+"""Files in all formats, pages without overlap, degenerate robots, bad input."""
+
+from __future__ import annotations
+
+from collections.abc import Iterator
+from pathlib import Path
+from xml.etree import ElementTree
+
+import matplotlib
+import matplotlib.image
+import numpy as np
+import pytest
+
+from impact_posture.errors import InputError, OutputError
+from impact_posture.output import result_folder
+from impact_posture.output.plot import FIGURES, FORMATS, FigureNotFound, ResultView, draw_all, postures_figure
+from impact_posture.output.plot.classical_figure import classical_figure
+from impact_posture.output.plot.ellipsoid_figure import ellipsoid_figure
+from impact_posture.output.plot.jump_figure import jump_figure
+from impact_posture.output.plot.path_figures import path_figure, tradeoff_figure
+from impact_posture.output.plot.self_motion_figure import self_motion_figure
+from impact_posture.output.plot.style import WIDTH
+from tests.output.page import defects
+from tests.output.views import PENDULUM, make_view, text_of
+
+
+def test_figures_are_written_in_all_formats(tilthex: ResultView, tmp_path: Path) -> None:
+    # Surfaces and hatches in every format, the rest in one each: the writers are matplotlib's.
+    first = draw_all(tilthex, tmp_path / "figures", FORMATS, only=["ellipsoid", "jump"])
+    assert [p.name for p in first] == [f"{n}.{f}" for n in ("ellipsoid", "jump") for f in ("png", "svg", "pdf")]
+    paths = first + draw_all(tilthex, tmp_path / "figures", (".PNG",), only=["postures"])
+    paths += draw_all(
+        tilthex, tmp_path / "figures", ("svg", "svg"), only=["nullspace", "classical", "tradeoff", "path"]
+    )
+    paths += draw_all(tilthex, tmp_path / "figures", only=["self_motion"])
+    assert len(paths) == len(set(paths)) == 12
+    assert {p.stem for p in paths} == set(FIGURES)
+    for path in paths:
+        assert path.stat().st_size > 8_000, path
+        if path.suffix == ".png":
+            image = matplotlib.image.imread(path)
+            assert image.shape[1] == round(200 * WIDTH)
+            # Something other than paper everywhere: left and right, top and bottom half.
+            rows, columns = (image[..., :3].min(axis=2) < 0.9).nonzero()
+            assert rows.min() < 0.1 * len(image) < 0.8 * len(image) < rows.max()
+            assert columns.min() < 0.1 * image.shape[1] < 0.8 * image.shape[1] < columns.max()
+        elif path.suffix == ".svg":
+            assert ElementTree.parse(path).getroot().tag.endswith("svg")
+        else:
+            content = path.read_bytes()
+            assert content.startswith(b"%PDF") and b"/Type3" not in content and b"/CreationDate" not in content
+
+
+def test_the_same_view_gives_the_same_files(pendulum: ResultView, tmp_path: Path) -> None:
+    (first,) = draw_all(pendulum, tmp_path / "a", ("svg",), only=["ellipsoid"])
+    (second,) = draw_all(pendulum, tmp_path / "b", ("svg",), only=["ellipsoid"])
+    assert first.read_bytes() == second.read_bytes()
+
+
+@pytest.mark.skipif(
+    matplotlib.__version_info__ < (3, 11), reason="before 3.11 matplotlib puts a label here and there on a line"
+)
+@pytest.mark.parametrize(
+    ("name", "figure"),
+    [
+        ("talos", postures_figure),
+        ("tilthex", postures_figure),
+        ("solo8", postures_figure),
+        ("pendulum", postures_figure),
+        ("turned", postures_figure),
+        ("two_hands", postures_figure),
+        ("panda", postures_figure),
+        ("talos", jump_figure),
+        ("panda", jump_figure),
+        ("solo8", ellipsoid_figure),
+        ("solo8_cone", ellipsoid_figure),
+        ("torso", ellipsoid_figure),
+        ("turned", ellipsoid_figure),
+        ("pendulum", ellipsoid_figure),
+        ("talos", classical_figure),
+        ("turned", classical_figure),
+        ("pendulum", classical_figure),
+        ("tilthex", tradeoff_figure),
+        ("pendulum", path_figure),
+        ("tilthex", self_motion_figure),
+        ("surface", self_motion_figure),
+    ],
+)
+def test_pages_have_no_defects(name: str, figure: object, request: pytest.FixtureRequest) -> None:
+    page = figure(request.getfixturevalue(name))  # type: ignore[operator]
+    assert defects(page) == []
+    head, body, foot = page.subfigs
+    for part in (head, foot):
+        for words in part.texts:
+            box = words.get_window_extent()
+            assert box.y0 >= part.bbox.y0 and box.y1 <= part.bbox.y1
+    # A pixel less all round: what they touch is blank.
+    boxes = [axes.get_tightbbox().padded(-1) for axes in body.axes]
+    for box in boxes:
+        assert box.x0 >= 0 and box.x1 <= body.bbox.x1
+        assert box.y0 >= body.bbox.y0 and box.y1 <= body.bbox.y1
+    for legend in body.legends:
+        assert not any(legend.get_window_extent().overlaps(box) for box in boxes)
+
+
+def test_defects_are_found(monkeypatch: pytest.MonkeyPatch, turned: ResultView) -> None:
+    monkeypatch.setattr("impact_posture.output.plot.style.draw_with_labels", lambda figure: None)
+    page = postures_figure(turned)
+    _, flat = page.axes
+    flat.set_xlabel("x")
+    flat.text(0.5, 0.5, "one", transform=flat.transAxes)
+    flat.text(0.5, 0.51, "other", transform=flat.transAxes)
+    flat.plot([], [], label="line")
+    flat.legend()
+    found = defects(page)
+    assert "'one' stands on 'other'" in found and "2 legends" in found and "no unit on an axis 'x'" in found
+    flat.plot(np.mean(flat.get_xlim()), np.mean(flat.get_ylim()), "ks", markersize=30)
+    assert "'one' stands on a line" in defects(page)
+
+
+def test_degenerate_robot_draws(pendulum: ResultView) -> None:
+    assert np.linalg.matrix_rank(pendulum.after.ellipsoid, tol=1e-9) < 3
+    words = {
+        "classical": "force unbounded: a strip",
+        "ellipsoid": "S undefined",
+        "jump": "Diamonds: with friction 0.7 the contact point",
+        "nullspace": "S is undefined along the path",
+        "path": "Note: a reason.",
+        "postures": "seen along −x",
+        "self_motion": "runs from one limit to another",
+        "tradeoff": "S is undefined at these postures",
+    }
+    for name, build in FIGURES.items():
+        figure = build(pendulum)
+        figure.draw_without_rendering()
+        assert words[name] in text_of(figure)
+
+
+def test_a_contact_that_cannot_move_draws() -> None:
+    # Across the pendulum's plane nothing gives: H = G = 0, V is infinite.
+    view = make_view(PENDULUM, (1, 0, 0), q0=np.array([0.4, 0.9]))
+    assert view.before.G == view.after.G == 0
+    assert "G = 0" in text_of(jump_figure(view))
+    for figure in (ellipsoid_figure(view), jump_figure(view), path_figure(view)):
+        figure.draw_without_rendering()
+
+
+def test_a_turning_normal_is_drawn_twice() -> None:
+    view = make_view("ur5", (0.3, 0.4, 1), normal_frame="contact", path=False)
+    for figure in (ellipsoid_figure(view), classical_figure(view)):
+        assert {"n₀", "n₁", "n₀ before, n₁ after"} <= set(text_of(figure).split(" | "))
+    figure.draw_without_rendering()
+
+
+def test_user_settings_are_put_back_and_ignored(pendulum: ResultView, tmp_path: Path) -> None:
+    (clean,) = draw_all(pendulum, tmp_path / "clean", ("svg",), only=["jump"])
+    with matplotlib.rc_context({"font.size": 21.0, "axes.facecolor": "red", "savefig.dpi": 37}):
+        (own,) = draw_all(pendulum, tmp_path / "own", ("svg",), only=["jump"])
+        assert matplotlib.rcParams["font.size"] == 21.0
+    assert clean.read_bytes() == own.read_bytes()
+
+
+def test_bad_input(pendulum: ResultView, panda: ResultView, tmp_path: Path) -> None:
+    with pytest.raises(FigureNotFound, match="did you mean ellipsoid"):
+        draw_all(pendulum, tmp_path, only=["elipsoid"])
+    with pytest.raises(InputError, match="no format 'gif'"):
+        draw_all(pendulum, tmp_path, ("gif",))
+    with pytest.raises(InputError, match="no path to draw"):
+        draw_all(panda, tmp_path, only=["nullspace"])
+    with pytest.raises(InputError, match=r"no trade-off to draw.*`tradeoff`"):
+        draw_all(panda, tmp_path, only=["tradeoff"])
+    with pytest.raises(InputError, match=r"no map to draw.*search=.global"):
+        draw_all(panda, tmp_path, only=["self_motion"])
+    (tmp_path / "file").write_text("in the way")
+    with pytest.raises(OutputError, match="cannot be written"):
+        draw_all(pendulum, tmp_path / "file", ("png",), only=["jump"])
+    assert [p.name for p in tmp_path.iterdir()] == ["file"]
+
+
+def test_a_figure_is_drawn_while_the_temporary_folders_of_others_vanish(
+    tmp_path: Path, tilthex: ResultView, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    """Another process had just removed its folder when this one came to search in it."""
+
+    def vanished(folder: Path, pattern: str) -> Iterator[Path]:
+        raise FileNotFoundError(folder / f".impact-posture-gone/{pattern}")
+
+    monkeypatch.setattr(Path, "rglob", vanished)
+    drawings = result_folder._drawings(tilthex, tmp_path, ("png",), True)
+    ((name, address),) = drawings[-1]()
+    assert (tmp_path / f"{name}.png").is_file() and address.startswith("data:image/png;base64,")

@@ -1,0 +1,236 @@
+"""Motions along paths: analytic times, limits by plain RNEA at ten times the resolution, forces that exist."""
+
+from __future__ import annotations
+
+from functools import cache
+
+import numpy as np
+import pinocchio as pin
+import pytest
+from scipy.optimize import lsq_linear
+
+from impact_posture.impact.impact_contact import ImpactContact
+from impact_posture.impact.worst_case_objective import WorstCaseObjective
+from impact_posture.path import path_timing as timing
+from impact_posture.path import timed_curve
+from impact_posture.path.actuator_limits import ActuatorLimits
+from impact_posture.path.path_curve import PathCurve
+from impact_posture.path.path_space import PathSpace
+from impact_posture.path.posture_path import PosturePath, posture_path
+from impact_posture.posture.formulation.build_problem import build_problem
+from impact_posture.posture.formulation.problem_file import prepare
+from impact_posture.posture.program.constrained_problem import Requirements
+from impact_posture.posture.search.multistart import PostureSolution, solve
+from impact_posture.robot.actuation import allocation_matrix, thrust_limits
+from impact_posture.robot.robot import Robot
+from impact_posture.system.arrays import Array
+from tests.support.arms import TIP, Z, arm, yaw_and_pitches
+from tests.support.helpers import robot
+from tests.support.settings import make_settings
+
+CASES: dict[str, dict[str, object]] = {
+    "ur5": {"robot": "ur5", "normal": (0, 0, 1), "contact_pose": "aligned"},
+    "panda": {"robot": "panda", "normal": (0, 0, 1), "contact_pose": "full"},
+    "tilthex_arm": {"robot": "tilthex_arm", "normal": (0, 0, 1)},
+    "solo8": {"robot": "solo8", "normal": (1, 0, 0)},
+}
+
+
+@cache
+def solved(name: str) -> PostureSolution:
+    return solve(prepare(make_settings(CASES[name])).problem, starts=4, jobs=1)
+
+
+@pytest.fixture(params=CASES, scope="module")
+def dense(request: pytest.FixtureRequest) -> tuple[Robot, PosturePath]:
+    """The same motion at ten times the resolution."""
+    solution = solved(request.param)
+    coarse = posture_path(solution)
+    with pytest.MonkeyPatch.context() as patch:
+        patch.setattr(timed_curve, "SAMPLE_TIME", timed_curve.SAMPLE_TIME / 10)
+        patch.setattr(timed_curve, "_LEAST_POINTS", 10 * timed_curve._LEAST_POINTS)
+        fine = posture_path(solution)
+    assert fine.found and fine.duration == pytest.approx(coarse.duration, rel=1e-9)
+    assert len(fine.t) >= 9 * len(coarse.t)
+    return solution.problem.robot, fine
+
+
+def test_positions_velocities_and_accelerations_belong_together(dense: tuple[Robot, PosturePath]) -> None:
+    loaded, path = dense
+    dt = np.diff(path.t)[:, None]
+    steps = np.array([pin.difference(loaded.model, a, b) for a, b in zip(path.q, path.q[1:], strict=False)])
+    # Postures are pulled onto the constraints by up to 1e-5 each.
+    assert np.abs(steps - dt * (path.v[1:] + path.v[:-1]) / 2).max() < 3e-5
+    # The time-optimal acceleration jumps; elsewhere it is the slope of the velocity.
+    off = np.abs(np.diff(path.v, axis=0) / dt - (path.a[1:] + path.a[:-1]) / 2).max(axis=1)
+    assert np.median(off) < 0.01 * np.abs(path.a).max()
+    assert np.abs(path.v[[0, -1]]).max() < 1e-6
+
+
+def test_limits_hold_at_ten_times_the_resolution(dense: tuple[Robot, PosturePath]) -> None:
+    """By RNEA on the robot's own model, and by forces that are searched anew as a sum of rays in the cones."""
+    loaded, path = dense
+    model, data = loaded.model, loaded.model.createData()
+    base = 6 if loaded.floating else 0
+    allowed = 1.01
+    assert (np.abs(path.v) / allowed <= np.asarray(model.velocityLimit)).all()
+    assert path.max_violation < 1e-8
+    effort, largest = np.asarray(model.effortLimit)[base:], 0.0
+    for q, v, a in list(zip(path.q, path.v, path.a, strict=True))[:: 1 if not base else 7]:
+        load = np.array(pin.rnea(model, data, q, v, a))
+        if not base:
+            assert (np.abs(load) <= allowed * effort).all()
+            largest = max(largest, float((np.abs(load) / effort).max()))
+            continue
+        matrix, low, high = forces(loaded, q)
+        limits = np.concatenate([np.asarray(effort), high])
+        found = lsq_linear(
+            np.hstack([np.eye(model.nv)[:, base:], matrix]), load,
+            bounds=(np.concatenate([-effort, low]) - 0.01 * np.abs(limits).clip(max=1e3), allowed * limits),
+        )  # fmt: skip
+        assert np.abs(found.fun).max() < 1e-5 * loaded.mass * 9.81
+    if not base:
+        # Nor does the motion dawdle: some limit is met.
+        assert max(largest, float((np.abs(path.v) / model.velocityLimit).max())) > 0.98
+
+
+def forces(loaded: Robot, q: Array) -> tuple[Array, Array, Array]:
+    """Generalized forces of rotors, or of rays on the edge of the friction cones of the feet, and their bounds."""
+    if loaded.spec.propulsion is not None:
+        matrix = np.vstack([allocation_matrix(loaded.model, loaded.spec.propulsion), np.zeros((loaded.nv - 6, 6))])
+        low, high = thrust_limits(loaded.spec.propulsion)
+        return matrix, np.full(6, low), np.full(6, high)
+    data, columns = loaded.model.createData(), []
+    pin.computeJointJacobians(loaded.model, data, q)
+    pin.updateFramePlacements(loaded.model, data)
+    for spec in loaded.spec.supports:
+        assert spec.kind == "point"
+        index = loaded.frame_id(spec.frame)
+        J = pin.getFrameJacobian(loaded.model, data, index, pin.LOCAL_WORLD_ALIGNED)
+        arm_of = data.oMf[index].rotation @ np.array(spec.offset)
+        at_point = J[:3] - pin.skew(arm_of) @ J[3:]
+        for angle in np.linspace(0, 2 * np.pi, 24, endpoint=False):
+            columns.append(at_point.T @ np.array([0.7 * np.cos(angle), 0.7 * np.sin(angle), 1.0]))
+    return np.array(columns).T, np.zeros(len(columns)), np.full(len(columns), np.inf)
+
+
+def pendulum(effort: float, *, gravity: float = 0.0) -> PathSpace:
+    """A single hinge; its axis is upright without gravity, else level."""
+    made = arm([(0, 1, 0) if gravity else Z], [0.0], floating=False, rods=[(0.5, 0, 0)], effort=effort)
+    objective = WorstCaseObjective(made, ImpactContact(TIP, (0, 0, 1) if gravity else (0, 1, 0)))
+    return PathSpace(build_problem(made, objective, made.posture(), Requirements(contact_pose="free")))
+
+
+def limits_of(space: PathSpace) -> ActuatorLimits:
+    return ActuatorLimits(space.problem.objective, space.problem.given, space.problem.requirements)
+
+
+def curve_of(space: PathSpace, angle: float) -> PathCurve:
+    return PathCurve(space, [space.problem.given + x for x in np.linspace(0, angle, 6)[:, None]])
+
+
+@pytest.mark.parametrize(("effort", "angle"), [(0.5, 1.0), (2.0, -0.7)])
+def test_a_pendulum_takes_the_time_of_bang_bang(effort: float, angle: float) -> None:
+    """T = 2 √(I Δ/τ); with the smooth law the largest acceleration is 10/√3 Δ/T²."""
+    space = pendulum(effort)
+    inertia = float(pin.crba(space.model, space.model.createData(), space.problem.given)[0, 0])
+    limits = limits_of(space)
+    assert not limits.missing
+    fastest = timing.timed(space, curve_of(space, angle), limits)
+    assert fastest.method == "time-optimal" and not fastest.notes
+    assert fastest.t[-1] == pytest.approx(2 * np.sqrt(inertia * abs(angle) / effort), rel=5e-3)
+    smooth = timing.scaled(space, curve_of(space, angle), limits)
+    assert smooth.t[-1] == pytest.approx(np.sqrt(10 / np.sqrt(3) * inertia * abs(angle) / effort), rel=5e-3)
+
+
+@pytest.mark.parametrize("name", ["panda", "tilthex_arm"])
+def test_a_corner_is_passed_slowly_and_the_rest_is_not(name: str, monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setattr(timed_curve, "SAMPLE_TIME", timed_curve.SAMPLE_TIME / 10)
+    loaded = robot(name)
+    objective = WorstCaseObjective(loaded, ImpactContact(loaded.spec.contact.frame, (0, 0, 1)))
+    space = PathSpace(build_problem(loaded, objective, loaded.posture(), Requirements(contact_pose="free")))
+    moves = np.zeros((129, loaded.nv))
+    first, other = (6, 7) if loaded.floating else (0, 1)
+    moves[:, first] = np.interp(np.arange(129), [0, 48], [0, 0.4])
+    moves[48:, other] = np.linspace(0, 0.7, 81)
+    curve = PathCurve(space, [np.array(pin.integrate(loaded.model, space.problem.given, way)) for way in moves])
+    motion = timing.timed(space, curve, limits_of(space))
+    assert motion.method == "slowed" and not motion.notes
+    limits, largest = limits_of(space), 0.0
+    for z, v, a in zip(motion.z, motion.v, motion.a, strict=True):
+        q = curve.at(z)
+        shares = limits.shares(q, limits.load(q, v, a))
+        assert shares is not None
+        largest = max(largest, float(np.abs(shares).max()), float((np.abs(v) / loaded.velocity_limits).max()))
+    assert 0.5 < largest < 1.0
+    # Where the curve is straight, the motion is much faster than at the corner.
+    slow = np.linalg.norm(motion.z - curve.z[48], axis=1).argmin()
+    assert np.abs(motion.v[slow]).max() < 0.3 * np.abs(motion.v).max()
+
+
+def test_without_a_torque_limit_velocities_count_and_this_is_said() -> None:
+    space = pendulum(0.0)
+    limits = limits_of(space)
+    motion = timing.timed(space, curve_of(space, 1.0), limits)
+    assert motion.method == "scaled" and motion.notes == (
+        "no effort limit of a joint is known: timed by velocities alone",
+    )
+    # The joint may turn at 10 rad/s, and the smooth law is fastest in its middle: 15/8 Δ/T.
+    assert np.abs(motion.v).max() == pytest.approx(10.0, rel=1e-3)
+    assert motion.t[-1] == pytest.approx(15 / 8 / 10.0, rel=1e-3)
+
+
+def test_a_joint_without_a_torque_limit_leaves_those_of_the_others() -> None:
+    """Of two upright hinges the first has a motor of known torque, and takes the time of bang-bang."""
+    made = arm([Z, Z], [0.0, 0.0], floating=False, rods=[(0.5, 0, 0)] * 2, effort=0.5)
+    made.model.effortLimit = np.array([0.5, 0.0])
+    objective = WorstCaseObjective(made, ImpactContact(TIP, (0, 1, 0)))
+    space = PathSpace(build_problem(made, objective, made.posture(), Requirements(contact_pose="free")))
+    inertia = float(pin.crba(space.model, space.model.createData(), space.problem.given)[0, 0])
+    curve = PathCurve(space, [space.problem.given + np.array([x, 0.0]) for x in np.linspace(0, 1.0, 6)])
+    limits = limits_of(space)
+    assert limits.names == ("joint_0",) and not limits.missing
+    fastest = timing.timed(space, curve, limits)
+    assert fastest.method == "time-optimal"
+    assert fastest.t[-1] == pytest.approx(2 * np.sqrt(inertia / 0.5), rel=5e-3)
+
+
+def test_a_posture_that_the_motor_cannot_hold_is_named() -> None:
+    space = pendulum(0.2, gravity=9.81)
+    limits = limits_of(space)
+    motion = timing.timed(space, curve_of(space, 0.3), limits)
+    held = 0.2 * 9.81 * 0.25 / 0.2
+    assert motion.notes == (f"joint_0 would need {held:.3g} times its limit at rest on the path: "
+                            "timed by velocities alone",)  # fmt: skip
+
+
+def test_a_floating_base_without_rotors_or_feet_is_said() -> None:
+    made = yaw_and_pitches()
+    loose = Robot(**{**vars_of(made), "spec": type(made.spec)()})
+    objective = WorstCaseObjective(loose, ImpactContact(TIP, (0, 0, 1)))
+    limits = ActuatorLimits(objective, loose.posture(), Requirements())
+    assert limits.missing == "there are neither rotors nor feet that could hold it up"
+
+
+def vars_of(made: Robot) -> dict[str, object]:
+    return {name: getattr(made, name) for name in made.__dataclass_fields__}
+
+
+@pytest.mark.parametrize("name", ["solo8", "go2", "anymal_c"])
+def test_a_light_standing_robot_rests_and_a_slippery_one_does_not(name: str) -> None:
+    """Level ground needs no friction at rest in a symmetric stance, but some for a push sideways."""
+    loaded = robot(name)
+    supports = loaded.spec.supports
+    objective = WorstCaseObjective(loaded, ImpactContact(loaded.spec.contact.frame, (1, 0, 0)), supports=supports)
+    q, zero = loaded.posture(), np.zeros(loaded.nv)
+    limits = ActuatorLimits(objective, q, Requirements(friction=0.7))
+    rest = limits.load(q, zero, zero)
+    sideways = limits.load(q, zero, np.eye(loaded.nv)[1]) - rest
+    shares = limits.shares(q, rest)
+    assert shares is not None and np.abs(shares).max() < 1
+    rate = limits.largest_rate(q, rest, sideways)
+    assert rate is not None
+    # μ g bounds the acceleration of the mass center, whatever the motors can do.
+    assert 0 < rate < 0.7 * 9.81 * 1.5
+    slippery = ActuatorLimits(objective, q, Requirements(friction=0.07)).largest_rate(q, rest, sideways)
+    assert slippery is None or slippery < 0.3 * rate

@@ -1,0 +1,266 @@
+"""The fastest approach within velocity limits, and the constraint that asks for it."""
+
+from __future__ import annotations
+
+import functools
+import json
+from collections.abc import Sequence
+from pathlib import Path
+
+import casadi as ca
+import numpy as np
+import pinocchio as pin
+import pytest
+from hypothesis import given, settings
+from hypothesis import strategies as st
+from scipy.optimize import linprog
+
+from impact_posture.dynamics.chart import Chart
+from impact_posture.dynamics.numeric import Numeric
+from impact_posture.dynamics.tree import Tree
+from impact_posture.errors import Infeasible, InputError
+from impact_posture.posture.analysis.result_document import result_document
+from impact_posture.posture.approach.approach_speed import ApproachSpeed
+from impact_posture.posture.approach.attainable_speed import AttainableSpeed
+from impact_posture.posture.formulation.problem_file import Prepared, prepare
+from impact_posture.posture.search.multistart import solve
+from tests.support.command import refused, run
+from tests.support.helpers import Vector, assert_close, central_gradient, rng
+from tests.support.settings import make_settings
+
+# Fixed base and standing, one contact and two, a normal that turns with the frame, a held joint and a kept frame.
+PROBLEMS: dict[str, dict[str, object]] = {
+    "ur5": {"normal": (0.2, -0.1, 1.0)},
+    "panda": {"normal": (0, 0, 1), "hold": ("panda_joint1",)},
+    "xarm7": {"normal": (0.3, 0.2, -1), "normal_frame": "contact", "contact_pose": "position"},
+    "tiago": {"normal": (-1, 0, 0)},
+    "talos": {"frame": "gripper_right_base_link", "normal": (-1, 0, 0), "keep": ("gripper_left_base_link",)},
+    "g1": {
+        "contact": ("left_rubber_hand:-1,0,0", "right_rubber_hand:-1,0,0"),
+        "contact_pose": "position",
+    },
+}
+
+
+@functools.cache
+def prepared(name: str, speed: float = 0.5, **more: object) -> Prepared:
+    over = {"robot": name, "collision": False, "speed": speed, "approach": True, **PROBLEMS[name], **more}
+    return prepare(make_settings(over))
+
+
+def constraint_of(made: Prepared) -> ApproachSpeed:
+    (found,) = (c for c in made.problem.constraints if isinstance(c, ApproachSpeed))
+    return found
+
+
+def posture(made: Prepared, seed: int) -> Vector:
+    robot = made.problem.robot
+    return np.array(pin.integrate(robot.model, made.problem.given, 0.3 * rng(seed).normal(size=robot.nv)))
+
+
+def fastest(made: Prepared, q: Vector) -> float:
+    """Another program from raw Jacobians: all entries of the velocity, with those that may not move as bounds."""
+    robot, wanted = made.problem.robot, made.problem.requirements
+    model, data = robot.model, robot.model.createData()
+    pin.computeJointJacobians(model, data, q)
+    pin.updateFramePlacements(model, data)
+    nv, rows, arrives = model.nv, [], []
+    contacts = made.problem.objective.contacts
+    for contact in contacts:
+        frame = model.getFrameId(contact.frame)
+        J = pin.getFrameJacobian(model, data, frame, pin.ReferenceFrame.LOCAL_WORLD_ALIGNED)
+        R = data.oMf[frame].rotation
+        arm, n = R @ contact.offset, np.array(contact.normal)
+        n = R @ n if contact.normal_frame == "contact" else n
+        point = J[:3] - pin.skew(arm) @ J[3:]
+        if len(contacts) > 1:
+            rows, arrives = [*rows, n @ point], [*arrives, 1.0]
+            continue
+        rows, arrives = [*rows, *point], [*arrives, *n]
+        if wanted.contact_pose == "full":
+            rows, arrives = [*rows, *J[3:]], [*arrives, 0.0, 0.0, 0.0]
+        elif wanted.contact_pose.startswith("aligned"):
+            # Two of three rows: the third is their sum, because the turn about the normal is free.
+            rows, arrives = [*rows, *((np.eye(3) - np.outer(n, n)) @ J[3:])], [*arrives, 0.0, 0.0, 0.0]
+    for frame in wanted.keep:
+        J = pin.getFrameJacobian(model, data, model.getFrameId(frame), pin.ReferenceFrame.LOCAL_WORLD_ALIGNED)
+        rows, arrives = [*rows, *J], [*arrives, *np.zeros(6)]
+    limit = np.where(model.velocityLimit > 0, model.velocityLimit, np.inf)
+    if robot.floating:
+        limit[:6] = 0.0
+    for joint in wanted.hold:
+        limit[model.idx_vs[model.getJointId(joint)]] = 0.0
+    A = np.column_stack([np.array(rows), arrives])
+    bounds = [*((-v, v) if np.isfinite(v) else (None, None) for v in limit), (0, 1e3)]
+    found = linprog(np.append(np.zeros(nv), -1.0), A_eq=A, b_eq=np.zeros(len(A)), bounds=bounds)
+    return float(-found.fun)
+
+
+@pytest.mark.parametrize("name", PROBLEMS)
+@given(seed=st.integers(0, 2**20))
+@settings(max_examples=6)
+def test_the_fastest_approach_is_that_of_another_program(name: str, seed: int) -> None:
+    made = prepared(name)
+    attainable = AttainableSpeed(made.problem.robot, made.problem.objective, made.problem.requirements)
+    q = posture(made, seed)
+    found = attainable.at(Numeric(made.problem.robot.model).at(q))
+    assert found.speed == pytest.approx(fastest(made, q), rel=1e-6, abs=1e-9)
+    assert (np.abs(found.velocities) <= attainable.upper + 1e-9).all()
+
+
+@pytest.mark.parametrize("name", PROBLEMS)
+@given(seed=st.integers(0, 2**20))
+@settings(max_examples=4)
+def test_reduced_form_has_the_gradient_of_the_manifold(name: str, seed: int) -> None:
+    made = prepared(name)
+    constraint, model = constraint_of(made), made.problem.robot.model
+    numeric, q = Numeric(model), posture(made, seed)
+
+    def value(q: Vector) -> float:
+        return float(constraint.evaluate(numeric.at(q))[0][0])
+
+    gradient, slope = constraint.evaluate(numeric.at(q))[1][0], rng(seed, 1).normal(size=model.nv)
+    sides = [side * (value(pin.integrate(model, q, side * 1e-6 * slope)) - value(q)) / 1e-6 for side in (1, -1)]
+    # The speed has a kink where another joint comes to its limit.
+    margin = 1e-4 + 1e-3 * np.abs(sides).max()
+    assert min(sides) - margin <= gradient @ slope <= max(sides) + margin
+
+
+@pytest.mark.parametrize("name", PROBLEMS)
+def test_lifted_rows_say_the_same_twice_with_the_jacobian_of_the_manifold(name: str) -> None:
+    made = prepared(name)
+    constraint, model = constraint_of(made), made.problem.robot.model
+    numeric, chart = Numeric(model), Chart(model)
+    q, x, p = posture(made, 5), ca.SX.sym("x", chart.nx), ca.SX.sym("p", len(constraint.parameters))
+    lifted = constraint.lift(Tree(model, chart.configuration(x), x), p)
+    z = rng(name).uniform(-1, 1, constraint.unknowns)
+    program = ca.Function("rows", [x, lifted.variables, p], [lifted.rows])
+    rows = np.array(program(chart.to_x(q), z, constraint.parameters)).ravel()
+    found = constraint.linearize(numeric.at(q), z)
+    assert_close(rows, found.value[: rows.size], 1e-10, "rows", 1.0)
+    assert len(found.names) == len(found.value)
+    for bounds, own in zip((found.lower, found.upper), constraint.lifted_bounds, strict=True):
+        assert (bounds[: rows.size] == own).all()
+    slopes = central_gradient(lambda q: constraint.linearize(numeric.at(q), z).value, model, q, 1e-3)
+    assert_close(found.posture, slopes, 1e-8, "by posture", 1e-3)
+    step = rng(name, 1).normal(size=z.size)
+    moved = constraint.linearize(numeric.at(q), z + step).value
+    assert_close(found.value + found.auxiliary @ step, moved, 1e-9, "by velocities", 1.0)
+
+
+@pytest.mark.parametrize(("name", "speed"), [("tiago", 0.8), ("talos", 1.0)])
+def test_an_optimum_that_is_too_slow_moves_to_one_that_is_not(name: str, speed: float) -> None:
+    """Both certify; the optimum without the demand arrives too slowly, and is the better one for that."""
+    free, asked = (prepared(name, speed, approach=approach) for approach in (False, True))
+    attainable = AttainableSpeed(asked.problem.robot, asked.problem.objective, asked.problem.requirements)
+    found = [solve(made.problem, starts=4, jobs=1) for made in (free, asked)]
+    slow, fast = (attainable.reached(one.q) for one in found)
+    assert slow is not None and fast is not None
+    assert slow < 0.9 * speed <= speed * (1 - 1e-6) <= fast
+    assert found[1].optima[0].objective > found[0].optima[0].objective
+    documents = [result_document(made, one) for made, one in zip((free, asked), found, strict=True)]
+    warned = [any("approach=True" in line for line in document["warnings"]) for document in documents]
+    assert warned == [True, False]
+    assert fastest(asked, found[1].q) == pytest.approx(documents[1]["optimal"]["attainable_speed"], rel=1e-6)
+
+
+def test_what_the_joints_cannot_do_is_infeasible_and_named() -> None:
+    made = prepared("ur5", 20.0)
+    with pytest.raises(Infeasible, match="approach at 20 m/s"):
+        solve(made.problem, starts=2, jobs=1)
+
+
+@pytest.mark.parametrize(
+    ("more", "words"),
+    [
+        ({"robot": "tilthex_arm"}, "nothing bounds it"),
+        ({"robot": "solo12", "frame": "base_link", "contact_pose": "free"}, "nothing bounds it"),
+        ({"robot": "talos", "frame": "base_link", "contact_pose": "position"}, "the legs move the contact"),
+        ({"robot": "solo12", "frame": "FL_LOWER_LEG", "contact_pose": "position"}, "the legs move the contact"),
+    ],
+)
+def test_where_joints_with_limits_do_not_bring_the_contact_nothing_is_demanded(
+    more: dict[str, object], words: str
+) -> None:
+    made = prepare(make_settings({"normal": (0, 0, 1), "approach": True, **more}))
+    assert not any(isinstance(c, ApproachSpeed) for c in made.problem.constraints)
+    assert any("speed of the approach is not demanded" in note and words in note for note in made.problem.notes)
+    assert AttainableSpeed(made.problem.robot, made.problem.objective, made.problem.requirements).unknown
+
+
+def test_a_kept_foot_is_no_leg_that_moves_the_hand() -> None:
+    made = prepared("talos", keep=("right_sole_link",))
+    constraint = constraint_of(made)
+    at = Numeric(made.problem.robot.model).at(made.problem.given)
+    assert constraint.evaluate(at)[0][0] == pytest.approx(
+        constraint_of(prepared("talos", keep=())).evaluate(at)[0][0]
+    )
+
+
+def chain(path: Path, axes: str, limits: Sequence[float]) -> str:
+    """An arm of links along z; a limit of zero is none."""
+    turns = {"x": "1 0 0", "y": "0 1 0", "z": "0 0 1"}
+    parts = ['<robot name="chain"><link name="ground"/>']
+    for k, (axis, limit) in enumerate(zip(axes, limits, strict=True)):
+        parent = f"l{k - 1}" if k else "ground"
+        parts.append(
+            f'<link name="l{k}"><inertial><origin xyz="0 0 0.15"/><mass value="2"/>'
+            '<inertia ixx="0.02" ixy="0" ixz="0" iyy="0.02" iyz="0" izz="0.01"/></inertial></link>'
+            f'<joint name="j{k}" type="revolute"><parent link="{parent}"/><child link="l{k}"/>'
+            f'<origin xyz="0 0 {0.3 if k else 0}"/><axis xyz="{turns[axis]}"/>'
+            f'<limit lower="-2.5" upper="2.5" effort="200" velocity="{limit}"/></joint>'
+        )
+    parts.append(
+        f'<link name="tip"/><joint name="end" type="fixed"><parent link="l{len(axes) - 1}"/><child link="tip"/>'
+        '<origin xyz="0 0 0.3"/></joint></robot>'
+    )
+    path.write_text("".join(parts))
+    return str(path)
+
+
+@pytest.mark.parametrize(
+    ("axes", "limits", "pose"),
+    [
+        # Rows out of the plane are zero.
+        ("yyyy", [2, 2, 2, 2], "full"),
+        # Limits that stand for none.
+        ("zyzyzyz", [2, 2, 2, 2, 2, 2, 1e6], "full"),
+        ("zyzyzyz", [5e9, 5e9, 5e9, 5e9, 5e9, 5e9, 2], "full"),
+        # Only the first joint has a limit, so nothing bounds the speed at most postures.
+        ("zyzyzyz", [2, 0, 0, 0, 0, 0, 0], "full"),
+        # Five joints cannot hold the turn of the tip, which then turns.
+        ("zyyyz", [2, 2, 2, 2, 2], "position"),
+    ],
+)
+def test_unusual_arms_certify(tmp_path: Path, axes: str, limits: list[float], pose: str) -> None:
+    path = chain(tmp_path / "chain.urdf", axes, limits)
+    q = tuple([0.3, 0.6, 0.5, 0.4, 0.3, 0.4, 0.2][: len(axes)])
+    values = {"robot": path, "frame": "tip", "normal": (-1, 0, 0), "q": q, "contact_pose": pose}
+    made = prepare(make_settings({**values, "speed": 0.2, "approach": True}))
+    found = solve(made.problem, starts=3, jobs=1)
+    assert found.certificate.holds() and found.certified_starts == 3
+    attainable = AttainableSpeed(made.problem.robot, made.problem.objective, made.problem.requirements)
+    assert 0.2 - 1e-8 <= (attainable.reached(found.q) or np.inf)
+
+
+def test_joints_that_are_too_few_are_refused(tmp_path: Path) -> None:
+    held = {"hold": tuple(f"joint{k}" for k in range(1, 8)), "robot": "xarm7", "normal": (0, 0, 1)}
+    with pytest.raises(InputError, match="cannot move"):
+        prepare(make_settings({**held, "approach": True}))
+    made = prepare(make_settings(held))
+    attainable = AttainableSpeed(made.problem.robot, made.problem.objective, made.problem.requirements)
+    assert attainable.reached(made.problem.given) == 0.0
+
+
+def test_the_command(tmp_path: Path) -> None:
+    words = ("optimize", "ur5", "--normal", 0, 0, 1, "--speed", 0.8, "--approach", "--starts", 2, "--no-codegen")
+    done = run(*words, "--out", "out", cwd=tmp_path)
+    assert done.returncode == 0, done.stderr
+    document = json.loads((tmp_path / "out" / "result.json").read_text())
+    speed = document["optimal"]["attainable_speed"]
+    assert speed >= 0.8 * (1 - 1e-6)
+    assert f"{speed:.4g}  m/s" in done.stdout
+    assert "approach at 0.8 m/s within the velocity limits of the joints" in document["constraints"]
+    assert run("optimize", tmp_path / "out" / "problem.toml", "--out", "again", cwd=tmp_path).returncode == 0
+    still = run("optimize", "ur5", "--normal", 0, 0, 1, "--speed", 0, "--approach", cwd=tmp_path)
+    refused(still, 1, "--approach", "--speed")

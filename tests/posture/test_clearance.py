@@ -1,0 +1,391 @@
+"""Separating planes: their rows in numbers and as expressions, their derivatives, the postures that they allow."""
+
+from __future__ import annotations
+
+import gc
+from itertools import product
+
+import casadi as ca
+import coal
+import numpy as np
+import pinocchio as pin
+import pytest
+from hypothesis import given, settings
+from hypothesis import strategies as st
+
+from impact_posture.collision.swept_hull import SweptHull
+from impact_posture.config.obstacle import Obstacle
+from impact_posture.config.settings import ProblemSettings
+from impact_posture.config.toml_tables import validate
+from impact_posture.dynamics.chart import Chart
+from impact_posture.dynamics.numeric import Numeric
+from impact_posture.dynamics.tree import PointOnLink, Tree
+from impact_posture.errors import Infeasible, InputError
+from impact_posture.impact.impact_contact import point_on
+from impact_posture.posture.constraints.clearance import Clearance
+from impact_posture.posture.constraints.pair_distances import PairDistances
+from impact_posture.posture.constraints.separator import EQUATIONS, ConvexBody, Separator
+from impact_posture.posture.formulation.build_problem import retarget
+from impact_posture.posture.formulation.problem_file import prepare
+from impact_posture.posture.manifold.feasible_start import Projector, random_posture
+from impact_posture.posture.program.posture_nlp import build_nlp
+from impact_posture.posture.search.conflicts import ElasticProgram, elastic
+from impact_posture.posture.search.multistart import solve
+from impact_posture.posture.search.solver_runs import feasible
+from impact_posture.robot.robot import Robot
+from impact_posture.robot.robot_loader import load_robot
+
+BOX = np.array(list(product((-0.04, 0.05), (-0.03, 0.06), (-0.05, 0.07))))
+ROBOTS = ("tilthex_arm", "talos", "panda", "kinova")
+KINDS = ("pair", "world", "half-space", "in the frame", "with a point")
+
+
+def _separator(robot: Robot, kind: str) -> Separator:
+    last, first = robot.model.njoints - 1, 1
+    a = ConvexBody.of_link(SweptHull("a", "a", last, BOX, 0.01))
+    point = PointOnLink(first, np.array([0.1, -0.2, 0.05]), pin.exp3(np.array([0.3, 0.2, -0.5])))
+    normal = np.array([0.6, 0.0, 0.8])
+    b = {
+        "pair": ConvexBody.of_link(SweptHull("b", "b", first, 1.5 * BOX, 0.02)),
+        "world": ConvexBody.of_link(SweptHull("b", "b", 0, 2 * BOX + 0.1, 0.0)),
+        "half-space": ConvexBody("b", None, PointOnLink(0, np.array([0.0, 0.1, -0.3]), np.eye(3)), normal=normal),
+        "in the frame": ConvexBody("b", None, point, normal=normal, offset=-0.1),
+        "with a point": ConvexBody("b", SweptHull("b", "b", first, BOX, 0.005), point, turns=False),
+    }[kind]
+    return Separator(a, b, 0.002)
+
+
+def _random(robot: Robot, rng: np.random.Generator) -> np.ndarray:
+    return pin.integrate(robot.model, pin.neutral(robot.model), rng.normal(size=robot.nv) * 0.8)
+
+
+@pytest.mark.parametrize("name", ROBOTS)
+def test_placements_along_the_way_are_those_of_pinocchio(name: str) -> None:
+    robot, rng = load_robot(name), np.random.default_rng(5)
+    q = ca.SX.sym("q", robot.nq)
+    tree, numeric = Tree(robot.model, q), Numeric(robot.model)
+    pairs = [tuple(rng.integers(0, robot.model.njoints, 2)) for _ in range(6)] + [(0, robot.model.njoints - 1)]
+    expressions = [part for pair in pairs for part in tree.relative(int(pair[0]), int(pair[1]))]
+    function = ca.Function("relative", [q], expressions)
+    posture = _random(robot, rng)
+    numeric.at(posture)
+    found = function(posture)
+    for k, (base, joint) in enumerate(pairs):
+        expected = numeric.data.oMi[int(base)].actInv(numeric.data.oMi[int(joint)])
+        assert np.allclose(np.array(found[2 * k]), expected.rotation, atol=1e-12)
+        assert np.allclose(np.array(found[2 * k + 1]).ravel(), expected.translation, atol=1e-12)
+
+
+@pytest.mark.parametrize("name", ROBOTS)
+def test_guess_satisfies_the_rows_where_bodies_are_apart(name: str) -> None:
+    robot, rng = load_robot(name), np.random.default_rng(1)
+    numeric, chart = Numeric(robot.model), Chart(robot.model)
+    x = ca.SX.sym("x", chart.nx)
+    tree = Tree(robot.model, chart.configuration(x), x)
+    apart = touching = 0
+    for kind, _ in product(KINDS, range(6)):
+        separator, q = _separator(robot, kind), _random(robot, rng)
+        distance = separator.distance(numeric.at(q))[0]
+        corners = separator.corners(numeric)
+        lifted = separator.lift(tree, "", ca.SX(separator.b.plane))
+        sides = separator.sides(lifted.variables, corners)
+        rows = ca.Function("rows", [x, lifted.variables], [ca.vertcat(lifted.rows, sides)])
+        guess = separator.guess(numeric).values.copy()
+        assert len(guess) == separator.count
+        # Without the slack.
+        guess[-1] = 0.0
+        value = np.array(rows(chart.to_x(q), guess)).ravel()
+        lower, upper = (np.append(np.zeros(EQUATIONS), side) for side in separator.bounds(corners))
+        outside = np.maximum(lower - value, value - upper)
+        # The guess of the normal is 2 % short, so a gap of a few millimeters may not show.
+        if abs(distance) > 0.03:
+            assert (outside.max() < 1e-9) == (distance > 0)
+            apart, touching = apart + (distance > 0), touching + (distance < 0)
+    assert apart and touching
+
+
+@pytest.mark.parametrize("name", ROBOTS)
+@pytest.mark.parametrize("kind", KINDS)
+def test_linearization_is_the_derivative_of_the_rows(name: str, kind: str) -> None:
+    """Against manifold differences of the heights of corners over a plane."""
+    robot, rng = load_robot(name), np.random.default_rng(2)
+    separator, numeric = _separator(robot, kind), Numeric(robot.model)
+    q, n = _random(robot, rng), rng.normal(size=3)
+    # A plane far on the wrong side of both bodies, so that every corner has a row.
+    height = 50.0
+    rows = separator.linearize_at(numeric.at(q), n, height)
+    assert len(rows.names) == len(BOX) + (0 if separator.known else 1)
+
+    def heights(posture: np.ndarray, normal: np.ndarray, c: float) -> np.ndarray:
+        return separator.linearize_at(numeric.at(posture), normal, c).value
+
+    h = 1e-6
+    for k, unit in enumerate(np.eye(robot.nv)):
+        ahead, behind = (heights(pin.integrate(robot.model, q, s * h * unit), n, height) for s in (1, -1))
+        assert np.allclose((ahead - behind) / (2 * h), rows.posture[:, k], atol=1e-7)
+    if not separator.known:
+        for k, unit in enumerate(np.eye(3)):
+            difference = (heights(q, n + h * unit, height) - heights(q, n - h * unit, height)) / (2 * h)
+            assert np.allclose(difference, rows.auxiliary[:, k], atol=1e-6)
+        difference = (heights(q, n, height + h) - heights(q, n, height - h)) / (2 * h)
+        assert np.allclose(difference, rows.auxiliary[:, 3], atol=1e-6)
+
+
+@pytest.mark.parametrize("name", ["tilthex_arm", "panda"])
+def test_distances_and_their_gradient(name: str) -> None:
+    robot, rng = load_robot(name), np.random.default_rng(4)
+    constraint = Clearance("c", [_separator(robot, kind) for kind in KINDS], "words")
+    numeric, h, seen = Numeric(robot.model), 1e-6, 0
+    for _ in range(40):
+        q = _random(robot, rng)
+        jacobian = constraint.evaluate(numeric.at(q))[1]
+        for row in np.flatnonzero(np.abs(jacobian).max(axis=1) > 0):
+            numbers = []
+            for unit in np.eye(robot.nv):
+                ahead, behind = (
+                    constraint.evaluate(numeric.at(pin.integrate(robot.model, q, s * h * unit)))[0][row]
+                    for s in (1, -1)
+                )
+                numbers.append((ahead - behind) / (2 * h))
+            # Two edges of boxes that are not parallel: the distance is smooth.
+            seen += bool(np.allclose(numbers, jacobian[row], atol=1e-5))
+    assert seen > 10
+
+
+def test_a_pair_that_stays_violated_has_rows_for_all_corners_in_the_end() -> None:
+    """Else a plane of the program that cuts corners without rows would look like a trap."""
+    robot, rng = load_robot("tilthex_arm"), np.random.default_rng(5)
+    constraint = Clearance("c", [_separator(robot, kind) for kind in KINDS], "words")
+    numeric, seen = Numeric(robot.model), set[bool]()
+    for _ in range(40):
+        values = constraint.value(numeric.at(_random(robot, rng)))
+        last, now = constraint, constraint.grown(numeric)
+        while now is not last:
+            last, now = now, now.grown(numeric)
+        assert set(now.active) == set(np.flatnonzero(values < 0))
+        for k, corners in now.active.items():
+            one = now._separators[k]
+            seen.add(one.known)
+            whole = set(range(len(one._x))), set(range(len(one._y)))
+            assert one.known or (corners.a, corners.b) == whole
+    assert seen == {False, True}
+
+
+def test_a_pair_that_slack_lets_off_gets_no_more_corners() -> None:
+    """More rows do not keep bodies apart where to penetrate pays; without slack it is corners that are missing."""
+    robot, rng = load_robot("tilthex_arm"), np.random.default_rng(5)
+    constraint = Clearance("c", [_separator(robot, kind) for kind in KINDS], "words")
+    numeric, seen = Numeric(robot.model), 0
+    for _ in range(100):
+        q = _random(robot, rng)
+        first = constraint.grown(numeric.at(q))
+        numeric.at(pin.integrate(robot.model, q, 0.3 * rng.normal(size=robot.nv)))
+        # The guess of each pair has the slack for what it violates, as the end of a run has where that pays.
+        let_off = first.guess(numeric).values
+        strict = let_off.copy()
+        strict[[int(own[-1]) for own in first._ends(np.arange(strict.size)).values()]] = 0.0
+        depths = np.maximum(0.0, -constraint.value(numeric))[list(first.active)]
+        assert first.slack(let_off) >= depths.max(initial=0.0) and first.slack(strict) == 0
+        kept, more = first.grown(numeric, let_off).active, first.grown(numeric, strict).active
+        assert all(kept[k] == corners for k, corners in first.active.items())
+        assert more == first.grown(numeric).active
+        seen += any(more[k] != corners for k, corners in first.active.items())
+    assert seen > 5
+
+
+@settings(max_examples=25, deadline=None)
+@given(seed=st.integers(0, 10_000))
+def test_bound_on_distances_is_one(seed: int) -> None:
+    """Spheres around the bodies are never farther apart than the distance that counts."""
+    robot = load_robot("tilthex_arm")
+    separators = [_separator(robot, kind) for kind in KINDS]
+    constraint = Clearance("c", separators, "words")
+    rng = np.random.default_rng(seed)
+    numeric, q = Numeric(robot.model), _random(robot, rng)
+    for size in (0.0, 1e-3, 0.03, 0.3, 1.0):
+        # What was exact before bounds what comes after.
+        q = pin.integrate(robot.model, q, size * rng.normal(size=robot.nv))
+        values = constraint.evaluate(numeric.at(q))[0]
+        exact = np.array([one.distance(numeric)[0] for one in separators])
+        assert (values <= exact + 1e-9).all()
+        assert ((values < 0) == (exact < 0)).all() and np.allclose(values[exact < 0], exact[exact < 0])
+
+
+@settings(max_examples=25, deadline=None)
+@given(seed=st.integers(0, 10_000))
+def test_distances_of_some_pairs_do_not_depend_on_what_was_asked_before(seed: int) -> None:
+    robot, rng = load_robot("tilthex_arm"), np.random.default_rng(seed)
+    separators = [_separator(robot, kind) for kind in KINDS]
+    known, numeric = PairDistances(separators), Numeric(robot.model)
+    q = _random(robot, rng)
+    for _ in range(3):
+        q = pin.integrate(robot.model, q, 0.1 * rng.normal(size=robot.nv))
+        exact = np.array([one.distance(numeric.at(q))[0] for one in separators])
+        assert (known.bounds(numeric, range(5)) <= exact + 1e-9).all()
+        for limit, pairs in product(rng.permutation([-0.1, 0.0, 0.05, 1.0]), (range(2), range(2, 5), range(5))):
+            found, own = known.within(numeric, float(limit), pairs), exact[pairs.start : pairs.stop]
+            assert (found <= own + 1e-9).all() and np.allclose(found[own < limit], own[own < limit], atol=1e-9)
+            assert not (found[own >= limit] < limit - 1e-9).any()
+
+
+def _problem(**changes: object) -> ProblemSettings:
+    return ProblemSettings(robot="tilthex_arm", frame="ee", normal=(0.0, 0.0, 1.0), **changes)  # type: ignore[arg-type]
+
+
+def test_a_body_in_the_way_of_the_optimum() -> None:
+    """The optimum without the obstacle runs through it; with it, it touches the obstacle and certifies."""
+    free = solve(prepare(_problem()).problem, starts=4, jobs=1, compile="never")
+    model = free.problem.robot.model
+    data = model.createData()
+    pin.forwardKinematics(model, data, free.q)
+    # The last link moves with the contact frame, which is held; the one before it does not.
+    shoulder = tuple(float(v) for v in data.oMi[model.njoints - 2].translation)
+    blocked = prepare(_problem(obstacles=(Obstacle(name="ball", sphere=0.05, position=shoulder),))).problem
+    assert not feasible(blocked, free.q)
+    found = solve(blocked, starts=8, jobs=1, compile="never")
+    assert found.certificate.holds()
+    assert feasible(found.problem, found.q)
+    touched = [active for active in found.certificate.active if active.constraint.endswith("/ ball")]
+    assert touched and all(active.multiplier > 0 for active in touched)
+    objective = found.problem.objective
+    assert objective.value(free.q) < objective.value(found.q)
+
+
+@pytest.mark.parametrize("names", [("a", "a"), ("base_link[0]",), ("surface at ee",)])
+def test_obstacles_that_messages_could_not_tell_apart_are_refused(names: tuple[str, ...]) -> None:
+    balls = tuple(Obstacle(name=name, sphere=0.01, position=(5.0, 0.0, 0.0)) for name in names)
+    with pytest.raises(InputError, match="is the name of another body"):
+        prepare(_problem(obstacles=balls))
+
+
+@pytest.mark.parametrize("name", ["", "  ", "x" * 100])
+def test_an_obstacle_without_a_name_to_print_is_refused(name: str) -> None:
+    with pytest.raises(InputError, match="name"):
+        Obstacle(name=name, sphere=1.0)
+
+
+def test_obstacles_need_collisions() -> None:
+    ball = Obstacle(name="ball", sphere=0.01, position=(5.0, 0.0, 0.0))
+    with pytest.raises(InputError, match="obstacles"):
+        prepare(_problem(obstacles=(ball,), collision=False))
+
+
+def test_what_is_impossible_is_named() -> None:
+    """An obstacle around the contact point can never be left, whatever the posture."""
+    robot = load_robot("tilthex_arm")
+    numeric = Numeric(robot.model).at(robot.posture())
+    tool = numeric.data.oMi[robot.model.njoints - 1].translation
+    around = Obstacle(name="block", box=(0.1, 0.1, 0.1), position=tuple(float(v) for v in tool))
+    with pytest.raises(Infeasible) as caught:
+        solve(prepare(_problem(obstacles=(around,), contact_pose="full", base="fixed")).problem, jobs=1)
+    assert "block" in str(caught.value)
+    assert caught.value.exit_code == 3
+
+
+@pytest.mark.parametrize(
+    ("pose", "position"), [("full", None), ("full", (3.0, 0.0, 0.0)), ("position", (3.0, 0.0, 0.0))]
+)
+def test_a_turn_that_solves_a_conflict_is_the_hint(pose: str, position: tuple[float, ...] | None) -> None:
+    """The wrist of z1 is in a floor that its hand faces, and nothing helps a hand that is out of reach."""
+    settings = {"robot": "z1", "normal": (0.0, 0.0, 1.0), "contact_pose": pose, "target_position": position}
+    problem = prepare(validate(ProblemSettings, settings, "options")).problem
+    with pytest.raises(Infeasible) as caught:
+        solve(problem, jobs=1)
+    assert ("contact_pose='position'" in caught.value.hint) == (position is None)
+    if position is None:
+        turned = prepare(validate(ProblemSettings, settings | {"contact_pose": "position"}, "options")).problem
+        assert solve(turned, starts=2, jobs=1).certificate.holds()
+
+
+@pytest.mark.parametrize(
+    ("name", "normal"), [("z1", (-1.0, 0.0, 0.0)), ("panda", (1.0, 0.0, 0.0)), ("kinova", (0.0, 1.0, 0.0))]
+)
+def test_a_surface_lies_where_the_link_of_the_contact_reaches(name: str, normal: tuple[float, float, float]) -> None:
+    problem = prepare(validate(ProblemSettings, {"robot": name, "normal": normal}, "options")).problem
+    around, contact, robot = problem.surroundings, problem.objective.contact, problem.robot
+    assert around is not None
+    point = point_on(robot, contact.frame, contact.offset)
+    height = float(np.array(normal) @ Numeric(robot.model).at(problem.given).placement(point).translation)
+    data = robot.model.createData()
+    pin.forwardKinematics(robot.model, data, problem.given)
+    own = [shape for shape in around.shapes.geometry.geometryObjects if shape.parentJoint == point.joint]
+
+    def touched(above: float) -> bool:
+        """Whether coal finds a mesh of the link in the half-space so far above the surface, m."""
+        half = coal.Halfspace(np.array(normal), height - around.depth(contact) + above)
+        request = coal.CollisionRequest()
+        at = [data.oMi[point.joint] * shape.placement for shape in own]
+        return any(
+            coal.collide(
+                half, coal.Transform3s(), shape.geometry, coal.Transform3s(p.rotation, p.translation), request,
+                coal.CollisionResult(),
+            )
+            for shape, p in zip(own, at, strict=True)
+        )  # fmt: skip
+
+    assert around.depth(contact) > 0
+    assert not touched(-1e-6)
+    # A swept hull is a few millimeters larger than the mesh inside.
+    assert touched(0.015)
+
+
+def test_a_relaxed_program_serves_other_targets_and_is_let_go() -> None:
+    problem = prepare(validate(ProblemSettings, {"robot": "panda", "normal": (0, 0, 1)}, "test")).problem
+    program = ElasticProgram(problem)
+    for height in (1.4, -0.3, 1.5):
+        kept, fresh = (
+            elastic(retarget(one.problem, (0.4, 0.1, height), None), program=one, beside=1e-3)
+            for one in (program, ElasticProgram(problem))
+        )
+        assert bool(kept.conflicts) is bool(height > 1) and kept.conflicts.keys() == fresh.conflicts.keys()
+        assert sum(kept.conflicts.values()) == pytest.approx(sum(fresh.conflicts.values()), rel=0.05)
+    assert program.time_s > 0 and program.problem is not problem
+    shared = [c._lifted for c in problem.constraints if isinstance(c, Clearance)]
+    assert any(len(lifted) for lifted in shared)
+    del program, kept, fresh
+    gc.collect()
+    assert not any(len(lifted) for lifted in shared)
+
+
+@pytest.mark.parametrize("name", ["tilthex_arm", "panda", "solo12"])
+def test_derivatives_of_a_program_that_grew_are_those_of_casadi(name: str) -> None:
+    asked = {"robot": name, "normal": (0.0, 0.0, 1.0), "contact_pose": "position"}
+    problem = prepare(validate(ProblemSettings, asked, "options")).problem
+    rng, projector = np.random.default_rng(3), Projector(problem)
+    first = nlp = build_nlp(problem, compile="never")
+    for _ in range(3):
+        # Postures anywhere bring in pairs and corners, as the ends of runs do.
+        ends = [random_posture(problem, projector.chart, rng) for _ in range(3)]
+        problem = problem.grown(ends)
+        nlp = nlp.grown(problem, compile="never")
+    assert nlp.solver.size1_in("lbg") > first.solver.size1_in("lbg") + 50
+    symbols, _ = nlp.program.symbols(problem)
+    plain = ca.nlpsol("plain", "ipopt", symbols, {"print_time": False, "ipopt.print_level": 0})
+    numbers = [rng.normal(size=nlp.solver.get_function("nlp_hess_l").size1_in(k)) for k in range(4)]
+    for function, count in (("nlp_jac_g", 2), ("nlp_hess_l", 4)):
+        ours, theirs = (solver.get_function(function)(*numbers[:count]) for solver in (nlp.solver, plain))
+        pairs = zip(ours, theirs, strict=True) if count == 2 else [(ours, theirs)]
+        for one, other in pairs:
+            np.testing.assert_allclose(ca.DM(one).full(), ca.DM(other).full(), rtol=1e-9, atol=1e-9)
+
+
+def test_starts_lie_near_a_posture_that_is_clear() -> None:
+    # The given posture reaches far through the wall, and most starts near it end between bodies.
+    posed = prepare(ProblemSettings(robot="xarm7", normal=(-1, 0, 0), holdable=False)).problem
+    found = solve(posed, starts=16, jobs=1, compile="never", finish_all=True)
+    assert found.certified_starts == 16
+
+
+@pytest.mark.parametrize("seed", [1, 9, 33])
+def test_the_way_past_a_wall_is_found_from_every_seed(seed: int) -> None:
+    # Few random postures lead to the free part.
+    posed = prepare(ProblemSettings(robot="xarm7", normal=(-1, 0, 0))).problem
+    assert not elastic(posed, seed).conflicts
+
+
+def test_no_slack_is_left_where_the_objective_falls_steeply() -> None:
+    # The first price of the slack lets every start end 0.6 mm inside the clearance of the surface.
+    urdf = "example-robot-data:ur_description/urdf/ur10_robot.urdf"
+    posed = prepare(ProblemSettings(robot=urdf, frame="tool0", normal=(0, 0, 1))).problem
+    found = solve(posed, starts=4, jobs=1, compile="never", finish_all=True)
+    assert found.certified_starts == 4

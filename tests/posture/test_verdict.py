@@ -1,0 +1,186 @@
+"""The verdict on a posture: the predicted jumps in words, what would do better, and the objective ``auto``."""
+
+from __future__ import annotations
+
+import json
+from dataclasses import replace
+from math import sqrt
+from pathlib import Path
+
+import numpy as np
+import pytest
+
+from impact_posture.impact.elasticity.contact_compression import ContactStiffness
+from impact_posture.impact.resolved_impact import ResolvedImpact, resolve
+from impact_posture.posture.analysis.verdict import verdict
+from impact_posture.posture.formulation.problem_file import dump_settings, prepare, resolved_settings
+from impact_posture.posture.search.multistart import solve
+from impact_posture.robot.robot_spec import TransmissionSpec
+from tests.support.command import run
+from tests.support.helpers import random_configurations
+from tests.support.settings import make_settings
+
+NORMAL = {"normal": (0.0, 0.0, 1.0)}
+CASES = {"panda": {}, "tilthex_arm": {}, "solo12": {"frame": "base_link"}, "talos": {"normal": (-1.0, 0.0, 0.0)}}
+
+
+def resolved(name: str, **more: object) -> ResolvedImpact:
+    return resolve(make_settings({"robot": name, **NORMAL, **CASES[name], **more}))
+
+
+@pytest.mark.parametrize("name", CASES)
+@pytest.mark.parametrize("friction", [0.0, 0.3, 5.0])
+def test_the_changes_are_those_of_the_predicted_jumps(name: str, friction: float) -> None:
+    impact = resolved(name, friction=friction, speed=0.6, contact_stiffness=2e5)
+    model = impact.robot.model
+    for q in random_configurations(model, 2, name, "verdict", spread=0.3):
+        before, after = impact.evaluate(), impact.evaluate(q)
+        assert before.coulomb is not None and after.coulomb is not None
+        told = verdict(impact, before, after)
+        assert told.jump == pytest.approx(after.coulomb.norm / before.coulomb.norm - 1)
+        assert told.impulse == pytest.approx(after.coulomb.impulse_size / before.coulomb.impulse_size - 1)
+        assert told.peak_force == pytest.approx(sqrt(before.G / after.G) - 1)
+        assert told.jump is not None and told.impulse is not None and told.peak_force is not None
+        expected = "better at the price of impulse" if told.impulse > 0.01 else "better"
+        expected = "better at the price of force" if told.peak_force > 0.01 else expected
+        if told.jump > -0.01:
+            expected = "worse" if told.jump > 0.01 else "no better"
+        assert told.outcome == expected and told.line.startswith(f"verdict: {expected}.")
+        assert ("sticking)" if after.coulomb.sticks else "slipping)") in told.line
+        assert any("objective='coulomb'" in line for line in told.advice) == (expected in ("worse", "no better"))
+        assert any("max_force" in line for line in told.advice) == (expected == "better at the price of force")
+        assert told.before is not None and told.after is not None
+        for side, found in ((told.before, before), (told.after, after)):
+            assert found.coulomb is not None and found.compression is not None
+            assert (side.jump, side.impulse) == (found.coulomb.norm, found.coulomb.impulse_size)
+            assert (side.peak_force, side.sticks) == (found.compression.peak_force, found.coulomb.sticks)
+        assert told.assumptions[0] == f"rigid impact at 0.6 m/s with restitution 0 and friction {friction:g}"
+        assert ("the feet stay on the ground" in told.assumptions) == bool(impact.objective.supports)
+        assert told.assumptions[-1] == "peak force of the stated contact, without friction"
+
+
+def test_a_posture_against_itself() -> None:
+    impact = resolved("panda")
+    told = verdict(impact, impact.evaluate(), impact.evaluate())
+    assert told.outcome == "no better" and told.jump == told.impulse == told.peak_force == 0
+    assert "(linear contact)" in told.line
+
+
+def test_there_is_none_without_a_speed() -> None:
+    impact = resolved("panda", speed=0.0)
+    told = verdict(impact, impact.evaluate(), impact.evaluate())
+    assert told.outcome == "unknown" and "no approach speed" in told.line
+    assert told.to_dict()["before"] is None and told.to_dict()["assumptions"] == []
+
+
+def test_the_joint_model_that_fits_has_its_say() -> None:
+    plain = resolved("panda", contact_stiffness=1e8)
+    found = replace(plain.robot, spec=replace(plain.robot.spec, transmission=TransmissionSpec("elastic", 14e3)))
+    impact = replace(plain, objective=replace(plain.objective, robot=found))
+    (q,) = random_configurations(found.model, 1, "fits", spread=0.3)
+    told = verdict(impact, impact.evaluate(), impact.evaluate(q))
+    assert any(line.startswith("with joint model 'link' (x = ") for line in told.advice)
+    soft = replace(impact, contact_stiffness=ContactStiffness(linear=1e3))
+    told = verdict(soft, soft.evaluate(), soft.evaluate(q))
+    assert not any(line.startswith("with joint model") for line in told.advice)
+
+
+def test_the_hand_of_talos_is_not_sold() -> None:
+    """The paper's objective falls, the jump at a given speed does not."""
+    chosen = make_settings({"robot": "talos", "normal": (-1.0, 0.0, 0.0), "frame": "gripper_right_base_link"})
+    prepared = prepare(chosen)
+    found = solve(prepared.problem, starts=4, compile="never")
+    told = verdict(prepared.impact, prepared.impact.evaluate(found.initial), prepared.impact.evaluate(found.q))
+    assert found.reduction > 0.5 and told.outcome == "worse"
+    better = prepare(replace(chosen, objective="coulomb"))
+    found = solve(better.problem, starts=4, compile="never")
+    told = verdict(better.impact, better.impact.evaluate(found.initial), better.impact.evaluate(found.q))
+    assert told.outcome.startswith("better") and told.jump is not None and told.jump < 0
+
+
+@pytest.mark.parametrize(
+    ("more", "kind", "words"),
+    [
+        ({}, "coulomb", "friction 0.7"),
+        ({"friction": 0.0}, "speed", "slips freely"),
+        ({"speed": 0.0}, "impulse", "no approach speed"),
+        ({"normal_cone": 10.0}, "sticking", "cone of normals"),
+    ],
+)
+def test_auto_chooses_and_says_why(more: dict[str, object], kind: str, words: str) -> None:
+    prepared = prepare(make_settings({"robot": "tilthex_arm", **NORMAL, "objective": "auto", **more}))
+    assert prepared.impact.objective.kind == kind and words in prepared.impact.choice
+    assert f'objective = "{kind}"' in dump_settings(resolved_settings(prepared))
+
+
+def test_auto_with_several_contacts() -> None:
+    chosen = make_settings(
+        {
+            "robot": "talos",
+            "contact": ("gripper_right_base_link:-1,0,0", "gripper_left_base_link:-1,0,0"),
+            "objective": "auto",
+        }
+    )
+    assert resolve(chosen).objective.kind == "impulse"
+
+
+def test_several_contacts_come_at_once() -> None:
+    contacts = ("gripper_right_base_link:-1,0,0", "gripper_left_base_link:-1,0,0")
+    impact = resolve(make_settings({"robot": "talos", "contact": contacts}))
+    told = verdict(impact, impact.evaluate(), impact.evaluate())
+    assert ", all contacts at once, the jump stays" in told.line
+    assert "the impulse at gripper_right_base_link stays" in told.line
+    found = impact.evaluate()
+    assert found.together is not None and found.coulomb is not None
+    # Where the jump of all is unknown at one posture, the first contact alone is compared, and the line says so.
+    unknown = replace(found, together=None)
+    pulls = resolve(make_settings({"robot": "talos", "contact": contacts, "bilateral": True}))
+    for said in (verdict(impact, found, unknown), verdict(impact, unknown, found), verdict(pulls, unknown, unknown)):
+        assert said.outcome == "no better" and ", at gripper_right_base_link alone, the jump stays" in said.line
+        assert said.before is not None and said.before == said.after and said.before.jump == found.coulomb.norm
+
+
+def test_the_command_says_it_first(tmp_path: Path) -> None:
+    out = tmp_path / "out"
+    done = run(
+        "optimize", "tilthex_arm", "--normal", 0, 0, 1, "--objective", "auto", "--friction", 0.3, "--starts", 4,
+        "--no-codegen", "--out", out,
+    )  # fmt: skip
+    assert done.returncode == 0, done.stderr
+    assert "objective coulomb: at 1 m/s with friction 0.3" in done.stdout
+    assert done.stdout.index("verdict: better.") < done.stdout.index("before")
+    document = json.loads((out / "result.json").read_text())
+    assert document["verdict"]["outcome"] == "better" and document["verdict"]["jump"] < -0.5
+    assert document["metric"]["objective"] == "coulomb" and document["notes"][0].startswith("objective coulomb")
+    told = np.array([document[name]["jump"]["coulomb"]["norm"] for name in ("initial", "optimal")])
+    assert document["verdict"]["jump"] == pytest.approx(told[1] / told[0] - 1)
+    assert [document["verdict"][side]["jump"] for side in ("before", "after")] == told.tolist()
+    assert document["verdict"]["before"]["peak_force"] is None and document["verdict"]["after"]["sticks"] is not None
+    free = ("--starts", 2, "--no-collision", "--no-holdable", "--no-codegen", "--out", tmp_path / "talos")
+    paper = run("optimize", "talos", "--normal", -1, 0, 0, *free)
+    assert "verdict: worse." in paper.stdout and "--objective coulomb minimizes this jump" in paper.stdout
+
+
+@pytest.mark.parametrize(
+    ("kind", "more", "better"),
+    [
+        ("impulse", {}, "coulomb"),
+        ("impulse", {"friction": 0.0}, "coulomb"),
+        ("impulse", {"normal_cone": 5.0}, "sticking"),
+        ("impulse", {"normal_cone": 5.0, "friction": 0.0}, None),
+        # What minimizes the very jump of the verdict is not blamed for it.
+        ("speed", {"friction": 0.0}, None),
+        ("sticking", {"friction": 5.0}, None),
+        ("sticking", {"friction": 0.0}, "coulomb"),
+    ],
+)
+def test_another_objective_is_advised_only_if_it_minimizes_the_jump(
+    kind: str, more: dict[str, object], better: str | None
+) -> None:
+    prepared = prepare(make_settings({"robot": "panda", **NORMAL, "objective": kind, **more}))
+    found = prepared.impact.evaluate()
+    # The posture that was given is no better than itself.
+    told = verdict(prepared.impact, found, found)
+    assert told.outcome == "no better"
+    advised = [line for line in told.advice if "minimizes this jump" in line]
+    assert [line.split("'")[1] for line in advised] == ([] if better is None else [better])

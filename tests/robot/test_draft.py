@@ -1,0 +1,167 @@
+"""What names and geometry suggest of a robot, and the ``robot.toml`` that is drafted from it."""
+
+from __future__ import annotations
+
+import json
+import shutil
+import tomllib
+from pathlib import Path
+
+import numpy as np
+import pinocchio as pin
+import pytest
+
+from impact_posture.config.settings import LoadOptions
+from impact_posture.errors import InputError, OutputError
+from impact_posture.posture.formulation.problem_file import prepare
+from impact_posture.posture.search.multistart import solve
+from impact_posture.robot.draft import write_draft
+from impact_posture.robot.draft_text import Draft
+from impact_posture.robot.foot_shape import support
+from impact_posture.robot.guessed_parts import feet, tips
+from impact_posture.robot.robot_loader import load_robot
+from impact_posture.robot.robot_spec import RobotSpec, read_spec
+from impact_posture.robot.urdf import EXAMPLE_PREFIX, example_robot_data, robots_data
+from tests.support.helpers import NAMES
+from tests.support.settings import make_settings
+
+B1_Z1 = "example-robot-data:b1_description/urdf/b1-z1.urdf"
+FOUR = ("FL_foot", "FR_foot", "RL_foot", "RR_foot")
+
+
+def uri(folder: str) -> str:
+    return EXAMPLE_PREFIX + folder
+
+
+CATALOGUE: dict[str, RobotSpec] = {
+    name: spec
+    for name in NAMES
+    if (spec := read_spec(robots_data() / name / "robot.toml")).model.urdf.startswith(EXAMPLE_PREFIX)  # type: ignore[union-attr]
+}
+
+
+@pytest.mark.parametrize(
+    ("path", "expected", "tip"),
+    [
+        ("b1_description/urdf/b1-z1.urdf", FOUR, "gripperStator"),
+        ("a1_description/urdf/a1.urdf", FOUR, "RR_foot"),
+        ("solo_description/robots/solo12.urdf", ("FL_FOOT", "FR_FOOT", "HL_FOOT", "HR_FOOT"), "HR_FOOT"),
+        ("quadruped_description/urdf/quadruped.urdf", ("BL_contact", "BR_contact", "FL_contact", "FR_contact"),
+         "FR_contact"),
+        ("g1_description/urdf/g1_29dof_rev_1_0.urdf", ("left_ankle_roll_link", "right_ankle_roll_link"),
+         "right_rubber_hand"),
+        ("romeo_description/urdf/romeo.urdf", ("l_sole", "r_sole"), "r_gripper"),
+        ("panda_description/urdf/panda.urdf", (), "panda_hand_tcp"),
+        ("hextilt_description/urdf/hextilt_flying_arm_5.urdf", (), "flying_arm_5__gripper"),
+        ("tiago_description/robots/tiago.urdf", (), "hand_tool_link"),
+    ],
+)  # fmt: skip
+def test_feet_and_tips_by_names_and_geometry(path: str, expected: tuple[str, ...], tip: str) -> None:
+    found = load_robot(uri(path), LoadOptions(root="free-flyer", lock_massless=True))
+    assert feet(found) == expected
+    ordered = tips(found, feet(found))
+    assert ordered[0] == tip
+    # Nothing that moves is left out.
+    assert set(ordered) == {str(f.name) for f in found.model.frames if f.parentJoint > 0} - {"root_joint"}
+
+
+@pytest.mark.parametrize(
+    ("path", "foot", "kind", "size"),
+    [
+        ("b1_description/urdf/b1-z1.urdf", "FL_foot", "point", (0, 0)),
+        ("talos_data/robots/talos_reduced_box.urdf", "left_sole_link", "surface", (0.105, 0.065)),
+        ("g1_description/urdf/g1_29dof_rev_1_0.urdf", "left_ankle_roll_link", "surface", (0.085, 0.03)),
+        ("go2_description/urdf/go2.urdf", "FL_foot", "point", (0, 0)),
+    ],
+)
+def test_a_sole_is_read_from_balls_and_boxes(path: str, foot: str, kind: str, size: tuple[float, float]) -> None:
+    """A ball on b1, a box on talos, four balls at the corners of g1's sole, a mesh on go2: not opened."""
+    found = load_robot(uri(path), LoadOptions(root="free-flyer"))
+    spec = support(found, foot, example_robot_data() / path, flat=False)
+    assert spec.kind == kind
+    assert spec.size == pytest.approx(size, abs=1e-3)
+    assert any(spec.offset) == ("go2" not in path)
+    if kind == "point" and any(spec.offset):
+        # The lowest point of a ball lies straight below its center, one radius down.
+        data = found.model.createData()
+        pin.framesForwardKinematics(found.model, data, found.posture())
+        down = data.oMf[found.frame_id(foot)].rotation @ np.array(spec.offset)
+        np.testing.assert_allclose(down, [0, 0, -0.04], atol=2e-4)
+
+
+def commented(text: str) -> list[str]:
+    """Lines with a key that neither say where its value comes from nor stand below a line that does."""
+    lines = text.splitlines()
+    keys = [k for k, line in enumerate(lines) if " = " in line and not line.startswith(("#", "schema"))]
+    return [lines[k] for k in keys if "  # " not in lines[k] and not lines[k - 1].startswith("# ")]
+
+
+@pytest.mark.parametrize("name", [*CATALOGUE, "b1-z1"])
+def test_a_draft_loads_without_change(name: str, tmp_path: Path) -> None:
+    """Of every robot of the catalogue, from its URDF alone: root and feet as the catalogue's file says."""
+    known = CATALOGUE.get(name)
+    source = B1_Z1 if known is None else known.model.urdf
+    assert source is not None
+    out, draft = write_draft(source, LoadOptions(), tmp_path / "draft.toml")
+    assert [p.name for p in tmp_path.iterdir()] == ["draft.toml"]
+    assert tomllib.loads(draft.text) and out.read_text(encoding="utf-8") == draft.text
+    found = load_robot(source, LoadOptions(config=str(out)))
+    found.check_posture(found.posture())
+    assert commented(draft.text) == []
+    assert max(len(line) for line in draft.text.splitlines() if line.startswith("#")) <= 100
+    assert found.spec.contact.frame in found.frame_names
+    expected = FOUR if known is None else [s.frame for s in known.supports]
+    assert sorted(s.frame for s in found.spec.supports) == sorted(expected)
+    assert found.root == ("free-flyer" if known is None else known.model.root)
+    if known is not None and known.kind != "other":
+        assert found.spec.kind == known.kind
+    assert not set(found.spec.constraints.hold) & set(found.locked)
+
+
+def test_a_draft_beside_the_urdf_is_found_by_itself(tmp_path: Path) -> None:
+    shutil.copy(example_robot_data() / B1_Z1.removeprefix(EXAMPLE_PREFIX), tmp_path)
+    urdf = str(tmp_path / "b1-z1.urdf")
+    (tmp_path / "srdf").mkdir()
+    shutil.copy(example_robot_data() / "b1_description/srdf/b1-z1.srdf", tmp_path / "srdf" / "other.srdf")
+    options = LoadOptions(srdf=str(tmp_path / "srdf" / "other.srdf"), armature={"joint1": 0.02}, lock=("jointGri*",))
+    out, draft = write_draft(urdf, options, None)
+    assert out == tmp_path / "robot.toml"
+    found = load_robot(urdf)
+    assert found.default_posture.startswith("standing") and found.locked == ("jointGripper",)
+    assert found.armature[found.model.idx_vs[found.joint_id("joint1")]] == 0.02
+    assert 'srdf = "srdf/other.srdf"  # as --srdf says' in draft.text
+    with pytest.raises(OutputError, match="`force=True`"):
+        write_draft(urdf, LoadOptions(), None)
+    assert out.read_text() == draft.text
+    write_draft(urdf, LoadOptions(root="fixed"), None, force=True)
+    assert load_robot(urdf).root == "fixed"
+    assert sorted(p.name for p in tmp_path.iterdir()) == ["b1-z1.urdf", "robot.toml", "srdf"]
+
+
+def test_what_a_draft_refuses(tmp_path: Path) -> None:
+    with pytest.raises(InputError, match=r"panda: has its robot\.toml already"):
+        write_draft("panda", LoadOptions(), tmp_path / "panda.toml")
+    with pytest.raises(OutputError, match="cannot be written"):
+        write_draft(B1_Z1, LoadOptions(), tmp_path / "nowhere" / "b1.toml")
+    assert not list(tmp_path.iterdir())
+
+
+def test_names_cannot_break_out_of_a_comment() -> None:
+    draft = Draft()
+    draft.key("name", 'a"\nb', 'a link named "x"\nroot = 1')
+    assert tomllib.loads(draft.text) == {"name": 'a"\nb'}
+
+
+def test_b1_z1_stays_upright_with_its_draft(tmp_path: Path) -> None:
+    """By its bare URDF it was turned upside down, feet a meter above the tip."""
+    out, _ = write_draft(B1_Z1, LoadOptions(), tmp_path / "b1-z1.toml")
+    prepared = prepare(make_settings({"robot": B1_Z1, "config": str(out), "normal": (-1, 0, 0)}))
+    solution = solve(prepared.problem, starts=2, jobs=1, compile="never")
+    model, q = prepared.impact.robot.model, solution.q
+    data = model.createData()
+    pin.framesForwardKinematics(model, data, q)
+    assert pin.Quaternion(q[3:7]).toRotationMatrix()[2, 2] > 0.7
+    tip = data.oMf[prepared.impact.robot.frame_id("gripperStator")].translation
+    for foot in FOUR:
+        at = data.oMf[prepared.impact.robot.frame_id(foot)].translation
+        assert at[2] < q[2] - 0.2 and at[0] < tip[0], json.dumps({foot: list(at)})

@@ -1,0 +1,231 @@
+"""The contact-consistent quantities to sixty digits.
+
+The system ``[M, −J_sᵀ; J_s, εI]`` with Pinocchio's doubles for ``M, J, J_s`` is solved in decimal arithmetic (the
+standard library's, compiled), so that what is solved is exactly what the oracle is given.
+"""
+
+from __future__ import annotations
+
+import decimal
+from collections.abc import Iterator
+from contextlib import contextmanager
+from dataclasses import dataclass
+from decimal import Decimal
+from functools import cached_property
+from typing import Any
+
+import numpy as np
+from numpy.typing import NDArray
+
+from impact_posture.impact.quantities.impact_oracle import ImpactOracle
+
+Vector = NDArray[np.float64]
+Exact = NDArray[Any]
+
+DIGITS = 60
+
+
+@contextmanager
+def digits(count: int = DIGITS) -> Iterator[None]:
+    """Decimal arithmetic of so many digits within."""
+    with decimal.localcontext() as context:
+        context.prec = count
+        yield
+
+
+def exact(values: object) -> Exact:
+    """Doubles as the decimal numbers that they are."""
+    doubles = np.asarray(values, dtype=float)
+    found = np.empty(doubles.shape, dtype=object)
+    for index in np.ndindex(doubles.shape):
+        found[index] = Decimal(float(doubles[index]))
+    return found
+
+
+def rounded(values: Exact) -> Vector:
+    """To doubles."""
+    return np.asarray(values, dtype=float)
+
+
+def distance(found: object, expected: Exact) -> Vector:
+    """``|found − expected|``, subtracted before it is rounded."""
+    return rounded(abs(exact(found).reshape(np.shape(expected)) - expected))
+
+
+def solve(matrix: Exact, right: Exact) -> Exact:
+    """Gaussian elimination with partial pivoting; ``right`` by columns."""
+    A, B = matrix.copy(), right.copy()
+    size = len(A)
+    for k in range(size):
+        pivot = k + int(np.argmax(abs(A[k:, k])))
+        if pivot != k:
+            A[[k, pivot]], B[[k, pivot]] = A[[pivot, k]], B[[pivot, k]]
+        for i in range(k + 1, size):
+            if A[i, k]:
+                factor = A[i, k] / A[k, k]
+                A[i, k + 1 :] -= factor * A[k, k + 1 :]
+                B[i] -= factor * B[k]
+    for k in reversed(range(size)):
+        B[k] = (B[k] - A[k, k + 1 :] @ B[k + 1 :]) / A[k, k]
+    return B
+
+
+@dataclass(frozen=True, eq=False)
+class ExactImpact:
+    """Everything about one posture, W = I, a normal in the world.
+
+    Attributes:
+        oracle: At the posture; gives ``M, J, J_s, n`` and their derivatives as doubles.
+        compliance: ε, 1/kg; any, the oracle's own or another.
+    """
+
+    oracle: ImpactOracle
+    compliance: float
+
+    @cached_property
+    def K(self) -> Exact:
+        M, Js = self.oracle.M, self.oracle.Js
+        rows, size = Js.shape
+        K = exact(np.zeros((size + rows, size + rows)))
+        K[:size, :size], K[:size, size:], K[size:, :size] = exact(M), -exact(Js.T), exact(Js)
+        K[range(size, size + rows), range(size, size + rows)] = Decimal(self.compliance)
+        return K
+
+    @cached_property
+    def inverse(self) -> Exact:
+        """``K⁻¹``; its first nv rows and columns are ``M̃⁻¹``."""
+        return solve(self.K, exact(np.eye(len(self.K))))
+
+    @property
+    def nv(self) -> int:
+        return len(self.oracle.M)
+
+    def answer(self, tau: Exact) -> tuple[Exact, Exact]:
+        """``a`` and ``f`` for ``τ``."""
+        found = self.inverse[:, : self.nv] @ tau
+        return found[: self.nv], found[self.nv :]
+
+    # ---- quantities -------------------------------------------------------------------------------------------
+
+    @cached_property
+    def n(self) -> Exact:
+        return exact(self.oracle.n)
+
+    @cached_property
+    def J(self) -> Exact:
+        return exact(self.oracle.J)
+
+    @cached_property
+    def jump(self) -> Exact:
+        return self.answer(self.J.T @ self.n)[0]
+
+    @cached_property
+    def impulse(self) -> Exact:
+        return self.answer(self.J.T @ self.n)[1]
+
+    @cached_property
+    def second(self) -> tuple[Exact, Exact]:
+        """``b`` and ``g``: the answer to ``a``."""
+        return self.answer(self.jump)
+
+    @property
+    def H(self) -> Decimal:
+        return Decimal(self.jump @ self.jump)
+
+    @property
+    def G(self) -> Decimal:
+        return Decimal(self.n @ self.J @ self.jump)
+
+    @property
+    def V(self) -> Decimal:
+        return self.H / self.G**2
+
+    @cached_property
+    def K_held(self) -> Exact:
+        """K with the contact point held too: ``J a = v`` in three more rows, ``−Jᵀs`` in three more columns."""
+        size = len(self.K)
+        K = exact(np.zeros((size + 3, size + 3)))
+        K[:size, :size], K[: self.nv, size:], K[size:, : self.nv] = self.K, -self.J.T, self.J
+        return K
+
+    def _held(self, right: Exact) -> tuple[Exact, Exact, Exact]:
+        found = solve(self.K_held, right[:, None])[:, 0]
+        return found[-3:], found[: self.nv], found[self.nv : -3]
+
+    @cached_property
+    def sticking(self) -> tuple[Exact, Exact, Exact]:
+        """The impulse ``s``, and the jump and the feet's impulses that belong to it."""
+        return self._held(np.concatenate([exact(np.zeros(len(self.K))), self.n]))
+
+    @property
+    def S(self) -> Decimal:
+        jump = self.sticking[1]
+        return Decimal(jump @ jump)
+
+    # ---- gradients --------------------------------------------------------------------------------------------
+
+    @cached_property
+    def dM(self) -> Vector:
+        """``∂M_ij/∂q_k``, shape (nv, nv, nv)."""
+        eye, numeric = np.eye(self.nv), self.oracle.numeric
+        return np.array([[numeric.inertial_gradient(i, j) for j in eye] for i in eye])
+
+    @cached_property
+    def dJ(self) -> Vector:
+        return self._rate(self.oracle.point, 3)
+
+    @cached_property
+    def dJs(self) -> Vector:
+        return np.concatenate([self._rate(foot.point, foot.rows) for foot in self.oracle.feet])
+
+    def _rate(self, point: Any, rows: int) -> Vector:
+        numeric = self.oracle.numeric
+        return np.array(
+            [[numeric.coupling_gradient(point, np.eye(6)[i], v) for v in np.eye(self.nv)] for i in range(rows)]
+        )
+
+    @cached_property
+    def grad_H(self) -> Exact:
+        """``2 ∂_q[nᵀJb + fᵀJ_s b + gᵀJ_s a − bᵀMa]``."""
+        (b, g), a, f = self.second, self.jump, self.impulse
+        feet = bracket(self.dJs, f, b) + bracket(self.dJs, g, a)
+        return 2 * (bracket(self.dJ, self.n, b) + feet - bracket(self.dM, b, a))
+
+    @cached_property
+    def grad_G(self) -> Exact:
+        """``∂_q[2nᵀJa + 2fᵀJ_s a − aᵀMa]``."""
+        a, f = self.jump, self.impulse
+        return 2 * (bracket(self.dJ, self.n, a) + bracket(self.dJs, f, a)) - bracket(self.dM, a, a)
+
+    @cached_property
+    def grad_S(self) -> Exact:
+        """``2 ∂_q[sᵀJb + rᵀJa + fᵀJ_s b + gᵀJ_s a − bᵀMa]``."""
+        s, a, f = self.sticking
+        r, b, g = self._held(np.concatenate([a, exact(np.zeros(len(self.K_held) - self.nv))]))
+        feet = bracket(self.dJs, f, b) + bracket(self.dJs, g, a)
+        return 2 * (bracket(self.dJ, s, b) + bracket(self.dJ, r, a) + feet - bracket(self.dM, b, a))
+
+    # ---- derivatives of the answers ---------------------------------------------------------------------------
+
+    def _moved(self, a: Exact, f: Exact, force: Exact) -> Exact:
+        """``∂_k a`` where ``M a − J_sᵀf = τ, J_s a + εf = 0`` and ``∂_k τ`` is ``force``, shape (nv, nv)."""
+        first = force - np.tensordot(a, exact(self.dM), (0, 0)) + np.tensordot(f, exact(self.dJs), (0, 0))
+        slip = -np.tensordot(exact(self.dJs), a, (1, 0))
+        return self.inverse[: self.nv] @ np.concatenate([first, slip])
+
+    @cached_property
+    def jump_rates(self) -> Exact:
+        """``∂_k a``, column k."""
+        return self._moved(self.jump, self.impulse, np.tensordot(self.n, exact(self.dJ), (0, 0)))
+
+    @cached_property
+    def second_rates(self) -> Exact:
+        """``∂_k b``, column k."""
+        return self._moved(*self.second, self.jump_rates)
+
+
+def bracket(rates: Any, left: Any, right: Any) -> Any:
+    """``Σ_ij l_i r_j ∂_k T_ij``, shape (nv,)."""
+    if left.dtype == object and rates.dtype != object:
+        rates = exact(rates)
+    return np.tensordot(right, np.tensordot(left, rates, (0, 0)), (0, 0))

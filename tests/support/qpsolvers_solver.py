@@ -1,0 +1,46 @@
+"""Any solver of the qpsolvers package on the programs of the online controllers, to hold DAQP against."""
+
+from __future__ import annotations
+
+import numpy as np
+import qpsolvers
+
+from impact_posture.tsid.qp.quadratic_program import EQUALITY, QP, Solved
+
+
+class QpsolversSolver:
+    """A solver by its name in qpsolvers (``proxqp``, ``quadprog``, …), cold at every program."""
+
+    def __init__(self, name: str, **settings: float) -> None:
+        self._name, self._settings = name, settings
+
+    def solve(self, qp: QP) -> Solved | None:
+        """The solution, or ``None``.
+
+        Raises:
+            qpsolvers.SolverNotFound: No solver of that name is installed.
+        """
+        equal = qp.sense == EQUALITY
+        rows = np.vstack([np.eye(qp.n), qp.A])
+        above, below = ~equal & np.isfinite(qp.upper), ~equal & np.isfinite(qp.lower)
+        problem = qpsolvers.Problem(
+            qp.H,
+            qp.g,
+            np.vstack([rows[above], -rows[below]]),
+            np.concatenate([qp.upper[above], -qp.lower[below]]),
+            rows[equal] if equal.any() else None,
+            qp.upper[equal] if equal.any() else None,
+        )
+        try:
+            answer = qpsolvers.solve_problem(problem, solver=self._name, **self._settings)
+        except ValueError:
+            # quadprog's word for a program without a solution.
+            return None
+        if not answer.found or answer.x is None:
+            return None
+        multipliers = np.zeros(qp.n + qp.m)
+        count = int(above.sum())
+        multipliers[above] += answer.z[:count]
+        multipliers[below] -= answer.z[count:]
+        multipliers[equal] = answer.y
+        return Solved(np.asarray(answer.x), multipliers, 0)

@@ -1,0 +1,160 @@
+"""The relaxation in C for tests: its library, a call, and a certificate of what it returns."""
+
+from __future__ import annotations
+
+import ctypes
+import re
+import subprocess
+import time
+from collections.abc import Callable
+from dataclasses import dataclass
+from pathlib import Path
+
+import numpy as np
+import scipy.linalg
+import scipy.optimize
+
+from impact_posture.controller_export import controller_source as render
+from impact_posture.controller_export import daqp_sources
+from tests.support.daqp import sources_or_skip
+from tests.support.relaxed_ticks import RelaxedTick
+
+SOURCES = Path(daqp_sources.__file__).parent / "c"
+SOLVED, WITHOUT_COST, INFEASIBLE, BUDGET, UNSOLVED = 1, 2, -1, -4, -8
+_STRICT = ("-std=c99", "-Wall", "-Wextra", "-Wconversion", "-pedantic", "-Werror")
+FORCE_UNIT = float(re.findall(r"#define IP_FORCE_UNIT (\S+)", (SOURCES / "give_way.c").read_text())[0])
+_ARRAYS = ("A", "lower", "upper", "level", "H", "g", "unit")
+
+
+class _Problem(ctypes.Structure):
+    _fields_ = [
+        *((name, ctypes.c_int) for name in ("n", "m", "levels")),
+        *((name, ctypes.c_void_p) for name in _ARRAYS),
+    ]
+
+
+class _Report(ctypes.Structure):
+    _fields_ = [("iterations", ctypes.c_int), ("violation", ctypes.c_double)]
+
+
+@dataclass(frozen=True)
+class Answer:
+    """Code, point, number of iterations, largest violation of level 0, and the shortest time of a call, s."""
+
+    code: int
+    z: np.ndarray
+    iterations: int
+    violation: float
+    seconds: float
+
+
+class Relaxation:
+    """The compiled relaxation with a workspace for each size, which keeps the active rows."""
+
+    def __init__(self, folder: Path, *flags: str) -> None:
+        """Compile in a folder; our own code without a warning."""
+        for name, content in sources_or_skip().items():
+            (folder / name).write_bytes(content)
+        for name, text in render.relaxation().items():
+            (folder / name).write_text(text, encoding="utf-8")
+        compiler = ["cc", "-O1", "-fPIC", *flags]
+        subprocess.run(
+            [*compiler, *_STRICT, "-isystem", str(folder), "-c", "relaxation.c"],
+            cwd=folder, check=True,
+        )  # fmt: skip
+        subprocess.run(
+            [*compiler, "-shared", "relaxation.o", *daqp_sources.SOURCES, "-o", "relaxation.so", "-lm"],
+            cwd=folder, check=True,
+        )  # fmt: skip
+        library = ctypes.CDLL(str(folder / "relaxation.so"))
+        library.relaxation_bytes.restype = ctypes.c_size_t
+        self._bytes: Callable[..., int] = library.relaxation_bytes
+        self._solve: Callable[..., int] = library.relaxation_solve
+        self._work = dict[tuple[int, ...], np.ndarray]()
+
+    def forget(self) -> None:
+        """Start the next problem without active rows."""
+        self._work.clear()
+
+    def solve(self, tick: RelaxedTick, budget: int = 2000, repeats: int = 1) -> Answer:
+        """Solve the program of a tick, as often as told from the same active rows."""
+        m, n = tick.A.shape
+        levels = int(tick.level.max())
+        values = {name: np.ascontiguousarray(getattr(tick, name), dtype=float) for name in _ARRAYS}
+        # The search measures forces as give_way.c does; the certificate keeps Python's units.
+        values["unit"] = np.where(tick.unit == 1.0, 1.0, FORCE_UNIT * tick.unit)
+        values["level"] = np.ascontiguousarray(tick.level, dtype=np.intc)
+        problem = _Problem(n, m, levels, *(values[name].ctypes.data for name in _ARRAYS))
+        work = self._work.setdefault((n, m, levels), np.zeros(self._bytes(n, m, levels) // 8 + 1))
+        z, report, before, shortest = np.zeros(n), _Report(), work.copy(), np.inf
+        arguments = [ctypes.byref(problem), ctypes.c_void_p(work.ctypes.data), budget, ctypes.c_void_p(z.ctypes.data)]
+        for _ in range(repeats):
+            work[:] = before
+            began = time.thread_time_ns()
+            code = self._solve(*arguments, ctypes.byref(report))
+            shortest = min(shortest, (time.thread_time_ns() - began) / 1e9)
+        return Answer(code, z, report.iterations, report.violation, shortest)
+
+
+# ---- certificate --------------------------------------------------------------------------------------------------
+
+# Violation that counts, relative to the length of a row times the size of the point.
+COUNTS = 1e-7
+
+
+def violations(tick: RelaxedTick, z: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
+    """Return the signed violation of each entry of ``[z; A z]``, and the violation that counts."""
+    values = np.concatenate([z, tick.A @ z])
+    rows = np.vstack([np.diag(tick.unit), tick.A * tick.unit])
+    size, lengths = max(1.0, float(np.max(np.abs(z) / tick.unit))), np.linalg.norm(rows, axis=1)
+    # No point changes what a vanishing row misses.
+    return np.where(lengths > 0, values - np.clip(values, tick.lower, tick.upper), 0.0), COUNTS * size * lengths
+
+
+def missed(tick: RelaxedTick, z: np.ndarray) -> list[float]:
+    """Return the largest violation of each level, level 0 first, in units of the size of the point."""
+    over, counts = violations(tick, z)
+    found = COUNTS * np.abs(over) / np.where(counts > 0, counts, np.inf)
+    return [float(np.max(found[tick.level == k], initial=0.0)) for k in range(int(tick.level.max()) + 1)]
+
+
+def stationarity(tick: RelaxedTick, z: np.ndarray) -> list[float]:
+    """Return how far the gradient of each level's sum of squares, and last of the cost, is from its constraints.
+
+    At the lexicographic answer, the negative gradient is a combination of the rows above: of any sign for equations
+    and missed rows, non-negative for active bounds.  The distance is relative to the terms of the gradient; it is 0
+    for a level that holds.  Nothing here is shared with the code in C.
+    """
+    rows = np.vstack([np.diag(tick.unit), tick.A * tick.unit])
+    lengths = np.linalg.norm(rows, axis=1)
+    lengths[lengths == 0.0] = 1.0
+    over, counts = violations(tick, z)
+    values, levels, found = np.concatenate([z, tick.A @ z]), int(tick.level.max()), []
+    for k in range(1, levels + 2):
+        own = tick.level == k
+        if k <= levels and (np.abs(over) <= counts)[own].all():
+            found.append(0.0)
+            continue
+        if k <= levels:
+            gradient, terms = rows[own].T @ over[own], float(np.abs(over[own]) @ lengths[own])
+        else:
+            gradient = (tick.H @ z + tick.g) * tick.unit
+            terms = float(np.linalg.norm((np.abs(tick.H) @ np.abs(z) + np.abs(tick.g)) * tick.unit))
+        above = tick.level < k
+        fixed = above & ((tick.lower == tick.upper) | ((np.abs(over) > counts) & (tick.level > 0)))
+        upper = above & ~fixed & (values >= tick.upper - counts)
+        lower = above & ~fixed & (values <= tick.lower + counts)
+        unit = rows / lengths[:, None]
+        kept = _complement(unit[fixed])
+        normals = kept @ np.vstack([unit[upper], -unit[lower]]).T
+        left = kept @ -gradient
+        rest = scipy.optimize.nnls(normals, left, maxiter=10_000)[1] if normals.size else np.linalg.norm(left)
+        found.append(float(rest) / max(terms, 1e-300))
+    return found
+
+
+def _complement(rows: np.ndarray) -> np.ndarray:
+    """Return an orthonormal basis, as rows, of what is orthogonal to the given rows."""
+    if not rows.size:
+        return np.eye(rows.shape[1])
+    return scipy.linalg.null_space(rows, rcond=1e-9).T

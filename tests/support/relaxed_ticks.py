@@ -1,0 +1,105 @@
+"""Ticks that need the relaxation, as Python solves them, recorded from simulated robots and from random states."""
+
+from __future__ import annotations
+
+from collections.abc import Iterator
+from contextlib import contextmanager
+from dataclasses import dataclass
+
+import numpy as np
+import pytest
+
+from impact_posture.simulation.controllers.controller_factory import ControllerFactory
+from impact_posture.simulation.scenario import set_up
+from impact_posture.simulation.scenario_file import read_scenario
+from impact_posture.simulation.world.actuator_command import Push
+from impact_posture.simulation.world.world import SimulationDiverged
+from impact_posture.tsid import relaxation
+from impact_posture.tsid.assembly import Assembly
+
+# Scenario, force (N) on the frame of the push from 0.2 s to 0.6 s, seconds.
+RUNS = {
+    "tilthex_arm": ("aerial-vertical", "ee", (0.0, 60.0, 40.0), 2.0),
+    "solo8": ("solo8-push", "base_link", (150.0, 80.0, 0.0), 2.0),
+    "talos": ("talos-push", "torso_2_link", (150.0, 60.0, 0.0), 2.0),
+    "g1": ("g1-strike", "torso_link", (60.0, 40.0, 0.0), 2.0),
+}
+
+
+@dataclass(frozen=True, eq=False)
+class RelaxedTick:
+    """Program of a tick, with Python's answer.
+
+    Attributes:
+        H: Shape (n, n).
+        g: Shape (n,).
+        A: Shape (m, n).
+        lower: Shape (n + m,).
+        upper: Shape (n + m,).
+        level: 0 for what always holds, 1 for joint limits, then the strict levels, shape (n + m,).
+        unit: Value of each variable that compares with an acceleration of 1, shape (n,).
+        z: Python's answer, shape (n,); NaN where it has none.
+    """
+
+    H: np.ndarray
+    g: np.ndarray
+    A: np.ndarray
+    lower: np.ndarray
+    upper: np.ndarray
+    level: np.ndarray
+    unit: np.ndarray
+    z: np.ndarray
+
+
+def problem_of(assembly: Assembly, z: np.ndarray | None) -> RelaxedTick:
+    """Return the program that the relaxation of an assembly solves."""
+    qp = assembly.rank.qp.copy()
+    level = np.zeros(qp.n + qp.m, dtype=np.intc)
+    level[assembly.limits] = 1
+    for k, (_, rows) in enumerate(assembly.levels):
+        level[qp.n + rows.start : qp.n + rows.stop] = 2 + k
+    unit = assembly.rank.units.copy()
+    answer = np.full(qp.n, np.nan) if z is None else z
+    return RelaxedTick(qp.H, qp.g, qp.A, qp.lower, qp.upper, level, unit, answer)
+
+
+@contextmanager
+def recording() -> Iterator[list[RelaxedTick]]:
+    """Record each relaxed tick of any controller."""
+    found, relax = list[RelaxedTick](), relaxation._relax
+
+    def recorded(assembly: Assembly) -> relaxation.Outcome:
+        outcome = relax(assembly)
+        found.append(problem_of(assembly, None if outcome.solved is None else outcome.solved.z))
+        return outcome
+
+    with pytest.MonkeyPatch.context() as patch:
+        patch.setattr(relaxation, "_relax", recorded)
+        yield found
+
+
+def pushed(name: str) -> tuple[list[RelaxedTick], int]:
+    """Push a simulated robot with its nominal controller.
+
+    Returns:
+        Its relaxed ticks, and how many of them come before it falls: before its base has sunk by a third.
+    """
+    scenario, frame, force, seconds = RUNS[name]
+    setup = set_up(read_scenario(scenario))
+    driver, world, period = ControllerFactory(setup).driver("nominal"), setup.world, setup.scenario.control.period
+    standing = None
+    with recording() as found:
+        command = driver.reset(setup.q)
+        world.reset(setup.q, seed=0, rotor_speed=command.rotor_speed)
+        for k in range(round(seconds / period)):
+            if k == round(0.2 / period):
+                world.push(Push(frame, force, 0.4))
+            reading = world.read()
+            if standing is None and setup.scenario.control.footing and reading.q[2] < setup.q[2] * 2 / 3:
+                standing = len(found)
+            command = driver.tick(reading, None)
+            try:
+                world.step(command, round(period / world.timestep))
+            except SimulationDiverged:
+                break
+    return found, len(found) if standing is None else standing

@@ -1,0 +1,129 @@
+"""Restitution of a contact law, measured with a ball in the world that robots are simulated in."""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from dataclasses import dataclass
+
+import numpy as np
+import pinocchio as pin
+
+from impact_posture.errors import InputError
+from impact_posture.robot.robot import Robot
+from impact_posture.robot.robot_spec import RobotSpec
+from impact_posture.simulation.world.actuator_command import ActuatorCommand
+from impact_posture.simulation.world.scene import ContactLaw, Physics, Scene, Shape, Surface
+from impact_posture.simulation.world.world import World, build_world
+
+_RADIUS = 0.02
+# Number of time constants of the law after which a contact counts as endless.
+_PATIENCE = 200
+# Shares of a time step after which the ball touches, because restitution depends on that a little.
+_PHASES = (0.1, 0.3, 0.5, 0.7, 0.9)
+
+
+@dataclass(frozen=True)
+class Bounce:
+    """An impact, averaged over the parts of a time step where it may begin.
+
+    Attributes:
+        restitution: Normal speed after over before.
+        spread: Largest minus smallest restitution over those parts.
+        duration: Time from the first to the last force, s.
+        depth: Largest depth of the ball, m.
+        peak: Largest force times duration over impulse, 1 for a constant force.
+    """
+
+    restitution: float
+    spread: float
+    duration: float
+    depth: float
+    peak: float
+
+
+def ideal_restitution(damping: float) -> float:
+    """Return the restitution of ``r'' = −2ζω r' − ω² r`` at any ω, where the contact ends when it would have to pull.
+
+    ``exp(−2ζ arccos ζ/√(1 − ζ²))`` below ζ = 1, ``e⁻²`` there, ``exp(−2ζ arcosh ζ/√(ζ² − 1))`` above.  A
+    :class:`ContactLaw` approaches it when its share d is near 1 and its time constant is many time steps.
+
+    Args:
+        damping: ζ, at least zero.
+    """
+    if abs(damping - 1) < 1e-9:
+        return float(np.exp(-2.0))
+    turn = np.arccos(damping) if damping < 1 else np.arccosh(damping)
+    return float(np.exp(-2 * damping * turn / np.sqrt(abs(1 - damping**2))))
+
+
+def ball(mass: float = 1.0, radius: float = _RADIUS) -> Robot:
+    """Return a robot without joints: a solid ball, with the frame ``ball`` in its center."""
+    model = pin.Model()
+    joint = model.addJoint(0, pin.JointModelFreeFlyer(), pin.SE3.Identity(), "root_joint")
+    model.appendBodyToJoint(joint, pin.Inertia.FromSphere(mass, radius), pin.SE3.Identity())
+    model.addFrame(pin.Frame("ball", joint, 0, pin.SE3.Identity(), pin.FrameType.BODY))
+    q = np.asarray(pin.neutral(model))
+    return Robot("ball", "", model, "free-flyer", {"neutral": q}, "neutral", RobotSpec())
+
+
+def measure_restitution(
+    law: ContactLaw, *, speed: float = 0.5, timestep: float = Physics().timestep, mass: float = 1.0
+) -> Bounce:
+    """Let a ball hit a surface squarely, without gravity.
+
+    Args:
+        law: Contact law of the surface.
+        speed: Approach speed, m/s.
+        timestep: Time step of the physics, s.
+        mass: Mass of the ball, kg.  It makes no difference, because MuJoCo scales the law by the mass that it feels.
+
+    Raises:
+        InputError: The ball stays on the surface, or the law does not fit the time step.
+    """
+    found = [_one(law, speed, timestep, mass, phase) for phase in _PHASES]
+    restitutions = [b.restitution for b in found]
+    return Bounce(
+        restitution=float(np.mean(restitutions)),
+        spread=float(np.ptp(restitutions)),
+        duration=_mean(found, "duration"),
+        depth=_mean(found, "depth"),
+        peak=_mean(found, "peak"),
+    )
+
+
+def _one(law: ContactLaw, speed: float, timestep: float, mass: float, phase: float) -> Bounce:
+    robot = ball(mass)
+    scene = Scene(
+        surfaces=(Surface("floor", (0, 0, 1), gap=phase * speed * timestep, **vars(law)),),
+        shapes=(Shape("ball", size=(_RADIUS,), center=(0, 0, 0)),),
+        physics=Physics(timestep, gravity=(0, 0, 0)),
+    )
+    world = build_world(robot, scene)
+    world.reset(robot.posture(), [0, 0, -speed, 0, 0, 0])
+    return _follow(world, scene.surfaces[0], speed)
+
+
+def _follow(world: World, surface: Surface, speed: float) -> Bounce:
+    """Step until the contact ends."""
+    idle = ActuatorCommand(np.zeros(0), np.zeros(0))
+    time = surface.solref[0]
+    constant = time if time > 0 else 1 / np.sqrt(-time)
+    forces, depth, ended = [0.0], 0.0, False
+    for _ in range(int(_PATIENCE * constant / world.timestep)):
+        world.step(idle)
+        truth = world.truth()
+        forces.append(float(truth.shapes[0].force[2]))
+        depth = max(depth, -surface.gap - float(truth.q[2]))
+        ended = forces[-1] == 0 and max(forces) > 0
+        if ended:
+            break
+    if not ended:
+        raise InputError(f"the ball stays on it (solref {surface.solref})", where="contact law", hint="damp it less")
+    pushed = np.flatnonzero(forces)
+    duration, impulse = (pushed[-1] - pushed[0] + 1) * world.timestep, sum(forces) * world.timestep
+    after = float(world.truth().v[2])
+    return Bounce(after / speed, 0.0, duration, depth, max(forces) * duration / impulse)
+
+
+def _mean(found: Sequence[Bounce], name: str) -> float:
+    return float(np.mean([getattr(bounce, name) for bounce in found]))

@@ -1,0 +1,15 @@
+"""Settings of a problem as tests write them."""
+
+from __future__ import annotations
+
+from impact_posture.config.settings import ProblemSettings
+from impact_posture.config.toml_tables import validate
+
+
+def make_settings(values: dict[str, object]) -> ProblemSettings:
+    """Check values as those of options are checked; collisions and loads count only if the values ask for them.
+
+    What is tested with these settings is the impact and the program.  Shapes and motors would make some normals
+    impossible (a wall through the robot).  ``test_clearance.py``, ``test_holdable.py`` and the commands have them.
+    """
+    return validate(ProblemSettings, {"collision": False, "holdable": False, **values}, "options")

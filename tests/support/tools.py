@@ -1,0 +1,48 @@
+"""Tools that a test may need and a machine may lack: the test then skips and names the tool."""
+
+from __future__ import annotations
+
+import os
+import shutil
+import sys
+from pathlib import Path
+
+import pytest
+
+from impact_posture.system.toolchain import find_compiler, words_of
+
+# Warnings that the generated C must not give.
+STRICT = ("-Wall", "-Wextra", "-pedantic", "-Werror")
+
+
+def need_compiler() -> list[str]:
+    compiler = find_compiler()
+    if compiler is None:
+        pytest.skip("no C compiler (cc, gcc, clang)")
+    return compiler
+
+
+def need(tool: str) -> str:
+    path = shutil.which(tool)
+    if path is None:
+        pytest.skip(f"no {tool}")
+    return path
+
+
+def cxx_compiler() -> list[str] | None:
+    """``$CXX``, g++, clang++ or c++."""
+    candidates = (words_of("CXX"), ["g++"], ["clang++"], ["c++"])
+    return next((words for words in candidates if words and shutil.which(words[0])), None)
+
+
+def eigen_headers() -> Path | None:
+    """``$EIGEN3_INCLUDE_DIR``, the wheel cmeel-eigen, the distribution's, or what CasADi's wheel brings."""
+    installed = [Path(folder) for folder in sys.path]
+    folders = [folder / "cmeel.prefix" / "include" for folder in installed]
+    folders += [
+        Path("/usr/include"),
+        Path("/usr/local/include"),
+        *[folder / "casadi" / "include" for folder in installed],
+    ]
+    candidates = [Path(os.environ.get("EIGEN3_INCLUDE_DIR") or "/nonexistent"), *[f / "eigen3" for f in folders]]
+    return next((folder for folder in candidates if (folder / "Eigen" / "Cholesky").is_file()), None)

@@ -1,0 +1,322 @@
+"""Output folders: whole or not at all, whoever interferes; nobody's files are lost, nothing is left behind."""
+
+from __future__ import annotations
+
+import json
+import os
+import signal
+import subprocess
+import sys
+from collections.abc import Callable
+from pathlib import Path
+
+import pytest
+from matplotlib.figure import Figure
+
+import impact_posture as ip
+from impact_posture.config.settings import LoadOptions
+from impact_posture.errors import InputError, OutputError
+from impact_posture.experiment.run_reports import write_run_report
+from impact_posture.output.plot.style import save
+from impact_posture.output.result_reader import load_view
+from impact_posture.robot.draft import write_draft
+from impact_posture.robot.posture_files import read_posture
+from impact_posture.robot.robot_loader import load_robot
+from impact_posture.simulation.scenario_file import read_scenario
+from impact_posture.system.output_folder import Kind, add_to_record, check_output, whole_folder, write_whole
+from impact_posture.system.scratch_folder import RECORD, SCRATCH, scratch_folder
+
+
+def write(out: Path, text: str, *, force: bool = False, kind: Kind = "result") -> None:
+    with whole_folder(out, force=force, kind=kind, products=("c/made.o",)) as folder:
+        (folder / "result.json").write_text(text)
+        (folder / "c").mkdir()
+        (folder / "c" / "a.c").write_text(text)
+
+
+def content(folder: Path) -> dict[str, str]:
+    files = (path for path in sorted(folder.rglob("*")) if path.name != RECORD)
+    return {path.relative_to(folder).as_posix(): "" if path.is_dir() else path.read_text() for path in files}
+
+
+def test_force_replaces_and_leaves_nothing_else(tmp_path: Path) -> None:
+    write(tmp_path / "out", "one")
+    (tmp_path / "out" / "c" / "made.o").write_text("what the Makefile made")
+    write(tmp_path / "out", "two", force=True)
+    assert content(tmp_path) == {"out": "", "out/c": "", "out/c/a.c": "two", "out/result.json": "two"}
+
+
+# ---- what is not ours ----------------------------------------------------------------------------------------------
+
+
+def notes(out: Path) -> None:
+    (out / "notes.txt").write_text("ten years")
+
+
+def notes_below(out: Path) -> None:
+    (out / "c" / "thesis.tex").write_text("ten years")
+
+
+def folder_of_notes(out: Path) -> None:
+    (out / "mine" / "deep").mkdir(parents=True)
+
+
+def link_in_place_of_a_file(out: Path) -> None:
+    (out / "result.json").rename(out.parent / "elsewhere.json")
+    (out / "result.json").symlink_to(out.parent / "elsewhere.json")
+
+
+def record_gone(out: Path) -> None:
+    (out / RECORD).unlink()
+
+
+def record_broken(out: Path) -> None:
+    (out / RECORD).write_text('{"schema": "impact-posture/folder/1", "files": 3}')
+
+
+@pytest.mark.parametrize(
+    ("change", "named"),
+    [
+        (notes, "notes.txt"),
+        (notes_below, "c/thesis.tex"),
+        (folder_of_notes, "mine/"),
+        (link_in_place_of_a_file, "result.json"),
+        (record_gone, "c/, result.json"),
+        (record_broken, ".impact-posture.json, c/, result.json"),
+    ],
+)
+def test_what_we_did_not_write_stops_force_by_name(
+    change: Callable[[Path], None], named: str, tmp_path: Path
+) -> None:
+    out = tmp_path / "out"
+    write(out, "one")
+    change(out)
+    before = content(tmp_path)
+    with pytest.raises(OutputError) as caught:
+        write(out, "two", force=True)
+    assert f"holds {named}, which this command did not write" in caught.value.line
+    assert content(tmp_path) == before
+
+
+@pytest.mark.parametrize("document", ["result.json", "run.json", "comparison.json", "x.json"])
+def test_a_file_with_the_name_of_ours_makes_no_folder_ours(document: str, tmp_path: Path) -> None:
+    out = tmp_path / "experiment"
+    out.mkdir()
+    (out / document).write_text('{"schema": "impact-posture/result/1"}')
+    (out / "thesis.txt").write_text("ten years")
+    before = content(tmp_path)
+    names = ", ".join(sorted([document, "thesis.txt"]))
+    with pytest.raises(OutputError, match=f"holds {names}, which"):
+        write(out, "two", force=True)
+    assert content(tmp_path) == before
+
+
+def test_the_results_of_another_command_are_kept(tmp_path: Path) -> None:
+    write(tmp_path / "out", "one")
+    with pytest.raises(OutputError, match=r"another command's results \(result\)"):
+        write(tmp_path / "out", "two", force=True, kind="export")
+    assert content(tmp_path / "out")["result.json"] == "one"
+
+
+def test_files_that_are_added_to_the_record_are_ours(tmp_path: Path) -> None:
+    write(tmp_path / "out", "one")
+    (tmp_path / "out" / "jump.svg").write_text("a picture")
+    with pytest.raises(OutputError, match=r"jump\.svg"):
+        write(tmp_path / "out", "two", force=True)
+    add_to_record(tmp_path / "out", [tmp_path / "out" / "jump.svg"])
+    write(tmp_path / "out", "two", force=True)
+    assert content(tmp_path / "out")["result.json"] == "two"
+
+
+def test_what_comes_while_we_write_is_kept(tmp_path: Path) -> None:
+    out = tmp_path / "out"
+    write(out, "one")
+    with (
+        pytest.raises(OutputError, match=r"holds late\.txt"),
+        whole_folder(out, force=True, kind="result") as folder,
+    ):
+        (folder / "result.json").write_text("two")
+        (out / "late.txt").write_text("just now")
+    assert content(out) == {"c": "", "c/a.c": "one", "result.json": "one", "late.txt": "just now"}
+    assert os.listdir(tmp_path) == ["out"]
+
+
+def a_link(place: Path) -> Path:
+    (place / "real").mkdir()
+    (place / "link").symlink_to(place / "real")
+    return place / "link"
+
+
+def a_dangling_link(place: Path) -> Path:
+    (place / "link").symlink_to(place / "nowhere")
+    return place / "link"
+
+
+def a_file(place: Path) -> Path:
+    (place / "file").write_text("x")
+    return place / "file"
+
+
+def a_pipe(place: Path) -> Path:
+    os.mkfifo(place / "pipe")
+    return place / "pipe"
+
+
+@pytest.mark.parametrize(
+    ("make", "words"),
+    [
+        (a_link, "is a symbolic link"),
+        (a_dangling_link, "is a symbolic link"),
+        (a_file, "is no folder"),
+        (a_pipe, "is no folder"),
+        (lambda place: Path(), "current folder"),
+        (lambda place: Path(".."), "current folder"),
+        (lambda place: place.parent, "current folder"),
+        (lambda place: Path("/"), "current folder"),
+        (lambda place: Path("/proc"), "mount point"),
+        (lambda place: a_file(place) / "below", "cannot be written"),
+    ],
+)
+@pytest.mark.parametrize("force", [False, True])
+def test_places_that_no_folder_can_take(
+    make: Callable[[Path], Path], words: str, force: bool, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    monkeypatch.chdir(tmp_path)
+    out = make(tmp_path)
+    before = sorted(os.listdir(tmp_path))
+    with pytest.raises(OutputError, match=words):
+        check_output(out, force=force, kind="result")
+    with pytest.raises(OutputError, match=words), whole_folder(out, force=force, kind="result"):
+        raise AssertionError("is not reached")
+    assert sorted(os.listdir(tmp_path)) == before
+
+
+def test_a_file_goes_through_no_link(tmp_path: Path) -> None:
+    (tmp_path / "thesis.txt").write_text("ten years")
+    for name in ("x.json", f".x.json.{os.getpid()}.part"):
+        (tmp_path / name).symlink_to(tmp_path / "thesis.txt")
+    write_whole(tmp_path / "x.json", "ours")
+    assert content(tmp_path) == {"thesis.txt": "ten years", "x.json": "ours"}
+
+
+@pytest.mark.parametrize("kind", ["device", "pipe"])
+def test_a_record_without_end_is_none(kind: str, tmp_path: Path) -> None:
+    (tmp_path / f"{SCRATCH}0").mkdir()
+    os.mkfifo(tmp_path / f"{SCRATCH}0" / RECORD)
+    write(tmp_path / "out", "one")
+    (tmp_path / "out" / RECORD).unlink()
+    if kind == "device":
+        (tmp_path / "out" / RECORD).symlink_to("/dev/zero")
+    else:
+        os.mkfifo(tmp_path / "out" / RECORD)
+    with pytest.raises(OutputError, match="which this command did not write"):
+        write(tmp_path / "out", "two", force=True)
+
+
+# ---- interruptions -------------------------------------------------------------------------------------------------
+
+
+@pytest.mark.parametrize("at", [1, 2])
+def test_interrupt_between_the_renames_keeps_the_old_result(
+    at: int, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    write(tmp_path / "out", "one")
+    real, calls = os.rename, []
+
+    def rename(source: object, target: object) -> None:
+        calls.append(target)
+        if len(calls) == at:
+            raise KeyboardInterrupt
+        real(source, target)  # type: ignore[arg-type]
+
+    monkeypatch.setattr(os, "rename", rename)
+    with pytest.raises(KeyboardInterrupt):
+        write(tmp_path / "out", "two", force=True)
+    assert (tmp_path / "out" / "result.json").read_text() == "one"
+    assert os.listdir(tmp_path) == ["out"]
+
+
+def test_a_folder_that_appears_meanwhile_is_not_replaced(tmp_path: Path) -> None:
+    out = tmp_path / "out"
+    with pytest.raises(OutputError, match="exists"), whole_folder(out, force=False, kind="result") as folder:
+        (folder / "result.json").write_text("mine")
+        write(out, "theirs")
+    assert (out / "result.json").read_text() == "theirs"
+    assert os.listdir(tmp_path) == ["out"]
+
+
+def test_failure_inside_leaves_nothing_and_made_parents_go(tmp_path: Path) -> None:
+    out = tmp_path / "a" / "b" / "c"
+    with pytest.raises(RuntimeError), whole_folder(out, force=False, kind="result") as folder:
+        (folder / "half").write_text("x")
+        raise RuntimeError
+    assert os.listdir(tmp_path) == []
+
+
+KILLED = """
+import os, signal, sys
+from pathlib import Path
+from impact_posture.system.output_folder import whole_folder
+from impact_posture.system.scratch_folder import scratch_folder
+
+with whole_folder(Path(sys.argv[1], "out"), force=False, kind="result") as folder, scratch_folder(folder):
+    (folder / "half").write_text("x")
+    os.kill(os.getpid(), signal.SIGKILL)
+"""
+
+
+def test_what_a_killed_run_left_is_swept_by_the_next_and_nothing_else(tmp_path: Path) -> None:
+    killed = subprocess.run([sys.executable, "-c", KILLED, str(tmp_path)], check=False, timeout=60)
+    assert killed.returncode == -signal.SIGKILL
+    (left,) = tmp_path.iterdir()
+    others = {
+        ".impact-posture-notes": {"notes.txt": "not ours"},
+        ".impact-posture-00000000": {RECORD: '{"schema": "another/1"}'},
+        ".impact-posture-11111111": {RECORD: "[]"},
+        ".impact-posture-22222222": {RECORD: json.dumps({"schema": "impact-posture/folder/1", "host": "elsewhere"})},
+        ".out-abcdef": {"result.json": "{}"},
+    }
+    for name, files in others.items():
+        (tmp_path / name).mkdir()
+        for file, text in files.items():
+            (tmp_path / name / file).write_text(text)
+    with scratch_folder(tmp_path) as alive:
+        write(tmp_path / "out", "whole")
+        assert alive.is_dir(), "somebody works in it"
+    assert not left.exists()
+    assert sorted(os.listdir(tmp_path)) == sorted([*others, "out"])
+    assert all((tmp_path / name / file).read_text() == text for name in others for file, text in others[name].items())
+
+
+# ---- names that no file has ----------------------------------------------------------------------------------------
+
+
+@pytest.mark.parametrize("name", ["a\0b", "x" * 300, "a\ud800"])
+def test_names_that_no_file_can_have_are_refused(name: str, tmp_path: Path) -> None:
+    arm, contact = load_robot("tilthex_arm"), ip.ImpactContact("ee", (0.0, 0.0, 1.0))
+    objective, out = ip.ImpactObjective(arm, contact), tmp_path / name
+    for use in (
+        lambda: write(out, "one"),
+        lambda: objective.export(out, build=False),
+        lambda: save(Figure(), out, "one"),
+        lambda: write_draft("example-robot-data:ur_description/urdf/ur5_robot.urdf", LoadOptions(), out),
+        lambda: load_robot(str(out)),
+        lambda: load_robot(name),
+        lambda: load_robot("ur5", srdf=str(out)),
+        lambda: load_robot("ur5", package_dir=(str(out),)),
+        lambda: read_posture(arm, name, where="posture"),
+        lambda: read_scenario(name),
+        lambda: load_view(out),
+        lambda: write_run_report(out),
+        lambda: ip.ImpactGradient.load(out),
+    ):
+        with pytest.raises(InputError) as caught:
+            use()
+        assert caught.value.hint and "\n" not in caught.value.line
+    assert not list(tmp_path.iterdir())
+
+
+def test_a_long_name_between_folders_that_are_missing_is_named(tmp_path: Path) -> None:
+    with pytest.raises(OutputError) as caught:
+        write(tmp_path / "missing" / ("x" * 300) / "out", "one")
+    assert "x" * 300 in caught.value.where and not list(tmp_path.iterdir())

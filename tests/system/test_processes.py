@@ -1,0 +1,375 @@
+"""Work shared out among processes: the same results in whatever order, faults come home, nobody is left behind."""
+
+from __future__ import annotations
+
+import contextlib
+import os
+import signal
+import subprocess
+import sys
+import time
+from collections.abc import Callable, Iterator
+from pathlib import Path
+
+import numpy as np
+import pytest
+
+from impact_posture.config.settings import ProblemSettings
+from impact_posture.errors import (
+    ControllerNotFound,
+    ImpactPostureError,
+    InputError,
+    SimulationDiverged,
+    WorkerDied,
+)
+from impact_posture.output.early_writer import early_writer, load
+from impact_posture.system.processes import end_early, fork_call, fork_map, fork_server, signals_held, undone
+
+pytestmark = pytest.mark.skipif(not Path("/proc/self/status").is_file(), reason="needs /proc to look at processes")
+
+
+def alive(pid: int) -> bool:
+    """Whether a process runs; one that has ended and that nobody asked about yet does not."""
+    try:
+        return "\nState:\tZ" not in Path(f"/proc/{pid}/status").read_text(encoding="utf-8")
+    except OSError:
+        return False
+
+
+def gone(pids: list[int], within: float = 10.0) -> bool:
+    end = time.monotonic() + within
+    while any(alive(pid) for pid in pids):
+        if time.monotonic() > end:
+            return False
+        time.sleep(0.02)
+    return True
+
+
+@pytest.mark.parametrize("jobs", [1, 2, 5])
+def test_every_index_comes_once_with_its_result_in_whatever_order(jobs: int) -> None:
+    def work(index: int) -> tuple[int, int]:
+        # The first are the slowest: they come last where others work beside them.
+        time.sleep(0.02 * (3 - index) if index < 3 else 0)
+        return index**2, os.getpid()
+
+    with fork_map(work, 7, jobs) as results:
+        found = dict(results)
+    assert {index: square for index, (square, _) in found.items()} == {k: k**2 for k in range(7)}
+    pids = {pid for _, pid in found.values()}
+    assert (os.getpid() in pids) == (jobs == 1) and len(pids) <= jobs
+    assert jobs == 1 or gone(list(pids))
+
+
+def test_a_worker_that_is_killed_is_noticed() -> None:
+    def work(index: int) -> int:
+        if index == 2:
+            os.kill(os.getpid(), signal.SIGKILL)
+        return index
+
+    with pytest.raises(WorkerDied, match="jobs=1"), fork_map(work, 6, 2) as results:
+        list(results)
+    with fork_map(lambda index: index, 3, 2) as results:
+        assert sorted(results) == [(k, k) for k in range(3)]
+
+
+def test_what_cannot_be_sent_to_a_process_is_found_there() -> None:
+    held = open(__file__, encoding="utf-8")
+    with held, fork_map(lambda index: (index, held.name), 3, 2) as results:
+        assert sorted(results) == [(k, (k, __file__)) for k in range(3)]
+
+
+def test_nothing_to_do() -> None:
+    with fork_map(lambda index: index, 0, 4) as results:
+        assert list(results) == []
+
+
+@pytest.mark.parametrize("jobs", [1, 3])
+@pytest.mark.parametrize(
+    "error",
+    [
+        SimulationDiverged(1.25, where="solo8"),
+        ControllerNotFound("robsut", ("robust", "nominal"), hint="look"),
+        ZeroDivisionError("by zero"),
+    ],
+    ids=lambda e: type(e).__name__,
+)
+def test_a_workers_fault_reaches_the_caller_whole(error: Exception, jobs: int) -> None:
+    def work(index: int) -> int:
+        if index == 2:
+            raise error
+        return index
+
+    with pytest.raises(type(error)) as caught, fork_map(work, 6, jobs) as results:
+        for _ in results:
+            pass
+    assert str(caught.value) == str(error)
+    if isinstance(error, ImpactPostureError):
+        assert vars(caught.value) == vars(error)
+
+
+def test_after_a_fault_no_process_is_left_and_the_next_sharing_works(tmp_path: Path) -> None:
+    def work(index: int) -> int:
+        (tmp_path / str(os.getpid())).touch()
+        if index == 0:
+            raise ValueError("stop")
+        time.sleep(30)
+        return index
+
+    begin = time.monotonic()
+    with pytest.raises(ValueError, match="stop"), fork_map(work, 4, 2) as results:
+        list(results)
+    assert time.monotonic() - begin < 15
+    assert gone([int(path.name) for path in tmp_path.iterdir()])
+    with fork_map(lambda index: -index, 4, 2) as results:
+        assert dict(results) == {k: -k for k in range(4)}
+
+
+def test_leaving_early_leaves_no_process(tmp_path: Path) -> None:
+    def work(index: int) -> int:
+        (tmp_path / str(os.getpid())).touch()
+        time.sleep(0 if index == 0 else 30)
+        return index
+
+    with fork_map(work, 4, 2) as results:
+        assert next(results) == (0, 0)
+    pids = [int(path.name) for path in tmp_path.iterdir()]
+    assert pids and gone(pids)
+
+
+PROGRAM = """
+import os, signal, sys, time
+from pathlib import Path
+from impact_posture.system.processes import fork_call, fork_map
+
+# A shell ignores Ctrl-C for what it runs in the background, and its children inherit that.
+signal.signal(signal.SIGINT, signal.default_int_handler)
+
+def work(index):
+    Path(sys.argv[1], str(os.getpid())).touch()
+    time.sleep(60)
+
+try:
+    with fork_map(work, 4, 2) as results:
+        list(results)
+except KeyboardInterrupt:
+    print("stopped")
+    sys.exit(130)
+"""
+
+
+@pytest.mark.parametrize("send", [os.kill, os.killpg], ids=["to the parent", "to the group, as a terminal does"])
+def test_ctrl_c_leaves_no_process_and_no_noise(tmp_path: Path, send: Callable[[int, int], None]) -> None:
+    process = subprocess.Popen(
+        [sys.executable, "-c", PROGRAM, str(tmp_path)], start_new_session=True, text=True,
+        stdout=subprocess.PIPE, stderr=subprocess.PIPE,
+    )  # fmt: skip
+    try:
+        end = time.monotonic() + 60
+        while len(list(tmp_path.iterdir())) < 2 and time.monotonic() < end:
+            time.sleep(0.02)
+        workers = [int(path.name) for path in tmp_path.iterdir()]
+        assert len(workers) == 2 and all(alive(pid) for pid in workers)
+        send(process.pid, signal.SIGINT)
+        out, err = process.communicate(timeout=30)
+        assert (process.returncode, out, err) == (130, "stopped\n", "")
+        assert gone(workers)
+    finally:
+        # Its own session: nothing else is in that group.
+        with contextlib.suppress(ProcessLookupError):
+            os.killpg(process.pid, signal.SIGKILL)
+
+
+KILLED = """
+import os, signal, sys, time
+from pathlib import Path
+from impact_posture.system.processes import fork_call, fork_map
+from impact_posture.system.toolchain import run_compilers
+
+folder = Path(sys.argv[2])
+
+def linger(index=0):
+    Path(folder, str(os.getpid())).touch()
+    time.sleep(60)
+
+if sys.argv[1] == "workers":
+    with fork_map(linger, 4, 2) as results:
+        list(results)
+elif sys.argv[1] == "a copy":
+    with fork_call(linger) as collect:
+        collect()
+else:
+    # Like a compiler, it starts others.
+    script = 'touch $1/$$; sh -c "touch $1/\\$\\$; sleep 60; :"; :'
+    run_compilers([["sh", "-c", script, "cc", str(folder), "-o", f"{folder}/none"]] * 2, folder)
+"""
+
+
+@pytest.mark.parametrize(("what", "count"), [("workers", 2), ("a copy", 1), ("compilers", 4)])
+def test_nobody_outlives_a_killed_parent(what: str, count: int, tmp_path: Path) -> None:
+    if what == "compilers" and (os.cpu_count() or 1) < 2:
+        count = 2
+    process = subprocess.Popen([sys.executable, "-c", KILLED, what, str(tmp_path)], start_new_session=True)
+    pids: list[int] = []
+    try:
+        end = time.monotonic() + 60
+        while len(pids) < count and time.monotonic() < end:
+            time.sleep(0.02)
+            pids = [int(path.name) for path in tmp_path.iterdir()]
+        assert len(pids) == count and all(alive(pid) for pid in pids)
+        process.kill()
+        process.wait()
+        assert gone(pids)
+    finally:
+        for pid in (process.pid, *pids):
+            with contextlib.suppress(ProcessLookupError):
+                os.kill(pid, signal.SIGKILL)
+
+
+# ---- ending early --------------------------------------------------------------------------------------------------
+
+
+@pytest.fixture
+def ended(monkeypatch: pytest.MonkeyPatch) -> list[str]:
+    monkeypatch.setattr("impact_posture.system.processes._LATER", [])
+    return []
+
+
+def test_what_is_unfinished_is_undone_newest_first_whatever_fails(ended: list[str]) -> None:
+    with undone(lambda: ended.append("old")), contextlib.suppress(ZeroDivisionError), undone(lambda: [][1 // 0]):
+        with undone(lambda: ended.append("done")):
+            pass
+        with undone(lambda: ended.append("new")):
+            end_early(lambda: ended.append("left"))
+    assert ended == ["done", "new", "old", "left", "new", "old"]
+
+
+def test_a_copy_does_not_undo_what_its_original_has_begun(tmp_path: Path) -> None:
+    (tmp_path / "folder").mkdir()
+    with undone((tmp_path / "folder").rmdir), fork_call(lambda: end_early(lambda: None)) as collect:
+        collect()
+        assert (tmp_path / "folder").is_dir()
+
+
+def test_nothing_ends_the_process_while_signals_are_held(ended: list[str]) -> None:
+    with signals_held():
+        with signals_held():
+            end_early(lambda: ended.append("left"))
+        assert ended == []
+    assert ended == ["left"]
+
+
+# ---- a copy of this process ----------------------------------------------------------------------------------------
+
+
+def test_a_copy_goes_on_from_the_very_state() -> None:
+    numbers = np.random.default_rng(5)
+    numbers.random(3)
+
+    def draw() -> np.ndarray:
+        return numbers.random(100_000)
+
+    with fork_call(draw) as collect:
+        # More than a pipe holds: the copy waits, this process does not.
+        here = draw()
+        np.testing.assert_array_equal(collect(), here)
+
+
+def test_what_a_copy_raises_is_raised_here() -> None:
+    def fail() -> None:
+        raise InputError("is wrong", where="the copy", hint="correct it")
+
+    with fork_call(fail) as collect, pytest.raises(InputError, match="the copy: is wrong; correct it"):
+        collect()
+
+
+def test_a_copy_that_dies_is_an_error() -> None:
+    with fork_call(lambda: os.kill(os.getpid(), signal.SIGKILL)) as collect, pytest.raises(OSError, match="has died"):
+        collect()
+
+
+def test_no_copy_outlives_its_block(tmp_path: Path) -> None:
+    told = tmp_path / "pid"
+
+    def linger() -> None:
+        told.with_suffix(".part").write_text(str(os.getpid()))
+        told.with_suffix(".part").replace(told)
+        time.sleep(60)
+
+    with pytest.raises(KeyboardInterrupt), fork_call(linger):
+        while not told.exists():
+            time.sleep(0.01)
+        raise KeyboardInterrupt
+    assert gone([int(told.read_text())], within=1.0)
+
+
+def test_a_server_begins_before_it_is_asked_and_answers_as_it_goes(tmp_path: Path) -> None:
+    begun = tmp_path / "begun"
+
+    def begin(requested: Callable[[], bool]) -> Callable[[list[int]], Iterator[tuple[int, int]]]:
+        assert not requested()
+        begun.touch()
+        end = time.monotonic() + 30
+        while not requested() and time.monotonic() < end:
+            time.sleep(0.001)
+        known = requested()
+        return lambda numbers: ((number**2 if known else 0, os.getpid()) for number in numbers)
+
+    with fork_server(begin) as ask:
+        end = time.monotonic() + 30
+        while not begun.exists() and time.monotonic() < end:
+            time.sleep(0.01)
+        assert begun.exists()
+        answers = ask([1, 2, 3])
+        square, pid = next(answers)
+        assert square == 1 and pid != os.getpid() and alive(pid)
+        assert list(answers) == [(4, pid), (9, pid)]
+        # Nobody writes any more when the iteration has ended.
+        assert not alive(pid)
+
+
+@pytest.mark.parametrize("early", [True, False])
+def test_a_servers_fault_is_raised_where_it_is_asked(early: bool) -> None:
+    def begin(_: Callable[[], bool]) -> Callable[[int], Iterator[float]]:
+        if early:
+            raise InputError("is wrong", where="the copy", hint="correct it")
+        return lambda number: iter([1.0, 1.0 / number])
+
+    with fork_server(begin) as ask, pytest.raises(InputError if early else ZeroDivisionError):
+        list(ask(0))
+
+
+def test_an_iteration_that_is_left_leaves_no_server() -> None:
+    def count(start: int) -> Iterator[int]:
+        yield os.getpid()
+        yield from range(start, 1000)
+        time.sleep(60)
+
+    with fork_server(lambda _: count) as ask:
+        answers = ask(0)
+        pid = next(answers)
+        del answers
+        assert gone([pid], within=1.0)
+
+
+@pytest.mark.parametrize("late", [False, True])
+def test_a_writer_prepares_more_only_while_nothing_is_requested(late: bool, tmp_path: Path) -> None:
+    done: list[str] = []
+
+    def prepare() -> list[str]:
+        with pytest.MonkeyPatch.context() as patch:
+            patch.setattr("impact_posture.codegen.export.cached_code", lambda *_: done.append("code"))
+            load(ProblemSettings(robot="tilthex_arm", normal=(0, 0, 1)), tmp_path, False, False, lambda: late)
+        return done
+
+    # In a copy, because it moves the temporary folder of its process.
+    with fork_call(prepare) as collect:
+        assert collect() == ([] if late else ["code"])
+
+
+def test_where_nothing_can_be_forked_the_solving_process_writes(monkeypatch: pytest.MonkeyPatch) -> None:
+    def fail() -> int:
+        raise BlockingIOError(11, "Resource temporarily unavailable")
+
+    monkeypatch.setattr("os.fork", fail)
+    with early_writer(ProblemSettings(robot="panda"), jobs=2) as finish:
+        assert finish is None

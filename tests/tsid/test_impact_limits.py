@@ -1,0 +1,108 @@
+"""Limits of what an impact would do: the jump is that of the rigid impact, and a controller obeys them."""
+
+from __future__ import annotations
+
+import numpy as np
+import pinocchio as pin
+import pytest
+from hypothesis import given
+from hypothesis import strategies as st
+
+from impact_posture.tsid.controller import Controller, Status
+from impact_posture.tsid.limits.impact_limits import ImpactLimits
+from impact_posture.tsid.point_kinematics import Point
+from impact_posture.tsid.state import State
+from impact_posture.tsid.support_contact import SupportContact, support_contacts
+from impact_posture.tsid.task_formulation import TaskFormulation
+from impact_posture.tsid.tasks.frame_tasks import FramePosition
+from impact_posture.tsid.tasks.joint_posture import JointPosture
+from tests.support.helpers import Vector, frame_jacobian, mass_matrix, rng, robot, unit
+
+ROBOTS = {"tilthex_arm": "ee", "panda": "panda_hand", "solo12": "base_link", "talos": "gripper_left_base_link"}
+
+
+def limits_of(name: str, normal: Vector, **options: float) -> tuple[ImpactLimits, State, tuple[SupportContact, ...]]:
+    """Limits of an impact at the frame of a robot, which stands if it has feet, and a state near its posture."""
+    made, generator = robot(name), rng(name, "impact limits")
+    contacts, point = support_contacts(made), Point(ROBOTS[name])
+    limits = ImpactLimits(made, point, normal, contacts)
+    for key, value in {**options, "active": True}.items():
+        setattr(limits, key, value)
+    q = np.array(pin.integrate(made.model, made.posture(), 0.1 * generator.normal(size=made.nv)))
+    return limits, State(made, limits.points).update(q, generator.normal(size=made.nv)), contacts
+
+
+@pytest.mark.parametrize("name", ROBOTS)
+def test_the_jump_is_the_least_change_of_energy(name: str) -> None:
+    normal, e = unit(rng(name, "normal")), 0.3
+    limits, state, contacts = limits_of(name, normal, restitution=e)
+    model, q, v = robot(name).model, state.q, state.v
+    M, J = mass_matrix(model, q), frame_jacobian(model, q, robot(name).frame_id(ROBOTS[name]))[:3]
+    feet = [frame_jacobian(model, q, robot(name).frame_id(c.point.frame), c.point.offset)[: c.size] for c in contacts]
+    rows = np.vstack([J, *feet])
+    wanted = np.zeros(rows.shape[0])
+    wanted[:3] = -(1 + e) * normal * (normal @ J @ v)
+    # Gauss: of all jumps that the contacts allow, the one with the least kinetic energy.
+    root = np.linalg.cholesky(M).T
+    expected = np.linalg.solve(root, np.linalg.lstsq(rows @ np.linalg.inv(root), wanted, rcond=1e-7)[0])
+    jump, impulse = limits.jump(state)
+    np.testing.assert_allclose(jump @ v, expected, atol=1e-5 * np.abs(expected).max())
+    # The generalized impulse of the contact alone makes it, with the feet's.
+    rest = M @ (jump @ v) - impulse @ v
+    if contacts:
+        rest -= np.vstack(feet).T @ np.linalg.lstsq(np.vstack(feet).T, rest, rcond=1e-9)[0]
+    assert np.abs(rest).max() < 1e-5 * np.abs(impulse @ v).max()
+
+
+@given(seed=st.integers(0, 10_000), name=st.sampled_from(sorted(ROBOTS)))
+def test_a_row_is_kept_where_its_limit_is(seed: int, name: str) -> None:
+    limits, state, _ = limits_of(name, np.array([0.0, 0.6, 0.8]), duration=4e-3)
+    made = robot(name)
+    first, acceleration = (6 if made.floating else 0), 300 * rng(seed).normal(size=made.nv)
+    A, lower, upper = limits.rows(state)
+    before = state.v + 1e-3 * acceleration
+    jump, impulse = (part @ before for part in limits.jump(state))
+    rates, torques = (before + jump)[first:], impulse[first:] / 4e-3
+    speed, effort = made.model.velocityLimit[first:], made.model.effortLimit[first:]
+    allowed = np.concatenate([np.where(speed > 0, speed, np.inf), np.where(effort > 0, effort, np.inf)])
+    room = allowed - np.abs(np.concatenate([rates, torques]))
+    found = np.minimum(A @ acceleration - lower, upper - A @ acceleration)
+    np.testing.assert_allclose(found, room, rtol=1e-9, atol=1e-6)
+
+
+def test_a_controller_approaches_only_as_fast_as_the_limits_allow() -> None:
+    made, point = robot("panda"), Point("panda_hand")
+    speeds = {}
+    for active in (False, True):
+        limits = ImpactLimits(made, point, [0, 0, 1])
+        limits.active = active
+        task = FramePosition(point, kp=0.0, kd=50.0, weight=1.0)
+        controller = Controller(
+            made, TaskFormulation(((task,),), (), JointPosture(made, kp=10.0), row_limits=(limits,))
+        )
+        q, v = made.posture(), np.zeros(made.nv)
+        controller.reset(q, v)
+        task.target_velocity = np.array([0.0, 0.0, -1.0])
+        for k in range(200):
+            command = controller.tick(1e-3 * k, q, v)
+            assert command.status in (Status.SOLVED, Status.RELAXED)
+            v = v + 1e-3 * command.acceleration
+            q = pin.integrate(made.model, q, 1e-3 * v)
+        state = controller.state.update(q, v)
+        speeds[active] = -float(state.at(point).jacobian[2] @ v)
+        limits.active = True
+        _, lower, upper = limits.rows(state)
+        # What an impact now would do, relative to what the limits leave.
+        over = np.maximum(lower, -upper).max() / np.abs(upper).max()
+        assert (over > 1e-3) if not active else (over < 1e-3), over
+    assert speeds[False] == pytest.approx(1.0, abs=0.05)
+    assert 0.05 < speeds[True] < 0.9
+
+
+def test_without_an_impact_nothing_is_limited() -> None:
+    limits, state, _ = limits_of("panda", np.array([0.0, 0.0, 1.0]))
+    limits.active = False
+    A, lower, upper = limits.rows(state)
+    assert not A.any()
+    assert np.isinf(lower).all()
+    assert np.isinf(upper).all()

@@ -1,0 +1,497 @@
+"""The reference flow: it lowers the objective on the constraints, within its limits, and comes to rest in time."""
+
+from __future__ import annotations
+
+import functools
+from collections.abc import Callable
+from dataclasses import dataclass, replace
+
+import numpy as np
+import pinocchio as pin
+import pytest
+import scipy.optimize
+from hypothesis import given, settings
+from hypothesis import strategies as st
+
+from docs.studies.flow_course import formulation_for
+from impact_posture.errors import InputError, MetricError
+from impact_posture.robot.robot import Robot
+from impact_posture.tsid.actuators import Actuators
+from impact_posture.tsid.controller import Controller, Status
+from impact_posture.tsid.flow.flow_direction import FlowOptions
+from impact_posture.tsid.flow.redundancy import Redundancy
+from impact_posture.tsid.flow.reference_flow import PHASES, ReferenceFlow
+from impact_posture.tsid.flow.reference_flow_posture import ReferenceFlowPosture
+from impact_posture.tsid.flow.zero_moment_point import ZeroMomentPoint
+from impact_posture.tsid.point_kinematics import Point
+from impact_posture.tsid.support_contact import SupportContact
+from impact_posture.tsid.task_formulation import TaskFormulation
+from impact_posture.tsid.tasks.joint_posture import JointPosture
+from tests.support.helpers import Vector, rng, robot
+from tests.tsid.test_tsid_controller import DT, integrate
+
+ROBOTS = ("tilthex_arm", "hextilt", "panda", "solo8")
+Well = Callable[[Vector], tuple[float, Vector]]
+
+
+def well(r: Robot, goal: Vector, depth: float = 0.1) -> Well:
+    """A bowl around a posture: its least value is a share of that at the robot's own."""
+    base = 6 if r.floating else 0
+
+    def function(q: Vector) -> tuple[float, Vector]:
+        away = np.array(pin.difference(r.model, goal, q))
+        away[:base] = 0.0
+        # Joints add, hence the gradient is the difference itself.
+        return depth + 0.5 * float(away @ away), away
+
+    return function
+
+
+def goal_of(r: Robot, key: object, size: float) -> Vector:
+    """A posture whose joints are up to ``size`` rad from the robot's own."""
+    way = size * rng(r.name, key).uniform(-1, 1, r.nv)
+    way[: 6 if r.floating else 0] = 0.0
+    return np.array(pin.integrate(r.model, r.posture(), way))
+
+
+def flow_of(r: Robot, function: Well, weaker: float = 1.0, **options: float) -> ReferenceFlow:
+    formulation, actuators = formulation_for(r, JointPosture(r)), Actuators(r)
+    actuators.upper[actuators.rotors :] *= weaker
+    actuators.lower[actuators.rotors :] *= weaker
+    flow = ReferenceFlow(r, function, formulation, actuators, FlowOptions(**options))
+    flow.reset(r.posture())
+    return flow
+
+
+@dataclass(frozen=True)
+class Course:
+    """Where a flow ended, ``H/H₀`` at each update, when it rested (s), and how far it was from contacts and tasks."""
+
+    q: Vector
+    values: Vector
+    rested: float
+    missed: float
+
+
+def course(flow: ReferenceFlow, q: Vector, longest: float) -> Course:
+    """Let the flow go from ``q`` until it rests; the robot follows exactly."""
+    flow.reset(q)
+    flow.on = True
+    values, missed = [flow.value], 0.0
+    for k in range(round(longest / DT)):
+        flow.advance(DT, flow.q)
+        if k % len(PHASES) == len(PHASES) - 1:
+            values.append(flow.value)
+            missed = max(missed, float(np.abs(flow.error).max(initial=0.0)))
+            if flow.resting and not np.abs(flow.velocity).max() > 1e-4:
+                break
+    rested = (k + 1) * DT if flow.resting else np.inf
+    return Course(flow.q.copy(), np.array(values) / flow.start, rested, missed)
+
+
+@pytest.mark.parametrize("name", ROBOTS)
+def test_it_lowers_the_objective_and_rests(name: str) -> None:
+    r = robot(name)
+    flow = flow_of(r, well(r, goal_of(r, "rest", 0.6)))
+    found = course(flow, r.posture(), 8.0)
+    assert found.rested < 8.0 and found.missed < 1e-3
+    assert np.diff(found.values).max() < 1e-6 and found.values[-1] < 0.999
+
+
+@settings(max_examples=2, deadline=None)
+@given(st.integers(0, 10**6))
+@pytest.mark.parametrize("name", ["panda", "talos"])
+def test_no_limit_is_crossed_wherever_the_goal_is(name: str, seed: int) -> None:
+    r = robot(name)
+    flow = flow_of(r, well(r, goal_of(r, seed, 3.0)))
+    options, start = flow.options, flow.shares.copy()
+    lower, upper = (np.array(flow._state.room[k]) for k in (1, 0))
+    worst = max(1.0, float(np.abs(start).max()))
+    flow.on = True
+    for _ in range(1500):
+        before = flow.velocity.copy()
+        flow.advance(DT, flow.q)
+        assert np.abs(flow._governor.flow).max() <= options.speed * (1 + 1e-9)
+        assert np.abs(flow.velocity - before).max() <= 1.6 * options.acceleration * DT
+        assert np.abs(flow.shares).max() < worst + 0.03
+    room = flow._state.update(flow.q, np.zeros(r.nv)).room
+    for now, at_start in ((room[1], lower), (room[0], upper)):
+        bounded = np.isfinite(now)
+        margin = np.minimum(options.joint_margin, (room[0] + room[1])[bounded] / 8)
+        assert (now[bounded] > np.minimum(margin, at_start[bounded]) - 5e-3).all()
+
+
+def valley(r: Robot, key: object) -> Well:
+    """A steep valley with a bend: the flow has to turn while it is fast."""
+    base = 6 if r.floating else 0
+    along, across = rng(r.name, key).normal(size=(2, r.nv - base)) / np.sqrt(r.nv - base)
+
+    def function(q: Vector) -> tuple[float, Vector]:
+        x = np.array(pin.difference(r.model, r.posture(), q))[base:]
+        a = float(along @ x)
+        off = float(across @ x) - 2 * a**2
+        slope = np.zeros(r.nv)
+        slope[base:] = (a - 1) * along + 20 * off * (across - 4 * a * along)
+        return 0.1 + 0.5 * ((a - 1) ** 2 + 20 * off**2), slope
+
+    return function
+
+
+def test_it_does_not_climb_where_it_turns() -> None:
+    """Without looking ahead it climbs by 2e-2 and more."""
+    r = robot("talos")
+    found = course(flow_of(r, valley(r, 3)), r.posture(), 3.0)
+    assert (found.values - np.minimum.accumulate(found.values)).max() < 1e-3
+    assert found.values[-1] < 0.3
+
+
+def test_it_does_not_climb_where_it_brakes_to_rest() -> None:
+    """It rests in the bend, where straight on is up: without looking ahead it climbs by 1e-1."""
+    r = robot("talos")
+    found = course(flow_of(r, valley(r, 4), epsilon=0.05), r.posture(), 3.0)
+    assert (found.values - np.minimum.accumulate(found.values)).max() < 1e-5
+    assert found.rested < 2.5
+
+
+@pytest.mark.parametrize("name", ["solo8", "talos"])
+def test_the_base_tilts_no_further_than_it_may(name: str) -> None:
+    """An objective that falls as the base tilts, about an axis that is neither roll nor pitch."""
+    r, way = robot(name), np.array([0.4, 1.0, 0.0])
+
+    def tilted(q: Vector) -> tuple[float, Vector]:
+        vertical = pin.Quaternion(q[3:7]).matrix()[2]
+        slope = np.zeros(r.nv)
+        slope[3:6] = np.cross(way, vertical)
+        return 2.0 + float(way @ vertical), slope
+
+    def tilt(q: Vector) -> float:
+        """The angle of the base's z axis from the vertical."""
+        return float(np.arccos(pin.Quaternion(q[3:7]).matrix()[2, 2]))
+
+    bound = 0.12
+    free, kept = (course(flow_of(r, tilted, tilt=t), r.posture(), 4.0) for t in (1.0, bound))
+    assert tilt(free.q) > 1.5 * bound
+    assert 0.9 * bound < tilt(kept.q) < bound + 2e-3
+
+
+@pytest.mark.parametrize(("name", "weaker"), [("panda", 0.5), ("talos", 1.0)])
+def test_haste_takes_its_share_of_what_rest_leaves_of_the_motors(name: str, weaker: float) -> None:
+    """Pinocchio's recursive Newton-Euler algorithm and a least-norm division of the base's wrench are the oracle."""
+    r = robot(name)
+    flow = flow_of(r, well(r, goal_of(r, "haste", 2.0)), weaker, speed=20.0, acceleration=100.0)
+    data, none, base = r.model.createData(), np.zeros(r.nv), 6 if r.floating else 0
+    effort = weaker * r.model.effortLimit[base:]
+    limited = effort > 0
+    eased = np.sqrt(np.tile([1.0] * 3 + [100.0] * 3, 2))
+
+    def torques(acceleration: Vector) -> Vector:
+        force = pin.rnea(r.model, data, flow.q, none, acceleration)
+        if base:
+            feet = flow._J[:12] / eased[:, None]
+            force = force - feet.T @ np.linalg.lstsq(feet[:, :6].T, force[:6], rcond=None)[0]
+        return np.array(force[base:][limited] / effort[limited])
+
+    flow.on = True
+    ratios = []
+    # Later talos brakes before a limit, with a larger share.
+    for k in range(500):
+        flow.advance(DT, flow.q)
+        if k % len(PHASES) == len(PHASES) - 1:
+            static, whole = torques(none), torques(flow.acceleration)
+            taken = whole - static
+            ratios.append(float((taken / (np.sign(taken) - static)).max()))
+    assert 0.9 * flow.options.haste < max(ratios) < 1.1 * flow.options.haste
+
+
+def test_the_zero_moment_point_stays_within_the_feet(monkeypatch: pytest.MonkeyPatch) -> None:
+    """The force that Pinocchio's recursive Newton-Euler algorithm asks for acts within the feet."""
+    r = robot("talos")
+    data, none = r.model.createData(), np.zeros(r.nv)
+
+    def least_room() -> float:
+        """The least distance from the point to an edge of the polygon of the feet, m."""
+        flow = flow_of(r, well(r, goal_of(r, "feet", 2.0)), acceleration=10.0)
+        ground = flow._state.at(flow._contacts[0].point).position[2]
+        flow.on, least = True, np.inf
+        for _ in range(400):
+            flow.advance(DT, flow.q)
+            wrench = pin.Force(pin.rnea(r.model, data, flow.q, none, flow.acceleration)[:6])
+            base = pin.SE3(pin.Quaternion(flow.q[3:7]).matrix(), flow.q[:3] - [0, 0, ground])
+            force, moment = (lambda w: (w.linear, w.angular))(base.act(wrench))
+            point = np.array([-moment[1], moment[0]]) / force[2]
+            least = min(least, float((-flow._offsets - flow._edges @ point).min()))
+        return least
+
+    assert least_room() > -1e-3
+    monkeypatch.setattr(ZeroMomentPoint, "keep", lambda self, space, period, step: step)
+    assert least_room() < -0.05
+
+
+def test_feet_that_share_the_weight_with_a_fixed_base_are_refused() -> None:
+    r = robot("panda")
+    formulation = TaskFormulation(posture=JointPosture(r), contacts=(SupportContact(Point("panda_link4")),))
+    flow = ReferenceFlow(r, well(r, r.posture()), formulation, Actuators(r), FlowOptions())
+    with pytest.raises(InputError, match="panda: its base is fixed"):
+        flow.reset(r.posture())
+
+
+def test_the_rest_is_an_optimum_under_the_constraints() -> None:
+    """SciPy's SLSQP, which knows nothing of the flow, finds no better posture nearby."""
+    r = robot("panda")
+    function = well(r, goal_of(r, "optimum", 1.0))
+    flow = flow_of(r, function, rho=0.0, epsilon=1e-9)
+    found = course(flow, r.posture(), 12.0)
+    frame, data = r.frame_id("panda_hand_tcp"), r.model.createData()
+    pin.framesForwardKinematics(r.model, data, r.posture())
+    home = data.oMf[frame].copy()
+
+    def pose(q: Vector) -> Vector:
+        pin.framesForwardKinematics(r.model, data, q)
+        return np.array(pin.log6(home.actInv(data.oMf[frame])).vector)
+
+    room = np.minimum(0.1, (r.model.upperPositionLimit - r.model.lowerPositionLimit) / 8)
+    bounds = list(zip(r.model.lowerPositionLimit + room, r.model.upperPositionLimit - room, strict=True))
+    bounds[7:] = [(x, x) for x in r.posture()[7:]]
+    best = scipy.optimize.minimize(
+        function, found.q, jac=True, method="SLSQP", bounds=bounds, constraints={"type": "eq", "fun": pose},
+        options={"ftol": 1e-14, "maxiter": 200},
+    )  # fmt: skip
+    assert best.success and found.values[-1] * function(r.posture())[0] == pytest.approx(best.fun, rel=1e-3)
+
+
+def test_the_law_does_not_depend_on_the_basis_of_the_redundancy(monkeypatch: pytest.MonkeyPatch) -> None:
+    r, find = robot("talos"), Redundancy.of
+    function, found = well(r, goal_of(r, "basis", 0.6)), []
+    for turned in (False, True):
+
+        def of(J: Vector, turned: bool = turned) -> Redundancy:
+            space = find(J)
+            Q = np.linalg.qr(rng("basis").normal(size=(space.basis.shape[1],) * 2))[0]
+            return replace(space, basis=space.basis @ Q) if turned else space
+
+        monkeypatch.setattr(Redundancy, "of", of)
+        found.append(course(flow_of(r, function), r.posture(), 0.5).q)
+    assert np.abs(found[0] - r.posture()).max() > 0.05
+    np.testing.assert_allclose(found[1], found[0], rtol=0, atol=1e-9)
+
+
+def test_a_tick_evaluates_at_most_one_gradient() -> None:
+    r, calls = robot("solo8"), [0]
+    inner = well(r, goal_of(r, "calls", 0.5))
+
+    def function(q: Vector) -> tuple[float, Vector]:
+        calls[0] += 1
+        return inner(q)
+
+    flow = flow_of(r, function)
+    flow.on = True
+    counts = []
+    for _ in range(4 * len(PHASES)):
+        calls[0] = 0
+        flow.advance(DT, flow.q)
+        counts.append(calls[0])
+    assert max(counts) == 1 and sum(counts) == 4 * 2
+
+
+def flying(function: Well) -> tuple[Controller, ReferenceFlowPosture, Vector, Vector]:
+    r = robot("tilthex_arm")
+    posture = ReferenceFlowPosture(r, function)
+    controller = Controller(r, formulation_for(r, posture))
+    q, v = r.posture(), np.zeros(r.nv)
+    controller.reset(q, v)
+    return controller, posture, q, v
+
+
+@functools.cache
+def arm_well() -> Well:
+    return well(robot("tilthex_arm"), goal_of(robot("tilthex_arm"), "arm", 1.0))
+
+
+def test_it_rests_before_an_impact_at_a_known_time() -> None:
+    t_impact = 1.6
+    controller, posture, q, v = flying(arm_well())
+    posture.brace(t_impact)
+    moved, start = 0.0, q.copy()
+    for k in range(round((t_impact + 0.5) / DT)):
+        command = controller.tick(k * DT, q, v)
+        assert command.status is Status.SOLVED
+        if k * DT > t_impact - posture.settle + 0.01:
+            # What is left brings contacts and tasks back.
+            assert not np.abs(posture.flow.velocity).max() > 1e-3
+        if k * DT >= t_impact:
+            assert np.abs(v).max() < 5e-3
+        q, v = integrate(robot("tilthex_arm"), q, v, command)
+        moved = float(np.abs(posture.target[7:] - start[7:]).max())
+    assert moved > 0.005
+    # It stays until it is told again.
+    posture.brace()
+    for k in range(400):
+        controller.tick(t_impact + 0.5 + k * DT, q, v)
+    assert np.abs(posture.target[7:] - start[7:]).max() > moved + 0.05
+
+
+def test_it_moves_for_no_longer_than_it_may_and_then_for_as_long_again() -> None:
+    r = robot("tilthex_arm")
+    flow = flow_of(r, arm_well(), duration=0.5)
+    flow.on, moved = True, list[float]()
+    for late in (0, len(PHASES)):
+        # The second time, it rests until the next update.
+        for _ in range(round(0.5 / DT) + late):
+            flow.advance(DT, flow.q)
+        assert not np.abs(flow.velocity).max() > 1e-4
+        moved.append(float(np.abs(flow.q[7:] - r.posture()[7:]).max()))
+        stopped = flow.q.copy()
+        for _ in range(200):
+            flow.advance(DT, flow.q)
+        assert flow.resting and flow.direction.gain > 10 * flow.options.epsilon
+        np.testing.assert_allclose(flow.q, stopped, atol=1e-4)
+        flow.rest_at(np.inf)
+    assert moved[1] > 1.2 * moved[0] > 0.01
+
+
+def test_contact_and_release_stop_it_and_a_reset_forgets_all() -> None:
+    controller, posture, q, v = flying(arm_well())
+
+    def torques(count: int) -> list[Vector]:
+        return [controller.tick(k * DT, q, v).u for k in range(count)]
+
+    still = torques(20)
+    posture.brace()
+    assert posture.level == 1
+    torques(300)
+    for stop in (posture.contact, posture.release):
+        stop()
+        assert posture.level == 0
+        torques(1000)
+        target = posture.target.copy()
+        torques(20)
+        np.testing.assert_array_equal(posture.target, target)
+    controller.reset(q, v)
+    np.testing.assert_array_equal(torques(20), still)
+
+
+def test_a_flow_that_stops_leaves_no_acceleration() -> None:
+    r = robot("panda")
+    posture = ReferenceFlowPosture(r, well(r, goal_of(r, "stop", 0.6)))
+    controller = Controller(r, TaskFormulation(posture=posture))
+    q, v = r.posture(), np.zeros(r.nv)
+    controller.reset(q, v)
+    for k in range(2500):
+        if k in (20, 320):
+            (posture.brace if k == 20 else posture.contact)()
+        command = controller.tick(k * DT, q, v)
+        q, v = integrate(r, q, v, command)
+    assert 0.01 < np.abs(pin.difference(r.model, r.posture(), q)).max()
+    np.testing.assert_allclose(pin.difference(r.model, q, posture.target), 0.0, atol=1e-5)
+
+
+@pytest.mark.parametrize("name", ["solo8", "talos"])
+def test_a_reset_gives_led_tasks_their_present_output(name: str) -> None:
+    r = robot(name)
+    posture = ReferenceFlowPosture(r, well(r, goal_of(r, "reset", 0.6)))
+    formulation = formulation_for(r, posture)
+    controller = Controller(r, formulation)
+    q, v = r.posture(), np.zeros(r.nv)
+    first = controller.reset(q, v)
+    posture.brace()
+    for k in range(300):
+        q, v = integrate(r, q, v, controller.tick(k * DT, q, v))
+    assert all(np.abs(task.target_velocity).max() > 1e-3 for task in posture.flow.led)
+    np.testing.assert_allclose(controller.reset(r.posture(), np.zeros(r.nv)).u, first.u, rtol=0, atol=1e-9)
+
+
+def test_the_way_back_to_tasks_keeps_speed_and_acceleration() -> None:
+    """The end effector is led away before the flow goes."""
+    r = robot("panda")
+    flow = flow_of(r, well(r, goal_of(r, "back", 0.3)))
+    task = flow._tasks[0]
+    task.target = pin.SE3(task.target.rotation, task.target.translation + np.array([0.0, 0.0, -0.2]))  # type: ignore[attr-defined]
+    flow.on, before = True, flow.velocity.copy()
+    for _ in range(round(3.0 / DT)):
+        flow.advance(DT, flow.q)
+        # The flow itself has limits of the same size.
+        assert np.abs(flow.velocity).max() < 1.5 * flow.options.speed
+        assert np.abs(flow.velocity - before).max() < 2.1 * flow.options.acceleration * DT
+        before = flow.velocity.copy()
+    assert np.abs(flow.error).max() < 1e-4
+
+
+def test_a_flow_goes_on_from_where_the_posture_was_moved() -> None:
+    r = robot("panda")
+    posture = ReferenceFlowPosture(r, well(r, goal_of(r, "moved", 0.3)))
+    controller = Controller(r, TaskFormulation(posture=posture))
+    q, v, last, steps = r.posture(), np.zeros(r.nv), np.zeros(r.nv), []
+    other = np.array(q)
+    other[0] += 0.6
+    controller.reset(q, v)
+    posture.move_to(other)
+    for k in range(4000):
+        if k in (200, 3000):
+            # Once in the middle of the fade, and once at its end.
+            posture.brace()
+        if k == 400:
+            posture.contact()
+        if k == 1000:
+            posture.move_to(other)
+        command = controller.tick(k * DT, q, v)
+        steps.append(float(np.abs(command.acceleration - last).max()))
+        last = command.acceleration
+        if k == 2999:
+            np.testing.assert_allclose(q, other, atol=0.02)
+        q, v = integrate(r, q, v, command)
+    # The flow itself begins a few ticks later.
+    assert max(steps[200], steps[3000]) < 0.1
+
+
+def test_a_reset_forgets_a_reference_that_was_led() -> None:
+    r = robot("panda")
+    posture = JointPosture(r)
+    controller = Controller(r, TaskFormulation(posture=posture))
+    q, v = r.posture(), np.zeros(r.nv)
+    first = controller.reset(q, v)
+    posture.lead(q, 0.5 + v, 2.0 + v)
+    assert np.abs(controller.tick(0.0, q, v).acceleration).max() > 1.0
+    np.testing.assert_allclose(controller.reset(q, v).acceleration, first.acceleration, rtol=0, atol=1e-9)
+    posture.lead(q, 0.5 + v, 2.0 + v)
+    posture.move_to(q)
+    np.testing.assert_allclose(controller.tick(0.0, q, v).acceleration, first.acceleration, rtol=0, atol=1e-9)
+
+
+def test_a_gradient_that_fails_stops_the_flow_until_it_is_back() -> None:
+    fails = [False]
+
+    def function(q: Vector) -> tuple[float, Vector]:
+        if fails[0]:
+            raise MetricError("does not exist there", where="H", hint="start elsewhere")
+        return arm_well()(q)
+
+    controller, posture, q, v = flying(function)
+    posture.brace()
+    for k in range(900):
+        fails[0] = 300 <= k < 800
+        assert controller.tick(k * DT, q, v).status is Status.SOLVED
+        if k == 750:
+            # It brakes evenly.
+            assert posture.flow.failed and not np.abs(posture.flow.velocity).max() > 1e-4
+    assert not posture.flow.failed and np.abs(posture.flow.velocity).max() > 0.01
+
+
+@pytest.mark.parametrize("case", ["options", "share", "number", "time", "before", "flat", "nan"])
+def test_what_cannot_flow_is_refused(case: str) -> None:
+    r = robot("tilthex_arm")
+    with pytest.raises((InputError, MetricError)) as caught:
+        if case == "options":
+            FlowOptions(speed=0.0)
+        elif case == "share":
+            FlowOptions(share=1.2)
+        elif case == "number":
+            FlowOptions(tilt=float("nan"))
+        elif case == "time":
+            flying(arm_well())[1].brace(float("nan"))
+        elif case == "before":
+            ReferenceFlowPosture(r, arm_well()).brace()
+        elif case == "flat":
+            flying(lambda q: (0.0, np.zeros(r.nv)))
+        else:
+            flying(lambda q: (1.0, np.full(r.nv, np.nan)))
+    assert caught.value.hint

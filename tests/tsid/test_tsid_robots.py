@@ -1,0 +1,266 @@
+"""Every robot of the catalogue under every program that suits it, and one that nobody here knows."""
+
+from __future__ import annotations
+
+import gc
+import tracemalloc
+from contextlib import suppress
+from itertools import pairwise
+from pathlib import Path
+
+import numpy as np
+import pinocchio as pin
+import pytest
+
+from impact_posture.config.settings import LoadOptions
+from impact_posture.errors import InputError
+from impact_posture.impact.impact_contact import ImpactContact
+from impact_posture.impact.worst_case_objective import WorstCaseObjective
+from impact_posture.robot.robot import Robot
+from impact_posture.robot.robot_loader import load_robot
+from impact_posture.tsid.controller import Controller, Status
+from impact_posture.tsid.point_kinematics import Point
+from impact_posture.tsid.state import State
+from impact_posture.tsid.task_formulation import (
+    TaskFormulation,
+    aerial_formulation,
+    arm_formulation,
+    legged_formulation,
+)
+from impact_posture.tsid.tasks.activation import Activation
+from impact_posture.tsid.tasks.frame_tasks import FramePosition
+from impact_posture.tsid.tasks.impact_robust import Gradient, ImpactRobustPosture, Spring
+from impact_posture.tsid.tasks.joint_posture import JointPosture
+from tests.support.helpers import NAMES, rng, robot
+from tests.support.step_bounds import step_bound
+from tests.tsid.test_tsid_controller import DT, assert_dynamics, assert_limits, integrate, run
+from tests.tsid.test_tsid_never_fails import ANSWERED, PROGRAMS, bracing, program_of, well
+
+
+def programs(r: Robot, posture: JointPosture) -> list[TaskFormulation]:
+    """All that suit the robot."""
+    found = []
+    if not r.floating:
+        found += [arm_formulation(r, posture, order=order) for order in ("strict", "weighted")]  # type: ignore[arg-type]
+    if r.spec.propulsion is not None:
+        found += [aerial_formulation(r, posture, order=order) for order in ("strict", "weighted")]  # type: ignore[arg-type]
+    if r.spec.supports:
+        found.append(legged_formulation(r, posture))
+    return found
+
+
+def assert_flies(r: Robot, formulation: TaskFormulation, ticks: int) -> None:
+    """Finite and within all limits, tick after tick of perfect dynamics."""
+    controller = Controller(r, formulation)
+    q, v = r.posture(), 0.05 * rng(r.name, "start").normal(size=r.nv)
+    # Nobody can stop at once at a limit.
+    v[controller.state.update(q, v).room.min(axis=0) < 0.01] = 0.0
+    controller.reset(q, v)
+    if isinstance(formulation.posture, ImpactRobustPosture):
+        formulation.posture.brace()
+    contacts = controller.assembly.contacts
+    for k, command, _, _ in run(controller, q, v, ticks):
+        assert command.status is Status.SOLVED
+        assert_limits(controller, command)
+        assert (contacts.cone @ command.forces >= contacts.least - 1e-7).all()
+        assert controller.state.least_room > -1e-6
+        if k % 20 == 0:
+            assert_dynamics(controller, command)
+            assert controller.report().dynamics <= 1e-8
+
+
+@pytest.mark.parametrize("name", NAMES)
+def test_every_robot_under_every_program(name: str) -> None:
+    r = robot(name)
+    gains = {"kp": 20.0, "weight": 0.1, "base_weight": 0.0}
+    count = len(programs(r, JointPosture(r)))
+    # Robots whose propellers nobody described cannot be told what to do.
+    assert count or (r.spec.kind == "aerial" and r.spec.propulsion is None)
+    for k in range(count):
+        assert_flies(r, programs(r, JointPosture(r, **gains))[k], 60)  # type: ignore[arg-type]
+        robust = ImpactRobustPosture(r, well(r), K=20.0, **gains)  # type: ignore[arg-type]
+        assert_flies(r, programs(r, robust)[k], 60)
+
+
+OWN = """<robot name="own">
+<link name="a">{mass}</link><link name="b">{mass}</link><link name="c">{mass}</link><link name="d">{mass}</link>
+<joint name="turns" type="continuous"><parent link="a"/><child link="b"/><axis xyz="1 2 3"/></joint>
+<joint name="stuck" type="prismatic"><parent link="b"/><child link="c"/><origin xyz="0 0 0.4"/><axis xyz="1 0 0"/>
+<limit lower="0" upper="0" effort="10" velocity="1"/></joint>
+<joint name="bends" type="revolute"><parent link="c"/><child link="d"/><origin xyz="0 0 0.4"/><axis xyz="0 1 0"/>
+<limit lower="-1" upper="1" effort="0" velocity="0"/></joint></robot>""".format(
+    mass='<inertial><origin xyz="0 0 0.2"/><mass value="1"/>'
+    '<inertia ixx="0.01" iyy="0.01" izz="0.01" ixy="0" ixz="0" iyz="0"/></inertial>'
+)
+
+
+@pytest.mark.parametrize("root", ["fixed", "free-flyer"])
+def test_a_urdf_of_ones_own(root: str, tmp_path: Path) -> None:
+    """A continuous joint about an odd axis, one whose limits leave no room, one without torque or speed limits."""
+    (tmp_path / "own.urdf").write_text(OWN)
+    r = load_robot(str(tmp_path / "own.urdf"), LoadOptions(root=root))  # type: ignore[arg-type]
+    # In free fall, and with a motor that may do anything, a strict task would ask for just that.
+    for level in (((FramePosition(Point("d")),),), ()) if root == "fixed" else ((),):
+        posture = ImpactRobustPosture(r, well(r), K=20.0, kp=20.0)
+        controller = Controller(r, TaskFormulation(level, () if level else (FramePosition(Point("d")),), posture))
+        q, v = r.posture(), 0.1 * rng("own").normal(size=r.nv)
+        v[r.nv - 2] = 0.0
+        controller.reset(q, v)
+        posture.brace()
+        for _, command, now, _ in run(controller, q, v, 200):
+            assert command.status in ANSWERED and np.isfinite(command.u).all()
+            assert_dynamics(controller, command)
+            assert np.isfinite(posture.term).all()
+            assert abs(now[r.model.idx_qs[r.model.getJointId("stuck")]]) < 1e-6
+
+
+@pytest.mark.parametrize(
+    ("name", "build", "hint"),
+    [
+        ("panda", aerial_formulation, "arm_formulation"),
+        ("talos", aerial_formulation, "propulsion"),
+        ("talos", arm_formulation, "legged_formulation"),
+        ("panda", legged_formulation, "supports"),
+    ],
+)
+def test_programs_that_do_not_suit_a_robot_say_which_does(name: str, build: type, hint: str) -> None:
+    with pytest.raises(InputError, match=hint):
+        build(robot(name), JointPosture(robot(name)))
+
+
+def test_a_push_at_a_standing_robot_enters_its_dynamics() -> None:
+    r, force = robot("solo8"), np.array([3.0, 0.0, -1.0])
+    formulation = legged_formulation(r, JointPosture(r, base_weight=0.0), force_point=Point("base_link"))
+    controller = Controller(r, formulation)
+    controller.reset(r.posture(), np.zeros(r.nv))
+    command = controller.tick(0.0, r.posture(), np.zeros(r.nv), force)
+    assert command.status is Status.SOLVED
+    assert_dynamics(controller, command, force)
+
+
+# ---- the course of an impact -------------------------------------------------------------------------------------
+
+
+@pytest.mark.parametrize("spring", ["keep", "release", "follow"])
+@pytest.mark.parametrize(("name", "kind"), [("tilthex_arm", "strict"), ("kinova", "arm")])
+def test_events_at_odd_moments_make_no_step(name: str, kind: str, spring: Spring) -> None:
+    """At a state that stands still only ramps and fades move ``ν̇*``, by no more than their bound."""
+    r, generator = robot(name), rng(name, spring)
+    posture = ImpactRobustPosture(
+        r, well(r), K=20.0, kp=20.0, base_weight=0.0, spring=spring, every=3, activation=Activation(ramp=0.05)
+    )
+    controller = Controller(r, program_of(r, kind, posture))
+    v = np.zeros(r.nv)
+    controller.reset(r.posture(), v)
+    q = np.array(pin.integrate(r.model, r.posture(), 0.2 * generator.normal(size=r.nv)))
+    state = State(r, controller.formulation.points).update(q, v)
+    base, steps, t = (6 if r.floating else 0), [], 0.0
+    for _ in range(300):
+        before = posture.desired(state).copy()
+        if generator.random() < 0.08:
+            # One that does not follow the present phase is refused.
+            with suppress(InputError):
+                getattr(posture, generator.choice(["brace", "contact", "release"]))()
+        # The event itself moves nothing (a floating base's orientation is blended by its logarithm, not exactly).
+        assert np.abs(posture.desired(state) - before)[base:].max() <= 1e-9
+        dt = float(generator.choice([0.0, DT, DT, 4 * DT, 1.0]))
+        t += dt
+        allowed = step_bound(posture, state, min(dt, 10 * DT))
+        controller.tick(t, q, v)
+        allowed = max(allowed, step_bound(posture, state, min(dt, 10 * DT)))
+        steps.append(float(np.abs(posture.desired(state) - before)[base:].max()))
+        # What `follow` moves the target by comes on top: its own time constant, not a ramp.
+        follows = 20.0 * 2.0 * min(dt, 10 * DT) / 0.5 if spring == "follow" else 0.0
+        # The first tick with the term takes the gradient where the robot is now.
+        assert steps[-1] <= allowed + follows + 1e-9
+    assert max(steps) > 0.1
+
+
+@pytest.mark.parametrize(("name", "kind"), PROGRAMS)
+def test_same_inputs_same_bits_under_every_program(name: str, kind: str) -> None:
+    """Through a brace, a contact, kicks, pushes and measurements that are none."""
+
+    def record(controller: Controller, posture: ImpactRobustPosture) -> np.ndarray:
+        r, generator, rows = controller.robot, rng(name, kind, "bits"), []
+        q, v = r.posture(), np.zeros(r.nv)
+        controller.reset(q, v)
+        for k in range(60):
+            if k in (2, 30, 35):
+                (posture.brace if k == 2 else posture.contact if k == 30 else posture.release)()
+            if k % 17 == 0:
+                v = v + 0.5 * generator.normal(size=r.nv)
+            push = 5.0 * generator.normal(size=6) if kind != "legged" and k % 7 == 0 else None
+            command = controller.tick(k * DT, np.full_like(q, np.nan) if k % 20 == 19 else q, v, push)
+            rows.append(np.concatenate([command.u, command.acceleration, command.forces, command.rotor_speed]))
+            q, v = integrate(r, q, v, command)
+        return np.array(rows)
+
+    one, other = bracing(name, kind), bracing(name, kind)
+    first = record(*one)
+    assert np.array_equal(record(*one), first)
+    assert np.array_equal(record(*other), first)
+
+
+def test_ticks_leave_no_memory_behind() -> None:
+    """Solved, relaxed and held ones."""
+    controller, _ = bracing("tilthex_arm", "strict")
+    q, v = controller.robot.posture(), np.zeros(controller.robot.nv)
+    hard, broken = np.array([0.0, 30.0, -20.0]), np.full(3, np.nan)
+
+    def fly(ticks: int) -> int:
+        for k in range(ticks):
+            controller.tick(k * DT, q, v, (None, hard, broken)[k % 3])
+        gc.collect()
+        return tracemalloc.get_traced_memory()[0]
+
+    tracemalloc.start()
+    try:
+        # A number kept a tick would be 7,200 bytes in every round.  NumPy's caches of small arrays fill up in the
+        # first rounds, by how much depends on what ran before.
+        assert any(after - before < 3_000 for before, after in pairwise(fly(300) for _ in range(9)))
+    finally:
+        tracemalloc.stop()
+
+
+# ---- the flow on other robots ------------------------------------------------------------------------------------
+
+
+def own_gradient(r: Robot, normal: tuple[float, float, float]) -> Gradient:
+    """``H`` at the default contact frame by the library's own interpreted functions."""
+    value = WorstCaseObjective(r, ImpactContact(r.spec.contact.frame or "", normal))
+    function = value.gradient_fun()
+
+    def gradient(q: np.ndarray) -> tuple[float, np.ndarray]:
+        H, slope = function(q, value.contact.normal)
+        return float(H), np.array(slope).ravel()
+
+    return gradient
+
+
+@pytest.mark.parametrize("name", ["panda", "xarm7", "tiago"])
+def test_energy_never_grows(name: str) -> None:
+    """No spring, unit weights, perfect dynamics: ``K H/λ + ½‖ν‖²`` falls, to where ``∇H`` can move nothing more."""
+    r, dt, K = robot(name), 2e-3, 10.0
+    gradient = own_gradient(r, (0.0, 0.0, 1.0))
+    posture = ImpactRobustPosture(
+        r, gradient, K=K, kp=0.0, kd=6.0, every=1, fade=(1e-6, 2e-6), reach=1e6, activation=Activation(ramp=1e-6)
+    )
+    controller = Controller(r, arm_formulation(r, posture), period=dt)
+    q, v = r.posture(), np.zeros(r.nv)
+    controller.reset(q, v)
+    Z = controller.assembly.redundancy(controller.state)
+    start = float(np.linalg.norm(Z.T @ gradient(q)[1]))
+    posture.brace()
+    energy = []
+    for k in range(1500):
+        energy.append(K / posture.scale * gradient(q)[0] + 0.5 * float(v @ v))
+        command = controller.tick(k * dt, q, v)
+        assert command.status is Status.SOLVED
+        v = v + dt * command.acceleration
+        q = np.array(pin.integrate(r.model, q, dt * v))
+    assert np.diff(energy).max() <= 1e-6 * energy[0] and energy[-1] < energy[0]
+    # What is left: motion that the end effector allows and no joint limit is in the way of.
+    stopped = np.eye(r.nv)[controller.state.room.min(axis=0) < 1e-2]
+    rows = np.vstack([controller.assembly.strict.J, stopped])
+    Z = np.linalg.svd(rows)[2][np.linalg.matrix_rank(rows, tol=1e-6) :].T
+    assert np.linalg.norm(Z.T @ gradient(q)[1]) < 0.2 * start
