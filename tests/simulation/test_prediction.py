@@ -100,7 +100,8 @@ def test_a_drop_without_friction_jumps_as_predicted(k: int) -> None:
     assert found.approach == pytest.approx(0.5, rel=1e-6)
     e = restitution(setup, run, 0.5)
     assert 0.05 < e < 0.25
-    # Stated band: 5 %, for the 4 ms that the contact takes (tests/simulation/test_world.py has 3 % for the impact alone).
+    # Stated band: 5 %, for the 4 ms that the contact takes (tests/simulation/test_world.py has 3 % for the impact
+    # alone).
     assert found.measured == pytest.approx((1 + e) * 0.5 * np.sqrt(found.V), rel=0.05)
     assert found.frictionless == pytest.approx(0.5 * np.sqrt(found.V))
     assert found.coulomb == pytest.approx(found.frictionless)
