@@ -22,10 +22,10 @@ from impact_posture.system.arrays import Array
 from impact_posture.system.libraries import (
     build_library,
     cache_folder,
+    hash_path,
     is_cached,
     library_path,
     load_library,
-    seal_path,
     source_key,
 )
 from impact_posture.system.scratch_folder import scratch_folder
@@ -121,7 +121,7 @@ def _cached_library(export_dir: Path, prefix: str) -> Path | None:
         library.touch()
         for old in sorted(library.parent.glob("*.so"), key=lambda path: path.stat().st_mtime)[:-_CACHED]:
             old.unlink()
-            seal_path(old).unlink(missing_ok=True)
+            hash_path(old).unlink(missing_ok=True)
     except (OutputError, OSError):
         return None
     return library

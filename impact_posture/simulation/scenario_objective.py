@@ -23,7 +23,7 @@ from impact_posture.simulation.scenario import Setup
 from impact_posture.system.arrays import Array
 from impact_posture.system.libraries import cache_folder, is_cached, library_path, source_key
 from impact_posture.system.progress import tell
-from impact_posture.system.toolchain import find_compiler, no_compiler
+from impact_posture.system.toolchain import require_compiler
 
 Gradient = Callable[[Array], tuple[float, Array]]
 
@@ -69,8 +69,7 @@ def compiled(objective: WorstCaseObjective) -> Gradient:
     folder = cache_folder("gradients") / objective_key(objective)
     with locked(folder.with_suffix(".lock")):
         if not is_cached(library_path(folder, "impact")):
-            if find_compiler() is None:
-                raise no_compiler("gradient")
+            require_compiler("gradient")
             tell("compiling the gradient")
             write_export([objective], folder, prefix="impact", portable=True, build=True, force=True)
     return ImpactGradient.load(folder, robot=objective.robot).objective

@@ -36,9 +36,16 @@ def find_compiler() -> list[str] | None:
     return None
 
 
-def no_compiler(where: str) -> CompilerError:
-    """Build the error for a machine without a C compiler."""
-    return CompilerError("no C compiler found", where=where, hint=GET_ONE)
+def require_compiler(where: str) -> list[str]:
+    """Return the C compiler as :func:`find_compiler` does; ``where`` names the work that needs it.
+
+    Raises:
+        CompilerError: There is no compiler, or ``$CC`` has an open quote.
+    """
+    compiler = find_compiler()
+    if compiler is None:
+        raise CompilerError("no C compiler found", where=where, hint=GET_ONE)
+    return compiler
 
 
 def words_of(variable: str) -> list[str]:

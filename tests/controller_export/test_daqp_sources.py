@@ -13,7 +13,7 @@ import pytest
 from impact_posture.controller_export import daqp_sources as module
 from impact_posture.controller_export.daqp_sources import FILES, SOURCES, VERSION, daqp_sources
 from impact_posture.errors import InputError
-from impact_posture.system.libraries import building, seal_path
+from impact_posture.system.libraries import building, hash_path
 from tests.support.daqp import sources_or_skip
 
 
@@ -78,7 +78,7 @@ def test_a_huge_member_is_refused(cache: Path) -> None:
         daqp_sources()
 
 
-def test_a_sealed_file_that_is_no_archive(cache: Path) -> None:
+def test_a_file_with_its_hash_that_is_not_an_archive(cache: Path) -> None:
     cache.mkdir(mode=0o700)
     with building(cache / f"daqp-{VERSION}.tar.gz") as folder:
         (folder / f"daqp-{VERSION}.tar.gz").write_bytes(b"no archive")
@@ -86,9 +86,9 @@ def test_a_sealed_file_that_is_no_archive(cache: Path) -> None:
         daqp_sources()
 
 
-def test_an_archive_without_its_seal_is_loaded_again(cache: Path) -> None:
+def test_an_archive_without_its_hash_is_loaded_again(cache: Path) -> None:
     in_cache(cache)
-    seal_path(cache / f"daqp-{VERSION}.tar.gz").write_text("0" * 64)
+    hash_path(cache / f"daqp-{VERSION}.tar.gz").write_text("0" * 64)
     with pytest.raises(InputError, match="cannot be downloaded"):
         daqp_sources()
 

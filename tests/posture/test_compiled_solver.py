@@ -131,7 +131,7 @@ def test_auto_falls_back_with_one_warning(
     if how == "compiler":
         monkeypatch.setenv("CC", need("false"))
     elif how == "disk":
-        monkeypatch.setattr(libraries, "_put", full_disk)
+        monkeypatch.setattr(libraries, "_replace", full_disk)
     elif how == "cache":
         cache.write_text("a file")
     else:
@@ -162,7 +162,7 @@ def test_compiling_needs_a_compiler(
     problem: ConstrainedProblem, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     monkeypatch.setenv("IMPACT_POSTURE_CACHE", str(tmp_path))
-    monkeypatch.setattr(compiled, "find_compiler", lambda: None)
+    monkeypatch.setattr("impact_posture.system.toolchain.find_compiler", lambda: None)
     with pytest.raises(CompilerError, match="no C compiler"):
         build_nlp(problem, compile="always")
 

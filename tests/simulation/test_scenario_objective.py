@@ -28,7 +28,7 @@ from impact_posture.simulation.controllers.driver import RobustDriver
 from impact_posture.simulation.scenario import set_up
 from impact_posture.simulation.scenario_file import read_scenario
 from impact_posture.simulation.scenario_objective import compiled, interpreted, scenario_objective
-from impact_posture.system.libraries import seal_path
+from impact_posture.system.libraries import hash_path
 from tests.simulation.factories import factory, needs_mujoco
 from tests.support.helpers import Vector, assert_close, central_gradient, frame_jacobian, mass_matrix, rng, robot
 from tests.support.tools import need_compiler
@@ -231,7 +231,7 @@ def test_what_cannot_be_compiled_or_loaded_is_interpreted(
             written = write(objectives, folder, **options)
             written.library.unlink()
             written.library.write_text("of another machine")
-            seal_path(written.library).write_text(hashlib.sha256(written.library.read_bytes()).hexdigest())
+            hash_path(written.library).write_text(hashlib.sha256(written.library.read_bytes()).hexdigest())
             return written
 
         monkeypatch.setattr(module, "write_export", elsewhere)

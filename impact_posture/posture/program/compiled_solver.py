@@ -17,7 +17,7 @@ import casadi as ca
 from impact_posture.errors import CompilerError, InputError, OutputError
 from impact_posture.posture.program.constrained_problem import ConstrainedProblem
 from impact_posture.system.libraries import building, cache_folder, cache_path, is_cached, source_key
-from impact_posture.system.toolchain import find_compiler, no_compiler, run_compiler, run_compilers
+from impact_posture.system.toolchain import find_compiler, require_compiler, run_compiler, run_compilers
 
 CompileMode = Literal["auto", "always", "never"]
 
@@ -69,9 +69,7 @@ def compiled_solver(
         if mode != "never" and (found := _cached(problem, options)) is not None:
             return BuiltSolver(found, True)
         interpreted = ca.nlpsol("posture", "ipopt", symbols, {**options, **derivatives})
-        compiler = find_compiler()
-        if mode == "always" and compiler is None:
-            raise no_compiler("compile")
+        compiler = require_compiler("compile") if mode == "always" else find_compiler()
         if mode == "never" or compiler is None or (mode == "auto" and not _pays(interpreted, starts)):
             return BuiltSolver(interpreted, False)
         _compile(interpreted, compiler, f"{_key(problem)}.so")

@@ -21,7 +21,7 @@ from impact_posture.simulation.world.sensor_noise import Reading
 from impact_posture.system.arrays import Array
 from impact_posture.system.libraries import cache_folder, is_cached, library_path, source_key
 from impact_posture.system.progress import tell
-from impact_posture.system.toolchain import find_compiler, no_compiler
+from impact_posture.system.toolchain import require_compiler
 from impact_posture.tsid.controller import Command, Controller
 from impact_posture.tsid.tasks.task import TargetTask
 
@@ -115,8 +115,7 @@ def compiled_tick(controller: Controller, structure: Structure, objective: Worst
     folder = cache_folder("controllers") / _key(structure, objective)
     with locked(folder.with_suffix(".lock")):
         if not is_cached(library_path(folder, _PREFIX)):
-            if find_compiler() is None:
-                raise no_compiler("controller")
+            require_compiler("controller")
             tell("compiling the controller")
             given: dict[str, Any] = {"objective": objective, "prefix": _PREFIX, "build": True, "force": True}
             given |= {"generated": _QUICK, "shared": True}
