@@ -14,7 +14,7 @@ from pathlib import Path
 
 from docs.studies.core import ROOT, Request, say
 from impact_posture.experiment.experiment_folders import draw_reproduction
-from impact_posture.experiment.job_store import Store
+from impact_posture.experiment.job_store import JobStore
 from impact_posture.experiment.reproduction import PAPER, Reproduction, controllers_of, reproduce
 from impact_posture.experiment.reproduction_summary import LEGEND, advice, remarks, scenario_table, table_one
 
@@ -25,7 +25,7 @@ OTHERS = 2
 
 def lines(request: Request) -> Iterator[str]:
     """The page; its pictures are drawn where it is written."""
-    scenarios, store = tuple(s for s in PAPER if request.only in s), Store(ROOT / "build" / "reproduction")
+    scenarios, store = tuple(s for s in PAPER if request.only in s), JobStore(ROOT / "build" / "reproduction")
     shared = {"processes": request.jobs, "store": store, "progress": lambda a, b: say(f"\r{a} of {b} runs", end="")}
     began = time.perf_counter()
     plan = {s: controllers_of(s, False) for s in scenarios}

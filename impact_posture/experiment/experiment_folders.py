@@ -9,7 +9,7 @@ from pathlib import Path
 
 import numpy as np
 
-from impact_posture.experiment.job_store import Store
+from impact_posture.experiment.job_store import JobStore
 from impact_posture.experiment.jobs import Document, Job
 from impact_posture.experiment.reproduction import PAPER, Reproduction
 from impact_posture.experiment.reproduction_summary import summary
@@ -59,7 +59,7 @@ def write_simulation(output: Output, job: Job, runs: Sequence[Run], document: Do
         return try_report(folder, job.scenario, meshes=output.meshes) if output.report else ""
 
 
-def write_comparison(output: Output, found: Reproduction, store: Store) -> str:
+def write_comparison(output: Output, found: Reproduction, store: JobStore) -> str:
     """Write ``comparison.json``, figures, ``runs/`` and ``report.html`` of the first seed, and remove the store.
 
     Returns:
@@ -78,7 +78,7 @@ def write_comparison(output: Output, found: Reproduction, store: Store) -> str:
     return failure
 
 
-def write_reproduction(output: Output, found: Reproduction, store: Store) -> Document:
+def write_reproduction(output: Output, found: Reproduction, store: JobStore) -> Document:
     """Write ``reproduction.json``, ``SUMMARY.md``, all documents in ``runs/``, and figures, and remove the store.
 
     Returns:
@@ -99,13 +99,13 @@ def write_reproduction(output: Output, found: Reproduction, store: Store) -> Doc
     return document
 
 
-def store_beside(out: Path) -> AbstractContextManager[Store]:
+def store_beside(out: Path) -> AbstractContextManager[JobStore]:
     """Take the store that keeps the runs of an output folder until it is written.
 
     Raises:
-        OutputError: As :meth:`Store.taken`.
+        OutputError: As :meth:`JobStore.locked`.
     """
-    return Store(out.absolute().parent / f".{out.name}.runs").taken()
+    return JobStore(out.absolute().parent / f".{out.name}.runs").locked()
 
 
 def draw_runs(job: Job, runs: Sequence[Run], document: Document, folder: Path, formats: Sequence[str]) -> None:
@@ -116,7 +116,7 @@ def draw_runs(job: Job, runs: Sequence[Run], document: Document, folder: Path, f
         save_all(figures_of_run(run_view(job, part, one.series)), into, formats)
 
 
-def draw_side_by_side(jobs: Sequence[Job], store: Store, folder: Path, formats: Sequence[str]) -> None:
+def draw_side_by_side(jobs: Sequence[Job], store: JobStore, folder: Path, formats: Sequence[str]) -> None:
     """Draw several controllers in one scenario, with the first sign of a push."""
     tell("drawing")
     kept = [(job, kept_run(job, store)) for job in jobs]
@@ -125,7 +125,7 @@ def draw_side_by_side(jobs: Sequence[Job], store: Store, folder: Path, formats: 
         save_all(figures_of_comparison(views), folder, formats)
 
 
-def draw_reproduction(found: Reproduction, store: Store, folder: Path, formats: Sequence[str]) -> None:
+def draw_reproduction(found: Reproduction, store: JobStore, folder: Path, formats: Sequence[str]) -> None:
     """Draw ``bars``, and for each scenario a folder with nominal, robust and the best controller side by side."""
     bars = []
     for row in found.rows:

@@ -1,62 +1,56 @@
-"""Many jobs in several processes.  Each is kept when it is done, so that an interrupted batch can go on."""
+"""JobStore of finished jobs, so that an interrupted comparison continues instead of starting again."""
 
 from __future__ import annotations
 
 import fcntl
 import hashlib
-import hmac
 import io
 import json
 import os
 import re
-import secrets
 from collections.abc import Callable, Iterator, Sequence
 from contextlib import contextmanager, suppress
-from dataclasses import asdict, dataclass
+from dataclasses import asdict
 from functools import cache
 from pathlib import Path
 
 from impact_posture.collision.coal_geometry import geometry_key
 from impact_posture.collision.urdf_shapes import read_urdf_shapes
-from impact_posture.config.cached_values import read_stored, write_stored
 from impact_posture.errors import ImpactPostureError, InputError, MetricError, OutputError
-from impact_posture.experiment.jobs import Document, Job, controller_factory, execute, lost, software
+from impact_posture.experiment.jobs import Document, Job, controller_factory, execute, lost_control, software
 from impact_posture.posture.program.ipopt import one_blas_thread
 from impact_posture.simulation.controllers.controller_factory import CONTROLLERS
 from impact_posture.simulation.run import Run
 from impact_posture.simulation.scenario_file import scenario_path
 from impact_posture.system.libraries import source_key
-from impact_posture.system.npz_files import MOST_BYTES
 from impact_posture.system.output_folder import parents_of, write_whole
 from impact_posture.system.processes import fork_map, undone
-from impact_posture.system.scratch_folder import RECORD
 from impact_posture.system.text_files import read_text
 
 Progress = Callable[[int, int], None]
-# Names of the files of a store, and of the parts of them that a killed process leaves.
-_OURS = re.compile(r"\.?[0-9a-f]{64}(\.minus)?\.(json|npz)(\.\d+\.part)?")
+# Names of stored files, and of the incomplete files that a killed process leaves.
+_STORED = re.compile(r"\.?[0-9a-f]{64}(\.minus)?\.(json|npz)(\.\d+\.part)?")
 
 
-class Store:
-    """A folder of finished jobs.
+class JobStore:
+    """Folder with the documents and time series of finished jobs.
 
-    The name of a file is a hash of everything that the result of its job depends on (:func:`key_of`), so nothing is
-    taken for the result of another job.  A document begins with a seal, which only this user can make.
+    The name of a file is a hash of everything that its job depends on (:func:`key_of`).  A document begins with its
+    checksum and has the checksums of its time series, so a damaged file is noticed and its job runs again.
 
     Args:
-        folder: The folder, which is made when it is first written to.
+        folder: The folder.  It is made when the first job is stored.
     """
 
     def __init__(self, folder: Path) -> None:
         self.folder = folder
-        self._secret = _secret()
 
     @contextmanager
-    def taken(self) -> Iterator[Store]:
-        """Make the folder, and keep other commands out of it.  An empty one disappears at the end.
+    def locked(self) -> Iterator[JobStore]:
+        """Make the folder and lock it against other commands.  Remove it at the end if it is empty.
 
         Raises:
-            OutputError: It cannot be made or written, is not ours, or another command works in it.
+            OutputError: The folder cannot be made or read, or another command uses it.
         """
         with parents_of(self.folder):
             lock = self._lock()
@@ -67,15 +61,9 @@ class Store:
                 os.close(lock)
 
     def _lock(self) -> int:
-        """Return a descriptor of the folder, which keeps others out while it is open."""
-        with self._writing():
-            try:
-                self.folder.mkdir()
-            except FileExistsError:
-                if fault := self._fault():
-                    hint = "runs are kept there until `out` is written: move it away, or choose another `out`"
-                    raise OutputError(fault, where=str(self.folder), hint=hint) from None
-            lock = os.open(self.folder, os.O_RDONLY | os.O_DIRECTORY | os.O_NOFOLLOW)
+        """Return a descriptor of the folder.  The folder is locked while the descriptor is open."""
+        self._make_folder()
+        lock = os.open(self.folder, os.O_RDONLY)
         try:
             fcntl.flock(lock, fcntl.LOCK_EX | fcntl.LOCK_NB)
         except BlockingIOError:
@@ -87,54 +75,45 @@ class Store:
             pass
         return lock
 
-    @contextmanager
-    def _writing(self) -> Iterator[None]:
+    def _make_folder(self) -> None:
         try:
-            yield
+            self.folder.mkdir(parents=True, exist_ok=True)
         except OSError as error:
-            words = f"cannot be written ({error.strerror or error})"
-            raise OutputError(words, where=str(self.folder), hint="free space or choose another `out`") from error
-
-    def _fault(self) -> str:
-        """Return why an existing folder cannot be used; empty if it can."""
-        if self.folder.is_symlink() or not self.folder.is_dir():
-            return "is no folder"
-        if os.path.lexists(self.folder / RECORD):
-            return "holds results of another command or version"
-        return "" if os.access(self.folder, os.R_OK | os.W_OK | os.X_OK) else "cannot be written"
+            hint = "runs are kept there until `out` is written: move it away, or choose another `out`"
+            raise OutputError(f"cannot be made ({error.strerror})", where=str(self.folder), hint=hint) from error
 
     def _remove_empty(self) -> None:
         with suppress(OSError):
             self.folder.rmdir()
 
     def remove(self) -> None:
-        """Remove the files of jobs, and the folder unless it holds others."""
+        """Remove the stored files, and the folder unless it holds other files."""
         with suppress(OSError):
-            for entry in os.scandir(self.folder):
-                if _OURS.fullmatch(entry.name) and entry.is_file(follow_symlinks=False):
-                    os.unlink(entry.path)
+            for path in self.folder.iterdir():
+                if _STORED.fullmatch(path.name):
+                    path.unlink()
         self._remove_empty()
 
     def find(self, job: Job) -> Document | None:
-        """Return the document of a finished job; ``None`` for no file, or one that is damaged or lacks its series."""
-        path = self._path(job)
+        """Return the document of a finished job, or ``None`` if a file is missing or damaged."""
         try:
-            seal, _, text = read_text(path).partition("\n") if path.is_file() else ("", "", "")
-            if not hmac.compare_digest(seal.encode(), self._seal(job, text).encode()):
+            checksum, _, text = read_text(self._path(job)).partition("\n")
+            if checksum != _checksum(text.encode()):
                 return None
-            kept = json.loads(text)
-            if all(_digest(self.series(job, int(sign))) == digest for sign, digest in kept["series"].items()):
-                document: Document = kept["document"]
-                return document
+            stored = json.loads(text)
+            for sign, checksum in stored["series"].items():
+                if checksum != _checksum(self.series(job, int(sign)).read_bytes()):
+                    return None
         except (OSError, UnicodeError):
-            pass
-        return None
+            return None
+        document: Document = stored["document"]
+        return document
 
     def finished(self, job: Job) -> Document:
         """Return the document of a job that :func:`run_batch` has finished.
 
         Raises:
-            OutputError: Somebody removed or changed it since.
+            OutputError: A file was removed or changed since.
         """
         document = self.find(job)
         if document is None:
@@ -147,65 +126,43 @@ class Store:
         return self._path(job).with_suffix(f"{'' if sign > 0 else '.minus'}.npz")
 
     def keep(self, job: Job, document: Document, runs: Sequence[Run] = ()) -> None:
-        """Write a document and the time series of runs, so that :meth:`find` finds all or nothing.
+        """Write a document and the time series of its runs.
+
+        The document is written last, so an interrupted call stores nothing that :meth:`find` returns.
 
         Raises:
-            OutputError: They cannot be written.
+            OutputError: The files cannot be written.
         """
-        with self._writing():
-            self.folder.mkdir(parents=True, exist_ok=True)
-        series = {}
-        for one in runs:
+        self._make_folder()
+        checksums = {}
+        for run in runs:
             content = io.BytesIO()
-            one.series.save(content)
-            write_whole(self.series(job, one.sign), content.getvalue())
-            series[str(one.sign)] = hashlib.sha256(content.getvalue()).hexdigest()
-        text = json.dumps({"series": series, "document": document})
-        write_whole(self._path(job), f"{self._seal(job, text)}\n{text}")
+            run.series.save(content)
+            write_whole(self.series(job, run.sign), content.getvalue())
+            checksums[str(run.sign)] = _checksum(content.getvalue())
+        text = json.dumps({"series": checksums, "document": document})
+        write_whole(self._path(job), f"{_checksum(text.encode())}\n{text}")
 
     def _path(self, job: Job) -> Path:
         return self.folder / f"{key_of(job)}.json"
 
-    def _seal(self, job: Job, text: str) -> str:
-        """Return the first line of a stored document, which only this text of this job has."""
-        return hmac.digest(self._secret.encode(), f"{key_of(job)}\0{text}".encode(), "sha256").hex()
 
-
-@dataclass(frozen=True)
-class _Secret:
-    text: str
-
-
-def _secret() -> str:
-    """Return a text that only this user knows; empty where the cache cannot be used, as a seal then shows damage."""
-    found = read_stored("secret", "runs", _Secret)
-    if found is None:
-        write_stored("secret", "runs", _Secret(secrets.token_hex(32)))
-        # Another process may have been faster.
-        found = read_stored("secret", "runs", _Secret)
-    return "" if found is None else found.text
-
-
-def _digest(path: Path) -> str:
-    """Return the hash of a time series; empty for what cannot be one."""
-    if not path.is_file() or path.stat().st_size > MOST_BYTES:
-        return ""
-    with path.open("rb") as file:
-        return hashlib.file_digest(file, "sha256").hexdigest()
+def _checksum(content: bytes) -> str:
+    return hashlib.sha256(content).hexdigest()
 
 
 def key_of(job: Job) -> str:
     """Return a hash of everything that the result of a job depends on."""
     content = [source_key((), ""), repr(software()), repr(asdict(job)), _scenario(job.scenario)]
-    return hashlib.sha256("\0".join(content).encode()).hexdigest()
+    return _checksum("\0".join(content).encode())
 
 
 @cache
 def _scenario(scenario: str) -> str:
-    """Return the text of the file, and what the other files of its experiment say."""
+    """Return the text of a scenario file, and hashes of the files that the scenario names."""
     setup = controller_factory(scenario, False).setup
     shapes = ""
-    # A mesh that cannot be read shapes nothing.
+    # A mesh that cannot be read has no influence.
     with suppress(OSError):
         shapes = geometry_key(setup.robot, read_urdf_shapes(setup.robot)[0])
     text = scenario_path(scenario).read_text(encoding="utf-8")
@@ -216,7 +173,7 @@ def run_batch(
     jobs: Sequence[Job],
     *,
     processes: int = 1,
-    store: Store | None = None,
+    store: JobStore | None = None,
     progress: Progress | None = None,
 ) -> list[Document]:
     """Run the jobs that are not stored yet, and return all documents in the order of the jobs.
@@ -227,23 +184,23 @@ def run_batch(
     Args:
         jobs: The jobs.
         processes: Number of processes.
-        store: Folder where finished jobs are kept and found, with the time series of those that are shown.
+        store: Folder of finished jobs.  It also keeps the time series of the jobs that figures and reports show.
         progress: Callback with (done, all).
 
     Raises:
-        ImpactPostureError: A scenario cannot be set up, or there is no such controller.
+        ImpactPostureError: A scenario cannot be set up, or a controller does not exist.
     """
     done: dict[int, Document] = {}
     for k, job in enumerate(jobs):
-        # Every wrong scenario or controller is refused here, before hours of runs.
+        # This refuses every wrong scenario or controller before hours of runs.
         factory = controller_factory(job.scenario, job.free)
         if job.controller not in CONTROLLERS:
             # The key of a stored job does not cover the code of another package, so the job runs again.
             factory.driver(job.controller)
         elif store is not None:
-            found = store.find(job)
-            if found is not None:
-                done[k] = found
+            document = store.find(job)
+            if document is not None:
+                done[k] = document
     waiting = [k for k in range(len(jobs)) if k not in done]
     if progress:
         progress(len(done), len(jobs))
@@ -259,15 +216,15 @@ def run_batch(
     return [done[k] for k in range(len(jobs))]
 
 
-def _run(job: Job, store: Store | None) -> Document:
+def _run(job: Job, store: JobStore | None) -> Document:
     runs: Sequence[Run] = ()
     try:
         runs, document = execute(job)
     except ImpactPostureError as error:
         if isinstance(error, InputError) and not isinstance(error, MetricError):
-            # A mistake of the user is the same for all seeds, and no result.
+            # A user's mistake fails with every seed, so it ends the batch.
             raise
-        document = lost(job, error)
+        document = lost_control(job, error)
     if store is not None:
         store.keep(job, document, runs if job.shown else ())
     return document

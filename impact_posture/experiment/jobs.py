@@ -153,7 +153,7 @@ def software() -> dict[str, str]:
     return versions() | {"mujoco": str(import_mujoco().__version__)}
 
 
-def lost(job: Job, error: Exception) -> Document:
+def lost_control(job: Job, error: Exception) -> Document:
     """Return the document of a job that failed on its own, with the status ``control lost`` and without runs."""
     event = {"status": "control lost", "time": getattr(error, "time", None), "what": str(error), "sign": None}
     return {"schema": SCHEMA, "scenario": job.scenario, "controller": job.controller, "mode": job.mode,

@@ -6,7 +6,7 @@ from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass
 from typing import Any
 
-from impact_posture.experiment.job_store import Progress, Store, run_batch
+from impact_posture.experiment.job_store import JobStore, Progress, run_batch
 from impact_posture.experiment.jobs import Document, Job, jsonable, parse_controller, worth_compiling
 from impact_posture.experiment.seed_statistics import ControllerRow, Interval, row_of
 from impact_posture.posture.program.compiled_solver import CompileMode
@@ -182,7 +182,7 @@ def reproduce(
     *,
     seeds: int = 10,
     processes: int = 1,
-    store: Store | None = None,
+    store: JobStore | None = None,
     progress: Progress | None = None,
     compile: CompileMode = "auto",
 ) -> Reproduction:

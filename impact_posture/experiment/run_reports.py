@@ -13,7 +13,7 @@ import numpy as np
 
 from impact_posture.dynamics.numeric import Numeric
 from impact_posture.errors import ImpactPostureError, InputError, SpecError, one_line, shown
-from impact_posture.experiment.job_store import Store
+from impact_posture.experiment.job_store import JobStore
 from impact_posture.experiment.jobs import SCHEMA as SIMULATION_SCHEMA
 from impact_posture.experiment.jobs import Document, Job, controller_factory
 from impact_posture.experiment.reproduction import COMPARISON_SCHEMA
@@ -40,7 +40,7 @@ _COLUMNS = {field.name for field in fields(RunView)} & {field.name for field in 
 _BROKEN = (LookupError, ArithmeticError, ValueError, TypeError, AttributeError, OSError, RecursionError)
 
 
-def keep_runs(folder: Path, jobs: Sequence[Job], store: Store) -> None:
+def keep_runs(folder: Path, jobs: Sequence[Job], store: JobStore) -> None:
     """Write the document and the ticks that a report shows of each stored job into ``runs/`` of a comparison.
 
     A run whose state runs away at once is left out.
@@ -59,11 +59,11 @@ def keep_runs(folder: Path, jobs: Sequence[Job], store: Store) -> None:
                 write_json(path.with_name(f"{path.name}.json"), document)
 
 
-def kept_run(job: Job, store: Store) -> tuple[Document, Series] | None:
+def kept_run(job: Job, store: JobStore) -> tuple[Document, Series] | None:
     """Return the document of a stored job and the time series of its first run, or ``None`` if it has no runs.
 
     Raises:
-        OutputError: As :meth:`Store.finished`.
+        OutputError: As :meth:`JobStore.finished`.
     """
     document = store.finished(job)
     if not document["runs"]:
@@ -224,8 +224,6 @@ def _runs(document: Document, stem: Path, scenario: str, count: int) -> list[tup
     job, found = _job(document, scenario), []
     factory = controller_factory(job.scenario, job.free)
     parts = document["runs"][:count]
-    if len({_series(stem, part["sign"]) for part in parts}) < len(parts):
-        raise SpecError("names one time series several times", where=str(stem.parent), hint="run it again")
     if document["model_sha256"] != factory.setup.robot.model_sha256:
         raise SpecError("was run with another robot model", where=str(stem.parent), hint="run it again")
     for part in parts:

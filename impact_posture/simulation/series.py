@@ -116,4 +116,4 @@ class Series:
                 raise ValueError("columns of different lengths")
             return Series(**columns)
         except (OSError, ValueError, KeyError, TypeError, IndexError) as error:
-            raise SpecError(f"is no time series ({error})", where=str(path), hint="run simulate again") from None
+            raise SpecError(f"is not a time series ({error})", where=str(path), hint="run simulate again") from None

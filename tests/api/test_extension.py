@@ -20,7 +20,7 @@ import impact_posture as ip
 from impact_posture.dynamics.numeric import Numeric
 from impact_posture.dynamics.tree import Tree
 from impact_posture.errors import InputError
-from impact_posture.experiment.job_store import Store
+from impact_posture.experiment.job_store import JobStore
 from impact_posture.experiment.reproduction import reproduce
 from impact_posture.impact.impact_contact import ImpactContact, Support
 from impact_posture.impact.objective import Objective, Subgradients
@@ -191,7 +191,7 @@ def test_a_registered_controller_is_compared_and_runs_again(setback: ModuleType,
     needs_mujoco()
     scenario = tmp_path / "aerial.toml"
     scenario.write_text(cut("aerial-vertical", count=1, settle=0.1, dwell=0.2, pause=0.05), encoding="utf-8")
-    plan, store = {str(scenario): ["nominal", "setback"]}, Store(tmp_path / "store")
+    plan, store = {str(scenario): ["nominal", "setback"]}, JobStore(tmp_path / "store")
     first = reproduce(plan, seeds=1, store=store)
     assert [row.status for row in first.rows] == ["completed", "completed"]
     setback.SetbackDriver.brace = setback.Driver.brace

@@ -198,6 +198,6 @@ def test_what_is_no_series_is_one_line(tmp_path: Path, kind: str) -> None:
             np.save(file, np.zeros(3))
     elif kind == "other":
         np.savez(path, t=np.zeros(3))
-    with pytest.raises(SpecError, match="is no time series") as caught:
+    with pytest.raises(SpecError, match="is not a time series") as caught:
         Series.load(path)
     assert "\n" not in caught.value.line and "series.npz" in caught.value.line

@@ -15,7 +15,7 @@ from docs.studies.robustness.draws import COUNT, DWELL, PATIENCE, PAUSE, Draw, d
 from docs.studies.robustness.variations import RANGES
 from impact_posture.dynamics.numeric import Numeric
 from impact_posture.errors import ImpactPostureError
-from impact_posture.experiment.jobs import Document, Job, execute, lost, parse_controller
+from impact_posture.experiment.jobs import Document, Job, execute, lost_control, parse_controller
 from impact_posture.experiment.reproduction import missed_targets
 from impact_posture.experiment.seed_statistics import ControllerRow, row_of
 from impact_posture.impact.impact_contact import point_on
@@ -192,7 +192,7 @@ def _document(factory: ControllerFactory, chosen: Draw, label: str, play: _Play)
     try:
         runs, found = play(job, factory)
     except (ImpactPostureError, np.linalg.LinAlgError) as error:
-        return {**lost(job, error), "runs": [], "duration": 0.0, "offset": None}
+        return {**lost_control(job, error), "runs": [], "duration": 0.0, "offset": None}
     signs = [{"sign": part["sign"]} for part in found["runs"]]
     kept = {name: value for name, value in found.items() if name not in _LEFT_OUT}
     duration = max(float(run.series.t[-1]) for run in runs)
