@@ -133,9 +133,9 @@ def _controller_parts(
     """Return the robot, its tasks, and the objective that the posture task follows."""
     if scenario is not None:
         from impact_posture.simulation.controllers.controller_factory import ControllerFactory
-        from impact_posture.simulation.scenario import set_up
         from impact_posture.simulation.scenario_file import read_scenario
         from impact_posture.simulation.scenario_objective import interpreted
+        from impact_posture.simulation.setup import set_up
 
         if given.values:
             raise UsageError(f"--{next(iter(given.values))} contradicts --scenario, which has robot and impact.")

@@ -15,7 +15,7 @@ from impact_posture_cli.progress_line import progress
 from impact_posture_cli.settings_options import positive
 
 if TYPE_CHECKING:
-    from impact_posture.simulation.scenario import Scenario
+    from impact_posture.simulation.scenario_file import Scenario
 
 # Exit code of a run that did not complete.
 _FAILED = 4
@@ -121,7 +121,7 @@ def simulate(
 
 
 def _export_world(page: Page, scenario: Scenario, out: Path, force: bool) -> None:
-    from impact_posture.simulation.scenario import set_up
+    from impact_posture.simulation.setup import set_up
     from impact_posture.simulation.world_export import export_world
     from impact_posture.system.output_folder import check_output
 

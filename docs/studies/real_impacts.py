@@ -21,8 +21,8 @@ from impact_posture.experiment.jobs import Job, execute
 from impact_posture.impact.friction.coulomb_impulse import coulomb_impact
 from impact_posture.simulation.controllers.baselines import resting_posture
 from impact_posture.simulation.controllers.controller_factory import CONTROLLERS, ControllerFactory
-from impact_posture.simulation.scenario import RepeatedContacts, Scenario, set_up
-from impact_posture.simulation.scenario_file import read_scenario
+from impact_posture.simulation.scenario_file import RepeatedContacts, Scenario, read_scenario
+from impact_posture.simulation.setup import set_up
 from impact_posture.simulation.world.throw import Throw, thrown_jumps
 
 # A number is another speed of the hand than that of the scenario, m/s.

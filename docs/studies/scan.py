@@ -23,8 +23,9 @@ from impact_posture.posture.formulation.build_problem import build_problem
 from impact_posture.posture.manifold.feasible_start import Projector
 from impact_posture.simulation.controllers.controller_factory import ControllerFactory
 from impact_posture.simulation.offline_posture import offline_posture, scenario_requirements
-from impact_posture.simulation.scenario import Setup, SinglePush
+from impact_posture.simulation.scenario_file import SinglePush
 from impact_posture.simulation.scenario_objective import interpreted, scenario_objective
+from impact_posture.simulation.setup import Setup
 from impact_posture.simulation.world.world import build_world
 
 ARM, HUMANOID = "aerial-vertical", "talos-push"

@@ -18,8 +18,8 @@ from impact_posture.simulation.metrics import Metrics, measure
 from impact_posture.simulation.outcome import gravest, judge, links_behind
 from impact_posture.simulation.prediction import predict
 from impact_posture.simulation.run import Run, run
-from impact_posture.simulation.scenario import set_up
 from impact_posture.simulation.scenario_file import read_scenario
+from impact_posture.simulation.setup import set_up
 from impact_posture.system.escape import file_name
 
 Document = dict[str, Any]

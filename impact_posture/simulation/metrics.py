@@ -7,8 +7,8 @@ from dataclasses import asdict, dataclass
 import numpy as np
 
 from impact_posture.simulation.run import Run
-from impact_posture.simulation.scenario import Setup
 from impact_posture.simulation.series import Array, Flags, Series, Window
+from impact_posture.simulation.setup import Setup
 
 # Time after the first touch within which the velocity jump is measured, s.
 JUMP = 0.015

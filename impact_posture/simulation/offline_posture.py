@@ -17,7 +17,7 @@ from impact_posture.posture.formulation.build_problem import build_problem
 from impact_posture.posture.formulation.problem_file import requirements
 from impact_posture.posture.program.constrained_problem import Requirements
 from impact_posture.posture.search.multistart import PostureSolution, solve
-from impact_posture.simulation.scenario import Setup, naming_keys
+from impact_posture.simulation.setup import Setup, naming_keys
 from impact_posture.system.arrays import Array
 from impact_posture.system.progress import tell
 from impact_posture.tsid.flow.flow_direction import FlowOptions

@@ -12,8 +12,8 @@ from scipy import ndimage
 
 from impact_posture.simulation.recorder import feet_of
 from impact_posture.simulation.run import Run
-from impact_posture.simulation.scenario import Setup
 from impact_posture.simulation.series import Flags, Series
+from impact_posture.simulation.setup import Setup
 from impact_posture.system.arrays import Array
 
 # Each is graver than the one before.

@@ -12,7 +12,7 @@ from impact_posture.impact.kinds.kinds_by_name import KINDS
 from impact_posture.impact.worst_case_objective import WorstCaseObjective
 from impact_posture.simulation.metrics import before, jump
 from impact_posture.simulation.run import Run
-from impact_posture.simulation.scenario import Setup
+from impact_posture.simulation.setup import Setup
 from impact_posture.simulation.world.throw import thrown_jumps
 
 

@@ -8,8 +8,8 @@ import numpy as np
 
 from impact_posture.errors import ImpactPostureError
 from impact_posture.impact.impact_contact import point_on
-from impact_posture.simulation.scenario import Setup
 from impact_posture.simulation.series import STATUSES, Series
+from impact_posture.simulation.setup import Setup
 from impact_posture.simulation.world.actuator_command import Trace
 from impact_posture.system.arrays import Array
 from impact_posture.tsid.controller import Command

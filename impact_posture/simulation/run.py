@@ -16,7 +16,7 @@ from impact_posture.simulation.controllers.contact_reference import Reference
 from impact_posture.simulation.controllers.controller_factory import ControllerFactory, Mode
 from impact_posture.simulation.controllers.driver import Driver
 from impact_posture.simulation.recorder import Recorder
-from impact_posture.simulation.scenario import RepeatedContacts, SinglePush
+from impact_posture.simulation.scenario_file import RepeatedContacts, SinglePush
 from impact_posture.simulation.series import RECOVERY, Series, Window
 from impact_posture.simulation.world.throw import FLIGHT, Throw
 from impact_posture.system.arrays import Array

@@ -19,7 +19,7 @@ from impact_posture.impact.impact_contact import ImpactContact
 from impact_posture.impact.jump_metric import Metric
 from impact_posture.impact.supports import resolve_supports
 from impact_posture.impact.worst_case_objective import WorstCaseObjective
-from impact_posture.simulation.scenario import Setup
+from impact_posture.simulation.setup import Setup
 from impact_posture.system.arrays import Array
 from impact_posture.system.libraries import cache_folder, is_cached, library_path, source_key
 from impact_posture.system.progress import tell

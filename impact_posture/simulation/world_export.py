@@ -20,7 +20,8 @@ from impact_posture.impact.impact_contact import point_on
 from impact_posture.simulation.controllers.contact_reference import Reference
 from impact_posture.simulation.metrics import JUMP
 from impact_posture.simulation.run import BRACE
-from impact_posture.simulation.scenario import RepeatedContacts, Setup, SinglePush
+from impact_posture.simulation.scenario_file import RepeatedContacts, SinglePush
+from impact_posture.simulation.setup import Setup
 from impact_posture.simulation.world.throw import Throw
 from impact_posture.system.output_folder import whole_folder
 

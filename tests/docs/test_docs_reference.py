@@ -20,7 +20,7 @@ from impact_posture.posture.program.certificate import Certificate
 from impact_posture.posture.search.multistart import solve
 from impact_posture.robot.robot_spec import RobotSpec
 from impact_posture.simulation.controllers.controller_factory import CONTROLLERS
-from impact_posture.simulation.scenario import ScenarioTable
+from impact_posture.simulation.scenario_file import ScenarioTable
 from impact_posture_cli.app import COMMANDS, build
 from tests.support.settings import make_settings
 

@@ -13,10 +13,10 @@ import pytest
 from impact_posture.simulation.controllers.controller_factory import ControllerFactory, Mode
 from impact_posture.simulation.recorder import feet_of
 from impact_posture.simulation.run import Run, run
-from impact_posture.simulation.scenario import Setup, set_up
 from impact_posture.simulation.scenario_file import read_scenario
 from impact_posture.simulation.scenario_objective import interpreted
 from impact_posture.simulation.series import Series
+from impact_posture.simulation.setup import Setup, set_up
 
 AERIAL = ("aerial-vertical", "aerial-lateral")
 PUSHES = ("solo8-push", "talos-push")

@@ -18,8 +18,8 @@ from impact_posture.simulation.controllers.contact_reference import Reference
 from impact_posture.simulation.controllers.controller_factory import ControllerFactory
 from impact_posture.simulation.controllers.driver import RobustDriver
 from impact_posture.simulation.controllers.impact_baselines import InvariantDriver
-from impact_posture.simulation.scenario import RepeatedContacts, set_up
-from impact_posture.simulation.scenario_file import read_scenario
+from impact_posture.simulation.scenario_file import RepeatedContacts, read_scenario
+from impact_posture.simulation.setup import set_up
 from impact_posture.simulation.world.actuator_command import ActuatorCommand
 from impact_posture.simulation.world.sensor_noise import Reading
 from impact_posture.tsid.tasks.task import Task

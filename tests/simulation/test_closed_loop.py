@@ -16,8 +16,8 @@ from impact_posture.simulation.controllers.driver import Driver
 from impact_posture.simulation.controllers.task_formulations import nominal_posture
 from impact_posture.simulation.metrics import measure
 from impact_posture.simulation.run import run
-from impact_posture.simulation.scenario import Setup, set_up
 from impact_posture.simulation.scenario_file import read_scenario
+from impact_posture.simulation.setup import Setup, set_up
 from impact_posture.simulation.world.scene import Sensors
 from impact_posture.simulation.world_export import export_world
 from tests.simulation.factories import needs_mujoco

@@ -15,9 +15,9 @@ from impact_posture.experiment.jobs import Job, execute, worth_compiling
 from impact_posture.simulation.controllers.compiled_tick import CompiledTick
 from impact_posture.simulation.controllers.controller_factory import ControllerFactory
 from impact_posture.simulation.metrics import measure
-from impact_posture.simulation.scenario import set_up
 from impact_posture.simulation.scenario_file import read_scenario
 from impact_posture.simulation.scenario_objective import interpreted
+from impact_posture.simulation.setup import set_up
 from impact_posture.simulation.world.sensor_noise import Reading
 from impact_posture.system.libraries import cache_path
 from tests.simulation.factories import driven, factory, needs_mujoco

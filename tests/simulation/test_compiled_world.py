@@ -16,8 +16,8 @@ from impact_posture.simulation import compiled_world, run
 from impact_posture.simulation.controllers.controller_factory import ControllerFactory
 from impact_posture.simulation.metrics import measure
 from impact_posture.simulation.outcome import judge
-from impact_posture.simulation.scenario import set_up
 from impact_posture.simulation.scenario_file import read_scenario
+from impact_posture.simulation.setup import set_up
 from impact_posture.simulation.world.actuator_command import ActuatorCommand
 from tests.simulation.factories import controller_factory, driven, factory, fields_of, near, needs_mujoco, shortened
 from tests.support.daqp import sources_or_skip

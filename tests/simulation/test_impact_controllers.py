@@ -8,7 +8,7 @@ import pytest
 from impact_posture.simulation.controllers.contact_reference import Reference
 from impact_posture.simulation.controllers.impact_baselines import ImpactAwareDriver, ReferenceSpreadingDriver
 from impact_posture.simulation.metrics import before
-from impact_posture.simulation.scenario import RepeatedContacts
+from impact_posture.simulation.scenario_file import RepeatedContacts
 from impact_posture.simulation.world.sensor_noise import Reading
 from tests.simulation.factories import factory, lived, needs_mujoco
 from tests.support.helpers import Vector, frame_jacobian, mass_matrix, rng

@@ -15,9 +15,9 @@ from impact_posture.posture.search.solver_runs import feasible
 from impact_posture.robot.actuation import allocation_matrix, thrust_limits
 from impact_posture.simulation import offline_posture as offline
 from impact_posture.simulation.offline_posture import SHARE, offline_posture, scenario_requirements
-from impact_posture.simulation.scenario import set_up
 from impact_posture.simulation.scenario_file import read_scenario
 from impact_posture.simulation.scenario_objective import scenario_objective
+from impact_posture.simulation.setup import set_up
 from impact_posture.tsid.flow.flow_direction import FlowOptions
 from tests.simulation.factories import needs_mujoco
 

@@ -15,9 +15,9 @@ from impact_posture.simulation.metrics import measure
 from impact_posture.simulation.outcome import Event, judge, links_behind
 from impact_posture.simulation.recorder import STATUSES
 from impact_posture.simulation.run import Run
-from impact_posture.simulation.scenario import Bounds, Setup, set_up
-from impact_posture.simulation.scenario_file import read_scenario
+from impact_posture.simulation.scenario_file import Bounds, read_scenario
 from impact_posture.simulation.series import Window
+from impact_posture.simulation.setup import Setup, set_up
 from impact_posture.tsid.controller import Status
 from tests.simulation.factories import SHIPPED, by_hand, controller_factory, driven, factory, needs_mujoco, shortened
 

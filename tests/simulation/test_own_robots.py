@@ -17,8 +17,8 @@ from impact_posture.simulation.controllers.controller_factory import CONTROLLERS
 from impact_posture.simulation.metrics import measure
 from impact_posture.simulation.prediction import predict
 from impact_posture.simulation.run import run
-from impact_posture.simulation.scenario import set_up
 from impact_posture.simulation.scenario_file import read_scenario
+from impact_posture.simulation.setup import set_up
 from tests.simulation.factories import controller_factory, driven, fields_of, needs_mujoco
 from tests.support.helpers import robot
 

@@ -14,12 +14,13 @@ from impact_posture.simulation.metrics import JUMP, before, measure
 from impact_posture.simulation.prediction import Prediction, predict
 from impact_posture.simulation.recorder import Recorder
 from impact_posture.simulation.run import Run
-from impact_posture.simulation.scenario import Setup
 from impact_posture.simulation.scenario_file import read_scenario
 from impact_posture.simulation.scenario_objective import scenario_objective
 from impact_posture.simulation.series import Window
+from impact_posture.simulation.setup import Setup
 from impact_posture.simulation.world.actuator_command import ActuatorCommand
-from impact_posture.simulation.world.scene import ContactLaw, Physics, Scene, Sensors
+from impact_posture.simulation.world.contact_law import ContactLaw
+from impact_posture.simulation.world.scene import Physics, Scene, Sensors
 from impact_posture.simulation.world.world import build_world
 from impact_posture.tsid.controller import Command, Status
 from tests.simulation.factories import driven, factory, needs_mujoco

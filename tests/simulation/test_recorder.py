@@ -10,7 +10,7 @@ import pytest
 
 from impact_posture.errors import MetricError
 from impact_posture.simulation.recorder import STATUSES, Recorder
-from impact_posture.simulation.scenario import Setup
+from impact_posture.simulation.setup import Setup
 from impact_posture.simulation.world.actuator_command import Trace
 from impact_posture.tsid.controller import Command, Status
 from tests.simulation.factories import factory, needs_mujoco

@@ -15,8 +15,8 @@ from impact_posture.simulation.metrics import measure
 from impact_posture.simulation.outcome import judge
 from impact_posture.simulation.prediction import predict
 from impact_posture.simulation.run import Run, run
-from impact_posture.simulation.scenario import RepeatedContacts, SinglePush, set_up
-from impact_posture.simulation.scenario_file import read_scenario
+from impact_posture.simulation.scenario_file import RepeatedContacts, SinglePush, read_scenario
+from impact_posture.simulation.setup import set_up
 from impact_posture.simulation.world.world import build_world
 from tests.simulation.factories import (
     AERIAL,

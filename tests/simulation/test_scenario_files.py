@@ -23,16 +23,16 @@ from impact_posture.simulation.controller_gains import Gains, StanceGains
 from impact_posture.simulation.controllers.contact_reference import Reference
 from impact_posture.simulation.controllers.controller_factory import ControllerFactory
 from impact_posture.simulation.run import run
-from impact_posture.simulation.scenario import (
+from impact_posture.simulation.scenario_file import SHIPPED as SHIPPED_FOLDER
+from impact_posture.simulation.scenario_file import (
     Bounds,
     RepeatedContacts,
     Scenario,
     SinglePush,
-    naming_keys,
-    set_up,
+    known_scenarios,
+    read_scenario,
 )
-from impact_posture.simulation.scenario_file import SHIPPED as SHIPPED_FOLDER
-from impact_posture.simulation.scenario_file import known_scenarios, read_scenario
+from impact_posture.simulation.setup import naming_keys, set_up
 from impact_posture.simulation.world.actuator_command import ActuatorCommand
 
 DOCS = Path(__file__).parents[2] / "docs"

@@ -25,9 +25,9 @@ from impact_posture.impact.worst_case_objective import WorstCaseObjective
 from impact_posture.simulation import scenario_objective as module
 from impact_posture.simulation.controllers.controller_factory import ControllerFactory
 from impact_posture.simulation.controllers.driver import RobustDriver
-from impact_posture.simulation.scenario import set_up
 from impact_posture.simulation.scenario_file import read_scenario
 from impact_posture.simulation.scenario_objective import compiled, interpreted, scenario_objective
+from impact_posture.simulation.setup import set_up
 from impact_posture.system.libraries import hash_path
 from tests.simulation.factories import factory, needs_mujoco
 from tests.support.helpers import Vector, assert_close, central_gradient, frame_jacobian, mass_matrix, rng, robot

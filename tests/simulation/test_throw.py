@@ -17,8 +17,8 @@ from impact_posture.simulation.outcome import judge
 from impact_posture.simulation.prediction import predict
 from impact_posture.simulation.recorder import feet_of
 from impact_posture.simulation.run import run
-from impact_posture.simulation.scenario import Setup, set_up
 from impact_posture.simulation.scenario_file import SHIPPED, read_scenario
+from impact_posture.simulation.setup import Setup, set_up
 from impact_posture.simulation.world.actuator_command import ActuatorCommand
 from impact_posture.simulation.world.throw import FLIGHT, Throw, thrown_jumps
 from impact_posture.simulation.world.world import World, build_world

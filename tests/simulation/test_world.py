@@ -15,7 +15,8 @@ from impact_posture.impact.worst_case_objective import WorstCaseObjective
 from impact_posture.robot.actuation import actuation_matrix, hover
 from impact_posture.robot.robot import Robot
 from impact_posture.simulation.world.actuator_command import ActuatorCommand, Push, Truth
-from impact_posture.simulation.world.scene import ContactLaw, Physics, Scene, Sensors, Shape, Surface
+from impact_posture.simulation.world.contact_law import ContactLaw
+from impact_posture.simulation.world.scene import Physics, Scene, Sensors, Shape, Surface
 from impact_posture.simulation.world.world import World, build_world
 from impact_posture.simulation.world.world_builder import build_scene
 from tests.dynamics.test_mjcf import qacc

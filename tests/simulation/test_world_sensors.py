@@ -25,8 +25,9 @@ from impact_posture.robot.actuation import hover
 from impact_posture.robot.robot import Robot
 from impact_posture.robot.robot_spec import RobotSpec
 from impact_posture.simulation.world.actuator_command import ActuatorCommand, Push
+from impact_posture.simulation.world.contact_law import ContactLaw
 from impact_posture.simulation.world.rotors import Vibration
-from impact_posture.simulation.world.scene import ContactLaw, Physics, Scene, Sensors, Shape, Surface
+from impact_posture.simulation.world.scene import Physics, Scene, Sensors, Shape, Surface
 from impact_posture.simulation.world.world import World, build_world
 from tests.support.helpers import assert_close, mass_matrix, random_configurations, robot
 from tests.support.restitution import ball, ideal_restitution, measure_restitution

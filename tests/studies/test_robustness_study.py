@@ -51,8 +51,8 @@ from impact_posture.robot.robot_loader import load_robot
 from impact_posture.simulation.controllers.controller_factory import ControllerFactory
 from impact_posture.simulation.metrics import Metrics
 from impact_posture.simulation.run import Run
-from impact_posture.simulation.scenario import RepeatedContacts, Setup, SinglePush, set_up
-from impact_posture.simulation.scenario_file import read_scenario
+from impact_posture.simulation.scenario_file import RepeatedContacts, SinglePush, read_scenario
+from impact_posture.simulation.setup import Setup, set_up
 
 DOCS = Path(__file__).parents[2] / "docs"
 AERIAL, STANDING = "aerial-vertical", "solo8-push"

@@ -17,8 +17,8 @@ from docs.studies.core import page_of
 from docs.studies.scan import ARM, HUMANOID, Place
 from impact_posture.dynamics.numeric import Numeric
 from impact_posture.impact.impact_contact import point_on
-from impact_posture.simulation.scenario import set_up
 from impact_posture.simulation.scenario_file import read_scenario
+from impact_posture.simulation.setup import set_up
 
 
 def test_the_arm_looks_at_the_floor_along_the_whole_scan() -> None:

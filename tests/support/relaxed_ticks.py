@@ -10,8 +10,8 @@ import numpy as np
 import pytest
 
 from impact_posture.simulation.controllers.controller_factory import ControllerFactory
-from impact_posture.simulation.scenario import set_up
 from impact_posture.simulation.scenario_file import read_scenario
+from impact_posture.simulation.setup import set_up
 from impact_posture.simulation.world.actuator_command import Push
 from impact_posture.simulation.world.world import SimulationDiverged
 from impact_posture.tsid import relaxation

@@ -12,7 +12,8 @@ from impact_posture.errors import InputError
 from impact_posture.robot.robot import Robot
 from impact_posture.robot.robot_spec import RobotSpec
 from impact_posture.simulation.world.actuator_command import ActuatorCommand
-from impact_posture.simulation.world.scene import ContactLaw, Physics, Scene, Shape, Surface
+from impact_posture.simulation.world.contact_law import ContactLaw
+from impact_posture.simulation.world.scene import Physics, Scene, Shape, Surface
 from impact_posture.simulation.world.world import World, build_world
 
 _RADIUS = 0.02

@@ -12,7 +12,7 @@ from impact_posture.robot.robot import Robot
 from impact_posture.simulation.controllers.controller_factory import ControllerFactory, Mode
 from impact_posture.simulation.controllers.driver import Driver
 from impact_posture.simulation.controllers.task_formulations import nominal_posture
-from impact_posture.simulation.scenario import Setup
+from impact_posture.simulation.setup import Setup
 from impact_posture.tsid.state import State
 
 Vector = NDArray[np.float64]

@@ -18,9 +18,9 @@ from impact_posture.posture.manifold.feasible_start import Projector
 from impact_posture.posture.program.constrained_problem import Requirements
 from impact_posture.robot.robot_loader import load_robot
 from impact_posture.simulation.controller_gains import Gains, StanceGains
-from impact_posture.simulation.scenario import RepeatedContacts, Scenario, Setup, SinglePush, set_up
-from impact_posture.simulation.scenario_file import read_scenario
+from impact_posture.simulation.scenario_file import RepeatedContacts, Scenario, SinglePush, read_scenario
 from impact_posture.simulation.scenario_objective import scenario_objective
+from impact_posture.simulation.setup import Setup, set_up
 from impact_posture.simulation.world.world import build_world
 
 # To bound the time, the same for every point and less than in the scenarios' files: contacts, seconds behind the

@@ -25,8 +25,8 @@ from impact_posture.simulation.controllers.controller_factory import ControllerF
 from impact_posture.simulation.metrics import before
 from impact_posture.simulation.offline_posture import SHARE, OfflinePosture, offline_posture, scenario_requirements
 from impact_posture.simulation.run import Run
-from impact_posture.simulation.scenario import Setup
 from impact_posture.simulation.scenario_objective import interpreted
+from impact_posture.simulation.setup import Setup
 
 SCHEMA = 3
 NOMINAL = "nominal"

@@ -8,8 +8,8 @@ import pinocchio as pin
 from impact_posture.robot.robot import Robot
 from impact_posture.simulation.controllers.contact_reference import ReferencePoint
 from impact_posture.simulation.controllers.driver import MOVE, Driver, RobustDriver
-from impact_posture.simulation.scenario import Setup
 from impact_posture.simulation.scenario_objective import Gradient
+from impact_posture.simulation.setup import Setup
 from impact_posture.simulation.world.sensor_noise import Reading
 from impact_posture.system.arrays import Array
 from impact_posture.tsid.controller import Command

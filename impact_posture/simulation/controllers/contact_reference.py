@@ -9,7 +9,7 @@ from typing import NamedTuple
 import numpy as np
 
 from impact_posture.errors import InputError
-from impact_posture.simulation.scenario import RepeatedContacts
+from impact_posture.simulation.scenario_file import RepeatedContacts
 
 
 class ReferencePoint(NamedTuple):

@@ -32,8 +32,8 @@ from impact_posture.simulation.controllers.impact_baselines import (
 )
 from impact_posture.simulation.controllers.task_formulations import nominal_posture, posture_options
 from impact_posture.simulation.offline_posture import OfflinePosture, offline_posture
-from impact_posture.simulation.scenario import Setup
 from impact_posture.simulation.scenario_objective import Gradient, compiled, interpreted, scenario_objective
+from impact_posture.simulation.setup import Setup
 from impact_posture.system.arrays import Array
 from impact_posture.system.progress import tell
 from impact_posture.system.toolchain import find_compiler

@@ -11,7 +11,7 @@ from impact_posture.path.posture_path import PosturePath
 from impact_posture.simulation.controllers.compiled_tick import CompiledTick
 from impact_posture.simulation.controllers.contact_reference import ReferencePoint
 from impact_posture.simulation.controllers.task_formulations import build_formulation, end_effector_task
-from impact_posture.simulation.scenario import Setup
+from impact_posture.simulation.setup import Setup
 from impact_posture.simulation.world.sensor_noise import Reading
 from impact_posture.system.arrays import Array
 from impact_posture.tsid.controller import Command, Controller

@@ -9,7 +9,7 @@ import numpy as np
 
 from impact_posture.simulation.controllers.contact_reference import ReferencePoint
 from impact_posture.simulation.controllers.driver import Driver
-from impact_posture.simulation.scenario import Setup
+from impact_posture.simulation.setup import Setup
 from impact_posture.simulation.world.sensor_noise import Reading
 from impact_posture.system.arrays import Array
 from impact_posture.tsid.controller import Command, Controller

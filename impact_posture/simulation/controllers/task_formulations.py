@@ -11,7 +11,7 @@ from impact_posture.dynamics.numeric import Numeric
 from impact_posture.errors import FrameNotFound, SpecError
 from impact_posture.impact.impact_contact import point_on
 from impact_posture.simulation.controller_gains import StanceGains
-from impact_posture.simulation.scenario import Setup
+from impact_posture.simulation.setup import Setup
 from impact_posture.tsid.point_kinematics import Point
 from impact_posture.tsid.support_contact import SupportContact, support_contacts
 from impact_posture.tsid.task_formulation import TaskFormulation

@@ -12,41 +12,9 @@ from impact_posture.config.toml_tables import Checked
 from impact_posture.errors import InputError
 from impact_posture.impact.impact_contact import LARGEST
 from impact_posture.robot.robot_spec import NonNegative, Positive
+from impact_posture.simulation.world.contact_law import ContactLaw, Finite, FiniteVector
 
 ShapeKind = Literal["sphere", "box"]
-Finite = Annotated[float, Field(allow_inf_nan=False)]
-FiniteVector = tuple[Finite, Finite, Finite]
-
-
-@dataclass(frozen=True, kw_only=True)
-class ContactLaw(Checked):
-    """Spring and damper with which MuJoCo lets a surface push, scaled by the mass that the contact feels.
-
-    At distance r (negative inside) the contact wants the acceleration ``r* = −b r' − k r`` with ``b = 2/(d₁T)`` and
-    ``k = d/(d₁Tζ)²`` of ``solref = (T, ζ)``.  If both numbers are negative, they are ``(−k, −b)``.  The contact gets
-    the share d of it, ``r'' = d r* + (1 − d) r''₀``, where ``r''₀`` is the acceleration without contact.  With
-    ``solimp = (d₀, d₁, width)``, d rises from ``d₀`` at depth 0 to ``d₁`` at depth ``width`` (m).
-    The page on simulation has the measured restitution of many laws (``make calibration``).
-
-    Attributes:
-        solref: Time constant T in s and damping ratio ζ.
-        solimp: ``d₀``, ``d₁`` and the width in m.
-        friction: Coulomb coefficient, 0 for no friction.
-    """
-
-    solref: tuple[Finite, Finite] = (0.002, 1.0)
-    solimp: FiniteVector = (0.95, 0.99, 0.001)
-    friction: NonNegative = 0.7
-
-    def __post_init__(self) -> None:
-        """Refuse numbers that MuJoCo would silently change."""
-        super().__post_init__()
-        a, b = self.solref
-        if not ((a > 0 and b > 0) or (a < 0 and b <= 0)):
-            raise _wrong("solref", self.solref, "give a time and a damping ratio above zero, or both numbers below")
-        low, high, width = self.solimp
-        if not (0.0001 <= low <= high <= 0.9999 and width > 0):
-            raise _wrong("solimp", self.solimp, "give 0.0001 ≤ d₀ ≤ d₁ ≤ 0.9999 and a width above zero (m)")
 
 
 @dataclass(frozen=True)
@@ -214,7 +182,3 @@ class Scene(Checked):
                 where="sensors",
                 hint=f"one of: {', '.join(frames)}" if frames else "add a shape",
             )
-
-
-def _wrong(key: str, value: object, hint: str) -> InputError:
-    return InputError(f"{key} is {value}", where="scene", hint=hint)

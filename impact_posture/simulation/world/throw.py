@@ -13,7 +13,7 @@ from impact_posture.dynamics.mjcf import Mjcf, import_mujoco
 from impact_posture.errors import InputError
 from impact_posture.impact.quantities.impact_oracle import ImpactOracle
 from impact_posture.robot.robot_spec import NonNegative, Positive
-from impact_posture.simulation.world.scene import ContactLaw, FiniteVector
+from impact_posture.simulation.world.contact_law import ContactLaw, FiniteVector
 from impact_posture.system.arrays import Array
 from impact_posture.system.escape import xml_name
 

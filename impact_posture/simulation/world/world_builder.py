@@ -16,7 +16,8 @@ from impact_posture.errors import InputError, UnsupportedJoint
 from impact_posture.impact.impact_contact import point_on
 from impact_posture.robot.actuation import actuation_matrix
 from impact_posture.robot.robot import Robot
-from impact_posture.simulation.world.scene import ContactLaw, Physics, Scene, Shape, Surface
+from impact_posture.simulation.world.contact_law import ContactLaw
+from impact_posture.simulation.world.scene import Physics, Scene, Shape, Surface
 from impact_posture.simulation.world.throw import BALL, Throw, add_ball
 from impact_posture.system.arrays import Array
 from impact_posture.system.escape import xml_name

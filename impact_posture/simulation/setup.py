@@ -1,0 +1,103 @@
+"""A scenario that is ready to run: the loaded robot in its start posture, and the world around it."""
+
+from __future__ import annotations
+
+from collections.abc import Iterator
+from contextlib import contextmanager
+from dataclasses import dataclass, fields
+
+from impact_posture.config.option_names import as_keys
+from impact_posture.errors import ImpactPostureError, JointLocked, NameNotFound, SpecError
+from impact_posture.robot.actuation import allocation
+from impact_posture.robot.posture_files import read_posture, set_joints
+from impact_posture.robot.robot import Robot
+from impact_posture.robot.robot_loader import load_robot
+from impact_posture.simulation.scenario_file import Scenario, ScenarioTable
+from impact_posture.simulation.world.world import World, build_world
+from impact_posture.system.arrays import Array
+from impact_posture.system.progress import tell
+
+_KEYS = {field.name for field in fields(ScenarioTable)}
+# Settings of a problem whose key in a scenario has another name.
+_RENAMED = {"contact_pose": "control.end_effector.pose"}
+
+
+@dataclass(frozen=True, eq=False)
+class Setup:
+    """An experiment that is ready to run.
+
+    Attributes:
+        scenario: The experiment.
+        robot: The loaded robot.
+        q: Start posture, shape (nq,).
+        world: The simulated world, before its first reset.
+    """
+
+    scenario: Scenario
+    robot: Robot
+    q: Array
+    world: World
+
+    @property
+    def gap(self) -> float:
+        """Distance of the shape that hits from its surface at the start, m.
+
+        Raises:
+            InputError: The robot is pushed instead.
+        """
+        return self.world.built.gaps[self.scenario.surface.name, self.scenario.shape.frame]
+
+
+def set_up(scenario: Scenario) -> Setup:
+    """Load the robot, pose it, and build the world around it.
+
+    Raises:
+        ImpactPostureError: Something does not fit.
+    """
+    tell(f"loading {scenario.robot}")
+    with naming_keys(scenario):
+        robot = load_robot(scenario.robot, scenario)
+        _check_base(robot, scenario)
+        if rigid := [joint for joint in scenario.joints if joint in robot.locked]:
+            raise JointLocked(rigid[0], where=scenario.source)
+        start = read_posture(robot, scenario.posture, where="posture")
+        q = set_joints(robot, start, scenario.joints, scenario.source)
+        q = robot.check_posture(q, where=scenario.source)
+        robot.frame_id(scenario.task.frame)
+        return Setup(scenario, robot, q, build_world(robot, scenario, q, scenario.throw))
+
+
+@contextmanager
+def naming_keys(scenario: Scenario) -> Iterator[None]:
+    """Let errors name the keys of a scenario and its file, where they name settings."""
+    try:
+        yield
+    except ImpactPostureError as error:
+        where = error.where
+        if {where.partition(" ")[0], where.rpartition(" ")[2]} & _KEYS and scenario.source:
+            where = f"{scenario.source}, {where}"
+        elif where in ("", "problem") or (isinstance(error, NameNotFound) and "." not in where):
+            # What a robot lacks is named in the scenario, but a key of robot.toml is not.
+            where = scenario.source
+        error.reword(as_keys(error.what, _RENAMED), where, as_keys(error.hint, _RENAMED))
+        raise
+
+
+def _check_base(robot: Robot, scenario: Scenario) -> None:
+    """Refuse a floating base that nothing holds, or that its rotors cannot push in every direction."""
+    if not robot.floating or scenario.control.footing is not None:
+        return
+    propulsion = robot.spec.propulsion
+    if propulsion is None:
+        feet = "add [control.footing] to the scenario" if robot.spec.supports else (
+            "add [propulsion] or [[supports]] to its robot.toml, or set root to fixed"
+        )  # fmt: skip
+        missing = "the scenario has no [control.footing]" if robot.spec.supports else "its data names no feet"
+        raise SpecError(f"{robot.name} would fall: it has no rotors and {missing}", where=scenario.source, hint=feet)
+    rank = allocation(robot.model, propulsion).rank
+    if rank < 6:
+        raise SpecError(
+            f"the rotors of {robot.name} push and turn its base in {rank} of 6 directions",
+            where=scenario.source,
+            hint="the controllers need all 6: tilt the rotors, or take another robot",
+        )
