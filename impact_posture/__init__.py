@@ -33,7 +33,7 @@ if TYPE_CHECKING:
     from impact_posture.controller_export.export_controller import export_controller as export_controller
     from impact_posture.errors import ImpactPostureError as ImpactPostureError
     from impact_posture.impact.impact_contact import ImpactContact as ImpactContact
-    from impact_posture.impact.jump_metric import Metric as Metric
+    from impact_posture.impact.metric import Metric as Metric
     from impact_posture.robot.robot import Robot as Robot
     from impact_posture.robot.robot_loader import known_robots as known_robots
     from impact_posture.robot.robot_loader import load_robot as load_robot
@@ -47,7 +47,7 @@ _HOMES = {
     "ImpactGradient": "codegen.impact_gradient",
     "ImpactObjective": "api.impact_objective",
     "ImpactPostureError": "errors",
-    "Metric": "impact.jump_metric",
+    "Metric": "impact.metric",
     "PostureProblem": "api.posture_problem",
     "PostureResult": "api.posture_result",
     "Robot": "robot.robot",

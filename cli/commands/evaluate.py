@@ -11,7 +11,7 @@ from impact_posture_cli.output import Page, number, print_json, vector
 from impact_posture_cli.settings_options import Given, with_settings
 
 if TYPE_CHECKING:
-    from impact_posture.impact.elasticity.elastic_joints import ElasticResponse
+    from impact_posture.impact.elasticity.elastic_impact import ElasticResponse
     from impact_posture.impact.evaluation.coulomb_jump import CoulombJump
     from impact_posture.impact.evaluation.ellipsoids import Ellipsoid
     from impact_posture.impact.evaluation.evaluation import Evaluation

@@ -18,7 +18,7 @@ from docs.studies.core import ROOT, Request, collected, table
 from impact_posture.errors import ImpactPostureError, MetricError
 from impact_posture.experiment.job_store import key_of
 from impact_posture.experiment.jobs import Job, execute
-from impact_posture.impact.friction.coulomb_impulse import coulomb_impact
+from impact_posture.impact.friction.coulomb_impact import coulomb_impact
 from impact_posture.simulation.controllers.baselines import resting_posture
 from impact_posture.simulation.controllers.controller_factory import CONTROLLERS, ControllerFactory
 from impact_posture.simulation.scenario_file import RepeatedContacts, Scenario, read_scenario

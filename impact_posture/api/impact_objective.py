@@ -18,9 +18,10 @@ from impact_posture.config.settings import (
 )
 from impact_posture.errors import InputError
 from impact_posture.impact.evaluation.evaluation import Evaluation, evaluate
-from impact_posture.impact.impact_contact import ImpactContact, check_compliance
-from impact_posture.impact.jump_metric import Metric, build_metric, check_weights
+from impact_posture.impact.impact_contact import ImpactContact
+from impact_posture.impact.metric import Metric, build_metric, check_weights
 from impact_posture.impact.resolved_impact import missing_support
+from impact_posture.impact.support_compliance import check_compliance
 from impact_posture.impact.supports import refuse_held, refuse_rigid, resolve_supports
 from impact_posture.impact.worst_case_objective import WorstCaseObjective
 from impact_posture.robot.joint_model import with_joint_model
@@ -41,7 +42,7 @@ class ImpactObjective(WorstCaseObjective):
         robot: The robot.
         contact: Contact of the impact, or several contacts that act at once.  A contact without an offset at the
             contact frame of robot.toml takes the offset from there.
-        metric: ``euclidean``, ``kinetic`` or ``weighted``, or a :class:`~impact_posture.impact.jump_metric.Metric`.
+        metric: ``euclidean``, ``kinetic`` or ``weighted``, or a :class:`~impact_posture.impact.metric.Metric`.
         kind: ``impulse`` (λ̄²H), ``speed`` (V), ``sticking`` (S), ``coulomb`` (C) or ``energy`` (E).
         supports: Feet that stay, as ``FRAME[:point|surface]``; ``None`` for those of robot.toml, ``()`` for none.
         compliance: ε of the supports, 1/kg; 0 for 1e-4 over the robot's mass.
@@ -116,10 +117,10 @@ class ImpactObjective(WorstCaseObjective):
             build: Whether to build and check the library, if a C compiler is installed.
             options: Options ``prefix``, ``posture``, ``single``, ``portable`` and ``force`` of :func:`write_export`.
         """
-        from impact_posture.codegen.existing_export import kept_export
+        from impact_posture.codegen.existing_export import existing_export
         from impact_posture.codegen.export import write_export
 
-        kept = None if options else kept_export(self, Path(out), build=build)
+        kept = None if options else existing_export(self, Path(out), build=build)
         return kept or write_export([self], Path(out), build=build, **options)
 
 

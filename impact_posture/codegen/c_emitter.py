@@ -6,16 +6,12 @@ arithmetic is written as that of numbers.
 
 from __future__ import annotations
 
-import math
 import re
 from collections.abc import Mapping
 from dataclasses import dataclass
-from typing import Any
-
-import numpy as np
-from numpy.typing import ArrayLike, NDArray
 
 from impact_posture.codegen.block_layout import Block, Layout
+from impact_posture.codegen.c_literals import Real
 from impact_posture.codegen.expression_graph import COSINE, Node
 
 # Approximate number of characters in the place of a constant.
@@ -28,62 +24,6 @@ _SHARED = ("s", "c", "w", "w2", "w4")
 # The compiler splits a vector that is wider than the processor's.  Without optimization the parts and the whole have
 # a place each.
 _HALVES = 2
-_MATH = re.compile(r"\b(exp|log|pow|sqrt|a?sin|a?cos|a?tan|atan2|tanh|hypot|fabs|fmin|fmax)\(")
-
-
-@dataclass(frozen=True)
-class Real:
-    """The C type that an export computes in.
-
-    Attributes:
-        name: ``double`` or ``float``.
-        size: Bytes of a number.
-        unit_tolerance: Largest distance of the norm of a quaternion from one.
-    """
-
-    name: str
-    size: int
-    unit_tolerance: float
-
-    @property
-    def dtype(self) -> np.dtype[np.floating[Any]]:
-        """The same type in numpy."""
-        return np.dtype(np.float64 if self.name == "double" else np.float32)
-
-    def rounded(self, values: ArrayLike) -> NDArray[np.float64]:
-        """Return the nearest numbers of this type, as doubles."""
-        return np.array(values, dtype=self.dtype).astype(np.float64)
-
-    def literal(self, value: float) -> str:
-        """Return a literal that reads back as the nearest number; a negative one is in parentheses."""
-        if self.name == "double" or not math.isfinite(value):
-            return c_double(value)
-        with np.errstate(over="ignore", under="ignore"):
-            nearest = np.float32(value)
-        text = c_double(float(str(nearest)))
-        if not np.isfinite(nearest):
-            return text
-        return f"{text[:-1]}f)" if text.endswith(")") else f"{text}f"
-
-    def spelled(self, operation: str) -> str:
-        """Return the C of an operation on doubles in this type: ``sinf`` for ``sin``, ``1.0f`` for ``1.0``."""
-        if self.name == "double":
-            return operation
-        text = _MATH.sub(r"\1f(", operation).replace("(double)", "(float)")
-        return re.sub(r"\b\d+\.\d+", r"\g<0>f", text)
-
-
-DOUBLE = Real("double", 8, 1e-6)
-FLOAT = Real("float", 4, 1e-5)
-REALS = {real.name: real for real in (DOUBLE, FLOAT)}
-
-
-def c_double(value: float) -> str:
-    """Return a double literal that reads back exactly; a negative one is in parentheses."""
-    if math.isnan(value):
-        return "NAN"
-    text = "INFINITY" if math.isinf(value) else repr(abs(value))
-    return f"(-{text})" if math.copysign(1.0, value) < 0 else text
 
 
 @dataclass(frozen=True)
@@ -128,7 +68,7 @@ class Constants:
         """Return the C of the tables, with the type of each width, and of their short names."""
         lines = []
         for width, known in sorted(self._tables.items()):
-            rows = [", ".join(self._real.literal(v).strip("()") for v in value) for value in known]
+            rows = [", ".join(self._real.plain(v) for v in value) for value in known]
             if width > 1:
                 rows = ["{" + row + "}" for row in rows]
             body = ",\n".join(f"  {row}" for row in rows)

@@ -7,7 +7,7 @@ from dataclasses import replace
 from pathlib import Path
 from typing import Any
 
-from impact_posture.codegen.build_check import compile_and_check
+from impact_posture.codegen.compile_and_check import compile_and_check
 from impact_posture.codegen.export import Export, default_prefix
 from impact_posture.codegen.manifest_builder import build_manifest
 from impact_posture.impact.worst_case_objective import WorstCaseObjective
@@ -19,7 +19,7 @@ from impact_posture.system.toolchain import find_compiler
 _OTHERS = ("posture", "compression", "stack_bytes")
 
 
-def kept_export(objective: WorstCaseObjective, out: Path, *, build: bool) -> Export | None:
+def existing_export(objective: WorstCaseObjective, out: Path, *, build: bool) -> Export | None:
     """Return the export of an objective that a folder holds already, such as ``c/`` of a result; else ``None``.
 
     The manifest may also state a posture and the compression of the impact.  All else must be what

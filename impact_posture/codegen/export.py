@@ -11,14 +11,14 @@ from typing import Any
 
 import numpy as np
 
-from impact_posture.codegen.build_check import compile_and_check
-from impact_posture.codegen.c_emitter import DOUBLE, FLOAT, Real
+from impact_posture.codegen.c_literals import DOUBLE, FLOAT, Real
 from impact_posture.codegen.c_names import c_identifier, check_prefix, products
-from impact_posture.codegen.export_files import render
-from impact_posture.codegen.export_functions import NamedObjective, named_objectives
+from impact_posture.codegen.c_source import CSource, build_c_source
+from impact_posture.codegen.compile_and_check import compile_and_check
+from impact_posture.codegen.export_files import render_files
+from impact_posture.codegen.export_library import NamedObjective, named_objectives
 from impact_posture.codegen.impact_gradient import ImpactGradient
 from impact_posture.codegen.manifest_builder import build_manifest
-from impact_posture.codegen.source_blocks import Code, build_code
 from impact_posture.config.argument_types import checked
 from impact_posture.errors import CompilerError, InputError, OutputError
 from impact_posture.impact.elasticity.contact_compression import Compression
@@ -162,7 +162,7 @@ def export(
         posture = given if np.allclose(given, posture, rtol=0, atol=1e-9) else posture
     exported, code = cached_code(tuple(objectives), prefix, real, portable)
     manifest = build_manifest(objectives, prefix, posture, compression, real, code.stack_bytes, portable=portable)
-    texts = render(exported, prefix, manifest, code, real)
+    texts = render_files(exported, prefix, manifest, code, real)
     texts[f"{prefix}.json"] = json.dumps(manifest, indent=2, allow_nan=False) + "\n"
     there = [name for name in texts if (out / name).exists()]
     if there and not force:
@@ -178,10 +178,10 @@ def export(
 @lru_cache(maxsize=1)
 def cached_code(
     objectives: tuple[WorstCaseObjective, ...], prefix: str, real: Real, portable: bool
-) -> tuple[tuple[NamedObjective, ...], Code]:
+) -> tuple[tuple[NamedObjective, ...], CSource]:
     """Return the functions of an export, which take most of the time of :func:`export` and need no posture."""
     exported = named_objectives(objectives, prefix)
-    return exported, build_code(exported, prefix, real, portable=portable)
+    return exported, build_c_source(exported, prefix, real, portable=portable)
 
 
 @checked

@@ -13,12 +13,13 @@ from typing import Any
 
 from jinja2 import Environment, PackageLoader, StrictUndefined, Template
 
-from impact_posture.codegen.build_check import self_test_tolerance
-from impact_posture.codegen.c_emitter import DOUBLE, SHORT_NAMES, Real
-from impact_posture.codegen.c_names import SIGNATURES, lengths
-from impact_posture.codegen.export_functions import NamedObjective
+from impact_posture.codegen.c_emitter import SHORT_NAMES
+from impact_posture.codegen.c_literals import DOUBLE, Real, brace_initializer
+from impact_posture.codegen.c_source import CSource
+from impact_posture.codegen.export_functions import SIGNATURES, lengths
+from impact_posture.codegen.export_library import NamedObjective
 from impact_posture.codegen.manifest_reader import identity
-from impact_posture.codegen.source_blocks import Code
+from impact_posture.codegen.self_test import self_test_tolerance
 from impact_posture.impact.worst_case_objective import WorstCaseObjective
 from impact_posture.robot.robot import unit_parts
 from impact_posture.system.escape import c_comment, markdown
@@ -33,8 +34,8 @@ class Verbatim(str):
     __slots__ = ()
 
 
-def render(
-    exported: Sequence[NamedObjective], prefix: str, manifest: dict[str, Any], code: Code, real: Real
+def render_files(
+    exported: Sequence[NamedObjective], prefix: str, manifest: dict[str, Any], code: CSource, real: Real
 ) -> dict[str, str]:
     """Return file name → text of every file but the manifest."""
     context = _context(exported, prefix, manifest, code, real)
@@ -71,9 +72,9 @@ def environment(package: str, escape: Callable[[str], str]) -> Environment:
         "verbatim": str,
         "c_comment": c_comment,
         "numbers": lambda values: ", ".join(f"{v:.9g}" for v in values),
-        "double": lambda value: _plain(DOUBLE, value),
-        "doubles": partial(_initializer, DOUBLE, indent="  "),
-        "places": lambda values: _rows([str(v) for v in values], 20, "  "),
+        "double": DOUBLE.plain,
+        "doubles": partial(DOUBLE.initializer, indent="  "),
+        "places": lambda values: brace_initializer([str(v) for v in values], 20, "  "),
         "wrapped": lambda words, indent: wrapped(map(escape, words), indent),
         "lines": lambda parts, between: between.join(map(escape, parts)),
     }
@@ -97,21 +98,6 @@ def wrapped(words: Iterable[str], indent: str) -> str:
     return f"\n{indent}".join([*lines, line])
 
 
-def _plain(real: Real, value: float) -> str:
-    """A literal without the parentheses of negative numbers, which an initializer does not need."""
-    return real.literal(float(value)).strip("()")
-
-
-def _initializer(real: Real, values: Sequence[float], indent: str = "") -> str:
-    """A brace initializer with four numbers a line."""
-    return _rows([_plain(real, v) for v in values], 4, indent)
-
-
-def _rows(texts: Sequence[str], count: int, indent: str) -> str:
-    rows = [", ".join(texts[k : k + count]) for k in range(0, len(texts), count)]
-    return "{\n" + ",\n".join(f"{indent}  {row}" for row in rows) + f"\n{indent}}}"
-
-
 def _parameters(real: Real, sizes: Mapping[str, int], function: str) -> str:
     """C parameters of an exported function."""
     inputs, results = SIGNATURES[function]
@@ -126,7 +112,7 @@ def _parameters(real: Real, sizes: Mapping[str, int], function: str) -> str:
 
 
 def _context(
-    exported: Sequence[NamedObjective], prefix: str, manifest: dict[str, Any], code: Code, real: Real
+    exported: Sequence[NamedObjective], prefix: str, manifest: dict[str, Any], code: CSource, real: Real
 ) -> dict[str, Any]:
     single = [v for v in exported if not v.joint]
     joint = next((v for v in exported if v.joint), None)
@@ -169,7 +155,7 @@ def _context(
         "unit_bounds": [real.literal(float(f"{(1 + sign * real.unit_tolerance) ** 2:.12f}")) for sign in (-1, 1)],
         "macros": SHORT_NAMES,
         "parameters": _verbatim(partial(_parameters, real, lengths(manifest["nq"], manifest["nv"]))),
-        "reals": _verbatim(partial(_initializer, real)),
+        "reals": _verbatim(real.initializer),
         "literals": _verbatim(lambda values: ", ".join(map(real.literal, values))),
         "frames": [_frame(v, test, alone) for v, test in zip(single, tests, strict=True)],
         "several": None if joint is None else _several(joint, manifest["several"]["self_test"]),

@@ -1,196 +1,45 @@
-"""CasADi functions of an export, and the references that its compiled code must reproduce."""
+"""The C functions of an export: what they are called, what they take and what they return."""
 
 from __future__ import annotations
 
-from collections.abc import Callable, Mapping, Sequence
-from dataclasses import dataclass, replace
-from functools import lru_cache
+from collections.abc import Mapping, Sequence
 
-import casadi as ca
-import numpy as np
-from numpy.typing import ArrayLike
-
-from impact_posture.codegen.c_names import stems
-from impact_posture.codegen.expression_graph import Graph, graph_of
-from impact_posture.codegen.simd_lanes import Seed, packed
-from impact_posture.dynamics.chart import Chart
-from impact_posture.dynamics.repeated_limbs import RepeatedLimbs
 from impact_posture.errors import InputError
-from impact_posture.impact.quantities.impact_kernel import ImpactKernel
-from impact_posture.impact.quantities.impact_oracle import ImpactOracle
-from impact_posture.impact.worst_case_objective import WorstCaseObjective
-from impact_posture.system.arrays import Array
+from impact_posture.system.escape import identifier
 
-Reference = Callable[[Array, Array], dict[str, Array]]
-"""Quantities at a configuration ``q`` (nq,) and a normal ``n`` (3,), by name, each a flat array."""
-
-
-# The manifest and the check of the same export need the same references.
-@lru_cache(maxsize=8)
-def casadi_reference(objective: WorstCaseObjective) -> Reference:
-    """Return the quantities of an export as CasADi interprets them.
-
-    The names are ``H``, ``grad`` (nv,), ``jump`` (nv,), ``G``, ``V = H/G²``, ``ellipsoid`` (9,).  ``objective`` and
-    ``objective_grad`` (nv,) are at the objective's own normal; several contacts at once have these two only.
-    """
-    k = objective.kernel
-    value, gradient = objective.gradient_fun().call([k.q, ca.DM(objective.contact.normal)])
-    outputs = {} if objective.others else {"H": k.H, "grad": k.grad_H}
-    outputs |= {"objective": value, "objective_grad": gradient}
-    outputs |= {} if objective.others else {"jump": k.jump.a, "G": k.G, "V": k.V, "ellipsoid": k.ellipsoid}
-    function = ca.Function("reference", [k.q, k.n], [*outputs.values()], ["q", "n"], [*outputs])
-
-    def evaluate(q: Array, n: Array) -> dict[str, Array]:
-        return {name: np.array(x, dtype=float).ravel() for name, x in zip(outputs, function(q, n), strict=True)}
-
-    return evaluate
+SIGNATURES: Mapping[str, tuple[tuple[str, ...], tuple[str, ...]]] = {
+    "eval": (("q", "n"), ("H", "grad")),
+    "objective": (("q",), ("value", "grad")),
+    "value": (("q", "n"), ("H",)),
+    "jump": (("q", "n"), ("a", "G", "V")),
+    "ellipsoid": (("q",), ("L",)),
+}
+"""Name of each C function → its inputs and its results, in the order of its parameters."""
 
 
-def oracle_reference(objective: WorstCaseObjective) -> Reference:
-    """Return the same quantities from the numbers of Pinocchio."""
-
-    def evaluate(q: Array, n: Array) -> dict[str, Array]:
-        found: dict[str, ArrayLike] = {"objective": objective.value(q), "objective_grad": objective.gradient(q)}
-        if not objective.others:
-            oracle = oracle_along(objective, n)
-            at = oracle.quantities(q)
-            found |= {"H": at.H, "grad": oracle.gradient_H(q), "jump": at.jump, "G": at.G, "V": at.V}
-            found["ellipsoid"] = at.ellipsoid
-        return {name: np.array(value, dtype=float).ravel() for name, value in found.items()}
-
-    return evaluate
+FUNCTIONS = (*SIGNATURES, "eval_batch")
+"""The functions of each frame; their C names are ``<stem>_<function>``."""
 
 
-def oracle_along(objective: WorstCaseObjective, normal: Array) -> ImpactOracle:
-    """Return the oracle of the leading contact along another normal, shape (3,), in the axes of its own."""
-    x, y, z = (float(v) for v in normal)
-    return ImpactOracle(replace(objective.case, contact=replace(objective.contact, normal=(x, y, z))))
+def lengths(nq: int, nv: int) -> dict[str, int]:
+    """Return the length of each parameter that is an array; the other parameters are single numbers."""
+    return {"q": nq, "n": 3, "grad": nv, "a": nv, "L": 9}
 
 
-@dataclass(frozen=True)
-class NamedObjective:
-    """An objective with the beginning of its C names.
-
-    Attributes:
-        objective: The objective.
-        stem: Beginning of its C names.
-        free: Whether it is the free robot beside one that stands.
-        joint: Whether it is of several contacts at once; it has no ``H`` of its own.
-    """
-
-    objective: WorstCaseObjective
-    stem: str
-    free: bool = False
-    joint: bool = False
-
-
-def named_objectives(objectives: Sequence[WorstCaseObjective], prefix: str) -> tuple[NamedObjective, ...]:
-    """Return the objective of each contact, followed by ``<stem>_free`` without its supports where it has some.
-
-    A problem of several contacts has these for each contact, and the objective of all contacts last.
+def stems(prefix: str, frames: Sequence[str]) -> tuple[str, ...]:
+    """Return what the function names of each frame begin with: the prefix for one frame, else prefix and frame.
 
     Raises:
-        InputError: A problem of several contacts is not the only objective.
+        InputError: A frame is given twice, or two frames have the same C identifier.
     """
-    several = [objective for objective in objectives if objective.others]
-    if several and len(objectives) > 1:
-        raise InputError(
-            "is one problem of several contacts beside others", where="codegen", hint="export them one by one"
-        )
-    # A frame with two contacts has one H, of any normal.
-    singles: dict[str, WorstCaseObjective] = {}
-    for single in (single for objective in several for single in objective.singles):
-        singles.setdefault(single.contact.frame, single)
-    each = [*singles.values()] if several else [*objectives]
-    frames = [o.contact.frame for o in each]
-    names = stems(prefix, frames) if len(frames) > 1 or not several else (f"{prefix}_contact",)
-    found: list[NamedObjective] = []
-    for objective, stem in zip(each, names, strict=True):
-        found.append(NamedObjective(objective, stem))
-        if objective.supports:
-            found.append(NamedObjective(replace(objective, supports=()), f"{stem}_free", free=True))
-    return (*found, *[NamedObjective(objective, prefix, joint=True) for objective in several])
-
-
-@dataclass(frozen=True)
-class Exported:
-    """One function of the library.
-
-    Attributes:
-        stem: Beginning of its C name.
-        name: A name of :data:`~impact_posture.codegen.c_names.SIGNATURES`.
-        outputs: The outputs of :attr:`Library.function` that it returns.
-    """
-
-    stem: str
-    name: str
-    outputs: tuple[str, ...]
-
-
-@dataclass(frozen=True)
-class Library:
-    """Everything that a library computes, as one function, so that common expressions exist once.
-
-    Attributes:
-        function: ``(q, n, constants)`` → all outputs.
-        constants: Values of the input ``constants``, in which repeated limbs differ.
-        seeds: Input name and index → its place among repeated limbs.
-        functions: The exported functions.
-    """
-
-    function: ca.Function
-    constants: tuple[float, ...]
-    seeds: Mapping[tuple[str, int], Seed]
-    functions: tuple[Exported, ...]
-
-    def graph(self) -> Graph:
-        """Return the operations on single numbers, with the constants as numbers."""
-        *inputs, _ = self.function.sx_in()
-        values = self.function.call([*inputs, ca.DM(self.constants)])
-        names = self.function.name_in()[:-1], self.function.name_out()
-        return graph_of(ca.Function("numbers", inputs, values, *names, {"cse": True}))
-
-    def vector_graph(self) -> Graph:
-        """Return the same operations, with one vector operation for those that repeated limbs share."""
-        if not self.seeds:
-            return self.graph()
-        return packed(graph_of(self.function), self.seeds, {"constants": self.constants})
-
-
-def library(exported: Sequence[NamedObjective]) -> Library:
-    """Return the functions of objectives of one robot.
-
-    The C code has ``objective`` from ``H`` where it is a multiple of ``H``, and ``V`` from ``H`` and ``G``.
-    """
-    model = exported[0].objective.robot.model
-    q, n, limbs = ca.SX.sym("q", model.nq), ca.SX.sym("n", 3), RepeatedLimbs(model)
-    outputs: dict[str, ca.SX] = {}
-    functions: list[Exported] = []
-    for number, v in enumerate(exported):
-        k = ImpactKernel(v.objective.case, q, n, limbs)
-        parts: dict[str, dict[str, ca.SX]] = {}
-        if not v.joint:
-            parts["eval"], parts["value"] = {"H": k.H, "grad": k.grad_H}, {"H": k.H}
-            parts["jump"], parts["ellipsoid"] = {"a": k.jump.a, "G": k.G, "H": k.H}, {"L": k.ellipsoid}
-        if not v.objective.is_multiple_of_H:
-            expressions = v.objective.worst_case.expressions(k)
-            parts["objective"] = dict(zip(("value", "gradient"), expressions, strict=True))
-        for name, part in parts.items():
-            found = {f"o{number}_{output}": value for output, value in part.items()}
-            functions.append(Exported(v.stem, name, tuple(found)))
-            outputs |= found
-    constants = [value for _, value in limbs.parameters.values()]
-    inputs = [q, n, ca.vertcat(ca.SX(0, 1), *[symbol for symbol, _ in limbs.parameters.values()])]
-    names = ["q", "n", "constants"], [*outputs]
-    function = ca.Function("library", inputs, [*outputs.values()], *names, {"cse": True})
-    return Library(function, tuple(constants), _seeds(model, limbs), tuple(functions))
-
-
-def _seeds(model: object, limbs: RepeatedLimbs) -> dict[tuple[str, int], Seed]:
-    found = {("constants", i): Seed(group, lane, name) for i, (group, lane, name) in enumerate(limbs.parameters)}
-    for slot in Chart(model).slots:
-        place = limbs.places.get(slot.index)
-        if place is not None:
-            for i in range(slot.q.start, slot.q.stop):
-                found["q", i] = Seed(place.group, place.lane, f"{place.position}.q.{i - slot.q.start}")
-    return found
+    if len(frames) == 1:
+        return (prefix,)
+    found: dict[str, str] = {}
+    for frame in frames:
+        stem = f"{prefix}_{identifier(frame)}"
+        if stem in found:
+            other = found[stem]
+            what = f"'{frame}' is given twice" if other == frame else f"'{other}' and '{frame}' are one name in C"
+            raise InputError(what, where="frame", hint="give each frame once, or export one by one")
+        found[stem] = frame
+    return tuple(found)

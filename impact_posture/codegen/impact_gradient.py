@@ -11,7 +11,7 @@ from typing import TYPE_CHECKING, Any
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
-from impact_posture.codegen.c_names import SIGNATURES, lengths
+from impact_posture.codegen.export_functions import SIGNATURES, lengths
 from impact_posture.codegen.manifest_reader import check_library, check_robot, frame_block, read_manifest
 from impact_posture.config.argument_types import checked
 from impact_posture.errors import InputError, ManifestMismatch, MetricError, PostureError, SpecError
@@ -135,7 +135,7 @@ class ImpactGradient:
         """Call a C function and return its code and views of its results, also when the code is not zero.
 
         Args:
-            name: A function of :data:`~impact_posture.codegen.c_names.SIGNATURES`.
+            name: A function of :data:`~impact_posture.codegen.export_functions.SIGNATURES`.
             q: Configuration, shape (nq,).
             n: Unit normal out of the surface, in the manifest's ``normal_frame``, shape (3,).
 

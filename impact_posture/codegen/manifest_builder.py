@@ -10,22 +10,18 @@ import casadi as ca
 import numpy as np
 import pinocchio as pin
 
-from impact_posture.codegen.c_emitter import DOUBLE, Real
-from impact_posture.codegen.c_names import FUNCTIONS
-from impact_posture.codegen.export_functions import casadi_reference, named_objectives
+from impact_posture.codegen.c_literals import DOUBLE, Real
+from impact_posture.codegen.export_functions import FUNCTIONS
+from impact_posture.codegen.export_library import named_objectives
 from impact_posture.codegen.manifest_reader import SCHEMA
+from impact_posture.codegen.self_test import self_test
 from impact_posture.dynamics.chart import Chart
-from impact_posture.errors import MetricError
 from impact_posture.impact.elasticity.contact_compression import Compression
 from impact_posture.impact.impact_contact import ImpactContact
 from impact_posture.impact.worst_case_objective import WorstCaseObjective
 from impact_posture.robot.robot import Robot
 from impact_posture.system.arrays import Array
 from impact_posture.version import __version__
-
-# A unit vector along no axis, so that no entry of a gradient vanishes.  It is exact enough in binary.
-_NORMAL = (0.48, -0.6, 0.64)
-_SCALARS = frozenset({"H", "objective", "G", "V"})
 
 
 def configuration_names(robot: Robot) -> list[str]:
@@ -40,33 +36,6 @@ def configuration_names(robot: Robot) -> list[str]:
         "revolute": ("(rad)",),
     }
     return [f"{slot.name} {part}" for slot in Chart(robot.model).slots for part in parts[slot.kind.family]]
-
-
-def sample_postures(robot: Robot, count: int, seed: int) -> list[Array]:
-    """Return random configurations around the default posture, each of shape (nq,)."""
-    rng = np.random.default_rng(seed)
-    start = robot.posture()
-    return [np.asarray(pin.integrate(robot.model, start, rng.uniform(-0.5, 0.5, robot.nv))) for _ in range(count)]
-
-
-def self_test(objective: WorstCaseObjective, real: Real = DOUBLE) -> dict[str, Any]:
-    """Return reference values at one posture and normal, from CasADi: ``q, n, H, grad, objective, …``.
-
-    Posture and normal are numbers of the type of the export, so that the call changes nothing.
-
-    Raises:
-        MetricError: The objective does not exist there.
-    """
-    q, n = real.rounded(sample_postures(objective.robot, 1, 0)[0]), real.rounded(_NORMAL)
-    found = casadi_reference(objective)(q, n)
-    if not all(np.isfinite(value).all() for value in found.values()):
-        raise MetricError(
-            f"objective '{objective.name}' is not finite at a random posture of {objective.robot.name}",
-            where="codegen",
-            hint="choose another objective or frame",
-        )
-    inputs = {"q": q} if objective.others else {"q": q, "n": n}
-    return {name: float(value[0]) if name in _SCALARS else value.tolist() for name, value in (inputs | found).items()}
 
 
 def build_manifest(

@@ -16,7 +16,7 @@ Key = tuple[object, ...]
 
 
 @dataclass(frozen=True)
-class Seed:
+class LimbInput:
     """An input that each of several repeated limbs has.
 
     Attributes:
@@ -30,7 +30,9 @@ class Seed:
     name: str
 
 
-def packed(graph: Graph, seeds: Mapping[tuple[str, int], Seed], values: Mapping[str, Sequence[float]]) -> Graph:
+def pack_lanes(
+    graph: Graph, seeds: Mapping[tuple[str, int], LimbInput], values: Mapping[str, Sequence[float]]
+) -> Graph:
     """Return the same computation with vectors for what repeated limbs share.
 
     Args:
@@ -63,7 +65,7 @@ def _levels(graph: Graph) -> list[list[int]]:
 
 
 def _bundles(
-    graph: Graph, levels: list[list[int]], places: Mapping[int, Seed], widths: Mapping[int, int]
+    graph: Graph, levels: list[list[int]], places: Mapping[int, LimbInput], widths: Mapping[int, int]
 ) -> dict[int, tuple[int, ...]]:
     """Return node → the nodes in one vector with it, itself among them.
 
@@ -93,7 +95,7 @@ def _bundles(
 
 
 def _place(
-    graph: Graph, k: int, places: Mapping[int, Seed], lanes: Mapping[int, tuple[int, int]], short: list[int]
+    graph: Graph, k: int, places: Mapping[int, LimbInput], lanes: Mapping[int, tuple[int, int]], short: list[int]
 ) -> tuple[Key, tuple[int, int]] | None:
     """Return the key of a node with its group and lane; ``None`` where it is in no lane or in several."""
     node = graph.nodes[k]

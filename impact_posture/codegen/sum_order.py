@@ -14,7 +14,7 @@ _TRIG = 40
 _WORTH = 8
 
 
-def rebuilt(graph: Graph) -> Graph:
+def reorder_sums(graph: Graph) -> Graph:
     """Return the same computation with every sum in the order in which its terms become ready."""
     found = Graph(graph.inputs)
     ready: list[int] = []

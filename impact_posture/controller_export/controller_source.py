@@ -13,11 +13,12 @@ import casadi as ca
 import numpy as np
 
 from impact_posture.codegen.block_layout import lay_out
-from impact_posture.codegen.c_emitter import DOUBLE, BlockText, Constants, Emitter, c_double
+from impact_posture.codegen.c_emitter import BlockText, Constants, Emitter
+from impact_posture.codegen.c_literals import DOUBLE, c_double
 from impact_posture.codegen.export_files import environment
 from impact_posture.codegen.expression_graph import graph_of
 from impact_posture.codegen.manifest_builder import configuration_names
-from impact_posture.codegen.sum_order import rebuilt
+from impact_posture.codegen.sum_order import reorder_sums
 from impact_posture.config.settings import Vector3
 from impact_posture.controller_export.controller_parameters import RULES, Field
 from impact_posture.controller_export.controller_structure import Structure
@@ -111,7 +112,7 @@ def _generated(inputs: dict[str, ca.SX], found: dict[str, ca.SX]) -> GeneratedCo
     """Generate C for the entries of outputs, by their targets in C."""
     names = [f"o{k}" for k in range(len(found))]
     function = ca.Function("code", [*inputs.values()], [*found.values()], [*inputs], names, {"cse": True})
-    graph = rebuilt(graph_of(function))
+    graph = reorder_sums(graph_of(function))
     layout = lay_out(graph, [names])
     constants = Constants("ip", DOUBLE)
     emitter = Emitter(layout, "ip", DOUBLE, {1: "double"}, constants)

@@ -6,9 +6,11 @@ from dataclasses import dataclass, field
 from functools import cached_property
 
 from impact_posture.dynamics.tree import PointOnLink
-from impact_posture.impact.impact_contact import ImpactContact, Support, default_compliance, point_on
-from impact_posture.impact.jump_metric import Metric
+from impact_posture.impact.impact_contact import ImpactContact, point_on
+from impact_posture.impact.metric import Metric
+from impact_posture.impact.support_compliance import default_compliance
 from impact_posture.robot.robot import Robot
+from impact_posture.robot.robot_spec import Support
 
 
 @dataclass(frozen=True)
@@ -21,7 +23,7 @@ class ImpactCase:
         metric: Weight ``W`` of the squared norm of the jump.
         supports: Feet that stay on the ground; empty for a robot that flies or is bolted down.
         compliance: ε of the supports, 1/kg; zero for
-            :func:`~impact_posture.impact.impact_contact.default_compliance`.
+            :func:`~impact_posture.impact.support_compliance.default_compliance`.
     """
 
     robot: Robot

@@ -5,15 +5,13 @@ from __future__ import annotations
 from dataclasses import dataclass
 
 import numpy as np
-import pinocchio as pin
 
 from impact_posture.config.argument_types import check_types
 from impact_posture.config.settings import FRICTION, NormalFrame, Vector3
 from impact_posture.dynamics.tree import PointOnLink
-from impact_posture.errors import ContactError, InputError, shown
+from impact_posture.errors import ContactError, shown
 from impact_posture.robot.robot import Robot
 from impact_posture.robot.robot_spec import Support as Support
-from impact_posture.system.arrays import Array
 
 # A normal shorter than this is zero up to rounding.
 _DUST = 1e-9
@@ -21,8 +19,6 @@ _DUST = 1e-9
 _UNIT = 1e-15
 # Largest impulse and speed.  Their squares, times the numbers of a robot, must stay within the range of doubles.
 LARGEST = 1e100
-# Compliance times the mass of the robot: the default, and the least value that leaves enough digits.
-_DEFAULT_COMPLIANCE, _LEAST_COMPLIANCE = 1e-4, 1e-6
 
 
 @dataclass(frozen=True)
@@ -105,55 +101,3 @@ def point_on(robot: Robot, frame: str, offset: Vector3 = (0.0, 0.0, 0.0)) -> Poi
         )
     position = found.placement.act(np.array(offset, dtype=float))
     return PointOnLink(int(found.parentJoint), np.array(position), np.array(found.placement.rotation))
-
-
-def default_compliance(robot: Robot) -> float:
-    """Return the default support compliance ε in 1/kg: a foot is held as if it weighed 10⁴ robots.
-
-    ``M a − J_sᵀ f = Jᵀ n, J_s a + ε f = 0`` is smooth in ``q`` for any ε > 0.  Its effect on the jump
-    differs from that of rigid feet by a share of at most ``ε/(σ + ε)``.  σ is the least eigenvalue of ``J_sM⁻¹J_sᵀ``
-    above zero.  The share is 1e-4 where the feet bear the mass of the robot.  It is larger where ``J_s`` nearly loses
-    rank.
-    """
-    return _DEFAULT_COMPLIANCE / robot.mass
-
-
-def least_compliance(robot: Robot) -> float:
-    """Return the least compliance ε that the symbolic kernel and the C export allow, 1/kg.
-
-    Both add ``1/ε`` to the inertia of the feet and subtract it again on the way to the base.  This costs as many
-    digits as ``ε`` has zeros; about eight digits are left at this limit.
-    """
-    return _LEAST_COMPLIANCE / robot.mass
-
-
-def check_compliance(robot: Robot, compliance: float) -> None:
-    """Refuse a support compliance ε, 1/kg, that is below :func:`least_compliance` or not finite.
-
-    Raises:
-        InputError: The compliance is too small, negative or not finite.
-    """
-    least = least_compliance(robot)
-    if not (np.isfinite(compliance) and compliance >= least):
-        raise InputError(
-            f"the compliance is {compliance:g} 1/kg",
-            where="support_compliance",
-            hint=f"give at least {least:.3g}, 1e-6 over the mass, because rounding outweighs stiffer feet below it",
-        )
-
-
-def heavy_feet_rounding(robot: Robot, compliance: float) -> float:
-    """Return the rounding error of ``M + J_sᵀJ_s/ε`` relative to the default compliance; it grows with ``1/ε``."""
-    return max(1.0, default_compliance(robot) / compliance)
-
-
-def support_inertia(robot: Robot, supports: tuple[Support, ...], compliance: float) -> dict[int, Array]:
-    """Return ``J_sᵀJ_s/ε`` by link, as 6×6 inertias: point masses ``1/ε``, and moments ``1/ε`` for a surface."""
-    extra: dict[int, Array] = {}
-    for support in supports:
-        point = point_on(robot, support.frame, support.offset)
-        jacobian = np.eye(6)
-        jacobian[:3, 3:] = -pin.skew(point.position)
-        jacobian = jacobian[: support.rows]
-        extra[point.joint] = extra.get(point.joint, np.zeros((6, 6))) + jacobian.T @ jacobian / compliance
-    return extra

@@ -12,11 +12,12 @@ import casadi as ca
 import numpy as np
 
 from impact_posture.dynamics.tree import Tree
-from impact_posture.impact.impact_contact import ImpactContact, Support
+from impact_posture.impact.impact_contact import ImpactContact
 from impact_posture.impact.quantities.impact_kernel import ImpactKernel
 from impact_posture.impact.quantities.impact_oracle import ImpactOracle
 from impact_posture.impact.quantities.lifted_form import Guess, Lifted
 from impact_posture.robot.robot import Robot
+from impact_posture.robot.robot_spec import Support
 from impact_posture.system.arrays import Array
 
 

@@ -13,8 +13,9 @@ from impact_posture.config.settings import ImpactSettings, ObjectiveKind, Vector
 from impact_posture.errors import ContactError, FrameNotFound
 from impact_posture.impact.elasticity.contact_compression import ContactStiffness
 from impact_posture.impact.evaluation.evaluation import Evaluation, evaluate
-from impact_posture.impact.impact_contact import ImpactContact, Support, check_compliance, point_on
-from impact_posture.impact.jump_metric import Metric, build_metric
+from impact_posture.impact.impact_contact import ImpactContact, point_on
+from impact_posture.impact.metric import Metric, build_metric
+from impact_posture.impact.support_compliance import check_compliance
 from impact_posture.impact.supports import refuse_held, refuse_rigid, resolve_supports
 from impact_posture.impact.worst_case_objective import WorstCaseObjective
 from impact_posture.robot.guessed_parts import feet, tips
@@ -23,6 +24,7 @@ from impact_posture.robot.model_variant import Payload, build_model_variants
 from impact_posture.robot.posture_files import read_posture
 from impact_posture.robot.robot import Robot
 from impact_posture.robot.robot_loader import load_robot
+from impact_posture.robot.robot_spec import Support
 from impact_posture.system.arrays import Array
 
 FLOATS = "because its data name neither feet nor rotors"

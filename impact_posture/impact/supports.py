@@ -9,9 +9,10 @@ import numpy as np
 
 from impact_posture.config.settings import SupportKind
 from impact_posture.errors import ContactError, FrameNotFound, InputError
-from impact_posture.impact.impact_contact import ImpactContact, Support, point_on
+from impact_posture.impact.impact_contact import ImpactContact, point_on
 from impact_posture.robot.guessed_parts import feet
 from impact_posture.robot.robot import Robot
+from impact_posture.robot.robot_spec import Support
 
 
 def resolve_supports(robot: Robot, texts: Sequence[str] | None) -> tuple[Support, ...]:

@@ -20,19 +20,21 @@ from impact_posture.config.settings import ObjectiveKind
 from impact_posture.dynamics.tree import Tree
 from impact_posture.errors import InputError
 from impact_posture.impact.impact_case import ImpactCase
-from impact_posture.impact.impact_contact import ImpactContact, Support, default_compliance
-from impact_posture.impact.jump_metric import Metric
+from impact_posture.impact.impact_contact import ImpactContact
 from impact_posture.impact.kinds.impact_kind import ImpactKind, QuadraticKind
 from impact_posture.impact.kinds.kinds_by_name import KINDS
+from impact_posture.impact.metric import Metric
 from impact_posture.impact.objective import Subgradients, WorstCase
 from impact_posture.impact.quantities.impact_kernel import ImpactKernel
 from impact_posture.impact.quantities.impact_oracle import ImpactOracle
 from impact_posture.impact.quantities.lifted_form import Guess, Lifted
+from impact_posture.impact.support_compliance import default_compliance
 from impact_posture.impact.worst_case.impulse_box import ImpulseBox, check_contacts
 from impact_posture.impact.worst_case.model_set import ModelSet
 from impact_posture.impact.worst_case.normal_cone import NormalCone, check_cone
 from impact_posture.robot.model_variant import ModelVariant
 from impact_posture.robot.robot import Robot
+from impact_posture.robot.robot_spec import Support
 from impact_posture.system.arrays import Array
 
 

@@ -85,10 +85,10 @@ def load(
     import threadpoolctl
 
     import impact_posture.output.plot  # noqa: F401 (the import is what takes long)
-    from impact_posture.codegen.c_emitter import DOUBLE
+    from impact_posture.codegen.c_literals import DOUBLE
     from impact_posture.codegen.export import cached_code, default_prefix
     from impact_posture.codegen.export_files import load_templates
-    from impact_posture.codegen.export_functions import casadi_reference
+    from impact_posture.codegen.self_test import casadi_reference
     from impact_posture.output.result_folder import finish_result
     from impact_posture.posture.formulation.problem_file import prepare
 

@@ -5,7 +5,7 @@ from __future__ import annotations
 from typing import TYPE_CHECKING, Any, NamedTuple
 
 if TYPE_CHECKING:
-    from impact_posture.impact.jump_metric import Metric
+    from impact_posture.impact.metric import Metric
     from impact_posture.impact.resolved_impact import ResolvedImpact
 
 

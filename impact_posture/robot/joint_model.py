@@ -78,7 +78,7 @@ def with_joint_model(robot: Robot, joint_model: JointModel) -> Robot:
     ``rigid``.  ``locked`` holds all joints, as position control with stiff gears does, so that only a floating base
     moves.  Joints whose transmission is ``locked`` move in no joint model.  ``elastic`` leaves the armature out at
     joints with springs of known stiffness, whose rotors then follow
-    (:mod:`impact_posture.impact.elasticity.elastic_joints`); H, G, V, S and E are those of the first moment.
+    (:mod:`impact_posture.impact.elasticity.elastic_impact`); H, G, V, S and E are those of the first moment.
 
     Raises:
         InertiaError: The mass matrix is singular without the rotors.

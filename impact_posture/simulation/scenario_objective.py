@@ -16,7 +16,7 @@ from impact_posture.codegen.impact_gradient import ImpactGradient
 from impact_posture.config.settings import ObjectiveKind
 from impact_posture.errors import MetricError, OutputError
 from impact_posture.impact.impact_contact import ImpactContact
-from impact_posture.impact.jump_metric import Metric
+from impact_posture.impact.metric import Metric
 from impact_posture.impact.supports import resolve_supports
 from impact_posture.impact.worst_case_objective import WorstCaseObjective
 from impact_posture.simulation.setup import Setup

@@ -9,12 +9,11 @@ from dataclasses import dataclass, field, replace
 import numpy as np
 import pinocchio as pin
 
-from impact_posture.codegen.build_check import RESULTS
 from impact_posture.codegen.export import export
-from impact_posture.codegen.export_functions import casadi_reference, oracle_along
 from impact_posture.codegen.impact_gradient import ImpactGradient
+from impact_posture.codegen.self_test import RESULTS, casadi_reference, oracle_along
 from impact_posture.dynamics.chart import Chart
-from impact_posture.dynamics.mjcf_numeric import MujocoNumeric
+from impact_posture.dynamics.mujoco_numeric import MujocoNumeric
 from impact_posture.dynamics.numeric import hold_locked
 from impact_posture.impact.worst_case_objective import WorstCaseObjective
 from impact_posture.robot.model_joints import finite_armature

@@ -10,7 +10,7 @@ from typing import Literal
 
 import numpy as np
 
-from impact_posture.codegen.build_check import Deviation, deviation
+from impact_posture.codegen.compile_and_check import Deviation, deviation
 from impact_posture.dynamics.mjcf import import_mujoco
 from impact_posture.errors import InputError
 from impact_posture.impact.worst_case_objective import WorstCaseObjective

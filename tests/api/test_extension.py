@@ -22,7 +22,7 @@ from impact_posture.dynamics.tree import Tree
 from impact_posture.errors import InputError
 from impact_posture.experiment.job_store import JobStore
 from impact_posture.experiment.reproduction import reproduce
-from impact_posture.impact.impact_contact import ImpactContact, Support
+from impact_posture.impact.impact_contact import ImpactContact
 from impact_posture.impact.objective import Objective, Subgradients
 from impact_posture.impact.quantities.lifted_form import Guess, Lifted
 from impact_posture.posture.constraints.constraint import ExpressionConstraint
@@ -31,6 +31,7 @@ from impact_posture.posture.manifold.null_space_path import null_space_path
 from impact_posture.posture.program.constrained_problem import Requirements
 from impact_posture.posture.search.multistart import solve
 from impact_posture.robot.robot import Robot
+from impact_posture.robot.robot_spec import Support
 from impact_posture.simulation.controllers.controller_factory import GROUP
 from impact_posture.simulation.run import run
 from tests.experiment.conftest import shortened as cut

@@ -10,7 +10,8 @@ import numpy as np
 import pytest
 
 from impact_posture.codegen.block_layout import lay_out
-from impact_posture.codegen.c_emitter import DOUBLE, Constants, Emitter, c_double
+from impact_posture.codegen.c_emitter import Constants, Emitter
+from impact_posture.codegen.c_literals import DOUBLE, c_double
 from impact_posture.codegen.expression_graph import CALLS, graph_of
 from impact_posture.errors import CompilerError
 from impact_posture.system.toolchain import run_compiler

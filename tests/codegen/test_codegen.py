@@ -16,14 +16,13 @@ import pinocchio as pin
 import pytest
 from jinja2 import UndefinedError
 
-from impact_posture.codegen.build_check import largest_difference
+from impact_posture.codegen.compile_and_check import largest_difference
 from impact_posture.codegen.export import Export, export
 from impact_posture.codegen.export_files import Verbatim, environment
-from impact_posture.codegen.export_functions import casadi_reference, oracle_reference
-from impact_posture.codegen.manifest_builder import sample_postures
+from impact_posture.codegen.self_test import casadi_reference, oracle_reference, sample_postures
 from impact_posture.config.settings import ObjectiveKind
 from impact_posture.impact.impact_contact import ImpactContact
-from impact_posture.impact.jump_metric import Metric
+from impact_posture.impact.metric import Metric
 from impact_posture.impact.worst_case_objective import WorstCaseObjective
 from impact_posture.robot.robot_loader import load_robot
 from impact_posture.system.escape import c_comment

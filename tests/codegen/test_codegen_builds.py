@@ -12,17 +12,16 @@ from typing import Any
 import numpy as np
 import pytest
 
-from impact_posture.codegen.build_check import largest_difference, self_test_tolerance
-from impact_posture.codegen.c_emitter import DOUBLE, FLOAT, Real
+from impact_posture.codegen.c_literals import DOUBLE, FLOAT, Real
 from impact_posture.codegen.c_names import products
+from impact_posture.codegen.compile_and_check import largest_difference
 from impact_posture.codegen.export import export, write_export
-from impact_posture.codegen.export_functions import casadi_reference, oracle_reference
 from impact_posture.codegen.impact_gradient import ImpactGradient
-from impact_posture.codegen.manifest_builder import sample_postures
+from impact_posture.codegen.self_test import casadi_reference, oracle_reference, sample_postures, self_test_tolerance
 from impact_posture.config.settings import LoadOptions
 from impact_posture.errors import CompilerError, InputError, OutputError
 from impact_posture.impact.impact_contact import ImpactContact
-from impact_posture.impact.jump_metric import Metric
+from impact_posture.impact.metric import Metric
 from impact_posture.impact.worst_case_objective import WorstCaseObjective
 from impact_posture.robot.robot_loader import load_robot
 from impact_posture.system.scratch_folder import RECORD
@@ -326,8 +325,8 @@ def test_a_build_that_fails_leaves_what_was_there(
     if how == "compiler fails":
         monkeypatch.setenv("CC", need("false"))
     elif how == "other numbers":
-        monkeypatch.setattr("impact_posture.codegen.build_check._ORACLE_TOLERANCE", -1.0)
-        monkeypatch.setattr("impact_posture.codegen.build_check.self_test_tolerance", lambda *_: -1.0)
+        monkeypatch.setattr("impact_posture.codegen.compile_and_check._ORACLE_TOLERANCE", -1.0)
+        monkeypatch.setattr("impact_posture.codegen.self_test.self_test_tolerance", lambda *_: -1.0)
     else:
         error = KeyboardInterrupt
 

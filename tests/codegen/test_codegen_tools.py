@@ -9,8 +9,8 @@ from pathlib import Path
 import numpy as np
 import pytest
 
-from impact_posture.codegen.build_check import compile_and_check
 from impact_posture.codegen.c_names import c_identifier
+from impact_posture.codegen.compile_and_check import compile_and_check
 from impact_posture.codegen.export import export
 from impact_posture.errors import CompilerError, InputError, MetricError, OutputError, PostureError
 from impact_posture.impact.impact_contact import ImpactContact

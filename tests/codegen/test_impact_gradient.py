@@ -14,10 +14,10 @@ from pathlib import Path
 import numpy as np
 import pytest
 
-from impact_posture.codegen.c_emitter import DOUBLE, FLOAT, Real
+from impact_posture.codegen.c_literals import DOUBLE, FLOAT, Real
 from impact_posture.codegen.export import export
 from impact_posture.codegen.impact_gradient import ImpactGradient
-from impact_posture.codegen.manifest_builder import sample_postures
+from impact_posture.codegen.self_test import sample_postures
 from impact_posture.config.settings import LoadOptions
 from impact_posture.errors import (
     CompilerError,

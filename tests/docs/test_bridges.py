@@ -17,7 +17,7 @@ import numpy as np
 import pinocchio as pin
 import pytest
 
-from impact_posture.codegen.c_emitter import DOUBLE, FLOAT, Real
+from impact_posture.codegen.c_literals import DOUBLE, FLOAT, Real
 from impact_posture.codegen.export import export
 from impact_posture.errors import CompilerError
 from impact_posture.impact.impact_contact import ImpactContact

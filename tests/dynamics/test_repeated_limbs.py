@@ -14,19 +14,21 @@ from hypothesis import given
 from hypothesis import strategies as st
 
 from impact_posture.codegen.block_layout import lay_out
-from impact_posture.codegen.build_check import largest_difference
+from impact_posture.codegen.compile_and_check import largest_difference
 from impact_posture.codegen.export import export
-from impact_posture.codegen.export_functions import NamedObjective, library, oracle_reference
+from impact_posture.codegen.export_library import NamedObjective, export_library
 from impact_posture.codegen.expression_graph import ARITHMETIC, COSINE, Graph
-from impact_posture.codegen.sum_order import rebuilt
+from impact_posture.codegen.self_test import oracle_reference
+from impact_posture.codegen.sum_order import reorder_sums
 from impact_posture.config.settings import LoadOptions
 from impact_posture.dynamics.repeated_limbs import RepeatedLimbs
 from impact_posture.impact.impact_case import ImpactCase
-from impact_posture.impact.impact_contact import ImpactContact, Support
-from impact_posture.impact.jump_metric import Metric
+from impact_posture.impact.impact_contact import ImpactContact
+from impact_posture.impact.metric import Metric
 from impact_posture.impact.quantities.impact_oracle import ImpactOracle
 from impact_posture.impact.worst_case_objective import WorstCaseObjective
 from impact_posture.robot.robot_loader import load_robot
+from impact_posture.robot.robot_spec import Support
 from impact_posture.system.toolchain import run_compiler
 from tests.support.exported import built
 from tests.support.helpers import assert_close, random_configurations, rng, robot, unit
@@ -138,7 +140,7 @@ def test_random_limbs_against_pinocchio(
     supports = (Support(f"b1_{len(limb) - 1}"),) if seed % 3 == 0 else ()
     contact = ImpactContact(f"b0_{len(limb) - 1}", (0.3, -0.4, 0.9), (0.05, 0.1, -0.02))
     objective = WorstCaseObjective(loaded, contact, Metric(metric, weights), "speed", supports)  # type: ignore[arg-type]
-    found = library([NamedObjective(objective, "limbs")])
+    found = export_library([NamedObjective(objective, "limbs")])
     graph = found.vector_graph()
     assert max(shares(graph)) == (4 if count > 3 else 2)
     for q in random_configurations(loaded.model, 2, "limbs", seed):
@@ -164,7 +166,7 @@ def test_random_limbs_against_pinocchio(
 )
 def test_robots_with_repeated_limbs(name: str, frame: str, width: int, most: float) -> None:
     objective = WorstCaseObjective(robot(name), ImpactContact(frame, (0.0, 0.6, 0.8)))
-    found = library([NamedObjective(objective, name)])
+    found = export_library([NamedObjective(objective, name)])
     graph = found.vector_graph()
     counts = shares(graph)
     assert set(counts) == {1, width}
@@ -189,9 +191,11 @@ def longest(graph: Graph) -> int:
 @pytest.mark.parametrize("name", ["solo8", "panda", "talos"])
 def test_sums_in_another_order_have_the_same_value_sooner(name: str) -> None:
     frame = robot(name).spec.contact.frame if robot(name).spec.contact else robot(name).model.frames[-1].name
-    found = library([NamedObjective(WorstCaseObjective(robot(name), ImpactContact(frame, (0.0, 0.6, 0.8))), name)])
+    found = export_library(
+        [NamedObjective(WorstCaseObjective(robot(name), ImpactContact(frame, (0.0, 0.6, 0.8))), name)]
+    )
     graph = found.vector_graph()
-    other = rebuilt(graph)
+    other = reorder_sums(graph)
     assert longest(other) < 0.95 * longest(graph)
     assert sum(shares(other).values()) <= 1.01 * sum(shares(graph).values())
     for q in random_configurations(robot(name).model, 2, name):
@@ -269,7 +273,7 @@ def test_angles_near_and_far(tmp_path: Path, flags: tuple[str, ...]) -> None:
 def test_blocks_are_shared() -> None:
     """What value needs is a part of what eval needs, computed by blocks that both call."""
     objective = WorstCaseObjective(robot("talos"), ImpactContact("gripper_right_base_link", (0.0, 0.6, 0.8)))
-    found = library([NamedObjective(objective, "t")])
+    found = export_library([NamedObjective(objective, "t")])
     layout = lay_out(found.vector_graph(), [f.outputs for f in found.functions])
     names = [f.name for f in found.functions]
     calls = {

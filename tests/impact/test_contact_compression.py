@@ -24,7 +24,7 @@ from impact_posture.impact.elasticity.contact_compression import (
     hertz_stiffness,
     springs_along,
 )
-from impact_posture.impact.elasticity.elastic_joints import ElasticImpact
+from impact_posture.impact.elasticity.elastic_impact import ElasticImpact
 from impact_posture.impact.evaluation.evaluation import evaluate
 from impact_posture.impact.impact_contact import ImpactContact
 from impact_posture.impact.worst_case_objective import WorstCaseObjective

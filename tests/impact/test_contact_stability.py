@@ -13,14 +13,15 @@ from impact_posture.dynamics.numeric import Numeric
 from impact_posture.dynamics.tree import Tree
 from impact_posture.impact.friction.contact_stability import contact_stability
 from impact_posture.impact.impact_case import ImpactCase
-from impact_posture.impact.impact_contact import ImpactContact, Support
-from impact_posture.impact.jump_metric import Metric
+from impact_posture.impact.impact_contact import ImpactContact
+from impact_posture.impact.metric import Metric
 from impact_posture.impact.quantities.impact_oracle import ImpactOracle
 from impact_posture.impact.worst_case_objective import WorstCaseObjective
 from impact_posture.posture.constraints.kept_contacts import KeptContacts
 from impact_posture.posture.formulation.problem_file import prepare
 from impact_posture.posture.search.multistart import solve
 from impact_posture.robot.robot import Robot
+from impact_posture.robot.robot_spec import Support
 from tests.support.command import run
 from tests.support.helpers import assert_close, central_gradient, frame_jacobian, mass_matrix, robot
 from tests.support.settings import make_settings

@@ -15,9 +15,9 @@ from hypothesis import strategies as st
 from impact_posture.dynamics.tree import Tree
 from impact_posture.errors import ContactError, MetricError
 from impact_posture.impact.evaluation.evaluation import evaluate
-from impact_posture.impact.friction.coulomb_impulse import coulomb_direction, coulomb_gradient, coulomb_impact
+from impact_posture.impact.friction.coulomb_impact import coulomb_direction, coulomb_gradient, coulomb_impact
 from impact_posture.impact.impact_contact import ImpactContact
-from impact_posture.impact.jump_metric import Metric
+from impact_posture.impact.metric import Metric
 from impact_posture.impact.worst_case_objective import WorstCaseObjective
 from impact_posture.robot.robot import Robot
 from tests.impact.test_impact import WHOLE, combinations, describe

@@ -12,9 +12,9 @@ from hypothesis import strategies as st
 
 from impact_posture.dynamics.mjcf import build_mjcf, import_mujoco
 from impact_posture.impact.evaluation.coulomb_jump import contact_impulses, coulomb_jump, coulomb_jumps
-from impact_posture.impact.friction.coulomb_impulse import coulomb_impact
+from impact_posture.impact.friction.coulomb_impact import coulomb_impact
 from impact_posture.impact.impact_contact import ImpactContact, point_on
-from impact_posture.impact.jump_metric import Metric
+from impact_posture.impact.metric import Metric
 from impact_posture.impact.worst_case_objective import WorstCaseObjective
 from tests.support.helpers import Vector, assert_close, random_configurations, rng, robot, unit
 

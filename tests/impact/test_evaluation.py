@@ -14,10 +14,11 @@ from impact_posture.errors import ContactError, FrameNotFound, InputError
 from impact_posture.impact.evaluation.ellipsoids import classical_ellipsoids, ellipsoid_of, force_ellipsoid
 from impact_posture.impact.evaluation.evaluation import Evaluation, evaluate
 from impact_posture.impact.evaluation.velocity_jump import tangent_units
-from impact_posture.impact.impact_contact import Support, default_compliance
 from impact_posture.impact.resolved_impact import resolve
+from impact_posture.impact.support_compliance import default_compliance
 from impact_posture.impact.worst_case_objective import WorstCaseObjective
 from impact_posture.robot.robot import Robot
+from impact_posture.robot.robot_spec import Support
 from tests.support.helpers import (
     assert_close,
     central_gradient,

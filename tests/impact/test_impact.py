@@ -15,13 +15,15 @@ import impact_posture as ip
 from impact_posture.config.settings import ObjectiveKind
 from impact_posture.dynamics.tree import Tree
 from impact_posture.impact.impact_case import ImpactCase
-from impact_posture.impact.impact_contact import ImpactContact, Support, default_compliance
-from impact_posture.impact.jump_metric import Metric, build_metric
+from impact_posture.impact.impact_contact import ImpactContact
+from impact_posture.impact.metric import Metric, build_metric
 from impact_posture.impact.quantities.impact_kernel import ImpactKernel
 from impact_posture.impact.quantities.impact_oracle import ImpactOracle
+from impact_posture.impact.support_compliance import default_compliance
 from impact_posture.impact.supports import resolve_supports
 from impact_posture.impact.worst_case_objective import WorstCaseObjective
 from impact_posture.robot.robot import Robot
+from impact_posture.robot.robot_spec import Support
 from tests.support.helpers import (
     NAMES,
     Vector,

@@ -12,12 +12,15 @@ import pytest
 from impact_posture.config.settings import LoadOptions
 from impact_posture.errors import ContactError, MetricError
 from impact_posture.impact.impact_case import ImpactCase
-from impact_posture.impact.impact_contact import ImpactContact, Support, default_compliance, support_inertia
-from impact_posture.impact.jump_metric import Metric
-from impact_posture.impact.quantities.impact_oracle import ImpactOracle, ImpactQuantities
+from impact_posture.impact.impact_contact import ImpactContact
+from impact_posture.impact.metric import Metric
+from impact_posture.impact.quantities.impact_oracle import ImpactOracle
+from impact_posture.impact.quantities.impact_quantities import ImpactQuantities
+from impact_posture.impact.support_compliance import default_compliance, support_inertia
 from impact_posture.impact.worst_case_objective import WorstCaseObjective
 from impact_posture.robot.robot import Robot
 from impact_posture.robot.robot_loader import load_robot
+from impact_posture.robot.robot_spec import Support
 from tests.support.helpers import (
     NAMES,
     Vector,

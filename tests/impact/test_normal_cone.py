@@ -18,7 +18,7 @@ from impact_posture.config.settings import ObjectiveKind
 from impact_posture.errors import InputError, MetricError
 from impact_posture.impact.evaluation.evaluation import evaluate
 from impact_posture.impact.impact_contact import ImpactContact
-from impact_posture.impact.jump_metric import Metric
+from impact_posture.impact.metric import Metric
 from impact_posture.impact.worst_case.normal_cone import NormalCone
 from impact_posture.impact.worst_case.worst_normal import cone_axes, worst_normal
 from impact_posture.impact.worst_case.worst_normal_symbolic import worst_normal_symbolic

@@ -12,11 +12,11 @@ import pytest
 from hypothesis import given, settings
 from hypothesis import strategies as st
 
-from impact_posture.codegen.manifest_builder import sample_postures
+from impact_posture.codegen.self_test import sample_postures
 from impact_posture.errors import ContactError, ImpactPostureError, InputError, MetricError, SpecError
 from impact_posture.impact.evaluation.evaluation import evaluate
-from impact_posture.impact.impact_contact import ImpactContact, Support
-from impact_posture.impact.jump_metric import Metric
+from impact_posture.impact.impact_contact import ImpactContact
+from impact_posture.impact.metric import Metric
 from impact_posture.impact.worst_case.impulse_box import ImpulseBox, WorstImpulses, corners
 from impact_posture.impact.worst_case_objective import WorstCaseObjective
 from impact_posture.posture.constraints.clearance import Clearance
@@ -26,7 +26,7 @@ from impact_posture.posture.manifold.feasible_start import feasible_start
 from impact_posture.posture.program.constrained_problem import ConstrainedProblem
 from impact_posture.posture.search.multistart import solve
 from impact_posture.robot.robot import Robot
-from impact_posture.robot.robot_spec import RobotSpec
+from impact_posture.robot.robot_spec import RobotSpec, Support
 from tests.dynamics.test_dynamics import random_tree
 from tests.support.helpers import (
     assert_close,

@@ -18,11 +18,13 @@ from impact_posture.codegen.export import export
 from impact_posture.codegen.impact_gradient import ImpactGradient
 from impact_posture.config.settings import ImpactSettings
 from impact_posture.errors import InputError
-from impact_posture.impact.impact_contact import ImpactContact, Support, least_compliance
+from impact_posture.impact.impact_contact import ImpactContact
 from impact_posture.impact.quantities.impact_oracle import ImpactOracle
 from impact_posture.impact.resolved_impact import resolve
+from impact_posture.impact.support_compliance import least_compliance
 from impact_posture.impact.worst_case_objective import WorstCaseObjective
 from impact_posture.robot.robot import Robot
+from impact_posture.robot.robot_spec import Support
 from impact_posture.verification.verification import verify
 from tests.support.exact import Exact, ExactImpact, digits, distance, exact, rounded
 from tests.support.exact_bounds import Bounded

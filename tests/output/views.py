@@ -11,7 +11,7 @@ import pinocchio as pin
 from matplotlib.figure import Figure
 
 from impact_posture.impact.impact_contact import ImpactContact
-from impact_posture.impact.jump_metric import Metric
+from impact_posture.impact.metric import Metric
 from impact_posture.impact.worst_case_objective import WorstCaseObjective
 from impact_posture.output.plot import ResultView, TradeOffData
 from impact_posture.path.path_timing import LimitUse

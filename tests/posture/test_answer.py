@@ -18,10 +18,10 @@ from hypothesis import given, settings
 from hypothesis import strategies as st
 from scipy.spatial import ConvexHull, QhullError
 
-from impact_posture.codegen import source_blocks as code_module
-from impact_posture.codegen.c_emitter import DOUBLE, FLOAT
-from impact_posture.codegen.export_functions import named_objectives
-from impact_posture.codegen.source_blocks import build_code
+from impact_posture.codegen import c_source as code_module
+from impact_posture.codegen.c_literals import DOUBLE, FLOAT
+from impact_posture.codegen.c_source import build_c_source
+from impact_posture.codegen.export_library import named_objectives
 from impact_posture.config.settings import ProblemSettings
 from impact_posture.dynamics.numeric import Numeric
 from impact_posture.impact.worst_case_objective import WorstCaseObjective
@@ -99,7 +99,7 @@ def test_code_from_the_cache_is_the_code(
 
     def texts(**changed: object) -> list[str]:
         exported = named_objectives([changed.pop("objective", objective)], "a")
-        code = build_code(exported, "a", changed.pop("real", DOUBLE), **changed)
+        code = build_c_source(exported, "a", changed.pop("real", DOUBLE), **changed)
         from impact_posture.codegen.export_files import render
         from impact_posture.codegen.manifest_builder import build_manifest
 

@@ -9,8 +9,8 @@ import numpy as np
 import pytest
 
 from impact_posture.codegen.export import export
-from impact_posture.codegen.manifest_builder import sample_postures
-from impact_posture.impact.friction.coulomb_impulse import coulomb_impact
+from impact_posture.codegen.self_test import sample_postures
+from impact_posture.impact.friction.coulomb_impact import coulomb_impact
 from impact_posture.impact.impact_contact import ImpactContact
 from impact_posture.impact.worst_case_objective import WorstCaseObjective
 from impact_posture.posture.formulation.build_problem import build_problem

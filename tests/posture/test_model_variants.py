@@ -14,8 +14,8 @@ import scipy.optimize
 from impact_posture.dynamics.numeric import Numeric
 from impact_posture.errors import FrameNotFound, ImpactPostureError, InputError, SpecError
 from impact_posture.impact.evaluation.evaluation import evaluate
-from impact_posture.impact.impact_contact import ImpactContact, Support
-from impact_posture.impact.jump_metric import Metric
+from impact_posture.impact.impact_contact import ImpactContact
+from impact_posture.impact.metric import Metric
 from impact_posture.impact.worst_case.model_set import ModelSet, finite_maximum
 from impact_posture.impact.worst_case_objective import WorstCaseObjective
 from impact_posture.posture.analysis.robustness import Robustness, VariantOptimum, solve_robustly
@@ -26,6 +26,7 @@ from impact_posture.posture.program.constrained_problem import ConstrainedProble
 from impact_posture.posture.search.multistart import solve
 from impact_posture.robot.model_variant import MOST_VARIANTS, Payload, between, build_model_variants
 from impact_posture.robot.robot import Robot
+from impact_posture.robot.robot_spec import Support
 from tests.support.helpers import (
     assert_close,
     central_gradient,

@@ -8,10 +8,10 @@ from pathlib import Path
 
 import pytest
 
-from impact_posture.codegen.c_emitter import DOUBLE, FLOAT, Real
+from impact_posture.codegen.c_literals import DOUBLE, FLOAT, Real
 from impact_posture.codegen.export import export
 from impact_posture.codegen.impact_gradient import ImpactGradient
-from impact_posture.codegen.manifest_builder import sample_postures
+from impact_posture.codegen.self_test import sample_postures
 from impact_posture.system.libraries import build_library, library_path
 from tests.posture.test_model_variants import MORE, objective_of
 from tests.support.command import run

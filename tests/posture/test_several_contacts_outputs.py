@@ -8,13 +8,13 @@ from pathlib import Path
 
 import pytest
 
-from impact_posture.codegen.c_emitter import DOUBLE, FLOAT, Real
+from impact_posture.codegen.c_literals import DOUBLE, FLOAT, Real
 from impact_posture.codegen.export import export
 from impact_posture.codegen.impact_gradient import ImpactGradient
-from impact_posture.codegen.manifest_builder import sample_postures
+from impact_posture.codegen.self_test import sample_postures
 from impact_posture.config.settings import LoadOptions
 from impact_posture.impact.impact_contact import ImpactContact
-from impact_posture.impact.jump_metric import Metric
+from impact_posture.impact.metric import Metric
 from impact_posture.impact.worst_case_objective import WorstCaseObjective
 from impact_posture.robot.robot_loader import load_robot
 from impact_posture.system.libraries import build_library, library_path

@@ -9,7 +9,7 @@ import pytest
 
 from impact_posture.errors import ContactError, MetricError, NotWithinLimits, PostureError
 from impact_posture.impact.impact_contact import ImpactContact
-from impact_posture.impact.jump_metric import build_metric
+from impact_posture.impact.metric import build_metric
 from tests.robot.test_bad_models import one_line
 from tests.support.helpers import NAMES, robot
 

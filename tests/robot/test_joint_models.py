@@ -18,7 +18,7 @@ from impact_posture.config.settings import JointModel, ObjectiveKind
 from impact_posture.errors import ImpactPostureError, InertiaError, InputError, JointNotFound
 from impact_posture.impact.friction.contact_stability import contact_stability
 from impact_posture.impact.impact_contact import ImpactContact
-from impact_posture.impact.jump_metric import Metric
+from impact_posture.impact.metric import Metric
 from impact_posture.impact.worst_case_objective import WorstCaseObjective
 from impact_posture.posture.formulation.problem_file import prepare, read_settings
 from impact_posture.posture.program.compiled_solver import _key

@@ -19,7 +19,7 @@ import pytest
 from impact_posture.config.settings import ObjectiveKind
 from impact_posture.errors import CompilerError, MetricError, OutputError
 from impact_posture.impact.impact_contact import ImpactContact
-from impact_posture.impact.jump_metric import Metric
+from impact_posture.impact.metric import Metric
 from impact_posture.impact.supports import resolve_supports
 from impact_posture.impact.worst_case_objective import WorstCaseObjective
 from impact_posture.simulation import scenario_objective as module
@@ -277,7 +277,7 @@ def test_two_processes_that_build_at_once_do_it_once(tmp_path: Path) -> None:
     program = (
         "import sys; from impact_posture.robot.robot_loader import load_robot\n"
         "from impact_posture.impact.impact_contact import ImpactContact\n"
-        "from impact_posture.impact.jump_metric import Metric\n"
+        "from impact_posture.impact.metric import Metric\n"
         "from impact_posture.impact.worst_case_objective import WorstCaseObjective\n"
         "from impact_posture.simulation import scenario_objective\n"
         "write = scenario_objective.write_export\n"

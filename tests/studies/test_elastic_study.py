@@ -12,7 +12,7 @@ from docs.studies.core import Request, page_of
 from docs.studies.elastic.figure import PICTURE, figure
 from docs.studies.elastic.study import STUDIED, lines, rows_of
 from docs.studies.elastic.world import ElasticWorld
-from impact_posture.impact.elasticity.elastic_joints import ElasticImpact
+from impact_posture.impact.elasticity.elastic_impact import ElasticImpact
 from impact_posture.impact.impact_case import ImpactCase
 from impact_posture.impact.impact_contact import ImpactContact
 from impact_posture.robot.robot_spec import JointTransmissionSpec, TransmissionSpec

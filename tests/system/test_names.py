@@ -23,10 +23,10 @@ from markdown_it.token import Token
 from matplotlib.figure import Figure
 
 from impact_posture import errors
-from impact_posture.codegen.c_emitter import DOUBLE
+from impact_posture.codegen.c_literals import DOUBLE
+from impact_posture.codegen.c_source import build_c_source
 from impact_posture.codegen.export import default_prefix, export
-from impact_posture.codegen.export_functions import named_objectives
-from impact_posture.codegen.source_blocks import build_code
+from impact_posture.codegen.export_library import named_objectives
 from impact_posture.config.settings import LoadOptions, ProblemSettings
 from impact_posture.config.toml_tables import validate
 from impact_posture.dynamics.mjcf import build_mjcf
@@ -121,10 +121,10 @@ def exports(arm: Robot, tmp_path_factory: pytest.TempPathFactory) -> dict[str, P
     # Names are no part of the functions: they are made once.
     point = (0.3, 0.0, 0.0)
     harmless = WorstCaseObjective(arm, ImpactContact("tip", (0, 0.6, 0.8), point))
-    code = build_code(named_objectives([harmless], "arm"), "arm", DOUBLE)
+    code = build_c_source(named_objectives([harmless], "arm"), "arm", DOUBLE)
     folders = {}
     with pytest.MonkeyPatch.context() as patch:
-        patch.setattr("impact_posture.codegen.export.build_code", lambda *_, **__: code)
+        patch.setattr("impact_posture.codegen.export.build_c_source", lambda *_, **__: code)
         for name in ("tip", *NASTY):
             robot = renamed(arm, name)
             objective = WorstCaseObjective(robot, ImpactContact(name, (0, 0.6, 0.8), point, "contact"))

@@ -15,7 +15,7 @@ from docs.studies.core import Request, machine, say, table
 from docs.studies.elastic.figure import draw
 from docs.studies.elastic.world import ElasticWorld, Measured
 from impact_posture.dynamics.mjcf import import_mujoco
-from impact_posture.impact.elasticity.elastic_joints import ElasticImpact
+from impact_posture.impact.elasticity.elastic_impact import ElasticImpact
 from impact_posture.impact.impact_case import ImpactCase
 from impact_posture.impact.impact_contact import ImpactContact
 from impact_posture.impact.quantities.impact_oracle import ImpactOracle

@@ -8,7 +8,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from impact_posture.dynamics.mjcf import build_mjcf, import_mujoco, pose
-from impact_posture.impact.elasticity.elastic_joints import ElasticImpact
+from impact_posture.impact.elasticity.elastic_impact import ElasticImpact
 
 Vector = NDArray[np.float64]
 

@@ -13,7 +13,7 @@ from docs.studies.cases import CASES, Case
 from docs.studies.core import Vector
 from docs.studies.impact.surface import Measured, NoImpact, Scene, Surface
 from impact_posture.errors import ImpactPostureError
-from impact_posture.impact.quantities.impact_oracle import ImpactQuantities
+from impact_posture.impact.quantities.impact_quantities import ImpactQuantities
 from impact_posture.posture.manifold.feasible_start import feasible_start
 from impact_posture.posture.search.multistart import solve
 

@@ -11,7 +11,7 @@ import pinocchio as pin
 from docs.studies.core import Vector
 from impact_posture.dynamics.mjcf import Mjcf, build_mjcf, import_mujoco, pose
 from impact_posture.dynamics.numeric import Numeric
-from impact_posture.impact.friction.coulomb_impulse import coulomb_impact
+from impact_posture.impact.friction.coulomb_impact import coulomb_impact
 from impact_posture.impact.impact_contact import point_on
 from impact_posture.impact.worst_case_objective import WorstCaseObjective
 

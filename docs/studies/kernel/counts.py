@@ -7,7 +7,7 @@ from collections.abc import Sequence
 
 import casadi as ca
 
-from impact_posture.codegen.export_functions import NamedObjective, library
+from impact_posture.codegen.export_library import NamedObjective, export_library
 from impact_posture.codegen.expression_graph import ARITHMETIC, COSINE, SINE, Graph
 from impact_posture.impact.worst_case_objective import WorstCaseObjective
 
@@ -39,7 +39,7 @@ def of_export(objective: WorstCaseObjective) -> tuple[Operations, int | None]:
     cosines are still one each; ``None``: no repeated limbs.  The order in which the C adds up sums is not looked at:
     it moves the count by a hundredth at most.
     """
-    found = library([NamedObjective(objective, "kernel")])
+    found = export_library([NamedObjective(objective, "kernel")])
     outputs = next(f.outputs for f in found.functions if f.name == "eval")
     graph = found.graph()
     kinds = (_NODES.get(graph.nodes[k].op) for k in _reached(graph, outputs))

@@ -18,7 +18,7 @@ from docs.studies.core import say
 from docs.studies.kernel.counts import of_export, of_function
 from docs.studies.kernel.harness import Absent, Kernel, Samples, c_compiler
 from impact_posture.codegen.export import export
-from impact_posture.codegen.export_functions import NamedObjective, library
+from impact_posture.codegen.export_library import NamedObjective, export_library
 from impact_posture.dynamics.chart import Chart
 from impact_posture.dynamics.spatial import quaternion_matrix
 from impact_posture.dynamics.tree import Tree, Wrench
@@ -75,7 +75,7 @@ def ours(samples: Samples) -> list[Kernel]:
 
 def same_graph(samples: Samples) -> list[Kernel]:
     """The expressions that our export is written from, printed by CasADi, compiled as ours."""
-    found = library([NamedObjective(samples.objective, "kernel")])
+    found = export_library([NamedObjective(samples.objective, "kernel")])
     q, n, _ = found.function.sx_in()
     values = found.function.call([q, n, ca.DM(found.constants)])
     outputs = next(f.outputs for f in found.functions if f.name == "eval")

@@ -9,7 +9,7 @@ compression δ and the force are greatest:
 - of known T: the linear contact with that T, ``F = (π/2) mv/T``.
 
 Whether the rotors behind elastic transmissions take part is decided by ``x = T √(G/C)`` with ``G = jM⁻¹jᵀ`` of the
-links alone and ``C = jK⁻¹jᵀ`` of the joint springs, ``j = nᵀJ``: T in units of the time in which the springs answer.
+links alone and ``C = jK⁻¹jᵀ`` of the joint springs, ``j = nᵀJ``: T in units of the time in which the springs respond.
 """
 
 from __future__ import annotations
@@ -21,7 +21,7 @@ import numpy as np
 
 from impact_posture.config.settings import MATERIALS, JointModel
 from impact_posture.errors import InputError
-from impact_posture.impact.elasticity.elastic_joints import ElasticImpact
+from impact_posture.impact.elasticity.elastic_impact import ElasticImpact
 from impact_posture.impact.impact_case import ImpactCase
 from impact_posture.impact.quantities.impact_oracle import ImpactOracle
 from impact_posture.impact.worst_case_objective import WorstCaseObjective
@@ -32,7 +32,7 @@ from impact_posture.system.arrays import Array
 HERTZ_TIME = sqrt(pi) * gamma(7 / 5) / gamma(9 / 10)
 # Radius of the steel tip that touches a material, m.
 TIP_RADIUS = 0.01
-# Below the first x the links alone answer, above the second x the rotors go along (docs: which inertia).
+# Below the first x the links alone respond, above the second x the rotors go along (docs: which inertia).
 SHORT, LONG = 0.2, 0.75
 
 

@@ -13,7 +13,7 @@ import numpy as np
 
 from impact_posture.errors import MetricError
 from impact_posture.impact.evaluation.velocity_jump import Jump, weighed_jump
-from impact_posture.impact.friction.coulomb_impulse import coulomb_impact
+from impact_posture.impact.friction.coulomb_impact import coulomb_impact
 from impact_posture.impact.worst_case_objective import WorstCaseObjective
 from impact_posture.system.arrays import Array
 

@@ -16,11 +16,10 @@ from impact_posture.impact.elasticity.contact_compression import (
     both_models,
     compression,
 )
-from impact_posture.impact.elasticity.elastic_joints import ElasticImpact, ElasticResponse
+from impact_posture.impact.elasticity.elastic_impact import ElasticImpact, ElasticResponse
 from impact_posture.impact.evaluation.coulomb_jump import CoulombJump, coulomb_jump, coulomb_jumps
 from impact_posture.impact.evaluation.ellipsoids import Ellipsoid, ellipsoid_of
-from impact_posture.impact.evaluation.scalars import (
-    Scalars,
+from impact_posture.impact.evaluation.objective_value import (
     VariantValue,
     objective_gradient,
     objective_value,
@@ -31,6 +30,7 @@ from impact_posture.impact.evaluation.velocity_jump import Dominance, Jump, find
 from impact_posture.impact.friction.contact_stability import ContactStability, contact_stability
 from impact_posture.impact.impact_contact import LARGEST, point_on
 from impact_posture.impact.quantities.impact_oracle import ImpactOracle
+from impact_posture.impact.quantities.impact_quantities import Scalars
 from impact_posture.impact.worst_case.impulse_box import ImpulseBox, WorstImpulses
 from impact_posture.impact.worst_case.worst_normal import WorstNormal
 from impact_posture.impact.worst_case_objective import WorstCaseObjective
@@ -154,7 +154,7 @@ def evaluate(
 
     The frictionless jump is ``Δν = a (1+e) v_n / G``, with the impulse ``(1+e) v_n / G`` along n.  The jump of a
     contact that sticks is ``Δν = (1+e) v_n M⁻¹Jᵀ(JM⁻¹Jᵀ)⁻¹ n``.
-    :mod:`impact_posture.impact.friction.coulomb_impulse` has that with the friction of the contact.
+    :mod:`impact_posture.impact.friction.coulomb_impact` has that with the friction of the contact.
 
     Args:
         objective: Robot, contact, metric, kind and supports.

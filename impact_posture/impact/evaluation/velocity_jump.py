@@ -8,7 +8,7 @@ import numpy as np
 
 from impact_posture.config.toml_tables import json_block
 from impact_posture.dynamics.joints import joint_kind
-from impact_posture.impact.quantities.impact_oracle import ImpactQuantities
+from impact_posture.impact.quantities.impact_quantities import ImpactQuantities
 from impact_posture.impact.worst_case_objective import WorstCaseObjective
 from impact_posture.robot.model_joints import v_slice
 from impact_posture.robot.robot import Robot

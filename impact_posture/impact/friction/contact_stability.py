@@ -14,8 +14,8 @@ import numpy as np
 import scipy
 
 from impact_posture.config.toml_tables import json_block
-from impact_posture.impact.impact_contact import Support
 from impact_posture.impact.quantities.impact_oracle import ImpactOracle
+from impact_posture.robot.robot_spec import Support
 from impact_posture.system.arrays import Array
 
 # A singular value of J_s below this share of the largest one is rounding.

@@ -9,7 +9,7 @@ import numpy as np
 
 from impact_posture.dynamics.tree import Tree
 from impact_posture.errors import MetricError
-from impact_posture.impact.friction.coulomb_impulse import (
+from impact_posture.impact.friction.coulomb_impact import (
     NO_FRICTION,
     coulomb_direction,
     coulomb_gradient,
@@ -28,7 +28,7 @@ _CORNER = 1e-10
 class CoulombKind(ImpactKind):
     """``C = ‖M⁻¹Jᵀp‖²_W/v²``: the squared jump at a given approach speed with the friction ``μ`` of the contact.
 
-    The impulse ``p`` is that of :mod:`impact_posture.impact.friction.coulomb_impulse`.  ``C`` is ``S`` where the
+    The impulse ``p`` is that of :mod:`impact_posture.impact.friction.coulomb_impact`.  ``C`` is ``S`` where the
     contact point sticks,
     and ``V`` without friction.  It is continuous, with a kink where the contact point begins to slip.
     """
@@ -65,7 +65,7 @@ class CoulombKind(ImpactKind):
         R = in_world(case, k.tree, ca.SX.eye(3))
         B = R.T @ k.mobility @ R
         direction, K = coulomb_direction(B, n, case.contact.friction)
-        x = k.answer([impact_at(case, direction / ca.dot(B @ n, direction))])
+        x = k.respond([impact_at(case, direction / ca.dot(B @ n, direction))])
         value = k.product(x, x)
         r = -value * n - K @ (R.T @ k.adjoint_velocity(x) - value * (B @ n))
         return value, k.size_gradient(x, impact_at(case, r))

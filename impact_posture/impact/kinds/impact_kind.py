@@ -13,7 +13,7 @@ from impact_posture.dynamics.tree import Tree
 from impact_posture.impact.impact_case import ImpactCase
 from impact_posture.impact.objective import Subgradients
 from impact_posture.impact.quantities.impact_kernel import ImpactKernel
-from impact_posture.impact.quantities.impact_oracle import ImpactOracle, no_sticking
+from impact_posture.impact.quantities.impact_oracle import ImpactOracle
 from impact_posture.impact.quantities.lifted_form import (
     Guess,
     Lifted,
@@ -23,6 +23,7 @@ from impact_posture.impact.quantities.lifted_form import (
     unknown_jump,
     weighed,
 )
+from impact_posture.impact.quantities.sticking_point import no_sticking
 from impact_posture.system.arrays import Array
 
 

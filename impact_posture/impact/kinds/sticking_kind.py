@@ -8,9 +8,8 @@ import numpy as np
 from impact_posture.dynamics.tree import Tree, Wrench
 from impact_posture.impact.kinds.impact_kind import QuadraticKind
 from impact_posture.impact.quantities.impact_kernel import ImpactKernel
-from impact_posture.impact.quantities.impact_oracle import no_sticking
 from impact_posture.impact.quantities.lifted_form import UnknownJump, in_world, unknown_jump
-from impact_posture.impact.quantities.sticking_point import SINGULAR
+from impact_posture.impact.quantities.sticking_point import SINGULAR, no_sticking
 from impact_posture.system.arrays import Array
 
 

@@ -17,8 +17,8 @@ from impact_posture.dynamics.numeric import Numeric
 from impact_posture.dynamics.repeated_limbs import RepeatedLimbs
 from impact_posture.dynamics.tree import ByJoint, PointOnLink, Response, Tree, Wrench
 from impact_posture.impact.impact_case import ImpactCase
-from impact_posture.impact.impact_contact import support_inertia
 from impact_posture.impact.quantities.lifted_form import impact_at, in_world
+from impact_posture.impact.support_compliance import support_inertia
 from impact_posture.robot.robot import Robot
 from impact_posture.system.arrays import Array, null_space
 
@@ -57,7 +57,7 @@ class ImpactKernel:
     @cached_property
     def jump(self) -> Response:
         """Response of the robot to the impact; its ``a`` is ``M⁻¹Jᵀn``."""
-        return self.answer([self.impact])
+        return self.respond([self.impact])
 
     def _alike(self, wrench: Wrench) -> list[Wrench]:
         """Return the wrench, or for a repeated limb a wrench on each limb of the group, zero on all but its own."""
@@ -92,7 +92,7 @@ class ImpactKernel:
         """``2 ∂_q[nᵀJb − bᵀMa]`` with ``Mb = Wa`` (plus ``∂_q aᵀMa`` where W = M), shape (nv,)."""
         return self.grad_G if self.metric.kind == "kinetic" and not self._supported else self.size_gradient(self.jump)
 
-    def answer(self, impacts: Sequence[Wrench]) -> Response:
+    def respond(self, impacts: Sequence[Wrench]) -> Response:
         """Return the response of the robot to several impulses at once, at any points."""
         return self.tree.respond(wrenches=[part for impact in impacts for part in self._alike(impact)])
 
@@ -149,7 +149,7 @@ class ImpactKernel:
     def _axes(self) -> list[Response]:
         """``M⁻¹Jᵀe_k`` for the three world directions."""
         eye = np.eye(3)
-        return [self.answer([self._force(ca.SX(eye[k]))]) for k in range(3)]
+        return [self.respond([self._force(ca.SX(eye[k]))]) for k in range(3)]
 
     @cached_property
     def ellipsoid(self) -> ca.SX:
@@ -176,7 +176,7 @@ class ImpactKernel:
     @cached_property
     def _sticking(self) -> Response:
         """Response to the impulse ``s = (JM⁻¹Jᵀ)⁻¹n`` per unit approach speed."""
-        return self.answer([self._force(self._mobility_inverse @ self.world_normal)])
+        return self.respond([self._force(self._mobility_inverse @ self.world_normal)])
 
     @cached_property
     def S(self) -> ca.SX:

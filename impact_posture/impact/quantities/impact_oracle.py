@@ -12,54 +12,14 @@ import numpy as np
 
 from impact_posture.dynamics.jump_derivatives import Foot
 from impact_posture.dynamics.numeric import Numeric, hold_locked
-from impact_posture.errors import MetricError
 from impact_posture.impact.impact_case import ImpactCase
 from impact_posture.impact.impact_contact import point_on
-from impact_posture.impact.quantities.sticking_point import Answer, StickingPoint
+from impact_posture.impact.quantities.impact_quantities import ImpactQuantities
+from impact_posture.impact.quantities.sticking_point import ImpulseResponse, StickingPoint, no_sticking
 from impact_posture.system.arrays import Array
 
-# A contact whose 1/m_eff along the normal is below this share of the largest mobility cannot move along it.
-_BLOCKED = 1e-12
 # Postures whose factorization is kept, because a search comes back to its starts.
 _KEPT = 32
-
-
-@dataclass(frozen=True)
-class ImpactQuantities:
-    """The impact quantities of one contact at one posture.
-
-    Attributes:
-        H: ``nᵀΛ_c n``, squared jump per squared impulse.
-        G: ``nᵀJM⁻¹Jᵀn = 1/m_eff``, 1/kg.
-        V: ``H/G²``, squared jump per squared approach speed (frictionless, e = 0).
-        S: The same if the contact sticks; ``None`` where it does not exist.
-        E: ``1/(2G)``, energy dissipated per squared approach speed, kg.
-        jump: ``a = M⁻¹Jᵀn``, shape (nv,).
-        sticking_jump: Jump per unit approach speed of a contact that sticks, shape (nv,), or ``None``.
-        sticking_impulse: Impulse per unit approach speed of a contact that sticks, world, shape (3,), or ``None``.
-        ellipsoid: ``Λ_c``, shape (3, 3).
-        mobility: ``JM⁻¹Jᵀ``, shape (3, 3), 1/kg.
-        normal: World unit normal, shape (3,).
-        support_impulse: ``f`` per unit impulse, stacked rows of the supports.
-    """
-
-    H: float
-    G: float
-    V: float
-    S: float | None
-    E: float
-    jump: Array
-    sticking_jump: Array | None
-    sticking_impulse: Array | None
-    ellipsoid: Array
-    mobility: Array
-    normal: Array
-    support_impulse: Array
-
-    @property
-    def blocked(self) -> bool:
-        """Whether the contact cannot move along the normal."""
-        return self.G <= _BLOCKED * float(np.linalg.eigvalsh(self.mobility)[-1])
 
 
 @dataclass(eq=False)
@@ -110,18 +70,18 @@ class ImpactOracle:
         np.fill_diagonal(kkt[self._nv :, self._nv :], self.compliance)
         return _Factorized(M, J, Js, kkt, self._normals(None)[1])
 
-    def answer(self, tau: Array, slip: Array | None = None) -> Answer:
+    def respond(self, tau: Array, slip: Array | None = None) -> ImpulseResponse:
         """Solve ``M a − J_sᵀf = τ, J_s a + εf = slip`` for vectors or columns; the slip is zero by default."""
         rhs: Array = np.zeros((len(self._kkt), *tau.shape[1:]))
         rhs[: self._nv] = (tau.T * ~self.numeric.locked).T
         if slip is not None:
             rhs[self._nv :] = slip
         found = np.asarray(np.linalg.solve(self._kkt, rhs), dtype=np.float64)
-        return Answer(found[: self._nv], found[self._nv :])
+        return ImpulseResponse(found[: self._nv], found[self._nv :])
 
     def solve(self, tau: Array) -> Array:
         """Return ``(M + J_sᵀJ_s/ε)⁻¹ τ`` for a vector or columns."""
-        return self.answer(tau).a
+        return self.respond(tau).a
 
     def weigh(self, a: Array) -> Array:
         """Return ``W a``."""
@@ -134,7 +94,7 @@ class ImpactOracle:
         known = self.at(q)._known[self._key]
         if known.quantities is not None:
             return known.quantities
-        answers = self.answer(self.J.T)
+        answers = self.respond(self.J.T)
         A = answers.a
         mobility = self.J @ A
         mobility = (mobility + mobility.T) / 2
@@ -144,7 +104,7 @@ class ImpactOracle:
         held = StickingPoint.of(self._kkt, self.J, mobility, ~self.numeric.locked)
         stuck, s = None, None
         if held.can_move(self.n):
-            found, s = held.answer(velocity=self.n)
+            found, s = held.respond(velocity=self.n)
             stuck = found.a
         known.quantities = ImpactQuantities(
             H=H,
@@ -183,8 +143,8 @@ class ImpactOracle:
         """
         self.at(q)
         own, n = self._normals(normal)
-        x = self.answer(self.J.T @ n)
-        y = self.answer(self.weigh(x.a))
+        x = self.respond(self.J.T @ n)
+        y = self.respond(self.weigh(x.a))
         gradient = 2 * (self.coupling(own, y.a, self.case.in_contact_frame) - self.inertial(y, x))
         return gradient + self.metric_gradient(x.a)
 
@@ -192,7 +152,7 @@ class ImpactOracle:
         """Return the tangent gradient of G, shape (nv,), with ``normal`` as in :meth:`gradient_H`."""
         self.at(q)
         own, n = self._normals(normal)
-        x = self.answer(self.J.T @ n)
+        x = self.respond(self.J.T @ n)
         return 2 * self.coupling(own, x.a, self.case.in_contact_frame) - self.inertial(x, x)
 
     def gradient_S(self, q: Array, normal: Array | None = None) -> Array:
@@ -209,8 +169,8 @@ class ImpactOracle:
         held = StickingPoint.of(self._kkt, self.J, self.J @ self.solve(self.J.T), ~self.numeric.locked)
         if not held.can_move(n):
             raise no_sticking()
-        x, s = held.answer(velocity=n)
-        y, r = held.answer(tau=self.weigh(x.a))
+        x, s = held.respond(velocity=n)
+        y, r = held.respond(tau=self.weigh(x.a))
         gradient = 2 * (self.coupling(s, y.a, False) + self.coupling(r, x.a, False) - self.inertial(y, x))
         if self.case.in_contact_frame:
             gradient = gradient - 2 * self.numeric.turning_gradient(self.point, n, r)
@@ -241,7 +201,7 @@ class ImpactOracle:
         Row k uses the adjoint ``M p − J_sᵀr = 0, J_s p + εr = −e_k``: ``∂f_k = pᵀ∂(Jᵀn + J_sᵀf − M a) + rᵀ∂(J_s a)``.
         """
         rows = len(self.at(q).Js)
-        return self._adjoint_rows(self.answer(np.zeros((self._nv, rows)), -np.eye(rows)))
+        return self._adjoint_rows(self.respond(np.zeros((self._nv, rows)), -np.eye(rows)))
 
     def jump_gradient(self, q: Array) -> Array:
         """Return the tangent Jacobian of ``a = M⁻¹Jᵀn``, shape (nv, nv).
@@ -249,13 +209,13 @@ class ImpactOracle:
         Row k is ``∂a_k = p_kᵀ∂(Jᵀn − M a)`` with ``M p_k = e_k``.
         """
         self.at(q)
-        return self._adjoint_rows(self.answer(np.eye(self._nv)))
+        return self._adjoint_rows(self.respond(np.eye(self._nv)))
 
-    def _adjoint_rows(self, adjoints: Answer) -> Array:
+    def _adjoint_rows(self, adjoints: ImpulseResponse) -> Array:
         """Return ``pᵀ∂(Jᵀn + J_sᵀf − M a) + rᵀ∂(J_s a)`` for each adjoint ``p, r``, shape (k, nv)."""
-        own, x = np.array(self.contact.normal), self.answer(self.J.T @ self.n)
+        own, x = np.array(self.contact.normal), self.respond(self.J.T @ self.n)
         rows = [
-            self.coupling(own, p, self.case.in_contact_frame) - self.inertial(Answer(p, r), x)
+            self.coupling(own, p, self.case.in_contact_frame) - self.inertial(ImpulseResponse(p, r), x)
             for p, r in zip(adjoints.a.T, adjoints.f.T, strict=True)
         ]
         return np.array(rows).reshape(-1, self._nv)
@@ -265,7 +225,7 @@ class ImpactOracle:
         wrench = np.concatenate([direction, np.zeros(3)])
         return self.numeric.coupling_gradient(self.point, wrench, v, in_frame=in_frame)
 
-    def inertial(self, left: Answer, right: Answer) -> Array:
+    def inertial(self, left: ImpulseResponse, right: ImpulseResponse) -> Array:
         """Return ``∂_q [lᵀMr − f_lᵀJ_s r − f_rᵀJ_s l]`` with all four letters held: ``∂_q lᵀ(M + J_sᵀJ_s/ε)r``."""
         gradient = self.numeric.inertial_gradient(left.a, right.a)
         first = 0
@@ -280,12 +240,3 @@ class ImpactOracle:
     def metric_gradient(self, a: Array) -> Array:
         """Return ``∂_q aᵀWa`` with ``a`` held fixed, shape (nv,); zero unless W = M."""
         return self.numeric.inertial_gradient(a, a) if self.metric.kind == "kinetic" else np.zeros(self._nv)
-
-
-def no_sticking() -> MetricError:
-    """Build the error for a posture where S does not exist."""
-    return MetricError(
-        "S does not exist here: the normal has a part along which the contact point cannot move",
-        where="objective sticking",
-        hint="choose `objective='speed'`, or another frame, normal or posture",
-    )

@@ -13,7 +13,7 @@ from impact_posture.dynamics.jump_derivatives import Foot, JumpDerivatives
 from impact_posture.dynamics.tree import Tree, Wrench
 from impact_posture.impact.impact_case import ImpactCase
 from impact_posture.impact.impact_contact import point_on
-from impact_posture.impact.jump_metric import Metric
+from impact_posture.impact.metric import Metric
 from impact_posture.system.arrays import Array
 
 # Start of t above its bounds by attempt, in units of the scale.  A barrier is finite inside only.

@@ -7,6 +7,7 @@ from dataclasses import dataclass
 import numpy as np
 from numpy.typing import NDArray
 
+from impact_posture.errors import MetricError
 from impact_posture.system.arrays import Array
 
 # Relative size of an eigenvalue of JM⁻¹Jᵀ, and of the part of n outside its range, that counts as zero.
@@ -14,7 +15,7 @@ SINGULAR = 1e-9
 
 
 @dataclass(frozen=True, eq=False)
-class Answer:
+class ImpulseResponse:
     """Jump of the robot under a generalized impulse, or under several.
 
     Attributes:
@@ -63,7 +64,7 @@ class StickingPoint:
         """Return whether the point can move along ``n``."""
         return bool(np.linalg.norm(self.outside.T @ n) <= np.sqrt(SINGULAR))
 
-    def answer(self, *, tau: Array | None = None, velocity: Array | None = None) -> tuple[Answer, Array]:
+    def respond(self, *, tau: Array | None = None, velocity: Array | None = None) -> tuple[ImpulseResponse, Array]:
         """Return the jump under ``τ`` with the point moving at ``v``, and the impulse ``s`` of the point."""
         right, nv = np.zeros(len(self.system)), len(self.mobile)
         size = len(right) - self.axes.shape[1]
@@ -72,4 +73,13 @@ class StickingPoint:
         if velocity is not None:
             right[size:] = self.axes.T @ velocity
         found = np.asarray(np.linalg.solve(self.system, right), dtype=np.float64)
-        return Answer(found[:nv], found[nv:size]), np.asarray(self.axes @ found[size:])
+        return ImpulseResponse(found[:nv], found[nv:size]), np.asarray(self.axes @ found[size:])
+
+
+def no_sticking() -> MetricError:
+    """Build the error for a posture where S does not exist."""
+    return MetricError(
+        "S does not exist here: the normal has a part along which the contact point cannot move",
+        where="objective sticking",
+        hint="choose `objective='speed'`, or another frame, normal or posture",
+    )

@@ -163,8 +163,8 @@ class ImpulseBox:
         oracles = [oracle.at(q) for oracle in self.oracles]
         first = oracles[0]
         forces = np.stack([oracle.J.T @ oracle.n for oracle in oracles], axis=1)
-        x = first.answer(forces @ impulses)
-        y = first.answer(first.weigh(x.a))
+        x = first.respond(forces @ impulses)
+        y = first.respond(first.weigh(x.a))
         gradient = -first.inertial(y, x)
         for weight, oracle in zip(impulses, oracles, strict=True):
             own = np.array(oracle.contact.normal)
@@ -174,11 +174,11 @@ class ImpulseBox:
     def expressions(self, k: ImpactKernel) -> tuple[ca.SX, ca.SX]:
         """See :class:`~impact_posture.impact.objective.WorstCase`; the gradient is that of the worst corner."""
         impacts = self._impacts(k.n)
-        jumps = [k.answer([impact]) for impact in impacts]
+        jumps = [k.respond([impact]) for impact in impacts]
         K = _gram(len(jumps), lambda i, j: k.product(jumps[i], jumps[j]))
         rows = [ca.DM(corner) for corner in self.corners]
         _, impulses = first_of_largest([_form(K, row) for row in rows], [ca.SX(row) for row in rows])
-        worst = k.answer([
+        worst = k.respond([
             Wrench(one.point, one.force * impulses[i], one.moment, one.in_frame) for i, one in enumerate(impacts)
         ])  # fmt: skip
         return k.product(worst, worst), k.size_gradient(worst)

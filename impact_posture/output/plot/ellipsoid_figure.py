@@ -13,7 +13,7 @@ from matplotlib.figure import Figure
 from matplotlib.lines import Line2D
 from matplotlib.patches import Patch
 
-from impact_posture.impact.quantities.impact_oracle import ImpactQuantities
+from impact_posture.impact.quantities.impact_quantities import ImpactQuantities
 from impact_posture.impact.worst_case.worst_normal import WorstNormal
 from impact_posture.output.plot.ellipsoid_shapes import (
     COORDINATE_PLANES,

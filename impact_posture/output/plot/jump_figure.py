@@ -12,7 +12,7 @@ from matplotlib.patches import Patch
 
 from impact_posture.impact.evaluation.coulomb_jump import CoulombJump, coulomb_jump
 from impact_posture.impact.evaluation.velocity_jump import tangent_units
-from impact_posture.impact.quantities.impact_oracle import ImpactQuantities
+from impact_posture.impact.quantities.impact_quantities import ImpactQuantities
 from impact_posture.output.plot.result_view import ResultView, header_lines, jump_unit, number
 from impact_posture.output.plot.style import AFTER_BAR, BEFORE_BAR, INK, VERMILLION, framed, shared_legend
 from impact_posture.system.arrays import Array

@@ -12,11 +12,12 @@ from numpy.typing import NDArray
 
 from impact_posture.config.settings import Against
 from impact_posture.errors import MetricError
-from impact_posture.impact.evaluation.scalars import objective_value
+from impact_posture.impact.evaluation.objective_value import objective_value
 from impact_posture.impact.evaluation.velocity_jump import tangent_units
 from impact_posture.impact.impact_contact import point_on
 from impact_posture.impact.kinds.impact_kind import ImpactKind
-from impact_posture.impact.quantities.impact_oracle import ImpactOracle, ImpactQuantities
+from impact_posture.impact.quantities.impact_oracle import ImpactOracle
+from impact_posture.impact.quantities.impact_quantities import ImpactQuantities
 from impact_posture.impact.worst_case.worst_normal import WorstNormal
 from impact_posture.impact.worst_case_objective import WorstCaseObjective
 from impact_posture.robot.robot import Robot

@@ -12,9 +12,10 @@ from numpy.typing import NDArray
 
 from impact_posture.errors import InputError
 from impact_posture.impact.evaluation.velocity_jump import tangent_units
-from impact_posture.impact.impact_contact import ImpactContact, Support
+from impact_posture.impact.impact_contact import ImpactContact
 from impact_posture.output.plot.result_view import SEPARATOR, number
 from impact_posture.robot.robot import Robot
+from impact_posture.robot.robot_spec import Support
 from impact_posture.system.arrays import Array
 
 # Imported for its name alone, because the figures need no simulation.

@@ -9,10 +9,11 @@ import numpy as np
 import pinocchio as pin
 
 from impact_posture.dynamics.tree import PointOnLink
-from impact_posture.impact.impact_contact import ImpactContact, Support, point_on
+from impact_posture.impact.impact_contact import ImpactContact, point_on
 from impact_posture.output.plot.ellipsoid_shapes import cone_rim
 from impact_posture.output.plot.silhouette import PlacedHull, place_hulls
 from impact_posture.robot.robot import Robot
+from impact_posture.robot.robot_spec import Support
 from impact_posture.system.arrays import Array
 
 # Least height of a body, as a part of its shorter side.

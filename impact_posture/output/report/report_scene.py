@@ -16,8 +16,8 @@ import pinocchio as pin
 from numpy.typing import NDArray
 
 from impact_posture.impact.impact_contact import point_on
-from impact_posture.impact.jump_metric import Metric
-from impact_posture.impact.quantities.impact_oracle import ImpactQuantities
+from impact_posture.impact.metric import Metric
+from impact_posture.impact.quantities.impact_quantities import ImpactQuantities
 from impact_posture.impact.worst_case_objective import WorstCaseObjective
 from impact_posture.output.plot.ellipsoid_shapes import root
 from impact_posture.output.quantity_table import quantities

@@ -16,8 +16,8 @@ import numpy as np
 
 from impact_posture.dynamics.numeric import Numeric
 from impact_posture.dynamics.tree import Tree
-from impact_posture.impact.impact_contact import support_inertia
 from impact_posture.impact.quantities.lifted_form import impact_at
+from impact_posture.impact.support_compliance import support_inertia
 from impact_posture.impact.worst_case_objective import WorstCaseObjective
 from impact_posture.posture.constraints.constraint import ExpressionConstraint
 from impact_posture.system.arrays import Array

@@ -11,7 +11,8 @@ import numpy as np
 from impact_posture.dynamics.numeric import Numeric
 from impact_posture.dynamics.tree import Tree, Wrench
 from impact_posture.impact.friction.contact_stability import FrictionCones
-from impact_posture.impact.impact_contact import point_on, support_inertia
+from impact_posture.impact.impact_contact import point_on
+from impact_posture.impact.support_compliance import support_inertia
 from impact_posture.impact.worst_case_objective import WorstCaseObjective
 from impact_posture.posture.constraints.constraint import ExpressionConstraint
 from impact_posture.system.arrays import Array

@@ -17,12 +17,13 @@ from impact_posture.config.settings import PATCH
 from impact_posture.dynamics.numeric import Numeric
 from impact_posture.dynamics.tree import PointOnLink
 from impact_posture.errors import InputError
-from impact_posture.impact.impact_contact import ImpactContact, Support, point_on
+from impact_posture.impact.impact_contact import ImpactContact, point_on
 from impact_posture.posture.constraints.clearance import Clearance
 from impact_posture.posture.constraints.nested_links import NestedLinks
 from impact_posture.posture.constraints.pair_distances import PairDistances
 from impact_posture.posture.constraints.separator import ConvexBody, Separator
 from impact_posture.robot.robot import Robot
+from impact_posture.robot.robot_spec import Support
 from impact_posture.system.arrays import Array
 
 # A contact point this near (m) to a plane lies in it.

@@ -13,7 +13,7 @@ from impact_posture.config.settings import Vector3
 from impact_posture.dynamics.chart import Chart
 from impact_posture.dynamics.numeric import Numeric
 from impact_posture.errors import InputError
-from impact_posture.impact.impact_contact import ImpactContact, Support, point_on
+from impact_posture.impact.impact_contact import ImpactContact, point_on
 from impact_posture.impact.objective import Objective
 from impact_posture.impact.worst_case_objective import WorstCaseObjective
 from impact_posture.posture.approach.approach_speed import ApproachSpeed
@@ -34,6 +34,7 @@ from impact_posture.posture.formulation.well_posed import pin_undetermined, regu
 from impact_posture.posture.loads.load_cases import LoadCases, load_cases
 from impact_posture.posture.program.constrained_problem import ConstrainedProblem, Requirements
 from impact_posture.robot.robot import Robot
+from impact_posture.robot.robot_spec import Support
 from impact_posture.robot.support_polygon import polygon_edges
 from impact_posture.system.arrays import Array
 

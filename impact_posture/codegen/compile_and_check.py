@@ -10,13 +10,19 @@ from pathlib import Path
 
 import numpy as np
 
-from impact_posture.codegen.c_emitter import REALS, Real
-from impact_posture.codegen.export_functions import Reference, casadi_reference, named_objectives, oracle_reference
+from impact_posture.codegen.c_literals import REALS
+from impact_posture.codegen.export_library import named_objectives
 from impact_posture.codegen.impact_gradient import ImpactGradient
-from impact_posture.codegen.manifest_builder import sample_postures
 from impact_posture.codegen.manifest_reader import read_manifest
+from impact_posture.codegen.self_test import (
+    RESULTS,
+    Reference,
+    casadi_reference,
+    oracle_reference,
+    sample_postures,
+    self_test_tolerance,
+)
 from impact_posture.errors import CompilerError, OutputError
-from impact_posture.impact.impact_contact import heavy_feet_rounding
 from impact_posture.impact.worst_case_objective import WorstCaseObjective
 from impact_posture.system.arrays import Array
 from impact_posture.system.libraries import (
@@ -37,28 +43,9 @@ _ORACLE_TOLERANCE = 1e-5
 _SAMPLES = 20
 # Number of libraries in the cache. The oldest go first.
 _CACHED = 16
-# C function → the reference's names of its results.
-RESULTS = {
-    "eval": ("H", "grad"),
-    "objective": ("objective", "objective_grad"),
-    "value": ("H",),
-    "jump": ("jump", "G", "V"),
-    "ellipsoid": ("ellipsoid",),
-}
 # An error of a gradient is relative to a thousandth of its value at least.
 _LEAST = {"grad": "H", "objective_grad": "objective"}
 _SHARE = 1e-3
-
-
-def self_test_tolerance(objective: WorstCaseObjective, real: Real) -> float:
-    """Return the largest relative difference from the numbers of CasADi that rounding explains.
-
-    The C code divides by reciprocals, and a compiler may fuse sums with products.  In float the condition of the
-    model shows.
-    """
-    if real.name == "double":
-        return 1e-9 * (heavy_feet_rounding(objective.robot, objective.compliance) if objective.supports else 1.0)
-    return 0.05 if objective.supports else 2e-3
 
 
 def compile_and_check(
@@ -138,7 +125,7 @@ def largest_difference(
     Args:
         gradient: The export.
         objective: The exported objective.
-        build_reference: :func:`~impact_posture.codegen.export_functions.casadi_reference` or ``oracle_reference``.
+        build_reference: :func:`~impact_posture.codegen.self_test.casadi_reference` or ``oracle_reference``.
         samples: The number of random postures and normals.
     """
     reference = build_reference(objective)

@@ -12,10 +12,10 @@ from scipy.integrate import solve_ivp
 
 from impact_posture.config.settings import MetricKind, NormalFrame
 from impact_posture.errors import ContactError, ImpactPostureError, InputError
-from impact_posture.impact.elasticity.elastic_joints import ElasticImpact, ElasticResponse
+from impact_posture.impact.elasticity.elastic_impact import ElasticImpact, ElasticResponse
 from impact_posture.impact.impact_case import ImpactCase
 from impact_posture.impact.impact_contact import ImpactContact
-from impact_posture.impact.jump_metric import Metric
+from impact_posture.impact.metric import Metric
 from impact_posture.impact.quantities.impact_oracle import ImpactOracle
 from impact_posture.robot.joint_model import with_joint_model
 from impact_posture.robot.robot import Robot

@@ -9,11 +9,12 @@ from typing import Any
 import casadi as ca
 
 from impact_posture.codegen.block_layout import Layout, lay_out
-from impact_posture.codegen.c_emitter import BlockText, Constants, Emitter, Real
-from impact_posture.codegen.c_names import SIGNATURES, lengths
-from impact_posture.codegen.export_functions import Exported, Library, NamedObjective, library
+from impact_posture.codegen.c_emitter import BlockText, Constants, Emitter
+from impact_posture.codegen.c_literals import Real
+from impact_posture.codegen.export_functions import SIGNATURES, lengths
+from impact_posture.codegen.export_library import Exported, ExportLibrary, NamedObjective, export_library
 from impact_posture.codegen.expression_graph import ARITHMETIC, Graph
-from impact_posture.codegen.sum_order import rebuilt
+from impact_posture.codegen.sum_order import reorder_sums
 from impact_posture.config.cached_values import read_stored, write_stored
 from impact_posture.system.libraries import source_key
 
@@ -32,7 +33,7 @@ _BATCH_BLOCK = 60
 
 
 @dataclass(frozen=True)
-class Code:
+class CSource:
     """Functions of an export.
 
     Attributes:
@@ -62,7 +63,7 @@ class Code:
     stack_bytes: int
 
 
-def build_code(exported: Sequence[NamedObjective], prefix: str, real: Real, *, portable: bool = False) -> Code:
+def build_c_source(exported: Sequence[NamedObjective], prefix: str, real: Real, *, portable: bool = False) -> CSource:
     """Generate the functions of each objective, or take them from the cache of the user by what they compute.
 
     Args:
@@ -71,27 +72,29 @@ def build_code(exported: Sequence[NamedObjective], prefix: str, real: Real, *, p
         real: The C type to compute in.
         portable: Use no vectors, for compilers that have none.
     """
-    found = library(exported)
+    found = export_library(exported)
     models = [
         (v.stem, v.joint, v.free, v.objective.contact, v.objective.scale, v.objective.is_multiple_of_H)
         for v in exported
     ]
     content = (ca.CasadiMeta.version(), found.constants, found.seeds, found.functions, models, prefix, real, portable)
     key = source_key([repr(content), found.function.serialize()], "codegen")
-    code = read_stored("code", key, Code)
+    code = read_stored("code", key, CSource)
     if code is None:
         code = _generate(exported, found, prefix, real, portable=portable)
         write_stored("code", key, code)
     return code
 
 
-def _generate(exported: Sequence[NamedObjective], found: Library, prefix: str, real: Real, *, portable: bool) -> Code:
+def _generate(
+    exported: Sequence[NamedObjective], found: ExportLibrary, prefix: str, real: Real, *, portable: bool
+) -> CSource:
     single = [v for v in exported if not v.joint]
     contacts = {v.stem: v.objective.contact for v in single}
     robot = single[0].objective.robot
     scalars = found.graph()
     # A single call waits for results more than for arithmetic units.  A batch has other lanes to go on with.
-    graph = rebuilt(scalars if portable else found.vector_graph())
+    graph = reorder_sums(scalars if portable else found.vector_graph())
     layout = lay_out(graph, [f.outputs for f in found.functions])
     constants = Constants(prefix, real)
     # The names of types stand in thousands of places, so they are short.  The source undefines them at its end.
@@ -131,7 +134,7 @@ def _generate(exported: Sequence[NamedObjective], found: Library, prefix: str, r
         batches.append(batch)
     work = [(types[width], f"w{width if width > 1 else ''}", count) for width, count in sorted(layout.sizes.items())]
     stack_bytes = -(-(largest + _FRAMES) // 64) * 64
-    return Code(
+    return CSource(
         portable, constants.text(types), tuple(emitter.blocks), angles, room, tuple(work), tuple(functions),
         tuple(batches), stack_bytes,
     )  # fmt: skip

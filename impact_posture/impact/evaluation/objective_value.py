@@ -8,45 +8,10 @@ import numpy as np
 
 from impact_posture.errors import MetricError
 from impact_posture.impact.kinds.impact_kind import ImpactKind
-from impact_posture.impact.quantities.impact_oracle import ImpactQuantities
+from impact_posture.impact.quantities.impact_quantities import Scalars
 from impact_posture.impact.quantities.sticking_point import SINGULAR
 from impact_posture.impact.worst_case_objective import WorstCaseObjective
 from impact_posture.system.arrays import Array
-
-
-@dataclass(frozen=True)
-class Scalars:
-    """The five numbers of an impact; ``None`` where one does not exist.
-
-    Attributes:
-        H: Squared jump per squared impulse.
-        G: Inverse effective mass along the normal, 1/kg.
-        V: Squared jump per squared approach speed, frictionless, e = 0.
-        S: The same if the contact point sticks.
-        E: Energy dissipated per squared approach speed, e = 0, which is half the effective mass, kg.
-    """
-
-    H: float
-    G: float
-    V: float | None
-    S: float | None
-    E: float | None
-
-    @staticmethod
-    def of(found: ImpactQuantities) -> Scalars:
-        """Return the numbers; ``V`` and ``E`` do not exist if the contact cannot move along the normal."""
-        if found.blocked:
-            return Scalars(found.H, found.G, None, found.S, None)
-        return Scalars(found.H, found.G, found.V, found.S, found.E)
-
-    @property
-    def effective_mass(self) -> float | None:
-        """``1/G``, kg; ``None`` where unbounded."""
-        return None if self.E is None else 1 / self.G
-
-    def to_dict(self) -> dict[str, float | None]:
-        """Return JSON content."""
-        return {"H": self.H, "G": self.G, "V": self.V, "S": self.S, "E": self.E}
 
 
 @dataclass(frozen=True)

@@ -1,7 +1,7 @@
 """Velocity jump of a robot whose rotors hang on springs, in a contact of known stiffness.
 
 A short contact meets the links alone, and a long one takes the rotors along.  Between the two, links ``x``, rotors
-``y`` and contact answer as a linear system about the configuration ``q``, in increments over free flight:
+``y`` and contact respond as a linear system about the configuration ``q``, in increments over free flight:
 
     M ẍ = jᵀf − Eᵀτ,   B ÿ = τ,   s = Ex − y,   τ = K s + D ṡ,
     δ̇ = v − jẋ,   f = k δ,   j = nᵀJ,
@@ -31,7 +31,7 @@ from impact_posture.errors import ContactError, InputError
 from impact_posture.impact.impact_case import ImpactCase
 from impact_posture.impact.impact_contact import LARGEST
 from impact_posture.impact.quantities.impact_oracle import ImpactOracle
-from impact_posture.impact.quantities.sticking_point import Answer
+from impact_posture.impact.quantities.sticking_point import ImpulseResponse
 from impact_posture.robot.joint_model import transmissions, with_joint_model
 from impact_posture.system.arrays import Array
 
@@ -56,7 +56,7 @@ class ElasticResponse:
         speed: Approach speed ``v``, m/s.
         duration: ``T``, s.
         compliance_ratio: ``T√(G/C)`` with ``G = jM⁻¹jᵀ`` and the compliance ``C = jK⁻¹jᵀ`` of the contact point on
-            the springs.  The links alone answer where it is small, links and rotors where it is large.  Infinite if
+            the springs.  The links alone respond where it is small, links and rotors where it is large.  Infinite if
             no spring gives way to the contact.
         force: ``kδ(T)``, the largest force of the contact, N.
         impulse: ``∫f`` until ``T``, N·s.
@@ -154,15 +154,15 @@ class ElasticImpact:
         """
         c = self._compression(q, stiffness)
         oracle, P, impulse = self.oracle, c.columns, c.impulse(c.state)
-        x = Answer(P.a @ impulse, P.f @ impulse)
+        x = ImpulseResponse(P.a @ impulse, P.f @ impulse)
         weighed = oracle.weigh(x.a)
-        b = oracle.answer(weighed)
+        b = oracle.respond(weighed)
         X = c.adjoint(P.a.T @ (2 * weighed))
         own, pushed = np.array(oracle.contact.normal), 2 * (P.a @ X[:, -1] + impulse[-1] * b.a)
         gradient = oracle.coupling(own, pushed, oracle.case.in_contact_frame) - 2 * oracle.inertial(b, x)
         weights, axes = np.linalg.eigh(X)
         for weight, axis in zip(weights, axes.T, strict=True):
-            mode = Answer(P.a @ axis, P.f @ axis)
+            mode = ImpulseResponse(P.a @ axis, P.f @ axis)
             gradient = gradient - weight * oracle.inertial(mode, mode)
         return np.asarray(gradient + oracle.metric_gradient(x.a))
 
@@ -176,7 +176,7 @@ class ElasticImpact:
         if oracle.quantities(q).blocked:
             where, hint = f"frame {oracle.contact.frame}", "choose another frame, normal or posture"
             raise ContactError("the contact cannot move along its normal", where=where, hint=hint)
-        columns = oracle.answer(-rows.T)
+        columns = oracle.respond(-rows.T)
         A = np.diag(np.append(1 / self.rotors, 0.0)) - rows @ columns.a
         kappa, d = np.append(self.kappa, float(stiffness)), np.append(self.d, 0.0)
         return _Compression((A + A.T) / 2, columns, kappa, d, oracle)
@@ -203,7 +203,9 @@ class _Compression:
         oracle: Weighs velocities.
     """
 
-    def __init__(self, mobility: Array, columns: Answer, kappa: Array, d: Array, oracle: ImpactOracle) -> None:
+    def __init__(
+        self, mobility: Array, columns: ImpulseResponse, kappa: Array, d: Array, oracle: ImpactOracle
+    ) -> None:
         self.mobility, self.columns, self.kappa, self.d, self._oracle = mobility, columns, kappa, d, oracle
         try:
             self._L = np.linalg.cholesky(mobility)

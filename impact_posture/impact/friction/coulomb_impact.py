@@ -16,7 +16,8 @@ import casadi as ca
 import numpy as np
 
 from impact_posture.dynamics.spatial import cross
-from impact_posture.impact.quantities.impact_oracle import ImpactOracle, no_sticking
+from impact_posture.impact.quantities.impact_oracle import ImpactOracle
+from impact_posture.impact.quantities.sticking_point import no_sticking
 from impact_posture.system.arrays import Array
 
 # An eigenvalue of B_tt below this share of the trace of B is zero.

@@ -1,0 +1,146 @@
+"""CasADi functions of an export, and the references that its compiled code must reproduce."""
+
+from __future__ import annotations
+
+from collections.abc import Mapping, Sequence
+from dataclasses import dataclass, replace
+
+import casadi as ca
+
+from impact_posture.codegen.export_functions import stems
+from impact_posture.codegen.expression_graph import Graph, graph_of
+from impact_posture.codegen.simd_lanes import LimbInput, pack_lanes
+from impact_posture.dynamics.chart import Chart
+from impact_posture.dynamics.repeated_limbs import RepeatedLimbs
+from impact_posture.errors import InputError
+from impact_posture.impact.quantities.impact_kernel import ImpactKernel
+from impact_posture.impact.worst_case_objective import WorstCaseObjective
+
+
+@dataclass(frozen=True)
+class NamedObjective:
+    """An objective with the beginning of its C names.
+
+    Attributes:
+        objective: The objective.
+        stem: Beginning of its C names.
+        free: Whether it is the free robot beside one that stands.
+        joint: Whether it is of several contacts at once; it has no ``H`` of its own.
+    """
+
+    objective: WorstCaseObjective
+    stem: str
+    free: bool = False
+    joint: bool = False
+
+
+def named_objectives(objectives: Sequence[WorstCaseObjective], prefix: str) -> tuple[NamedObjective, ...]:
+    """Return the objective of each contact, followed by ``<stem>_free`` without its supports where it has some.
+
+    A problem of several contacts has these for each contact, and the objective of all contacts last.
+
+    Raises:
+        InputError: A problem of several contacts is not the only objective.
+    """
+    several = [objective for objective in objectives if objective.others]
+    if several and len(objectives) > 1:
+        raise InputError(
+            "is one problem of several contacts beside others", where="codegen", hint="export them one by one"
+        )
+    # A frame with two contacts has one H, of any normal.
+    singles: dict[str, WorstCaseObjective] = {}
+    for single in (single for objective in several for single in objective.singles):
+        singles.setdefault(single.contact.frame, single)
+    each = [*singles.values()] if several else [*objectives]
+    frames = [o.contact.frame for o in each]
+    names = stems(prefix, frames) if len(frames) > 1 or not several else (f"{prefix}_contact",)
+    found: list[NamedObjective] = []
+    for objective, stem in zip(each, names, strict=True):
+        found.append(NamedObjective(objective, stem))
+        if objective.supports:
+            found.append(NamedObjective(replace(objective, supports=()), f"{stem}_free", free=True))
+    return (*found, *[NamedObjective(objective, prefix, joint=True) for objective in several])
+
+
+@dataclass(frozen=True)
+class Exported:
+    """One function of the library.
+
+    Attributes:
+        stem: Beginning of its C name.
+        name: A name of :data:`~impact_posture.codegen.export_functions.SIGNATURES`.
+        outputs: The outputs of :attr:`ExportLibrary.function` that it returns.
+    """
+
+    stem: str
+    name: str
+    outputs: tuple[str, ...]
+
+
+@dataclass(frozen=True)
+class ExportLibrary:
+    """Everything that a library computes, as one function, so that common expressions exist once.
+
+    Attributes:
+        function: ``(q, n, constants)`` → all outputs.
+        constants: Values of the input ``constants``, in which repeated limbs differ.
+        seeds: Input name and index → its place among repeated limbs.
+        functions: The exported functions.
+    """
+
+    function: ca.Function
+    constants: tuple[float, ...]
+    seeds: Mapping[tuple[str, int], LimbInput]
+    functions: tuple[Exported, ...]
+
+    def graph(self) -> Graph:
+        """Return the operations on single numbers, with the constants as numbers."""
+        *inputs, _ = self.function.sx_in()
+        values = self.function.call([*inputs, ca.DM(self.constants)])
+        names = self.function.name_in()[:-1], self.function.name_out()
+        return graph_of(ca.Function("numbers", inputs, values, *names, {"cse": True}))
+
+    def vector_graph(self) -> Graph:
+        """Return the same operations, with one vector operation for those that repeated limbs share."""
+        if not self.seeds:
+            return self.graph()
+        return pack_lanes(graph_of(self.function), self.seeds, {"constants": self.constants})
+
+
+def export_library(exported: Sequence[NamedObjective]) -> ExportLibrary:
+    """Return the functions of objectives of one robot.
+
+    The C code has ``objective`` from ``H`` where it is a multiple of ``H``, and ``V`` from ``H`` and ``G``.
+    """
+    model = exported[0].objective.robot.model
+    q, n, limbs = ca.SX.sym("q", model.nq), ca.SX.sym("n", 3), RepeatedLimbs(model)
+    outputs: dict[str, ca.SX] = {}
+    functions: list[Exported] = []
+    for number, v in enumerate(exported):
+        k = ImpactKernel(v.objective.case, q, n, limbs)
+        parts: dict[str, dict[str, ca.SX]] = {}
+        if not v.joint:
+            parts["eval"], parts["value"] = {"H": k.H, "grad": k.grad_H}, {"H": k.H}
+            parts["jump"], parts["ellipsoid"] = {"a": k.jump.a, "G": k.G, "H": k.H}, {"L": k.ellipsoid}
+        if not v.objective.is_multiple_of_H:
+            expressions = v.objective.worst_case.expressions(k)
+            parts["objective"] = dict(zip(("value", "gradient"), expressions, strict=True))
+        for name, part in parts.items():
+            found = {f"o{number}_{output}": value for output, value in part.items()}
+            functions.append(Exported(v.stem, name, tuple(found)))
+            outputs |= found
+    constants = [value for _, value in limbs.parameters.values()]
+    inputs = [q, n, ca.vertcat(ca.SX(0, 1), *[symbol for symbol, _ in limbs.parameters.values()])]
+    names = ["q", "n", "constants"], [*outputs]
+    function = ca.Function("library", inputs, [*outputs.values()], *names, {"cse": True})
+    return ExportLibrary(function, tuple(constants), _seeds(model, limbs), tuple(functions))
+
+
+def _seeds(model: object, limbs: RepeatedLimbs) -> dict[tuple[str, int], LimbInput]:
+    found = {("constants", i): LimbInput(group, lane, name) for i, (group, lane, name) in enumerate(limbs.parameters)}
+    for slot in Chart(model).slots:
+        place = limbs.places.get(slot.index)
+        if place is not None:
+            for i in range(slot.q.start, slot.q.stop):
+                found["q", i] = LimbInput(place.group, place.lane, f"{place.position}.q.{i - slot.q.start}")
+    return found

@@ -1,0 +1,121 @@
+"""Reference values that the code of an export must reproduce, and how closely: the self-test of a manifest."""
+
+from __future__ import annotations
+
+from collections.abc import Callable
+from dataclasses import replace
+from functools import lru_cache
+from typing import Any
+
+import casadi as ca
+import numpy as np
+import pinocchio as pin
+from numpy.typing import ArrayLike
+
+from impact_posture.codegen.c_literals import DOUBLE, Real
+from impact_posture.errors import MetricError
+from impact_posture.impact.quantities.impact_oracle import ImpactOracle
+from impact_posture.impact.support_compliance import heavy_feet_rounding
+from impact_posture.impact.worst_case_objective import WorstCaseObjective
+from impact_posture.robot.robot import Robot
+from impact_posture.system.arrays import Array
+
+Reference = Callable[[Array, Array], dict[str, Array]]
+"""Quantities at a configuration ``q`` (nq,) and a normal ``n`` (3,), by name, each a flat array."""
+
+
+# The manifest and the check of the same export need the same references.
+@lru_cache(maxsize=8)
+def casadi_reference(objective: WorstCaseObjective) -> Reference:
+    """Return the quantities of an export as CasADi interprets them.
+
+    The names are ``H``, ``grad`` (nv,), ``jump`` (nv,), ``G``, ``V = H/G²``, ``ellipsoid`` (9,).  ``objective`` and
+    ``objective_grad`` (nv,) are at the objective's own normal; several contacts at once have these two only.
+    """
+    k = objective.kernel
+    value, gradient = objective.gradient_fun().call([k.q, ca.DM(objective.contact.normal)])
+    outputs = {} if objective.others else {"H": k.H, "grad": k.grad_H}
+    outputs |= {"objective": value, "objective_grad": gradient}
+    outputs |= {} if objective.others else {"jump": k.jump.a, "G": k.G, "V": k.V, "ellipsoid": k.ellipsoid}
+    function = ca.Function("reference", [k.q, k.n], [*outputs.values()], ["q", "n"], [*outputs])
+
+    def evaluate(q: Array, n: Array) -> dict[str, Array]:
+        return {name: np.array(x, dtype=float).ravel() for name, x in zip(outputs, function(q, n), strict=True)}
+
+    return evaluate
+
+
+def oracle_reference(objective: WorstCaseObjective) -> Reference:
+    """Return the same quantities from the numbers of Pinocchio."""
+
+    def evaluate(q: Array, n: Array) -> dict[str, Array]:
+        found: dict[str, ArrayLike] = {"objective": objective.value(q), "objective_grad": objective.gradient(q)}
+        if not objective.others:
+            oracle = oracle_along(objective, n)
+            at = oracle.quantities(q)
+            found |= {"H": at.H, "grad": oracle.gradient_H(q), "jump": at.jump, "G": at.G, "V": at.V}
+            found["ellipsoid"] = at.ellipsoid
+        return {name: np.array(value, dtype=float).ravel() for name, value in found.items()}
+
+    return evaluate
+
+
+def oracle_along(objective: WorstCaseObjective, normal: Array) -> ImpactOracle:
+    """Return the oracle of the leading contact along another normal, shape (3,), in the axes of its own."""
+    x, y, z = (float(v) for v in normal)
+    return ImpactOracle(replace(objective.case, contact=replace(objective.contact, normal=(x, y, z))))
+
+
+# A unit vector along no axis, so that no entry of a gradient vanishes.  It is exact enough in binary.
+_NORMAL = (0.48, -0.6, 0.64)
+
+
+_SCALARS = frozenset({"H", "objective", "G", "V"})
+
+
+def sample_postures(robot: Robot, count: int, seed: int) -> list[Array]:
+    """Return random configurations around the default posture, each of shape (nq,)."""
+    rng = np.random.default_rng(seed)
+    start = robot.posture()
+    return [np.asarray(pin.integrate(robot.model, start, rng.uniform(-0.5, 0.5, robot.nv))) for _ in range(count)]
+
+
+def self_test(objective: WorstCaseObjective, real: Real = DOUBLE) -> dict[str, Any]:
+    """Return reference values at one posture and normal, from CasADi: ``q, n, H, grad, objective, …``.
+
+    Posture and normal are numbers of the type of the export, so that the call changes nothing.
+
+    Raises:
+        MetricError: The objective does not exist there.
+    """
+    q, n = real.rounded(sample_postures(objective.robot, 1, 0)[0]), real.rounded(_NORMAL)
+    found = casadi_reference(objective)(q, n)
+    if not all(np.isfinite(value).all() for value in found.values()):
+        raise MetricError(
+            f"objective '{objective.name}' is not finite at a random posture of {objective.robot.name}",
+            where="codegen",
+            hint="choose another objective or frame",
+        )
+    inputs = {"q": q} if objective.others else {"q": q, "n": n}
+    return {name: float(value[0]) if name in _SCALARS else value.tolist() for name, value in (inputs | found).items()}
+
+
+# C function → the reference's names of its results.
+RESULTS = {
+    "eval": ("H", "grad"),
+    "objective": ("objective", "objective_grad"),
+    "value": ("H",),
+    "jump": ("jump", "G", "V"),
+    "ellipsoid": ("ellipsoid",),
+}
+
+
+def self_test_tolerance(objective: WorstCaseObjective, real: Real) -> float:
+    """Return the largest relative difference from the numbers of CasADi that rounding explains.
+
+    The C code divides by reciprocals, and a compiler may fuse sums with products.  In float the condition of the
+    model shows.
+    """
+    if real.name == "double":
+        return 1e-9 * (heavy_feet_rounding(objective.robot, objective.compliance) if objective.supports else 1.0)
+    return 0.05 if objective.supports else 2e-3
