@@ -13,11 +13,12 @@ import pinocchio as pin
 from docs.studies.cases import AHEAD, DOWN, Case
 from docs.studies.core import Request, Vector, collected, machine, table
 from docs.studies.flow_course import CompiledFlow, Course
+from impact_posture.posture.constraints.requirements import Requirements
 from impact_posture.posture.formulation.build_problem import build_problem
 from impact_posture.posture.manifold.feasible_start import feasible_start
-from impact_posture.posture.program.constrained_problem import ConstrainedProblem, Requirements
+from impact_posture.posture.program.constrained_problem import ConstrainedProblem
 from impact_posture.posture.program.posture_nlp import build_nlp
-from impact_posture.posture.search.solver_runs import run_start
+from impact_posture.posture.search.growing_search import run_start
 from impact_posture.robot.robot import Robot
 from impact_posture.system.processes import fork_map
 from impact_posture.tsid.flow.flow_direction import FlowOptions

@@ -18,7 +18,7 @@ from impact_posture.dynamics.tree import Tree
 from impact_posture.impact.quantities.impact_kernel import ImpactKernel
 from impact_posture.posture.program.ipopt import IPOPT_OPTIONS
 from impact_posture.posture.program.posture_nlp import PostureNLP, build_nlp
-from impact_posture.posture.search.solver_runs import run_start
+from impact_posture.posture.search.growing_search import run_start
 
 _CASES = ("tilthex_arm", "panda", "solo8, four feet", "talos, two feet")
 _HEAD = "case|formulation|unknowns|operations of Hessian|Jacobian|gradient|solve ms|iterations|ended".split("|")

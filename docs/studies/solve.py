@@ -14,8 +14,8 @@ from docs.studies.core import Request, Vector, cell, crba_time, feasible_starts,
 from docs.studies.exported import feet
 from impact_posture.posture.program.constrained_problem import ConstrainedProblem
 from impact_posture.posture.program.posture_nlp import PostureNLP, build_nlp
+from impact_posture.posture.search.growing_search import run_start
 from impact_posture.posture.search.multistart import solve
-from impact_posture.posture.search.solver_runs import run_start
 from impact_posture.system.toolchain import find_compiler
 
 # What the project asks of one start, ms.

@@ -25,8 +25,8 @@ from impact_posture.posture.manifold.null_space_path import null_space_path
 from impact_posture.posture.program.certificate import Certificate
 from impact_posture.posture.program.compiled_solver import CompileMode
 from impact_posture.posture.search.global_search import GlobalSearch, check_searchable, search_globally
+from impact_posture.posture.search.growing_search import Progress
 from impact_posture.posture.search.multistart import PostureSolution
-from impact_posture.posture.search.solver_runs import Progress
 from impact_posture.robot.posture_files import write_posture
 from impact_posture.system.arrays import Array
 from impact_posture.system.output_folder import whole_folder, write_json

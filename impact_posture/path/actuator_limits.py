@@ -8,8 +8,8 @@ import numpy as np
 import pinocchio as pin
 
 from impact_posture.impact.objective import Objective
+from impact_posture.posture.constraints.requirements import Requirements
 from impact_posture.posture.loads.load_cases import load_cases
-from impact_posture.posture.program.constrained_problem import Requirements
 from impact_posture.system.arrays import Array
 
 # Least part of the weight that counts as a wrench on the base that the rotors cannot make.

@@ -13,9 +13,9 @@ from impact_posture.errors import Infeasible, SolverFailed
 from impact_posture.impact.impact_contact import point_on
 from impact_posture.impact.worst_case_objective import WorstCaseObjective
 from impact_posture.posture.constraints.posture_distance import distance
+from impact_posture.posture.constraints.requirements import Requirements
 from impact_posture.posture.formulation.build_problem import build_problem
 from impact_posture.posture.formulation.problem_file import requirements
-from impact_posture.posture.program.constrained_problem import Requirements
 from impact_posture.posture.search.multistart import PostureSolution, solve
 from impact_posture.simulation.setup import Setup, naming_keys
 from impact_posture.system.arrays import Array

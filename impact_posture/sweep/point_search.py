@@ -15,9 +15,9 @@ from impact_posture.posture.manifold.feasible_start import FEASIBLE, Projector, 
 from impact_posture.posture.program.certificate import Certificate, certify
 from impact_posture.posture.program.constrained_problem import ConstrainedProblem
 from impact_posture.posture.program.posture_nlp import SLACK_PRICE, PostureNLP, WarmStart
-from impact_posture.posture.search.conflicts import ElasticAnswer, ElasticProgram, elastic
+from impact_posture.posture.search.conflicts import ElasticProgram, LeastViolation, find_conflicts
+from impact_posture.posture.search.growing_search import HIGH_PRICE
 from impact_posture.posture.search.multistart import distinct, solve
-from impact_posture.posture.search.solver_runs import HIGH_PRICE
 from impact_posture.system.arrays import Array
 
 # Most rounds in which the program of a point grows, and most of them before anything says that the point is feasible.
@@ -90,11 +90,11 @@ class Walk:
         """Return a problem with its target at a place."""
         return retarget(problem, *place, self.nlp.program.numeric)
 
-    def relax(self, place: Place, guesses: Sequence[Array] = (), beside: float = 0.0) -> ElasticAnswer:
+    def relax(self, place: Place, guesses: Sequence[Array] = (), beside: float = 0.0) -> LeastViolation:
         """Relax the constraints at a place, with the parts that the places before needed for it."""
         program = self._relaxed = self._relaxed or ElasticProgram(self.problem, self.nlp.program.rows.branch())
         before = program.time_s
-        found = elastic(self.at(program.problem, place), self.settings.seed, program, guesses, beside)
+        found = find_conflicts(self.at(program.problem, place), self.settings.seed, program, guesses, beside)
         self.timer.solver_s += program.time_s - before
         return found
 

@@ -26,9 +26,9 @@ from impact_posture.impact.impact_contact import ImpactContact
 from impact_posture.impact.objective import Objective, Subgradients
 from impact_posture.impact.quantities.lifted_form import Guess, Lifted
 from impact_posture.posture.constraints.constraint import ExpressionConstraint
+from impact_posture.posture.constraints.requirements import Requirements
 from impact_posture.posture.formulation.build_problem import build_problem
 from impact_posture.posture.manifold.null_space_path import null_space_path
-from impact_posture.posture.program.constrained_problem import Requirements
 from impact_posture.posture.search.multistart import solve
 from impact_posture.robot.robot import Robot
 from impact_posture.robot.robot_spec import Support

@@ -8,7 +8,7 @@ import pytest
 
 from impact_posture.config.settings import ProblemSettings
 from impact_posture.posture.formulation.problem_file import prepare
-from impact_posture.posture.program.program_expressions import Program
+from impact_posture.posture.program.program import Program
 from impact_posture.posture.program.program_rows import Derivatives
 from tests.support.settings import make_settings
 

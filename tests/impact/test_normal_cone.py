@@ -23,12 +23,12 @@ from impact_posture.impact.worst_case.normal_cone import NormalCone
 from impact_posture.impact.worst_case.worst_normal import cone_axes, worst_normal
 from impact_posture.impact.worst_case.worst_normal_symbolic import worst_normal_symbolic
 from impact_posture.impact.worst_case_objective import WorstCaseObjective
+from impact_posture.posture.constraints.requirements import Requirements
 from impact_posture.posture.formulation.build_problem import build_problem
 from impact_posture.posture.formulation.problem_file import prepare, read_settings
-from impact_posture.posture.program.constrained_problem import Requirements
 from impact_posture.posture.program.posture_nlp import build_nlp
+from impact_posture.posture.search.growing_search import run_start
 from impact_posture.posture.search.multistart import solve
-from impact_posture.posture.search.solver_runs import run_start
 from impact_posture.robot.robot_loader import load_robot
 from tests.support.command import run
 from tests.support.helpers import (

@@ -22,10 +22,11 @@ from impact_posture.path.path_search import connect, shortened
 from impact_posture.path.path_space import CHECK_DISTANCE, PathSpace
 from impact_posture.path.posture_path import posture_path
 from impact_posture.posture.constraints.constraint import ExpressionConstraint
+from impact_posture.posture.constraints.requirements import Requirements
 from impact_posture.posture.formulation.build_problem import build_problem
 from impact_posture.posture.formulation.problem_file import prepare
 from impact_posture.posture.manifold.feasible_start import feasible_start, random_posture
-from impact_posture.posture.program.constrained_problem import ConstrainedProblem, Requirements, equality_jacobian
+from impact_posture.posture.program.constrained_problem import ConstrainedProblem, equality_jacobian
 from impact_posture.posture.search.multistart import PostureSolution, solve
 from impact_posture.system.arrays import Array
 from tests.support.arms import TIP, Z, arm

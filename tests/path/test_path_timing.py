@@ -17,9 +17,9 @@ from impact_posture.path.actuator_limits import ActuatorLimits
 from impact_posture.path.path_curve import PathCurve
 from impact_posture.path.path_space import PathSpace
 from impact_posture.path.posture_path import PosturePath, posture_path
+from impact_posture.posture.constraints.requirements import Requirements
 from impact_posture.posture.formulation.build_problem import build_problem
 from impact_posture.posture.formulation.problem_file import prepare
-from impact_posture.posture.program.constrained_problem import Requirements
 from impact_posture.posture.search.multistart import PostureSolution, solve
 from impact_posture.robot.actuation import allocation_matrix, thrust_limits
 from impact_posture.robot.robot import Robot

@@ -30,10 +30,10 @@ from impact_posture.output.report.drawn_robot import DrawnRobot, draw_robot
 from impact_posture.posture.formulation.problem_file import prepare
 from impact_posture.posture.loads.load_cases import load_cases
 from impact_posture.posture.manifold.feasible_start import Projector, feasible_start
-from impact_posture.posture.search import solver_runs as search_module
+from impact_posture.posture.search import growing_search as search_module
 from impact_posture.posture.search import start_draws as draws_module
+from impact_posture.posture.search.growing_search import GrowingSearch
 from impact_posture.posture.search.multistart import solve
-from impact_posture.posture.search.solver_runs import Search
 from impact_posture.posture.search.start_draws import StartDraws
 from impact_posture.robot.robot_loader import load_robot
 from impact_posture.robot.support_polygon import polygon_edges
@@ -144,7 +144,7 @@ def test_an_end_that_lacks_parts_is_certified_in_the_last_round_only(monkeypatch
     problem = prepare(ProblemSettings(robot="panda", frame="panda_hand_tcp", normal=(-1.0, 0.0, 0.0))).problem
     scale = problem.objective.value(problem.given)
     draws = StartDraws(problem, (problem.given,), 2, 0)
-    search = Search(problem, draws, scale, compile="never", finish_all=True)
+    search = GrowingSearch(problem, draws, scale, compile="never", finish_all=True)
     runs = [search._run(index, last=False) for index in range(2)]
     lacking = [index for index, run in enumerate(runs) if run.lacks]
     # Without such an end the test shows nothing.
@@ -230,13 +230,13 @@ def test_starts_that_share_a_run_end_where_their_own_runs_would(
     robot: str, normal: tuple[float, float, float], monkeypatch: pytest.MonkeyPatch
 ) -> None:
     problem = prepare(ProblemSettings(robot=robot, normal=normal)).problem
-    ran, run = list[int](), Search._run
+    ran, run = list[int](), GrowingSearch._run
 
-    def counted(search: Search, index: int, *, last: bool) -> search_module.Run:
+    def counted(search: GrowingSearch, index: int, *, last: bool) -> search_module.SolverRun:
         ran.append(index)
         return run(search, index, last=last)
 
-    monkeypatch.setattr(Search, "_run", counted)
+    monkeypatch.setattr(GrowingSearch, "_run", counted)
     together = solve(problem, starts=16, jobs=1, compile="never", finish_all=True)
     shared = len(ran)
     monkeypatch.setattr(search_module, "_SAME", 0.0)

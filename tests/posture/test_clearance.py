@@ -24,14 +24,14 @@ from impact_posture.errors import Infeasible, InputError
 from impact_posture.impact.impact_contact import point_on
 from impact_posture.posture.constraints.clearance import Clearance
 from impact_posture.posture.constraints.pair_distances import PairDistances
-from impact_posture.posture.constraints.separator import EQUATIONS, ConvexBody, Separator
+from impact_posture.posture.constraints.separating_plane import EQUATIONS, ConvexBody, SeparatingPlane
 from impact_posture.posture.formulation.build_problem import retarget
 from impact_posture.posture.formulation.problem_file import prepare
 from impact_posture.posture.manifold.feasible_start import Projector, random_posture
 from impact_posture.posture.program.posture_nlp import build_nlp
-from impact_posture.posture.search.conflicts import ElasticProgram, elastic
+from impact_posture.posture.search.conflicts import ElasticProgram, find_conflicts
+from impact_posture.posture.search.growing_search import feasible
 from impact_posture.posture.search.multistart import solve
-from impact_posture.posture.search.solver_runs import feasible
 from impact_posture.robot.robot import Robot
 from impact_posture.robot.robot_loader import load_robot
 
@@ -40,7 +40,7 @@ ROBOTS = ("tilthex_arm", "talos", "panda", "kinova")
 KINDS = ("pair", "world", "half-space", "in the frame", "with a point")
 
 
-def _separator(robot: Robot, kind: str) -> Separator:
+def _separator(robot: Robot, kind: str) -> SeparatingPlane:
     last, first = robot.model.njoints - 1, 1
     a = ConvexBody.of_link(SweptHull("a", "a", last, BOX, 0.01))
     point = PointOnLink(first, np.array([0.1, -0.2, 0.05]), pin.exp3(np.array([0.3, 0.2, -0.5])))
@@ -52,7 +52,7 @@ def _separator(robot: Robot, kind: str) -> Separator:
         "in the frame": ConvexBody("b", None, point, normal=normal, offset=-0.1),
         "with a point": ConvexBody("b", SweptHull("b", "b", first, BOX, 0.005), point, turns=False),
     }[kind]
-    return Separator(a, b, 0.002)
+    return SeparatingPlane(a, b, 0.002)
 
 
 def _random(robot: Robot, rng: np.random.Generator) -> np.ndarray:
@@ -334,7 +334,7 @@ def test_a_relaxed_program_serves_other_targets_and_is_let_go() -> None:
     program = ElasticProgram(problem)
     for height in (1.4, -0.3, 1.5):
         kept, fresh = (
-            elastic(retarget(one.problem, (0.4, 0.1, height), None), program=one, beside=1e-3)
+            find_conflicts(retarget(one.problem, (0.4, 0.1, height), None), program=one, beside=1e-3)
             for one in (program, ElasticProgram(problem))
         )
         assert bool(kept.conflicts) is bool(height > 1) and kept.conflicts.keys() == fresh.conflicts.keys()
@@ -380,7 +380,7 @@ def test_starts_lie_near_a_posture_that_is_clear() -> None:
 def test_the_way_past_a_wall_is_found_from_every_seed(seed: int) -> None:
     # Few random postures lead to the free part.
     posed = prepare(ProblemSettings(robot="xarm7", normal=(-1, 0, 0))).problem
-    assert not elastic(posed, seed).conflicts
+    assert not find_conflicts(posed, seed).conflicts
 
 
 def test_no_slack_is_left_where_the_objective_falls_steeply() -> None:

@@ -17,18 +17,18 @@ from impact_posture.dynamics.numeric import Numeric
 from impact_posture.dynamics.tree import PointOnLink, Tree
 from impact_posture.impact.impact_contact import ImpactContact, point_on
 from impact_posture.impact.worst_case_objective import WorstCaseObjective
+from impact_posture.posture.constraints.center_of_mass_over_feet import CenterOfMassOverFeet
 from impact_posture.posture.constraints.constraint import ExpressionConstraint
 from impact_posture.posture.constraints.pose_constraints import (
     AxisInCone,
-    CenterOfMassOverFeet,
     HeldOrientation,
     HeldPose,
     HeldPosition,
     HeldTurn,
     PositionBox,
 )
+from impact_posture.posture.constraints.requirements import Requirements
 from impact_posture.posture.formulation.build_problem import build_problem
-from impact_posture.posture.program.constrained_problem import Requirements
 from impact_posture.robot.robot import Robot
 from impact_posture.robot.robot_loader import load_robot
 from impact_posture.system.arrays import independent_rows

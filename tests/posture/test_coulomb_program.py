@@ -13,13 +13,14 @@ from impact_posture.codegen.self_test import sample_postures
 from impact_posture.impact.friction.coulomb_impact import coulomb_impact
 from impact_posture.impact.impact_contact import ImpactContact
 from impact_posture.impact.worst_case_objective import WorstCaseObjective
+from impact_posture.posture.constraints.requirements import Requirements
 from impact_posture.posture.formulation.build_problem import build_problem
 from impact_posture.posture.formulation.problem_file import prepare, read_settings
 from impact_posture.posture.manifold.feasible_start import feasible_start
-from impact_posture.posture.program.constrained_problem import ConstrainedProblem, Requirements
+from impact_posture.posture.program.constrained_problem import ConstrainedProblem
 from impact_posture.posture.program.posture_nlp import build_nlp
+from impact_posture.posture.search.growing_search import run_start
 from impact_posture.posture.search.multistart import solve
-from impact_posture.posture.search.solver_runs import run_start
 from tests.support.arms import TIP, Y, arm
 from tests.support.command import refused, run
 from tests.support.exported import built

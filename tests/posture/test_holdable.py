@@ -27,9 +27,9 @@ from impact_posture.posture.loads.load_cases import LoadCase, LoadCases, load_ca
 from impact_posture.posture.manifold.feasible_start import feasible_start, random_posture
 from impact_posture.posture.program.constrained_problem import ConstrainedProblem
 from impact_posture.posture.program.posture_nlp import build_nlp
-from impact_posture.posture.search.conflicts import elastic
+from impact_posture.posture.search.conflicts import find_conflicts
+from impact_posture.posture.search.growing_search import run_start
 from impact_posture.posture.search.multistart import solve
-from impact_posture.posture.search.solver_runs import run_start
 from impact_posture.robot.actuation import allocation_matrix, hover, torque_limits
 from tests.support.helpers import Vector, assert_close, central_gradient, frame_jacobian, rng
 from tests.support.settings import make_settings
@@ -341,7 +341,7 @@ def test_a_tight_limit_is_kept_and_has_a_multiplier() -> None:
 def test_a_force_beyond_the_robot_is_infeasible_and_names_what_fails(
     name: str, normal: tuple[float, float, float], force: float, named: str
 ) -> None:
-    conflicts = elastic(problem(name, normal=normal, hold_force=force)).conflicts
+    conflicts = find_conflicts(problem(name, normal=normal, hold_force=force)).conflicts
     assert f"{named} while it pushes with {force:g} N" in conflicts
 
 

@@ -19,8 +19,8 @@ from impact_posture.impact.metric import Metric
 from impact_posture.impact.worst_case.model_set import ModelSet, finite_maximum
 from impact_posture.impact.worst_case_objective import WorstCaseObjective
 from impact_posture.posture.analysis.robustness import Robustness, VariantOptimum, solve_robustly
+from impact_posture.posture.constraints.center_of_mass_over_feet import CenterOfMassOverFeet
 from impact_posture.posture.constraints.kept_contacts import KeptContacts
-from impact_posture.posture.constraints.pose_constraints import CenterOfMassOverFeet
 from impact_posture.posture.formulation.problem_file import dump_settings, prepare, read_settings, resolved_settings
 from impact_posture.posture.program.constrained_problem import ConstrainedProblem
 from impact_posture.posture.search.multistart import solve

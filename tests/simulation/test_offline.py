@@ -11,7 +11,7 @@ import pytest
 from docs.studies.robustness.outcomes import is_held
 from impact_posture.posture.formulation.build_problem import build_problem
 from impact_posture.posture.loads.load_cases import load_cases
-from impact_posture.posture.search.solver_runs import feasible
+from impact_posture.posture.search.growing_search import feasible
 from impact_posture.robot.actuation import allocation_matrix, thrust_limits
 from impact_posture.simulation import offline_posture as offline
 from impact_posture.simulation.offline_posture import SHARE, offline_posture, scenario_requirements

@@ -16,8 +16,9 @@ from impact_posture.codegen.impact_gradient import ImpactGradient
 from impact_posture.errors import InputError, ManifestMismatch, MetricError
 from impact_posture.impact.impact_contact import ImpactContact
 from impact_posture.impact.worst_case_objective import WorstCaseObjective
+from impact_posture.posture.constraints.requirements import Requirements
 from impact_posture.posture.formulation.build_problem import build_problem
-from impact_posture.posture.program.constrained_problem import ConstrainedProblem, Requirements
+from impact_posture.posture.program.constrained_problem import ConstrainedProblem
 from impact_posture.posture.search.multistart import solve
 from impact_posture.robot.joint_model import with_joint_model
 from impact_posture.robot.robot_loader import load_robot

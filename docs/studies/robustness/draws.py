@@ -13,9 +13,9 @@ import pinocchio as pin
 from docs.studies.core import Vector
 from docs.studies.robustness.variations import RANGES, URDF_X, URDF_Z, VARIATIONS
 from impact_posture.errors import Infeasible, InputError
+from impact_posture.posture.constraints.requirements import Requirements
 from impact_posture.posture.formulation.build_problem import build_problem
 from impact_posture.posture.manifold.feasible_start import Projector
-from impact_posture.posture.program.constrained_problem import Requirements
 from impact_posture.robot.robot_loader import load_robot
 from impact_posture.simulation.controller_gains import Gains, StanceGains
 from impact_posture.simulation.scenario_file import RepeatedContacts, Scenario, SinglePush, read_scenario

@@ -1,1 +1,1 @@
-"""Verdict, caveats, trade-off, robustness and the result document."""
+"""Verdict, warnings, trade-off, robustness and the result document."""

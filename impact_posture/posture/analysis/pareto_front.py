@@ -26,14 +26,14 @@ import numpy as np
 
 from impact_posture.errors import InputError, MetricError
 from impact_posture.impact.elasticity.contact_compression import ContactStiffness
-from impact_posture.posture.analysis.price_rulers import DistanceRuler, ForceRuler, Ruler
 from impact_posture.posture.analysis.trade_off import TradeOff, TradePoint, find_knee
+from impact_posture.posture.analysis.trade_off_price import DistancePrice, ForcePrice, TradeOffPrice
 from impact_posture.posture.program.certificate import Certificate, certify
 from impact_posture.posture.program.compiled_solver import CompileMode
 from impact_posture.posture.program.constrained_problem import ConstrainedProblem
 from impact_posture.posture.program.posture_nlp import PostureNLP, WarmStart, build_nlp
+from impact_posture.posture.search.growing_search import Progress, run_start
 from impact_posture.posture.search.multistart import PostureSolution, solve
-from impact_posture.posture.search.solver_runs import Progress, run_start
 from impact_posture.system.arrays import Array
 
 # A move below this (rad, m) is zero.
@@ -75,24 +75,26 @@ def pareto_front(
     if points < 1:
         raise InputError(f"the number of points is {points}", where="tradeoff", hint="give 1 or more")
     problem = solution.problem
-    ruler = _ruler(solution, force, compile)
-    least, most = ruler.measure(ruler.nearest), ruler.measure(solution.q)
-    bounded = _bounded(problem, ruler)
+    price = _price(solution, force, compile)
+    least, most = price.measure(price.nearest), price.measure(solution.q)
+    bounded = _bounded(problem, price)
     if most - least < _STILL * max(1.0, least):
-        curve = _Curve(bounded, None, ruler, [least])
-        return curve.finish(solution, 0.0, 0.0, [f"trade-off: {ruler.nothing}, nothing to trade"])
+        curve = _Curve(bounded, None, price, [least])
+        return curve.finish(solution, 0.0, 0.0, [f"trade-off: {price.nothing}, nothing to trade"])
     nlp = build_nlp(bounded, compile=compile, starts=2 * points)
     began = time.perf_counter()
     levels = [float(v) for v in least + (most - least) * np.arange(points + 1) / points]
-    curve = _Curve(bounded, nlp, ruler, levels, compile)
+    curve = _Curve(bounded, nlp, price, levels, compile)
     curve.follow(solution, progress)
     return curve.finish(solution, time.perf_counter() - began, nlp.build_time_s, [])
 
 
-def _ruler(solution: PostureSolution, force: tuple[ContactStiffness, float] | None, compile: CompileMode) -> Ruler:
+def _price(
+    solution: PostureSolution, force: tuple[ContactStiffness, float] | None, compile: CompileMode
+) -> TradeOffPrice:
     problem = solution.problem
     if force is None:
-        return DistanceRuler(problem.robot.model, solution.initial)
+        return DistancePrice(problem.robot.model, solution.initial)
     objective, (contact, speed) = problem.impact, force
     if objective.others:
         raise InputError(
@@ -101,12 +103,12 @@ def _ruler(solution: PostureSolution, force: tuple[ContactStiffness, float] | No
     # E = 1/(2G), and the force falls as G rises.
     lightest = replace(objective, kind="energy", normal_cone_deg=0.0, model_variants=())
     found = solve(replace(problem, objective=lightest), starts=_FORCE_STARTS, compile=compile, guesses=[solution.q])
-    return ForceRuler(objective, contact, speed, found.q)
+    return ForcePrice(objective, contact, speed, found.q)
 
 
-def _bounded(problem: ConstrainedProblem, ruler: Ruler) -> ConstrainedProblem:
+def _bounded(problem: ConstrainedProblem, price: TradeOffPrice) -> ConstrainedProblem:
     """The problem with the bound as its last constraint, and without its regularization."""
-    row = ruler.bound(1.0)
+    row = price.bound(1.0)
     return replace(
         problem,
         requirements=replace(problem.requirements, regularization=0.0),
@@ -135,18 +137,18 @@ class _Curve:
         self,
         problem: ConstrainedProblem,
         nlp: PostureNLP | None,
-        ruler: Ruler,
+        price: TradeOffPrice,
         levels: list[float],
         compile: CompileMode = "auto",
     ) -> None:
-        self._problem, self._nlp, self._ruler, self._levels, self._compile = problem, nlp, ruler, levels, compile
-        self._scale = problem.objective.value(ruler.nearest)
+        self._problem, self._nlp, self._price, self._levels, self._compile = problem, nlp, price, levels, compile
+        self._scale = problem.objective.value(price.nearest)
         self._best: list[_Found | None] = [None] * len(levels)
         self._tried: set[tuple[int, bytes]] = set()
         # Ends of solves by their postures.
         self._ends: dict[bytes, WarmStart] = {}
         self.solves = 0
-        self._take(0, "outward", ruler.nearest)
+        self._take(0, "outward", price.nearest)
 
     def follow(self, solution: PostureSolution, progress: Progress | None) -> None:
         """Solve outward from the least price, and inward from the optimum and from cheaper optima."""
@@ -155,7 +157,7 @@ class _Curve:
         self._take(last, "inward", solution.q)
         paths = [("inward", last, solution.q)]
         for number, optimum in enumerate(solution.optima[1 : 1 + _PATHS]):
-            price = self._ruler.measure(optimum.q)
+            price = self._price.measure(optimum.q)
             if price <= self._levels[last]:
                 k = int(np.searchsorted(self._levels, price))
                 paths.append((f"optimum {number}", k, optimum.q))
@@ -170,7 +172,7 @@ class _Curve:
             for inner in range(k - 1, 0, -1):
                 q = self._solve(inner, path, q)
                 step()
-        q = self._ruler.nearest
+        q = self._price.nearest
         for k in range(1, last + 1):
             q = self._solve(k, "outward", q)
             step()
@@ -198,7 +200,7 @@ class _Curve:
         if self._nlp is None or key in self._tried:
             return start
         self._tried.add(key)
-        start = self._ruler.within(start, level)
+        start = self._price.within(start, level)
         try:
             for _ in range(_GROWTH):
                 nlp, warm = self._nlp.bounded(self._at(level)), self._ends.get(start.tobytes())
@@ -219,7 +221,7 @@ class _Curve:
         return record.q if certificate.holds() else start
 
     def _at(self, level: float) -> ConstrainedProblem:
-        bound = self._ruler.bound(level)
+        bound = self._price.bound(level)
         return replace(self._problem, constraints=(*self._problem.constraints[:-1], bound))
 
     def _take(self, k: int, path: str, q: Array, certificate: Certificate | None = None) -> None:
@@ -236,7 +238,7 @@ class _Curve:
         found = problem.impact.oracle.quantities(q)
         return TradePoint(
             within=self._levels[k],
-            distance=self._ruler.measure(q),
+            distance=self._price.measure(q),
             q=q,
             objective=problem.objective.value(q),
             H=found.H,
@@ -252,7 +254,7 @@ class _Curve:
         points: list[TradePoint] = []
         for k, found in enumerate(self._best):
             # If no solve ended on the constraints, the posture of the previous level satisfies them.
-            before = points[-1].q if points else self._ruler.nearest
+            before = points[-1].q if points else self._price.nearest
             points.append(self._point(k, before) if found is None else found.point)
         best = solution.problem.objective.value(solution.q)
         open_ = [f"{p.within:.3g}" for p in points if not p.certified]
@@ -273,4 +275,4 @@ class _Curve:
                 "more `starts` may find it, too"
             )
         knee = find_knee(np.array([p.distance for p in points]), np.array([p.objective for p in points]))
-        return TradeOff(tuple(points), knee, self.solves, solve, build, tuple(notes), self._ruler.against)
+        return TradeOff(tuple(points), knee, self.solves, solve, build, tuple(notes), self._price.against)

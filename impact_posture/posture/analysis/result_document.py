@@ -14,7 +14,7 @@ from numpy.typing import NDArray
 
 from impact_posture.config.toml_tables import json_block
 from impact_posture.impact.evaluation.evaluation import Evaluation
-from impact_posture.posture.analysis.caveats import caveats
+from impact_posture.posture.analysis.posture_warnings import posture_warnings
 from impact_posture.posture.analysis.robustness import Robustness
 from impact_posture.posture.analysis.trade_off import TradeOff
 from impact_posture.posture.analysis.verdict import verdict
@@ -57,7 +57,7 @@ def result_document(
     approach = AttainableSpeed(impact.robot, impact.objective, prepared.problem.requirements)
     attainable = [approach.reached(q) for q in (solution.initial, solution.q)]
     fault = [solution.compiler_fault] if solution.compiler_fault else []
-    found = caveats(prepared, solution.initial, solution.q, after, attainable[1])
+    found = posture_warnings(prepared, solution.initial, solution.q, after, attainable[1])
     warnings = (*impact.warnings, *initial.warnings, *optimal.warnings, *fault, *found)
     curve = {} if tradeoff is None else {"tradeoff": tradeoff.to_list(), "tradeoff_against": tradeoff.against}
     return {

@@ -15,9 +15,9 @@ from impact_posture.impact.worst_case_objective import WorstCaseObjective
 from impact_posture.posture.formulation.build_problem import build_problem
 from impact_posture.posture.program.compiled_solver import CompileMode
 from impact_posture.posture.program.constrained_problem import ConstrainedProblem
+from impact_posture.posture.search.growing_search import Progress
 from impact_posture.posture.search.impact_notes import percent
 from impact_posture.posture.search.multistart import SAME_POSTURE, PostureSolution, solve, wrapped_difference
-from impact_posture.posture.search.solver_runs import Progress
 from impact_posture.robot.model_variant import between
 from impact_posture.system.arrays import Array
 

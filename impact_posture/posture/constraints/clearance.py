@@ -16,7 +16,7 @@ from impact_posture.dynamics.tree import Tree
 from impact_posture.impact.quantities.lifted_form import Guess
 from impact_posture.posture.constraints.constraint import Constraint, LiftedRows, Linearization
 from impact_posture.posture.constraints.pair_distances import PairDistances
-from impact_posture.posture.constraints.separator import EQUATIONS, Corners, Separator
+from impact_posture.posture.constraints.separating_plane import EQUATIONS, Corners, SeparatingPlane
 from impact_posture.system.arrays import Array
 
 # Pairs closer than this (m) beyond their clearance are computed exactly; a bound is enough for the others.
@@ -52,7 +52,7 @@ class Clearance(Constraint):
     def __init__(
         self,
         name: str,
-        separators: Sequence[Separator],
+        separators: Sequence[SeparatingPlane],
         words: str,
         active: Mapping[int, Corners] | None = None,
         lifted: _Lifted | None = None,
@@ -151,7 +151,7 @@ class Clearance(Constraint):
     # ---- lifted form ------------------------------------------------------------------------------------------
 
     @property
-    def _program(self) -> list[tuple[int, Separator, Corners]]:
+    def _program(self) -> list[tuple[int, SeparatingPlane, Corners]]:
         return [(k, self._separators[k], corners) for k, corners in self.active.items()]
 
     def _own_plane(self, k: int) -> slice:

@@ -8,7 +8,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from impact_posture.dynamics.numeric import Numeric
-from impact_posture.posture.constraints.separator import ConvexBody, Separator
+from impact_posture.posture.constraints.separating_plane import ConvexBody, SeparatingPlane
 from impact_posture.system.arrays import Array
 
 
@@ -23,7 +23,7 @@ class PairDistances:
         separators: The pairs.
     """
 
-    def __init__(self, separators: Sequence[Separator]) -> None:
+    def __init__(self, separators: Sequence[SeparatingPlane]) -> None:
         self._separators = tuple(separators)
         bodies: dict[int, ConvexBody] = {}
         for one in self._separators:

@@ -21,7 +21,7 @@ from impact_posture.impact.impact_contact import ImpactContact, point_on
 from impact_posture.posture.constraints.clearance import Clearance
 from impact_posture.posture.constraints.nested_links import NestedLinks
 from impact_posture.posture.constraints.pair_distances import PairDistances
-from impact_posture.posture.constraints.separator import ConvexBody, Separator
+from impact_posture.posture.constraints.separating_plane import ConvexBody, SeparatingPlane
 from impact_posture.robot.robot import Robot
 from impact_posture.robot.robot_spec import Support
 from impact_posture.system.arrays import Array
@@ -166,11 +166,11 @@ class Surroundings:
     def constraints(self) -> list[Clearance]:
         """Return one constraint for the links among themselves, and one for each wall."""
         near = f"at least {1e3 * self._clearance:g} mm apart"
-        pairs = [Separator(self._bodies[i], self._bodies[j], self._clearance) for i, j in self.shapes.pairs]
+        pairs = [SeparatingPlane(self._bodies[i], self._bodies[j], self._clearance) for i, j in self.shapes.pairs]
         groups = [("self-collision", pairs, f"links {near} ({len(pairs)} pairs)")]
         for wall in self._walls:
             apart = [
-                Separator(body, wall.body, self._clearance)
+                SeparatingPlane(body, wall.body, self._clearance)
                 for body in self._bodies
                 if body.point.joint not in wall.exempt
             ]
@@ -265,7 +265,7 @@ class Surroundings:
         return self._height(ConvexBody.of_link(hull), plane)
 
     def _height(self, body: ConvexBody, plane: ConvexBody) -> float:
-        return Separator(body, plane, 0.0).distance(self._numeric)[0]
+        return SeparatingPlane(body, plane, 0.0).distance(self._numeric)[0]
 
 
 def _rigid_groups(robot: Robot, held: Sequence[str]) -> list[int]:

@@ -18,21 +18,22 @@ from impact_posture.impact.objective import Objective
 from impact_posture.impact.worst_case_objective import WorstCaseObjective
 from impact_posture.posture.approach.approach_speed import ApproachSpeed
 from impact_posture.posture.approach.attainable_speed import AttainableSpeed
+from impact_posture.posture.constraints.center_of_mass_over_feet import CenterOfMassOverFeet
 from impact_posture.posture.constraints.constraint import Constraint
-from impact_posture.posture.constraints.impact_constraints import in_every_variant, kept_feet, limits
 from impact_posture.posture.constraints.pose_constraints import (
     AxisInCone,
-    CenterOfMassOverFeet,
     HeldOrientation,
     HeldPose,
     HeldPosition,
     PositionBox,
     base_point,
 )
+from impact_posture.posture.constraints.requirements import Requirements
 from impact_posture.posture.constraints.surroundings import Surroundings
-from impact_posture.posture.formulation.well_posed import pin_undetermined, regularize
+from impact_posture.posture.formulation.impact_constraints import in_every_variant, kept_feet, limits
+from impact_posture.posture.formulation.well_posed import fix_undetermined_motions, make_well_posed
 from impact_posture.posture.loads.load_cases import LoadCases, load_cases
-from impact_posture.posture.program.constrained_problem import ConstrainedProblem, Requirements
+from impact_posture.posture.program.constrained_problem import ConstrainedProblem
 from impact_posture.robot.robot import Robot
 from impact_posture.robot.robot_spec import Support
 from impact_posture.robot.support_polygon import polygon_edges
@@ -89,7 +90,7 @@ def build_problem(robot: Robot, objective: Objective, given: Array, requirements
     held_up = load_cases(objective, given, requirements) if requirements.holdable else LoadCases()
     decided += held_up.notes
     loads = [constraint for case in held_up.cases for constraint in case.constraints()]
-    more, notes = pin_undetermined(robot, objective, numeric, requirements, constraints)
+    more, notes = fix_undetermined_motions(robot, objective, numeric, requirements, constraints)
     clear, around = [], None
     if requirements.collision:
         around = _surroundings(objective, numeric, requirements, list(struck.values()))
@@ -98,7 +99,7 @@ def build_problem(robot: Robot, objective: Objective, given: Array, requirements
         robot, objective, requirements, given, (*constraints, *more, *clear, *loads), lower, upper,
         notes=(*decided, *notes), surroundings=around,
     )  # fmt: skip
-    return regularize(problem)
+    return make_well_posed(problem)
 
 
 def retarget(

@@ -15,9 +15,10 @@ from impact_posture.impact.elasticity.contact_compression import ContactStiffnes
 from impact_posture.impact.objective import Objective
 from impact_posture.impact.resolved_impact import FLOATS, ResolvedImpact, resolve
 from impact_posture.posture.approach.attainable_speed import FASTEST
-from impact_posture.posture.constraints.pose_constraints import CenterOfMassOverFeet
+from impact_posture.posture.constraints.center_of_mass_over_feet import CenterOfMassOverFeet
+from impact_posture.posture.constraints.requirements import Requirements
 from impact_posture.posture.formulation.build_problem import build_problem
-from impact_posture.posture.program.constrained_problem import ConstrainedProblem, Requirements
+from impact_posture.posture.program.constrained_problem import ConstrainedProblem
 from impact_posture.robot.model_variant import ModelVariant
 from impact_posture.robot.robot import Robot
 from impact_posture.robot.robot_loader import from_folder, names_a_path

@@ -12,11 +12,11 @@ from impact_posture.dynamics.numeric import Numeric
 from impact_posture.impact.objective import Objective
 from impact_posture.posture.constraints.constraint import Constraint
 from impact_posture.posture.constraints.pose_constraints import HeldPosition, HeldTurn, base_point
+from impact_posture.posture.constraints.requirements import Requirements
 from impact_posture.posture.manifold.feasible_start import Projector, feasible_start
 from impact_posture.posture.program.constrained_problem import (
     RANK_TOLERANCE,
     ConstrainedProblem,
-    Requirements,
     equality_jacobian,
     held_rows,
     rank,
@@ -30,7 +30,7 @@ _TRIAL, _SURVIVES = 0.05, 0.1
 _SAMPLES = 4
 
 
-def pin_undetermined(
+def fix_undetermined_motions(
     robot: Robot,
     objective: Objective,
     numeric: Numeric,
@@ -81,7 +81,7 @@ def pin_undetermined(
     return added, notes
 
 
-def regularize(problem: ConstrainedProblem) -> ConstrainedProblem:
+def make_well_posed(problem: ConstrainedProblem) -> ConstrainedProblem:
     """Choose independent equality rows for the program, and hold turns that exist to first order only.
 
     Four point feet on planar legs (solo8) give 12 equations of rank 10.  Two equations repeat others, and the base

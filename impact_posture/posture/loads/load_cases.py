@@ -13,11 +13,11 @@ from impact_posture.impact.impact_contact import ImpactContact, point_on
 from impact_posture.impact.objective import Objective
 from impact_posture.impact.worst_case_objective import WorstCaseObjective
 from impact_posture.posture.constraints.constraint import Constraint
-from impact_posture.posture.loads.actuator_loads import Holding
+from impact_posture.posture.constraints.requirements import Requirements
 from impact_posture.posture.loads.equilibrium import Equilibrium, Thrusts
 from impact_posture.posture.loads.holdable import Holdable, ReachableWrench
+from impact_posture.posture.loads.holding_forces import HoldingForces
 from impact_posture.posture.loads.static_load import ForceSource, StaticLoad
-from impact_posture.posture.program.constrained_problem import Requirements
 from impact_posture.robot.actuation import allocation_matrix, thrust_limits, torque_limits
 from impact_posture.robot.robot import Robot
 from impact_posture.system.arrays import Array
@@ -70,11 +70,11 @@ class LoadCases:
     notes: tuple[str, ...] = ()
     unknown: str = ""
 
-    def holding(self, q: Array) -> Holding | None:
+    def holding(self, q: Array) -> HoldingForces | None:
         """Return what holds ``q``, at rest and in the other cases; ``None`` if the data do not say."""
         if not self.cases:
             return None
-        found = [Holding.of(case.name, case.equilibrium, case.unreachable, q) for case in self.cases]
+        found = [HoldingForces.of(case.name, case.equilibrium, case.unreachable, q) for case in self.cases]
         return replace(found[0], other_loads=tuple(found[1:]))
 
 

@@ -8,82 +8,19 @@ from itertools import accumulate, pairwise
 
 import numpy as np
 
-from impact_posture.config.obstacle import Obstacle
-from impact_posture.config.settings import CLEARANCE, Vector3
 from impact_posture.dynamics.numeric import Numeric
 from impact_posture.errors import InputError
 from impact_posture.impact.objective import Objective
 from impact_posture.impact.quantities.lifted_form import Guess
 from impact_posture.impact.worst_case_objective import WorstCaseObjective
 from impact_posture.posture.constraints.constraint import Constraint
+from impact_posture.posture.constraints.requirements import Requirements
 from impact_posture.posture.constraints.surroundings import Surroundings
 from impact_posture.robot.robot import Robot
 from impact_posture.system.arrays import Array
 
 # A direction of the tangent space is held if a unit step along it moves a constraint by more than this.
 RANK_TOLERANCE = 1e-7
-
-
-@dataclass(frozen=True)
-class Requirements:
-    """Demands of the task on the posture.
-
-    Attributes:
-        contact_pose: Part of the pose of the leading contact frame that is held, as in the setting of that name.
-        other_poses: The same for each other contact frame.
-        target_position: Position of the contact frame, world, meters; ``None`` for its initial position.
-        target_quaternion: Orientation of the contact frame, x y z w; ``None`` for its initial orientation.
-        box: Half extents of the box of ``contact_pose = box``, meters.
-        base: Freedom of the floating base: ``free``, ``level`` (tilt zero, yaw free), ``level:DEG`` (tilt from
-            its default posture at most DEG degrees, yaw free), ``fixed`` or ``box``.
-        base_box: Half extents of the box of ``base = box``, meters.
-        keep: Frames whose pose is held.
-        hold: Joints kept at their initial value.
-        com_over_feet: Keep the center of mass above the support polygon.
-        com_asked: Whether the user set ``com_over_feet``; else it is dropped if the feet span no area.
-        com_margin: Distance from the polygon's edges, meters.
-        keep_contacts: The impact must neither lift nor slide a foot.
-        friction: Friction coefficient of the feet.
-        holdable: Thrusts, torques and forces of the feet that hold the posture stay within their limits.
-        limit_share: Share of the limits of torques and thrusts that holding may take; of a range, about its middle.
-        hold_force: Force that each contact pushes back with after the impact, N, which has to be held as well.
-        least_mobility: Least G of each contact, 1/kg, for the bound on the peak force; 0 for none.
-        largest_jump: Largest jump of a joint per approach speed; infinite for no bound.
-        approach_speed: Speed at which the joints have to bring the contact to the surface, m/s; 0 for no demand.
-        collision: Keep the links clear of each other, the surface, the ground and the obstacles.
-        clearance: Least distance of all of these, m.
-        surface: ``plane``, ``none``, or the edge length of a square patch in m; ``None`` to decide by the robot.
-        obstacles: Bodies in the world.
-        limit_margin: Distance from the joint limits, rad or m.
-        regularization: Weight of the squared distance from the initial posture, relative to the initial objective.
-    """
-
-    contact_pose: str = "full"
-    other_poses: tuple[str, ...] = ()
-    target_position: Vector3 | None = None
-    target_quaternion: tuple[float, float, float, float] | None = None
-    box: Vector3 = (0.05, 0.05, 0.05)
-    base: str = "free"
-    base_box: Vector3 = (0.2, 0.2, 0.2)
-    keep: tuple[str, ...] = ()
-    hold: tuple[str, ...] = ()
-    com_over_feet: bool = False
-    com_asked: bool = True
-    com_margin: float = 0.0
-    keep_contacts: bool = False
-    friction: float = 0.7
-    holdable: bool = False
-    limit_share: float = 1.0
-    hold_force: float = 0.0
-    least_mobility: float = 0.0
-    largest_jump: float = float("inf")
-    approach_speed: float = 0.0
-    collision: bool = False
-    clearance: float = CLEARANCE
-    surface: str | float | None = None
-    obstacles: tuple[Obstacle, ...] = ()
-    limit_margin: float = 0.0
-    regularization: float = 0.0
 
 
 @dataclass(frozen=True)

@@ -15,7 +15,7 @@ from impact_posture.dynamics.chart import Chart
 from impact_posture.posture.program.compiled_solver import CompileMode, compiled_solver
 from impact_posture.posture.program.constrained_problem import ConstrainedProblem
 from impact_posture.posture.program.ipopt import CONVERGED, IPOPT_OPTIONS, WARM_OPTIONS, WORST_OPTIONS, run_solver
-from impact_posture.posture.program.program_expressions import Program, parameters
+from impact_posture.posture.program.program import Program, parameters
 from impact_posture.posture.program.program_rows import ProgramRows
 from impact_posture.system.arrays import Array
 

@@ -35,7 +35,7 @@ _ROUNDS = 20
 
 
 @dataclass(frozen=True)
-class ElasticAnswer:
+class LeastViolation:
     """The least violation that could be found.
 
     Attributes:
@@ -53,13 +53,13 @@ class ElasticAnswer:
     violation: float
 
 
-def elastic(
+def find_conflicts(
     problem: ConstrainedProblem,
     seed: int = 0,
     program: ElasticProgram | None = None,
     guesses: Sequence[Array] = (),
     beside: float = 0.0,
-) -> ElasticAnswer:
+) -> LeastViolation:
     """Minimize the slack ``Σ (s⁺ + s⁻)`` with ``c(q) + s⁺ − s⁻`` within bounds, from several postures.
 
     Args:
@@ -72,7 +72,7 @@ def elastic(
     """
     chart = Chart.of(problem.robot.model)
     program = program or ElasticProgram(problem)
-    best: ElasticAnswer | None = None
+    best: LeastViolation | None = None
     for count, start in enumerate(islice(chain(guesses, _starts(problem, chart, seed)), _TRIES), 1):
         for _ in range(_ROUNDS):
             found = _relax(problem, chart, program, start)
@@ -98,7 +98,7 @@ def _starts(problem: ConstrainedProblem, chart: Chart, seed: int) -> Iterator[Ar
         yield from (found[k].q for k in sorted(range(len(found)), key=order.__getitem__))
 
 
-def _relax(problem: ConstrainedProblem, chart: Chart, program: ElasticProgram, start: Array) -> ElasticAnswer:
+def _relax(problem: ConstrainedProblem, chart: Chart, program: ElasticProgram, start: Array) -> LeastViolation:
     """Minimize the slack from one posture; the answer's problem has grown if the program lacked parts."""
     lower_rows, upper_rows = problem.row_bounds
     norms = np.zeros(len(chart.quaternion_slices()))
@@ -183,7 +183,7 @@ def _widened(hessian: ca.SX, before: int, width: int, after: int) -> ca.SX:
     return wide
 
 
-def _judge(problem: ConstrainedProblem, chart: Chart, q: Array) -> ElasticAnswer:
+def _judge(problem: ConstrainedProblem, chart: Chart, q: Array) -> LeastViolation:
     numeric = Numeric(problem.robot.model).at(q)
     conflicts: dict[str, float] = {}
     total = 0.0
@@ -201,4 +201,4 @@ def _judge(problem: ConstrainedProblem, chart: Chart, q: Array) -> ElasticAnswer
             limits.append(f"'{slot.name}' at its lower limit")
         elif problem.upper[slot.x] - x[slot.x] < 1e-4:
             limits.append(f"'{slot.name}' at its upper limit")
-    return ElasticAnswer(q, problem, conflicts, tuple(limits), total)
+    return LeastViolation(q, problem, conflicts, tuple(limits), total)

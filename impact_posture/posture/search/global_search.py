@@ -24,8 +24,8 @@ from impact_posture.posture.manifold.self_motion import SelfMotion, map_self_mot
 from impact_posture.posture.program.compiled_solver import CompileMode
 from impact_posture.posture.program.constrained_problem import ConstrainedProblem, equality_jacobian, rank
 from impact_posture.posture.program.ipopt import one_blas_thread
+from impact_posture.posture.search.growing_search import Progress
 from impact_posture.posture.search.multistart import PostureSolution, solve
-from impact_posture.posture.search.solver_runs import Progress
 from impact_posture.system.arrays import Array
 
 # Hops for each start of the multi-start search, and so rounds of as many hops as starts.

@@ -11,8 +11,8 @@ from impact_posture.posture.formulation.build_problem import build_problem
 from impact_posture.posture.manifold.feasible_start import Projector, feasible_start
 from impact_posture.posture.program.constrained_problem import ConstrainedProblem
 from impact_posture.posture.program.program_rows import ProgramRows
-from impact_posture.posture.search.conflicts import ElasticProgram, elastic
-from impact_posture.posture.search.solver_runs import feasible
+from impact_posture.posture.search.conflicts import ElasticProgram, find_conflicts
+from impact_posture.posture.search.growing_search import feasible
 from impact_posture.system.arrays import Array
 
 # A violation so small that the relaxed constraints stop after the first few postures.
@@ -33,7 +33,7 @@ def initial_posture(problem: ConstrainedProblem, seed: int, rows: ProgramRows) -
     if start is not None and feasible(problem, start):
         return problem, start
     given, problem = problem.given, problem if start is None else replace(problem, given=start)
-    answer = elastic(problem, seed, ElasticProgram(problem, rows))
+    answer = find_conflicts(problem, seed, ElasticProgram(problem, rows))
     if answer.conflicts:
         limits = f"; there {', '.join(answer.at_limits[:4])}" if answer.at_limits else ""
         sign = "; check the sign of the normal, which points towards the robot, and how far the `surface` reaches"
@@ -60,7 +60,7 @@ def _way_out(problem: ConstrainedProblem, seed: int) -> str:
     freed = replace(problem.requirements, contact_pose="position", target_quaternion=None)
     try:
         turned = build_problem(problem.robot, problem.objective, problem.given, freed)
-        found = elastic(turned, seed, beside=_QUICK)
+        found = find_conflicts(turned, seed, beside=_QUICK)
     except ImpactPostureError:
         return ""
     return "" if found.conflicts else "let the contact frame turn (`contact_pose='position'`), which is possible; or "

@@ -7,10 +7,10 @@ from collections.abc import Sequence
 from impact_posture.dynamics.numeric import Numeric
 from impact_posture.errors import InputError
 from impact_posture.impact.worst_case_objective import WorstCaseObjective
+from impact_posture.posture.constraints.center_of_mass_over_feet import CenterOfMassOverFeet
 from impact_posture.posture.constraints.constraint import Constraint
 from impact_posture.posture.constraints.impact_bounds import ImpactBounds
 from impact_posture.posture.constraints.kept_contacts import KeptContacts
-from impact_posture.posture.constraints.pose_constraints import CenterOfMassOverFeet
 
 
 def limits(objective: WorstCaseObjective, bounds: tuple[float, float], variant: str = "") -> list[Constraint]:

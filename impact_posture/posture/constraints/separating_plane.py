@@ -112,7 +112,7 @@ class Corners(NamedTuple):
     b: frozenset[int]
 
 
-class Separator:
+class SeparatingPlane:
     """The rows and unknowns that keep body ``a`` clear of body ``b``.
 
     Args:

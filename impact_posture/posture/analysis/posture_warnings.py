@@ -5,7 +5,7 @@ from __future__ import annotations
 from impact_posture.dynamics.numeric import Numeric
 from impact_posture.impact.impact_contact import point_on
 from impact_posture.posture.formulation.problem_file import Prepared
-from impact_posture.posture.loads.actuator_loads import Holding
+from impact_posture.posture.loads.holding_forces import HoldingForces
 from impact_posture.system.arrays import Array
 
 # Share of the approach speed that three digits do not show.
@@ -14,8 +14,8 @@ _REACHED = 5e-3
 _BEHIND = 0.01
 
 
-def caveats(
-    prepared: Prepared, initial: Array, q: Array, holding: Holding | None, attainable: float | None
+def posture_warnings(
+    prepared: Prepared, initial: Array, q: Array, holding: HoldingForces | None, attainable: float | None
 ) -> list[str]:
     """Return warnings about holding, approach, surface and ground, for the initial and the optimal posture.
 

@@ -31,7 +31,7 @@ class ActuatorLoad:
 
 
 @dataclass(frozen=True)
-class Holding:
+class HoldingForces:
     """Forces that hold a posture with the least largest share of a limit.
 
     Attributes:
@@ -51,10 +51,10 @@ class Holding:
     unbalanced: float
     actuators: dict[str, ActuatorLoad]
     contact_forces: dict[str, list[float]]
-    other_loads: tuple[Holding, ...] = field(default=())
+    other_loads: tuple[HoldingForces, ...] = field(default=())
 
     @staticmethod
-    def of(load: str, rest: Equilibrium, unreachable: Array, q: Array) -> Holding:
+    def of(load: str, rest: Equilibrium, unreachable: Array, q: Array) -> HoldingForces:
         """Distribute the forces at ``q``.
 
         Args:
@@ -75,7 +75,7 @@ class Holding:
             if own.size and not source.in_frame:
                 foot = source.names[0]
                 forces[foot] = forces.get(foot, np.zeros(3)) + (source.columns @ own)[:3]
-        return Holding(
+        return HoldingForces(
             load=load,
             feasible=unbalanced <= _ROUNDING and found.largest <= 1 + _ROUNDING,
             largest_share=found.largest,

@@ -18,7 +18,7 @@ from impact_posture.system.arrays import Array
 
 
 @dataclass(frozen=True, eq=False)
-class DistanceRuler:
+class DistancePrice:
     """The distance from the initial posture, rad mixed with m.
 
     Attributes:
@@ -48,7 +48,7 @@ class DistanceRuler:
 
 
 @dataclass(frozen=True, eq=False)
-class ForceRuler:
+class ForcePrice:
     """The peak force of the impact without friction, N, which falls as G rises."""
 
     objective: WorstCaseObjective
@@ -59,16 +59,16 @@ class ForceRuler:
     nothing: str = "the optimum has the least force"
 
     def measure(self, q: Array) -> float:
-        """See :class:`DistanceRuler`."""
+        """See :class:`DistancePrice`."""
         return self.contact.peak_force(self.objective.oracle.quantities(q).G, self.speed)
 
     def bound(self, level: float) -> Constraint:
-        """See :class:`DistanceRuler`."""
+        """See :class:`DistancePrice`."""
         return ImpactBounds(self.objective, self.contact.least_mobility(level, self.speed), float("inf"))
 
     def within(self, q: Array, level: float) -> Array:
-        """See :class:`DistanceRuler`."""
+        """See :class:`DistancePrice`."""
         return q
 
 
-Ruler = DistanceRuler | ForceRuler
+TradeOffPrice = DistancePrice | ForcePrice

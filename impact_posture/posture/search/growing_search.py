@@ -102,7 +102,7 @@ def run_start(
     return record, certificate
 
 
-class Search:
+class GrowingSearch:
     """The runs from all starts, whose program gets what it lacks until no end of a run lacks anything.
 
     Args:
