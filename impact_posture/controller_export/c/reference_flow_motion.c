@@ -100,6 +100,23 @@ static int ip_flow_stops(const ip_flow *f, const ip_params *p, const double *ste
   return 1;
 }
 
+/* Shorten the sum of the flow and its change to the largest speed, because a part that is taken out of the change of all
+ * joints can speed up one of them. */
+static void ip_flow_bound_speed(const ip_flow *f, const ip_params *p, double *step)
+{
+  double after[IP_NV];
+  int i;
+  for (i = 0; i < IP_NV; ++i) {
+    after[i] = f->flow[i] + step[i];
+  }
+  if (ip_largest(after, 0) > p->flow_speed[0]) {
+    ip_shorten(after, p->flow_speed[0]);
+    for (i = 0; i < IP_NV; ++i) {
+      step[i] = after[i] - f->flow[i];
+    }
+  }
+}
+
 /* The change of the flow towards the wanted step, by at most so much an entry: as fast as each joint can, or straight, each
  * of them twice without what crosses limits, or braking.  The first of them counts from which the flow can stop within the
  * limits.  Where the first does not slow down, it goes without what moves the zero moment point too far.  Return whether the
@@ -138,6 +155,7 @@ static int ip_flow_change(const ip_flow *f, const ip_params *p, double period, d
       if (descends) {
         ip_flow_downhill(f, stop, step);
       }
+      ip_flow_bound_speed(f, p, step);
       ip_shorten(step, most);
       if (ip_flow_stops(f, p, step, period)) {
         return 0;
@@ -172,7 +190,9 @@ static void ip_flow_govern(ip_context *c)
   fastest = fmin(fastest, 0.4 * p->flow_acceleration[0] * fmax(f->remains, 0.0));
   fastest = f->on ? fastest : 0.0;
   ip_flow_back(c, period, back);
+  /* The constraints have turned since the last change.  Back on them, a joint can be faster than before. */
   ip_flow_project(f, f->flow);
+  ip_shorten(f->flow, p->flow_speed[0]);
   for (i = 0; i < N; ++i) {
     known[i] = (f->flow[i] + back[i] - f->velocity[i]) / period;
   }

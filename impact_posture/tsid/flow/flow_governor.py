@@ -92,7 +92,7 @@ class FlowGovernor:
                     change = direction.along(Z, flow, self._braking(change, period), change)
                 if slope is not None:
                     change = direction.downhill(Z, slope, flow, stop, change)
-                change = limited(change, most)
+                change = limited(self._within_speed(change), most)
                 if direction.stops(flow + change, self._braking(change, period)):
                     return change, False
         return limited(-flow, most), True
@@ -103,6 +103,14 @@ class FlowGovernor:
         change = change * part
         self.flow = self.flow + change
         return change
+
+    def _within_speed(self, change: Array) -> Array:
+        """Return a change after which the flow is not faster than it may be.
+
+        A limit takes a part out of the change of all joints.  This can speed up one of them.
+        """
+        after, fastest = self.flow + change, self._options.speed
+        return limited(after, fastest) - self.flow if np.abs(after).max(initial=0.0) > fastest else change
 
     def _braking(self, change: Array, period: float) -> float:
         """Return the time for which the flow goes on if it changes and then brakes evenly, s."""

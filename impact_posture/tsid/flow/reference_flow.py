@@ -13,7 +13,7 @@ from impact_posture.robot.robot import Robot
 from impact_posture.system.arrays import Array
 from impact_posture.tsid.actuators import Actuators
 from impact_posture.tsid.flow.flow_direction import FlowDirection, FlowOptions
-from impact_posture.tsid.flow.flow_governor import FlowGovernor
+from impact_posture.tsid.flow.flow_governor import FlowGovernor, limited
 from impact_posture.tsid.flow.flow_probes import ProbeDirections
 from impact_posture.tsid.flow.redundancy import Redundancy
 from impact_posture.tsid.flow.static_controls import StaticControls, support_edges
@@ -264,7 +264,8 @@ class ReferenceFlow:
         if not self.on:
             fastest = 0.0
         governor = self._governor
-        governor.flow = self._space.project(governor.flow)
+        # The constraints have turned since the last change.  Back on them, a joint can be faster than before.
+        governor.flow = limited(self._space.project(governor.flow), options.speed)
         descends = fastest > 0 and self._visited == len(self._path)
         slope = self._slope if descends else None
         back = governor.back(self._space.back(self.error, self._base), period)
