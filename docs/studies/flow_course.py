@@ -16,7 +16,7 @@ from impact_posture.posture.program.constrained_problem import ConstrainedProble
 from impact_posture.robot.robot import Robot
 from impact_posture.system.libraries import library_path, load_library
 from impact_posture.tsid.flow.flow_direction import FlowOptions
-from impact_posture.tsid.flow.reference_flow import PHASES
+from impact_posture.tsid.flow.reference_flow import UPDATE_TICKS
 from impact_posture.tsid.flow.reference_flow_posture import ReferenceFlowPosture
 from impact_posture.tsid.joint_ranges import JointRanges
 from impact_posture.tsid.task_formulation import (
@@ -28,7 +28,7 @@ from impact_posture.tsid.task_formulation import (
 from impact_posture.tsid.tasks.joint_posture import JointPosture
 
 DT = 1e-3
-UPDATE = DT * len(PHASES)
+UPDATE = DT * UPDATE_TICKS
 _DRIVER = Path(__file__).with_suffix(".c")
 _BUILDERS = {"aerial": aerial_formulation, "arm": arm_formulation}
 

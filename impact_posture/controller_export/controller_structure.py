@@ -232,8 +232,8 @@ def _check(robot: Robot, formulation: TaskFormulation) -> None:
         if type(task) not in known:
             raise refuse(f"task '{task.name}' ({type(task).__name__}) has no C code")
     if isinstance(formulation.posture, ReferenceFlowPosture) and formulation.contacts and not robot.floating:
-        # Python refuses them at a reset, so that to run it there is no way out.
-        what = f"'{formulation.posture.name}' knows no feet that share the weight with a fixed base"
+        # Python refuses them at a reset, too, so "run it in Python" is not a hint here.
+        what = f"'{formulation.posture.name}' with contacts needs a floating base"
         raise InputError(what, where="controller export", hint="leave out `contacts`")
     if formulation.row_limits:
         raise refuse(f"'{formulation.row_limits[0].name}' ({type(formulation.row_limits[0]).__name__}) has no C code")

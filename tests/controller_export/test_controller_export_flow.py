@@ -22,7 +22,7 @@ from impact_posture.system.libraries import library_path, load_library
 from impact_posture.system.toolchain import find_compiler
 from impact_posture.tsid.controller import Controller, Status
 from impact_posture.tsid.flow.redundancy import Redundancy
-from impact_posture.tsid.flow.reference_flow import PHASES
+from impact_posture.tsid.flow.reference_flow import UPDATE_TICKS
 from impact_posture.tsid.flow.reference_flow_posture import ReferenceFlowPosture
 from impact_posture.tsid.flow.zero_moment_point import ZeroMomentPoint
 from impact_posture.tsid.point_kinematics import Point
@@ -128,7 +128,7 @@ def test_a_step_that_is_not_found_leaves_the_reference_at_rest_and_is_counted() 
     theirs.parameters["flow_path"][:] = 1e300
     theirs.reset(r.posture(), np.zeros(r.nv))
     theirs.brace()
-    for k in range(5 * len(PHASES)):
+    for k in range(5 * UPDATE_TICKS):
         assert theirs.tick(k * DT, r.posture(), np.zeros(r.nv)).status is Status.SOLVED
     assert theirs.flow_failures == 5
     np.testing.assert_allclose(theirs.target, r.posture(), atol=1e-6)
@@ -209,7 +209,7 @@ def test_what_is_no_time_no_parameter_and_no_task_is_refused() -> None:
     with pytest.raises(InputError, match=r"'flow posture' \(Mine\) has no C code"):
         structure_of(r, arm_formulation(r, Mine(r, lambda q: (1.0, q[: r.nv]))))
     flow = ReferenceFlowPosture(r, lambda q: (1.0, q[: r.nv]))
-    with pytest.raises(InputError, match="feet that share the weight with a fixed base; leave out `contacts`"):
+    with pytest.raises(InputError, match="'flow posture' with contacts needs a floating base; leave out `contacts`"):
         structure_of(r, replace(arm_formulation(r, flow), contacts=(SupportContact(Point("panda_link4")),)))
 
 

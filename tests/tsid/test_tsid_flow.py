@@ -20,7 +20,7 @@ from impact_posture.tsid.actuators import Actuators
 from impact_posture.tsid.controller import Controller, Status
 from impact_posture.tsid.flow.flow_direction import FlowOptions
 from impact_posture.tsid.flow.redundancy import Redundancy
-from impact_posture.tsid.flow.reference_flow import PHASES, ReferenceFlow
+from impact_posture.tsid.flow.reference_flow import UPDATE_TICKS, ReferenceFlow
 from impact_posture.tsid.flow.reference_flow_posture import ReferenceFlowPosture
 from impact_posture.tsid.flow.zero_moment_point import ZeroMomentPoint
 from impact_posture.tsid.point_kinematics import Point
@@ -80,7 +80,7 @@ def course(flow: ReferenceFlow, q: Vector, longest: float) -> Course:
     values, missed = [flow.value], 0.0
     for k in range(round(longest / DT)):
         flow.advance(DT, flow.q)
-        if k % len(PHASES) == len(PHASES) - 1:
+        if k % UPDATE_TICKS == UPDATE_TICKS - 1:
             values.append(flow.value)
             missed = max(missed, float(np.abs(flow.error).max(initial=0.0)))
             if flow.resting and not np.abs(flow.velocity).max() > 1e-4:
@@ -197,7 +197,7 @@ def test_haste_takes_its_share_of_what_rest_leaves_of_the_motors(name: str, weak
     # Later talos brakes before a limit, with a larger share.
     for k in range(500):
         flow.advance(DT, flow.q)
-        if k % len(PHASES) == len(PHASES) - 1:
+        if k % UPDATE_TICKS == UPDATE_TICKS - 1:
             static, whole = torques(none), torques(flow.acceleration)
             taken = whole - static
             ratios.append(float((taken / (np.sign(taken) - static)).max()))
@@ -287,7 +287,7 @@ def test_a_tick_evaluates_at_most_one_gradient() -> None:
     flow = flow_of(r, function)
     flow.on = True
     counts = []
-    for _ in range(4 * len(PHASES)):
+    for _ in range(4 * UPDATE_TICKS):
         calls[0] = 0
         flow.advance(DT, flow.q)
         counts.append(calls[0])
@@ -335,7 +335,7 @@ def test_it_moves_for_no_longer_than_it_may_and_then_for_as_long_again() -> None
     r = robot("tilthex_arm")
     flow = flow_of(r, arm_well(), duration=0.5)
     flow.on, moved = True, list[float]()
-    for late in (0, len(PHASES)):
+    for late in (0, UPDATE_TICKS):
         # The second time, it rests until the next update.
         for _ in range(round(0.5 / DT) + late):
             flow.advance(DT, flow.q)

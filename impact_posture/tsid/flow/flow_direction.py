@@ -17,19 +17,19 @@ from impact_posture.tsid.qp.daqp_solver import DaqpSolver
 from impact_posture.tsid.qp.quadratic_program import QP
 from impact_posture.tsid.state import State
 
-# Least ``H/H₀`` whose root counts.
+# Least ``H/H₀`` under the root.
 _LEAST = 1e-8
-# Sine of an angle of the base below which the tilt has no slope.
+# Sine of the tilt below which the tilt has no slope.
 _LEVEL = 1e-6
-# What a limit may be missed by where the flow brakes, rad (m), or as a share.
+# Violation of a limit that a braking flow may reach, rad (m), or as a share.
 _NEAR = 1e-3
-# What of that the flow takes where a limit is missed by so much already: along it, the flow would creep across.
+# Largest violation at which the flow may still move along a limit.  With all of ``_NEAR``, it would creep across.
 _SPENT = 9.9e-4
-# Distance from the limits of joints to which the flow aims, rad (m).
+# Distance that the flow keeps from the joint limits, rad (m).
 _AIM = 2e-3
-# Distance from those of static controls, whose slope it learns, as a share.
+# Distance that it keeps from the limits of static controls, as a share.  Their slope is learned, hence inexact.
 _RESERVE = 8e-3
-# Square of the length below which a row has no direction on the constraints.
+# Least square of the length of a row on the constraints.
 _FLAT = 1e-6
 
 
@@ -40,17 +40,17 @@ class FlowOptions:
 
     Attributes:
         speed: Largest speed ``v`` of an entry of ``q_r``, rad/s (m/s).
-        acceleration: Largest acceleration ``a``, rad/s² (m/s²); two fifths of it stop the flow on its step.
+        acceleration: Largest acceleration ``a``, rad/s² (m/s²); two fifths of it stop the flow within its step.
         rho: ρ, pull of the joints towards the start per rad², relative to ``H₀``.
         mu: μ, least curvature per rad², relative to ``H₀``.
         epsilon: ε, predicted decrease relative to ``H₀`` below which the flow rests; it resumes above 4 ε.
-        duration: Longest time that the flow moves after it is told to, without that on a path and at rest, s.
+        duration: Longest time that the flow moves after each start, s.  Time on a path or at rest does not count.
         joint_margin: Distance from the joint limits, rad (m); at most an eighth of the range of a joint.
         com_margin: Distance of the center of mass from the edges of the support polygon, m.
         tilt: Largest angle between the vertical and :attr:`~impact_posture.robot.robot.Robot.upright`, rad.
-        share: Share of the actuators' limits that holding ``q_r`` may take.
-        haste: Share that accelerating may take of what is then left of the actuators' limits.  Braking before a limit
-            may take half of the rest as well.
+        share: Share of the actuators' limits that holding ``q_r`` may use.
+        haste: Share of the remaining actuators' limits that acceleration may use.  Braking before a limit may also
+            use half of the rest.
         tracking: Error of the joints at which the flow waits for the robot, rad (m).
     """
 
@@ -70,7 +70,7 @@ class FlowOptions:
     def __post_init__(self) -> None:
         """Refuse numbers out of range."""
         may_vanish = ("rho", "joint_margin", "com_margin")
-        # Comparisons one by one refuse what is not a number, too.
+        # Single comparisons also refuse NaN.
         good = all(x > 0 or (x == 0 and name in may_vanish) for name, x in asdict(self).items())
         if not (good and max(self.share, self.haste) <= 1):
             raise InputError("a number is out of range", where="flow options", hint="see the docstring")
@@ -79,19 +79,19 @@ class FlowOptions:
 class FlowDirection:
     """Newton step ``δ = Z y`` of ``Φ = 2√(H/H₀) + ρ/2 ‖q_r ⊖ q₀‖²`` on the constraints.
 
-    The root counts, because the velocity jump grows with it: low in a valley, the pull towards the start is weak.
-    ``y`` minimizes ``½ yᵀ|B_Z| y + (Zᵀ∇Φ)ᵀ y``, where ``B_Z`` is the curvature of ``H/H₀`` times ``√(H₀/H)``, and
-    that of the pull.  ``|B_Z|`` has its eigenvectors and ``max(|λᵢ|, μ)`` for its eigenvalues (saddle-free Newton,
-    Dauphin et al. 2014), so that the step leaves saddles.  The curvature ``B`` is learned from secants by Powell's
-    symmetric Broyden update, the slope ``T`` of the static controls by Broyden's.  Rows keep joints, center of mass,
-    tilt of the base and static controls within their limits.  A limit that does not hold at ``q_r`` is not crossed
-    further.
+    ``Φ`` has the root of ``H``, because the velocity jump grows with the root.  ``y`` minimizes
+    ``½ yᵀ|B_Z| y + (Zᵀ∇Φ)ᵀ y``.  ``B_Z`` is the curvature of ``H/H₀`` times ``√(H₀/H)`` plus the curvature of the
+    pull towards the start.  ``|B_Z|`` has the same eigenvectors and the eigenvalues ``max(|λᵢ|, μ)`` (saddle-free
+    Newton, Dauphin et al. 2014), so that the step leaves saddles.  The curvature ``B`` is learned from secants by the
+    Powell symmetric Broyden update, and the slope ``T`` of the static controls by the Broyden update.  Rows keep
+    joints, center of mass, tilt of the base and static controls within their limits.  A limit that is already
+    violated at ``q_r`` is not violated further.
 
     Attributes:
         B: Curvature of ``H/H₀`` on the constraints, shape (nv, nv).
         T: Slope of the static controls (:class:`StaticControls`), shape (controls, nv).
-        gain: Decrease of ``H/H₀`` that the last step predicts, at most that to first order.
-        failures: Number of steps that the solver did not find.  They are zero.
+        gain: Predicted decrease of ``H/H₀`` by the last step, at most the first-order decrease.
+        failures: Number of steps for which the solver failed.  These steps are zero.
     """
 
     def __init__(self, robot: Robot, edges: Array, controls: int, options: FlowOptions) -> None:
@@ -109,13 +109,13 @@ class FlowDirection:
         self._margin = np.minimum(options.joint_margin, width / 8)
         self._edges, self._mu, self._tilt = edges, options.mu, options.tilt
         self._up = robot.upright
-        # The row of the tilt, the tilt and the vertical in the base.
+        # Index of the tilt's row, the tilt, and the vertical in the base.
         self._tilting, self._angle, self._vertical = self._joints.size + edges.shape[0], 0.0, np.zeros(3)
-        # The pull towards the start acts on joints.  Others lead the base.
+        # The pull towards the start acts on joints only.
         self._pull = np.full(nv, options.rho)
         self._pull[: 6 if robot.floating else 0] = 0.0
         self.B, self.gain, self.failures = np.zeros((nv, nv)), 0.0, 0
-        # The sizes never change.  Directions that the constraints take keep columns of zeros.
+        # The sizes never change.  Without redundancy in a direction, its column is zero.
         self._qp = QP.empty(nv, self._joints.size + edges.shape[0] + (1 if robot.floating else 0) + controls)
         self._solver = DaqpSolver(nv, self._qp.m)
         self._rows, self._room = np.zeros((self._qp.m, nv)), np.zeros((2, self._qp.m))
@@ -132,13 +132,13 @@ class FlowDirection:
         self.T += np.multiply.outer(slope - self.T @ z, z)
 
     def limit(self, state: State, rooms: Array, shares: Array, coasting: Array) -> None:
-        """Set the rows for a state at ``ν = 0``, less what the flow needs to brake.
+        """Set the rows for a state at ``ν = 0``, less the braking distance of the flow.
 
         Args:
             state: The state.
             rooms: Distance of the center of mass to each edge of the polygon, less its margin, m, shape (k,).
             shares: Static controls, shape (controls,).
-            coasting: Way on which the present flow brakes, shape (nv,).
+            coasting: Displacement in which the present flow brakes, shape (nv,).
         """
         upper, lower = self._qp.upper[self._qp.n :], self._qp.lower[self._qp.n :]
         count, k = self._joints.size, self._edges.shape[0]
@@ -184,24 +184,24 @@ class FlowDirection:
             slope -= space.springs.T @ error
             curvature.flat[:: slope.size + 1] += space.stiffness
         values, vectors = np.linalg.eigh(curvature)
-        way = Z @ (vectors / np.sqrt(np.maximum(np.abs(values), self._mu)))
-        step = self._solve(way, way.T @ (Z @ slope))
-        # The flow does not climb for what the pull or the springs win.
+        axes = Z @ (vectors / np.sqrt(np.maximum(np.abs(values), self._mu)))
+        step = self._solve(axes, axes.T @ (Z @ slope))
+        # H must decrease: a gain of the pull or of the springs does not count.
         self.gain = min(self.gain * root, -float(gradient @ step))
         return step
 
-    def towards(self, Z: Array, way: Array) -> Array:
-        """Return the step nearest to ``way``, shape (nv,), on the constraints and within the limits."""
-        return self._solve(Z, -Z.T @ way)
+    def towards(self, Z: Array, displacement: Array) -> Array:
+        """Return the step on the constraints and within the limits that is nearest to a displacement, shape (nv,)."""
+        return self._solve(Z, -Z.T @ displacement)
 
     def downhill(self, Z: Array, gradient: Array, flow: Array, stop: Array, step: Array) -> Array:
-        """Return a step of the flow without the part of it by which ``H`` would rise now, or where the flow stops.
+        """Return a change of the flow without the part that raises ``H`` now or at the point where the flow stops.
 
         Args:
             Z: Basis of the redundancy, shape (nv, r).
             gradient: ``∇H/H₀``, shape (nv,).
             flow: ``u``, shape (nv,).
-            stop: Way on which it stops, shape (nv,).
+            stop: Displacement in which it stops, shape (nv,).
             step: Change of ``u``, shape (nv,).
         """
         for slope in (gradient + self.B @ stop, gradient):
@@ -212,21 +212,24 @@ class FlowDirection:
         return step
 
     def stops(self, flow: Array, time: float) -> bool:
-        """Return whether ``flow``, shape (nv,), stays within the limits for so many seconds."""
-        way = flow * time
-        ahead = self._rows @ way
+        """Return whether ``flow``, shape (nv,), stays within the limits for ``time`` seconds."""
+        displacement = flow * time
+        ahead = self._rows @ displacement
         if self._up is not None:
-            ahead[self._tilting] = self._tilted(way, float(ahead[self._tilting]))
+            ahead[self._tilting] = self._tilt_change(displacement, float(ahead[self._tilting]))
         return not float(np.maximum(ahead - self._room[0], self._room[1] - ahead).max(initial=0.0)) > _NEAR
 
-    def _tilted(self, way: Array, along: float) -> float:
-        """Return how much the tilt changes along a way, shape (nv,), which also turns it aside."""
-        turn = float(self._vertical @ way[3:6])
-        aside = float(way[3:6] @ way[3:6]) - turn**2 - along**2
+    def _tilt_change(self, displacement: Array, along: float) -> float:
+        """Return the change of the tilt in a displacement, shape (nv,), of which ``along`` acts on the tilt directly.
+
+        The part across the tilt raises it to second order.
+        """
+        turn = float(self._vertical @ displacement[3:6])
+        aside = float(displacement[3:6] @ displacement[3:6]) - turn**2 - along**2
         return math.hypot(self._angle + along, math.sqrt(max(aside, 0.0))) - self._angle
 
     def along(self, Z: Array, flow: Array, time: float, step: Array) -> Array:
-        """Return a step of the flow without the part of it by which limits would be crossed, one after the other.
+        """Return a change of the flow without the parts that cross limits, taken out row by row.
 
         Args:
             Z: Basis of the redundancy, shape (nv, r).
@@ -235,10 +238,10 @@ class FlowDirection:
             step: Change of ``u``, shape (nv,).
         """
         for k, (row, high, low) in enumerate(zip(self._rows, *self._room, strict=True)):
-            way = time * (flow + step)
-            ahead = float(row @ way)
+            displacement = time * (flow + step)
+            ahead = float(row @ displacement)
             if self._up is not None and k == self._tilting:
-                ahead = self._tilted(way, ahead)
+                ahead = self._tilt_change(displacement, ahead)
             if low <= ahead <= high:
                 continue
             across = Z @ (Z.T @ row)
@@ -247,18 +250,18 @@ class FlowDirection:
                 step = step - across * ((ahead - min(max(ahead, low), high)) / time / square)
         return step
 
-    def _solve(self, way: Array, slope: Array) -> Array:
-        """Return ``δ = way·y`` for the least ``½‖y‖² + slope·y``; zero if the solver fails."""
-        qp, r = self._qp, way.shape[1]
-        qp.A[:, :r] = self._rows @ way
+    def _solve(self, axes: Array, slope: Array) -> Array:
+        """Return ``δ = axes·y`` for the least ``½‖y‖² + slope·y``; zero if the solver fails."""
+        qp, r = self._qp, axes.shape[1]
+        qp.A[:, :r] = self._rows @ axes
         qp.A[:, r:] = 0.0
         qp.g[:r], qp.g[r:] = slope, 0.0
-        # Without what the last step left: a row that was zero then would stay out.
+        # A cold start, because a row that was zero in the last step would otherwise stay inactive.
         self._solver.reset()
         solved = self._solver.solve(qp)
         if solved is None:
             self.gain, self.failures = 0.0, self.failures + 1
-            return np.zeros(way.shape[0])
+            return np.zeros(axes.shape[0])
         y = solved.z[:r]
         self.gain = -float(slope @ y + y @ y / 2)
-        return np.asarray(way @ y)
+        return np.asarray(axes @ y)

@@ -11,17 +11,17 @@ from impact_posture.tsid.flow.flow_direction import FlowDirection, FlowOptions
 from impact_posture.tsid.flow.redundancy import Redundancy
 from impact_posture.tsid.flow.zero_moment_point import ZeroMomentPoint
 
-# How often a change of the flow is tried: as it is, and twice without what crosses limits.
-_TIMES = 3
-# Least share of the acceleration with which the flow counts on braking, and its growth with each change.
+# Number of attempts for a change: as it is, then twice without the part that crosses limits.
+_ATTEMPTS = 3
+# Least share of the acceleration that counts as available for braking.  A change can raise the share by this much.
 _ABLE = 0.1
-# Factor of the time of braking, because the slopes of the limits change on the way.
+# Factor of the braking time, because the slopes of the limits change during braking.
 _CAUTION = 1.5
 # Largest ratio of the speed of the flow to its step, 1/s.
 _RATE = 4.8
-# Least size of a step that the pace is divided by, rad (m).
+# Least size of a step that divides a speed, rad (m).
 _TINY = 1e-12
-# Time constant with which the reference comes back to contacts and tasks, s.
+# Time constant of the return to contacts and tasks, s.
 _RETURN = 0.1
 
 
@@ -30,31 +30,31 @@ class FlowGovernor:
 
     Attributes:
         flow: ``u`` without the return to the constraints, rad/s (m/s), shape (nv,).
-        returning: Velocity of that return, shape (nv,).
+        returning: Velocity of the return, shape (nv,).
     """
 
     def __init__(self, direction: FlowDirection, options: FlowOptions) -> None:
-        """Begin at rest.
-
-        Args:
-            direction: Limits and learned curvature.
-            options: Parameters.
-        """
+        """Begin at rest, with the limits and the curvature of ``direction``."""
         self._direction, self._options, self._able = direction, options, 1.0
         self.flow, self.returning = np.zeros((2, direction.B.shape[0]))
 
-    def back(self, way: Array, period: float) -> Array:
-        """Change the velocity of the return, which has a way to go, within speed and acceleration; return it."""
-        options, size = self._options, max(float(np.abs(way).max(initial=0.0)), _TINY)
-        # Two fifths of the acceleration stop a speed of sqrt(4/5 a d) on the way d.
+    def back(self, remaining: Array, period: float) -> Array:
+        """Change the velocity of the return within speed and acceleration, and return it, shape (nv,).
+
+        Args:
+            remaining: Displacement that leads back to the constraints, shape (nv,).
+            period: Time in which the velocity changes, s.
+        """
+        options, size = self._options, max(float(np.abs(remaining).max(initial=0.0)), _TINY)
+        # Two fifths of the acceleration stop a speed of sqrt(4/5 a d) within the distance d.
         pace = min(1.0 / _RETURN, math.sqrt(0.8 * options.acceleration / size), options.speed / size)
-        change = pace * way - self.returning
+        change = pace * remaining - self.returning
         largest = max(float(np.abs(change).max(initial=0.0)), _TINY)
         self.returning += min(options.acceleration * period / largest, 1.0) * change
         return self.returning
 
     def stopping(self, flow: Array) -> float:
-        """Return the time in which a flow stops evenly, s, which takes twice the way that braking takes."""
+        """Return the time in which a flow stops evenly, s.  Going on for this time is twice the braking distance."""
         return float(np.abs(flow).max()) / self._options.acceleration
 
     def change(
@@ -62,33 +62,34 @@ class FlowGovernor:
     ) -> tuple[Array, bool]:
         """Return the change of the flow towards a step, shape (nv,), and whether it only brakes.
 
-        Each joint turns as fast as it can, and then all stay on the constraints; or all change evenly; or all brake
-        evenly.  The first two count twice more without what crosses limits, and the first, unless it slows down,
-        without what moves the zero moment point too far.  The first change counts from which the
-        flow can stop within the limits by braking evenly, as hard as it lately could.
+        There are three candidates.  In the first, each joint changes as fast as it can, projected on the constraints.
+        In the second, all joints change evenly.  In the third, all joints brake evenly.  The first two have three
+        attempts each, of which the last two leave out the part that crosses limits.  The first candidate also leaves
+        out the part that moves the zero moment point too far, unless it slows the flow down.  The result is the first
+        attempt from which the flow can stop within the limits, by braking evenly as hard as it lately could.
 
         Args:
             space: The redundancy.
             step: ``δ``, shape (nv,).
             fastest: Largest speed of an entry, rad/s (m/s).
             period: Time in which the flow changes, s.
-            slope: ``∇H/H₀``, shape (nv,), of which the flow goes down; none while it may climb.
-            zmp: Bounds of the acceleration beside what is known of it.
+            slope: ``∇H/H₀``, shape (nv,), along which the flow must not climb; ``None`` where it may.
+            zmp: Bounds of the acceleration.
         """
         options, direction, Z, flow = self._options, self._direction, space.basis, self.flow
         most = options.acceleration * period
-        # Two fifths of the acceleration stop a speed of √(4/5 a δ) on the step δ.
+        # Two fifths of the acceleration stop a speed of √(4/5 a δ) within the step δ.
         pace = min(math.sqrt(0.8 * options.acceleration / max(np.abs(step).max(), _TINY)), _RATE)
         away = limited(pace * step, fastest) - flow
-        # Twice the way on which it stops, because the curvature may grow on it.
+        # Twice the braking distance, because the curvature may grow on it.
         stop = flow * self.stopping(flow)
         fast = space.project(np.minimum(np.maximum(away, -most), most))
         for change, keeps in ((fast, True), (away, False)):
             change = limited(change, most)
-            for again in range(_TIMES):
+            for attempt in range(_ATTEMPTS):
                 if keeps and float(change @ flow) >= 0:
                     change = zmp.keep(space, period, change)
-                if again:
+                if attempt:
                     change = direction.along(Z, flow, self._braking(change, period), change)
                 if slope is not None:
                     change = direction.downhill(Z, slope, flow, stop, change)
@@ -98,14 +99,14 @@ class FlowGovernor:
         return limited(-flow, most), True
 
     def take(self, change: Array, part: float) -> Array:
-        """Change the flow by the part of a change that the actuators permit, and return that, shape (nv,)."""
+        """Change the flow by the part of a change that the actuators permit, and return the part, shape (nv,)."""
         self._able = min(max(part, _ABLE), self._able + _ABLE)
         change = change * part
         self.flow = self.flow + change
         return change
 
     def _within_speed(self, change: Array) -> Array:
-        """Return a change after which the flow is not faster than it may be.
+        """Return a change that leaves the flow within its speed limit.
 
         A limit takes a part out of the change of all joints.  This can speed up one of them.
         """

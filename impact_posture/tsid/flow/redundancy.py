@@ -1,4 +1,4 @@
-"""Directions of motion that contacts and tasks leave, and those that bring back to them."""
+"""Motions that contacts and tasks leave free, and motions that lead back to them."""
 
 from __future__ import annotations
 
@@ -8,18 +8,19 @@ import numpy as np
 
 from impact_posture.system.arrays import Array
 
-# Singular value of the constraints, relative to the largest, below which they are springs.  The rows of points on one
-# body can depend on each other almost: held exactly in one posture, free in the next, a flow would never rest.
+# Directions with a smaller singular value, relative to the largest, are springs and not constraints.  The rows of
+# points on one body can be almost dependent: held exactly in one posture and free in the next, they would never let a
+# flow rest.
 _SOFT = 2e-2
-# Stiffness of those springs relative to ``H₀``, 1/m²: an error of 6 mm costs half of ``H₀``.
+# Stiffness of these springs relative to ``H₀``, 1/m²: an error of 6 mm costs half of ``H₀``.
 _STIFFNESS = 3e4
-# Pull to zero of the base's share in a motion that the joints do not determine.
+# Small weight of the base in a motion that the joints do not determine.
 _IDLE = 1e-9
 
 
 @dataclass(frozen=True)
 class Redundancy:
-    """Directions that the constraints leave, ``J = U S Vᵀ``, and a pseudo-inverse of those that they hold.
+    """Directions that the constraints leave, ``J = U S Vᵀ``, and a pseudo-inverse for the directions that they hold.
 
     Attributes:
         basis: ``Z``, orthonormal, shape (nv, r).
@@ -54,9 +55,9 @@ class Redundancy:
         return np.asarray(self.basis @ (self.basis.T @ vector))
 
     def back(self, rate: Array, base: int) -> Array:
-        """Return the velocity that changes the constraints at a rate, shape (rows,), as a motion, shape (nv,).
+        """Return a motion, shape (nv,), that changes the constraints at a rate, shape (rows,).
 
-        Of all such motions, it is that of the first ``base`` entries and not of the joints.
+        Of all such motions, it moves the first ``base`` entries and spares the joints.
         """
         back, Z = self.inverse @ rate, self.basis
         if base:

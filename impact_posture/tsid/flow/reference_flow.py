@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import math
-from collections.abc import Callable, Sequence
+from collections.abc import Sequence
 
 import numpy as np
 import pinocchio as pin
@@ -28,26 +28,30 @@ from impact_posture.tsid.tasks.task import Task
 
 # Step of the differences along the redundancy, rad.
 _STEP = 1e-4
-# Way of the flow that is long enough to learn from, rad (m).
+# Least displacement of the flow between looks from which it learns, rad (m).
 _MOVED = 1e-6
-# Step below which a posture on the way is reached, or as near as the limits permit, rad (m).
+# Step below which a posture of the path counts as reached, or as near as the limits permit, rad (m).
 _REACHED = 0.02
 # Speed below which a flow that is off stands still, rad/s (m/s).
 _STILL = 1e-5
-# Length of a velocity below which the flow has no way to stop on.
+# Length of the velocity below which a probe at the stopping point tells nothing.
 _SLOW = 1e-3
+# Ticks of an update.
+UPDATE_TICKS = 14
+# Tick of the first change of the motion in an update, and ticks from the second change to the next look.
+_UNTIL, _SINCE = 4, 3
 
 
 class ReferenceFlow:
     """Saddle-free Newton flow of a reference posture ``q_r`` in the null space of contacts and tasks.
 
     ``H`` and ``∇H`` are evaluated at ``q_r`` and not at the measured posture, so that noise, tracking errors and the
-    impact itself do not enter.  An update takes as many ticks as :data:`PHASES` has parts.  The controller in C
-    spreads the work of a part over the empty ticks beside it.  All memory is in arrays whose sizes do not change,
-    except for the basis of the redundancy.
+    impact itself do not matter.  An update takes :data:`UPDATE_TICKS` ticks and changes the motion twice.  The
+    controller in C changes the motion at the same ticks, and spreads the other work over the ticks between them.  All
+    arrays but the basis of the redundancy keep their sizes.
 
-    Contacts stay at their places, and tasks of the strict levels and weighted tasks at their targets.  Only the
-    ``led`` tasks (center of mass, base orientation) follow the flow.  Joints that ``robot.toml`` holds do not move.
+    Contacts stay at their places, and strict and weighted tasks at their targets.  Only the ``led`` tasks (center of
+    mass, base orientation) follow the flow.  Joints that ``robot.toml`` holds do not move.
 
     Attributes:
         robot: The robot.
@@ -57,7 +61,7 @@ class ReferenceFlow:
         value: ``H(q_r)`` at the last update.
         start: ``H₀``, its value at the reset.
         on: Whether the flow may move.
-        resting: Whether no step promises a decrease of more than ε, or the flow has moved as long as it may.
+        resting: Whether no step predicts a decrease of more than ε, or the flow has moved as long as it may.
         failed: Whether the last evaluation raised or was not finite.  The flow then brakes.
         led: Tasks that follow the flow.
         error: Distance from contacts and tasks at the last update, m and rad, and zeros for held joints.
@@ -81,7 +85,7 @@ class ReferenceFlow:
             formulation: Tasks and contacts.
             actuators: Rotors and motors.
             options: Parameters.
-            path: Postures to visit first, each of shape (nq,); the last may be an optimum that was found offline.
+            path: Postures to visit first, each of shape (nq,); the last may be the optimum of an offline solution.
         """
         self._model, self._gradient, self.options = robot.model, gradient, options
         self._contacts = formulation.contacts
@@ -97,8 +101,8 @@ class ReferenceFlow:
         self._static = StaticControls(actuators, self._contacts, options.share)
         self.q, self.velocity, self.acceleration = robot.posture(), np.zeros(nv), np.zeros(nv)
         self.robot, self._path = robot, tuple(path)
-        self._aside = ProbeDirections(nv)
-        self._phase, self._elapsed, self.resting = 0, 0.0, False
+        self._probes = ProbeDirections(nv)
+        self._tick, self._elapsed, self.resting = 0, 0.0, False
 
     def reset(self, q: Array) -> None:
         """Begin at rest at a posture, shape (nq,), and measure the curvature there.
@@ -115,7 +119,7 @@ class ReferenceFlow:
         self._visited, self._clock = 0, 0.0
         self.rest_at(np.inf)
         self.on, self.failed = False, False
-        self._ahead = False
+        self._probes_ahead = False
         state.update(q, None)
         kinds = {3: FramePosition, 6: FramePose}
         self._held: list[Task] = [*(kinds[c.size](c.point) for c in self._contacts), *self._tasks]
@@ -134,32 +138,38 @@ class ReferenceFlow:
             raise MetricError("the objective vanishes or does not exist", where="reset", hint="start elsewhere")
         self.start = abs(self.value)
         self._look()
-        self._aside.count = 0
+        self._probes.count = 0
         for _ in range(self._space.basis.shape[1]):
             self._probe()
-        self._aside.count = 0
+        self._probes.count = 0
 
     def advance(self, dt: float, measured: Array) -> None:
         """Advance by ``dt`` seconds; ``measured`` is the configuration of the robot that follows, shape (nq,)."""
         self._clock += dt
         self._elapsed += dt
-        self._measured = measured
-        phase, self._phase = self._phase, (self._phase + 1) % len(PHASES)
-        PHASES[phase](self)
+        tick, self._tick = self._tick, (self._tick + 1) % UPDATE_TICKS
+        if tick == 0:
+            self._look()
+        elif tick in (_UNTIL, UPDATE_TICKS - _SINCE):
+            self._govern(measured)
+        elif tick == _UNTIL + 1:
+            self._probe()
+        elif tick == UPDATE_TICKS - 1:
+            self._direct()
         self.velocity += dt * self.acceleration
         self.q[:] = pin.integrate(self._model, self.q, dt * self.velocity)
         if not self.on and np.abs(self.velocity).max() <= _STILL:
             self.velocity[:] = self.acceleration[:] = 0.0
 
     def start_at(self, q: Array) -> None:
-        """Go on from another posture, at rest, with what was learnt."""
+        """Go on from another posture, at rest, and keep the learned curvature."""
         if not np.array_equal(q, self.q):
             self._place_at(q)
 
     def rest_at(self, after: float) -> None:
         """Come to rest within ``after`` seconds from now, as far as the acceleration permits, and stay.
 
-        The time that the flow may move is counted anew from now.
+        The longest time of a motion counts from now.
         """
         self._deadline, self._moved, self._remains = self._clock + after, 0.0, np.inf
 
@@ -168,18 +178,19 @@ class ReferenceFlow:
         """Whether :meth:`advance` has anything to do."""
         return self.on or bool(self.velocity.any())
 
-    # ---- the parts of an update, one a tick -----------------------------------------------------------------------
+    # ---- the parts of an update -----------------------------------------------------------------------------------
 
     def _look(self) -> None:
-        """Evaluate objective, constraints and limits, and learn from the way since the last look.
+        """Evaluate objective, constraints and limits, and learn from the displacement since the last look.
 
-        The motion changes in a later tick.  The look is at where ``q_r`` will be then.
+        The posture of the look is ``q_r`` at the next change of the motion.
         """
         state, direction = self._state, self.direction
         dt = self._elapsed / _SINCE
-        way = _UNTIL * dt * (self.velocity + (_UNTIL + 1) / 2 * dt * self.acceleration)
-        ahead = pin.integrate(self._model, self.q, way)
-        way, slope, shares = pin.difference(self._model, ahead, self._here), self._slope, self.shares
+        ahead = pin.integrate(
+            self._model, self.q, _UNTIL * dt * (self.velocity + (_UNTIL + 1) / 2 * dt * self.acceleration)
+        )
+        moved, slope, shares = pin.difference(self._model, ahead, self._here), self._slope, self.shares
         self._place(ahead)
         self._here[:] = ahead
         for task, rows in zip(self._held, self._places, strict=True):
@@ -189,10 +200,10 @@ class ReferenceFlow:
         self._multipliers = space.inverse.T @ self._slope
         self._reduced = self._slope - self._J.T @ self._multipliers
         self.shares = self._static.shares(state, self._J)
-        length = math.sqrt(float(way @ way))
-        # A look that failed has no slope.
+        length = math.sqrt(float(moved @ moved))
+        # The slope is zero after a look at which the gradient failed.
         if length > _MOVED and not self.failed and slope.any():
-            self._compare(way / length, length, slope - self._before.T @ self._multipliers, shares)
+            self._learn(moved / length, length, slope - self._before.T @ self._multipliers, shares)
         self._before[:] = self._J
         rooms = self._offsets
         if rooms.size:
@@ -201,42 +212,41 @@ class ReferenceFlow:
         direction.limit(state, rooms, self.shares, coasting)
 
     def _probe(self) -> None:
-        """Evaluate the reduced gradient and the static controls beside the posture of the last look, and learn."""
+        """Evaluate the reduced gradient and the static controls beside the posture of the last look, and learn.
+
+        Every other probe is at the point where the flow stops, because the flow needs the slopes there.
+        """
         if self.failed or not self._space.basis.shape[1]:
             return
-        self._ahead = not self._ahead
+        self._probes_ahead = not self._probes_ahead
         flow = self._governor.flow
         size = math.sqrt(float(flow @ flow))
-        if self._ahead and size > _SLOW:
-            # Where the flow stops: what it learns there is what it needs to know.
+        ahead = self._probes_ahead and size > _SLOW
+        if ahead:
             z, length = flow / size, max(size * self._governor.stopping(flow), _STEP)
-            self._beside(z, length)
-            return
-        if self._beside(self._aside.next(self._space), _STEP):
-            self._aside.count += 1
-
-    def _beside(self, z: Array, length: float) -> bool:
-        """Learn from the end of a way ``z · length`` from the last look; return whether ``H`` exists there."""
+        else:
+            z, length = self._probes.next(self._space), _STEP
         q = pin.integrate(self._model, self._here, length * z)
         _, slope = self._evaluate(q)
         self._place(q)
         if not self.failed:
             reduced = slope - self._J.T @ self._multipliers
-            self._compare(z, length, reduced, self._static.shares(self._state, self._J))
-        return not self.failed
+            self._learn(z, length, reduced, self._static.shares(self._state, self._J))
+            self._probes.count += not ahead
 
-    def _compare(self, z: Array, length: float, reduced: Array, shares: Array) -> None:
-        """Learn from reduced gradient and static controls at the end of a way ``z · length`` from the last look."""
+    def _learn(self, z: Array, length: float, reduced: Array, shares: Array) -> None:
+        """Learn from reduced gradient and static controls at ``length`` along ``z`` from the last look."""
         self.direction.learn(z, (reduced - self._reduced) / length, (shares - self.shares) / length)
 
     def _direct(self) -> None:
-        """Find the step, and whether it is worth moving."""
+        """Compute the step, and whether it is worth moving."""
         self._wanted[:] = 0.0
         if self.failed:
             return
         if self._visited < len(self._path):
-            way, before = pin.difference(self._model, self.q, self._path[self._visited]), self.direction.failures
-            self._wanted[:] = self.direction.towards(self._space.basis, way)
+            remaining = pin.difference(self._model, self.q, self._path[self._visited])
+            before = self.direction.failures
+            self._wanted[:] = self.direction.towards(self._space.basis, remaining)
             self._visited += int(self.direction.failures == before and np.abs(self._wanted).max() < _REACHED)
             return
         offset = pin.difference(self._model, self._first, self._here)
@@ -244,21 +254,21 @@ class ReferenceFlow:
         gain, least = self.direction.gain, self.options.epsilon
         self.resting = gain < (4 * least if self.resting else least) or self._remains <= 0.0
         if self.resting:
-            # It brakes as it turns, downhill.
+            # The governor then brakes downhill.
             self._wanted[:] = 0.0
 
-    def _govern(self) -> None:
+    def _govern(self, measured: Array) -> None:
         """Limit speed and acceleration, and return to contacts and tasks."""
         options = self.options
         period, self._elapsed = self._elapsed, 0.0
         if not period > 0:
-            # A clock that stands still.
+            # The clock stands still.
             return
-        error = np.abs(pin.difference(self._model, self._measured, self.q)[self._base :]).max(initial=0.0)
+        error = np.abs(pin.difference(self._model, measured, self.q)[self._base :]).max(initial=0.0)
         fastest = options.speed * max(1.0 - error / options.tracking, 0.0)
         if self.on and not self.resting and self._visited == len(self._path):
             self._moved += period
-        # The speed is that at the next change, and rest comes with the one after, on two fifths of the acceleration.
+        # The speed holds after the next change, and the change after it stops the flow with 2/5 of the acceleration.
         self._remains = min(self._deadline - self._clock, options.duration - self._moved) - 2 * period
         fastest = min(fastest, 0.4 * options.acceleration * max(self._remains, 0.0))
         if not self.on:
@@ -276,20 +286,17 @@ class ReferenceFlow:
         known = (governor.flow + back + along - self.velocity) / period
         self._zmp.limit(self._state, known)
         change, brakes = governor.change(self._space, self._wanted, fastest, period, slope, self._zmp)
-        # To stop within the limits counts more than to leave the actuators much.
+        # A stop within the limits matters more than room for the actuators.
         most = (1 + options.haste) / 2 if brakes else options.haste
         part = self._static.permitted(self._state.M, known, change / period, self.shares, most)
         self.acceleration[:] = known + governor.take(change, part) / period
-
-    def _coast(self) -> None:
-        """Do nothing, because the controller in C spreads the parts over these ticks, so that none takes long."""
 
     def _place_at(self, q: Array) -> None:
         """Put ``q_r`` at rest at a posture, where the next update begins."""
         self.q[:], self._first[:], self._here[:] = q, q, q
         for moving in self.velocity, self.acceleration, self._governor.flow, self._governor.returning:
             moving[:] = 0.0
-        self._phase, self._elapsed, self.resting = 0, 0.0, False
+        self._tick, self._elapsed, self.resting = 0, 0.0, False
 
     def _place(self, q: Array) -> None:
         """Evaluate the Jacobian of the constraints at a posture."""
@@ -301,24 +308,9 @@ class ReferenceFlow:
         """Return ``H`` and a copy of ``∇H/H₀``, zero where they do not exist."""
         try:
             value, gradient = self._gradient(q)
-            found = np.array(gradient, dtype=float) / self.start
-            self.failed = not np.isfinite(found).all()
+            slope = np.array(gradient, dtype=float) / self.start
+            self.failed = not np.isfinite(slope).all()
         except Exception:
             # A user's function may raise anything, but the tick must go on.  `failed` reports it.
             self.failed = True
-        return (np.nan, np.zeros(self.velocity.size)) if self.failed else (float(value), found)
-
-
-PHASES: tuple[Callable[[ReferenceFlow], None], ...] = (
-    ReferenceFlow._look,
-    *3 * (ReferenceFlow._coast,),
-    ReferenceFlow._govern,
-    ReferenceFlow._probe,
-    *5 * (ReferenceFlow._coast,),
-    ReferenceFlow._govern,
-    ReferenceFlow._coast,
-    ReferenceFlow._direct,
-)
-# Ticks from a look to the change of the motion, and those since the last change that the flow has counted at a look.
-_UNTIL = PHASES.index(ReferenceFlow._govern)
-_SINCE = PHASES[::-1].index(ReferenceFlow._govern) + 1
+        return (np.nan, np.zeros(self.velocity.size)) if self.failed else (float(value), slope)

@@ -26,10 +26,9 @@ from impact_posture.tsid.tasks.joint_posture import JointPosture
 class ReferenceFlowPosture(JointPosture):
     """``ν̇* = K_p (q_r ⊖ q) + K_d (u − ν) + u̇``, where ``q_r`` follows the reference flow.
 
-    There is no gain for ``∇H``.  :class:`~impact_posture.tsid.flow.reference_flow.ReferenceFlow` has a speed, an
-    acceleration and a rule when to rest, which are the same for every robot.  Center of mass and base orientation of
-    a standing robot follow ``q_r`` too.  A flow that rests may be taken elsewhere by :meth:`move_to`; the next
-    :meth:`brace` goes on from there.
+    ``∇H`` needs no gain: :class:`~impact_posture.tsid.flow.reference_flow.ReferenceFlow` has a speed, an acceleration
+    and a rule for resting that suit every robot.  Center of mass and base orientation of a standing robot follow
+    ``q_r``, too.  :meth:`move_to` may move a posture whose flow rests; the next :meth:`brace` goes on from there.
 
     Attributes:
         settle: Time at rest before a known impact, s: four time constants ``1/√K_p``.
@@ -49,15 +48,15 @@ class ReferenceFlowPosture(JointPosture):
 
         Args:
             robot: The robot.
-            gradient: ``q → (H, ∇H)``, or a compiled export, whose own objective is then used.
+            gradient: ``q → (H, ∇H)``, or a compiled export, whose exported objective is then used.
             options: Parameters of the flow.
-            path: Posture to visit first, shape (nq,), or several, shape (k, nq).  The flow walks to an optimum that
-                was found offline, or along its path, and goes on from there.
+            path: Posture to visit first, shape (nq,), or postures, shape (k, nq), such as an optimum that was solved
+                offline or the path to it.  The flow goes on from the last of them.
             name: Name in reports.
-            gains: As of :class:`~impact_posture.tsid.tasks.joint_posture.JointPosture`.
+            gains: Arguments of :class:`~impact_posture.tsid.tasks.joint_posture.JointPosture`.
 
         Raises:
-            PostureError: A posture of the path is no configuration of the robot.
+            PostureError: A posture of the path is not a configuration of the robot.
             ManifestMismatch: The export is of another robot.
         """
         super().__init__(robot, name=name, **gains)
@@ -82,11 +81,11 @@ class ReferenceFlowPosture(JointPosture):
         return self._flow
 
     def brace(self, t_impact: float | None = None) -> None:
-        """Let the flow go, for ``duration`` of its options at most, because an impact is coming.
+        """Start the flow because an impact is coming.  It moves for at most ``options.duration``.
 
         Args:
-            t_impact: Time until the impact, s.  The flow then rests :attr:`settle` earlier and stays, as far as its
-                acceleration permits.
+            t_impact: Time until the impact, s.  The flow rests :attr:`settle` before it, as far as its acceleration
+                permits.
 
         Raises:
             InputError: The time is not finite, or no controller with this task has been reset.
@@ -99,11 +98,11 @@ class ReferenceFlowPosture(JointPosture):
         self.flow.rest_at(np.inf if t_impact is None else t_impact - self.settle)
 
     def contact(self) -> None:
-        """Stop the flow and hold what it has reached."""
+        """Stop the flow and hold the reached posture."""
         self.flow.on = False
 
     def release(self) -> None:
-        """Stop the flow and hold what it has reached, as :meth:`contact` does."""
+        """Stop the flow and hold the reached posture, as :meth:`contact` does."""
         self.contact()
 
     @property
@@ -112,7 +111,7 @@ class ReferenceFlowPosture(JointPosture):
         return 0.0 if self._flow is None else float(self._flow.on)
 
     def reset(self, state: State) -> None:
-        """Take the present posture as target, and the present output as that of the tasks that the flow has led."""
+        """Take the present posture as target, and the present outputs as targets of the tasks that the flow led."""
         super().reset(state)
         self._lead.reset(state)
 

@@ -1,4 +1,4 @@
-"""Controls that hold a posture at rest, as shares of what the actuators may give, and the polygon of the feet."""
+"""Controls that hold a posture at rest, as shares of the actuators' limits, and the polygon of the feet."""
 
 from __future__ import annotations
 
@@ -14,22 +14,23 @@ from impact_posture.tsid.actuators import Actuators
 from impact_posture.tsid.state import State
 from impact_posture.tsid.support_contact import SupportContact
 
-# Weight of a moment (N·m) relative to that of a force (N) in the choice of contact wrenches.
+# Weight of a moment (N·m), relative to a force (N), in the choice of contact wrenches.
 _MOMENT = 100.0
-# Least share of the half range of a control that counts as left.
+# Least share of the half range of a control that counts as available.
 _LEFT = 0.1
-# Share of the weight that is spread evenly over soles.
+# Share of the weight that soles carry in equal parts.
 _EVEN = 0.6
-# An edge that turns less than this from the left is the last, rad.
+# An edge whose direction is within this angle of the first direction counts as the last edge, rad.
 _START = 1e-8
-# Share of the trace that makes the balance of the base solvable where the feet cannot carry it.
+# Share of the trace that keeps the balance of the base solvable where the feet cannot carry it.
 _TINY = 1e-12
 
 
 class StaticControls:
-    """Controls at rest, ``u = G⁺(h − Jᵀf)``, from the middle of their range in units of a share of its half.
+    """Controls at rest, ``u = G⁺(h − Jᵀf)``, as distances from the middle of their ranges.
 
-    The contact wrenches ``f`` carry the base with the least weighted norm.  Redundant rotors share evenly.
+    The unit is a share of half the range.  The contact wrenches ``f`` are the least in a weighted norm that carry the
+    base.  Redundant rotors share evenly.
 
     Attributes:
         limited: Controls that have limits, shape (m,).
@@ -41,17 +42,17 @@ class StaticControls:
         self.limited = np.flatnonzero(np.isfinite(actuators.upper) & np.isfinite(actuators.lower))
         lower, upper = actuators.lower[self.limited], actuators.upper[self.limited]
         self._middle, self._half = (upper + lower) / 2, share * (upper - lower) / 2
-        # The limits, and the least that counts as left where the start itself needs more than its share.
+        # The limits, and the least room that counts where the start itself needs more than its share.
         self._whole, self._least = 1.0 / share, _LEFT / share
         wrench = np.array([1.0] * 3 + [_MOMENT] * 3)
         self._ease = 1.0 / np.concatenate([np.zeros(0), *(wrench[: c.size] for c in contacts)])
         self._count, self._base = self._ease.size, base
-        # u = inverse · force for everything but the contacts.
+        # u = inverse · force, where the force is without the contacts' part.
         self._inverse = np.linalg.pinv(actuators.G, rcond=1e-9)[self.limited] / self._half[:, None]
-        # Forces on the contacts that carry the base, times -Jᵀ: what they take from generalized forces.
+        # Generalized forces of the contacts, per unit of the wrench on the base that they carry.
         self._carried = np.zeros((actuators.G.shape[0], base))
         if contacts:
-            # Imported here, because SciPy takes long to import.  For six unknowns it takes a third of NumPy's time.
+            # Imported here, because SciPy takes long to import.  NumPy takes three times as long for six unknowns.
             from scipy.linalg.lapack import dposv
 
             self._solve = dposv
@@ -62,7 +63,7 @@ class StaticControls:
 
         Args:
             state: The state, whose ``h`` is gravity.
-            J: Jacobian whose first rows are those of the contacts, shape (≥ contact rows, nv).
+            J: Jacobian whose first rows belong to the contacts, shape (≥ contact rows, nv).
         """
         if self._count:
             J = J[: self._count]
@@ -71,22 +72,22 @@ class StaticControls:
             square = eased @ A.T
             # Feet on a line carry no moment about it.
             square.flat[:: self._base + 1] += _TINY * square.trace()
-            _, found, wrong = self._solve(square, eased)
-            if not wrong:
-                np.matmul(J.T, found.T, out=self._carried)
+            _, wrenches, failed = self._solve(square, eased)
+            if not failed:
+                np.matmul(J.T, wrenches.T, out=self._carried)
         return np.asarray(self._needed(state.h) - self._central)
 
     def permitted(self, M: Array, known: Array, more: Array, shares: Array, most: float) -> float:
-        """Return the share of ``more``, 0 to 1, that accelerations permit which take ``most`` of what rest leaves.
+        """Return the share of ``more``, 0 to 1, that the actuators permit.
 
-        The contacts are those of the last :meth:`shares`.
+        It uses the contact forces of the last :meth:`shares`.
 
         Args:
             M: Mass matrix, shape (nv, nv).
-            known: Acceleration that is not to change, shape (nv,).
+            known: Acceleration that must not change, shape (nv,).
             more: Acceleration to add, shape (nv,).
             shares: Static controls at the state, shape (m,).
-            most: Share of what the static controls leave of the limits.
+            most: Largest share of the room beside the static controls that both accelerations may use.
         """
         self._pair[:, 0], self._pair[:, 1] = known, more
         taken, added = self._needed(M @ self._pair).T
@@ -95,25 +96,25 @@ class StaticControls:
         return max(float((left / np.maximum(np.abs(added), _TINY)).min(initial=1.0)), 0.0)
 
     def _needed(self, force: Array) -> Array:
-        """Return the shares that make generalized forces, shape (m,) for (nv,) or (m, k) for (nv, k)."""
+        """Return the controls that produce generalized forces, shape (m,) for (nv,) or (m, k) for (nv, k)."""
         if self._count:
             force = force - self._carried @ force[: self._base]
         return np.asarray(self._inverse @ force)
 
 
 def support_edges(state: State, contacts: Sequence[SupportContact]) -> tuple[Array, Array]:
-    """Return ``n`` (k, 2) and ``b`` (k,) of the polygon ``n·c + b ≤ 0`` of feet on level ground, m, around it.
+    """Return ``n`` (k, 2) and ``b`` (k,) of the polygon ``n·c + b ≤ 0`` of the feet on level ground, m.
 
-    Where the center of mass ``c`` is in it, each sole carries its part of what is spread evenly.  A sole that carries
-    nothing leaves the ground with the least push.  Each corner of a sole is moved towards the mean of these corners.
-    Point feet stay as they are, because three of four carry a robot.
-    Feet that span no area allow no motion of the center of mass: each direction then is an edge out of reach.
+    A center of mass ``c`` in the polygon leaves each sole its equal part of 60 % of the weight, because a sole
+    without load leaves the ground at the least push.  For this, each corner of a sole moves towards the mean of the
+    same corners of all soles.  Point feet stay as they are, because three of four carry a robot.  Feet that span no
+    area allow no motion of the center of mass.  The result is then four edges at an infinite distance.
 
     Raises:
-        InputError: The base is fixed, so feet do not bear the weight alone.
+        InputError: The base is fixed, so the feet do not carry the weight alone.
     """
     if contacts and not state.robot.floating:
-        what = "its base is fixed, and the flow knows no feet that share the weight with it"
+        what = "its base is fixed, and a flow with contacts needs a floating base"
         raise InputError(what, where=state.robot.name, hint="leave out `contacts`")
     corners = []
     for contact in contacts:
@@ -129,7 +130,7 @@ def support_edges(state: State, contacts: Sequence[SupportContact]) -> tuple[Arr
     if edges is None:
         return np.vstack([np.eye(2), -np.eye(2)]), np.full(4, np.inf)
     normals, offsets = edges
-    # Around from the leftmost corner as in C, because what edges forbid is removed one after the other.
+    # In the order of the C code, from the leftmost corner around, because edges act one after the other.
     turn = np.arctan2(normals[:, 1], normals[:, 0])
     order = np.argsort(np.where(turn < _START - np.pi, np.pi, turn))
     return normals[order], -offsets[order]
