@@ -1,23 +1,23 @@
-/* The reference flow: a posture q_r that goes down the gradient on contacts and tasks, limited in speed and acceleration,
- * before the posture task follows it.  An update takes IP_FLOW_PHASES ticks, so that none takes much longer than without it.
- * The formulas are in impact_posture/tsid/flow/reference_flow.py. */
+/* The reference flow: a posture q_r that descends along the gradient on contacts and tasks, limited in speed and
+ * acceleration.  The posture task follows it.  The work of an update is spread over IP_FLOW_PHASES ticks, so that no tick
+ * takes much longer.  The formulas are in impact_posture/tsid/flow/reference_flow.py. */
 
-/* Ticks of an update, from its look to the change of the motion, and from the last change to the look. */
+/* Ticks of an update, tick of the first change of the motion, and ticks from the second change to the next look. */
 #define IP_FLOW_PHASES 14
 #define IP_FLOW_UNTIL 4
 #define IP_FLOW_SINCE 3
 
-/* Step of the differences, rad; step below which a posture on the way is reached, rad (m). */
+/* Step of the differences, rad; step below which a posture of the path counts as reached, rad (m). */
 #define IP_PROBE 1e-4
 #define IP_REACHED 0.02
-/* Way of the flow that is long enough to learn from, rad (m). */
+/* Least displacement of the flow between looks from which it learns, rad (m). */
 #define IP_MOVED 1e-6
-/* Length of what is new in a direction below which it is taken twice. */
+/* A direction with a shorter new part is orthogonalized once more. */
 #define IP_NEW 0.1
-/* Length of a velocity below which the flow has no way to stop on. */
+/* Length of the velocity below which a probe at the stopping point tells nothing. */
 #define IP_SLOW 1e-3
 
-/* Model and rows of the constraints at a posture at rest; their errors too, where they are wanted. */
+/* Model and rows of the constraints at a posture at rest, and their errors unless `error` is null. */
 static void ip_flow_place(ip_context *c, const double *q, double *error)
 {
   static const double still[IP_NV] = {0};
@@ -53,16 +53,16 @@ static void ip_flow_place(ip_context *c, const double *q, double *error)
   }
 }
 
-/* The objective and its gradient over H0 at a posture; zero where they do not exist. */
-static void ip_flow_evaluate(ip_flow *f, const double *q, double *slope)
+/* Return the objective at a posture, and its gradient over H0 in `slope`; NaN and zero where they do not exist. */
+static double ip_flow_evaluate(ip_flow *f, const double *q, double *slope)
 {
   double value;
   int i;
   f->failed = IP_GRADIENT(&f->m, q, &value, slope) != 0 || !isfinite(value + ip_dot(slope, slope, IP_NV));
-  f->found = f->failed ? NAN : value;
   for (i = 0; i < IP_NV; ++i) {
     slope[i] = f->failed ? 0.0 : slope[i] / f->start;
   }
+  return f->failed ? NAN : value;
 }
 
 /* The gradient on the constraints, slope - J'multiplier, in place. */
@@ -74,30 +74,28 @@ static void ip_flow_reduce(const ip_flow *f, double (*J)[IP_NV], double *slope)
   }
 }
 
-/* Evaluate objective and constraints where q_r is when the governor changes its motion. */
+/* Evaluate objective and constraints at the posture that q_r will have at the next change of the motion. */
 static void ip_flow_look(ip_context *c)
 {
   ip_flow *f = &c->flow;
-  double ahead[IP_NQ], way[IP_NV];
+  double ahead[IP_NQ], mean[IP_NV];
   const double dt = f->elapsed / IP_FLOW_SINCE;
-  memcpy(way, f->velocity, sizeof way);
-  ip_add(way, (IP_FLOW_UNTIL + 1) / 2.0 * dt, f->acceleration, IP_NV);
-  ip_integrate(f->q, way, IP_FLOW_UNTIL * dt, ahead);
+  memcpy(mean, f->velocity, sizeof mean);
+  ip_add(mean, (IP_FLOW_UNTIL + 1) / 2.0 * dt, f->acceleration, IP_NV);
+  ip_integrate(f->q, mean, IP_FLOW_UNTIL * dt, ahead);
   ip_difference(ahead, f->here, f->z);
   f->length = sqrt(ip_dot(f->z, f->z, IP_NV));
   memcpy(f->here, ahead, sizeof f->here);
   memcpy(f->there, f->slope, sizeof f->there);
   ip_flow_place(c, f->here, f->error);
-  ip_flow_evaluate(f, f->here, f->slope);
-  f->value = f->found;
+  f->value = ip_flow_evaluate(f, f->here, f->slope);
   memcpy(f->shared, f->shares, sizeof f->shared);
   ip_flow_shares(c, f->shares);
 }
 
-/* Find the redundancy, and the gradient on it. */
-static void ip_flow_split(ip_context *c)
+/* Compute the redundancy, and the gradient on it. */
+static void ip_flow_split(ip_flow *f)
 {
-  ip_flow *f = &c->flow;
   int i;
   ip_flow_space(f);
   memset(f->multiplier, 0, sizeof f->multiplier);
@@ -108,11 +106,11 @@ static void ip_flow_split(ip_context *c)
   ip_flow_reduce(f, f->J, f->reduced);
 }
 
-/* Learn from the way since the last look, find the limits, and prepare the return. */
+/* Learn from the displacement since the last look, set the limits, and prepare the return. */
 static void ip_flow_limit(ip_context *c)
 {
   ip_flow *f = &c->flow;
-  /* A look that failed has no slope. */
+  /* The slope is zero after a look at which the gradient failed. */
   if (f->length > IP_MOVED && !f->failed && ip_dot(f->there, f->there, IP_NV) > 0.0) {
     ip_flow_reduce(f, f->before, f->there);
     ip_scaled(f->z, 1.0 / f->length, f->z, IP_NV);
@@ -123,7 +121,8 @@ static void ip_flow_limit(ip_context *c)
   ip_flow_still(f);
 }
 
-/* A direction of the redundancy that does not depend on its basis: what is new of a fixed one. */
+/* The part of the next fixed direction that is orthogonal to the last ones: a direction of the redundancy that does not
+ * depend on its basis. */
 static void ip_flow_aim(ip_flow *f)
 {
   double *z = f->seen[f->probed], *was = f->work, s;
@@ -132,7 +131,7 @@ static void ip_flow_aim(ip_flow *f)
     const uint32_t j = (uint32_t)(f->probed * IP_NV + i + 1);
     z[i] = (double)(uint32_t)(j * j * UINT32_C(2654435769)) / 4294967296.0 - 0.5;
   }
-  /* Where little of the direction is new, once more makes it exact. */
+  /* Where little of the direction is new, a second pass makes it exact. */
   for (again = 0, s = 0.0; again < 2 && s < IP_NEW; ++again) {
     memcpy(was, z, sizeof(double) * IP_NV);
     for (k = 0; k < f->probed; ++k) {
@@ -170,7 +169,7 @@ static void ip_flow_probe(ip_context *c)
   ip_flow_place(c, q, NULL);
 }
 
-/* Learn from it, by the gradient on the constraints and the static controls there. */
+/* Learn from the gradient on the constraints and the static controls at the probe. */
 static void ip_flow_compare(ip_context *c)
 {
   ip_flow *f = &c->flow;
@@ -186,42 +185,7 @@ static void ip_flow_compare(ip_context *c)
   }
 }
 
-/* The parts of finding the eigenvalues of the curvature. */
-static void ip_flow_curve(ip_context *c)
-{
-  ip_flow *f = &c->flow;
-  if (ip_flow_descends(f)) {
-    ip_flow_bend(c);
-  }
-}
-
-static void ip_flow_tridiagonal(ip_context *c)
-{
-  ip_flow *f = &c->flow;
-  if (ip_flow_descends(f)) {
-    ip_tridiagonal(f->work, f->work + IP_NV * IP_NV, f->left);
-  }
-}
-
-static void ip_flow_diagonalize(ip_context *c)
-{
-  ip_flow *f = &c->flow;
-  if (ip_flow_descends(f)) {
-    ip_diagonalize(f->work, f->work + IP_NV * IP_NV, f->left, f->left * f->left / 2);
-  }
-}
-
-static void ip_flow_variables(ip_context *c)
-{
-  ip_flow *f = &c->flow;
-  if (ip_flow_descends(f)) {
-    ip_diagonalize(f->work, f->work + IP_NV * IP_NV, f->left, 30 * f->left * f->left);
-    ip_flow_turn(c);
-    ip_flow_rows(f);
-  }
-}
-
-/* Find the step, and whether it is worth moving. */
+/* Compute the step, and whether it is worth moving. */
 static void ip_flow_direct(ip_context *c)
 {
   ip_flow *f = &c->flow;
@@ -232,13 +196,13 @@ static void ip_flow_direct(ip_context *c)
 #if IP_PATH
   if (f->visited < IP_PATH) {
     const int before = f->failures;
-    double way[IP_NV];
+    double remaining[IP_NV];
     int i, k;
-    ip_difference(f->q, c->p.flow_path + f->visited * IP_NQ, way);
+    ip_difference(f->q, c->p.flow_path + f->visited * IP_NQ, remaining);
     for (k = 0; k < f->left; ++k) {
-      f->steep[k] = -ip_dot(f->Z[k], way, IP_NV);
+      f->steep[k] = -ip_dot(f->Z[k], remaining, IP_NV);
       for (i = 0; i < IP_NV; ++i) {
-        f->way[i * f->left + k] = f->Z[k][i];
+        f->axes[i * f->left + k] = f->Z[k][i];
       }
     }
     ip_flow_rows(f);
@@ -248,11 +212,11 @@ static void ip_flow_direct(ip_context *c)
   }
 #endif
   ip_flow_solve(f);
-  /* The flow does not climb for what the pull or the springs win. */
+  /* H must decrease: a gain of the pull or of the springs does not count. */
   f->gain = fmin(f->gain * ip_flow_root(f), -ip_dot(f->slope, f->wanted, IP_NV));
   f->resting = f->gain < (f->resting ? 4.0 : 1.0) * c->p.flow_epsilon[0] || f->remains <= 0.0;
   if (f->resting) {
-    /* It brakes as it turns, downhill. */
+    /* The governor then brakes downhill. */
     memset(f->wanted, 0, sizeof f->wanted);
   }
 }

@@ -1,23 +1,23 @@
 /* Direction of the reference flow: a saddle-free Newton step on the constraints, as a QP with limits.  The formulas are
  * in impact_posture/tsid/flow/flow_direction.py. */
 
-/* Least H/H0 whose root counts. */
+/* Least H/H0 under the root. */
 #define IP_LEAST_VALUE 1e-8
 
-/* The rows of a step along f->way, which has NV rows, in f->work, and their bounds. */
+/* Write the rows of a step along f->axes, an NV x left matrix, into f->work, and their bounds. */
 static void ip_flow_rows(ip_flow *f)
 {
   enum { N = IP_NV };
-  const double *way = f->way;
+  const double *axes = f->axes;
   const int n = f->left;
   int r;
   for (r = 0; r < IP_FLOW_ROWS; ++r) {
     const int k = r - IP_JOINTS_V;
     double *row = f->work + r * n, length, shift;
     if (k < 0) {
-      memcpy(row, way + (IP_BASE + r) * n, sizeof(double) * (size_t)n);
+      memcpy(row, axes + (IP_BASE + r) * n, sizeof(double) * (size_t)n);
     } else {
-      ip_combine(row, n, k < IP_PLACED ? f->row[k] : f->T[k - IP_PLACED], 1, way, n, N);
+      ip_combine(row, n, k < IP_PLACED ? f->row[k] : f->T[k - IP_PLACED], 1, axes, n, N);
     }
     length = ip_dot(row, row, n);
     shift = ip_dot(row, f->steep, n);
@@ -30,8 +30,8 @@ static void ip_flow_rows(ip_flow *f)
   }
 }
 
-/* The step with the least |y|^2/2 + f->steep y, f->wanted = f->way y, within the rows; zero if the solver fails.  With
- * u = y + f->steep this is the least |u|^2. */
+/* Set f->wanted = f->axes y for the least |y|^2/2 + f->steep y within the rows, or to zero if the solver fails.  With
+ * u = y + f->steep, the program is the least |u|^2. */
 APART static void ip_flow_solve(ip_flow *f)
 {
   enum { N = IP_NV, M = IP_FLOW_ROWS };
@@ -52,7 +52,7 @@ APART static void ip_flow_solve(ip_flow *f)
   w.scaling = f->scaling;
   w.sense = f->sense;
   if (daqp_reactivate_constraints(&w) < 0 || daqp_ldp(&w) <= 0 || w.state & DAQP_STATE_NOISE_FLOOR) {
-    /* The last is an answer that violates bounds after circles. */
+    /* The noise floor means that the solver cycled and its answer violates bounds. */
     ++f->failures;
     return;
   }
@@ -61,7 +61,7 @@ APART static void ip_flow_solve(ip_flow *f)
     f->gain -= slope[k] * u[k] + u[k] * u[k] / 2.0;
   }
   for (k = 0; k < N; ++k) {
-    step[k] = ip_dot(f->way + k * n, u, n);
+    step[k] = ip_dot(f->axes + k * n, u, n);
   }
   if (!isfinite(ip_dot(step, step, N))) {
     ++f->failures;
@@ -76,13 +76,13 @@ static int ip_flow_descends(const ip_flow *f)
   return !f->failed && f->visited == IP_PATH;
 }
 
-/* The root of H/H0, or the least that counts. */
+/* The root of H/H0, or its least value that counts. */
 static double ip_flow_root(const ip_flow *f)
 {
   return sqrt(fmax(fabs(f->value / f->start), IP_LEAST_VALUE));
 }
 
-/* Curvature and slope of 2 sqrt(H/H0) + rho/2 |q - q0|^2 on the redundancy, into f->work and f->steep. */
+/* Write curvature and slope of 2 sqrt(H/H0) + rho/2 |q - q0|^2 on the redundancy into f->work and f->steep. */
 static void ip_flow_bend(ip_context *c)
 {
   enum { N = IP_NV };
@@ -113,7 +113,7 @@ static void ip_flow_bend(ip_context *c)
   }
 }
 
-/* The variables of the Newton step by the eigenvalues of the curvature: their ways, and the slope along them in place of
+/* Make the variables of the Newton step from the eigenvectors of the curvature: f->axes, and the slope along them in
  * f->steep. */
 static void ip_flow_turn(ip_context *c)
 {
@@ -135,12 +135,12 @@ static void ip_flow_turn(ip_context *c)
     }
   }
   for (i = 0; i < N; ++i) {
-    ip_combine(f->way + i * n, n, f->Z[0] + i, N, C, n, n);
+    ip_combine(f->axes + i * n, n, f->Z[0] + i, N, C, n, n);
   }
 }
 
 /* Learn the curvature and the slope of the static controls along f->z, from the reduced gradient and the static controls
- * at the end of a way, f->z times its length, that begins at the last look. */
+ * at the distance f->length along it from the last look. */
 static void ip_flow_learn(ip_flow *f, const double *slope, const double *shares)
 {
   const double *z = f->z, length = f->length;
@@ -160,7 +160,7 @@ static void ip_flow_learn(ip_flow *f, const double *slope, const double *shares)
   }
 }
 
-/* Take out of a step of the flow the part by which H would rise now, or where the flow stops. */
+/* Take out of a change of the flow the part that raises H now or, with the displacement `stop`, where the flow stops. */
 static void ip_flow_downhill(const ip_flow *f, const double *stop, double *step)
 {
   double uphill[IP_NV], climb;
@@ -177,7 +177,7 @@ static void ip_flow_downhill(const ip_flow *f, const double *stop, double *step)
   }
 }
 
-/* Time in which the flow stops evenly, which takes twice the way that braking takes. */
+/* Time in which the flow stops evenly.  Going on for this time is twice the braking distance. */
 static double ip_flow_stopping(const ip_flow *f, const ip_params *p)
 {
   return ip_largest(f->flow, 0) / p->flow_acceleration[0];

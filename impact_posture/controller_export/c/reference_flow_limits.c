@@ -1,18 +1,17 @@
-/* Limits of the reference flow: how much room each has, and steps without what crosses it.  The formulas are in
+/* Limits of the reference flow: their room, and changes of the flow that do not cross them.  The formulas are in
  * impact_posture/tsid/flow/flow_direction.py. */
 
-/* What of IP_NEAR the flow takes where a limit is missed by so much already: along it, the flow would creep across. */
+/* Largest violation at which the flow may still move along a limit.  With all of IP_NEAR, it would creep across. */
 #define IP_SPENT 9.9e-4
-/* Distance from the limits of joints to which the flow aims, rad (m), and from those of static controls, whose slope it
- * learns, as a share. */
+/* Distance that the flow keeps from the joint limits, rad (m), and from the limits of static controls, as a share. */
 #define IP_AIM 2e-3
 #define IP_RESERVE 8e-3
-/* Square of the length below which a row has no direction on the constraints. */
+/* Least square of the length of a row on the constraints. */
 #define IP_FLAT 1e-6
-/* Sine of an angle of the base below which the tilt has no slope. */
+/* Sine of the tilt below which the tilt has no slope. */
 #define IP_LEVEL 1e-6
 
-/* The largest entry from the first one on. */
+/* The largest absolute value from the entry `first` on. */
 static double ip_largest(const double *x, int first)
 {
   double most = 0.0;
@@ -23,21 +22,17 @@ static double ip_largest(const double *x, int first)
   return most;
 }
 
-/* How much a row changes along a way. */
-static double ip_flow_along(const ip_flow *f, int r, const double *way)
+/* Change of the value of a row in a displacement of the flow.  A turn of the base across the tilt raises the tilt to second
+ * order. */
+static double ip_flow_ahead(const ip_flow *f, int r, const double *moved)
 {
-  return r < IP_JOINTS_V               ? way[IP_BASE + r]
-         : r < IP_JOINTS_V + IP_PLACED ? ip_dot(f->row[r - IP_JOINTS_V], way, IP_NV)
-                                       : ip_dot(f->T[r - IP_JOINTS_V - IP_PLACED], way, IP_NV);
-}
-
-/* How much a row changes along a way of the flow.  The base tilts about the way as well as along it. */
-static double ip_flow_ahead(const ip_flow *f, int r, const double *way)
-{
-  const double along = ip_flow_along(f, r, way);
+  const double along = r < IP_JOINTS_V               ? moved[IP_BASE + r]
+                       : r < IP_JOINTS_V + IP_PLACED ? ip_dot(f->row[r - IP_JOINTS_V], moved, IP_NV)
+                                                     : ip_dot(f->T[r - IP_JOINTS_V - IP_PLACED], moved, IP_NV);
 #if IP_BASE
   if (r == IP_JOINTS_V + IP_EDGES) {
-    const double turn = ip_dot(f->vertical, way + 3, 3), aside = ip_dot(way + 3, way + 3, 3) - turn * turn - along * along;
+    const double turn = ip_dot(f->vertical, moved + 3, 3);
+    const double aside = ip_dot(moved + 3, moved + 3, 3) - turn * turn - along * along;
     return hypot(f->tilt + along, sqrt(fmax(aside, 0.0))) - f->tilt;
   }
 #endif
@@ -60,7 +55,7 @@ static double ip_flow_tilt(const ip_flow *f, double *row)
 }
 #endif
 
-/* Bounds of the rows on the step, at the model of the flow, less what the flow needs to brake. */
+/* Bounds of the rows on the step, at the model of the flow, less the braking distance of the flow. */
 static void ip_flow_limits(ip_context *c)
 {
   ip_flow *f = &c->flow;
@@ -114,18 +109,17 @@ static void ip_flow_limits(ip_context *c)
   }
 }
 
-/* Take out of a step of the flow, which then goes on for a time, the parts by which limits would be crossed, one after the
- * other. */
+/* Take out of a change of the flow the parts that cross limits within a time, row by row. */
 static void ip_flow_along_limits(const ip_flow *f, double time, double *step)
 {
-  double way[IP_NV], across[IP_NV], over, square;
+  double moved[IP_NV], across[IP_NV], over, square;
   int i, r;
   for (i = 0; i < IP_NV; ++i) {
-    way[i] = time * (f->flow[i] + step[i]);
+    moved[i] = time * (f->flow[i] + step[i]);
   }
   for (r = 0; r < IP_FLOW_ROWS; ++r) {
     const int k = r - IP_JOINTS_V;
-    over = ip_flow_ahead(f, r, way);
+    over = ip_flow_ahead(f, r, moved);
     over -= fmin(fmax(over, f->room[1][r]), f->room[0][r]);
     if (over == 0.0) {
       continue;
@@ -140,7 +134,7 @@ static void ip_flow_along_limits(const ip_flow *f, double time, double *step)
     square = ip_dot(across, across, IP_NV);
     if (square > IP_FLAT) {
       ip_add(step, -over / time / square, across, IP_NV);
-      ip_add(way, -over / square, across, IP_NV);
+      ip_add(moved, -over / square, across, IP_NV);
     }
   }
 }

@@ -1,15 +1,15 @@
-/* How the reference flow moves: its governor, its beginning, and what it leads. */
+/* Motion of the reference flow: its governor, its start, and the tasks that it leads. */
 
-/* Time constant of the return to contacts and tasks, s; speed of a flow that stands still, rad/s (m/s). */
+/* Time constant of the return to contacts and tasks, s; speed below which a flow that is off stands still, rad/s (m/s). */
 #define IP_RETURN 0.1
 #define IP_STILL 1e-5
-/* What a limit may be missed by where the flow brakes, rad (m), or as a share. */
+/* Violation of a limit that a braking flow may reach, rad (m), or as a share. */
 #define IP_NEAR 1e-3
-/* How often a change of the flow is tried: as it is, and twice without what crosses limits. */
-#define IP_TIMES 3
-/* Least share of the acceleration with which the flow counts on braking, and its growth with each change. */
+/* Number of attempts for a change: as it is, then twice without the part that crosses limits. */
+#define IP_ATTEMPTS 3
+/* Least share of the acceleration that counts as available for braking.  A change can raise the share by this much. */
 #define IP_ABLE 0.1
-/* Factor of the time of braking, because the slopes of the limits change on the way. */
+/* Factor of the braking time, because the slopes of the limits change during braking. */
 #define IP_CAUTION 1.5
 /* Largest ratio of the speed of the flow to its step, 1/s. */
 #define IP_RATE 4.8
@@ -23,8 +23,8 @@ static void ip_shorten(double *x, double most)
   }
 }
 
-/* The motion that changes the constraints at a rate; of all such motions that of the base and not of the joints, by
- * ip_flow_still. */
+/* A motion that changes the constraints at a rate.  Of all such motions, it moves the base and spares the joints, by the
+ * factor of ip_flow_still. */
 static void ip_flow_moving(const ip_flow *f, const double *rate, double *back)
 {
   int i;
@@ -46,7 +46,7 @@ static void ip_flow_moving(const ip_flow *f, const double *rate, double *back)
 #endif
 }
 
-/* The velocity back to contacts and tasks, within speed and acceleration, and along with tasks. */
+/* The velocity back to contacts and tasks, within speed and acceleration, plus the velocity of moving tasks. */
 static void ip_flow_back(ip_context *c, double period, double *back)
 {
   ip_flow *f = &c->flow;
@@ -55,7 +55,7 @@ static void ip_flow_back(ip_context *c, double period, double *back)
   int i, k, row;
   ip_flow_moving(f, f->error, back);
   size = fmax(ip_largest(back, 0), IP_TINY);
-  /* Two fifths of the acceleration stop a speed of sqrt(4/5 a d) on the way d. */
+  /* Two fifths of the acceleration stop a speed of sqrt(4/5 a d) within the distance d. */
   pace = fmin(fmin(1.0 / IP_RETURN, sqrt(0.8 * p->flow_acceleration[0] / size)), p->flow_speed[0] / size);
   for (i = 0; i < IP_NV; ++i) {
     change[i] = pace * back[i] - f->returning[i];
@@ -71,28 +71,28 @@ static void ip_flow_back(ip_context *c, double period, double *back)
   ip_add(back, 1.0, f->returning, IP_NV);
 }
 
-/* Time for which the flow goes on if it changes by a step and then brakes, all entries evenly, as hard as it lately could. */
+/* Time for which the flow goes on if it changes by a step and then brakes evenly, as hard as it lately could. */
 static double ip_flow_braking(const ip_flow *f, const ip_params *p, const double *step, double period)
 {
-  double way[IP_NV];
+  double after[IP_NV];
   int i;
   for (i = 0; i < IP_NV; ++i) {
-    way[i] = f->flow[i] + step[i];
+    after[i] = f->flow[i] + step[i];
   }
-  return IP_CAUTION * ip_largest(way, 0) / (2.0 * f->able * p->flow_acceleration[0]) + period;
+  return IP_CAUTION * ip_largest(after, 0) / (2.0 * f->able * p->flow_acceleration[0]) + period;
 }
 
-/* Whether the flow then stays within the limits. */
+/* Whether the flow stays within the limits in that time. */
 static int ip_flow_stops(const ip_flow *f, const ip_params *p, const double *step, double period)
 {
   const double time = ip_flow_braking(f, p, step, period);
-  double way[IP_NV];
+  double moved[IP_NV];
   int i, r;
   for (i = 0; i < IP_NV; ++i) {
-    way[i] = time * (f->flow[i] + step[i]);
+    moved[i] = time * (f->flow[i] + step[i]);
   }
   for (r = 0; r < IP_FLOW_ROWS; ++r) {
-    const double ahead = ip_flow_ahead(f, r, way);
+    const double ahead = ip_flow_ahead(f, r, moved);
     if (ahead > f->room[0][r] + IP_NEAR || ahead < f->room[1][r] - IP_NEAR) {
       return 0;
     }
@@ -100,8 +100,8 @@ static int ip_flow_stops(const ip_flow *f, const ip_params *p, const double *ste
   return 1;
 }
 
-/* Shorten the sum of the flow and its change to the largest speed, because a part that is taken out of the change of all
- * joints can speed up one of them. */
+/* Shorten the flow after a change to the largest speed.  A limit takes a part out of the change of all joints, which can
+ * speed up one of them. */
 static void ip_flow_bound_speed(const ip_flow *f, const ip_params *p, double *step)
 {
   double after[IP_NV];
@@ -117,22 +117,19 @@ static void ip_flow_bound_speed(const ip_flow *f, const ip_params *p, double *st
   }
 }
 
-/* The change of the flow towards the wanted step, by at most so much an entry: as fast as each joint can, or straight, each
- * of them twice without what crosses limits, or braking.  The first of them counts from which the flow can stop within the
- * limits.  Where the first does not slow down, it goes without what moves the zero moment point too far.  Return whether the
- * flow only brakes. */
+/* The change of the flow towards the wanted step, as FlowGovernor.change has it.  Return whether the flow only brakes. */
 static int ip_flow_change(const ip_flow *f, const ip_params *p, double period, double fastest, double *step)
 {
   enum { N = IP_NV, FAST = 0, BRAKE = 2 };
   const double a = p->flow_acceleration[0], most = a * period, time = ip_flow_stopping(f, p);
-  /* Two fifths of the acceleration stop a speed of sqrt(4/5 a d) on the step d. */
+  /* Two fifths of the acceleration stop a speed of sqrt(4/5 a d) within the step d. */
   const double pace = fmin(sqrt(0.8 * a / fmax(ip_largest(f->wanted, 0), IP_TINY)), IP_RATE);
   const int descends = fastest > 0.0 && f->visited == IP_PATH;
   double wanted[N], stop[N];
-  int i, k, again;
+  int i, k, attempt;
   for (i = 0; i < N; ++i) {
     wanted[i] = pace * f->wanted[i];
-    /* Twice the way on which it stops, because the curvature may grow on it. */
+    /* Twice the braking distance, because the curvature may grow on it. */
     stop[i] = time * f->flow[i];
   }
   ip_shorten(wanted, fastest);
@@ -145,11 +142,11 @@ static int ip_flow_change(const ip_flow *f, const ip_params *p, double period, d
       ip_flow_project(f, step);
     }
     ip_shorten(step, most);
-    for (again = 0; again < IP_TIMES; ++again) {
+    for (attempt = 0; attempt < IP_ATTEMPTS; ++attempt) {
       if (k == FAST && ip_dot(step, f->flow, N) >= 0.0) {
         ip_flow_keep_zmp(f, period, step);
       }
-      if (again) {
+      if (attempt) {
         ip_flow_along_limits(f, ip_flow_braking(f, p, step, period), step);
       }
       if (descends) {
@@ -185,7 +182,7 @@ static void ip_flow_govern(ip_context *c)
   if (f->on && !f->resting && f->visited == IP_PATH) {
     f->moved += period;
   }
-  /* The speed is that at the next change, and rest comes with the one after, on two fifths of the acceleration. */
+  /* The speed holds after the next change, and the change after it stops the flow with 2/5 of the acceleration. */
   f->remains = fmin(f->deadline - f->clock, p->flow_duration[0] - f->moved) - 2.0 * period;
   fastest = fmin(fastest, 0.4 * p->flow_acceleration[0] * fmax(f->remains, 0.0));
   fastest = f->on ? fastest : 0.0;
@@ -201,7 +198,7 @@ static void ip_flow_govern(ip_context *c)
   for (i = 0; i < N; ++i) {
     more[i] = step[i] / period;
   }
-  /* To stop within the limits counts more than to leave the actuators much. */
+  /* A stop within the limits matters more than room for the actuators. */
   part = ip_flow_permitted(c, known, more, brakes ? (1.0 + p->flow_haste[0]) / 2.0 : p->flow_haste[0]);
   f->able = fmin(fmax(part, IP_ABLE), f->able + IP_ABLE);
   ip_add(f->flow, part, step, N);
@@ -240,7 +237,8 @@ static void ip_flow_start_at(ip_flow *f, const double *q)
   f->phase = f->resting = 0;
 }
 
-/* Begin at rest at the present posture, and measure the curvature there.  Return 0 where there is none. */
+/* Begin at rest at the present posture, and measure the curvature there.  Return 0 where the objective does not exist or
+ * vanishes. */
 static int ip_flow_begin(ip_context *c)
 {
   ip_flow *f = &c->flow;
@@ -264,14 +262,13 @@ static int ip_flow_begin(ip_context *c)
   ip_flow_polygon(c);
 #endif
   f->start = 1.0;
-  ip_flow_evaluate(f, f->q, f->slope);
-  if (f->failed || f->found == 0.0) {
+  f->start = fabs(ip_flow_evaluate(f, f->q, f->slope));
+  if (f->failed || f->start == 0.0) {
     return 0;
   }
-  f->start = fabs(f->found);
   ip_flow_look(c);
-  ip_flow_decompose(c);
-  ip_flow_split(c);
+  ip_flow_decompose(f);
+  ip_flow_split(f);
   ip_flow_limit(c);
   for (k = 0; k < f->left; ++k) {
     ip_flow_probe(c);
@@ -282,15 +279,58 @@ static int ip_flow_begin(ip_context *c)
   return 1;
 }
 
+/* Do the work of one tick of an update.  Python does it at the ticks of the look, the changes, the probe and the step. */
+static void ip_flow_update(ip_context *c)
+{
+  ip_flow *f = &c->flow;
+  double *C = f->work, *V = C + IP_NV * IP_NV;
+  const int n = f->left, descends = ip_flow_descends(f);
+  switch (f->phase) {
+  case 0:
+    ip_flow_look(c);
+    break;
+  case 1:
+    ip_flow_decompose(f);
+    break;
+  case 2:
+    ip_flow_split(f);
+    break;
+  case 3:
+    ip_flow_limit(c);
+    break;
+  case IP_FLOW_UNTIL:
+  case IP_FLOW_PHASES - IP_FLOW_SINCE:
+    ip_flow_govern(c);
+    break;
+  case 5:
+    ip_flow_probe(c);
+    break;
+  case 6:
+    ip_flow_compare(c);
+    break;
+  case 13:
+    ip_flow_direct(c);
+    break;
+  default:
+    if (descends && f->phase == 7) {
+      ip_flow_bend(c);
+    } else if (descends && f->phase == 8) {
+      ip_tridiagonal(C, V, n);
+    } else if (descends) {
+      /* The last part goes on to the end. */
+      ip_diagonalize(C, V, n, f->phase == 12 ? 30 * n * n : n * n / 2);
+    }
+    if (descends && f->phase == 12) {
+      ip_flow_turn(c);
+      ip_flow_rows(f);
+    }
+  }
+  f->phase = (f->phase + 1) % IP_FLOW_PHASES;
+}
+
 /* Advance the flow by dt seconds, and move the targets of the posture task and of the tasks that it leads. */
 static void ip_flow_lead(ip_context *c, double dt)
 {
-  /* The look, the governor (twice), the probe and the direction are in the ticks in which Python has them. */
-  static void (*const phases[IP_FLOW_PHASES])(ip_context *) = {
-    ip_flow_look,    ip_flow_decompose, ip_flow_split,       ip_flow_limit,       ip_flow_govern,      ip_flow_probe,
-    ip_flow_compare, ip_flow_curve,     ip_flow_tridiagonal, ip_flow_diagonalize, ip_flow_diagonalize, ip_flow_govern,
-    ip_flow_variables, ip_flow_direct,
-  };
   ip_flow *f = &c->flow;
   double position[3], J[3 * IP_NV], drift[3];
   int i, k;
@@ -299,8 +339,7 @@ static void ip_flow_lead(ip_context *c, double dt)
   }
   f->clock += dt;
   f->elapsed += dt;
-  phases[f->phase](c);
-  f->phase = (f->phase + 1) % IP_FLOW_PHASES;
+  ip_flow_update(c);
   ip_add(f->velocity, dt, f->acceleration, IP_NV);
   ip_integrate(f->q, f->velocity, dt, f->q);
   if (!f->on && ip_largest(f->velocity, 0) <= IP_STILL) {
@@ -320,7 +359,7 @@ static void ip_flow_lead(ip_context *c, double dt)
     /* A reset takes the present output. */
     target->set = -1.0;
     if (ip_flow_led[k] == 1) {
-      /* The first of them: the others read the same. */
+      /* Only for the first of them, because the others read the same model. */
       ip_dynamics(f->q, f->velocity, &f->ahead);
     }
     if (ip_task_kind[k] == IP_MASS_CENTER) {

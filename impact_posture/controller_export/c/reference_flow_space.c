@@ -1,20 +1,19 @@
-/* What contacts and tasks leave to the reference flow, and what the actuators need to hold it, as
- * impact_posture/tsid/flow/flow_direction.py (Redundancy) and static_controls.py have them. */
+/* Redundancy of the reference flow, and the controls that hold it at rest.  The formulas are in
+ * impact_posture/tsid/flow/redundancy.py and static_controls.py. */
 
-/* Singular value of the constraints, relative to the largest, below which they are springs, and their stiffness relative
- * to H0, 1/m2. */
+/* Constraints with a smaller singular value, relative to the largest, are springs; their stiffness relative to H0, 1/m2. */
 #define IP_SLACK 2e-2
 #define IP_SPRING 3e4
-/* Weight of a moment (N m) relative to that of a force (N), and a share that makes equations solvable. */
+/* Weight of a moment (N m), relative to a force (N), and a share that keeps equations solvable. */
 #define IP_MOMENT 100.0
 #define IP_TINY 1e-12
 /* Points nearer to a line than this lie on it, m. */
 #define IP_ON_LINE 1e-9
-/* Pull to zero of the base's share in a motion that the joints do not determine. */
+/* Small weight of the base in a motion that the joints do not determine. */
 #define IP_IDLE 1e-9
-/* Least share of the half range of a control that counts as left. */
+/* Least share of the half range of a control that counts as available. */
 #define IP_LEFT 0.1
-/* Share of the weight that is spread evenly over soles. */
+/* Share of the weight that soles carry in equal parts. */
 #define IP_EVEN 0.6
 
 #if IP_BASE
@@ -37,12 +36,10 @@ static void ip_solve_factor(const double *R, int n, double *b)
 }
 #endif
 
-/* Eigenvectors of JJ' and its eigenvalues into f->work.  A Gram matrix is exact enough, because what counts has singular
- * values above 2 %. */
-static void ip_flow_decompose(ip_context *c)
+/* Write eigenvectors and eigenvalues of JJ' into f->work.  A Gram matrix is exact enough for singular values above 2 %. */
+static void ip_flow_decompose(ip_flow *f)
 {
   enum { N = IP_NV, M = IP_HELD };
-  ip_flow *f = &c->flow;
   double *G = f->work;
   int i, j;
   for (i = 0; i < M; ++i) {
@@ -53,8 +50,8 @@ static void ip_flow_decompose(ip_context *c)
   f->most = ip_eigen(G, G + M * M, M);
 }
 
-/* With J = U S V' of these: the inverse of the directions that J holds, and an orthonormal basis of the others, by the rows
- * of Z. */
+/* With J = U S V' from these: the inverse of the directions that J holds, and an orthonormal basis of the others in the
+ * rows of Z. */
 static void ip_flow_space(ip_flow *f)
 {
   enum { N = IP_NV, M = IP_HELD };
@@ -71,8 +68,8 @@ static void ip_flow_space(ip_flow *f)
   for (i = 0; i < N; ++i) {
     ip_combine(f->inverse + i * M, M, held + i, N, U, M, rank);
   }
-  /* Reflections that take these rows to the first entries take the other entries to Z.  Their product is I - V'RV, with
-   * their vectors in the rows of V and R upper triangular (Golub and Van Loan, section 5.1.7).  T is R'. */
+  /* The reflections that take these rows to the first entries take the other entries to Z.  Their product is I - V'RV with
+   * their vectors in the rows of V and an upper triangular R (Golub and Van Loan, section 5.1.7).  T is R'. */
   for (k = 0; k < rank; ++k) {
     double *v = held + k * N, size = sqrt(ip_dot(v + k, v + k, N - k));
     v[k] += v[k] < 0.0 ? -size : size;
@@ -106,7 +103,7 @@ static void ip_flow_space(ip_flow *f)
   }
 }
 
-/* Factor of what the joints have of Z, by which the return does without them. */
+/* Factor of the joints' part of Z, by which the return spares the joints. */
 static void ip_flow_still(ip_flow *f)
 {
 #if IP_BASE
@@ -171,14 +168,14 @@ static void ip_flow_carry(ip_flow *f)
 #endif
 }
 
-/* Half of the share of a control's range that rest may take; 0 where the control has no limits. */
+/* Half of a control's range that rest may use; 0 where the control has no limits. */
 static double ip_flow_half(const ip_params *p, int i)
 {
   const double half = p->flow_share[0] * (p->control_upper[i] - p->control_lower[i]) / 2.0;
   return isfinite(half) ? half : 0.0;
 }
 
-/* Controls that make a generalized force, in units of ip_flow_half. */
+/* Controls that produce a generalized force, in units of ip_flow_half. */
 static void ip_flow_needed(const ip_context *c, const double *force, double *shares)
 {
   double rest[IP_NV];
@@ -205,7 +202,7 @@ static void ip_flow_shares(ip_context *c, double *shares)
   }
 }
 
-/* The part of `more`, 0 to 1, that accelerations permit which take `haste` of what rest leaves. */
+/* The share of `more`, 0 to 1, with which both accelerations use at most `haste` of the room beside the static controls. */
 static double ip_flow_permitted(const ip_context *c, const double *known, const double *more, double haste)
 {
   const ip_flow *f = &c->flow;
@@ -228,9 +225,8 @@ static double ip_flow_permitted(const ip_context *c, const double *known, const 
 }
 
 #if IP_CONTACTS
-/* Outward normals n and offsets b of the polygon n c + b <= 0 of the feet on level ground, on which each sole carries its part
- * of what is spread evenly.  Feet that span no area allow no motion of the center of mass: each direction is then an edge out
- * of reach. */
+/* Outward normals n and offsets b of the polygon n c + b <= 0 of the feet on level ground, as support_edges has them.  Feet
+ * that span no area allow no motion of the center of mass: the result is then four edges at an infinite distance. */
 static void ip_flow_polygon(ip_context *c)
 {
   enum { COUNT = 4 * IP_CONTACTS };
@@ -254,27 +250,27 @@ static void ip_flow_polygon(ip_context *c)
     for (j = 0; j < 2; ++j) {
       x[i][j] += even * (mean[i % 4][j] - x[i][j]);
     }
-    /* A corner, and no point on the way between two. */
+    /* The leftmost corner, not a point between two corners. */
     start = x[i][0] < x[start][0] - IP_ON_LINE || (x[i][0] <= x[start][0] + IP_ON_LINE && x[i][1] < x[start][1]) ? i
                                                                                                                 : start;
   }
   for (at = start; edges < IP_EDGES; at = next) {
-    double way[2] = {0.0, 0.0}, length = 0.0;
+    double edge[2] = {0.0, 0.0}, length = 0.0;
     for (i = 0, next = at; i < COUNT; ++i) {
       const double step[2] = {x[i][0] - x[at][0], x[i][1] - x[at][1]}, far = hypot(step[0], step[1]);
-      const double turn = way[0] * step[1] - way[1] * step[0];
+      const double turn = edge[0] * step[1] - edge[1] * step[0];
       const double near = IP_ON_LINE * length;
       if (far > IP_ON_LINE && (next == at || turn < -near || (turn <= near && far > length))) {
         next = i;
         length = far;
-        memcpy(way, step, sizeof way);
+        memcpy(edge, step, sizeof edge);
       }
     }
     if (next == at) {
       break;
     }
-    f->edge[edges][0] = way[1] / length;
-    f->edge[edges][1] = -way[0] / length;
+    f->edge[edges][0] = edge[1] / length;
+    f->edge[edges][1] = -edge[0] / length;
     f->offset[edges] = -ip_dot(f->edge[edges], x[at], 2);
     ++edges;
     if (hypot(x[next][0] - x[start][0], x[next][1] - x[start][1]) <= IP_ON_LINE) {

@@ -1,11 +1,11 @@
-/* Bounds of the acceleration that keep the zero moment point of a robot that stands within the polygon of its feet.  The
+/* Bounds of the acceleration that keep the zero moment point of a standing robot within the polygon of its feet.  The
  * formulas are in impact_posture/tsid/flow/zero_moment_point.py. */
 
 /* Share of the way from the center of mass to an edge that accelerations may take, and the least distance that counts, m. */
 #define IP_ZMP_SHARE 0.8
 #define IP_ZMP_LEAST 0.01
 
-/* Rows and the room that a known acceleration leaves. */
+/* Set the rows, and the room beside a known acceleration. */
 static void ip_flow_limit_zmp(ip_flow *f, const double *known)
 {
 #if IP_CONTACTS
@@ -33,10 +33,9 @@ static void ip_flow_limit_zmp(ip_flow *f, const double *known)
 #endif
 }
 
-/* Take out of a change of the velocity within a period what moves the point too far, edge by edge. */
+/* Take out of a change of the velocity in a period the parts that move the point beyond an edge. */
 static void ip_flow_keep_zmp(const ip_flow *f, double period, double *step)
 {
-#if IP_CONTACTS
   double across[IP_NV], over, square;
   int k;
   for (k = 0; k < f->edges; ++k) {
@@ -50,7 +49,4 @@ static void ip_flow_keep_zmp(const ip_flow *f, double period, double *step)
       }
     }
   }
-#else
-  (void)f, (void)period, (void)step;
-#endif
 }
