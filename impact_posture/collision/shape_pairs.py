@@ -133,5 +133,5 @@ def disabled_links(robot: Robot) -> set[frozenset[str]]:
     try:
         tags = ET.parse(path).getroot().iter("disable_collisions")
     except (OSError, ET.ParseError) as error:
-        raise UrdfError(f"is no SRDF ({error})", where=str(path), hint="correct the SRDF") from None
+        raise UrdfError(f"is not an SRDF ({error})", where=str(path), hint="correct the SRDF") from None
     return {frozenset((tag.get("link1", ""), tag.get("link2", ""))) for tag in tags}

@@ -48,11 +48,11 @@ class Hover:
     thrust_margin: float
     """Least distance of a thrust to its limits over the width of its range: at most 0.5, negative outside."""
     torque_margin: float
-    """Least ``1 - |τ|/τ_max`` over the joints; 1 where there are none."""
+    """Least ``1 - |τ|/τ_max`` over the joints; 1 without joints."""
     residual: float
     """Largest base force or moment (N, N·m) that the rotors leave unbalanced."""
     violations: tuple[str, ...]
-    """Reasons in words why the robot cannot hover here; empty if it can."""
+    """Reasons why the robot cannot hover in this posture, in words; empty if it can."""
 
     @property
     def feasible(self) -> bool:
@@ -87,9 +87,9 @@ def thrust_limits(propulsion: PropulsionSpec) -> tuple[float, float]:
 
 
 def torque_limits(model: pin.Model) -> Array:
-    """Return the largest torque of each velocity entry, N·m or N, shape (nv,); infinite where none is known.
+    """Return the largest torque of each velocity entry, N·m or N, shape (nv,).
 
-    A limit of zero is no data, nothing drives a floating base, and a brake holds a locked joint (infinite armature).
+    It is infinite where the model states none (zero), at a floating base, and at a locked joint (infinite armature).
     """
     limits = np.array(model.effortLimit, dtype=float)
     unknown = ~(np.isfinite(limits) & (limits > 0)) | finite_armature(model)[1]
@@ -160,9 +160,9 @@ def actuation_matrix(model: pin.Model, propulsion: PropulsionSpec | None = None)
 def hover(model: pin.Model, propulsion: PropulsionSpec, q: ArrayLike) -> Hover:
     """Return the thrusts and torques that hold posture ``q`` at rest: ``h(q, 0) = G u``.
 
-    The rows of the base determine the thrusts.  For six independent rotors, they are unique.  For more rotors, they
-    are the thrusts farthest from their limits.  If the rotors cannot make the wrench, they are the nearest within the
-    limits.  The other rows are the torques, which are compared with the effort limits of the model.
+    The rows of the base determine the thrusts, which are unique for six independent rotors.  Of more rotors, the
+    result has the thrusts farthest from their limits.  If the rotors cannot make the wrench, it has the nearest
+    thrusts within the limits.  The other rows are the torques, which must be within the effort limits of the model.
     """
     matrix = allocation_matrix(model, propulsion)
     low, high = thrust_limits(propulsion)
@@ -202,7 +202,7 @@ def lateral_force_range(model: pin.Model, propulsion: PropulsionSpec, q: ArrayLi
     A linear program per direction maximizes ``F = m a`` over thrusts ``f`` and acceleration ``a >= 0``.  Its
     constraints are ``A f = h_b + M_b e a`` (six rows, which carry the weight and permit no rotation), the thrust
     limits, and ``|h_j + M_j e a| <= τ_max`` for the joints, which do not move; ``e`` moves the whole robot in the
-    direction.  The force is that at zero tilt if the base is level.
+    direction.
     """
     matrix = allocation_matrix(model, propulsion)
     low, high = thrust_limits(propulsion)
@@ -224,34 +224,34 @@ def lateral_force_range(model: pin.Model, propulsion: PropulsionSpec, q: ArrayLi
         count = matrix.shape[1]
         held = np.isfinite(limits)
         zeros = np.zeros((int(held.sum()), count))
-        found = _maximize_last(
+        solution = _maximize_last(
             np.column_stack([matrix, -push[:6]]),
             load[:6],
             np.block([[zeros, push[6:][held, None]], [zeros, -push[6:][held, None]]]),
             np.r_[(limits - load[6:])[held], (limits + load[6:])[held]],
             [(low, high)] * count + [(0.0, None)],
         )
-        return float("nan") if found is None else max(0.0, mass * float(found[-1]))  # no -0
+        return float("nan") if solution is None else max(0.0, mass * float(solution[-1]))  # no -0
 
     return LateralForce(largest(forward), largest(-forward), largest(left), largest(-left))
 
 
 def _centred_thrusts(matrix: Array, wrench: Array, low: float, high: float) -> Array:
-    """Return the thrusts with ``A f = w`` farthest from their limits; without any, the nearest within the limits."""
+    """Return the thrusts with ``A f = w`` farthest from their limits, or else the nearest within the limits."""
     count = matrix.shape[1]
     if count == 6 and np.linalg.matrix_rank(matrix) == 6:
         return np.asarray(np.linalg.solve(matrix, wrench))
     # Variables f and s: low + s (high - low) <= f <= high - s (high - low) with the largest s.
     width = np.full((count, 1), high - low)
-    found = _maximize_last(
+    solution = _maximize_last(
         np.column_stack([matrix, np.zeros(6)]),
         wrench,
         np.block([[-np.eye(count), width], [np.eye(count), width]]),
         np.r_[np.full(count, -low), np.full(count, high)],
         [(None, None)] * (count + 1),
     )
-    if found is not None:
-        return found[:-1]
+    if solution is not None:
+        return solution[:-1]
     from scipy.optimize import lsq_linear
 
     return np.asarray(lsq_linear(matrix, wrench, bounds=(low, high)).x)

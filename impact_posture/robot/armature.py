@@ -22,8 +22,7 @@ def set_armature(model: pin.Model, spec: RobotSpec, srdf: Path | None, option: A
 
     The values come from the option, else from robot.toml, else from rotor data of the SRDF, else they are zero.
 
-    Returns:
-        Source of the values in words.
+    Returns the source of the values in words.
 
     Raises:
         InputError: A joint does not exist, a value is below zero, or a file cannot be read.
@@ -54,7 +53,7 @@ def set_armature(model: pin.Model, spec: RobotSpec, srdf: Path | None, option: A
 
 
 def armature_warning(model: pin.Model, source: str, held: Sequence[str] = ()) -> tuple[str, ...]:
-    """Return a warning about joints without armature, or nothing; joints that are held by default do not count."""
+    """Return a warning about joints without armature, or nothing.  Joints that are held by default do not count."""
     armature = np.asarray(model.armature)
     counted = {i: str(model.names[i]) for i in joint_range(model) if model.names[i] not in held}
     bare = [name for i, name in counted.items() if not (armature[v_slice(model, i)] > 0).any()]
@@ -76,7 +75,7 @@ def _armature_file(path: Path) -> dict[str, float]:
     try:
         return {str(k): float(v) for k, v in values.items()}
     except (TypeError, ValueError, OverflowError):
-        raise SpecError("holds no table joint = value", where=str(path), hint="write: joint_name = 0.01") from None
+        raise SpecError("has no table joint = value", where=str(path), hint="write: joint_name = 0.01") from None
 
 
 def _set_joints(

@@ -1,4 +1,4 @@
-"""Draft of a ``robot.toml`` from a URDF, in which every guess is marked."""
+"""Draft a ``robot.toml`` from a URDF and mark every guess."""
 
 from __future__ import annotations
 
@@ -22,23 +22,23 @@ from impact_posture.robot.urdf import EXAMPLE_PREFIX, example_robot_data, resolv
 from impact_posture.system.escape import toml
 from impact_posture.system.output_folder import check_name
 
-# Pose modes by the least number of joints to a frame of a fixed robot, because the posture needs some freedom.
+# Pose modes by the least number of joints before a frame of a fixed robot, so that the posture keeps some freedom.
 _POSES = ((7, "full"), (6, "aligned"), (4, "position"), (0, "free"))
 # Least depth (m) of the center of mass in the support polygon for com_over_feet.
 _LEAST_DEPTH = 0.02
 
 
 def write_draft(robot: str, options: LoadOptions, out: Path | None, *, force: bool = False) -> tuple[Path, Draft]:
-    """Write a commented ``robot.toml`` that loads without change; return its path and its content.
+    """Write a commented ``robot.toml`` that can be loaded without changes; return its path and its content.
 
     Args:
         robot: Path to a ``.urdf``, or ``example-robot-data:<path>``.
-        options: Data that the user states; the rest is read or guessed.
+        options: Data that the user states; other data are read or guessed.
         out: File; by default ``robot.toml`` beside the URDF, or ``./<name>.toml`` for a URDF in a package.
         force: Whether an existing file may be replaced.
 
     Raises:
-        InputError: The robot is known by name and has its ``robot.toml``.
+        InputError: The robot is known by name, so that it has a ``robot.toml``.
         OutputError: The file exists and ``force`` is not set, or it cannot be written.
     """
     if robot in known_robots():
@@ -53,20 +53,19 @@ def write_draft(robot: str, options: LoadOptions, out: Path | None, *, force: bo
         raise OutputError("exists", where=str(out), hint="name another file, or `force=True` to replace it")
     draft = draft_spec(located, options, out.absolute().parent)
     # The temporary file is in the same folder, so that its relative paths are the same.
-    beside = out.with_name(f".{out.name}-{os.getpid()}")
+    temporary = out.with_name(f".{out.name}-{os.getpid()}")
     try:
-        beside.write_text(draft.text, encoding="utf-8")
-        load_robot(robot, LoadOptions(config=str(beside)))
+        temporary.write_text(draft.text, encoding="utf-8")
+        load_robot(robot, LoadOptions(config=str(temporary)))
         if force:
-            os.replace(beside, out)
+            os.replace(temporary, out)
         else:
-            os.link(beside, out)  # Fails if the name was taken in the meantime.
+            os.link(temporary, out)  # Fails if another process has made the file in the meantime.
     except OSError as error:
-        raise OutputError(
-            f"cannot be written ({error.strerror or error})", where=str(out), hint="name another file"
-        ) from None
+        fault = f"cannot be written ({error.strerror or error})"
+        raise OutputError(fault, where=str(out), hint="name another file") from None
     finally:
-        beside.unlink(missing_ok=True)
+        temporary.unlink(missing_ok=True)
     return out, draft
 
 
@@ -85,9 +84,9 @@ def draft_spec(located: Located, options: LoadOptions, folder: Path) -> Draft:
     default = guess.start_posture(robot)
     draft = Draft(
         comment_lines(
-            f"What the URDF of {robot.name} cannot say, drafted by impact-posture inspect --write-robot-toml. GUESS "
-            "marks what is read from names and geometry alone: check it before you trust a result. The file is found "
-            "by itself as robot.toml beside the URDF, else by --config."
+            f"Data of {robot.name} that a URDF cannot hold, drafted by impact-posture inspect --write-robot-toml. "
+            "GUESS marks values from names and geometry alone: check them before you trust a result. This file is "
+            "read as robot.toml beside the URDF, else by --config."
         )
     )
     draft.lines.append(f'schema = "{SCHEMA}"')
@@ -107,8 +106,8 @@ def draft_spec(located: Located, options: LoadOptions, folder: Path) -> Draft:
     if default == "neutral":
         base = ("base = [0.0, 0.0, 0.0, 0.0, 0.0, 0.0, 1.0]",) if robot.floating else ()
         draft.note(
-            "No posture is named: optimizations start with all joints at zero or at the nearest limit, often "
-            'straight and singular. Name a bent one here, and default_posture = "start" above the tables:',
+            "There is no named posture: optimizations start with all joints at zero or at the nearest limit, often "
+            'straight and singular. Write a bent posture here, and default_posture = "start" above the tables:',
             "[postures.start]",
             *base,
             f"joints = {toml(dict.fromkeys(robot.joint_names[:2], 0.5))}",
@@ -137,20 +136,20 @@ def _model(draft: Draft, robot: Robot, options: LoadOptions, folder: Path) -> No
         draft.key("package_dirs", dirs, "as --package-dir says")
     wheels = () if robot.floating else guess.wheels(robot)
     if options.lock or wheels:
-        given = "as --lock says" if options.lock else ""
-        why = ", and ".join(filter(None, (given, "wheels by their names, the base stands still" if wheels else "")))
-        draft.key("lock", [*options.lock, *wheels], why, guessed=bool(wheels))
+        reasons = ["as --lock says"] if options.lock else []
+        reasons += ["wheels by their names, the base stands still"] if wheels else []
+        draft.key("lock", [*options.lock, *wheels], ", and ".join(reasons), guessed=bool(wheels))
     massless = [joint for joint in robot.locked if not any(fnmatchcase(joint, p) for p in options.lock)]
     if massless:
         draft.key("lock_massless", True, f"these joints move no mass: {', '.join(massless)}")
     faults = [warning.partition("; accepted")[0] for warning in robot.warnings if "; accepted" in warning]
     if faults:
-        why = f"no rigid body has these inertias, correct the URDF: {'; '.join(faults)}"
+        why = f"these inertias are impossible, correct the URDF: {'; '.join(faults)}"
         draft.key("accept_inertias", True, why, guessed=True)
 
 
 def _contact(draft: Draft, robot: Robot, feet: Sequence[str], ends: Sequence[str]) -> Sequence[str]:
-    """Write the table of the contact; return the joints that lead to its frame."""
+    """Write the table of the contact; return the joints that move its frame."""
     base, fingers = guess.base_frame(robot), guess.fingers(robot)
     legs = {joint for foot in feet for joint in guess.joints_to(robot, foot)}
     arms: list[str] = []
@@ -163,7 +162,7 @@ def _contact(draft: Draft, robot: Robot, feet: Sequence[str], ends: Sequence[str
     if frame == base:
         pose, why = "free", "a push at the base"
     else:
-        # A floating base adds its own freedom.
+        # A floating base adds degrees of freedom.
         count = len(joints) + (4 if robot.floating else 0)
         pose, why = next(p for least, p in _POSES if count >= least), f"{len(joints)} joints lead to it"
     draft.lines += ["", "[contact]"]
@@ -178,7 +177,7 @@ def _contact(draft: Draft, robot: Robot, feet: Sequence[str], ends: Sequence[str
 
 def _supports(draft: Draft, robot: Robot, feet: Sequence[Support]) -> None:
     if robot.floating and not feet:
-        text = "No feet were found: it is taken to float. If it stands, list each foot:"
+        text = "No feet were found, so the robot is assumed to float. If it stands, list each foot:"
         draft.note(text, "[[supports]]", 'frame = "FOOT"', 'kind = "point"')
     for foot in feet:
         draft.lines += ["", "[[supports]]"]
@@ -187,10 +186,10 @@ def _supports(draft: Draft, robot: Robot, feet: Sequence[Support]) -> None:
         reason = reason if foot.kind == "surface" else "no flat collision shape"
         draft.key("kind", foot.kind, reason, guessed=True)
         if any(foot.offset):
-            draft.key("offset", list(foot.offset), "lowest of its collision shapes at the default posture")
+            draft.key("offset", list(foot.offset), "lowest point of its collision shapes at the default posture")
         else:
             draft.lines += comment_lines(
-                "offset: its shape is a mesh (not opened) or none, so the frame's origin touches"
+                "offset: it has no shape, or a mesh (not opened), so the frame's origin touches the ground"
             )
         if any(foot.size):
             draft.key("size", list(foot.size), "the sole, from its collision shapes")
@@ -248,8 +247,8 @@ def _armature(draft: Draft, robot: Robot, options: LoadOptions) -> None:
         draft.note(f"Armature: read from the SRDF's rotor_params, {low:.3g} to {high:.3g} kg m^2 a joint.")
     else:
         draft.note(
-            "No armature was found, hence zero, and H can be wrong by orders of magnitude. Geared motors have gear "
-            "ratio^2 x rotor inertia, kg m^2; write the data sheet's:",
+            "No armature was found, so it is zero, and H can be wrong by orders of magnitude. Geared motors have an "
+            "armature of gear ratio^2 x rotor inertia, kg m^2; write the values of the data sheet:",
             "[armature]",
             "default = 0.01",
             'source = "the data sheet of ..."',
@@ -257,7 +256,7 @@ def _armature(draft: Draft, robot: Robot, options: LoadOptions) -> None:
 
 
 def _path(path: Path, folder: Path) -> str:
-    """Return a path as the file holds it: in example-robot-data, or relative to its folder."""
+    """Return a path for the file: an example-robot-data URI, or relative to ``folder``."""
     path = path.expanduser().resolve()
     if path.is_relative_to(example_robot_data()):
         return EXAMPLE_PREFIX + path.relative_to(example_robot_data()).as_posix()

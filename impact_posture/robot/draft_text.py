@@ -25,7 +25,7 @@ class Draft:
 
     @property
     def text(self) -> str:
-        """The whole file."""
+        """Text of the file."""
         return "\n".join(self.lines) + "\n"
 
     def key(self, name: str, value: object, why: str, *, guessed: bool = False) -> None:

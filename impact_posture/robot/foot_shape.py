@@ -20,7 +20,7 @@ from impact_posture.robot.support_polygon import polygon_edges
 from impact_posture.robot.urdf import quiet_stderr
 from impact_posture.system.arrays import Array
 
-# Points of a foot within this distance (m) of its lowest one touch the ground with it.
+# Points of a foot within this distance (m) of its lowest point touch the ground, too.
 _PATCH = 2e-3
 # A patch narrower than this (m) is a point.
 _SOLE = 0.01
@@ -29,9 +29,9 @@ _UPRIGHT = float(np.cos(np.radians(1.0)))
 
 
 def support(robot: Robot, frame: str, urdf: Path, *, flat: bool) -> Support:
-    """Return a foot with its contact point or sole, as far as primitive collision shapes define them.
+    """Return a foot with its contact point or sole from its primitive collision shapes.
 
-    A foot without shapes counts as a surface if it is ``flat``.
+    A foot without such shapes is a surface if it is ``flat``.
     """
     data, index = upright_frames(robot), robot.frame_id(frame)
     points = _lowest_points(robot, data, index, urdf)
@@ -50,7 +50,7 @@ def support(robot: Robot, frame: str, urdf: Path, *, flat: bool) -> Support:
 
 
 def foot_specs(robot: Robot, feet: Sequence[str], urdf: Path) -> list[Support]:
-    """Return the feet as supports; those of two legs of six joints or more count as flat."""
+    """Return the feet as supports.  Two feet on legs of six joints or more count as flat."""
     flat = len(feet) == 2
     return [support(robot, f, urdf, flat=flat and len(joints_to(robot, f)) > 5) for f in feet]
 
@@ -80,12 +80,12 @@ def _lowest_points(robot: Robot, data: pin.Data, index: int, urdf: Path) -> Arra
     with quiet_stderr():
         shapes = pin.buildGeomFromUrdfString(robot.model, ET.tostring(root, "unicode"), pin.GeometryType.COLLISION)
     moving = [shape for shape in shapes.geometryObjects if shape.parentJoint == joint]
-    found = [point for shape in moving for point in _bottom(shape.geometry, data.oMi[joint] * shape.placement)]
-    return np.array(found).reshape(-1, 3)
+    points = [point for shape in moving for point in _bottom(shape.geometry, data.oMi[joint] * shape.placement)]
+    return np.array(points).reshape(-1, 3)
 
 
 def _bottom(shape: Any, at: pin.SE3) -> Sequence[Array]:
-    """Return points of a primitive shape that include its lowest ones."""
+    """Return points of a primitive shape, its lowest points among them."""
     match shape:
         case coal.Sphere():
             return [at.translation - [0, 0, shape.radius]]

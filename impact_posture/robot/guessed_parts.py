@@ -5,6 +5,7 @@ from __future__ import annotations
 import re
 import xml.etree.ElementTree as ET
 from collections.abc import Mapping, Sequence
+from contextlib import suppress
 from pathlib import Path
 
 import pinocchio as pin
@@ -66,34 +67,31 @@ def upright_frames(robot: Robot) -> pin.Data:
 def feet(robot: Robot, named: Sequence[str] = ()) -> tuple[str, ...]:
     """Return frames that look like feet: ends of legs that reach the lowest level of the default posture.
 
-    Feet that the SRDF names as end effectors (``named``) replace the guess.
+    Feet that the SRDF names as end effectors (``named``) replace the guess, and feet by name replace feet by height.
     """
     known = tuple(name for name in named if name in robot.frame_names)
     if known:
         return known
     model, data = robot.model, upright_frames(robot)
     height = {str(f.name): float(data.oMf[i].translation[2]) for i, f in enumerate(model.frames)}
-    found: dict[str, bool] = {}
+    called_feet, others = list[str](), list[str]()
     for joint in _leaves(robot):
         line = chain(robot, joint)
         words = [str(model.names[i]) for i in line] + [n for i in line for n in _links(robot, i)]
-        own = [n for n in _links(robot, joint) if not _SENSOR.search(n) and not _ROTOR.search(n)]
-        by_name = [n for n in own if _FOOT.search(n)]
-        other = (_WHEEL, _FINGER) if by_name else (_WHEEL, _FINGER, _ARM)
-        if len(line) < 2 or not own or any(part.search(word) for part in other for word in words):
+        links = [n for n in _links(robot, joint) if not _SENSOR.search(n) and not _ROTOR.search(n)]
+        by_name = [n for n in links if _FOOT.search(n)]
+        excluded = (_WHEEL, _FINGER) if by_name else (_WHEEL, _FINGER, _ARM)
+        if len(line) < 2 or not links or any(part.search(word) for part in excluded for word in words):
             continue
         # A sole is part of a foot, and an ankle lies above it.
-        best = min(by_name or own, key=lambda n: ("sole" not in n.lower(), round(height[n], 3), own.index(n)))
-        found[best] = bool(by_name)
-    if any(found.values()):
-        found = {name: True for name, named_so in found.items() if named_so}
-    else:
-        ground = min(height.values())
-        level = ground + _LEVEL * (max(height.values()) - ground)
-        found = {name: False for name in found if height[name] <= level}
-        if len(found) < 2:
-            return ()
-    return tuple(found)
+        best = min(by_name or links, key=lambda n: ("sole" not in n.lower(), round(height[n], 3), links.index(n)))
+        (called_feet if by_name else others).append(best)
+    if called_feet:
+        return tuple(called_feet)
+    ground = min(height.values())
+    level = ground + _LEVEL * (max(height.values()) - ground)
+    low = tuple(name for name in others if height[name] <= level)
+    return low if len(low) > 1 else ()
 
 
 def tips(robot: Robot, feet: Sequence[str] = ()) -> tuple[str, ...]:
@@ -126,7 +124,7 @@ def tips(robot: Robot, feet: Sequence[str] = ()) -> tuple[str, ...]:
 
 
 def fingers(robot: Robot) -> tuple[str, ...]:
-    """Return the joints whose name, or whose ancestor's name, is that of a gripper or hand."""
+    """Return the joints that belong to a gripper or hand, by their own name or the name of an ancestor."""
     names = robot.model.names
     return tuple(
         joint
@@ -142,7 +140,7 @@ def base_frame(robot: Robot) -> str:
 
 
 def wheels(robot: Robot) -> tuple[str, ...]:
-    """Return the joints with names of wheels and casters."""
+    """Return the joints that are wheels or casters by their names."""
     return tuple(name for name in robot.joint_names if _WHEEL.search(name))
 
 
@@ -152,7 +150,7 @@ def flies(robot: Robot) -> bool:
 
 
 def srdf_near(urdf: Path) -> Path | None:
-    """Return the SRDF beside the URDF or in ``../srdf`` whose name begins that of the URDF, or the only one there."""
+    """Return the SRDF beside the URDF or in ``../srdf`` with which the URDF's name begins, or the only SRDF there."""
     folders = (urdf.parent, urdf.parent.parent / "srdf")
     near = [path for folder in folders for path in sorted(folder.glob("*.srdf"))]
     fitting = [path for path in near if urdf.stem.startswith(path.stem)]
@@ -189,15 +187,13 @@ def likely_kind(robot: Robot, feet: Sequence[str]) -> tuple[str, str]:
 
 def start_posture(robot: Robot) -> str:
     """Return a named posture within the limits, preferably for standing or starting."""
-    able = []
+    allowed = []
     for name in robot.postures:
-        try:
+        with suppress(PostureError):
             robot.check_posture(robot.posture(name))
-        except PostureError:
-            continue
-        able.append(name)
+            allowed.append(name)
 
     def rank(name: str) -> int:
         return next((k for k, word in enumerate(_STARTS) if word in name.lower()), len(_STARTS))
 
-    return min((name for name in able if name != "neutral"), key=rank, default="neutral")
+    return min((name for name in allowed if name != "neutral"), key=rank, default="neutral")

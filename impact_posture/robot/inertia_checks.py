@@ -1,4 +1,4 @@
-"""Checks for masses and inertias that no rigid body has, and for singular mass matrices."""
+"""Checks for impossible masses and inertias, and for singular mass matrices."""
 
 from __future__ import annotations
 
@@ -14,7 +14,7 @@ from impact_posture.robot.robot import Robot
 
 # A mass (kg) or a moment (kg m²) below _TINY counts as zero.  A relative fault below the slack counts as rounding.
 _TINY = 1e-10
-# Entries of a mass matrix beyond it leave double precision where they are multiplied.
+# Products of larger entries of a mass matrix overflow.
 _LARGEST = 1e100
 _TRIANGLE_SLACK = 1e-3
 # Ratio of extreme eigenvalues below which a mass matrix with unit diagonal is singular; known robots exceed 1e-3.
@@ -22,9 +22,9 @@ _SINGULAR = 1e-12
 
 
 def check_inertias(root: ET.Element, model: pin.Model, path: Path, accept: bool) -> tuple[str, ...]:
-    """Refuse links that no rigid body can be; return warnings.
+    """Refuse links with impossible masses or inertias; return warnings.
 
-    A fault is a warning if it is too small to matter in the body that contains the link, or with ``accept``.
+    A fault is a warning with ``accept``, or if it is too small to matter in the body that contains the link.
 
     Raises:
         InertiaError: A mass is negative, a link without mass has moments, or moments break the triangle inequality.
@@ -37,8 +37,8 @@ def check_inertias(root: ET.Element, model: pin.Model, path: Path, accept: bool)
         name = link.get("name", "?")
         frame = model.getFrameId(name, pin.FrameType.BODY)
         joint = model.frames[frame].parentJoint if frame < model.nframes else 0
-        if joint == 0:
-            continue  # The link is welded to the world.
+        if joint == 0:  # The link is welded to the world.
+            continue
         size, words = fault
         body = float(np.linalg.eigvalsh(model.inertias[joint].inertia)[-1])
         if size <= _TRIANGLE_SLACK * body:
@@ -55,13 +55,13 @@ def check_inertias(root: ET.Element, model: pin.Model, path: Path, accept: bool)
 def massless_joints(model: pin.Model) -> tuple[str, ...]:
     """Return the joints without armature whose whole subtree has neither mass nor rotational inertia."""
     moved = np.array([max(i.mass, float(np.abs(i.inertia).max())) for i in model.inertias])
-    found: list[str] = []
+    massless: list[str] = []
     for joint in range(model.njoints - 1, 0, -1):
         armature = np.asarray(model.armature)[v_slice(model, joint)]
         if moved[joint] <= _TINY and not (armature > 0).all():
-            found.insert(0, str(model.names[joint]))
+            massless.insert(0, str(model.names[joint]))
         moved[model.parents[joint]] += moved[joint]
-    return tuple(found)
+    return tuple(massless)
 
 
 def check_moved_mass(model: pin.Model, where: str) -> None:
@@ -70,23 +70,23 @@ def check_moved_mass(model: pin.Model, where: str) -> None:
     Raises:
         InertiaError: Joints move no mass; the message names all of them.
     """
-    found = massless_joints(model)
-    if found:
-        named = ", ".join(f"'{name}'" for name in found)
-        one = len(found) == 1
-        raise InertiaError(
-            f"joint {named} moves no mass" if one else f"{len(found)} joints move no mass: {named}",
-            where=where,
-            hint=f"give {'its' if one else 'their'} links a mass, or make {'it' if one else 'them'} rigid by "
-            "`lock_massless=True` (robot.toml [model] lock_massless = true)",
-        )
+    if not (joints := massless_joints(model)):
+        return
+    named = ", ".join(f"'{name}'" for name in joints)
+    single = len(joints) == 1
+    raise InertiaError(
+        f"joint {named} moves no mass" if single else f"{len(joints)} joints move no mass: {named}",
+        where=where,
+        hint=f"give {'its' if single else 'their'} links a mass, or make {'it' if single else 'them'} rigid by "
+        "`lock_massless=True` (robot.toml [model] lock_massless = true)",
+    )
 
 
 def check_mass_matrix(robot: Robot, where: str) -> None:
     """Refuse a robot whose mass matrix is singular at the default posture.
 
-    Causes are a massless floating base, a point mass that turns, or two joints about one axis.  ``M`` is first scaled
-    to a unit diagonal, so that kilograms and kg m² compare.
+    Possible causes are a massless floating base, a rotating point mass, or two joints about the same axis.  ``M`` is
+    first scaled to a unit diagonal, so that kg and kg m² can be compared.
 
     Raises:
         InertiaError: The matrix is not finite, or singular; the message names the directions that move no inertia.
@@ -122,7 +122,7 @@ def check_mass_matrix(robot: Robot, where: str) -> None:
 
 
 def _link_fault(link: ET.Element, where: str) -> tuple[float, str] | None:
-    """Return the distance of a link's inertia from a possible one, kg m², and the fault in words."""
+    """Return the distance of the inertia of a link from a possible inertia, kg m², and the fault in words."""
     inertial, name = link.find("inertial"), link.get("name", "?")
     if inertial is None:
         return None
@@ -159,5 +159,5 @@ def _number(tag: ET.Element, key: str, link: str, where: str) -> float:
     except ValueError:
         value = float("nan")
     if not np.isfinite(value):
-        raise InertiaError(f"link '{link}': {tag.tag} {key}='{text}' is no number", where=where, hint="correct it")
+        raise InertiaError(f"link '{link}': {tag.tag} {key}='{text}' is not a number", where=where, hint="correct it")
     return value

@@ -1,9 +1,9 @@
-"""The inertia that an impact meets at the joints: with the rotors, without them, or joints that do not move.
+"""Joint models: the inertia at the joints in an impact, with rotors, without rotors, or with locked joints.
 
-The impulse of a short impact is over before a soft spring between rotor and link has turned the rotor.  Then the link
-alone answers (``M``).  A stiff transmission takes the rotor along (``M + B``, with the armature ``B``), and a joint
-that cannot be driven from its link does not move at all.  Each joint model is an armature: that of the rotors, zero,
-or infinity.
+A short impact ends before a soft spring between rotor and link has turned the rotor.  Then only the link reacts
+(``M``).  With a stiff transmission, the rotor moves along (``M + B``, with the armature ``B``).  A joint that cannot
+be driven from its link does not move at all.  Each joint model sets the armature to the rotor inertia, zero, or
+infinity.
 """
 
 from __future__ import annotations
@@ -32,9 +32,9 @@ class Transmissions:
     Attributes:
         rigid: Whether the rotor moves with the link.
         locked: Whether the joint cannot be driven from its link.
-        stiffness: Of the spring between rotor and link, N·m/rad (N/m if prismatic), shape (nv,); infinite where
-            none is stated.
-        damping: Of the damper beside it, N·m·s/rad (N·s/m), shape (nv,).
+        stiffness: Stiffness of the spring between rotor and link, N·m/rad (N/m if prismatic), shape (nv,); infinite
+            where the robot states none.
+        damping: Damping beside the spring, N·m·s/rad (N·s/m), shape (nv,).
     """
 
     rigid: Mask
@@ -55,45 +55,44 @@ def transmissions(robot: Robot) -> Transmissions:
         JointNotFound: The table names a joint that the robot lacks.
     """
     spec, model, nv = robot.spec.transmission, robot.model, robot.nv
-    none = np.zeros(nv, dtype=bool)
-    found = Transmissions(none, none.copy(), np.full(nv, np.inf), np.zeros(nv))
+    result = Transmissions(np.zeros(nv, dtype=bool), np.zeros(nv, dtype=bool), np.full(nv, np.inf), np.zeros(nv))
     for joint in spec.joints:
         if joint not in robot.locked:
             joint_index(model, joint, f"{robot.name} [transmission.joints]")
     for joint in robot.joint_names:
-        own = spec.joints.get(joint, JointTransmissionSpec())
-        kind, entries = own.kind or spec.kind, v_slice(model, robot.joint_id(joint))
-        found.rigid[entries], found.locked[entries] = kind == "rigid", kind == "locked"
-        stiffness = own.stiffness or spec.stiffness
-        if stiffness is not None:
-            found.stiffness[entries] = stiffness
-        found.damping[entries] = spec.damping if own.damping is None else own.damping
-    return found
+        table = spec.joints.get(joint, JointTransmissionSpec())
+        kind, entries = table.kind or spec.kind, v_slice(model, robot.joint_id(joint))
+        result.rigid[entries], result.locked[entries] = kind == "rigid", kind == "locked"
+        result.stiffness[entries] = table.stiffness or spec.stiffness or np.inf
+        result.damping[entries] = spec.damping if table.damping is None else table.damping
+    return result
 
 
 def with_joint_model(robot: Robot, joint_model: JointModel) -> Robot:
-    """Return the robot as an impact meets it.
+    """Return the robot with the armature that counts in an impact.
 
-    ``reflected`` keeps the armature at all joints.  ``link`` leaves it out, except at joints whose transmission is
-    ``rigid``.  ``locked`` holds all joints, as position control with stiff gears does, so that only a floating base
-    moves.  Joints whose transmission is ``locked`` move in no joint model.  ``elastic`` leaves the armature out at
-    joints with springs of known stiffness, whose rotors then follow
-    (:mod:`impact_posture.impact.elasticity.elastic_impact`); H, G, V, S and E are those of the first moment.
+    - ``reflected`` keeps the armature at all joints.
+    - ``link`` removes it, except at joints with a ``rigid`` transmission.
+    - ``locked`` locks all joints, as position control with stiff gears does, so that only a floating base moves.
+    - ``elastic`` removes it at joints with springs of known stiffness, whose rotors follow later
+      (:mod:`impact_posture.impact.elasticity.elastic_impact`).  H, G, V, S and E are for the first instant.
+
+    A joint with a ``locked`` transmission moves in no joint model.
 
     Raises:
         InertiaError: The mass matrix is singular without the rotors.
-        InputError: Nothing is left that moves, or ``elastic`` finds no spring.
+        InputError: No joint and no base can move, or ``elastic`` finds no spring.
     """
-    stated, found = robot.armature, transmissions(robot)
+    stated, table = robot.armature, transmissions(robot)
     armature = stated.copy()
     joints = np.arange(robot.nv) >= (6 if robot.floating else 0)
     if joint_model == "link":
-        armature = np.where(joints & ~found.rigid, 0.0, armature)
+        armature = np.where(joints & ~table.rigid, 0.0, armature)
     elif joint_model == "locked":
         armature[joints] = np.inf
     elif joint_model == "elastic":
         # A rotor without inertia holds nothing against its spring.
-        springs = found.elastic & (stated > 0)
+        springs = table.elastic & (stated > 0)
         if not springs.any():
             raise InputError(
                 f"no joint of {robot.name} has a rotor on a spring of known stiffness",
@@ -101,7 +100,7 @@ def with_joint_model(robot: Robot, joint_model: JointModel) -> Robot:
                 hint="state stiffness in robot.toml [transmission] and the inertia of the rotors in [armature]",
             )
         armature = np.where(springs, 0.0, armature)
-    armature[found.locked] = np.inf
+    armature[table.locked] = np.inf
     if (np.isinf(armature) | ~joints).all() and not robot.floating:
         raise InputError(
             f"all joints of {robot.name} are locked, so nothing moves in an impact",
@@ -118,7 +117,7 @@ def with_joint_model(robot: Robot, joint_model: JointModel) -> Robot:
 
 
 def describe_joints(robot: Robot) -> str:
-    """Say in words what the impact meets at the joints."""
+    """Return in words which inertia counts at the joints in an impact."""
     armature = np.asarray(robot.model.armature)[6 if robot.floating else 0 :]
     held, kept = int(np.isinf(armature).sum()), int((np.isfinite(armature) & (armature > 0)).sum())
     words = {

@@ -1,4 +1,4 @@
-"""Joints of a ``pin.Model``: which ones there are, and where they stand in ``q`` and ``ν``."""
+"""Joints of a ``pin.Model``: their names and indices, and their entries in ``q`` and ``ν``."""
 
 from __future__ import annotations
 
@@ -35,7 +35,7 @@ def v_slice(model: pin.Model, index: int) -> slice:
 
 
 def scalar_entries(model: pin.Model, index: int, value: float) -> tuple[float, ...]:
-    """Return the entries of ``q`` of a joint with one degree of freedom: its value, or cosine and sine of it."""
+    """Return the entries in ``q`` of a joint with one degree of freedom: its value, or the cosine and sine of it."""
     return (value,) if model.nqs[index] == 1 else (math.cos(value), math.sin(value))
 
 

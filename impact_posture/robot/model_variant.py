@@ -59,15 +59,14 @@ class ModelVariant:
 def build_model_variants(
     robot: Robot, armature_range: tuple[float, float] | None, payloads: Sequence[Payload]
 ) -> tuple[ModelVariant, ...]:
-    """Return all pairs of an armature (as stated, lowest, highest) and a payload (none, or one of those given).
+    """Return all pairs of an armature (as stated, lowest, highest) and a payload (none, or one of ``payloads``).
 
     Args:
         robot: The robot as modeled, which is the first variant.
         armature_range: Factors on the stated armature, lowest and highest.
         payloads: Payloads; each variant has at most one of them.
 
-    Returns:
-        The variants; empty if nothing is uncertain.
+    The result is empty if nothing is uncertain.
 
     Raises:
         InputError: A range or mass is invalid, the armature is zero, or there are too many variants.
@@ -89,11 +88,11 @@ def build_model_variants(
         if payloads.count(payload) > 1:
             what = f"{payload.mass:g} kg at '{payload.frame}' is given twice"
             raise InputError(what, where="payload", hint="remove one of them")
-    found = [_variant(robot, factor, payload) for payload in (None, *payloads) for factor in factors]
-    if len(found) > MOST_VARIANTS:
+    variants = tuple(_variant(robot, factor, payload) for payload in (None, *payloads) for factor in factors)
+    if len(variants) > MOST_VARIANTS:
         hint = f"give at most {MOST_VARIANTS} combinations"
-        raise InputError(f"{len(found)} model variants, each a separate model", where="payload", hint=hint)
-    return tuple(found) if len(found) > 1 else ()
+        raise InputError(f"{len(variants)} model variants, each a separate model", where="payload", hint=hint)
+    return variants if len(variants) > 1 else ()
 
 
 def _factors(robot: Robot, armature_range: tuple[float, float] | None) -> list[float]:
@@ -106,8 +105,8 @@ def _factors(robot: Robot, armature_range: tuple[float, float] | None) -> list[f
             where="armature_range",
             hint="give two factors above zero, the lower first, such as 0.5 2",
         )
-    felt = np.asarray(robot.model.armature)
-    if not felt[np.isfinite(felt)].any():
+    armature = np.asarray(robot.model.armature)
+    if not armature[np.isfinite(armature)].any():
         none = robot.armature.any() and f"no armature with the joint model '{robot.joint_model}'"
         raise InputError(
             f"{robot.name} has {none or 'no armature'}, so a factor changes nothing",
@@ -134,20 +133,20 @@ def _variant(robot: Robot, factor: float, payload: Payload | None) -> ModelVaria
 
 
 def between(variants: Sequence[ModelVariant], count: int, seed: int) -> list[Robot]:
-    """Return random robots between variants of :func:`build_model_variants`, the robot as modeled first.
+    """Return random robots between the variants of :func:`build_model_variants`.
 
-    They have any factor on the armature, and any share of one of the payloads.
+    Each robot has a random factor on the armature and a random share of one of the payloads.
     """
     generator = np.random.default_rng(seed)
     factors = [variant.armature_factor for variant in variants]
     payloads = [variant.payload for variant in variants if variant.payload is not None]
-    found = []
+    robots = []
     for _ in range(count):
-        # Uniform in the logarithm, because half and twice are equally far from the stated value.
+        # Uniform in the logarithm, because the factors 1/2 and 2 are equally far from 1.
         factor = float(np.exp(generator.uniform(np.log(min(factors)), np.log(max(factors)))))
         payload = None
         if payloads:
             whole = payloads[generator.integers(len(payloads))]
             payload = replace(whole, mass=float(generator.uniform(0, whole.mass)))
-        found.append(_variant(variants[0].robot, factor, payload).robot)
-    return found
+        robots.append(_variant(variants[0].robot, factor, payload).robot)
+    return robots

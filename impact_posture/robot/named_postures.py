@@ -1,4 +1,4 @@
-"""Named postures of a model: those of its SRDF, those of ``robot.toml``, and the neutral one."""
+"""Named postures of a model, from its SRDF and ``robot.toml``, and the neutral posture."""
 
 from __future__ import annotations
 
@@ -18,12 +18,12 @@ from impact_posture.system.arrays import Array
 def named_postures(
     model: pin.Model, srdf: Path | None, spec: RobotSpec, root: Root, name: str
 ) -> tuple[dict[str, Array], str]:
-    """Return all named postures, shape (nq,) each, and the name of the default one.
+    """Return all named postures, shape (nq,) each, and the name of the default posture.
 
     Args:
         model: The model, with its final limits.
         srdf: SRDF with ``group_state`` tags, or ``None``.
-        spec: The ``robot.toml``; its postures replace those of the SRDF.
+        spec: The ``robot.toml``; its postures replace postures of the SRDF with the same name.
         root: Root joint of the model.
         name: Name of the robot.
 
@@ -43,7 +43,7 @@ def named_postures(
 
 
 def states_with_base(srdf: Path | None) -> list[str]:
-    """Return the names of the ``group_state`` tags of an SRDF that contain a base pose (seven numbers of a joint)."""
+    """Return the names of the ``group_state`` tags of an SRDF with a base pose (a joint with seven numbers)."""
     states = ET.parse(srdf).getroot().iter("group_state") if srdf is not None else ()
     return [
         str(state.get("name"))
@@ -53,7 +53,7 @@ def states_with_base(srdf: Path | None) -> list[str]:
 
 
 def ignored_bases(spec: RobotSpec, srdf: Path | None, default: str) -> tuple[str, ...]:
-    """Return a warning about the postures whose base pose a fixed root ignores, or nothing."""
+    """Return a warning about postures whose base pose is ignored because the root is fixed, or nothing."""
     named = [key for key, posture in spec.postures.items() if posture.base is not None] + states_with_base(srdf)
     if not named:
         return ()
@@ -70,7 +70,7 @@ def _srdf_postures(model: pin.Model, srdf: Path | None, spec: RobotSpec) -> dict
     try:
         pin.loadReferenceConfigurations(model, str(srdf), False)
     except Exception as error:  # Pinocchio passes on whatever its XML library raises.
-        raise UrdfError(f"is no SRDF ({error})", where=str(srdf), hint="correct the SRDF") from None
+        raise UrdfError(f"is not an SRDF ({error})", where=str(srdf), hint="correct the SRDF") from None
     states = {item.key(): np.array(item.data(), dtype=float) for item in model.referenceConfigurations}
     return {name: pin.normalize(model, q) for name, q in states.items() if name not in spec.postures}
 
@@ -86,7 +86,7 @@ def _toml_postures(model: pin.Model, spec: RobotSpec, root: Root, name: str) -> 
                 where=name,
                 hint='remove it, or write root = "free-flyer" in [model]',
             )
-        # A floating robot that the user fixes to the world keeps its postures, with a warning about their base.
+        # A floating robot that the user fixes to the world keeps its postures (ignored_bases warns about their base).
         if posture.base is not None and root == "free-flyer":
             norm = float(np.linalg.norm(posture.base[3:]))
             if not (np.isfinite(posture.base).all() and abs(norm - 1) < 1e-3):

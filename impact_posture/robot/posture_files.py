@@ -1,4 +1,4 @@
-"""Postures as users write them: a name, ``posture.json``, joints by name, or a ``sensor_msgs/JointState`` in YAML."""
+"""Postures of users: a name, ``posture.json``, joints by name, or a ``sensor_msgs/JointState`` in YAML."""
 
 from __future__ import annotations
 
@@ -8,6 +8,7 @@ import os
 import re
 from collections import Counter
 from collections.abc import Mapping, Sequence
+from contextlib import suppress
 from pathlib import Path
 
 import numpy as np
@@ -29,20 +30,20 @@ _NO_BASE = "remove the base and give `normal` in those axes, or use `root='free-
 
 
 def read_posture(robot: Robot, text: str | None, where: str = "posture") -> Array:
-    """Return the configuration that ``text`` names, shape (nq,), with its length, quaternion and limits checked.
+    """Return the posture that ``text`` names, shape (nq,), after checks of its length, quaternion and limits.
 
     Args:
         robot: The robot.
         text: Name of one of its postures, or a file: ``posture.json`` (``q`` in the order of ``joint_names``),
             ``{"base": [x, y, z, qx, qy, qz, qw], "joints": {name: value}}``, or a ``sensor_msgs/JointState`` in YAML
-            (``name: [...]``, ``position: [...]``).  By name, a continuous joint is one angle in rad, and joints
-            that are not named stay as in the default posture.  ``None`` means the default posture.
+            (``name: [...]``, ``position: [...]``).  By name, a continuous joint is one angle in rad, and other joints
+            stay as in the default posture.  ``None`` means the default posture.
         where: Option or file to name in errors.
 
     Raises:
         PostureNotFound: ``text`` is neither a posture nor a file; carries the nearest names.
         JointNotFound: A file names a joint that the robot lacks; carries the nearest names.
-        PostureError: The file cannot be read, or its numbers are no posture of this robot.
+        PostureError: The file cannot be read, or its numbers cannot be a posture of this robot.
     """
     if text is None or text in robot.postures:
         return robot.check_posture(robot.posture(text), where=f"{where} {text or robot.default_posture}")
@@ -57,7 +58,7 @@ def write_posture(robot: Robot, q: Array) -> dict[str, object]:
     """Return the content of ``posture.json`` for ``q``, shape (nq,); :func:`read_posture` reads it back.
 
     Raises:
-        PostureError: ``q`` is no posture of this robot.
+        PostureError: ``q`` cannot be a posture of this robot.
     """
     q = robot.check_posture(q, limits=False)
     return {
@@ -82,8 +83,8 @@ def _load(path: Path) -> Mapping[str, object]:
     kind = "JSON" if path.suffix == ".json" else "YAML"
     try:
         text = read_text(path)
-        # `ros2 topic echo` ends every message with `---`, hence the first document is read.  The base loader keeps
-        # every scalar as text: others read 1:30 as 90 and a joint called `on` as true, and fail on bad tags.
+        # `ros2 topic echo` ends each message with `---`, so only the first document is read.  The base loader keeps
+        # scalars as text.  Other loaders read 1:30 as 90 and a joint called `on` as true, and fail on bad tags.
         data = json.loads(text) if kind == "JSON" else next(yaml.load_all(text, yaml.BaseLoader), None)
     except FileNotFoundError:
         raise PostureError("no such file", where=str(path), hint="check the path") from None
@@ -97,10 +98,11 @@ def _load(path: Path) -> Mapping[str, object]:
 
 
 def _configuration(robot: Robot, data: Mapping[str, object], where: str) -> Array:
-    """Read one of the three shapes, which differ in their keys."""
+    """Read one of the three file formats, which differ in their keys."""
     schema = data.get("schema", SCHEMA)
     if schema != SCHEMA:
-        raise PostureError(f"schema '{shown(schema)}' is no posture", where=where, hint=f'give a file of "{SCHEMA}"')
+        fault = f"schema '{shown(schema)}' is not a posture"
+        raise PostureError(fault, where=where, hint=f'give a file of "{SCHEMA}"')
     if "q" in data:
         _only(data, _OUR_KEYS, where)
         return _in_order(robot, data, where)
@@ -108,10 +110,14 @@ def _configuration(robot: Robot, data: Mapping[str, object], where: str) -> Arra
         _only(data, _BY_NAME_KEYS, where)
         joints = data.get("joints", {})
         if not isinstance(joints, dict):
-            raise PostureError("'joints' is no table", where=where, hint='write "joints": {"name": value}')
+            raise PostureError("'joints' is not a table", where=where, hint='write "joints": {"name": value}')
         return _by_name(robot, {str(k): v for k, v in joints.items()}, data.get("base"), where)
     if "name" in data and "position" in data:
-        return _by_name(robot, _joint_state(data["name"], data["position"], where), None, where)
+        names, values = _names(data["name"], "name", where), _numbers(data["position"], "position", where)
+        if len(names) != len(values):
+            fault = f"{len(names)} names but {len(values)} positions"
+            raise PostureError(fault, where=where, hint="give one position per name")
+        return set_joints(robot, robot.posture(), dict(zip(names, values, strict=True)), where)
     raise PostureError("holds no posture", where=where, hint=f"give {_SHAPES}")
 
 
@@ -155,12 +161,12 @@ def _by_name(robot: Robot, joints: Mapping[str, object], base: object, where: st
 
 
 def set_joints(robot: Robot, q: Array, joints: Mapping[str, object], where: str) -> Array:
-    """Return a configuration with the given joints at other values, otherwise unchecked.
+    """Return a copy of a posture with some joints at other values, without a check of the result.
 
     Args:
         robot: The robot.
-        q: Configuration, shape (nq,); not changed.
-        joints: Values by name: one number for a joint of one degree of freedom, its entries of q for others.
+        q: The posture, shape (nq,).
+        joints: Values by name: a number for a joint of one degree of freedom, the entries of ``q`` for other joints.
         where: Option or file to name in errors.
 
     Raises:
@@ -169,8 +175,8 @@ def set_joints(robot: Robot, q: Array, joints: Mapping[str, object], where: str)
     """
     q = q.copy()
     for name, value in joints.items():
-        if name in robot.locked:
-            continue  # Messages of a robot name all its joints, and a rigid one has no entry in q.
+        if name in robot.locked:  # ROS messages name all joints, but a locked joint has no entry in q.
+            continue
         if name not in robot.joint_names:
             raise JointNotFound(name, robot.joint_names, where=where)
         index = robot.joint_id(name)
@@ -191,18 +197,9 @@ def set_joints(robot: Robot, q: Array, joints: Mapping[str, object], where: str)
     return q
 
 
-def _joint_state(name: object, position: object, where: str) -> dict[str, object]:
-    names, positions = _names(name, "name", where), _numbers(position, "position", where)
-    if len(names) != len(positions):
-        raise PostureError(
-            f"{len(names)} names but {len(positions)} positions", where=where, hint="give one position per name"
-        )
-    return dict(zip(names, positions, strict=True))
-
-
 def _names(value: object, key: str, where: str) -> list[str]:
     if not isinstance(value, list) or not all(isinstance(v, str) for v in value):
-        raise PostureError(f"'{key}' is no list of names", where=where, hint="correct it")
+        raise PostureError(f"'{key}' is not a list of names", where=where, hint="correct it")
     twice = next((name for name, count in Counter(value).items() if count > 1), None)
     if twice is not None:
         raise PostureError(f"'{key}' names '{shown(twice)}' twice", where=where, hint="remove one of them")
@@ -211,15 +208,13 @@ def _names(value: object, key: str, where: str) -> list[str]:
 
 def _numbers(value: object, key: str, where: str) -> list[float]:
     if not isinstance(value, list):
-        raise PostureError(f"'{key}' is no list of numbers", where=where, hint="correct it")
+        raise PostureError(f"'{key}' is not a list of numbers", where=where, hint="correct it")
     return [_number(item, f"'{key}' entry {k}", where) for k, item in enumerate(value)]
 
 
 def _number(value: object, key: str, where: str) -> float:
-    # Every number from YAML is text, with a dot before inf and nan.
+    # Numbers from YAML are text, with a dot before inf and nan.
     if isinstance(value, (int, float, str)) and not isinstance(value, bool):
-        try:
+        with suppress(ValueError, OverflowError):
             return float(re.sub(r"\.(?=(inf|nan)$)", "", value, flags=re.I) if isinstance(value, str) else value)
-        except (ValueError, OverflowError):
-            pass
-    raise PostureError(f"{key} is '{shown(value)}', no number", where=where, hint="correct it")
+    raise PostureError(f"{key} is '{shown(value)}', not a number", where=where, hint="correct it")

@@ -1,4 +1,4 @@
-"""The robot: a ``pin.Model`` with names, postures, and the data of ``robot.toml``."""
+"""Robot: a ``pin.Model`` with names, postures, and the data of ``robot.toml``."""
 
 from __future__ import annotations
 
@@ -51,8 +51,8 @@ class Robot:
         warnings: Warnings about this model, one line each.
         joint_model: Inertia that the impact meets at the joints
             (:func:`~impact_posture.robot.joint_model.with_joint_model`).
-        stated_armature: Armature as stated, shape (nv,), if ``joint_model`` has changed that of ``model``.
-        settings: Settings of :func:`~impact_posture.robot.robot_loader.load_robot`; ``None`` for any other origin.
+        stated_armature: Armature as stated, shape (nv,), if ``joint_model`` has changed ``model.armature``.
+        settings: Settings of :func:`~impact_posture.robot.robot_loader.load_robot`; ``None`` for another origin.
     """
 
     name: str
@@ -113,7 +113,7 @@ class Robot:
 
     @property
     def velocity_limits(self) -> Array:
-        """Velocity limit of each velocity entry, rad/s or m/s, infinite where the model states none, shape (nv,)."""
+        """Velocity limits, rad/s or m/s, shape (nv,); infinite where the model states none."""
         limits = np.array(self.model.velocityLimit)
         limits[: 6 if self.floating else 0] = np.inf
         return np.where((limits > 0) & (limits < 1e10), limits, np.inf)
@@ -130,28 +130,28 @@ class Robot:
 
     @cached_property
     def model_sha256(self) -> str:
-        """Hash of the quantities that determine the dynamics: joints, placements, inertias and armature as stated."""
+        """Hash of the data of the dynamics: joints, placements, inertias and armature as stated."""
         return dynamics_hash(self.model, self.armature)
 
     @cached_property
     def impact_sha256(self) -> str:
-        """The same hash with the armature that the joint model leaves to an impact."""
+        """The same hash with the armature of the joint model."""
         return dynamics_hash(self.model, np.asarray(self.model.armature))
 
     @cached_property
     def kinematics_sha256(self) -> str:
-        """Hash of joints, frames, limits of positions, and postures."""
+        """Hash of joints, frames, position limits, and postures."""
         return kinematics_hash(self.model, self.postures, self.default_posture)
 
     @cached_property
     def data_sha256(self) -> str:
-        """Hash of all data but shapes: dynamics, kinematics, limits, and what ``robot.toml`` says."""
+        """Hash of all data but shapes: dynamics, kinematics, limits, and ``robot.toml``."""
         efforts, rates = rounded(self.model.effortLimit), rounded(self.model.velocityLimit)
         return hash_of((self.model_sha256, self.kinematics_sha256, efforts, rates, repr(self.spec)))
 
     @checked
     def frame_id(self, name: str) -> int:
-        """Return the index of the frame ``name``; if a link and a joint share the name, that of the link.
+        """Return the index of the frame ``name``, of the link if a link and a joint have this name.
 
         Raises:
             FrameNotFound: There is no such frame; carries the nearest names.
@@ -165,7 +165,7 @@ class Robot:
         frames = list(enumerate(self.model.frames))
         links = [(i, frame.name) for i, frame in frames if frame.type == pin.FrameType.BODY]
         others = [(i, frame.name) for i, frame in frames if frame.name != "universe"]
-        # The first of a name counts, and a link before what is none.
+        # The first frame of a name counts, and links count before other frames.
         return {name: i for i, name in reversed([*links, *others])}
 
     @checked
@@ -184,13 +184,13 @@ class Robot:
 
     @checked
     def contact_pose(self, frame: str) -> ContactPose:
-        """Return the default pose mode of a contact frame, which is ``position`` for a point foot."""
-        balls = [foot.frame for foot in self.spec.supports if foot.kind == "point"]
-        return self.spec.contact.frames.get(frame, "position" if frame in balls else self.spec.contact.pose)
+        """Return the default pose mode of a contact frame; ``position`` for a point foot."""
+        points = [foot.frame for foot in self.spec.supports if foot.kind == "point"]
+        return self.spec.contact.frames.get(frame, "position" if frame in points else self.spec.contact.pose)
 
     @checked
     def posture(self, name: str | None = None) -> Array:
-        """Return a copy of the named posture, or of the default one, shape (nq,).
+        """Return a copy of the named posture, or of the default posture, shape (nq,).
 
         Raises:
             PostureNotFound: There is no such posture; carries the nearest names.
@@ -202,7 +202,7 @@ class Robot:
 
     @property
     def upright(self) -> Array | None:
-        """Direction in a floating base that is vertical in the default posture, shape (3,), or ``None``."""
+        """Vertical of the default posture in the axes of a floating base, shape (3,), or ``None``."""
         return pin.Quaternion(self.posture()[3:7]).matrix()[2].copy() if self.floating else None
 
     @checked
@@ -238,16 +238,16 @@ class Robot:
             norm = float(np.linalg.norm(q[part]))
             if abs(norm - 1) > 1e-3:
                 four, name = part.stop - part.start == 4, str(self.model.names[i])
-                what = "quaternion" if four else "pair of cosine and sine"
-                whose = f"the base {what}" if self.floating and i == 1 else f"the {what} of joint '{name}'"
+                kind = "quaternion" if four else "pair of cosine and sine"
+                what = f"the base {kind}" if self.floating and i == 1 else f"the {kind} of joint '{name}'"
                 order = " x y z w" if four else ""
-                raise PostureError(f"{whose} has norm {norm:.4g}", where=where, hint=f"give a unit {what}{order}")
+                raise PostureError(f"{what} has norm {norm:.4g}", where=where, hint=f"give a unit {kind}{order}")
 
     def _check_swapped(self, quaternion: Array, where: str) -> None:
-        """Refuse a base quaternion that is plainly in the order w x y z."""
+        """Refuse a base quaternion that is clearly in the order w x y z."""
         rotation = pin.Quaternion(*[float(quaternion[k]) for k in (3, 0, 1, 2)]).matrix()
         swapped = pin.Quaternion(*[float(v) for v in quaternion]).matrix()
-        # Upside down as given, but upright if w were first.  These robots do not start upside down.
+        # Upside down in the order x y z w, but upright in the order w x y z.  These robots do not start upside down.
         if rotation[2, 2] < -0.9 and swapped[2, 2] > 0.9 and self.spec.kind in ("aerial", "quadruped", "humanoid"):
             fault = "puts the robot on its head"
         elif abs(quaternion[0]) > 0.999 and abs(quaternion[3]) < 0.04:
@@ -272,11 +272,11 @@ class Robot:
 
 
 def unit_parts(model: pin.Model) -> list[tuple[int, slice]]:
-    """Return the joints with a quaternion or a cosine and sine in ``q``, with its entries, the last of the joint."""
-    found = []
+    """Return joints with a quaternion or a cosine and sine, and the entries of these in ``q``."""
+    parts = []
     for joint in range(1, model.njoints):
         freedom, end = int(model.nvs[joint]), q_slice(model, joint).stop
         if model.nqs[joint] != freedom:
             count = 4 if freedom in (3, 6) and "Planar" not in model.joints[joint].shortname() else 2
-            found.append((joint, slice(end - count, end)))
-    return found
+            parts.append((joint, slice(end - count, end)))
+    return parts

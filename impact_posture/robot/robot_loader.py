@@ -1,4 +1,4 @@
-"""Loading of a robot, from its name or from the path of a URDF."""
+"""Load a robot by its name or by the path of a URDF."""
 
 from __future__ import annotations
 
@@ -47,8 +47,8 @@ def load_robot(robot: str, options: LoadOptions | None = None, **settings: Any) 
         SpecError: The robot.toml cannot be used.
     """
     options = options or validate(LoadOptions, settings, "load_robot")
-    given = {field.name: getattr(options, field.name) for field in fields(LoadOptions)}
-    return replace(build_robot(locate(robot, options), options), settings=RobotSettings(robot=robot, **given))
+    values = {field.name: getattr(options, field.name) for field in fields(LoadOptions)}
+    return replace(build_robot(locate(robot, options), options), settings=RobotSettings(robot=robot, **values))
 
 
 def build_robot(located: Located, options: LoadOptions) -> Robot:
@@ -108,7 +108,7 @@ def _check_package_dirs(folders: Sequence[str], base: Path, where: str) -> None:
 
 
 def names_a_path(robot: str, folder: Path) -> bool:
-    """Tell whether ROBOT is a path (from ``folder``), and not a known name or an example-robot-data URI."""
+    """Tell whether ``robot`` is a path (from ``folder``) and not a known name or an example-robot-data URI."""
     if robot.startswith(EXAMPLE_PREFIX) or robot in known_robots():
         return False
     return robot.endswith((".urdf", ".xml", ".xacro")) or "/" in robot or os.path.isfile(folder / robot)
@@ -148,18 +148,18 @@ class Located(NamedTuple):
 
 def locate(robot: str, options: LoadOptions) -> Located:
     """Find the files of a robot by name, path or URI."""
-    own = robots_data() / robot / "robot.toml"
-    if "/" not in robot and os.path.isfile(own):
-        spec, base = read_spec(own), own.parent
+    shipped = robots_data() / robot / "robot.toml"
+    if "/" not in robot and os.path.isfile(shipped):
+        spec, base = read_spec(shipped), shipped.parent
         text = spec.model.urdf or ""
         source = text if text.startswith(EXAMPLE_PREFIX) else f"impact-posture:{robot}/{text}"
         urdf = resolve_path(text, base)
         if options.config:
-            # The catalogue provides what the user's file does not state.
-            spec, base = read_spec(Path(options.config), over=own), Path(options.config).parent
-            found = resolve_path(spec.model.urdf or text, base)
-            if found != urdf:
-                urdf = found
+            # The file of this package provides what the user's file does not state.
+            spec, base = read_spec(Path(options.config), over=shipped), Path(options.config).parent
+            chosen = resolve_path(spec.model.urdf or text, base)
+            if chosen != urdf:
+                urdf = chosen
                 source = text if (text := spec.model.urdf or "").startswith(EXAMPLE_PREFIX) else str(urdf)
         return Located(spec, urdf, source, base, spec.name or robot)
     if robot.startswith(EXAMPLE_PREFIX):
@@ -167,8 +167,8 @@ def locate(robot: str, options: LoadOptions) -> Located:
     elif names_a_path(robot, Path()):
         urdf, source = Path(robot).expanduser(), robot
     else:
-        shipped = [EXAMPLE_PREFIX + p for p in example_models() if robot.casefold() in Path(p).stem.casefold()]
-        raise RobotNotFound(robot, [*known_robots(), *shipped], hint="(or give a path to a .urdf)")
+        similar = [EXAMPLE_PREFIX + p for p in example_models() if robot.casefold() in Path(p).stem.casefold()]
+        raise RobotNotFound(robot, [*known_robots(), *similar], hint="(or give a path to a .urdf)")
     config = Path(options.config) if options.config else urdf.parent / "robot.toml"
     if options.config or (os.path.isfile(config) and EXAMPLE_PREFIX not in source):
         spec, base = read_spec(config), config.parent
@@ -194,16 +194,15 @@ def srdf_path(spec: RobotSpec, options: LoadOptions, base: Path) -> Path | None:
 
 def _remount(model: pin.Model, mounting: Mapping[str, Vector3], name: str) -> None:
     """Move joints with their subtrees; the parent links keep their inertias."""
-    for joint, offset in mounting.items():
-        index = joint_index(model, joint, f"{name} mounting")
-        moved = np.array(offset, dtype=float)
-        if moved.shape != (3,) or not np.isfinite(moved).all():
-            what = "is not finite" if moved.shape == (3,) else "has not three numbers"
-            raise InputError(
-                f"the offset of '{joint}' {what}", where=f"{name} mounting", hint="give three, in meters"
-            )
+    where = f"{name} mounting"
+    for joint, values in mounting.items():
+        index = joint_index(model, joint, where)
+        offset = np.array(values, dtype=float)
+        if offset.shape != (3,) or not np.isfinite(offset).all():
+            fault = "is not finite" if offset.shape == (3,) else "does not have three numbers"
+            raise InputError(f"the offset of '{joint}' {fault}", where=where, hint="give three, in meters")
         placement = model.jointPlacements[index].copy()
-        placement.translation = placement.translation + moved
+        placement.translation = placement.translation + offset
         model.jointPlacements[index] = placement
 
 
@@ -232,34 +231,32 @@ def _override_limits(model: pin.Model, spec: RobotSpec, name: str) -> None:
 
 
 def _check_limits(model: pin.Model, source: str) -> None:
-    for k in np.flatnonzero(model.lowerPositionLimit > model.upperPositionLimit):
-        joint = next(
-            name for i, name in enumerate(model.names) if model.idx_qs[i] <= k < model.idx_qs[i] + model.nqs[i]
-        )
-        limits = f"{model.lowerPositionLimit[k]:g}, {model.upperPositionLimit[k]:g}"
-        raise UrdfError(
-            f"the lower position limit of '{joint}' is above the upper one ({limits})",
-            where=source,
-            hint="swap them there, or give robot.toml [limits.position]",
-        )
+    swapped = model.lowerPositionLimit > model.upperPositionLimit
+    for index in range(1, model.njoints):
+        for k in np.flatnonzero(swapped[q_slice(model, index)]) + model.idx_qs[index]:
+            limits = f"{model.lowerPositionLimit[k]:g}, {model.upperPositionLimit[k]:g}"
+            raise UrdfError(
+                f"the lower position limit of '{model.names[index]}' is above its upper limit ({limits})",
+                where=source,
+                hint="swap them there, or give robot.toml [limits.position]",
+            )
 
 
 def _named(model: pin.Model, patterns: Sequence[str], where: str) -> tuple[str, ...]:
-    """Return the joints that names or patterns select, each once.
+    """Return the joints that names or patterns select, without repetition.
 
     Raises:
         JointNotFound: A name or pattern selects no joint; carries the nearest names.
     """
     known = movable_joints(model)
-    found: dict[str, None] = {}
+    selected: dict[str, None] = {}
     for pattern in patterns:
         fitting = [pattern] if pattern in known else [n for n in known if fnmatchcase(n, pattern)]
         if not fitting:
-            raise JointNotFound(
-                pattern, known, where=where, hint="(nothing fits this pattern)" if set(pattern) & set("*?[") else ""
-            )
-        found.update(dict.fromkeys(fitting))
-    return tuple(found)
+            hint = "(nothing fits this pattern)" if set(pattern) & set("*?[") else ""
+            raise JointNotFound(pattern, known, where=where, hint=hint)
+        selected.update(dict.fromkeys(fitting))
+    return tuple(selected)
 
 
 def _lock(

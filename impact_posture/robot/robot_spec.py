@@ -1,4 +1,4 @@
-"""``robot.toml``: the data of a robot that URDF and SRDF cannot hold, checked as it is read."""
+"""``robot.toml``: checked data of a robot that URDF and SRDF cannot hold."""
 
 from __future__ import annotations
 
@@ -39,7 +39,7 @@ class ModelSpec(_Table):
 
 @dataclass(frozen=True)
 class PostureSpec(_Table):
-    """A named posture: joints by name (the others are neutral), base pose ``[x, y, z, qx, qy, qz, qw]``."""
+    """A named posture: base pose ``[x, y, z, qx, qy, qz, qw]`` and joints by name; other joints are neutral."""
 
     base: tuple[float, float, float, float, float, float, float] | None = None
     joints: dict[str, float] = field(default_factory=dict)
@@ -47,7 +47,7 @@ class PostureSpec(_Table):
 
 @dataclass(frozen=True)
 class ContactSpec(_Table):
-    """The default contact frame, and the pose mode of contact frames while the posture moves."""
+    """The default contact frame, and the pose modes of contact frames."""
 
     frame: str | None = None
     offset: Vector3 = (0.0, 0.0, 0.0)
@@ -62,7 +62,7 @@ class Support(_Table):
 
     Attributes:
         frame: Frame of the foot.
-        kind: ``point`` holds the three velocities of the contact point, ``surface`` also those of rotation.
+        kind: ``point`` holds the velocity of the contact point, ``surface`` also the angular velocity.
         offset: Contact point from the frame's origin, in the frame, meters.
         size: Half extents (x, y) of the sole around the contact point, in the frame, meters.
     """
@@ -74,12 +74,12 @@ class Support(_Table):
 
     @property
     def rows(self) -> int:
-        """Number of velocities that it holds."""
+        """Number of velocities that the foot holds."""
         return 3 if self.kind == "point" else 6
 
     @property
     def has_sole(self) -> bool:
-        """Whether it is a surface of known size."""
+        """Whether the foot is a surface of known size."""
         return self.kind == "surface" and min(self.size) > 0
 
 
@@ -96,7 +96,7 @@ class ConstraintSpec(_Table):
 
 @dataclass(frozen=True)
 class LimitSpec(_Table):
-    """Limits that replace those of the URDF: rad or m, rad/s or m/s, N·m or N."""
+    """Limits that replace the limits of the URDF: rad or m, rad/s or m/s, N·m or N."""
 
     position: dict[str, tuple[float, float]] = field(default_factory=dict)
     velocity: dict[str, Positive] = field(default_factory=dict)
@@ -114,7 +114,7 @@ class ArmatureSpec(_Table):
 
 @dataclass(frozen=True)
 class JointTransmissionSpec(_Table):
-    """Transmission of one joint; a missing value is that of the whole robot."""
+    """Transmission of a joint; :class:`TransmissionSpec` provides missing values."""
 
     kind: TransmissionKind | None = None
     stiffness: Positive | None = None
@@ -123,11 +123,11 @@ class JointTransmissionSpec(_Table):
 
 @dataclass(frozen=True)
 class TransmissionSpec(_Table):
-    """What lies between a rotor and its link; the rotor's inertia is in :class:`ArmatureSpec`.
+    """Transmissions between rotors and links; the inertia of the rotors is in :class:`ArmatureSpec`.
 
-    A ``rigid`` transmission moves the rotor with the link.  An ``elastic`` one has a spring of ``stiffness`` and a
-    damper of ``damping`` between the two, N·m/rad and N·m·s/rad at the joint (N/m and N·s/m if prismatic).  A
-    ``locked`` joint cannot be driven from its link, as a worm gear.
+    With a ``rigid`` transmission, the rotor moves with the link.  An ``elastic`` transmission has a spring of
+    ``stiffness`` and a damper of ``damping``, N·m/rad and N·m·s/rad at the joint (N/m and N·s/m if prismatic).  A
+    ``locked`` transmission, such as a worm gear, cannot be driven from its link.
     """
 
     kind: TransmissionKind | None = None
@@ -184,15 +184,15 @@ class RobotSpec(_Table):
 
 
 def read_spec(path: Path, over: Path | None = None) -> RobotSpec:
-    """Read and check a ``robot.toml``; ``over`` provides missing values, with paths relative to its own folder.
+    """Read and check a ``robot.toml``; the file ``over`` provides missing values, with paths relative to its folder.
 
-    A file that names another URDF describes another robot and takes nothing from ``over``.
+    A file with a URDF of its own describes another robot and takes nothing from ``over``.
     """
     data = read_toml(path)
     model = data.get("model", {})
     if over is not None and not (isinstance(model, dict) and "urdf" in model):
         data = _overlay(_absolute_paths(read_toml(over), over.parent), data)
-    # Checked before the keys, because those of another schema are not misspelt.
+    # Checked before the keys, because the keys of another schema are not misspelt.
     schema = data.get("schema", SCHEMA)
     if schema != SCHEMA:
         raise SpecError(f"schema '{shown(schema)}'", where=str(path), hint=f'write schema = "{SCHEMA}"')

@@ -1,4 +1,4 @@
-"""Summary of a robot in plain JSON values, the content of ``robots`` and ``inspect``."""
+"""Summary of a robot in JSON values, for the commands ``robots`` and ``inspect``."""
 
 from __future__ import annotations
 
@@ -29,7 +29,7 @@ def catalogue() -> list[dict[str, Any]]:
     for name in known_robots():
         spec = read_spec(robots_data() / name / "robot.toml")
         urdf = spec.model.urdf or ""
-        own = not urdf.startswith(EXAMPLE_PREFIX)
+        shipped = not urdf.startswith(EXAMPLE_PREFIX)
         entries.append(
             {
                 "name": name,
@@ -38,8 +38,8 @@ def catalogue() -> list[dict[str, Any]]:
                 "root": spec.model.root,
                 "frame": spec.contact.frame,
                 "supports": [support.frame for support in spec.supports],
-                "urdf": f"impact-posture:{name}/{urdf}" if own else urdf,
-                "from": "impact-posture" if own else EXAMPLE_PREFIX.rstrip(":"),
+                "urdf": f"impact-posture:{name}/{urdf}" if shipped else urdf,
+                "from": "impact-posture" if shipped else EXAMPLE_PREFIX.rstrip(":"),
                 "sources": list(spec.sources),
             }
         )
@@ -106,7 +106,7 @@ def _family(joint: pin.JointModel) -> str:
 
 
 def _frames(robot: Robot) -> list[dict[str, Any]]:
-    """Return the frames, each name once, as :meth:`Robot.frame_id` finds it."""
+    """Return the frames of :meth:`Robot.frame_id`, one for each name."""
     frames = [robot.model.frames[robot.frame_id(name)] for name in dict.fromkeys(robot.frame_names)]
     return [
         {
@@ -131,10 +131,10 @@ def _posture(robot: Robot, name: str) -> dict[str, Any]:
 def _actuation(robot: Robot, propulsion: PropulsionSpec) -> dict[str, Any]:
     """Return rank and condition of the allocation, and lateral force and hover at each posture.
 
-    The condition mixes N and N·m.  It and the forces are ``None`` where they do not exist.
+    The condition number mixes N and N·m.  It is ``None`` below rank 6, and the force without a level base.
     """
     model = robot.model
-    found = allocation(model, propulsion)
+    rotors = allocation(model, propulsion)
     low, high = thrust_limits(propulsion)
     postures = []
     for name in robot.postures:
@@ -158,8 +158,8 @@ def _actuation(robot: Robot, propulsion: PropulsionSpec) -> dict[str, Any]:
         "frame": propulsion.frame,
         "thrust_min": low,
         "thrust_max": high,
-        "rank": found.rank,
-        "condition": _finite(found.condition),
+        "rank": rotors.rank,
+        "condition": _finite(rotors.condition),
         "postures": postures,
         "source": propulsion.source,
     }

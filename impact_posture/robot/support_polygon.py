@@ -8,16 +8,16 @@ import numpy as np
 
 from impact_posture.system.arrays import Array
 
-# Points nearer to a line than this (m) lie on it, and places are rounded to it.
+# Points nearer to a line than this (m) lie on it.  Edges are rounded to so many digits.
 _ROUNDING, _DIGITS = 1e-9, 12
 
 
 def convex_ring(points: Array) -> list[int]:
     """Return the corners of the convex hull of points of the plane as indices, counter-clockwise.
 
-    Each chain of the hull goes along the sorted points and leaves out those that do not turn left (A. M. Andrew,
-    "Another efficient algorithm for convex hulls in two dimensions", Inf. Process. Lett. 1979).  SciPy has convex
-    hulls as well, but takes longer to import than many problems take to solve.
+    Each chain of the hull follows the sorted points and leaves out points without a left turn (A. M. Andrew, "Another
+    efficient algorithm for convex hulls in two dimensions", Inf. Process. Lett. 1979).  The import of SciPy, which
+    has convex hulls, takes longer than many problems take to solve.
 
     Args:
         points: Points, shape (k, 2).
@@ -39,9 +39,9 @@ def convex_ring(points: Array) -> list[int]:
 
 
 def polygon_edges(points: Iterable[Array]) -> tuple[Array, Array] | None:
-    """Return the edges ``n·p ≤ b`` of the convex hull of points of the plane; ``None`` if they span no area.
+    """Return the edges ``n·p ≤ b`` of the convex hull of points of the plane; ``None`` if their hull has no area.
 
-    Corners that lie on the line of their neighbors are left out.
+    Corners on the line between their neighbors are left out.
 
     Args:
         points: Points, shape (2,) each, m.
@@ -52,7 +52,7 @@ def polygon_edges(points: Iterable[Array]) -> tuple[Array, Array] | None:
     places = np.array(list(points), dtype=float).reshape(-1, 2)
     corners = [places[k] for k in convex_ring(places)]
     while len(corners) > 2:
-        # Only now is a point near the line of its neighbors also between them.
+        # On the hull, a point near the line through its neighbors is also between them.
         around = zip(np.roll(corners, 1, axis=0), np.roll(corners, -1, axis=0), corners, strict=True)
         heights = [_height(*points) for points in around]
         if min(heights) >= _ROUNDING:
@@ -69,6 +69,6 @@ def polygon_edges(points: Iterable[Array]) -> tuple[Array, Array] | None:
 
 
 def _height(start: Array, end: Array, point: Array) -> float:
-    """Distance of a point to the right of a line, m; negative to the left of it."""
+    """Return the distance of a point to the right of a line, m; negative to the left."""
     along, off = end - start, point - start
     return float((along[1] * off[0] - along[0] * off[1]) / np.linalg.norm(along))

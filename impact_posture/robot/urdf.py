@@ -1,4 +1,4 @@
-"""Reading of a URDF into a ``pin.Model`` without its meshes, with plain errors."""
+"""Read a URDF into a ``pin.Model`` without its meshes."""
 
 from __future__ import annotations
 
@@ -10,16 +10,15 @@ from collections.abc import Iterator
 from functools import cache
 from importlib.resources import files
 from pathlib import Path
-from typing import IO
 
 import pinocchio as pin
 
 from impact_posture.errors import PackageNotFound, SpecError, UrdfError, nearest
 from impact_posture.robot.inertia_checks import check_inertias
 
-# The data of Pinocchio always hold 6 nv³ numbers: 0.4 GB at 200 degrees of freedom and 48 GB at 1,000.
+# pin.Data always holds 6 nv³ numbers: 0.4 GB at 200 degrees of freedom and 48 GB at 1,000.
 MOST_DEGREES_OF_FREEDOM = 200
-# Joints from the root to a tip, fixed ones included; the URDF parser overflows the stack somewhere above 2,000.
+# Joints from the root to a tip, with fixed joints; the URDF parser overflows the stack somewhere above 2,000.
 _DEEPEST = 1_000
 
 EXAMPLE_PREFIX = "example-robot-data:"
@@ -58,10 +57,10 @@ def resolve_path(text: str, base: Path) -> Path:
 
     Raises:
         PackageNotFound: There is no such file in the package; carries the nearest paths below ``robots/``.
-        SpecError: No path of any system has such characters.
+        SpecError: The path contains a null character.
     """
     if "\0" in text:
-        raise SpecError(f"'{text}' is no path", where="robot.toml [model]", hint="remove the null character")
+        raise SpecError(f"'{text}' is not a path", where="robot.toml [model]", hint="remove the null character")
     if not text.startswith(EXAMPLE_PREFIX):
         return (base / Path(text).expanduser()).resolve()
     root = example_robot_data()
@@ -81,7 +80,7 @@ def example_models(suffix: str = ".urdf") -> list[str]:
 def build_model(
     path: Path, *, free_flyer: bool, accept_inertias: bool = False
 ) -> tuple[pin.Model, tuple[str, ...], dict[str, str]]:
-    """Parse the URDF at ``path`` without opening meshes; return the model, warnings and which joint mimics which.
+    """Parse the URDF at ``path`` without opening meshes; return the model, warnings, and mimicked joint by joint.
 
     Args:
         path: The URDF.
@@ -89,17 +88,17 @@ def build_model(
         accept_inertias: Turn refusals of impossible inertias into warnings.
 
     Raises:
-        UrdfError: The file is missing or is no URDF, Pinocchio rejects its tree, or it has too many joints.
-        InertiaError: A link has a mass or inertia that no rigid body has.
+        UrdfError: The file is missing or is not a URDF, Pinocchio rejects its tree, or it has too many joints.
+        InertiaError: A link has an impossible mass or inertia.
     """
     root = parse_urdf(path)
     _check_depth(root, path)
     try:
-        with quiet_stderr() as words:
+        with quiet_stderr() as errors:
             model = pin.buildModelFromUrdf(str(path), *([pin.JointModelFreeFlyer()] if free_flyer else []))
     except Exception as error:  # Pinocchio raises ValueError, RuntimeError or IndexError, by version and fault.
-        said = words[0] or str(error)
-        raise UrdfError(f"makes no robot ({said})", where=str(path), hint="correct the URDF") from None
+        fault = f"makes no robot ({errors[0] or error})"
+        raise UrdfError(fault, where=str(path), hint="correct the URDF") from None
     if model.nv == 0:
         raise UrdfError("has no movable joint", where=str(path), hint="use `root='free-flyer'` or another URDF")
     first = 2 if free_flyer else 1
@@ -120,44 +119,42 @@ def build_model(
 
 
 def _check_depth(root: ET.Element, path: Path) -> None:
-    """Refuse trees that end the process: the URDF parser descends them without a bound, and follows circles."""
+    """Refuse deep trees and circles, because the URDF parser follows them until its stack overflows."""
     joints = [(joint.find("parent"), joint.find("child")) for joint in root.findall("joint")]
-    above = {c.get("link"): p.get("link") for p, c in joints if p is not None and c is not None}
-    depth: dict[str | None, int] = {}
-    for link in above:
-        way, seen = [], set[str | None]()
-        at: str | None = link
-        while at in above and at not in depth:
-            if at in seen:
-                raise UrdfError(f"link '{at}' is below itself", where=str(path), hint="correct its joints")
-            seen.add(at)
-            way.append(at)
-            at = above[at]
-        for at in reversed(way):
-            depth[at] = depth.get(above[at], 0) + 1
-        if depth[link] > _DEEPEST:
-            hint = "fix joints in the URDF that hardly matter"
-            raise UrdfError(f"has a chain of more than {_DEEPEST} joints", where=str(path), hint=hint)
+    parents = {c.get("link"): p.get("link") for p, c in joints if p is not None and c is not None}
+    children: dict[str | None, list[str | None]] = {}
+    for child, parent in parents.items():
+        children.setdefault(parent, []).append(child)
+    level, below = [link for link in children if link not in parents], set(parents)
+    for _ in range(_DEEPEST):
+        level = [child for link in level for child in children.get(link, ())]
+        below.difference_update(level)
+    if any(link in children for link in level):
+        hint = "fix joints in the URDF that hardly matter"
+        raise UrdfError(f"has a chain of more than {_DEEPEST} joints", where=str(path), hint=hint)
+    if below:
+        link = next(link for link in parents if link in below)
+        raise UrdfError(f"link '{link}' is below itself", where=str(path), hint="correct its joints")
 
 
 def _mimics(root: ET.Element) -> tuple[dict[str, str], list[str]]:
-    """Return the joints that mimic another, with it, and a warning for each that mimics what is no joint."""
+    """Return the mimicked joint by joint, and a warning for each ``<mimic>`` of a joint that does not exist."""
     joints = {joint.get("name", ""): joint.find("mimic") for joint in root.findall("joint")}
-    followed = {name: mimic.get("joint", "") for name, mimic in joints.items() if mimic is not None}
+    mimics = {name: mimic.get("joint", "") for name, mimic in joints.items() if mimic is not None}
     lost = [
-        f"joint '{name}' mimics '{other}', which is no joint of the URDF (did you mean "
+        f"joint '{name}' mimics '{other}', which is not a joint of the URDF (did you mean "
         f"{nearest(other, joints, 1)[0]}?): it moves by itself; correct its <mimic>"
-        for name, other in followed.items()
+        for name, other in mimics.items()
         if other not in joints
     ]
-    return {name: other for name, other in followed.items() if other in joints}, lost
+    return {name: other for name, other in mimics.items() if other in joints}, lost
 
 
 def parse_urdf(path: Path) -> ET.Element:
     """Return the root of the URDF at ``path``.
 
     Raises:
-        UrdfError: The file is missing or is no URDF.
+        UrdfError: The file is missing or is not a URDF.
     """
     if os.path.isdir(path):
         raise UrdfError("is a folder", where=str(path), hint="name the .urdf file in it")
@@ -167,7 +164,7 @@ def parse_urdf(path: Path) -> ET.Element:
         raise UrdfError("no such file", where=str(path), hint="check the path") from None
     except OSError as error:
         raise UrdfError(f"cannot be read ({error.strerror})", where=str(path), hint="check the file") from None
-    except (ET.ParseError, ValueError) as error:  # A ValueError, if no file can have such a name.
+    except (ET.ParseError, ValueError) as error:  # Path raises ValueError for a name with a null character.
         raise UrdfError(f"is not XML ({error})", where=str(path), hint="give a URDF file") from None
     if root.tag != "robot":
         raise UrdfError(
@@ -180,23 +177,20 @@ def parse_urdf(path: Path) -> ET.Element:
     return root
 
 
-def _nameless_file() -> IO[bytes]:
-    """Return a file in memory if the system supports it, because no folder may be writable."""
-    return os.fdopen(os.memfd_create("words"), "w+b") if hasattr(os, "memfd_create") else tempfile.TemporaryFile()
-
-
 @contextlib.contextmanager
 def quiet_stderr() -> Iterator[list[str]]:
-    """Keep the output of the URDF parser off the terminal, and yield its first error line in a list."""
-    words = [""]
-    with _nameless_file() as sink:
+    """Keep the output of the URDF parser off the terminal, and yield a list for its first error line."""
+    errors = [""]
+    # A file in memory if the system has them, because no folder may be writable.
+    in_memory = hasattr(os, "memfd_create")
+    with os.fdopen(os.memfd_create("stderr"), "w+b") if in_memory else tempfile.TemporaryFile() as sink:
         saved = os.dup(2)
         os.dup2(sink.fileno(), 2)
         try:
-            yield words
+            yield errors
         finally:
             os.dup2(saved, 2)
             os.close(saved)
             sink.seek(0)
             lines = sink.read().decode(errors="replace").split("\n")
-            words[0] = next((line.strip() for line in lines if "rror" in line), "")
+            errors[0] = next((line.strip() for line in lines if "rror" in line), "")

@@ -117,7 +117,7 @@ INERTIAL = (
         (INERTIAL.format(m=-1, x=0.01, y=0.01, z=0.01), ("'b'", "-1 kg")),
         (INERTIAL.format(m=1, x=0.01, y=0.01, z=0.05), ("'b'", "triangle")),
         (INERTIAL.format(m=1, x=-0.01, y=0.01, z=0.01), ("'b'", "negative")),
-        (INERTIAL.format(m=1, x="nan", y=0.01, z=0.01), ("'b'", "no number")),
+        (INERTIAL.format(m=1, x="nan", y=0.01, z=0.01), ("'b'", "not a number")),
         ("", ("'j2'", "moves no mass")),
     ],
 )

@@ -164,7 +164,7 @@ def test_files_that_change_after_loading_are_one_line(tmp_path: Path) -> None:
     urdf.write_text(text)
     robot = load()
     srdf.write_text("<robot")
-    with pytest.raises(UrdfError, match="is no SRDF"):
+    with pytest.raises(UrdfError, match="is not an SRDF"):
         load_shapes(robot)
 
 

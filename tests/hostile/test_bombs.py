@@ -19,26 +19,26 @@ DIGITS = "1" * 5_000
 LONG = "z" * 1_000_000
 
 FILES = {
-    "aliases as a number": ("p.yaml", NINES + "name: [shoulder]\nposition: [*i]\n", POSTURE, "no number"),
-    "aliases as a schema": ("p.yaml", NINES + "schema: *i\n", POSTURE, "is no posture"),
+    "aliases as a number": ("p.yaml", NINES + "name: [shoulder]\nposition: [*i]\n", POSTURE, "not a number"),
+    "aliases as a schema": ("p.yaml", NINES + "schema: *i\n", POSTURE, "is not a posture"),
     "aliases of themselves": ("p.yaml", "joints: &j\n  shoulder: *j\n", POSTURE, "recursive"),
-    "empty float": ("p.yaml", 'joints:\n  shoulder: !!float ""\n', POSTURE, "no number"),
-    "bool that is none": ("p.yaml", 'joints:\n  shoulder: !!bool "maybe"\n', POSTURE, "no number"),
-    "time that is none": ("p.yaml", 'joints:\n  shoulder: !!timestamp "x"\n', POSTURE, "no number"),
-    "minutes and seconds": ("p.yaml", "joints:\n  shoulder: 0:1\n", POSTURE, "no number"),
+    "empty float": ("p.yaml", 'joints:\n  shoulder: !!float ""\n', POSTURE, "not a number"),
+    "bool that is none": ("p.yaml", 'joints:\n  shoulder: !!bool "maybe"\n', POSTURE, "not a number"),
+    "time that is none": ("p.yaml", 'joints:\n  shoulder: !!timestamp "x"\n', POSTURE, "not a number"),
+    "minutes and seconds": ("p.yaml", "joints:\n  shoulder: 0:1\n", POSTURE, "not a number"),
     "code in a tag": ("p.yaml", '!!python/object/apply:os.system ["touch gone"]\n', POSTURE, "holds no posture"),
     "names by the thousand": (
         "p.json", '{"name": [' + ",".join(f'"j{k}"' for k in range(100_000)) + '], "position": [0]}', POSTURE,
         "100000 names but 1 positions",
     ),
-    "long value": ("p.json", f'{{"joints": {{"shoulder": "{LONG}"}}}}', POSTURE, "no number"),
+    "long value": ("p.json", f'{{"joints": {{"shoulder": "{LONG}"}}}}', POSTURE, "not a number"),
     "long key": ("p.json", f'{{"q": [1], "{LONG}": 1}}', POSTURE, "unknown key"),
     "digits in TOML": ("r.toml", f"[armature]\ndefault = {DIGITS}\n", CONFIG, "digits"),
     "hexadecimal digits": (
         "r.toml", f"[armature]\ndefault = 0x{'f' * 5_000}\n", CONFIG, "digits",
     ),
     "long key in TOML": ("r.toml", f'"{LONG}" = 1\n', CONFIG, "unknown key"),
-    "null in a path": ("r.toml", '[model]\nsrdf = "a\\u0000b"\n', CONFIG, "is no path"),
+    "null in a path": ("r.toml", '[model]\nsrdf = "a\\u0000b"\n', CONFIG, "is not a path"),
     "weight beyond all numbers": (
         "w.toml", f"shoulder = {'1' * 400}\n", ("evaluate", *PUSH, "--metric", "weighted", "--weights"), "no number",
     ),

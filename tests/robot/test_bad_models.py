@@ -110,7 +110,7 @@ def test_a_joint_that_mimics_no_joint_is_warned_about(load: Load) -> None:
         loaded = load(*parts, joint("b", "c").replace("</joint>", f'<mimic joint="{other}"/></joint>'))
         warnings = [line for line in loaded.warnings if "mimics" in line]  # type: ignore[attr-defined]
         assert len(warnings) == 1
-        assert f"'b_c' mimics '{other}', which is no joint of the URDF (did you mean a_b?)" in warnings[0]
+        assert f"'b_c' mimics '{other}', which is not a joint of the URDF (did you mean a_b?)" in warnings[0]
 
 
 def test_a_joint_whose_coupling_is_left_out_is_warned_about(load: Load) -> None:
@@ -126,7 +126,7 @@ def test_a_joint_whose_coupling_is_left_out_is_warned_about(load: Load) -> None:
 def test_swapped_limits(load: Load) -> None:
     swapped = joint("a", "b").replace('lower="-1" upper="1"', 'lower="1" upper="-1"')
     elements = (link("a", GOOD), link("b", OFF_AXIS), swapped)
-    with pytest.raises(UrdfError, match="lower position limit of 'a_b' is above the upper one"):
+    with pytest.raises(UrdfError, match="lower position limit of 'a_b' is above its upper limit"):
         load(*elements)
     load(*elements, toml="[limits.position]\na_b = [-1, 1]")
 
@@ -151,7 +151,7 @@ def test_bad_srdf(tmp_path: Path, load: Load) -> None:
         path.write_text(text, encoding="utf-8")
         with pytest.raises(UrdfError) as caught:
             load(*elements, srdf=str(path))
-        one_line(caught.value, "bad.srdf", "is no SRDF")
+        one_line(caught.value, "bad.srdf", "is not an SRDF")
 
 
 # ---- inertias -----------------------------------------------------------------------------------------------------
@@ -166,9 +166,9 @@ def test_bad_srdf(tmp_path: Path, load: Load) -> None:
         (inertia(0.01, 0.01, 0.01, xy=0.02), ("link 'b'", "negative principal moment")),
         (inertia(-0.01, 0.01, 0.01), ("link 'b'", "negative principal moment")),
         ('<inertia ixx="1" iyy="1" izz="1" ixy="0" ixz="0" iyz="0"/>', ("link 'b'", "without <mass>")),
-        (GOOD.replace('value="1"', 'value="heavy"'), ("link 'b'", "'heavy' is no number")),
-        (GOOD.replace('value="1"', 'value="nan"'), ("link 'b'", "is no number")),
-        (GOOD.replace('ixx="0.01"', 'ixx="inf"'), ("link 'b'", "is no number")),
+        (GOOD.replace('value="1"', 'value="heavy"'), ("link 'b'", "'heavy' is not a number")),
+        (GOOD.replace('value="1"', 'value="nan"'), ("link 'b'", "is not a number")),
+        (GOOD.replace('ixx="0.01"', 'ixx="inf"'), ("link 'b'", "is not a number")),
     ],
 )
 def test_inertias_of_no_rigid_body(load: Load, inertial: str, words: tuple[str, ...]) -> None:
