@@ -164,7 +164,7 @@ def test_a_pair_that_stays_violated_has_rows_for_all_corners_in_the_end() -> Non
             last, now = now, now.grown(numeric)
         assert set(now.active) == set(np.flatnonzero(values < 0))
         for k, corners in now.active.items():
-            one = now._separators[k]
+            one = now._pairs[k]
             seen.add(one.known)
             whole = set(range(len(one._x))), set(range(len(one._y)))
             assert one.known or (corners.a, corners.b) == whole
@@ -183,7 +183,7 @@ def test_a_pair_that_slack_lets_off_gets_no_more_corners() -> None:
         # The guess of each pair has the slack for what it violates, as the end of a run has where that pays.
         let_off = first.guess(numeric).values
         strict = let_off.copy()
-        strict[[int(own[-1]) for own in first._ends(np.arange(strict.size)).values()]] = 0.0
+        strict[[int(own[-1]) for own in first._unknowns(np.arange(strict.size)).values()]] = 0.0
         depths = np.maximum(0.0, -constraint.value(numeric))[list(first.active)]
         assert first.slack(let_off) >= depths.max(initial=0.0) and first.slack(strict) == 0
         kept, more = first.grown(numeric, let_off).active, first.grown(numeric, strict).active

@@ -59,15 +59,12 @@ class ForcePrice:
     nothing: str = "the optimum has the least force"
 
     def measure(self, q: Array) -> float:
-        """See :class:`DistancePrice`."""
         return self.contact.peak_force(self.objective.oracle.quantities(q).G, self.speed)
 
     def bound(self, level: float) -> Constraint:
-        """See :class:`DistancePrice`."""
         return ImpactBounds(self.objective, self.contact.least_mobility(level, self.speed), float("inf"))
 
     def within(self, q: Array, level: float) -> Array:
-        """See :class:`DistancePrice`."""
         return q
 
 

@@ -48,7 +48,6 @@ class ApproachSpeed(Constraint):
 
     @property
     def structure(self) -> str:
-        """See :class:`Constraint`."""
         own = self._attainable
         parts = [np.array([*self.parameters.shape, *self._kept]), own.free, own.scale]
         for moved in own.points:
@@ -58,11 +57,9 @@ class ApproachSpeed(Constraint):
         return f"{type(self).__name__}:{digest}"
 
     def describe(self) -> str:
-        """See :class:`Constraint`."""
         return f"{self.name} within the velocity limits of the joints"
 
     def evaluate(self, model: Numeric) -> tuple[Array, Array]:
-        """See :class:`Constraint`."""
         found = self._attainable.at(model)
         # Where nothing bounds it, twice the speed will do.
         speed = found.speed if np.isfinite(found.speed) else 2 * self._speed
@@ -72,12 +69,10 @@ class ApproachSpeed(Constraint):
 
     @property
     def lifted_bounds(self) -> tuple[Array, Array]:
-        """See :class:`Constraint`."""
         zero = np.zeros(len(self._kept))
         return zero, zero
 
     def lift(self, tree: Tree, parameters: ca.SX) -> LiftedRows:
-        """See :class:`Constraint`."""
         own = self._attainable
         z = ca.SX.sym("w", len(own.free))
         v = ca.SX(tree.model.nv, 1)
@@ -93,7 +88,6 @@ class ApproachSpeed(Constraint):
 
     @property
     def unknowns(self) -> int:
-        """See :class:`Constraint`."""
         return len(self._attainable.free)
 
     def guess(self, model: Numeric) -> Guess:

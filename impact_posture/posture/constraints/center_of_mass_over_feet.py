@@ -16,10 +16,10 @@ class CenterOfMassOverFeet(ExpressionConstraint):
     """The center of mass stays above the feet: ``A xy − b ≤ −margin``, meters.
 
     Args:
-        normals: Outward unit normals of the support polygon's edges, shape (k, 2).
+        normals: ``A``, outward unit normals of the edges of the support polygon, shape (k, 2).
         offsets: ``b``, shape (k,).
-        margin: Least distance from the edges.
-        loaded: Another model and its name, whose center of mass counts; ``None`` for the model of the problem.
+        margin: Least distance from the edges, m.
+        loaded: Another model, with its name, whose center of mass counts instead.
     """
 
     def __init__(
@@ -28,29 +28,21 @@ class CenterOfMassOverFeet(ExpressionConstraint):
         self.name = "center of mass over the feet" + (f" with {loaded[1]}" if loaded else "")
         self.normals, self.offsets, self.margin = normals, offsets, margin
         self._model = loaded[0] if loaded else None
-        self._k = len(offsets)
         self.parameters = np.concatenate([normals.T.reshape(-1), offsets])
-        self.lower = np.full(self._k, -np.inf)
-        self.upper = np.full(self._k, -margin)
+        self.lower, self.upper = np.full(len(offsets), -np.inf), np.full(len(offsets), -margin)
 
     def describe(self) -> str:
-        """See :class:`Constraint`."""
         return f"{self.name}, {self.margin:g} m inside the support polygon"
 
     def symbolic(self, tree: Tree, parameters: ca.SX) -> ca.SX:
-        """See :class:`Constraint`."""
-        k, own = self._k, tree if self._model is None else Tree(self._model, tree.q)
-        center = own.center_of_mass()
+        k, loaded = self.rows, tree if self._model is None else Tree(self._model, tree.q)
+        center = loaded.center_of_mass()
         return parameters[:k] * center[0] + parameters[k : 2 * k] * center[1] - parameters[2 * k :]
 
     def evaluate(self, model: Numeric) -> tuple[Array, Array]:
-        """See :class:`Constraint`."""
-        k = self._k
-        normals = self.parameters[: 2 * k].reshape(2, k).T
-        own = model if self._model is None else Numeric(self._model).at(model.q)
-        center, jacobian = own.center_of_mass()
-        return normals @ center[:2] - self.parameters[2 * k :], normals @ jacobian[:2]
+        loaded = model if self._model is None else Numeric(self._model).at(model.q)
+        center, jacobian = loaded.center_of_mass()
+        return self.normals @ center[:2] - self.offsets, self.normals @ jacobian[:2]
 
     def row_name(self, row: int) -> str:
-        """See :class:`Constraint`."""
         return f"{self.name} (edge {row})"

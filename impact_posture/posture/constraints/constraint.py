@@ -1,13 +1,13 @@
-"""Constraints on a posture, each as an expression and in Pinocchio's numbers.
+"""Base classes of the constraints on a posture, which CasADi sees as expressions and Pinocchio as numbers.
 
-To add a constraint, derive from :class:`ExpressionConstraint` and implement ``symbolic`` and ``evaluate``; with
-unknowns of its own, from :class:`Constraint` and implement ``lift``, ``unknowns``, ``guess``, ``linearize`` and
-``evaluate``.  The program, the search for feasible starts, the certificate and the elastic diagnosis need nothing
-else.
+To add a constraint, derive from :class:`ExpressionConstraint` and implement ``symbolic`` and ``evaluate``.  If it has
+unknowns, derive from :class:`Constraint` and implement ``lift``, ``unknowns``, ``guess``, ``linearize`` and
+``evaluate``.  The program, the feasible starts, the certificate and the search for conflicts need nothing else.
 """
 
 from __future__ import annotations
 
+import hashlib
 from abc import ABC, abstractmethod
 from collections.abc import Sequence
 from dataclasses import dataclass, field
@@ -22,6 +22,12 @@ from impact_posture.impact.quantities.lifted_form import Guess
 from impact_posture.system.arrays import Array
 
 
+def digest(*parts: object) -> str:
+    """Return a short hash of arrays and texts, for :attr:`Constraint.structure`."""
+    content = b"".join(part.tobytes() if isinstance(part, np.ndarray) else repr(part).encode() for part in parts)
+    return hashlib.sha256(content).hexdigest()[:16]
+
+
 @dataclass(frozen=True, eq=False)
 class LiftedRows:
     """A constraint in the unknowns of the program: ``lower ≤ g(q, z) ≤ upper`` with auxiliaries z.
@@ -29,9 +35,9 @@ class LiftedRows:
     Attributes:
         rows: ``g(q, z)``, shape (m, 1).
         variables: ``z``, shape (k, 1).
-        slack: Sum of those auxiliaries that relax rows, meters; the program drives it to zero.
-        sides: More rows, which see only ``z``.
-        pieces: The pieces of a constraint that grows.  The expressions of a piece's ``rows`` stay the same object.
+        slack: Sum of the auxiliaries that relax rows, meters; the program drives it to zero.
+        sides: More rows, which depend on ``z`` alone.
+        pieces: Pieces of a constraint that grows.  ``rows`` of a piece stays the same object.
     """
 
     rows: ca.SX
@@ -42,7 +48,7 @@ class LiftedRows:
 
     @staticmethod
     def joined(pieces: Sequence[LiftedRows]) -> LiftedRows:
-        """Return pieces as one: the rows of all, then the sides of all."""
+        """Join pieces: the rows of all, then the sides of all."""
         rows, sides, variables = (
             ca.vertcat(ca.SX(0, 1), *[getattr(piece, key) for piece in pieces])
             for key in ("rows", "sides", "variables")
@@ -53,7 +59,7 @@ class LiftedRows:
 
 @dataclass(frozen=True, eq=False)
 class Linearization:
-    """Rows of a constraint near a posture, over the tangent space and the auxiliaries that the certificate keeps.
+    """Rows of a constraint near a posture, over the tangent space and the auxiliaries of the certificate.
 
     Attributes:
         names: Name of each row.
@@ -73,8 +79,8 @@ class Linearization:
 
     @staticmethod
     def joined(parts: Sequence[Linearization], nv: int) -> Linearization:
-        """Return the rows of several parts, each with auxiliaries of its own."""
-        # Most postures are far from most bounds.
+        """Join the rows of parts whose auxiliaries are separate."""
+        # Most parts are empty, because most postures are far from most bounds.
         parts = [part for part in parts if part.names or part.auxiliary.shape[1]]
         if len(parts) == 1:
             return parts[0]
@@ -93,16 +99,19 @@ class Linearization:
 
 
 class Constraint(ABC):
-    """Abstract base of constraints ``lower ≤ c(q) ≤ upper``, which are equalities if both bounds are equal.
+    """Abstract base class of constraints ``lower ≤ c(q) ≤ upper``.
+
+    A constraint is an equality if both bounds are equal.
 
     Attributes:
         name: Name in lists of active and of conflicting constraints.
         parameters: Numbers that may change without rebuilding the program (targets, polygons).
         lower: Lower bounds, shape (rows,).
         upper: Upper bounds, shape (rows,).
-        projected: Whether starts are pulled onto it; else the program alone satisfies it.
-        grows: Whether its program is likely to grow by :meth:`grown`.
-        price: Price of a violation of a row where constraints conflict; a cheap one gives way, and is named.
+        projected: Whether starts are pulled onto the constraint; else the program alone satisfies it.
+        grows: Whether :meth:`grown` is likely to add parts to the program.
+        by_row: Whether conflicts name each row instead of the constraint.
+        price: Price of a violation where constraints conflict.  A cheap constraint gives way, and is named.
     """
 
     name: str
@@ -111,6 +120,7 @@ class Constraint(ABC):
     upper: Array
     projected: bool = True
     grows: bool = False
+    by_row: bool = False
     price: float = 1.0
 
     @property
@@ -125,7 +135,7 @@ class Constraint(ABC):
 
     @property
     def structure(self) -> str:
-        """Text that distinguishes it apart from parameters and bounds; part of the key of the compile cache."""
+        """Text that identifies the expressions, part of the key of the compile cache."""
         return f"{type(self).__name__}:{self.name}:{self.rows}"
 
     @abstractmethod
@@ -133,14 +143,14 @@ class Constraint(ABC):
         """Return ``c(q)``, shape (rows,), and its tangent Jacobian, shape (rows, nv), at ``model.q``."""
 
     def value(self, model: Numeric) -> Array:
-        """Return ``c(q)`` alone; exact where it violates a bound."""
+        """Return ``c(q)``, which needs to be exact only where it violates a bound."""
         return self.evaluate(model)[0]
 
     # ---- lifted form, by default without auxiliaries ----------------------------------------------------------
 
     @abstractmethod
     def lift(self, tree: Tree, parameters: ca.SX) -> LiftedRows:
-        """Return the rows of the program with their auxiliaries, of a ``tree`` that was built with ``chart_x``."""
+        """Return the rows of the program with their auxiliaries; ``tree`` is built with ``chart_x``."""
 
     @property
     def lifted_bounds(self) -> tuple[Array, Array]:
@@ -157,7 +167,7 @@ class Constraint(ABC):
         return Guess(np.zeros(0), np.zeros(0))
 
     def linearize(self, model: Numeric, auxiliaries: Array) -> Linearization:
-        """Return the rows at ``model.q`` in Pinocchio's numbers; those far from their bounds may be left out.
+        """Return the rows at ``model.q`` by Pinocchio, without rows that are far from their bounds.
 
         Args:
             model: The model at the posture.
@@ -168,30 +178,28 @@ class Constraint(ABC):
         return Linearization(names, value, self.lower, self.upper, jacobian, np.zeros((self.rows, 0)))
 
     def grown(self, model: Numeric, auxiliaries: Array | None = None) -> Self:
-        """Return the constraint with the parts that its program lacks at ``model.q``; itself if it lacks none.
+        """Return the constraint with the parts that its program lacks at ``model.q``, or itself if none are missing.
 
         Args:
             model: The model at the posture.
-            auxiliaries: The auxiliaries of the program there, if the posture is the end of a run, shape (k,).
+            auxiliaries: The auxiliaries of the program, shape (k,), if the posture is the end of a run.
         """
         return self
 
     def slack(self, auxiliaries: Array) -> float:
-        """Return by how much (m) a run was let off where it ended; zero without slack.
-
-        Args:
-            auxiliaries: The auxiliaries of the program at the end, shape (k,).
-        """
+        """Return the slack (m) in the auxiliaries of :meth:`lift`, shape (k,), at the end of a run."""
         return 0.0
 
-    # ---- words ------------------------------------------------------------------------------------------------
+    # ---- messages ---------------------------------------------------------------------------------------------
 
     def excess(self, value: Array) -> Array:
         """Return how far ``c(q)`` lies outside its bounds, signed, shape (rows,)."""
         return value - np.clip(value, self.lower, self.upper)
 
     def conflicts(self, excess: Array) -> dict[str, float]:
-        """Return names of what is violated, and by how much."""
+        """Return the names of what is violated, with the size of each violation."""
+        if self.by_row:
+            return {self.row_name(row): abs(float(excess[row])) for row in np.flatnonzero(excess).tolist()}
         return {self.name: float(np.linalg.norm(excess))}
 
     def describe(self) -> str:
@@ -203,17 +211,16 @@ class Constraint(ABC):
         return self.name if self.rows == 1 else f"{self.name}[{row}]"
 
     def pose_error(self, value: Array) -> tuple[float, float]:
-        """Return the error of a held pose in meters and radians where ``c(q)`` is ``value``; zeros without a pose."""
+        """Return the position (m) and orientation error (rad) of a held pose where ``c(q)`` is ``value``."""
         return 0.0, 0.0
 
 
 class ExpressionConstraint(Constraint):
-    """Abstract base of constraints that are an expression of the posture alone."""
+    """Abstract base class of constraints that are an expression of the posture alone."""
 
     @abstractmethod
     def symbolic(self, tree: Tree, parameters: ca.SX) -> ca.SX:
-        """Return ``c(q)`` as an expression, shape (rows, 1), of a ``tree`` that was built with ``chart_x``."""
+        """Return ``c(q)`` as an expression, shape (rows, 1); ``tree`` is built with ``chart_x``."""
 
     def lift(self, tree: Tree, parameters: ca.SX) -> LiftedRows:
-        """See :class:`Constraint`."""
         return LiftedRows(self.symbolic(tree, parameters))

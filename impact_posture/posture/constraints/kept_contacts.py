@@ -2,28 +2,29 @@
 
 from __future__ import annotations
 
-import hashlib
 from dataclasses import replace
 
 import casadi as ca
 import numpy as np
 
 from impact_posture.dynamics.numeric import Numeric
-from impact_posture.dynamics.tree import Tree, Wrench
+from impact_posture.dynamics.tree import Tree
 from impact_posture.impact.friction.contact_stability import FrictionCones
 from impact_posture.impact.impact_contact import point_on
+from impact_posture.impact.quantities.lifted_form import impact_at
 from impact_posture.impact.support_compliance import support_inertia
 from impact_posture.impact.worst_case_objective import WorstCaseObjective
-from impact_posture.posture.constraints.constraint import ExpressionConstraint
+from impact_posture.posture.constraints.constraint import ExpressionConstraint, digest
 from impact_posture.system.arrays import Array
 
 
 class KeptContacts(ExpressionConstraint):
-    """Support impulses ``f = −J_s a/ε`` stay in the friction cones: ``A f(q) ≤ 0`` per unit impulse, 1 at the start.
+    """Support impulses ``f = −J_s a/ε`` stay in the friction cones: ``A f(q) ≤ 0`` per unit impulse.
 
-    These are the impulses of feet at compliance ε, one member of the set of
-    :mod:`impact_posture.impact.friction.contact_stability`.  So the constraint is sufficient for the feet to stay.
-    It is stricter than necessary where that set has several members.
+    These impulses of feet with compliance ε are one member of the set of
+    :mod:`impact_posture.impact.friction.contact_stability`.  So the constraint is sufficient for the feet to stay,
+    and stricter than necessary where that set has several members.  ``A`` is scaled so that the largest impulse at
+    the given posture is 1.
 
     Args:
         objective: Impact along the normal of the leading contact, and its supports.
@@ -35,7 +36,6 @@ class KeptContacts(ExpressionConstraint):
     def __init__(self, objective: WorstCaseObjective, numeric: Numeric, friction: float, variant: str = "") -> None:
         self._where = f" ({variant})" if variant else ""
         self.name = f"feet that stay{self._where}"
-        self._robot, self._supports = objective.robot, objective.supports
         self._objective = replace(objective, normal_cone_deg=0.0)
         self._feet = [(point_on(objective.robot, s.frame, s.offset), s.rows) for s in objective.supports]
         axes = [np.asarray(numeric.placement(point).rotation) for point, _ in self._feet]
@@ -43,36 +43,27 @@ class KeptContacts(ExpressionConstraint):
         size = np.abs(self._objective.oracle.quantities(numeric.q).support_impulse).max(initial=1e-300)
         self._matrix = matrix / size
         self.parameters = np.array(objective.contact.normal)
-        self.lower = np.full(len(matrix), -np.inf)
-        self.upper = np.zeros(len(matrix))
+        self.lower, self.upper = np.full(len(matrix), -np.inf), np.zeros(len(matrix))
 
     def describe(self) -> str:
-        """See :class:`Constraint`."""
         return f"{self.name}: the impact neither lifts nor slides one"
 
     @property
     def structure(self) -> str:
-        """See :class:`Constraint`."""
-        digest = hashlib.sha256(self._matrix.tobytes()).hexdigest()[:16]
-        return f"{super().structure}:{digest}:{self._objective.compliance!r}"
+        return f"{super().structure}:{digest(self._matrix)}:{self._objective.compliance!r}"
 
     def symbolic(self, tree: Tree, parameters: ca.SX) -> ca.SX:
-        """See :class:`Constraint`."""
-        contact, compliance = self._objective.contact, self._objective.compliance
-        extra = support_inertia(self._robot, self._supports, compliance)
-        heavy = Tree(self._robot.model, tree.q, extra_inertia=extra)
-        point = point_on(self._robot, contact.frame, contact.offset)
-        in_frame = contact.normal_frame == "contact"
-        found = heavy.respond(wrenches=[Wrench(point, parameters, ca.SX.zeros(3), in_frame)])
-        parts = [-heavy.point_velocity(foot, found.velocities)[:rows] / compliance for foot, rows in self._feet]
+        case = self._objective.case
+        extra = support_inertia(case.robot, case.supports, case.compliance)
+        heavy = Tree(case.robot.model, tree.q, extra_inertia=extra)
+        velocities = heavy.respond(wrenches=[impact_at(case, parameters)]).velocities
+        parts = [-heavy.point_velocity(foot, velocities)[:rows] / case.compliance for foot, rows in self._feet]
         return ca.densify(ca.SX(self._matrix) @ ca.vertcat(*parts))
 
     def evaluate(self, model: Numeric) -> tuple[Array, Array]:
-        """See :class:`Constraint`."""
         oracle = self._objective.oracle
         impulse = oracle.quantities(model.q).support_impulse
         return self._matrix @ impulse, self._matrix @ oracle.support_gradient(model.q)
 
     def row_name(self, row: int) -> str:
-        """See :class:`Constraint`."""
         return f"{self._names[row]}{self._where}"

@@ -1,8 +1,6 @@
-"""The constraint that two links in each other's hollows stay where their shapes do not touch."""
+"""The constraint that two links stay where their shapes do not touch, although their hulls overlap."""
 
 from __future__ import annotations
-
-import hashlib
 
 import casadi as ca
 import numpy as np
@@ -10,18 +8,13 @@ import numpy as np
 from impact_posture.collision.joint_planes import JointPlanes
 from impact_posture.dynamics.numeric import Numeric
 from impact_posture.dynamics.tree import Tree
-from impact_posture.posture.constraints.constraint import ExpressionConstraint
+from impact_posture.posture.constraints.constraint import ExpressionConstraint, digest
 from impact_posture.robot.robot import Robot
 from impact_posture.system.arrays import Array
 
 
 class NestedLinks(ExpressionConstraint):
-    """``N θ ≤ b`` for the joints ``θ`` between two links (:class:`JointPlanes`), in shares of half their ranges.
-
-    Args:
-        robot: The robot.
-        planes: The planes.
-    """
+    """``N θ ≤ b`` for the joints ``θ`` between two links (:class:`JointPlanes`), in shares of half their ranges."""
 
     def __init__(self, robot: Robot, planes: JointPlanes) -> None:
         joints = [robot.joint_id(name) for name in planes.joints]
@@ -34,19 +27,15 @@ class NestedLinks(ExpressionConstraint):
 
     @property
     def structure(self) -> str:
-        """See :class:`Constraint`."""
-        return f"{super().structure}:{self._q}:{hashlib.sha256(self._planes.normals.tobytes()).hexdigest()[:16]}"
+        return f"{super().structure}:{self._q}:{digest(self._planes.normals)}"
 
     def describe(self) -> str:
-        """See :class:`Constraint`."""
         return f"{self.name} apart by the joints {', '.join(self._planes.joints)}"
 
     def symbolic(self, tree: Tree, parameters: ca.SX) -> ca.SX:
-        """See :class:`Constraint`."""
         return ca.densify(ca.SX(self._planes.normals) @ tree.q[self._q])
 
     def evaluate(self, model: Numeric) -> tuple[Array, Array]:
-        """See :class:`Constraint`."""
         normals = self._planes.normals
         jacobian = np.zeros((len(normals), model.model.nv))
         jacobian[:, self._v] = normals

@@ -1,4 +1,4 @@
-"""Distances of many pairs of bodies: exact where they are near, and else lower bounds that cost little."""
+"""Distances of many pairs of bodies: exact for near pairs, and cheap lower bounds for all others."""
 
 from __future__ import annotations
 
@@ -15,24 +15,21 @@ from impact_posture.system.arrays import Array
 class PairDistances:
     """Distances less the clearance of pairs of bodies, at one posture after another.
 
-    Cheap lower bounds show for most pairs that they are apart: balls around the bodies, the last exact distance less
-    what the bodies have moved since, and the gap between the hulls along two directions.  What is known of the last
-    posture stays known, because a search looks at a posture several times.
-
-    Args:
-        separators: The pairs.
+    Three cheap lower bounds show that most pairs are apart: the distance of balls around the bodies, the last exact
+    distance less the motion of the bodies since, and the gap between the hulls along two directions.  The values at
+    the last posture are kept, because a search evaluates a posture several times.
     """
 
-    def __init__(self, separators: Sequence[SeparatingPlane]) -> None:
-        self._separators = tuple(separators)
+    def __init__(self, pairs: Sequence[SeparatingPlane]) -> None:
+        self._pairs = tuple(pairs)
         bodies: dict[int, ConvexBody] = {}
-        for one in self._separators:
-            bodies |= {id(one.a): one.a, id(one.b): one.b}
+        for pair in self._pairs:
+            bodies |= {id(pair.a): pair.a, id(pair.b): pair.b}
         self._bodies = list(bodies.values())
         where = {key: k for k, key in enumerate(bodies)}
-        self._first = np.array([where[id(one.a)] for one in self._separators], dtype=int)
-        self._second = np.array([where[id(one.b)] for one in self._separators], dtype=int)
-        # A body that does not turn keeps world axes around its point.
+        self._first = np.array([where[id(pair.a)] for pair in self._pairs], dtype=int)
+        self._second = np.array([where[id(pair.b)] for pair in self._pairs], dtype=int)
+        # The axes of a body that does not turn with its link are the world axes.
         self._turns = np.array([body.turns for body in self._bodies], dtype=bool)[:, None, None]
         self._joints, self._on = np.unique([body.point.joint for body in self._bodies], return_inverse=True)
         still = np.where(self._turns[:, 0], 0.0, 1.0)
@@ -40,45 +37,39 @@ class PairDistances:
         points = np.array([body.point.position for body in self._bodies]).reshape(-1, 3)
         self._carried, self._beside = ((1 - still) * centers + still * points)[:, :, None], still * centers
         self._reach = np.array([0.0 if body.hull is None else body.hull.reach for body in self._bodies])
-        margins = np.array([one.margin for one in self._separators])
+        margins = np.array([pair.margin for pair in self._pairs])
         self._ends = (0, self._first), (1, self._second)
         self._least = self._reach[self._first] + self._reach[self._second] + margins
-        # Corners of the hulls around their centers, in axes that turn with the body; the last one fills the rows.
+        # Corners of the hulls around their centers, in axes that turn with the body; the last corner is repeated.
         corners = [_corners(body) for body in self._bodies]
-        most = max((len(own) for own in corners), default=0)
-        filled = [np.vstack([own, np.repeat(own[-1:], most - len(own), axis=0)]) for own in corners]
-        self._corners = np.array(filled).reshape(len(corners), most, 3)
-        self._gaps = np.array([one.gap for one in self._separators])
+        most = max(map(len, corners), default=0)
+        padded = [np.vstack([points, np.repeat(points[-1:], most - len(points), axis=0)]) for points in corners]
+        self._corners = np.array(padded).reshape(len(corners), most, 3)
+        self._gaps = np.array([pair.gap for pair in self._pairs])
         self._planes = [(k, body) for k, body in enumerate(self._bodies) if body.normal is not None]
         self._offsets = np.array([body.offset for body in self._bodies])
-        self._known = np.array([one.known for one in self._separators], dtype=bool)
-        # The last exact distance of each pair of hulls, its normal, and the places of its bodies then.
-        self._latest = np.full(len(self._separators), -np.inf)
-        self._normals = np.zeros((len(self._separators), 3))
-        self._then = np.zeros((2, len(self._separators), 12))
-        # The last posture, the bodies there, the normals of planes, and what is known of the distances.
+        self._known = np.array([pair.known for pair in self._pairs], dtype=bool)
+        # The last exact distance of each pair of hulls, its normal, and the places of both bodies at that time.
+        self._latest = np.full(len(self._pairs), -np.inf)
+        self._normals = np.zeros((len(self._pairs), 3))
+        self._then = np.zeros((2, len(self._pairs), 12))
+        # The last posture, the bodies there, the normals of planes, and the distances or bounds.
         self._q = np.zeros(0)
         self._axes, self._centers = np.zeros((0, 3, 3)), np.zeros((0, 3))
         self._up = np.zeros((len(self._bodies), 3))
         self._balls = self._values = np.zeros(0)
-        self._exact = np.zeros(len(self._separators), dtype=bool)
+        self._exact = np.zeros(len(self._pairs), dtype=bool)
 
     def bounds(self, model: Numeric, pairs: range) -> Array:
-        """Return lower bounds on the distances of some pairs from a ball around each body, m."""
+        """Return lower bounds on the distances of ``pairs`` by a ball around each body, m."""
         self._move(model)
         return np.array(self._balls[pairs.start : pairs.stop])
 
     def within(self, model: Numeric, limit: float, pairs: range) -> Array:
-        """Return the distances of some pairs, m: exact below a limit, and else exact or lower bounds.
-
-        Args:
-            model: The model at the posture.
-            limit: The limit, m.
-            pairs: The pairs.
-        """
+        """Return the distances of ``pairs``, m; values above ``limit`` (m) may be lower bounds."""
         self._move(model)
-        own = slice(pairs.start, pairs.stop)
-        near = pairs.start + np.flatnonzero((self._values[own] < limit) & ~self._exact[own])
+        part = slice(pairs.start, pairs.stop)
+        near = pairs.start + np.flatnonzero((self._values[part] < limit) & ~self._exact[part])
         if near.size:
             hulls = near[~self._known[near]]
             if hulls.size:
@@ -89,13 +80,13 @@ class PairDistances:
             self._values[near] = np.maximum(self._values[near], self._along(near))
             self._exact[near] |= self._known[near]
         for k in near[(self._values[near] < limit) & ~self._known[near]].tolist():
-            self._values[k], self._normals[k], _ = self._separators[k].distance(model)
+            self._values[k], self._normals[k], _ = self._pairs[k].distance(model)
             self._latest[k], self._exact[k] = self._values[k], True
             self._then[:, k] = self._places(np.array([self._first[k], self._second[k]]))
-        return self._values[own].copy()
+        return self._values[part].copy()
 
     def _move(self, model: Numeric) -> None:
-        """Place all bodies, unless the posture is the last one."""
+        """Place all bodies, unless they are at this posture already."""
         if np.array_equal(self._q, model.q):
             return
         self._q = model.q
@@ -114,15 +105,15 @@ class PairDistances:
         self._values = self._balls.copy()
 
     def _places(self, bodies: Array) -> Array:
-        """Return the axes times the reach, and the center of bodies, shape (k, 12)."""
+        """Return the axes of bodies times their reach, and their centers, shape (k, 12)."""
         axes = self._axes[bodies] * self._reach[bodies][:, None, None]
         return np.hstack([axes.reshape(-1, 9), self._centers[bodies]])
 
     def _along(self, pairs: NDArray[np.intp]) -> Array:
-        """Return the gaps of pairs along the normal of the plane, or the larger one along two directions, m."""
+        """Return the gaps of pairs along the normal of the plane, or the larger gap along two directions, m."""
         first, second = self._first[pairs], self._second[pairs]
         apart = self._centers[first] - self._centers[second]
-        # The direction between the centers, and the normal when the pair was near.
+        # The two directions: between the centers, and the normal when the pair was near last.
         length = np.sqrt((apart * apart).sum(axis=1, keepdims=True))
         between = apart / np.maximum(length, np.finfo(float).tiny)
         along = np.stack(
@@ -131,13 +122,13 @@ class PairDistances:
         low = (self._corners[first] @ (self._axes[first].transpose(0, 2, 1) @ along)).min(axis=1)
         high = (self._corners[second] @ (self._axes[second].transpose(0, 2, 1) @ along)).max(axis=1)
         gaps = (apart[:, None] @ along)[:, 0] + low - high
-        # A pair that was never near has no normal, and a gap of zero along it.
+        # A pair that was never near has a normal of zeros, and the gap along it means nothing.
         best = np.where(self._normals[pairs].any(axis=1), gaps.max(axis=1), gaps[:, 0])
         return np.asarray(best - self._gaps[pairs] - self._offsets[second])
 
 
 def _corners(body: ConvexBody) -> Array:
-    """Return the corners of a hull around its center, in axes that turn with the body; one of a half-space."""
+    """Return the corners of a hull around its center in axes that turn with the body; the origin of a half-space."""
     if body.hull is None:
         return np.zeros((1, 3))
     corners = body.hull.vertices - body.hull.center
@@ -145,11 +136,11 @@ def _corners(body: ConvexBody) -> Array:
 
 
 def _moved(now: Array, then: Array) -> Array:
-    """Return how far a point of each body has moved at most, ``|Δc| + |ΔR| r``, m, shape (k,).
+    """Return the largest motion ``|Δc| + |ΔR| r`` of a point of each body, m, shape (k,).
 
     Args:
         now: Axes ``R`` times reach ``r``, and center ``c`` of each body, shape (k, 12).
-        then: The same before.
+        then: These values at the earlier posture.
     """
     change = (now - then) ** 2
     return np.asarray(np.sqrt(change[:, 9:].sum(axis=1)) + np.sqrt(change[:, :9].sum(axis=1)))

@@ -24,19 +24,16 @@ class HeldPosition(ExpressionConstraint):
         self.lower = self.upper = np.zeros(3)
 
     def symbolic(self, tree: Tree, parameters: ca.SX) -> ca.SX:
-        """See :class:`Constraint`."""
         return tree.position(self.point) - parameters
 
     def evaluate(self, model: Numeric) -> tuple[Array, Array]:
-        """See :class:`Constraint`."""
         return self.value(model), model.jacobian(self.point)[:3]
 
     def value(self, model: Numeric) -> Array:
-        """See :class:`Constraint`."""
         return np.asarray(model.placement(self.point).translation - self.parameters)
 
     def pose_error(self, value: Array) -> tuple[float, float]:
-        """See :class:`Constraint`; outside a box it is the distance from the box."""
+        """Return the distance from the target, or from the box around it."""
         return float(np.linalg.norm(self.excess(value))), 0.0
 
 
@@ -49,20 +46,18 @@ class PositionBox(HeldPosition):
         self.lower = -self.upper
 
     def describe(self) -> str:
-        """See :class:`Constraint`."""
         return f"{super().describe()} (" + " × ".join(f"±{v:g}" for v in self.upper) + " m)"
 
     def row_name(self, row: int) -> str:
-        """See :class:`Constraint`."""
         return f"{self.name} along {'xyz'[row]}"
 
 
 class HeldOrientation(ExpressionConstraint):
     """The frame keeps its orientation, or the direction of one of its axes.
 
-    ``2 vec(Q_left* ⊗ Q(q) ⊗ Q_right)`` is the vector part of the error quaternion, polynomial in half angles.  It is
-    smooth, and the rotation vector in radians to first order.  It is zero at the target only, and largest at 180°,
-    where a skew-symmetric error is zero again.  The first two components alone hold the direction of ``axis``.
+    The rows are ``2 vec(Q_left* ⊗ Q(q) ⊗ Q_right)``, the vector part of the error quaternion.  To first order this is
+    the rotation vector in radians.  It is zero at the target only and largest at 180°, where a skew-symmetric error
+    is zero again.  Its first two components alone hold the direction of ``axis``.
 
     Args:
         name: Name of the constraint.
@@ -75,36 +70,36 @@ class HeldOrientation(ExpressionConstraint):
         self.name, self.point, target = name, point, np.array(target, dtype=float)
         self.axis = axis
         width = 3 if axis is None else 2
-        right = np.eye(3) if axis is None else _rotation_to(axis)
+        right = np.eye(3)
+        if axis is not None:
+            right = pin.Quaternion.FromTwoVectors(right[2], np.array(axis, dtype=float)).matrix()
         left = target @ right
+
         self.parameters = np.concatenate([_coefficients(left.T), _coefficients(right)])
         self._left, self._right = pin.Quaternion(self.parameters[:4]), pin.Quaternion(self.parameters[4:8])
         self._axes = self._right.matrix()
         self.lower = self.upper = np.zeros(width)
 
     def describe(self) -> str:
-        """See :class:`Constraint`."""
         return super().describe() + ("" if self.axis is None else " (tilt zero, yaw free)")
 
     def symbolic(self, tree: Tree, parameters: ca.SX) -> ca.SX:
-        """See :class:`Constraint`."""
         error = quaternion_product(quaternion_product(parameters[:4], tree.quaternion(self.point)), parameters[4:8])
         return 2 * error[: self.rows]
 
     def evaluate(self, model: Numeric) -> tuple[Array, Array]:
-        """See :class:`Constraint`."""
         return self.error(model.placement(self.point).rotation, model.jacobian(self.point)[3:])
 
     def error(self, rotation: Array, jacobian: Array) -> tuple[Array, Array]:
-        """Return the rows and their tangent Jacobian for a frame with an angular Jacobian, shape (3, nv)."""
+        """Return the rows and their tangent Jacobian from the rotation and angular Jacobian (3, nv) of the frame."""
         error = (self._left * pin.Quaternion(rotation) * self._right).coeffs()
         x, y, z, w = (error if error[3] >= 0 else -error).tolist()
-        # d(2 vec(Q)) = (w I + [v]×) ω in the axes that Q turns: those of the frame times `right`.
+        # d(2 vec(Q)) = (w I + [v]×) ω in the axes that Q turns: the axes of the frame times `right`.
         turn = np.array([[w, -z, y], [z, w, -x], [-y, x, w]])[: self.rows] @ (rotation @ self._axes).T
         return 2 * np.array([x, y, z])[: self.rows], turn @ jacobian
 
     def pose_error(self, value: Array) -> tuple[float, float]:
-        """See :class:`Constraint`; the rows are ``2 sin(θ/2)`` along the axis of a rotation by θ, or of a tilt."""
+        """Return the angle θ of a rotation or tilt, because the rows are ``2 sin(θ/2)`` along its axis."""
         return 0.0, 2 * float(np.arcsin(min(1.0, float(np.linalg.norm(value)) / 2)))
 
 
@@ -121,16 +116,13 @@ class HeldPose(ExpressionConstraint):
         self.lower = self.upper = np.zeros(sum(p.rows for p in self._parts))
 
     def describe(self) -> str:
-        """See :class:`Constraint`."""
         return super().describe() + ("" if self.rows == 6 else " (position and normal; spin free)")
 
     def symbolic(self, tree: Tree, parameters: ca.SX) -> ca.SX:
-        """See :class:`Constraint`."""
         position, orientation = self._parts
         return ca.vertcat(position.symbolic(tree, parameters[:3]), orientation.symbolic(tree, parameters[3:]))
 
     def evaluate(self, model: Numeric) -> tuple[Array, Array]:
-        """See :class:`Constraint`."""
         position, orientation = self._parts
         at, jacobian = model.placement(position.point), model.jacobian(position.point)
         turned, turning = orientation.error(at.rotation, jacobian[3:])
@@ -140,17 +132,16 @@ class HeldPose(ExpressionConstraint):
         )
 
     def pose_error(self, value: Array) -> tuple[float, float]:
-        """See :class:`Constraint`."""
         position, orientation = self._parts
         return position.pose_error(value[:3])[0], orientation.pose_error(value[3:])[1]
 
 
 class AxisInCone(ExpressionConstraint):
-    """An axis of the frame stays within a cone: ``−dᵀR(q)c ≤ −cos α``; the frame may turn about the axis.
+    """An axis of the frame stays within a cone, ``−dᵀR(q)c ≤ −cos α``, and the frame may turn about it.
 
     Args:
         name: Name of the constraint.
-        point: Point on the link that the frame belongs to.
+        point: Point on the link of the frame.
         axis: Unit axis ``c`` in the frame, shape (3,).
         direction: Axis ``d`` of the cone, world, shape (3,).
         degrees: Half angle α of the cone, degrees.
@@ -162,15 +153,12 @@ class AxisInCone(ExpressionConstraint):
         self.lower, self.upper = np.array([-np.inf]), np.array([-np.cos(np.deg2rad(degrees))])
 
     def describe(self) -> str:
-        """See :class:`Constraint`."""
         return f"{self.name} at most {self._degrees:g}°, spin free"
 
     def symbolic(self, tree: Tree, parameters: ca.SX) -> ca.SX:
-        """See :class:`Constraint`."""
         return -ca.dot(tree.rotation(self.point) @ parameters[:3], parameters[3:])
 
     def evaluate(self, model: Numeric) -> tuple[Array, Array]:
-        """See :class:`Constraint`."""
         axis, direction = self.parameters[:3], self.parameters[3:]
         now = model.placement(self.point).rotation @ axis
         return -np.array([now @ direction]), (model.jacobian(self.point)[3:].T @ np.cross(direction, now))[None, :]
@@ -188,18 +176,16 @@ class HeldTurn(ExpressionConstraint):
 
     def __init__(self, point: PointOnLink, target: Array, axis: Array, name: str) -> None:
         self.name = name
-        self._whole = HeldOrientation(name, point, target)
+        self._orientation = HeldOrientation(name, point, target)
         self._axis = np.array(axis, dtype=float)
-        self.parameters = np.concatenate([self._whole.parameters, self._axis])
+        self.parameters = np.concatenate([self._orientation.parameters, self._axis])
         self.lower = self.upper = np.zeros(1)
 
     def symbolic(self, tree: Tree, parameters: ca.SX) -> ca.SX:
-        """See :class:`Constraint`."""
-        return ca.dot(parameters[8:], self._whole.symbolic(tree, parameters[:8]))
+        return ca.dot(parameters[8:], self._orientation.symbolic(tree, parameters[:8]))
 
     def evaluate(self, model: Numeric) -> tuple[Array, Array]:
-        """See :class:`Constraint`."""
-        value, jacobian = self._whole.evaluate(model)
+        value, jacobian = self._orientation.evaluate(model)
         return np.array([self._axis @ value]), (self._axis @ jacobian)[None, :]
 
 
@@ -209,9 +195,5 @@ def base_point() -> PointOnLink:
 
 
 def _coefficients(rotation: Array) -> Array:
+    """Return the unit quaternion x y z w of a rotation matrix."""
     return np.array(pin.Quaternion(np.asarray(rotation)).coeffs())
-
-
-def _rotation_to(axis: Array) -> Array:
-    """A rotation that takes e_z to ``axis``."""
-    return np.array(pin.Quaternion.FromTwoVectors(np.array([0.0, 0.0, 1.0]), np.array(axis, dtype=float)).matrix())

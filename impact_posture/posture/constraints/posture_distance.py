@@ -18,17 +18,17 @@ from impact_posture.system.arrays import Array
 def distance_squared(chart: Chart, q: Any, reference: Any) -> Any:
     """Return the squared distance of two configurations, ``SX`` or ``DM``: about ``‖q ⊖ reference‖²`` in rad and m.
 
-    It is smooth everywhere.  A turn by Δ counts ``4 (1 − (quaternion·quaternion)²) = 4 sin²(Δ/2)``, which equals the
-    ``2 (1 − cos Δ)`` of a continuous joint.  Revolute and sliding joints and positions count Δ².
+    The distance is smooth everywhere.  A turn by Δ of a base, a ball joint or a continuous joint counts
+    ``4 sin²(Δ/2) = 4 (1 − (quaternion·quaternion)²) = 2 (1 − cos Δ)``.  Other joints and positions count Δ².
     """
     parts = []
     for slot in chart.slots:
-        one, other = q[slot.q], reference[slot.q]
+        a, b = q[slot.q], reference[slot.q]
         if slot.kind.family in ("free-flyer", "spherical"):
-            parts.append(4 * (1 - ca.dot(one[-4:], other[-4:]) ** 2))
-            one, other = one[:-4], other[:-4]
+            parts.append(4 * (1 - ca.dot(a[-4:], b[-4:]) ** 2))
+            a, b = a[:-4], b[:-4]
         # For a cosine and a sine this is 2 (1 − cos Δ).
-        parts.append(ca.sumsqr(one - other))
+        parts.append(ca.sumsqr(a - b))
     return ca.sum1(ca.vertcat(*parts))
 
 
@@ -41,22 +41,23 @@ def distance_gradient(chart: Chart, q: Array, reference: Array) -> Array:
     """Return the tangent gradient of :func:`distance_squared` at ``q``, shape (nv,)."""
     gradient = np.zeros(chart.nv)
     for slot in chart.slots:
-        one, other, family = q[slot.q], reference[slot.q], slot.kind.family
+        a, b, family = q[slot.q], reference[slot.q], slot.kind.family
         if family in ("free-flyer", "spherical"):
-            R = pin.Quaternion(one[-4:]).matrix()
-            relative = pin.Quaternion(other[-4:]).inverse() * pin.Quaternion(one[-4:])
+            turn = pin.Quaternion(a[-4:])
+            relative = pin.Quaternion(b[-4:]).inverse() * turn
             # d(4 (1 − w²)) = −8 w dw with dw = −½ v·ω.
             gradient[slot.v][-3:] = 4 * float(relative.w) * np.array(relative.coeffs()[:3])
             if family == "free-flyer":
-                gradient[slot.v][:3] = 2 * R.T @ (one[:3] - other[:3])
+                gradient[slot.v][:3] = 2 * turn.matrix().T @ (a[:3] - b[:3])
         elif family in ("continuous", "planar"):
-            c, s = one[-2:]
-            d = 2 * (one[:-2] - other[:-2])
-            gradient[slot.v.stop - 1] = 2 * (s * other[-2] - c * other[-1])
+            c, s = a[-2:]
+            d = 2 * (a[:-2] - b[:-2])
+            gradient[slot.v.stop - 1] = 2 * (s * b[-2] - c * b[-1])
             if family == "planar":
                 gradient[slot.v][:2] = c * d[0] + s * d[1], -s * d[0] + c * d[1]
         else:
-            gradient[slot.v] = 2 * (one - other)
+            gradient[slot.v] = 2 * (a - b)
+
     return gradient
 
 
@@ -78,11 +79,9 @@ class WithinDistance(ExpressionConstraint):
         self.lower, self.upper = np.array([-np.inf]), np.array([radius**2])
 
     def symbolic(self, tree: Tree, parameters: ca.SX) -> ca.SX:
-        """See :class:`Constraint`."""
         value: ca.SX = distance_squared(self._chart, tree.q, parameters)
         return value
 
     def evaluate(self, model: Numeric) -> tuple[Array, Array]:
-        """See :class:`Constraint`."""
         value = distance(self._chart, model.q, self.parameters) ** 2
         return np.array([value]), distance_gradient(self._chart, model.q, self.parameters)[None, :]

@@ -13,30 +13,31 @@ class Requirements:
     """Demands of the task on the posture.
 
     Attributes:
-        contact_pose: Part of the pose of the leading contact frame that is held, as in the setting of that name.
-        other_poses: The same for each other contact frame.
+        contact_pose: Held part of the pose of the leading contact frame, as in the setting ``contact_pose``.
+        other_poses: Held part of the pose of each other contact frame.
         target_position: Position of the contact frame, world, meters; ``None`` for its initial position.
         target_quaternion: Orientation of the contact frame, x y z w; ``None`` for its initial orientation.
         box: Half extents of the box of ``contact_pose = box``, meters.
-        base: Freedom of the floating base: ``free``, ``level`` (tilt zero, yaw free), ``level:DEG`` (tilt from
-            its default posture at most DEG degrees, yaw free), ``fixed`` or ``box``.
+        base: Freedom of the floating base: ``free``, ``level`` (tilt zero, yaw free), ``level:DEG`` (tilt from its
+            default posture at most DEG degrees, yaw free), ``fixed`` or ``box``.
         base_box: Half extents of the box of ``base = box``, meters.
         keep: Frames whose pose is held.
-        hold: Joints kept at their initial value.
+        hold: Joints held at their initial value.
         com_over_feet: Keep the center of mass above the support polygon.
-        com_asked: Whether the user set ``com_over_feet``; else it is dropped if the feet span no area.
-        com_margin: Distance from the polygon's edges, meters.
+        com_asked: Whether the user set ``com_over_feet``.  If not, it is dropped where the feet span no area.
+        com_margin: Least distance of the center of mass from the edges of the polygon, meters.
         keep_contacts: The impact must neither lift nor slide a foot.
         friction: Friction coefficient of the feet.
         holdable: Thrusts, torques and forces of the feet that hold the posture stay within their limits.
-        limit_share: Share of the limits of torques and thrusts that holding may take; of a range, about its middle.
-        hold_force: Force that each contact pushes back with after the impact, N, which has to be held as well.
+        limit_share: Share of the limits of torques and thrusts that holding may take, about the middle of a range.
+        hold_force: Force with which each contact pushes back after the impact, N, which has to be held as well.
         least_mobility: Least G of each contact, 1/kg, for the bound on the peak force; 0 for none.
         largest_jump: Largest jump of a joint per approach speed; infinite for no bound.
         approach_speed: Speed at which the joints have to bring the contact to the surface, m/s; 0 for no demand.
         collision: Keep the links clear of each other, the surface, the ground and the obstacles.
-        clearance: Least distance of all of these, m.
-        surface: ``plane``, ``none``, or the edge length of a square patch in m; ``None`` to decide by the robot.
+        clearance: Least distance between any two of these, m.
+        surface: ``plane``, ``none``, or the edge length of a square patch in m; ``None`` to choose by the robot.
+
         obstacles: Bodies in the world.
         limit_margin: Distance from the joint limits, rad or m.
         regularization: Weight of the squared distance from the initial posture, relative to the initial objective.

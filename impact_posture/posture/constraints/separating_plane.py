@@ -1,4 +1,4 @@
-"""A plane between two bodies as unknowns of the program: a proof that they do not touch.
+"""A plane between two bodies whose existence proves that they do not touch; its coefficients are unknowns.
 
 Two convex bodies do not touch if a plane separates them (S. Boyd and L. Vandenberghe, Convex Optimization, 2004,
 section 2.5).  With the plane ``{y: n·y = c}`` in the axes of body b, sweep radii r and the clearance δ, corners x of
@@ -7,9 +7,9 @@ a and y of b satisfy::
     m·x + d + s ≥ r_a + r_b + δ,      n·y − c ≤ 0,      n·n ≤ 1,
     m = Qᵀn,   d = n·t − c            (Q, t: placement of a in the axes of b)
 
-Every row of a corner is linear in the unknowns (n, c, m, d, s), and only four equations of a pair see the posture.
-The slack s lets a solver start from bodies that penetrate each other.  A half-space has a known plane, and drops n
-and c.  The program has rows of those corners only that a plane could meet.
+Every row of a corner is linear in the unknowns (n, c, m, d, s), and only four equations of a pair depend on the
+posture.  The slack s lets a solver start from bodies that penetrate each other.  A half-space has a known plane, so n
+and c are constants.  The program has rows of those corners only that a plane could meet.
 """
 
 from __future__ import annotations
@@ -30,17 +30,17 @@ from impact_posture.system.arrays import Array
 
 # Number of equations of a pair.
 EQUATIONS = 4
-# Least n·n.  Without it a normal could shrink to zero where bodies penetrate each other, which leaves no way out.
+# Least n·n.  Without it the normal could shrink to zero where bodies penetrate, and the solver would be stuck.
 _SHORT = 0.8
-# A slack starts so far (m) above the penetration, and a normal at this length, inside their bounds.
+# The slack starts this much (m) above the penetration and the normal at this length, both inside their bounds.
 _ABOVE, _LENGTH = 0.01, 0.98
-# Unit (m) of the slack among the unknowns.  At the usual price of a meter its multiplier is then one, which is where
-# IPOPT begins, and a run takes a quarter fewer iterations than with meters.
+# Unit (m) of the slack among the unknowns.  With the usual price of a meter its multiplier is then one, IPOPT's first
+# guess, and a run takes a quarter fewer iterations than with meters.
 _UNIT = 0.02
-# Tangent of the tilt at which more corners of a body get a row, and the sides to which it tilts.
+# Corners get a row if the plane meets them first, also if it is tilted by this tangent to any of eight sides.
 _TILT = 0.5
 _AROUND = np.array([[0.0, 0.0], *[[np.cos(a), np.sin(a)] for a in np.arange(8) * np.pi / 4]])
-# A plane keeps corners on their sides if it cuts off less than this (m), half of what certifies.
+# A plane separates if it cuts off less than this (m) of a body, half of what certifies.
 _KEPT = 5e-9
 # Rows of corners farther than this (m) from their plane have no multiplier.
 _NEAR = 1e-3
@@ -48,14 +48,14 @@ _NEAR = 1e-3
 
 @dataclass(frozen=True, eq=False)
 class ConvexBody:
-    """A swept hull that moves with a link, stands in the world, or moves with a point without turning.
+    """A swept hull or half-space that moves with a link, stands in the world, or follows a point without turning.
 
     Attributes:
         name: Name in messages.
         hull: Corners and sweep radius in the axes of ``point``; ``None`` for the half-space behind a plane.
-        point: The point and axes that carry it; joint 0 is the world.
-        turns: Whether it turns with the link; else it keeps world axes.
-        normal: Unit normal out of the half-space, in the same axes, shape (3,).
+        point: The point and axes that carry the body; joint 0 is the world.
+        turns: Whether the body turns with the link; otherwise it keeps world axes.
+        normal: Unit normal out of the half-space, in the axes of ``point``, shape (3,).
         offset: Height of its plane ``{y: normal·y = offset}``, m.
     """
 
@@ -77,9 +77,9 @@ class ConvexBody:
         return np.zeros(0) if self.normal is None else np.append(self.normal, self.offset)
 
     def placement(self, model: Numeric) -> pin.SE3:
-        """Return the placement of its axes in the world."""
-        found = model.placement(self.point)
-        return found if self.turns else pin.SE3(np.eye(3), found.translation)
+        """Return the placement of the axes of the body in the world."""
+        placement = model.placement(self.point)
+        return placement if self.turns else pin.SE3(np.eye(3), placement.translation)
 
     @property
     def center(self) -> Array:
@@ -113,7 +113,7 @@ class Corners(NamedTuple):
 
 
 class SeparatingPlane:
-    """The rows and unknowns that keep body ``a`` clear of body ``b``.
+    """The rows and unknowns of the plane that keeps body ``a`` clear of body ``b``.
 
     Args:
         a: A swept hull.
@@ -127,7 +127,7 @@ class SeparatingPlane:
         self._x, self._y = a.hull.vertices, np.zeros((0, 3)) if b.hull is None else b.hull.vertices
         self.gap = a.hull.radius + (0.0 if b.hull is None else b.hull.radius) + margin
         self.margin = margin
-        # The last distance, because one posture is looked at several times, and the placements that it is for.
+        # The last distance and the placements of both bodies there: a search evaluates a posture several times.
         self._latest: tuple[pin.SE3, pin.SE3, tuple[float, Array, Array]] | None = None
 
     @property
@@ -145,14 +145,13 @@ class SeparatingPlane:
         return self.b.normal is not None
 
     def bounds(self, corners: Corners) -> tuple[Array, Array]:
-        """Return the bounds of the :meth:`sides`; the rows of :meth:`lift` are :data:`EQUATIONS`."""
-        first, second, own = len(corners.a), len(corners.b), 0 if self.known else 1
-        lower = np.concatenate([np.full(first, self.gap), np.full(second, -np.inf), np.full(own, _SHORT)])
-        upper = np.concatenate([np.full(first, np.inf), np.zeros(second), np.ones(own)])
-        return lower, upper
+        """Return the bounds of the :meth:`sides`; the :data:`EQUATIONS` of :meth:`lift` are zero."""
+        of_a, of_b, normal = len(corners.a), len(corners.b), [] if self.known else [1.0]
+        lower = np.array([*[self.gap] * of_a, *[-np.inf] * of_b, *[_SHORT] * len(normal)])
+        return lower, np.array([*[np.inf] * of_a, *[0.0] * of_b, *normal])
 
     def content(self, corners: Corners) -> str:
-        """Return a text with everything that shapes the rows, but a known plane, which is a parameter."""
+        """Return a text of all numbers in the rows except a known plane, which is a parameter."""
         bodies = [(b.point.joint, b.point.position.tolist(), b.point.rotation.tolist()) for b in (self.a, self.b)]
         points = self._x[sorted(corners.a)].tolist(), self._y[sorted(corners.b)].tolist()
         return repr((bodies, self.b.turns, self.known, points))
@@ -165,12 +164,11 @@ class SeparatingPlane:
         Args:
             tree: The dynamics at the posture.
             label: End of the names of the unknowns.
-            known: ``n, c`` of a half-space, shape (4, 1); empty without one.
+            known: ``n, c`` of a half-space, shape (4, 1); not used for a swept hull.
         """
         plane = ca.SX(0, 1) if self.known else ca.SX.sym(f"plane{label}", 4)
         m, d, s = ca.SX.sym(f"m{label}", 3), ca.SX.sym(f"d{label}"), ca.SX.sym(f"s{label}")
-        both = known if self.known else plane
-        n, c = both[:3], both[3]
+        n, c = ca.vertsplit(known if self.known else plane, [0, 3, 4])
         Q, t = self._relative(tree)
         return LiftedRows(ca.vertcat(m - Q.T @ n, d - (ca.dot(n, t) - c)), ca.vertcat(plane, m, d, s), _UNIT * s)
 
@@ -184,7 +182,7 @@ class SeparatingPlane:
         return ca.vertcat(*rows)
 
     def corners(self, model: Numeric) -> Corners:
-        """Return the corners that a plane between the closest points meets first, as it is and tilted a little."""
+        """Return the corners that a plane between the closest points meets first, also if it is tilted."""
         normal = self.distance(model)[1]
         across = np.linalg.svd(normal[None])[2][1:]
         directions = normal + _TILT * _AROUND @ across
@@ -196,13 +194,12 @@ class SeparatingPlane:
 
     @property
     def every_corner(self) -> Corners:
-        """All corners of both bodies; none of a body in front of a known plane, which is the one that it has."""
-        if self.known:
-            return Corners(frozenset(), frozenset())
-        return Corners(frozenset(range(len(self._x))), frozenset(range(len(self._y))))
+        """All corners of both bodies; none where the plane is known, because the closest corner then suffices."""
+        first, second = (0, 0) if self.known else (len(self._x), len(self._y))
+        return Corners(frozenset(range(first)), frozenset(range(second)))
 
     def _relative(self, tree: Tree) -> tuple[ca.SX, ca.SX]:
-        """Placement of ``a`` in the axes of ``b``."""
+        """Return the rotation and position of ``a`` in the axes of ``b``."""
         if self.b.turns:
             R, p = tree.relative(self.b.point.joint, self.a.point.joint)
             axes = ca.SX(self.b.point.rotation).T
@@ -211,7 +208,7 @@ class SeparatingPlane:
         return R, p - tree.position(self.b.point)
 
     def distance(self, model: Numeric) -> tuple[float, Array, Array]:
-        """Return the distance less the clearance, the normal from b to a, the closest points (2, 3), in the world."""
+        """Return distance less clearance, normal from b to a, and closest points, shape (2, 3), in world axes."""
         at_a, at_b = self.a.placement(model), self.b.placement(model)
         if self._latest is None or self._latest[0] != at_a or self._latest[1] != at_b:
             self._latest = at_a, at_b, self._distance(at_a, at_b)
@@ -220,8 +217,8 @@ class SeparatingPlane:
     def _distance(self, at_a: pin.SE3, at_b: pin.SE3) -> tuple[float, Array, Array]:
         if self.b.hull is not None:
             assert self.a.hull is not None  # noqa: S101 (narrows a type)
-            found = separation(self.a.hull, at_a, self.b.hull, at_b)
-            return found.distance - self.margin, found.normal, np.array([found.point_a, found.point_b])
+            nearest = separation(self.a.hull, at_a, self.b.hull, at_b)
+            return nearest.distance - self.margin, nearest.normal, np.array([nearest.point_a, nearest.point_b])
         n = at_b.rotation @ self.b.normal
         points = self._x @ at_a.rotation.T + at_a.translation
         heights = (points - at_b.translation) @ n - self.b.offset
@@ -243,7 +240,7 @@ class SeparatingPlane:
         return Guess(values, lower)
 
     def _plane(self, at_b: pin.SE3, relative: pin.SE3, normal: Array) -> tuple[Array, float]:
-        """The plane in the axes of ``b`` with a world normal, in the middle between the swept bodies."""
+        """Return ``n, c`` of the plane with a world normal in the middle between the bodies, in the axes of ``b``."""
         if self.b.normal is not None:
             return self.b.normal, self.b.offset
         n = normal @ at_b.rotation
@@ -255,13 +252,13 @@ class SeparatingPlane:
 
         Args:
             model: The model at the posture.
-            unknowns: Those of :meth:`lift`; ``None`` for the plane between the closest points.
+            unknowns: Unknowns of :meth:`lift`; ``None`` for the plane between the closest points.
         """
         if unknowns is not None and not self.known:
-            found = self.linearize_at(model, unknowns[:3], float(unknowns[3]))
-            # A plane of the program may cut corners that have no row there, and then the pair is not active.
-            if max((found.lower - found.value).max(), (found.value - found.upper).max()) <= _KEPT:
-                return found
+            rows = self.linearize_at(model, unknowns[:3], float(unknowns[3]))
+            # The plane of the program may cut corners that have no row there, and then the pair is not active.
+            if max((rows.lower - rows.value).max(), (rows.value - rows.upper).max()) <= _KEPT:
+                return rows
         at_b = self.b.placement(model)
         relative = at_b.actInv(self.a.placement(model))
         return self.linearize_at(model, *self._plane(at_b, relative, self.distance(model)[1]))
@@ -270,24 +267,23 @@ class SeparatingPlane:
         """Return the rows for the plane ``{y: n·y = c}`` in the axes of body b."""
         at_a, at_b, nv = self.a.placement(model), self.b.placement(model), model.model.nv
         corners = self._x @ at_a.rotation.T + at_a.translation
-        seen = (corners - at_b.translation) @ at_b.rotation
-        near = seen @ n - c < self.gap + _NEAR
-        corners, seen = corners[near], seen[near]
+        in_b = (corners - at_b.translation) @ at_b.rotation
+        near = in_b @ n - c < self.gap + _NEAR
+        corners, in_b = corners[near], in_b[near]
         world = at_b.rotation @ n
         rates = self.a.rates(model, world, corners) - self.b.rates(model, world, corners)
-        first, infinite = len(seen), np.inf
-        names = [self.name] * first
+        first = len(in_b)
+        names, lower, upper = [self.name] * first, np.full(first, self.gap), np.full(first, np.inf)
         if self.known:
-            lower, upper = np.full(first, self.gap), np.full(first, infinite)
-            return Linearization(names, seen @ n - c, lower, upper, rates, np.zeros((first, 0)))
-        own = self._y[self._y @ n - c > -_NEAR]
-        others = len(own) + 1
-        plane = np.vstack([np.c_[seen, -np.ones(first)], np.c_[own, -np.ones(len(own))], [[*(2 * n), 0.0]]])
+            return Linearization(names, in_b @ n - c, lower, upper, rates, np.zeros((first, 0)))
+        of_b = self._y[self._y @ n - c > -_NEAR]
+        more = len(of_b) + 1
+        of_plane = [np.c_[in_b, -np.ones(first)], np.c_[of_b, -np.ones(len(of_b))], [[*(2 * n), 0.0]]]
         return Linearization(
-            names=[*names, *[""] * others],
-            value=np.concatenate([seen @ n - c, own @ n - c, [n @ n]]),
-            lower=np.concatenate([np.full(first, self.gap), np.full(others, -infinite)]),
-            upper=np.concatenate([np.full(first, infinite), np.zeros(len(own)), [1.0]]),
-            posture=np.vstack([rates, np.zeros((others, nv))]),
-            auxiliary=plane,
+            names=[*names, *[""] * more],
+            value=np.concatenate([in_b @ n - c, of_b @ n - c, [n @ n]]),
+            lower=np.append(lower, np.full(more, -np.inf)),
+            upper=np.concatenate([upper, np.zeros(len(of_b)), [1.0]]),
+            posture=np.vstack([rates, np.zeros((more, nv))]),
+            auxiliary=np.vstack(of_plane),
         )

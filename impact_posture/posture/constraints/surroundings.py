@@ -1,4 +1,4 @@
-"""What the robot must stay clear of: itself, the surface that it strikes, the ground under its feet, obstacles."""
+"""The bodies that the robot must not touch: its own links, the struck surface, the ground and obstacles."""
 
 from __future__ import annotations
 
@@ -26,17 +26,17 @@ from impact_posture.robot.robot import Robot
 from impact_posture.robot.robot_spec import Support
 from impact_posture.system.arrays import Array
 
-# A contact point this near (m) to a plane lies in it.
+# A contact point this near (m) to a plane lies in the plane.
 _BESIDE = 0.03
 # Least cosine between the normals of contacts at the same surface.
 _PARALLEL = 0.999
-# A body that cannot move and lies this far (m) behind the plane of the surface shows that the surface ends before it.
+# A fixed body farther (m) behind the plane of the surface shows that the surface ends before it.
 _BEHIND = 1e-3
 
 
 @dataclass(frozen=True, eq=False)
 class _Wall:
-    """A plane or a body that the links must stay clear of, but those that are exempt."""
+    """A plane or body that the links must stay clear of, except the links of the exempt joints."""
 
     body: ConvexBody
     exempt: frozenset[int]
@@ -62,26 +62,23 @@ class Surroundings:
         self._depths: dict[ImpactContact, float] = {}
         self.notes: list[str] = list(self.shapes.warnings)
         if touching := self.shapes.always_touching:
-            self.notes.append(
-                f"{len(touching)} pairs of shapes may touch, because they do so at most postures: "
-                + ", ".join(" / ".join(pair) for pair in touching[:3])
-                + (", …" if len(touching) > 3 else "")
-            )
+            pairs = [*(" / ".join(pair) for pair in touching[:3]), *["…"] * (len(touching) > 3)]
+            text = "pairs of shapes may touch, because they do so at most postures"
+            self.notes.append(f"{len(touching)} {text}: {', '.join(pairs)}")
 
-    # ---- what is there ----------------------------------------------------------------------------------------
+    # ---- bodies -----------------------------------------------------------------------------------------------
 
     def add_ground(self, supports: Sequence[Support], struck: Sequence[ImpactContact]) -> None:
-        """Put level ground under the lowest foot; the feet and the links that are struck may touch it."""
+        """Put level ground under the lowest foot; the feet and the struck links may touch it."""
         if not supports:
             return
         feet = [point_on(self.robot, s.frame, s.offset) for s in supports]
         height = min(float(self._numeric.placement(foot).translation[2]) for foot in feet)
         self._still |= self._rigid(foot.joint for foot in feet)
         touching = [foot.joint for foot in feet] + [point_on(self.robot, c.frame).joint for c in struck]
-        exempt = self._rigid([0, *touching])
         up = np.array([0.0, 0.0, 1.0])
-        body = ConvexBody("ground", None, PointOnLink(0, np.array([0.0, 0.0, height]), np.eye(3)), normal=up)
-        self._walls.append(_Wall(body, exempt))
+        body = ConvexBody("ground", None, PointOnLink(0, height * up, np.eye(3)), normal=up)
+        self._walls.append(_Wall(body, self._rigid([0, *touching])))
 
     def add_surface(
         self,
@@ -92,15 +89,14 @@ class Surroundings:
     ) -> None:
         """Put the surface behind a contact: the whole plane, or a square patch of it.
 
-        The plane passes through the contact point, or behind the link of the contact (with what held joints fix to
-        it) if that reaches farther at the given posture.  This link may touch it, and so may a link whose own contact
-        lies in the plane, such as a foot beside the one that is struck, or that meets the same surface, such as the
-        other hand at a wall.  The surface is a patch as well if a foot or a fixed base lies behind the plane, because
-        then it ends before it reaches there.
+        The plane passes through the contact point, or behind the contact link and all links fixed to it, whichever
+        lies deeper at the given posture.  These links may touch the surface.  So may a link whose own contact lies in
+        the plane, such as a foot beside the struck one, or at the same surface, such as the other hand at a wall.  If
+        a foot or a fixed base lies behind the plane, the surface must end before it, and becomes a patch.
 
         Args:
             contact: The contact.
-            width: Edge length of the patch, m; infinite for the plane, ``None`` to decide.
+            width: Edge length of the patch, m; infinite for the plane, ``None`` to choose.
             feet: Contact points of the feet.
             contacts: Contacts that act at the same time.
         """
@@ -109,9 +105,8 @@ class Surroundings:
         n = np.array(contact.normal)
         name = f"surface at {contact.frame}"
         exempt = self._rigid([point.joint])
-        own = [b for b in self._bodies if b.point.joint in exempt]
         through = ConvexBody(name, None, point, turns, n)
-        depth = max([0.0, *[-self._height(body, through) for body in own]])
+        depth = max([0.0, *[-self._height(b, through) for b in self._bodies if b.point.joint in exempt]])
         self._depths[contact] = depth
         plane = replace(through, offset=-depth)
         beside = [foot for foot in feet if abs(self._above(foot, plane)) < _BESIDE]
@@ -119,7 +114,7 @@ class Surroundings:
             # Links of the same kind reach equally far behind their contact points, where the surface is.
             facing = self._world_normal(contact) @ self._world_normal(other) > _PARALLEL
             at = point_on(self.robot, other.frame, other.offset)
-            if any(abs(self._above(at, one)) < _BESIDE for one in ((plane, through) if facing else (plane,))):
+            if any(abs(self._above(at, face)) < _BESIDE for face in ((plane, through) if facing else (plane,))):
                 beside.append(at)
         exempt |= self._rigid(at.joint for at in beside)
         behind = self._stands_behind(plane, exempt)
@@ -137,10 +132,10 @@ class Surroundings:
         self._walls.append(_Wall(ConvexBody(name, hull, point, turns), exempt))
 
     def add_obstacles(self, obstacles: Sequence[Obstacle]) -> None:
-        """Add bodies that stand in the world; links that cannot move either may touch them.
+        """Add bodies that stand in the world; links that cannot move may touch them.
 
         Raises:
-            InputError: Two bodies have one name, which messages could not tell apart.
+            InputError: Two bodies have the same name, so messages could not tell them apart.
         """
         taken = {body.name for body in self._bodies} | {wall.body.name for wall in self._walls}
         for obstacle in obstacles:
@@ -152,39 +147,37 @@ class Surroundings:
             self._walls.append(_Wall(ConvexBody.of_link(obstacle_hull(obstacle)), self._rigid([0])))
 
     def depth(self, contact: ImpactContact) -> float:
-        """Return how far behind the contact point the surface lies, m; zero where a contact has no surface."""
+        """Return the distance of the surface behind the contact point, m; zero if a contact has no surface."""
         return self._depths.get(contact, 0.0)
 
-    # ---- what follows -----------------------------------------------------------------------------------------
+    # ---- constraints and checks -------------------------------------------------------------------------------
 
     @cached_property
     def nested(self) -> list[NestedLinks]:
-        """Return the constraints of links in each other's hollows."""
+        """Constraints of links whose hulls overlap (:class:`NestedLinks`)."""
         return [NestedLinks(self.robot, planes) for planes in self.shapes.joint_planes if len(planes.bounds)]
 
     @cached_property
     def constraints(self) -> list[Clearance]:
-        """Return one constraint for the links among themselves, and one for each wall."""
+        """One constraint for the links among themselves, and one for each wall."""
         near = f"at least {1e3 * self._clearance:g} mm apart"
         pairs = [SeparatingPlane(self._bodies[i], self._bodies[j], self._clearance) for i, j in self.shapes.pairs]
         groups = [("self-collision", pairs, f"links {near} ({len(pairs)} pairs)")]
         for wall in self._walls:
-            apart = [
-                SeparatingPlane(body, wall.body, self._clearance)
-                for body in self._bodies
-                if body.point.joint not in wall.exempt
-            ]
-            groups.append((wall.body.name, apart, f"links and {wall.body.name} {near}"))
-        # All are needed at each posture that one is needed at.
-        distances, first, found = PairDistances([one for _, own, _ in groups for one in own]), 0, []
-        for name, own, words in groups:
-            if own:
-                found.append(Clearance(name, own, words, distances=(distances, range(first, first + len(own)))))
-                first += len(own)
-        return found
+            apart = [b for b in self._bodies if b.point.joint not in wall.exempt]
+            pairs = [SeparatingPlane(body, wall.body, self._clearance) for body in apart]
+            groups.append((wall.body.name, pairs, f"links and {wall.body.name} {near}"))
+        # A posture that needs the distances of one group needs all of them.
+        distances, first, constraints = PairDistances([pair for _, pairs, _ in groups for pair in pairs]), 0, []
+        for name, pairs, text in groups:
+            if pairs:
+                indices = range(first, first + len(pairs))
+                constraints.append(Clearance(name, pairs, text, distances=(distances, indices)))
+                first += len(pairs)
+        return constraints
 
     def closest(self, q: Array) -> dict[str, object]:
-        """Return the bodies that are closest at ``q``, and their distance, m."""
+        """Return the closest bodies at ``q`` and their distance, m."""
         numeric = self._moving.at(q)
         name, value = min((c.closest(numeric) for c in self.constraints), key=lambda pair: pair[1])
         return {"closest": name, "distance": value + self._clearance}
@@ -202,13 +195,13 @@ class Surroundings:
         }
 
     def collisions(self, q: Array) -> list[tuple[str, str]]:
-        """Return the original shapes that touch each other, the surface, the ground or an obstacle at ``q``."""
+        """Return pairs of original shapes that touch at ``q``, with the surface, the ground and obstacles."""
         planes, solids = self.walls_at(q)
         return self._meshes.collisions(q, solids, planes)
 
     @cached_property
     def _moving(self) -> Numeric:
-        """The model at the posture that is looked at last, because the other one stays at the given posture."""
+        """A second model for other postures, because the first stays at the given posture."""
         return Numeric(self.robot.model)
 
     @cached_property
@@ -216,10 +209,7 @@ class Surroundings:
         return MeshCheck(self.robot, self.shapes)
 
     def walls_at(self, q: Array) -> tuple[list[HalfSpace], list[tuple[SweptHull, pin.SE3, frozenset[int]]]]:
-        """Return the planes and the bodies, with their placements, that the links stay clear of at ``q``.
-
-        Each comes with its exempt joints.
-        """
+        """Return the planes, and the bodies with placements, around the robot at ``q``, with their exempt joints."""
         numeric, planes, solids = self._moving.at(q), [], []
         for wall in self._walls:
             at = wall.body.placement(numeric)
@@ -230,37 +220,32 @@ class Surroundings:
                 solids.append((wall.body.hull, at, wall.exempt))
         return planes, solids
 
-    def _stands_behind(self, plane: ConvexBody, exempt: frozenset[int]) -> str:
-        """Name something that cannot move and lies behind a plane: a foot, or the place of a fixed base."""
-        still = (b for b in self._bodies if self._is_still(b) and b.point.joint not in exempt)
-        behind = [b.name for b in still if self._height(b, plane) < -_BEHIND]
-        if not behind and not self.robot.floating:
-            root = SweptHull("the base", "", 0, np.array([self.robot.model.jointPlacements[1].translation]), 0.0)
-            behind = ["the base"] if self._height(ConvexBody.of_link(root), plane) < -_BEHIND else []
-        return behind[0] if behind else ""
-
     # ---- helpers ----------------------------------------------------------------------------------------------
 
+    def _stands_behind(self, plane: ConvexBody, exempt: frozenset[int]) -> str:
+        """Return the name of a fixed body behind a plane, which may be a foot or the base; empty if there is none."""
+        still = self._still | self._rigid([0])
+        for body in self._bodies:
+            joint = body.point.joint
+            if joint in still and joint not in exempt and self._height(body, plane) < -_BEHIND:
+                return body.name
+        root = PointOnLink(0, self.robot.model.jointPlacements[1].translation, np.eye(3))
+        return "the base" if not self.robot.floating and self._above(root, plane) < -_BEHIND else ""
+
     def _rigid(self, joints: Iterable[int]) -> frozenset[int]:
-        """The joints whose links do not move relative to one of these."""
+        """Return all joints whose links are fixed relative to the link of one of ``joints``."""
         groups = {self._group[joint] for joint in joints}
         return frozenset(k for k, group in enumerate(self._group) if group in groups)
 
-    def _is_fixed(self, body: ConvexBody) -> bool:
-        return self._group[body.point.joint] == self._group[0]
-
-    def _is_still(self, body: ConvexBody) -> bool:
-        return self._is_fixed(body) or body.point.joint in self._still
-
     def _world_normal(self, contact: ImpactContact) -> Array:
-        """Normal of a contact at the given posture, world, shape (3,)."""
+        """Return the normal of a contact at the given posture, world, shape (3,)."""
         n = np.array(contact.normal)
         if contact.normal_frame == "world":
             return n
         return np.asarray(self._numeric.placement(point_on(self.robot, contact.frame, contact.offset)).rotation @ n)
 
     def _above(self, point: PointOnLink, plane: ConvexBody) -> float:
-        """Height of a point above a plane."""
+        """Return the height of a point above a plane, m."""
         hull = SweptHull("", "", point.joint, np.array([point.position]), 0.0)
         return self._height(ConvexBody.of_link(hull), plane)
 
@@ -269,7 +254,7 @@ class Surroundings:
 
 
 def _rigid_groups(robot: Robot, held: Sequence[str]) -> list[int]:
-    """The group of each joint of the model; links of one group do not move relative to each other."""
+    """Return the group of each joint; links of a group do not move relative to each other."""
     fixed = {robot.joint_id(joint) for joint in held}
     group = list(range(robot.model.njoints))
     for joint in range(1, robot.model.njoints):
@@ -279,7 +264,7 @@ def _rigid_groups(robot: Robot, held: Sequence[str]) -> list[int]:
 
 
 def _box_behind(n: Array, width: float) -> Array:
-    """Corners of a box behind a plane, one face of which is a square of the plane around the origin, shape (8, 3)."""
+    """Return the corners of a box behind the plane through the origin, with a face in the plane, shape (8, 3)."""
     turn = pin.Quaternion.FromTwoVectors(np.array([0.0, 0.0, 1.0]), n).matrix()
     signs = np.array([[x, y, z] for x in (-1, 1) for y in (-1, 1) for z in (-2, 0)]) * width / 2
     return np.asarray(signs @ turn.T)

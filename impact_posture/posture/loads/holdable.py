@@ -54,26 +54,21 @@ class Holdable(Constraint):
         self.upper = np.zeros(1 + len(self._names))
 
     def describe(self) -> str:
-        """See :class:`Constraint`."""
         return self._words
 
     @property
     def structure(self) -> str:
-        """See :class:`Constraint`."""
         return (
             f"{super().structure}:{_digest(np.column_stack([self._rest.rows, self._rest.offset]), self._rest.load)}"
         )
 
     def row_name(self, row: int) -> str:
-        """See :class:`Constraint`."""
         return self._names[row - 1] if row else self._balance
 
     def conflicts(self, excess: Array) -> dict[str, float]:
-        """See :class:`Constraint`."""
         return {self.row_name(int(row)): float(excess[row]) for row in np.flatnonzero(excess)}
 
     def evaluate(self, model: Numeric) -> tuple[Array, Array]:
-        """See :class:`Constraint`."""
         found = self._rest.distribute(model.q)
         # No torque is known without a balance.
         shares = np.full(len(self._names), -1.0) if found.unbalanced else np.abs(found.shares) - 1
@@ -84,7 +79,6 @@ class Holdable(Constraint):
         return np.zeros(self.rows) if self._rest.spares(model.q, 0.0) else self.evaluate(model)[0]
 
     def grown(self, model: Numeric, auxiliaries: Array | None = None) -> Self:
-        """See :class:`Constraint`."""
         if self.active or self.value(model).max() <= _KEPT:
             return self
         return type(self)(self._load, self._rest, self._words, active=True)
@@ -99,11 +93,9 @@ class Holdable(Constraint):
 
     @property
     def lifted_bounds(self) -> tuple[Array, Array]:
-        """See :class:`Constraint`."""
         return self._bounds if self.active else (np.zeros(0), np.zeros(0))
 
     def lift(self, tree: Tree, parameters: ca.SX) -> LiftedRows:
-        """See :class:`Constraint`."""
         if not self.active:
             return LiftedRows(ca.SX(0, 1))
         rest, load = self._rest, self._rest.load
@@ -113,11 +105,9 @@ class Holdable(Constraint):
 
     @property
     def unknowns(self) -> int:
-        """See :class:`Constraint`."""
         return self._rest.load.count if self.active else 0
 
     def guess(self, model: Numeric) -> Guess:
-        """See :class:`Constraint`."""
         if not self.active:
             return Guess(np.zeros(0), np.zeros(0))
         load = self._rest.load
@@ -168,20 +158,16 @@ class ReachableWrench(ExpressionConstraint):
 
     @property
     def structure(self) -> str:
-        """See :class:`Constraint`."""
         return f"{super().structure}:{_digest(self._rows, self._load)}"
 
     def describe(self) -> str:
-        """See :class:`Constraint`."""
         return f"no {self.name}"
 
     def symbolic(self, tree: Tree, parameters: ca.SX) -> ca.SX:
-        """See :class:`Constraint`."""
         own = tree if tree.model is self._load.model else Tree(self._load.model, tree.q)
         return _rows(self._rows) @ self._load.symbolic(own, ca.SX(0, 1))
 
     def evaluate(self, model: Numeric) -> tuple[Array, Array]:
-        """See :class:`Constraint`."""
         torque = self._load.torque(model.q, np.zeros(0))
         return self._rows @ torque.value, self._rows @ torque.by_posture
 
