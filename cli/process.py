@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import atexit
 import os
 import resource
 import signal
@@ -13,8 +12,6 @@ from typing import NoReturn
 
 _WORDS = {signal.SIGINT: "interrupted", signal.SIGTERM: "terminated", signal.SIGHUP: "the terminal was closed"}
 _SEEN: list[int] = []
-# The exit code of a process that has done its work.
-_CODE: list[int] = []
 # Below this limit on the address space OpenBLAS may wait forever for memory while SciPy is imported.
 _LEAST_MEMORY = 1 << 30
 
@@ -30,26 +27,13 @@ def prepare() -> None:
         # Ignored signals stay ignored: by nohup, and for background jobs of a shell.
         if signal.getsignal(number) is not signal.SIG_IGN:
             signal.signal(number, _end)
-    # What is registered first runs last.
-    atexit.register(_vanish)
 
 
 def finish(code: int) -> NoReturn:
     """End with an exit code, and ignore signals from now on, because the interpreter restores their default."""
     for number in _WORDS:
         signal.signal(number, signal.SIG_IGN)
-    _CODE.append(code)
     sys.exit(code)
-
-
-def _vanish() -> None:
-    """End at once, because to free the expressions of a large robot one by one takes 0.15 s."""
-    if not _CODE:
-        return
-    for stream in (sys.stdout, sys.stderr):
-        with suppress(OSError, ValueError):
-            stream.flush()
-    os._exit(_CODE[0])
 
 
 def memory_fault() -> str:

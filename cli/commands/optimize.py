@@ -50,61 +50,55 @@ def optimize(
     gc.set_threshold(*_RARELY)
     settings = _settings(robot, given)
     _refuse_idle(given, settings)
-    from impact_posture.output.early_writer import early_writer
+    from impact_posture.api.posture_problem import PostureProblem
+    from impact_posture.api.posture_result import optimize as solve
+    from impact_posture.output.result_folder import FORMATS, default_out
+    from impact_posture.posture.formulation.problem_file import prepare
+    from impact_posture.system.output_folder import check_output
 
-    with early_writer(settings, jobs, report=not no_report, meshes=meshes) as finish:
-        from impact_posture.api.posture_problem import PostureProblem
-        from impact_posture.api.posture_result import optimize as solve
-        from impact_posture.output.result_folder import FORMATS, default_out
-        from impact_posture.posture.formulation.problem_file import prepare
-        from impact_posture.system.output_folder import check_output
+    if settings.path:
+        from impact_posture.path.posture_path import check_package
 
-        if settings.path:
-            from impact_posture.path.posture_path import check_package
-
-            check_package()
-        page, shown = Page(quiet=quiet or json), not (quiet or json)
-        # The shapes of a large robot are fitted once, which can take some seconds.
-        with progress("preparing", "", shown=shown):
-            prepared = prepare(settings)
-        folder = Path(out) if out else default_out(prepared)
-        check_output(folder, force=force, kind="result")
-        announce(page, prepared)
-        with progress("solving", "starts", shown=shown, first="building the expressions") as advance:
-            result = solve(
-                PostureProblem.of(prepared),
-                starts=settings.starts,
-                seed=settings.seed,
-                jobs=jobs,
-                compile=compile,
-                search=settings.search,
-                progress=advance,
-                # A path that does not reach the best optimum leads to the next.
-                finish_all=settings.finish_all or settings.path,
-            )
-        if settings.tradeoff:
-            with progress("solving", "points", shown=shown) as advance:
-                result = result.trade_off(
-                    settings.tradeoff, settings.tradeoff_against, compile=compile, progress=advance
-                )
-        if settings.path:
-            with progress("planning", "paths", shown=shown, first="searching a path to the optimum"):
-                result = result.path(seed=settings.seed)
-        if not json:
-            # The result comes first, because figures and C code take longer.
-            summarize(page, prepared, result.solution, result.document)
-        with progress("drawing" if no_codegen else "drawing and compiling", "files", shown=shown) as advance:
-            written = result.save(
-                folder,
-                force=force,
-                codegen=not no_codegen,
-                formats=format or FORMATS,
-                report=not no_report,
-                meshes=meshes,
-                jobs=jobs,
-                progress=advance,
-                finish=finish,
-            )
+        check_package()
+    page, shown = Page(quiet=quiet or json), not (quiet or json)
+    # The shapes of a large robot are fitted once, which can take some seconds.
+    with progress("preparing", "", shown=shown):
+        prepared = prepare(settings)
+    folder = Path(out) if out else default_out(prepared)
+    check_output(folder, force=force, kind="result")
+    announce(page, prepared)
+    with progress("solving", "starts", shown=shown, first="building the expressions") as advance:
+        result = solve(
+            PostureProblem.of(prepared),
+            starts=settings.starts,
+            seed=settings.seed,
+            jobs=jobs,
+            compile=compile,
+            search=settings.search,
+            progress=advance,
+            # A path that does not reach the best optimum leads to the next.
+            finish_all=settings.finish_all or settings.path,
+        )
+    if settings.tradeoff:
+        with progress("solving", "points", shown=shown) as advance:
+            result = result.trade_off(settings.tradeoff, settings.tradeoff_against, compile=compile, progress=advance)
+    if settings.path:
+        with progress("planning", "paths", shown=shown, first="searching a path to the optimum"):
+            result = result.path(seed=settings.seed)
+    if not json:
+        # The result comes first, because figures and C code take longer.
+        summarize(page, prepared, result.solution, result.document)
+    with progress("drawing" if no_codegen else "drawing and compiling", "files", shown=shown) as advance:
+        written = result.save(
+            folder,
+            force=force,
+            codegen=not no_codegen,
+            formats=format or FORMATS,
+            report=not no_report,
+            meshes=meshes,
+            jobs=jobs,
+            progress=advance,
+        )
     if written.compiler_error:
         page.warnings([f"the C code in c/ is written but could not be built: {written.compiler_error}"])
     if written.report_error:

@@ -4,7 +4,7 @@ from __future__ import annotations
 
 from collections.abc import Sequence
 from dataclasses import dataclass, replace
-from functools import cached_property, partial
+from functools import cached_property
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
@@ -14,7 +14,7 @@ from impact_posture.api.posture_problem import PostureProblem
 from impact_posture.config.argument_types import checked
 from impact_posture.config.settings import Against, Search
 from impact_posture.errors import InputError
-from impact_posture.output.result_folder import FORMATS, Finish, FinishRequest, Written, finish_result
+from impact_posture.output.result_folder import FORMATS, Written, finish_result
 from impact_posture.output.result_reader import SolvedPostures, result_view
 from impact_posture.posture.analysis.pareto_front import pareto_front
 from impact_posture.posture.analysis.result_document import result_arrays, result_document
@@ -82,7 +82,7 @@ class PostureResult:
         """The content of ``result.json``.
 
         Raises:
-            InputError: The objective is not that of an impact.
+            InputError: The objective is not an impact objective.
         """
         path = None if self.motion is None else self.motion.to_dict()
         extras = self.robustness, self.tradeoff, path, self.global_search
@@ -97,9 +97,11 @@ class PostureResult:
     @property
     def _prepared(self) -> Prepared:
         if self.problem.prepared is None:
-            # This raises an error that names the remedy.
-            _ = self.problem.problem.impact
-            raise AssertionError
+            raise InputError(
+                f"is '{self.problem.problem.objective.name}', which is not an impact objective",
+                where="objective",
+                hint="give an ImpactObjective",
+            )
         return self.problem.prepared
 
     @checked
@@ -164,7 +166,6 @@ class PostureResult:
         meshes: bool = False,
         jobs: int = 2,
         progress: Progress | None = None,
-        finish: Finish | None = None,
     ) -> Written:
         """Write the result folder: result.json, problem.toml, posture.json, pictures and C code; whole or not at all.
 
@@ -177,8 +178,6 @@ class PostureResult:
             meshes: Whether the page may hold the meshes of the user's own URDF, which it then passes on.
             jobs: Processes that draw and compile side by side.
             progress: Called after each figure, the C code and the report with the numbers done and in all.
-            finish: What draws and compiles; :func:`~impact_posture.output.early_writer.early_writer` by the command
-                line.
 
         Returns:
             The folder, the export in it, and the reason if its C code could not be built.
@@ -187,8 +186,6 @@ class PostureResult:
             OutputError: The folder exists without ``force``, or cannot be written.
         """
         prepared, found = self._prepared, self._found
-        export: Export | None = None
-        compiler_error = report_error = ""
         with whole_folder(Path(out), force=force, kind="result") as folder:
             write_json(folder / "result.json", self.document)
             arrays = result_arrays(self.solution, found.path, self.tradeoff, found.mapped)
@@ -199,15 +196,11 @@ class PostureResult:
                 from impact_posture.path.path_files import write_path
 
                 write_path(folder, prepared.impact.robot, self.motion)
-            request = FinishRequest(folder, found, codegen, formats, report, meshes, jobs)
-            for done, count, result in (finish or partial(finish_result, prepared))(request):
-                if isinstance(result, str):
-                    report_error = result
-                elif result is not None:
-                    export, compiler_error = result
-                if progress:
-                    progress(done, count)
-        return Written(Path(out), export, compiler_error, report_error)
+            written = finish_result(
+                folder, prepared, found, codegen=codegen, formats=formats, report=report, meshes=meshes, jobs=jobs,
+                progress=progress,
+            )  # fmt: skip
+        return replace(written, out=Path(out))
 
     @checked
     def plot(

@@ -68,7 +68,8 @@ def compile_and_check(
     """
     manifest, _ = read_manifest(export_dir / f"{prefix}.json")
     real, worst = REALS[manifest["real"]], 0.0
-    with scratch_folder() as folder:
+    # A killed process leaves its temporary files, which must go with the folder of the result.
+    with scratch_folder(export_dir) as folder:
         if keep or (built := _cached_library(export_dir, prefix)) is None:
             built = build_library(export_dir, prefix, library_path(export_dir if keep else folder, prefix))
         library = load_library(built)

@@ -1,10 +1,10 @@
-"""What finishes a result folder: figures, C code and report, in this process or in another."""
+"""Finish a result folder with its figures, C code and report."""
 
 from __future__ import annotations
 
-from collections.abc import Callable, Iterator, Sequence
+from collections.abc import Callable, Sequence
 from contextlib import suppress
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from functools import partial
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
@@ -12,6 +12,7 @@ from typing import TYPE_CHECKING, Any
 from impact_posture.errors import CompilerError, one_line
 from impact_posture.output.result_reader import SolvedPostures, motion_of, result_view
 from impact_posture.posture.formulation.problem_file import Prepared
+from impact_posture.posture.search.growing_search import Progress
 from impact_posture.system.escape import file_name
 from impact_posture.system.output_folder import write_record
 from impact_posture.system.processes import fork_map
@@ -19,37 +20,9 @@ from impact_posture.system.processes import fork_map
 # Matplotlib and the C export are imported where they are used, because that takes longer than a small problem.
 if TYPE_CHECKING:
     from impact_posture.codegen.export import Export
-    from impact_posture.output.plot import ResultView
     from impact_posture.output.report.report_scene import ReportScene
 
 FORMATS = ("png",)
-
-
-@dataclass(frozen=True, eq=False)
-class FinishRequest:
-    """What :func:`finish_result` draws, exports and reports.  It can be sent to a process.
-
-    Attributes:
-        folder: The folder, with the files of the path to the optimum, if it was searched.
-        found: The solution.
-        codegen: Whether to export, build and check the C code.
-        formats: Formats of the figures.
-        report: Whether to write ``report.html``.
-        meshes: Whether the report may hold the meshes of the user's own URDF.
-        jobs: Processes that draw and compile side by side.
-    """
-
-    folder: Path
-    found: SolvedPostures
-    codegen: bool
-    formats: Sequence[str]
-    report: bool
-    meshes: bool
-    jobs: int
-
-
-Finished = tuple[int, int, "tuple[Export, str] | str | None"]
-Finish = Callable[[FinishRequest], Iterator[Finished]]
 
 
 @dataclass(frozen=True)
@@ -64,7 +37,7 @@ class Written:
     """
 
     out: Path
-    export: Export | None
+    export: Export | None = None
     compiler_error: str = ""
     report_error: str = ""
 
@@ -74,100 +47,91 @@ def default_out(prepared: Prepared) -> Path:
     return Path(file_name(f"{prepared.impact.robot.name}-{prepared.impact.contact.frame}"))
 
 
-def finish_result(prepared: Prepared, request: FinishRequest) -> Iterator[Finished]:
-    """Draw the figures of a result, export its C code and write its report; yield after each.
-
-    Yields:
-        The number of finished files, the number of all files, and what :func:`_export` or :func:`_report` returns if
-        it has ended.
-    """
-    # The C code comes first, because it takes longest.
-    exports = [partial(_export, prepared, request)] if request.codegen else []
-    motion = motion_of(request.folder, request.found.document, prepared.impact.robot)
-    view = result_view(prepared, request.found, motion)
-    tasks: list[Callable[[], Any]] = [*exports, *_drawings(view, request.folder, request.formats, request.report)]
-    count = len(tasks) + request.report
-    scene: ReportScene | None = None
-    pictures: list[tuple[str, str]] = []
-    with fork_map(lambda index: tasks[index](), len(tasks), request.jobs) as results:
-        if request.report:
-            # This process would only wait.  What goes wrong here goes wrong again for the report, which says so.
-            with suppress(Exception):
-                scene = _scene(prepared, view, request.meshes)
-        for done, (index, result) in enumerate(results, start=1):
-            exported = index < len(exports)
-            pictures += [] if exported else result
-            yield done, count, result if exported else None
-    if request.report:
-        # It shows the figures, so it comes last.
-        yield count, count, _report(prepared, view, request, scene, sorted(pictures))
-
-
-def _scene(prepared: Prepared, view: ResultView, meshes: bool) -> ReportScene:
-    """Return the packed scene of the report, and load the viewer."""
-    from impact_posture.output.report.report_page import read_viewer
-    from impact_posture.output.report.result_report import result_scene
-
-    scene = result_scene(prepared, view, meshes)
-    _ = scene.packed
-    read_viewer()
-    return scene
-
-
-def _report(
+def finish_result(
+    folder: Path,
     prepared: Prepared,
-    view: ResultView,
-    request: FinishRequest,
-    scene: ReportScene | None,
-    pictures: Sequence[tuple[str, str]],
-) -> str:
-    """Write the report; return why that failed, because a result is kept without it."""
-    try:
-        from impact_posture.output.report.result_report import write_result_report
+    postures: SolvedPostures,
+    *,
+    codegen: bool,
+    formats: Sequence[str],
+    report: bool,
+    meshes: bool,
+    jobs: int,
+    progress: Progress | None,
+) -> Written:
+    """Draw the figures of a result, export its C code and write its report.
 
-        write_result_report(
-            request.folder,
-            prepared,
-            view,
-            request.found.document,
-            meshes=request.meshes,
-            scene=scene,
-            pictures=pictures,
-        )
-    except Exception as error:
-        return one_line(f"{type(error).__name__}: {error}")
-    return ""
-
-
-def _export(prepared: Prepared, request: FinishRequest) -> tuple[Export, str]:
-    """Write the C export; return it and the reason if it could not be built."""
-    from impact_posture.codegen.c_names import products
-    from impact_posture.codegen.export import export
-    from impact_posture.impact.elasticity.contact_compression import compression
-
-    folder, optimal, failure, impact = request.folder / "c", request.found.optimal, "", prepared.impact
-    folder.mkdir()
-    squeezed = compression(impact.objective, optimal, impact.speed, impact.contact_stiffness)
-    try:
-        made = export(impact.objective, folder, posture=optimal, compression=squeezed)
-    except CompilerError as error:
-        # The posture is kept although the compiler failed. The command line reports the error.
-        failure = error.line
-        made = export(impact.objective, folder, posture=optimal, compression=squeezed, force=True, check=False)
-    # A record of its own lets the export be replaced alone, with the products of its Makefile.
-    write_record(folder, "export", products(made.prefix))
-    return made, failure
-
-
-def _drawings(
-    view: ResultView, folder: Path, formats: Sequence[str], report: bool
-) -> list[Callable[[], list[tuple[str, str]]]]:
-    """Return a function for each figure that draws it, and returns it as the report shows it."""
+    Args:
+        folder: The folder, which holds ``problem.toml`` and the path to the optimum, if a path was searched.
+        prepared: The problem.
+        postures: Its solution.
+        codegen: Whether to export, build and check the C code.
+        formats: Formats of the figures.
+        report: Whether to write ``report.html``.
+        meshes: Whether the report may hold the meshes of the user's own URDF.
+        jobs: Processes that draw and compile side by side.
+        progress: Called with the numbers of finished files and of all files.
+    """
     from impact_posture.output.plot import draw_all, drawable
     from impact_posture.output.report.report_page import figures
+    from impact_posture.output.report.result_report import result_scene, write_result_report
+
+    view = result_view(prepared, postures, motion_of(folder, postures.document, prepared.impact.robot))
 
     def draw(name: str) -> list[tuple[str, str]]:
         drawn = draw_all(view, folder, formats, [name])
         return figures(folder, drawn) if report else []
 
-    return [partial(draw, name) for name in drawable(view)]
+    # The C code comes first, because it takes longest.
+    tasks: list[Callable[[], Any]] = [partial(_export, folder, prepared, postures)] if codegen else []
+    tasks += [partial(draw, name) for name in drawable(view)]
+    count, written = len(tasks) + report, Written(folder)
+    scene: ReportScene | None = None
+    pictures: list[tuple[str, str]] = []
+    with fork_map(lambda index: tasks[index](), len(tasks), jobs) as results:
+        if report:
+            # This process would only wait.  An error occurs again when the report is written.
+            with suppress(Exception):
+                scene = result_scene(prepared, view, meshes)
+                _ = scene.packed
+        for done, (index, result) in enumerate(results, start=1):
+            if codegen and index == 0:
+                written = result
+            else:
+                pictures += result
+            if progress:
+                progress(done, count)
+    if not report:
+        return written
+    report_error = ""
+    try:
+        # The report shows the figures, so it comes last.
+        write_result_report(
+            folder, prepared, view, postures.document, meshes=meshes, scene=scene, pictures=sorted(pictures)
+        )
+    except Exception as error:
+        # A result is kept without its report.
+        report_error = one_line(f"{type(error).__name__}: {error}")
+    if progress:
+        progress(count, count)
+    return replace(written, report_error=report_error)
+
+
+def _export(folder: Path, prepared: Prepared, postures: SolvedPostures) -> Written:
+    """Write the C export, and the reason if it could not be built."""
+    from impact_posture.codegen.c_names import products
+    from impact_posture.codegen.export import export
+    from impact_posture.impact.elasticity.contact_compression import compression
+
+    code, impact, compiler_error = folder / "c", prepared.impact, ""
+    code.mkdir()
+    squeezed = compression(impact.objective, postures.optimal, impact.speed, impact.contact_stiffness)
+    write = partial(export, impact.objective, code, posture=postures.optimal, compression=squeezed)
+    try:
+        exported = write()
+    except CompilerError as error:
+        # The posture is kept although the compiler failed. The command line reports the error.
+        compiler_error, exported = error.line, write(force=True, check=False)
+    # A record of its own lets the export be replaced alone, with the products of its Makefile.
+    write_record(code, "export", products(exported.prefix))
+    return Written(folder, exported, compiler_error)

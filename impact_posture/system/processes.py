@@ -7,14 +7,13 @@ import multiprocessing
 import os
 import signal
 import sys
-from collections.abc import Callable, Iterable, Iterator
+from collections.abc import Callable, Iterator
 from concurrent.futures import BrokenExecutor, Future, ProcessPoolExecutor, as_completed
 from contextlib import contextmanager, suppress
-from typing import Any, NoReturn, TypeVar
+from typing import Any, NoReturn, TypeVar, cast
 
 from impact_posture.errors import WorkerDied
 
-_Request = TypeVar("_Request")
 _Result = TypeVar("_Result")
 
 # Signals by which a user or a system ends a process.  A closed terminal sends SIGHUP.
@@ -141,76 +140,44 @@ def fork_call(function: Callable[[], _Result]) -> Iterator[Callable[[], _Result]
     Raises:
         OSError: The system cannot fork.
     """
-
-    def begin(_: Callable[[], bool]) -> Callable[[None], Iterable[_Result]]:
-        result = function()
-        return lambda _: [result]
-
-    with fork_server(begin) as ask:
-        yield lambda: next(ask(None))
-
-
-@contextmanager
-def fork_server(
-    begin: Callable[[Callable[[], bool]], Callable[[_Request], Iterable[_Result]]],
-) -> Iterator[Callable[[_Request], Iterator[_Result]]]:
-    """Start ``begin`` in a copy of this process, and yield a function that sends one request to what it returns.
-
-    So the copy can do what needs no request, such as imports, while this process finds out what to request.
-    ``begin`` takes a function that tells whether the request has come.  The yielded function yields the results as
-    they come.  Exceptions of the copy are raised there.  The copy does not outlive the block, and not the iteration.
-
-    Raises:
-        OSError: The system cannot fork.
-    """
     if not hasattr(os, "fork"):
         raise OSError("the system cannot fork")
-    ours, theirs = multiprocessing.Pipe()
+    receiver, sender = multiprocessing.Pipe(duplex=False)
     with signals_held():
         parent, child = os.getpid(), os.fork()
         if child == 0:
-            ours.close()
+            receiver.close()
             depend(parent)
-            _serve(begin, theirs)
-    theirs.close()
-    running = [child]
+            _send_result(function, sender)
+    sender.close()
 
     def kill() -> None:
-        with suppress(ProcessLookupError, ChildProcessError):
-            for pid in running:
-                os.kill(pid, signal.SIGKILL)
-                os.waitpid(pid, 0)
-        running.clear()
+        # After the first call, another process may have this number.
+        with suppress(ChildProcessError):
+            if os.waitpid(child, os.WNOHANG) == (0, 0):
+                os.kill(child, signal.SIGKILL)
+                os.waitpid(child, 0)
 
-    def ask(request: _Request) -> Iterator[_Result]:
-        # What the copy writes may lie in a folder that is removed on a signal.  So the copy must end before that.
-        with undone(kill):
-            try:
-                ours.send(request)
-                while (message := ours.recv()) is not None:
-                    good, result = message
-                    if not good:
-                        raise result
-                    yield result
-            except (EOFError, BrokenPipeError, ConnectionResetError):
-                raise OSError("a process that was forked has died") from None
-
-    with undone(kill):
+    def collect() -> _Result:
         try:
-            yield ask
-        finally:
-            ours.close()
+            error, result = receiver.recv()
+        except (EOFError, ConnectionResetError):
+            raise OSError("a process that was forked has died") from None
+        if error is not None:
+            raise error
+        return cast(_Result, result)
+
+    with undone(kill), receiver:
+        yield collect
 
 
-def _serve(begin: Callable[[Callable[[], bool]], Callable[[Any], Iterable[Any]]], channel: Any) -> NoReturn:
-    """Run in the copy: send the results, and end without the clean-up of the original."""
+def _send_result(function: Callable[[], Any], sender: Any) -> NoReturn:
+    """Run in the copy: send the error and the result, and end without the clean-up of the original."""
     try:
         try:
-            for result in begin(channel.poll)(channel.recv()):
-                channel.send((True, result))
-            channel.send(None)
+            sender.send((None, function()))
         except BaseException as error:
-            channel.send((False, error))
+            sender.send((error, None))
     finally:
         os._exit(0)
 

@@ -233,7 +233,7 @@ def test_an_objective_from_outside_is_optimized_and_cannot_be_saved(tmp_path: Pa
         ip.PostureProblem(JointDistance(ip.load_robot("ur5"), (0.3, -1.0, 1.0, 0.2, 0.1, 0.0))), starts=2, jobs=1
     )
     assert found.reduction > 0
-    with pytest.raises(InputError, match="not that of an impact"):
+    with pytest.raises(InputError, match="not an impact objective"):
         found.save(tmp_path / "out")
     assert not (tmp_path / "out").exists()
 

@@ -12,7 +12,6 @@ import numpy as np
 import pytest
 
 from impact_posture.errors import InputError, OutputError
-from impact_posture.output import result_folder
 from impact_posture.output.plot import FIGURES, FORMATS, FigureNotFound, ResultView, draw_all, postures_figure
 from impact_posture.output.plot.classical_figure import classical_figure
 from impact_posture.output.plot.ellipsoid_figure import ellipsoid_figure
@@ -20,6 +19,7 @@ from impact_posture.output.plot.jump_figure import jump_figure
 from impact_posture.output.plot.path_figures import path_figure, tradeoff_figure
 from impact_posture.output.plot.self_motion_figure import self_motion_figure
 from impact_posture.output.plot.style import WIDTH
+from impact_posture.output.report.report_page import figures
 from tests.output.page import defects
 from tests.output.views import PENDULUM, make_view, text_of
 
@@ -177,15 +177,14 @@ def test_bad_input(pendulum: ResultView, panda: ResultView, tmp_path: Path) -> N
     assert [p.name for p in tmp_path.iterdir()] == ["file"]
 
 
-def test_a_figure_is_drawn_while_the_temporary_folders_of_others_vanish(
-    tmp_path: Path, tilthex: ResultView, monkeypatch: pytest.MonkeyPatch
+def test_a_figure_is_read_while_the_temporary_folders_of_others_vanish(
+    tmp_path: Path, pendulum: ResultView, monkeypatch: pytest.MonkeyPatch
 ) -> None:
-    """Another process had just removed its folder when this one came to search in it."""
+    """Searching the folder fails where another process has just removed a temporary folder in it."""
 
     def vanished(folder: Path, pattern: str) -> Iterator[Path]:
         raise FileNotFoundError(folder / f".impact-posture-gone/{pattern}")
 
     monkeypatch.setattr(Path, "rglob", vanished)
-    drawings = result_folder._drawings(tilthex, tmp_path, ("png",), True)
-    ((name, address),) = drawings[-1]()
-    assert (tmp_path / f"{name}.png").is_file() and address.startswith("data:image/png;base64,")
+    ((name, address),) = figures(tmp_path, draw_all(pendulum, tmp_path, only=["jump"]))
+    assert name == "jump" and address.startswith("data:image/png;base64,")

@@ -144,7 +144,7 @@ def test_a_result_is_kept_without_its_report(tmp_path: Path, monkeypatch: pytest
     result = ip.optimize(
         ip.PostureProblem(ip.ImpactObjective(robot, ip.ImpactContact("ee", (0, 0, 1)))), starts=1, jobs=1
     )
-    monkeypatch.setattr("impact_posture.output.result_folder._drawings", lambda *_: [])
+    monkeypatch.setattr("impact_posture.output.plot.drawable", lambda *_: [])
     with monkeypatch.context() as patch:
         patch.setattr("impact_posture.output.report.result_report.write_page", fail)
         written = result.save(tmp_path / "out", codegen=False, jobs=1)
@@ -165,7 +165,7 @@ def test_parameters_are_options_on_the_page(scene: ReportScene) -> None:
 
 
 def test_every_contact_is_shown(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
-    monkeypatch.setattr("impact_posture.output.result_folder._drawings", lambda *_: [])
+    monkeypatch.setattr("impact_posture.output.plot.drawable", lambda *_: [])
     robot = ip.load_robot("solo12")
     contacts = [ip.ImpactContact(foot, (0, 0, 1)) for foot in ("FL_FOOT", "HR_FOOT")]
     feet = tuple(ip.Support(foot) for foot in ("FR_FOOT", "HL_FOOT"))

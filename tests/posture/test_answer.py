@@ -5,12 +5,8 @@ from __future__ import annotations
 import os
 import subprocess
 import sys
-from collections.abc import Callable
-from contextlib import AbstractContextManager
 from dataclasses import replace
-from functools import partial
 from pathlib import Path
-from typing import Any
 
 import numpy as np
 import pytest
@@ -31,13 +27,11 @@ from impact_posture.posture.formulation.problem_file import prepare
 from impact_posture.posture.loads.load_cases import load_cases
 from impact_posture.posture.manifold.feasible_start import Projector, feasible_start
 from impact_posture.posture.search import growing_search as search_module
-from impact_posture.posture.search import start_draws as draws_module
 from impact_posture.posture.search.growing_search import GrowingSearch
 from impact_posture.posture.search.multistart import solve
 from impact_posture.posture.search.start_draws import StartDraws
 from impact_posture.robot.robot_loader import load_robot
 from impact_posture.robot.support_polygon import polygon_edges
-from impact_posture.system.processes import fork_server
 
 
 @pytest.fixture
@@ -156,43 +150,6 @@ def test_an_end_that_lacks_parts_is_certified_in_the_last_round_only(monkeypatch
             assert ended.certificate is not None and not ended.good
     monkeypatch.setattr(search_module, "_ROUNDS", 1)
     assert [run.good for run in search.run(1, None)][lacking[0]] is False
-
-
-@pytest.mark.parametrize("count", [0, 2, 4, "dies", "fails"])
-def test_starts_are_the_same_whoever_draws_them(count: int | str, monkeypatch: pytest.MonkeyPatch) -> None:
-    """The copy of the process is asked after so many starts, or dies, or runs out of memory when it is asked."""
-    problem = prepare(ProblemSettings(robot="solo8", normal=(0.0, 0.0, 1.0))).problem
-    here, ahead = (StartDraws(problem, (problem.given,), 6, 3) for _ in range(2))
-    answers = [False] * (count if isinstance(count, int) else 0)
-
-    def asked(poll: Callable[[float], bool]) -> bool:
-        if count == "dies":
-            os._exit(1)
-        if count == "fails" and poll(60.0):
-            raise MemoryError
-        return not answers or answers.pop()
-
-    def server(begin: Callable[..., Any]) -> AbstractContextManager[Any]:
-        return fork_server(lambda poll: begin(partial(asked, poll)))
-
-    monkeypatch.setattr(draws_module, "fork_server", server)
-    drawn_ahead = len(answers)
-    with ahead.ahead(2):
-        ahead.collect()
-    assert len(ahead._drawn) == drawn_ahead
-    for index in range(6):
-        drawn, expected = ahead.choose(index), here.choose(index)
-        assert drawn is not None and expected is not None
-        np.testing.assert_array_equal(drawn, expected)
-
-
-def test_a_system_that_cannot_fork_draws_starts_when_they_run(monkeypatch: pytest.MonkeyPatch) -> None:
-    problem = prepare(ProblemSettings(robot="solo8", normal=(0.0, 0.0, 1.0))).problem
-    draws = StartDraws(problem, (problem.given,), 3, 0)
-    monkeypatch.delattr(os, "fork")
-    with draws.ahead(2):
-        draws.collect()
-    assert not draws._drawn and draws.choose(2) is not None
 
 
 def test_what_even_forces_hold_needs_no_linear_program(monkeypatch: pytest.MonkeyPatch) -> None:

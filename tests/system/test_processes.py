@@ -8,13 +8,12 @@ import signal
 import subprocess
 import sys
 import time
-from collections.abc import Callable, Iterator
+from collections.abc import Callable
 from pathlib import Path
 
 import numpy as np
 import pytest
 
-from impact_posture.config.settings import ProblemSettings
 from impact_posture.errors import (
     ControllerNotFound,
     ImpactPostureError,
@@ -22,8 +21,7 @@ from impact_posture.errors import (
     SimulationDiverged,
     WorkerDied,
 )
-from impact_posture.output.early_writer import early_writer, load
-from impact_posture.system.processes import end_early, fork_call, fork_map, fork_server, signals_held, undone
+from impact_posture.system.processes import end_early, fork_call, fork_map, signals_held, undone
 
 pytestmark = pytest.mark.skipif(not Path("/proc/self/status").is_file(), reason="needs /proc to look at processes")
 
@@ -300,76 +298,3 @@ def test_no_copy_outlives_its_block(tmp_path: Path) -> None:
             time.sleep(0.01)
         raise KeyboardInterrupt
     assert gone([int(told.read_text())], within=1.0)
-
-
-def test_a_server_begins_before_it_is_asked_and_answers_as_it_goes(tmp_path: Path) -> None:
-    begun = tmp_path / "begun"
-
-    def begin(requested: Callable[[], bool]) -> Callable[[list[int]], Iterator[tuple[int, int]]]:
-        assert not requested()
-        begun.touch()
-        end = time.monotonic() + 30
-        while not requested() and time.monotonic() < end:
-            time.sleep(0.001)
-        known = requested()
-        return lambda numbers: ((number**2 if known else 0, os.getpid()) for number in numbers)
-
-    with fork_server(begin) as ask:
-        end = time.monotonic() + 30
-        while not begun.exists() and time.monotonic() < end:
-            time.sleep(0.01)
-        assert begun.exists()
-        answers = ask([1, 2, 3])
-        square, pid = next(answers)
-        assert square == 1 and pid != os.getpid() and alive(pid)
-        assert list(answers) == [(4, pid), (9, pid)]
-        # Nobody writes any more when the iteration has ended.
-        assert not alive(pid)
-
-
-@pytest.mark.parametrize("early", [True, False])
-def test_a_servers_fault_is_raised_where_it_is_asked(early: bool) -> None:
-    def begin(_: Callable[[], bool]) -> Callable[[int], Iterator[float]]:
-        if early:
-            raise InputError("is wrong", where="the copy", hint="correct it")
-        return lambda number: iter([1.0, 1.0 / number])
-
-    with fork_server(begin) as ask, pytest.raises(InputError if early else ZeroDivisionError):
-        list(ask(0))
-
-
-def test_an_iteration_that_is_left_leaves_no_server() -> None:
-    def count(start: int) -> Iterator[int]:
-        yield os.getpid()
-        yield from range(start, 1000)
-        time.sleep(60)
-
-    with fork_server(lambda _: count) as ask:
-        answers = ask(0)
-        pid = next(answers)
-        del answers
-        assert gone([pid], within=1.0)
-
-
-@pytest.mark.parametrize("late", [False, True])
-def test_a_writer_prepares_more_only_while_nothing_is_requested(late: bool, tmp_path: Path) -> None:
-    done: list[str] = []
-
-    def prepare() -> list[str]:
-        with pytest.MonkeyPatch.context() as patch:
-            patch.setattr("impact_posture.codegen.export.cached_code", lambda *_: done.append("code"))
-            load(ProblemSettings(robot="tilthex_arm", normal=(0, 0, 1)), tmp_path, False, False, lambda: late)
-        return done
-
-    # In a copy, because it moves the temporary folder of its process.
-    with fork_call(prepare) as collect:
-        assert collect() == ([] if late else ["code"])
-
-
-def test_where_nothing_can_be_forked_the_solving_process_writes(monkeypatch: pytest.MonkeyPatch) -> None:
-    def fail() -> int:
-        raise BlockingIOError(11, "Resource temporarily unavailable")
-
-    monkeypatch.setattr("os.fork", fail)
-    with early_writer(ProblemSettings(robot="panda"), jobs=2) as finish:
-        assert finish is None

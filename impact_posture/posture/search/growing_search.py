@@ -36,7 +36,7 @@ _SMALL = 1000
 # is built more often.  A run that ended in a trap may end below its bound.
 _BATCH, _LEAST, _FAR = 600, 2, 0.05
 # A fork takes as long as the runs of programs with so many unknowns in all.
-FORK = 200
+_FORK = 200
 # Starts that go on from postures this close (rad, m) share one run, which would end at the same posture.
 _SAME = 1e-6
 # Price of a meter of slack for runs that ended in a trap, and how often they begin anew, each time ten times as dear:
@@ -150,8 +150,6 @@ class GrowingSearch:
         while waiting:
             batch = self._next(waiting, runs)
             self._grow([owed.pop(k) for k in batch if k in owed])
-            if runs:
-                self._draws.collect()
             shared = self._shared(batch)
             last = {k for own in shared.values() if max(counts[j] for j in own) >= _ROUNDS - 1 for k in own}
             for leader, run in self._round(list(shared), jobs, last):
@@ -225,7 +223,7 @@ class GrowingSearch:
         return groups
 
     def _round(self, waiting: list[int], jobs: int, last: set[int]) -> Iterator[tuple[int, SolverRun]]:
-        jobs = jobs if len(waiting) * self._unknowns > FORK else 1
+        jobs = jobs if len(waiting) * self._unknowns > _FORK else 1
         with fork_map(lambda k: self._timed(waiting[k], last=waiting[k] in last), len(waiting), jobs) as results:
             if around := self.problem.surroundings:
                 # The last word needs the shapes themselves, and this process would only wait.

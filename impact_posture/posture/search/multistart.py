@@ -17,7 +17,7 @@ from impact_posture.posture.program.compiled_solver import CompileMode
 from impact_posture.posture.program.constrained_problem import ConstrainedProblem, equality_jacobian, rank
 from impact_posture.posture.program.ipopt import one_blas_thread
 from impact_posture.posture.program.program_rows import ProgramRows
-from impact_posture.posture.search.growing_search import FIRST, FORK, GrowingSearch, Progress, SolverRun
+from impact_posture.posture.search.growing_search import GrowingSearch, Progress, SolverRun
 from impact_posture.posture.search.impact_notes import notes_on_impacts
 from impact_posture.posture.search.initial_posture import initial_objective, initial_posture
 from impact_posture.posture.search.start_draws import StartDraws
@@ -126,11 +126,8 @@ def solve(
     scale = initial_objective(problem, initial)
     began = time.perf_counter()
     draws = StartDraws(problem, (initial, *guesses), starts, seed)
-    # The other core has time for this while the program is built.
-    early = problem.grows and jobs > 1 and starts * initial.size > FORK
-    with draws.ahead(FIRST if early else starts):
-        search = GrowingSearch(problem, draws, scale, compile=compile, finish_all=finish_all, rows=rows)
-        runs = search.run(jobs, progress)
+    search = GrowingSearch(problem, draws, scale, compile=compile, finish_all=finish_all, rows=rows)
+    runs = search.run(jobs, progress)
     problem, nlp = search.problem, search.nlp
     certified = [r for r in runs if r.good]
     if not certified:
