@@ -94,11 +94,11 @@ def test_code_from_the_cache_is_the_code(
     def texts(**changed: object) -> list[str]:
         exported = named_objectives([changed.pop("objective", objective)], "a")
         code = build_c_source(exported, "a", changed.pop("real", DOUBLE), **changed)
-        from impact_posture.codegen.export_files import render
+        from impact_posture.codegen.export_files import render_files
         from impact_posture.codegen.manifest_builder import build_manifest
 
         manifest = build_manifest([v.objective for v in exported][:1], "a", None, None, DOUBLE, code.stack_bytes)
-        return list(render(exported, "a", manifest, code, DOUBLE).values())
+        return list(render_files(exported, "a", manifest, code, DOUBLE).values())
 
     first = texts()
     assert texts() == first and len(count) == 1
