@@ -1,4 +1,4 @@
-"""Output folders of runs, comparisons and reproductions, with their figures.  Each is written whole or not at all."""
+"""Output folders of runs, comparisons and reproductions.  Each is written as a whole or not at all."""
 
 from __future__ import annotations
 
@@ -13,7 +13,7 @@ from impact_posture.experiment.job_store import JobStore
 from impact_posture.experiment.jobs import Document, Job
 from impact_posture.experiment.reproduction import PAPER, Reproduction
 from impact_posture.experiment.reproduction_summary import summary
-from impact_posture.experiment.run_reports import COMPARISON, SIMULATION, keep_runs, kept_run, run_view, try_report
+from impact_posture.experiment.run_reports import COMPARISON, SIMULATION, keep_runs, run_view, stored_run, try_report
 from impact_posture.output.plot import Bar, bars_figure, figures_of_comparison, figures_of_run, save, save_all
 from impact_posture.simulation.run import Run
 from impact_posture.system.output_folder import whole_folder, write_json
@@ -25,14 +25,14 @@ FORMATS = ("png",)
 
 @dataclass(frozen=True)
 class Output:
-    """Where results are written, and what beside the numbers.
+    """Output folder, and what it contains besides the numbers.
 
     Attributes:
         folder: The folder.
         force: Whether an earlier result there may be replaced.
         formats: Formats of the figures.
         report: Whether ``report.html`` is written.
-        meshes: Whether it shows the meshes of the robot.
+        meshes: Whether the report shows the meshes of the robot.
     """
 
     folder: Path
@@ -46,39 +46,39 @@ def write_simulation(output: Output, job: Job, runs: Sequence[Run], document: Do
     """Write ``run.json``, ``series.npz`` (``series-minus.npz`` for a push with sign -1), figures and ``report.html``.
 
     Returns:
-        Why there is no report; empty if there is one, or if none was wanted.
+        Reason why the report is missing; empty if it was written or not requested.
 
     Raises:
-        OutputError: The folder exists without ``force``, is not ours, or cannot be written.
+        OutputError: The folder exists without ``force``, has foreign files, or cannot be written.
     """
     with whole_folder(output.folder, force=output.force, kind="run") as folder:
         write_json(folder / SIMULATION, document)
-        for one in runs:
-            one.series.save(folder / f"series{'' if one.sign > 0 else '-minus'}.npz")
+        for run in runs:
+            run.series.save(folder / f"series{'' if run.sign > 0 else '-minus'}.npz")
         draw_runs(job, runs, document, folder, output.formats)
         return try_report(folder, job.scenario, meshes=output.meshes) if output.report else ""
 
 
-def write_comparison(output: Output, found: Reproduction, store: JobStore) -> str:
+def write_comparison(output: Output, comparison: Reproduction, store: JobStore) -> str:
     """Write ``comparison.json``, figures, ``runs/`` and ``report.html`` of the first seed, and remove the store.
 
     Returns:
-        Why there is no report; empty if there is one, or if none was wanted.
+        Reason why the report is missing; empty if it was written or not requested.
 
     Raises:
         OutputError: As :func:`write_simulation`.
     """
     with whole_folder(output.folder, force=output.force, kind="comparison") as folder:
-        write_json(folder / COMPARISON, found.comparison())
-        draw_side_by_side(found.shown, store, folder, output.formats)
-        keep_runs(folder, found.shown, store)
-        scenario = found.shown[0].scenario
+        write_json(folder / COMPARISON, comparison.comparison())
+        draw_side_by_side(comparison.shown, store, folder, output.formats)
+        keep_runs(folder, comparison.shown, store)
+        scenario = comparison.shown[0].scenario
         failure = try_report(folder, scenario, meshes=output.meshes) if output.report else ""
     store.remove()
     return failure
 
 
-def write_reproduction(output: Output, found: Reproduction, store: JobStore) -> Document:
+def write_reproduction(output: Output, reproduction: Reproduction, store: JobStore) -> Document:
     """Write ``reproduction.json``, ``SUMMARY.md``, all documents in ``runs/``, and figures, and remove the store.
 
     Returns:
@@ -87,20 +87,20 @@ def write_reproduction(output: Output, found: Reproduction, store: JobStore) -> 
     Raises:
         OutputError: As :func:`write_simulation`.
     """
-    document = {**found.to_dict(), "summary": summary(found)}
+    document = {**reproduction.to_dict(), "summary": summary(reproduction)}
     with whole_folder(output.folder, force=output.force, kind="reproduction") as folder:
         write_json(folder / REPRODUCTION, document)
         (folder / "SUMMARY.md").write_text(document["summary"], encoding="utf-8")
         (folder / "runs").mkdir()
-        for job in found.jobs:
+        for job in reproduction.jobs:
             write_json(folder / "runs" / f"{job.name}.json", store.finished(job))
-        draw_reproduction(found, store, folder, output.formats)
+        draw_reproduction(reproduction, store, folder, output.formats)
     store.remove()
     return document
 
 
 def store_beside(out: Path) -> AbstractContextManager[JobStore]:
-    """Take the store that keeps the runs of an output folder until it is written.
+    """Lock the store that keeps finished runs until the output folder is written.
 
     Raises:
         OutputError: As :meth:`JobStore.locked`.
@@ -109,33 +109,36 @@ def store_beside(out: Path) -> AbstractContextManager[JobStore]:
 
 
 def draw_runs(job: Job, runs: Sequence[Run], document: Document, folder: Path, formats: Sequence[str]) -> None:
-    """Draw the figures of a job.  Those of the push with sign -1 are in ``minus/``."""
-    for one, part in zip(runs, document["runs"], strict=True):
-        into = folder if one is runs[0] else folder / "minus"
+    """Draw the figures of a job; figures of the second sign of a push are in ``minus/``."""
+    for run, part in zip(runs, document["runs"], strict=True):
         tell("drawing")
-        save_all(figures_of_run(run_view(job, part, one.series)), into, formats)
+        subfolder = folder if run is runs[0] else folder / "minus"
+        save_all(figures_of_run(run_view(job, part, run.series)), subfolder, formats)
 
 
 def draw_side_by_side(jobs: Sequence[Job], store: JobStore, folder: Path, formats: Sequence[str]) -> None:
     """Draw several controllers in one scenario, with the first sign of a push."""
     tell("drawing")
-    kept = [(job, kept_run(job, store)) for job in jobs]
-    views = [run_view(job, found[0]["runs"][0], found[1]) for job, found in kept if found is not None]
+    views = []
+    for job in jobs:
+        if (stored := stored_run(job, store)) is not None:
+            document, series = stored
+            views.append(run_view(job, document["runs"][0], series))
     if views:
         save_all(figures_of_comparison(views), folder, formats)
 
 
-def draw_reproduction(found: Reproduction, store: JobStore, folder: Path, formats: Sequence[str]) -> None:
+def draw_reproduction(reproduction: Reproduction, store: JobStore, folder: Path, formats: Sequence[str]) -> None:
     """Draw ``bars``, and for each scenario a folder with nominal, robust and the best controller side by side."""
     bars = []
-    for row in found.rows:
+    for row in reproduction.rows:
         paper, total = PAPER.get(row.scenario), row.metrics.get("q_total_impact")
         mean, half = (np.nan, 0.0) if total is None else (total.mean, total.shown or 0.0)
-        # The paper has the nominal and the robust controller.
+        # The paper has values for the nominal and the robust controller only.
         bars.append(Bar(row.scenario, row.controller, mean, half, getattr(paper, row.controller, None)))
     save(bars_figure(bars), folder, "bars", formats)
-    for scenario in found.scenarios:
-        best = found.best(scenario)
+    for scenario in reproduction.scenarios:
+        best = reproduction.best(scenario)
         shown = dict.fromkeys(("nominal", "robust", *(() if best is None else (best.controller,))))
-        labels = {job.label: job for job in found.shown if job.scenario == scenario}
+        labels = {job.label: job for job in reproduction.shown if job.scenario == scenario}
         draw_side_by_side([labels[label] for label in shown if label in labels], store, folder / scenario, formats)

@@ -178,8 +178,8 @@ def run_batch(
 ) -> list[Document]:
     """Run the jobs that are not stored yet, and return all documents in the order of the jobs.
 
-    A job that fails on its own (a metric does not exist where the robot went) has a document without runs, with the
-    status ``control lost``.
+    A job that fails (for example where a metric is undefined) has a document without runs and with the status
+    ``control lost``.
 
     Args:
         jobs: The jobs.

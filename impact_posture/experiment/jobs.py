@@ -1,4 +1,4 @@
-"""A run as a job, and the document with its results."""
+"""Jobs of an experiment, and the documents with their results."""
 
 from __future__ import annotations
 
@@ -25,14 +25,14 @@ from impact_posture.system.escape import file_name
 Document = dict[str, Any]
 
 SCHEMA = "impact-posture/simulation/4"
-# Runs from which building pays: a humanoid's library takes about 6 s, and saves 4 s of each run.  The cache does not
-# count, because a run would then depend on what ran before, and differ from another one by amplified rounding.
+# Number of runs from which compiling pays.  The library of a humanoid takes about 6 s and saves 4 s of each run.  An
+# existing library in the cache does not count, because the rounding of a run must not depend on earlier runs.
 _PAYS = 2
 
 
 @dataclass(frozen=True)
 class Job:
-    """A run, or both runs of a push.
+    """Runs of one controller in one scenario: one run, or one for each sign of a push or throw.
 
     Attributes:
         scenario: Name or file of the scenario.
@@ -40,9 +40,9 @@ class Job:
         seed: Seed of the sensor noise.
         mode: ``live`` or ``held``.
         free: Whether gradients and the offline optimum ignore the feet.
-        gain: K instead of that of the scenario, 1/s².
-        sign: The only sign of the push to run.
-        compile: Whether its controller runs as machine code: ``auto`` where it can, always, or never.
+        gain: K in place of the value in the scenario, 1/s².
+        sign: Sign to run; both by default.
+        compile: Whether the controller runs as machine code: ``auto`` where it can, always, or never.
     """
 
     scenario: str
@@ -61,20 +61,17 @@ class Job:
 
     @property
     def shown(self) -> bool:
-        """Whether figures and reports show it, for which its time series are kept: of several seeds the first."""
+        """Whether figures and reports show this job, so that its time series are stored (first seed only)."""
         return self.seed == 0
 
     @property
     def name(self) -> str:
-        """Name of its files."""
+        """Name of the files of this job."""
         return f"{file_name(self.scenario)}-{file_name(self.label.replace(':', '-'))}-{self.seed}"
 
 
 def worth_compiling(compile: CompileMode, runs: int) -> CompileMode:
-    """Return what :attr:`Job.compile` says where each controller has a number of runs.
-
-    ``auto`` means machine code from two runs on.
-    """
+    """Return :attr:`Job.compile` for a number of runs of each controller; ``auto`` compiles from two runs on."""
     return "never" if compile == "auto" and runs < _PAYS else compile
 
 
@@ -82,18 +79,18 @@ def parse_controller(text: str) -> tuple[str, Mode, bool]:
     """Parse ``robust``, ``robust:held``, ``robust:free`` or ``robust:held:free``.
 
     Raises:
-        InputError: There is no such variant.
+        InputError: A variant is unknown.
     """
-    name, *words = text.strip().split(":")
-    for word in words:
-        if word not in ("held", "live", "free"):
-            raise InputError(f"no variant '{word}'", where=f"controller '{text}'", hint="use held, live or free")
-    return name, "held" if "held" in words else "live", "free" in words
+    name, *variants = text.strip().split(":")
+    for variant in variants:
+        if variant not in ("held", "live", "free"):
+            raise InputError(f"no variant '{variant}'", where=f"controller '{text}'", hint="use held, live or free")
+    return name, "held" if "held" in variants else "live", "free" in variants
 
 
 @lru_cache(maxsize=8)
 def controller_factory(scenario: str, free: bool = False) -> ControllerFactory:
-    """Return a scenario that is ready to run, and keep it for the next job.
+    """Return the controllers of a scenario, and keep them for the next job.
 
     Raises:
         ImpactPostureError: The scenario cannot be read or set up.
@@ -102,11 +99,11 @@ def controller_factory(scenario: str, free: bool = False) -> ControllerFactory:
 
 
 def execute(job: Job, factory: ControllerFactory | None = None) -> tuple[tuple[Run, ...], Document]:
-    """Run a job and return its runs and its document.
+    """Run a job.  Return the runs and the document.
 
     Args:
         job: The job.
-        factory: A variation of its scenario to run instead.
+        factory: Controllers of a variation of the scenario, which replaces it.
 
     Raises:
         ImpactPostureError: As :func:`impact_posture.simulation.run.run`, or the scenario cannot be set up.
@@ -117,9 +114,9 @@ def execute(job: Job, factory: ControllerFactory | None = None) -> tuple[tuple[R
     scenario = factory.setup.scenario
     if job.sign is not None and job.sign not in scenario.signs:
         raise InputError(f"is not pushed with sign {job.sign}", where=scenario.name, hint="leave `sign` out")
-    found = run(factory, job.controller, seed=job.seed, mode=job.mode, gain=job.gain, only=job.sign)
-    metrics = [measure(factory.setup, one) for one in found]
-    parts = [_run_document(factory, one, measured) for one, measured in zip(found, metrics, strict=True)]
+    runs = run(factory, job.controller, seed=job.seed, mode=job.mode, gain=job.gain, only=job.sign)
+    metrics = [measure(factory.setup, record) for record in runs]
+    parts = [_run_document(factory, *each) for each in zip(runs, metrics, strict=True)]
     status = gravest(part["status"] for part in parts)
     completed = status == "completed"
     offline = factory.offline(job.controller)
@@ -135,17 +132,17 @@ def execute(job: Job, factory: ControllerFactory | None = None) -> tuple[tuple[R
         "language": "C" if factory.in_c else "Python",
         "status": status,
         "events": [{**event, "sign": part["sign"]} for part in parts for event in part["events"]],
-        "metrics": together(metrics).to_dict() if completed else None,
+        "metrics": combined(metrics).to_dict() if completed else None,
         "windows": [{**window, "sign": part["sign"]} for part in parts for window in part["windows"]],
         "prediction": _mean_prediction([p for part in parts for p in part["prediction"]]) if completed else None,
         "runs": parts,
         "offline": None if offline is None else offline.to_dict(),
         "path": factory.path.to_dict() if job.controller.removesuffix("-stiff") == "path" else None,
-        "warnings": [*factory.warnings, *(links_behind(factory.setup, found) if completed else ())],
+        "warnings": [*factory.warnings, *(links_behind(factory.setup, runs) if completed else ())],
         "model_sha256": factory.setup.robot.model_sha256,
         "versions": software(),
     }
-    return found, jsonable(document)
+    return runs, jsonable(document)
 
 
 def software() -> dict[str, str]:
@@ -154,7 +151,7 @@ def software() -> dict[str, str]:
 
 
 def lost_control(job: Job, error: Exception) -> Document:
-    """Return the document of a job that failed on its own, with the status ``control lost`` and without runs."""
+    """Return the document of a failed job: status ``control lost``, without runs."""
     event = {"status": "control lost", "time": getattr(error, "time", None), "what": str(error), "sign": None}
     return {"schema": SCHEMA, "scenario": job.scenario, "controller": job.controller, "mode": job.mode,
             "free": job.free, "seed": job.seed, "status": "control lost", "events": [event], "metrics": None,
@@ -162,12 +159,12 @@ def lost_control(job: Job, error: Exception) -> Document:
 
 
 def jsonable(content: object) -> Any:
-    """Return JSON content: a dataclass becomes an object, an array a list, a number that is not finite ``None``."""
+    """Return JSON content: dataclasses as objects, arrays as lists, and non-finite numbers as ``None``."""
     return to_jsonable_python(content, inf_nan_mode="null", fallback=lambda array: array.tolist())
 
 
-def together(metrics: list[Metrics]) -> Metrics:
-    """Combine several runs: sums of ticks, the largest of what is a largest, all stops, and means of the others."""
+def combined(metrics: list[Metrics]) -> Metrics:
+    """Combine the metrics of several runs: sums of counts, largest peaks, all stops, and means of the others."""
     first = metrics[0]
     if len(metrics) == 1:
         return first
@@ -179,25 +176,25 @@ def together(metrics: list[Metrics]) -> Metrics:
     return Metrics(**{**values, **ticks, **largest, "stops": stops, "rested": all(m.rested for m in metrics)})
 
 
-def _run_document(factory: ControllerFactory, one: Run, metrics: Metrics) -> Document:
-    events = judge(factory.setup, one)
+def _run_document(factory: ControllerFactory, record: Run, metrics: Metrics) -> Document:
+    events = judge(factory.setup, record)
     content = {
-        "sign": one.sign,
-        "waited": one.waited,
+        "sign": record.sign,
+        "waited": record.waited,
         "status": gravest(event.status for event in events),
         "events": events,
-        "ticks": one.series.t.size,
+        "ticks": record.series.t.size,
         "metrics": metrics.to_dict(),
-        "windows": one.windows,
-        "prediction": predict(factory.setup, factory.objective(), one),
+        "windows": record.windows,
+        "prediction": predict(factory.setup, factory.objective(), record),
     }
     return dict(jsonable(content))
 
 
 def _mean_prediction(impacts: list[Document]) -> Document:
-    """Return means over the impacts, and ``None`` where a value is undefined for one of them."""
-    found: Document = {"impacts": len(impacts)}
+    """Return means over the impacts; a mean is ``None`` if the value of an impact is undefined."""
+    means: Document = {"impacts": len(impacts)}
     for key in ("H", "G", "V", "S", "approach", "frictionless", "sticking", "coulomb", "measured", "ratio"):
         values = [impact[key] for impact in impacts]
-        found[key] = None if not values or None in values else float(np.mean(values))
-    return found
+        means[key] = None if not values or None in values else float(np.mean(values))
+    return means

@@ -13,15 +13,15 @@ from impact_posture.posture.program.compiled_solver import CompileMode
 from impact_posture.simulation.controllers.controller_factory import CONTROLLERS
 
 SCHEMA, COMPARISON_SCHEMA = "impact-posture/reproduction/3", "impact-posture/comparison/3"
-# The first two show what the posture that a term reaches does on its own, the third the metric without the feet.
+# ``held`` shows the effect of the posture that a term reaches, ``free`` the effect of the metric without the feet.
 HELD, FREE = ("robust:held", "walker:held"), "robust:free"
-# Labels of controllers, by scenario.
+# Labels of controllers by scenario.
 Plan = Mapping[str, Sequence[str]]
 
 
 @dataclass(frozen=True)
 class PaperRow:
-    """A row of Table I: ``q_total_impact`` of two controllers, and the reduction that the text names.
+    """Row of Table I: ``q_total_impact`` of two controllers, and the reduction that the text of the paper states.
 
     Attributes:
         nominal: Nominal TSID.
@@ -43,7 +43,7 @@ PAPER: dict[str, PaperRow] = {
     "talos-push": PaperRow(0.305, 0.166, 0.456),
 }
 
-# The controllers that keep their targets most often over the envelope (docs: reproduction), or at least come nearest.
+# The controller that meets its targets most often in the envelope (docs: reproduction), or comes nearest to them.
 RECOMMENDED: dict[str, str] = {
     "aerial-vertical": "posture",
     "aerial-lateral": "robust-flow",
@@ -51,9 +51,9 @@ RECOMMENDED: dict[str, str] = {
     "talos-push": "robust-flow",
 }
 
-# Targets of a better controller, for the means over the runs of a row: whether a row misses them, given the reduction
-# of the paper, and what it then has.  A motion that only comes later, in the recovery, is no reduction.  Numbers of
-# ticks are whole, so a saturation that only differs in the last digits is the same.
+# Targets of a better controller: whether the means of a row miss a target, given the reduction of the paper, and what
+# the row has instead.  A motion that only comes later, in the recovery, is not a reduction.  Saturations are
+# multiples of a tick, so a difference in the last digits is rounding.
 _TARGETS: dict[str, tuple[Callable[[ControllerRow, float], bool], str]] = {
     "reduction": (lambda row, paper: _mean(row.reduction) < paper, "less than the paper's reduction"),
     "recovery": (lambda row, _: _mean(row.recovery) <= 0, "no less motion than nominal over the recovery"),
@@ -90,13 +90,13 @@ def missed_targets(row: ControllerRow) -> dict[str, str] | None:
 
 
 def best_of(rows: Sequence[ControllerRow]) -> ControllerRow | None:
-    """Return the row with the largest reduction, of those that meet every target, or else of all.
+    """Return the row with the largest reduction among the rows that meet every target, or else among all rows.
 
-    The smaller of the two reductions counts, within the window and until the recovery ends.
+    The reduction of a row is the smaller one of ``reduction`` and ``recovery``.
     """
-    tried = [(row, missed) for row in rows if (missed := missed_targets(row)) is not None and row.rested]
-    met = [row for row, missed in tried if not missed] or [row for row, _ in tried]
-    return max(met, key=lambda row: min(_mean(row.reduction), _mean(row.recovery)), default=None)
+    missed = [(row, targets) for row in rows if (targets := missed_targets(row)) is not None and row.rested]
+    candidates = [row for row, targets in missed if not targets] or [row for row, _ in missed]
+    return max(candidates, key=lambda row: min(_mean(row.reduction), _mean(row.recovery)), default=None)
 
 
 def controllers_of(scenario: str, everything: bool) -> tuple[str, ...]:
@@ -108,12 +108,12 @@ def controllers_of(scenario: str, everything: bool) -> tuple[str, ...]:
 
 def jobs_of(plan: Plan, seeds: int, compile: CompileMode = "auto") -> list[Job]:
     """Return all jobs of a plan, scenario by scenario, controller by controller, seed by seed."""
-    found, compile = [], worth_compiling(compile, seeds)
+    jobs, compile = [], worth_compiling(compile, seeds)
     for scenario, labels in plan.items():
         for label in labels:
             name, mode, free = parse_controller(label)
-            found += [Job(scenario, name, seed, mode, free, compile=compile) for seed in range(seeds)]
-    return found
+            jobs += [Job(scenario, name, seed, mode, free, compile=compile) for seed in range(seeds)]
+    return jobs
 
 
 def gather(scenario: str, labels: Sequence[str], documents: Sequence[Document]) -> list[ControllerRow]:
@@ -121,17 +121,17 @@ def gather(scenario: str, labels: Sequence[str], documents: Sequence[Document]) 
     count = len(documents) // len(labels)
     parts = {label: documents[k * count : (k + 1) * count] for k, label in enumerate(labels)}
     name = next((d["scenario"] for d in documents if d["runs"]), scenario)
-    return [row_of(name, label, own, parts.get("nominal", [])) for label, own in parts.items()]
+    return [row_of(name, label, part, parts.get("nominal", [])) for label, part in parts.items()]
 
 
 @dataclass(frozen=True, eq=False)
 class Reproduction:
-    """Rows of all scenarios.
+    """Results of all controllers in all scenarios.
 
     Attributes:
         seeds: Number of seeds.
         rows: Rows, scenario by scenario, nominal first.
-        jobs: The jobs that they are of.
+        jobs: Jobs of the rows.
     """
 
     seeds: int

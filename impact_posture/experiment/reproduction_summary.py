@@ -1,4 +1,4 @@
-"""Sentences and Markdown tables about a reproduction.  Every number comes from its rows."""
+"""Sentences and Markdown tables about a reproduction."""
 
 from __future__ import annotations
 
@@ -26,13 +26,13 @@ LEGEND = (
 )
 
 
-def table_one(found: Reproduction) -> str:
+def table_one(results: Reproduction) -> str:
     """Return Table I of the paper beside ours: ``q_total_impact`` of nominal, robust and the best controller."""
     head = "scenario|paper: nominal|robust|reduction|ours: nominal|robust|reduction|best|reduction"
     lines = []
-    for scenario in found.scenarios:
-        paper, best = PAPER.get(scenario), found.best(scenario)
-        nominal, robust = found.row(scenario, "nominal"), found.row(scenario, "robust")
+    for scenario in results.scenarios:
+        paper, best = PAPER.get(scenario), results.best(scenario)
+        nominal, robust = results.row(scenario, "nominal"), results.row(scenario, "robust")
         printed = ["–"] * 3
         if paper is not None:
             printed = [f"{paper.nominal:g}", f"{paper.robust:g}", f"{100 * paper.reduction:.1f} %"]
@@ -75,37 +75,41 @@ def _table(head: str, rows: Sequence[Sequence[str]]) -> str:
     return "\n".join([lines[0], "|---" * len(columns) + "|", *lines[1:]])
 
 
-def summary(found: Reproduction) -> str:
+def summary(results: Reproduction) -> str:
     """Return the content of ``SUMMARY.md``."""
-    many = f"{found.seeds} seeds" if found.seeds > 1 else "one seed"
-    shown = ", with 95 % confidence intervals." if found.seeds >= FEWEST else ", so there are no intervals."
+    many = f"{results.seeds} seeds" if results.seeds > 1 else "one seed"
+    shown = ", with 95 % confidence intervals." if results.seeds >= FEWEST else ", so there are no intervals."
     parts = [
         "# The experiments of the paper, simulated again",
         f"Means over {many}{shown}",
         "## What to choose",
-        "\n".join(f"- {line}" for line in advice(found)),
+        "\n".join(f"- {line}" for line in advice(results)),
         "## Table I of Afifi et al. 2026, and ours",
-        table_one(found),
+        table_one(results),
         "The paper has other robots, gains, contact models and windows, and prints few of them. Compare reductions, "
         "not values. `q_total_impact` is the integral of ‖ν‖ over fixed windows, which are the same for every "
         "controller. Contacts are summed, and pushes are the mean of both signs.",
         LEGEND,
     ]
-    for scenario in found.scenarios:
-        parts += [f"## {markdown(scenario)}", scenario_table(found.of(scenario)), "\n".join(remarks(found, scenario))]
+    for scenario in results.scenarios:
+        parts += [
+            f"## {markdown(scenario)}",
+            scenario_table(results.of(scenario)),
+            "\n".join(remarks(results, scenario)),
+        ]
     return "\n\n".join(parts) + "\n"
 
 
-def advice(found: Reproduction, beside: Reproduction | None = None) -> list[str]:
+def advice(results: Reproduction, others: Reproduction | None = None) -> list[str]:
     """Return one line for each scenario: the best controller, its reduction, and its disadvantages.
 
     Args:
-        found: Rows of the controllers that may be best.
-        beside: Rows of more controllers, which may have the held variant of the best one.
+        results: Results of the controllers that may be best.
+        others: Results of more controllers, which may contain the held variant of the best one.
     """
     lines = []
-    for scenario in found.scenarios:
-        best, robust = found.best(scenario), found.row(scenario, "robust")
+    for scenario in results.scenarios:
+        best, robust = results.best(scenario), results.row(scenario, "robust")
         if best is None or best.reduction is None:
             lines.append(f"**{markdown(scenario)}**: nothing was better than nominal.")
             continue
@@ -115,8 +119,8 @@ def advice(found: Reproduction, beside: Reproduction | None = None) -> list[str]
             f"{reduction_text(best)} less than nominal, over the recovery {percent(best.recovery)}"
         )
         line += f", but with {missed}." if missed else ", every target met at this point."
-        line += _force(best, found.row(scenario, "nominal"))
-        line += _held(best, (beside or found).row(scenario, f"{best.controller}:held"))
+        line += _force(best, results.row(scenario, "nominal"))
+        line += _held(best, (others or results).row(scenario, f"{best.controller}:held"))
         if robust is not None and robust is not best and robust.reduction is not None:
             missed = _missed(robust)
             line += f" The paper's term: {reduction_text(robust)}" + (f", with {missed}." if missed else ".")
@@ -125,7 +129,7 @@ def advice(found: Reproduction, beside: Reproduction | None = None) -> list[str]
 
 
 def _force(best: ControllerRow, nominal: ControllerRow | None) -> str:
-    """Return how much more force the contact has to bear."""
+    """Return a sentence if the contact has to bear more than 10 % more force."""
     if nominal is None:
         return ""
     before, after = (row.metrics["peak_force"].mean for row in (nominal, best))
@@ -133,7 +137,7 @@ def _force(best: ControllerRow, nominal: ControllerRow | None) -> str:
 
 
 def _held(best: ControllerRow, held: ControllerRow | None) -> str:
-    """Return a warning if the reduction of a term is not due to its posture."""
+    """Return a warning if most of the reduction does not come from the posture."""
     share = _share(held, best)
     if share is None or share > 0.5:
         return ""
@@ -144,17 +148,17 @@ def _held(best: ControllerRow, held: ControllerRow | None) -> str:
 
 
 def _share(part: ControllerRow | None, whole: ControllerRow | None) -> float | None:
-    """Return one reduction over another, 0 if the other is not positive, or ``None`` if there are not both."""
+    """Return the ratio of two reductions: 0 if ``whole`` is not positive, ``None`` if a reduction is missing."""
     if part is None or whole is None or part.reduction is None or whole.reduction is None:
         return None
     return part.reduction.mean / whole.reduction.mean if whole.reduction.mean > 0 else 0.0
 
 
-def remarks(found: Reproduction, scenario: str) -> list[str]:
+def remarks(results: Reproduction, scenario: str) -> list[str]:
     """Return notes for the reader of the table of a scenario."""
     lines = []
     for name in ("robust", "walker"):
-        held, whole = found.row(scenario, f"{name}:held"), found.row(scenario, name)
+        held, whole = results.row(scenario, f"{name}:held"), results.row(scenario, name)
         share = _share(held, whole)
         if share is not None:
             why = "posture" if share > 0.5 else "the stiffness of the term, not the posture"
@@ -162,13 +166,13 @@ def remarks(found: Reproduction, scenario: str) -> list[str]:
                 f"`{name}`: with the reached posture held before the impact, {reduction_text(held)} remain of "
                 f"{reduction_text(whole)}. Most of it is {why}."
             )
-    live, stiff = found.row(scenario, "robust"), found.row(scenario, "stiff")
+    live, stiff = results.row(scenario, "robust"), results.row(scenario, "stiff")
     if stiff is not None and live is not None and stiff.reduction is not None and live.reduction is not None:
         more = "more" if stiff.reduction.mean > live.reduction.mean else "less"
         lines.append(
             f"`stiff`, a nominal controller as stiff as the term, gives {reduction_text(stiff)}, which is {more}."
         )
-    for row in found.of(scenario):
+    for row in results.of(scenario):
         if not row.rested:
             lines.append(f"`{row.controller}` does not come to rest, so the metrics contain its own motion.")
         if row.stops:
@@ -179,10 +183,7 @@ def remarks(found: Reproduction, scenario: str) -> list[str]:
 
 
 def interval_text(value: Interval, digits: int = 3) -> str:
-    """Return ``mean ± half width`` with a number of significant digits of the mean.
-
-    There is no half width for few samples (:attr:`Interval.shown`).
-    """
+    """Return ``mean ± half width`` with significant digits of the mean; the half width only where people see it."""
     decimals = max(0, digits - 1 - int(np.floor(np.log10(abs(value.mean))))) if value.mean else 0
     return _plus_minus(value, min(decimals, _DECIMALS))
 
@@ -204,7 +205,7 @@ def reduction_text(row: ControllerRow | None) -> str:
 
 
 def targets_text(row: ControllerRow) -> str:
-    """Return whether the targets are met, or which are not."""
+    """Return ``met``, or the names of the missed targets."""
     missed = missed_targets(row)
     if missed is None:
         return ""
@@ -212,7 +213,7 @@ def targets_text(row: ControllerRow) -> str:
 
 
 def _missed(row: ControllerRow) -> str:
-    """Return what the row has instead of the targets that it misses."""
+    """Return what a row has instead of its missed targets."""
     return ", ".join((missed_targets(row) or {}).values())
 
 

@@ -24,8 +24,8 @@ _METRICS = (
     ("peak_force", "N", "largest normal force in the impact windows"),
     ("slip", "m", "way that the contact slid in the impact windows"),
 )
-# What the same metrics are for pushes.
-_OF_PUSHES = {
+# Meanings of the same metrics for pushes.
+_PUSH_MEANINGS = {
     "peak_jump": "largest ‖ν‖ from a push on until its window ends, mean of the pushes",
     "peak_jump_max": "the largest of the pushes",
     "peak_recovery": "as peak_jump, until 1 s after each push began",
@@ -50,7 +50,11 @@ def run_content(folder: Path, document: Document, view: RunView, job: Job) -> Co
     metrics, status = document["metrics"], document["status"]
     verdict = [f"{status}: its numbers are no result" if metrics is None else f"{status}: {_summary(metrics)}"]
     verdict += [f"t = {event['time']:.2f} s: {event['what']}" for event in document["events"]]
-    rows = [] if metrics is None else [(key, number(metrics[key]), unit, words) for key, unit, words in _meant(view)]
+    rows = (
+        []
+        if metrics is None
+        else [(key, number(metrics[key]), unit, words) for key, unit, words in table_metrics(view)]
+    )
     if document["prediction"] is not None:
         rows.append(
             ("H before", number(document["prediction"]["H"]), "jump²/(N·s)²", "jump² per impulse² at the impacts")
@@ -66,9 +70,10 @@ def run_content(folder: Path, document: Document, view: RunView, job: Job) -> Co
     )
 
 
-def _meant(view: RunView) -> list[tuple[str, str, str]]:
+def table_metrics(view: RunView) -> list[tuple[str, str, str]]:
     """Return key, unit and meaning of the metrics of a table."""
-    return [(key, unit, (_OF_PUSHES if view.pushed else {}).get(key, words)) for key, unit, words in _METRICS]
+    meanings = _PUSH_MEANINGS if view.pushed else {}
+    return [(key, unit, meanings.get(key, meaning)) for key, unit, meaning in _METRICS]
 
 
 def _summary(metrics: Mapping[str, Any]) -> str:
@@ -77,11 +82,11 @@ def _summary(metrics: Mapping[str, Any]) -> str:
 
 
 def comparison_content(folder: Path, document: Document, view: RunView) -> Content:
-    """Return the texts and the table of a page about a comparison, of which ``view`` is any run."""
+    """Return the texts and the table of a page about a comparison.  ``view`` is any of its runs."""
     rows = document["rows"]
     labels = [str(row["controller"]) for row in rows]
     table = [("status", *(str(row["status"]) for row in rows), "", "")]
-    for key, unit, meaning in _meant(view):
+    for key, unit, meaning in table_metrics(view):
         table.append((key, *(_mean(row["metrics"].get(key)) for row in rows), unit, meaning))
     verdict = []
     for row in rows:
@@ -92,7 +97,7 @@ def comparison_content(folder: Path, document: Document, view: RunView) -> Conte
         f"Within the impact windows, against nominal: {'; '.join(verdict)}." if verdict else "No reduction is known."
     )
     seeds = len(document["seeds"])
-    alike = without_noise(Interval(**found) for row in rows for found in row["metrics"].values())
+    alike = without_noise(Interval(**interval) for row in rows for interval in row["metrics"].values())
     intervals = ", with 95 % intervals" if seeds >= FEWEST else ""
     intervals = ", all alike, because the scenario has no noise" if alike else intervals
     means = "One seed" if seeds == 1 else f"Means of {seeds} seeds{intervals}"
@@ -108,9 +113,9 @@ def comparison_content(folder: Path, document: Document, view: RunView) -> Conte
     )
 
 
-def _mean(found: Mapping[str, Any] | None) -> str:
-    """Return a mean, with half of its interval where it is shown."""
-    if found is None:
+def _mean(interval: Mapping[str, Any] | None) -> str:
+    """Return a mean, with the half width of its interval where people see it."""
+    if interval is None:
         return "–"
-    half = Interval(**found).shown
-    return number(found["mean"]) + ("" if half is None else f" ± {number(half)}")
+    half = Interval(**interval).shown
+    return number(interval["mean"]) + ("" if half is None else f" ± {number(half)}")

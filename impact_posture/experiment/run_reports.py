@@ -1,4 +1,4 @@
-"""Reports of runs and comparisons, from the files of their folders."""
+"""Reports of runs and comparisons, which are written from the files in their folders."""
 
 from __future__ import annotations
 
@@ -31,9 +31,9 @@ from impact_posture.system.output_folder import write_json
 from impact_posture.system.text_files import read_text
 
 SIMULATION, COMPARISON, RUNS = "run.json", "comparison.json", "runs"
-# Time between frames in impact windows and elsewhere, s.
+# Time between shown ticks, in impact windows and elsewhere, s.
 _FINE, _COARSE = 0.001, 0.025
-# No position of a robot that is under control is larger, m or rad.
+# A larger position means that the state has diverged, m or rad.
 _AWAY = 1e3
 # Columns of the time series that figures show.
 _COLUMNS = {field.name for field in fields(RunView)} & {field.name for field in fields(Series)}
@@ -41,26 +41,25 @@ _BROKEN = (LookupError, ArithmeticError, ValueError, TypeError, AttributeError, 
 
 
 def keep_runs(folder: Path, jobs: Sequence[Job], store: JobStore) -> None:
-    """Write the document and the ticks that a report shows of each stored job into ``runs/`` of a comparison.
+    """Write the document and the shown ticks of each stored job into ``runs/`` of a comparison.
 
-    A run whose state runs away at once is left out.
+    A run whose state diverges at once is left out.
 
     Raises:
-        OSError: They cannot be written.
+        OSError: The files cannot be written.
     """
     (folder / RUNS).mkdir()
     for job in jobs:
-        found = kept_run(job, store)
-        if found is not None:
-            (document, series), path = found, folder / RUNS / _stem(job.label)
+        if (stored := stored_run(job, store)) is not None:
+            (document, series), path = stored, folder / RUNS / _stem(job.label)
             part = document["runs"][0]
             with suppress(InputError):
                 thin(series, _windows(part)).save(_series(path, part["sign"]))
                 write_json(path.with_name(f"{path.name}.json"), document)
 
 
-def kept_run(job: Job, store: JobStore) -> tuple[Document, Series] | None:
-    """Return the document of a stored job and the time series of its first run, or ``None`` if it has no runs.
+def stored_run(job: Job, store: JobStore) -> tuple[Document, Series] | None:
+    """Return the document of a stored job and the series of its first run; ``None`` if it has no runs.
 
     Raises:
         OutputError: As :meth:`JobStore.finished`.
@@ -72,7 +71,7 @@ def kept_run(job: Job, store: JobStore) -> tuple[Document, Series] | None:
 
 
 def run_view(job: Job, part: Document, series: Series) -> RunView:
-    """Return the view of a run from its document, with a label that says if the run did not complete."""
+    """Return the view of a run from its document.  The label has the status of an incomplete run."""
     factory = controller_factory(job.scenario, job.free)
     setup, scenario, objective = factory.setup, factory.setup.scenario, factory.objective()
     return RunView(
@@ -90,7 +89,7 @@ def run_view(job: Job, part: Document, series: Series) -> RunView:
 
 
 def try_report(folder: Path, scenario: str, *, meshes: bool) -> str:
-    """Write the report of a folder; return why that failed, because the runs are kept without it."""
+    """Write the report of a folder.  Return the reason if that fails, because the runs are kept without it."""
     try:
         write_run_report(folder, scenario, meshes=meshes)
     except Exception as error:
@@ -99,15 +98,15 @@ def try_report(folder: Path, scenario: str, *, meshes: bool) -> str:
 
 
 def write_run_report(folder: Path, scenario: str = "", *, meshes: bool = False) -> Path:
-    """Write ``report.html`` of a run or comparison into its folder, from the files there; return its path.
+    """Write ``report.html`` of a run or comparison into its folder.  Return the path of the report.
 
     Args:
         folder: A folder that ``simulate`` or ``compare`` wrote.
         scenario: Name or file of the scenario; from the folder by default.
-        meshes: Pass on the meshes of the user's own URDF, too.
+        meshes: Include the meshes of the user's URDF.
 
     Raises:
-        SpecError: The folder is none of these, or its files do not fit.
+        SpecError: The folder holds neither a run nor a comparison, or its files do not fit together.
         ImpactPostureError: The scenario cannot be set up any more.
         OutputError: The report cannot be written.
     """
@@ -118,7 +117,7 @@ def write_run_report(folder: Path, scenario: str = "", *, meshes: bool = False) 
             content = run_content(folder, document, runs[0][0], _job(document, scenario))
         else:
             document, runs = _read(folder / COMPARISON, COMPARISON_SCHEMA), []
-            # Each file is read once, however often it is named.
+            # Rows with the same name share one file.
             for stem in dict.fromkeys(_stem(row["controller"]) for row in document["rows"]):
                 if (path := folder / RUNS / f"{stem}.json").is_file():
                     runs += _runs(_read(path, SIMULATION_SCHEMA), folder / RUNS / stem, scenario, 1)
@@ -132,16 +131,19 @@ def write_run_report(folder: Path, scenario: str = "", *, meshes: bool = False) 
 
 
 def thin(series: Series, windows: Iterable[Window]) -> Series:
-    """Return the ticks of a run that a report shows; a force is the largest since the last of them.
+    """Return the ticks of a run that a report shows.  A force is the largest one since the previous shown tick.
 
-    The ticks end where the state runs away.
+    The ticks end where the state diverges.
 
     Args:
         series: All ticks.
-        windows: Windows of the run, of which those of kind ``impact`` are shown finely.
+        windows: Windows of the run.  Ticks within windows of kind ``impact`` are denser.
+
+    Raises:
+        InputError: The state diverges within two ticks.
     """
-    gone = np.flatnonzero(~(np.abs(series.q).max(axis=1) < _AWAY))
-    t = series.t[: gone[0]] if len(gone) else series.t
+    away = np.flatnonzero(~(np.abs(series.q).max(axis=1) < _AWAY))
+    t = series.t[: away[0]] if len(away) else series.t
     if len(t) < 2:
         raise InputError("runs away at once", where="report", hint="there is nothing to show")
     step = float(t[1] - t[0])
@@ -149,9 +151,9 @@ def thin(series: Series, windows: Iterable[Window]) -> Series:
     for window in windows:
         if window.kind == "impact":
             inside |= (t >= window.begin - _FINE) & (t <= window.end)
-    # Counted in ticks, because a sum of times is not exact.
-    each = np.where(inside, max(round(_FINE / step), 1), max(round(_COARSE / step), 1))
-    kept = np.flatnonzero((np.arange(len(t)) % each == 0) | (np.arange(len(t)) == len(t) - 1))
+    # Strides count ticks, because a sum of times is not exact.
+    stride = np.where(inside, max(round(_FINE / step), 1), max(round(_COARSE / step), 1))
+    kept = np.flatnonzero((np.arange(len(t)) % stride == 0) | (np.arange(len(t)) == len(t) - 1))
     size = np.linalg.norm(series.force[: len(t)], axis=1)
     begins = np.concatenate([[0], kept[:-1] + 1])
     strongest = [a + int(np.argmax(size[a : b + 1])) for a, b in zip(begins, kept, strict=True)]
@@ -164,8 +166,8 @@ def run_scene(runs: Sequence[tuple[RunView, WorstCaseObjective]], *, meshes: boo
     """Return the scene of runs of one scenario.
 
     Args:
-        runs: The runs, with the ticks of :func:`thin`, and the impact that each is about.
-        meshes: Pass on the meshes of the user's own URDF, too.
+        runs: Views of the runs, with the ticks of :func:`thin`, and the objective of each.
+        meshes: Include the meshes of the user's URDF.
     """
     first, objective = runs[0]
     planes = []
@@ -175,7 +177,7 @@ def run_scene(runs: Sequence[tuple[RunView, WorstCaseObjective]], *, meshes: boo
         numeric = Numeric(first.robot.model).at(first.q[0])
         feet = [numeric.placement(point_on(first.robot, s.frame, s.offset)).translation for s in first.supports]
         planes.append(("ground", min(feet, key=lambda foot: float(foot[2])), np.array([0.0, 0.0, 1.0])))
-    tracks = tuple(_track(view, one) for view, one in runs)
+    tracks = tuple(_track(*run) for run in runs)
     return ReportScene(draw_robot(first.robot, meshes), objective, tracks, tuple(planes), (), False)
 
 
@@ -185,10 +187,10 @@ def _track(view: RunView, objective: WorstCaseObjective) -> Track:
         within = (view.t >= window.begin) & (view.t <= window.end)
         if within.any():
             jumps[within] = view.v[within] - view.v[max(int(np.argmax(within)) - 1, 0)]
-    found = [objective.oracle.quantities(q) for q in view.q]
+    quantities = [objective.oracle.quantities(q) for q in view.q]
     force = ("largest normal force", "N", view.peak)
-    curves = (*impact_curves(found, objective.metric), force)
-    return Track(view.name, view.t, "s", view.q, [found], jumps, curves, view.force)
+    curves = (*impact_curves(quantities, objective.metric), force)
+    return Track(view.name, view.t, "s", view.q, [quantities], jumps, curves, view.force)
 
 
 def _read(path: Path, schema: str) -> Document:
@@ -212,22 +214,21 @@ def _series(stem: Path, sign: int) -> Path:
 
 
 def _job(document: Document, scenario: str) -> Job:
-    """Return the job of a document, with the scenario by its name if it is a shipped one."""
+    """Return the job of a document.  A shipped scenario is named, another one is given by its path."""
     name, source = str(document["scenario"]), str(document["source"])
     shipped = name in known_scenarios() and Path(source) == scenario_path(name)
-    place = scenario or (name if shipped else source)
-    return Job(place, document["controller"], document["seed"], document["mode"], document["free"], document["gain"])
+    scenario = scenario or (name if shipped else source)
+    return Job(scenario, *(document[key] for key in ("controller", "seed", "mode", "free", "gain")))
 
 
 def _runs(document: Document, stem: Path, scenario: str, count: int) -> list[tuple[RunView, WorstCaseObjective]]:
-    """Return the first runs of a document with their impact."""
-    job, found = _job(document, scenario), []
+    """Return views of the first runs of a document, each with its objective."""
+    job, runs = _job(document, scenario), []
     factory = controller_factory(job.scenario, job.free)
-    parts = document["runs"][:count]
     if document["model_sha256"] != factory.setup.robot.model_sha256:
         raise SpecError("was run with another robot model", where=str(stem.parent), hint="run it again")
-    for part in parts:
+    for part in document["runs"][:count]:
         view = run_view(job, part, thin(Series.load(_series(stem, part["sign"])), _windows(part)))
         label = f"{view.label}, push {part['sign']:+d}" if count > 1 else view.label
-        found.append((replace(view, label=label), factory.objective()))
-    return found
+        runs.append((replace(view, label=label), factory.objective()))
+    return runs

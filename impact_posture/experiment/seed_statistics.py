@@ -1,4 +1,4 @@
-"""Means over seeds with confidence intervals, and reductions against the nominal controller, seed by seed."""
+"""Means over seeds with confidence intervals, and reductions against the nominal controller with the same seed."""
 
 from __future__ import annotations
 
@@ -15,9 +15,10 @@ from impact_posture.simulation.outcome import Outcome, gravest
 # The metrics that have a mean and an interval.
 QUANTITIES = tuple(f.name for f in fields(Metrics) if f.name not in ("stops", "contacts", "contacts_asked", "rested"))
 
-# Fewest samples whose interval is shown.  That of two says nothing, because its quantile of Student's t is 12.7.
+# Fewest samples whose interval is shown.  For two samples, the quantile of Student's t is 12.7, so an interval says
+# nothing.
 FEWEST = 3
-# A relative half width below which the samples are the same but for rounding, as without noise.
+# Samples with a smaller relative half width differ only by rounding, because the scenario has no noise.
 _SAME = 1e-12
 
 
@@ -37,12 +38,12 @@ class Interval:
 
     @property
     def shown(self) -> float | None:
-        """Half width that people see, ``None`` for fewer than :data:`FEWEST` samples, and for equal ones."""
+        """Half width that people see; ``None`` for fewer than :data:`FEWEST` samples or equal ones."""
         return None if self.samples < FEWEST or self.alike else self.half_width
 
     @property
     def alike(self) -> bool:
-        """Whether all of several samples are the same but for rounding."""
+        """Whether several samples differ only by rounding."""
         return self.half_width is not None and self.half_width <= _SAME * abs(self.mean)
 
     @staticmethod
@@ -53,10 +54,10 @@ class Interval:
         return Interval(float(np.mean(values)), half_width, n)
 
 
-def without_noise(found: Iterable[Interval]) -> bool:
-    """Return whether there are intervals and the samples of each are alike, as without noise."""
-    known = list(found)
-    return bool(known) and all(one.alike for one in known)
+def without_noise(intervals: Iterable[Interval]) -> bool:
+    """Return whether there are intervals, and the samples of each are alike because the scenario has no noise."""
+    alike = [interval.alike for interval in intervals]
+    return bool(alike) and all(alike)
 
 
 @dataclass(frozen=True)
@@ -71,15 +72,15 @@ class ControllerRow:
         completed: Number of runs that completed.
         failed: Reason why a run did not complete, one line each.
         metrics: Means of the completed runs, by name of :data:`QUANTITIES`.  Empty if no run completed.
-        reduction: Reduction of ``q_total_impact`` against nominal with the same seed, a share.  ``None`` for no
+        reduction: Reduction of ``q_total_impact`` against nominal with the same seed, a share.  ``None`` without
             nominal runs, or if a run of either controller did not complete.
         recovery: Reduction of ``q_total_recovery``.
-        change: Differences of all quantities to nominal, under the same conditions.
+        change: Differences of all quantities from nominal; empty where ``reduction`` is ``None``.
         stops: Joints that reached a position limit within an impact window of any run.
         rested: Whether the robot was at rest before every push.
         H: Mean of H just before the impacts.
-        ratio: Mean ratio of the measured jump to that of the rigid model with the friction of the surface.
-        force: Ratio of ``peak_force`` to that of nominal with the same seed, ``None`` as for ``reduction``.
+        ratio: Mean of the measured jump over the jump of the rigid model with the friction of the surface.
+        force: ``peak_force`` over the nominal value with the same seed; ``None`` where ``reduction`` is ``None``.
     """
 
     scenario: str
@@ -108,7 +109,7 @@ def value_of(document: Document, quantity: str) -> float:
 
 
 def fate(document: Document) -> str:
-    """Return the first event of the gravest kind in a run that did not complete, with its time."""
+    """Return the first event of the gravest kind in an incomplete run, with its time."""
     status = str(document["status"])
     first = next(event for event in document["events"] if event["status"] == status)
     sign = f" (push {first['sign']:+d})" if len(document["runs"]) > 1 else ""
@@ -116,20 +117,22 @@ def fate(document: Document) -> str:
     return f"{status}: {first['what']}{when}{sign}"
 
 
-def row_of(scenario: str, controller: str, own: Sequence[Document], nominal: Sequence[Document]) -> ControllerRow:
+def row_of(
+    scenario: str, controller: str, documents: Sequence[Document], nominal: Sequence[Document]
+) -> ControllerRow:
     """Summarize the runs of a controller.
 
     Args:
         scenario: Name of the scenario.
         controller: Label of the controller.
-        own: Documents of its runs.
+        documents: Documents of its runs.
         nominal: Documents of the nominal controller, paired by seed.  Without them there is no comparison.
     """
-    good = [d for d in own if d["status"] == "completed"]
+    good = [d for d in documents if d["status"] == "completed"]
     base = {d["seed"]: d for d in nominal}
-    pairs = [(d, base[d["seed"]]) for d in own if d["seed"] in base]
-    # The seeds that are left after some runs failed are no fair sample.
-    fair = bool(pairs) and len(good) == len(own) and all(n["status"] == "completed" for _, n in pairs)
+    pairs = [(d, base[d["seed"]]) for d in documents if d["seed"] in base]
+    # If some runs failed, the seeds of the others are not a fair sample.
+    fair = bool(pairs) and len(good) == len(documents) and all(n["status"] == "completed" for _, n in pairs)
 
     def paired(name: str, compare: Callable[[float, float], float]) -> Interval:
         return Interval.of([compare(value_of(d, name), value_of(n, name)) for d, n in pairs])
@@ -138,16 +141,16 @@ def row_of(scenario: str, controller: str, own: Sequence[Document], nominal: Seq
         return paired(name, lambda mine, nominal: mine / nominal) if fair else None
 
     def reduction(name: str) -> Interval | None:
-        found = share(name)
-        return found and replace(found, mean=1 - found.mean)
+        ratio = share(name)
+        return ratio and replace(ratio, mean=1 - ratio.mean)
 
     return ControllerRow(
         scenario=scenario,
         controller=controller,
-        status=gravest(d["status"] for d in own),
-        runs=len(own),
+        status=gravest(d["status"] for d in documents),
+        runs=len(documents),
         completed=len(good),
-        failed=tuple(f"seed {d['seed']}: {fate(d)}" for d in own if d["status"] != "completed"),
+        failed=tuple(f"seed {d['seed']}: {fate(d)}" for d in documents if d["status"] != "completed"),
         metrics={name: Interval.of([value_of(d, name) for d in good]) for name in QUANTITIES} if good else {},
         reduction=reduction("q_total_impact"),
         recovery=reduction("q_total_recovery"),

@@ -1,12 +1,9 @@
-"""``simulate``, ``compare``, ``reproduce`` as a user runs them."""
+"""Commands ``simulate``, ``compare`` and ``reproduce``."""
 
 from __future__ import annotations
 
 import json
-import os
 import re
-import subprocess
-import sys
 from collections.abc import Callable
 from pathlib import Path
 from typing import Any
@@ -19,38 +16,35 @@ from impact_posture.simulation.series import Series
 from impact_posture_cli.commands.simulate import _show
 from impact_posture_cli.output import Page
 from tests.experiment.conftest import shortened
-from tests.support.command import on_terminal, read_terminal
+from tests.support.command import on_terminal
 from tests.support.command import run as start
-
-COMMAND = Path(sys.executable).parent / "impact-posture"
 
 
 def document(*arguments: str, cwd: Path, prepare: Callable[[], None] | None = None) -> dict[str, Any]:
     done = start(*arguments, "--json", cwd=cwd, prepare=prepare)
     assert (done.returncode, done.stderr) == (0, "")
-    found = json.loads(done.stdout)
-    assert isinstance(found, dict)
-    return found
+    content = json.loads(done.stdout)
+    assert isinstance(content, dict)
+    return content
 
 
 def test_simulate(aerial: Path, tmp_path: Path) -> None:
-    asked = ("simulate", str(aerial), *"--controller robust --seed 3 --out run --format png".split())
-    found = document(*asked, cwd=tmp_path)
-    assert (found["scenario"], found["controller"], found["seed"]) == ("aerial-lateral", "robust", 3)
+    command = ("simulate", str(aerial), *"--controller robust --seed 3 --out run --format png".split())
+    result = document(*command, cwd=tmp_path)
+    assert (result["scenario"], result["controller"], result["seed"]) == ("aerial-lateral", "robust", 3)
     for key in ("q_total_impact", "q_total_dwell", "peak_jump", "peak_force", "relaxed_ticks"):
-        assert isinstance(found["metrics"][key], int | float)
-    assert json.loads((tmp_path / "run" / "run.json").read_text()) == found
+        assert isinstance(result["metrics"][key], int | float)
+    assert json.loads((tmp_path / "run" / "run.json").read_text()) == result
     series = Series.load(tmp_path / "run" / "series.npz")
-    window = found["windows"][0]
+    window = result["windows"][0]
     speed = np.linalg.norm(series.v[series.slice(window["begin"], window["end"])], axis=1)
-    assert speed.sum() * 1e-3 == pytest.approx(found["metrics"]["q_total_impact"])
+    assert speed.sum() * 1e-3 == pytest.approx(result["metrics"]["q_total_impact"])
     assert list((tmp_path / "run").glob("*.png")) and not list((tmp_path / "run").glob("*.pdf"))
-    # Never over what is there; the same again is the same.
+    # An existing folder needs --force.  The same command gives the same result.
     refused = start("simulate", str(aerial), "--controller", "robust", "--out", "run", cwd=tmp_path)
     assert refused.returncode == 1 and "--force" in refused.stderr
-    again = document(*asked, "--force", cwd=tmp_path)
-    assert again == found
-    # Time that stands still is no run, and its report says so.
+    assert document(*command, "--force", cwd=tmp_path) == result
+    # A series whose time does not advance has no report.
     columns = vars(series) | {"t": np.zeros_like(series.t)}
     Series(**columns).save(tmp_path / "run" / "series.npz")
     refused = start("report", "run", cwd=tmp_path)
@@ -58,25 +52,25 @@ def test_simulate(aerial: Path, tmp_path: Path) -> None:
 
 
 def test_simulate_without_a_compiler(aerial: Path, tmp_path: Path) -> None:
-    """One warning, and the numbers that the compiled gradient gives."""
-    asked = ("simulate", aerial, "--controller", "robust", "--format", "png", "--out")
+    """There is one warning, and the numbers are those of the compiled gradient."""
+    command = ("simulate", aerial, "--controller", "robust", "--format", "png", "--out")
     bare = {"PATH": str(tmp_path), "CC": "", "IMPACT_POSTURE_CACHE": str(tmp_path / "cache")}
-    done = start(*asked, "bare", cwd=tmp_path, env=bare)
+    done = start(*command, "bare", cwd=tmp_path, env=bare)
     assert done.returncode == 0
     (line,) = done.stderr.splitlines()
     assert line.startswith("warning: the gradient is interpreted, not compiled, which is slower: ")
     assert "no C compiler found" in line
-    assert start(*asked, "quiet", "--quiet", cwd=tmp_path, env=bare).stderr == ""
-    assert start(*asked, "whole", cwd=tmp_path).returncode == 0
+    assert start(*command, "quiet", "--quiet", cwd=tmp_path, env=bare).stderr == ""
+    assert start(*command, "whole", cwd=tmp_path).returncode == 0
     totals = []
     for folder, warnings in (("bare", 1), ("quiet", 1), ("whole", 0)):
-        found = json.loads((tmp_path / folder / "run.json").read_text())
-        assert len(found["warnings"]) == warnings
-        totals.append(found["metrics"]["q_total_impact"])
+        result = json.loads((tmp_path / folder / "run.json").read_text())
+        assert len(result["warnings"]) == warnings
+        totals.append(result["metrics"]["q_total_impact"])
     assert totals[0] == totals[1] == pytest.approx(totals[2], rel=1e-3)
 
 
-def test_simulate_for_people(push: Path, tmp_path: Path) -> None:
+def test_simulate_prints_a_summary(push: Path, tmp_path: Path) -> None:
     done = start("simulate", str(push), "--controller", "robust", "--mode", "held", "--format", "png", cwd=tmp_path)
     assert (done.returncode, done.stderr) == (0, "")
     assert "solo8-push, robust:held" in done.stdout and "pushed after" in done.stdout
@@ -86,7 +80,7 @@ def test_simulate_for_people(push: Path, tmp_path: Path) -> None:
 
 @pytest.fixture(scope="session")
 def falls(push: Path, tmp_path_factory: pytest.TempPathFactory) -> Path:
-    """A push that no controller stands."""
+    """A push after which every controller falls."""
     path = tmp_path_factory.mktemp("scenarios") / "falls.toml"
     text, count = re.subn(r"(?m)^force = \[6.5, 0, 0\]", "force = [60, 0, 0]", push.read_text(encoding="utf-8"))
     assert count == 1
@@ -103,10 +97,10 @@ def test_simulate_a_robot_that_falls(falls: Path, tmp_path: Path) -> None:
     assert max(len(line) for line in done.stdout.splitlines()) <= 80
     assert list((tmp_path / "fell").glob("*.png")) and (tmp_path / "fell" / "series.npz").is_file()
     again = start("simulate", str(falls), *"--sign +1 --out fell --format png --force --json".split(), cwd=tmp_path)
-    found = json.loads(again.stdout)
-    assert again.returncode == 4 and found == json.loads((tmp_path / "fell" / "run.json").read_text())
-    assert (found["status"], found["metrics"], found["prediction"]) == ("fell", None, None)
-    assert {"status", "time", "what", "sign"} == set(found["events"][0])
+    result = json.loads(again.stdout)
+    assert again.returncode == 4 and result == json.loads((tmp_path / "fell" / "run.json").read_text())
+    assert (result["status"], result["metrics"], result["prediction"]) == ("fell", None, None)
+    assert {"status", "time", "what", "sign"} == set(result["events"][0])
 
 
 def test_compare_robots_that_fall(falls: Path, tmp_path: Path) -> None:
@@ -117,8 +111,7 @@ def test_compare_robots_that_fall(falls: Path, tmp_path: Path) -> None:
     assert ["nominal", "fell", "1/1"] in rows and ["stiff", "fell", "1/1"] in rows
     assert "no reduction if a run of either controller did not complete" in done.stdout
     assert "seed 0: fell: the base" in done.stdout
-    found = json.loads((tmp_path / "both" / "comparison.json").read_text())
-    for row in found["rows"]:
+    for row in json.loads((tmp_path / "both" / "comparison.json").read_text())["rows"]:
         assert (row["status"], row["runs"], row["completed"]) == ("fell", 1, 0)
         assert row["metrics"] == {} and row["reduction"] is None and len(row["failed"]) == 1
     # The page can be written later.
@@ -131,30 +124,24 @@ def test_compare_robots_that_fall(falls: Path, tmp_path: Path) -> None:
     assert done.returncode == 1 and "both: holds no run to show" in done.stderr
 
 
-def test_contacts_are_counted_against_what_was_asked_for(capsys: pytest.CaptureFixture[str]) -> None:
+def test_simulate_prints_made_and_expected_contacts(capsys: pytest.CaptureFixture[str]) -> None:
     numbers = {"relaxed_ticks": 7, "failed_ticks": 2, "contacts": 3, "contacts_asked": 5}
     event = {"status": "lost contact", "time": 1.25, "what": "2 of 5 contacts were never made", "sign": 1}
-    found = {"scenario": "mine", "seed": 0, "status": "lost contact", "metrics": None, "events": [event],
-             "windows": [{"kind": "dwell"}], "runs": [{"ticks": 900, "metrics": numbers}],
-             "offline": None, "path": None, "warnings": []}  # fmt: skip
-    _show(Page(), found, "nominal", Path("there"))
-    said = " ".join(capsys.readouterr().out.split())
-    assert "contacts 3 of 5" in said and "relaxed 7 of 900 ticks" in said and "held 2 ticks" in said
-    assert "t = 1.25 s: lost contact: 2 of 5 contacts were never made" in said and "q_total" not in said
+    result = {"scenario": "mine", "seed": 0, "status": "lost contact", "metrics": None, "events": [event],
+              "windows": [{"kind": "dwell"}], "runs": [{"ticks": 900, "metrics": numbers}],
+              "offline": None, "path": None, "warnings": []}  # fmt: skip
+    _show(Page(), result, "nominal", Path("there"))
+    text = " ".join(capsys.readouterr().out.split())
+    assert "contacts 3 of 5" in text and "relaxed 7 of 900 ticks" in text and "held 2 ticks" in text
+    assert "t = 1.25 s: lost contact: 2 of 5 contacts were never made" in text and "q_total" not in text
 
 
 def test_progress_is_for_terminals(aerial: Path, tmp_path: Path) -> None:
-    asked = ("simulate", str(aerial), "--out", "run", "--force", "--format", "png", "--no-report")
-    ours, theirs = os.openpty()
-    with subprocess.Popen(
-        [COMMAND, *asked], stdout=subprocess.DEVNULL, stderr=theirs, cwd=tmp_path, env={**os.environ, "TERM": "xterm"}
-    ) as process:
-        os.close(theirs)
-        said = read_terminal(ours)
-    assert process.returncode == 0
+    command = ("simulate", str(aerial), "--out", "run", "--force", "--format", "png", "--no-report")
+    text = on_terminal(*command, cwd=tmp_path)
     for words in ("loading", "building the expressions", "simulating, t = ", "drawing"):
-        assert words in said, words
-    assert on_terminal(*asked, "--quiet", cwd=tmp_path) == ""
+        assert words in text, words
+    assert on_terminal(*command, "--quiet", cwd=tmp_path) == ""
 
 
 def test_compare(aerial: Path, tmp_path: Path) -> None:
@@ -162,54 +149,43 @@ def test_compare(aerial: Path, tmp_path: Path) -> None:
     assert (done.returncode, done.stderr) == (0, "")
     assert max(len(line) for line in done.stdout.splitlines()) <= 80
     assert not list(tmp_path.iterdir())
-    found = document(
-        "compare",
-        str(aerial),
-        "--controllers",
-        "nominal,robust",
-        "--seeds",
-        "2",
-        "--out",
-        "both",
-        "--format",
-        "png",
-        cwd=tmp_path,
-    )
-    assert [row["controller"] for row in found["rows"]] == ["nominal", "robust"]
-    nominal, robust = (row["metrics"]["q_total_impact"] for row in found["rows"])
+    options = "--controllers nominal,robust --seeds 2 --out both --format png".split()
+    result = document("compare", str(aerial), *options, cwd=tmp_path)
+    assert [row["controller"] for row in result["rows"]] == ["nominal", "robust"]
+    nominal, robust = (row["metrics"]["q_total_impact"] for row in result["rows"])
     assert nominal["samples"] == 2 and nominal["half_width"] > 0
-    assert found["rows"][1]["reduction"]["mean"] == pytest.approx(1 - robust["mean"] / nominal["mean"], abs=0.05)
-    assert json.loads((tmp_path / "both" / "comparison.json").read_text()) == found
-    assert sorted(path.name for path in tmp_path.iterdir()) == ["both"], "the runs' folder has gone"
-    # Its page has both runs, from what the folder keeps of them.
+    assert result["rows"][1]["reduction"]["mean"] == pytest.approx(1 - robust["mean"] / nominal["mean"], abs=0.05)
+    assert json.loads((tmp_path / "both" / "comparison.json").read_text()) == result
+    assert sorted(path.name for path in tmp_path.iterdir()) == ["both"], "the store is removed"
+    # The page shows both runs from the files of the folder.
     assert start("report", "both", "--quiet", cwd=tmp_path).returncode == 0
     page = (tmp_path / "both" / "report.html").read_text()
     assert "default-src 'none'" in page and len(page) < 2e6
     assert all(f'<option value="{k}">{name}</option>' in page for k, name in enumerate(("nominal", "robust")))
-    assert "Means of 2 seeds</caption>" in page and "±" not in page, "intervals from 3 seeds on, as on the terminal"
+    assert "Means of 2 seeds</caption>" in page and "±" not in page, "intervals need 3 seeds, as on the terminal"
 
 
 def test_reproduce(tmp_path: Path) -> None:
     pytest.importorskip("mujoco", reason="mujoco is not installed (the extra 'sim')")
-    # The scenario as shipped, with less time to settle in and none to recover in.
+    # A shipped scenario with a short wait and a short recovery.
     shipped = tmp_path / "scenarios"
     shipped.mkdir()
     (shipped / "solo8-push.toml").write_text(shortened("solo8-push", settle=1.0, patience=1.0, after=0.1))
-    asked = "reproduce --scenario solo8-push --seeds 1 --out all --format png".split()
-    found = document(*asked, cwd=tmp_path, prepare=lambda: setattr(scenario_file, "SHIPPED", shipped))
-    rows = {row["controller"]: row for row in found["rows"]}
-    assert {"nominal", "robust"} < set(rows) and all(row["scenario"] == "solo8-push" for row in found["rows"])
+    command = "reproduce --scenario solo8-push --seeds 1 --out all --format png".split()
+    result = document(*command, cwd=tmp_path, prepare=lambda: setattr(scenario_file, "SHIPPED", shipped))
+    rows = {row["controller"]: row for row in result["rows"]}
+    assert {"nominal", "robust"} < set(rows) and all(row["scenario"] == "solo8-push" for row in result["rows"])
     assert rows["robust"]["paper"] == {"nominal": 0.411, "robust": 0.342, "reduction": 0.168}
     assert rows["robust"]["reduction"]["mean"] > 0
-    assert sum(row["best"] for row in found["rows"]) == 1
+    assert sum(row["best"] for row in result["rows"]) == 1
     text = (tmp_path / "all" / "SUMMARY.md").read_text()
-    assert text == found["summary"] and "## What to choose" in text
+    assert text == result["summary"] and "## What to choose" in text
     assert len(list((tmp_path / "all" / "runs").glob("*.json"))) == len(rows)
     assert list((tmp_path / "all").rglob("*.png"))
 
 
 @pytest.mark.parametrize(
-    ("arguments", "code", "said"),
+    ("arguments", "code", "words"),
     [
         (("simulate", "aerial-vertcal"), 1, "did you mean aerial-vertical"),
         (("simulate", "solo8-push", "--controller", "robst"), 1, "did you mean robust"),
@@ -223,11 +199,13 @@ def test_reproduce(tmp_path: Path) -> None:
         (("simulate", "missing.toml"), 1, "missing.toml"),
     ],
 )
-def test_one_line_says_what_is_wrong(arguments: tuple[str, ...], code: int, said: str, tmp_path: Path) -> None:
+def test_a_wrong_command_is_refused_in_one_line(
+    arguments: tuple[str, ...], code: int, words: str, tmp_path: Path
+) -> None:
     pytest.importorskip("mujoco", reason="mujoco is not installed (the extra 'sim')")
     done = start(*arguments, cwd=tmp_path)
     assert done.returncode == code
-    assert said in " ".join(done.stderr.replace("│", " ").split())
+    assert words in " ".join(done.stderr.replace("│", " ").split())
     assert "Traceback" not in done.stderr and not list(tmp_path.iterdir())
     if code == 1:
         assert len(done.stderr.strip().splitlines()) == 1

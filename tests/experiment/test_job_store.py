@@ -1,4 +1,4 @@
-"""Jobs and their store: finished jobs are found again, unless something that they depend on has changed."""
+"""Jobs and their store: finished jobs do not run again unless one of their inputs has changed."""
 
 from __future__ import annotations
 

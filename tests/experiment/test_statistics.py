@@ -1,4 +1,4 @@
-"""Means, intervals, reductions, targets and what is said of them, from documents made by hand."""
+"""Means, intervals, reductions, targets and texts, from synthetic documents."""
 
 from __future__ import annotations
 
@@ -11,7 +11,7 @@ import pytest
 from scipy import stats
 
 from impact_posture.errors import InputError
-from impact_posture.experiment.jobs import Job, jsonable, parse_controller, together
+from impact_posture.experiment.jobs import Job, combined, jsonable, parse_controller
 from impact_posture.experiment.reproduction import (
     PAPER,
     RECOMMENDED,
@@ -43,24 +43,24 @@ def document(controller: str, seed: int, q: float, **changed: Any) -> dict[str, 
 NOMINAL = [document("nominal", k, 2.0 + 0.1 * k) for k in range(4)]
 
 
-def test_interval_is_students() -> None:
+def test_interval_follows_students_t() -> None:
     samples = [1.0, 2.0, 4.0, 4.5]
-    found = Interval.of(samples)
-    assert found.shown == found.half_width and Interval.of(samples[:2]).shown is None
+    interval = Interval.of(samples)
+    assert interval.shown == interval.half_width and Interval.of(samples[:2]).shown is None
     low, high = stats.t.interval(0.95, 3, loc=np.mean(samples), scale=stats.sem(samples))
-    assert found.mean - found.half_width == pytest.approx(low)
-    assert found.mean + found.half_width == pytest.approx(high)
+    assert interval.mean - interval.half_width == pytest.approx(low)
+    assert interval.mean + interval.half_width == pytest.approx(high)
     assert Interval.of([3.0]) == Interval(3.0, None, 1)
-    # Runs without noise are the same for every seed but for rounding.
+    # Without noise, runs differ only by rounding.
     same = Interval.of([0.1 + 0.2, 0.3, 0.3])
-    assert same.alike and same.shown is None and not found.alike
-    assert without_noise([same, same]) and not without_noise([same, found]) and not without_noise([])
+    assert same.alike and same.shown is None and not interval.alike
+    assert without_noise([same, same]) and not without_noise([same, interval]) and not without_noise([])
 
 
 def test_reductions_are_paired_by_seed() -> None:
-    # Half of nominal, seed by seed; in another order, and one seed that nominal does not have.
-    own = [document("robust", k, (2.0 + 0.1 * k) / 2) for k in (3, 1, 0, 2)] + [document("robust", 9, 50.0)]
-    row = row_of("aerial-vertical", "robust", own, NOMINAL)
+    # Half of the nominal value for each seed, in another order, and a seed without a nominal run.
+    documents = [document("robust", k, (2.0 + 0.1 * k) / 2) for k in (3, 1, 0, 2)] + [document("robust", 9, 50.0)]
+    row = row_of("aerial-vertical", "robust", documents, NOMINAL)
     assert row.reduction is not None
     assert row.reduction.mean == pytest.approx(0.5) and row.reduction.half_width == pytest.approx(0, abs=1e-12)
     assert row.reduction.samples == 4
@@ -74,25 +74,25 @@ def failed(controller: str, seed: int, *statuses: str) -> dict[str, Any]:
             "events": events, "runs": [{"sign": 1}], "metrics": None, "prediction": None}  # fmt: skip
 
 
-def test_runs_that_failed_are_told_and_left_out() -> None:
-    own = [document("robust", 0, 1.0), failed("robust", 1, "lost contact", "fell")]
-    row = row_of("aerial-vertical", "robust", own, NOMINAL)
+def test_failed_runs_are_reported_and_left_out() -> None:
+    documents = [document("robust", 0, 1.0), failed("robust", 1, "lost contact", "fell")]
+    row = row_of("aerial-vertical", "robust", documents, NOMINAL)
     assert (row.status, row.completed, row.runs) == ("fell", 1, 2)
     assert row.failed == ("seed 1: fell: broke bound 1 at t = 2.50 s",) and row.metrics["peak_jump"].samples == 1
-    # Nothing is compared with a robot that fell, whichever of the two it was.
+    # There is no comparison if either robot fell.
     assert row.reduction is None and row.recovery is None and not row.change and missed_targets(row) is None
     against = row_of("aerial-vertical", "robust", [document("robust", 0, 1.0)], [failed("nominal", 0, "fell")])
     assert against.status == "completed" and against.reduction is None
     assert jsonable(row)["reduction"] is None and jsonable(row)["completed"] == 1
-    nothing = row_of("aerial-vertical", "robust", own[1:], NOMINAL)
+    nothing = row_of("aerial-vertical", "robust", documents[1:], NOMINAL)
     assert nothing.reduction is None and missed_targets(nothing) is None and not nothing.metrics
     assert "| robust | fell, 0 of 1 completed |" in scenario_table([nothing])
-    found = Reproduction(2, (row_of("aerial-vertical", "nominal", NOMINAL[:2], NOMINAL[:2]), row))
-    assert best_of(found.rows) is None and "nothing was better" in advice(found)[0]
-    assert "robust`: seed 1: fell" in summary(found)
+    results = Reproduction(2, (row_of("aerial-vertical", "nominal", NOMINAL[:2], NOMINAL[:2]), row))
+    assert best_of(results.rows) is None and "nothing was better" in advice(results)[0]
+    assert "robust`: seed 1: fell" in summary(results)
 
 
-def test_the_gravest_of_two_pushes_is_told() -> None:
+def test_the_gravest_event_of_two_pushes_is_reported() -> None:
     both = {**failed("robust", 0, "control lost", "fell"), "runs": [{"sign": 1}, {"sign": -1}]}
     assert fate(both) == "fell: broke bound 1 at t = 2.50 s (push +1)"
     assert [gravest(s) for s in ((), ("completed", "lost contact"), ("fell", "control lost"))] == [
@@ -104,8 +104,8 @@ def test_the_gravest_of_two_pushes_is_told() -> None:
     ("changed", "missed"),
     [
         ({}, ()),
-        ({"q_total_impact": 1.1}, ("reduction",)),
-        # Stored in the window and given back after it.
+        ({"q": 1.1}, ("reduction",)),
+        # The motion is stored in the window and released after it.
         ({"q_total_recovery": 4.7}, ("recovery",)),
         ({"q_total_recovery": 4.2}, ()),
         ({"peak_recovery": 3.1}, ("peak_recovery",)),
@@ -117,15 +117,9 @@ def test_the_gravest_of_two_pushes_is_told() -> None:
     ],
 )
 def test_targets(changed: dict[str, Any], missed: tuple[str, ...]) -> None:
-    own = [document("robust", k, **{"q": 0.9, **_without_q(changed)}) for k in range(4)]
-    if "q_total_impact" in changed:
-        own = [document("robust", k, 1.1) for k in range(4)]
-    targets = missed_targets(row_of("aerial-vertical", "robust", own, NOMINAL))
+    documents = [document("robust", k, **{"q": 0.9, **changed}) for k in range(4)]
+    targets = missed_targets(row_of("aerial-vertical", "robust", documents, NOMINAL))
     assert targets is not None and tuple(targets) == missed and all(targets.values())
-
-
-def _without_q(changed: dict[str, Any]) -> dict[str, Any]:
-    return {key: value for key, value in changed.items() if key != "q_total_impact"}
 
 
 def rows() -> list[Any]:
@@ -135,47 +129,45 @@ def rows() -> list[Any]:
     return gather("aerial-vertical", ["nominal", "robust", "posture", "walker"], [*NOMINAL, *less, *good, *restless])
 
 
-def test_the_best_meets_the_targets_first_and_moves_least_second() -> None:
-    found = rows()
-    best = best_of(found)
+def test_the_best_row_meets_the_targets_or_else_moves_least() -> None:
+    best = best_of(rows())
     assert best is not None and best.controller == "posture"
-    best = best_of([row for row in found if row.controller != "posture"])
-    # Nobody meets them all: the one that moves least, of those that were at rest.
+    # Without `posture`, no row meets every target.  `walker` moves least, but was not at rest.
+    best = best_of([row for row in rows() if row.controller != "posture"])
     assert best is not None and best.controller == "robust"
-    assert best_of(found[:1]) is None
+    assert best_of(rows()[:1]) is None
 
 
-def test_the_summary_leads_with_a_choice_and_says_what_is_wrong() -> None:
-    found = Reproduction(4, tuple(rows()))
-    lines = advice(found)
+def test_the_summary_begins_with_advice_and_names_faults() -> None:
+    results = Reproduction(4, tuple(rows()))
+    lines = advice(results)
     assert len(lines) == 1 and "`posture`" in lines[0] and "every target met at this point." in lines[0]
     assert "a higher peak jump than nominal" in lines[0]
-    text = summary(found)
+    text = summary(results)
     assert text.index("What to choose") < text.index("Table I")
-    assert "does not come to rest" in "\n".join(remarks(found, "aerial-vertical"))
-    cells = re.findall(r"^\| aerial-vertical \|.*$", table_one(found), re.MULTILINE)[0]
+    assert "does not come to rest" in "\n".join(remarks(results, "aerial-vertical"))
+    cells = re.findall(r"^\| aerial-vertical \|.*$", table_one(results), re.MULTILINE)[0]
     assert "10.4" in cells and "5.1" in cells and "51.0 %" in cells and "posture" in cells
-    rows_found = found.to_dict()["rows"]
-    assert [row["best"] for row in rows_found] == [False, False, True, False]
-    assert rows_found[0]["paper"] == {"nominal": 10.4, "robust": 5.1, "reduction": 0.51}
+    json_rows = results.to_dict()["rows"]
+    assert [row["best"] for row in json_rows] == [False, False, True, False]
+    assert json_rows[0]["paper"] == {"nominal": 10.4, "robust": 5.1, "reduction": 0.51}
 
 
 def test_the_summary_of_one_seed_has_no_intervals() -> None:
-    found = Reproduction(
-        1, tuple(gather("aerial-vertical", ["nominal", "robust"], [NOMINAL[0], document("robust", 0, 1)]))
-    )
-    assert "±" not in summary(found) and "no intervals" in summary(found)
+    single = gather("aerial-vertical", ["nominal", "robust"], [NOMINAL[0], document("robust", 0, 1)])
+    text = summary(Reproduction(1, tuple(single)))
+    assert "±" not in text and "no intervals" in text
 
 
-def test_a_held_posture_tells_stiffness_from_posture() -> None:
+def test_the_held_posture_separates_stiffness_from_posture() -> None:
     for held, word in ((1.9, "stiffness"), (0.6, "Most of it is posture")):
         parts = [
             *NOMINAL,
             *[document("robust", k, 0.5) for k in range(4)],
             *[document("robust", k, held) for k in range(4)],
         ]
-        found = Reproduction(4, tuple(gather("aerial-vertical", ["nominal", "robust", "robust:held"], parts)))
-        assert word in "\n".join(remarks(found, "aerial-vertical"))
+        held_rows = gather("aerial-vertical", ["nominal", "robust", "robust:held"], parts)
+        assert word in "\n".join(remarks(Reproduction(4, tuple(held_rows)), "aerial-vertical"))
 
 
 def test_names_of_controllers() -> None:
@@ -189,17 +181,17 @@ def test_names_of_controllers() -> None:
     assert Job("a/b.toml", "robust", 3, "held").name == "a_b.toml-robust-held-3"
 
 
-def test_what_is_known_of_the_paper_fits_the_scenarios() -> None:
+def test_values_of_the_paper_fit_the_scenarios() -> None:
     assert set(PAPER) == set(RECOMMENDED) < set(known_scenarios())
     assert set(MEANING) == set(CONTROLLERS)
     for name, row in PAPER.items():
-        # The text's percentages are those of its table's rounded numbers, within what rounding allows.
+        # The percentages in the text follow from the rounded numbers of the table.
         assert row.reduction == pytest.approx(1 - row.robust / row.nominal, abs=6e-3)
         assert controllers_of(name, False)[:2] == ("nominal", "robust")
         assert set(CONTROLLERS) < set(controllers_of(name, True))
 
 
-def test_what_is_recommended_is_what_the_page_of_the_envelope_says() -> None:
+def test_recommendations_match_the_page_of_the_envelope() -> None:
     page = (Path(__file__).parents[2] / "docs" / "generated" / "envelope.md").read_text(encoding="utf-8")
     assert dict(re.findall(r"^- \*\*([\w-]+)\*\*: .*?(?:Take|The best is) `([\w-]+)`", page, re.M)) == RECOMMENDED
 
@@ -208,10 +200,10 @@ def test_metrics_of_both_signs() -> None:
     other = Metrics(
         **{**METRICS.__dict__, "q_total_impact": 3.0, "peak_jump_max": 9.0, "stops": ("knee",), "rested": False}
     )
-    found = together([METRICS, other])
-    assert (found.q_total_impact, found.peak_jump_max, found.relaxed_ticks) == (2.0, 9.0, 14)
-    assert found.stops == ("knee",) and not found.rested
-    assert together([METRICS]) is METRICS
+    both = combined([METRICS, other])
+    assert (both.q_total_impact, both.peak_jump_max, both.relaxed_ticks) == (2.0, 9.0, 14)
+    assert both.stops == ("knee",) and not both.rested
+    assert combined([METRICS]) is METRICS
 
 
 def test_documents_have_no_infinities() -> None:

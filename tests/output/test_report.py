@@ -20,7 +20,7 @@ from hypothesis import given, settings
 from hypothesis import strategies as st
 
 import impact_posture as ip
-from impact_posture.experiment.run_report_content import _meant
+from impact_posture.experiment.run_report_content import table_metrics
 from impact_posture.experiment.run_reports import thin
 from impact_posture.impact.evaluation.coulomb_jump import coulomb_jump, coulomb_jumps
 from impact_posture.output.report.drawn_robot import draw_robot
@@ -262,7 +262,7 @@ def test_the_viewer_gets_the_robot_where_it_is(folder: Path) -> None:
 
 def test_metrics_of_a_push_are_explained_as_those_of_a_push() -> None:
     views = {pushed: SimpleNamespace(pushed=pushed) for pushed in (True, False)}
-    words = {pushed: {key: word for key, _, word in _meant(view)} for pushed, view in views.items()}  # type: ignore[arg-type]
+    words = {pushed: {key: word for key, _, word in table_metrics(view)} for pushed, view in views.items()}  # type: ignore[arg-type]
     assert "15 ms of the touch" in words[False]["peak_jump"] and "push" in words[True]["peak_jump"]
     assert list(words[True]) == list(words[False])
 
