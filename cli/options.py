@@ -8,7 +8,7 @@ from typing import Annotated, Any, Literal
 
 import typer
 
-from impact_posture.config.demands import CONTACT, OUTPUT, SEARCH
+from impact_posture.config.setting import CONTACT, OUTPUT, SEARCH
 
 CompileMode = Literal["auto", "always", "never"]
 

@@ -12,9 +12,9 @@ from typing import Annotated, Any, TypeVar, Union, get_args, get_origin, get_typ
 
 import typer
 
-from impact_posture.config.demands import CONTACT, METRIC, ROBOT, SEARCH, TASK, Setting
-from impact_posture.config.settings import ImpactSettings, RobotSettings
-from impact_posture.config.toml_tables import validate
+from impact_posture.config.setting import CONTACT, METRIC, ROBOT, SEARCH, TASK, Setting
+from impact_posture.config.settings import RobotSettings
+from impact_posture.config.table_validation import validate
 from impact_posture.errors import ImpactPostureError
 from impact_posture_cli.error_boundary import UsageError
 
@@ -105,36 +105,32 @@ def with_settings(
     return decorate
 
 
-def _settings_of(settings: type[RobotSettings]) -> dict[str, tuple[Any, Setting]]:
-    """Return type and description of each field that has an option."""
-    found = {}
-    for name, hint in get_type_hints(settings, include_extras=True).items():
-        described = [m for m in getattr(hint, "__metadata__", ()) if isinstance(m, Setting)]
-        if described:
-            found[name] = (get_args(hint)[0], described[0])
-    return found
+def settings_of(settings: type[RobotSettings]) -> dict[str, Setting]:
+    """Return the description of each field that has an option."""
+    return {f.name: f.metadata["setting"] for f in fields(settings) if "setting" in f.metadata}
 
 
 def _options(settings: type[RobotSettings], without: Collection[str]) -> dict[str, tuple[Any, Any]]:
     """Return annotation and default of each option, panel by panel."""
-    known, found = _settings_of(settings), {}
+    described, options = settings_of(settings), {}
+    types, demands = get_type_hints(settings), get_type_hints(settings, include_extras=True)
     defaults: dict[str, Any] = {f.name: None if f.default is MISSING else f.default for f in fields(settings)}
-    for name in sorted((n for n in known if n not in without), key=lambda n: _PANELS.index(known[n][1].panel)):
-        kind, setting = known[name]
-        default = None if isinstance(defaults[name], tuple) else defaults[name]
-        words = setting.words
-        if words is None and isinstance(defaults[name], tuple) and defaults[name]:
-            words = " ".join(f"{value:g}" for value in defaults[name])
+    names = (name for name in described if name not in without)
+    for name in sorted(names, key=lambda name: _PANELS.index(described[name].panel)):
+        setting, default, words = described[name], defaults[name], described[name].words
+        if isinstance(default, tuple):
+            words = " ".join(f"{value:g}" for value in default) if words is None and default else words
+            default = None
         option = typer.Option(
             setting.option or _spelled(name),
             metavar=setting.takes,
             help=setting.help,
             rich_help_panel=setting.panel,
             show_default=words if words is not None else True,
-            callback=_callback(setting),
+            callback=demanding(demands[name], setting),
         )
-        found[name] = (Annotated[_option_type(kind, setting, default is None), option], default)
-    return found
+        options[name] = (Annotated[_option_type(types[name], setting, default is None), option], default)
+    return options
 
 
 def _option_type(kind: Any, setting: Setting, optional: bool) -> Any:
@@ -145,29 +141,27 @@ def _option_type(kind: Any, setting: Setting, optional: bool) -> Any:
     return inner[0] | None if optional else inner[0]
 
 
-def _callback(setting: Setting) -> Callable[[Any], Any]:
+def demanding(annotation: Any, setting: Setting | None = None) -> Callable[[Any], Any]:
+    """Return the callback that checks the value of an option against an annotation."""
+
     def check(value: Any) -> Any:
         if value is not None and value != []:
+            from impact_posture.config.checked import hint_for
+
             try:
-                setting.check(_value(setting, value))
+                hint = hint_for(_value(setting, value), annotation)
             except ImpactPostureError as error:
                 raise typer.BadParameter(f"{error.what}; {error.hint}") from None
-            except ValueError as error:
-                raise typer.BadParameter(str(error)) from None
+            if hint:
+                raise typer.BadParameter(hint)
         return value
 
     return check
 
 
-positive = _callback(Setting("", holds=lambda value: 0 < value < float("inf"), demand="give a number above zero"))
-"""Callback that refuses numbers that are not above zero."""
-check_direction = _callback(_settings_of(ImpactSettings)["normal"][1])
-"""Callback that refuses a vector of length zero."""
-
-
-def _value(setting: Setting, value: Any) -> Any:
+def _value(setting: Setting | None, value: Any) -> Any:
     """Return the value of a setting from the text of its option."""
-    if setting.parse is not None:
+    if setting is not None and setting.parse is not None:
         return setting.parse(value)
     return tuple(value) if isinstance(value, list) else value
 
@@ -175,15 +169,15 @@ def _value(setting: Setting, value: Any) -> Any:
 def _given(
     context: typer.Context, options: Mapping[str, tuple[Any, Any]], settings: type[RobotSettings]
 ) -> dict[str, Any]:
-    known, found = _settings_of(settings), {}
+    described, values = settings_of(settings), {}
     for name in options:
-        if name in known and _on_command_line(context, name):
-            found[name] = _value(known[name][1], context.params[name])
+        if name in described and _on_command_line(context, name):
+            values[name] = _value(described[name], context.params[name])
     if context.params.get("no_support"):
-        if "support" in found:
+        if "support" in values:
             raise UsageError("--no-support contradicts --support: give one of the two.")
-        found["support"] = ()
-    return found
+        values["support"] = ()
+    return values
 
 
 def _on_command_line(context: typer.Context, name: str) -> bool:

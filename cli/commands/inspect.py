@@ -5,7 +5,7 @@ from __future__ import annotations
 from pathlib import Path
 from typing import TYPE_CHECKING, Annotated, Any
 
-from impact_posture.config.demands import OUTPUT
+from impact_posture.config.setting import OUTPUT
 from impact_posture.config.settings import RobotSettings
 from impact_posture_cli import options
 from impact_posture_cli.error_boundary import UsageError

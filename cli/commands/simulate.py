@@ -8,11 +8,12 @@ from typing import TYPE_CHECKING, Annotated, Any, Literal
 
 import typer
 
+from impact_posture.config.demand import Positive
 from impact_posture_cli import options
 from impact_posture_cli.experiments import RUN, Compile, Mode, ScenarioName
 from impact_posture_cli.output import Page, complain, number, print_json
 from impact_posture_cli.progress_line import progress
-from impact_posture_cli.settings_options import positive
+from impact_posture_cli.settings_options import demanding
 
 if TYPE_CHECKING:
     from impact_posture.simulation.scenario_file import Scenario
@@ -43,7 +44,7 @@ Free = Annotated[
 Gain = Annotated[
     float | None,
     options.option(
-        "--gain", panel=RUN, callback=positive, show_default="the scenario's",
+        "--gain", panel=RUN, callback=demanding(Positive), show_default="the scenario's",
         help="Gain K of the impact-robust term, 1/s².",
     ),
 ]  # fmt: skip

@@ -8,12 +8,13 @@ from typing import TYPE_CHECKING, Annotated
 
 import typer
 
-from impact_posture.config.demands import CONTACT, OUTPUT
-from impact_posture.config.settings import ImpactSettings, Vector3
+from impact_posture.config.demand import Direction, Vector3
+from impact_posture.config.setting import CONTACT, OUTPUT
+from impact_posture.config.settings import ImpactSettings
 from impact_posture_cli import options
 from impact_posture_cli.output import Page, complain, print_json
 from impact_posture_cli.progress_line import progress
-from impact_posture_cli.settings_options import Given, check_direction, with_settings
+from impact_posture_cli.settings_options import Given, demanding, with_settings
 
 if TYPE_CHECKING:
     from impact_posture.impact.resolved_impact import ResolvedImpact
@@ -22,7 +23,7 @@ if TYPE_CHECKING:
 NormalOfFirst = Annotated[
     Vector3 | None,
     options.option(
-        "--normal", metavar="X Y Z", callback=check_direction, panel=CONTACT,
+        "--normal", metavar="X Y Z", callback=demanding(Direction), panel=CONTACT,
         show_default="0 0 1", help="Normal of the first sample; the others' are random.",
     ),
 ]  # fmt: skip

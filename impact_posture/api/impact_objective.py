@@ -10,12 +10,9 @@ from typing import TYPE_CHECKING, Any
 import numpy as np
 from numpy.typing import ArrayLike
 
-from impact_posture.config.argument_types import checked, checked_class
-from impact_posture.config.settings import (
-    JointModel,
-    MetricKind,
-    ObjectiveKind,
-)
+from impact_posture.config.checked import checked
+from impact_posture.config.demand import Factors, HalfAngle, NonNegative
+from impact_posture.config.settings import JointModel, MetricKind, ObjectiveKind
 from impact_posture.errors import InputError
 from impact_posture.impact.evaluation.evaluation import Evaluation, evaluate
 from impact_posture.impact.impact_contact import ImpactContact
@@ -34,7 +31,7 @@ if TYPE_CHECKING:
     from impact_posture.codegen.export import Export
 
 
-@checked_class
+@checked
 class ImpactObjective(WorstCaseObjective):
     """The objective of one or several impacts, by default with the supports of the robot.
 
@@ -67,14 +64,14 @@ class ImpactObjective(WorstCaseObjective):
         metric: MetricKind | Metric = "euclidean",
         kind: ObjectiveKind = "impulse",
         supports: Sequence[str | Support] | None = None,
-        compliance: float = 0.0,
-        normal_cone_deg: float = 0.0,
+        compliance: NonNegative = 0.0,
+        normal_cone_deg: HalfAngle = 0.0,
         others: Sequence[ImpactContact] = (),
         bilateral: bool = False,
         model_variants: Sequence[ModelVariant] = (),
         *,
         weights: str | Sequence[float] | None = None,
-        armature_range: tuple[float, float] | None = None,
+        armature_range: Factors | None = None,
         payloads: Sequence[tuple[str, float]] = (),
         joint_model: JointModel | None = None,
     ) -> None:

@@ -8,13 +8,13 @@ from typing import TYPE_CHECKING, Any
 
 import numpy as np
 
-from impact_posture.config.argument_types import checked_class
+from impact_posture.config.checked import checked
 from impact_posture.config.settings import (
     ImpactSettings,
     ProblemSettings,
     RobotSettings,
 )
-from impact_posture.config.toml_tables import validate
+from impact_posture.config.table_validation import validate
 from impact_posture.errors import InputError
 from impact_posture.impact.elasticity.contact_compression import ContactStiffness
 from impact_posture.impact.objective import Objective
@@ -35,7 +35,7 @@ if TYPE_CHECKING:
 _OF_THE_OBJECTIVE = {field.name for field in fields(ImpactSettings)} - {"contact_stiffness", "contact_duration"}
 
 
-@checked_class
+@checked
 class PostureProblem:
     """``min_q objective(q)`` under the constraints of a task; a missing argument comes from the robot.
 

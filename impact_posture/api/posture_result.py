@@ -11,7 +11,8 @@ from typing import TYPE_CHECKING, Any
 import numpy as np
 
 from impact_posture.api.posture_problem import PostureProblem
-from impact_posture.config.argument_types import checked
+from impact_posture.config.checked import checked
+from impact_posture.config.demand import OneOrMore, ZeroOrMore
 from impact_posture.config.settings import Against, Search
 from impact_posture.errors import InputError
 from impact_posture.output.result_folder import FORMATS, Written, finish_result
@@ -107,7 +108,7 @@ class PostureResult:
     @checked
     def trade_off(
         self,
-        points: int = 16,
+        points: OneOrMore = 16,
         against: Against = "distance",
         *,
         compile: CompileMode = "auto",
@@ -138,7 +139,7 @@ class PostureResult:
         return replace(self, tradeoff=curve)
 
     @checked
-    def path(self, *, seed: int = 0) -> PostureResult:
+    def path(self, *, seed: ZeroOrMore = 0) -> PostureResult:
         """Return the same result with a path from the start to the optimum, timed within the robot's limits.
 
         See :func:`~impact_posture.path.posture_path.posture_path`.  Where it does not reach the optimum, it tries the
@@ -164,7 +165,7 @@ class PostureResult:
         formats: Sequence[str] = FORMATS,
         report: bool = True,
         meshes: bool = False,
-        jobs: int = 2,
+        jobs: OneOrMore = 2,
         progress: Progress | None = None,
     ) -> Written:
         """Write the result folder: result.json, problem.toml, posture.json, pictures and C code; whole or not at all.
@@ -224,9 +225,9 @@ class PostureResult:
 def optimize(
     problem: PostureProblem,
     *,
-    starts: int = 16,
-    seed: int = 0,
-    jobs: int = 2,
+    starts: OneOrMore = 16,
+    seed: ZeroOrMore = 0,
+    jobs: OneOrMore = 2,
     compile: CompileMode = "auto",
     search: Search = "multistart",
     progress: Progress | None = None,
@@ -249,8 +250,6 @@ def optimize(
         Infeasible: No posture satisfies the constraints; the error names the conflicting constraints.
         SolverFailed: No run ended at a certified posture.
     """
-    if starts < 1:
-        raise InputError(f"is {starts}", where="starts", hint="give 1 or more")
     if search == "global":
         check_searchable(problem.problem)
     found = solve_robustly(

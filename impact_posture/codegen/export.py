@@ -19,7 +19,7 @@ from impact_posture.codegen.export_files import render_files
 from impact_posture.codegen.export_library import NamedObjective, named_objectives
 from impact_posture.codegen.impact_gradient import ImpactGradient
 from impact_posture.codegen.manifest_builder import build_manifest
-from impact_posture.config.argument_types import checked
+from impact_posture.config.checked import checked
 from impact_posture.errors import CompilerError, InputError, OutputError
 from impact_posture.impact.elasticity.contact_compression import Compression
 from impact_posture.impact.worst_case_objective import WorstCaseObjective

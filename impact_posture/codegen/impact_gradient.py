@@ -13,7 +13,7 @@ from numpy.typing import ArrayLike, NDArray
 
 from impact_posture.codegen.export_functions import SIGNATURES, lengths
 from impact_posture.codegen.manifest_reader import check_library, check_robot, frame_block, read_manifest
-from impact_posture.config.argument_types import checked
+from impact_posture.config.checked import checked
 from impact_posture.errors import InputError, ManifestMismatch, MetricError, PostureError, SpecError
 from impact_posture.system.libraries import build_library, library_path, load_library
 

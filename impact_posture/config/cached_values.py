@@ -13,7 +13,7 @@ import numpy as np
 from numpy.typing import NDArray
 from pydantic import PlainSerializer, PlainValidator
 
-from impact_posture.config.toml_tables import adapter
+from impact_posture.config.table_validation import adapter
 from impact_posture.errors import OutputError
 from impact_posture.system.libraries import cache_folder, check_private
 from impact_posture.system.output_folder import write_whole

@@ -11,15 +11,31 @@ from __future__ import annotations
 
 from collections.abc import Mapping
 from dataclasses import dataclass, field
-from typing import Any, ClassVar, Literal, get_args
+from typing import Annotated, Literal, get_args
 
-from impact_posture.config import demands as demand
-from impact_posture.config.demands import CONTACT, METRIC, ROBOT, SEARCH, TASK, setting, with_demands
+from impact_posture.config.demand import (
+    Contacts,
+    Direction,
+    Factors,
+    HalfAngle,
+    Lengths,
+    NonNegative,
+    OneOrMore,
+    Payloads,
+    Position,
+    Positive,
+    Share,
+    UnitQuaternion,
+    ZeroOrMore,
+    between,
+    kind_or_tilt,
+)
+from impact_posture.config.demand import Vector3 as Vector3
 from impact_posture.config.obstacle import Obstacle
-from impact_posture.config.option_values import parse_armature, parse_number_or_name, parse_payloads
-from impact_posture.config.toml_tables import STRICT
+from impact_posture.config.setting import CONTACT, METRIC, ROBOT, SEARCH, TASK, setting
+from impact_posture.config.table_validation import StrictTable
+from impact_posture.config.text_parsers import parse_armature, parse_number_or_name, parse_payloads
 
-Vector3 = tuple[float, float, float]
 Root = Literal["free-flyer", "fixed"]
 NormalFrame = Literal["world", "contact"]
 MetricKind = Literal["euclidean", "kinetic", "weighted"]
@@ -47,8 +63,7 @@ TRADEOFF_POINTS = 16
 
 
 @dataclass(frozen=True, kw_only=True)
-@with_demands
-class LoadOptions:
+class LoadOptions(StrictTable):
     """Options of loading a robot; the ``robot.toml`` provides a value for ``None``.
 
     Attributes:
@@ -62,8 +77,6 @@ class LoadOptions:
         package_dir: Folders of ``package://`` paths.  Dynamics need none, but pictures may.
         mounting: Displacement of joints from their place in the URDF, by joint, meters, in the parent joint's axes.
     """
-
-    __pydantic_config__: ClassVar[dict[str, Any]] = STRICT
 
     lock: tuple[str, ...] = setting(
         (), "Make a joint rigid, or all that fit a pattern such as 'gripper_*' (in quotes); repeatable.", ROBOT,
@@ -99,41 +112,34 @@ class RobotSettings(LoadOptions):
 
 
 @dataclass(frozen=True, kw_only=True)
-@with_demands
 class ImpactSettings(RobotSettings):
     """An impact of a robot; the robot provides a value for ``None``."""
 
     frame: str | None = setting(None, "Contact frame.", CONTACT, "F", "the robot's")
-    normal: Vector3 | None = setting(
+    normal: Direction | None = setting(
         None, "Direction out of the surface, towards the robot, of any length. Required unless --contact is given.",
-        CONTACT, "X Y Z", **demand.DIRECTION,
+        CONTACT, "X Y Z",
     )  # fmt: skip
-    offset: Vector3 | None = setting(
-        None, "Contact point from the frame's origin, in the frame, m.", CONTACT, "X Y Z", "0 0 0", **demand.NUMBERS
+    offset: Position | None = setting(
+        None, "Contact point from the frame's origin, in the frame, m.", CONTACT, "X Y Z", "0 0 0"
     )
     normal_frame: NormalFrame = setting("world", "Axes in which the normal is given.", CONTACT)
-    contact: str | tuple[str, ...] | None = setting(
+    contact: Contacts | None = setting(
         None, "Contact, in place of --frame and --normal; repeatable for up to 6 contacts at once.", CONTACT,
-        "FRAME:NX,NY,NZ[:IMPULSE]", **demand.CONTACTS, repeatable=True,
+        "FRAME:NX,NY,NZ[:IMPULSE]", repeatable=True,
     )  # fmt: skip
     bilateral: bool = setting(False, "Contacts can also pull, as in a grasp.", CONTACT)
-    impulse: float = setting(1.0, "Bound on the impulse, N·s.", CONTACT, **demand.ABOVE_ZERO)
-    speed: float = setting(1.0, "Approach speed, m/s.", CONTACT, **demand.ZERO_OR_MORE)
-    restitution: float = setting(
-        0.0, "Coefficient of restitution, 0 (plastic) to 1 (elastic).", CONTACT, **demand.SHARE
-    )
-    contact_stiffness: str | float | None = setting(
+    impulse: Positive = setting(1.0, "Bound on the impulse, N·s.", CONTACT)
+    speed: NonNegative = setting(1.0, "Approach speed, m/s.", CONTACT)
+    restitution: Share = setting(0.0, "Coefficient of restitution, 0 (plastic) to 1 (elastic).", CONTACT)
+    contact_stiffness: Annotated[str | float, between(1.0, 1e12, "N/m", tuple(MATERIALS))] | None = setting(
         None, f"Stiffness of the contact, or the material that a steel tip touches: {', '.join(MATERIALS)}.",
         CONTACT, "N/M|MATERIAL", "not known", parse=parse_number_or_name,
-        **demand.between(1.0, 1e12, "N/m", tuple(MATERIALS)),
     )  # fmt: skip
-    contact_duration: float | None = setting(
+    contact_duration: Annotated[float, between(1e-7, 100.0, "s")] | None = setting(
         None, "Time from touch to greatest compression, s.", CONTACT, words="not known",
-        **demand.between(1e-7, 100.0, "s"),
     )  # fmt: skip
-    friction: float = setting(
-        FRICTION, "Friction coefficient at the impact and at the feet.", CONTACT, **demand.ZERO_OR_MORE
-    )
+    friction: NonNegative = setting(FRICTION, "Friction coefficient at the impact and at the feet.", CONTACT)
     metric: MetricKind = setting(
         "euclidean", "Norm of the velocity jump: euclidean, kinetic or weighted.", METRIC, "KIND"
     )
@@ -152,17 +158,16 @@ class ImpactSettings(RobotSettings):
         "transmissions), locked (rigid joints) or elastic (rotors on springs; evaluate only).",
         METRIC, "KIND",
     )  # fmt: skip
-    normal_cone: float = setting(
+    normal_cone: HalfAngle = setting(
         0.0, "Half angle of the cone of normals that are possible; the worst normal counts.", METRIC, "DEG",
-        **demand.HALF_ANGLE,
     )  # fmt: skip
-    armature_range: tuple[float, float] | None = setting(
+    armature_range: Factors | None = setting(
         None, "Lowest and highest factor on the armature that are possible; the worst case counts.", METRIC,
-        "LOW HIGH", "as stated", **demand.FACTORS,
+        "LOW HIGH", "as stated",
     )  # fmt: skip
-    payload: tuple[tuple[str, float], ...] = setting(
+    payload: Payloads = setting(
         (), "Mass in kg that the robot may carry at the frame; repeatable; the worst case counts.", METRIC,
-        "FRAME MASS", parse=parse_payloads, repeatable=True, **demand.MASSES,
+        "FRAME MASS", parse=parse_payloads, repeatable=True,
     )  # fmt: skip
     posture: str | None = setting(
         None, "Named posture, posture.json, or a JointState as .yaml.", ROBOT, "NAME|FILE", "the robot's"
@@ -175,45 +180,41 @@ class ImpactSettings(RobotSettings):
 
 
 @dataclass(frozen=True, kw_only=True)
-@with_demands
 class ProblemSettings(ImpactSettings):
     """Content of a ``problem.toml``; the robot or the default of the option provides a value for ``None``."""
 
     schema: Literal["impact-posture/problem/1"] = "impact-posture/problem/1"
     q: tuple[float, ...] | None = None
-    target_position: Vector3 | None = setting(
-        None, "Contact frame's position, world, m.", TASK, "X Y Z", "where it is", **demand.NUMBERS
+    target_position: Position | None = setting(
+        None, "Contact frame's position, world, m.", TASK, "X Y Z", "where it is"
     )
-    target_quaternion: tuple[float, float, float, float] | None = setting(
-        None, "Contact frame's orientation, scalar last.", TASK, "X Y Z W", "as it is", **demand.UNIT
+    target_quaternion: UnitQuaternion | None = setting(
+        None, "Contact frame's orientation, scalar last.", TASK, "X Y Z W", "as it is"
     )
-    contact_pose: str | None = setting(
+    contact_pose: Annotated[str, kind_or_tilt(get_args(ContactPose), "aligned")] | None = setting(
         None,
         "Constraint on the contact frame: full, position, aligned (spin free), aligned:DEG (and tilted by up to "
         "DEG), free or box.",
-        TASK, "KIND", "robot.toml's, else full", **demand.kind_or_tilt(get_args(ContactPose), "aligned"),
+        TASK, "KIND", "robot.toml's, else full",
     )  # fmt: skip
-    box: Vector3 = setting(
-        (0.05, 0.05, 0.05), "Half extents of --contact-pose box, m.", TASK, "X Y Z", **demand.LENGTHS
-    )
+    box: Lengths = setting((0.05, 0.05, 0.05), "Half extents of --contact-pose box, m.", TASK, "X Y Z")
     keep: tuple[str, ...] = setting((), "Hold the pose of another frame; repeatable.", TASK, "FRAME", repeatable=True)
     hold: tuple[str, ...] | None = setting(
         None, "Keep a joint at its value, in place of robot.toml's; repeatable.", TASK, "JOINT", "robot.toml's",
         repeatable=True,
     )  # fmt: skip
-    base: str | None = setting(
+    base: Annotated[str, kind_or_tilt(get_args(BaseMode), "level")] | None = setting(
         None,
         "Constraint on a floating base: free, level (yaw free), level:DEG (and tilted by up to DEG), fixed or "
         "box.",
-        TASK, "KIND", "robot.toml's, else free", **demand.kind_or_tilt(get_args(BaseMode), "level"),
+        TASK, "KIND", "robot.toml's, else free",
     )  # fmt: skip
-    base_box: Vector3 = setting((0.2, 0.2, 0.2), "Half extents of --base box, m.", TASK, "X Y Z", **demand.LENGTHS)
+    base_box: Lengths = setting((0.2, 0.2, 0.2), "Half extents of --base box, m.", TASK, "X Y Z")
     com: bool | None = setting(
         None, "Keep the center of mass above the feet.", TASK, words="robot.toml's", option="--com/--no-com"
     )
-    com_margin: float | None = setting(
+    com_margin: NonNegative | None = setting(
         None, "Distance of the center of mass from the support polygon's edges, m.", TASK, words="robot.toml's",
-        **demand.ZERO_OR_MORE,
     )  # fmt: skip
     keep_contacts: bool = setting(False, "The impact must neither lift nor slide a foot.", TASK)
     holdable: bool = setting(
@@ -225,48 +226,44 @@ class ProblemSettings(ImpactSettings):
     approach: bool = setting(
         False, "The joints can bring the contact to the surface at --speed within their velocity limits.", TASK
     )
-    hold_force: float = setting(
+    hold_force: Annotated[float, between(0.0, 1e6, "N")] = setting(
         0.0, "Force along the normal that the robot also has to hold after the impact, N.", TASK, "N",
-        **demand.between(0.0, 1e6, "N"),
     )  # fmt: skip
-    max_force: float | None = setting(
+    max_force: Annotated[float, between(1e-6, 1e9, "N")] | None = setting(
         None, "Largest allowed peak force, N, without friction; needs --contact-stiffness or --contact-duration.",
-        TASK, words="no bound", **demand.between(1e-6, 1e9, "N"),
+        TASK, words="no bound",
     )  # fmt: skip
-    max_joint_jump: float | None = setting(
+    max_joint_jump: Annotated[float, between(1e-6, 1e9, "rad/s or m/s")] | None = setting(
         None, "Largest allowed velocity jump of a joint without friction, rad/s or m/s.", TASK, words="no bound",
-        **demand.between(1e-6, 1e9, "rad/s or m/s"),
     )  # fmt: skip
-    max_torque: float | None = setting(
+    max_torque: Annotated[float, between(1e-6, 1e9, "N·m")] | None = setting(
         None, "Largest torque with which the controller may answer the jump, N·m; needs --velocity-gain.", TASK,
-        words="no bound", **demand.between(1e-6, 1e9, "N·m"),
+        words="no bound",
     )  # fmt: skip
-    velocity_gain: float | None = setting(
+    velocity_gain: Annotated[float, between(1e-6, 1e9, "N·m·s/rad")] | None = setting(
         None, "Gain K_d of the controller for --max-torque, N·m·s/rad.", TASK, words="not known",
-        **demand.between(1e-6, 1e9, "N·m·s/rad"),
     )  # fmt: skip
     collision: bool = setting(
         True, "Keep the links clear of each other, the surface, the ground and obstacles.", TASK,
         option="--collision/--no-collision",
     )  # fmt: skip
-    clearance: float = setting(
-        CLEARANCE, "Least distance of links that stay apart, m.", TASK, **demand.between(1e-4, 1.0, "m")
+    clearance: Annotated[float, between(1e-4, 1.0, "m")] = setting(
+        CLEARANCE, "Least distance of links that stay apart, m.", TASK
     )
-    surface: str | float | None = setting(
+    surface: Annotated[str | float, between(1e-3, 1e3, "m", ("plane", "none"))] | None = setting(
         None, "Surface at the contact: an endless plane, none, or a square of this edge length, m.", TASK,
         "plane|none|M", f"the plane, or {PATCH:g} where the robot stands behind it", parse=parse_number_or_name,
-        **demand.between(1e-3, 1e3, "m", ("plane", "none")),
     )  # fmt: skip
     obstacles: tuple[Obstacle, ...] = ()
-    limit_margin: float | None = setting(
-        None, "Distance from the joint limits, rad or m.", TASK, words="robot.toml's", **demand.ZERO_OR_MORE
+    limit_margin: NonNegative | None = setting(
+        None, "Distance from the joint limits, rad or m.", TASK, words="robot.toml's"
     )
-    regularization: float = setting(0.0, "Weight of the distance from the start.", TASK, **demand.ZERO_OR_MORE)
-    tradeoff: int = setting(
+    regularization: NonNegative = setting(0.0, "Weight of the distance from the start.", TASK)
+    tradeoff: ZeroOrMore = setting(
         0,
         "Also find the best posture within each of K distances from the start, which shows what a smaller change "
         f"gains; {TRADEOFF_POINTS} distances without K, none for 0.",
-        TASK, "[K]", **demand.ZERO_OR_MORE,
+        TASK, "[K]",
     )  # fmt: skip
     tradeoff_against: Against = setting(
         "distance", "What --tradeoff bounds: the distance from the start, or the peak force of the impact.", TASK,
@@ -280,8 +277,8 @@ class ProblemSettings(ImpactSettings):
         "multistart, or global: maps self-motions of 1 or 2 degrees of freedom, else hops from the best optimum.",
         SEARCH, "HOW",
     )  # fmt: skip
-    starts: int = setting(16, "Number of starting points of the search.", SEARCH, **demand.ONE_OR_MORE)
+    starts: OneOrMore = setting(16, "Number of starting points of the search.", SEARCH)
     finish_all: bool = setting(
         False, "Finish starts of large programs that can no longer be the best: lists all optima.", SEARCH
     )
-    seed: int = setting(0, "Seed of the random starts.", SEARCH, **demand.ZERO_OR_MORE)
+    seed: ZeroOrMore = setting(0, "Seed of the random starts.", SEARCH)

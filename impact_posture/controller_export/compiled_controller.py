@@ -13,7 +13,7 @@ import pinocchio as pin
 from numpy.typing import ArrayLike
 
 from impact_posture.codegen.manifest_reader import check_library, check_robot
-from impact_posture.config.argument_types import checked
+from impact_posture.config.checked import checked
 from impact_posture.controller_export.compiled_report import STATUSES, read_report
 from impact_posture.controller_export.controller_manifest import Manifest, build_controller, read_controller
 from impact_posture.errors import ContactError, InputError, MetricError, PostureError, SpecError

@@ -17,7 +17,7 @@ from impact_posture.codegen.export import WrittenCode
 from impact_posture.codegen.export import export as export_gradient
 from impact_posture.codegen.manifest_builder import configuration_names
 from impact_posture.codegen.manifest_reader import identity
-from impact_posture.config.argument_types import checked
+from impact_posture.config.checked import checked
 from impact_posture.controller_export.compiled_controller import CompiledController
 from impact_posture.controller_export.controller_manifest import SCHEMA, build_controller
 from impact_posture.controller_export.controller_parameters import Field, parameters

@@ -9,15 +9,17 @@ from typing import get_args
 
 import numpy as np
 
-from impact_posture.config.argument_types import check_types
+from impact_posture.config.checked import checked
+from impact_posture.config.demand import Positive
 from impact_posture.config.settings import MetricKind
-from impact_posture.config.toml_tables import read_toml
+from impact_posture.config.table_validation import read_toml
 from impact_posture.errors import MetricError
 from impact_posture.robot.model_joints import v_slice
 from impact_posture.robot.robot import Robot
 from impact_posture.system.arrays import Array
 
 
+@checked
 @dataclass(frozen=True)
 class Metric:
     """The weight ``W`` of ``‖Δν‖²_W``.
@@ -28,27 +30,21 @@ class Metric:
         source: Origin of the weights.
 
     Raises:
-        InputError: The kind is none of them.
-        MetricError: The weights do not belong to the kind, or are not all above zero.
+        InputError: The kind is not one of them, or a weight is not above zero.
+        MetricError: The weights do not belong to the kind.
     """
 
     kind: MetricKind = "euclidean"
-    weights: tuple[float, ...] | None = None
+    weights: tuple[Positive, ...] | None = None
     source: str = ""
 
     def __post_init__(self) -> None:
-        check_types(type(self).__init__, vars(self))
         if (self.kind == "weighted") != (self.weights is not None):
             what = "needs weights" if self.weights is None else "takes no weights"
             raise MetricError(f"the {self.kind} metric {what}", where="metric", hint="see build_metric")
         if self.weights is not None:
             # An array has neither truth value nor hash.
             object.__setattr__(self, "weights", tuple(float(weight) for weight in self.weights))
-        for value in self.weights or ():
-            if not (np.isfinite(value) and value > 0):
-                raise MetricError(
-                    f"a weight is {value:g}", where=self.source or "weights", hint="every weight must be above zero"
-                )
 
     def diagonal(self, nv: int) -> Array:
         """Return the diagonal of ``W`` of a constant metric, shape (nv,)."""

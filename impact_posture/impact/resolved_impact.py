@@ -8,8 +8,8 @@ from __future__ import annotations
 
 from dataclasses import dataclass
 
-from impact_posture.config.option_values import parse_contact
 from impact_posture.config.settings import ImpactSettings, ObjectiveKind, Vector3
+from impact_posture.config.text_parsers import parse_contact
 from impact_posture.errors import ContactError, FrameNotFound
 from impact_posture.impact.elasticity.contact_compression import ContactStiffness
 from impact_posture.impact.evaluation.evaluation import Evaluation, evaluate

@@ -9,16 +9,16 @@ normals and model variants.  No combination is a class of its own.  Each shape o
 
 from __future__ import annotations
 
-import math
 from dataclasses import dataclass, field, replace
 from functools import cached_property
 
 import casadi as ca
 import numpy as np
 
+from impact_posture.config.checked import checked
+from impact_posture.config.demand import HalfAngle, NonNegative
 from impact_posture.config.settings import ObjectiveKind
 from impact_posture.dynamics.tree import Tree
-from impact_posture.errors import InputError
 from impact_posture.impact.impact_case import ImpactCase
 from impact_posture.impact.impact_contact import ImpactContact
 from impact_posture.impact.kinds.impact_kind import ImpactKind, QuadraticKind
@@ -38,6 +38,7 @@ from impact_posture.robot.robot_spec import Support
 from impact_posture.system.arrays import Array
 
 
+@checked
 @dataclass(frozen=True)
 class WorstCaseObjective:
     """Impulse ``λ̄²H``, speed ``V``, sticking ``S``, coulomb ``C`` or energy ``E`` of an impact, in its worst case.
@@ -60,8 +61,8 @@ class WorstCaseObjective:
     metric: Metric = field(default_factory=Metric)
     kind: ObjectiveKind = "impulse"
     supports: tuple[Support, ...] = ()
-    compliance: float = 0.0
-    normal_cone_deg: float = 0.0
+    compliance: NonNegative = 0.0
+    normal_cone_deg: HalfAngle = 0.0
     others: tuple[ImpactContact, ...] = ()
     bilateral: bool = False
     model_variants: tuple[ModelVariant, ...] = ()
@@ -70,8 +71,6 @@ class WorstCaseObjective:
         kind = KINDS[self.kind]
         check_cone(kind, self.normal_cone_deg)
         check_contacts(self.contacts, kind, bilateral=self.bilateral, cone=self.normal_cone_deg != 0)
-        if not 0 <= self.compliance < math.inf:
-            raise InputError(f"is {self.compliance:g}", where="compliance", hint="give 1/kg, zero or more")
         if self.compliance == 0:
             object.__setattr__(self, "compliance", default_compliance(self.robot))
 

@@ -8,7 +8,7 @@ from pathlib import Path
 import numpy as np
 import pinocchio as pin
 
-from impact_posture.config.toml_tables import read_toml
+from impact_posture.config.table_validation import read_toml
 from impact_posture.errors import InputError, SpecError
 from impact_posture.robot.model_joints import is_free_flyer, joint_index, joint_range, v_slice
 from impact_posture.robot.robot_spec import RobotSpec

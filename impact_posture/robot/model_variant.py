@@ -8,6 +8,8 @@ from dataclasses import asdict, dataclass, replace
 import numpy as np
 import pinocchio as pin
 
+from impact_posture.config.checked import checked
+from impact_posture.config.demand import Factors, Positive
 from impact_posture.errors import InputError
 from impact_posture.robot.joint_model import with_joint_model
 from impact_posture.robot.robot import Robot
@@ -17,6 +19,7 @@ AS_MODELED = "as modeled"
 MOST_VARIANTS = 12
 
 
+@checked
 @dataclass(frozen=True)
 class Payload:
     """A point mass at the origin of a frame.
@@ -27,7 +30,7 @@ class Payload:
     """
 
     frame: str
-    mass: float
+    mass: Positive
 
 
 @dataclass(frozen=True, eq=False)
@@ -56,8 +59,9 @@ class ModelVariant:
         }
 
 
+@checked
 def build_model_variants(
-    robot: Robot, armature_range: tuple[float, float] | None, payloads: Sequence[Payload]
+    robot: Robot, armature_range: Factors | None, payloads: Sequence[Payload]
 ) -> tuple[ModelVariant, ...]:
     """Return all pairs of an armature (as stated, lowest, highest) and a payload (none, or one of ``payloads``).
 
@@ -75,10 +79,6 @@ def build_model_variants(
     factors = _factors(robot, armature_range)
     for payload in payloads:
         robot.frame_id(payload.frame)
-        if not (np.isfinite(payload.mass) and payload.mass > 0):
-            raise InputError(
-                f"the mass at '{payload.frame}' is {payload.mass:g}", where="payload", hint="give kg above zero"
-            )
         if robot.model.frames[robot.frame_id(payload.frame)].parentJoint == 0:
             raise InputError(
                 f"frame '{payload.frame}' is welded to the world, where a mass changes nothing",
@@ -99,12 +99,6 @@ def _factors(robot: Robot, armature_range: tuple[float, float] | None) -> list[f
     if armature_range is None:
         return [1.0]
     low, high = armature_range
-    if not (np.isfinite([low, high]).all() and 0 < low <= high):
-        raise InputError(
-            f"the armature range is {low:g} to {high:g}",
-            where="armature_range",
-            hint="give two factors above zero, the lower first, such as 0.5 2",
-        )
     armature = np.asarray(robot.model.armature)
     if not armature[np.isfinite(armature)].any():
         none = robot.armature.any() and f"no armature with the joint model '{robot.joint_model}'"

@@ -9,7 +9,7 @@ from functools import cached_property
 import numpy as np
 import pinocchio as pin
 
-from impact_posture.config.argument_types import checked
+from impact_posture.config.checked import checked
 from impact_posture.config.settings import ContactPose, JointModel, RobotSettings, Root
 from impact_posture.errors import (
     FrameNotFound,

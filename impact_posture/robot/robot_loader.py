@@ -12,9 +12,9 @@ from typing import Any, NamedTuple
 import numpy as np
 import pinocchio as pin
 
-from impact_posture.config.argument_types import checked
+from impact_posture.config.checked import checked
 from impact_posture.config.settings import LoadOptions, RobotSettings, Root, Vector3
-from impact_posture.config.toml_tables import validate
+from impact_posture.config.table_validation import validate
 from impact_posture.errors import InputError, JointNotFound, PackageNotFound, RobotNotFound, SpecError, UrdfError
 from impact_posture.robot.armature import armature_warning, set_armature
 from impact_posture.robot.inertia_checks import check_mass_matrix, check_moved_mass, massless_joints

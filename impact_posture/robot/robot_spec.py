@@ -4,19 +4,15 @@ from __future__ import annotations
 
 from dataclasses import dataclass, field
 from pathlib import Path
-from typing import Annotated, Any, ClassVar, Literal
+from typing import Any, ClassVar, Literal
 
-from pydantic import Field
-
-from impact_posture.config.argument_types import checked_class
-from impact_posture.config.settings import ContactPose, Root, SupportKind, TransmissionKind, Vector3
-from impact_posture.config.toml_tables import read_toml, validate
+from impact_posture.config.checked import checked
+from impact_posture.config.demand import NonNegative, Positive, Vector3
+from impact_posture.config.settings import ContactPose, Root, SupportKind, TransmissionKind
+from impact_posture.config.table_validation import read_toml, validate
 from impact_posture.errors import SpecError, shown
 
 SCHEMA = "impact-posture/robot/1"
-
-Positive = Annotated[float, Field(gt=0, allow_inf_nan=False)]
-NonNegative = Annotated[float, Field(ge=0, allow_inf_nan=False)]
 
 
 class _Table:
@@ -55,7 +51,7 @@ class ContactSpec(_Table):
     frames: dict[str, ContactPose] = field(default_factory=dict)
 
 
-@checked_class
+@checked
 @dataclass(frozen=True)
 class Support(_Table):
     """A foot that stays on the ground; its velocities are zero up to the compliance.

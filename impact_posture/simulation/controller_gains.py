@@ -5,17 +5,17 @@ from __future__ import annotations
 from dataclasses import dataclass
 from typing import Annotated, Literal
 
-from pydantic import Field
-
-from impact_posture.config.toml_tables import Checked
-from impact_posture.robot.robot_spec import NonNegative, Positive
+from impact_posture.config.checked import checked
+from impact_posture.config.demand import Demand, NonNegative, Positive, between
+from impact_posture.config.table_validation import StrictTable
 
 EndEffectorPose = Literal["full", "position", "aligned"]
-OneOrEach = Positive | Annotated[tuple[Positive, ...], Field(min_length=1)]
+OneOrEach = Positive | Annotated[tuple[Positive, ...], Demand(lambda values: len(values) > 0, "numbers above zero")]
 
 
+@checked
 @dataclass(frozen=True)
-class Gains(Checked):
+class Gains(StrictTable):
     """Gains of one task.
 
     Attributes:
@@ -29,6 +29,7 @@ class Gains(Checked):
     weight: Positive = 1.0
 
 
+@checked
 @dataclass(frozen=True)
 class EndEffectorGains(Gains):
     """Gains of the end effector task.
@@ -41,8 +42,9 @@ class EndEffectorGains(Gains):
     pose: EndEffectorPose = "full"
 
 
+@checked
 @dataclass(frozen=True)
-class RobustTerm(Checked):
+class RobustTerm(StrictTable):
     """The impact-robust term of the posture task.
 
     Attributes:
@@ -56,8 +58,9 @@ class RobustTerm(Checked):
     fade: tuple[NonNegative, Positive] = (0.05, 0.2)
 
 
+@checked
 @dataclass(frozen=True)
-class StanceGains(Checked):
+class StanceGains(StrictTable):
     """Contact constraints of a controller for a standing robot.
 
     Attributes:
@@ -73,8 +76,9 @@ class StanceGains(Checked):
     lifted: tuple[str, ...] = ()
 
 
+@checked
 @dataclass(frozen=True)
-class Control(Checked):
+class Control(StrictTable):
     """Gains that all controllers of an experiment share.  A task without gains is not there.
 
     Attributes:
@@ -91,7 +95,7 @@ class Control(Checked):
 
     posture: Gains
     robust: RobustTerm
-    period: Annotated[float, Field(gt=0, le=3600)] = 1e-3
+    period: Annotated[float, between(1e-12, 3600, "s")] = 1e-3
     tilt: Gains | None = None
     end_effector: EndEffectorGains | None = None
     apparent_mass: Positive | None = None

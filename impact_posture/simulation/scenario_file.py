@@ -6,19 +6,18 @@ import os
 from collections.abc import Mapping
 from dataclasses import dataclass, field
 from pathlib import Path
-from typing import Annotated, Literal
+from typing import Literal
 
 import numpy as np
-from pydantic import Field
 
-from impact_posture.config.settings import FRICTION, RobotSettings, Vector3
-from impact_posture.config.toml_tables import Checked, read_toml, validate
+from impact_posture.config.checked import checked
+from impact_posture.config.demand import Direction, Finite, NonNegative, OneOrMore, Positive, Share, Vector3
+from impact_posture.config.settings import FRICTION, RobotSettings
+from impact_posture.config.table_validation import StrictTable, read_toml, validate
 from impact_posture.errors import InputError, ScenarioNotFound, SpecError, shown
 from impact_posture.robot.robot_loader import from_folder
-from impact_posture.robot.robot_spec import NonNegative, Positive
 from impact_posture.simulation.controller_gains import Control
 from impact_posture.simulation.world.actuator_command import Push
-from impact_posture.simulation.world.contact_law import Finite, FiniteVector
 from impact_posture.simulation.world.scene import Scene, Shape, Surface
 from impact_posture.simulation.world.throw import Settling, Throw
 from impact_posture.system.arrays import Array
@@ -27,8 +26,9 @@ SCHEMA = "impact-posture/scenario/1"
 SHIPPED = Path(__file__).parent / "scenarios"
 
 
+@checked
 @dataclass(frozen=True)
-class RepeatedContacts(Checked):
+class RepeatedContacts(StrictTable):
     """The end effector flies into a surface and away again, several times.
 
     A reference starts where the shape is at the start.  It moves against the normal of the surface until it is
@@ -52,7 +52,7 @@ class RepeatedContacts(Checked):
     surface: str
     speed: Positive
     acceleration: Positive = 1.0
-    count: Annotated[int, Field(ge=1)] = 5
+    count: OneOrMore = 5
     settle: NonNegative = 4.0
     dwell: Positive = 0.8
     beyond: NonNegative = 0.03
@@ -60,6 +60,7 @@ class RepeatedContacts(Checked):
     window: Positive = 0.3
 
 
+@checked
 @dataclass(frozen=True)
 class SinglePush(Settling):
     """A standing robot is pushed after it has come to rest.
@@ -71,14 +72,8 @@ class SinglePush(Settling):
     """
 
     frame: str
-    force: FiniteVector
+    force: Direction
     duration: Positive = 0.4
-
-    def __post_init__(self) -> None:
-        """Refuse a push without force."""
-        super().__post_init__()
-        if not any(self.force):
-            raise InputError("key 'push.force': no force", hint="give newtons, not all zero")
 
     def push(self, sign: int) -> Push:
         """Return the push of a run."""
@@ -86,8 +81,9 @@ class SinglePush(Settling):
         return Push(self.frame, (x, y, z), self.duration)
 
 
+@checked
 @dataclass(frozen=True)
-class Bounds(Checked):
+class Bounds(StrictTable):
     """Bounds that a run must keep to count (:func:`impact_posture.simulation.outcome.judge`).
 
     The first three are for a floating base.
@@ -105,10 +101,11 @@ class Bounds(Checked):
     clearance: Finite = 0.0
     sink: Positive = 1.0
     lifted: NonNegative = 0.1
-    relaxed: Annotated[float, Field(ge=0, le=1)] = 0.5
+    relaxed: Share = 0.5
     held: NonNegative = 0.05
 
 
+@checked
 @dataclass(frozen=True, eq=False, kw_only=True)
 class ScenarioTable(Scene, RobotSettings):
     """Content of a ``scenario.toml``.
@@ -162,6 +159,7 @@ class ScenarioTable(Scene, RobotSettings):
                 raise InputError(what, hint="make it a sphere and give its center, at which the ball flies")
 
 
+@checked
 @dataclass(frozen=True, eq=False, kw_only=True)
 class Scenario(ScenarioTable):
     """An experiment before anything is loaded.

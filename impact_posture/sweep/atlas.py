@@ -12,7 +12,7 @@ from functools import lru_cache
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
-from impact_posture.config.argument_types import checked
+from impact_posture.config.checked import checked
 from impact_posture.errors import InputError, OutputError, SpecError
 from impact_posture.posture.formulation.problem_file import dump_settings
 from impact_posture.sweep.case_solver import CaseSolver

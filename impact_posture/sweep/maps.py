@@ -16,7 +16,7 @@ from matplotlib.patches import Patch, Rectangle
 from numpy.typing import NDArray
 
 from impact_posture.config.settings import ProblemSettings
-from impact_posture.config.toml_tables import validate
+from impact_posture.config.table_validation import validate
 from impact_posture.errors import InputError, SpecError, nearest
 from impact_posture.output.plot.style import GRAY, INK, PALE, VERMILLION, framed, save, shared_legend
 from impact_posture.posture.formulation.problem_file import prepare

@@ -8,13 +8,13 @@ from functools import cached_property
 from itertools import product
 from math import prod
 from pathlib import Path
-from typing import Any, ClassVar, Literal
+from typing import Annotated, Any, Literal
 
 import numpy as np
 
-from impact_posture.config.demands import between, setting, with_demands
+from impact_posture.config.demand import between
 from impact_posture.config.settings import ProblemSettings
-from impact_posture.config.toml_tables import STRICT, read_toml, validate
+from impact_posture.config.table_validation import StrictTable, read_toml, validate
 from impact_posture.errors import SpecError, nearest, printable
 from impact_posture.impact.impact_contact import LARGEST
 from impact_posture.robot.robot_loader import from_folder
@@ -93,8 +93,7 @@ class Grid:
 
 
 @dataclass(frozen=True)
-@with_demands
-class SweepSettings:
+class SweepSettings(StrictTable):
     """Content of a ``SWEEP.toml``.
 
     Attributes:
@@ -104,11 +103,9 @@ class SweepSettings:
         schema: Name of this format.
     """
 
-    __pydantic_config__: ClassVar[dict[str, Any]] = STRICT
-
     problem: str | dict[str, Any]
     grid: dict[str, Any]
-    shard: int = setting(256, "Points of a shard.", **between(1, 1e6, "points"))
+    shard: Annotated[int, between(1, 1e6, "points")] = 256
     schema: Literal["impact-posture/sweep/1"] = "impact-posture/sweep/1"
 
 

@@ -9,7 +9,8 @@ from enum import Enum
 import numpy as np
 from numpy.typing import ArrayLike
 
-from impact_posture.config.argument_types import checked_class
+from impact_posture.config.checked import checked
+from impact_posture.config.demand import Positive
 from impact_posture.errors import InputError, PostureError
 from impact_posture.robot.robot import Robot
 from impact_posture.system.arrays import Array
@@ -100,7 +101,7 @@ class Report:
     iterations: int
 
 
-@checked_class
+@checked
 class Controller:
     """Task-space inverse dynamics by one QP per tick.
 
@@ -113,7 +114,7 @@ class Controller:
         assembly: Buffers of the QP.
     """
 
-    def __init__(self, robot: Robot, formulation: TaskFormulation, *, period: float = 1e-3) -> None:
+    def __init__(self, robot: Robot, formulation: TaskFormulation, *, period: Positive = 1e-3) -> None:
         """Size all buffers.
 
         Args:
@@ -125,8 +126,6 @@ class Controller:
             FrameNotFound: The frame of a task does not exist.
             InputError: The period is not positive.
         """
-        if not period > 0:
-            raise InputError("the period is not positive", where="controller", hint="give seconds above zero")
         self.robot, self.formulation, self.period = robot, formulation, period
         self.state = State(robot, formulation.points)
         self.actuators = Actuators(robot)

@@ -8,7 +8,7 @@ from dataclasses import dataclass
 import numpy as np
 import pinocchio as pin
 
-from impact_posture.config.argument_types import checked_class
+from impact_posture.config.checked import checked
 from impact_posture.robot.robot import Robot
 from impact_posture.system.arrays import Array
 
@@ -19,7 +19,7 @@ _SHIFT[[1, 2, 0], [0, 1, 2], [5, 3, 4]] = -1.0
 _FLAT, _EYE = _SHIFT.reshape(3, 36), np.eye(6).reshape(36)
 
 
-@checked_class
+@checked
 @dataclass(frozen=True, eq=False)
 class Point:
     """A point that moves with a frame of the robot.

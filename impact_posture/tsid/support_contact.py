@@ -3,14 +3,14 @@
 from __future__ import annotations
 
 import itertools
-import math
 from collections.abc import Sequence
 from dataclasses import dataclass
 
 import numpy as np
 import pinocchio as pin
 
-from impact_posture.config.argument_types import checked, checked_class
+from impact_posture.config.checked import checked
+from impact_posture.config.demand import NonNegative, Positive
 from impact_posture.config.settings import SupportKind
 from impact_posture.errors import ContactError
 from impact_posture.robot.robot import Robot
@@ -20,7 +20,7 @@ from impact_posture.tsid.qp.quadratic_program import stacked_rows
 from impact_posture.tsid.state import State
 
 
-@checked_class
+@checked
 @dataclass(frozen=True, eq=False)
 class SupportContact:
     """A foot (or hand) on the ground.
@@ -43,27 +43,19 @@ class SupportContact:
     kind: SupportKind = "point"
     half: tuple[float, float] = (0.0, 0.0)
     normal: tuple[float, float, float] = (0.0, 0.0, 1.0)
-    friction: float = 0.7
-    least: float = 1.0
-    kp: float = 100.0
-    kd: float = 20.0
-    weight: float | None = None
+    friction: Positive = 0.7
+    least: NonNegative = 1.0
+    kp: NonNegative = 100.0
+    kd: NonNegative = 20.0
+    weight: Positive | None = None
 
     def __post_init__(self) -> None:
-        """Refuse values that make no contact."""
+        """Refuse a surface without extent and a normal that is not a unit vector."""
         where = f"contact at {self.point.frame}"
-        if not min(self.least, self.kp, self.kd) >= 0 or not math.isfinite(self.least + self.kp + self.kd):
-            raise ContactError(
-                "least, kp or kd is out of range", where=where, hint="give finite numbers from zero up"
-            )
-        if not self.friction > 0:
-            raise ContactError("friction is not positive", where=where, hint="give a coefficient above zero")
         if self.kind == "surface" and not min(self.half) > 0:
             raise ContactError("a surface without extent", where=where, hint="give half extents or kind 'point'")
         if not abs(float(np.linalg.norm(self.normal)) - 1) < 1e-9:
-            raise ContactError("the normal is no unit vector", where=where, hint="normalize it")
-        if self.weight is not None and not self.weight > 0:
-            raise ContactError("the weight is not positive", where=where, hint="give a positive weight or none")
+            raise ContactError("the normal is not a unit vector", where=where, hint="normalize it")
 
     @property
     def size(self) -> int:
@@ -86,7 +78,7 @@ class SupportContact:
 
 
 @checked
-def support_contacts(robot: Robot, *, friction: float = 0.7) -> tuple[SupportContact, ...]:
+def support_contacts(robot: Robot, *, friction: Positive = 0.7) -> tuple[SupportContact, ...]:
     """Return the supports of ``robot.toml`` on level ground: soles are hard constraints, points have a weight.
 
     Args:

@@ -5,7 +5,8 @@ from __future__ import annotations
 from dataclasses import dataclass, field
 from typing import Literal
 
-from impact_posture.config.argument_types import checked, checked_class
+from impact_posture.config.checked import checked
+from impact_posture.config.demand import Positive
 from impact_posture.errors import InputError
 from impact_posture.robot.robot import Robot
 from impact_posture.tsid.limits.acceleration_bounds import LimitLaw
@@ -22,7 +23,7 @@ Order = Literal["strict", "weighted"]
 END_EFFECTOR_KP = 60.0
 
 
-@checked_class
+@checked
 @dataclass(frozen=True, eq=False)
 class TaskFormulation:
     """Tasks, contacts and limits that a controller solves for at each tick.
@@ -46,19 +47,17 @@ class TaskFormulation:
     force_point: Point | None = None
     law: LimitLaw | None = field(default_factory=LimitLaw)
     row_limits: tuple[ImpactLimits, ...] = ()
-    force_weight: float = 1e-6
-    spare_weight: float = 1e-3
+    force_weight: Positive = 1e-6
+    spare_weight: Positive = 1e-3
 
     def __post_init__(self) -> None:
-        """Refuse a formulation without tasks, two tasks of the same name, and weights that are not positive."""
+        """Refuse a formulation without tasks, and two tasks of the same name."""
         names = [task.name for task in self.tasks]
         if not names:
             raise InputError("has no task", where="program", hint="give tasks or a posture")
         twice = sorted({name for name in names if names.count(name) > 1})
         if twice:
             raise InputError(f"two tasks are called '{twice[0]}'", where="program", hint="rename one of them")
-        if not (self.force_weight > 0 and self.spare_weight > 0):
-            raise InputError("a weight is not positive", where="program", hint="give positive weights")
 
     @property
     def tasks(self) -> tuple[Task, ...]:
@@ -140,8 +139,8 @@ def legged_formulation(
     robot: Robot,
     posture: JointPosture,
     *,
-    kp: float = 20.0,
-    friction: float = 0.7,
+    kp: Positive = 20.0,
+    friction: Positive = 0.7,
     center_of_mass: CenterOfMass | None = None,
     base: BaseOrientation | None = None,
     contacts: tuple[SupportContact, ...] | None = None,

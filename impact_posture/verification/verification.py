@@ -11,6 +11,8 @@ from typing import Literal
 import numpy as np
 
 from impact_posture.codegen.compile_and_check import Deviation, deviation
+from impact_posture.config.checked import checked
+from impact_posture.config.demand import OneOrMore, ZeroOrMore
 from impact_posture.dynamics.mjcf import import_mujoco
 from impact_posture.errors import InputError
 from impact_posture.impact.worst_case_objective import WorstCaseObjective
@@ -102,10 +104,11 @@ class VerificationReport:
         }
 
 
+@checked
 def verify(
     objective: WorstCaseObjective,
-    samples: int = 10,
-    seed: int = 0,
+    samples: OneOrMore = 10,
+    seed: ZeroOrMore = 0,
     progress: Callable[[int, int], None] | None = None,
 ) -> VerificationReport:
     """Compare ``H``, ``G``, ``Λ_c`` and ``∇H`` from every source with the numbers of Pinocchio.
@@ -128,10 +131,6 @@ def verify(
         InputError: There is no sample, or the seed is negative.
         CompilerError: The compiler failed; with its words and the command.
     """
-    if samples < 1:
-        raise InputError(f"the number of samples is {samples}", where="samples", hint="give one or more")
-    if seed < 0:
-        raise InputError(f"the seed is {seed}", where="seed", hint="give zero or more")
     drawn = random_samples(objective.robot, samples, seed, np.array(objective.contact.normal))
     expected = [pinocchio_numbers(objective, sample) for sample in drawn]
     allowed, by_differences = _ON_FEET if objective.supports else (_VALUES, _DIFFERENCES)

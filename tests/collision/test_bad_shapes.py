@@ -20,7 +20,7 @@ from impact_posture.collision.robot_shapes import NO_SHAPES, RobotShapes, load_s
 from impact_posture.collision.swept_hull import distance_from_hull, obstacle_hull
 from impact_posture.config import cached_values
 from impact_posture.config.obstacle import Obstacle
-from impact_posture.config.toml_tables import validate
+from impact_posture.config.table_validation import validate
 from impact_posture.errors import InputError, SpecError, UrdfError
 from impact_posture.robot.robot import Robot
 from impact_posture.robot.robot_loader import load_robot

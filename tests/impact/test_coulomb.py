@@ -13,7 +13,7 @@ from hypothesis import assume, given
 from hypothesis import strategies as st
 
 from impact_posture.dynamics.tree import Tree
-from impact_posture.errors import ContactError, MetricError
+from impact_posture.errors import InputError, MetricError
 from impact_posture.impact.evaluation.evaluation import evaluate
 from impact_posture.impact.friction.coulomb_impact import coulomb_direction, coulomb_gradient, coulomb_impact
 from impact_posture.impact.impact_contact import ImpactContact
@@ -226,5 +226,5 @@ def test_lifted_form_holds_at_its_guess(name: str) -> None:
 
 def test_impossible_frictions_are_refused() -> None:
     for value in (-0.1, float("nan"), float("inf")):
-        with pytest.raises(ContactError, match="coefficient"):
+        with pytest.raises(InputError, match="friction: "):
             ImpactContact("panda_hand", (0, 0, 1), friction=value)

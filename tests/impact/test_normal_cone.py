@@ -314,7 +314,7 @@ def test_speed_has_no_dual_and_no_cone_is_half_open() -> None:
         WorstCaseObjective(robot("tilthex_arm"), contact, kind="speed", normal_cone_deg=5.0)
     assert "\n" not in caught.value.line
     for degrees in (-1.0, 90.0, float("nan")):
-        with pytest.raises(InputError, match="half angle"):
+        with pytest.raises(InputError, match="from 0 to below 90"):
             WorstCaseObjective(robot("tilthex_arm"), contact, normal_cone_deg=degrees)
 
 

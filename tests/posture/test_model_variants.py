@@ -94,9 +94,9 @@ def test_which_model_variants_there_are() -> None:
     [
         ("panda", None, [("panda_hnd", 1.0)], FrameNotFound, "panda_hand"),
         ("panda", None, [("panda_link0", 1.0)], InputError, "welded to the world"),
-        ("panda", None, [("panda_hand", -1.0)], InputError, "kg above zero"),
-        ("panda", None, [("panda_hand", float("nan"))], InputError, "kg above zero"),
-        ("panda", None, [("panda_hand", float("inf"))], InputError, "kg above zero"),
+        ("panda", None, [("panda_hand", -1.0)], InputError, "number above zero"),
+        ("panda", None, [("panda_hand", float("nan"))], InputError, "number above zero"),
+        ("panda", None, [("panda_hand", float("inf"))], InputError, "number above zero"),
         ("panda", None, [("panda_hand", 1.0)] * 2, InputError, "given twice"),
         ("panda", (2.0, 0.5), [], InputError, "the lower first"),
         ("panda", (0.0, 2.0), [], InputError, "above zero"),

@@ -10,7 +10,7 @@ import pinocchio as pin
 import pytest
 
 import impact_posture_robots
-from impact_posture.config.toml_tables import validate
+from impact_posture.config.table_validation import validate
 from impact_posture.errors import FrameNotFound, PostureError, SpecError
 from impact_posture.robot.actuation import (
     actuation_matrix,

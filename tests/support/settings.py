@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from impact_posture.config.settings import ProblemSettings
-from impact_posture.config.toml_tables import validate
+from impact_posture.config.table_validation import validate
 
 
 def make_settings(values: dict[str, object]) -> ProblemSettings:

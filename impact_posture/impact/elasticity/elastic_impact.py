@@ -26,7 +26,7 @@ from dataclasses import dataclass, replace
 import numpy as np
 import scipy
 
-from impact_posture.config.toml_tables import json_block
+from impact_posture.config.json_block import json_block
 from impact_posture.errors import ContactError, InputError
 from impact_posture.impact.impact_case import ImpactCase
 from impact_posture.impact.impact_contact import LARGEST

@@ -4,11 +4,14 @@ from __future__ import annotations
 
 from dataclasses import dataclass, replace
 from operator import attrgetter
+from typing import Annotated
 
 import numpy as np
 import pinocchio as pin
 
-from impact_posture.config.toml_tables import json_block
+from impact_posture.config.checked import checked
+from impact_posture.config.demand import Share, between
+from impact_posture.config.json_block import json_block
 from impact_posture.errors import InputError, MetricError
 from impact_posture.impact.elasticity.contact_compression import (
     Compression,
@@ -143,11 +146,12 @@ _JUMP = ("speed", "restitution", "frictionless", "sticking", "coulomb", "energy_
 _OWN = ("H", "G", "V", "S", "E", "effective_mass", "gradient", "ellipsoid", "pose", "free", "footing")
 
 
+@checked
 def evaluate(
     objective: WorstCaseObjective,
     q: Array,
-    speed: float = 1.0,
-    restitution: float = 0.0,
+    speed: Annotated[float, between(0, LARGEST, "m/s")] = 1.0,
+    restitution: Share = 0.0,
     contact_stiffness: ContactStiffness | None = None,
 ) -> Evaluation:
     """Compute all impact quantities at ``q`` from Pinocchio's numbers, and predict the jump of one impact.
@@ -166,10 +170,6 @@ def evaluate(
     Raises:
         InputError: The speed is negative or not finite, or the restitution lies outside [0, 1].
     """
-    if not 0 <= speed <= LARGEST:
-        raise InputError(f"the approach speed is {speed:g}", where="speed", hint=f"give m/s, 0 to {LARGEST:g}")
-    if not 0 <= restitution <= 1:
-        raise InputError(f"the restitution is {restitution:g}", where="restitution", hint="give 0 to 1")
     robot, oracle = objective.robot, objective.oracle
     found = oracle.quantities(q)
     scalars = Scalars.of(found)

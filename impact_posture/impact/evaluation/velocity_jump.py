@@ -6,7 +6,7 @@ from dataclasses import dataclass
 
 import numpy as np
 
-from impact_posture.config.toml_tables import json_block
+from impact_posture.config.json_block import json_block
 from impact_posture.dynamics.joints import joint_kind
 from impact_posture.impact.quantities.impact_quantities import ImpactQuantities
 from impact_posture.impact.worst_case_objective import WorstCaseObjective

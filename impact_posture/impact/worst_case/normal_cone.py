@@ -22,7 +22,7 @@ import casadi as ca
 import numpy as np
 
 from impact_posture.dynamics.tree import Tree
-from impact_posture.errors import InputError, MetricError
+from impact_posture.errors import MetricError
 from impact_posture.impact.kinds.impact_kind import ImpactKind, QuadraticKind
 from impact_posture.impact.objective import Subgradients
 from impact_posture.impact.quantities.impact_kernel import ImpactKernel
@@ -41,14 +41,11 @@ _UPPER = ((0, 0), (0, 1), (0, 2), (1, 1), (1, 2), (2, 2))
 
 
 def check_cone(kind: type[ImpactKind], degrees: float) -> None:
-    """Refuse an angle that is no cone, and a kind without an exact worst case over a cone.
+    """Refuse a kind without an exact worst case over a cone.
 
     Raises:
-        InputError: The angle is no half angle of a cone.
         MetricError: The kind is no quadratic form of the normal.
     """
-    if not 0 <= degrees < 90:
-        raise InputError(f"the half angle is {degrees:g}°", where="normal_cone", hint="give 0 to below 90 degrees")
     if degrees and not issubclass(kind, QuadraticKind):
         raise MetricError(
             kind.no_cone,

@@ -24,6 +24,8 @@ from itertools import pairwise
 
 import numpy as np
 
+from impact_posture.config.checked import checked
+from impact_posture.config.demand import OneOrMore
 from impact_posture.errors import InputError, MetricError
 from impact_posture.impact.elasticity.contact_compression import ContactStiffness
 from impact_posture.posture.analysis.trade_off import TradeOff, TradePoint, find_knee
@@ -50,9 +52,10 @@ _GROWTH = 8
 _FORCE_STARTS = 8
 
 
+@checked
 def pareto_front(
     solution: PostureSolution,
-    points: int = 16,
+    points: OneOrMore = 16,
     *,
     force: tuple[ContactStiffness, float] | None = None,
     compile: CompileMode = "auto",
@@ -72,8 +75,6 @@ def pareto_front(
     Raises:
         InputError: The number of points is below 1, or there are several contacts whose forces would compete.
     """
-    if points < 1:
-        raise InputError(f"the number of points is {points}", where="tradeoff", hint="give 1 or more")
     problem = solution.problem
     price = _price(solution, force, compile)
     least, most = price.measure(price.nearest), price.measure(solution.q)

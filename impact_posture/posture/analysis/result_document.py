@@ -12,7 +12,7 @@ import numpy as np
 import pinocchio as pin
 from numpy.typing import NDArray
 
-from impact_posture.config.toml_tables import json_block
+from impact_posture.config.json_block import json_block
 from impact_posture.impact.evaluation.evaluation import Evaluation
 from impact_posture.posture.analysis.posture_warnings import posture_warnings
 from impact_posture.posture.analysis.robustness import Robustness

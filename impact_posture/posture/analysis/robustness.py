@@ -8,7 +8,7 @@ from functools import partial
 
 import numpy as np
 
-from impact_posture.config.toml_tables import json_block
+from impact_posture.config.json_block import json_block
 from impact_posture.dynamics.numeric import Numeric
 from impact_posture.errors import Infeasible, SolverFailed
 from impact_posture.impact.worst_case_objective import WorstCaseObjective

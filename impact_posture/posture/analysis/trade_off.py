@@ -6,8 +6,8 @@ from dataclasses import dataclass, replace
 
 import numpy as np
 
+from impact_posture.config.json_block import json_block
 from impact_posture.config.settings import Against
-from impact_posture.config.toml_tables import json_block
 from impact_posture.posture.program.certificate import Certificate
 from impact_posture.system.arrays import Array
 

@@ -7,7 +7,7 @@ from dataclasses import dataclass
 from math import sqrt
 from typing import Literal
 
-from impact_posture.config.toml_tables import json_block
+from impact_posture.config.json_block import json_block
 from impact_posture.impact.elasticity.contact_compression import both_models
 from impact_posture.impact.evaluation.coulomb_jump import CoulombJump, coulomb_jump
 from impact_posture.impact.evaluation.evaluation import Evaluation

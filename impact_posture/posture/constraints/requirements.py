@@ -4,10 +4,13 @@ from __future__ import annotations
 
 from dataclasses import dataclass
 
+from impact_posture.config.checked import checked
+from impact_posture.config.demand import Lengths, NonNegative, Position, UnitQuaternion
 from impact_posture.config.obstacle import Obstacle
-from impact_posture.config.settings import CLEARANCE, Vector3
+from impact_posture.config.settings import CLEARANCE
 
 
+@checked
 @dataclass(frozen=True)
 class Requirements:
     """Demands of the task on the posture.
@@ -16,7 +19,7 @@ class Requirements:
         contact_pose: Held part of the pose of the leading contact frame, as in the setting ``contact_pose``.
         other_poses: Held part of the pose of each other contact frame.
         target_position: Position of the contact frame, world, meters; ``None`` for its initial position.
-        target_quaternion: Orientation of the contact frame, x y z w; ``None`` for its initial orientation.
+        target_quaternion: UnitQuaternion | None = None
         box: Half extents of the box of ``contact_pose = box``, meters.
         base: Freedom of the floating base: ``free``, ``level`` (tilt zero, yaw free), ``level:DEG`` (tilt from its
             default posture at most DEG degrees, yaw free), ``fixed`` or ``box``.
@@ -45,18 +48,18 @@ class Requirements:
 
     contact_pose: str = "full"
     other_poses: tuple[str, ...] = ()
-    target_position: Vector3 | None = None
-    target_quaternion: tuple[float, float, float, float] | None = None
-    box: Vector3 = (0.05, 0.05, 0.05)
+    target_position: Position | None = None
+    target_quaternion: UnitQuaternion | None = None
+    box: Lengths = (0.05, 0.05, 0.05)
     base: str = "free"
-    base_box: Vector3 = (0.2, 0.2, 0.2)
+    base_box: Lengths = (0.2, 0.2, 0.2)
     keep: tuple[str, ...] = ()
     hold: tuple[str, ...] = ()
     com_over_feet: bool = False
     com_asked: bool = True
-    com_margin: float = 0.0
+    com_margin: NonNegative = 0.0
     keep_contacts: bool = False
-    friction: float = 0.7
+    friction: NonNegative = 0.7
     holdable: bool = False
     limit_share: float = 1.0
     hold_force: float = 0.0
@@ -67,5 +70,5 @@ class Requirements:
     clearance: float = CLEARANCE
     surface: str | float | None = None
     obstacles: tuple[Obstacle, ...] = ()
-    limit_margin: float = 0.0
-    regularization: float = 0.0
+    limit_margin: NonNegative = 0.0
+    regularization: NonNegative = 0.0

@@ -9,7 +9,7 @@ from pathlib import Path
 import numpy as np
 
 from impact_posture.config.settings import ProblemSettings
-from impact_posture.config.toml_tables import read_toml, validate
+from impact_posture.config.table_validation import read_toml, validate
 from impact_posture.errors import InputError, SpecError
 from impact_posture.impact.elasticity.contact_compression import ContactStiffness
 from impact_posture.impact.objective import Objective

@@ -3,20 +3,16 @@
 from __future__ import annotations
 
 from dataclasses import dataclass
-from typing import Annotated
 
-from pydantic import Field
-
-from impact_posture.config.toml_tables import Checked
+from impact_posture.config.checked import checked
+from impact_posture.config.demand import Finite, FiniteVector, NonNegative
+from impact_posture.config.table_validation import StrictTable
 from impact_posture.errors import InputError
-from impact_posture.robot.robot_spec import NonNegative
-
-Finite = Annotated[float, Field(allow_inf_nan=False)]
-FiniteVector = tuple[Finite, Finite, Finite]
 
 
+@checked
 @dataclass(frozen=True, kw_only=True)
-class ContactLaw(Checked):
+class ContactLaw(StrictTable):
     """Spring and damper with which a surface pushes in MuJoCo.  Both scale with the mass that the contact feels.
 
     At distance r (negative inside), the contact demands the acceleration ``r* = −b r' − k r`` with ``b = 2/(d₁T)``
@@ -38,7 +34,6 @@ class ContactLaw(Checked):
 
     def __post_init__(self) -> None:
         """Refuse numbers that MuJoCo would silently change."""
-        super().__post_init__()
         a, b = self.solref
         if not ((a > 0 and b > 0) or (a < 0 and b <= 0)):
             hint = "give a time and a damping ratio above zero, or both numbers below"

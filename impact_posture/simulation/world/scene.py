@@ -5,18 +5,24 @@ from __future__ import annotations
 from dataclasses import dataclass
 from typing import Annotated, Literal
 
-import numpy as np
-from pydantic import Field
-
-from impact_posture.config.toml_tables import Checked
+from impact_posture.config.checked import checked
+from impact_posture.config.demand import Demand, Finite, FiniteVector, NonNegative, Positive, Vector3, between
+from impact_posture.config.table_validation import StrictTable
 from impact_posture.errors import InputError
 from impact_posture.impact.impact_contact import LARGEST
-from impact_posture.robot.robot_spec import NonNegative, Positive
-from impact_posture.simulation.world.contact_law import ContactLaw, Finite, FiniteVector
+from impact_posture.simulation.world.contact_law import ContactLaw
 
 ShapeKind = Literal["sphere", "box"]
+_Normal = Annotated[
+    Vector3,
+    Demand(
+        lambda normal: 1e-9 < max(abs(value) for value in normal) <= LARGEST,
+        f"three numbers, not all zero, up to {LARGEST:g}",
+    ),
+]
 
 
+@checked
 @dataclass(frozen=True)
 class Surface(ContactLaw):
     """Endless plane that pushes with its contact law.
@@ -29,20 +35,14 @@ class Surface(ContactLaw):
     """
 
     name: str
-    normal: FiniteVector
+    normal: _Normal
     point: FiniteVector | None = None
     gap: Finite = 0.0
 
-    def __post_init__(self) -> None:
-        """Refuse a normal without direction."""
-        super().__post_init__()
-        if not 1e-9 < np.abs(self.normal).max() <= LARGEST:
-            hint = f"give three numbers, not all zero, up to {LARGEST:g}"
-            raise InputError("the normal has no direction", where=f"surface '{self.name}'", hint=hint)
 
-
+@checked
 @dataclass(frozen=True)
-class Shape(Checked):
+class Shape(StrictTable):
     """Massless shape on the robot, which surfaces push.
 
     Attributes:
@@ -62,7 +62,6 @@ class Shape(Checked):
 
     def __post_init__(self) -> None:
         """Refuse a size of another kind."""
-        super().__post_init__()
         count, words = (1, "a radius") if self.kind == "sphere" else (3, "three half extents")
         if len(self.size) != count:
             raise InputError(
@@ -72,8 +71,9 @@ class Shape(Checked):
             )
 
 
+@checked
 @dataclass(frozen=True)
-class Physics(Checked):
+class Physics(StrictTable):
     """Time step, gravity, and the stops of the joints.
 
     Attributes:
@@ -83,19 +83,19 @@ class Physics(Checked):
         stop_solimp: ``solimp`` of the joint stops.
     """
 
-    timestep: Annotated[float, Field(ge=1e-12, allow_inf_nan=False)] = 2.5e-4
+    timestep: Annotated[float, between(1e-12, 1e100, "s")] = 2.5e-4
     gravity: FiniteVector | None = None
     stop_solref: tuple[Finite, Finite] = (0.005, 1.0)
     stop_solimp: FiniteVector = (0.95, 0.99, 0.001)
 
     def __post_init__(self) -> None:
         """Refuse stops that MuJoCo would silently change."""
-        super().__post_init__()
         ContactLaw(solref=self.stop_solref, solimp=self.stop_solimp)
 
 
+@checked
 @dataclass(frozen=True)
-class Sensors(Checked):
+class Sensors(StrictTable):
     """Errors of what a controller measures.  By default all sensors are perfect.
 
     Noise is white and normal, and every reading draws it anew.  Numbers are standard deviations.
@@ -127,11 +127,12 @@ class Sensors(Checked):
     force_frame: str | None = None
     force: NonNegative = 0.0
     force_cutoff: Positive = 100.0
-    delay: Annotated[float, Field(ge=0, le=3600)] = 0.0
+    delay: Annotated[float, between(0, 3600, "s")] = 0.0
 
 
+@checked
 @dataclass(frozen=True)
-class Scene(Checked):
+class Scene(StrictTable):
     """Surroundings of a robot.
 
     Every shape can touch every surface, and nothing else touches.
@@ -155,7 +156,6 @@ class Scene(Checked):
 
     def __post_init__(self) -> None:
         """Refuse a name that is used twice, a law that is too fast for the time step, and an unknown force sensor."""
-        super().__post_init__()
         for words, names in (
             ("surfaces are called", [s.name for s in self.surfaces]),
             ("shapes are at", [s.frame for s in self.shapes]),

@@ -6,14 +6,13 @@ from dataclasses import dataclass
 from typing import Annotated, Any, Literal
 
 import numpy as np
-from pydantic import Field
 
-from impact_posture.config.toml_tables import Checked
+from impact_posture.config.checked import checked
+from impact_posture.config.demand import Demand, Direction, NonNegative, Positive
+from impact_posture.config.table_validation import StrictTable
 from impact_posture.dynamics.mjcf import Mjcf, import_mujoco
-from impact_posture.errors import InputError
 from impact_posture.impact.quantities.impact_oracle import ImpactOracle
-from impact_posture.robot.robot_spec import NonNegative, Positive
-from impact_posture.simulation.world.contact_law import ContactLaw, FiniteVector
+from impact_posture.simulation.world.contact_law import ContactLaw
 from impact_posture.system.arrays import Array
 from impact_posture.system.escape import xml_name
 
@@ -28,8 +27,9 @@ _AWAY = (0.0, 0.0, -1e3)
 _SPIN = 3.5
 
 
+@checked
 @dataclass(frozen=True, kw_only=True)
-class Settling(Checked):
+class Settling(StrictTable):
     """A robot that comes to rest before something happens to it.
 
     Attributes:
@@ -41,7 +41,7 @@ class Settling(Checked):
         after: Time that the run goes on after a push or the flight of a body, s.
     """
 
-    signs: Annotated[tuple[Literal[1, -1], ...], Field(min_length=1)] = (1, -1)
+    signs: Annotated[tuple[Literal[1, -1], ...], Demand(lambda signs: len(signs) > 0, "1, -1 or both")] = (1, -1)
     settle: NonNegative = 1.0
     quiet: Positive = 0.005
     still: NonNegative = 0.2
@@ -49,6 +49,7 @@ class Settling(Checked):
     after: NonNegative = 1.0
 
 
+@checked
 @dataclass(frozen=True, kw_only=True)
 class Throw(ContactLaw, Settling):
     """A solid ball is thrown at a shape of a robot that stands or hangs still.
@@ -69,14 +70,8 @@ class Throw(ContactLaw, Settling):
     mass: Positive
     radius: Positive
     speed: Positive
-    direction: FiniteVector
+    direction: Direction
     window: Positive = 0.3
-
-    def __post_init__(self) -> None:
-        """Refuse a throw without direction."""
-        super().__post_init__()
-        if not any(self.direction):
-            raise InputError("key 'throw.direction': no direction", hint="give three numbers, not all zero")
 
 
 def thrown_jumps(oracle: ImpactOracle, q: Array, throw: Throw, speed: float) -> tuple[float, float, float]:

@@ -3,12 +3,13 @@
 from __future__ import annotations
 
 import math
-from dataclasses import asdict, dataclass
+from dataclasses import dataclass
+from typing import Annotated
 
 import numpy as np
 
-from impact_posture.config.argument_types import checked_class
-from impact_posture.errors import InputError
+from impact_posture.config.checked import checked
+from impact_posture.config.demand import Demand, NonNegative, Positive
 from impact_posture.robot.robot import Robot
 from impact_posture.system.arrays import Array
 from impact_posture.tsid.flow.redundancy import Redundancy
@@ -31,9 +32,10 @@ _AIM = 2e-3
 _RESERVE = 8e-3
 # Least square of the length of a row on the constraints.
 _FLAT = 1e-6
+_PositiveShare = Annotated[float, Demand(lambda value: 0 < value <= 1, "a number above zero, up to 1")]
 
 
-@checked_class
+@checked
 @dataclass(frozen=True)
 class FlowOptions:
     """Parameters of the reference flow; the same for every robot.
@@ -54,26 +56,18 @@ class FlowOptions:
         tracking: Error of the joints at which the flow waits for the robot, rad (m).
     """
 
-    speed: float = 1.0
-    acceleration: float = 4.0
-    rho: float = 0.001
-    mu: float = 0.05
-    epsilon: float = 3e-6
-    duration: float = 7.9
-    joint_margin: float = 0.1
-    com_margin: float = 0.05
-    tilt: float = 0.8
-    share: float = 0.8
-    haste: float = 0.5
-    tracking: float = 0.3
-
-    def __post_init__(self) -> None:
-        """Refuse numbers out of range."""
-        may_vanish = ("rho", "joint_margin", "com_margin")
-        # Single comparisons also refuse NaN.
-        good = all(x > 0 or (x == 0 and name in may_vanish) for name, x in asdict(self).items())
-        if not (good and max(self.share, self.haste) <= 1):
-            raise InputError("a number is out of range", where="flow options", hint="see the docstring")
+    speed: Positive = 1.0
+    acceleration: Positive = 4.0
+    rho: NonNegative = 0.001
+    mu: Positive = 0.05
+    epsilon: Positive = 3e-6
+    duration: Positive = 7.9
+    joint_margin: NonNegative = 0.1
+    com_margin: NonNegative = 0.05
+    tilt: Positive = 0.8
+    share: _PositiveShare = 0.8
+    haste: _PositiveShare = 0.5
+    tracking: Positive = 0.3
 
 
 class FlowDirection:

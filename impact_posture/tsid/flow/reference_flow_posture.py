@@ -9,7 +9,7 @@ import numpy as np
 from numpy.typing import ArrayLike
 
 from impact_posture.codegen.impact_gradient import ImpactGradient
-from impact_posture.config.argument_types import checked_class
+from impact_posture.config.checked import checked
 from impact_posture.errors import InputError
 from impact_posture.robot.robot import Robot
 from impact_posture.tsid.actuators import Actuators
@@ -22,7 +22,7 @@ from impact_posture.tsid.tasks.impact_robust import Gradient, fitting_gradient
 from impact_posture.tsid.tasks.joint_posture import JointPosture
 
 
-@checked_class
+@checked
 class ReferenceFlowPosture(JointPosture):
     """``ν̇* = K_p (q_r ⊖ q) + K_d (u − ν) + u̇``, where ``q_r`` follows the reference flow.
 

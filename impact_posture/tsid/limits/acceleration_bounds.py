@@ -3,10 +3,12 @@
 from __future__ import annotations
 
 from dataclasses import dataclass
+from typing import Annotated
 
 import numpy as np
 
-from impact_posture.config.argument_types import checked_class
+from impact_posture.config.checked import checked
+from impact_posture.config.demand import Demand, NonNegative, Positive
 from impact_posture.errors import InputError
 from impact_posture.robot.robot import Robot
 from impact_posture.system.arrays import Array
@@ -14,7 +16,7 @@ from impact_posture.tsid.joint_ranges import JointRanges
 from impact_posture.tsid.state import State
 
 
-@checked_class
+@checked
 @dataclass(frozen=True)
 class LimitLaw:
     """Law that stops joints at their limits.
@@ -32,16 +34,14 @@ class LimitLaw:
         margin: Distance kept from the position limits, rad (m); at most a quarter of the joint's range.
     """
 
-    approach: float = 10.0
+    approach: Positive = 10.0
     rate: float = 50.0
-    deceleration: float = 50.0
-    acceleration: float = np.inf
-    margin: float = 0.0
+    deceleration: Positive = 50.0
+    acceleration: Annotated[float, Demand(lambda value: value > 0, "a number above zero")] = np.inf
+    margin: NonNegative = 0.0
 
     def __post_init__(self) -> None:
         """Refuse a law that does not stop the joints."""
-        if not (self.approach > 0 and self.deceleration > 0 and self.acceleration > 0 and self.margin >= 0):
-            raise InputError("a number is not positive", where="limit law", hint="give positive numbers")
         if not self.rate >= 4 * self.approach:
             raise InputError(
                 f"rate {self.rate:g} is below four times approach {self.approach:g}",

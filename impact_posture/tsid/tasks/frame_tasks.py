@@ -11,7 +11,8 @@ import numpy as np
 import pinocchio as pin
 from numpy.typing import ArrayLike
 
-from impact_posture.config.argument_types import checked_class
+from impact_posture.config.checked import checked
+from impact_posture.config.demand import Positive
 from impact_posture.errors import InputError
 from impact_posture.system.arrays import Array
 from impact_posture.tsid.point_kinematics import Point, PointState
@@ -19,7 +20,7 @@ from impact_posture.tsid.state import State
 from impact_posture.tsid.tasks.task import Target, TargetTask
 
 
-@checked_class
+@checked
 @dataclass(frozen=True)
 class Impedance:
     """Apparent inertia by which a measured force accelerates a frame: ``M_d⁻¹ F̂``.
@@ -32,15 +33,8 @@ class Impedance:
         inertia: Apparent rotational inertia, kg·m²; with ``None``, measured moments do not turn the frame.
     """
 
-    mass: float
-    inertia: float | None = None
-
-    def __post_init__(self) -> None:
-        """Refuse masses that are not positive."""
-        if not self.mass > 0 or (self.inertia is not None and not self.inertia > 0):
-            raise InputError(
-                "apparent mass or inertia is not positive", where="impedance", hint="give positive numbers"
-            )
+    mass: Positive
+    inertia: Positive | None = None
 
     def inverse(self) -> Array:
         """Return the diagonal of ``M_d⁻¹`` for force and moment, shape (6,)."""
@@ -48,7 +42,7 @@ class Impedance:
         return np.array([1.0 / self.mass] * 3 + [turn] * 3)
 
 
-@checked_class
+@checked
 class FrameTask(TargetTask[Target]):
     """Base of the tasks of a point that moves with a frame.
 
@@ -160,7 +154,7 @@ class FramePose(FrameTask[pin.SE3]):
         return six
 
 
-@checked_class
+@checked
 class FrameAligned(FrameTask[pin.SE3]):
     """Regulate the world position of a point and the direction of an axis; spin about the axis is free (5 × nv).
 

@@ -11,7 +11,7 @@ import pinocchio as pin
 from numpy.typing import ArrayLike
 
 from impact_posture.codegen.impact_gradient import ImpactGradient
-from impact_posture.config.argument_types import checked_class
+from impact_posture.config.checked import checked
 from impact_posture.errors import InputError, MetricError
 from impact_posture.robot.robot import Robot
 from impact_posture.system.arrays import Array
@@ -58,7 +58,7 @@ def fitting_gradient(robot: Robot, gradient: Gradient | ImpactGradient) -> Gradi
     return gradient_of(gradient)
 
 
-@checked_class
+@checked
 class ImpactRobustPosture(JointPosture):
     """``ν̇* = K_p (q_des ⊖ q) − K_d ν − α K s(q) ∇H(q)/λ`` (Afifi et al. 2026, impact-robust posture).
 

@@ -6,8 +6,8 @@ import numpy as np
 import pinocchio as pin
 from numpy.typing import ArrayLike
 
-from impact_posture.config.argument_types import checked, checked_class
-from impact_posture.errors import InputError
+from impact_posture.config.checked import checked
+from impact_posture.config.demand import Positive
 from impact_posture.robot.robot import Robot
 from impact_posture.system.arrays import Array
 from impact_posture.tsid.smooth_step import smooth
@@ -15,7 +15,7 @@ from impact_posture.tsid.state import State
 from impact_posture.tsid.tasks.task import Task, gain
 
 
-@checked_class
+@checked
 class JointPosture(Task):
     """Regulate the posture by ``ν̇* = K_p (q_des ⊖ q) − K_d ν`` (Afifi et al. 2026, nominal posture).
 
@@ -95,7 +95,7 @@ class JointPosture(Task):
         self.lead(state.q if self._given is None else self._given, 0.0, 0.0)
 
     @checked
-    def move_to(self, target: ArrayLike, over: float = 0.5) -> None:
+    def move_to(self, target: ArrayLike, over: Positive = 0.5) -> None:
         """Fade ``q_des`` to another posture within ``over`` seconds.
 
         A running fade stops where it is, and the new one starts there.
@@ -104,8 +104,6 @@ class JointPosture(Task):
             PostureError: The target is no configuration of the robot.
             InputError: The time is not positive.
         """
-        if not over > 0:
-            raise InputError("the time is not positive", where=self.name, hint="give seconds above zero")
         self._fade_to(self._robot.check_posture(np.asarray(target), limits=False), over)
 
     def lead(self, q: Array, v: Array | float, a: Array | float) -> None:

@@ -9,7 +9,7 @@ from typing import Generic, TypeVar
 import numpy as np
 from numpy.typing import ArrayLike
 
-from impact_posture.config.argument_types import checked_class
+from impact_posture.config.checked import checked
 from impact_posture.errors import InputError
 from impact_posture.system.arrays import Array
 from impact_posture.tsid.point_kinematics import Point
@@ -22,7 +22,7 @@ Target = TypeVar("Target")
 _STEP = 1e-4
 
 
-@checked_class
+@checked
 class Task(ABC):
     """Accelerate an output ``y(q)`` with ``ÿ* = ÿ_des + K_p e + K_d (ẏ_des − Jν)``.
 
@@ -121,7 +121,7 @@ class Task(ABC):
         self._velocity, self._acceleration = velocity, acceleration
 
 
-@checked_class
+@checked
 class TargetTask(Task, Generic[Target]):
     """Base of the tasks that lead an output to a target, by default to the output at ``reset``.
 

@@ -1,0 +1,104 @@
+"""Read TOML files, and validate their tables against dataclasses, with suggestions for misspelt keys."""
+
+from __future__ import annotations
+
+import json
+import re
+import tomllib
+from dataclasses import asdict, fields, is_dataclass
+from functools import cache
+from pathlib import Path
+from typing import Any, ClassVar, TypeVar, get_type_hints
+
+from impact_posture.errors import SpecError, nearest, not_one_of, shown
+from impact_posture.system.text_files import read_text
+
+_Table = TypeVar("_Table")
+
+
+class StrictTable:
+    """Base of dataclasses that refuse unknown keys, numbers in quotes, and ``true`` for 1 in a file."""
+
+    __pydantic_config__: ClassVar[dict[str, Any]] = {"extra": "forbid", "strict": True}
+
+
+def validate(cls: type[_Table], data: object, where: str) -> _Table:
+    """Make a dataclass of a table; the first fault becomes one line with the nearest valid key.
+
+    Args:
+        cls: Dataclass, whose fields may be dataclasses; its ``__pydantic_config__`` defines how strict it is.
+        data: Table from :func:`read_toml`; the key ``schema`` fills a field ``schema_``.
+        where: File to name in errors.
+
+    Raises:
+        SpecError: A key is unknown or missing, or a value does not fit.
+    """
+    from pydantic import ValidationError
+
+    try:
+        # As JSON, because strict dataclasses do not accept Python dictionaries.
+        text = json.dumps(data, default=_plain)
+    except ValueError as error:  # An integer with more digits than Python converts.
+        raise SpecError(f"cannot be read ({error})", where=where, hint="correct the value") from None
+    try:
+        table: _Table = adapter(cls).validate_json(text)  # type: ignore[arg-type]
+        return table
+    except ValidationError as error:
+        # A misspelt key is reported before the key that is then missing.
+        faults = error.errors()
+        fault = next((f for f in faults if f["type"] in _UNKNOWN), faults[0])
+    # Pydantic also names the alternative of a union.
+    location = tuple(p for p in fault["loc"] if not (isinstance(p, str) and ("[" in p or p in ("str", "float"))))
+    path = ".".join(str(part) for part in location)
+    what, hint = f"key '{path}': {fault['msg']}", "correct the value"
+    if fault["type"] in _UNKNOWN:
+        close = ", ".join(nearest(str(location[-1]), _keys_at(cls, location[:-1])))
+        what, hint = f"unknown key '{shown(path)}'", f"did you mean {close}?"
+    elif fault["type"] == "value_error":  # from a Demand
+        what, hint = f"key '{path}' is {shown(fault['input'])}", str(fault["ctx"]["error"])
+    elif fault["type"] == "literal_error":
+        what, hint = not_one_of(fault["input"], re.findall(r"'([^']*)'", fault["ctx"]["expected"]))
+        what = f"key '{path}': {what}"
+    raise SpecError(what, where=where, hint=hint)
+
+
+def _plain(value: Any) -> Any:
+    return asdict(value) if is_dataclass(value) and not isinstance(value, type) else str(value)
+
+
+_UNKNOWN = ("extra_forbidden", "unexpected_keyword_argument")
+
+
+@cache
+def adapter(cls: type) -> Any:
+    """Return the ``TypeAdapter`` of a dataclass, made once."""
+    from pydantic import TypeAdapter
+
+    return TypeAdapter(cls)
+
+
+def _keys_at(cls: type, location: tuple[int | str, ...]) -> list[str]:
+    """Return the keys of the table at a location inside the table of ``cls``."""
+    for part in location:
+        hint = get_type_hints(cls).get(str(part))
+        inner = [c for c in (hint, *getattr(hint, "__args__", ())) if isinstance(c, type) and is_dataclass(c)]
+        cls = inner[0] if inner else cls
+    return [field.name for field in fields(cls)]
+
+
+def read_toml(path: Path) -> dict[str, object]:
+    """Read a TOML file.
+
+    Raises:
+        SpecError: There is no such file, it cannot be read, or it is not valid TOML.
+    """
+    try:
+        return tomllib.loads(read_text(path))
+    except FileNotFoundError:
+        raise SpecError("no such file", where=str(path), hint="check the path") from None
+    except (OSError, UnicodeDecodeError) as error:
+        raise SpecError(f"cannot be read ({error})", where=str(path), hint="check the file") from None
+    except RecursionError:
+        raise SpecError("is nested too deeply", where=str(path), hint="correct the syntax") from None
+    except ValueError as error:  # A TOMLDecodeError, or a number with more digits than Python converts.
+        raise SpecError(f"is not valid TOML ({error})", where=str(path), hint="correct the syntax") from None
