@@ -1,4 +1,4 @@
-"""Limits of what an impact would do: the jump is that of the rigid impact, and a controller obeys them."""
+"""Limits of the effects of an impact: the jump is a rigid impact, and a controller obeys the limits."""
 
 from __future__ import annotations
 
@@ -22,14 +22,14 @@ ROBOTS = {"tilthex_arm": "ee", "panda": "panda_hand", "solo12": "base_link", "ta
 
 
 def limits_of(name: str, normal: Vector, **options: float) -> tuple[ImpactLimits, State, tuple[SupportContact, ...]]:
-    """Limits of an impact at the frame of a robot, which stands if it has feet, and a state near its posture."""
-    made, generator = robot(name), rng(name, "impact limits")
-    contacts, point = support_contacts(made), Point(ROBOTS[name])
-    limits = ImpactLimits(made, point, normal, contacts)
+    """Return the limits of an impact at a frame, a state near the default posture, and the contacts of the feet."""
+    r, generator = robot(name), rng(name, "impact limits")
+    contacts, point = support_contacts(r), Point(ROBOTS[name])
+    limits = ImpactLimits(r, point, normal, contacts)
     for key, value in {**options, "active": True}.items():
         setattr(limits, key, value)
-    q = np.array(pin.integrate(made.model, made.posture(), 0.1 * generator.normal(size=made.nv)))
-    return limits, State(made, limits.points).update(q, generator.normal(size=made.nv)), contacts
+    q = np.array(pin.integrate(r.model, r.posture(), 0.1 * generator.normal(size=r.nv)))
+    return limits, State(r, limits.points).update(q, generator.normal(size=r.nv)), contacts
 
 
 @pytest.mark.parametrize("name", ROBOTS)
@@ -42,12 +42,12 @@ def test_the_jump_is_the_least_change_of_energy(name: str) -> None:
     rows = np.vstack([J, *feet])
     wanted = np.zeros(rows.shape[0])
     wanted[:3] = -(1 + e) * normal * (normal @ J @ v)
-    # Gauss: of all jumps that the contacts allow, the one with the least kinetic energy.
+    # Gauss: the contacts allow many jumps, and the impact makes the jump with the least kinetic energy.
     root = np.linalg.cholesky(M).T
     expected = np.linalg.solve(root, np.linalg.lstsq(rows @ np.linalg.inv(root), wanted, rcond=1e-7)[0])
     jump, impulse = limits.jump(state)
     np.testing.assert_allclose(jump @ v, expected, atol=1e-5 * np.abs(expected).max())
-    # The generalized impulse of the contact alone makes it, with the feet's.
+    # The impulses of the contact and of the feet produce the jump.
     rest = M @ (jump @ v) - impulse @ v
     if contacts:
         rest -= np.vstack(feet).T @ np.linalg.lstsq(np.vstack(feet).T, rest, rcond=1e-9)[0]
@@ -55,44 +55,42 @@ def test_the_jump_is_the_least_change_of_energy(name: str) -> None:
 
 
 @given(seed=st.integers(0, 10_000), name=st.sampled_from(sorted(ROBOTS)))
-def test_a_row_is_kept_where_its_limit_is(seed: int, name: str) -> None:
+def test_each_row_has_the_room_of_its_limit(seed: int, name: str) -> None:
     limits, state, _ = limits_of(name, np.array([0.0, 0.6, 0.8]), duration=4e-3)
-    made = robot(name)
-    first, acceleration = (6 if made.floating else 0), 300 * rng(seed).normal(size=made.nv)
+    r = robot(name)
+    first, acceleration = (6 if r.floating else 0), 300 * rng(seed).normal(size=r.nv)
     A, lower, upper = limits.rows(state)
     before = state.v + 1e-3 * acceleration
     jump, impulse = (part @ before for part in limits.jump(state))
     rates, torques = (before + jump)[first:], impulse[first:] / 4e-3
-    speed, effort = made.model.velocityLimit[first:], made.model.effortLimit[first:]
+    speed, effort = r.model.velocityLimit[first:], r.model.effortLimit[first:]
     allowed = np.concatenate([np.where(speed > 0, speed, np.inf), np.where(effort > 0, effort, np.inf)])
     room = allowed - np.abs(np.concatenate([rates, torques]))
-    found = np.minimum(A @ acceleration - lower, upper - A @ acceleration)
-    np.testing.assert_allclose(found, room, rtol=1e-9, atol=1e-6)
+    of_rows = np.minimum(A @ acceleration - lower, upper - A @ acceleration)
+    np.testing.assert_allclose(of_rows, room, rtol=1e-9, atol=1e-6)
 
 
 def test_a_controller_approaches_only_as_fast_as_the_limits_allow() -> None:
-    made, point = robot("panda"), Point("panda_hand")
+    r, point = robot("panda"), Point("panda_hand")
     speeds = {}
     for active in (False, True):
-        limits = ImpactLimits(made, point, [0, 0, 1])
+        limits = ImpactLimits(r, point, [0, 0, 1])
         limits.active = active
         task = FramePosition(point, kp=0.0, kd=50.0, weight=1.0)
-        controller = Controller(
-            made, TaskFormulation(((task,),), (), JointPosture(made, kp=10.0), row_limits=(limits,))
-        )
-        q, v = made.posture(), np.zeros(made.nv)
+        controller = Controller(r, TaskFormulation(((task,),), (), JointPosture(r, kp=10.0), row_limits=(limits,)))
+        q, v = r.posture(), np.zeros(r.nv)
         controller.reset(q, v)
         task.target_velocity = np.array([0.0, 0.0, -1.0])
         for k in range(200):
             command = controller.tick(1e-3 * k, q, v)
             assert command.status in (Status.SOLVED, Status.RELAXED)
             v = v + 1e-3 * command.acceleration
-            q = pin.integrate(made.model, q, 1e-3 * v)
+            q = pin.integrate(r.model, q, 1e-3 * v)
         state = controller.state.update(q, v)
         speeds[active] = -float(state.at(point).jacobian[2] @ v)
         limits.active = True
         _, lower, upper = limits.rows(state)
-        # What an impact now would do, relative to what the limits leave.
+        # Violation of the limits by an impact now, relative to the limits.
         over = np.maximum(lower, -upper).max() / np.abs(upper).max()
         assert (over > 1e-3) if not active else (over < 1e-3), over
     assert speeds[False] == pytest.approx(1.0, abs=0.05)

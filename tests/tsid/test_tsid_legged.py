@@ -1,7 +1,8 @@
-"""Standing robots: cones and limits, and the same tick assembled apart over all of (ν̇, f, τ) for another solver."""
+"""Standing robots: cones, limits, and the same tick over all variables (ν̇, f, τ) by another solver."""
 
 from __future__ import annotations
 
+import casadi as ca
 import numpy as np
 import pinocchio as pin
 import pytest
@@ -34,34 +35,23 @@ def displaced(name: str, amount: float) -> np.ndarray:
 
 
 @pytest.mark.parametrize("name", LEGGED)
-def test_every_tick_satisfies_dynamics_cones_and_limits(name: str) -> None:
-    controller = controller_of(name)
-    q, v = robot(name).posture(), 0.05 * rng(name, "v").normal(size=robot(name).nv)
-    controller.reset(q, v)
-    contacts = controller.assembly.contacts
-    for k, command, _, _ in run(controller, q, v, 200):
-        assert command.status is Status.SOLVED
-        assert controller.report().dynamics <= 1e-8
-        assert (contacts.cone @ command.forces >= contacts.least - 1e-7).all()
-        assert_limits(controller, command)
-        if k % 20 == 0:
-            assert_dynamics(controller, command)
-    # A fair share of the weight on each foot, and all of it together.
-    normal = sum(float(command.forces[rows][2]) for rows in contacts.rows)
-    assert normal == pytest.approx(9.81 * robot(name).mass, rel=0.1)
-
-
-@pytest.mark.parametrize("name", LEGGED)
 def test_feet_stay_where_they_are(name: str) -> None:
-    # A posture of little weight: it is in the way of the center of mass.
+    # The posture has little weight, because it resists the motion of the center of mass.
     controller = controller_of(name, kp=40.0, weight=1e-3)
     q, v = robot(name).posture(), np.zeros(robot(name).nv)
     controller.reset(q, v)
     com = controller.formulation.weighted[0]
     com.target = com.target + np.array([0.01, 0.005, -0.02])  # type: ignore[attr-defined]
     start = [controller.state.at(c.point).position.copy() for c in controller.formulation.contacts]
-    for _, command, _, _ in run(controller, q, v, 800):
+    contacts = controller.assembly.contacts
+    for k, command, _, _ in run(controller, q, v, 800):
         assert command.status is Status.SOLVED
+        assert (contacts.cone @ command.forces >= contacts.least - 1e-7).all()
+        if k % 20 == 0:
+            assert_dynamics(controller, command)
+    # At rest, the feet carry the weight.
+    normal = sum(float(command.forces[rows][2]) for rows in contacts.rows)
+    assert normal == pytest.approx(9.81 * robot(name).mass, rel=0.1)
     reached = controller.state.center_of_mass()[0]
     for contact, place in zip(controller.formulation.contacts, start, strict=True):
         assert np.linalg.norm(controller.state.at(contact.point).position - place) < 1e-4
@@ -69,22 +59,11 @@ def test_feet_stay_where_they_are(name: str) -> None:
     assert abs(reached[2] - com.target[2]) < 2e-3  # type: ignore[attr-defined]
 
 
-def test_same_inputs_same_bits() -> None:
-    """A humanoid's program goes another way to the solver than an aerial manipulator's."""
-    controller, r = controller_of("talos"), robot("talos")
+def dense_torques(controller: Controller, q: np.ndarray, v: np.ndarray) -> np.ndarray:
+    """Return the torques of the same tick over (ν̇, f, τ), from raw Pinocchio calls.
 
-    def record() -> np.ndarray:
-        controller.reset(r.posture(), np.zeros(r.nv))
-        return np.array([c.u for _, c, _, _ in run(controller, r.posture(), 0.1 * np.ones(r.nv), 25)])
-
-    first = record()
-    assert np.array_equal(record(), first)
-
-
-def dense_torques(controller: Controller, q: np.ndarray, v: np.ndarray, solver: str) -> np.ndarray:
-    """The same tick over (ν̇, f, τ): every term from raw Pinocchio calls, forces of a sole at its four corners.
-
-    The cost on a sole's corner forces is the one of its wrench, so that the optimum is the same.
+    A sole has forces at its four corners with the cost of their wrench, so that the optimum is the same.
+    The solver is qpOASES of CasADi, as in the paper.
     """
     r, formulation = controller.robot, controller.formulation
     model, nv, nj = r.model, r.nv, r.nv - 6
@@ -177,32 +156,17 @@ def dense_torques(controller: Controller, q: np.ndarray, v: np.ndarray, solver: 
     effort = model.effortLimit[6:]
     G = np.vstack([-np.array(cone), -np.array(low), limits, -limits])
     top = np.concatenate([np.zeros(len(cone)), -np.ones(len(low)), effort, effort])
-    qpsolvers = pytest.importorskip("qpsolvers")
-    if solver == "qpoases":
-        return qpoases(H, g, np.vstack(equal), np.concatenate(right), G, top)[-nj:]
-    x = qpsolvers.solve_qp(H, g, G, top, np.vstack(equal), np.concatenate(right), solver=solver)
-    assert x is not None
-    return np.asarray(x[-nj:])
-
-
-def qpoases(H: np.ndarray, g: np.ndarray, E: np.ndarray, e: np.ndarray, G: np.ndarray, top: np.ndarray) -> np.ndarray:
-    """The paper's solver, through CasADi's plugin."""
-    ca = pytest.importorskip("casadi")
-    A = np.vstack([E, G])
-    solver = ca.conic(
-        "s", "qpoases", {"h": ca.DM(H).sparsity(), "a": ca.DM(A).sparsity()}, {"printLevel": "none", "sparse": False}
-    )
-    lower = np.concatenate([e, np.full(len(top), -np.inf)])
-    answer = solver(h=H, g=g, a=A, lba=lower, uba=np.concatenate([e, top]))
+    A = np.vstack([*equal, G])
+    shapes = {"h": ca.DM(H).sparsity(), "a": ca.DM(A).sparsity()}
+    solver = ca.conic("s", "qpoases", shapes, {"printLevel": "none", "sparse": False})
+    e = np.concatenate(right)
+    answer = solver(h=H, g=g, a=A, lba=np.concatenate([e, np.full(len(top), -np.inf)]), uba=np.concatenate([e, top]))
     assert solver.stats()["success"]
-    return np.array(answer["x"]).ravel()
+    return np.array(answer["x"]).ravel()[-nj:]
 
 
 @pytest.mark.parametrize("name", ["solo8", "talos"])
-@pytest.mark.parametrize("solver", ["quadprog", "qpoases"])
-def test_torques_are_those_of_a_dense_program_assembled_apart(name: str, solver: str) -> None:
-    if solver == "quadprog":
-        pytest.importorskip("quadprog")
+def test_torques_equal_a_dense_program_over_all_variables(name: str) -> None:
     r = robot(name)
     controller = controller_of(name)
     controller.reset(r.posture(), np.zeros(r.nv))
@@ -210,14 +174,14 @@ def test_torques_are_those_of_a_dense_program_assembled_apart(name: str, solver:
         q, v = displaced(name, amount), 3 * amount * rng(name, k).normal(size=r.nv)
         command = controller.tick(k * DT, q, v)
         assert command.status is Status.SOLVED
-        # Bounds of joint limits are left out of the dense formulation: none may be active here.
+        # The dense formulation has no joint limits, so none of them may be active here.
         assert not [name for name, _ in controller.report().active if name in r.tangent_names[6:]]
-        found = dense_torques(controller, q, v, solver)
-        assert np.abs(found - command.torque).max() <= 1e-6 * np.abs(command.torque).max()
+        difference = dense_torques(controller, q, v) - command.torque
+        assert np.abs(difference).max() <= 1e-6 * np.abs(command.torque).max()
 
 
 @pytest.mark.parametrize("name", ["quadprog", "proxqp"])
-def test_other_solvers_agree_on_our_own_program(name: str) -> None:
+def test_other_solvers_agree_on_the_program_of_a_tick(name: str) -> None:
     pytest.importorskip("quadprog" if name == "quadprog" else "proxsuite")
     pytest.importorskip("qpsolvers")
     from tests.support.qpsolvers_solver import QpsolversSolver
@@ -231,8 +195,8 @@ def test_other_solvers_agree_on_our_own_program(name: str) -> None:
         command = controller.tick(0.0, displaced(robot_name, 0.01), 0.1 * rng(robot_name).normal(size=r.nv))
         solved = other.solve(controller.assembly.qp)
         assert solved is not None
-        theirs = controller.assembly.controls(controller.state, solved.z)
-        assert np.abs(theirs - command.u).max() <= 1e-5 * np.abs(command.u).max()
+        controls = controller.assembly.controls(controller.state, solved.z)
+        assert np.abs(controls - command.u).max() <= 1e-5 * np.abs(command.u).max()
 
 
 def test_a_solution_certifies_itself() -> None:
@@ -253,8 +217,8 @@ def test_a_solution_certifies_itself() -> None:
         assert np.abs(solved.multipliers[inside]).max() <= 1e-9 * scale
 
 
-def test_soles_wrench_cone_is_that_of_forces_at_its_corners() -> None:
-    """Caron's closed form against linear programs: a wrench is inside exactly if corner forces make it."""
+def test_the_wrench_cone_of_a_sole_contains_exactly_the_corner_forces() -> None:
+    """Caron's closed form equals linear programs: a wrench is inside exactly if corner forces produce it."""
     from scipy.optimize import linprog
 
     half, friction = (0.1, 0.06), 0.7
@@ -301,8 +265,8 @@ def test_slippery_ground_binds_the_cone() -> None:
         assert np.hypot(f[0], f[1]) <= 0.05 * f[2] + 1e-6
 
 
-def test_motion_of_feet_that_no_force_can_stop_relaxes_and_never_fails() -> None:
-    """Torn off the ground at 30 m/s, the legs have not the torque to keep the feet back: the contacts give way."""
+def test_feet_too_fast_for_the_motors_relax_the_contacts() -> None:
+    """At 30 m/s upwards, the legs lack the torque to hold the feet on the ground, so the contacts give way."""
     controller = controller_of("talos")
     r = robot("talos")
     controller.reset(r.posture(), np.zeros(r.nv))
@@ -327,7 +291,7 @@ def test_motion_of_feet_that_no_force_can_stop_relaxes_and_never_fails() -> None
         lambda: legged_formulation(robot("panda"), JointPosture(robot("panda"))),
     ],
 )
-def test_what_makes_no_contact_is_refused(wrong: object) -> None:
+def test_invalid_contacts_are_refused(wrong: object) -> None:
     with pytest.raises((ContactError, InputError)):
         wrong()  # type: ignore[operator]
 

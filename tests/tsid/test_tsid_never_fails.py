@@ -1,4 +1,4 @@
-"""A tick always gives a command: hard states, broken measurements and functions, clocks that jump."""
+"""A tick always gives a command, at hard states, with broken measurements and functions, and clocks that jump."""
 
 from __future__ import annotations
 
@@ -35,7 +35,7 @@ PROGRAMS = [
 
 
 def well(r: Robot) -> Gradient:
-    """A quadratic well around another posture."""
+    """Return the gradient of a quadratic well around another posture."""
     goal = np.array(pin.integrate(r.model, r.posture(), 0.3 * rng(r.name, "well").normal(size=r.nv)))
 
     def gradient(q: np.ndarray) -> tuple[float, np.ndarray]:
@@ -66,7 +66,7 @@ def bracing(name: str, kind: str, spring: Spring = "keep") -> tuple[Controller, 
 
 @pytest.mark.parametrize(("name", "kind"), PROGRAMS)
 def test_hard_states_are_answered(name: str, kind: str) -> None:
-    """Far from the posture, too fast, pushed with up to 10 kN: what must hold holds, the rest gives way."""
+    """Far from the posture, too fast, pushed with up to 10 kN, a tick keeps the hard constraints."""
     controller, _ = bracing(name, kind)
     r, generator = controller.robot, rng(name, kind)
     seen = set()
@@ -91,8 +91,8 @@ def test_hard_states_are_answered(name: str, kind: str) -> None:
 
 
 @pytest.mark.parametrize(("name", "kind"), [("tilthex_arm", "strict"), ("kinova", "arm"), ("talos", "legged")])
-def test_measurements_that_are_none_are_held_and_forgotten(name: str, kind: str) -> None:
-    """One after the other, each followed by a good one; a second controller that saw none of them ends alike."""
+def test_broken_measurements_hold_the_command_and_are_forgotten(name: str, kind: str) -> None:
+    """A good measurement follows each broken one, and the last command is the same without broken ones."""
     controller, posture = bracing(name, kind)
     r = controller.robot
     q, v, force = r.posture(), 0.01 * rng(name).normal(size=r.nv), np.zeros(6)
@@ -112,6 +112,7 @@ def test_measurements_that_are_none_are_held_and_forgotten(name: str, kind: str)
         for k, (bad_q, bad_v, bad_force) in enumerate(broken):
             good = controller.tick(k * DT, q, v, force)
             assert good.status is Status.SOLVED
+            assert controller.tick(np.nan, q, v, force).status is Status.NON_FINITE
             term = posture.term.copy()
             held = controller.tick((k + 0.5) * DT, bad_q, bad_v, bad_force)
             assert held.status is Status.NON_FINITE and np.array_equal(posture.term, term)
@@ -143,7 +144,7 @@ def test_arrays_of_another_shape_are_refused() -> None:
 
 
 def test_nearly_unit_numbers_are_normalized() -> None:
-    """A quaternion, and cosines with sines, as estimators give them: not quite of unit length."""
+    """Quaternions, and cosines with sines, of estimators do not have exactly unit length."""
     for name, kind in (("tilthex_arm", "strict"), ("kinova", "arm")):
         controller, posture = bracing(name, kind)
         q, v = controller.robot.posture(), np.zeros(controller.robot.nv)
@@ -154,12 +155,12 @@ def test_nearly_unit_numbers_are_normalized() -> None:
         controller.reset(q, v)
         posture.brace()
         assert np.allclose(controller.tick(0.0, off, v).u, exact.u, rtol=0, atol=1e-9)
-        # The reached posture becomes the target without being looked at again.
+        # The reached posture becomes the target without another check.
         posture.contact()
         assert controller.tick(DT, off, v).status is Status.SOLVED
 
 
-def test_events_upside_down_are_no_mistake() -> None:
+def test_phases_upside_down_are_answered() -> None:
     controller, posture = bracing("tilthex_arm", "strict")
     q, v = controller.robot.posture(), np.zeros(controller.robot.nv)
     q[3:7] = (1.0, 0.0, 0.0, 0.0)
@@ -170,7 +171,7 @@ def test_events_upside_down_are_no_mistake() -> None:
 
 
 @pytest.mark.parametrize("how", ["raises", "nan", "inf", "shape", "none"])
-def test_gradients_that_fail_leave_the_term_before(how: str) -> None:
+def test_a_gradient_that_fails_keeps_the_last_term(how: str) -> None:
     r, works = robot("tilthex_arm"), True
     good = well(r)
 
@@ -198,7 +199,7 @@ def test_gradients_that_fail_leave_the_term_before(how: str) -> None:
 
 
 def test_clocks_that_stand_jump_and_run_backwards() -> None:
-    """No time passes backwards, none faster than ten periods a tick, and afterwards all is as before."""
+    """A tick advances the time by 0 to 10 periods, and the controller goes on after each jump."""
     controller, posture = bracing("tilthex_arm", "strict")
     q, v = controller.robot.posture(), np.zeros(controller.robot.nv)
     level, longest = 0.0, level_bound(posture.activation, 10 * DT)
@@ -210,7 +211,7 @@ def test_clocks_that_stand_jump_and_run_backwards() -> None:
 
 
 def test_motors_without_torque() -> None:
-    """Next to none at all, and hardly a cone for the feet: everything gives way but dynamics, limits and cones."""
+    """With almost no torque, all levels give way, but dynamics, limits and cones hold."""
     for name, kind in (("panda", "arm"), ("solo8", "legged")):
         controller, _ = bracing(name, kind)
         for bound, sign in ((controller.actuators.lower, -1.0), (controller.actuators.upper, 1.0)):
@@ -226,7 +227,7 @@ def test_motors_without_torque() -> None:
 # ---- levels ----------------------------------------------------------------------------------------------------
 
 
-def test_rows_of_one_length_are_the_same_least_squares() -> None:
+def test_balanced_rows_keep_the_least_squares() -> None:
     generator = rng("balanced")
     for k, n in ((1, 3), (2, 5), (6, 9), (6, 4), (12, 38)):
         A, b = generator.normal(size=(k, n)) * 10.0 ** generator.uniform(-2, 2, size=(k, 1)), generator.normal(size=k)
@@ -238,7 +239,7 @@ def test_rows_of_one_length_are_the_same_least_squares() -> None:
 
 @pytest.mark.parametrize("refined", [True, False])
 def test_levels_against_one_quadratic_program_after_the_other(refined: bool, monkeypatch: pytest.MonkeyPatch) -> None:
-    """The same by quadprog: the least that each level can miss, with what those above it reached as equations."""
+    """quadprog solves each level with the results of the levels above as equations."""
     quadprog = pytest.importorskip("quadprog")
     if not refined:
         monkeypatch.setattr(hierarchy, "_no_worse", lambda *points: False)
@@ -254,12 +255,12 @@ def test_levels_against_one_quadratic_program_after_the_other(refined: bool, mon
         for A, b in ((first, wanted[0]), (second, wanted[1])):
             x = quadprog.solve_qp(A.T @ A + 1e-9 * np.eye(n), A.T @ b, rows.T, least)[0]
             assert np.linalg.norm(A @ z - b) == pytest.approx(np.linalg.norm(A @ x - b), rel=1e-4, abs=1e-4)
-            # What was reached is kept, with room for rounding.
+            # The reached values become bounds, with room for rounding.
             rows = np.vstack([rows, A, -A])
             least = np.concatenate([least, A @ x - 1e-7, -A @ x - 1e-7])
 
 
-def test_a_level_that_the_solver_gives_up_and_that_can_hold_holds(monkeypatch: pytest.MonkeyPatch) -> None:
+def test_a_level_that_can_hold_holds_though_the_solver_gives_it_up(monkeypatch: pytest.MonkeyPatch) -> None:
     generator, n = rng("given up"), 8
     C, d = generator.normal(size=(10, n)), generator.uniform(0.1, 1, 10)
     inside, below = 0.01 * generator.normal(size=n), generator.normal(size=(3, n))
@@ -273,6 +274,6 @@ def test_a_level_that_the_solver_gives_up_and_that_can_hold_holds(monkeypatch: p
         return nearest([given[0], given[2]] if len(calls) == 1 else given)
 
     monkeypatch.setattr(hierarchy, "_nearest", gives_up)
-    found = lexicographic(levels)
-    assert calls == [3, 2] and right is not None and found is not None
-    assert np.allclose(found, right, rtol=0, atol=1e-9)
+    z = lexicographic(levels)
+    assert calls == [3, 2] and right is not None and z is not None
+    assert np.allclose(z, right, rtol=0, atol=1e-9)

@@ -33,26 +33,25 @@ Vector = np.ndarray[Any, Any]
 
 
 def borinot() -> Robot:
-    """With rotors that it does not have: the data of the real ones are not published."""
-    found, rotors = robot("borinot"), robot("tilthex_arm").spec.propulsion
+    """Return borinot with the rotors of another robot, because the data of its rotors are not published."""
+    r, rotors = robot("borinot"), robot("tilthex_arm").spec.propulsion
     assert rotors is not None
-    spec = replace(found.spec, propulsion=replace(rotors, frame="borinot__base_link"))
-    return replace(found, spec=spec)
+    return replace(r, spec=replace(r.spec, propulsion=replace(rotors, frame="borinot__base_link")))
 
 
-MADE: dict[str, Callable[[], Robot]] = {"yaw, three pitches": yaw_and_pitches, "borinot": borinot}
+FLYING_ARMS: dict[str, Callable[[], Robot]] = {"yaw, three pitches": yaw_and_pitches, "borinot": borinot}
 
 
 # ---- free flight ------------------------------------------------------------------------------------------------
 
 
 @pytest.mark.parametrize("noise", [0.0, 1e-3])
-@pytest.mark.parametrize("name", MADE)
+@pytest.mark.parametrize("name", FLYING_ARMS)
 def test_gentle_flight_is_solved_at_every_tick(name: str, noise: float) -> None:
     """The arm cannot roll the end effector, hence the base's tilt and the pose share a row."""
-    r = MADE[name]()
+    r = FLYING_ARMS[name]()
     controller, generator = Controller(r, aerial_formulation(r, JointPosture(r))), rng(name, noise)
-    # A nudge: the shared row is asked for two different things, if only in the seventh digit.
+    # A small velocity makes the two demands on the shared row differ in the seventh digit.
     q, v = r.posture(), 1e-7 * generator.normal(size=r.nv)
     assert controller.reset(q, v).status is Status.SOLVED
     for k in range(300):
@@ -65,9 +64,9 @@ def test_gentle_flight_is_solved_at_every_tick(name: str, noise: float) -> None:
     assert np.linalg.norm(v) < (0.05 if noise else 1e-6)
 
 
-@pytest.mark.parametrize("name", MADE)
-def test_rows_that_agree_hold_exactly_and_rows_that_do_not_say_so(name: str) -> None:
-    r = MADE[name]()
+@pytest.mark.parametrize("name", FLYING_ARMS)
+def test_rows_that_agree_hold_exactly_and_others_are_reported(name: str) -> None:
+    r = FLYING_ARMS[name]()
     away = pin.integrate(r.model, r.posture(), np.r_[np.zeros(6), 0.3 * rng(name).normal(size=r.nv - 6)])
     controller = Controller(r, aerial_formulation(r, JointPosture(r, away)))
     controller.reset(r.posture(), np.zeros(r.nv))
@@ -75,7 +74,7 @@ def test_rows_that_agree_hold_exactly_and_rows_that_do_not_say_so(name: str) -> 
     hand = controller.formulation.levels[1][0]
     assert report.status is Status.SOLVED and report.relaxed == report.deficient == ()
     assert np.abs(report.residuals["tilt"]).max() <= 1e-8 and np.abs(report.residuals[hand.name]).max() <= 1e-8
-    # Rolled about the arm's plane: the tilt wins, the rest of the pose is as near as it comes.
+    # A target that is rolled about the arm's plane: the tilt holds, and the pose comes as near as it can.
     assert isinstance(hand, FramePose) and hand.target is not None
     hand.target = pin.SE3(pin.exp3(np.array([0.1, 0.05, 0.0])) @ hand.target.rotation, hand.target.translation)
     command, report = controller.tick(0.0, r.posture(), np.zeros(r.nv)), controller.report()
@@ -88,8 +87,8 @@ def test_rows_that_agree_hold_exactly_and_rows_that_do_not_say_so(name: str) -> 
 
 
 @pytest.mark.parametrize(("kind", "rows"), [(FramePosition, 3), (FrameAligned, 5)])
-def test_a_task_that_asks_for_less_needs_no_rank_that_is_missing(kind: type[EndEffector], rows: int) -> None:
-    """The tool looks forward: spin about its axis, which the arm cannot make, is left free."""
+def test_a_task_with_fewer_rows_is_not_deficient(kind: type[EndEffector], rows: int) -> None:
+    """The tool points forward, and the task leaves free the spin about its axis, which the arm cannot produce."""
     r = arm([Z, Y, Y, Y], [0.3, -0.8, 0.3, -0.5], floating=True)
     axis: Any = {} if kind is FramePosition else {"axis": rotation(r).T @ np.array([np.cos(0.3), np.sin(0.3), 0.0])}
     task = kind(Point(TIP), kp=60.0, **axis)
@@ -110,7 +109,7 @@ def rotation(r: Robot) -> Vector:
 
 
 class Scaled(Task):
-    """Another task in another unit."""
+    """Express another task in another unit."""
 
     def __init__(self, inner: Task, factor: float) -> None:
         super().__init__(f"{inner.name}, scaled", inner.size, kp=inner.kp, kd=inner.kd)
@@ -142,7 +141,7 @@ def task_of(kind: str, link: int, name: str) -> Task:
 
 
 def turn_away(task: Task, by: Vector) -> None:
-    """Another target than the task that it is a copy of."""
+    """Move the target of a task."""
     task = task.inner if isinstance(task, Scaled) else task
     if isinstance(task, FramePosition):
         task.target = task.target + by[:3]
@@ -156,7 +155,7 @@ def turn_away(task: Task, by: Vector) -> None:
 
 @st.composite
 def stacks(draw: st.DrawFn, *, limited: bool, far: float, fast: float) -> tuple[Controller, Vector, Vector]:
-    """A controller of an arm that nobody would build, and where it is: copies, scaled copies, contradictions."""
+    """Draw a controller of a strange arm, with copied, scaled and contradictory tasks, and a state."""
     floating, generator = draw(st.booleans()), np.random.default_rng(draw(st.integers(0, 2**32 - 1)))
     axes = draw(st.lists(st.sampled_from([X, Y, Z, None]), min_size=1 if floating else 2, max_size=7))
     n = len(axes)
@@ -197,7 +196,7 @@ def stacks(draw: st.DrawFn, *, limited: bool, far: float, fast: float) -> tuple[
 
 
 def levels_of(controller: Controller) -> list[tuple[Vector, Vector]]:
-    """``J`` and ``ÿ* − J̇ν`` of each level, from the tasks themselves."""
+    """Return ``J`` and ``ÿ* − J̇ν`` of each level, computed by the tasks."""
     state = controller.state
     return [
         (
@@ -209,7 +208,7 @@ def levels_of(controller: Controller) -> list[tuple[Vector, Vector]]:
 
 
 def free_answer(controller: Controller) -> tuple[Vector, Vector, list[float], float]:
-    """Without limits, level by level: least squares, what is left free, what each misses; least singular value."""
+    """Return the answer without limits, the free directions, each level's miss, and the least singular value."""
     x, Zs, missed, least = np.zeros(controller.robot.nv), np.eye(controller.robot.nv), [], np.inf
     for J, b in levels_of(controller):
         values = np.linalg.svd(J @ Zs, compute_uv=False) / max(np.linalg.norm(J, axis=1).max(), 1e-3)
@@ -228,7 +227,7 @@ def reached(controller: Controller, command: Command) -> list[float]:
 @settings(max_examples=60)
 @given(stacks(limited=False, far=0.1, fast=0.3))
 def test_any_stack_has_the_lexicographic_answer(drawn: tuple[Controller, Vector, Vector]) -> None:
-    """Against NumPy's least squares, one level after the other, and the posture in what they leave."""
+    """NumPy solves the levels by least squares one after the other, then the posture in the free directions."""
     controller, q, v = drawn
     command = controller.tick(0.0, q, v)
     assert command.status is Status.SOLVED
@@ -236,7 +235,7 @@ def test_any_stack_has_the_lexicographic_answer(drawn: tuple[Controller, Vector,
     assume(least > 1.5 * SINGULAR)
     posture = controller.formulation.posture
     assert posture is not None
-    # What nothing weighs has a weight of its own, towards zero.
+    # An acceleration without a weight has a small weight towards zero.
     weight, wanted = np.maximum(posture.weight, 1e-8), posture.weight * posture.desired(controller.state)
     best = x + Zs @ np.linalg.solve(Zs.T @ (weight[:, None] * Zs), Zs.T @ (wanted - weight * x))
     np.testing.assert_allclose(command.acceleration, best, rtol=0, atol=1e-6 * (1 + np.abs(best).max()))
@@ -252,7 +251,7 @@ def test_any_stack_has_the_lexicographic_answer(drawn: tuple[Controller, Vector,
 @settings(max_examples=40)
 @given(stacks(limited=True, far=0.5, fast=3.0))
 def test_any_stack_is_answered_within_limits(drawn: tuple[Controller, Vector, Vector]) -> None:
-    """Against one quadratic program a level by quadprog, in what the levels above leave."""
+    """quadprog solves one quadratic program for each level, in the directions that the levels above leave."""
     quadprog = pytest.importorskip("quadprog")
     controller, q, v = drawn
     command = controller.tick(0.0, q, v)
@@ -267,30 +266,30 @@ def test_any_stack_is_answered_within_limits(drawn: tuple[Controller, Vector, Ve
     lower, upper = np.delete(qp.lower, np.s_[n : n + count]), np.delete(qp.upper, np.s_[n : n + count])
     below, above = np.isfinite(lower), np.isfinite(upper)
     C, d = np.vstack([rows[below], -rows[above]]), np.concatenate([lower[below], -upper[above]])
-    x, Zs, found = command.acceleration, np.eye(n), reached(controller, command)
+    x, Zs, misses = command.acceleration, np.eye(n), reached(controller, command)
     for k, (J, b) in enumerate(levels_of(controller)):
         A = J @ Zs
-        # From where it is and in what is free: nothing may bring this level nearer.
+        # No step in the free directions may bring this level nearer.
         step = quadprog.solve_qp(
             A.T @ A + 1e-9 * np.eye(A.shape[1]), A.T @ (b - J @ x), (C @ Zs).T, d - C @ x - 1e-7 * (1 + np.abs(d))
         )[0]
-        # Four digits of the numbers that a row adds up: how closely what gave way is held.
-        assert found[k] <= np.linalg.norm(A @ step + J @ x - b) + 1e-4 * (1 + (np.abs(J) @ np.abs(x)).max())
+        # A level that gave way is held to four digits of the terms of its rows.
+        assert misses[k] <= np.linalg.norm(A @ step + J @ x - b) + 1e-4 * (1 + (np.abs(J) @ np.abs(x)).max())
         values, right = np.linalg.svd(A)[1:]
         Zs = Zs @ right[np.count_nonzero(values > 1e-7) :].T
         if not Zs.shape[1]:
             break
     if command.status is Status.SOLVED:
-        np.testing.assert_allclose(found, free, rtol=0, atol=1e-5 * (1 + max(free)))
+        np.testing.assert_allclose(misses, free, rtol=0, atol=1e-5 * (1 + max(free)))
     else:
-        assert any(miss > best + 1e-9 for miss, best in zip(found, free, strict=True))
+        assert any(miss > best + 1e-9 for miss, best in zip(misses, free, strict=True))
 
 
 # ---- near a singularity -----------------------------------------------------------------------------------------
 
 
 def planar(position: type[EndEffector] = FramePosition) -> tuple[Robot, TaskFormulation]:
-    """Three parallel hinges: nothing ever moves sideways, and stretched nothing moves along the arm."""
+    """Three parallel hinges cannot move the tip sideways, nor along the stretched arm."""
     r = arm([Y, Y, Y], [0.3, 0.4, -0.2], floating=False, effort=0.0)
     return r, arm_formulation(r, JointPosture(r), end_effector=position(Point(TIP), kp=60.0))
 
@@ -301,19 +300,19 @@ def wrist() -> tuple[Robot, TaskFormulation]:
 
 
 def flying() -> tuple[Robot, TaskFormulation]:
-    """The second hinge rolls the tip; where the first link hangs straight down it yaws instead, as the base does."""
+    """The second hinge rolls the tip.  Where the first link hangs straight down, it yaws the tip as the base does."""
     r = arm([Y, Z, Y], [0.3, 0.4, -0.2], floating=True)
     return r, aerial_formulation(r, JointPosture(r), law=None)
 
 
 def two_levels() -> tuple[Robot, TaskFormulation]:
-    """Both singular at once, and the lower one needs what the upper one lets go."""
+    """Both levels are singular at once, and the lower one needs the direction that the upper one releases."""
     r = arm([Z, Y, Y, X, Y, X], [0.3, 0.4, 0.8, 0.2, 0.5, 0.1], floating=False, effort=0.0)
     tip, elbow = FramePosition(Point(TIP), kp=60.0), FramePosition(Point("link_2", (0, 0, -0.3)), kp=60.0)
     return r, TaskFormulation(((tip,), (elbow,)), (), JointPosture(r), law=None)
 
 
-# How far the targets of a sweep are off, m (rad): no limit is to be reached.
+# Distance of the targets of a sweep, m (rad), so small that no limit is reached.
 AHEAD = {"flying": 1e-3}
 SWEEPS: dict[str, tuple[Callable[[], tuple[Robot, TaskFormulation]], list[float], list[float]]] = {
     "planar": (planar, [0.3, 0.0, 0.0], [0.0, 0.8, 0.5]),
@@ -330,17 +329,17 @@ def swept(
     torque: float = np.inf,
     look: Callable[[Controller, Command], None] = lambda controller, command: None,
 ) -> tuple[Vector, set[Status], Controller]:
-    """Accelerations at ``count`` states on the way through the singular posture; all targets are a bit ahead."""
+    """Return accelerations at ``count`` states through the singular posture, with all targets slightly ahead."""
     make, through, along = SWEEPS[name]
     r, formulation = make()
     controller, state = Controller(r, formulation), State(r, formulation.points)
     controller.reset(r.posture(), np.zeros(r.nv))
     if torque < np.inf:
         controller.actuators.lower[:], controller.actuators.upper[:] = -torque, torque
-    found, seen, way = [], set(), np.linspace(-1.0, 1.0, count)
+    accelerations, seen, places = [], set(), np.linspace(-1.0, 1.0, count)
     for k in range(count) if indices is None else indices:
         q, v = r.posture(), np.zeros(r.nv)
-        q[-len(along) :], v[-len(along) :] = np.array(through) + way[k] * np.array(along), 0.05 * np.array(along)
+        q[-len(along) :], v[-len(along) :] = np.array(through) + places[k] * np.array(along), 0.05 * np.array(along)
         state.update(q, v)
         for task in (task for level in formulation.levels for task in level):
             if not isinstance(task, Tilt):
@@ -349,14 +348,14 @@ def swept(
             turn_away(task, AHEAD.get(name, 0.01) * np.array([0.3, 0.2, -1.0, 0.5, -0.4, 0.3]))
         command = controller.tick(k * DT, q, v)
         look(controller, command)
-        found.append(command.acceleration)
+        accelerations.append(command.acceleration)
         seen.add(command.status)
-    return np.array(found), seen, controller
+    return np.array(accelerations), seen, controller
 
 
 @pytest.mark.parametrize("name", SWEEPS)
 def test_a_slow_sweep_through_a_singular_posture_is_continuous(name: str) -> None:
-    """Half the step, half the change: there is no jump on the way, and nothing explodes."""
+    """Half the step halves the change, so that there is no jump, and accelerations stay bounded."""
     coarse, seen, _ = swept(name, 401)
     fine, again, controller = swept(name, 801)
     assert seen == again == {Status.SOLVED}
@@ -369,7 +368,7 @@ def test_a_slow_sweep_through_a_singular_posture_is_continuous(name: str) -> Non
 
 @pytest.mark.parametrize(("name", "torque"), [("wrist", 1.0), ("two levels", 0.3)])
 def test_a_relaxed_answer_is_damped_alike(name: str, torque: float) -> None:
-    """Where limits are reached near a singularity, quadprog finds the same minimum of the damped cost."""
+    """At limits near a singularity, quadprog has the same minimum of the damped cost."""
     quadprog, damped = pytest.importorskip("quadprog"), []
 
     def look(controller: Controller, command: Command) -> None:
@@ -394,7 +393,7 @@ def test_a_relaxed_answer_is_damped_alike(name: str, torque: float) -> None:
 
 @pytest.mark.parametrize("name", SWEEPS)
 def test_there_is_no_hysteresis(name: str) -> None:
-    """The same states in another order: the same commands, wherever the controller came from."""
+    """The same states in another order give the same commands."""
     count = 201
     forth, _, _ = swept(name, count)
     order = rng(name, "order").permutation(count)

@@ -1,4 +1,4 @@
-"""The tasks of the online side: Jacobians and drifts against differences, errors, and what each asks for."""
+"""The tasks of the controller: Jacobians and drifts against differences, errors, and desired accelerations."""
 
 from __future__ import annotations
 
@@ -39,10 +39,9 @@ OFFSET = (0.03, -0.02, 0.05)
 
 def tasks(name: str) -> list[Task]:
     point, bare = Point(FRAMES[name], OFFSET), Point(FRAMES[name])
-    found: list[Task] = [FramePose(point), FramePosition(bare), JointPosture(robot(name))]
-    if robot(name).floating:
-        found += [Tilt(), BaseOrientation(), CenterOfMass()]
-    return [*found, FrameAligned(point, (0.3, -0.5, 0.8))]
+    body = [Tilt(), BaseOrientation(), CenterOfMass()] if robot(name).floating else []
+    aligned = FrameAligned(point, (0.3, -0.5, 0.8))
+    return [FramePose(point), FramePosition(bare), JointPosture(robot(name)), *body, aligned]
 
 
 def state_of(name: str, task: Task, q: np.ndarray, v: np.ndarray) -> State:
@@ -81,12 +80,12 @@ def test_error_falls_by_jacobian(name: str, k: int) -> None:
 
 
 @pytest.mark.parametrize(("name", "k"), CASES)
-def test_drift_is_the_jacobians_rate_along_the_motion(name: str, k: int) -> None:
+def test_drift_is_the_rate_of_the_jacobian_along_the_motion(name: str, k: int) -> None:
     task = tasks(name)[k]
     q, v = sample(name, k)
     state = state_of(name, task, q, v)
     if isinstance(task, FramePose):
-        # The twist is a body twist turned into world axes: it is the body twist whose rate the drift is.
+        # The output is the body twist in world axes, and the drift is the rate of the body twist.
         def rate(s: float) -> np.ndarray:
             there = state_of(name, task, pin.integrate(robot(name).model, q, s * v), v).at(task.points[0])
             return np.concatenate([there.rotation.T @ there.velocity[:3], there.rotation.T @ there.velocity[3:]])
@@ -100,7 +99,7 @@ def test_drift_is_the_jacobians_rate_along_the_motion(name: str, k: int) -> None
 
 
 @pytest.mark.parametrize("name", FRAMES)
-def test_state_is_pinocchios(name: str) -> None:
+def test_the_state_agrees_with_pinocchio(name: str) -> None:
     model, point = robot(name).model, Point(FRAMES[name], OFFSET)
     q, v = sample(name, "state")
     state = State(robot(name), [point]).update(q, v)
@@ -119,8 +118,8 @@ def test_state_is_pinocchios(name: str) -> None:
         assert_close(J, pin.jacobianCenterOfMass(model, data, q), 1e-12, "J com")
 
 
-def test_state_survives_many_updates_of_itself() -> None:
-    """The views stay Pinocchio's: an old state object at a new configuration is as good as a new one."""
+def test_an_updated_state_equals_a_new_one() -> None:
+    """The views on the data of Pinocchio stay valid."""
     point = Point("ee")
     old = State(robot("tilthex_arm"), [point])
     for k in range(5):
@@ -132,7 +131,7 @@ def test_state_survives_many_updates_of_itself() -> None:
 
 
 class Reach(Task):
-    """A task of two methods, as a user writes it: distance of a point from the vertical axis through the origin."""
+    """Task of a user, with two methods, for the distance of a point from the vertical axis through the origin."""
 
     def __init__(self, point: Point) -> None:
         super().__init__("reach", 1, kp=50.0)
@@ -146,16 +145,16 @@ class Reach(Task):
         return (here.position[:2] / np.hypot(*here.position[:2]))[None] @ here.jacobian[:2]
 
 
-def test_the_documentations_task_is_this_one() -> None:
+def test_the_task_in_the_documentation_is_the_tested_one() -> None:
     page = (Path(__file__).parents[2] / "docs" / "tsid.md").read_text(encoding="utf-8")
     (shown,) = (block for block in re.findall(r"```python\n(.*?)```", page, re.DOTALL) if "class Reach" in block)
     there: dict[str, Any] = {"Task": Task, "Point": Point, "State": State, "np": np}
     exec(shown, there)
     q, v = sample("panda", "shown")
-    theirs, ours = there["Reach"](Point("panda_hand_tcp")), Reach(Point("panda_hand_tcp"))
-    state = State(robot("panda"), theirs.points).update(q, v)
-    assert np.array_equal(theirs.desired(state), Reach(theirs.point).desired(state))
-    assert theirs.size == ours.size and theirs.name == ours.name
+    documented, tested = (kind(Point("panda_hand_tcp")) for kind in (there["Reach"], Reach))
+    state = State(robot("panda"), [documented.point, tested.point]).update(q, v)
+    assert np.array_equal(documented.desired(state), tested.desired(state))
+    assert documented.size == tested.size and documented.name == tested.name
 
 
 def test_two_methods_make_a_task() -> None:
@@ -172,12 +171,12 @@ def test_two_methods_make_a_task() -> None:
         return 0.5 - float(task.error(there)[0])
 
     step = 1e-4
-    found = (reach(step) - 2 * reach(0) + reach(-step)) / step**2
-    assert_close(found, task.desired(state), 1e-5, "acceleration of the output")
+    output = (reach(step) - 2 * reach(0) + reach(-step)) / step**2
+    assert_close(output, task.desired(state), 1e-5, "acceleration of the output")
 
 
 @pytest.mark.parametrize(("name", "k"), CASES)
-def test_an_unconstrained_solve_gives_the_acceleration_that_was_asked_for(name: str, k: int) -> None:
+def test_an_unconstrained_solution_has_the_desired_acceleration(name: str, k: int) -> None:
     task, model = tasks(name)[k], robot(name).model
     q, v = sample(name, k)
     state = state_of(name, task, q, v)
@@ -205,7 +204,7 @@ def test_measured_force_softens_the_end_effector() -> None:
     assert_close(soft.desired(state) - stiff.desired(state), [1 / 3, 2 / 3, 1, 0.2, 0.4, 0.6], 1e-12, "F/M")
 
 
-def test_tilt_takes_the_shortest_way_and_leaves_yaw() -> None:
+def test_tilt_takes_the_shortest_rotation_and_leaves_yaw() -> None:
     task, model = Tilt(kp=1.0), robot("tilthex_arm").model
     q = robot("tilthex_arm").posture()
     for yaw in (0.0, 1.0, 3.0):
@@ -215,9 +214,8 @@ def test_tilt_takes_the_shortest_way_and_leaves_yaw() -> None:
             error = task.error(State(robot("tilthex_arm")).update(q, np.zeros(model.nv)))
             assert_close(error, -0.4 * axis[:2], 1e-12, "tilt error")
     q[3:7] = (1, 0, 0, 0)
-    assert_close(
-        np.linalg.norm(task.error(State(robot("tilthex_arm")).update(q, np.zeros(model.nv)))), np.pi, 1e-12, ""
-    )
+    upside_down = task.error(State(robot("tilthex_arm")).update(q, np.zeros(model.nv)))
+    assert_close(np.linalg.norm(upside_down), np.pi, 1e-12, "upside down")
 
 
 def test_posture_fades_without_a_step() -> None:
@@ -233,7 +231,7 @@ def test_posture_fades_without_a_step() -> None:
         bound = step_bound(task, state, 1e-3)
         task.advance(state, 1e-3)
         now = task.desired(state)
-        # Two base orientations are blended by their logarithms, joints exactly.
+        # Only the joints: base orientations are blended by their logarithms, which is not exact.
         assert np.abs(now - before)[6:].max() <= bound + 1e-9
         before = now
     assert_close(task.target, r.posture(), 1e-12, "target")
@@ -253,13 +251,13 @@ def test_posture_fades_without_a_step() -> None:
         lambda: State(robot("panda"), [Point("panda_hand_tpc")]),
     ],
 )
-def test_what_makes_no_task_is_refused(make: Callable[[], object]) -> None:
+def test_invalid_tasks_are_refused(make: Callable[[], object]) -> None:
     with pytest.raises((InputError, PostureError)):
         make()
 
 
 def test_no_casadi_online() -> None:
-    """Building a controller and ticking needs numpy, Pinocchio and DAQP."""
+    """A controller needs NumPy, Pinocchio and DAQP only."""
     code = """
 import sys, numpy as np
 from impact_posture.robot.robot_loader import load_robot
