@@ -1,4 +1,4 @@
-"""``api-reference PACKAGE…``: one section for each module, found by looking, so that none is forgotten."""
+"""``api-reference PACKAGE…``: one section for each module of the packages."""
 
 from __future__ import annotations
 

@@ -47,14 +47,14 @@ def commands() -> dict[str, Callable[..., None]]:
 def parameters(command: Callable[..., None]) -> list[Parameter]:
     """What a command takes, in the order of its signature."""
     hints = get_type_hints(command, include_extras=True)
-    found = []
+    options = []
     for name, parameter in inspect.signature(command).parameters.items():
         annotation = hints[name]
         infos = [m for m in getattr(annotation, "__metadata__", ()) if isinstance(m, ArgumentInfo | OptionInfo)]
         if annotation is typer.Context:
             continue
         if not infos:
-            raise TypeError(f"parameter '{name}' of '{command.__name__}' is no documented option")
+            raise TypeError(f"parameter '{name}' of '{command.__name__}' is not documented as an option")
         info, value = infos[0], parameter.default
         inner = _plain(get_args(annotation)[0])
         argument = isinstance(info, ArgumentInfo)
@@ -63,7 +63,7 @@ def parameters(command: Callable[..., None]) -> list[Parameter]:
         names = (*first, *(info.param_decls or ())) or (f"--{name.replace('_', '-')}",)
         takes = info.metavar or ("" if inner is bool else _choices(inner) or _WORDS.get(inner, "TEXT"))
         names = (info.metavar or name.upper(),) if argument else tuple(n.replace("/", " / ") for n in names)
-        found.append(
+        options.append(
             Parameter(
                 names=names,
                 takes="" if argument else takes,
@@ -73,7 +73,7 @@ def parameters(command: Callable[..., None]) -> list[Parameter]:
                 argument=argument,
             )
         )
-    return found
+    return options
 
 
 def _plain(annotation: Any) -> Any:

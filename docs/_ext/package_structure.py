@@ -15,7 +15,7 @@ SUFFIXES = {".py", ".c", ".cpp", ".hpp"}
 
 
 def part_of(module: str) -> str:
-    """The folder or module of the library that a dotted name belongs to; the command line as one part."""
+    """Folder or module of the library that a dotted name belongs to.  The command line is one part."""
     names = module.split(".")
     if names[0] == "impact_posture_cli":
         return "cli"
@@ -23,8 +23,8 @@ def part_of(module: str) -> str:
 
 
 def imports_of(path: Path) -> set[str]:
-    """The parts that a file imports when it is loaded or when its functions run, not for annotations alone."""
-    found: set[str] = set()
+    """Parts that a file imports when it is loaded or when its functions run, not for annotations alone."""
+    imported: set[str] = set()
     todo: list[ast.AST] = [ast.parse(path.read_text(encoding="utf-8"))]
     while todo:
         node = todo.pop()
@@ -33,24 +33,24 @@ def imports_of(path: Path) -> set[str]:
         if isinstance(node, ast.ImportFrom) and (node.module or "").split(".")[0] in PACKAGES:
             # `from impact_posture import tsid` names a part, too.
             names = [f"{node.module}.{alias.name}" for alias in node.names]
-            found |= {part_of(name) for name in ([node.module or ""] if "." in (node.module or "") else names)}
+            imported |= {part_of(name) for name in ([node.module or ""] if "." in (node.module or "") else names)}
         todo += ast.iter_child_nodes(node)
-    return found - {""}
+    return imported - {""}
 
 
 def parts() -> dict[str, tuple[int, int, set[str]]]:
     """Files, lines and imports of each part, the largest first."""
-    found: dict[str, tuple[int, int, set[str]]] = {}
+    counts: dict[str, tuple[int, int, set[str]]] = {}
     for package, folder in PACKAGES.items():
         for path in sorted(p for p in folder.rglob("*") if p.suffix in SUFFIXES):
             inner = path.relative_to(folder)
             name = "cli" if package.endswith("cli") else inner.parts[0].removesuffix(".py")
             if name == "__init__":
                 continue
-            files, lines, imports = found.get(name, (0, 0, set()))
+            files, lines, imports = counts.get(name, (0, 0, set()))
             more = imports_of(path) if path.suffix == ".py" else set()
-            found[name] = files + 1, lines + len(path.read_text(encoding="utf-8").splitlines()), imports | more
-    return dict(sorted(found.items(), key=lambda item: -item[1][1]))
+            counts[name] = files + 1, lines + len(path.read_text(encoding="utf-8").splitlines()), imports | more
+    return dict(sorted(counts.items(), key=lambda item: -item[1][1]))
 
 
 def markdown() -> str:

@@ -46,11 +46,11 @@ def _rows(request: Request, programs: dict[str, str]) -> Iterator[list[str]]:
     for case, (options, answer, end) in CASES.items():
         if request.only not in case:
             continue
-        found: dict[str, list[Run]] = {name: [] for name in programs}
+        runs_of: dict[str, list[Run]] = {name: [] for name in programs}
         for _ in range(1 + request.count):
             for name, program in programs.items():
-                found[name].append(timed([program, "optimize", *options.split()]))
-        for name, runs in found.items():
+                runs_of[name].append(timed([program, "optimize", *options.split()]))
+        for name, runs in runs_of.items():
             middle = Run(*(statistics.median(times) for times in zip(*runs[1:], strict=True)))
             yield [case, name, *f"{middle.answer:.2f}|{answer}|{middle.end:.2f}|{end}|{middle.busy:.2f}".split("|")]
             if name == "this one" and (middle.answer > answer or middle.end > end):

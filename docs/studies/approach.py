@@ -1,4 +1,4 @@
-"""How fast robots arrive in their optima, and what it costs to arrive as fast as in the start."""
+"""How fast robots arrive in their optima, and the cost of arriving as fast as in the start."""
 
 from __future__ import annotations
 
@@ -20,9 +20,9 @@ _SHARE = 0.9
 def lines(request: Request) -> Iterator[str]:
     """A row for each robot whose joints bring its contact to the surface, and each normal."""
     yield f"The fastest approach at the start and at the best of {STARTS} starts, clear of collisions and held by"
-    yield f"the motors; then the optimum with {_SHARE:.0%} of the speed at the start demanded. *loss*: how much the"
-    yield "objective rises. *a start*: median time of a start against the one without the demand. Robots that fly and"
-    yield "contacts on the trunk have no bound; where no posture is clear of collisions, there is no row."
+    yield f"the motors; then the optimum with {_SHARE:.0%} of the speed at the start demanded. *loss*: rise of the"
+    yield "objective. *a start*: median time of a start over the median without the demand. Robots that fly and"
+    yield "contacts on the trunk have no bound. Robots without a posture clear of collisions have no row."
     yield machine()
     yield ""
     cases = [(robot, normal) for robot in known_robots() if request.only in robot for normal in (DOWN, BACK)]
@@ -36,17 +36,17 @@ def _row(robot: str, normal: tuple[float, float, float], seed: int) -> list[str]
     attainable = AttainableSpeed(problem.robot, problem.objective, problem.requirements)
     if attainable.unknown:
         return []
-    found, (apart, _) = solved(asked)
-    if not isinstance(found, PostureSolution):
+    solution, (apart, _) = solved(asked)
+    if not isinstance(solution, PostureSolution):
         return []
-    start, optimum = (attainable.reached(q) for q in (found.initial, found.q))
+    start, optimum = (attainable.reached(q) for q in (solution.initial, solution.q))
     cells = [robot, "down" if normal == DOWN else "ahead", _digits(start), _digits(optimum)]
     if not start:
         return [*cells, *["–"] * 4]
     speed = float(f"{_SHARE * start:.2g}")
     again, (took, _) = solved(asked | {"approach": True, "speed": speed})
     assert isinstance(again, PostureSolution), again
-    loss = again.optima[0].objective / found.optima[0].objective - 1
+    loss = again.optima[0].objective / solution.optima[0].objective - 1
     return [*cells, f"{speed:g}", f"{100 * loss:.1f} %", f"{again.certified_starts}", f"{took / apart:.1f}×"]
 
 

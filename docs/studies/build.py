@@ -75,8 +75,8 @@ def processor() -> dict[str, str]:
     """Name, and the instructions that it has, of the first processor; empty where the system does not say."""
     file = Path("/proc/cpuinfo")
     lines = file.read_text(encoding="utf-8").splitlines() if file.is_file() else []
-    found = {key.strip(): value.strip() for key, _, value in (line.partition(":") for line in reversed(lines))}
-    return {"name": found.get("model name", platform.processor()), "flags": found.get("flags", "")}
+    entries = {key.strip(): value.strip() for key, _, value in (line.partition(":") for line in reversed(lines))}
+    return {"name": entries.get("model name", platform.processor()), "flags": entries.get("flags", "")}
 
 
 def compiler_version(compiler: Sequence[str]) -> str:

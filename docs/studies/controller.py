@@ -1,7 +1,7 @@
-"""The exported controller beside the one in Python, in three parts: equal answers, growth, and what a tick takes.
+"""The exported controller beside the Python controller, in three parts: equal answers, growth, and times of a tick.
 
 ``python -m docs.studies.controller [TICKS] [equality|growth|times]`` writes a part, or all of them, into pages of
-the documentation.  Times need a quiet machine, the others do not.
+the documentation.  Only times need a quiet machine.
 """
 
 from __future__ import annotations
@@ -27,7 +27,7 @@ from impact_posture.tsid.controller import Controller
 from tests.support.exported_controller import KINDS, exported, formulation_of, impact_of
 
 HARNESS = Path(__file__).with_name("controller_times.c")
-# A repetition is interrupted by other programs; the least of some is the tick's own.
+# Other programs interrupt repetitions, so the shortest of some counts.
 REPETITIONS = 7
 # Ticks that are timed, and random ticks in which the memory must not grow.
 TIMED, RANDOM = 1000, 1_000_000
@@ -38,7 +38,7 @@ _HEAD = "<!-- Written by `make study-controller`; do not edit. -->"
 
 
 def quiet(name: str, ticks: int) -> tuple[list[Vector], list[float]]:
-    """Return the states of a robot that Python's controller holds, and what its ticks took, µs."""
+    """Return the states of a robot that the Python controller holds, and the times of its ticks, µs."""
     robot, formulation = formulation_of(name)
     controller, recorded, taken = Controller(robot, formulation), list[Vector](), list[float]()
     q, v = robot.posture(), np.zeros(robot.nv)
@@ -75,7 +75,7 @@ def times(folder: Path, recorded: list[Vector], flags: list[str], cold: bool) ->
 
 
 def robust_over_nominal(name: str, frame: str, recorded: list[Vector]) -> list[str]:
-    """Return a row: how much longer ticks are with the impact-robust term, every fifth tick and every tick."""
+    """Return a row of ticks with the impact-robust term over nominal ticks, every fifth tick and every tick."""
     robot = formulation_of(name)[0]
     folder = exported(name, impact_of(robot, frame, (0.0, 0.0, 1.0)))
     nominal, fifth, every = _least(folder, recorded, ["-O2"], [[], ["5"], ["1"]])
@@ -94,34 +94,34 @@ def _least(folder: Path, recorded: list[Vector], flags: list[str], variants: lis
         command = [*(find_compiler() or ["cc"]), "-std=c99", "-ffp-contract=fast", "-isystem", "daqp", "-I.", *flags]
         subprocess.run([*command, *sources, "-o", str(program), "-lm"], cwd=folder, check=True)
         least = [np.full((len(recorded), 2), np.inf) for _ in variants]
-        for found, words in REPETITIONS * list(zip(least, variants, strict=True)):
+        for shortest, words in REPETITIONS * list(zip(least, variants, strict=True)):
             ran = subprocess.run([program, data, *words], capture_output=True, check=True)
             numbers = [[int(line.split()[k]) for k in (0, 3)] for line in ran.stdout.splitlines()]
-            np.minimum(found, np.array(numbers) / 1e3, out=found)
+            np.minimum(shortest, np.array(numbers) / 1e3, out=shortest)
     return least
 
 
 def equality(ticks: int) -> Iterator[str]:
-    """Yield what differs between both controllers over the same states."""
+    """Yield the differences of both controllers over the same states."""
     some, most = controller_equality.SOME, controller_equality.MOST
     yield (
         f"{ticks} ticks of each kind of states. Controls are compared relative to the largest. *Its own*: largest "
-        "change of Python's controls, in ticks over 1e-9, where each number of the program moves by its last digit. "
-        f"Where answers differ (the first {most}), and of every {some}th relaxed tick: largest violation of what "
-        "always holds, and largest residual of optimality, by a certificate that neither controller shares."
+        "change of Python's controls, in ticks over 1e-9, when the last digit of each number in the program changes. "
+        f"Where answers differ (the first {most}), and in every {some}th relaxed tick: largest violation of hard "
+        "constraints, and largest residual of optimality, by an independent certificate."
     )
     yield ""
     yield from table(controller_equality.HEAD, controller_equality.equality(ticks))
 
 
 def growth(_: int) -> Iterator[str]:
-    """Yield what random ticks take of memory."""
+    """Yield the growth of memory over random ticks."""
     head = ["robot", "random ticks", "growth", "statuses: solved, relaxed, infeasible, unsolved, not finite"]
     yield from table(head, controller_equality.growth(RANDOM))
 
 
 def times_of_ticks(_: int) -> Iterator[str]:
-    """Yield what a tick takes in Python, in C, and by hand in C++, each row as soon as it is known."""
+    """Yield times of a tick in Python, in C, and by hand in C++, each row as soon as it is known."""
     ratios = list[list[str]]()
     yield f"Median / p99 of {TIMED} quiet states, µs; each tick of C and C++ is the least of {REPETITIONS}."
     yield ""
@@ -137,7 +137,7 @@ def times_of_ticks(_: int) -> Iterator[str]:
             "C -O2",
             "C native",
             "C -O2, caches flushed",
-            "on the way of a flow, C -O2",
+            "with a moving flow, C -O2",
             theirs,
         ]
         yield from table(head, _speeds(peer, ratios))
@@ -153,8 +153,8 @@ def _speeds(peer: Path | None, ratios: list[list[str]]) -> Iterator[list[str]]:
         for flags, cold in ((BUILDS["-O2"], False), (BUILDS["native"], False), (BUILDS["-O2"], True)):
             row.append("{:.1f} / {:.1f}".format(*times(exported(name), recorded, flags, cold)))
         row.append("{:.1f} / {:.1f}".format(*times(*flowing(name, 3 * TIMED), BUILDS["-O2"], False)))
-        found = None if peer is None else controller_peer.times(peer, name, recorded)
-        row.append("–" if found is None else "{:.1f} / {:.1f}".format(*found))
+        peer_times = None if peer is None else controller_peer.times(peer, name, recorded)
+        row.append("–" if peer_times is None else "{:.1f} / {:.1f}".format(*peer_times))
         if name in IMPACTS:
             ratios.append(robust_over_nominal(name, IMPACTS[name], recorded))
         yield row

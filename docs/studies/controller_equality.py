@@ -1,7 +1,6 @@
-"""Whether the exported controller answers as the one in Python: the same statuses and controls over the same states.
+"""Compare statuses and controls of the exported controller and the Python controller over the same states.
 
-Where they differ, a certificate that neither shares (:mod:`tests.support.relaxation_in_c`) says which of them is
-right.
+Where they differ, an independent certificate (:mod:`tests.support.relaxation_in_c`) says which of them is right.
 """
 
 from __future__ import annotations
@@ -38,9 +37,9 @@ HEAD = (
     "robot|states|solved|largest difference of u|over 1e-9|its own|relaxed|status differs (Python/C)|"
     "C: violation, optimality|Python's|held (C)|difference of q_r"
 ).split("|")
-# Largest violation of what always holds, and largest residual of optimality, of a right answer.
+# Largest violation of hard constraints, and largest residual of optimality, of a right answer.
 HOLDS, OPTIMAL = 1e-9, 1e-7
-# Of so many relaxed ticks, one is certified, and of solved ticks that differ, at most so many.
+# One of SOME relaxed ticks is certified, and at most MOST of the solved ticks that differ.
 SOME, MOST = 20, 500
 # Robots that tick a million times.
 GROWTH = ("tilthex_arm", "panda", "solo8", "talos")
@@ -52,7 +51,7 @@ class States:
 
     Attributes:
         push: Acceleration of each joint that pushes the robot in half of the time, relative.
-        size: Size of random states, which follow each other unrelated; 0 for those of a robot that moves.
+        size: Size of random, unrelated states; 0 for the states of a robot that moves.
         follows: Whether a ``term`` or a ``flow`` follows the gradient of an impact, through all phases.
         again: Ticks after which the robot is set up again, because it may have fallen.
     """
@@ -82,12 +81,12 @@ class Agreement:
         solved: Ticks that both solved.
         worst: Largest relative difference of their controls.
         differ: Solved ticks whose controls differ by more than 1e-9.
-        own: Largest relative difference, in those, of Python's controls from its own with the last digits moved.
+        own: Largest relative change of Python's controls in these ticks when the last digits of the program change.
         relaxed: Ticks that both relaxed.
         other: Ticks with different statuses, as ``Python/C``.
-        held: Ticks in which C found no answer.
+        held: Ticks in which C failed and held its command.
         off: Largest violation and residual of optimality, of C and of Python, where answers differ or were relaxed.
-        wrong: Differences, and certified relaxed ticks, in which the answer of C, or of Python, is not right.
+        wrong: Differences and certified relaxed ticks in which the answer of C, or of Python, is wrong.
         reference: Largest difference of the postures that flows have reached, rad or m.
     """
 
@@ -131,8 +130,8 @@ def pair(name: str, follows: str) -> tuple[Controller, CompiledController]:
 
 
 def agreement(name: str, kind: str, ticks: int) -> Agreement:
-    """Run both controllers over the same states: random ones, or those of a robot that follows the one in Python."""
-    states, found = STATES[kind], Agreement()
+    """Run both controllers over the same states: random states, or the states of a robot that Python controls."""
+    states, tally = STATES[kind], Agreement()
     (ours, theirs), rng = pair(name, states.follows), np.random.default_rng(7)
     robot, posture, push = ours.robot, ours.formulation.posture, np.zeros(ours.robot.nv)
     q, v = robot.posture(), np.zeros(robot.nv)
@@ -149,41 +148,41 @@ def agreement(name: str, kind: str, ticks: int) -> Agreement:
             getattr(posture, phase)()
             getattr(theirs, phase)()
         a, b = ours.tick(1e-3 * k, q, v), theirs.tick(1e-3 * k, q, v)
-        _compare(found, ours, a, b)
+        _compare(tally, ours, a, b)
         if isinstance(posture, ReferenceFlowPosture):
             away = pin.difference(robot.model, posture.target, theirs.target)
-            found.reference = max(found.reference, float(np.max(np.abs(away))))
+            tally.reference = max(tally.reference, float(np.max(np.abs(away))))
         if k % 50 == 0:
             push = states.push * rng.normal(size=robot.nv) * (k % 100 == 0)
         v = v + 1e-3 * (a.acceleration + push)
         q = np.asarray(pin.integrate(robot.model, q, 1e-3 * v))
-    return found
+    return tally
 
 
-def _compare(found: Agreement, ours: Controller, a: Command, b: Command) -> None:
+def _compare(tally: Agreement, ours: Controller, a: Command, b: Command) -> None:
     """Count a tick, and certify both answers where they differ, or in some relaxed ticks."""
     answered, certify = (Status.SOLVED, Status.RELAXED), a.status is not b.status
-    found.held += b.status not in answered
+    tally.held += b.status not in answered
     if certify:
-        found.other[f"{a.status.value}/{b.status.value}"] += 1
+        tally.other[f"{a.status.value}/{b.status.value}"] += 1
     elif a.status is Status.SOLVED:
-        found.solved += 1
+        tally.solved += 1
         difference = _difference(a.u, b.u)
-        found.worst, certify = max(found.worst, difference), difference > 1e-9
-        found.differ += certify
-        certify &= found.differ <= MOST
+        tally.worst, certify = max(tally.worst, difference), difference > 1e-9
+        tally.differ += certify
+        certify &= tally.differ <= MOST
         if certify:
-            found.own = max(found.own, _difference(a.u, _moved(ours)))
+            tally.own = max(tally.own, _difference(a.u, _moved(ours)))
     elif a.status is Status.RELAXED:
-        found.relaxed += 1
-        certify = found.relaxed % SOME == 1
+        tally.relaxed += 1
+        certify = tally.relaxed % SOME == 1
     for i, command in enumerate((b, a) if certify else ()):
         if command.status in answered:
             z = np.concatenate([command.acceleration, command.forces])
             program = problem_of(ours.assembly, z)
             off = missed(program, z)[0], max(stationarity(program, z))
-            found.off[i] = np.maximum(found.off[i], off)
-            found.wrong[i] += not (off[0] <= HOLDS and off[1] <= OPTIMAL)
+            tally.off[i] = np.maximum(tally.off[i], off)
+            tally.wrong[i] += not (off[0] <= HOLDS and off[1] <= OPTIMAL)
 
 
 def _difference(u: Vector, other: Vector) -> float:

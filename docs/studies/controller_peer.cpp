@@ -1,5 +1,5 @@
 // A tick as it is written by hand with Pinocchio and DAQP: the dynamics, Jacobians and drifts that the tasks need, then the
-// QP by DAQP from its last active set.  The QPs are those of the controller in Python, read from the file, so that their
+// QP by DAQP from its last active set.  The QPs come from the controller in Python by a file, so that their
 // assembly takes no time here.
 // Arguments: model, ticks.  Prints nanoseconds, one a line; fails where an answer is not Python's.
 #include <chrono>

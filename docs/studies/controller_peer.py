@@ -22,13 +22,13 @@ from tests.support.exported_controller import formulation_of
 SOURCE = Path(__file__).with_suffix(".cpp")
 _REPETITIONS, _MOST = 7, 500
 _PREFIX = Path(pin.__file__).parents[4]
-# Of Pinocchio's CMake package.
+# From the CMake package of Pinocchio.
 _DEFINITIONS = ["BOOST_MPL_LIMIT_LIST_SIZE=30", "BOOST_MPL_LIMIT_VECTOR_SIZE=30", "BOOST_FUSION_INVOKE_MAX_ARITY=12",
                 "BOOST_MPL_CFG_NO_PREPROCESSED_HEADERS", "NDEBUG"]  # fmt: skip
 
 
 class Missing(Exception):
-    """What the peer needs and this machine lacks."""
+    """A requirement of the peer that this machine lacks."""
 
 
 @contextmanager
@@ -54,7 +54,7 @@ def _build(folder: Path, daqp: Path) -> Path:
     sources = [str(path) for path in (daqp / "src").glob("*.c")]
     library = str(next((_PREFIX / "lib").glob("libboost_serialization.so*"), "-lboost_serialization"))
     headers = ["-I", str(daqp / "include"), "-isystem", str(_PREFIX / "include")]
-    # CasADi's wheel has the headers of Eigen, Pinocchio's has not.
+    # The wheel of CasADi has the headers of Eigen, the wheel of Pinocchio does not.
     eigen = ["-isystem", str(Path(casadi.__file__).parent / "include" / "eigen3")]
     definitions = [f"-D{word}" for word in _DEFINITIONS]
     objects = [f"{Path(source).stem}.o" for source in sources]

@@ -114,13 +114,13 @@ def say(words: str, end: str = "\n") -> None:
 
 def collected(work: Callable[[int], _T], count: int, jobs: int, what: str) -> list[_T]:
     """Return ``work(0)`` to ``work(count - 1)`` from several processes, and tell the progress."""
-    found: dict[int, _T] = {}
+    results_by_index: dict[int, _T] = {}
     with fork_map(work, count, jobs) as results:
         for index, result in results:
-            found[index] = result
-            say(f"\r{what}: {len(found)} of {count}", end="")
+            results_by_index[index] = result
+            say(f"\r{what}: {len(results_by_index)} of {count}", end="")
     say("")
-    return [found[k] for k in range(count)]
+    return [results_by_index[k] for k in range(count)]
 
 
 def table(head: Sequence[str], rows: Iterator[Sequence[str]] | Sequence[Sequence[str]]) -> Iterator[str]:
@@ -176,5 +176,5 @@ def crba_time(model: pin.Model) -> float:
 
 def feasible_starts(problem: ConstrainedProblem, count: int, seed: int) -> list[Vector]:
     """The first feasible of random postures, ``count`` of them."""
-    found = (feasible_start(problem, index, seed) for index in range(1, 4 * count))
-    return [start for start in found if start is not None][:count]
+    starts = (feasible_start(problem, index, seed) for index in range(1, 4 * count))
+    return [start for start in starts if start is not None][:count]

@@ -1,4 +1,4 @@
-"""What a compliance of the feet changes, and how many digits double precision keeps: against sixty digits."""
+"""Effect of the compliance of feet, and digits that double precision keeps, against sixty digits."""
 
 from __future__ import annotations
 
@@ -22,7 +22,7 @@ from tests.support.helpers import random_configurations
 
 _CASES = ("solo8, four feet", "solo8, aside", "solo12", "bolt", "talos, two feet")
 COMPLIANCES = (1e-4, 1e-6, 1e-9)
-# Its bias is beyond doubles, and the rounding of J_s holds nothing at it.
+# At this compliance, the bias is below rounding, and the rounding of J_s has no effect.
 _RIGID = 1e-14
 _HEAD = "robot|n|rank of $J_s$|ε m|bound|$H$ moved|oracle: H|∇H|f|kernel: H|∇H|C: H|∇H".split("|")
 
@@ -30,9 +30,10 @@ _HEAD = "robot|n|rank of $J_s$|ε m|bound|$H$ moved|oracle: H|∇H|f|kernel: H|�
 def lines(request: Request) -> Iterator[str]:
     """A row a case and compliance."""
     yield (
-        f"The least digits over the default and {request.count} random postures; in brackets what backward error "
-        "analysis\npromises. $H$ moved: by the compliance, at most, against feet held exactly; before it the bound\n"
-        "$\\varepsilon/(\\sigma+\\varepsilon)$ on the share of what the feet do."
+        f"The least digits over the default and {request.count} random postures; in brackets the "
+        "guarantee of backward "
+        "error\nanalysis. $H$ moved: largest change by the compliance, against feet held exactly. Bound:\n"
+        "$\\varepsilon/(\\sigma+\\varepsilon)$, relative to the effect of the feet on the jump."
     )
     yield ""
     wanted = [CASES[name] for name in _CASES if request.only in name]
@@ -79,8 +80,8 @@ def _row(case: Case, share: float, postures: int) -> list[str]:
     return cells + [f"{min(own for own, _ in pairs):.0f} ({min(b for _, b in pairs):.0f})" for pairs in kept.values()]
 
 
-def _digits(found: object, expected: Exact, promised: object, least: float) -> tuple[float, float]:
-    """Digits kept, and digits promised, relative to the largest entry or to ``least`` if that is more."""
+def _digits(value: object, expected: Exact, promised: object, least: float) -> tuple[float, float]:
+    """Return digits kept and digits promised, relative to the largest entry, or to ``least`` if this is larger."""
     scale = max(float(np.max(np.abs(np.asarray(expected, dtype=float)))), least)
-    worst = float(np.max(distance(found, expected))) / scale
+    worst = float(np.max(distance(value, expected))) / scale
     return -np.log10(max(worst, 1e-16)), -np.log10(float(np.max(np.asarray(promised))) / scale)

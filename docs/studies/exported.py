@@ -1,4 +1,4 @@
-"""Exported H and ∇H: of a robot that stands beside the same robot free, and of a call from Python."""
+"""Time of exported H and ∇H: of a standing robot and the same robot free, and of a call from Python."""
 
 from __future__ import annotations
 
@@ -16,14 +16,14 @@ from impact_posture.codegen.export import export
 from impact_posture.codegen.impact_gradient import ImpactGradient
 from impact_posture.system.libraries import library_path
 
-# Robots that stand, with what the project asks of both at most, µs.
+# Robots that stand, with the goal for both times, µs.
 _FEET = {"solo8, four feet": "–", "solo12": "–", "g1": "–", "talos, two feet": "2.5"}
 _LOADED = ("tilthex_arm", "solo8, four feet", "panda")
 _ROUNDS = 61
 
 
 def feet(request: Request) -> Iterator[str]:
-    """A row a robot and set of flags."""
+    """Yield a row for each robot and set of flags."""
     rows = (row for name, target in _FEET.items() if request.only in name for row in _standing(name, target))
     yield from table(["exported H and ∇H", "made by", "standing µs", "free µs", "ratio", "target"], rows)
 
@@ -38,7 +38,7 @@ def _standing(name: str, target: str) -> Iterator[list[str]]:
 
 
 def loader(request: Request) -> Iterator[str]:
-    """A row a robot: a call through the loader, the same function called from C, and the difference."""
+    """Yield a row for each robot: a call through the loader, the same function called from C, and the difference."""
     yield from (machine(), "")
     rows = (_loaded(name, request.count) for name in _LOADED if request.only in name)
     yield from table(["robot", "call from Python, µs", "from C", "above"], rows)
@@ -51,7 +51,7 @@ def _loaded(name: str, passes: int) -> list[str]:
         export(objective, Path(folder), check=False)
         gradient = ImpactGradient.load(Path(folder))
         prefix = str(gradient.manifest["prefix"])
-        # The very library that the loader calls.
+        # The same library that the loader calls.
         built = Built(ctypes.CDLL(str(library_path(Path(folder), prefix))), "", 0.0)
         kernel = Kernel(prefix, "ours", built, {"eval": built.symbol(f"{prefix}_eval")})
         pairs = list(zip(*samples.drawn, strict=True))

@@ -1,4 +1,4 @@
-"""What feasibility costs: the optimum without demands, clear of collisions, and also held by the motors."""
+"""Cost of feasibility: the optimum without demands, clear of collisions, and also held by the motors."""
 
 from __future__ import annotations
 
@@ -26,13 +26,13 @@ class Cost(NamedTuple):
     """Searches with demands, one for each seed.
 
     Attributes:
-        found: The solutions.
-        start: Median time of a start, against that of a free search just before; the median over the seeds.
+        solutions: Best solution of each seed.
+        start: Median time of a start over the same time in a free search just before; the median over the seeds.
         search: Time of the whole search, in the same way.
         took: Time of the first search, s.
     """
 
-    found: tuple[PostureSolution, ...]
+    solutions: tuple[PostureSolution, ...]
     start: float
     search: float
     took: float
@@ -40,30 +40,37 @@ class Cost(NamedTuple):
     @property
     def certified(self) -> str:
         """Least number of certified ends of a seed."""
-        return f"{min(one.certified_starts for one in self.found)}"
+        return f"{min(solution.certified_starts for solution in self.solutions)}"
 
 
 def lines(request: Request) -> Iterator[str]:
     """A row for each robot and normal."""
     yield "Each robot of the catalogue at its own contact frame, striking a floor (*down*) and a wall (*ahead*),"
     yield f"from {STARTS} starts: *free* of demands, *clear* of collisions, and with *all*, also held by the motors."
-    yield "*collide*: of the distinct optima of the free problem, those at which shapes touch each other, the surface"
-    yield "or the ground. *loss*: how much the objective of the best posture rises. *left out*: certified ends that"
-    yield "the check on the original shapes refused. *ms*: median time of a start. *a start*: that median against the"
-    yield "one of a free search just before. *search*: the same of the whole search, where some starts run several"
-    yield f"times. One seed is luck: both are medians over {request.count} seeds, *certified* is the least of these,"
-    yield "and *left out* the sum. All of these finish every start. The default leaves starts that can no longer"
-    yield "become the best: *left* is their number, *above* how far its best posture lies above that of all starts,"
-    yield "and *time* the share of the time that it takes. A dash: no posture meets the demands, and the last column"
-    yield "says what conflicts."
+    yield "*collide*: number of distinct optima of the free problem at which shapes touch each other, the surface"
+    yield (
+        "or the ground. *loss*: rise of the objective of the best posture. *left out*: certified ends that the check"
+    )
+    yield "on the original shapes refused. *ms*: median time of a start. *a start*: this median over the median of a"
+    yield (
+        "free search just before. *search*: the same for the time of the whole search, where some starts run several"
+    )
+    yield f"times. These two are medians over {request.count} seeds. *certified* is the least number over the seeds,"
+    yield (
+        "and *left out* the sum. All of these searches finish every start. The default drops starts "
+        "that can no longer"
+    )
+    yield "become the best: *left* is their number, *above* the rise of the best objective because of it,"
+    yield "and *time* the time of the default search over the time with all starts. A dash: no posture meets the"
+    yield "demands, and the last column names the conflict."
     yield machine()
     yield ""
     ends, left = list[int](), list[int]()
     cases = [(robot, name) for robot in known_robots() if request.only in robot for name in _NORMALS]
     yield from table((*_HEAD, "conflict"), (_row(robot, name, request, ends, left) for robot, name in cases))
     yield ""
-    yield f"Certified ends with all demands, from {request.count} seeds: {sum(ends)}.  At {sum(left)} of them"
-    yield "original shapes touch, and these were left out."
+    yield f"Certified ends with all demands, from {request.count} seeds: {sum(ends)}.  At {sum(left)} of them,"
+    yield "original shapes touch, and these ends were left out."
 
 
 def _row(robot: str, name: str, request: Request, ends: list[int], left: list[int]) -> list[str]:
@@ -92,12 +99,12 @@ def _row(robot: str, name: str, request: Request, ends: list[int], left: list[in
             cells += ["–"] * (4 if demands is clear else 8)
             conflict = cost
             continue
-        first = cost.found[0].optima[0].objective
+        first = cost.solutions[0].optima[0].objective
         cells += [f"{100 * (first / best - 1):.1f} %", cost.certified]
         if demands is everything:
-            touching = [one.colliding_starts for one in cost.found]
+            touching = [solution.colliding_starts for solution in cost.solutions]
             cells.append(f"{sum(touching)}")
-            ends += [one.certified_starts + one.colliding_starts for one in cost.found]
+            ends += [solution.certified_starts + solution.colliding_starts for solution in cost.solutions]
             left += touching
         cells += [f"{cost.start:.1f}×", f"{cost.search:.1f}×"]
         if demands is everything:
@@ -111,23 +118,23 @@ def _row(robot: str, name: str, request: Request, ends: list[int], left: list[in
 
 
 def _cost(asked: dict[str, object], demands: dict[str, object], seeds: Sequence[int]) -> Cost | str:
-    """Search with demands from several seeds; return why there is no posture where one of them finds none."""
-    found, starts, searches, times = list[PostureSolution](), list[float](), list[float](), list[float]()
+    """Search with demands from several seeds; return the reason if one of the searches fails."""
+    solutions, starts, searches, times = list[PostureSolution](), list[float](), list[float](), list[float]()
     for seed in seeds:
         # Other work on the machine changes the speed, so each ratio has a free search of its own.
         apart = solved(asked | {"seed": seed})[1]
         solution, took = solved(asked | demands | {"seed": seed})
         if not isinstance(solution, PostureSolution):
             return solution
-        found.append(solution)
+        solutions.append(solution)
         starts.append(took[0] / apart[0])
         searches.append(took[1] / apart[1])
         times.append(took[1])
-    return Cost(tuple(found), statistics.median(starts), statistics.median(searches), times[0])
+    return Cost(tuple(solutions), statistics.median(starts), statistics.median(searches), times[0])
 
 
 def solved(asked: dict[str, object], finish_all: bool = True) -> tuple[PostureSolution | str, tuple[float, float]]:
-    """The solution, or why there is none, and the median time of a start and the time of the search, s."""
+    """Return the solution or the reason of a failure, the median time of a start and the time of the search, s."""
     try:
         problem = prepare(make_settings(asked)).problem
         began = time.perf_counter()

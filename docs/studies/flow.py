@@ -1,4 +1,4 @@
-"""Where the reference flow of ``robust-flow`` comes to rest, from random feasible starts; kinematics only."""
+"""Rest of the reference flow of ``robust-flow`` from random feasible starts; kinematics only."""
 
 from __future__ import annotations
 
@@ -23,7 +23,7 @@ from impact_posture.robot.robot import Robot
 from impact_posture.system.processes import fork_map
 from impact_posture.tsid.flow.flow_direction import FlowOptions
 
-# The time in which a flow is to rest, the longest that one may take, and that of a fine one, s.
+# Time in which a flow should rest, time after which it is stopped, and time of a finer flow, s.
 REST, LONGEST, FINE = 8.0, 16.0, 5.0
 FINER = FlowOptions(rho=0.0, mu=0.005, epsilon=1e-7)
 # Share of the start's H that counts: as distance from an optimum, and between basins.
@@ -44,7 +44,7 @@ _HEAD = (
 
 
 def problem_of(case: Case) -> ConstrainedProblem:
-    """The offline problem with the rows of the flow but for those of actuators and tilt."""
+    """Build the offline problem with the rows of the flow except actuators and tilt."""
     objective, options = case.problem().objective, FlowOptions()
     robot = objective.robot
     stands = bool(robot.spec.supports)
@@ -98,13 +98,21 @@ def lines(request: Request) -> Iterator[str]:
     yield machine("daqp")
     yield ""
     starts = f"{each} random feasible starts for each robot and seed"
-    yield f"{starts}, all on the same contacts and tool pose. Those that need"
-    yield "more than 80 % of what the actuators can give are drawn again. The flow is that of the controller in C."
-    yield "The robot follows exactly (no physics). The optimum of a basin is what the offline program (IPOPT) finds"
-    yield "from the end of the flow under the same rows. Where that lies elsewhere, or needs more torque or tilt,"
-    yield "it is the end of a finer flow (ρ = 0, ε = 10⁻⁷, 5 s more). Another basin: that optimum lies more than"
-    yield "1 % of H₀ above the best that any start has found. *Sent to the best*: of these, which visit that posture"
-    yield "first, those that end within 1 % of H₀ of it."
+    yield f"{starts}, all on the same contacts and tool pose. Starts that need"
+    yield "more than 80 % of the actuator limits are drawn again. The flow runs in the controller in C."
+    yield (
+        "The robot follows exactly (no physics). The optimum of a basin is the solution of the offline "
+        "program (IPOPT)"
+    )
+    yield (
+        "from the end of the flow under the same rows. If this solution lies elsewhere, or needs more torque or tilt,"
+    )
+    yield (
+        "the optimum is the end of a finer flow (ρ = 0, ε = 10⁻⁷, 5 s more). Another basin: the optimum "
+        "lies more than"
+    )
+    yield "1 % of H₀ above the best optimum of all starts. *Sent to the best*: these starts visit the best optimum"
+    yield "first; the number says how many end within 1 % of H₀ of it."
     yield ""
     seeds, chosen = range(request.seed, request.seed + 4), [case for case in CASES if request.only in case.name]
     rows = (_row(case, each, replace(request, seed=seed)) for case in chosen for seed in seeds)
@@ -120,26 +128,26 @@ def _row(case: Case, count: int, request: Request) -> list[str]:
     starts = starts_of(problem, flow, count, request.seed)
 
     def one(index: int) -> Outcome:
-        found = flow.course(starts[index], LONGEST, FlowOptions())
-        start, end = found.values[[0, -1]]
-        record, certificate = run_start(nlp, found.q, float(end))
+        course = flow.course(starts[index], LONGEST, FlowOptions())
+        start, end = course.values[[0, -1]]
+        record, certificate = run_start(nlp, course.q, float(end))
         # The program has no rows for actuators and tilt.  Where a start tilts more, the flow does not tilt further.
-        tilted = max(FlowOptions().tilt, _tilt(robot, found.q))
+        tilted = max(FlowOptions().tilt, _tilt(robot, course.q))
         fits = certificate.holds() and flow.share(record.q) < 1.001 and _tilt(robot, record.q) < tilted + 0.001
-        away = np.abs(pin.difference(robot.model, found.q, record.q)[6 if robot.floating else 0 :]).max()
+        away = np.abs(pin.difference(robot.model, course.q, record.q)[6 if robot.floating else 0 :]).max()
         optimum = problem.objective.value(record.q)
         if fits and away < 0.5 and optimum < end + 1e-6 * start:
-            return Outcome(found, optimum, record.q, True)
-        finer = flow.course(found.q, FINE, FINER)
-        return Outcome(found, float(finer.values[-1]), finer.q, False)
+            return Outcome(course, optimum, record.q, True)
+        finer = flow.course(course.q, FINE, FINER)
+        return Outcome(course, float(finer.values[-1]), finer.q, False)
 
     outcomes = collected(one, len(starts), request.jobs, case.name)
     best = min(outcomes, key=lambda o: o.optimum)
     apart = [i for i, o in enumerate(outcomes) if o.optimum - best.optimum > CLOSE * o.start]
 
     def again(k: int) -> bool:
-        found = flow.course(starts[apart[k]], LONGEST, FlowOptions(), first=best.q)
-        return bool(found.values[-1] - best.optimum <= CLOSE * found.values[0])
+        course = flow.course(starts[apart[k]], LONGEST, FlowOptions(), first=best.q)
+        return bool(course.values[-1] - best.optimum <= CLOSE * course.values[0])
 
     with fork_map(again, len(apart), request.jobs) as results:
         arrived = [good for _, good in results]
@@ -147,7 +155,7 @@ def _row(case: Case, count: int, request: Request) -> list[str]:
 
 
 def _tilt(robot: Robot, q: Vector) -> float:
-    """Angle between the vertical and its direction in the base at the default posture, rad."""
+    """Return the angle between the vertical and its direction in the base at the default posture, rad."""
     if robot.upright is None:
         return 0.0
     return float(np.arccos(np.clip(pin.Quaternion(q[3:7]).matrix()[2] @ robot.upright, -1.0, 1.0)))
@@ -180,12 +188,12 @@ def _cells(name: str, seed: int, outcomes: Sequence[Outcome], best: float, arriv
 
 
 def starts_of(problem: ConstrainedProblem, flow: CompiledFlow, count: int, seed: int) -> list[Vector]:
-    """Random feasible postures whose static shares are within the limits."""
-    found: list[Vector] = []
+    """Draw feasible postures whose static shares are within the limits."""
+    starts: list[Vector] = []
     for index in range(1, 20 * count):
         start = feasible_start(problem, index, seed)
         if start is not None and flow.share(start) <= 1.0:
-            found.append(start)
-        if len(found) == count:
+            starts.append(start)
+        if len(starts) == count:
             break
-    return found
+    return starts

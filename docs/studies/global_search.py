@@ -1,4 +1,4 @@
-"""What the search ``global`` finds: maps and bounds of small redundancy, and basin hopping beside multi-start."""
+"""Maps and bounds of the global search at small redundancy, and basin hopping beside multi-start."""
 
 from __future__ import annotations
 
@@ -35,6 +35,7 @@ _HOPPED = [
     Case("talos, aside", "talos", ASIDE),
 ]
 _MAP = "case|degrees of freedom|components|objective|gap|word|patches|processor s|starts that missed it|runs that did"
+_Search = Callable[[ConstrainedProblem, int, float, float], tuple[PostureSolution, int]]
 _HOP = (
     "case|processor s|multi-start: starts|above the best, %|screened: postures|above, %|hops|above, %|best of all|"
     "hops better : worse than multi-start"
@@ -42,13 +43,13 @@ _HOP = (
 
 
 def maps(request: Request) -> Iterator[str]:
-    """The page of maps: a row a case."""
+    """Yield the page of maps, a row for each case."""
     yield from _machine(request)
     yield from table(_MAP.split("|"), _maps(request))
 
 
 def hops(request: Request) -> Iterator[str]:
-    """The page of searches at equal time: a row a case."""
+    """Yield the page of searches at equal time, a row for each case."""
     yield from _machine(request)
     yield from table(_HOP.split("|"), _searches(request))
 
@@ -63,18 +64,18 @@ def _maps(request: Request) -> Iterator[list[str]]:
         problem = case.problem()
         runs = [_run(problem, seed, finish_all=True) for seed in range(request.count)]
         began = time.process_time()
-        found = search_globally(runs[0], jobs=1, compile="never")
+        mapped = search_globally(runs[0], jobs=1, compile="never")
         took = time.process_time() - began
-        assert found.search.bound is not None and found.search.motion is not None
-        best = found.search.bound.best
+        assert mapped.search.bound is not None and mapped.search.motion is not None
+        best = mapped.search.bound.best
         hits = [(o.objective <= best * (1 + _MISSED), o.hits) for run in runs for o in run.optima]
         missed = sum(count for near, count in hits if not near) / sum(count for _, count in hits)
         failed = sum(run.optima[0].objective > best * (1 + _MISSED) for run in runs)
-        if case.robot in _GOALS and (took > 60 or found.search.bound.gap > 0.01):
-            request.missed.append(f"{case.name}: gap {found.search.bound.gap:.3f} in {took:.0f} s")
+        if case.robot in _GOALS and (took > 60 or mapped.search.bound.gap > 0.01):
+            request.missed.append(f"{case.name}: gap {mapped.search.bound.gap:.3f} in {took:.0f} s")
         yield [
-            case.name, str(found.search.redundancy), str(len(found.search.motion.components)), f"{best:.5g}",
-            f"{100 * found.search.bound.gap:.2g} %", str(found.search.word), str(found.search.bound.patches),
+            case.name, str(mapped.search.redundancy), str(len(mapped.search.motion.components)), f"{best:.5g}",
+            f"{100 * mapped.search.bound.gap:.2g} %", str(mapped.search.word), str(mapped.search.bound.patches),
             f"{took:.1f}", f"{100 * missed:.0f} %", f"{failed} of {len(runs)}",
         ]  # fmt: skip
 
@@ -82,51 +83,56 @@ def _maps(request: Request) -> Iterator[list[str]]:
 def _searches(request: Request) -> Iterator[list[str]]:
     for case in (case for case in _HOPPED if request.only in case.name):
         problem = case.problem()
-        found: dict[str, list[tuple[float, float, int]]] = {"multi": [], "screened": [], "hops": []}
+        runs_by_search: dict[str, list[tuple[float, float, int]]] = {"multi": [], "screened": [], "hops": []}
         for seed in range(request.count):
             began = time.process_time()
             first = _run(problem, seed)
-            one = (time.process_time() - began) / _STARTS
+            start_s = (time.process_time() - began) / _STARTS
             hopped = search_globally(first, seed=seed, jobs=1, compile="never")
             budget = time.process_time() - began
             best = hopped.solution.problem.objective.value(hopped.solution.q)
-            found["hops"].append((best, budget, hopped.search.hops))
-            found["multi"].append(_timed(lambda: _many(problem, seed, budget, one)))  # noqa: B023 (called at once)
-            found["screened"].append(_timed(lambda: _screened(problem, seed, budget, one)))  # noqa: B023
-            say(f"{case.name}, seed {seed}: " + ", ".join(f"{k} {v[-1][0]:.5g}" for k, v in found.items()))
-        best = min(value for runs in found.values() for value, _, _ in runs)
-        middle = {key: [statistics.median(part) for part in zip(*runs, strict=True)] for key, runs in found.items()}
-        ratios = [ours[0] / theirs[0] for ours, theirs in zip(found["hops"], found["multi"], strict=True)]
+            runs_by_search["hops"].append((best, budget, hopped.search.hops))
+            arguments = problem, seed, budget, start_s
+            runs_by_search["multi"].append(_timed(_many, arguments))
+            runs_by_search["screened"].append(_timed(_screened, arguments))
+            say(f"{case.name}, seed {seed}: " + ", ".join(f"{k} {v[-1][0]:.5g}" for k, v in runs_by_search.items()))
+        best = min(value for runs in runs_by_search.values() for value, _, _ in runs)
+        medians = {
+            key: [statistics.median(part) for part in zip(*runs, strict=True)] for key, runs in runs_by_search.items()
+        }
+        pairs = zip(runs_by_search["hops"], runs_by_search["multi"], strict=True)
+        ratios = [hops[0] / multi[0] for hops, multi in pairs]
         won, lost = sum(r < 1 - _MISSED for r in ratios), sum(r > 1 + _MISSED for r in ratios)
         if lost > won:
             request.missed.append(f"{case.name}: basin hopping lost {lost} times and won {won}")
-        times = " / ".join(f"{middle[key][1]:.1f}" for key in found)
-        shown = (text for key in found for text in _shown(middle[key], best))
-        yield [case.name, times, *shown, f"{best:.5g}", f"{won} : {lost}"]
-
-
-def _shown(middle: list[float], best: float) -> tuple[str, str]:
-    return f"{middle[2]:.0f}", f"{100 * (middle[0] / best - 1):.2f}"
+        times = " / ".join(f"{middle[1]:.1f}" for middle in medians.values())
+        cells = [
+            text
+            for value, _, count in medians.values()
+            for text in (f"{count:.0f}", f"{100 * (value / best - 1):.2f}")
+        ]
+        yield [case.name, times, *cells, f"{best:.5g}", f"{won} : {lost}"]
 
 
 def _run(problem: ConstrainedProblem, seed: int, starts: int = _STARTS, finish_all: bool = False) -> PostureSolution:
     return solve(problem, starts=starts, seed=seed, jobs=1, compile="never", finish_all=finish_all)
 
 
-def _timed(call: Callable[[], tuple[PostureSolution, int]]) -> tuple[float, float, int]:
+def _timed(search: _Search, arguments: tuple[ConstrainedProblem, int, float, float]) -> tuple[float, float, int]:
+    """Objective of a search, its processor time, s, and the number of its starts."""
     began = time.process_time()
-    solution, count = call()
+    solution, count = search(*arguments)
     return solution.problem.objective.value(solution.q), time.process_time() - began, count
 
 
-def _many(problem: ConstrainedProblem, seed: int, budget: float, one: float) -> tuple[PostureSolution, int]:
-    """As many independent starts as the time allows."""
-    count = max(1, round(budget / one))
+def _many(problem: ConstrainedProblem, seed: int, budget: float, start_s: float) -> tuple[PostureSolution, int]:
+    """Solve from as many independent starts as the time allows."""
+    count = max(1, round(budget / start_s))
     return _run(problem, seed, count), count
 
 
-def _screened(problem: ConstrainedProblem, seed: int, budget: float, one: float) -> tuple[PostureSolution, int]:
-    """Random feasible postures for half of the time; starts from the best of them that are apart."""
+def _screened(problem: ConstrainedProblem, seed: int, budget: float, start_s: float) -> tuple[PostureSolution, int]:
+    """Draw feasible postures for half of the time, and solve from the best of them that are apart."""
     began, rng, kept, tried = time.process_time(), np.random.default_rng([seed, 2]), [], 0
     while time.process_time() - began < budget / 2:
         start = feasible_start(problem, len(kept) + tried, seed + 1000)
@@ -140,6 +146,6 @@ def _screened(problem: ConstrainedProblem, seed: int, budget: float, one: float)
     for k in order:
         if not chosen or np.linalg.norm(points[chosen] - points[k], axis=1).min() > apart:
             chosen.append(int(k))
-    count = max(1, round((began + budget - time.process_time()) / one))
+    count = max(1, round((began + budget - time.process_time()) / start_s))
     guesses = [manifold.to_q(x[k]) for k in chosen[:count]]
     return solve(problem, starts=1 + len(guesses), seed=seed, jobs=1, compile="never", guesses=guesses), len(x)

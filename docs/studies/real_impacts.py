@@ -1,8 +1,8 @@
-"""Impacts of robots that stand, reach and fly: what the rigid model predicts of each controller, then its run.
+"""Impacts of robots that stand, reach and fly: the prediction of the rigid model for each controller, then its run.
 
 The prediction needs no run.  The controller braces in a robot that does exactly what it plans, and takes the end
-effector to the surface.  The rigid model takes the posture that is reached and the speed of the scenario.  Runs that
-are done are kept in build/real-impacts.
+effector to the surface.  The rigid model takes the reached posture and the speed of the scenario.  Finished runs are
+kept in build/real-impacts.
 """
 
 from __future__ import annotations
@@ -25,7 +25,7 @@ from impact_posture.simulation.scenario_file import RepeatedContacts, Scenario, 
 from impact_posture.simulation.setup import set_up
 from impact_posture.simulation.world.throw import Throw, thrown_jumps
 
-# A number is another speed of the hand than that of the scenario, m/s.
+# A number replaces the speed of the hand in the scenario, m/s.
 SCENARIOS = (
     "talos-throw", "solo8-throw", "talos-strike", "talos-strike 0.5", "talos-strike 1.5", "g1-strike",
     "g1-strike 0.5", "g1-strike 1.5", "solo12-landing", "panda-tap", "hextilt-poke"
@@ -48,7 +48,7 @@ FOLDER = ROOT / "build" / "real-impacts"
 
 
 def scenario_of(name: str) -> Scenario:
-    """A shipped scenario, with another speed if the name has one, and the acceleration that the gap then takes."""
+    """Read a shipped scenario.  A speed in the name replaces its speed, with enough acceleration for the gap."""
     shipped, *speed = name.split()
     scenario = read_scenario(shipped)
     if not speed:
@@ -62,25 +62,25 @@ def scenario_of(name: str) -> Scenario:
 
 
 def predicted(factory: ControllerFactory, name: str) -> dict[str, float | None]:
-    """H, the sticking and the Coulomb jump in the posture that a controller meets the impact in, before any run."""
+    """Predict H, the sticking jump and the Coulomb jump in the posture in which a controller meets the impact."""
     setup = factory.setup
     task, oracle = setup.scenario.task, factory.objective().oracle
     q = resting_posture(factory.driver(name), task.settle, ahead=setup.gap if setup.scenario.contacts else 0.0)
-    found = oracle.quantities(q)
+    quantities = oracle.quantities(q)
     if isinstance(task, Throw):
         _, sticking, coulomb = thrown_jumps(oracle, q, task, task.speed)
-        return {"H": found.H, "sticking": sticking, "coulomb": coulomb}
+        return {"H": quantities.H, "sticking": sticking, "coulomb": coulomb}
     assert isinstance(task, RepeatedContacts)
-    sticking = None if found.S is None else task.speed * float(np.sqrt(found.S))
+    sticking = None if quantities.S is None else task.speed * float(np.sqrt(quantities.S))
     try:
         jump = task.speed * float(np.linalg.norm(coulomb_impact(oracle, q).jump))
     except MetricError:
         jump = None
-    return {"H": found.H, "sticking": sticking, "coulomb": jump}
+    return {"H": quantities.H, "sticking": sticking, "coulomb": jump}
 
 
 def result(scenario: str, name: str) -> dict[str, Any]:
-    """The prediction and the run of one controller, kept by scenario, robot and code."""
+    """Return prediction and run of a controller; they are kept by scenario, robot and code."""
     shipped = scenario.split()[0]
     key = key_of(Job(shipped, name, 0, compile="auto"))[:12]
     kept = FOLDER / f"{scenario.replace(' ', '-')}-{name}-{key}.json"
@@ -90,24 +90,24 @@ def result(scenario: str, name: str) -> dict[str, Any]:
         factory = ControllerFactory(set_up(scenario_of(scenario)))
         before = predicted(factory, name)
         _, document = execute(Job(shipped, name, 0, compile="auto"), factory)
-        found = {"predicted": before, "status": document["status"], "metrics": document["metrics"]}
-        found["offline"] = (document["offline"] or {}).get("note", "")
-        found["why"] = "; ".join(dict.fromkeys(event["what"] for event in document["events"]))
+        answer = {"predicted": before, "status": document["status"], "metrics": document["metrics"]}
+        answer["offline"] = (document["offline"] or {}).get("note", "")
+        answer["why"] = "; ".join(dict.fromkeys(event["what"] for event in document["events"]))
     except ImpactPostureError as error:
-        found = {"predicted": None, "status": "no answer", "metrics": None, "offline": "", "why": error.line}
+        answer = {"predicted": None, "status": "no answer", "metrics": None, "offline": "", "why": error.line}
     FOLDER.mkdir(parents=True, exist_ok=True)
-    kept.write_text(json.dumps(found), encoding="utf-8")
-    return found
+    kept.write_text(json.dumps(answer), encoding="utf-8")
+    return answer
 
 
 def lines(request: Request) -> Iterator[str]:
     """A table for each scenario."""
     controllers = [c for c in COMPARED if c in CONTROLLERS]
-    # At other speeds, those whose posture depends on what the impact gives, beside the nominal one.
+    # At other speeds, only controllers whose posture depends on the speed or impulse, beside the nominal one.
     others = [c for c in controllers if c.endswith(("nominal", "robust", "sticking"))]
     pairs = [(s, c) for s in SCENARIOS if request.only in s for c in (others if " " in s else controllers)]
     answers = collected(lambda k: result(*pairs[k]), len(pairs), request.jobs, "runs")
-    found = dict(zip(pairs, answers, strict=True))
+    answer_of = dict(zip(pairs, answers, strict=True))
     for scenario in dict.fromkeys(s for s, _ in pairs):
         yield from (
             f"### {scenario}" + " m/s" * (" " in scenario),
@@ -115,7 +115,7 @@ def lines(request: Request) -> Iterator[str]:
             f"{scenario_of(scenario).description}. Seed 0.",
             "",
         )
-        rows = {c: found[s, c] for s, c in pairs if s == scenario}
+        rows = {c: answer_of[s, c] for s, c in pairs if s == scenario}
         yield from table(HEAD, [_row(name, row, rows["nominal"]) for name, row in rows.items()])
         notes = [f"`{name}`: {text}" for name, row in rows.items() for text in (row["offline"], row["why"]) if text]
         yield from ("", *(f"- {note.rstrip('.')}." for note in notes), *([""] if notes else []))
@@ -125,13 +125,14 @@ def _row(name: str, row: dict[str, Any], nominal: dict[str, Any]) -> list[str]:
     before, base = row["predicted"] or {}, nominal["predicted"] or {}
     jumps = [before.get(key) for key in ("sticking", "coulomb")]
     cells = [f"`{name}`", _number(before.get("H")), *map(_number, jumps), _ratio(jumps[1], base.get("coulomb"))]
-    found, other = row["metrics"], nominal["metrics"]
-    if found is None:
+    metrics, nominal_metrics = row["metrics"], nominal["metrics"]
+    if metrics is None:
         return [*cells, "–", "–", "–", "–", "–", "–", row["status"]]
-    pairs = [(found[key], other and other[key]) for key in ("peak_jump", "q_total_impact", "q_total_recovery")]
-    saturation = found["saturation_s"]
+    keys = ("peak_jump", "q_total_impact", "q_total_recovery")
+    pairs = [(metrics[key], nominal_metrics and nominal_metrics[key]) for key in keys]
+    saturation = metrics["saturation_s"]
     return [
-        *cells, _number(pairs[0][0]), *(_ratio(*pair) for pair in pairs), f"{found['peak_force']:.0f}",
+        *cells, _number(pairs[0][0]), *(_ratio(*pair) for pair in pairs), f"{metrics['peak_force']:.0f}",
         f"{saturation['inside']:.2f} / {saturation['outside']:.2f}", row["status"],
     ]  # fmt: skip
 

@@ -1,4 +1,4 @@
-"""What the relaxation in C takes and reaches on the relaxed ticks of robots that are pushed over."""
+"""Times and accuracy of the relaxation in C on the relaxed ticks of robots that are pushed over."""
 
 from __future__ import annotations
 

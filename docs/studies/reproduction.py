@@ -29,13 +29,13 @@ def lines(request: Request) -> Iterator[str]:
     shared = {"processes": request.jobs, "store": store, "progress": lambda a, b: say(f"\r{a} of {b} runs", end="")}
     began = time.perf_counter()
     plan = {s: controllers_of(s, False) for s in scenarios}
-    found = reproduce(plan, seeds=request.count, **shared)
+    main = reproduce(plan, seeds=request.count, **shared)
     say(f"\nthe first part took {time.perf_counter() - began:.0f} s, less what was kept")
     every = reproduce({s: controllers_of(s, True) for s in scenarios}, seeds=OTHERS, **shared)
-    yield "\n\n".join(_parts(found, every))
+    yield "\n\n".join(_parts(main, every))
     if request.write:
         with tempfile.TemporaryDirectory() as folder:
-            draw_reproduction(found, store, Path(folder), ["png"])
+            draw_reproduction(main, store, Path(folder), ["png"])
             _take_shown(Path(folder))
 
 
@@ -48,14 +48,14 @@ def _take_shown(folder: Path) -> None:
         shutil.copy(folder / name, IMAGES / name)
 
 
-def _parts(found: Reproduction, every: Reproduction) -> Iterator[str]:
-    seeds = ", ".join(str(k) for k in range(found.seeds))
-    shown = f"seeds {seeds}; mean ± half of the 95 % confidence interval" if found.seeds > 2 else (
-        f"seeds {seeds}; too few for intervals" if found.seeds > 1 else "seed 0 alone: no means, no intervals"
+def _parts(main: Reproduction, every: Reproduction) -> Iterator[str]:
+    seeds = ", ".join(str(k) for k in range(main.seeds))
+    shown = f"seeds {seeds}; mean ± half of the 95 % confidence interval" if main.seeds > 2 else (
+        f"seeds {seeds}; too few for intervals" if main.seeds > 1 else "seed 0 alone: no means, no intervals"
     )  # fmt: skip
-    yield from ("### What did best at this point", "\n".join(f"- {line}" for line in advice(found, every)))
-    yield from ("### Table I of the paper, and ours", f"`q_total_impact`, {shown}.", table_one(found), LEGEND)
+    yield from ("### What did best at this point", "\n".join(f"- {line}" for line in advice(main, every)))
+    yield from ("### Table I of the paper, and ours", f"`q_total_impact`, {shown}.", table_one(main), LEGEND)
     few = f"means over seeds 0 to {every.seeds - 1}" if every.seeds > 1 else "seed 0"
-    for scenario in found.scenarios:
-        yield from (f"### {scenario}", scenario_table(found.of(scenario)), f"Every controller, {few}:")
+    for scenario in main.scenarios:
+        yield from (f"### {scenario}", scenario_table(main.of(scenario)), f"Every controller, {few}:")
         yield from (scenario_table(every.of(scenario)), " ".join(remarks(every, scenario)))

@@ -1,4 +1,4 @@
-"""What rebound each contact law has, measured in the simulated world."""
+"""Restitution of each contact law, measured in the simulated world."""
 
 from __future__ import annotations
 
@@ -22,17 +22,18 @@ def lines(request: Request) -> Iterator[str]:
     import_mujoco()
     low, high, width = ContactLaw().solimp
     yield (
-        f"A ball at {SPEED:g} m/s, `solimp` [{low:g}, {high:g}, {width:g}]; *e* with the range that comes of where "
-        "in\na time step the contact begins; *ideal*: of the same spring and damper in continuous time."
+        f"A ball at {SPEED:g} m/s, `solimp` [{low:g}, {high:g}, {width:g}]. The range of *e* depends on "
+        "where in a time "
+        "step\nthe contact begins. *Ideal*: the same spring and damper in continuous time."
     )
     yield ""
-    # What is faster than the time steps is refused.
+    # The world refuses laws that are faster than the time steps.
     laws = ((s, t, z) for s in STEPS for t in TIMES for z in DAMPINGS if t >= 2 * s and t * z >= s * (1 - 1e-9))
     yield from table(_HEAD, (_row(*law) for law in laws))
     default = Physics().timestep
     fast, slow = (measure_restitution(ContactLaw(), speed=v, timestep=default) for v in (0.1, 1.0))
     heavy = measure_restitution(ContactLaw(), speed=SPEED, timestep=default, mass=100.0)
-    yield from ("", "*Peak force*: over the mean force of the contact.", "")
+    yield from ("", "*Peak force*: largest force over the mean force of the contact.", "")
     yield (
         f"The default law (T = {ContactLaw().solref[0] * 1e3:g} ms, ζ = {ContactLaw().solref[1]:g}) has e = "
         f"{fast.restitution:.3f} at 0.1 m/s, {slow.restitution:.3f} at 1 m/s, and {heavy.restitution:.3f} at "
@@ -42,6 +43,6 @@ def lines(request: Request) -> Iterator[str]:
 
 def _row(step: float, time: float, damping: float) -> list[str]:
     b = measure_restitution(ContactLaw((time, damping)), speed=SPEED, timestep=step)
-    found = [f"{b.restitution:.3f}", f"{b.spread:.3f}", f"{ideal_restitution(damping):.3f}"]
+    bounce = [f"{b.restitution:.3f}", f"{b.spread:.3f}", f"{ideal_restitution(damping):.3f}"]
     rest = [f"{b.duration * 1e3:.1f} ms", f"{b.depth * 1e3:.2f} mm", f"{b.peak:.1f}"]
-    return [f"{step * 1e3:g} ms", f"{time * 1e3:g} ms", f"{damping:g}", *found, *rest]
+    return [f"{step * 1e3:g} ms", f"{time * 1e3:g} ms", f"{damping:g}", *bounce, *rest]

@@ -1,4 +1,4 @@
-"""Collision shapes of the catalogue: how close the hulls are, how many pairs are left, and how long the fit takes."""
+"""Collision shapes of the catalogue: tightness of the hulls, number of pairs, and time of the fit."""
 
 from __future__ import annotations
 
@@ -22,9 +22,12 @@ _HEAD = ("robot", "shapes", "hulls", "corners", "sweep, mm", "pairs of shapes", 
 
 def lines(request: Request) -> Iterator[str]:
     """A row a robot."""
-    yield "Corners: median of the hulls. Sweep: median and largest of the hulls that are no ball or capsule. Fit:"
-    yield "processor time with the loading of meshes. At the default: shapes and hulls that collide there. Nested:"
-    yield "pairs kept apart by the joints between them, the rows that this takes, and pairs that nothing keeps apart."
+    yield "Corners: median of the hulls. Sweep: median and largest of the hulls, without balls and capsules. Fit:"
+    yield "processor time with the loading of meshes. At the default: shapes and hulls that collide in this posture."
+    yield (
+        "Nested: pairs kept apart by the joints between them, the rows that this takes, and pairs that "
+        "are not kept apart."
+    )
     yield machine("pin")
     yield ""
     yield from table(_HEAD, (_row(name) for name in known_robots() if request.only in name))

@@ -1,4 +1,4 @@
-"""What feet, cones and their like cost: a solve from one start, building it, the exported gradient."""
+"""Cost of feet, cones and other options: a solve from one start, building it, the exported gradient."""
 
 from __future__ import annotations
 
@@ -18,7 +18,7 @@ from impact_posture.posture.search.growing_search import run_start
 from impact_posture.posture.search.multistart import solve
 from impact_posture.system.toolchain import find_compiler
 
-# What the project asks of one start, ms.
+# Goals for one start, ms.
 TARGETS_MS = {
     "tilthex_arm": 5, "tilthex_arm, ahead": 5, "panda": 5, "tilthex_arm, cone 5°": 10, "tilthex_arm, cone 20°": 10,
     "tilthex_arm, cone 45°": 10, "solo8, four feet": 30, "solo8, four feet, cone 20°": None, "talos, two feet": 50,
@@ -26,13 +26,13 @@ TARGETS_MS = {
     "talos, both hands": None, "solo12, two feet struck": None, "tilthex_arm, 6 models": None,
     "talos, two feet, 3 models": None,
 }  # fmt: skip
-_HEAD = "case|unknowns|way|build s|processor s|again s|solve ms|processor ms|× `crba`|iterations|certified|target ms"
+_HEAD = "case|unknowns|mode|build s|processor s|again s|solve ms|processor ms|× `crba`|iterations|certified|target ms"
 
 
 def lines(request: Request) -> Iterator[str]:
-    """The page: a row a case and way, then the exported gradient with feet and without."""
+    """Yield a row for each case and mode of compiling, then the exported gradient with feet and without."""
     yield (
-        f"{machine()}; medians of {request.count} random feasible starts, one at a time; × `crba` is of processor "
+        f"{machine()}; medians of {request.count} random feasible starts, one at a time; × `crba` compares processor "
         "time. `again`: with the cache that the first build filled."
     )
     yield ""
@@ -45,14 +45,14 @@ def _rows(request: Request) -> Iterator[list[str]]:
     for case in (CASES[name] for name in TARGETS_MS if request.only in name):
         problem = case.problem()
         starts = feasible_starts(problem, request.count, seed=1)
-        for way in ("interpreted", "compiled") if find_compiler() else ("interpreted",):
-            yield _row(case, problem, starts, way)
+        for mode in ("interpreted", "compiled") if find_compiler() else ("interpreted",):
+            yield _row(case, problem, starts, mode)
 
 
-def _row(case: Case, problem: ConstrainedProblem, starts: Sequence[Vector], way: str) -> list[str]:
+def _row(case: Case, problem: ConstrainedProblem, starts: Sequence[Vector], mode: str) -> list[str]:
     with tempfile.TemporaryDirectory() as folder, patch.dict(os.environ, IMPACT_POSTURE_CACHE=folder):
-        nlp, cold, busy_building = _built(problem, way)
-        nlp, again, _ = _built(problem, way)
+        nlp, cold, busy_building = _built(problem, mode)
+        nlp, again, _ = _built(problem, mode)
     scale = problem.objective.value(problem.given)
     runs, times = [], list[float]()
     for start in starts:
@@ -63,7 +63,7 @@ def _row(case: Case, problem: ConstrainedProblem, starts: Sequence[Vector], way:
     return [
         case.name,
         str(nlp.solver.size1_in("x0")),
-        way,
+        mode,
         f"{cold:.1f}",
         f"{busy_building:.1f}",
         f"{again:.2f}",
@@ -76,15 +76,15 @@ def _row(case: Case, problem: ConstrainedProblem, starts: Sequence[Vector], way:
     ]
 
 
-def _built(problem: ConstrainedProblem, way: str) -> tuple[PostureNLP, float, float]:
-    """The program, and wall and processor seconds, the compiler's with them."""
+def _built(problem: ConstrainedProblem, mode: str) -> tuple[PostureNLP, float, float]:
+    """Build the program; return it with wall and processor seconds, including the compiler."""
     began, busy = time.perf_counter(), sum(os.times()[:4])
-    nlp = build_nlp(problem, compile="never" if way == "interpreted" else "always")
+    nlp = build_nlp(problem, compile="never" if mode == "interpreted" else "always")
     return nlp, time.perf_counter() - began, sum(os.times()[:4]) - busy
 
 
 def optima(request: Request) -> Iterator[str]:
-    """A row a case: the best objective of 16 starts over the best of many."""
+    """Yield a row for each case: the best objective of 16 starts over the best of many."""
     yield from (machine(), "")
     rows = ([name, _above(name, request.count)] for name, ms in TARGETS_MS.items() if ms and request.only in name)
     yield from table(["case", f"best of 16 above the best of {request.count}"], rows)
@@ -92,6 +92,6 @@ def optima(request: Request) -> Iterator[str]:
 
 def _above(name: str, many: int) -> str:
     problem = CASES[name].problem()
-    found = (solve(problem, starts=16), solve(problem, starts=many, seed=7, compile="never"))
-    few, best = (min(optimum.objective for optimum in solution.optima) for solution in found)
+    solutions = (solve(problem, starts=16), solve(problem, starts=many, seed=7, compile="never"))
+    few, best = (min(optimum.objective for optimum in solution.optima) for solution in solutions)
     return f"{few / best - 1:+.2%}"

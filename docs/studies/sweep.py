@@ -176,9 +176,9 @@ def speed(folder: Path, points: int) -> None:
     def progress(done: int, count: int) -> None:
         seen.append((done, _resident()))
 
-    found: SweepRun = run_sweep(sweep, folder / "long", progress=progress)
-    solved = sum(found.counts.values())
-    share, each = found.solver_s / found.total_s, 1e3 * found.total_s / solved
+    result: SweepRun = run_sweep(sweep, folder / "long", progress=progress)
+    solved = sum(result.counts.values())
+    share, each = result.solver_s / result.total_s, 1e3 * result.total_s / solved
     print(f"{solved} problems: {each:.2f} ms each, {100 * share:.1f} % of it within IPOPT")
     late = seen[len(seen) // 3 :]
     slope = (late[-1][1] - late[0][1]) / max(1, late[-1][0] - late[0][0]) * 1e3
@@ -191,7 +191,7 @@ def speed(folder: Path, points: int) -> None:
     with process_pool(2) as pool:
         run_sweep(sweep, folder / "two", pool)
     # The solver alone is one process that stores nothing: the shards of the first run, without the rest of it.
-    alone, together = solved / found.total_s, solved / (time.perf_counter() - began)
+    alone, together = solved / result.total_s, solved / (time.perf_counter() - began)
     share = together / (2 * alone)
     print(f"the search alone {alone:.0f} a second, the sweep with two workers {together:.0f}: {100 * share:.0f} %")
 
@@ -222,7 +222,7 @@ class Watched(Executor):
 
 
 def atlas(folder: Path, name: str, points: int) -> None:
-    """Solve a large sweep by two processes, or go on with it, and print what it took and what it found."""
+    """Solve a large sweep by two processes, or go on with it, and print what it took and what it result."""
     folder.mkdir(parents=True, exist_ok=True)
     file, count = folder / f"{name}.toml", math.isqrt(points - 1) + 1
     file.write_text(tilted(count) if name == "tilthex_arm" else TALOS.replace("COUNT", str(count)))
@@ -241,9 +241,9 @@ def atlas(folder: Path, name: str, points: int) -> None:
 
     with process_pool(2) as pool:
         watched = Watched(pool)
-        found = run_sweep(sweep, folder / name, watched, progress=progress, in_hand=4)
-    solved, took = sum(found.counts.values()), time.perf_counter() - began
-    print(f"{name}: {solved} of {found.points} problems in this run, {took:.0f} s, {solved / took:.1f} a second")
+        result = run_sweep(sweep, folder / name, watched, progress=progress, in_hand=4)
+    solved, took = sum(result.counts.values()), time.perf_counter() - began
+    print(f"{name}: {solved} of {result.points} problems in this run, {took:.0f} s, {solved / took:.1f} a second")
     table = open_atlas(folder / name).to_table(columns=["status", "reason"]).to_pylist()
     for status, count in Counter(row["status"] for row in table).most_common():
         print(f"{status}: {count} ({100 * count / len(table):.1f} %)")

@@ -59,12 +59,12 @@ def compared(robot: str, count: int, half: float, folder: Path) -> Iterator[str]
     known = [alone(robot, x, y) for x, y in product(axis, axis)]
     ratio = (time.process_time() - began) / spent
     pairs = list(zip(rows, known, strict=True))
-    found = [row["status"] == "certified" for row in rows]
+    certified = [row["status"] == "certified" for row in rows]
     false = [(row, one) for row, one in pairs if row["status"] != "certified" and one is not None]
-    new = sum(one is None for own, one in zip(found, known, strict=True) if own)
+    new = sum(one is None for own, one in zip(certified, known, strict=True) if own)
     worse = sum(row["value"] > (1 + _WORSE) * one for row, one in pairs if row["value"] and one)
     yield (
-        f"{robot}: {sum(found)} of {len(rows)} points certified by the sweep, {len(false)} missed, {new} that "
+        f"{robot}: {sum(certified)} of {len(rows)} points certified by the sweep, {len(false)} missed, {new} that "
         f"optimize misses; {worse} at a worse optimum; optimize took {ratio:.1f} times as long"
     )
     for row, one in false:

@@ -1,4 +1,4 @@
-"""What a tick of the online controllers takes of one core, along a moving reference."""
+"""Processor time of a tick of the online controllers on one core, along a moving reference."""
 
 from __future__ import annotations
 
@@ -29,7 +29,7 @@ from impact_posture.tsid.tasks.joint_posture import JointPosture
 from tests.support.qpsolvers_solver import QpsolversSolver
 
 DT = 1e-3
-# The most that the impact-robust controller may take of the nominal one's tick.
+# Largest ratio of the tick of the impact-robust controller to the nominal tick.
 RATIO = 1.05
 # The same for the mean of the controller with a reference flow, whose updates are spread over the ticks.
 FLOW_RATIO = 2.0
@@ -48,7 +48,7 @@ GOALS = {
 
 
 class Timed:
-    """A solver that notes what it takes, µs, and keeps every tenth of the programs."""
+    """Record the time of each solve, µs, and keep every tenth program."""
 
     def __init__(self, inner: DaqpSolver) -> None:
         self.inner, self.times, self.kept = inner, list[float](), list[tuple[QP, Solved | None]]()
@@ -68,7 +68,7 @@ class Timed:
 
 
 class Flight:
-    """One controller on its robot, moved by what it plans, after a sine with its velocity and acceleration."""
+    """A controller whose robot moves exactly as planned, along a sine with its velocity and acceleration."""
 
     def __init__(self, amplitude: Sequence[float], robot: Robot, posture: JointPosture) -> None:
         aerial = robot.spec.kind == "aerial"
@@ -105,7 +105,7 @@ class Flight:
 
     @property
     def usual(self) -> Vector:
-        """The median, and the mean of the shorter 99 %, which leaves out what the machine does beside."""
+        """Median, and mean of the shorter 99 %, which leaves out interruptions by other programs."""
         took = np.sort(self.took)
         return np.array([np.median(took), took[: int(0.99 * took.size)].mean()])
 
@@ -114,10 +114,12 @@ def lines(request: Request) -> Iterator[str]:
     """A row of ticks and a row of solvers for each robot."""
     yield from (machine("daqp"), "")
     yield (
-        f"{request.count} ticks, one core; impact-robust controller, bracing. Processor time of a tick, µs; wall\n"
-        "time includes what else the machine did. Robust over nominal: of medians, of means of the shorter 99 %;\n"
-        "the gradient sampled every fifth tick (in brackets: every tick). Flow: the posture of robust-flow on its\n"
-        "way; ratio of means of the shorter 99 %, and the 99th percentile."
+        f"{request.count} ticks, one core; impact-robust controller, bracing. Processor time of a tick, "
+        "µs. Wall time\n"
+        "includes other programs on the machine. Robust over nominal: ratio of medians, and of means of the shorter\n"
+        "99 %, with the gradient every fifth tick (in brackets: every tick). Flow: a reference flow "
+        "that moves; ratio\n"
+        "of means of the shorter 99 %, and the 99th percentile."
     )
     yield ""
     solvers = []
@@ -143,7 +145,7 @@ def lines(request: Request) -> Iterator[str]:
 def _postures(
     robot: Robot, gradient: Gradient, every: int = 5
 ) -> tuple[JointPosture, ImpactRobustPosture, ReferenceFlowPosture]:
-    """Nominal, impact-robust, and with a reference flow; the same gains but for the term."""
+    """Return the nominal, the impact-robust and the flowing posture task, with the same gains except for the term."""
     aerial = robot.spec.kind == "aerial"
     more = {} if aerial else {"kp": 20.0, "weight": 0.1, "base_weight": 0.0}
     return (
@@ -192,7 +194,7 @@ def _solvers(name: str, robot: Robot, gradient: Gradient, ticks: int) -> list[st
 
 
 def _other(solver: QpsolversSolver, programs: Sequence[tuple[QP, Solved | None]]) -> str:
-    """Median time of another solver on the same programs, with its largest difference from ours; or a dash."""
+    """Write the median time of another solver on the same programs, with its largest difference from ours."""
     times, apart = [], 0.0
     for qp, solved in programs:
         began = time.thread_time_ns()

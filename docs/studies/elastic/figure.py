@@ -16,20 +16,23 @@ if TYPE_CHECKING:
     from docs.studies.elastic.study import Row
 
 PICTURE = ROOT / "docs" / "images" / "elastic.png"
-# Errors below this share are drawn there.
+# Errors below this share are drawn at it.
 _LEAST = 1e-4
 _MODELS = {"elastic": (BLUE, "o"), "link": (VERMILLION, "^"), "reflected": (GREEN, "s")}
 
 
 def figure(rows: Sequence[Row]) -> Figure:
-    """Return one panel for the peak link velocity and one for the force: each impact a mark, medians lines."""
-    made = Figure(figsize=(WIDTH, 3.4), layout="constrained")
-    FigureCanvasAgg(made)
+    """Draw a panel for the peak link velocity and a panel for the force: marks are impacts, lines are medians."""
+    drawing = Figure(figsize=(WIDTH, 3.4), layout="constrained")
+    FigureCanvasAgg(drawing)
     x = np.array([row.x for row in rows])
     bins = np.geomspace(x.min(), x.max() * (1 + 1e-9), 9)
     place = np.digitize(x, bins)
     for axes, which, title in zip(
-        made.subplots(1, 2, sharey=True), ("error", "force_error"), ("peak link velocity", "peak force"), strict=True
+        drawing.subplots(1, 2, sharey=True),
+        ("error", "force_error"),
+        ("peak link velocity", "peak force"),
+        strict=True,
     ):
         for model, (color, mark) in _MODELS.items():
             errors = np.maximum([getattr(row, which)[model] for row in rows], _LEAST)
@@ -45,10 +48,10 @@ def figure(rows: Sequence[Row]) -> Figure:
         axes.set_xticks(ticks, [f"{tick:g}" for tick in ticks])
         axes.minorticks_off()
         axes.grid(True, linewidth=0.4, color="#d9d9d9")
-    made.axes[0].set_ylabel("error against MuJoCo, %")
-    made.axes[0].set_yticks([0.01, 0.1, 1, 10, 100], ["0.01", "0.1", "1", "10", "100"])
-    made.legend(*made.axes[0].get_legend_handles_labels(), loc="outside upper center", ncols=3, frameon=False)
-    return made
+    drawing.axes[0].set_ylabel("error against MuJoCo, %")
+    drawing.axes[0].set_yticks([0.01, 0.1, 1, 10, 100], ["0.01", "0.1", "1", "10", "100"])
+    drawing.legend(*drawing.axes[0].get_legend_handles_labels(), loc="outside upper center", ncols=3, frameon=False)
+    return drawing
 
 
 def draw(rows: Sequence[Row]) -> None:

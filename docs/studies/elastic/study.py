@@ -1,4 +1,4 @@
-"""Which inertia does an arm with elastic joints meet a contact with?  Predictions beside impacts in MuJoCo."""
+"""Inertia with which an arm with elastic joints meets a contact: predictions beside impacts in MuJoCo."""
 
 from __future__ import annotations
 
@@ -42,7 +42,7 @@ ASSUMED = (14e3,) * 4 + (9e3,) * 3
 
 @dataclass(frozen=True)
 class Studied:
-    """A robot, its contact frame, its elastic joints, and what is said of their stiffness."""
+    """A robot, its contact frame, its elastic joints, and words about their stiffness."""
 
     load: Callable[[], Robot]
     frame: str
@@ -52,12 +52,12 @@ class Studied:
 
     @cache  # noqa: B019 (kept as long as the program runs)
     def robot(self) -> Robot:
-        """The robot with these springs, and no others."""
-        found = self.load()
+        """Return the robot with only these springs."""
+        loaded = self.load()
         springs = {
             name: JointTransmissionSpec("elastic", K) for name, K in zip(self.joints, self.stiffness, strict=True)
         }
-        return replace(found, spec=replace(found.spec, transmission=TransmissionSpec(joints=springs)))
+        return replace(loaded, spec=replace(loaded.spec, transmission=TransmissionSpec(joints=springs)))
 
 
 def panda() -> Robot:
@@ -88,7 +88,7 @@ STUDIED = {
 
 @dataclass(frozen=True)
 class Row:
-    """One impact: what happened, and what each model says."""
+    """One impact: measurement and prediction of each model."""
 
     robot: str
     x: float  # with the time of the elastic response
@@ -100,27 +100,27 @@ class Row:
 
 
 def rows_of(name: str, count: int, seed: int) -> Iterator[Row]:
-    """Impacts of one robot: random postures within the limits, random normals, stiffnesses over the range of x."""
+    """Yield impacts of a robot: random postures within the limits, random normals, and stiffnesses over all x."""
     studied = STUDIED[name]
-    found, generator = studied.robot(), rng(name, seed)
-    low, high = (np.array(limit) for limit in (found.model.lowerPositionLimit, found.model.upperPositionLimit))
+    arm, generator = studied.robot(), rng(name, seed)
+    low, high = (np.array(limit) for limit in (arm.model.lowerPositionLimit, arm.model.upperPositionLimit))
     low, high = np.maximum(low, -np.pi), np.minimum(high, np.pi)
     done = 0
     while done < count:
         q, n = generator.uniform(low, high), unit(generator)
-        case = ImpactCase(found, ImpactContact(studied.frame, tuple(n)))
+        case = ImpactCase(arm, ImpactContact(studied.frame, tuple(n)))
         impact = ElasticImpact(case)
         oracle = impact.oracle.at(q)
         j = oracle.n @ oracle.J
         if np.linalg.norm(j[impact.joints]) < _REACH:
             continue
         done += 1
-        rigid = {model: ImpactOracle(replace(case, robot=with_joint_model(found, model))) for model in MODELS[1:]}
-        known = {model: one.quantities(q) for model, one in rigid.items()}
+        rigid = {model: ImpactOracle(replace(case, robot=with_joint_model(arm, model))) for model in MODELS[1:]}
+        quantities = {model: rigid_oracle.quantities(q) for model, rigid_oracle in rigid.items()}
         compliance = float(np.sum(j[impact.joints] ** 2 / impact.kappa))
         world = ElasticWorld(impact)
         a = oracle.solve(j)
-        pull = np.zeros(found.nv)
+        pull = np.zeros(arm.nv)
         pull[impact.joints] = impact.kappa * a[impact.joints]
         turning = float(np.sqrt(np.linalg.norm(oracle.solve(pull)) / np.linalg.norm(a)))
         for place in np.arange(STIFFNESSES) + generator.random(STIFFNESSES):
@@ -132,8 +132,8 @@ def rows_of(name: str, count: int, seed: int) -> Iterator[Row]:
             measured: Measured = world.compress(q, stiffness, SPEED, response.duration)
             peaks = {"elastic": response.peak_jump_norm}
             forces = {"elastic": response.force}
-            for model, one in known.items():
-                peaks[model], forces[model] = SPEED * np.sqrt(one.V), SPEED * np.sqrt(stiffness / one.G)
+            for model, values in quantities.items():
+                peaks[model], forces[model] = SPEED * np.sqrt(values.V), SPEED * np.sqrt(stiffness / values.G)
             yield Row(
                 name, response.compliance_ratio, x, measured.duration * turning,
                 {model: abs(value / measured.peak - 1) for model, value in peaks.items()},
@@ -143,7 +143,7 @@ def rows_of(name: str, count: int, seed: int) -> Iterator[Row]:
 
 
 def lines(request: Request) -> Iterator[str]:
-    """What came out, the tables, and the figure's place."""
+    """Yield results and tables, and draw the figure where the page is written."""
     import_mujoco()
     began = time.perf_counter()
     rows: list[Row] = []
@@ -152,9 +152,9 @@ def lines(request: Request) -> Iterator[str]:
         say(f"{name}: {len(rows)} impacts, {time.perf_counter() - began:.0f} s")
     yield f"{request.count} random postures and normals (seed {request.seed}) of each robot, {len(rows)} impacts:"
     yield ""
-    yield from (f"- `{name}`: {one.words}; `{one.frame}`" for name, one in STUDIED.items() if request.only in name)
-    yield from ("", f"Approach speed {SPEED:g} m/s, plastic, no damping. Errors are those of the size.", "")
-    yield from ("### What came out", "", *_verdicts(rows, request), "")
+    yield from (f"- `{name}`: {arm.words}; `{arm.frame}`" for name, arm in STUDIED.items() if request.only in name)
+    yield from ("", f"Approach speed {SPEED:g} m/s, plastic, no damping. Errors are errors of the norm.", "")
+    yield from ("### Results", "", *_verdicts(rows, request), "")
     yield from ("### Error of the peak link velocity: median (largest), %", "")
     yield from (*_errors(rows, "error"), "", "### Error of the peak force: median (largest), %", "")
     yield from (*_errors(rows, "force_error"), "", "### Elastic model by robot: largest error, %", "")
@@ -174,7 +174,7 @@ def lines(request: Request) -> Iterator[str]:
 
 
 def _verdicts(rows: Sequence[Row], request: Request) -> Iterator[str]:
-    """The goals, met or missed, and where the rules of thumb hold, with x of both times."""
+    """Yield the goals, met or missed, and the range of the rules of thumb, with x of both times."""
     for model, values, goal, where in (
         ("elastic", "error", 0.10, "peak link velocity"), ("elastic", "force_error", 0.15, "peak force"),
     ):  # fmt: skip

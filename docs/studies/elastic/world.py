@@ -1,4 +1,4 @@
-"""An arm with elastic joints in MuJoCo: a spring between the bodies of link and rotor, and one as the contact."""
+"""An arm with elastic joints in MuJoCo: springs between the bodies of link and rotor, and a spring as the contact."""
 
 from __future__ import annotations
 
@@ -20,52 +20,54 @@ STEPS = 4000
 
 @dataclass(frozen=True, eq=False)
 class Measured:
-    """One compression as it happened; changes are those of velocities since the touch."""
+    """Measurements of one compression."""
 
     duration: float  # from touch to greatest compression, s
     force: float  # largest, N
-    jump: Vector  # change of the links' velocity at the end, shape (nv,)
-    peak: float  # largest norm of that change on the way
+    jump: Vector  # change of the links' velocity since the touch, at the end, shape (nv,)
+    peak: float  # largest norm of this change during the compression
     torque: Vector  # largest of each spring, N m, shape (nv,)
 
 
 class ElasticWorld:
     """An arm on a fixed base whose joints turn about one axis each.
 
-    The rotor's body hangs on the same parent as the link, about the same axis, and a fixed tendon is the spring and
-    the damper between both joints.  So the rotor feels its inertia along its own axis alone, as an armature does.
-    Gravity and joint limits are off.  The contact pushes with ``f = kδ`` along the normal at the contact point; its
-    depth and direction are those of the moving arm, not of a frozen one.
+    The body of the rotor turns about the same axis as the link, on the same parent.  A fixed tendon is the spring and
+    the damper between both joints.  So the rotor has inertia along its own axis alone, like an armature.
+    Gravity and joint limits are off.  The contact pushes with ``f = kδ`` along the normal at the contact point.
+    Depth and direction follow the moving arm, not a frozen one.
     """
 
     def __init__(self, impact: ElasticImpact) -> None:
         self._mujoco, oracle = import_mujoco(), impact.oracle
         robot, self._impact = oracle.robot, impact
-        found = build_mjcf(robot.model)
-        self._joints = [found.joints[robot.joint_id(name)][0] for name in robot.joint_names]
+        written = build_mjcf(robot.model)
+        self._joints = [written.joints[robot.joint_id(name)][0] for name in robot.joint_names]
         self._rotors = {}
         for k, inertia in zip(impact.joints, impact.rotors, strict=True):
             name, index = self._joints[k], robot.joint_id(robot.joint_names[k])
-            link = found.spec.joint(name)
-            rotor = found.body(int(robot.model.parents[index])).add_body(
+            link = written.spec.joint(name)
+            rotor = written.body(int(robot.model.parents[index])).add_body(
                 name=f"{name} rotor", mass=_TINY, inertia=[_TINY] * 3, explicitinertial=True,
                 **pose(robot.model.jointPlacements[index]),
             )  # fmt: skip
             self._rotors[k] = f"{name} rotor"
             rotor.add_joint(name=self._rotors[k], type=link.type, axis=link.axis, armature=inertia)
-            spring = found.spec.add_tendon(name=f"{name} spring")
+            spring = written.spec.add_tendon(name=f"{name} spring")
             spring.wrap_joint(name, 1.0)
             spring.wrap_joint(self._rotors[k], -1.0)
-        self._model = found.compile()
+        self._model = written.compile()
         flags = self._mujoco.mjtDisableBit
         self._model.opt.disableflags |= int(flags.mjDSBL_CONSTRAINT) | int(flags.mjDSBL_GRAVITY)
         self._model.tendon_stiffness[:], self._model.tendon_lengthspring[:] = impact.kappa, 0.0
         self._model.tendon_damping[:] = impact.d
-        self._body = self._model.body(found.bodies[oracle.point.joint]).id
+        self._body = self._model.body(written.bodies[oracle.point.joint]).id
         self._point = oracle.point.position
 
     def compress(self, q: Vector, stiffness: float, speed: float, duration: float) -> Measured:
-        """Approach with the least joint velocity that has the speed along the normal, rotors as links, until δ̇ = 0.
+        """Approach with the least joint velocity that has this speed along the normal, and compress until δ̇ = 0.
+
+        Rotors begin at the velocity of their links.
 
         Args:
             q: Configuration, shape (nq,).
@@ -79,10 +81,10 @@ class ElasticWorld:
         before = -speed * j / (j @ j)
         links = np.array([model.joint(name).dofadr[0] for name in self._joints])
         for k, name in enumerate(self._joints):
-            for one in (name, self._rotors.get(k)):
-                if one is not None:
-                    data.qpos[model.joint(one).qposadr[0]] = q[k]
-                    data.qvel[model.joint(one).dofadr[0]] = before[k]
+            for joint in (name, self._rotors.get(k)):
+                if joint is not None:
+                    data.qpos[model.joint(joint).qposadr[0]] = q[k]
+                    data.qvel[model.joint(joint).dofadr[0]] = before[k]
         model.opt.timestep = duration / STEPS
         J, norms, force, torques, start = np.zeros((3, model.nv)), [0.0], 0.0, np.zeros(model.ntendon), None
         for _ in range(4 * STEPS):

@@ -1,1 +1,1 @@
-"""One impact in MuJoCo, measured, beside what the objectives predict of it."""
+"""One impact in MuJoCo, measured and predicted by the objectives."""

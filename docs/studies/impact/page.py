@@ -1,4 +1,4 @@
-"""Do the objectives predict what an impact does?  Random postures meet a stiff surface in MuJoCo."""
+"""Page that compares the objectives with impacts: random postures meet a stiff surface in MuJoCo."""
 
 from __future__ import annotations
 
@@ -39,7 +39,7 @@ _VARIED = "impact|lasts, ms|e|no friction: rank of √V|measured/predicted|stick
 
 
 def lines(request: Request) -> Iterator[str]:
-    """All tables."""
+    """Yield all tables."""
     import_mujoco()
     if request.count < 3:
         raise InputError(f"{request.count} postures", where="--count", hint="a rank correlation needs three")
@@ -80,17 +80,17 @@ def _rank_row(row: Row) -> list[str]:
 
 
 def _left_out(rows: Sequence[Row]) -> list[str]:
-    """One line for each robot and surface with a posture that is not counted."""
-    found = [
+    """Return a line for each robot and surface with a posture that is not counted."""
+    entries = [
         f"- {row.robot}, {_friction(row.surface)}: {count} left out, {reason}"
         for row in rows
         for reason, count in sorted(row.left_out.items())
     ]
-    return found or ["- none left out"]
+    return entries or ["- none left out"]
 
 
 def _verdicts(rows: Sequence[Row]) -> Iterator[str]:
-    """The targets, met or missed: ``√C`` ≥ 0.95, jumps within 20 %; ``√V`` without friction and ``√S`` with it."""
+    """Yield the targets, met or missed, for ``√C``, ``√V`` without friction and ``√S`` with friction."""
     frictions = dict.fromkeys(row.surface.friction for row in rows)
     wanted = [("coulomb", mu, 0.95) for mu in frictions]
     for objective, mu, least in [
@@ -113,10 +113,10 @@ def _verdicts(rows: Sequence[Row]) -> Iterator[str]:
 
 
 def _which_stick(dropped: Sequence[Dropped], rows: Sequence[Row]) -> Iterator[str]:
-    """Does the angle of the sticking impulse say which postures stick?  And MuJoCo's own friction on the same."""
+    """Yield the postures that stick, by the angle of the sticking impulse, and the same with MuJoCo's friction."""
     between = [row for row in rows if 0 < row.surface.friction < np.inf]
     yield from ("### Which postures stick", "")
-    yield "A posture *should stick* where the friction is at least what its sticking impulse needs: the tangential"
+    yield "A posture *should stick* if its sticking impulse needs at most the friction of the surface: the tangential"
     yield from ("part of the impulse over the normal part.", "")
     body = []
     for row in between:
@@ -130,7 +130,9 @@ def _which_stick(dropped: Sequence[Dropped], rows: Sequence[Row]) -> Iterator[st
     yield from ("", "### MuJoCo's own friction", "")
     largest = max(row.measured("restitution").max() for row in between)
     yield "MuJoCo's friction (elliptic cones) is convex: sliding lifts the contact, which Coulomb's law does not do."
-    yield f"Under Coulomb's law, above, no posture rebounds with more than e = {largest:.2f}. The same postures here:"
+    yield (
+        f"Under Coulomb's law, above, every posture rebounds with at most e = {largest:.2f}. The same postures here:"
+    )
     yield ""
     convex = [by.on(replace(Surface(mu), convex=True)) for by in dropped for mu in FRICTIONS if 0 < mu < np.inf]
     yield from table(_CONVEX.split("|"), [_convex_row(row) for row in convex])
@@ -147,7 +149,7 @@ def _convex_row(row: Row) -> list[str]:
 
 
 def _variations(dropped: Sequence[Dropped], postures: int) -> Iterator[str]:
-    """Speed, restitution, stiffness, without friction and sticking; the lightest robot has its own rows."""
+    """Vary speed, restitution and stiffness, without friction and sticking; the lightest robot has its own rows."""
     few = [replace(robot, scenes=robot.scenes[:_FEW]) for robot in dropped]
     body, gone = [], []
     parts = ("", [r for r in few if r.robot != LIGHTEST]), (f", {LIGHTEST}", [r for r in few if r.robot == LIGHTEST])
@@ -166,14 +168,14 @@ def _variations(dropped: Sequence[Dropped], postures: int) -> Iterator[str]:
         left = [row for row in both if row.left_out]
         gone += [f"Left out, at {words}:", "", *_left_out(left), ""] if left else []
     yield from ("### Speed, rebound, stiffness", "")
-    yield f"The first {min(_FEW, postures)} postures of each robot; the rank is the lowest of the robots'."
-    yield f"{LIGHTEST}, whose arm is light, has rows of its own."
+    yield f"The first {min(_FEW, postures)} postures of each robot. The rank is the lowest over the robots."
+    yield f"{LIGHTEST}, whose arm is light, has separate rows."
     yield from ("", *table([*_VARIED.split("|"), "left out"], body), "", *gone)
 
 
 def _picks(robots: Sequence[str]) -> Iterator[str]:
-    """What each objective picks, and what happens there."""
-    found = {name: choices(name) for name in robots}
+    """Yield the posture that each objective picks, and the impact there."""
+    picks = {name: choices(name) for name in robots}
     smooth, sticks = FRICTIONS[0], FRICTIONS[-1]
     head = ["robot", "picked by", "H", "1/G, kg", "V", "S", "μ to stick"]
     head += [f"jump, {_friction(Surface(mu))}" for mu in FRICTIONS]
@@ -181,10 +183,10 @@ def _picks(robots: Sequence[str]) -> Iterator[str]:
         f"{what}, {_friction(Surface(mu))}" for what in ("impulse in N·s", "loss in J") for mu in (smooth, sticks)
     ]
     yield from ("### What each objective picks", "", f"`coulomb` is minimized for μ = {PICKED_FOR:g}.", "")
-    picked = [choice for some in found.values() if isinstance(some, list) for choice in some]
+    picked = [choice for some in picks.values() if isinstance(some, list) for choice in some]
     yield from table(head, [_choice(choice) for choice in picked])
     yield ""
-    yield from (f"- {n}: no optima, {error}" for n, error in found.items() if isinstance(error, ImpactPostureError))
+    yield from (f"- {n}: no optima, {error}" for n, error in picks.items() if isinstance(error, ImpactPostureError))
 
 
 def _choice(choice: Choice) -> list[str]:

@@ -24,7 +24,7 @@ PICKED_FOR = 0.3
 LIGHTEST = "hextilt"
 # A contact point that leaves with more tangential speed than this share of v_n has slid.
 SLID = 0.01
-# Cases by robot, with what random postures keep of the contact frame, and words.
+# Cases by robot, with the contact pose that random postures keep, and words.
 STUDIED: dict[str, tuple[Case, str, str]] = {
     CASES[name].robot: (CASES[name], pose, words)
     for name, pose, words in (
@@ -37,7 +37,7 @@ STUDIED: dict[str, tuple[Case, str, str]] = {
 }
 # Without friction, ice, two everyday surfaces, and one on which nothing slides.
 FRICTIONS = (0.0, 0.1, 0.3, 0.8, np.inf)
-# What else an impact may differ in: words, and the surface but for its friction.
+# Other variations of an impact: words, and the surface without its friction.
 VARIATIONS = (
     ("0.1 m/s", Surface(speed=0.1)),
     ("3 m/s", Surface(speed=3.0)),
@@ -49,14 +49,14 @@ VARIATIONS = (
 
 
 def needed_friction(predicted: ImpactQuantities) -> float:
-    """Least coefficient with which the contact point sticks: tangential over normal part of the sticking impulse."""
+    """Return the least friction that makes the contact point stick: tangential over normal part of its impulse."""
     s, n = predicted.sticking_impulse, predicted.normal
     return float("nan") if s is None else float(np.linalg.norm(s - (n @ s) * n) / (n @ s))
 
 
 @dataclass(frozen=True)
 class Outcome:
-    """One posture: what the objectives say, and what happened."""
+    """Prediction and measurement at one posture."""
 
     predicted: ImpactQuantities
     measured: Measured
@@ -70,7 +70,7 @@ class Outcome:
         return float(getattr(self.predicted, OBJECTIVES[objective]))
 
     def deviation(self, objective: str) -> float:
-        """``‖Δν − predicted Δν‖`` over its size, for all but ``impulse`` and ``energy``, whatever the metric."""
+        """``‖Δν − predicted Δν‖`` over the predicted norm, for all objectives except ``impulse`` and ``energy``."""
         o, rebound = self.predicted, (1 + self.measured.restitution) * self.speed
         jumps = {"speed": o.jump / o.G, "sticking": o.sticking_jump, "coulomb": self.coulomb}
         predicted = rebound * np.asarray(jumps[objective])
@@ -78,13 +78,13 @@ class Outcome:
 
     @property
     def per_impulse(self) -> float:
-        """``‖Δν‖/λ``: what ``√H`` claims to be."""
+        """``‖Δν‖/λ``, which ``√H`` predicts."""
         return self.measured.size / self.measured.impulse
 
     def ratio(self, objective: str) -> float:
-        """Measured over predicted, of what the objective is about: the jump, for energy the loss.
+        """Return measured over predicted jump, or for energy the loss.
 
-        ``impulse`` is given the measured normal impulse; the others approach speed and measured restitution.
+        ``impulse`` uses the measured normal impulse; the others use approach speed and measured restitution.
         """
         m, value, v = self.measured, self.value(objective), self.speed
         if objective == "impulse":
@@ -96,7 +96,7 @@ class Outcome:
 
 @dataclass(frozen=True)
 class Row:
-    """One robot on one surface: the postures that are counted, and how many are not, by reason."""
+    """One robot on one surface: the counted postures, and the number of the others by reason."""
 
     robot: str
     surface: Surface
@@ -104,7 +104,7 @@ class Row:
     left_out: Counter[str]
 
     def rank(self, objective: str, of: Callable[[Outcome], float] = lambda o: o.measured.size) -> float:
-        """Spearman's rank correlation of something measured, by default the jump, with an objective's value."""
+        """Return Spearman's rank correlation of a measurement, by default the jump, with an objective."""
         values = [o.value(objective) for o in self.outcomes]
         return float(scipy.stats.spearmanr([of(o) for o in self.outcomes], values).statistic)
 
@@ -122,7 +122,7 @@ class Row:
         return int((self.measured("slip") > SLID).sum())
 
     def split(self) -> tuple[Row, Row]:
-        """The postures that the surface has the friction to hold, by what they need to stick; and the others."""
+        """Return the postures that the friction of the surface should hold, and the others."""
         holds = [needed_friction(o.predicted) <= self.surface.friction for o in self.outcomes]
         held, rest = (
             replace(self, outcomes=tuple(o for o, h in zip(self.outcomes, holds, strict=True) if h is wanted))
@@ -141,7 +141,7 @@ class Dropped:
 
     @staticmethod
     def prepare(robot: str, count: int, seed: int) -> Dropped:
-        """Draw postures that the task allows: limits, feet, and the place of the contact point are kept."""
+        """Draw postures that keep the limits, the feet, and the place of the contact point."""
         case, pose, _ = STUDIED[robot]
         problem = case.problem(contact_pose=pose)
         left_out: Counter[str] = Counter()
@@ -151,10 +151,10 @@ class Dropped:
                 q = feasible_start(problem, index, seed)
                 if q is None:
                     raise NoImpact("not on the constraints")
-                found = problem.impact.oracle.quantities(q)
-                if found.S is None:
+                quantities = problem.impact.oracle.quantities(q)
+                if quantities.S is None:
                     raise NoImpact("S undefined")
-                scenes.append((Scene(problem.objective, q), found))
+                scenes.append((Scene(problem.objective, q), quantities))
             except NoImpact as reason:
                 left_out[str(reason)] += 1
         return Dropped(robot, tuple(scenes), left_out)
@@ -173,7 +173,7 @@ class Dropped:
 
 @dataclass(frozen=True)
 class Choice:
-    """What an objective picks, ``start`` for the initial posture; measured by friction, ``None``: no impact."""
+    """Posture that an objective picks, or the start; measurements by friction, ``None`` without an impact."""
 
     robot: str
     objective: str
@@ -182,19 +182,19 @@ class Choice:
 
 
 def choices(robot: str, starts: int = 16) -> list[Choice] | ImpactPostureError:
-    """Optimize each objective without collisions and loads, and drop the robot in what comes out."""
-    found: list[Choice] = []
+    """Optimize each objective without collisions and loads, and simulate the impact in the optimal posture."""
+    picked: list[Choice] = []
     for objective in OBJECTIVES:
         problem = STUDIED[robot][0].problem(objective=objective, friction=PICKED_FOR)
         try:
             solution = solve(problem, starts=starts, jobs=1)
         except ImpactPostureError as error:
             return error
-        for name, q in (("start", solution.initial), (objective, solution.q))[bool(found) :]:
+        for name, q in (("start", solution.initial), (objective, solution.q))[bool(picked) :]:
             scene = Scene(problem.objective, q)
             measured = {mu: _try(scene, Surface(mu)) for mu in FRICTIONS}
-            found.append(Choice(robot, name, problem.impact.oracle.quantities(q), measured))
-    return found
+            picked.append(Choice(robot, name, problem.impact.oracle.quantities(q), measured))
+    return picked
 
 
 def _try(scene: Scene, surface: Surface) -> Measured | None:

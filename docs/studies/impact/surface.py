@@ -1,4 +1,4 @@
-"""A robot in one posture meets a plane in MuJoCo; the jump of its velocity is measured."""
+"""Measure the velocity jump of a robot that meets a plane in MuJoCo in one posture."""
 
 from __future__ import annotations
 
@@ -17,7 +17,7 @@ from impact_posture.impact.worst_case_objective import WorstCaseObjective
 
 # Steps of physics in one time constant of the contact, and the constants after which a contact counts as endless.
 _FINE, _PATIENCE = 50, 40
-# Rate at which friction and supports stop a velocity, over that of the contact; friction where nothing slides.
+# Rate at which friction and supports stop a velocity, over the rate of the contact; friction that prevents sliding.
 _GRIP, _STICKY = 10.0, 10.0
 # Friction that stands for any amount in a prediction.
 _STICKS = 1e6
@@ -34,11 +34,11 @@ _SOLIMP = (0.9999, 0.9999, 0.001, 0.5, 2.0)
 
 @dataclass(frozen=True)
 class Surface:
-    """What the robot meets, and how fast.
+    """Surface that the robot meets, and approach speed.
 
-    The contact is MuJoCo's spring and damper, scaled by the mass that it feels: ``r'' = −2ζ r'/T − r/T²`` while it
-    pushes.  MuJoCo's own friction is convex and lifts a sliding contact off the surface, which looks like rebound:
-    Coulomb's law is written out here unless ``convex``.  What sticks is MuJoCo's own, with a coefficient of 10.
+    The contact is the spring and damper of MuJoCo, scaled by the mass that it feels: ``r'' = −2ζ r'/T − r/T²`` while
+    it pushes.  The friction of MuJoCo is convex and lifts a sliding contact off the surface like a rebound.  So this
+    study implements Coulomb's law unless ``convex``.  A sticking point has MuJoCo's friction, with coefficient 10.
     """
 
     friction: float = 0.0  # Coulomb coefficient; 0 for none at all, infinite for a contact point that sticks
@@ -50,7 +50,7 @@ class Surface:
 
 @dataclass(frozen=True, eq=False)
 class Measured:
-    """One impact as it happened."""
+    """Measurements of one impact."""
 
     jump: Vector  # Δν in Pinocchio's coordinates, shape (nv,)
     restitution: float  # normal speed after over before
@@ -67,7 +67,7 @@ class Measured:
 
 
 class NoImpact(Exception):
-    """The contact never came about, or did not end; the message says which."""
+    """The contact did not begin or did not end; the message says which."""
 
 
 class Scene:
@@ -83,7 +83,7 @@ class Scene:
     def __init__(self, objective: WorstCaseObjective, q: Vector) -> None:
         self._mujoco = import_mujoco()
         self._robot, self._q, self._objective = objective.robot, q, objective
-        # The oracle is shared and moves on: keep what it says of this posture.
+        # The oracle is shared, so copy its values at this posture.
         oracle = objective.oracle.at(q)
         self._M, self._J, self._Js, self._n = (np.array(x) for x in (oracle.M, oracle.J, oracle.Js, oracle.n))
         self._mobility = self._J @ oracle.solve(self._J.T)
@@ -100,18 +100,18 @@ class Scene:
         A robot that flies moves as one body along ``−n``; others by the smallest velocity of base and joints.
         """
         if self._robot.floating and not self._feet:
-            found = np.zeros(self._robot.nv)
-            found[:3] = -pin.Quaternion(np.array(self._q[3:7])).matrix().T @ self._n
-            return found
+            velocity = np.zeros(self._robot.nv)
+            velocity[:3] = -pin.Quaternion(np.array(self._q[3:7])).matrix().T @ self._n
+            return velocity
         J = np.vstack([self._J, self._Js])
         wanted = np.concatenate([-self._n, np.zeros(len(self._Js))])
-        found = np.linalg.pinv(J, rcond=1e-9) @ wanted
-        if np.abs(J @ found - wanted).max() > 1e-6:
+        velocity = np.linalg.pinv(J, rcond=1e-9) @ wanted
+        if np.abs(J @ velocity - wanted).max() > 1e-6:
             raise NoImpact("cannot move along the normal alone")
-        return np.asarray(found)
+        return np.asarray(velocity)
 
     def with_friction(self, friction: float) -> Vector:
-        """The predicted jump per approach speed with friction, plastic, shape (nv,)."""
+        """Return the predicted jump per approach speed with friction, plastic, shape (nv,)."""
         contact = replace(self._objective.contact, friction=min(friction, _STICKS))
         return coulomb_impact(replace(self._objective, contact=contact).oracle, self._q).jump
 
@@ -132,7 +132,6 @@ class Scene:
             if coulomb:
                 rubbing = self._rub(data, rubbing, surface.friction)
             mujoco.mj_step(model, data)
-            # Of the step just taken.
             pushed = self._normal_force(data)
             impulse += pushed * model.opt.timestep
             if pushed > 0:
@@ -149,11 +148,11 @@ class Scene:
         return total
 
     def _rub(self, data: Any, rubbing: Vector, friction: float) -> Vector:
-        """Apply Coulomb's friction for the next step and return it: at most ``μ f_n``, against the sliding.
+        """Apply Coulomb's friction for the next step, at most ``μ f_n`` against the sliding, and return it.
 
-        ``f ← P(f − r v)`` with P the projection on the disc of radius ``μ f_n`` and v the sliding velocity at the end
-        of the step: at rest f is what keeps the point there, in motion it points against v.  While f changes, the
-        contact's spring and damper hold the normal acceleration.
+        Iterate ``f ← P(f − r v)``, where P projects on the disc of radius ``μ f_n`` and v is the sliding velocity at
+        the end of the step.  At rest, f keeps the point in place.  In motion, it points against v.  While f changes,
+        the spring and damper of the contact hold the normal acceleration.
         """
         self._mujoco.mj_forward(self._model, data)
         step, center, n = self._model.opt.timestep, data.geom("ball").xpos, self._n
@@ -163,14 +162,14 @@ class Scene:
         sliding -= (n @ sliding) * n
         across = self._mobility @ n
         along = (self._mobility - np.outer(across, across) / (n @ across)) * step
-        rate, found = 1 / float(np.linalg.eigvalsh(along)[-1]), rubbing
+        rate, rubbed = 1 / float(np.linalg.eigvalsh(along)[-1]), rubbing
         for _ in range(_INNER):
-            change = found - rubbing
-            wanted = found - rate * (sliding + along @ change)
+            change = rubbed - rubbing
+            wanted = rubbed - rate * (sliding + along @ change)
             size, most = float(np.linalg.norm(wanted)), friction * (pushed - across @ change / (n @ across))
-            found = wanted * (min(1.0, max(most, 0.0) / size) if size > 0 else 0.0)
-        data.qfrc_applied[:] = J.T @ found
-        return np.asarray(found)
+            rubbed = wanted * (min(1.0, max(most, 0.0) / size) if size > 0 else 0.0)
+        data.qfrc_applied[:] = J.T @ rubbed
+        return np.asarray(rubbed)
 
     def _set(self, surface: Surface) -> None:
         model, T = self._model, surface.time

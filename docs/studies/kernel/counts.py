@@ -39,14 +39,14 @@ def of_export(objective: WorstCaseObjective) -> tuple[Operations, int | None]:
     cosines are still one each; ``None``: no repeated limbs.  The order in which the C adds up sums is not looked at:
     it moves the count by a hundredth at most.
     """
-    found = export_library([NamedObjective(objective, "kernel")])
-    outputs = next(f.outputs for f in found.functions if f.name == "eval")
-    graph = found.graph()
+    exported = export_library([NamedObjective(objective, "kernel")])
+    outputs = next(f.outputs for f in exported.functions if f.name == "eval")
+    graph = exported.graph()
     kinds = (_NODES.get(graph.nodes[k].op) for k in _reached(graph, outputs))
     single = Counter(kind for kind in kinds if kind)
-    if not found.seeds:
+    if not exported.seeds:
         return single, None
-    graph = found.vector_graph()
+    graph = exported.vector_graph()
     done = sum(graph.nodes[k].op in ARITHMETIC - {"neg"} for k in _reached(graph, outputs))
     return single, done + single["trig"]
 

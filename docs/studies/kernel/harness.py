@@ -47,10 +47,10 @@ def c_compiler() -> list[str]:
     Raises:
         CompilerError: There is none.
     """
-    found = find_compiler()
-    if found is None:
+    compiler = find_compiler()
+    if compiler is None:
         raise CompilerError("no C compiler found", where="benchmarks", hint="install gcc or clang, or set CC")
-    return found
+    return compiler
 
 
 @dataclass(frozen=True)
@@ -87,11 +87,11 @@ class Samples:
     @cached_property
     def reference(self) -> tuple[Vector, Vector]:
         """H and ∇H by the dense linear algebra of the oracle, which shares no code with any of the kernels."""
-        found = []
+        pairs = []
         for q, (x, y, z) in zip(*self.drawn, strict=True):
             oracle = ImpactOracle(ImpactCase(self.robot, ImpactContact(self.frame, (float(x), float(y), float(z)))))
-            found.append((oracle.quantities(q).H, oracle.gradient_H(q)))
-        return np.array([H for H, _ in found]), np.array([gradient for _, gradient in found])
+            pairs.append((oracle.quantities(q).H, oracle.gradient_H(q)))
+        return np.array([H for H, _ in pairs]), np.array([gradient for _, gradient in pairs])
 
     @property
     def point(self) -> PointOnLink:
@@ -165,12 +165,12 @@ class Harness:
             (H, gradient), (own_H, own) = (
                 (a[:few] for a in some) for some in (self.samples.reference, self._results)
             )
-            found = [worst, np.abs(own_H / H - 1).max()]
+            errors = [worst, np.abs(own_H / H - 1).max()]
             if kind != "value":
                 scale = np.maximum(np.abs(gradient).max(axis=1), 1e-3 * np.abs(H))
-                found.append((np.abs(own - gradient).max(axis=1) / scale).max())
+                errors.append((np.abs(own - gradient).max(axis=1) / scale).max())
             # np.max keeps a NaN, which max() may drop.
-            worst = float(np.max(found))
+            worst = float(np.max(errors))
         # Not ">": that is false for a NaN.
         if not worst <= (1e-5 if kernel.group == "differences" else 1e-6):
             raise Disagreement(f"its numbers differ from Pinocchio's by {worst:.1e}, relative")

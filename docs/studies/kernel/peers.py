@@ -61,13 +61,13 @@ def ours(samples: Samples) -> list[Kernel]:
     """The export, and ∇H by central differences of its H."""
     builds, size = exported(samples.objective, "kernel")
     count, packed = of_export(samples.objective)
-    found = []
+    kernels = []
     for label, built in builds:
         kinds = {"eval": "kernel_eval", "value": "kernel_value", "batch": "kernel_eval_batch"}
         functions = {kind: built.symbol(name) for kind, name in kinds.items()}
-        found.append(Kernel(f"ours {label}", "ours", built, functions, count, packed, size))
-        found.append(Kernel(f"differences {label}", "differences", built, {"differences": functions["value"]}))
-    return sorted(found, key=lambda kernel: kernel.group != "ours")
+        kernels.append(Kernel(f"ours {label}", "ours", built, functions, count, packed, size))
+        kernels.append(Kernel(f"differences {label}", "differences", built, {"differences": functions["value"]}))
+    return sorted(kernels, key=lambda kernel: kernel.group != "ours")
 
 
 # ---- CasADi's own C -----------------------------------------------------------------------------------------------
@@ -75,11 +75,11 @@ def ours(samples: Samples) -> list[Kernel]:
 
 def same_graph(samples: Samples) -> list[Kernel]:
     """The expressions that our export is written from, printed by CasADi, compiled as ours."""
-    found = export_library([NamedObjective(samples.objective, "kernel")])
-    q, n, _ = found.function.sx_in()
-    values = found.function.call([q, n, ca.DM(found.constants)])
-    outputs = next(f.outputs for f in found.functions if f.name == "eval")
-    wanted = [ca.densify(values[found.function.index_out(name)]) for name in outputs]
+    exported = export_library([NamedObjective(samples.objective, "kernel")])
+    q, n, _ = exported.function.sx_in()
+    values = exported.function.call([q, n, ca.DM(exported.constants)])
+    outputs = next(f.outputs for f in exported.functions if f.name == "eval")
+    wanted = [ca.densify(values[exported.function.index_out(name)]) for name in outputs]
     function = ca.Function("eval", [q, n], wanted, ["q", "n"], ["H", "grad"], {"cse": True})
     ways = {label: ["-std=c99", *flags] for label, flags in flag_sets().items()}
     return _printed("same graph", "same graph", function, ways)
@@ -166,13 +166,13 @@ def _printed(label: str, group: str, function: ca.Function, ways: dict[str, Sequ
         text = (Path(folder) / "peer.c").read_text(encoding="utf-8")
     sizes = {"arg": function.sz_arg(), "res": function.sz_res(), "iw": function.sz_iw(), "w": function.sz_w()}
     source = text + _WRAPPER.format(**{key: max(1, size) for key, size in sizes.items()})
-    found = []
+    kernels = []
     for way, flags in ways.items():
         say(f"{label} {way}")
         built = build({"peer.c": source}, c_compiler(), [*flags, CONTRACT])
         functions, size = {"eval": built.symbol("kernel_eval")}, len(source.encode()) / 1e3
-        found.append(Kernel(f"{label} {way}", group, built, functions, of_function(function), None, size))
-    return found
+        kernels.append(Kernel(f"{label} {way}", group, built, functions, of_function(function), None, size))
+    return kernels
 
 
 def _urdf(samples: Samples) -> str:
@@ -194,9 +194,9 @@ def _prismatic_joints_repaired() -> Iterator[None]:
     original = StdJoint.motion_subspace
 
     def repaired(joint: Any) -> Any:
-        found = original(joint)
-        if found.array.shape[0] == 6:
-            return found
+        subspace = original(joint)
+        if subspace.array.shape[0] == 6:
+            return subspace
         axis = np.array(ca.DM(joint.axis.array)).ravel()
         return joint.math.vertcat(*[joint.math.asarray(float(v)) for v in (*axis, 0.0, 0.0, 0.0)])
 

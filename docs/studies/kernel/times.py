@@ -29,7 +29,7 @@ _AGAINST = {
     "the same graph, printed by CasADi": ("same graph", ""),
     "central differences of our own H": ("differences", ""),
 }
-_HEAD = "way|H, ∇H µs|ratio|H µs|∇/H|batch µs|operations|packed|source kB|build s|error".split("|")
+_HEAD = "implementation|H, ∇H µs|ratio|H µs|∇/H|batch µs|operations|packed|source kB|build s|error".split("|")
 
 
 @dataclass(frozen=True)
@@ -80,7 +80,7 @@ def measure(samples: Samples, rounds: int, peers: Sequence[str] = tuple(PEERS)) 
             skipped.append(f"{kernel.name}: skipped, {wrong}")
     say(f"{robot.name}: {rounds} rounds")
     times = harness.times([kernel for kernel, _ in right], rounds)
-    rows = [(kernel, found, error) for (kernel, error), found in zip(right, times, strict=True)]
+    rows = [(kernel, timed, error) for (kernel, error), timed in zip(right, times, strict=True)]
     # Of the differences by each of our builds the fastest alone.
     differences = {kernel.name: t["differences"] for kernel, t, _ in rows if "differences" in t}
     slower = sorted(differences, key=lambda name: differences[name])[1:]

@@ -164,7 +164,7 @@ def _start(setup: Setup, chosen: Draw) -> Vector:
     problem = build_problem(robot, scenario_objective(setup), setup.q, requirements)
     step = chosen.values["stir"] * rng.normal(size=robot.nv)
     step[:6] *= _BASE
-    found = Projector(problem).project(np.asarray(pin.integrate(robot.model, setup.q, step)))
-    if found.violation > 1e-8:
-        raise Infeasible({"feet": found.violation}, where=f"{chosen.scenario} {chosen.number}")
-    return robot.check_posture(found.q, where=chosen.scenario)
+    projected = Projector(problem).project(np.asarray(pin.integrate(robot.model, setup.q, step)))
+    if projected.violation > 1e-8:
+        raise Infeasible({"feet": projected.violation}, where=f"{chosen.scenario} {chosen.number}")
+    return robot.check_posture(projected.q, where=chosen.scenario)

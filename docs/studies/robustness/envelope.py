@@ -1,4 +1,4 @@
-"""What each controller keeps over the envelope of a scenario, for the page of the reproduction."""
+"""Targets that each controller keeps over the envelope of a scenario, for the page of the reproduction."""
 
 from __future__ import annotations
 
@@ -14,9 +14,9 @@ from impact_posture.experiment.reproduction import PAPER
 from impact_posture.simulation.controllers.controller_factory import MEANING
 
 Records = Mapping[str, Sequence[Record]]
-# A controller that keeps every target at fewer points than this share is no advice.
+# A controller that keeps every target at fewer points than this share is not recommended.
 _OFTEN = 2 / 3
-# Variations that are told in words.
+# Number of variations in the sentence.
 _TOLD = 7
 _NAMES = {
     "reduction": "reduction below the paper's", "recovery": "no reduction over the second",
@@ -25,7 +25,7 @@ _NAMES = {
     "saturation_outside": "more saturation outside", "stops": "on a stop", "rested": "not at rest",
     "completed": "failed",
 }  # fmt: skip
-# Where a scenario differs from the robot's own data, and the variation that shows the effect.
+# Differences of a scenario from the data of the robot, and the variation that shows their effect.
 _DEVIATIONS = {
     "aerial-vertical": {"the arm is mounted under the base's center, 8 cm behind its own place": OWN_MOUNTING},
     "aerial-lateral": {
@@ -41,7 +41,7 @@ _HEAD = (
 
 
 def page(records: Records) -> Iterator[str]:
-    """All of it, as lines of Markdown."""
+    """Yield the page as lines of Markdown."""
     yield from ("### What to choose", "")
     yield from (choice(name, own) for name, own in records.items() if tried(own))
     yield from (_tuned(name, own) for name, own in records.items() if sum(bool(r.draw.name) for r in tried(own)) > 1)
@@ -57,48 +57,45 @@ def page(records: Records) -> Iterator[str]:
 
 
 def percent(value: float) -> str:
-    """A relative change; what failed has none."""
+    """Write a relative change; infinity stands for a failed run."""
     return "fails" if value == math.inf else f"{100 * value:+.0f} %".replace("-", "−")
 
 
 def spread(values: Sequence[float]) -> str:
-    """Median and quartiles of a relative change."""
+    """Write median and quartiles of a relative change."""
     low, middle, high = (percent(v) for v in values)
     return f"{middle} [{low}, {high}]"
 
 
 def choice(name: str, own: Sequence[Record]) -> str:
-    """What to take: what keeps every target most often, then what moves least."""
-    found = [summarize(own, c) for c in COMPARED if c != NOMINAL]
-    best = min(found, key=lambda s: (-s.kept, s.motion[1]))
-    if best.kept < _OFTEN * best.count:
-        lead = (
-            f"No controller keeps its targets reliably. The best is `{best.controller}` "
-            f"({MEANING[best.controller]}), which does"
-        )
-    else:
-        lead = f"Take `{best.controller}` ({MEANING[best.controller]}). It keeps every target"
+    """Recommend the controller that keeps every target most often, and among equals the one with least motion."""
+    summaries = [summarize(own, c) for c in COMPARED if c != NOMINAL]
+    best = min(summaries, key=lambda s: (-s.kept, s.motion[1]))
+    reliable = best.kept >= _OFTEN * best.count
+    lead = "Take" if reliable else "No controller keeps its targets reliably. The best is"
     words = (
-        f"- **{name}**: {lead} at {best.kept} of {best.count} points. It changes the motion by "
+        f"- **{name}**: {lead} `{best.controller}` ({MEANING[best.controller]}). "
+        f"It keeps every target at {best.kept} of {best.count} points. It changes the motion by "
         f"{percent(best.motion[1])} at the median (quartiles {percent(best.motion[0])} and {percent(best.motion[2])})"
     )
     if name.startswith("aerial"):
         words += f", with {best.force[0]:.1f} times the peak force"
     others = ", ".join(
-        f"`{s.controller}` at {s.kept} (motion {percent(s.motion[1])})" for s in found if s is not best
+        f"`{s.controller}` at {s.kept} (motion {percent(s.motion[1])})" for s in summaries if s is not best
     )
     return f"{words}. Of the others, every target is kept by {others}."
 
 
 def _tuned(name: str, own: Sequence[Record]) -> str:
-    """How the paper's term and the law without a gain do, one thing at a time."""
+    """Compare the term of the paper and the law without a gain, one variation at a time."""
     parts = []
     for controller in ("robust", "robust-flow"):
         named = [(r.draw.name, change(r, controller)) for r in tried(own) if r.draw.name]
         (_, shipped), *others = named
         # The variations of most interest come first; the table has all.
-        found = ", ".join(f"{percent(value)} ({words})" for words, value in others[:_TOLD])
-        parts.append(f"`{controller}` changes the motion by {percent(shipped)} as shipped, and otherwise by {found}")
+        changes = ", ".join(f"{percent(value)} ({words})" for words, value in others[:_TOLD])
+        changed = f"`{controller}` changes the motion by {percent(shipped)}"
+        parts.append(f"{changed} as shipped, and otherwise by {changes}")
     return f"- **How far {name} is tuned:** {'. '.join(parts)}."
 
 
@@ -109,14 +106,15 @@ def _counts(records: Records) -> Iterator[str]:
         words = f"of `{name}` {len(own) - draws} variations one at a time and {draws} random draws"
         if lacking:
             reasons = ", ".join(f"{r.draw.name} ({r.rejected[-1]})" for r in lacking)
-            words += f", without those that nominal itself does not get through: {reasons}"
+            words += f", without the points at which nominal itself fails: {reasons}"
         counts.append(words)
     planned = sum(len(VARIATIONS[name]) for name in records)
     yield f"The points are {'; '.join(counts)}."
-    yield f"Planned are {planned} variations in all, and 40 random draws of each scenario."
+    yield f"The plan has {planned} variations in all, and 40 random draws of each scenario."
     yield (
-        f"Shortened against the shipped scenarios: one seed of noise, {COUNT} contacts instead of 5, {DWELL:g} s "
-        f"behind the surface and {PAUSE:g} s between contacts; the pushes have both signs. So the way back "
+        f"The runs are shorter than the shipped scenarios: one seed of noise, {COUNT} contacts instead "
+        f"of 5, {DWELL:g} s "
+        f"behind the surface and {PAUSE:g} s between contacts; the pushes have both signs. So the motion back "
         "from the surface is part of the second after an impact, for all controllers alike."
     )
 
@@ -133,8 +131,8 @@ def _overview(name: str, own: Sequence[Record], controller: str) -> list[str]:
 
 
 def _explained() -> Iterator[str]:
-    yield "Change of the motion in the window / over the second, against nominal at the same point. **Bold**: every"
-    yield "target kept. *Nominal* is its motion in the window."
+    yield "Change of the motion in the window / over the second, against nominal at the same point. **Bold**: all"
+    yield "targets are kept. *Nominal*: motion of the nominal controller in the window."
 
 
 def _variations(own: Sequence[Record]) -> Iterator[str]:
@@ -163,7 +161,7 @@ def _cells(record: Record, others: Sequence[str]) -> Iterator[str]:
 
 
 def _deviations(records: Records) -> Iterator[str]:
-    """Every choice of a scenario that differs from the robot's own data, with its effect."""
+    """List the choices of a scenario that differ from the data of the robot, with their effects."""
     for name, deviations in _DEVIATIONS.items():
         known = {r.draw.name: r for r in records.get(name, ()) if r.draw.name}
         for words, variation in deviations.items():
@@ -179,4 +177,7 @@ def _deviations(records: Records) -> Iterator[str]:
             )
             paper = percent(-PAPER[name].reduction)
             yield f"- `{name}`: {words}. Motion with {variation}: {effects} (the paper: {paper})."
-    yield "- `solo8-push` and `talos-push` take the robots as they are. In all four, gains and sensors are choices."
+    yield (
+        "- `solo8-push` and `talos-push` do not change the robots. In all four scenarios, gains and "
+        "sensors are choices."
+    )

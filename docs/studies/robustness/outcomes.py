@@ -1,4 +1,4 @@
-"""What becomes of one point of the envelope: every controller runs through it, and a failure is an outcome too."""
+"""Outcomes of one point of the envelope: every controller runs through it, and a failure is an outcome too."""
 
 from __future__ import annotations
 
@@ -36,11 +36,11 @@ COMPARED = (NOMINAL, "robust", "robust-flow", "posture", "stiff")
 SATURATED = 0.05
 # Random draws of a point before it is given up.
 ATTEMPTS = 40
-# What a record does not keep of a document.
+# Entries of a document that a record leaves out.
 _LEFT_OUT = ("windows", "versions", "runs")
-# Offline postures that this process has found last, and how many it keeps: those of some points of each scenario.
+# Offline postures that this process computed last, and how many it keeps: enough for some points of each scenario.
 _KEPT = 16
-_FOUND: dict[str, OfflinePosture] = {}
+_OPTIMA: dict[str, OfflinePosture] = {}
 _Play = Callable[[Job, ControllerFactory], tuple[tuple[Run, ...], Document]]
 
 
@@ -77,38 +77,38 @@ class Record:
         return "" if status == "completed" else status
 
     def to_json(self) -> str:
-        """The record as text."""
+        """Write the record as text."""
         return json.dumps({"key": key(self.draw.scenario), **asdict(self)}, indent=1)
 
     @classmethod
     def from_json(cls, text: str) -> Record | None:
-        """Back again; ``None`` where the study has changed since."""
-        found = json.loads(text)
-        chosen = Draw(**found["draw"])
-        same = chosen.scenario in RANGES and found["key"] == key(chosen.scenario)
-        # A variation that was renumbered is another one.
+        """Read a record; return ``None`` if the study has changed since."""
+        stored = json.loads(text)
+        chosen = Draw(**stored["draw"])
+        same = chosen.scenario in RANGES and stored["key"] == key(chosen.scenario)
+        # A variation that was renumbered does not count.
         if not same or (chosen.name and draw(chosen.scenario, chosen.number, seed=chosen.seed) != chosen):
             return None
-        return cls(chosen, tuple(found["rejected"]), tuple(found["q"]), found["documents"])
+        return cls(chosen, tuple(stored["rejected"]), tuple(stored["q"]), stored["documents"])
 
 
 def key(scenario: str) -> str:
-    """What a kept record must have in common with this code."""
+    """Return the settings that a kept record must share with this code."""
     ranges = tuple((r.name, r.low, r.high, r.scale) for r in RANGES[scenario])
     return repr((SCHEMA, SHARE, SATURATED, ranges, COUNT, DWELL, PATIENCE, PAUSE))
 
 
 class NotAdmissible(Exception):
-    """A point that makes no experiment: the nominal controller itself does not get through it."""
+    """The nominal controller itself fails at a point, so that it cannot be compared."""
 
 
 def point(scenario: str, number: int, seed: int, known: Record | None = None, play: _Play = execute) -> Record:
-    """Return one point, with what is known of it and the runs that it lacks.
+    """Run the controllers that a point still lacks, and return its record.
 
-    A random draw is repeated until the nominal controller gets through.  A variation is not.
+    A random draw is repeated until the nominal controller succeeds.  A variation is not repeated.
 
     Raises:
-        NotAdmissible: No draw was.
+        NotAdmissible: No draw was admissible.
     """
     if known is not None and (known.documents or known.draw.name):
         return _complete(known, _factory(prepare(known.draw)), play)
@@ -136,19 +136,19 @@ def _complete(record: Record, factory: ControllerFactory, play: _Play) -> Record
 
 
 def is_complete(record: Record | None) -> bool:
-    """Whether a record has every controller, or is of a variation that cannot be tried."""
+    """Whether a record has every controller, or belongs to a variation that cannot be tried."""
     return record is not None and (not record.documents or set(COMPARED) <= set(record.documents))
 
 
 def is_held(setup: Setup, objective: WorstCaseObjective) -> bool:
-    """Whether at most :data:`SHARE` of the limits holds the start of a scenario, as far as the robot's data say."""
+    """Whether at most :data:`SHARE` of the known limits holds the start of a scenario."""
     holding = load_cases(objective, setup.q, scenario_requirements(setup, objective)).holding(setup.q)
     return holding is None or holding.feasible
 
 
 def _factory(setup: Setup) -> ControllerFactory:
-    """Return controllers for runs that no one draws."""
-    # What Python still evaluates is less than compiling the gradient anew for every armature and mounting.
+    """Return controllers for runs without pictures."""
+    # Evaluating the gradient in Python costs less than compiling it for every armature and mounting.
     factory = ControllerFactory(setup, gradient_of=interpreted, offline_of=_offline)
     # The metric over time is only drawn.
     factory.metric = lambda q: math.nan
@@ -156,14 +156,14 @@ def _factory(setup: Setup) -> ControllerFactory:
 
 
 def _offline(setup: Setup, objective: WorstCaseObjective, **options: Any) -> OfflinePosture:
-    """Optimize each problem once: gains, pushes and laws of contact leave it as it is."""
+    """Optimize each problem once, because gains, pushes and contact laws do not change it."""
     demands = scenario_requirements(setup, objective, at_contact=options["at_contact"])
     impact = objective.contact, objective.metric, objective.kind, objective.supports, objective.compliance
     key = repr((setup.robot.source, setup.robot.data_sha256, setup.q.tobytes(), impact, demands, options))
-    found = _FOUND[key] = _FOUND.pop(key, None) or offline_posture(setup, objective, **options)
-    if len(_FOUND) > _KEPT:
-        del _FOUND[next(iter(_FOUND))]
-    return found
+    optimum = _OPTIMA[key] = _OPTIMA.pop(key, None) or offline_posture(setup, objective, **options)
+    if len(_OPTIMA) > _KEPT:
+        del _OPTIMA[next(iter(_OPTIMA))]
+    return optimum
 
 
 def _admit(chosen: Draw, play: _Play) -> tuple[ControllerFactory, Document]:
@@ -186,25 +186,25 @@ def _admit(chosen: Draw, play: _Play) -> tuple[ControllerFactory, Document]:
 
 
 def _document(factory: ControllerFactory, chosen: Draw, label: str, play: _Play) -> Document:
-    """Let a controller run with the noise of seed 0; what it raises is what becomes of it."""
+    """Run a controller with the noise of seed 0.  An error that it raises is its outcome."""
     name, mode, free = parse_controller(label)
     job = Job(chosen.scenario, name, 0, mode, free, compile="auto")
     try:
-        runs, found = play(job, factory)
+        runs, document = play(job, factory)
     except (ImpactPostureError, np.linalg.LinAlgError) as error:
         return {**lost_control(job, error), "runs": [], "duration": 0.0, "offset": None}
-    signs = [{"sign": part["sign"]} for part in found["runs"]]
-    kept = {name: value for name, value in found.items() if name not in _LEFT_OUT}
+    signs = [{"sign": part["sign"]} for part in document["runs"]]
+    kept = {name: value for name, value in document.items() if name not in _LEFT_OUT}
     duration = max(float(run.series.t[-1]) for run in runs)
     return {**kept, "runs": signs, "duration": duration, "offset": _offset(factory, runs[0])}
 
 
-def _offset(factory: ControllerFactory, found: Run) -> float | None:
-    """Distance of the center of mass from the line along which the first impact acts."""
-    if not found.of("impact"):
+def _offset(factory: ControllerFactory, run: Run) -> float | None:
+    """Return the distance of the center of mass from the line along which the first impact acts."""
+    if not run.of("impact"):
         return None
     robot, contact = factory.setup.robot, factory.objective().contact
-    q = found.series.q[before(found.series, found.of("impact")[0])]
+    q = run.series.q[before(run.series, run.of("impact")[0])]
     place = Numeric(robot.model).at(q).placement(point_on(robot, contact.frame, contact.offset)).translation
     arm = np.array(pin.centerOfMass(robot.model, robot.model.createData(), q)) - place
     n = factory.setup.scenario.normal

@@ -1,4 +1,4 @@
-"""The page of where controllers help, all of it from the records: what to choose, in sentences, and tables."""
+"""Page that says where controllers help, from the records: recommendations in sentences, then tables."""
 
 from __future__ import annotations
 
@@ -29,9 +29,9 @@ from docs.studies.robustness.variations import RANGES
 from impact_posture.simulation.offline_posture import SHARE
 
 Records = Mapping[str, Sequence[Record]]
-# The page of the documentation takes what is before and what is after.
+# The page of the documentation includes the text before this mark and the text after it.
 MARK = "<!-- tables -->"
-# M: a shoulder that is less than this ahead of or behind the base's center is under it.
+# A shoulder that is less than this ahead of or behind the center of the base counts as under it, m.
 _UNDER = 0.04
 # Drawn values whose rank correlation is shown.
 _RANKED = ("x", "z", "speed", "force", "stiffness", "armature", "gain", "contact", "friction")
@@ -42,7 +42,7 @@ _OVERVIEW = (
 
 
 def page(records: Records, seed: int) -> Iterator[str]:
-    """All of it, as lines of Markdown."""
+    """Yield the page as lines of Markdown."""
     records = {name: own for name, own in records.items() if tried(own)}
     yield from (choice(name, own) for name, own in records.items())
     yield from (*_stiffness(records), *_failed(records), *_predictors(records))
@@ -66,7 +66,7 @@ def _is_contact(name: str) -> bool:
 
 
 def _stiffness(records: Records) -> list[str]:
-    """Where a nominal controller as stiff as the term does as well as the term."""
+    """Compare the stiffness of the term alone with the offline posture alone."""
     parts = []
     for name, own in records.items():
         term, stiff, posture = (summarize(own, c).motion[1] for c in ("robust", "stiff", "posture"))
@@ -77,34 +77,36 @@ def _stiffness(records: Records) -> list[str]:
             f"`posture`: {what}."
         )
     lead = (
-        "**Posture or stiffness?** `stiff` keeps the start posture, as stiffly as the term; `posture` takes the "
-        "offline optimum, without that stiffness."
+        "**Posture or stiffness?** `stiff` keeps the start posture with the stiffness of the term; "
+        "`posture` takes the "
+        "offline optimum, without this stiffness."
     )
     return [f"- {lead} {' '.join(parts)}"] if parts else []
 
 
 def _failed(records: Records) -> list[str]:
-    found = []
+    failures = []
     for name, own in records.items():
         for controller in COMPARED:
             summary = summarize(own, controller)
             words = ", ".join(f"{kind} {n}" for kind, n in sorted(summary.failures.items()))
             failed = sum(summary.failures.values())
-            found += [f"`{controller}` in `{name}` at {failed} of {summary.count} points ({words})"] if words else []
-    return [f"- **What failed:** {'; '.join(found) or 'nothing'}."]
+            if words:
+                failures.append(f"`{controller}` in `{name}` at {failed} of {summary.count} points ({words})")
+    return [f"- **What failed:** {'; '.join(failures) or 'nothing'}."]
 
 
 def _predictors(records: Records) -> list[str]:
-    """Which of S, V and H tells the jump of a contact."""
+    """Say which of S, V and H predicts the jump of a contact best."""
     aerial = {name: own for name, own in records.items() if _is_contact(name)}
     if not aerial:
         return []
     ranks = {name: ranks_of_jumps(own, tuple(PREDICTORS)) for name, own in aerial.items()}
-    least = {key: min(found[key] for found in ranks.values()) for key in PREDICTORS}
+    least = {key: min(correlations[key] for correlations in ranks.values()) for key in PREDICTORS}
     best = max(PREDICTORS, key=lambda key: -math.inf if math.isnan(least[key]) else least[key])
     parts = " and ".join(
-        f"in `{name}` {', '.join(f'{_signed(found[key])} with {key}' for key in PREDICTORS)}"
-        for name, found in ranks.items()
+        f"in `{name}` {', '.join(f'{_signed(correlations[key])} with {key}' for key in PREDICTORS)}"
+        for name, correlations in ranks.items()
     )
     every = [r for own in aerial.values() for r in tried(own)]
     names = [c for c in COMPARED if c != NOMINAL]
@@ -116,8 +118,8 @@ def _predictors(records: Records) -> list[str]:
     ways = ", ".join(f"{key} for {jump} jumps and {motion} motions" for key, (jump, motion) in same.items())
     return [
         f"- **{best} predicts the jump of a contact best.** Over all points and controllers, the measured jump has "
-        f"the rank correlations {parts}. Whether a controller does better or worse than nominal, in {count} runs, "
-        f"is told rightly by {ways}."
+        f"the rank correlations {parts}. Of {count} runs, the right sign of the change against nominal is predicted "
+        f"by {ways}."
     ]
 
 
@@ -136,13 +138,14 @@ def _jump_ranks(records: Records) -> Iterator[str]:
     yield (
         "Spearman's rank correlation of the measured jump with what each number predicts, over all points and\n"
         "controllers: $v\\sqrt V$ without friction, $v\\sqrt S$ where the contact sticks, $v\\sqrt C$ with the "
-        "friction of\nthe surface, and $\\sqrt H$. A push has an impulse and no speed, so only H speaks about it."
+        "friction of\nthe surface, and $\\sqrt H$. A push has an impulse and no speed, so only H can predict it."
     )
     yield ""
     body = []
     for name, own in records.items():
-        found = ranks_of_jumps(own, tuple(PREDICTORS) if _is_contact(name) else ("H",))
-        body.append([f"`{name}`", f"{found['n']:.0f}", *(_signed(found.get(key, math.nan)) for key in PREDICTORS)])
+        correlations = ranks_of_jumps(own, tuple(PREDICTORS) if _is_contact(name) else ("H",))
+        cells = (_signed(correlations.get(key, math.nan)) for key in PREDICTORS)
+        body.append([f"`{name}`", f"{correlations['n']:.0f}", *cells])
     yield from table(["scenario", "runs", *(f"{key}" for key in PREDICTORS)], body)
 
 
@@ -151,7 +154,7 @@ def _signed(value: float) -> str:
 
 
 def _ranks(records: Records) -> Iterator[str]:
-    """Rank correlations of the reduction by ``robust``."""
+    """Yield rank correlations of the reduction by ``robust``."""
     rows: dict[str, Callable[[Record], float | None]] = {
         **{f"fall of {key}": lambda r, key=key: fall(r, "robust", key) for key in ("H", "V", "S")},
         "fall of the offset": lambda r: fall(r, "robust", "offset"),
@@ -162,12 +165,12 @@ def _ranks(records: Records) -> Iterator[str]:
     bound = f"{1.96 / math.sqrt(least - 1):.2f}" if least > 3 else ""
     chance = f"; chance alone stays below {bound} nineteen times in twenty" if bound else ""
     yield (
-        "Spearman's rank correlation of the reduction of motion by `robust` with what it changed before the impact "
-        f"and\nwith what was drawn{chance}. *Offset*: distance of the center of mass from the line of the impact."
+        "Spearman's rank correlation of the reduction of motion by `robust` with its changes before the impact "
+        f"and\nwith the drawn values{chance}. *Offset*: distance of the center of mass from the line of the impact."
     )
     yield ""
-    found = {words: [rank(tried(own), "robust", of) for own in records.values()] for words, of in rows.items()}
-    body = [[words, *map(_signed, row)] for words, row in found.items()]
+    correlations = {words: [rank(tried(own), "robust", of) for own in records.values()] for words, of in rows.items()}
+    body = [[words, *map(_signed, row)] for words, row in correlations.items()]
     yield from table(["with", *(f"`{name}`" for name in records)], body)
 
 
@@ -176,14 +179,14 @@ def _part(part: Split) -> str:
 
 
 def _splits(records: Records) -> Iterator[str]:
-    """By mounting, armature and K, among the random draws."""
+    """Split the random draws by mounting, armature and K."""
     middle = {r.name: math.sqrt(r.low * r.high) for ranges in RANGES.values() for r in ranges if r.scale == "log"}
     words = {key: f"`{key}` below {middle[key]:.2g} × the scenario's" for key in ("armature", "gain")}
     body = []
     for name, own in records.items():
         drawn = [r for r in tried(own) if not r.draw.name]
         for key in ("x", *words) if name == "aerial-vertical" else words:
-            # The offline optimum knows no K; in the impact against a wall it is the height that matters.
+            # The offline optimum does not depend on K.  In the impact against a wall, the height matters.
             for controller in ("robust",) if key == "gain" else ("robust", "posture"):
                 limit = middle.get(key, _UNDER)
                 so, otherwise = split(drawn, controller, lambda r, k=key, m=limit: abs(r.draw.values[k]) < m)
@@ -195,7 +198,7 @@ def _splits(records: Records) -> Iterator[str]:
 
 
 def _counterexamples(records: Records) -> Iterator[str]:
-    """By name, with what it takes to see them again."""
+    """Name counterexamples, with the command that runs them again."""
     yield "These compare `robust` with `nominal`. `python -m docs.studies points --only NAME --number NUMBER`"
     yield from ("runs one of them again.", "")
     for name, every in records.items():
@@ -204,11 +207,11 @@ def _counterexamples(records: Records) -> Iterator[str]:
         if bad is not None and change(bad, "robust") > 0:
             yield "- `robust` moves the robot most, compared with nominal, in " + _case(bad)
         else:
-            yield f"- In `{name}`, `robust` moves the robot more than nominal at no point."
+            yield f"- In `{name}`, `robust` never moves the robot more than nominal."
         if wrong is not None:
             yield "- The jump rises although H falls most in " + _case(wrong)
         else:
-            yield f"- In `{name}`, the jump rises at no point where H falls."
+            yield f"- In `{name}`, the jump never rises where H falls."
         for record in [r for r in own if r.failure("robust")][:2]:
             yield f"- `robust` fails in {_where(record)}: {record.failure('robust')}."
 
@@ -236,15 +239,20 @@ def _case(record: Record) -> str:
 
 
 def _drawn(records: Records, seed: int) -> Iterator[str]:
-    """Ranges, what is fixed, what was drawn again."""
-    yield f"The seed is {seed}. Distributions are uniform where the table does not say otherwise."
+    """Yield ranges, fixed values and rejected draws."""
+    yield f"The seed is {seed}. Distributions are uniform unless the table says otherwise."
     yield from ("", *range_table(list(records)), "")
-    yield "Pushes have no mounting to vary, because a push acts at the frame. The variations one at a time are"
-    yield "those of [the reproduction](reproduction.md). A robot that does not come to rest is pushed"
-    yield f"{PATIENCE:g} s late. All runs have the noise of seed 0. Everything else is as the scenarios' files say."
+    yield (
+        "Pushes have no mounting to vary, because a push acts at the frame. [The reproduction](reproduction.md) lists"
+    )
+    yield "the variations one at a time. A robot that does not come to rest is pushed"
+    yield (
+        f"{PATIENCE:g} s late. All runs have the noise of seed 0. Everything else is as in the files of "
+        "the scenarios."
+    )
     yield ""
     yield f"A draw is taken if the motors hold its start with {100 * SHARE:.0f} % of their limits and the nominal"
-    yield "controller gets through: it makes all contacts, or comes to rest before the push, does not fall, and is at"
+    yield "controller succeeds: it makes all contacts, or comes to rest before the push, does not fall, and is at"
     yield f"a limit for at most {100 * SATURATED:.0f} % of the time outside the impact windows. Otherwise another"
     yield "draw takes its place."
     yield ""
@@ -256,6 +264,6 @@ def _drawn(records: Records, seed: int) -> Iterator[str]:
 
 
 def range_table(scenarios: Sequence[str]) -> Iterator[str]:
-    """What varies, and how far."""
+    """Yield a table of the varied values and their ranges."""
     body = [[f"`{name}`", f"`{r.name}`", r.text(), r.words] for name in scenarios for r in RANGES[name]]
     return table(["scenario", "value", "range", "what it is"], body)

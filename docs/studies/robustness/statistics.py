@@ -148,12 +148,12 @@ def ranks_of_jumps(records: Sequence[Record], names: Sequence[str]) -> dict[str,
     runs = [(r, c) for r in tried(records) for c in r.documents if not r.failure(c)]
     rows = [[value_of(r.documents[c], "peak_jump"), *(predicted(r, c, name) for name in names)] for r, c in runs]
     known = np.array([row for row in rows if None not in row], dtype=float).reshape(-1, 1 + len(names))
-    found = {"n": float(len(known))}
+    correlations = {"n": float(len(known))}
     for k, name in enumerate(names, 1):
         pair = known[:, [0, k]]
         constant = len(pair) < 3 or np.ptp(pair, axis=0).min() == 0
-        found[name] = math.nan if constant else float(spearmanr(pair).statistic)
-    return found
+        correlations[name] = math.nan if constant else float(spearmanr(pair).statistic)
+    return correlations
 
 
 def fall(record: Record, controller: str, name: str) -> float | None:

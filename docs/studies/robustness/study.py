@@ -106,10 +106,10 @@ class Store:
 
     def complete(self, scenarios: Sequence[str]) -> dict[str, list[Record]]:
         """Return the points of each scenario up to the first that is not complete."""
-        found: dict[str, list[Record]] = {}
+        records: dict[str, list[Record]] = {}
         for name in scenarios:
-            found[name] = []
-            while is_complete(record := self.get(name, len(found[name]))):
+            records[name] = []
+            while is_complete(record := self.get(name, len(records[name]))):
                 assert record is not None
-                found[name].append(record)
-        return found
+                records[name].append(record)
+        return records
