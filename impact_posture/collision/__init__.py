@@ -1,1 +1,1 @@
-"""Collision shapes: sphere-swept convex hulls around the shapes of a URDF, and the check on the shapes themselves."""
+"""Collision shapes: sphere-swept convex hulls around the shapes of a URDF, and collision checks of the shapes."""

@@ -1,4 +1,4 @@
-"""The shapes of a robot as Pinocchio and coal take them."""
+"""Load the shapes of a robot into Pinocchio and coal."""
 
 from __future__ import annotations
 
@@ -28,8 +28,8 @@ class Geometry(NamedTuple):
     Attributes:
         model: The shapes at their joints, without pairs.
         links: Link of each shape.
-        apart: Whether two shapes have to keep apart by the joints and the SRDF, shape (n, n).
-        warnings: Shapes left out, one line each.
+        apart: Whether two shapes must not touch, by the joints and the SRDF, shape (n, n).
+        warnings: Shapes that are left out, one line each.
     """
 
     model: pin.GeometryModel
@@ -42,7 +42,7 @@ def load_geometry(robot: Robot, described: list[UrdfShape]) -> Geometry:
     """Load the shapes that a URDF describes; a mesh that cannot be used is left out with a warning."""
     model, largest = robot.model, largest_extent(robot)
     kept, solids, warnings = [], [], []
-    # Limbs share meshes, and loading one may take a tenth of a second.
+    # Limbs share meshes, and loading a mesh may take a tenth of a second.
     loaded: dict[object, Corrected] = {}
     for shape in described:
         try:
@@ -52,7 +52,7 @@ def load_geometry(robot: Robot, described: list[UrdfShape]) -> Geometry:
             solids.append(loaded[key].mesh)
             kept.append(shape)
             if not loaded[key].exact:
-                why = f"the parts of {shape.mesh} cannot be told apart; export it as one part"
+                why = f"the parts of {shape.mesh} cannot be separated; export it as one part"
                 warnings.append(one_line(f"shape {shape.name} is its convex hull: {why}"))
         except UnusableShape as fault:
             warnings.append(left_out(shape.name, fault))
@@ -73,21 +73,21 @@ def load_geometry(robot: Robot, described: list[UrdfShape]) -> Geometry:
 def _placed(
     model: pin.Model, shapes: list[UrdfShape], solids: list[Any], *, turned: bool
 ) -> list[pin.GeometryObject]:
-    """Return the shapes at their joints; ``turned`` obeys the files that say that y is up.
+    """Return the shapes at their joints; ``turned`` turns meshes whose files say that y is up.
 
-    ROS ignores what COLLADA files say about it, so most URDFs are written for meshes as they are.
+    ROS ignores the up axis of COLLADA files, so most URDFs need meshes that are not turned.
     """
-    found = []
+    objects = []
     for shape, solid in zip(shapes, solids, strict=True):
         index = model.getFrameId(shape.link, pin.FrameType.BODY)
         frame = model.frames[index]
         placement = frame.placement * shape.placement * (_UPRIGHT if turned and shape.y_up else pin.SE3.Identity())
-        found.append(pin.GeometryObject(shape.name, frame.parentJoint, index, placement, solid))
-    return found
+        objects.append(pin.GeometryObject(shape.name, frame.parentJoint, index, placement, solid))
+    return objects
 
 
 def _gaps(model: pin.Model, objects: list[pin.GeometryObject]) -> float:
-    """Return the sum of the distances between joints and the boxes around the shapes of the links before them, m."""
+    """Return the sum over the joints of the distance to the shapes of the link before it (to their boxes), m."""
     boxes: dict[int, list[Array]] = {}
     for solid in objects:
         points = shape_points(solid.geometry) @ solid.placement.rotation.T + solid.placement.translation
@@ -102,7 +102,7 @@ def _gaps(model: pin.Model, objects: list[pin.GeometryObject]) -> float:
 
 
 def geometry_key(robot: Robot, described: list[UrdfShape]) -> str:
-    """Return a hash of everything that shapes the swept hulls of a robot and their pairs."""
+    """Return a hash of all data on which the swept hulls of a robot and their pairs depend."""
     content = [coal.__version__, robot.kinematics_sha256]
     for shape in described:
         content.append(repr((shape.name, shape.link, shape.kind, shape.sizes, shape.placement.homogeneous.tolist())))

@@ -1,4 +1,4 @@
-"""Bounds on the joints between two bodies whose hulls cannot keep apart although their shapes can."""
+"""Bounds on the joints between two bodies whose hulls overlap although their shapes do not."""
 
 from __future__ import annotations
 
@@ -14,25 +14,25 @@ from impact_posture.config.cached_values import StoredArray
 from impact_posture.robot.robot import Robot
 from impact_posture.system.arrays import Array
 
-# Positions of each joint at which shapes are tried.  More joints than this between two bodies are too many.
+# Positions of each joint on the grid, and the largest number of joints between two bodies.
 _TRIED, _MOST_JOINTS = 25, 3
-# Half of the largest range of a joint, rad (m), so that neighbors on the grid are half a radian apart at most.
+# Half of the largest range of a joint, rad (m), so that the step of the grid is at most half a radian.
 _MOST_HALF = 6.5
-# Most planes of a pair, and the least share of the free positions that they leave.
+# Largest number of planes of a pair, and the least share of the free positions that remains.
 _MOST_PLANES, _LEFT = 12, 1 / 3
-# A plane costs the free positions that it cuts off, and this share of all free positions for itself.
+# A plane costs the free positions that it removes, plus this share of all free positions.
 _WORTH = 0.05
 
 
 @dataclass(frozen=True, eq=False)
 class JointPlanes:
-    """Planes ``normals θ ≤ bounds`` for the joints between two bodies; within them their shapes do not touch.
+    """Planes ``normals θ ≤ bounds`` for the joints between two bodies.  Within them the shapes do not touch.
 
     Attributes:
         bodies: Names of the bodies.
-        joints: Names of the joints between them, m of one to three.
-        normals: Shape (k, m), per rad (m); no rows if the shapes touch nowhere.
-        bounds: Shape (k,).
+        joints: Names of the m joints between the bodies, one to three.
+        normals: Normals of the planes, shape (k, m), per rad (m); no rows if the shapes touch nowhere.
+        bounds: Bounds of the planes, shape (k,).
     """
 
     bodies: tuple[str, str]
@@ -44,24 +44,23 @@ class JointPlanes:
 def joint_planes(
     robot: Robot, names: tuple[str, str], ends: tuple[int, int], touch: Callable[[pin.Data], bool]
 ) -> JointPlanes | None:
-    """Return planes that keep the shapes of two bodies apart; ``None`` if none are found.
+    """Return planes that separate the shapes of two bodies; ``None`` if none are found.
 
-    The shapes are tried on a grid over the ranges of the joints.  Planes cut off the positions at which they touch,
-    with the cells of the grid around them: each time the one that cuts off most of them for the free positions that
-    it costs.
+    The shapes are checked on a grid over the ranges of the joints.  Planes remove the positions where the shapes
+    touch, with the grid cells around them.  Each step adds the plane that removes the most of these positions per
+    lost free position.
 
     Args:
         robot: The robot.
         names: Names of the bodies.
-        ends: Their joints.
-        touch: Whether the shapes touch at the placements in the data.
+        ends: Joints of the bodies.
+        touch: Tells whether the shapes touch at the placements in the data.
     """
     model, start = robot.model, robot.posture()
     lowest, highest = model.lowerPositionLimit, model.upperPositionLimit
-    # A joint without a range stays where it starts.
-    between = [
-        k for k in _between(model, *ends) if model.nqs[k] != 1 or lowest[model.idx_qs[k]] < highest[model.idx_qs[k]]
-    ]
+    # The joints that move one body against the other, without joints of no range, which keep their position.
+    moving = sorted(set(model.supports[ends[0]]) ^ set(model.supports[ends[1]]))
+    between = [k for k in moving if model.nqs[k] != 1 or lowest[model.idx_qs[k]] < highest[model.idx_qs[k]]]
     at = [model.idx_qs[k] for k in between]
     low, high = lowest[at], highest[at]
     half, single = (high - low) / 2, all(model.nqs[k] == 1 for k in between)
@@ -76,19 +75,19 @@ def joint_planes(
         return touch(data)
 
     hit = np.array([touches(theta) for theta in grid])
-    found = _cut_off(hit, (grid - start[at]) / half, 2 / (_TRIED - 1))
-    if found is None:
+    planes = _cut_off(hit, (grid - start[at]) / half, 2 / (_TRIED - 1))
+    if planes is None:
         return None
-    rows = found[0] / half
-    return JointPlanes(names, tuple(str(model.names[k]) for k in between), rows, found[1] + rows @ start[at])
+    rows = planes[0] / half
+    return JointPlanes(names, tuple(str(model.names[k]) for k in between), rows, planes[1] + rows @ start[at])
 
 
 def _cut_off(hit: NDArray[np.bool_], shares: Array, step: float) -> tuple[Array, Array] | None:
-    """Return normals, shape (k, m), and bounds of planes that cut off the positions hit, but not the origin.
+    """Return normals, shape (k, m), and bounds of planes that remove the positions hit, but not the origin.
 
     Args:
         hit: Whether the shapes touch at each position.
-        shares: Positions, measured from the default posture in shares of half the ranges, shape (n, m).
+        shares: Positions relative to the default posture, in units of half the ranges, shape (n, m).
         step: Step of the grid.
     """
     free, left = shares[~hit], shares[hit]
@@ -96,7 +95,7 @@ def _cut_off(hit: NDArray[np.bool_], shares: Array, step: float) -> tuple[Array,
     # Along each axis, and between axes.
     signs = np.array([signs for signs in product((-1, 0, 1), repeat=shares.shape[1]) if any(signs)], dtype=float)
     directions = signs / np.linalg.norm(signs, axis=1, keepdims=True)
-    # The cells around a position reach so far along each direction.
+    # Extent of the cells around a position along each direction.
     cells = step * np.abs(directions).sum(axis=1)
     normals, bounds = [np.zeros((0, shares.shape[1]))], [np.zeros(0)]
     while len(left):
@@ -114,9 +113,3 @@ def _cut_off(hit: NDArray[np.bool_], shares: Array, step: float) -> tuple[Array,
         bounds.append(np.array([bound]))
         free, left = free[free @ directions[k] <= bound], left[heights[:, k] < bound]
     return (np.vstack(normals), np.hstack(bounds)) if len(free) >= _LEFT * count else None
-
-
-def _between(model: pin.Model, first: int, second: int) -> list[int]:
-    """Return the joints that move one of two joints' bodies against the other."""
-    one, other = ({k for k in model.supports[end] if k} for end in (first, second))
-    return sorted(one ^ other)

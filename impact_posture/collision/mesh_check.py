@@ -1,4 +1,4 @@
-"""The last word on collisions: coal, on the shapes of the URDF themselves."""
+"""Check collisions of the shapes of the URDF with coal."""
 
 from __future__ import annotations
 
@@ -16,21 +16,21 @@ from impact_posture.robot.robot import Robot
 from impact_posture.system.arrays import Array
 
 TOLERANCE = 1e-6
-"""Depth (m) up to which two shapes may be in each other, because a solver lets hulls touch within its tolerance."""
-
+"""Penetration (m) that does not count as a collision, because solvers let hulls touch within a tolerance."""
 
 Standing = tuple[SweptHull, pin.SE3, Collection[int]]
+"""An obstacle: its hull, its placement in the world, and the joints whose shapes may touch it."""
 
 
 @dataclass(frozen=True, eq=False)
 class HalfSpace:
-    """The half-space behind a plane, at one posture.
+    """The half-space behind a plane.
 
     Attributes:
         name: Name in messages.
         point: A point of the plane, world, shape (3,), m.
-        normal: Unit normal out of it, world, shape (3,).
-        exempt: Joints whose links may be behind it.
+        normal: Unit normal out of the half-space, world, shape (3,).
+        exempt: Joints whose links may be behind the plane.
     """
 
     name: str
@@ -40,13 +40,13 @@ class HalfSpace:
 
 
 class MeshCheck:
-    """The check on the shapes of a robot, with what it needs of them at every posture.
+    """Collision check of the shapes of a robot, prepared for many postures.
 
-    A collision counts from a depth of 1 µm.  Meshes are surfaces: one that is wholly inside another does not collide.
+    A collision counts from a depth of 1 µm.  Meshes are surfaces: a mesh wholly inside another does not collide.
 
     Args:
         robot: The robot.
-        shapes: Its shapes.
+        shapes: The shapes of the robot.
     """
 
     def __init__(self, robot: Robot, shapes: RobotShapes) -> None:
@@ -56,31 +56,28 @@ class MeshCheck:
         for shape in self._shapes:
             shape.geometry.computeLocalAABB()
         self._joints = [int(shape.parentJoint) for shape in self._shapes]
-        # A ball around each shape: its center in the axes of the joint, and its radius.
+        # A ball around each shape, with its center in the axes of the joint.
         self._centers = [shape.placement.act(shape.geometry.aabb_center) for shape in self._shapes]
         self._reach = np.array([shape.geometry.aabb_radius for shape in self._shapes])
 
     def collisions(
         self, q: Array, obstacles: Sequence[Standing] = (), planes: Sequence[HalfSpace] = ()
     ) -> list[tuple[str, str]]:
-        """Return what collides at a posture.
+        """Return the names in each collision at a posture: two shapes, or a shape and an obstacle or plane.
 
         Args:
             q: The posture, shape (nq,).
-            obstacles: Swept hulls, each with its placement in the world and the joints whose shapes may touch it.
-            planes: Planes that the shapes have to stay in front of.
-
-        Returns:
-            Names of two shapes, of a shape and an obstacle, or of a shape and a plane.
+            obstacles: Obstacles that the shapes must not touch.
+            planes: Planes that the shapes must stay in front of.
         """
-        found, shapes = [], self._shapes
+        collisions, shapes = [], self._shapes
         if pin.computeCollisions(self._model, self._data, self._geometry, self._placed, q, False):
             for pair, result in zip(self._geometry.collisionPairs, self._placed.collisionResults, strict=True):
                 i, j = pair.first, pair.second
                 if result.isCollision() and _deep(shapes[i].geometry, self._at(i), shapes[j].geometry, self._at(j)):
-                    found.append((shapes[i].name, shapes[j].name))
+                    collisions.append((shapes[i].name, shapes[j].name))
         if not shapes:
-            return found
+            return collisions
         centers = np.array([self._data.oMi[k].act(at) for k, at in zip(self._joints, self._centers, strict=True)])
         walls: list[tuple[str, Any, pin.SE3]] = []
         near = [np.zeros((len(shapes), 0), dtype=bool)]
@@ -97,14 +94,14 @@ class MeshCheck:
         for k, wall in np.argwhere(np.hstack(near)):
             name, solid, where = walls[wall]
             if _deep(shapes[k].geometry, self._at(k), solid, where):
-                found.append((shapes[k].name, name))
-        return found
+                collisions.append((shapes[k].name, name))
+        return collisions
 
     def _at(self, index: int) -> pin.SE3:
         return self._data.oMi[self._joints[index]] * self._shapes[index].placement
 
     def _within(self, away: Array, exempt: Collection[int]) -> Array:
-        """Whether the ball around each shape reaches a body that is so far away, as a column."""
+        """Return whether the ball around each shape reaches a body at this distance, as a column."""
         allowed = np.array([joint not in exempt for joint in self._joints])
         return np.asarray((away <= self._reach) & allowed)[:, None]
 
@@ -112,12 +109,12 @@ class MeshCheck:
 def mesh_collisions(
     robot: Robot, shapes: RobotShapes, q: Array, obstacles: Sequence[Standing] = (), planes: Sequence[HalfSpace] = ()
 ) -> list[tuple[str, str]]:
-    """Return what collides at one posture; see :class:`MeshCheck`."""
+    """Return the collisions at one posture; see :meth:`MeshCheck.collisions`."""
     return MeshCheck(robot, shapes).collisions(q, obstacles, planes)
 
 
 def _deep(a: Any, at_a: pin.SE3, b: Any, at_b: pin.SE3) -> bool:
-    """Tell whether two shapes still collide after a move by the tolerance out of each other."""
+    """Tell whether two shapes still collide after a move apart by the tolerance."""
     request, result = coal.CollisionRequest(), coal.CollisionResult()
     if not coal.collide(a, transform(at_a), b, transform(at_b), request, result):
         return False

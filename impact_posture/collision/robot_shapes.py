@@ -1,4 +1,4 @@
-"""The collision shapes of a robot: its swept hulls, and which of them have to keep apart."""
+"""Collision shapes of a robot: its swept hulls, and the pairs of hulls that must not touch."""
 
 from __future__ import annotations
 
@@ -12,7 +12,7 @@ import pinocchio as pin
 from impact_posture.collision.coal_geometry import Geometry, geometry_key, load_geometry
 from impact_posture.collision.hull_bodies import Body, merged_bodies
 from impact_posture.collision.joint_planes import JointPlanes, joint_planes
-from impact_posture.collision.shape_pairs import Pair, hindered, mostly_touching, pairs_of, touch_of
+from impact_posture.collision.shape_pairs import Pair, mostly_touching, nested_pairs, pairs_of, touch_of
 from impact_posture.collision.swept_hull import Fit, SweptHull, fit_hull
 from impact_posture.collision.urdf_shapes import UrdfShape, read_urdf_shapes
 from impact_posture.config.cached_values import StoredArray, read_stored, write_stored
@@ -24,18 +24,18 @@ NO_SHAPES = "the robot has no shapes, so nothing keeps its links apart; joint or
 
 @dataclass(frozen=True, eq=False)
 class FittedShapes:
-    """The collision shapes of a robot, as they are stored.
+    """Collision shapes of a robot in the form that the cache stores.
 
     Attributes:
-        bodies: Swept hulls that hold all shapes.
-        pairs: Bodies that have to keep apart, as indices into ``bodies``, shape (k, 2).
-        always_touching: Names of shapes that touch at the default posture and at most others, so that they overlap by
-            design and need not keep apart.
-        joint_planes: What keeps bodies apart whose hulls touch at most of the postures at which their shapes do not.
-            They are in no pair.  Where their shapes touch nowhere, it has no rows.
-        hulls_touching: Names of such bodies for which no planes are found.  Only the check on the shapes finds their
+        bodies: Swept hulls that contain all shapes.
+        pairs: Pairs of bodies that must not touch, as indices into ``bodies``, shape (k, 2).
+        always_touching: Names of shapes that touch at the default posture and at most other postures.  They overlap
+            by design and may touch.
+        joint_planes: Bounds on joints for nested bodies, whose hulls touch at most postures at which their shapes do
+            not.  ``pairs`` leaves out nested bodies.
+        hulls_touching: Names of nested bodies for which no planes are found.  Only :class:`MeshCheck` finds their
             collisions.
-        warnings: Shapes that are left out, and what a robot without shapes means; one line each.
+        warnings: Shapes that are left out, one line each, or a line about a robot without shapes.
     """
 
     bodies: tuple[SweptHull, ...]
@@ -48,13 +48,13 @@ class FittedShapes:
 
 @dataclass(frozen=True, eq=False)
 class RobotShapes(FittedShapes):
-    """The same, with the robot, for the shapes themselves."""
+    """Collision shapes with their robot, which loads the shapes of the URDF on demand."""
 
     robot: Robot
 
     @cached_property
     def geometry(self) -> pin.GeometryModel:
-        """The shapes themselves, with the pairs that have to keep apart."""
+        """The shapes of the URDF, with the pairs that must not touch."""
         loaded = load_geometry(self.robot, read_urdf_shapes(self.robot)[0])
         names = [shape.name for shape in loaded.model.geometryObjects]
         touching = set(self.always_touching)
@@ -66,7 +66,7 @@ class RobotShapes(FittedShapes):
 
 @dataclass(frozen=True)
 class _Source:
-    """What shapes are made of; equal keys and warnings make equal shapes."""
+    """Description of shapes; equal keys and warnings give equal shapes."""
 
     key: str
     robot: Robot = field(compare=False)
@@ -76,9 +76,9 @@ class _Source:
 
 @lru_cache(maxsize=16)
 def load_shapes(robot: Robot) -> RobotShapes:
-    """Return the collision shapes of a robot from its URDF, with the visual ones of links that have no others.
+    """Return the collision shapes of a robot from its URDF; links without collision shapes use their visual shapes.
 
-    The fit is kept in memory, and in the cache of the user by the content of the URDF and its meshes.
+    The result is kept in memory, and in the user's cache by the content of the URDF and its meshes.
     """
     described, warnings = read_urdf_shapes(robot)
     return _shapes(_Source(geometry_key(robot, described), robot, described, tuple(warnings)))
@@ -86,16 +86,16 @@ def load_shapes(robot: Robot) -> RobotShapes:
 
 @lru_cache(maxsize=16)
 def _shapes(source: _Source) -> RobotShapes:
-    found = read_stored("shapes", source.key, FittedShapes)
-    if found is None:
-        found = fit_shapes(source.robot, source.described)
-        write_stored("shapes", source.key, found)
-    warnings = (*source.warnings, *found.warnings, *(() if found.bodies else (NO_SHAPES,)))
-    return RobotShapes(**vars(found) | {"warnings": warnings}, robot=source.robot)
+    fitted = read_stored("shapes", source.key, FittedShapes)
+    if fitted is None:
+        fitted = fit_shapes(source.robot, source.described)
+        write_stored("shapes", source.key, fitted)
+    warnings = (*source.warnings, *fitted.warnings, *(() if fitted.bodies else (NO_SHAPES,)))
+    return RobotShapes(**vars(fitted) | {"warnings": warnings}, robot=source.robot)
 
 
 def fit_shapes(robot: Robot, described: list[UrdfShape]) -> FittedShapes:
-    """Load the shapes, fit their hulls, and find the pairs; bodies in each other's hollows get bounds on joints."""
+    """Load the shapes, fit their hulls, and find the pairs; nested bodies get bounds on joints instead."""
     tell("fitting collision shapes")
     loaded = load_geometry(robot, described)
     shapes, apart = loaded.model.geometryObjects, loaded.apart
@@ -104,7 +104,7 @@ def fit_shapes(robot: Robot, described: list[UrdfShape]) -> FittedShapes:
         apart[i, j] = apart[j, i] = False
     merged = merged_bodies(shapes, apart)
     hulls = [_fitted(body, loaded) for body in merged]
-    # The shapes of a body have to keep apart from the same shapes.
+    # All shapes of a body must not touch the same shapes.
     first = [body.shapes[0] for body in merged]
     pairs = pairs_of(apart[np.ix_(first, first)])
     touch = touch_of(shapes)
@@ -113,24 +113,24 @@ def fit_shapes(robot: Robot, described: list[UrdfShape]) -> FittedShapes:
         a, b = (merged[k].shapes for k in pair)
         return any(touch((i, j), data) for i in a for j in b)
 
-    nested = hindered(robot, hulls, pairs, bodies_touch)
-    named = {pair: (hulls[pair[0]].name, hulls[pair[1]].name) for pair in nested}
-    planes = {
-        pair: joint_planes(robot, names, (hulls[pair[0]].joint, hulls[pair[1]].joint), partial(bodies_touch, pair))
-        for pair, names in named.items()
-    }
+    nested = nested_pairs(robot, hulls, pairs, bodies_touch)
+    planes: dict[tuple[str, str], JointPlanes | None] = {}
+    for pair in nested:
+        a, b = (hulls[k] for k in pair)
+        names = (a.name, b.name)
+        planes[names] = joint_planes(robot, names, (a.joint, b.joint), partial(bodies_touch, pair))
     return FittedShapes(
         bodies=tuple(replace(hull, known_faces=hull.faces) for hull in hulls),
-        pairs=np.array([pair for pair in pairs if pair not in named], dtype=int).reshape(-1, 2),
+        pairs=np.array([pair for pair in pairs if pair not in nested], dtype=int).reshape(-1, 2),
         always_touching=tuple((shapes[i].name, shapes[j].name) for i, j in touching),
-        hulls_touching=tuple(names for pair, names in named.items() if planes[pair] is None),
-        joint_planes=tuple(one for one in planes.values() if one is not None),
+        hulls_touching=tuple(names for names, bounds in planes.items() if bounds is None),
+        joint_planes=tuple(bounds for bounds in planes.values() if bounds is not None),
         warnings=loaded.warnings,
     )
 
 
 def _fitted(body: Body, loaded: Geometry) -> SweptHull:
-    """Fit the hull of a body; that of a single ball or capsule is exact."""
+    """Fit the hull of a body; a single ball or capsule is exact."""
     shape = loaded.model.geometryObjects[body.shapes[0]]
     alone, solid, at = len(body.shapes) == 1, shape.geometry, shape.placement
     if alone and isinstance(solid, coal.Sphere):

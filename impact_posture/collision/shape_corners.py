@@ -1,9 +1,9 @@
-"""Corners and triangles of the shapes of coal, with the triangles of meshes as coal should have read them.
+"""Corners and triangles of coal shapes, with a correction of triangles that coal reads wrongly.
 
-Where a node of a file holds several parts (one for each material), coal 3.0 appends the corners of all, but numbers
-the triangles of each part from the first corner of the node.  A part begins with its corners 0, 1 and 2 and uses all
-of its corners, so the places where parts begin can be found, and the find can be checked.  Where they cannot be
-found, the convex hull of the corners takes the place of the mesh, because it holds all of it.
+Where a node of a file has several parts (one for each material), coal 3.0 appends the corners of all parts but
+numbers the triangles of each part from the first corner of the node.  A part begins with its corners 0, 1 and 2 and
+uses all of its corners, so the beginnings of the parts can be found and checked.  If the check fails, the convex hull
+of the corners replaces the mesh, because it contains the mesh.
 """
 
 from __future__ import annotations
@@ -19,28 +19,28 @@ from numpy.typing import NDArray
 from impact_posture.collision.swept_hull import SweptHull, hull_corners
 from impact_posture.system.arrays import Array
 
-# Corners of the polygon around a circle: it is 0.5 % larger.
+# Corners of the polygon around a circle, which is 0.5 % larger.
 _SIDES = 32
-# Points around a ball: their hull is 2 % larger.
+# Points around a ball, whose hull is 2 % larger.
 _BALL = 200
 
 Triangles = NDArray[np.int_]
 
 
 class Corrected(NamedTuple):
-    """A mesh of coal, and whether it is the surface of the file (else its convex hull)."""
+    """A coal mesh, and whether it is the surface in the file (else its convex hull)."""
 
     mesh: Any
     exact: bool
 
 
 def mesh_points(shape: Any) -> Array:
-    """Return the vertices of a mesh of coal, shape (k, 3)."""
+    """Return the vertices of a coal mesh, shape (k, 3)."""
     return np.asarray(shape.vertices(), dtype=float).reshape(-1, 3)
 
 
 def mesh_triangles(shape: Any) -> Triangles:
-    """Return the triangles of a mesh of coal as indices of its vertices, shape (n, 3)."""
+    """Return the triangles of a coal mesh as indices of its vertices, shape (n, 3)."""
     corners = (shape.tri_indices(k) for k in range(shape.num_tris))
     return np.array([(triangle[0], triangle[1], triangle[2]) for triangle in corners], dtype=int).reshape(-1, 3)
 
@@ -52,36 +52,39 @@ def hull_surface(points: Array) -> tuple[Array, Triangles]:
 
 
 def correct(shape: Any) -> Corrected:
-    """Return a mesh of coal with the triangles that its file describes."""
+    """Return a coal mesh with the triangles in its file."""
     points, faces = mesh_points(shape), mesh_triangles(shape)
-    found = renumbered(len(points), faces)
-    if found is faces:
+    triangles = renumbered(len(points), faces)
+    if triangles is faces:
         return Corrected(shape, True)
-    surface = hull_surface(points) if found is None else (points, found)
+    exact = triangles is not None
+    if triangles is None:
+        points, triangles = hull_surface(points)
     mesh = coal.BVHModelOBBRSS()
-    mesh.beginModel(len(surface[1]), len(surface[0]))
-    mesh.addVertices(surface[0])
-    mesh.addTriangles(surface[1])
+    mesh.beginModel(len(triangles), len(points))
+    mesh.addVertices(points)
+    mesh.addTriangles(triangles)
     mesh.endModel()
     mesh.computeLocalAABB()
-    return Corrected(mesh, found is not None)
+    return Corrected(mesh, exact)
 
 
 def renumbered(count: int, faces: Triangles) -> Triangles | None:
-    """Return triangles that use every corner; ``None`` where the parts of the file cannot be told apart.
+    """Return triangles that use every corner; ``None`` if the parts of the file cannot be separated.
 
     Args:
         count: Number of corners.
-        faces: Triangles as coal numbers them, shape (n, 3).
+        faces: Triangles with the numbers of coal, shape (n, 3).
     """
     candidates = (shifted(faces) for shifted in (lambda same: same, _shifted, partial(_shifted, across=True)))
-    return next((found for found in candidates if np.bincount(found.ravel(), minlength=count).all()), None)
+    complete = (triangles for triangles in candidates if np.bincount(triangles.ravel(), minlength=count).all())
+    return next(complete, None)
 
 
 def _shifted(faces: Triangles, across: bool = False) -> Triangles:
-    """Return the triangles with each part numbered after the last.
+    """Return the triangles with the corners of each part numbered after the corners of the part before.
 
-    A part begins where the first corners of its node come again; ``across`` nodes, also where those of the next do.
+    A part begins where the first corners of its node occur again, with ``across`` also at the corners of a new node.
     """
     starts, shifts, begin = [0], [0], 0
     for k in np.flatnonzero((np.diff(faces, axis=1) == 1).all(axis=1))[1:]:
@@ -95,9 +98,9 @@ def _shifted(faces: Triangles, across: bool = False) -> Triangles:
 
 
 def shape_points(shape: Any) -> Array:
-    """Return points whose convex hull holds a shape in its own axes, shape (n, 3), m.
+    """Return points whose convex hull contains a shape, in the axes of the shape, shape (n, 3), m.
 
-    They are the corners of a box or mesh.  A round shape gets a polyhedron around it.
+    They are the corners of a box or mesh, or of a polyhedron around a round shape.
     """
     match shape:
         case coal.Box():
@@ -113,10 +116,7 @@ def shape_points(shape: Any) -> Array:
 
 
 def surface_of(shape: Any) -> tuple[Array, Triangles]:
-    """Return the corners of a shape in its own axes, shape (k, 3), m, and its triangles as indices, shape (n, 3).
-
-    They are those of a mesh, or of the hull around a primitive shape.
-    """
+    """Return corners, shape (k, 3), m, and triangles, shape (n, 3), of a mesh or of the hull around another shape."""
     points = shape_points(shape)
     return (points, mesh_triangles(shape)) if isinstance(shape, coal.BVHModelBase) else hull_surface(points)
 
@@ -134,7 +134,7 @@ def _circle() -> Array:
 
 @cache
 def _ball() -> Array:
-    """Return points on a spiral around the unit ball whose hull holds the ball."""
+    """Return points on a spiral around the unit ball whose hull contains the ball."""
     from scipy.spatial import ConvexHull
 
     height = 1 - (2 * np.arange(_BALL) + 1) / _BALL

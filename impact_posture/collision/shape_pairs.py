@@ -1,4 +1,4 @@
-"""Pairs of shapes that have to keep apart, and those that touch at the postures sampled."""
+"""Pairs of shapes that must not touch, and pairs that touch at most of the sampled postures."""
 
 from __future__ import annotations
 
@@ -16,7 +16,7 @@ from impact_posture.robot.robot import Robot
 from impact_posture.robot.robot_loader import locate, srdf_path
 from impact_posture.system.arrays import Array
 
-# Random postures at which shapes are tried, and hulls, of which far more pairs touch.
+# Numbers of random postures for shapes, and for hulls, of which far more pairs touch.
 _POSTURES = 1000
 _COUNTED = 100
 _SEED = 0
@@ -27,9 +27,9 @@ Pair = tuple[int, int]
 def pairs_apart(
     model: pin.Model, joints: Sequence[int], links: Sequence[str], disabled: set[frozenset[str]]
 ) -> NDArray[np.bool_]:
-    """Return whether two shapes have to keep apart, shape (n, n).
+    """Return whether two shapes must not touch, shape (n, n).
 
-    Shapes that move with one joint or with two joints in a row do not, nor do links that the SRDF allows to touch.
+    Shapes of the same joint or of consecutive joints may touch, and so may links that the SRDF allows to touch.
 
     Args:
         model: The model.
@@ -45,14 +45,14 @@ def pairs_apart(
 
 
 def pairs_of(apart: NDArray[np.bool_]) -> list[Pair]:
-    """Return the pairs that have to keep apart, the smaller index first."""
+    """Return the pairs that must not touch, the smaller index first."""
     return [(int(i), int(j)) for i, j in np.argwhere(np.triu(apart))]
 
 
 def mostly_touching(robot: Robot, shapes: Sequence[pin.GeometryObject], pairs: list[Pair]) -> list[Pair]:
-    """Return the pairs of shapes that touch at the default posture and at most of 1,000 random ones.
+    """Return the pairs of shapes that touch at the default posture and at most of 1,000 random postures.
 
-    Such shapes overlap by design, as the covers of a wrist.
+    These shapes overlap by design, such as the covers of a wrist.
     """
     data, touch = robot.model.createData(), touch_of(shapes)
     pin.forwardKinematics(robot.model, data, robot.posture())
@@ -64,22 +64,18 @@ def mostly_touching(robot: Robot, shapes: Sequence[pin.GeometryObject], pairs: l
     return [pair for pair, touched in count.items() if touched > _POSTURES / 2]
 
 
-def hindered(
-    robot: Robot,
-    bodies: Sequence[SweptHull],
-    pairs: list[Pair],
-    touch: Callable[[Pair, pin.Data], bool],
+def nested_pairs(
+    robot: Robot, bodies: Sequence[SweptHull], pairs: list[Pair], touch: Callable[[Pair, pin.Data], bool]
 ) -> list[Pair]:
     """Return the pairs of bodies whose hulls touch at most of the postures at which their shapes do not.
 
-    Such bodies lie in each other's hollows, as a shaft in its fork.  To keep their hulls apart would forbid most of
-    the postures that the robot has.
+    Such bodies are nested, such as a shaft in a fork.  Separate hulls would forbid most postures of the robot.
 
     Args:
         robot: The robot.
         bodies: The swept hulls.
-        pairs: The pairs to try.
-        touch: Whether shapes of two bodies touch at the placements in the data.
+        pairs: The pairs to check.
+        touch: Tells whether shapes of two bodies touch at the placements in the data.
     """
     data = robot.model.createData()
     apart, forbidden = np.zeros((2, len(pairs)), dtype=int)
@@ -96,11 +92,11 @@ def hindered(
                 apart[k] += 1
             elif not touch(pairs[k], data):
                 forbidden[k] += 1
-    return [pair for pair, more, less in zip(pairs, forbidden, apart, strict=True) if more >= less]
+    return [pair for pair, lost, kept in zip(pairs, forbidden, apart, strict=True) if lost >= kept]
 
 
 def touch_of(shapes: Sequence[pin.GeometryObject]) -> Callable[[Pair, pin.Data], bool]:
-    """Return the function that tells whether two shapes touch at the placements in the data."""
+    """Return a function that tells whether two shapes touch at the placements in the data."""
 
     def touch(pair: Pair, data: pin.Data) -> bool:
         a, b = (shapes[k] for k in pair)

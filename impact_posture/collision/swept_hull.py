@@ -1,4 +1,4 @@
-"""Sphere-swept convex hulls: their signed distance, their fit around points, and those of obstacles."""
+"""Sphere-swept convex hulls: signed distance, fit around points, and hulls of obstacles."""
 
 from __future__ import annotations
 
@@ -17,21 +17,21 @@ from impact_posture.config.obstacle import Obstacle
 from impact_posture.system.arrays import Array
 
 MOST_VERTICES = 40
-"""Most vertices of a hull, because each one is a row of a separating plane."""
+"""Largest number of vertices of a hull, because each vertex is a row of a separating plane."""
 
-# A flat set of points is thickened to this half thickness (m), and a thinner one is a segment or a point.
+# Half thickness (m) of the hull of a flat set of points, and largest thickness of a segment or point.
 _THIN = 1e-4
 _REQUEST = coal.DistanceRequest(True)
 _REQUEST.gjk_tolerance = 1e-12
 _POINT = coal.Sphere(0.0)
-# A hull gets corners until no point is farther (m) outside it.
+# A hull gets corners until no point is farther (m) outside.
 _TOLERANCE = 0.004
-# Corners are chosen among so many points at most; the sweep radius is that of all points.
+# Largest number of candidates for corners; the sweep radius counts all points.
 _MOST_CANDIDATES = 4000
 _CHUNK = 20_000
-# Points that are not worth a hull of their own.
+# For fewer points, a convex hull costs more than it saves.
 _FEW = 50
-# Error (m) of a distance by coal.
+# Error (m) of distances by coal.
 _ROUNDING = 1e-9
 
 
@@ -45,7 +45,7 @@ class SweptHull:
         joint: Index of the joint in the model; 0 is the world.
         vertices: Corners of the hull in the axes of the joint, shape (k, 3) with k ≤ 40, m.
         radius: Sweep radius, m.
-        known_faces: The ``faces``, if they are known.
+        known_faces: The value of ``faces``, if it is known.
     """
 
     name: str
@@ -57,12 +57,12 @@ class SweptHull:
 
     @cached_property
     def center(self) -> Array:
-        """Middle of the box around the vertices, in the axes of the joint, shape (3,), m."""
+        """Center of the box around the vertices, in the axes of the joint, shape (3,), m."""
         return np.asarray((self.vertices.min(axis=0) + self.vertices.max(axis=0)) / 2)
 
     @cached_property
     def reach(self) -> float:
-        """Radius of a sphere about ``center`` that holds the swept hull, m."""
+        """Radius of a sphere about ``center`` that contains the swept hull, m."""
         return float(np.linalg.norm(self.vertices - self.center, axis=1).max()) + self.radius
 
     @cached_property
@@ -70,26 +70,20 @@ class SweptHull:
         """Triangles of the hull as indices into ``vertices``, shape (n, 3); none for a point or a segment."""
         if self.known_faces is not None:
             return self.known_faces
-        from scipy.spatial import ConvexHull, QhullError
-
         if len(self.vertices) < 4:
             return np.array([[0, 1, 2], [0, 2, 1]] if len(self.vertices) == 3 else np.zeros((0, 3)), dtype=int)
-        try:
-            return np.asarray(ConvexHull(self.vertices).simplices)
-        except QhullError:
-            # A hull as flat as a rounding error: qhull joggles its corners.
-            return np.asarray(ConvexHull(self.vertices, qhull_options="QJ").simplices)
+        return np.asarray(_convex_hull(self.vertices).simplices)
 
     @cached_property
     def solid(self) -> tuple[Any, pin.SE3]:
-        """The swept hull as a shape of coal, and its placement in the axes of the joint."""
+        """The swept hull as a coal shape, and its placement in the axes of the joint."""
         if len(self.vertices) == 1:
             return coal.Sphere(self.radius), pin.SE3(np.eye(3), self.vertices[0])
         if len(self.vertices) == 2:
             span = self.vertices[1] - self.vertices[0]
             turn = pin.Quaternion.FromTwoVectors(np.array([0.0, 0.0, 1.0]), span).matrix()
             return coal.Capsule(self.radius, float(np.linalg.norm(span))), pin.SE3(turn, self.center)
-        # A vertex without a face has no neighbors, so coal would not find its way from there.
+        # coal searches from neighbor to neighbor, and a vertex without a face has no neighbors.
         used, faces = np.unique(self.faces, return_inverse=True)
         points, triangles = coal.StdVec_Vec3s(), coal.StdVec_Triangle()
         points.extend(list(self.vertices[used]))
@@ -116,7 +110,7 @@ class Separation(NamedTuple):
 
 
 def separation(a: SweptHull, placement_a: pin.SE3, b: SweptHull, placement_b: pin.SE3) -> Separation:
-    """Return the signed distance of two swept hulls whose joints are at these placements in the world."""
+    """Return the signed distance of two swept hulls with their joints at these placements in the world."""
     (shape_a, local_a), (shape_b, local_b) = a.solid, b.solid
     distance, result = _measure(shape_a, placement_a * local_a, shape_b, placement_b * local_b)
     points = np.array(result.getNearestPoint1()), np.array(result.getNearestPoint2())
@@ -124,16 +118,16 @@ def separation(a: SweptHull, placement_a: pin.SE3, b: SweptHull, placement_b: pi
 
 
 def distance_from_hull(point: Array, hull: SweptHull) -> float:
-    """Return the distance of a point in the axes of a hull from the swept hull, m."""
+    """Return the distance of a point, in the axes of the joint, from a swept hull, m."""
     return _measure(_POINT, pin.SE3(np.eye(3), point), *hull.solid)[0]
 
 
 def _measure(a: Any, at_a: pin.SE3, b: Any, at_b: pin.SE3) -> tuple[float, Any]:
-    """Return the distance of two shapes of coal, m, and what coal says of it."""
+    """Return the distance of two coal shapes, m, and the result of coal."""
     result = coal.DistanceResult()
     distance = coal.distance(a, transform(at_a), b, transform(at_b), _REQUEST, result)
     if not np.isfinite(result.normal).all():
-        # A corner on a corner leaves coal without a direction, which a nanometer gives it.
+        # If two corners coincide, coal finds no direction until a corner moves by a nanometer.
         at_a.translation = at_a.translation + np.array([0.6, 0.64, 0.48]) * 1e-9
         result = coal.DistanceResult()
         distance = coal.distance(a, transform(at_a), b, transform(at_b), _REQUEST, result)
@@ -141,17 +135,15 @@ def _measure(a: Any, at_a: pin.SE3, b: Any, at_b: pin.SE3) -> tuple[float, Any]:
 
 
 def transform(placement: pin.SE3) -> Any:
-    """Return a placement as coal takes it."""
+    """Return a placement as a coal transform."""
     return coal.Transform3s(placement.rotation, placement.translation)
 
 
 def hull_corners(points: Array) -> Array:
-    """Return the corners of the convex hull of points, shape (k, 3); one or two of them, or a slab, if it is flat.
+    """Return the corners of the convex hull of points, shape (k, 3); one or two points, or a slab, if it is flat.
 
-    The corners of a flat set lie up to 0.1 mm beside it, so that its hull has a volume.
+    The corners of a slab are up to 0.1 mm outside the flat points, so that the hull has a volume.
     """
-    from scipy.spatial import ConvexHull, QhullError
-
     middle = points.mean(axis=0)
     axes = np.linalg.eigh((points - middle).T @ (points - middle))[1]
     along = (points - middle) @ axes[:, ::-1]
@@ -163,30 +155,37 @@ def hull_corners(points: Array) -> Array:
         return np.asarray(middle + ends * axes[:, 2])
     if extent[2] < _THIN:
         points = np.vstack([points - _THIN * axes[:, 0], points + _THIN * axes[:, 0]])
+    return np.asarray(points[_convex_hull(points).vertices])
+
+
+def _convex_hull(points: Array) -> Any:
+    from scipy.spatial import ConvexHull, QhullError
+
     try:
-        return np.asarray(points[ConvexHull(points).vertices])
+        return ConvexHull(points)
     except QhullError:
-        return np.asarray(points[ConvexHull(points, qhull_options="QJ").vertices])
+        # The points are flat up to a rounding error.  QJ joggles them.
+        return ConvexHull(points, qhull_options="QJ")
 
 
 class Fit(NamedTuple):
-    """Corners of a hull, shape (k, 3), m, and the sweep radius (m) with which it holds the points."""
+    """Corners of a hull, shape (k, 3), m, and the sweep radius (m) that contains the points."""
 
     vertices: Array
     radius: float
 
 
 def fit_hull(points: Array, tolerance: float = _TOLERANCE) -> Fit:
-    """Fit a sphere-swept convex hull that holds the convex hull of points, shape (n, 3), m.
+    """Fit a sphere-swept convex hull that contains points, shape (n, 3), m.
 
-    The corner farthest from the hull of those chosen is added, until all are within the tolerance (m) of it or 40 are
-    chosen.  The sweep radius is the largest distance of a point from the hull, so every point is held.
+    Each step adds the corner farthest from the hull, until all corners are within the tolerance (m) or 40 are chosen.
+    The sweep radius is the largest distance of a point from the hull, so the result contains every point.
     """
     corners = hull_corners(points)
     candidates = corners[:: -(-len(corners) // _MOST_CANDIDATES)]
     axes = np.linalg.eigh(np.cov(candidates.T))[1] if len(candidates) > 1 else np.eye(3)
     chosen = list(dict.fromkeys(int(np.argmax(candidates @ axis)) for axis in np.hstack([axes, -axes]).T))
-    # A distance can only fall while the hull grows, so an old one is a bound: only the largest are computed anew.
+    # Distances only fall while the hull grows, so old distances are bounds and only the largest are computed again.
     bounds = np.linalg.norm(candidates[:, None] - candidates[chosen], axis=2).min(axis=1)
     queue = [(-bound, k) for k, bound in enumerate(bounds.tolist())]
     heapify(queue)
@@ -206,7 +205,7 @@ def fit_hull(points: Array, tolerance: float = _TOLERANCE) -> Fit:
 
 
 def _extreme(points: Array) -> Array:
-    """Return the corners of the hull of points: a distance from a convex set is convex, so the largest is at one."""
+    """Return the corners of the hull of points.  The largest distance from a convex set is at a corner."""
     from scipy.spatial import ConvexHull, QhullError
 
     try:
@@ -216,7 +215,7 @@ def _extreme(points: Array) -> Array:
 
 
 def _outside(points: Array, hull: SweptHull) -> Array:
-    """Return the points in front of a face, in parts so that a million of them need little memory."""
+    """Return the points outside a hull, computed in parts, so that a million points need little memory."""
     if not len(hull.faces):
         return points
     corners = hull.vertices[hull.faces] - hull.center

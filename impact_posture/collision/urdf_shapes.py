@@ -1,4 +1,4 @@
-"""Shapes of the links of a URDF, and what is wrong with those that cannot be used."""
+"""Read the shapes of the links of a URDF, and explain why a shape cannot be used."""
 
 from __future__ import annotations
 
@@ -21,10 +21,10 @@ from impact_posture.robot.robot import Robot
 from impact_posture.robot.robot_loader import locate
 from impact_posture.robot.urdf import parse_urdf, quiet_stderr
 
-# A shape larger than this (m), and larger than so many times the robot, is in millimeters.
+# A shape larger than this (m), and larger than so many times the robot, must be in millimeters.
 _LARGEST = 5.0
 _LARGEST_SHARE = 10.0
-# A COLLADA file says within so many bytes which axis is up.
+# Bytes of a COLLADA file that are searched for the up axis.
 _HEAD = 10_000
 # Loading takes about 20 times the size of a binary STL in memory.
 _LARGEST_FILE = 100_000_000
@@ -39,19 +39,19 @@ _SIZES = {
 
 
 class UnusableShape(Exception):
-    """A shape that is left out; the text says why and what to do."""
+    """A shape is left out; the text says why and what to do."""
 
 
 @dataclass(frozen=True)
 class UrdfShape:
-    """A shape as the URDF describes it.
+    """A shape in a URDF.
 
     Attributes:
         name: Unique name: the link, with ``[k]`` if the link has several shapes.
         link: Name of the link.
         placement: Placement in the axes of the link.
         kind: Tag of the URDF, such as ``box`` or ``mesh``.
-        sizes: Numbers of the tag in the order of the URDF, m; the scale of a mesh.
+        sizes: Sizes in the order of the URDF, m, or the scale of a mesh.
         mesh: File of a mesh.
         color: Red, green, blue and opacity, 0 to 1, if the URDF states them.
     """
@@ -73,7 +73,7 @@ class UrdfShape:
             return b"<up_axis>Y_UP" in file.read(_HEAD)
 
     def load(self, largest: float) -> Corrected:
-        """Return the shape of coal, and whether it is what the URDF describes or its convex hull.
+        """Return the coal shape, and whether it is exact or a convex hull.
 
         Args:
             largest: Largest extent (m) that a shape in meters can have.
@@ -81,30 +81,19 @@ class UrdfShape:
         Raises:
             UnusableShape: The mesh cannot be read, is empty, has numbers that are not finite, or is in millimeters.
         """
-        match self.kind:
-            case "box":
-                shape = coal.Box(*self.sizes)
-            case "sphere":
-                shape = coal.Sphere(*self.sizes)
-            case "cylinder":
-                shape = coal.Cylinder(*self.sizes)
-            case "capsule":
-                shape = coal.Capsule(*self.sizes)
-            case _:
-                return self._load_mesh(largest)
+        if self.kind == "mesh":
+            return self._load_mesh(largest)
         if max(self.sizes) > largest:
             raise UnusableShape(f"its <{self.kind}> has a size of {max(self.sizes):.3g} m; give sizes in meters")
-        return Corrected(shape, True)
+        return Corrected(getattr(coal, self.kind.capitalize())(*self.sizes), True)
 
     def _load_mesh(self, largest: float) -> Corrected:
         try:
             with quiet_stderr():
-                # Loaded one by one, because the loader keeps what it loads.
+                # A new loader each time, because loaders keep the meshes that they load.
                 shape = coal.MeshLoader().load(str(self.mesh), np.array(self.sizes))
-        except Exception:  # The loader passes on whatever assimp raises.
-            raise UnusableShape(
-                f"{self.mesh} is no mesh that can be read, or an empty one; export it again"
-            ) from None
+        except Exception:  # The loader passes on all exceptions of assimp.
+            raise UnusableShape(f"{self.mesh} cannot be read as a mesh, or is empty; export it again") from None
         points = mesh_points(shape)
         if not np.isfinite(points).all():
             raise UnusableShape(f"{self.mesh} has vertices that are not finite; export it again")
@@ -118,7 +107,7 @@ class UrdfShape:
 
 
 def largest_extent(robot: Robot) -> float:
-    """Return the extent (m) above which a shape must be in millimeters: 5 m, and ten times the robot's own extent."""
+    """Return the extent (m) above which a shape must be in millimeters: 5 m and ten times the extent of the robot."""
     data = robot.model.createData()
     pin.forwardKinematics(robot.model, data, robot.posture())
     points = [data.oMi[i].act(np.array(robot.model.inertias[i].lever)) for i in range(1, robot.model.njoints)]
@@ -127,19 +116,14 @@ def largest_extent(robot: Robot) -> float:
 
 
 def read_urdf_shapes(robot: Robot, first: str = "collision") -> tuple[list[UrdfShape], list[str]]:
-    """Read the collision shapes of a URDF, and the visual ones of links without; or the other way round.
-
-    Meshes are found but not read.
+    """Return the shapes of a URDF, with paths of meshes, and a line for each shape that is left out.
 
     Args:
         robot: The robot.
-        first: The shapes that count where a link has both, ``collision`` or ``visual``.
-
-    Returns:
-        The shapes, and one line for each shape left out.
+        first: Kind of shape to use where a link has both, ``collision`` or ``visual``.
 
     Raises:
-        UrdfError: The URDF cannot be read any more, or it has other links than the robot.
+        UrdfError: The URDF has become unreadable, or its links differ from the links of the robot.
     """
     if robot.settings is None:
         return [], []
@@ -156,16 +140,16 @@ def read_urdf_shapes(robot: Robot, first: str = "collision") -> tuple[list[UrdfS
             raise UrdfError("has changed since the robot was loaded", where=str(located.urdf), hint="load it again")
         tags = link.findall(first) or link.findall("visual") or link.findall("collision")
         for k, tag in enumerate(tags):
-            called = name if len(tags) == 1 else f"{name}[{k}]"
+            unique = name if len(tags) == 1 else f"{name}[{k}]"
             try:
-                shapes.append(_read(tag, called, name, located.urdf, folders, colors))
+                shapes.append(_read(tag, unique, name, located.urdf, folders, colors))
             except UnusableShape as fault:
-                warnings.append(left_out(called, fault))
+                warnings.append(left_out(unique, fault))
     return shapes, warnings
 
 
 def left_out(name: str, fault: UnusableShape) -> str:
-    """Return the line about a shape that is left out."""
+    """Return the warning about a shape that is left out."""
     return one_line(f"shape {name} is left out: {fault}")
 
 
@@ -194,7 +178,7 @@ def _read(
 
 
 def _color(material: ET.Element | None, named: Mapping[str, ET.Element]) -> tuple[float, ...] | None:
-    """Return the color of a shape, its own or that of a named material; ``None`` for none that can be read."""
+    """Return the color of a shape, its own or a named material's; ``None`` without a color that can be read."""
     for tag in () if material is None else (material, named.get(material.get("name", ""))):
         color = None if tag is None else tag.find("color")
         if color is not None:
@@ -214,7 +198,7 @@ def _numbers(text: str, count: int, where: str) -> list[float]:
 
 
 def _find_mesh(text: str, urdf: Path, folders: Sequence[Path]) -> Path:
-    """Return the file of a mesh; a ``package://`` path starts from a package folder or a folder above the URDF."""
+    """Return the file of a mesh; a ``package://`` path is relative to a package folder or a folder above the URDF."""
     scheme, colon, rest = text.partition("://")
     if scheme == "file":
         paths = [Path(unquote(rest))]

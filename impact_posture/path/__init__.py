@@ -1,1 +1,1 @@
-"""A path from the start to the optimum that the robot can take, and the time that it takes."""
+"""Paths from the start to the optimum, and their timing."""

@@ -1,4 +1,4 @@
-"""The loads that the actuators, rotors and feet of a robot can carry on its way."""
+"""Limits of motors, rotors and feet on the load of a motion."""
 
 from __future__ import annotations
 
@@ -12,15 +12,14 @@ from impact_posture.posture.constraints.requirements import Requirements
 from impact_posture.posture.loads.load_cases import load_cases
 from impact_posture.system.arrays import Array
 
-# Least part of the weight that counts as a wrench on the base that the rotors cannot make.
+# Least share of the weight that counts as a base wrench that the rotors cannot make.
 _UNREACHABLE = 1e-7
 
 
 class ActuatorLimits:
-    """Limits on the load ``M ν̇ + h`` of a motion, from what holds the robot at rest.
+    """Limits on the load ``M ν̇ + h`` of a motion.
 
-    Motors, rotors and feet are those of :class:`~impact_posture.posture.loads.equilibrium.Equilibrium`, which moves
-    here.
+    Motors, rotors and feet carry the load as in :class:`~impact_posture.posture.loads.equilibrium.Equilibrium`.
 
     Args:
         objective: The objective, with the robot and its supports.
@@ -29,24 +28,24 @@ class ActuatorLimits:
 
     Attributes:
         names: Names of the actuators with a limit.
-        kinds: Kind of each: ``torque`` or ``thrust``.
-        missing: Why the limits of this robot are not known; empty if they are.
+        kinds: Kind of each of these actuators: ``torque`` or ``thrust``.
+        missing: Why the limits of this robot are not known; empty if they are known.
     """
 
     def __init__(self, objective: Objective, q: Array, requirements: Requirements) -> None:
         robot = objective.robot
         self._model = robot.model.copy()
-        # The rotors move with their joints, whatever an impact meets of them.
+        # In a motion, the rotors move with their joints in every joint model.
         self._model.armature = np.where(np.isfinite(robot.armature), robot.armature, 0.0)
         self._data = self._model.createData()
-        found = load_cases(objective, q, replace(requirements, hold_force=0.0))
-        self.missing = found.unknown
+        loads = load_cases(objective, q, replace(requirements, hold_force=0.0))
+        self.missing = loads.unknown
         self.names: tuple[str, ...] = ()
         self.kinds: tuple[str, ...] = ()
-        if found.cases:
-            self._held, unreachable = found.cases[0].equilibrium, found.cases[0].unreachable
-            self._unreachable = unreachable / self._held.weight
-            self.names, self.kinds = self._held.actuators, self._held.kinds
+        if loads.cases:
+            self._equilibrium = loads.cases[0].equilibrium
+            self._unreachable = loads.cases[0].unreachable / self._equilibrium.weight
+            self.names, self.kinds = self._equilibrium.actuators, self._equilibrium.kinds
 
     def load(self, q: Array, v: Array, a: Array) -> Array:
         """Return the generalized forces of a motion, ``M ν̇ + h``, shape (nv,), by RNEA with gravity and armature."""
@@ -55,20 +54,20 @@ class ActuatorLimits:
     def largest_rate(self, q: Array, rest: Array, dynamic: Array) -> float | None:
         """Return the largest ``λ ≥ 0`` for which the limits allow the load ``rest + λ dynamic``; infinite if all do.
 
-        A motion that takes the time ``T`` has the load of gravity and ``1/T²`` times that of ``T = 1 s``.  So this is
-        the least duration at a posture.  ``None`` if the limits do not even allow the load at rest.
+        A motion of duration ``T`` has the load of gravity plus ``1/T²`` times the dynamic load for ``T = 1 s``.  So
+        the result is ``1/T²`` of the fastest motion.  ``None`` if the limits do not even allow the load at rest.
         """
         if self._out_of_reach(rest):
             return None
-        return 0.0 if self._out_of_reach(rest + dynamic) else self._held.largest_rate(q, rest, dynamic)
+        return 0.0 if self._out_of_reach(rest + dynamic) else self._equilibrium.largest_rate(q, rest, dynamic)
 
     def shares(self, q: Array, load: Array) -> Array | None:
-        """Return the signed shares of the limits that a load takes, the largest as small as possible, by name.
+        """Return the signed shares of the limits that a load needs, in the order of ``names``.
 
-        A share is 0 in the middle of the range of an actuator, and ±1 at its limits.  ``None`` if rotors or friction
-        do not allow the load.
+        A share is 0 in the middle of the range of an actuator, and ±1 at its limits.  The largest share is as small
+        as possible.  ``None`` if rotors or friction do not allow the load.
         """
-        return None if self._out_of_reach(load) else self._held.shares(q, load)
+        return None if self._out_of_reach(load) else self._equilibrium.shares(q, load)
 
     def _out_of_reach(self, load: Array) -> bool:
         wrench = self._unreachable @ load[: self._unreachable.shape[1]] if len(self._unreachable) else np.zeros(0)

@@ -1,4 +1,4 @@
-"""A smooth curve through postures on the constraints."""
+"""Smooth curves through postures on the constraints."""
 
 from __future__ import annotations
 
@@ -12,15 +12,15 @@ from impact_posture.path.path_search import even
 from impact_posture.path.path_space import STEP, PathSpace
 from impact_posture.system.arrays import Array
 
-# The curve leaves the constraints by no more than this tangent length; its samples are pulled onto them.
+# Largest tangent distance of the curve from the constraints.
 DEVIATION = 1e-5
-# How often the number of knots is doubled to get there; at the corners of a path along bodies that halves the rest.
+# How often the number of knots may double; at corners of a path along bodies, each time halves the deviation.
 _DOUBLINGS = 7
 # Step of central differences along the curve, whose length is 1.
 _STEP = 1e-5
-# Between knots of a corner, the curve bends so many times more than at the median knot.
+# At a corner, the curve bends so many times more than at the median knot.
 _SHARP = 5.0
-# Parts between two knots of a curve whose limits are checked, at corners and elsewhere.
+# Parts between two knots for the check of limits, at corners and elsewhere.
 _AT_CORNERS, _BETWEEN = 8, 2
 
 
@@ -32,8 +32,8 @@ class PathCurve:
         postures: At least two, in order.
 
     Attributes:
-        s: Places of the postures on the curve, evenly by path length, shape (n,).
-        z: Tangent coordinates of the postures at the first one, shape (n, nv).
+        s: Values of ``s`` at the postures, evenly by path length, shape (n,).
+        z: Tangent coordinates of the postures at the first posture, shape (n, nv).
         spline: The function ``z(s)``.
     """
 
@@ -58,7 +58,7 @@ class PathCurve:
 
     @property
     def places(self) -> Array:
-        """The knots and places between them, more at corners, where limits are checked."""
+        """Values of ``s`` for the check of limits: knots and values between them, more at corners."""
         parts = [
             np.linspace(a, b, _AT_CORNERS if corner else _BETWEEN, endpoint=False)
             for (a, b), corner in zip(pairwise(self.s), self.corners, strict=True)
@@ -84,10 +84,10 @@ class PathCurve:
         return (self.velocity(high) - self.velocity(low)) / (high - low)
 
     def deviation(self) -> float:
-        """Return the largest tangent distance of the curve to the constraints; infinite where it is not valid there.
+        """Return the largest tangent distance of the curve from the constraints; infinite if a posture is not valid.
 
-        The first distance above the one that is allowed is returned, because such a curve needs more knots anyway.
-        It is taken at so many places that no frame moves more than the check distance between two of them.
+        The search stops at the first distance above ``DEVIATION``, because then the curve needs more knots anyway.
+        Between two checked postures, no frame moves more than the check distance.
         """
         worst, before = 0.0, self.at(self.z[0])
         # The knots themselves are on the constraints.
@@ -104,7 +104,7 @@ class PathCurve:
 
 
 def fitted_curve(space: PathSpace, postures: Sequence[Array]) -> PathCurve | None:
-    """Return the curve through a path, with so many knots that it stays on the constraints; ``None`` if it cannot."""
+    """Return a curve through a path, with enough knots to stay on the constraints; ``None`` if that fails."""
     count = max(5, int(np.ceil(space.length(postures) / (2 * STEP))) + 1)
     for _ in range(_DOUBLINGS + 1):
         curve = PathCurve(space, even(space, postures, count))

@@ -1,4 +1,4 @@
-"""Files of a path: CSV, NumPy arrays and a ROS ``JointTrajectory``."""
+"""Write and read the files of a path: CSV, NumPy arrays and a ROS ``JointTrajectory``."""
 
 from __future__ import annotations
 
@@ -19,16 +19,18 @@ from impact_posture.system.arrays import Array
 from impact_posture.system.npz_files import read_arrays
 
 _SHARES = ("at", "velocity", "torque", "thrust")
-# Fields of a path that result.json has.
+# Fields of a path in result.json.
 _BLOCK = ("found", "reason", "method", "timing", "objective", "length", "max_violation")
 _BASE = ("x", "y", "z", "qx", "qy", "qz", "qw")
+# Larger numbers cannot be part of a path.
+_LARGEST = 1e9
 
 
 def write_path(folder: Path, robot: Robot, path: PosturePath) -> None:
     """Write ``path.csv``, ``path.npz`` and ``path.yaml`` into a folder.
 
-    The CSV has a row a time: ``t`` (s), positions ``q:…``, velocities ``v:…`` and accelerations ``a:…`` by name.  A
-    continuous joint is one angle without jumps.  The YAML is a ``trajectory_msgs/JointTrajectory`` of the joints.
+    The rows of the CSV have the time ``t`` (s), positions ``q:…``, velocities ``v:…`` and accelerations ``a:…`` by
+    name.  A continuous joint is an angle without jumps.  The YAML is a ``trajectory_msgs/JointTrajectory``.
     """
     names, angles = positions(robot, path.q)
     columns = [printable(name) for name in robot.tangent_names]
@@ -45,24 +47,20 @@ def write_path(folder: Path, robot: Robot, path: PosturePath) -> None:
     (folder / "path.yaml").write_text(_trajectory(robot, path, angles), encoding="utf-8")
 
 
-# Numbers above this are none of a path.
-_HUGE = 1e9
-
-
 def read_path(folder: Path, block: Mapping[str, Any], robot: Robot) -> PosturePath:
     """Read a path of a robot from ``path.npz`` and the block ``path`` of ``result.json``.
 
     Raises:
         ValueError: The arrays do not fit each other or the robot.
     """
-    arrays = {key: np.asarray(found, dtype=float) for key, found in read_arrays(folder / "path.npz").items()}
-    shares = {key.removeprefix("share_"): found for key, found in arrays.items() if key.startswith("share_")}
+    arrays = {key: np.asarray(array, dtype=float) for key, array in read_arrays(folder / "path.npz").items()}
+    shares = {key.removeprefix("share_"): array for key, array in arrays.items() if key.startswith("share_")}
     count, samples = arrays["t"].size, arrays["objective"].size
     wanted = {"t": (count,), "q": (count, robot.nq), "v": (count, robot.nv), "a": (count, robot.nv)}
     wanted |= {"objective": (samples,), **{f"share_{name}": (samples,) for name in shares}}
     for key, shape in wanted.items():
-        known = key in ("share_torque", "share_thrust") or np.isfinite(arrays[key]).all()
-        if arrays[key].shape != shape or not known or (np.abs(arrays[key]) > _HUGE).any():
+        finite = key in ("share_torque", "share_thrust") or np.isfinite(arrays[key]).all()
+        if arrays[key].shape != shape or not finite or (np.abs(arrays[key]) > _LARGEST).any():
             raise ValueError(f"'{key}' of path.npz does not fit the path of {robot.name}")
     if count == 0 or (np.diff(arrays["t"]) <= 0).any():
         raise ValueError("the times of path.npz do not rise")
@@ -75,12 +73,12 @@ def read_path(folder: Path, block: Mapping[str, Any], robot: Robot) -> PosturePa
 
 
 def positions(robot: Robot, q: Array) -> tuple[list[str], Array]:
-    """Return names and values of the position coordinates along a path, shape (n, nx); a turning joint is one angle.
+    """Return names and values of the position coordinates along a path, shape (n, nx).
 
-    The base of a floating robot has its position (m) and its quaternion, scalar last.
+    A continuous joint is one angle.  A floating base has its position (m) and its quaternion, scalar last.
     """
     chart, names = Chart(robot.model), []
-    x = np.array([chart.to_x(one) for one in q])
+    x = np.array([chart.to_x(posture) for posture in q])
     for slot in chart.slots:
         width = slot.x.stop - slot.x.start
         if slot.kind.family == "free-flyer":
@@ -93,7 +91,7 @@ def positions(robot: Robot, q: Array) -> tuple[list[str], Array]:
 
 
 def _trajectory(robot: Robot, path: PosturePath, angles: Array) -> str:
-    """Return the ``JointTrajectory`` of all joints of one axis as YAML."""
+    """Return the ``JointTrajectory`` of all joints with one degree of freedom as YAML."""
     slots = [s for s in Chart(robot.model).slots if s.x.stop - s.x.start == 1]
     x, v = [s.x.start for s in slots], [s.v.start for s in slots]
     points = []

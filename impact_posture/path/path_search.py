@@ -1,4 +1,4 @@
-"""The search for a path on the constraints: walks first, then trees of walks; and a shorter path."""
+"""Search a path on the constraints by walks and trees of walks, and shorten it."""
 
 from __future__ import annotations
 
@@ -12,10 +12,10 @@ from impact_posture.path.path_space import PathSpace
 from impact_posture.posture.manifold.feasible_start import random_posture
 from impact_posture.system.arrays import Array
 
-# Postures that the search may pull onto the constraints for a target.
+# Largest number of postures that the search pulls onto the constraints for a target.
 EFFORT = 5000
-# A path is shortened if it exceeds the straight distance of its ends by more than a share: by an elastic band, and
-# before it by shortcuts, whose walks cost more.
+# Relative excess over the straight distance of the ends above which a path gets an elastic band, and above which it
+# first gets shortcuts, whose walks cost more.
 _BENT, _DETOUR = 0.02, 0.2
 _SHORTCUTS = 24
 # Postures of the elastic bands, and sweeps over each.
@@ -24,13 +24,13 @@ _BANDS, _SWEEPS = (9, 17, 33), 12
 
 @dataclass(frozen=True, eq=False)
 class Connection:
-    """What was found between two postures.
+    """Result of a search between two postures.
 
     Attributes:
-        path: Postures from one to the other with valid motions between them; ``None`` if no path was found.
-        reached: All postures that were reached from the first.
-        method: ``continuation`` if walks alone arrived, else ``sampling``.
-        proof: Why no path exists; empty where this is not known.
+        path: Postures from the first to the second with valid motions between them; ``None`` if no path was found.
+        reached: All postures that the search reached from the first.
+        method: ``continuation`` if walks alone reached the second posture, else ``sampling``.
+        proof: Why no path exists; empty if this is not known.
     """
 
     path: list[Array] | None
@@ -40,7 +40,7 @@ class Connection:
 
 
 class _Tree:
-    """Postures that are reached from a root by walks, with their tangent coordinates at the root."""
+    """Tree of postures that walks reach from a root, with their tangent coordinates at the root."""
 
     def __init__(self, space: PathSpace, root: Array) -> None:
         self._space = space
@@ -60,20 +60,21 @@ class _Tree:
         return last
 
     def branch(self, index: int) -> list[Array]:
-        """Return the postures from the root to the one with this index."""
-        found = []
+        """Return the postures from the root to the posture with this index."""
+        branch = []
         while index >= 0:
-            found.append(self.postures[index])
+            branch.append(self.postures[index])
             index = self._parents[index]
-        return found[::-1]
+        return branch[::-1]
 
 
 def connect(space: PathSpace, start: Array, target: Array, seed: int = 0, effort: int = EFFORT) -> Connection:
-    """Search a path: walk from both ends towards each other, then grow trees of walks towards random postures, too.
+    """Search a path with two trees of walks, from the ends towards each other and towards random postures.
 
-    The trees are CBiRRT's (Berenson et al. 2009).  OMPL 2.0 has planners on projected state spaces, which stop at
-    inequalities where walks slide along: on a planar arm beside discs they found 5 of 18 paths in the time in which
-    these trees found 18.  The effort is counted and not timed, so that the result depends on the seed alone.
+    The method is CBiRRT (Berenson et al. 2009).  The planners of OMPL 2.0 on projected state spaces stop at
+    inequalities, while these walks slide along them.  On a planar arm beside discs, OMPL found 5 of 18 paths in the
+    time in which these trees found 18.  The effort is a count and not a time, so that the result depends only on the
+    seed.
 
     Args:
         space: The postures that the constraints allow.
@@ -83,8 +84,8 @@ def connect(space: PathSpace, start: Array, target: Array, seed: int = 0, effort
         effort: Number of postures pulled onto the constraints after which the search ends.
     """
     rng, chart = np.random.default_rng(seed), space.projector.chart
-    ours, theirs = _Tree(space, start), _Tree(space, target)
-    growing, other, attempt, begun = ours, theirs, 0, space.pulls
+    first, second = _Tree(space, start), _Tree(space, target)
+    growing, other, attempt, begun = first, second, 0, space.pulls
     while space.pulls - begun <= effort:
         near = space.problem.given if attempt % 4 < 2 else None
         aim = random_posture(space.problem, chart, rng, near) if attempt else target
@@ -93,18 +94,18 @@ def connect(space: PathSpace, start: Array, target: Array, seed: int = 0, effort
         last = 0 if meeting is target else other.extend(meeting)
         if other.postures[last] is meeting:
             halves = growing.branch(end), other.branch(last)[-2::-1]
-            path = [*halves[0], *halves[1]] if growing is ours else [*halves[1][::-1], *halves[0][::-1]]
-            return Connection(path, ours.postures, "sampling" if attempt else "continuation")
+            path = [*halves[0], *halves[1]] if growing is first else [*halves[1][::-1], *halves[0][::-1]]
+            return Connection(path, first.postures, "sampling" if attempt else "continuation")
         growing, other, attempt = other, growing, attempt + 1
-    return Connection(None, ours.postures, "sampling")
+    return Connection(None, first.postures, "sampling")
 
 
 def shortened(space: PathSpace, postures: Sequence[Array], seed: int = 0) -> list[Array]:
-    """Return a shorter and smoother path between the same ends: shortcuts, then an elastic band on the constraints.
+    """Return a shorter and smoother path between the same ends, by shortcuts and then an elastic band.
 
     A shortcut is a walk between two postures of the path that is shorter than the path between them.  The elastic
-    band moves each posture to the middle of its neighbors and pulls it onto the constraints, on finer and finer
-    bands.  The last band is kept only if its whole motion is valid.  A path that is almost straight stays as it is.
+    band moves each posture to the middle of its neighbors and pulls it onto the constraints, with more and more
+    postures.  The result is the last band if its whole motion is valid.  An almost straight path does not change.
     """
     path, rng = list(postures), np.random.default_rng(seed)
     straight = space.distance(path[0], path[-1])
@@ -132,10 +133,10 @@ def even(space: PathSpace, postures: Sequence[Array], count: int) -> list[Array]
     """Return ``count`` postures on the constraints that divide a path evenly, with both ends."""
     lengths = np.array([space.distance(a, b) for a, b in pairwise(postures)])
     ends = np.concatenate([[0.0], np.cumsum(lengths)])
-    found = [postures[0]]
+    divided = [postures[0]]
     for s in np.linspace(0.0, ends[-1], count)[1:-1]:
         k = min(int(np.searchsorted(ends, s, side="right")) - 1, len(lengths) - 1)
         step = space.difference(postures[k], postures[k + 1])
         moved = space.pulled(postures[k], step * ((s - ends[k]) / lengths[k]))
-        found.append(postures[k] if moved is None else moved)
-    return [*found, postures[-1]]
+        divided.append(postures[k] if moved is None else moved)
+    return [*divided, postures[-1]]

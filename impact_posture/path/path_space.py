@@ -1,4 +1,4 @@
-"""The postures that the constraints of a problem allow, and steps between them."""
+"""Postures that the constraints of a problem allow, and steps between them."""
 
 from __future__ import annotations
 
@@ -15,26 +15,26 @@ from impact_posture.system.arrays import Array
 
 # Largest violation of equalities and of inequalities at a valid posture (m, rad, or the unit of the constraint).
 EQUALITY, INEQUALITY = 1e-6, 1e-8
-# No frame of the robot moves farther between two postures that are checked, m.
+# Largest motion of a frame of the robot between two checked postures, m.
 CHECK_DISTANCE = 2e-2
 # Tangent length of a step along the constraints, rad mixed with m.
 STEP = 0.05
 # A step that comes nearer to its target by less than this share of its length counts as stuck.
 _PROGRESS = 0.05
-# A step on the constraints may be longer than planned by this factor.  A longer one has jumped to another branch.
+# Largest factor between the step on the constraints and the planned step.  A longer step jumps to another branch.
 _JUMP = 2.0
-# Leading velocity entries of a joint that slide.
+# Number of translations, the first velocity entries of a joint, by joint family.
 _SLIDING = {"free-flyer": 3, "planar": 2, "prismatic": 1, "translation": 3}
 
 
 class PathSpace:
-    """Postures on the constraints of a problem, and motions between them that are checked on the way.
+    """Postures on the constraints of a problem, and checked motions between them.
 
     Args:
         problem: The posture problem, whose constraints and joint limits hold along a path.
 
     Attributes:
-        pulls: Number of postures pulled onto the constraints so far, the measure of effort.
+        pulls: Number of postures pulled onto the constraints so far, which measures the effort.
     """
 
     def __init__(self, problem: ConstrainedProblem) -> None:
@@ -46,13 +46,15 @@ class PathSpace:
 
     def violations(self, q: Array) -> list[tuple[str, float, float]]:
         """Return name, violation and tolerance of each constraint and of the joint limits at ``q``, shape (nq,)."""
-        found = self.problem.violations(self.projector.numeric.at(q))
+        by_constraint = zip(
+            self.problem.constraints, self.problem.violations(self.projector.numeric.at(q)), strict=True
+        )
         x = self.projector.chart.to_x(q)
         outside = np.abs(x - np.clip(x, self.problem.lower, self.problem.upper)).max(initial=0.0)
         return [
             *(
                 (c.name, float(np.abs(rows).max(initial=0.0)), EQUALITY if c.equality else INEQUALITY)
-                for c, rows in zip(self.problem.constraints, found, strict=True)
+                for c, rows in by_constraint
             ),
             ("joint limits", float(outside), INEQUALITY),
         ]
@@ -76,27 +78,26 @@ class PathSpace:
     def pulled(self, q: Array, step: Array | None = None) -> Array | None:
         """Return ``q ⊕ step`` pulled onto the constraints, or ``None`` if it does not reach them."""
         self.pulls += 1
-        found = self.projector.project(q if step is None else np.asarray(pin.integrate(self.model, q, step))).q
-        return found if self.valid(found) else None
+        projected = self.projector.project(q if step is None else np.asarray(pin.integrate(self.model, q, step))).q
+        return projected if self.valid(projected) else None
 
     def size(self, step: Array) -> float:
-        """Return the size of a tangent step; between two postures that are checked it is at most 1.
+        """Return the size of a tangent step, which is at most 1 between two checked postures.
 
-        That is the check distance for the frame that moves farthest, and two steps of a walk for the tangent norm.
-        Without inequalities there is nothing to meet between two postures, and the norm alone counts.
+        The size is 1 if a frame moves by the check distance, or if the tangent norm is two steps of a walk.  Without
+        inequalities, no constraint can be met between two postures, and only the norm counts.
         """
         moved = float(self._reach @ np.abs(step)) / CHECK_DISTANCE if self._inequalities else 0.0
         return max(moved, float(np.linalg.norm(step)) / (_JUMP * STEP))
 
     def checks(self, step: Array) -> int:
-        """Return the number of parts in which a tangent step is checked; each may double on the constraints."""
+        """Return the number of parts for the check of a tangent step; a part may double on the constraints."""
         return max(1, int(np.ceil(_JUMP * self.size(step) - 1e-9)))
 
     def clear(self, one: Array, other: Array) -> bool:
         """Return whether the motion from ``one`` to ``other`` along the constraints is valid between its ends.
 
-        The postures between are those of the straight motion, pulled onto the constraints.  A part whose size exceeds
-        1 has met something.
+        The check pulls postures of the straight motion onto the constraints.  A part of a size above 1 is blocked.
         """
         whole, q = self.difference(one, other), one
         parts = self.checks(whole)
@@ -120,10 +121,10 @@ class PathSpace:
         return moved if self.clear(q, moved) else None
 
     def walk(self, start: Array, target: Array) -> list[Array]:
-        """Step from ``start`` towards ``target`` along the constraints, until it is reached or no step comes nearer.
+        """Step from ``start`` towards ``target`` along the constraints, until no step comes nearer.
 
-        The last posture is ``target`` itself if it was reached.  Inequalities deflect the steps, because a posture
-        is pulled onto them, too.
+        The last posture is ``target`` itself if the walk reaches it.  Inequalities deflect the steps, because the
+        postures are pulled onto them, too.
         """
         path = [start]
         while True:
@@ -139,7 +140,7 @@ class PathSpace:
             path.append(moved)
 
     def unwound(self, start: Array, target: Array) -> Array:
-        """Return ``target`` with revolute joints turned by full turns, within their limits, to be near ``start``."""
+        """Return ``target`` with revolute joints moved by full turns towards ``start``, within their limits."""
         target = target.copy()
         for slot in self.projector.chart.slots:
             if slot.kind.family == "revolute":
@@ -155,10 +156,10 @@ class PathSpace:
 
 
 def lever_arms(chart: Chart, model: pin.Model) -> Array:
-    """Return how far a frame can move per unit of each velocity entry, m/rad or 1, shape (nv,).
+    """Return a bound on the motion of a frame per unit of each velocity entry, m/rad or 1, shape (nv,).
 
-    For a rotation this is the length of the longest chain of placements from the joint to a frame that it carries,
-    an upper bound on the distance of the frame from the axis.  Sliding joints on the chain add their largest travel.
+    For a rotation, this is the length of the longest chain of placements from the joint to a frame behind it, which
+    bounds the distance of the frame from the axis.  Sliding joints on the chain add their largest travel.
     """
     depth = np.zeros(model.njoints)
     for frame in model.frames:

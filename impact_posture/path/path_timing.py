@@ -1,4 +1,4 @@
-"""The time that a robot needs along a path, within the limits of velocity, torque, thrust and friction."""
+"""Timing of a path within the limits of velocity, torque, thrust and friction."""
 
 from __future__ import annotations
 
@@ -14,40 +14,40 @@ from impact_posture.path.speed_profile import slowed
 from impact_posture.path.timed_curve import SAMPLE_TIME, TimedCurve, times
 from impact_posture.system.arrays import Array
 
-# Intervals of the time-optimal parametrization, within which a limit may be exceeded by less than 1 %.
+# Intervals of the time-optimal parametrization; within an interval, a limit may be exceeded by less than 1 %.
 _GRID = 400
-# Instants at which a scaled motion is checked, besides places of its curve; places of the table that finds these.
+# Instants for the check of a scaled motion, besides places of its curve, and rows of the table that finds these.
 INSTANTS, _INVERSE = 61, 2001
-# Joint speed where the robot's data limit nothing, rad/s or m/s.
+# Joint speed where the robot has no velocity limit, rad/s or m/s.
 _DEFAULT_SPEED = 1.0
-# From this share on, a limit is active.
+# Least share of an active limit.
 _ACTIVE = 0.98
 _ONE_AXIS = ("revolute", "continuous", "prismatic")
-# A time-optimal motion that takes a larger share of a limit at one of its points has corners, too.
+# A time-optimal motion with a larger share of a limit at one of its points is not used.
 _EXCEEDED = 1.01
 
 
 def time_optimal(space: PathSpace, curve: PathCurve, limits: ActuatorLimits) -> TimedCurve | None:
-    """Return the fastest motion within velocities and torques (TOPP-RA, Pham and Pham 2018), ``None`` if none exists.
+    """Return the fastest motion within velocity and torque limits (TOPP-RA, Pham and Pham 2018), or ``None``.
 
-    For a fixed base with joints of one axis, whose torque limits are known.
+    The robot must have a fixed base, joints of one degree of freedom, and known torque limits.
     """
     from toppra import SplineInterpolator
     from toppra.algorithm import TOPPRA
     from toppra.constraint import DiscretizationType, JointTorqueConstraint, JointVelocityConstraint
 
     speed = space.problem.robot.velocity_limits
-    # Joints without a limit get a bound that nothing reaches; the solver takes no infinities.
+    # The solver does not accept infinite limits.
     bound = np.where(np.isfinite(speed), speed, 1e6)
 
-    # TOPP-RA needs a torque for every joint.  That of a joint without a limit stays zero.
+    # TOPP-RA needs a torque for every joint; the torque of a joint without a limit is zero here.
     count, limited = space.model.nv, len(limits.names)
 
     def used(z: Array, v: Array, a: Array) -> Array:
         q = curve.at(z)
-        found = limits.shares(q, limits.load(q, v, a))
-        assert found is not None  # noqa: S101 (a fixed base balances every load)
-        return np.concatenate([found, np.zeros(count - limited)])
+        shares = limits.shares(q, limits.load(q, v, a))
+        assert shares is not None  # noqa: S101 (a fixed base balances every load)
+        return np.concatenate([shares, np.zeros(count - limited)])
 
     constraints = [
         JointVelocityConstraint(np.column_stack([-bound, bound])),
@@ -56,28 +56,28 @@ def time_optimal(space: PathSpace, curve: PathCurve, limits: ActuatorLimits) -> 
             discretization_scheme=DiscretizationType.Interpolation,
         ),
     ]  # fmt: skip
-    # By path length, because TOPP-RA loses digits where the speed along the path is far from 1.
+    # The parameter is the path length, because TOPP-RA loses digits where the speed along the path is far from 1.
     size = space.length([curve.at(z) for z in curve.z])
     planner = TOPPRA(
         constraints, SplineInterpolator(size * curve.s, curve.z), gridpoints=np.linspace(0.0, size, _GRID + 1),
-        # The default, a spline over time, exceeds the torques by a quarter where they switch.
+        # The default, a spline over time, exceeds the torque limits by a quarter where the torques switch.
         parametrizer="ParametrizeConstAccel",
     )  # fmt: skip
-    found = planner.compute_trajectory()
-    if found is None:
+    trajectory = planner.compute_trajectory()
+    if trajectory is None:
         return None
-    t = times(float(found.duration))
-    z, v, a = (np.asarray(found(t, order)) for order in range(3))
+    t = times(float(trajectory.duration))
+    z, v, a = (np.asarray(trajectory(t, order)) for order in range(3))
     return TimedCurve(t, z, v, a, "time-optimal")
 
 
 def scaled(space: PathSpace, curve: PathCurve, limits: ActuatorLimits) -> TimedCurve:
     """Return the fastest motion of the form ``s(t) = 10 τ³ − 15 τ⁴ + 6 τ⁵``, ``τ = t/T``, within all known limits.
 
-    The load of a motion is that of gravity and ``1/T²`` times a load that does not depend on ``T``.  So a linear
-    program at each instant gives the least ``T`` there, and the largest of them counts.  Instants are spread evenly,
-    and at places of the curve, most of them at its corners.
-    A curve with corners is slowed there alone if that takes less time.
+    The load of a motion is the load of gravity plus ``1/T²`` times a load that does not depend on ``T``.  So a linear
+    program at each instant gives the least ``T`` there, and the largest of these counts.  The instants are spread
+    evenly, plus those at the places of the curve, most of which are at corners.  If a curve has corners and
+    :func:`slowed` takes less time, the result is the slowed motion.
     """
     fine = np.linspace(0.0, 1.0, _INVERSE)
     notes, tau = [], np.concatenate([np.linspace(0.0, 1.0, INSTANTS), np.interp(curve.places, _law(fine)[0], fine)])
@@ -87,12 +87,12 @@ def scaled(space: PathSpace, curve: PathCurve, limits: ActuatorLimits) -> TimedC
     if known:
         zero = np.zeros(space.model.nv)
         rests = [(q, limits.load(q, zero, zero)) for q, _, _ in rates]
-        found = [
+        largest = [
             limits.largest_rate(q, rest, limits.load(q, v, a) - rest)
             for (q, v, a), (_, rest) in zip(rates, rests, strict=True)
         ]
-        known = all(found)
-        least = np.array([rate**-0.5 if rate else 0.0 for rate in found])
+        known = all(largest)
+        least = np.array([rate**-0.5 if rate else 0.0 for rate in largest])
     if not known:
         why = limits.missing or _cannot_move(space, limits, rests)
         notes.append(f"{why}: timed by velocities alone")
@@ -119,7 +119,7 @@ def scaled(space: PathSpace, curve: PathCurve, limits: ActuatorLimits) -> TimedC
 
 
 def _cannot_move(space: PathSpace, limits: ActuatorLimits, loads: Sequence[tuple[Array, Array]]) -> str:
-    """Say why the limits allow no speed on a path, from its postures and their loads at rest."""
+    """Return why the limits allow no speed on a path, from its postures and their loads at rest."""
     shares = [limits.shares(q, load) for q, load in loads]
     held = [share for share in shares if share is not None]
     if len(held) < len(shares):
@@ -131,9 +131,9 @@ def _cannot_move(space: PathSpace, limits: ActuatorLimits, loads: Sequence[tuple
 
 
 def timed(space: PathSpace, curve: PathCurve, limits: ActuatorLimits) -> TimedCurve:
-    """Return the motion along a curve: time-optimal for a fixed base with known torques, else scaled.
+    """Return the motion along a curve: time-optimal for a fixed base with known torque limits, else scaled.
 
-    A time-optimal motion that exceeds limits between the points of its grid gives way to one that does not.
+    If a time-optimal motion exceeds limits between the points of its grid, the slowed motion replaces it.
     """
     axes = all(slot.kind.family in _ONE_AXIS for slot in space.projector.chart.slots)
     if not limits.missing and axes and not space.problem.robot.floating:
@@ -147,7 +147,7 @@ def timed(space: PathSpace, curve: PathCurve, limits: ActuatorLimits) -> TimedCu
 
 
 def _exceeded(space: PathSpace, curve: PathCurve, motion: TimedCurve, limits: ActuatorLimits) -> float:
-    """Return the largest share of a limit that a motion of a fixed base takes."""
+    """Return the largest share of a limit that a motion of a fixed base needs."""
     largest = float((np.abs(motion.v) / space.problem.robot.velocity_limits).max())
     for z, v, a in zip(motion.z, motion.v, motion.a, strict=True):
         q = curve.at(z)
@@ -158,14 +158,15 @@ def _exceeded(space: PathSpace, curve: PathCurve, motion: TimedCurve, limits: Ac
 
 @dataclass(frozen=True, eq=False)
 class LimitUse:
-    """The shares of the limits that a motion takes over time; 1 is at a limit.
+    """Shares of the limits that a motion needs over time; 1 is at a limit.
 
     Attributes:
         at: Times, s, shape (m,).
         velocity: Largest share of a velocity limit at each time, shape (m,).
         torque: Largest share of a torque limit, NaN where not known, shape (m,).
-        thrust: Largest share of half of a thrust's range, from its middle, NaN where not known, shape (m,).
-        largest: Largest shares, whose they are, and the active limit, as in ``result.json``.
+        thrust: Largest distance from the middle of a thrust range, as a share of half the range, NaN where not known,
+            shape (m,).
+        largest: Largest shares, their actuators, and the active limit, as in ``result.json``.
     """
 
     at: Array
@@ -178,21 +179,21 @@ class LimitUse:
 def limit_use(space: PathSpace, motion: TimedCurve, postures: Array, limits: ActuatorLimits) -> LimitUse:
     """Return the shares of the limits along a motion with its postures on the constraints, shape (n, nq).
 
-    Forces of feet and of more than six rotors are not determined: those count whose largest share is least.
+    Forces of feet and of more than six rotors are not unique.  The forces with the least largest share count.
     """
     robot, count = space.problem.robot, len(motion.t)
-    # A floating robot takes a linear program an instant.  Where it bends most, it may need most.
+    # For a floating robot, each instant is a linear program, so only some count: evenly, and at large accelerations.
     even = [round(k) for k in np.linspace(0, count - 1, INSTANTS)]
     bent = np.argsort(-np.abs(motion.a).max(axis=1), kind="stable")[:INSTANTS].tolist()
     every = sorted({*even, *bent}) if robot.floating else list(range(count))
     shares = np.full((len(every), len(limits.names)), np.nan)
     for row, k in enumerate([] if limits.missing else every):
-        found = limits.shares(postures[k], limits.load(postures[k], motion.v[k], motion.a[k]))
-        shares[row] = np.nan if found is None else found
-    groups = {"velocity": (np.abs(motion.v[every]) / space.problem.robot.velocity_limits, robot.tangent_names)}
+        needed = limits.shares(postures[k], limits.load(postures[k], motion.v[k], motion.a[k]))
+        shares[row] = np.nan if needed is None else needed
+    groups = {"velocity": (np.abs(motion.v[every]) / robot.velocity_limits, robot.tangent_names)}
     for kind in ("torque", "thrust"):
-        own = [k for k, other in enumerate(limits.kinds) if other == kind]
-        groups[kind] = np.abs(shares[:, own]), tuple(limits.names[k] for k in own)
+        columns = [k for k, other in enumerate(limits.kinds) if other == kind]
+        groups[kind] = np.abs(shares[:, columns]), tuple(limits.names[k] for k in columns)
     largest: dict[str, object] = {}
     sizes: dict[str, float] = {}
     for name, (used, names) in groups.items():
@@ -210,16 +211,13 @@ def limit_use(space: PathSpace, motion: TimedCurve, postures: Array, limits: Act
 
 
 def _law(tau: Array) -> tuple[Array, Array, Array]:
-    """Return ``s(τ)`` and its two derivatives: at rest without acceleration at both ends."""
-    return (
-        tau**3 * (10 - 15 * tau + 6 * tau**2),
-        30 * tau**2 * (1 - tau) ** 2,
-        60 * tau * (1 - tau) * (1 - 2 * tau),
-    )
+    """Return ``s(τ)`` and its first two derivatives, which are zero at both ends."""
+    first, second = 30 * tau**2 * (1 - tau) ** 2, 60 * tau * (1 - tau) * (1 - 2 * tau)
+    return tau**3 * (10 - 15 * tau + 6 * tau**2), first, second
 
 
 def _rates(curve: PathCurve, tau: float) -> tuple[Array, Array, Array]:
-    """Return posture, velocity and acceleration of the motion that takes 1 s."""
+    """Return posture, velocity and acceleration of the motion with a duration of 1 s."""
     s, ds, dds = (float(x) for x in _law(np.array(tau)))
     v = curve.velocity(s)
     return curve.posture(s), v * ds, curve.acceleration(s) * ds**2 + v * dds

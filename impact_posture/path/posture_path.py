@@ -1,4 +1,4 @@
-"""A path from the start to the optimum that satisfies all constraints, timed within the robot's limits."""
+"""Find a path from the start to the optimum on the constraints, and time it within the limits of the robot."""
 
 from __future__ import annotations
 
@@ -18,22 +18,22 @@ from impact_posture.path.reachable_curve import ReachableCurve
 from impact_posture.posture.search.multistart import PostureSolution
 from impact_posture.system.arrays import Array
 
-# Optima that are tried, best first.
+# Largest number of optima to try, best first.
 _OPTIMA = 5
-# A path shorter than this (tangent length) is no motion, and a smaller relative gain is none.
+# Tangent length of a path up to which there is no motion, and relative gain that does not count.
 _NO_MOTION, _NO_GAIN = 1e-6, 1e-6
-# Visited postures that are evaluated where no optimum is reached.
+# Largest number of reached postures to evaluate if no optimum is reached.
 _MOST_VISITED = 400
 
 
 @dataclass(frozen=True, eq=False)
 class PosturePath:
-    """A motion from the start to the optimum, or to the best posture that is reached.
+    """A motion from the start to the optimum, or to the best reached posture.
 
     Attributes:
         found: Whether the path ends at the optimum.
-        reason: Why it does not, or what the timing leaves out; empty if there is nothing to say.
-        method: How the path was found: ``continuation`` or ``sampling``; empty without a motion.
+        reason: Why the path does not end at the optimum, and which limits the timing ignores; else empty.
+        method: Method of the search: ``continuation`` or ``sampling``; empty without a motion.
         timing: ``time-optimal``, ``scaled`` or ``slowed``; empty without a motion.
         objective: Objective at the end of the path.
         t: Times, s, shape (n,); a single zero if the start is the end.
@@ -83,10 +83,10 @@ class PosturePath:
 
 
 def check_package() -> None:
-    """Check that the package of the extra ``path`` is installed, before anything takes time.
+    """Check early that the package of the extra ``path`` is installed.
 
     Raises:
-        InputError: It is not.
+        InputError: The package is not installed.
     """
     if find_spec("toppra") is None:
         raise InputError(
@@ -99,12 +99,13 @@ def check_package() -> None:
 def posture_path(solution: PostureSolution, *, seed: int = 0, effort: int = EFFORT) -> PosturePath:
     """Find a path from ``solution.initial`` to ``solution.q`` along which all constraints hold, and time it.
 
-    If the optimum is not reached, the next certified optima are tried, best first, then the best posture on the way.
+    If the search does not reach the optimum, it tries other certified optima, best first, and then the best posture
+    that it has reached.
 
     Args:
         solution: A solved posture problem.
         seed: Seed of the samples.
-        effort: Postures that the search may pull onto the constraints for each optimum.
+        effort: Largest number of postures that the search pulls onto the constraints for each optimum.
 
     Raises:
         InputError: The package of the extra ``path`` is not installed.
@@ -114,8 +115,8 @@ def posture_path(solution: PostureSolution, *, seed: int = 0, effort: int = EFFO
     violated = [name for name, size, tolerance in space.violations(start) if size > tolerance]
     if violated:
         return _still(space, objective, start, f"the start violates: {', '.join(violated)}")
-    found, failure = _reached(solution, space, seed, effort)
-    postures = found.path or [start]
+    connection, failure = _reached(solution, space, seed, effort)
+    postures = connection.path or [start]
     if len(postures) == 1:
         return _still(space, objective, start, failure)
     curve = fitted_curve(space, shortened(space, postures, seed)) or fitted_curve(space, postures)
@@ -125,57 +126,51 @@ def posture_path(solution: PostureSolution, *, seed: int = 0, effort: int = EFFO
     motion = timed(space, curve, limits)
     q = np.array([space.projector.project(curve.at(z)).q for z in motion.z])
     use = limit_use(space, motion, q, limits)
-    at = np.searchsorted(motion.t, use.at)
+    objectives = np.array([objective.value(q[k]) for k in np.searchsorted(motion.t, use.at)])
+    reason = "; ".join(filter(None, [failure, *motion.notes]))
+    end, length, violation = float(objective.value(q[-1])), space.length(list(q)), max(map(space.worst, q))
     return PosturePath(
-        not failure,
-        "; ".join(filter(None, [failure, *motion.notes])),
-        found.method,
-        motion.method,
-        float(objective.value(q[-1])),
-        motion.t,
-        q,
-        motion.v,
-        motion.a,
-        space.length(list(q)),
-        max(map(space.worst, q)),
-        use,
-        np.array([objective.value(q[k]) for k in at]),
-    )
+        not failure, reason, connection.method, motion.method, end,
+        motion.t, q, motion.v, motion.a, length, violation, use, objectives,
+    )  # fmt: skip
 
 
 def _still(space: PathSpace, objective: Objective, q: Array, reason: str) -> PosturePath:
-    """Return the path of a robot that stays at its start; it is the optimum if there is no reason why not."""
+    """Return the path of a robot that stays at its start, which is the optimum if ``reason`` is empty."""
     rest = np.zeros((1, space.model.nv))
     value = float(objective.value(q))
     return PosturePath(not reason, reason, "", "", value, np.zeros(1), q[None], rest, rest, 0.0, space.worst(q))
 
 
 def _reached(solution: PostureSolution, space: PathSpace, seed: int, effort: int) -> tuple[Connection, str]:
-    """Return the path to the optimum, or to the best posture that is reached and why it ends there."""
+    """Return the path to the optimum, or the path to the best reached posture and why it ends there."""
     start, objective = solution.initial, solution.problem.objective
-    own = ReachableCurve.of(space, start)
+    curve = ReachableCurve.of(space, start)
     others = [o.q for o in solution.optima if not np.array_equal(o.q, solution.q)]
-    stay = found = Connection([start], [start], "")
-    end, proof, visited = "", "", [start]
+    stay = connection = Connection([start], [start], "")
+    end, proof, reached = "", "", [start]
+
+    def connect_to(target: Array) -> Connection:
+        return curve.connect(target) if curve else connect(space, start, target, seed, effort)
+
     for k, q in enumerate([solution.q, *others[: _OPTIMA - 1]]):
         target = space.pulled(space.unwound(start, q))
         if target is None or (k and objective.value(target) >= objective.value(start)):
             continue
-        found = own.connect(target) if own else connect(space, start, target, seed, effort)
-        visited += found.reached
-        proof = proof if k else found.proof
-        if found.path is not None:
+        connection = connect_to(target)
+        reached += connection.reached
+        proof = proof if k else connection.proof
+        if connection.path is not None:
             if k == 0:
-                return (found if space.length(found.path) > _NO_MOTION else stay), ""
+                return (connection if space.length(connection.path) > _NO_MOTION else stay), ""
             end = f"optimum that was reached, number {k + 1} of {len(solution.optima)}"
             break
-    best = objective.value(found.path[-1] if found.path else start) * (1 - _NO_GAIN)
-    lowest = own.lowest() if own else min(visited[:: max(1, len(visited) // _MOST_VISITED)], key=objective.value)
+    best = objective.value(connection.path[-1] if connection.path else start) * (1 - _NO_GAIN)
+    lowest = curve.lowest() if curve else min(reached[:: max(1, len(reached) // _MOST_VISITED)], key=objective.value)
     if objective.value(lowest) < best:
-        found = own.connect(lowest) if own else connect(space, start, lowest, seed, effort)
-        end = "posture that was reached"
-    words = "was found at this contact pose, which does not prove that there is none"
-    return (found if found.path else stay), (
-        f"no path to the optimum {f'exists at this contact pose ({proof})' if proof else words}"
-        + (f"; the path ends at the best {end}" if found.path else "; nothing better than the start was reached")
-    )
+        connection, end = connect_to(lowest), "posture that was reached"
+    unproved = "was found at this contact pose, which does not prove that none exists"
+    reason = f"no path to the optimum {f'exists at this contact pose ({proof})' if proof else unproved}; "
+    if connection.path:
+        return connection, f"{reason}the path ends at the best {end}"
+    return stay, f"{reason}nothing better than the start was reached"

@@ -1,7 +1,7 @@
-"""What a robot with one degree of freedom left can reach: a curve, followed from the start in both directions.
+"""Paths of a robot with one degree of freedom left, along the curve of its self-motion in both directions.
 
-Then no sampling is needed.  The curve leads to a posture, or it proves that no path does: because the posture is on
-another component of the self-motion, or because the constraints cut the curve on both ways to it.
+No sampling is needed.  Either the curve leads to a posture, or it proves that no path exists, because the posture is
+on another component of the self-motion, or because the constraints cut the curve in both directions.
 """
 
 from __future__ import annotations
@@ -20,12 +20,12 @@ from impact_posture.system.arrays import Array
 
 
 class ReachableCurve:
-    """The component of the self-motion that the start is on.
+    """The component of the self-motion through the start.
 
     Args:
         space: The postures that the constraints allow.
         start: A valid posture, shape (nq,).
-        motion: The curve through it.
+        motion: The self-motion through the start.
     """
 
     def __init__(self, space: PathSpace, start: Array, motion: SelfMotion) -> None:
@@ -35,11 +35,11 @@ class ReachableCurve:
         ahead, back = curve.x[home + 1 :], curve.x[:home][::-1]
         if curve.closed:
             ahead, back = curve.x[1:], curve.x[-2::-1]
-        self._ways = [self._way(nodes) for nodes in (ahead, back)]
+        self._sides = [self._side(nodes) for nodes in (ahead, back)]
 
     @staticmethod
     def of(space: PathSpace, start: Array) -> ReachableCurve | None:
-        """Return the component of a start; ``None`` if it is no curve, or has an end that proves nothing."""
+        """Return the component through a start; ``None`` if it is not a curve, or if an end of it proves nothing."""
         problem = space.problem
         jacobian = equality_jacobian(problem, space.projector.numeric.at(start))
         if not isinstance(problem.objective, WorstCaseObjective) or problem.robot.nv - rank(jacobian) != 1:
@@ -48,15 +48,15 @@ class ReachableCurve:
         return ReachableCurve(space, start, motion) if motion else None
 
     def connect(self, target: Array) -> Connection:
-        """Return the path along the curve to a posture on the constraints, or the proof that there is none."""
-        reached = [q for way, _ in self._ways for q in way]
-        paths = [path for way, _ in self._ways if (path := self._along(way, target))]
+        """Return the path along the curve to a posture on the constraints, or the proof that no path exists."""
+        reached = [q for side, _ in self._sides for q in side]
+        paths = [path for side, _ in self._sides if (path := self._along(side, target))]
         if paths:
             return Connection(min(paths, key=self._space.length), reached, "continuation")
         x = self._manifold.chart.to_x(target)[None]
-        proof = "the constraints cut the self-motion on all ways to it" if all(cut for _, cut in self._ways) else ""
+        proof = "the constraints cut the self-motion in both directions" if all(cut for _, cut in self._sides) else ""
         if self._motion.component_of(x)[0] < 0:
-            # Seen from there as well, because the answer rests on steps and not on intervals.
+            # Checked from the target as well, because curves are followed in steps without interval bounds.
             other = _followed(self._manifold, target)
             home = self._manifold.chart.to_x(self._start)[None]
             apart = other is not None and other.component_of(home)[0] < 0
@@ -64,22 +64,22 @@ class ReachableCurve:
         return Connection(None, reached, "continuation", proof)
 
     def lowest(self) -> Array:
-        """Return the posture with the lowest objective that is reached, shape (nq,)."""
+        """Return the reached posture with the lowest objective, shape (nq,)."""
         from scipy.optimize import minimize_scalar
 
         space, value = self._space, self._space.problem.objective.value
-        best = min((q for way, _ in self._ways for q in way), key=value)
+        best = min((q for side, _ in self._sides for q in side), key=value)
         tangent = self._manifold.tangents(self._manifold.chart.to_x(best)[None], 1)[0, 0]
 
         def beside(step: float) -> Array:
-            found = space.pulled(best, step * tangent)
-            return best if found is None else found
+            moved = space.pulled(best, step * tangent)
+            return best if moved is None else moved
 
-        found = minimize_scalar(lambda s: value(beside(s)), bounds=(-LONGEST_STEP, LONGEST_STEP), method="bounded")
-        return min(best, beside(float(found.x)), key=value)
+        minimum = minimize_scalar(lambda s: value(beside(s)), bounds=(-LONGEST_STEP, LONGEST_STEP), method="bounded")
+        return min(best, beside(float(minimum.x)), key=value)
 
-    def _way(self, nodes: Iterable[Array]) -> tuple[list[Array], bool]:
-        """Return the postures that are reached along nodes, and whether the way certainly ends there."""
+    def _side(self, nodes: Iterable[Array]) -> tuple[list[Array], bool]:
+        """Return the postures that are reached along nodes, and whether the constraints certainly cut the curve."""
         path = [self._start]
         for x in nodes:
             q = self._space.unwound(path[-1], self._manifold.to_q(x))
@@ -90,18 +90,18 @@ class ReachableCurve:
             path.append(q)
         return path, True
 
-    def _along(self, way: list[Array], target: Array) -> list[Array]:
-        """Return the part of a way to a posture; empty if it does not lead there."""
-        points = self._manifold.embed(np.array([self._manifold.chart.to_x(q) for q in (target, *way)]))
+    def _along(self, side: list[Array], target: Array) -> list[Array]:
+        """Return the part of a side that ends at a posture; empty if the side does not pass the posture."""
+        points = self._manifold.embed(np.array([self._manifold.chart.to_x(q) for q in (target, *side)]))
         for k in np.argsort(np.linalg.norm(points[1:] - points[0], axis=1))[:2]:
-            end = self._space.unwound(way[k], target)
-            if self._space.distance(way[k], end) <= LONGEST_STEP and self._space.clear(way[k], end):
-                return [*way[: k + 1], end]
+            end = self._space.unwound(side[k], target)
+            if self._space.distance(side[k], end) <= LONGEST_STEP and self._space.clear(side[k], end):
+                return [*side[: k + 1], end]
         return []
 
 
 def _followed(manifold: ConstraintManifold, q: Array) -> SelfMotion | None:
-    """Return the curve through a posture, if it is closed or ends at limits."""
+    """Return the self-motion through a posture if it is a closed curve or ends at limits."""
     x = manifold.chart.to_x(q)[None]
     if manifold.chart.nv - rank(manifold.equalities(x)[1][0]) != 1:
         return None

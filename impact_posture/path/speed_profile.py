@@ -1,4 +1,4 @@
-"""A motion along a curve that is slow at corners, within limits everywhere."""
+"""Motions along a curve that are slow at corners and within limits everywhere."""
 
 from __future__ import annotations
 
@@ -11,17 +11,18 @@ from impact_posture.path.path_curve import PathCurve
 from impact_posture.path.path_space import PathSpace
 from impact_posture.path.timed_curve import SAMPLE_TIME, TimedCurve, times
 
-# Share of the limits that speed and acceleration may take between them.
+# Share of the limits that speed and acceleration may use together.
 _SHARE = 0.95
 
 
 def slowed(space: PathSpace, curve: PathCurve, limits: ActuatorLimits) -> TimedCurve | None:
-    """Return the motion whose speed at each place is one that the limits allow there; ``None`` if there is none.
+    """Return a motion whose speed is within the limits at each place of the curve; ``None`` if none exists.
 
-    With ``x = ṡ²``, the load is that of gravity, plus ``x`` times a load, plus ``s̈`` times another.  The limits are
-    convex, so ``x`` and ``s̈`` are allowed together if each is half of what is allowed alone.  The largest such
-    ``x(s)`` follows from one pass in each direction with ``dx/ds = 2 s̈`` (Bobrow et al. 1985).  Between two knots of
-    the curve, the curvature is straight, so a few places more are enough, most of them at corners.
+    With ``x = ṡ²``, the load is the load of gravity, plus ``x`` times a load, plus ``s̈`` times another load.  The
+    limits are convex, so ``x`` and ``s̈`` are allowed together if each is at most half of its largest value alone.
+    The largest such ``x(s)`` follows from one pass in each direction with ``dx/ds = 2 s̈`` (Bobrow et al. 1985).
+    Between two knots, the second derivative of the curve is linear, so a few places are enough, most of them at
+    corners.
     """
     s = curve.places
     zero, speed = np.zeros(space.model.nv), space.problem.robot.velocity_limits

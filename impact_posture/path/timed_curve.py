@@ -1,4 +1,4 @@
-"""A curve with the times at which a robot passes its places."""
+"""Motions along a curve: times, velocities and accelerations."""
 
 from __future__ import annotations
 
@@ -23,7 +23,7 @@ class TimedCurve:
         a: Accelerations ``ν̇``, shape (n, nv).
         method: ``time-optimal`` (fixed base), ``scaled`` (one time scale for the whole motion) or ``slowed`` (slower
             at corners of the curve).
-        notes: What the motion does not respect, and why.
+        notes: Limits that the motion does not respect, and why.
     """
 
     t: Array
