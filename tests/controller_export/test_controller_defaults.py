@@ -1,4 +1,4 @@
-"""Tests for the end effector of controllers with default gains: it leaves the redundancy that `optimize` uses."""
+"""The end effector's task of controllers with default gains leaves the redundancy that `optimize` uses."""
 
 from __future__ import annotations
 
@@ -46,7 +46,7 @@ def test_the_task_has_the_rows_of_the_contact_pose(
     objective = WorstCaseObjective(robot, ImpactContact(frame, (0, 0, 1)))
     assert type(tip(default_formulation(robot, kind, objective))) is kept
     assert tip(default_formulation(robot, kind, objective)).point.frame == frame
-    # Without an impact there is no normal to align with.
+    # Without an impact, an alignment has no normal.
     assert type(tip(default_formulation(robot, kind))) is (FramePose if kept is FrameAligned else kept)
 
 
@@ -98,7 +98,7 @@ def test_an_arm_without_data_needs_the_frame_of_the_impact_only(tmp_path: Path) 
 
 
 @pytest.mark.parametrize("kind", ["aerial", "arm", "legged"])
-def test_a_floating_robot_without_rotors_and_feet_is_no_kind(kind: ControllerKind, tmp_path: Path) -> None:
+def test_a_floating_robot_without_rotors_and_feet_is_refused(kind: ControllerKind, tmp_path: Path) -> None:
     (tmp_path / "bare.urdf").write_text(BARE_ARM)
     (tmp_path / "robot.toml").write_text('[model]\nroot = "free-flyer"\n')
     with pytest.raises(InputError, match="propulsion"):

@@ -1,4 +1,4 @@
-"""The exported controller gives the commands, statuses and reports of the controller in Python."""
+"""The exported controller has the commands, statuses and reports of the controller in Python."""
 
 from __future__ import annotations
 
@@ -46,93 +46,86 @@ def assert_same_report(a: Report, b: Report, size: float) -> None:
 
 
 def both_at_rest(name: str) -> tuple[Controller, CompiledController, Array, Array]:
-    """Return the controllers in Python and in C, after a reset at the default posture, with that state."""
+    """Return the controllers in Python and in C after a reset at rest in the default posture, and this state."""
     robot, formulation = formulation_of(name)
-    ours, theirs = Controller(robot, formulation), compiled(name)
+    python, c = Controller(robot, formulation), compiled(name)
     q, v = robot.posture(), np.zeros(robot.nv)
-    ours.reset(q, v)
-    theirs.reset(q, v)
-    return ours, theirs, q, v
+    assert difference(python.reset(q, v), c.reset(q, v)) < 1e-9
+    return python, c, q, v
 
 
-# The other robots of KINDS are in the study (make study-controller).
+# The study of the controller (make study-controller) has the other robots of KINDS.
 @pytest.mark.parametrize("name", ["tilthex_arm", "panda", "solo8", "talos"])
-def test_the_commands_are_those_of_python(name: str) -> None:
-    robot, formulation = formulation_of(name)
-    ours, theirs = Controller(robot, formulation), compiled(name)
-    rng = np.random.default_rng(4)
-    q, v = robot.posture(), np.zeros(robot.nv)
-    assert difference(ours.reset(q, v), theirs.reset(q, v)) < 1e-9
-    seen = set()
+def test_commands_agree_with_python(name: str) -> None:
+    python, c, q, v = both_at_rest(name)
+    robot, rng, seen = python.robot, np.random.default_rng(4), set()
     for k in range(40):
         force = None if k % 3 else rng.normal(size=6 if k % 2 else 3)
         if k >= 20:
             q, v = random_state(robot, rng, 0.03)
-        a, b = ours.tick(1e-3 * k, q, v, force), theirs.tick(1e-3 * k, q, v, force)
+        a, b = python.tick(1e-3 * k, q, v, force), c.tick(1e-3 * k, q, v, force)
         assert a.status is b.status
         seen.add(a.status)
         if a.status is Status.SOLVED:
             assert difference(a, b) < 1e-9
-            assert_same_report(ours.report(), theirs.report(), max(1.0, float(np.abs(a.u).max())))
+            assert_same_report(python.report(), c.report(), max(1.0, float(np.abs(a.u).max())))
         v = v + 1e-3 * (a.acceleration + rng.normal(size=robot.nv))
         q = np.asarray(pin.integrate(robot.model, q, 1e-3 * v))
     assert Status.SOLVED in seen
 
 
-def test_the_answers_in_long_saturation_are_optimal() -> None:
-    """The condition of the cost is 4e10, so that controls agree to some digits only; the certificate is exact."""
-    ours, theirs, q, v = both_at_rest("solo8")
-    rng, push, checked = np.random.default_rng(7), np.zeros(ours.robot.nv), 0
+def test_commands_in_long_saturation_are_optimal() -> None:
+    """The cost has the condition 4e10, so that controls agree to a few digits only, but the certificate is exact."""
+    python, c, q, v = both_at_rest("solo8")
+    rng, push, checked = np.random.default_rng(7), np.zeros(python.robot.nv), 0
     for k in range(800):
-        command = theirs.tick(1e-3 * k, q, v)
+        command = c.tick(1e-3 * k, q, v)
         if command.status is Status.SOLVED and k >= 220 and k % 20 in (0, 1):
-            assert ours.tick(1e-3 * k, q, v).status is Status.SOLVED
+            assert python.tick(1e-3 * k, q, v).status is Status.SOLVED
             z = np.concatenate([command.acceleration, command.forces])
-            program = problem_of(ours.assembly, z)
+            program = problem_of(python.assembly, z)
             assert missed(program, z)[0] <= 1e-9 and max(missed(program, z)) <= 1e-7
             assert max(stationarity(program, z)) <= 1e-7
             checked += 1
         if k % 50 == 0:
-            push = 30.0 * rng.normal(size=ours.robot.nv) * (k % 100 == 0)
+            push = 30.0 * rng.normal(size=python.robot.nv) * (k % 100 == 0)
         v = v + 1e-3 * (command.acceleration + push)
-        q = np.asarray(pin.integrate(ours.robot.model, q, 1e-3 * v))
+        q = np.asarray(pin.integrate(python.robot.model, q, 1e-3 * v))
     assert checked >= 20
 
 
 def test_the_iterations_of_a_tick_are_bounded_and_suffice() -> None:
-    """Unrelated states far from any posture need more than a run, and at most half of what the header permits."""
+    """Unrelated far states need more iterations than a run, and at most half of the maximum in the header."""
     robot, rng = formulation_of("talos")[0], np.random.default_rng(3)
-    theirs = compiled("talos")
-    theirs.reset(robot.posture(), np.zeros(robot.nv))
+    c = compiled("talos")
+    c.reset(robot.posture(), np.zeros(robot.nv))
     header = (exported("talos") / "ctl.h").read_text(encoding="utf-8")
     most = int(re.findall(r"#define CTL_MOST_ITERATIONS (\d+)", header)[0])
     counts = []
     for k in range(100):
-        command = theirs.tick(1e-3 * k, *random_state(robot, rng, 0.3))
+        command = c.tick(1e-3 * k, *random_state(robot, rng, 0.3))
         assert command.status in (Status.SOLVED, Status.RELAXED)
-        counts.append(theirs.report().iterations)
+        counts.append(c.report().iterations)
     assert 100 < max(counts) <= most / 2
 
 
 @pytest.mark.parametrize("name", ["tilthex_arm", "talos"])
-def test_a_relaxed_tick_misses_its_levels_by_as_little(name: str) -> None:
-    ours, theirs, _, _ = both_at_rest(name)
-    robot = ours.robot
-    rng = np.random.default_rng(1)
-    relaxed = 0
+def test_a_relaxed_tick_misses_its_levels_as_in_python(name: str) -> None:
+    python, c, _, _ = both_at_rest(name)
+    robot, rng, relaxed = python.robot, np.random.default_rng(1), 0
     for k in range(12):
         q, v = random_state(robot, rng, 0.3)
-        a, b = ours.tick(1e-3 * k, q, v), theirs.tick(1e-3 * k, q, v)
+        a, b = python.tick(1e-3 * k, q, v), c.tick(1e-3 * k, q, v)
         if a.status is not Status.RELAXED or b.status is not Status.RELAXED:
             continue
         relaxed += 1
-        wanted, found = ({r.level: r.amount for r in c.report().relaxed} for c in (ours, theirs))
-        # The first level that gives way gives way as little; what comes below depends on it to fewer digits.
-        first = next(iter(wanted))
-        assert found.get(first, 0.0) <= wanted[first] * (1 + 1e-5) + 1e-6
-        assert np.all(b.u <= ours.actuators.upper * (1 + 1e-6))
-        assert np.all(b.u >= ours.actuators.lower - 1e-6 * np.abs(ours.actuators.lower))
-        assert theirs.report().dynamics < 1e-6 * max(1.0, float(np.abs(b.u).max()))
+        in_python, in_c = ({r.level: r.amount for r in x.report().relaxed} for x in (python, c))
+        # Only the first level that gives way: the lower levels depend on it and agree to fewer digits.
+        first = next(iter(in_python))
+        assert in_c.get(first, 0.0) <= in_python[first] * (1 + 1e-5) + 1e-6
+        assert np.all(b.u <= python.actuators.upper * (1 + 1e-6))
+        assert np.all(b.u >= python.actuators.lower - 1e-6 * np.abs(python.actuators.lower))
+        assert c.report().dynamics < 1e-6 * max(1.0, float(np.abs(b.u).max()))
     assert relaxed >= 3
 
 
@@ -141,74 +134,74 @@ def test_a_relaxed_tick_misses_its_levels_by_as_little(name: str) -> None:
     [("tilthex_arm", "ee", "keep"), ("tilthex_arm", "ee", "follow"), ("tilthex_arm", "ee", "release"),
      ("solo8", "base_link", "release")],
 )  # fmt: skip
-def test_the_impact_robust_term_is_that_of_python_through_its_phases(name: str, frame: str, spring: Spring) -> None:
+def test_the_impact_robust_term_agrees_with_python_in_all_phases(name: str, frame: str, spring: Spring) -> None:
     robot, formulation = formulation_of(name)
     objective = impact_of(robot, frame, (0.0, 0.0, 1.0))
-    theirs = compiled(name, objective)
+    c = compiled(name, objective)
     posture = formulation.posture
     assert posture is not None
     gradient = gradient_of(gradient_beside(name, objective))
     robust = ImpactRobustPosture(robot, gradient, kp=posture.kp, weight=posture.weight, spring=spring, follow=0.02)
     robust.activation.ramp = 0.01
     for parameter, value in (("ramp", 0.01), ("follow", 0.02), ("spring", get_args(Spring).index(spring))):
-        theirs.parameters[f"robust_{parameter}"][:] = value
-    ours = Controller(robot, type(formulation)(
+        c.parameters[f"robust_{parameter}"][:] = value
+    python = Controller(robot, type(formulation)(
         formulation.levels, formulation.weighted, robust, formulation.contacts, formulation.force_point,
     ))  # fmt: skip
     q, v = robot.posture(), np.zeros(robot.nv)
-    ours.reset(q, v)
-    theirs.reset(q, v)
+    python.reset(q, v)
+    c.reset(q, v)
     levels = set()
     phases = (("brace", 3), ("contact", 40), ("release", 75))
-    # Python's phases begin at the call.  C takes their times, and a call that is early, or due.
+    # In Python, a phase begins at the call.  In C, it has a time, and the call may be early.
     for phase, at in phases[:2]:
-        getattr(theirs, phase)(1e-3 * at)
+        getattr(c, phase)(1e-3 * at)
     for wrong, at in (("brace", 0.08), ("contact", 0.08), ("release", 0.03), ("release", np.nan)):
         with pytest.raises(InputError, match="follow"):
-            getattr(theirs, wrong)(at)
+            getattr(c, wrong)(at)
     for k in range(110):
         for phase, at in phases:
             if k == at:
                 getattr(robust, phase)()
                 if phase == "release":
-                    theirs.release()
-        a, b = ours.tick(1e-3 * k, q, v), theirs.tick(1e-3 * k, q, v)
+                    c.release()
+        a, b = python.tick(1e-3 * k, q, v), c.tick(1e-3 * k, q, v)
         assert a.status is b.status is Status.SOLVED
         assert difference(a, b) < 1e-9
-        assert theirs.level == theirs.report().level == robust.level
-        levels.add(round(theirs.level, 3))
+        assert c.level == c.report().level == robust.level
+        levels.add(round(c.level, 3))
         v = v + 1e-3 * a.acceleration
         q = np.asarray(pin.integrate(robot.model, q, 1e-3 * v))
     assert {0.0, 1.0} < levels
 
 
-def test_a_stiffened_posture_is_that_of_python(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+def test_a_stiffened_posture_agrees_with_python(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     robot, formulation = formulation_of("panda")
     root = np.random.default_rng(2).normal(size=(robot.nv, robot.nv))
     assert formulation.posture is not None
     formulation.posture.stiffen(3.0 * root @ root.T)
     monkeypatch.setenv("CFLAGS", "-O0")
     written = export_controller(robot, formulation, tmp_path / "c", daqp=exported("panda") / "daqp", build=True)
-    ours, theirs, q, v = Controller(robot, formulation), written.load(), robot.posture(), np.zeros(robot.nv)
-    for controller in (ours, theirs):
+    python, c, q, v = Controller(robot, formulation), written.load(), robot.posture(), np.zeros(robot.nv)
+    for controller in (python, c):
         controller.reset(q, v)
     rng = np.random.default_rng(3)
     for k in range(5):
         state = random_state(robot, rng, 0.03)
-        assert difference(ours.tick(1e-3 * k, *state), theirs.tick(1e-3 * k, *state)) < 1e-9
+        assert difference(python.tick(1e-3 * k, *state), c.tick(1e-3 * k, *state)) < 1e-9
 
 
 def test_a_sole_on_its_edge_is_refused_until_it_stands() -> None:
-    ours, theirs, q, v = both_at_rest("talos")
+    python, c, q, v = both_at_rest("talos")
     turned = q.copy()
     turned[3:7] = [0.0, np.sqrt(0.5), 0.0, np.sqrt(0.5)]
-    for controller in (ours, theirs):
+    for controller in (python, c):
         with pytest.raises(ContactError, match="stands on its edge"):
             controller.reset(turned, v)
     with pytest.raises(InputError, match="has not been reset"):
-        theirs.tick(0.0, q, v)
-    assert difference(ours.reset(q, v), theirs.reset(q, v)) < 1e-9
-    assert difference(ours.tick(0.0, q, v), theirs.tick(0.0, q, v)) < 1e-9
+        c.tick(0.0, q, v)
+    assert difference(python.reset(q, v), c.reset(q, v)) < 1e-9
+    assert difference(python.tick(0.0, q, v), c.tick(0.0, q, v)) < 1e-9
 
 
 def test_an_export_leaves_the_tasks_of_a_running_controller_alone() -> None:
@@ -223,87 +216,84 @@ def test_an_export_leaves_the_tasks_of_a_running_controller_alone() -> None:
 
 
 def test_a_singular_arm_is_damped_as_in_python() -> None:
-    robot, formulation = formulation_of("panda")
-    ours, theirs = Controller(robot, formulation), compiled("panda")
-    ours.reset(robot.posture(), np.zeros(robot.nv))
-    theirs.reset(robot.posture(), np.zeros(robot.nv))
+    python, c, _, _ = both_at_rest("panda")
     rng, deficient = np.random.default_rng(0), 0
     for k in range(280):
-        q, v = random_state(robot, rng, 1.0)
-        a, b = ours.tick(1e-3 * k, q, 0.2 * v), theirs.tick(1e-3 * k, q, 0.2 * v)
+        q, v = random_state(python.robot, rng, 1.0)
+        a, b = python.tick(1e-3 * k, q, 0.2 * v), c.tick(1e-3 * k, q, 0.2 * v)
         assert a.status is b.status
-        if a.status is Status.SOLVED and ours.report().deficient:
+        if a.status is Status.SOLVED and python.report().deficient:
             deficient += 1
             assert difference(a, b) < 1e-9
-            found, wanted = (c.report().deficient[0].amount for c in (theirs, ours))
-            assert found == pytest.approx(wanted, rel=1e-7)
+            in_python, in_c = (x.report().deficient[0].amount for x in (python, c))
+            assert in_c == pytest.approx(in_python, rel=1e-7)
     assert deficient >= 2
 
 
 def test_targets_are_set_by_the_name_of_their_task() -> None:
-    ours, theirs, q, v = both_at_rest("panda")
-    robot, task = ours.robot, ours.formulation.levels[0][0]
+    python, c, q, v = both_at_rest("panda")
+    robot, task = python.robot, python.formulation.levels[0][0]
     name = task.name
     turn = pin.exp3(np.array([0.1, -0.2, 0.3]))
     target = pin.SE3(task.target.rotation @ turn, task.target.translation + 0.01)  # type: ignore[attr-defined]
     task.target, task.target_velocity, task.target_acceleration = target, np.full(6, 0.1), np.full(6, -0.2)  # type: ignore[attr-defined]
-    theirs.set_target(name, target, 0.1, -0.2)
+    c.set_target(name, target, 0.1, -0.2)
     goal = robot.posture() + 0.1
-    ours.formulation.posture.move_to(goal, 0.01)  # type: ignore[union-attr]
-    theirs.move_to(goal, 0.01)
+    python.formulation.posture.move_to(goal, 0.01)  # type: ignore[union-attr]
+    c.move_to(goal, 0.01)
     for k in range(4):
-        assert difference(ours.tick(0.004 * k, q, v), theirs.tick(0.004 * k, q, v)) < 1e-9
-    # Without its target, the task holds where the next reset finds it.
-    theirs.forget_target(name)
+        assert difference(python.tick(0.004 * k, q, v), c.tick(0.004 * k, q, v)) < 1e-9
+    # Without a target, the task holds the pose at the next reset.
+    c.forget_target(name)
     fresh = compiled("panda")
-    for controller in (theirs, fresh):
+    for controller in (c, fresh):
         controller.reset(q, v)
-    assert difference(theirs.tick(0.0, q, v), fresh.tick(0.0, q, v)) < 1e-12
+    assert difference(c.tick(0.0, q, v), fresh.tick(0.0, q, v)) < 1e-12
     with pytest.raises(InputError, match="there is no task 'hand'"):
-        theirs.forget_target("hand")
+        c.forget_target("hand")
 
 
 def test_a_moving_reference_leads_the_posture() -> None:
-    ours, theirs, q, v = both_at_rest("solo8")
-    robot, posture = ours.robot, ours.formulation.posture
+    python, c, q, v = both_at_rest("solo8")
+    robot, posture = python.robot, python.formulation.posture
     assert posture is not None
     goal = np.asarray(pin.integrate(robot.model, q, np.full(robot.nv, 0.02)))
     posture._target[:], posture.target_velocity, posture.target_acceleration = goal, 0.3, -2.0
     rate = np.ones(robot.nv)
-    theirs.lead_posture(goal, 0.3 * rate, -2.0 * rate)
-    a, b = ours.tick(0.0, q, v), theirs.tick(0.0, q, v)
+    c.lead_posture(goal, 0.3 * rate, -2.0 * rate)
+    a, b = python.tick(0.0, q, v), c.tick(0.0, q, v)
     assert difference(a, b) < 1e-9
-    assert difference(a, theirs.reset(q, v)) > 1e-3
+    assert difference(a, c.reset(q, v)) > 1e-3
 
 
 def test_a_reset_forgets_a_led_posture() -> None:
-    _, theirs, q, v = both_at_rest("panda")
-    first = theirs.reset(q, v)
-    theirs.lead_posture(q, v + 0.5, v + 2.0)
-    # As a program in C resets it, without ip_init.
-    theirs._call("reset", *theirs._pointers[:2], ctypes.byref(theirs._command))
-    np.testing.assert_allclose(theirs._commanded().u, first.u, rtol=0, atol=1e-9)
+    _, c, q, v = both_at_rest("panda")
+    first = c.reset(q, v)
+    c.lead_posture(q, v + 0.5, v + 2.0)
+    # A program in C resets it like this, without ip_init.
+    c._call("reset", *c._pointers[:2], ctypes.byref(c._command))
+    np.testing.assert_allclose(c._commanded().u, first.u, rtol=0, atol=1e-9)
 
 
-def test_shapes_are_those_of_the_robot() -> None:
-    _, theirs, q, v = both_at_rest("panda")
-    theirs.tick(0.0, q, v)
-    pose = next(iter(theirs.targets))
+def test_arrays_of_another_shape_are_refused() -> None:
+    _, c, q, v = both_at_rest("panda")
+    c.tick(0.0, q, v)
+    pose = next(iter(c.targets))
     moves = [
-        lambda: theirs.tick(0.1, q, 0.1), lambda: theirs.tick(0.1, q, v[:1]), lambda: theirs.tick(0.1, q[None], v),
-        lambda: theirs.reset(0.3, v), lambda: theirs.move_to(0.3), lambda: theirs.lead_posture(q, 0.1, v),
-        lambda: theirs.set_target(pose, 0.5), lambda: theirs.set_target(pose, q[:3]),
+        lambda: c.tick(0.1, q, 0.1), lambda: c.tick(0.1, q, v[:1]), lambda: c.tick(0.1, q[None], v),
+        lambda: c.reset(0.3, v), lambda: c.move_to(0.3), lambda: c.lead_posture(q, 0.1, v),
+        lambda: c.set_target(pose, 0.5), lambda: c.set_target(pose, q[:3]),
     ]  # fmt: skip
     for move in moves:
         with pytest.raises(ValueError):
             move()
-    theirs.move_to(q + 0.1)
-    assert np.array_equal(theirs.measured[0], q)
+    c.move_to(q + 0.1)
+    assert np.array_equal(c.measured[0], q)
 
 
 def test_a_rate_beyond_all_measurements_damps_nothing() -> None:
-    ours, theirs, q, v = both_at_rest("panda")
-    for controller in (ours, theirs):
+    python, c, q, v = both_at_rest("panda")
+    for controller in (python, c):
         good = controller.tick(0.0, q, v)
         for rate in (2e8, -np.inf, np.nan):
             glitch = v.copy()
@@ -312,8 +302,7 @@ def test_a_rate_beyond_all_measurements_damps_nothing() -> None:
             assert held.status is Status.NON_FINITE and np.array_equal(held.u, good.u)
 
 
-def test_the_library_is_used_by_many_at_once() -> None:
-    """Two contexts of one library do not disturb each other."""
+def test_two_contexts_of_a_library_do_not_disturb_each_other() -> None:
     robot = formulation_of("panda")[0]
     one, other = compiled("panda"), compiled("panda")
     q, v = robot.posture(), np.zeros(robot.nv)

@@ -1,4 +1,4 @@
-"""The relaxations in C and in Python: both are lexicographic by an independent certificate, and they agree."""
+"""The relaxations in C and in Python agree, and an independent certificate shows that they are lexicographic."""
 
 from __future__ import annotations
 
@@ -38,17 +38,17 @@ def relaxation(tmp_path_factory: pytest.TempPathFactory) -> Relaxation:
 
 @functools.cache
 def ticks_of(name: str, kind: str) -> list[RelaxedTick]:
-    """Random states, too far and too fast, which controllers answer by relaxation."""
+    """Return the relaxed ticks of a controller at random states, too far and too fast."""
     controller, _ = bracing(name, kind)
     robot, generator = controller.robot, rng(name, "relaxed in C")
-    with recording() as found:
-        for k in itertools.takewhile(lambda k: k < 9 or len(found) < 4, range(60)):
+    with recording() as ticks:
+        for k in itertools.takewhile(lambda k: k < 9 or len(ticks) < 4, range(60)):
             far, fast = (0.0, 0.1, 1.0)[min(k // 3, 2)], (3.0, 10.0, 30.0)[k % 3]
             q = np.array(pin.integrate(robot.model, robot.posture(), far * generator.normal(size=robot.nv)))
             force = None if kind == "legged" else 100.0 * generator.normal(size=6)
             controller.tick(k * DT, q, fast * generator.normal(size=robot.nv), force)
-    assert len(found) >= 4
-    return found
+    assert len(ticks) >= 4
+    return ticks
 
 
 def squares(tick: RelaxedTick, z: np.ndarray) -> list[float]:
@@ -127,7 +127,7 @@ def test_random_stacks(relaxation: Relaxation, seed: int) -> None:
 
 
 def small(**changes: np.ndarray) -> RelaxedTick:
-    """Return two variables, of which the first is at most 1, and a level that asks for z = (2, 3)."""
+    """Return a problem of two variables: the first is at most 1, and a level demands z = (2, 3)."""
     inf = np.inf
     tick = RelaxedTick(
         H=np.eye(2), g=np.zeros(2), A=np.array([[1.0, 0.0], [1.0, 0.0], [0.0, 1.0]]),
@@ -141,8 +141,8 @@ def test_a_level_that_a_bound_stops(relaxation: Relaxation) -> None:
     assert np.allclose(relaxation.solve(small()).z, [1.0, 3.0], atol=1e-12)
 
 
-def test_what_no_level_asks_for_goes_to_the_cost(relaxation: Relaxation) -> None:
-    """Against SciPy: one equation, bounds, and a cost of any shape."""
+def test_the_cost_decides_in_the_free_directions(relaxation: Relaxation) -> None:
+    """SciPy solves the same problem: an equation, bounds, and a cost of any shape."""
     g = rng("cost")
     for _ in range(5):
         root, row = g.normal(size=(3, 3)), g.normal(size=3)
@@ -161,7 +161,7 @@ def test_what_no_level_asks_for_goes_to_the_cost(relaxation: Relaxation) -> None
 
 
 def test_without_levels_or_rows(relaxation: Relaxation) -> None:
-    """The least of z²/2 with z ≥ 1 is 1, whatever the level of the bound is."""
+    """The minimum of z²/2 with z ≥ 1 is at 1 for both levels of the bound."""
     for level in (0, 1):
         one = np.ones(1)
         tick = RelaxedTick(np.eye(1), 0 * one, np.zeros((0, 1)), one, np.inf * one, np.array([level]), one, one)
@@ -170,7 +170,7 @@ def test_without_levels_or_rows(relaxation: Relaxation) -> None:
 
 
 def test_a_budget_is_kept(relaxation: Relaxation) -> None:
-    """With too few iterations there is a code and no answer; the next tick goes on from where this one stopped."""
+    """With too few iterations, the result is a code.  The next tick goes on with the active rows of this one."""
     tick = ticks_of("talos", "legged")[-1]
     relaxation.forget()
     needed = relaxation.solve(tick).iterations
@@ -182,7 +182,7 @@ def test_a_budget_is_kept(relaxation: Relaxation) -> None:
     assert relaxation.solve(tick).iterations < needed
 
 
-def test_what_has_no_answer(relaxation: Relaxation) -> None:
+def test_problems_without_an_answer_have_a_code(relaxation: Relaxation) -> None:
     relaxation.forget()
     bounds = np.array([-np.inf, -np.inf, 5.0, 2.0, 3.0]), np.array([np.inf, np.inf, 6.0, 2.0, 3.0])
     equation = small(lower=bounds[0], upper=bounds[1], level=np.array([1, 1, 0, 0, 2]))
