@@ -77,6 +77,11 @@ class Linearization:
     posture: Array
     auxiliary: Array
 
+    @property
+    def violation(self) -> float:
+        """Largest violation of a bound; zero if all rows are within their bounds."""
+        return float(np.maximum(self.lower - self.value, self.value - self.upper).max(initial=0.0))
+
     @staticmethod
     def joined(parts: Sequence[Linearization], nv: int) -> Linearization:
         """Join the rows of parts whose auxiliaries are separate."""

@@ -257,7 +257,7 @@ class SeparatingPlane:
         if unknowns is not None and not self.known:
             rows = self.linearize_at(model, unknowns[:3], float(unknowns[3]))
             # The plane of the program may cut corners that have no row there, and then the pair is not active.
-            if max((rows.lower - rows.value).max(), (rows.value - rows.upper).max()) <= _KEPT:
+            if rows.violation <= _KEPT:
                 return rows
         at_b = self.b.placement(model)
         relative = at_b.actInv(self.a.placement(model))

@@ -1,8 +1,8 @@
-"""Machine code for the functions of the program where it pays, in a cache by content.
+"""Compile the functions of the program to machine code where this pays, and keep the code in a cache by content.
 
 CasADi interprets an operation in a few nanoseconds.  Machine code needs a few tenths of a nanosecond, but compiling
 takes about 100 µs for each operation.  So one optimization of a small robot is interpreted, and a study of thousands
-compiles once.
+of optimizations compiles once.
 """
 
 from __future__ import annotations
@@ -21,18 +21,18 @@ from impact_posture.system.toolchain import find_compiler, require_compiler, run
 
 CompileMode = Literal["auto", "always", "never"]
 
-# From what docs/studies/solve.py prints for talos: 170,000 operations take about 20 s to compile, and each
-# start of some 25 iterations is about 30 ms faster for it.  Orders of magnitude are enough to decide.
+# From docs/studies/solve.py for talos: 170,000 operations take about 20 s to compile, and a start of about
+# 25 iterations is then about 30 ms faster.  Orders of magnitude are enough to decide.
 _COMPILE_S_PER_OPERATION = 1.2e-4
 _SAVED_S_PER_OPERATION = 6e-9
 _ITERATIONS = 35
-# A function with more operations is not optimized.  The compiler would take three times as long for code three times
-# as fast, and the solve no longer waits for that code.
+# Functions with more operations are compiled with -O0.  With -O1 the compiler takes three times as long for code that
+# is three times as fast, and evaluating that code no longer dominates the solve.
 _OPTIMIZED = 100_000
 
 
 class BuiltSolver(NamedTuple):
-    """``nlpsol``, whether it runs as machine code, and the reason why a compilation failed, else empty."""
+    """``nlpsol``, whether it runs as machine code, and why a compilation failed (empty if none failed)."""
 
     solver: ca.Function
     compiled: bool
@@ -54,8 +54,8 @@ def compiled_solver(
         symbols: The expressions ``x``, ``p``, ``f`` and ``g``.
         options: Options of IPOPT.
         mode: Whether to compile.
-        starts: Number of runs that compiling has to pay for.
-        derivatives: Options of ``nlpsol`` with the derivatives that are known.
+        starts: Number of runs that share the cost of compiling.
+        derivatives: Options of ``nlpsol`` with known derivatives.
 
     Raises:
         InputError: There is no such mode.
@@ -66,16 +66,16 @@ def compiled_solver(
         raise InputError(f"no mode '{mode}'", where="compile", hint=f"choose from {', '.join(modes)}")
     interpreted: ca.Function | None = None
     try:
-        if mode != "never" and (found := _cached(problem, options)) is not None:
-            return BuiltSolver(found, True)
+        if mode != "never" and (solver := _cached(problem, options)) is not None:
+            return BuiltSolver(solver, True)
         interpreted = ca.nlpsol("posture", "ipopt", symbols, {**options, **derivatives})
         compiler = require_compiler("compile") if mode == "always" else find_compiler()
         if mode == "never" or compiler is None or (mode == "auto" and not _pays(interpreted, starts)):
             return BuiltSolver(interpreted, False)
         _compile(interpreted, compiler, f"{_key(problem)}.so")
-        if (found := _cached(problem, options)) is None:
+        if (solver := _cached(problem, options)) is None:
             raise CompilerError("what was built cannot be loaded", where="compile", hint="set CC to another compiler")
-        return BuiltSolver(found, True)
+        return BuiltSolver(solver, True)
     except (CompilerError, OutputError) as error:
         if mode == "always":
             raise
@@ -102,12 +102,12 @@ def _pays(solver: ca.Function, starts: int) -> bool:
 
 
 def _key(problem: ConstrainedProblem) -> str:
-    """Hash of everything that shapes the functions; targets, limits and the leading normal are parameters."""
+    """Return a hash of all numbers in the functions; targets, limits and the leading normal are parameters."""
     content = [
         ca.CasadiMeta.version(),
         f"{platform.system()} {platform.machine()}",
         problem.robot.impact_sha256,
-        # Placements of frames on links are no part of the dynamics, but of every expression of a point.
+        # Placements of frames on links are not in the hash of the dynamics, but enter every expression of a point.
         *[f"{f.name} {f.parentJoint} {f.placement.homogeneous.tolist()}" for f in problem.robot.model.frames],
         problem.objective.structure,
         problem.structure,
@@ -116,11 +116,11 @@ def _key(problem: ConstrainedProblem) -> str:
 
 
 def _compile(solver: ca.Function, compiler: list[str], name: str) -> None:
-    """Compile into the cache, each function in a file of its own, with one compiler for each core."""
+    """Compile each function into a separate object file, with one compiler for each core, and link in the cache."""
     library = cache_folder() / name
     with building(library) as folder:
         functions = [solver.oracle(), *[_shared(solver.get_function(name)) for name in solver.get_function()]]
-        # The largest function comes first, so that nothing waits for it at the end.
+        # The largest function is compiled first, so that nothing waits for it at the end.
         functions.sort(key=lambda function: -int(function.n_instructions()))
         commands = [_command(function, compiler, folder) for function in functions]
         run_compilers(commands, folder)
@@ -129,7 +129,7 @@ def _compile(solver: ca.Function, compiler: list[str], name: str) -> None:
 
 
 def _shared(function: ca.Function) -> ca.Function:
-    """The same function with equal subexpressions computed once.  Differentiation leaves many of them."""
+    """Return the function with equal subexpressions computed once, because differentiation leaves many of them."""
     inputs = function.sx_in()
     names = (function.name_in(), function.name_out())
     return ca.Function(function.name(), inputs, function.call(inputs), *names, {"cse": True})

@@ -1,4 +1,4 @@
-"""The posture problem as data: objective, constraints, bounds and start, and the rank of its equalities."""
+"""The posture problem: objective, constraints, limits and start, and the rank of its equalities."""
 
 from __future__ import annotations
 
@@ -19,7 +19,7 @@ from impact_posture.posture.constraints.surroundings import Surroundings
 from impact_posture.robot.robot import Robot
 from impact_posture.system.arrays import Array
 
-# A direction of the tangent space is held if a unit step along it moves a constraint by more than this.
+# A constraint holds a direction of the tangent space if a unit step along it moves the constraint by more than this.
 RANK_TOLERANCE = 1e-7
 
 
@@ -32,12 +32,12 @@ class ConstrainedProblem:
         objective: The function that is minimized.
         requirements: Demands of the task.
         given: Posture of the user, shape (nq,).
-        constraints: All constraints except bounds.
-        lower: Lower bounds in chart coordinates, with margin, and with held joints pinned, shape (nx,).
-        upper: Upper bounds, shape (nx,).
-        rows: Rows of each constraint that the program carries; empty for all rows.
-        notes: Decisions that the builder made for the user, one line each.
-        surroundings: The bodies that the robot stays clear of; ``None`` without this demand.
+        constraints: All constraints except joint limits.
+        lower: Lower joint limits plus margin, chart coordinates, shape (nx,); the limits of a held joint are equal.
+        upper: Upper joint limits less margin, shape (nx,).
+        rows: Rows of each constraint that the program contains; empty for all rows.
+        notes: Decisions of the builder, one line each.
+        surroundings: The bodies that the robot stays clear of; ``None`` without collision constraints.
     """
 
     robot: Robot
@@ -53,44 +53,41 @@ class ConstrainedProblem:
 
     @property
     def impact(self) -> WorstCaseObjective:
-        """The objective of an impact.
+        """The objective as an impact objective.
 
         Raises:
-            InputError: The objective is not that of an impact.
+            InputError: The objective is not an impact objective.
         """
         if not isinstance(self.objective, WorstCaseObjective):
             raise InputError(
-                f"is '{self.objective.name}', which is not that of an impact",
+                f"is '{self.objective.name}', which is not an impact objective",
                 where="objective",
-                hint="use an WorstCaseObjective for what needs H, G, V and S",
+                hint="use a WorstCaseObjective for what needs H, G, V and S",
             )
         return self.objective
 
     def carried(self, index: int) -> list[int]:
-        """Return the rows of constraint ``index`` that the program carries."""
+        """Return the rows of constraint ``index`` that the program contains."""
         return list(self.rows[index]) if self.rows else list(range(len(self.constraints[index].lifted_bounds[0])))
 
     @property
     def structure(self) -> str:
-        """Text that distinguishes the rows that the program carries, apart from parameters and bounds."""
+        """Text that identifies the rows of the program, without parameters and bounds."""
         return "\n".join(f"{c.structure}:{self.carried(k)}" for k, c in enumerate(self.constraints))
 
     @property
     def row_bounds(self) -> tuple[Array, Array]:
-        """Lower and upper bounds of all rows that the program carries."""
-        carried = [(*c.lifted_bounds, self.carried(i)) for i, c in enumerate(self.constraints)]
-        empty = np.zeros(0)
-        return (
-            np.concatenate([empty, *[lower[rows] for lower, _, rows in carried]]),
-            np.concatenate([empty, *[upper[rows] for _, upper, rows in carried]]),
-        )
+        """Lower and upper bounds of all rows of the program."""
+        bounds = [np.array(c.lifted_bounds)[:, self.carried(i)] for i, c in enumerate(self.constraints)]
+        lower, upper = np.concatenate([np.zeros((2, 0)), *bounds], axis=1)
+        return lower, upper
 
     def guess(self, numeric: Numeric) -> Guess:
-        """Return the auxiliaries of all constraints to start from at ``numeric.q``, with their bounds."""
+        """Return the initial auxiliaries of all constraints at ``numeric.q``, with their bounds."""
         return Guess.joined([c.guess(numeric) for c in self.constraints if c.unknowns])
 
     def split(self, auxiliaries: Array) -> list[Array]:
-        """Return the auxiliaries of each constraint."""
+        """Split auxiliaries by constraint."""
         ends = list(accumulate((c.unknowns for c in self.constraints), initial=0))
         return [auxiliaries[start:stop] for start, stop in pairwise(ends)]
 
@@ -102,19 +99,19 @@ class ConstrainedProblem:
     def grown(
         self, postures: Sequence[Array], numeric: Numeric | None = None, auxiliaries: Sequence[Array] | None = None
     ) -> ConstrainedProblem:
-        """Return the problem with the parts that its program lacks at any of the postures; itself if none.
+        """Return the problem with the parts that its program lacks at the postures, or itself if none are missing.
 
         Args:
             postures: The postures, shape (nq,) each.
             numeric: The model, if the caller has it; it is moved.
-            auxiliaries: Those of the program at the postures, if these are ends of runs, shape (k,) each.
+            auxiliaries: Auxiliaries of the program, shape (k,) each, if the postures are ends of runs.
         """
         constraints, numeric = list(self.constraints), numeric or Numeric(self.robot.model)
         for index, q in enumerate(postures):
             numeric.at(q)
             ends = [None] * len(constraints) if auxiliaries is None else self.split(auxiliaries[index])
             constraints = [c.grown(numeric, end) for c, end in zip(constraints, ends, strict=True)]
-        if all(one is other for one, other in zip(constraints, self.constraints, strict=True)):
+        if all(now is before for now, before in zip(constraints, self.constraints, strict=True)):
             return self
         rows = tuple(
             kept if now is before else tuple(range(len(now.lifted_bounds[0])))
@@ -123,7 +120,7 @@ class ConstrainedProblem:
         return replace(self, constraints=tuple(constraints), rows=rows)
 
     def slack(self, auxiliaries: Array) -> float:
-        """Return by how much (m) the constraints let off a run that ended at these auxiliaries."""
+        """Return the largest slack (m) of a constraint in the auxiliaries at the end of a run."""
         ends = self.split(auxiliaries)
         return max((c.slack(end) for c, end in zip(self.constraints, ends, strict=True)), default=0.0)
 
@@ -141,7 +138,7 @@ class ConstrainedProblem:
 
 
 def rank(jacobian: Array) -> int:
-    """Return the rank of a constraint Jacobian at the tolerance of all counts of redundancy."""
+    """Return the rank of a constraint Jacobian with the tolerance of every redundancy count."""
     return int(np.linalg.matrix_rank(jacobian, tol=RANK_TOLERANCE)) if jacobian.size else 0
 
 

@@ -1,8 +1,8 @@
-"""How IPOPT is called: its options, one thread for its linear algebra, and Ctrl-C.
+"""Call IPOPT with the right options, with one thread for linear algebra, and with a Ctrl-C that stops it.
 
-NumPy, SciPy and CasADi (for MUMPS, within IPOPT) each bring a BLAS that uses all cores.  The systems here have about
-a hundred unknowns, so these threads only wait for each other and block the cores of parallel starts.
-:func:`one_blas_thread` stops that.
+NumPy, SciPy and CasADi (for MUMPS in IPOPT) each bring a BLAS that uses all cores.  The systems here have about a
+hundred unknowns, so these threads only wait for each other and block the cores of parallel starts.
+:func:`one_blas_thread` prevents this.
 """
 
 from __future__ import annotations
@@ -26,11 +26,11 @@ IPOPT_OPTIONS: dict[str, Any] = {
     "ipopt.constr_viol_tol": 1e-10,
     "ipopt.dual_inf_tol": 1e-7,
     "ipopt.compl_inf_tol": 1e-9,
-    # Bounds are limits of the robot, which the solver must not relax.
+    # Bounds are limits of the robot, so the solver must not relax them.
     "ipopt.bound_relax_factor": 0.0,
     "ipopt.honor_original_bounds": "yes",
     "ipopt.mu_strategy": "adaptive",
-    # The rows of a program are of like size.  To scale and permute each matrix takes MUMPS longer than it saves.
+    # All rows have similar sizes, so scaling and permuting each matrix takes MUMPS longer than it saves.
     "ipopt.mumps_scaling": 0,
     "ipopt.mumps_permuting_scaling": 0,
     "ipopt.max_iter": 300,
@@ -40,11 +40,11 @@ IPOPT_OPTIONS: dict[str, Any] = {
     "no_nlp_grad": True,
     "error_on_fail": False,
 }
-# The equations of the dual of a cone are quadratic, and violated equations let the bound ``t`` fall.  A step that
-# violates them strongly to lower the objective never comes back.
+# For worst cases: the equations of the dual of a cone are quadratic, and violated equations let the bound ``t`` fall.
+# After a step that lowers the objective by a strong violation, IPOPT never returns to the equations.
 WORST_OPTIONS = {"ipopt.theta_max_fact": 1.0}
 CONVERGED = ("Solve_Succeeded", "Solved_To_Acceptable_Level")
-# A warm start keeps what is on a bound there.  By default IPOPT moves it inside and has to find the way back.
+# A warm start keeps unknowns on their bounds.  By default IPOPT moves them inside, and needs iterations to return.
 WARM_OPTIONS = {"ipopt.warm_start_init_point": "yes"} | {
     f"ipopt.warm_start_{name}": 1e-8
     for name in ("bound_push", "bound_frac", "slack_bound_push", "slack_bound_frac", "mult_bound_push")
@@ -63,7 +63,7 @@ threadpoolctl.register(_CasadiOpenBLAS)
 
 @contextmanager
 def one_blas_thread() -> Iterator[None]:
-    """Limit every BLAS of this process, and of processes forked within, to one thread."""
+    """Limit every BLAS to one thread, in this process and in processes forked within the context."""
     with _libraries().limit(limits=1):
         yield
 
@@ -75,32 +75,22 @@ def _libraries() -> threadpoolctl.ThreadpoolController:
 
 
 def run_solver(solver: ca.Function, **arguments: Array) -> dict[str, ca.DM]:
-    """Call an ``nlpsol``, and raise the Ctrl-C that IPOPT may catch."""
-    with _noticing_interrupts():
-        answer: dict[str, ca.DM] = solver(**arguments)
-    return answer
-
-
-@contextmanager
-def _noticing_interrupts() -> Iterator[None]:
-    """Raise a Ctrl-C after the solver, because the solver may take it for a failed evaluation and go on."""
-    in_charge = (
-        threading.current_thread() is threading.main_thread()
-        and signal.getsignal(signal.SIGINT) is signal.default_int_handler
-    )
-    if not in_charge:
-        yield
-        return
+    """Call an ``nlpsol``, and raise a Ctrl-C after it, which IPOPT may take for a failed evaluation and ignore."""
     seen: list[int] = []
 
     def note(number: int, frame: object) -> None:
         seen.append(number)
         raise KeyboardInterrupt
 
-    signal.signal(signal.SIGINT, note)
+    default = signal.default_int_handler
+    in_charge = threading.current_thread() is threading.main_thread() and signal.getsignal(signal.SIGINT) is default
+    if in_charge:
+        signal.signal(signal.SIGINT, note)
     try:
-        yield
+        answer: dict[str, ca.DM] = solver(**arguments)
     finally:
-        signal.signal(signal.SIGINT, signal.default_int_handler)
+        if in_charge:
+            signal.signal(signal.SIGINT, default)
     if seen:
         raise KeyboardInterrupt
+    return answer

@@ -1,4 +1,4 @@
-"""Linear programs by HiGHS of the CasADi wheels; SciPy takes longer to import than many problems take to solve."""
+"""Linear programs, solved by the HiGHS of the CasADi wheels, because scipy.optimize takes 0.35 s to import."""
 
 from __future__ import annotations
 
@@ -11,7 +11,7 @@ import numpy as np
 
 from impact_posture.system.arrays import Array
 
-# The default tolerances of HiGHS, 1e-7, are coarser than what a certificate accepts.
+# A certificate needs tighter tolerances than the defaults of HiGHS, 1e-7.
 _OPTIONS: dict[str, Any] = {
     "error_on_fail": False,
     "highs": {"output_flag": False, "primal_feasibility_tolerance": 1e-10, "dual_feasibility_tolerance": 1e-10},
@@ -36,12 +36,12 @@ class LinearOptimum:
 def solve_linear(
     cost: Array, rows: Array, lower: Array, upper: Array, low: Array, high: Array
 ) -> LinearOptimum | None:
-    """Return the optimum; ``None`` if there is none."""
+    """Return the optimum of :class:`LinearOptimum`, or ``None`` if the solver reports no success."""
     solver = _solver(*rows.shape)
-    found = solver(g=cost, a=rows, lba=lower, uba=upper, lbx=low, ubx=high)
+    solution = solver(g=cost, a=rows, lba=lower, uba=upper, lbx=low, ubx=high)
     if not solver.stats()["success"]:
         return None
-    x, multipliers = (np.array(found[key]).reshape(-1) for key in ("x", "lam_a"))
+    x, multipliers = (np.array(solution[key]).reshape(-1) for key in ("x", "lam_a"))
     return LinearOptimum(x, float(cost @ x), multipliers)
 
 

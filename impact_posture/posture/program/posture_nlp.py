@@ -1,4 +1,4 @@
-"""The nonlinear program, which is built once and solved for many starts, normals and targets."""
+"""The nonlinear program that is built once and solved for many starts, normals and targets."""
 
 from __future__ import annotations
 
@@ -19,7 +19,7 @@ from impact_posture.posture.program.program import Program, parameters
 from impact_posture.posture.program.program_rows import ProgramRows
 from impact_posture.system.arrays import Array
 
-# Price of a meter of slack in units of the scale.  It has to exceed what a meter of freedom is worth, and 2 did not.
+# Price of a meter of slack in units of the scale.  A meter of freedom must be worth less; with 2 slack was left.
 SLACK_PRICE = 50.0
 # Numbers of the programs of this process.
 _NUMBERS = count()
@@ -27,16 +27,16 @@ _NUMBERS = count()
 
 @dataclass(frozen=True, eq=False)
 class WarmStart:
-    """End of a run, from which a run of the same program with another target goes on.
+    """End of a run, from which a run of the same program with another target continues.
 
     Attributes:
         program: Number of the program.
         x: All unknowns, shape (n,).
-        lower: Their lower bounds, shape (n,).
-        upper: Their upper bounds, shape (n,).
+        lower: Lower bounds of the unknowns, shape (n,).
+        upper: Upper bounds of the unknowns, shape (n,).
         of_bounds: Multipliers of these bounds, shape (n,).
         of_rows: Multipliers of the rows, shape (m,).
-        scale: Divisor of the objective, to which the multipliers belong.
+        scale: Divisor of the objective with these multipliers.
     """
 
     program: int
@@ -59,7 +59,7 @@ class SolveRecord:
         time_s: Wall time of the call.
         auxiliaries: Final auxiliaries of the constraints, shape (k,).
         minimized: Value that the solver minimized, in units of the scale.
-        end: The end, to go on from.
+        end: All values that a warm start needs.
     """
 
     q: Array
@@ -72,7 +72,7 @@ class SolveRecord:
 
     @property
     def converged(self) -> bool:
-        """Whether IPOPT reports convergence.  The certificate is the proof."""
+        """Whether IPOPT reports convergence, which only the certificate proves."""
         return self.status in CONVERGED
 
 
@@ -86,8 +86,8 @@ class PostureNLP:
         solver: ``nlpsol`` of CasADi.
         build_time_s: Time to build and compile the program.
         compiled: Whether its functions run as machine code.
-        compiler_fault: Reason why a compilation failed; empty else.
-        number: Number of the program, the same with another target.
+        compiler_fault: Why a compilation failed; empty if none failed.
+        number: Number of the program, which is the same with another target.
     """
 
     problem: ConstrainedProblem
@@ -104,16 +104,16 @@ class PostureNLP:
         return self.program.chart
 
     def at(self, problem: ConstrainedProblem) -> PostureNLP:
-        """Return the program with another target, whose expressions and bounds of rows are the same."""
-        found = self.bounded(problem)
-        vars(found)["_row_bounds"] = self._row_bounds
-        return found
+        """Return the program for a problem with another target, which has the same expressions and row bounds."""
+        nlp = self.bounded(problem)
+        vars(nlp)["_row_bounds"] = self._row_bounds
+        return nlp
 
     def bounded(self, problem: ConstrainedProblem) -> PostureNLP:
-        """Return the program with other bounds of its rows."""
-        found = replace(self, problem=problem)
-        vars(found)["_warm_solver"] = self._warm_solver
-        return found
+        """Return the program for a problem with other row bounds."""
+        nlp = replace(self, problem=problem)
+        vars(nlp)["_warm_solver"] = self._warm_solver
+        return nlp
 
     def grown(self, problem: ConstrainedProblem, *, compile: CompileMode = "auto") -> PostureNLP:
         """Build the program of a problem that this one grew into."""
@@ -135,32 +135,31 @@ class PostureNLP:
             scale: Divisor of the objective; by default its value at ``start``.
             attempt: Index of the guess of the objective.
             price: Price of a meter of slack.
-            warm: End at ``start`` of a run with another target, of which only an end of the same program is used.
+            warm: End of a run at ``start`` with another target; it is ignored if it belongs to another program.
         """
         scale = scale or self.problem.objective.value(start)
         if warm is None or warm.program != self.number:
             return self._run(self.solver, self._cold(start, scale, attempt), price)
         ratio = warm.scale / scale
         warm = replace(warm, scale=scale, of_bounds=ratio * warm.of_bounds, of_rows=ratio * warm.of_rows)
-        found = self._run(self._warm_solver, warm, price)
-        if found.converged:
-            return found
+        record = self._run(self._warm_solver, warm, price)
+        if record.converged:
+            return record
         again = self._run(self.solver, self._cold(start, scale, attempt), price)
-        return replace(again, iterations=found.iterations + again.iterations, time_s=found.time_s + again.time_s)
+        return replace(again, iterations=record.iterations + again.iterations, time_s=record.time_s + again.time_s)
 
     def _cold(self, start: Array, scale: float, attempt: int) -> WarmStart:
         """Return the start of a run without multipliers."""
-        problem, given = self.problem, self.chart.to_x(start)
-        x = np.clip(given, problem.lower, problem.upper)
-        # The quantities at a posture within its limits are known as a rule.
-        q = start if np.array_equal(x, given) else self.chart.to_q(x)
-        guess = problem.objective.guess(q, scale, attempt)
-        own = problem.guess(self.program.numeric.at(q))
+        problem, unclipped = self.problem, self.chart.to_x(start)
+        x = np.clip(unclipped, problem.lower, problem.upper)
+        # The impact quantities at the start itself are usually known.
+        q = start if np.array_equal(x, unclipped) else self.chart.to_q(x)
+        impact, rows = problem.objective.guess(q, scale, attempt), problem.guess(self.program.numeric.at(q))
         return WarmStart(
             program=self.number,
-            x=np.concatenate([x, guess.values, own.values]),
-            lower=np.concatenate([problem.lower, guess.lower, own.lower]),
-            upper=np.concatenate([problem.upper, guess.above, own.above]),
+            x=np.concatenate([x, impact.values, rows.values]),
+            lower=np.concatenate([problem.lower, impact.lower, rows.lower]),
+            upper=np.concatenate([problem.upper, impact.above, rows.above]),
             of_bounds=np.zeros(0),
             of_rows=np.zeros(0),
             scale=scale,
@@ -188,7 +187,7 @@ class PostureNLP:
 
     @cached_property
     def _warm_solver(self) -> ca.Function:
-        """The solver that goes on from unknowns and multipliers."""
+        """The solver that continues from unknowns and multipliers."""
         names = {"grad_f": "nlp_grad_f", "jac_g": "nlp_jac_g", "hess_lag": "nlp_hess_l"}
         known = {option: self.solver.get_function(name) for option, name in names.items()}
         options = _options(self.problem) | WARM_OPTIONS | known
@@ -199,10 +198,9 @@ class PostureNLP:
         norms = np.zeros(len(self.chart.quaternion_slices()))
         lower, upper = (np.concatenate([norms, bounds]) for bounds in self.problem.row_bounds)
         # The other rows belong to the objective: first equations, then inequalities that bound it from below.
-        lifted = np.zeros(self.solver.size1_in("lbg") - len(lower))
-        below = lifted.copy()
-        below[lifted.size - self.program.bounded :] = -np.inf
-        return {"lbg": np.concatenate([lower, below]), "ubg": np.concatenate([upper, lifted])}
+        zeros = np.zeros(self.solver.size1_in("lbg") - len(lower))
+        below = np.where(np.arange(zeros.size) < zeros.size - self.program.bounded, 0.0, -np.inf)
+        return {"lbg": np.concatenate([lower, below]), "ubg": np.concatenate([upper, zeros])}
 
 
 def build_nlp(
@@ -213,14 +211,14 @@ def build_nlp(
     program: Program | None = None,
     rows: ProgramRows | None = None,
 ) -> PostureNLP:
-    """Build the program; the number of ``starts`` decides whether compiling pays.
+    """Build the program.
 
     Args:
         problem: The posture problem.
         compile: Whether to compile.
-        starts: Number of runs.
-        program: The expressions of a problem that grew into this one.
-        rows: The rows of the constraints of such a problem, if another program has them.
+        starts: Number of runs, which decides whether compiling pays.
+        program: Expressions of a problem that grew into this one.
+        rows: Rows of the constraints of such a problem, if another program has them.
 
     Raises:
         CompilerError, OutputError: As :func:`impact_posture.posture.program.compiled_solver.compiled_solver`.
@@ -228,7 +226,7 @@ def build_nlp(
     began = time.perf_counter()
     program = program or Program(problem, rows)
     symbols, derivatives = program.symbols(problem)
-    # A program that grows is soon another one, so it is not worth compiling.
+    # A program that grows is soon replaced, so it is compiled only if one run pays for it.
     built = compiled_solver(problem, symbols, _options(problem), compile, 1 if problem.grows else starts, derivatives)
     took = time.perf_counter() - began
     return PostureNLP(problem, program, built.solver, took, built.compiled, built.fault)

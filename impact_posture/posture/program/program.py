@@ -7,7 +7,7 @@ The lifted formulation leaves the linear solve of the impact to IPOPT::
                           c(q) within bounds,  |quaternions| = 1,  limits,
 
 Every function is then linear or quadratic in the auxiliaries, and the exact Hessian stays small
-(``docs/studies/formulations.py`` measures both forms).  An inner maximum adds a form of its own
+(``docs/studies/formulations.py`` measures both forms).  An inner maximum adds unknowns and rows
 (:mod:`impact_posture.impact.worst_case.model_set`).
 """
 
@@ -27,37 +27,37 @@ from impact_posture.system.arrays import Array
 
 
 class Program:
-    """The expressions of a program, most of which stay while the problem grows.
+    """The expressions of a program, most of which stay the same while the problem grows.
 
     Args:
         problem: The problem before it grows.
-        rows: The rows of its constraints, if another program of the problem has them.
+        rows: Rows of its constraints, if another program of the problem has them.
 
     Attributes:
-        rows: The rows of the constraints.
+        rows: Rows of the constraints.
         chart: Coordinates of the robot.
-        numeric: The model in numbers, made once for all runs.
-        bounded: Number of last rows that are inequalities ``≤ 0`` of the objective.
+        numeric: The model in Pinocchio, shared by all runs.
+        bounded: Number of inequalities ``≤ 0`` of the objective, which are the last rows.
     """
 
     def __init__(self, problem: ConstrainedProblem, rows: ProgramRows | None = None) -> None:
         self.rows = rows = rows or ProgramRows(problem)
         self.chart, self.numeric = rows.chart, Numeric(problem.robot.model)
-        own = ca.SX.sym("own", len(problem.objective.parameters))
+        impact = ca.SX.sym("own", len(problem.objective.parameters))
         scale, weight, self._price = ca.SX.sym("scale"), ca.SX.sym("weight"), ca.SX.sym("price")
-        self.lifted = lifted = problem.objective.lift(rows.tree, own, scale)
+        self.lifted = lifted = problem.objective.lift(rows.tree, impact, scale)
         self.bounded = int(lifted.inequalities.numel())
         self.value = lifted.value / scale + weight * rows.away
-        self.parameters = ca.vertcat(own, scale, weight, self._price, rows.reference, *rows.parameters)
+        self.parameters = ca.vertcat(impact, scale, weight, self._price, rows.reference, *rows.parameters)
 
     def branch(self) -> Program:
-        """Return a program that grows on its own from here."""
-        made = copy(self)
-        made.rows = self.rows.branch()
-        return made
+        """Return a copy that grows separately."""
+        branch = copy(self)
+        branch.rows = self.rows.branch()
+        return branch
 
     def symbols(self, problem: ConstrainedProblem) -> tuple[dict[str, ca.SX], dict[str, ca.Function]]:
-        """Return the expressions of a problem, and the derivatives of one that grows as options of ``nlpsol``.
+        """Return the expressions of a problem, and for a problem that grows its derivatives as options of ``nlpsol``.
 
         The expressions are ``x`` (unknowns), ``p`` (parameters), ``f`` and ``g``.
         """
@@ -67,26 +67,26 @@ class Program:
         symbols = {"x": x, "p": self.parameters, "f": self.value + self._price * rows.slack, "g": g}
         if not problem.grows:
             return symbols, {}
-        found = joined(self.own, self.rows.derivatives(rows), self.chart.nx)
-        # Own rows are the value, the norms and the rows of the objective, with the constraints between the latter.
-        norms, count, own = self.rows.norms.numel(), rows.rows.numel(), self.own.multipliers.numel()
-        order = [*range(1, 1 + norms), *range(own, own + count), *range(1 + norms, own)]
-        placed = Derivatives(found.multipliers[order], found.jacobian[order, :], found.hessian)
-        return symbols, placed.options(x, self.parameters, found.multipliers[0], g)
+        joint = joined(self.fixed, self.rows.derivatives(rows), self.chart.nx)
+        # Rows of ``joint``: the value, the norms, the rows of the objective, then of the constraints.  In ``g`` the
+        # constraints follow the norms.
+        norms, count, fixed = self.rows.norms.numel(), rows.rows.numel(), self.fixed.multipliers.numel()
+        order = [*range(1, 1 + norms), *range(fixed, fixed + count), *range(1 + norms, fixed)]
+        return symbols, joint.reordered(order).options(x, self.parameters, joint.multipliers[0], g)
 
     @cached_property
-    def own(self) -> Derivatives:
-        """Derivatives of the value and of all rows but those of constraints."""
+    def fixed(self) -> Derivatives:
+        """Derivatives of the value, the norms and the rows of the objective, which do not grow."""
         objective, nx, norms = self.lifted, self.chart.nx, self.rows.norms
         rows = ca.vertcat(self.value, norms, objective.rest, objective.inequalities)
-        found = Derivatives.of(rows, ca.vertcat(self.rows.x, objective.variables))
+        derivatives = Derivatives.of(rows, ca.vertcat(self.rows.x, objective.variables))
         for jump, row, column in objective.jumps:
             first = 1 + norms.numel() + row
-            jacobian, hessian = jump.known_derivatives(found.multipliers[first:])
-            own, size = [*range(nx), *range(nx + column, column + jacobian.shape[1])], jacobian.shape[0]
-            found.jacobian[first : first + size, own] += jacobian
-            found.hessian[own, own] += hessian
-        return found
+            jacobian, hessian = jump.known_derivatives(derivatives.multipliers[first:])
+            columns, size = [*range(nx), *range(nx + column, column + jacobian.shape[1])], jacobian.shape[0]
+            derivatives.jacobian[first : first + size, columns] += jacobian
+            derivatives.hessian[columns, columns] += hessian
+        return derivatives
 
 
 def parameters(problem: ConstrainedProblem, chart: Chart, scale: float, price: float) -> Array:

@@ -1,7 +1,7 @@
-"""The rows of all constraints in a program that grows, with derivatives that are computed once for each piece.
+"""The rows of all constraints in a program that grows, whose derivatives are computed once for each piece.
 
-Most of the time to build a program goes into its first and second derivatives.  When a program grows, all but a few
-of its pieces stay as they were, and so do their derivatives.
+To build a program, first and second derivatives take most of the time.  When a program grows, most of its pieces and
+their derivatives stay the same.
 """
 
 from __future__ import annotations
@@ -38,27 +38,28 @@ class Derivatives:
     def of(rows: ca.SX, unknowns: ca.SX) -> Derivatives:
         """Differentiate rows."""
         multipliers = ca.SX.sym("multipliers", rows.numel())
-        return Derivatives(
-            multipliers, ca.jacobian(rows, unknowns), ca.hessian(ca.dot(multipliers, rows), unknowns)[0]
-        )
+        hessian = ca.hessian(ca.dot(multipliers, rows), unknowns)[0]
+        return Derivatives(multipliers, ca.jacobian(rows, unknowns), hessian)
+
+    def reordered(self, rows: list[int]) -> Derivatives:
+        """Return the derivatives with these rows; the Hessian keeps the multipliers of all."""
+        return Derivatives(self.multipliers[rows], self.jacobian[rows, :], self.hessian)
 
     def options(self, x: ca.SX, p: ca.SX, price: ca.SX, g: ca.SX) -> dict[str, ca.Function]:
         """Return the options of ``nlpsol`` for ``g`` with these derivatives; ``price`` is the multiplier of f.
 
-        CasADi looks for them in a library by the names of functions, inputs and outputs.
+        In a compiled library CasADi finds them by the names of functions, inputs and outputs.
         """
-        jacobian, lagrangian = [x, p], [x, p, price, self.multipliers]
-        hessian = [ca.triu(self.hessian)]
+        lagrangian, hessian = [x, p, price, self.multipliers], [ca.triu(self.hessian)]
+        names = ["x", "p", "lam_f", "lam_g"]
         return {
-            "jac_g": ca.Function("nlp_jac_g", jacobian, [g, self.jacobian], ["x", "p"], ["g", "jac_g_x"]),
-            "hess_lag": ca.Function(
-                "nlp_hess_l", lagrangian, hessian, ["x", "p", "lam_f", "lam_g"], ["triu_hess_gamma_x_x"]
-            ),
+            "jac_g": ca.Function("nlp_jac_g", [x, p], [g, self.jacobian], names[:2], ["g", "jac_g_x"]),
+            "hess_lag": ca.Function("nlp_hess_l", lagrangian, hessian, names, ["triu_hess_gamma_x_x"]),
         }
 
 
 class ProgramRows:
-    """Lifts the constraints of a problem, and those of all problems that it grows into, for all of its programs.
+    """Lifted constraints of a problem, and of all problems that it grows into, shared by all programs of it.
 
     Args:
         problem: The problem before it grows.
@@ -68,7 +69,7 @@ class ProgramRows:
         x: Chart coordinates, shape (nx, 1).
         tree: The dynamics at ``x``.
         norms: Squared norms of the quaternions less one.
-        reference: Chart coordinates of the given posture, shape (nx, 1).
+        reference: Symbols of the chart coordinates of the given posture, shape (nx, 1).
         away: Squared distance from the given posture.
         parameters: Symbols of the parameters of each constraint.
     """
@@ -85,14 +86,14 @@ class ProgramRows:
         self._sides = WeakKeyDictionary[LiftedRows, Derivatives]()
 
     def branch(self) -> ProgramRows:
-        """Return rows that grow on their own from here."""
-        made = copy(self)
-        made._lifted, made._blocks = dict(self._lifted), list(self._blocks)
-        return made
+        """Return a copy that grows separately."""
+        branch = copy(self)
+        branch._lifted, branch._blocks = dict(self._lifted), list(self._blocks)
+        return branch
 
     def lift(self, problem: ConstrainedProblem) -> LiftedRows:
-        """Return the rows that the program of a problem carries, by constraint."""
-        found = []
+        """Return the rows in the program of a problem, by constraint."""
+        pieces = []
         for index, constraint in enumerate(problem.constraints):
             carried = problem.carried(index)
             # Constraints with another target have the same expressions.
@@ -102,33 +103,33 @@ class ProgramRows:
                 if not lifted.pieces:
                     lifted = LiftedRows(lifted.rows[carried], lifted.variables, lifted.slack)
                 self._lifted[key] = lifted
-            found.append(self._lifted[key])
-        return LiftedRows.joined(found)
+            pieces.append(self._lifted[key])
+        return LiftedRows.joined(pieces)
 
     def derivatives(self, lifted: LiftedRows) -> Derivatives:
         """Return the derivatives of the rows of :meth:`lift` over ``(x, z)``."""
         nx, row, column = self.x.numel(), 0, 0
         rows, sides, columns = dict[int, range](), dict[int, range](), dict[int, range]()
         pieces: dict[int, LiftedRows] = {}
-        for whole in lifted.pieces:
-            own = whole.pieces or (whole,)
+        for constraint in lifted.pieces:
+            its_pieces = constraint.pieces or (constraint,)
             for kind, places in (("rows", rows), ("sides", sides)):
-                for piece in own:
+                for piece in its_pieces:
                     size = getattr(piece, kind).numel()
                     places[id(piece.rows)] = range(row, row + size)
                     row += size
-            for piece in own:
+            for piece in its_pieces:
                 if piece.rows.numel():
                     pieces[id(piece.rows)] = piece
                 columns[id(piece.rows)] = range(column, column + piece.variables.numel())
                 column += piece.variables.numel()
         self._differentiate(list(pieces.values()))
-        # There may be no rows, but there is always x.
+        # Without any rows the derivatives over x are empty matrices.
         parts, order = [Derivatives(ca.SX(0, 1), ca.SX(0, nx), ca.SX(nx, nx))], list[int]()
         at = [k for _, block in self._blocks for piece in block for k in columns[id(piece.rows)]]
-        for found, block in self._blocks:
+        for derivatives, block in self._blocks:
             present = [pieces[id(piece.rows)] for piece in block]
-            parts.append(_with_sides(found, [self._of_sides(piece) for piece in present], nx))
+            parts.append(_with_sides(derivatives, [self._of_sides(piece) for piece in present], nx))
             order += [k for places in (rows, sides) for piece in present for k in places[id(piece.rows)]]
         J, H = _stacked(parts, nx)
         new_columns = [*range(nx), *(nx + np.argsort(at)).tolist()]
@@ -137,13 +138,13 @@ class ProgramRows:
         return Derivatives(multipliers[new_rows], J[new_rows, new_columns], H[new_columns, new_columns])
 
     def _of_sides(self, piece: LiftedRows) -> Derivatives:
-        """Differentiate the sides of a piece, which are another object where they change."""
+        """Differentiate the sides of a piece, which becomes another object when they change."""
         if piece not in self._sides:
             self._sides[piece] = Derivatives.of(piece.sides, piece.variables)
         return self._sides[piece]
 
     def _differentiate(self, pieces: list[LiftedRows]) -> None:
-        """Differentiate the pieces that are new, together, because they share expressions."""
+        """Differentiate all new pieces together, because they share expressions."""
         known = {id(piece.rows) for _, block in self._blocks for piece in block}
         new = [piece for piece in pieces if id(piece.rows) not in known]
         if new:
@@ -151,19 +152,18 @@ class ProgramRows:
             self._blocks.append((Derivatives.of(ca.vertcat(*[piece.rows for piece in new]), unknowns), new))
 
 
-def _with_sides(found: Derivatives, below: list[Derivatives], nx: int) -> Derivatives:
-    """Add rows that see only the auxiliaries of one piece each."""
-    jacobian = ca.diagcat(*[part.jacobian for part in below])
-    hessian = ca.diagcat(ca.SX(nx, nx), *[part.hessian for part in below])
+def _with_sides(rows: Derivatives, sides: list[Derivatives], nx: int) -> Derivatives:
+    """Add sides, each of which depends on the auxiliaries of one piece alone."""
+    jacobian = ca.diagcat(*[part.jacobian for part in sides])
     return Derivatives(
-        ca.vertcat(found.multipliers, *[part.multipliers for part in below]),
-        ca.vertcat(found.jacobian, ca.horzcat(ca.SX(jacobian.shape[0], nx), jacobian)),
-        found.hessian + hessian,
+        ca.vertcat(rows.multipliers, *[part.multipliers for part in sides]),
+        ca.vertcat(rows.jacobian, ca.horzcat(ca.SX(jacobian.shape[0], nx), jacobian)),
+        rows.hessian + ca.diagcat(ca.SX(nx, nx), *[part.hessian for part in sides]),
     )
 
 
 def _stacked(parts: list[Derivatives], nx: int) -> tuple[ca.SX, ca.SX]:
-    """Return the Jacobian and the Hessian of parts with the same x and auxiliaries of their own."""
+    """Return the Jacobian and the Hessian of parts that share x and no auxiliaries."""
     J = ca.horzcat(ca.vertcat(*[p.jacobian[:, :nx] for p in parts]), ca.diagcat(*[p.jacobian[:, nx:] for p in parts]))
     both = ca.horzcat(*[p.hessian[:nx, nx:] for p in parts])
     H = ca.vertcat(
@@ -173,6 +173,6 @@ def _stacked(parts: list[Derivatives], nx: int) -> tuple[ca.SX, ca.SX]:
     return J, H
 
 
-def joined(one: Derivatives, other: Derivatives, nx: int) -> Derivatives:
-    """Return the derivatives of the rows of both, which share x alone."""
-    return Derivatives(ca.vertcat(one.multipliers, other.multipliers), *_stacked([one, other], nx))
+def joined(first: Derivatives, second: Derivatives, nx: int) -> Derivatives:
+    """Join the derivatives of rows that share x alone."""
+    return Derivatives(ca.vertcat(first.multipliers, second.multipliers), *_stacked([first, second], nx))

@@ -18,17 +18,17 @@ from impact_posture.posture.program.ipopt import IPOPT_OPTIONS, run_solver
 from impact_posture.posture.program.program_rows import Derivatives, ProgramRows, joined
 from impact_posture.system.arrays import Array
 
-# A constraint with a violation below this (m, rad) is satisfied.
+# A violation below this (m, rad) counts as satisfied.
 _KEPT = 1e-6
-# Price of a meter of slack beside that of a violated row: where bodies are in the way of a pose, they are the reason.
+# Price of a meter of slack, lower than the price 1 of a violated pose: a body in the way of a pose is the reason.
 _SLACK_PRICE = 0.03
-# Price of the squared distance from the given posture, which makes the answer unique.
+# Price of the squared distance from the given posture, which makes the solution unique.
 _AWAY_PRICE = 1e-6
-# Most postures to begin from, and most that are drawn: the clearest of many lead to a posture where any 24 may not.
+# Most starts, and most postures drawn for them: the clearest of many lead to a feasible posture where any 24 may not.
 _TRIES, _DRAWN = 24, 200
-# Postures that confirm what conflicts nearby.  In panda before a wall two find the way past a body, if there is one.
+# Starts that confirm a conflict at a target nearby.  Panda before a wall needs two to find a way past a body.
 _CONFIRMING = 4
-# Postures that are drawn first: mostly few are needed, and to draw all takes longer than to relax a small robot.
+# Postures drawn first: few are usually enough, and drawing all takes longer than relaxing a small robot.
 _DRAW = 8
 # Most times that the program grows for one start.
 _ROUNDS = 20
@@ -36,12 +36,12 @@ _ROUNDS = 20
 
 @dataclass(frozen=True)
 class LeastViolation:
-    """The least violation that could be found.
+    """The least violation that the search found.
 
     Attributes:
         q: Configuration with the least violation, shape (nq,).
         problem: The problem with all parts that its program needed.
-        conflicts: Violated constraints and their violation; empty if all are satisfied.
+        conflicts: Violation of each violated constraint; empty if all are satisfied.
         at_limits: Joints on a limit at ``q``.
         violation: Sum of the violations at the price of each constraint.
     """
@@ -60,27 +60,27 @@ def find_conflicts(
     guesses: Sequence[Array] = (),
     beside: float = 0.0,
 ) -> LeastViolation:
-    """Minimize the slack ``Σ (s⁺ + s⁻)`` with ``c(q) + s⁺ − s⁻`` within bounds, from several postures.
+    """Minimize the slack ``Σ (s⁺ + s⁻)`` with ``c(q) + s⁺ − s⁻`` within bounds, from several starts.
 
     Args:
         problem: The posture problem.
-        seed: Seed of the postures.
-        program: The program of the same problem with another target, or of one that grew into it.
-        guesses: Postures to begin from before all others.
-        beside: Least violation known of a target nearby, which few postures confirm.  All are tried where these leave
-            less than half of it.
+        seed: Seed of the starts.
+        program: Program of the same problem with another target, or of a problem that grew into this one.
+        guesses: First starts.
+        beside: Least violation at a target nearby.  A few starts confirm it; the others run only if these leave less
+            than half of it.
     """
     chart = Chart.of(problem.robot.model)
     program = program or ElasticProgram(problem)
     best: LeastViolation | None = None
     for count, start in enumerate(islice(chain(guesses, _starts(problem, chart, seed)), _TRIES), 1):
         for _ in range(_ROUNDS):
-            found = _relax(problem, chart, program, start)
-            if found.problem is problem:
+            end = _relax(problem, chart, program, start)
+            if end.problem is problem:
                 break
-            problem = found.problem
-        if best is None or found.violation < best.violation:
-            best = found
+            problem = end.problem
+        if best is None or end.violation < best.violation:
+            best = end
         if not best.conflicts or (count == _CONFIRMING and 2 * best.violation >= beside > 0):
             break
     assert best is not None  # noqa: S101 (narrows a type)
@@ -88,25 +88,24 @@ def find_conflicts(
 
 
 def _starts(problem: ConstrainedProblem, chart: Chart, seed: int) -> Iterator[Array]:
-    """Yield the given posture, then random ones on the projected constraints, of each draw the clearest first."""
+    """Yield the given posture, then random postures on the projected constraints, the clearest of each draw first."""
     yield problem.given
     rng, projector = np.random.default_rng(seed), Projector(problem)
     near = [problem.given if k % 2 else None for k in range(1, _DRAWN)]
-    for some in near[:_DRAW], near[_DRAW:]:
-        found = [projector.project(random_posture(problem, chart, rng, posture)) for posture in some]
-        order = [(each.violation > FEASIBLE, projector.outside(each.q)) for each in found]
-        yield from (found[k].q for k in sorted(range(len(found)), key=order.__getitem__))
+    for draw in near[:_DRAW], near[_DRAW:]:
+        postures = [projector.project(random_posture(problem, chart, rng, posture)) for posture in draw]
+        yield from (p.q for p in sorted(postures, key=lambda p: (p.violation > FEASIBLE, projector.outside(p.q))))
 
 
 def _relax(problem: ConstrainedProblem, chart: Chart, program: ElasticProgram, start: Array) -> LeastViolation:
-    """Minimize the slack from one posture; the answer's problem has grown if the program lacked parts."""
+    """Minimize the slack from one start; the problem of the result has grown if the program lacked parts."""
     lower_rows, upper_rows = problem.row_bounds
     norms = np.zeros(len(chart.quaternion_slices()))
     x = np.clip(chart.to_x(start), problem.lower, problem.upper)
     guess = problem.guess(Numeric(problem.robot.model).at(chart.to_q(x)))
     solver, began = program.solver(problem), time.perf_counter()
     slacks = int(solver.size1_in("x0")) - chart.nx - len(guess.values)
-    answer = run_solver(
+    solution = run_solver(
         solver,
         x0=np.concatenate([x, np.full(slacks, 0.1), guess.values]),
         p=np.concatenate([chart.to_x(problem.given), *[c.parameters for c in problem.constraints]]),
@@ -116,20 +115,20 @@ def _relax(problem: ConstrainedProblem, chart: Chart, program: ElasticProgram, s
         ubg=np.concatenate([norms, upper_rows]),
     )
     program.time_s += time.perf_counter() - began
-    q = chart.to_q(np.array(answer["x"]).reshape(-1)[: chart.nx])
-    return _judge(problem.grown([q]), chart, q)
+    q = chart.to_q(np.array(solution["x"]).reshape(-1)[: chart.nx])
+    return _conflicts_at(problem.grown([q]), chart, q)
 
 
 class ElasticProgram:
-    """The elastic program, most of whose expressions stay while the problem grows.
+    """The elastic program, most of whose expressions stay the same while the problem grows.
 
     Args:
         problem: The problem before it grows.
-        rows: The rows of its constraints, if another program of the problem has them.
+        rows: Rows of its constraints, if another program of the problem has them.
 
     Attributes:
         problem: The problem as far as it has grown.
-        time_s: Wall time within the solver so far, s.
+        time_s: Wall time of the solver so far, s.
     """
 
     def __init__(self, problem: ConstrainedProblem, rows: ProgramRows | None = None) -> None:
@@ -137,10 +136,10 @@ class ElasticProgram:
         self._latest: tuple[str, ca.Function] | None = None
         self._rows = rows = rows or ProgramRows(problem)
         self._away = _AWAY_PRICE * rows.away
-        self._own = Derivatives.of(ca.vertcat(self._away, rows.norms), rows.x)
+        self._fixed = Derivatives.of(ca.vertcat(self._away, rows.norms), rows.x)
 
     def solver(self, problem: ConstrainedProblem) -> ca.Function:
-        """Return ``nlpsol`` for the first problem, also with another target, or one that grew out of it."""
+        """Return ``nlpsol`` for the first problem, or for a problem with another target or that grew from it."""
         self.problem, structure = problem, problem.structure
         if self._latest is None or self._latest[0] != structure:
             self._latest = structure, self._solver(problem)
@@ -149,41 +148,29 @@ class ElasticProgram:
     def _solver(self, problem: ConstrainedProblem) -> ca.Function:
         lifted = self._rows.lift(problem)
         z, nx = lifted.variables.numel(), self._rows.chart.nx
-        # Rows with a slack of their own, which is cheaper, need no other.
+        # Rows whose constraint has a slack, which is cheaper, need no other.
         counts = [len(problem.carried(i)) for i in range(len(problem.constraints))]
         rigid = np.repeat(np.array([not piece.slack.nnz() for piece in lifted.pieces], dtype=bool), counts)
         price = np.repeat([c.price for c in problem.constraints], counts)[rigid]
         k, place = len(price), ca.SX.eye(len(rigid))[:, np.flatnonzero(rigid).tolist()]
         up, down = ca.SX.sym("up", k), ca.SX.sym("down", k)
-        x, p = (
-            ca.vertcat(self._rows.x, up, down, lifted.variables),
-            ca.vertcat(self._rows.reference, *self._rows.parameters),
-        )
+        x = ca.vertcat(self._rows.x, up, down, lifted.variables)
+        p = ca.vertcat(self._rows.reference, *self._rows.parameters)
         g = ca.vertcat(self._rows.norms, lifted.rows + place @ (up - down))
         f = ca.dot(price, up + down) + _SLACK_PRICE * lifted.slack + self._away
         known = self._rows.derivatives(lifted)
         slacks = ca.horzcat(place, -place)
-        relaxed = Derivatives(
-            known.multipliers,
-            ca.horzcat(known.jacobian[:, :nx], slacks, known.jacobian[:, nx:]),
-            _widened(known.hessian, nx, 2 * k, z),
-        )
-        found = joined(self._own, relaxed, nx)
-        order = [*range(1, found.multipliers.numel())]
-        placed = Derivatives(found.multipliers[order], found.jacobian[order, :], found.hessian)
-        options = {**IPOPT_OPTIONS, "ipopt.tol": 1e-8, **placed.options(x, p, found.multipliers[0], g)}
+        # The slacks, between x and the auxiliaries, enter the rows linearly.
+        hessian, others = ca.SX(nx + 2 * k + z, nx + 2 * k + z), [*range(nx), *range(nx + 2 * k, nx + 2 * k + z)]
+        hessian[others, others] = known.hessian
+        jacobian = ca.horzcat(known.jacobian[:, :nx], slacks, known.jacobian[:, nx:])
+        joint = joined(self._fixed, Derivatives(known.multipliers, jacobian, hessian), nx)
+        derivatives = joint.reordered([*range(1, joint.multipliers.numel())])
+        options = {**IPOPT_OPTIONS, "ipopt.tol": 1e-8, **derivatives.options(x, p, joint.multipliers[0], g)}
         return ca.nlpsol("elastic", "ipopt", {"x": x, "p": p, "f": f, "g": g}, options)
 
 
-def _widened(hessian: ca.SX, before: int, width: int, after: int) -> ca.SX:
-    """Return a Hessian with unknowns that it does not depend on, between the first ones and the last."""
-    place = [*range(before), *range(before + width, before + width + after)]
-    wide = ca.SX(before + width + after, before + width + after)
-    wide[place, place] = hessian
-    return wide
-
-
-def _judge(problem: ConstrainedProblem, chart: Chart, q: Array) -> LeastViolation:
+def _conflicts_at(problem: ConstrainedProblem, chart: Chart, q: Array) -> LeastViolation:
     numeric = Numeric(problem.robot.model).at(q)
     conflicts: dict[str, float] = {}
     total = 0.0
