@@ -18,8 +18,8 @@ from typing import Any
 
 import typer
 
-from impact_posture.config.option_names import as_options, option_of
 from impact_posture.errors import ImpactPostureError, one_line, printable
+from impact_posture_cli.output import as_options
 
 DEBUG_VARIABLE = "IMPACT_POSTURE_DEBUG"
 _INTERRUPTED = 130
@@ -62,7 +62,11 @@ def run(command: Any, arguments: Sequence[str]) -> int:
             return 1
         if os.environ.get(DEBUG_VARIABLE):
             traceback.print_exc()
-        return _usage(error, wants_json) if isinstance(error, UsageError) else _report(_explain(error), wants_json)
+        return (
+            _usage(error, wants_json)
+            if isinstance(error, UsageError)
+            else _report(_explain(error, arguments), wants_json)
+        )
 
 
 @dataclass(frozen=True)
@@ -76,11 +80,14 @@ class _Fault:
     hint: str = ""
 
 
-def _explain(error: Exception) -> _Fault:
+def _explain(error: Exception, arguments: Sequence[str]) -> _Fault:
     kind = type(error).__name__
     if isinstance(error, ImpactPostureError):
-        what, where, hint = as_options(error.what), option_of(error.where), as_options(error.hint)
-        return _Fault(error.exit_code, kind, what, where, hint)
+        # A place that begins with an option of this command line is written as this option.
+        option = f"--{error.where.partition(' ')[0].replace('_', '-')}"
+        typed = any(word.partition("=")[0] == option for word in arguments)
+        where = option + error.where[len(option) - 2 :] if typed else error.where
+        return _Fault(error.exit_code, kind, as_options(error.what), where, as_options(error.hint))
     if isinstance(error, OSError):
         hint = "free some space" if error.errno == errno.ENOSPC else "check the path and its permissions"
         where = str(error.filename) if error.filename is not None else ""

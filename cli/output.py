@@ -3,15 +3,20 @@
 from __future__ import annotations
 
 import json
+import re
 import sys
 from collections.abc import Iterable, Sequence
 from typing import TYPE_CHECKING, Any
 
-from impact_posture.config.option_names import as_options
 from impact_posture.errors import one_line, printable
 
 if TYPE_CHECKING:
     from rich.console import Console
+
+
+def as_options(text: str) -> str:
+    """Write each parameter between backquotes as an option: ```out``` as ``--out``, no ```com``` as ``--no-com``."""
+    return re.sub(r"(no )?`(\w+)`", lambda m: f"--{'no-' if m[1] else ''}{m[2].replace('_', '-')}", text)
 
 
 def print_json(document: object) -> None:

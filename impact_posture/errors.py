@@ -281,7 +281,7 @@ class WorkerDied(ImpactPostureError):
         super().__init__(
             "a worker process was killed",
             where=option,
-            hint=f"give it more memory, or work in one process: `{option}=1`",
+            hint=f"give it more memory, or work in one process: `{option}` 1",
         )
 
 

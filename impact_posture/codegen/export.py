@@ -166,7 +166,7 @@ def export(
     texts[f"{prefix}.json"] = json.dumps(manifest, indent=2, allow_nan=False) + "\n"
     there = [name for name in texts if (out / name).exists()]
     if there and not force:
-        raise OutputError(f"holds {there[0]} already", where=str(out), hint="give `force=True` to replace it")
+        raise OutputError(f"holds {there[0]} already", where=str(out), hint="give `force` to replace it")
     for name, text in texts.items():
         write_whole(out / name, text)
     made = Export(out, robot, tuple(out / name for name in texts), manifest)
@@ -228,7 +228,7 @@ def write_export(
             try:
                 agreement = compile_and_check(folder, prefix, objectives, keep=True)
             except CompilerError as error:
-                hint = f"{error.hint}; without `build=True` the C code is written all the same"
+                hint = f"{error.hint}; without compiling, the C code is written all the same"
                 raise CompilerError(error.what, where=error.where, hint=hint) from None
     library = None if agreement is None else library_path(out, prefix)
     files = tuple(out / path.name for path in made.files)

@@ -94,7 +94,7 @@ def _hint(robot: Robot, kind: ControllerKind, error: InputError) -> str:
         return "name [propulsion] or [[supports]] in robot.toml"
     fits = "legged" if robot.spec.supports else "aerial" if robot.spec.propulsion else "arm"
     if fits != kind:
-        return f"try `kind='{fits}'`"
+        return f"try {fits}"
     if robot.spec.contact.frame is None:
         return "give `frame` and `normal`, or name contact.frame in robot.toml"
     return error.hint or ""

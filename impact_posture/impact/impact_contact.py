@@ -72,7 +72,7 @@ def point_on(robot: Robot, frame: str, offset: Vector3 = (0.0, 0.0, 0.0)) -> Poi
         raise ContactError(
             f"frame '{frame}' is welded to the world and cannot move",
             where=robot.name,
-            hint="choose a frame on a moving link, or `root='free-flyer'`",
+            hint="choose a frame on a moving link, or `root` free-flyer",
         )
     position = found.placement.act(np.array(offset, dtype=float))
     return PointOnLink(int(found.parentJoint), np.array(position), np.array(found.placement.rotation))

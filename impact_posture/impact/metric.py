@@ -63,14 +63,14 @@ def build_metric(robot: Robot, kind: MetricKind, weights: str | tuple[float, ...
     if kind != "weighted":
         if weights is not None and kind in get_args(MetricKind):
             raise MetricError(
-                f"are given, but the metric is {kind}", where="weights", hint="remove them or add `metric='weighted'`"
+                f"are given, but the metric is {kind}", where="weights", hint="remove them or add `metric` weighted"
             )
         return Metric(kind)
     if weights is None:
         raise MetricError(
             "the weighted metric needs weights",
             where="metric",
-            hint="add `weights=FILE` or `weights='velocity-limits'`",
+            hint="add `weights` FILE or `weights` velocity-limits",
         )
     source = weights if isinstance(weights, str) else "numbers"
     if not isinstance(weights, str):

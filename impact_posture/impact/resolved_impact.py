@@ -228,9 +228,10 @@ def missing_support(robot: Robot) -> str:
     if not robot.floating or known:
         return ""
     found = feet(robot)
-    stand = f"`support={list(found)}` (its feet by name or geometry)" if found else "`support=FRAME` for each foot"
+    named = " ".join(f"`support` {frame}" for frame in found)
+    stand = f"{named} (its feet by name or geometry)" if found else "`support` FRAME for each foot"
     return (
-        f"give {stand}, `support=[]` if it floats indeed, `base`, or a robot.toml "
+        f"give {stand}, no `support` if it floats indeed, `base`, or a robot.toml "
         "(inspect --write-robot-toml drafts one)"
     )
 

@@ -61,7 +61,7 @@ def refuse_held(robot: Robot, contact: ImpactContact, supports: Sequence[Support
             raise ContactError(
                 f"the contact point is held by the support at '{support.frame}'",
                 where=f"frame {contact.frame}",
-                hint="choose another frame, name the other `support` frames, or `support=[]`",
+                hint="choose another frame, name the other `support` frames, or choose no `support`",
             )
 
 
@@ -75,5 +75,5 @@ def refuse_rigid(robot: Robot, supports: Sequence[Support]) -> None:
         raise InputError(
             f"all joints of {robot.name} are locked and its feet stay, so nothing moves in an impact",
             where="joint_model",
-            hint="choose reflected or link, or `support=[]` for a robot off the ground",
+            hint="choose reflected or link, or no `support` for a robot off the ground",
         )

@@ -50,7 +50,7 @@ def write_draft(robot: str, options: LoadOptions, out: Path | None, *, force: bo
     out = out or (Path(f"{located.urdf.stem}.toml") if in_package else located.urdf.parent / "robot.toml")
     check_name(out)
     if out.exists() and not force:
-        raise OutputError("exists", where=str(out), hint="name another file, or `force=True` to replace it")
+        raise OutputError("exists", where=str(out), hint="name another file, or `force` to replace it")
     draft = draft_spec(located, options, out.absolute().parent)
     # The temporary file is in the same folder, so that its relative paths are the same.
     temporary = out.with_name(f".{out.name}-{os.getpid()}")

@@ -78,7 +78,7 @@ def check_moved_mass(model: pin.Model, where: str) -> None:
         f"joint {named} moves no mass" if single else f"{len(joints)} joints move no mass: {named}",
         where=where,
         hint=f"give {'its' if single else 'their'} links a mass, or make {'it' if single else 'them'} rigid by "
-        "`lock_massless=True` (robot.toml [model] lock_massless = true)",
+        "`lock_massless` (robot.toml [model] lock_massless = true)",
     )
 
 

@@ -60,7 +60,7 @@ def ignored_bases(spec: RobotSpec, srdf: Path | None, default: str) -> tuple[str
     which = default if default in named else ", ".join(dict.fromkeys(named))
     return (
         f"the root is fixed, so the base pose of posture {which} is left out, and the root link sits at the world's "
-        "origin along its axes; `root='free-flyer'` keeps the pose",
+        "origin along its axes; `root` free-flyer keeps the pose",
     )
 
 

@@ -26,7 +26,7 @@ _BY_NAME_KEYS = ("schema", "robot", "base", "joints")
 _SHAPES = "q with joint_names, joints by name, or a JointState's name and position"
 
 _FIXED = ", but the root is fixed, with the root link at the world's origin along its axes"
-_NO_BASE = "remove the base and give `normal` in those axes, or use `root='free-flyer'`"
+_NO_BASE = "remove the base and give `normal` in those axes, or use `root` free-flyer"
 
 
 def read_posture(robot: Robot, text: str | None, where: str = "posture") -> Array:

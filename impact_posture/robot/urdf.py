@@ -100,13 +100,13 @@ def build_model(
         fault = f"makes no robot ({errors[0] or error})"
         raise UrdfError(fault, where=str(path), hint="correct the URDF") from None
     if model.nv == 0:
-        raise UrdfError("has no movable joint", where=str(path), hint="use `root='free-flyer'` or another URDF")
+        raise UrdfError("has no movable joint", where=str(path), hint="use `root` free-flyer or another URDF")
     first = 2 if free_flyer else 1
     if model.njoints > first and model.joints[first].shortname() == "JointModelFreeFlyer":
         raise UrdfError(
             f"its first joint, '{model.names[first]}', is floating",
             where=str(path),
-            hint="remove that joint with its parent link, and use `root='free-flyer'`",
+            hint="remove that joint with its parent link, and use `root` free-flyer",
         )
     if model.nv > MOST_DEGREES_OF_FREEDOM:
         raise UrdfError(

@@ -6,7 +6,6 @@ from collections.abc import Iterator
 from contextlib import contextmanager
 from dataclasses import dataclass, fields
 
-from impact_posture.config.option_names import as_keys
 from impact_posture.errors import ImpactPostureError, JointLocked, NameNotFound, SpecError
 from impact_posture.robot.actuation import allocation
 from impact_posture.robot.posture_files import read_posture, set_joints
@@ -18,8 +17,6 @@ from impact_posture.system.arrays import Array
 from impact_posture.system.progress import tell
 
 _KEYS = {field.name for field in fields(ScenarioTable)}
-# Settings of a problem whose key in a scenario has another name.
-_RENAMED = {"contact_pose": "control.end_effector.pose"}
 
 
 @dataclass(frozen=True, eq=False)
@@ -79,7 +76,11 @@ def naming_keys(scenario: Scenario) -> Iterator[None]:
         elif where in ("", "problem") or (isinstance(error, NameNotFound) and "." not in where):
             # What a robot lacks is named in the scenario, but a key of robot.toml is not.
             where = scenario.source
-        error.reword(as_keys(error.what, _RENAMED), where, as_keys(error.hint, _RENAMED))
+        what, hint = (
+            text.replace("`contact_pose`", "control.end_effector.pose").replace("`", "")
+            for text in (error.what, error.hint)
+        )
+        error.reword(what, where, hint)
         raise
 
 

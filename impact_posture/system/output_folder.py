@@ -50,7 +50,7 @@ def check_output(out: Path, *, force: bool, kind: Kind) -> None:
         raise OutputError("is a mount point", where=str(out), hint="choose a folder in it")
     if out.is_dir() and any(out.iterdir()):
         if not force:
-            raise OutputError("exists", where=str(out), hint="choose another `out`, or `force=True` to replace it")
+            raise OutputError("exists", where=str(out), hint="choose another `out`, or `force` to replace it")
         _check_ours(out, kind)
     parent = next(folder for folder in out.absolute().parents if folder.exists())
     if not parent.is_dir() or not os.access(parent, os.W_OK | os.X_OK):
@@ -198,7 +198,7 @@ def _check_ours(out: Path, kind: Kind) -> None:
         raise OutputError(
             f"holds {', '.join(foreign[:_SHOWN])}{more}, which this command did not write",
             where=str(out),
-            hint="choose another `out`, or move that away: `force=True` replaces earlier results only",
+            hint="choose another `out`, or move that away: `force` replaces earlier results only",
         )
 
 
@@ -242,7 +242,7 @@ def _replace(beside: Path, out: Path, force: bool, kind: Kind) -> None:
         except OSError as error:
             if error.errno in (errno.ENOTEMPTY, errno.EEXIST):
                 raise OutputError(
-                    "exists", where=str(out), hint="choose another `out`, or `force=True` to replace it"
+                    "exists", where=str(out), hint="choose another `out`, or `force` to replace it"
                 ) from None
             raise
         return

@@ -199,10 +199,10 @@ def test_the_code_of_a_result_is_that_of_its_objective(result: ip.PostureResult,
         ip.ImpactObjective(objective.robot, ip.ImpactContact("ee", (0, 1, 0))),
     )
     for other in others:
-        with pytest.raises(OutputError, match="`force=True` to replace it"):
+        with pytest.raises(OutputError, match="`force` to replace it"):
             other.export(folder)
     portable = objective.export(tmp_path / "portable", portable=True, build=False).out
-    with pytest.raises(OutputError, match="`force=True` to replace it"):
+    with pytest.raises(OutputError, match="`force` to replace it"):
         objective.export(portable)
     # What asks for more than the defaults is never taken as it is.
     with pytest.raises(OutputError, match="choose another `out`"):

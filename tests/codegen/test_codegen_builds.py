@@ -290,7 +290,7 @@ def test_folder_is_replaced_only_if_it_is_an_export(arm: WorstCaseObjective, tmp
     assert [p.name for p in out.iterdir()] == ["arm.json"]
     ours = tmp_path / "ours"
     write_export([arm], ours, prefix="first")
-    with pytest.raises(OutputError, match="`force=True`"):
+    with pytest.raises(OutputError, match="`force`"):
         write_export([arm], ours, prefix="second")
     assert (ours / "first.c").is_file()
     written = write_export([arm], ours, prefix="second", force=True)

@@ -8,12 +8,12 @@ from typing import Any
 
 import pytest
 
-from impact_posture.config.option_names import as_keys, as_options, option_of
 from impact_posture.config.settings import ProblemSettings
 from impact_posture.config.table_validation import validate
 from impact_posture.errors import SpecError
 from impact_posture.posture.formulation.problem_file import dump_settings, prepare, read_settings, resolved_settings
 from impact_posture_cli.app import build
+from impact_posture_cli.output import as_options
 from impact_posture_cli.settings_options import settings_of
 from tests.support.command import run
 
@@ -100,15 +100,7 @@ def test_resolved_settings_are_the_same_problem(more: dict[str, object], tmp_pat
     assert again.problem.objective.value(q) == first.problem.objective.value(q)
 
 
-def test_options_are_named_where_the_library_names_settings() -> None:
-    assert as_options("give `support=['a', 'b']`, or `support=[]`") == "give --support a --support b, or --no-support"
-    assert as_options("`root='free-flyer'`, `force=True`, `com=False`, `seed`, `jobs=1`") == (
-        "--root free-flyer, --force, --no-com, --seed, --jobs 1"
+def test_parameters_in_messages_are_printed_as_options() -> None:
+    assert as_options("give `support` a, no `support`, or `normal_cone` 0") == (
+        "give --support a, --no-support, or --normal-cone 0"
     )
-    assert as_options("`build=True`, `kind='legged'`, `daqp`") == "--compile, --controller legged, --daqp"
-    assert as_options("`kind='speed'`, `kind`") == "--objective speed, --objective"
-    keys = as_keys("`srdf`, `contact_pose='position'`, `lock`", {"contact_pose": "control.end_effector.pose"})
-    assert keys == "srdf, control.end_effector.pose = 'position', lock"
-    assert option_of("normal_cone") == "--normal-cone" and option_of("panda") == "panda"
-    assert option_of("scheduler tcp://a:1") == "--scheduler tcp://a:1"
-    assert option_of("posture p.json") == "--posture p.json"

@@ -168,7 +168,7 @@ def test_the_controller_of_another_robot_is_refused() -> None:
 @pytest.mark.parametrize(
     ("arguments", "words"),
     [
-        (["solo8", "--controller", "aerial"], "try --controller legged"),
+        (["solo8", "--controller", "aerial"], "try legged"),
         (["panda", "--controller", "arm", "--float"], "--controller is double"),
         (["panda", "--daqp", "x", "--normal", "0", "0", "1"], "belong to --controller"),
         (["panda", "--controller", "arm", "--scenario", "solo8-push"], "is of solo8"),

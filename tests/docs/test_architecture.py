@@ -47,7 +47,7 @@ def test_the_machine_path_pattern_finds_them_and_spares_others() -> None:
 
 
 def test_errors_of_the_library_name_parameters_and_no_options() -> None:
-    """The command line writes `parameter` as an option (``option_names``); in Python there are no options."""
+    """The command line writes `parameter` as an option (``as_options``); in Python there are no options."""
     found = [
         f"{path.name}:{text.lineno}: {text.value}"
         for path in Path(impact_posture.__path__[0]).rglob("*.py")

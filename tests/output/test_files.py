@@ -169,7 +169,7 @@ def test_bad_input(pendulum: ResultView, panda: ResultView, tmp_path: Path) -> N
         draw_all(panda, tmp_path, only=["nullspace"])
     with pytest.raises(InputError, match=r"no trade-off to draw.*`tradeoff`"):
         draw_all(panda, tmp_path, only=["tradeoff"])
-    with pytest.raises(InputError, match=r"no map to draw.*search=.global"):
+    with pytest.raises(InputError, match=r"no map to draw.*`search` global"):
         draw_all(panda, tmp_path, only=["self_motion"])
     (tmp_path / "file").write_text("in the way")
     with pytest.raises(OutputError, match="cannot be written"):

@@ -157,11 +157,11 @@ def test_a_result_is_kept_without_its_report(tmp_path: Path, monkeypatch: pytest
     assert Reader(page).texts["code"][0] == "impact-posture optimize problem.toml"
 
 
-def test_parameters_are_options_on_the_page(scene: ReportScene) -> None:
-    content = Content("", "", (), ("`objective='coulomb'` minimizes this jump", "`max_force`"), (), "", ("`meshes`",))
+def test_parameters_are_plain_on_the_page(scene: ReportScene) -> None:
+    content = Content("", "", (), ("`objective` coulomb minimizes this jump", "`max_force`"), (), "", ("`meshes`",))
     texts = Reader(render(content, Packed(**vars(scene)), ())).texts
-    assert "--objective coulomb minimizes this jump" in texts["p"] and "--max-force" in texts["p"]
-    assert "--meshes" in texts["li"]
+    assert "objective coulomb minimizes this jump" in texts["p"] and "max_force" in texts["p"]
+    assert "meshes" in texts["li"]
 
 
 def test_every_contact_is_shown(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:

@@ -47,7 +47,7 @@ def test_the_changes_are_those_of_the_predicted_jumps(name: str, friction: float
             expected = "worse" if told.jump > 0.01 else "no better"
         assert told.outcome == expected and told.line.startswith(f"verdict: {expected}.")
         assert ("sticking)" if after.coulomb.sticks else "slipping)") in told.line
-        assert any("objective='coulomb'" in line for line in told.advice) == (expected in ("worse", "no better"))
+        assert any("`objective` coulomb" in line for line in told.advice) == (expected in ("worse", "no better"))
         assert any("max_force" in line for line in told.advice) == (expected == "better at the price of force")
         assert told.before is not None and told.after is not None
         for side, found in ((told.before, before), (told.after, after)):
@@ -183,4 +183,4 @@ def test_another_objective_is_advised_only_if_it_minimizes_the_jump(
     told = verdict(prepared.impact, found, found)
     assert told.outcome == "no better"
     advised = [line for line in told.advice if "minimizes this jump" in line]
-    assert [line.split("'")[1] for line in advised] == ([] if better is None else [better])
+    assert [line.split()[1] for line in advised] == ([] if better is None else [better])

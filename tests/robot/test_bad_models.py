@@ -83,7 +83,7 @@ def test_the_good_model_of_these_tests_loads(load: Load) -> None:
         ('<xacro:macro xmlns:xacro="http://x" name="m"><link name="a"/></xacro:macro>', ("not a URDF", "xacro")),
         ('<robot name="r" xmlns:xacro="http://x"><xacro:include filename="a"/></robot>', ("no <link>", "xacro")),
         ("<robot name='r'/>", ("no <link>",)),
-        ("<robot name='r'><link name='a'/></robot>", ("no movable joint", "root='free-flyer'")),
+        ("<robot name='r'><link name='a'/></robot>", ("no movable joint", "`root` free-flyer")),
         (f"<robot name='r'>{link('a', GOOD)}{joint('a', 'nowhere')}</robot>", ("makes no robot",)),
         (f"<robot name='r'>{link('a', GOOD)}{link('b', GOOD)}</robot>", ("makes no robot",)),
         (
@@ -207,7 +207,7 @@ def test_a_joint_that_moves_no_mass(load: Load) -> None:
     elements = (link("a", GOOD), link("b", OFF_AXIS), link("c", None), joint("a", "b"), joint("b", "c", "1 0 0"))
     with pytest.raises(InertiaError) as caught:
         load(*elements)
-    one_line(caught.value, "joint 'b_c' moves no mass", "`lock_massless=True`")
+    one_line(caught.value, "joint 'b_c' moves no mass", "`lock_massless`")
     # Armature gives it something to turn; locking removes it.
     load(*elements, armature={"b_c": 0.01})
     load(*elements, lock=("b_c",))
@@ -225,7 +225,7 @@ def test_a_base_that_the_urdf_itself_lets_float(load: Load) -> None:
     for root in (None, "fixed", "free-flyer"):
         with pytest.raises(UrdfError) as caught:
             load(*elements, *joints, root=root)
-        one_line(caught.value, "'world_a', is floating", "root='free-flyer'")
+        one_line(caught.value, "'world_a', is floating", "`root` free-flyer")
 
 
 def test_a_massless_floating_base(load: Load) -> None:

@@ -171,7 +171,7 @@ def test_weights_that_do_not_fit_the_metric(tmp_path: Path) -> None:
     one_line(caught.value, "needs weights")
     with pytest.raises(MetricError) as caught:
         build_metric(robot("panda"), "kinetic", "velocity-limits")
-    one_line(caught.value, "metric='weighted'")
+    one_line(caught.value, "`metric` weighted")
     path = tmp_path / "weights.toml"
     path.write_text("panda_joint1 = 4.0\n", encoding="utf-8")
     metric = build_metric(robot("panda"), "weighted", str(path))

@@ -130,7 +130,7 @@ def test_a_draft_beside_the_urdf_is_found_by_itself(tmp_path: Path) -> None:
     assert found.default_posture.startswith("standing") and found.locked == ("jointGripper",)
     assert found.armature[found.model.idx_vs[found.joint_id("joint1")]] == 0.02
     assert 'srdf = "srdf/other.srdf"  # as --srdf says' in draft.text
-    with pytest.raises(OutputError, match="`force=True`"):
+    with pytest.raises(OutputError, match="`force`"):
         write_draft(urdf, LoadOptions(), None)
     assert out.read_text() == draft.text
     write_draft(urdf, LoadOptions(root="fixed"), None, force=True)

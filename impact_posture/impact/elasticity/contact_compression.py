@@ -164,7 +164,7 @@ class Compression:
         else:
             meaning = "neither 'link' nor 'reflected' is right; "
             used = self.joint_model == "elastic"
-            meaning += "'elastic', as here, is" if used else "evaluate with `joint_model='elastic'`"
+            meaning += "'elastic', as here, is" if used else "evaluate with `joint_model` elastic"
         return f"x = {self.x:.2g}: {meaning}"
 
     def to_dict(self) -> dict[str, object]:

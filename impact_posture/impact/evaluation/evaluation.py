@@ -258,7 +258,7 @@ def _joint_model_warning(objective: WorstCaseObjective, q: Array, found: Compres
         return ()
     values = {name: objective_value(other, q) for name, other in both_models(objective).items()}
     listed = ", ".join(f"{value:.4g} with '{name}'" for name, value in values.items() if value is not None)
-    advice = f"`joint_model='{found.fitting}'` fits" if found.fitting else "expect a value between the two"
+    advice = f"`joint_model` {found.fitting} fits" if found.fitting else "expect a value between the two"
     return (f"{found.line}; the objective is {listed}: {advice}",)
 
 

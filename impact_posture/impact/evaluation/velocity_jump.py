@@ -127,7 +127,7 @@ def find_dominance(objective: WorstCaseObjective, found: ImpactQuantities) -> Do
             f"{oracle.M[k, k]:.3g} {unit} it moves)"
         )
         if objective.metric.kind != "kinetic":
-            line += ("; the rest of the robot hardly counts" if share > 0.9 else "") + ": compare `metric='kinetic'`"
+            line += ("; the rest of the robot hardly counts" if share > 0.9 else "") + ": compare `metric` kinetic"
     elif base > 0.5:
         line = (
             f"no single joint dominates H (the base carries {100 * base:.0f} %; largest joint: '{joint}', {percent})"

@@ -81,5 +81,5 @@ def no_sticking() -> MetricError:
     return MetricError(
         "S does not exist here: the normal has a part along which the contact point cannot move",
         where="objective sticking",
-        hint="choose `objective='speed'`, or another frame, normal or posture",
+        hint="choose `objective` speed, or another frame, normal or posture",
     )

@@ -50,7 +50,7 @@ def check_cone(kind: type[ImpactKind], degrees: float) -> None:
         raise MetricError(
             kind.no_cone,
             where="normal_cone",
-            hint="choose `objective='impulse'`, sticking or energy, or `normal_cone=0`",
+            hint="choose `objective` impulse, sticking or energy, or `normal_cone` 0",
         )
 
 

@@ -41,7 +41,7 @@ def self_motion_figure(view: ResultView) -> Figure:
     data = view.self_motion
     if data is None:
         raise InputError(
-            "there is no map to draw", where="figure self_motion", hint="run optimize again with `search='global'`"
+            "there is no map to draw", where="figure self_motion", hint="run optimize again with `search` global"
         )
     curves = bool(data.s.any())
     with framed(*header_lines(view), 3.4, [_CURVES if curves else _SURFACES, _GRAY]) as (figure, body):

@@ -14,7 +14,6 @@ from typing import Any
 
 import numpy as np
 
-from impact_posture.config.option_names import as_options
 from impact_posture.errors import SpecError, printable
 from impact_posture.output.plot.result_view import number
 from impact_posture.output.report import REPORT
@@ -164,7 +163,6 @@ def load_template() -> Any:
         trim_blocks=True, lstrip_blocks=True,
     )  # fmt: skip
     # The page names the command that makes it, so messages name its options.
-    environment.filters["options"] = as_options
     return environment.get_template("page.html.jinja")
 
 

@@ -33,7 +33,7 @@ def posture_warnings(
     if attainable is not None and attainable < (1 - _REACHED) * prepared.impact.speed and not demanded:
         held.append(
             f"the joints can bring the contact to the surface at no more than {attainable:.3g} m/s in the optimal "
-            f"posture, not at {prepared.impact.speed:g} m/s: add `approach=True`, or give the `speed` that is meant"
+            f"posture, not at {prepared.impact.speed:g} m/s: add `approach`, or give the `speed` that is meant"
         )
     around = prepared.problem.surroundings
     if around is not None and around.shapes.bodies:

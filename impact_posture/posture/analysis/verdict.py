@@ -188,7 +188,7 @@ def _better_objective(impact: ResolvedImpact, outcome: Outcome, jumps: tuple[Jum
         sticks = all(isinstance(jump, CoulombJump) and jump.sticks for jump in jumps)
         same = (kind, "speed" if slides else "", "sticking" if sticks else "")
         if objective.kind not in same and not (slides and kind == "sticking"):
-            yield f"`objective='{kind}'` minimizes this jump; '{objective.kind}' minimizes another quantity"
+            yield f"`objective` {kind} minimizes this jump; '{objective.kind}' minimizes another quantity"
     if outcome == "better at the price of force":
         yield "`max_force` bounds the force"
 

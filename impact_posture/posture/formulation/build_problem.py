@@ -154,12 +154,12 @@ def _check(robot: Robot, requirements: Requirements) -> None:
         raise InputError(
             f"base '{requirements.base}' does not fit a robot whose root is fixed",
             where="base",
-            hint="leave it out or use `root='free-flyer'`",
+            hint="leave it out or use `root` free-flyer",
         )
     if requirements.keep_contacts and not requirements.friction > 0:
         raise InputError(f"is {requirements.friction:g}", where="friction", hint="give a coefficient above zero")
     if requirements.hold_force and not requirements.holdable:
-        raise InputError("does nothing without `holdable=True`", where="hold_force", hint="leave out one of them")
+        raise InputError("does nothing without `holdable`", where="hold_force", hint="leave out one of them")
     for joint in requirements.hold:
         robot.joint_id(joint)
     _check_target(requirements)
@@ -254,7 +254,7 @@ def _com_constraint(
         raise InputError(
             "the feet span no area to keep the center of mass above",
             where="com_over_feet",
-            hint="give three feet or soles with a size, or set com_over_feet = false, or `com=False`",
+            hint="give three feet or soles with a size, set com_over_feet = false, or choose no `com`",
         )
     return CenterOfMassOverFeet(*edges, margin)
 

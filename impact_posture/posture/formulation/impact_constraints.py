@@ -25,7 +25,7 @@ def kept_feet(objective: WorstCaseObjective, numeric: Numeric, friction: float) 
         raise InputError(
             "contacts that pull as well as push would have to leave the feet without any impulse",
             where="keep_contacts",
-            hint="leave out `bilateral=True` or `keep_contacts=True`",
+            hint="leave out `bilateral` or `keep_contacts`",
         )
     return [KeptContacts(single, numeric, friction) for single in objective.singles]
 

@@ -118,7 +118,7 @@ def requirements(settings: ProblemSettings, objective: Objective) -> Requirement
         raise InputError("do nothing without `collision`", where="obstacles", hint="leave one of them out")
     if com and not objective.supports:
         raise InputError(
-            "there are no feet to keep the center of mass over", where="com", hint="add `support` or `com=False`"
+            "there are no feet to keep the center of mass over", where="com", hint="add `support`, or choose no `com`"
         )
     if settings.keep_contacts and not objective.supports:
         raise InputError("there are no feet to keep", where="keep_contacts", hint="add `support` or leave it out")

@@ -63,7 +63,7 @@ def _way_out(problem: ConstrainedProblem, seed: int) -> str:
         found = find_conflicts(turned, seed, beside=_QUICK)
     except ImpactPostureError:
         return ""
-    return "" if found.conflicts else "let the contact frame turn (`contact_pose='position'`), which is possible; or "
+    return "" if found.conflicts else "let the contact frame turn (`contact_pose` position), which is possible; or "
 
 
 def initial_objective(problem: ConstrainedProblem, initial: Array) -> float:
