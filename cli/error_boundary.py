@@ -120,7 +120,7 @@ def _usage(error: Any, wants_json: bool) -> int:
 def _in_our_words(error: Any) -> None:
     """Give the message of an invalid choice the words that the library has for a key in a file."""
     # Typer has no hook for this. The wording differs between versions; all contain the value and the choices.
-    given = re.search(r"'(.*?)' is not one of (.*)", str(getattr(error, "message", "")))
+    given = re.search(r"'(.*?)' is not one of ('.*)", str(getattr(error, "message", "")))
     if given:
         from impact_posture.errors import not_one_of
 

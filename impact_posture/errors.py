@@ -1,4 +1,4 @@
-"""Errors that a user can act on, with one root class; they carry data and a hint.
+"""Errors that a user can correct, with a common root class, data and a hint.
 
 The command line prints ``what``, ``where`` and ``hint`` as one line and exits with ``exit_code``.
 """
@@ -13,7 +13,7 @@ from typing import ClassVar
 
 # Longest name in a message.  A longer name loses its middle.
 _LONGEST_NAME = 200
-# Longest part of a message: it lists the 200 joints that a robot may have.
+# Longest part of a message, which may list the 200 joints of a large robot.
 _LONGEST_PART = 10_000
 
 
@@ -25,23 +25,19 @@ def printable(text: str, *, keep: str = "", longest: int = 0) -> str:
     Args:
         text: Any text.
         keep: Characters that stay, such as line breaks.
-        longest: Longest result, which drops the middle of a longer text; 0 keeps all of it.
+        longest: Longest result, without the middle of a longer text; 0 keeps the whole text.
     """
     if longest and len(text) > longest:
         half = longest // 2
         text = f"{text[:half]}…{text[len(text) - half + 1 :]}"
     if text.isprintable():
         return text
-    return "".join(c if c in keep or is_visible(c) else _code_point(c) for c in text)
+    return "".join(c if c in keep or is_visible(c) else c.encode("unicode_escape").decode() for c in text)
 
 
 def is_visible(character: str) -> bool:
-    """Return whether a character shows, or is a space."""
+    """Return whether a character is printable or a space."""
     return character.isprintable() or unicodedata.category(character) == "Zs"
-
-
-def _code_point(character: str) -> str:
-    return character.encode("unicode_escape").decode("ascii")
 
 
 def nearest(name: str, known: Iterable[str], count: int = 5) -> list[str]:
@@ -59,26 +55,26 @@ def one_line(text: str) -> str:
 
 
 def shown(value: object) -> str:
-    """Return a value of a file or of a caller for a message, with the middle of a long one left out.
+    """Return a value as text for a message, without the middle of a long value.
 
-    The aliases of a YAML file make a few lines into a list of lists that would fill the memory as text.
+    The aliases of a short YAML file can make a list of lists that would fill the memory as text.
     """
     if isinstance(value, str):
         return printable(value, longest=_LONGEST_NAME)
     try:
         return printable(reprlib.repr(value), longest=_LONGEST_NAME)
-    except Exception:  # Python converts no integer of more than 4300 digits, and a caller's object may do anything.
+    except Exception:  # Python refuses integers of more than 4300 digits, and repr may raise anything.
         return type(value).__name__
 
 
 def not_one_of(value: object, choices: Iterable[str]) -> tuple[str, str]:
-    """Return the fault and the hint for a value that is none of the choices."""
+    """Return the fault and the hint for a value that is not one of the choices."""
     names = list(choices)
     folded = {name.casefold(): name for name in names}
     text = shown(value).casefold()
     begun = [name for name in folded if text and name.startswith(text)]
     close = begun or difflib.get_close_matches(text, folded, n=1, cutoff=0.5)
-    what = f"'{shown(value)}' is none of {', '.join(names)}"
+    what = f"'{shown(value)}' is not one of {', '.join(names)}"
     return what, f"did you mean {folded[close[0]]}?" if close else "choose one of them"
 
 
@@ -97,7 +93,7 @@ class ImpactPostureError(Exception):
         self.reword(what, where, hint)
 
     def reword(self, what: str, where: str, hint: str) -> None:
-        """Replace the words of the message; type and data stay."""
+        """Replace the message; type and data stay."""
         self.what, self.where, self.hint = (one_line(text) for text in (what, where, hint))
         self.args = (self.line,)
 
@@ -108,7 +104,7 @@ class ImpactPostureError(Exception):
         return f"{text}; {self.hint}" if self.hint else text
 
     def __reduce__(self) -> tuple[object, ...]:
-        # Subclasses take other arguments, but worker processes must be able to return them.
+        # Worker processes return errors, but subclasses take other arguments.
         return BaseException.__new__, (type(self), self.line), self.__dict__.copy()
 
 
@@ -149,7 +145,7 @@ class JointNotFound(NameNotFound):
 
 
 class JointLocked(JointNotFound):
-    """The joint is rigid, so that it has no entry in ``q``."""
+    """The joint is locked, so that it has no entry in ``q``."""
 
     def __init__(self, name: str, *, where: str = "") -> None:
         self.name, self.nearest = name, []
@@ -158,7 +154,7 @@ class JointLocked(JointNotFound):
 
 
 class PostureNotFound(NameNotFound):
-    """The robot has no posture of this name, and no file has it either."""
+    """Neither a posture of the robot nor a file has this name."""
 
     kind = "posture"
 
@@ -182,7 +178,7 @@ class PackageNotFound(NameNotFound):
 
 
 class UrdfError(InputError):
-    """The URDF or SRDF cannot be read or describes no robot."""
+    """The URDF or SRDF cannot be read or does not describe a robot."""
 
 
 class InertiaError(UrdfError):
@@ -246,12 +242,12 @@ def _short(value: object) -> str:
     return text if len(text) <= 80 else f"{text[:12]}…"
 
 
-# Conflicts that one line names, the largest first.
+# Largest number of conflicts in a message.
 _MOST_NAMED = 6
 
 
 class Infeasible(ImpactPostureError):
-    """No posture satisfies the constraints; carries the conflicting ones."""
+    """No posture satisfies the constraints; carries the conflicting constraints."""
 
     exit_code = 3
 
@@ -269,13 +265,13 @@ class Infeasible(ImpactPostureError):
 
 
 class SolverFailed(ImpactPostureError):
-    """The solver converged from no start, or its answer failed the certificate."""
+    """The solver did not converge from any start, or its solution failed the certificate."""
 
     exit_code = 4
 
 
 class WorkerDied(ImpactPostureError):
-    """A worker process ended without an answer; carries the option that says how many there are."""
+    """A worker process ended without a result; the message names the option for the number of workers."""
 
     def __init__(self, option: str = "jobs") -> None:
         super().__init__(

@@ -1,4 +1,4 @@
-"""Hashes of a model, the same on every machine."""
+"""Hashes of a model that are the same on every machine."""
 
 from __future__ import annotations
 
@@ -26,7 +26,7 @@ def dynamics_hash(model: pin.Model, armature: Array) -> str:
 
 
 def kinematics_hash(model: pin.Model, postures: Mapping[str, Array], default: str) -> str:
-    """Return the hash of joints, frames, limits of positions, named postures and the name of the default one."""
+    """Return the hash of joints, frames, position limits, named postures and the name of the default posture."""
     placed = [(f.name, int(f.parentJoint), rounded(f.placement.homogeneous)) for f in model.frames]
     for k in range(1, model.njoints):
         joint, numbers = model.joints[k], model.jointPlacements[k].homogeneous
@@ -41,7 +41,7 @@ def hash_of(content: object) -> str:
 
 
 def rounded(values: object) -> list[str]:
-    """Return numbers to 12 digits, and zero for the rounding errors of sines."""
+    """Return numbers to 12 digits as text, with zero for rounding errors."""
     return [f"{v:.12g}" if abs(v) > _ROUNDING else "0" for v in map(float, np.asarray(values).reshape(-1))]
 
 
@@ -49,7 +49,7 @@ def _axis(joint: pin.JointModel) -> Array:
     """Return the motion subspace of a joint at the identity, which distinguishes two unaligned joints."""
     model = pin.Model()
     model.addJoint(0, joint, pin.SE3.Identity(), "joint")
-    # The copy, because the joint itself reads its own place in the configuration of its robot.
+    # A copy in a model of its own, because the joint would read other entries of a configuration.
     copy = model.joints[1]
     data = copy.createData()
     copy.calc(data, pin.neutral(model))

@@ -1,4 +1,4 @@
-"""The type of the arrays of numbers in signatures, and linear algebra that SciPy takes long to import."""
+"""The array type of signatures, and linear algebra without the slow import of SciPy."""
 
 import numpy as np
 from numpy.typing import NDArray
@@ -7,9 +7,9 @@ Array = NDArray[np.float64]
 
 
 def null_space(rows: Array, tolerance: float) -> Array:
-    """Return an orthonormal basis of the directions that rows do not see, as columns, shape (n, r).
+    """Return an orthonormal basis of the null space of a matrix, as columns, shape (n, r).
 
-    SciPy has the same function, but takes longer to import than many problems take to solve.
+    The import of SciPy, which has the same function, takes longer than many problems take to solve.
 
     Args:
         rows: Shape (k, n).
@@ -20,13 +20,13 @@ def null_space(rows: Array, tolerance: float) -> Array:
 
 
 def independent_rows(rows: Array, tolerance: float) -> list[int]:
-    """Return the indices of rows that span all of them; the next is always the one with most left without the others.
+    """Return the indices of linearly independent rows that span all rows, by pivoted Gram-Schmidt.
 
     Args:
         rows: Shape (k, n).
-        tolerance: A row of which no more than this is left is no row of its own.
+        tolerance: Largest remainder, after projection, of a row that counts as dependent.
     """
-    left, found = np.array(rows, dtype=float), list[int]()
+    left, chosen = np.array(rows, dtype=float), list[int]()
     for _ in range(len(left)):
         sizes = np.linalg.norm(left, axis=1)
         k = int(sizes.argmax())
@@ -34,5 +34,5 @@ def independent_rows(rows: Array, tolerance: float) -> list[int]:
             break
         left -= np.outer(left @ left[k], left[k]) / sizes[k] ** 2
         left[k] = 0.0
-        found.append(k)
-    return sorted(found)
+        chosen.append(k)
+    return sorted(chosen)

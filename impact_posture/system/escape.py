@@ -1,6 +1,6 @@
-"""Escapes for names in other languages.  The names of robots, joints, frames and files are data, not code.
+"""Escape names of robots, joints, frames and files for output languages.
 
-Every name that leaves the program passes through the function of its output language.
+Names are data and not code.  Each output language has a function that every name passes.
 """
 
 from __future__ import annotations
@@ -12,7 +12,7 @@ from dataclasses import asdict, is_dataclass
 
 from impact_posture.errors import is_visible, printable
 
-# ASCII for the symbols of our texts, because a compiler may not read others in C comments.
+# ASCII for the symbols of our texts, because some compilers refuse other characters in C comments.
 _ASCII = str.maketrans({"·": " ", "²": "^2", "×": "x", "λ": "l", "ε": "eps", "⁻": "^-", "¹": "1"})
 # Linkers and file systems accept more (255 bytes per file name), which leaves room for suffixes.
 _LONGEST_IDENTIFIER, _LONGEST_FILE_NAME, _LONGEST_LABEL = 100, 120, 60
@@ -20,16 +20,16 @@ _LONGEST_IDENTIFIER, _LONGEST_FILE_NAME, _LONGEST_LABEL = 100, 120, 60
 
 def identifier(text: str) -> str:
     """Return an identifier of ASCII letters, digits and single underscores; a long one ends in a checksum."""
-    found = re.sub(r"_{2,}", "_", re.sub(r"[^A-Za-z0-9]", "_", text)).strip("_")
-    if len(found) <= _LONGEST_IDENTIFIER:
-        return found
-    return f"{found[: _LONGEST_IDENTIFIER - 9]}_{zlib.crc32(text.encode('utf-8', 'surrogatepass')):08x}"
+    name = re.sub(r"_{2,}", "_", re.sub(r"[^A-Za-z0-9]", "_", text)).strip("_")
+    if len(name) <= _LONGEST_IDENTIFIER:
+        return name
+    return f"{name[: _LONGEST_IDENTIFIER - 9]}_{zlib.crc32(text.encode('utf-8', 'surrogatepass')):08x}"
 
 
 def file_name(text: str) -> str:
     """Return a name for a file or folder, without separators or a leading dot or dash, and of limited length."""
-    found = re.sub(r"[^\w.+@=-]", "_", text).lstrip(".-")
-    return found.encode("utf-8", "replace")[:_LONGEST_FILE_NAME].decode("utf-8", "ignore") or "_"
+    name = re.sub(r"[^\w.+@=-]", "_", text).lstrip(".-")
+    return name.encode("utf-8", "replace")[:_LONGEST_FILE_NAME].decode("utf-8", "ignore") or "_"
 
 
 def c_comment(text: str) -> str:
@@ -38,7 +38,7 @@ def c_comment(text: str) -> str:
 
 
 def toml(value: object) -> str:
-    """Return a value as TOML on one line, which reads back as the same value.
+    """Return a value as TOML on one line.
 
     Raises:
         UnicodeEncodeError: A text contains half a surrogate pair (a path that is not UTF-8), which TOML forbids.
@@ -64,17 +64,17 @@ def xml_name(text: str) -> str:
 
 def markdown(text: str) -> str:
     """Return text that Markdown shows unchanged, also in a table cell."""
-    # A single bracket makes no link, and underscores between letters make no emphasis.
+    # A bracket alone is not a link, and an underscore between letters is not emphasis.
     return re.sub(r"[\\`*<>|&$~#!]|\](?=[\[(:]|$)|_+", _escape_markdown, printable(text))
 
 
-def _escape_markdown(found: re.Match[str]) -> str:
-    before, after = found.string[: found.start()][-1:], found.string[found.end() :][:1]
-    within_a_word = found[0][0] == "_" and before.isalnum() and after.isalnum()
-    return found[0] if within_a_word else "".join(f"\\{c}" for c in found[0])
+def _escape_markdown(match: re.Match[str]) -> str:
+    before, after = match.string[: match.start()][-1:], match.string[match.end() :][:1]
+    within_a_word = match[0][0] == "_" and before.isalnum() and after.isalnum()
+    return match[0] if within_a_word else "".join(f"\\{c}" for c in match[0])
 
 
 def plot_label(text: str) -> str:
     """Return a label for matplotlib, which reads dollars as math and hides labels that begin with an underscore."""
-    found = printable(text, longest=_LONGEST_LABEL).replace("$", r"\$")
-    return f" {found}" if found.startswith("_") else found
+    label = printable(text, longest=_LONGEST_LABEL).replace("$", r"\$")
+    return f" {label}" if label.startswith("_") else label

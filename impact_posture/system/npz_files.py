@@ -1,4 +1,4 @@
-"""Reading of NPZ files that a user names, within bounds of memory."""
+"""Read NPZ files of users within bounds of memory."""
 
 from __future__ import annotations
 
@@ -10,18 +10,18 @@ from typing import TYPE_CHECKING, Any
 if TYPE_CHECKING:
     from numpy.typing import NDArray
 
-# The arrays of a run of an hour at 1 kHz.
+# Size of the arrays of a run of an hour at 1 kHz.
 MOST_BYTES = 1 << 32
 
 
 def read_arrays(path: Path) -> dict[str, NDArray[Any]]:
-    """Return the arrays of an NPZ file; a small file that states or unpacks to more than fits is refused.
+    """Return the arrays of an NPZ file.
 
     Raises:
         OSError: The file cannot be read, or its arrays are larger than :data:`MOST_BYTES`.
-        ValueError: The file is no NPZ, is damaged, or states more numbers than it has.
+        ValueError: The file is not an NPZ, is damaged, or states more numbers than it has.
     """
-    # Imported here because the help page does without.
+    # Imported here, because the help page does not need it.
     import zlib
     from zipfile import BadZipFile
 
@@ -36,12 +36,12 @@ def read_arrays(path: Path) -> dict[str, NDArray[Any]]:
                 raise OSError(errno.EFBIG, os.strerror(errno.EFBIG), str(path))
             arrays = {name: file[name] for name in file.files}
     except MemoryError:
-        # A header may state any size.
+        # The header of a small file may state any size.
         raise ValueError(f"{path.name} states more numbers than it has") from None
     except (BadZipFile, EOFError, RuntimeError, zlib.error) as error:
-        # A RuntimeError, if the damage states another compression or a password.
+        # A RuntimeError means that the file states another compression or a password.
         raise ValueError(f"{path.name} is damaged: {error}") from None
-    # Of an entry that is no array, NumPy returns the bytes.
-    if strange := [name for name, found in arrays.items() if not isinstance(found, np.ndarray)]:
-        raise ValueError(f"'{strange[0]}' of {path.name} is no array")
+    # NumPy returns bytes for an entry that is not an array.
+    if strange := [name for name, array in arrays.items() if not isinstance(array, np.ndarray)]:
+        raise ValueError(f"'{strange[0]}' of {path.name} is not an array")
     return arrays

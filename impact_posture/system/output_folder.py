@@ -1,6 +1,6 @@
-"""Output folders: written whole or not at all, and never over the files of others.
+"""Write output folders whole or not at all, and never over foreign files.
 
-Each output folder holds a record, ``.impact-posture.json``, of the files that were written into it.  ``--force``
+Each output folder has a record, ``.impact-posture.json``, of the files that were written into it.  ``--force``
 replaces a folder only if the record names every file in it.
 """
 
@@ -26,7 +26,7 @@ Kind = Literal["result", "export", "run", "comparison", "reproduction", "sweep",
 
 
 def check_output(out: Path, *, force: bool, kind: Kind) -> None:
-    """Refuse an output folder early, before hours of work.
+    """Refuse an unusable output folder before the work begins.
 
     Args:
         out: The folder to be written.
@@ -34,14 +34,14 @@ def check_output(out: Path, *, force: bool, kind: Kind) -> None:
         kind: The kind of content.
 
     Raises:
-        OutputError: The folder exists, is no folder, holds foreign files, cannot be replaced, or its parent cannot be
-            written.
+        OutputError: The path exists and is not a folder, the folder exists without ``force`` or has foreign files, or
+            it cannot be written.
     """
     check_name(out)
     if out.is_symlink():
         raise OutputError("is a symbolic link", where=str(out), hint="name the folder that it leads to, or another")
     if os.path.lexists(out) and not out.is_dir():
-        raise OutputError("exists and is no folder", where=str(out), hint="choose another `out`")
+        raise OutputError("exists and is not a folder", where=str(out), hint="choose another `out`")
     if Path(os.path.realpath(out)) in (Path.cwd(), *Path.cwd().parents):
         raise OutputError(
             "is the current folder or one around it", where=str(out), hint="choose a new folder, such as ./result"
@@ -58,7 +58,7 @@ def check_output(out: Path, *, force: bool, kind: Kind) -> None:
 
 
 def check_name(out: Path) -> None:
-    """Refuse a name that no file or folder can have, and one that cannot be looked up.
+    """Refuse a name that no file or folder can have.
 
     Raises:
         OutputError: The system refuses the name.
@@ -68,22 +68,22 @@ def check_name(out: Path) -> None:
     except (FileNotFoundError, NotADirectoryError):
         pass
     except (OSError, ValueError) as error:
-        words = f"cannot be written ({getattr(error, 'strerror', None) or error})"
-        raise OutputError(words, where=str(out), hint="choose another `out`") from None
+        fault = f"cannot be written ({getattr(error, 'strerror', None) or error})"
+        raise OutputError(fault, where=str(out), hint="choose another `out`") from None
 
 
 @contextmanager
 def whole_folder(out: Path, *, force: bool, kind: Kind, products: Sequence[str] = ()) -> Iterator[Path]:
-    """Yield a folder beside ``out`` to write into.  On success it takes the place of ``out``, else nothing remains.
+    """Yield a temporary folder beside ``out``.  After the block it replaces ``out``; after an error it is removed.
 
     Args:
         out: The folder to be written.
         force: Whether an existing folder of the same kind may be replaced.
         kind: The kind of content.
-        products: Files that the content may make there later, such as libraries; they count as ours.
+        products: Files that may be built there later, such as libraries; they are not foreign.
 
     Raises:
-        OutputError: As :func:`check_output`, or the disk is full or not writable.
+        OutputError: See :func:`check_output`; or the disk is full or not writable.
     """
     check_output(out, force=force, kind=kind)
     out = out.absolute()
@@ -92,7 +92,7 @@ def whole_folder(out: Path, *, force: bool, kind: Kind, products: Sequence[str] 
             try:
                 yield beside
             except OutputError as error:
-                # The user knows the folder by its own name.
+                # The user knows only the final folder.
                 raise OutputError(
                     error.what, where=error.where.replace(str(beside), str(out)), hint=error.hint
                 ) from None
@@ -100,17 +100,17 @@ def whole_folder(out: Path, *, force: bool, kind: Kind, products: Sequence[str] 
             with signals_held():
                 _replace(beside, out, force, kind)
     except OSError as error:
-        words = error.strerror or str(error)
+        reason = error.strerror or str(error)
         if isinstance(error, FileNotFoundError) and error.filename:
-            # What is missing may be another file than those of the folder.
-            words = f"{words}: {error.filename}"
+            # The missing file may be outside the folder.
+            reason = f"{reason}: {error.filename}"
         raise OutputError(
-            f"cannot be written ({words})", where=str(out), hint="free space or choose another `out`"
+            f"cannot be written ({reason})", where=str(out), hint="free space or choose another `out`"
         ) from error
 
 
 def write_record(folder: Path, kind: Kind, products: Sequence[str] = ()) -> None:
-    """Record every file in a folder as ours, and ``products`` that may be made there later.
+    """Write the record of a folder: all its files, and ``products`` that may be built there later.
 
     Raises:
         OSError: The record cannot be written.
@@ -121,7 +121,7 @@ def write_record(folder: Path, kind: Kind, products: Sequence[str] = ()) -> None
 
 
 def typed_command(folder: Path) -> str:
-    """Return the words with which a user made an output folder; empty where no command line made it."""
+    """Return the command line that wrote an output folder; empty if it was not a command line."""
     try:
         return str(json.loads(read_text(folder / RECORD)).get("command", ""))
     except (OSError, ValueError, AttributeError, RecursionError):
@@ -129,19 +129,19 @@ def typed_command(folder: Path) -> str:
 
 
 def is_ours(folder: Path, kind: Kind) -> bool:
-    """Return whether a folder has a record of this kind; it may hold other files too."""
+    """Return whether a folder has a record of this kind; it may have foreign files as well."""
     content = _read_record(folder)
     return content is not None and content["kind"] == kind
 
 
 def own_files(folder: Path, kind: Kind) -> list[str]:
-    """Return the files that the record of a folder of this kind lists, without itself; none without such a record."""
+    """Return the files that the record of a folder lists, without the record; empty without a record of this kind."""
     content = _read_record(folder)
     return [] if content is None or content["kind"] != kind else [name for name in content["files"] if name != RECORD]
 
 
 def add_to_record(folder: Path, paths: Iterable[Path]) -> None:
-    """Record more files as ours in a folder that has a record; do nothing in another folder.
+    """Add files to the record of a folder; do nothing in a folder without a record.
 
     Raises:
         OutputError: The record cannot be written.
@@ -155,7 +155,7 @@ def add_to_record(folder: Path, paths: Iterable[Path]) -> None:
 
 
 def write_json(path: Path, document: object) -> None:
-    """Write a document; NaN fails here and not in the program that reads it."""
+    """Write a document as JSON.  NaN fails here instead of in the program that reads the file."""
     path.write_text(json.dumps(document, indent=1, allow_nan=False) + "\n", encoding="utf-8")
 
 
@@ -174,7 +174,7 @@ def write_whole(path: Path, content: str | bytes) -> None:
     try:
         with undone(remove):
             beside.unlink(missing_ok=True)
-            # This follows no link that somebody put there.
+            # Mode x follows no symbolic link of another user.
             with beside.open("xb") as file:
                 file.write(content.encode() if isinstance(content, str) else content)
             os.replace(beside, path)
@@ -203,19 +203,19 @@ def _check_ours(out: Path, kind: Kind) -> None:
 
 
 def _foreign(folder: Path, ours: set[str], below: str = "") -> list[str]:
-    """Return the names in a folder that neither ``ours`` nor its own record has, sorted."""
+    """Return the names in a folder that are neither in ``ours`` nor in the record of the folder, sorted."""
     content = _read_record(folder)
     names = [] if content is None else [RECORD, *content["files"], *content["products"]]
     ours = ours.union(below + name for name in names)
-    found = []
+    foreign = []
     for entry in sorted(os.scandir(folder), key=lambda e: e.name):
         name = below + entry.name
         if entry.is_dir(follow_symlinks=False):
-            inside = any(one.startswith(f"{name}/") for one in ours) and not os.path.ismount(entry.path)
-            found += _foreign(Path(entry.path), ours, f"{name}/") if inside else [f"{name}/"]
+            inside = any(path.startswith(f"{name}/") for path in ours) and not os.path.ismount(entry.path)
+            foreign += _foreign(Path(entry.path), ours, f"{name}/") if inside else [f"{name}/"]
         elif name not in ours or not entry.is_file(follow_symlinks=False):
-            found.append(name)
-    return found
+            foreign.append(name)
+    return foreign
 
 
 def _read_record(folder: Path) -> dict[str, Any] | None:
@@ -234,10 +234,10 @@ def _read_record(folder: Path) -> dict[str, Any] | None:
 
 
 def _replace(beside: Path, out: Path, force: bool, kind: Kind) -> None:
-    """Put ``beside`` in the place of ``out``.  After any interruption one of the two results is there."""
+    """Replace ``out`` by ``beside``.  After any interruption, one of the two results is there."""
     if not force or not out.exists():
         try:
-            # This is atomic, and fails on a folder that somebody filled meanwhile.
+            # This is atomic, and fails if another process has filled the folder in the meantime.
             os.rename(beside, out)
         except OSError as error:
             if error.errno in (errno.ENOTEMPTY, errno.EEXIST):
@@ -246,11 +246,11 @@ def _replace(beside: Path, out: Path, force: bool, kind: Kind) -> None:
                 ) from None
             raise
         return
-    # Nobody sweeps this name.  If the process is killed between the two renames, the user finds the old result there.
+    # This name is never swept.  After a kill between the two renames, the user finds the old result there.
     old = out.with_name(f"{out.name}.old-{secrets.token_hex(4)}")
     os.rename(out, old)
     try:
-        # Check again, because nobody else writes there any more.
+        # Check again, because from now on no other process writes there.
         if any(old.iterdir()):
             _check_ours(old, kind)
         os.rename(beside, out)

@@ -1,4 +1,4 @@
-"""Progress of long jobs, which the library reports to a listener."""
+"""Report the progress of long jobs to a listener."""
 
 from __future__ import annotations
 
@@ -6,11 +6,11 @@ import os
 from collections.abc import Callable, Iterator
 from contextlib import contextmanager
 
-# A listener takes the present activity and the share of it that is done, or ``None`` if that is unknown.
+# A listener takes the present activity and the finished share of it, or ``None`` if the share is unknown.
 Listener = Callable[[str, float | None], None]
 
 _LISTENERS: list[Listener] = []
-# A forked process must not write on the terminal of its parent.
+# A forked process must not write to the terminal of its parent.
 os.register_at_fork(after_in_child=_LISTENERS.clear)
 
 

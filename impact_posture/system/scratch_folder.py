@@ -1,8 +1,7 @@
-"""Temporary folders, which disappear also after a process was killed.
+"""Temporary folders that are removed even after a process was killed.
 
-A temporary folder holds a record, ``.impact-posture.json``, from its first moment on, locked by the process that
-works in it.  A folder that nobody locks is what a killed process left.  The next process that works in the same
-place removes it.
+A temporary folder has a record, ``.impact-posture.json``, which the process that works in it locks.  A folder without
+a lock is left by a killed process.  The next process that works in the same parent folder removes it.
 """
 
 from __future__ import annotations
@@ -29,18 +28,18 @@ _PROGRAM = "impact-posture"
 
 
 def made_by() -> dict[str, str]:
-    """Return the words with which this program was called, for a record; nothing for another program."""
+    """Return the command line of this program for a record; nothing for another program."""
     program, *words = sys.argv or [""]
     return {"command": shlex.join([_PROGRAM, *words])} if Path(program).stem == _PROGRAM else {}
 
 
 @contextmanager
 def scratch_folder(parent: Path | None = None, mode: int = 0o700) -> Iterator[Path]:
-    """Yield a temporary folder.  It is removed after the block, also after a signal.
+    """Yield a temporary folder, which is removed after the block and after a signal.
 
     Args:
-        parent: The folder above it; the system's temporary folder by default.
-        mode: Permissions; only the user can read it by default.
+        parent: The parent folder; the system's temporary folder by default.
+        mode: Permissions; by default, only the user can read the folder.
 
     Raises:
         OutputError: The system has no temporary folder.
@@ -52,15 +51,15 @@ def scratch_folder(parent: Path | None = None, mode: int = 0o700) -> Iterator[Pa
         raise OutputError("no temporary folder can be written", where="TMPDIR", hint="set it to one") from None
     _sweep(parent)
     folder = parent / f"{SCRATCH}{secrets.token_hex(4)}"
-    # The folder does not exist yet, so no signal can come between.
+    # The folder is made inside the block, so that no signal can leave it behind.
     with undone(lambda: remove_scratch(folder)):
         folder.mkdir(mode)
         record = os.open(folder / RECORD, os.O_RDWR | os.O_CREAT | os.O_EXCL, 0o666)
         try:
-            # Where nothing can be locked, nothing is swept.
+            # Where files cannot be locked, folders are not swept.
             with suppress(OSError):
                 fcntl.flock(record, fcntl.LOCK_EX)
-            # This follows the lock.  A process that finds the record unlocked finds it empty, and leaves it alone.
+            # Written after the lock, because other processes ignore an empty record without a lock.
             content = {"schema": SCHEMA, "host": os.uname().nodename, **made_by()}
             os.write(record, json.dumps(content).encode())
             yield folder
@@ -69,23 +68,22 @@ def scratch_folder(parent: Path | None = None, mode: int = 0o700) -> Iterator[Pa
 
 
 def _sweep(parent: Path) -> None:
-    """Remove the temporary folders that processes of this package left when they were killed."""
+    """Remove the temporary folders of killed processes of this package."""
     with suppress(OSError):
         for folder in parent.glob(f"{SCRATCH}*"):
-            with suppress(OSError, ValueError, RecursionError, KeyError, TypeError):
-                _sweep_one(folder)
+            if not folder.is_symlink() and folder.stat().st_uid == os.geteuid():
+                with suppress(OSError, ValueError, RecursionError, KeyError, TypeError):
+                    _remove_unlocked(folder)
 
 
-def _sweep_one(folder: Path) -> None:
-    if folder.is_symlink() or folder.stat().st_uid != os.geteuid():
-        return
-    # A pipe in its place has nothing to read.
+def _remove_unlocked(folder: Path) -> None:
+    # Without O_NONBLOCK, a pipe of that name would block.
     record = os.open(folder / RECORD, os.O_RDWR | os.O_NOFOLLOW | os.O_NONBLOCK)
     try:
         # This fails while the process of the folder lives.
         fcntl.flock(record, fcntl.LOCK_EX | fcntl.LOCK_NB)
         content = json.loads(os.read(record, 1 << 24))
-        # Locks may not reach across machines.  The record of a finished folder names no machine.
+        # Locks may not work across machines.  The record of a finished folder names no machine.
         if content["schema"] == SCHEMA and content.get("host", os.uname().nodename) == os.uname().nodename:
             remove_scratch(folder)
     finally:
@@ -93,7 +91,7 @@ def _sweep_one(folder: Path) -> None:
 
 
 def remove_scratch(folder: Path) -> None:
-    """Remove a temporary folder and its record last, so that after an interruption it still counts as ours."""
+    """Remove a temporary folder, and its record last, so that the next sweep recognizes an interrupted removal."""
     with suppress(OSError):
         for entry in os.scandir(folder):
             if entry.is_dir(follow_symlinks=False):

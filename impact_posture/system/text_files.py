@@ -1,4 +1,4 @@
-"""Reading of text files of limited length."""
+"""Read text files of limited length."""
 
 from __future__ import annotations
 
@@ -6,18 +6,18 @@ import errno
 import os
 from pathlib import Path
 
-# The largest file that this package writes, a result of a long search, has about a million characters.
+# The largest file of this package, a result of a long search, has about a million characters.
 MOST_CHARACTERS = 1 << 26
 
 
 def read_text(path: Path) -> str:
-    """Return the content of a UTF-8 file; a device without an end, such as ``/dev/zero``, is refused.
+    """Return the content of a UTF-8 file; refuse an endless device such as ``/dev/zero``.
 
     Raises:
         OSError: The file cannot be read, or is larger than :data:`MOST_CHARACTERS`.
         UnicodeDecodeError: The file is not UTF-8.
     """
-    # Some editors put a byte-order mark first.
+    # Some editors write a byte-order mark at the start.
     with path.open(encoding="utf-8-sig") as file:
         text = file.read(MOST_CHARACTERS + 1)
     if len(text) > MOST_CHARACTERS:

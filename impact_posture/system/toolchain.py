@@ -1,4 +1,4 @@
-"""The C compiler of the user: find it and run it."""
+"""Find and run the C compiler of the user."""
 
 from __future__ import annotations
 
@@ -16,8 +16,8 @@ from impact_posture.system.processes import undone
 
 GET_ONE = "install gcc or clang, or set CC"
 
-# A compiler is several processes.  The shell makes them one group and kills it when the pipe on standard input ends,
-# which happens when this process closes the pipe and when this process is killed.
+# A compiler starts other processes.  The shell kills its whole process group when the pipe on standard input ends,
+# that is, when this process closes the pipe or is killed.
 _GUARD = (
     "exec 3<&0 </dev/null; { read -r _ <&3; kill -KILL 0; } >/dev/null 2>&1 & "
     '"$@" 3<&-; code=$?; kill -KILL $!; exit $code'
@@ -37,7 +37,7 @@ def find_compiler() -> list[str] | None:
 
 
 def require_compiler(where: str) -> list[str]:
-    """Return the C compiler as :func:`find_compiler` does; ``where`` names the work that needs it.
+    """Return the result of :func:`find_compiler`; ``where`` names the work that needs a compiler.
 
     Raises:
         CompilerError: There is no compiler, or ``$CC`` has an open quote.
@@ -73,7 +73,7 @@ def run_compiler(command: list[str], folder: Path) -> None:
 
 
 def run_compilers(commands: Sequence[list[str]], folder: Path) -> None:
-    """Run compiler commands in ``folder``, as many at once as there are cores, in this order.
+    """Run compiler commands in ``folder``, started in this order, as many in parallel as there are cores.
 
     Raises:
         CompilerError: A command failed; with the first error line of the first failure.
@@ -82,7 +82,7 @@ def run_compilers(commands: Sequence[list[str]], folder: Path) -> None:
     reader, writer = os.pipe()
 
     def stop() -> None:
-        """Kill every compiler and the processes that it has started."""
+        """Kill all compilers and the processes that they have started."""
         for _, process in running:
             with suppress(ProcessLookupError):
                 os.killpg(process.pid, signal.SIGKILL)
@@ -104,27 +104,27 @@ def run_compilers(commands: Sequence[list[str]], folder: Path) -> None:
             process.communicate()
 
 
-def _start(command: list[str], folder: Path, tied_to: int) -> subprocess.Popen[str]:
+def _start(command: list[str], folder: Path, guard: int) -> subprocess.Popen[str]:
     pipe = subprocess.PIPE
-    # The temporary files of a killed compiler go with the folder of its result.
-    beside = (folder / command[command.index("-o") + 1]).absolute().parent
+    # A killed compiler leaves temporary files.  In the folder of its result, they are removed with the folder.
+    temporary = (folder / command[command.index("-o") + 1]).absolute().parent
     try:
         return subprocess.Popen(
-            ["sh", "-c", _GUARD, "sh", *command], cwd=folder, stdin=tied_to, stdout=pipe, stderr=pipe, text=True,
-            errors="replace", start_new_session=True, env=os.environ | {"TMPDIR": str(beside)},
+            ["sh", "-c", _GUARD, "sh", *command], cwd=folder, stdin=guard, stdout=pipe, stderr=pipe, text=True,
+            errors="replace", start_new_session=True, env=os.environ | {"TMPDIR": str(temporary)},
         )  # fmt: skip
     except OSError as error:
         raise CompilerError(f"{error.strerror} ({shlex.join(command)})", where="C compiler", hint="set CC") from None
 
 
 def _check(command: list[str], folder: Path, code: int, output: str) -> None:
-    """Refuse a command that failed; ``output`` is its standard error, then its standard output."""
+    """Raise if a command failed; ``output`` is its standard error and then its standard output."""
     if code == 0 and (folder / command[command.index("-o") + 1]).is_file():
         return
     lines = [line for line in output.splitlines() if line.strip()]
     first = next((line for line in lines if "error" in line.lower()), lines[0] if lines else None)
     raise CompilerError(
-        f"{first or f'it said nothing, exit code {code}'} (command: {shlex.join(command)}, in {folder})",
+        f"{first or f'no output, exit code {code}'} (command: {shlex.join(command)}, in {folder})",
         where="the C compiler failed",
         hint="check the compiler or set CC to another",
     )

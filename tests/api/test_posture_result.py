@@ -277,9 +277,9 @@ def test_what_the_objective_holds_is_said_there(arguments: dict[str, Any], task:
     ("arguments", "words"),
     [
         # An unknown metric was taken as euclidean, without a word.
-        ({"metric": "Kinetic"}, "'Kinetic' is none of euclidean.*did you mean kinetic"),
-        ({"metric": None}, "None.*is none of"),
-        ({"metric": "foo", "weights": (1.0,) * 9}, "'foo' is none of"),
+        ({"metric": "Kinetic"}, "'Kinetic' is not one of euclidean.*did you mean kinetic"),
+        ({"metric": None}, "None.*is not one of"),
+        ({"metric": "foo", "weights": (1.0,) * 9}, "'foo' is not one of"),
         ({"compliance": -1.0}, "compliance: is -1"),
         ({"compliance": float("nan")}, "compliance: is nan"),
         ({"metric": ip.Metric("weighted", (1.0, 2.0))}, "weights: has 2 entries; give 9"),
@@ -293,7 +293,7 @@ def test_arguments_of_an_objective_that_do_not_fit(arguments: dict[str, Any], wo
 @pytest.mark.parametrize(
     ("arguments", "words"),
     [
-        (("foo",), "'foo' is none of"),
+        (("foo",), "'foo' is not one of"),
         (("weighted",), "needs weights"),
         (("kinetic", (1.0,) * 9), "takes no weights"),
         (("weighted", (1.0, -1.0)), "weights: .* above zero"),
@@ -306,7 +306,7 @@ def test_a_metric_that_is_none(arguments: tuple[Any, ...], words: str) -> None:
 
 
 def test_a_normal_frame_that_is_none() -> None:
-    with pytest.raises(InputError, match="'body' is none of world, contact"):
+    with pytest.raises(InputError, match="'body' is not one of world, contact"):
         ip.ImpactContact("ee", (0, 0, 1), normal_frame="body")  # type: ignore[arg-type]
 
 
@@ -336,7 +336,7 @@ def test_parts_of_an_objective_check_their_words() -> None:
             ip.ImpactContact("ee", UP, normal_frame=frame)
     with pytest.raises(InputError, match="frame: is 3; give text"):
         ip.ImpactContact(3, UP)
-    with pytest.raises(InputError, match="none of euclidean"):
+    with pytest.raises(InputError, match="not one of euclidean"):
         ip.Metric("mass")
     with pytest.raises(MetricError, match="needs weights"):
         ip.Metric("weighted")

@@ -174,12 +174,12 @@ def test_percent_never_rounds_to_what_is_not(share: float, text: str) -> None:
             "evaluate",
             "--metric",
             "kinetik",
-            "'kinetik' is none of euclidean, kinetic, weighted; did you mean kinetic?",
+            "'kinetik' is not one of euclidean, kinetic, weighted; did you mean kinetic?",
         ),
         ("evaluate", "--root", "free", "did you mean free-flyer?"),
-        ("optimize", "--format", "gif", "'gif' is none of png, svg, pdf; choose one of them"),
+        ("optimize", "--format", "gif", "'gif' is not one of png, svg, pdf; choose one of them"),
         ("optimize", "--contact-pose", "positon", "did you mean position?"),
-        ("optimize", "--compile", "maybe", "is none of auto, always, never"),
+        ("optimize", "--compile", "maybe", "is not one of auto, always, never"),
     ],
 )
 def test_a_value_that_is_none_of_a_few(

@@ -283,7 +283,7 @@ PLAIN = (link("a", None), link("b", OFF_AXIS), joint("a", "b"))
         ("[armature]\njoint = {}", ("unknown key 'armature.joint'", "joints")),
         ("[[supports]]\nframe = 'b'\nkid = 'point'", ("unknown key 'supports.0.kid'", "kind")),
         ("[postures.up]\njonts = {}", ("unknown key 'postures.up.jonts'", "joints")),
-        ("[[supports]]\nframe = 'b'\nkind = 'line'", ("supports.0.kind", "'line' is none of point, surface")),
+        ("[[supports]]\nframe = 'b'\nkind = 'line'", ("supports.0.kind", "'line' is not one of point, surface")),
         ("[model]\nroot = 'floating'", ("model.root", "free-flyer")),
         ("[limits.velocity]\na_b = 0.0", ("limits.velocity.a_b", "above zero")),
         ('schema = "impact-posture/robot/2"\nnew = 1', ("schema 'impact-posture/robot/2'", "impact-posture/robot/1")),

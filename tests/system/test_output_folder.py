@@ -167,8 +167,8 @@ def a_pipe(place: Path) -> Path:
     [
         (a_link, "is a symbolic link"),
         (a_dangling_link, "is a symbolic link"),
-        (a_file, "is no folder"),
-        (a_pipe, "is no folder"),
+        (a_file, "is not a folder"),
+        (a_pipe, "is not a folder"),
         (lambda place: Path(), "current folder"),
         (lambda place: Path(".."), "current folder"),
         (lambda place: place.parent, "current folder"),
