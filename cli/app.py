@@ -45,7 +45,6 @@ app = typer.Typer(
     help="Find the posture in which a redundant robot takes an impact best, see why, and hand it to the controller.",
     epilog="Each command has its own --help. ROBOT: a name from 'impact-posture robots', or a path to a .urdf.",
     no_args_is_help=True,
-    add_completion=False,
     pretty_exceptions_enable=False,
 )
 

@@ -1,5 +1,6 @@
-"""Run the command line by ``python -m impact_posture``."""
+"""``python -m impact_posture``, the same program as ``impact-posture``."""
 
 from impact_posture_cli.main import main
 
-main()
+if __name__ == "__main__":
+    main()

@@ -5,6 +5,7 @@ from __future__ import annotations
 import errno
 import functools
 import json
+import os
 import resource
 import subprocess
 import sys
@@ -86,9 +87,36 @@ def test_what_others_have_to_do_at_the_end_is_done() -> None:
         assert (done.returncode, done.stdout.splitlines()[-1]) == (expected, "the end")
 
 
-def test_version() -> None:
-    done = start("--version")
-    assert (done.returncode, done.stdout) == (0, f"impact-posture {__version__}\n")
+@pytest.mark.parametrize(
+    ("arguments", "code"), [(("--version",), 0), (("evalute",), 2), (("inspect", "nowhere"), 1)], ids=lambda a: str(a)
+)
+def test_the_module_is_the_same_program(arguments: tuple[str, ...], code: int) -> None:
+    done = start(*arguments)
+    command = [sys.executable, "-m", "impact_posture", *arguments]
+    module = subprocess.run(command, capture_output=True, text=True, timeout=60, env=os.environ | {"COLUMNS": "80"})
+    assert (module.returncode, module.stdout, module.stderr) == (code, done.stdout, done.stderr)
+    assert code or done.stdout == f"impact-posture {__version__}\n"
+
+
+@pytest.mark.parametrize(
+    ("words", "expected"),
+    [
+        ("op", ["optimize"]),
+        ("optimize --contact-s", ["--contact-stiffness"]),
+        ("evaluate panda --metric k", ["kinetic"]),
+    ],
+)
+def test_the_shell_completes_commands_options_and_choices(words: str, expected: list[str]) -> None:
+    count = str(len(words.split()))
+    request = {"COMP_WORDS": f"impact-posture {words}", "COMP_CWORD": count}
+    done = start("robots", env=request | {"_IMPACT_POSTURE_COMPLETE": "complete_bash"})
+    assert (done.returncode, done.stderr, done.stdout.split()) == (0, "", expected)
+
+
+def test_the_shell_gets_a_script_for_completion() -> None:
+    done = start("robots", env={"_IMPACT_POSTURE_COMPLETE": "source_bash"})
+    assert done.returncode == 0 and "_IMPACT_POSTURE_COMPLETE=complete_bash" in done.stdout
+    assert {"--install-completion", "--show-completion"} <= set(start("--help").stdout.split())
 
 
 def test_robots() -> None:
