@@ -49,11 +49,7 @@ _SHARE = 1e-3
 
 
 def compile_and_check(
-    export_dir: Path,
-    prefix: str,
-    objectives: Sequence[WorstCaseObjective],
-    *,
-    keep: bool = False,
+    export_dir: Path, prefix: str, objectives: Sequence[WorstCaseObjective], *, keep: bool = False
 ) -> float:
     """Build an export, compare it at random postures and normals, and return the largest relative difference.
 

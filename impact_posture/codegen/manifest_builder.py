@@ -86,10 +86,7 @@ def build_manifest(
         "v_names": list(robot.tangent_names),
         "nq": robot.nq,
         "nv": robot.nv,
-        "metric": {
-            "name": metric.kind,
-            "weights": None if metric.weights is None else list(metric.weights),
-        },
+        "metric": {"name": metric.kind, "weights": None if metric.weights is None else list(metric.weights)},
         "objective": first.name,
         "objective_units": first.units,
         "objective_kink": first.impact_kind.kink,

@@ -94,12 +94,7 @@ class Tree(Kinematics):
         return total
 
     def mass_times(
-        self,
-        v: ca.SX,
-        velocities: ByJoint | None = None,
-        *,
-        extra: bool = True,
-        less: Sequence[Wrench] = (),
+        self, v: ca.SX, velocities: ByJoint | None = None, *, extra: bool = True, less: Sequence[Wrench] = ()
     ) -> ca.SX:
         """Return ``M(q) v − Σ Jᵀ w`` in O(n), armature included, shape (nv,).
 

@@ -57,11 +57,7 @@ def _direction() -> ca.Function:
     return ca.Function("direction", [B, n, friction], [coulomb_direction(B, n, friction)[0]])
 
 
-@given(
-    st.integers(0, 2**32 - 1),
-    st.lists(st.floats(-5, 0), min_size=3, max_size=3),
-    st.floats(-10, 0.3),
-)
+@given(st.integers(0, 2**32 - 1), st.lists(st.floats(-5, 0), min_size=3, max_size=3), st.floats(-10, 0.3))
 def test_a_fixed_number_of_steps_solves_the_secular_equation_to_rounding(
     seed: int, powers: list[float], share: float
 ) -> None:
