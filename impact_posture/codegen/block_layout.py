@@ -136,8 +136,8 @@ def _depth_first(graph: Graph, roots: Sequence[int]) -> list[int]:
     """
     depth: list[int] = []
     for node in graph.nodes:
-        own = 1 if node.op in ARITHMETIC else 0
-        depth.append(own + max((depth[a] for a in node.operands), default=0))
+        steps = 1 if node.op in ARITHMETIC else 0
+        depth.append(steps + max((depth[a] for a in node.operands), default=0))
     seen: set[int] = set()
     order: list[int] = []
     for root in roots:
@@ -156,11 +156,11 @@ def _depth_first(graph: Graph, roots: Sequence[int]) -> list[int]:
 
 def _trig(graph: Graph, order: Sequence[int]) -> tuple[tuple[int, ...], dict[int, int]]:
     """Sines and cosines of inputs, vectors first, so that each vector starts at a multiple of its width."""
-    found = [k for k in order if graph.nodes[k].op in (SINE, COSINE)]
+    trigonometric = [k for k in order if graph.nodes[k].op in (SINE, COSINE)]
     starts: dict[int, int] = {}
     angles: list[int] = []
     trig: dict[int, int] = {}
-    for k in sorted(found, key=lambda k: -graph.nodes[k].width):
+    for k in sorted(trigonometric, key=lambda k: -graph.nodes[k].width):
         argument = graph.nodes[k].args[0]
         members = graph.nodes[argument].args if graph.nodes[argument].op == "gather" else (argument,)
         if all(graph.nodes[m].op == "in" for m in members):
@@ -173,15 +173,15 @@ def _trig(graph: Graph, order: Sequence[int]) -> tuple[tuple[int, ...], dict[int
 
 def _needed(graph: Graph, functions: Sequence[Sequence[str]], leaves: Set[int]) -> dict[int, frozenset[int]]:
     """Node → numbers of the exported functions that need it."""
-    found: dict[int, set[int]] = {}
+    numbers: dict[int, set[int]] = {}
     for number, names in enumerate(functions):
         waiting = [_source(graph, k) for name in names for k in graph.outputs[name]]
         while waiting:
             k = waiting.pop()
-            if number not in found.setdefault(k, set()):
-                found[k].add(number)
+            if number not in numbers.setdefault(k, set()):
+                numbers[k].add(number)
                 waiting += _sources(graph, leaves, k)
-    return {k: frozenset(v) for k, v in found.items()}
+    return {k: frozenset(v) for k, v in numbers.items()}
 
 
 def _inlined(
@@ -195,12 +195,12 @@ def _inlined(
     size: dict[int, int] = {}
     inlined: set[int] = set()
     for k in order:
-        node, own = graph.nodes[k], users.get(k, ())
+        node, used_by = graph.nodes[k], users.get(k, ())
         size[k] = 1 + sum(size[a] for a in node.operands if a in inlined)
-        if len(own) != 1 or k in outputs or node.op not in ARITHMETIC or size[k] >= _STATEMENT:
+        if len(used_by) != 1 or k in outputs or node.op not in ARITHMETIC or size[k] >= _STATEMENT:
             continue
-        user = graph.nodes[own[0]]
+        user = graph.nodes[used_by[0]]
         times = Counter(_source(graph, a) for a in user.operands)[k]
-        if times == 1 and k in user.operands and needed[own[0]] == needed[k] and user.op in ARITHMETIC:
+        if times == 1 and k in user.operands and needed[used_by[0]] == needed[k] and user.op in ARITHMETIC:
             inlined.add(k)
     return inlined

@@ -72,30 +72,39 @@ def build_c_source(exported: Sequence[NamedObjective], prefix: str, real: Real, 
         real: The C type to compute in.
         portable: Use no vectors, for compilers that have none.
     """
-    found = export_library(exported)
+    library = export_library(exported)
     models = [
         (v.stem, v.joint, v.free, v.objective.contact, v.objective.scale, v.objective.is_multiple_of_H)
         for v in exported
     ]
-    content = (ca.CasadiMeta.version(), found.constants, found.seeds, found.functions, models, prefix, real, portable)
-    key = source_key([repr(content), found.function.serialize()], "codegen")
+    content = (
+        ca.CasadiMeta.version(),
+        library.constants,
+        library.seeds,
+        library.functions,
+        models,
+        prefix,
+        real,
+        portable,
+    )
+    key = source_key([repr(content), library.function.serialize()], "codegen")
     code = read_stored("code", key, CSource)
     if code is None:
-        code = _generate(exported, found, prefix, real, portable=portable)
+        code = _generate(exported, library, prefix, real, portable=portable)
         write_stored("code", key, code)
     return code
 
 
 def _generate(
-    exported: Sequence[NamedObjective], found: ExportLibrary, prefix: str, real: Real, *, portable: bool
+    exported: Sequence[NamedObjective], library: ExportLibrary, prefix: str, real: Real, *, portable: bool
 ) -> CSource:
     single = [v for v in exported if not v.joint]
     contacts = {v.stem: v.objective.contact for v in single}
     robot = single[0].objective.robot
-    scalars = found.graph()
+    scalars = library.graph()
     # A single call waits for results more than for arithmetic units.  A batch has other lanes to go on with.
-    graph = reorder_sums(scalars if portable else found.vector_graph())
-    layout = lay_out(graph, [f.outputs for f in found.functions])
+    graph = reorder_sums(scalars if portable else library.vector_graph())
+    layout = lay_out(graph, [f.outputs for f in library.functions])
     constants = Constants(prefix, real)
     # The names of types stand in thousands of places, so they are short.  The source undefines them at its end.
     types = {1: real.name, 2: "V2", 4: "V4"}
@@ -104,7 +113,7 @@ def _generate(
     whole = 1 if portable else LARGEST_VECTOR // real.size
     room = max(1, -(-len(angles) // whole)) * whole
     functions = []
-    for number, function in enumerate(found.functions):
+    for number, function in enumerate(library.functions):
         inputs, results = SIGNATURES[function.name]
         sizes = [len(graph.outputs[output]) for output in function.outputs]
         blocks = zip(layout.blocks, emitter.blocks, strict=True)
@@ -124,7 +133,7 @@ def _generate(
     for v in single:
         scale = real.literal(v.objective.scale) if v.objective.is_multiple_of_H else ""
         batch = {"stem": v.stem, "normal": v.objective.contact.normal, "scale": scale, "blocks": ()}
-        function = next(f for f in found.functions if (f.stem, f.name) == (v.stem, "eval"))
+        function = next(f for f in library.functions if (f.stem, f.name) == (v.stem, "eval"))
         # A batch of the free robot beside one that stands would be another third of the source, so it is a loop.
         if not portable and not v.free and (lanes := _lanes(function, scalars, real, constants)):
             held = 2 * lanes["room"] + lanes["work"] + robot.nq + 3 + 2 * (1 + robot.nv)

@@ -70,23 +70,23 @@ def compile_and_check(
             built = build_library(export_dir, prefix, library_path(export_dir if keep else folder, prefix))
         library = load_library(built)
         for v in named_objectives(objectives, prefix):
-            own = v.objective
+            objective = v.objective
             # Beside an objective of several contacts, each frame has one of its own.
             block = manifest if v.joint else manifest | {"several": None}
-            gradient = ImpactGradient(library, block, own.contact.frame, free=v.free)
-            tolerance = self_test_tolerance(own, real)
+            gradient = ImpactGradient(library, block, objective.contact.frame, free=v.free)
+            tolerance = self_test_tolerance(objective, real)
             for reference, allowed, name in (
                 (casadi_reference, tolerance, "CasADi"),
                 (oracle_reference, max(_ORACLE_TOLERANCE, tolerance), "Pinocchio"),
             ):
-                found = largest_difference(gradient, own, reference, _SAMPLES)
-                if found > allowed:
+                difference = largest_difference(gradient, objective, reference, _SAMPLES)
+                if difference > allowed:
                     raise CompilerError(
-                        f"the numbers of the compiled code differ from those of {name} by {found:.3g}, relative",
+                        f"the numbers of the compiled code differ from those of {name} by {difference:.3g}, relative",
                         where=f"{prefix}.c",
                         hint="try another compiler (set CC) without -ffast-math, or double instead of float",
                     )
-                worst = max(worst, found)
+                worst = max(worst, difference)
     return worst
 
 
@@ -139,9 +139,9 @@ def largest_difference(
             code, results = gradient.call(name, q, n)
             if code != 0:
                 return float("inf")
-            for quantity, found in zip(quantities, results, strict=True):
+            for quantity, result in zip(quantities, results, strict=True):
                 least = _SHARE * abs(float(expected[_LEAST[quantity]][0])) if quantity in _LEAST else 0.0
-                worst = max(worst, deviation(found, expected[quantity], least).error)
+                worst = max(worst, deviation(result, expected[quantity], least).error)
         if not objective.others:
             H, rows = gradient.value_and_gradient_batch(np.stack([q, q]), np.stack([n, n]))
             value, row = gradient.value_and_gradient(q, n)
@@ -163,10 +163,10 @@ class Deviation:
     index: tuple[int, ...]
 
 
-def deviation(found: Array, expected: Array, scale: float = 0.0) -> Deviation:
+def deviation(values: Array, expected: Array, scale: float = 0.0) -> Deviation:
     """Return the largest deviation over the largest expected entry, or over ``scale`` if that is larger."""
     with np.errstate(invalid="ignore"):
-        difference = np.abs(found - expected)
+        difference = np.abs(values - expected)
     difference[~np.isfinite(difference)] = np.inf
     index = tuple(int(k) for k in np.unravel_index(int(np.argmax(difference)), difference.shape))
     largest, size = float(difference[index]), max(float(np.abs(expected).max()), scale)

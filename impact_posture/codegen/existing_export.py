@@ -39,17 +39,17 @@ def existing_export(objective: WorstCaseObjective, out: Path, *, build: bool) ->
         return None
     try:
         manifest = json.loads((out / f"{prefix}.json").read_text(encoding="utf-8"))
-        found = _comparable(manifest)
+        content = _comparable(manifest)
     except (OSError, LookupError, ValueError, TypeError, AttributeError, RecursionError):
         return None
     # What has been written and read has lists in place of tuples.
-    if found != _comparable(json.loads(json.dumps(build_manifest([objective], prefix, None, None)))):
+    if content != _comparable(json.loads(json.dumps(build_manifest([objective], prefix, None, None)))):
         return None
-    made = Export(out, objective.robot, tuple(out / name for name in files), manifest, requested=build)
+    existing = Export(out, objective.robot, tuple(out / name for name in files), manifest, requested=build)
     if not build or find_compiler() is None:
-        return made
+        return existing
     agreement = compile_and_check(out, prefix, [objective], keep=True)
-    return replace(made, agreement=agreement, library=library_path(out, prefix))
+    return replace(existing, agreement=agreement, library=library_path(out, prefix))
 
 
 def _comparable(manifest: dict[str, Any]) -> dict[str, Any]:

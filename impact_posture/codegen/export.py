@@ -156,10 +156,10 @@ def export(
     if not out.is_dir():
         raise OutputError("no such folder", where=str(out), hint="create it first")
     if posture is not None:
-        given = np.array(posture, dtype=float)
-        posture = robot.check_posture(given, limits=False)
+        stated = np.array(posture, dtype=float)
+        posture = robot.check_posture(stated, limits=False)
         # Normalizing a configuration of unit norm changes its last digits.  Keep those that result.json has.
-        posture = given if np.allclose(given, posture, rtol=0, atol=1e-9) else posture
+        posture = stated if np.allclose(stated, posture, rtol=0, atol=1e-9) else posture
     exported, code = cached_code(tuple(objectives), prefix, real, portable)
     manifest = build_manifest(objectives, prefix, posture, compression, real, code.stack_bytes, portable=portable)
     texts = render_files(exported, prefix, manifest, code, real)
@@ -169,10 +169,10 @@ def export(
         raise OutputError(f"holds {there[0]} already", where=str(out), hint="give `force` to replace it")
     for name, text in texts.items():
         write_whole(out / name, text)
-    made = Export(out, robot, tuple(out / name for name in texts), manifest)
+    written = Export(out, robot, tuple(out / name for name in texts), manifest)
     if not check or find_compiler() is None:
-        return made
-    return replace(made, agreement=compile_and_check(out, prefix, objectives))
+        return written
+    return replace(written, agreement=compile_and_check(out, prefix, objectives))
 
 
 @lru_cache(maxsize=1)
@@ -220,7 +220,7 @@ def write_export(
     real = FLOAT if single else DOUBLE
     agreement = None
     with whole_folder(out, force=force, kind="export", products=products(prefix)) as folder:
-        made = export(
+        written = export(
             objectives, folder, prefix=prefix, posture=posture, compression=compression, real=real, portable=portable,
             check=False,
         )  # fmt: skip
@@ -231,8 +231,8 @@ def write_export(
                 hint = f"{error.hint}; without compiling, the C code is written all the same"
                 raise CompilerError(error.what, where=error.where, hint=hint) from None
     library = None if agreement is None else library_path(out, prefix)
-    files = tuple(out / path.name for path in made.files)
-    return replace(made, out=out, files=files, agreement=agreement, library=library, requested=build)
+    files = tuple(out / path.name for path in written.files)
+    return replace(written, out=out, files=files, agreement=agreement, library=library, requested=build)
 
 
 def default_prefix(objectives: Sequence[WorstCaseObjective]) -> str:

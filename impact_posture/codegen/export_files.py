@@ -60,7 +60,7 @@ def environment(package: str, escape: Callable[[str], str]) -> Environment:
     def insert(value: object) -> str:
         return value if isinstance(value, Verbatim) else escape(str(value))
 
-    found = Environment(
+    templates = Environment(
         loader=PackageLoader(package),
         undefined=StrictUndefined,
         trim_blocks=True,
@@ -78,8 +78,8 @@ def environment(package: str, escape: Callable[[str], str]) -> Environment:
         "wrapped": lambda words, indent: wrapped(map(escape, words), indent),
         "lines": lambda parts, between: between.join(map(escape, parts)),
     }
-    found.filters |= {name: _verbatim(function) for name, function in filters.items()}
-    return found
+    templates.filters |= {name: _verbatim(function) for name, function in filters.items()}
+    return templates
 
 
 def _verbatim(function: Callable[..., str]) -> Callable[..., Verbatim]:
@@ -140,7 +140,9 @@ def _context(
         "identity": identity(manifest),
         "tolerance": f"{self_test_tolerance(objective, real):g}",
         "metric": f"{metric.kind} ({weights[metric.kind]})",
-        "joint_note": f"; {found['line']}" if (found := manifest["compression"]) and found["line"] else "",
+        "joint_note": f"; {compression['line']}"
+        if (compression := manifest["compression"]) and compression["line"]
+        else "",
         "supports": (
             f"{supports}; M stands for M + Js'Js/c with c = {objective.compliance:.6g} 1/kg"
             if supports

@@ -34,12 +34,12 @@ def stems(prefix: str, frames: Sequence[str]) -> tuple[str, ...]:
     """
     if len(frames) == 1:
         return (prefix,)
-    found: dict[str, str] = {}
+    frame_of: dict[str, str] = {}
     for frame in frames:
         stem = f"{prefix}_{identifier(frame)}"
-        if stem in found:
-            other = found[stem]
+        if stem in frame_of:
+            other = frame_of[stem]
             what = f"'{frame}' is given twice" if other == frame else f"'{other}' and '{frame}' are one name in C"
             raise InputError(what, where="frame", hint="give each frame once, or export one by one")
-        found[stem] = frame
-    return tuple(found)
+        frame_of[stem] = frame
+    return tuple(frame_of)

@@ -54,12 +54,12 @@ def named_objectives(objectives: Sequence[WorstCaseObjective], prefix: str) -> t
     each = [*singles.values()] if several else [*objectives]
     frames = [o.contact.frame for o in each]
     names = stems(prefix, frames) if len(frames) > 1 or not several else (f"{prefix}_contact",)
-    found: list[NamedObjective] = []
+    named: list[NamedObjective] = []
     for objective, stem in zip(each, names, strict=True):
-        found.append(NamedObjective(objective, stem))
+        named.append(NamedObjective(objective, stem))
         if objective.supports:
-            found.append(NamedObjective(replace(objective, supports=()), f"{stem}_free", free=True))
-    return (*found, *[NamedObjective(objective, prefix, joint=True) for objective in several])
+            named.append(NamedObjective(replace(objective, supports=()), f"{stem}_free", free=True))
+    return (*named, *[NamedObjective(objective, prefix, joint=True) for objective in several])
 
 
 @dataclass(frozen=True)
@@ -126,9 +126,9 @@ def export_library(exported: Sequence[NamedObjective]) -> ExportLibrary:
             expressions = v.objective.worst_case.expressions(k)
             parts["objective"] = dict(zip(("value", "gradient"), expressions, strict=True))
         for name, part in parts.items():
-            found = {f"o{number}_{output}": value for output, value in part.items()}
-            functions.append(Exported(v.stem, name, tuple(found)))
-            outputs |= found
+            part_outputs = {f"o{number}_{output}": value for output, value in part.items()}
+            functions.append(Exported(v.stem, name, tuple(part_outputs)))
+            outputs |= part_outputs
     constants = [value for _, value in limbs.parameters.values()]
     inputs = [q, n, ca.vertcat(ca.SX(0, 1), *[symbol for symbol, _ in limbs.parameters.values()])]
     names = ["q", "n", "constants"], [*outputs]
@@ -137,10 +137,10 @@ def export_library(exported: Sequence[NamedObjective]) -> ExportLibrary:
 
 
 def _seeds(model: object, limbs: RepeatedLimbs) -> dict[tuple[str, int], LimbInput]:
-    found = {("constants", i): LimbInput(group, lane, name) for i, (group, lane, name) in enumerate(limbs.parameters)}
+    seeds = {("constants", i): LimbInput(group, lane, name) for i, (group, lane, name) in enumerate(limbs.parameters)}
     for slot in Chart(model).slots:
         place = limbs.places.get(slot.index)
         if place is not None:
             for i in range(slot.q.start, slot.q.stop):
-                found["q", i] = LimbInput(place.group, place.lane, f"{place.position}.q.{i - slot.q.start}")
-    return found
+                seeds["q", i] = LimbInput(place.group, place.lane, f"{place.position}.q.{i - slot.q.start}")
+    return seeds

@@ -95,10 +95,10 @@ class Graph:
 
     def element(self, node: int, lane: int) -> int:
         """Return the node of one number of a vector."""
-        found = self.nodes[node]
-        if found.op == "const":
-            return self.constant(found.value[lane if found.width > 1 else 0])
-        return node if found.width == 1 else self.add(Node("lane", (node, lane)))
+        vector = self.nodes[node]
+        if vector.op == "const":
+            return self.constant(vector.value[lane if vector.width > 1 else 0])
+        return node if vector.width == 1 else self.add(Node("lane", (node, lane)))
 
 
 _COMPUTE: dict[str, Callable[..., float]] = {

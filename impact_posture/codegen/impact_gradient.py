@@ -64,9 +64,9 @@ class ImpactGradient:
         inputs = {name: (real * sizes[name])() for name in ("q", "n")}
         self._q, self._n = (np.frombuffer(buffer, dtype=self.dtype) for buffer in inputs.values())
         self._functions: dict[str, tuple[Callable[[], int], tuple[Array, ...]]] = {}
-        for name, (given, results) in SIGNATURES.items():
+        for name, (input_names, results) in SIGNATURES.items():
             buffers = [(real * sizes.get(result, 1))() for result in results]
-            arguments = [ctypes.byref(buffer) for buffer in (*[inputs[one] for one in given], *buffers)]
+            arguments = [ctypes.byref(buffer) for buffer in (*[inputs[one] for one in input_names], *buffers)]
             views = tuple(np.frombuffer(buffer, dtype=self.dtype) for buffer in buffers)
             self._functions[name] = partial(getattr(library, symbols[name]), *arguments), views
         self._batch = getattr(library, symbols["eval_batch"])
@@ -106,11 +106,11 @@ class ImpactGradient:
         library = load_library(target)
         check_library(library, manifest, where=str(target))
         try:
-            found = cls(library, manifest, frame, free=free)
+            gradient = cls(library, manifest, frame, free=free)
         except AttributeError as error:
             raise SpecError(f"lacks a function ({error})", where=str(target), hint="run codegen again") from None
-        found._self_test(str(target))
-        return found
+        gradient._self_test(str(target))
+        return gradient
 
     def copy(self) -> ImpactGradient:
         """Return the same functions with buffers of their own, for another thread."""
@@ -258,8 +258,8 @@ class ImpactGradient:
     def _self_test(self, where: str) -> None:
         test = self._reference
         H, grad = self.value_and_gradient(test["q"], test["n"])
-        found, expected = np.array([H, *grad]), np.array([test["H"], *test["grad"]])
-        difference = float(np.abs(found - expected).max() / np.abs(expected).max())
+        values, expected = np.array([H, *grad]), np.array([test["H"], *test["grad"]])
+        difference = float(np.abs(values - expected).max() / np.abs(expected).max())
         # A comparison by ">" would accept a NaN.
         if not difference <= _SELF_TEST[self.manifest["real"]]:
             raise ManifestMismatch(

@@ -75,12 +75,12 @@ def read_manifest(path: Path) -> tuple[dict[str, Any], Path]:
     Raises:
         SpecError: There is no manifest, there are several, or it is broken.
     """
-    manifest, found, file = read_checked(path, SCHEMA, _Manifest, "export", "codegen")
-    sizes = [("armature", len(found.armature), found.nv)]
-    for block in found.frames:
+    manifest, checked, file = read_checked(path, SCHEMA, _Manifest, "export", "codegen")
+    sizes = [("armature", len(checked.armature), checked.nv)]
+    for block in checked.frames:
         for part in filter(None, (block, block.free)):
-            sizes.append((f"self_test.q at {block.frame}", len(part.self_test.q), found.nq))
-            sizes.append((f"self_test.grad at {block.frame}", len(part.self_test.grad), found.nv))
+            sizes.append((f"self_test.q at {block.frame}", len(part.self_test.q), checked.nq))
+            sizes.append((f"self_test.grad at {block.frame}", len(part.self_test.grad), checked.nv))
     for name, size, expected in sizes:
         if size != expected:
             raise _not_whole(file, f"{name} has {size} numbers instead of {expected}")
@@ -154,12 +154,12 @@ def check_library(library: ctypes.CDLL, manifest: Mapping[str, Any], *, where: s
         ) from None
     inside = ctypes.string_at(address).decode("ascii", "replace")
     pairs = [dict(part.partition("=")[::2] for part in text.split()) for text in (identity(manifest), inside)]
-    for key, given in pairs[0].items():
-        if pairs[1].get(key) != given:
+    for key, value in pairs[0].items():
+        if pairs[1].get(key) != value:
             name = "the manifest's hash" if key == "sha256" else key
             raise ManifestMismatch(
                 name,
-                given,
+                value,
                 pairs[1].get(key),
                 where=where,
                 hint="delete the library: it is built again; or run codegen",

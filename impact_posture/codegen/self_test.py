@@ -49,13 +49,13 @@ def oracle_reference(objective: WorstCaseObjective) -> Reference:
     """Return the same quantities from the numbers of Pinocchio."""
 
     def evaluate(q: Array, n: Array) -> dict[str, Array]:
-        found: dict[str, ArrayLike] = {"objective": objective.value(q), "objective_grad": objective.gradient(q)}
+        values: dict[str, ArrayLike] = {"objective": objective.value(q), "objective_grad": objective.gradient(q)}
         if not objective.others:
             oracle = oracle_along(objective, n)
             at = oracle.quantities(q)
-            found |= {"H": at.H, "grad": oracle.gradient_H(q), "jump": at.jump, "G": at.G, "V": at.V}
-            found["ellipsoid"] = at.ellipsoid
-        return {name: np.array(value, dtype=float).ravel() for name, value in found.items()}
+            values |= {"H": at.H, "grad": oracle.gradient_H(q), "jump": at.jump, "G": at.G, "V": at.V}
+            values["ellipsoid"] = at.ellipsoid
+        return {name: np.array(value, dtype=float).ravel() for name, value in values.items()}
 
     return evaluate
 
@@ -89,15 +89,17 @@ def self_test(objective: WorstCaseObjective, real: Real = DOUBLE) -> dict[str, A
         MetricError: The objective does not exist there.
     """
     q, n = real.rounded(sample_postures(objective.robot, 1, 0)[0]), real.rounded(_NORMAL)
-    found = casadi_reference(objective)(q, n)
-    if not all(np.isfinite(value).all() for value in found.values()):
+    values = casadi_reference(objective)(q, n)
+    if not all(np.isfinite(value).all() for value in values.values()):
         raise MetricError(
             f"objective '{objective.name}' is not finite at a random posture of {objective.robot.name}",
             where="codegen",
             hint="choose another objective or frame",
         )
     inputs = {"q": q} if objective.others else {"q": q, "n": n}
-    return {name: float(value[0]) if name in _SCALARS else value.tolist() for name, value in (inputs | found).items()}
+    return {
+        name: float(value[0]) if name in _SCALARS else value.tolist() for name, value in (inputs | values).items()
+    }
 
 
 # C function → the reference's names of its results.

@@ -77,12 +77,12 @@ def _bundles(
     # In keys, a node stands for itself or for the first node of its bundle.
     short = list(range(len(graph.nodes)))
     for level in levels:
-        found: dict[Key, dict[int, list[int]]] = {}
+        by_key: dict[Key, dict[int, list[int]]] = {}
         for k in level:
             if (place := _place(graph, k, places, lanes, short)) is not None:
                 key, lanes[k] = place
-                found.setdefault(key, {}).setdefault(lanes[k][1], []).append(k)
-        for by_lane in found.values():
+                by_key.setdefault(key, {}).setdefault(lanes[k][1], []).append(k)
+        for by_lane in by_key.values():
             members = [k for nodes in by_lane.values() for k in nodes]
             if len(members) == len(by_lane) == widths[lanes[members[0]][0]]:
                 bundle = tuple(by_lane[lane][0] for lane in sorted(by_lane))
@@ -106,9 +106,9 @@ def _place(
     inside = {lanes[a] for a in node.operands if a in lanes}
     if len(inside) != 1 or not (node.op in ARITHMETIC or trigonometric):
         return None
-    (own,) = inside
+    (group_lane,) = inside
     operands = [short[a] for a in node.operands]
-    return (node.op, own[0], *(sorted(operands) if node.op in "+*" else operands)), own
+    return (node.op, group_lane[0], *(sorted(operands) if node.op in "+*" else operands)), group_lane
 
 
 def _merge(
@@ -118,35 +118,35 @@ def _merge(
     values: Mapping[str, Sequence[float]],
 ) -> Graph:
     """Return a graph with a vector for each bundle."""
-    found = Graph(graph.inputs)
-    made: dict[int, int] = {}
+    merged = Graph(graph.inputs)
+    singles: dict[int, int] = {}
     vectors: dict[tuple[int, ...], int] = {}
 
     def number(k: int) -> int:
         """The single number of node k."""
-        if k not in made:
+        if k not in singles:
             bundle = bundles[k]
-            made[k] = found.element(vectors[bundle], bundle.index(k))
-        return made[k]
+            singles[k] = merged.element(vectors[bundle], bundle.index(k))
+        return singles[k]
 
     def leaf(node: Node) -> int:
         name = graph.inputs[node.args[0]]
-        return found.constant(values[name][node.args[1]]) if name in values else found.add(node)
+        return merged.constant(values[name][node.args[1]]) if name in values else merged.add(node)
 
     def single(node: Node) -> int:
         if node.op == "in":
             return leaf(node)
         if node.op == "const":
-            return found.constant(*node.value)
-        return found.add(Node(node.op, tuple(number(a) for a in node.operands)))
+            return merged.constant(*node.value)
+        return merged.add(Node(node.op, tuple(number(a) for a in node.operands)))
 
     def vector(bundle: tuple[int, ...]) -> int:
         members = [graph.nodes[k] for k in bundle]
         if members[0].op == "in":
             parts = [leaf(node) for node in members]
-            if all(found.nodes[p].op == "const" for p in parts):
-                return found.constant(*[found.nodes[p].value[0] for p in parts])
-            return found.add(Node("gather", tuple(parts), len(parts)))
+            if all(merged.nodes[p].op == "const" for p in parts):
+                return merged.constant(*[merged.nodes[p].value[0] for p in parts])
+            return merged.add(Node("gather", tuple(parts), len(parts)))
         # Lanes share an operand that is a single number.  Their own operands are a vector in the same order.
         slots = [list(operands) for operands in zip(*[node.operands for node in members], strict=True)]
         if members[0].op in "+*":
@@ -155,16 +155,16 @@ def _merge(
             vectors[bundles[slot[0]]] if slot[0] in bundles and len(set(slot)) > 1 else number(slot[0])
             for slot in slots
         ]
-        return found.add(Node(members[0].op, tuple(operands), max(found.nodes[o].width for o in operands)))
+        return merged.add(Node(members[0].op, tuple(operands), max(merged.nodes[o].width for o in operands)))
 
     # The nodes of a bundle lie in one level, and their operands in earlier ones.
     for k in (k for level in levels for k in level):
         if k not in bundles:
-            made[k] = single(graph.nodes[k])
+            singles[k] = single(graph.nodes[k])
         elif bundles[k] not in vectors:
             vectors[bundles[k]] = vector(bundles[k])
-    found.outputs = {name: [number(k) for k in nodes] for name, nodes in graph.outputs.items()}
-    return found
+    merged.outputs = {name: [number(k) for k in nodes] for name, nodes in graph.outputs.items()}
+    return merged
 
 
 def _align(slots: list[list[int]], bundles: Mapping[int, tuple[int, ...]]) -> None:

@@ -16,15 +16,15 @@ _WORTH = 8
 
 def reorder_sums(graph: Graph) -> Graph:
     """Return the same computation with every sum in the order in which its terms become ready."""
-    found = Graph(graph.inputs)
+    reordered = Graph(graph.inputs)
     ready: list[int] = []
-    made: dict[int, int] = {}
+    new_of: dict[int, int] = {}
     inner = _inner(graph)
 
     def add(node: Node) -> int:
-        k = found.add(node)
-        while len(ready) < len(found.nodes):
-            new = found.nodes[len(ready)]
+        k = reordered.add(node)
+        while len(ready) < len(reordered.nodes):
+            new = reordered.nodes[len(ready)]
             ready.append(max((ready[a] for a in new.operands), default=0) + _LATENCY.get(new.op, _TRIG))
         return k
 
@@ -32,14 +32,14 @@ def reorder_sums(graph: Graph) -> Graph:
         if k in inner:
             continue
         if node.op in ("+", "-"):
-            terms = [(sign, made[t]) for sign, t in _terms(graph, k, inner)]
-            made[k] = _sum(found, add, ready, terms)
+            terms = [(sign, new_of[t]) for sign, t in _terms(graph, k, inner)]
+            new_of[k] = _sum(reordered, add, ready, terms)
         else:
-            operands = tuple(made[a] for a in node.operands)
+            operands = tuple(new_of[a] for a in node.operands)
             args = (operands[0], node.args[1]) if node.op == "lane" else operands if operands else node.args
-            made[k] = add(Node(node.op, args, node.width, node.value))
-    found.outputs = {name: [made[k] for k in nodes] for name, nodes in graph.outputs.items()}
-    return found
+            new_of[k] = add(Node(node.op, args, node.width, node.value))
+    reordered.outputs = {name: [new_of[k] for k in nodes] for name, nodes in graph.outputs.items()}
+    return reordered
 
 
 def _inner(graph: Graph) -> set[int]:
@@ -77,13 +77,13 @@ def _terms(graph: Graph, root: int, inner: set[int]) -> list[tuple[int, int]]:
     return terms
 
 
-def _sum(found: Graph, add: Callable[[Node], int], ready: list[int], terms: list[tuple[int, int]]) -> int:
+def _sum(graph: Graph, add: Callable[[Node], int], ready: list[int], terms: list[tuple[int, int]]) -> int:
     """Return the sum of signed nodes, the latest last."""
     queue = sorted(terms, key=lambda term: (ready[term[1]], term[1]))
 
     def plus(one: tuple[int, int], other: tuple[int, int]) -> tuple[int, int]:
         # A single number that all lanes add stays single until a vector joins it.
-        width = max(found.nodes[one[1]].width, found.nodes[other[1]].width)
+        width = max(graph.nodes[one[1]].width, graph.nodes[other[1]].width)
         if one[0] == other[0]:
             return one[0], add(Node("+", (one[1], other[1]), width))
         positive, negative = (one, other) if one[0] > 0 else (other, one)
@@ -97,4 +97,4 @@ def _sum(found: Graph, add: Callable[[Node], int], ready: list[int], terms: list
             other = queue.pop(0)
             term = plus(term, other)
         total = plus(total, term)
-    return total[1] if total[0] > 0 else add(Node("neg", (total[1],), found.nodes[total[1]].width))
+    return total[1] if total[0] > 0 else add(Node("neg", (total[1],), graph.nodes[total[1]].width))

@@ -1,1 +1,1 @@
-"""The same model twice: symbolic (CasADi, from a ``pin.Model``) and numeric (Pinocchio, the oracle)."""
+"""Dynamics of a ``pin.Model`` as CasADi expressions, computed with Pinocchio, and in MuJoCo."""

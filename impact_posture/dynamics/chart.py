@@ -21,7 +21,7 @@ BOUNDED = ("revolute", "prismatic", "translation")
 
 @dataclass(frozen=True)
 class JointSlot:
-    """Place of one joint in ``q``, ``v`` and the chart ``x``."""
+    """Entries of one joint in ``q``, ``v`` and the chart ``x``."""
 
     index: int
     name: str
@@ -32,15 +32,15 @@ class JointSlot:
 
 
 class Chart:
-    """Chart ``x`` of the configuration space, which is ``q`` with one angle for every continuous or planar rotation.
+    """Chart ``x`` of the configuration space: ``q`` with an angle in place of each cosine and sine.
 
-    Quaternions stay four numbers, and :meth:`norms` has the equations of their unit norm.  So ``q(x)`` is smooth, has
-    no singular point, and costs nothing.
+    A quaternion remains four numbers, and :meth:`norms` has the equation of its unit norm.  So ``q(x)`` is smooth and
+    has no singular point.
     """
 
     def __init__(self, model: pin.Model) -> None:
         self.slots: list[JointSlot] = []
-        # Places in q and x of the numbers that both have, and of each angle, which is a cosine and then a sine in q.
+        # Indices in q and x of equal numbers, and of each cosine (before its sine) in q and its angle in x.
         copied: list[tuple[int, int]] = []
         angles: list[tuple[int, int]] = []
         start = 0
@@ -63,12 +63,12 @@ class Chart:
     @staticmethod
     @lru_cache(maxsize=16)
     def of(model: pin.Model) -> Chart:
-        """Return the chart of a model, made once for the models used last."""
+        """Return the chart of a model.  The charts of the last models are kept."""
         return Chart(model)
 
     @cached_property
     def bounded(self) -> tuple[list[int], list[int]]:
-        """Tangent indices and chart indices of coordinates that may have limits, and equal their tangent entry."""
+        """Indices in ``v`` and in ``x`` of the coordinates that may have limits; their rate is the entry of ``v``."""
         slots = [slot for slot in self.slots if slot.kind.family in BOUNDED]
         in_v = [k for slot in slots for k in range(slot.v.start, slot.v.stop)]
         return in_v, [k for slot in slots for k in range(slot.x.start, slot.x.stop)]
@@ -83,7 +83,7 @@ class Chart:
         return ca.vertcat(*parts)
 
     def quaternion_slices(self) -> list[slice]:
-        """Return where ``x`` holds quaternions (x y z w)."""
+        """Return the slices of ``x`` that are quaternions (x y z w)."""
         return [slice(s.x.stop - 4, s.x.stop) for s in self.slots if s.kind.family in ("free-flyer", "spherical")]
 
     def norms(self, x: ca.SX) -> ca.SX:

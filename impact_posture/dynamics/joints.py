@@ -1,4 +1,4 @@
-"""Joints that the URDF parser of Pinocchio makes: placement, orientation and motion subspace as expressions."""
+"""The joint types of Pinocchio's URDF parser: transform, orientation and motion subspace as expressions."""
 
 from __future__ import annotations
 
@@ -19,7 +19,7 @@ _FAMILIES = {
     **dict.fromkeys(("PX", "PY", "PZ", "PrismaticUnaligned"), "prismatic"),
     **{"FreeFlyer": "free-flyer", "Planar": "planar", "Spherical": "spherical", "Translation": "translation"},
 }
-# Families that turn by an angle about an axis, and by a quaternion, which is the end of their configuration.
+# Families that rotate by an angle about an axis, and families whose configuration ends in a quaternion.
 _TURNING, _QUATERNION = ("revolute", "continuous", "planar"), ("free-flyer", "spherical")
 
 
@@ -30,8 +30,8 @@ class JointKind:
     Attributes:
         family: ``revolute``, ``continuous``, ``prismatic``, ``free-flyer``, ``planar``, ``spherical`` or
             ``translation``.
-        axis: Unit axis in the joint frame, shape (3,); zeros where it has none.
-        subspace: Motion subspace ``S`` in the joint frame, shape (6, nv); it is constant for all families.
+        axis: Unit axis in the joint frame, shape (3,); zeros for a family without an axis.
+        subspace: Motion subspace ``S`` in the joint frame, shape (6, nv), constant for all families.
         nq: Length of the configuration.
     """
 
@@ -50,17 +50,14 @@ def joint_kind(joint: pin.JointModel, name: str) -> JointKind:
     """Classify a Pinocchio joint.
 
     Raises:
-        UnsupportedJoint: No URDF makes such a joint (composite, universal, helical, ...).
+        UnsupportedJoint: The joint type is not possible in a URDF (composite, universal, helical, ...).
     """
     short = joint.shortname().removeprefix("JointModel")
     family = _FAMILIES.get(short)
     if family is None:
-        raise UnsupportedJoint(
-            f"joint '{name}' is of type {short}",
-            where="symbolic dynamics",
-            hint="lock it (`lock`) or model it by revolute and prismatic joints",
-        )
-    # S is the same at every configuration.
+        hint = "lock it (`lock`) or model it by revolute and prismatic joints"
+        raise UnsupportedJoint(f"joint '{name}' is of type {short}", where="symbolic dynamics", hint=hint)
+    # S does not depend on the configuration.
     data = joint.createData()
     joint.calc(data, np.full(joint.idx_q + joint.nq, 0.5))
     subspace = np.array(data.S, dtype=float).reshape(6, -1)
@@ -70,7 +67,7 @@ def joint_kind(joint: pin.JointModel, name: str) -> JointKind:
 
 
 def joint_transform(kind: JointKind, q: ca.SX) -> tuple[ca.SX, ca.SX]:
-    """Return rotation (3, 3) and translation (3,) of the moved frame in the rest frame of the joint."""
+    """Return rotation (3, 3) and translation (3,) of the joint at ``q``, in its rest frame."""
     rotation, translation = ca.SX.eye(3), ca.SX(3, 1)
     if kind.family in _TURNING:
         rotation = axis_rotation(*_cosine_sine(kind, q), axis=tuple(kind.axis.tolist()))
@@ -93,7 +90,7 @@ def joint_spin(kind: JointKind, q: ca.SX) -> Spin | None:
 
 
 def _cosine_sine(kind: JointKind, q: ca.SX) -> tuple[ca.SX, ca.SX]:
-    """Return cosine and sine of the angle of a joint, the last entries of its configuration or those of its angle."""
+    """Return cosine and sine of the angle of a joint."""
     return (ca.cos(q[0]), ca.sin(q[0])) if kind.family == "revolute" else (q[-2], q[-1])
 
 
@@ -105,10 +102,10 @@ def axis_rotation(cosine: ca.SX, sine: ca.SX, *, axis: tuple[float, ...]) -> ca.
 
 
 def joint_quaternion(kind: JointKind, x: ca.SX) -> ca.SX:
-    """Return the unit quaternion ``x y z w`` of a joint's rotation, smooth everywhere, from its chart coordinates.
+    """Return the unit quaternion ``x y z w`` of a joint's rotation as a smooth function of its chart coordinates.
 
-    Continuous and planar joints enter by their angle (see :class:`~impact_posture.dynamics.chart.Chart`), because a
-    half angle is no smooth function of its cosine and sine.
+    A half angle is not a smooth function of a cosine and a sine.  So a chart has the angle of a continuous or planar
+    joint (:class:`~impact_posture.dynamics.chart.Chart`).
     """
     if kind.family in _TURNING:
         half = x[-1] / 2

@@ -1,17 +1,17 @@
 """First and second derivatives of the equations of a velocity jump, in closed form.
 
-For a jump ``a`` and impulses ``f`` of feet, in the axes of the feet, the equations are ``M a − J_sᵀf`` and
-``J_s a + εf``.  With multipliers ``b`` and ``l`` their sum is ``φ = bᵀM a − bᵀJ_sᵀf + lᵀJ_s a + ε lᵀf``.  All vectors
-here are in the axes of a root link, so that the inertias of a subtree just add up.  Moving a joint j turns all that
-lies beyond it by ``S_j ×``.  Relative to these links, the velocities under ``a`` change by
-``U_j(a) = −S_j × V_p(a)``, where p is the parent.  So ::
+The equations of a jump ``a`` with impulses ``f`` on the feet, in the axes of the feet, are ``M a − J_sᵀf`` and ``J_s
+a + εf``.  Their sum with multipliers ``b`` and ``l`` is ``φ = bᵀM a − bᵀJ_sᵀf + lᵀJ_s a + ε lᵀf``.  All vectors here
+are in the axes of a root link, so that the inertia of a subtree is a sum.  A motion of joint j turns all links beyond
+it by ``S_j ×``.  Relative to these links, the velocities under ``a`` change by ``U_j(a) = −S_j × V_p(a)``, where p is
+the parent.  So ::
 
     ∂φ/∂q_j       = U_j(b)ᵀF_j(a) + U_j(a)ᵀF_j(b)
     ∂²φ/∂q_j∂q_k  = U_j(b)ᵀA_k(a) + U_j(a)ᵀA_k(b),   A_k = S_k ×* F_k + I_k U_k,   for k = j or beyond j
 
-``I_k`` is the inertia of the subtree of k, ``F_k(a)`` its momentum under a less the impulses ``f`` of its feet, and
-``F_k(b)`` its momentum under b plus ``l``.  For robots that stand, automatic differentiation takes about
-twice as many operations.
+``I_k`` is the inertia of the subtree of k.  ``F_k(a)`` is its momentum under a minus the impulses ``f`` on its feet,
+and ``F_k(b)`` its momentum under b plus ``l``.  For standing robots, automatic differentiation takes about twice as
+many operations.
 """
 
 from __future__ import annotations
@@ -27,17 +27,17 @@ from impact_posture.dynamics.kinematics import ByJoint, Kinematics, PointOnLink
 from impact_posture.dynamics.spatial import constant, cross, motion_cross_force, skew, symmetric, template
 from impact_posture.system.arrays import Array
 
-# Families of joints with one degree of freedom, whose coordinate in the chart changes at their velocity.
+# Families with one degree of freedom, whose velocity is the rate of their chart coordinate.
 _ONE_AXIS = ("revolute", "continuous", "prismatic")
 
 
 @dataclass(frozen=True, eq=False)
 class Foot:
-    """A point of a link that stays where it is.
+    """A point of a link that is held in place.
 
     Attributes:
-        point: The point, in whose axes its velocity and its impulse are.
-        rows: Number of entries that are held: 3 of the velocity, or 6 with the angular velocity.
+        point: The point.  Its velocity and its impulse are in the axes of its frame.
+        rows: Number of velocity entries that are held: 3 linear, or 6 with the angular ones.
     """
 
     point: PointOnLink
@@ -46,7 +46,7 @@ class Foot:
 
 @dataclass(frozen=True, eq=False)
 class _Motion:
-    """What one velocity of the robot gives for every joint beyond a root.
+    """``U`` and ``A`` of one velocity of the robot, for every joint beyond a root.
 
     Attributes:
         turned: ``U_j``, shape (6, joints).
@@ -70,13 +70,13 @@ class JumpDerivatives:
         self._parents = [int(parent) for parent in tree.model.parents]
         slots = tree.chart.slots
         self._beyond = [slot for slot in slots if self._parents[slot.index]]
-        # Joints of the degrees of freedom and of the columns of a motion.
+        # The joint of each degree of freedom, and of each column of a motion.
         self._of_v = [slot.index for slot in slots for _ in range(slot.kind.nv)]
         self._of_u = [slot.index for slot in self._beyond]
 
     @property
     def exist(self) -> bool:
-        """Whether all joints but those of root links have one degree of freedom."""
+        """Whether all joints beyond the roots have one degree of freedom."""
         return all(slot.kind.family in _ONE_AXIS for slot in self._beyond)
 
     def of(self, a: ca.SX, f: ca.SX, b: ca.SX, multipliers: ca.SX, compliance: float) -> tuple[ca.SX, ca.SX]:
@@ -84,19 +84,19 @@ class JumpDerivatives:
 
         Args:
             a: Jump, shape (nv,).
-            f: Impulses of the feet, one after the other, in their axes.
+            f: Impulses on the feet, one after the other, in the axes of each foot.
             b: Multipliers of ``M a − J_sᵀf``, shape (nv,).
-            multipliers: Those of ``J_s a + εf``, shape of ``f``.
+            multipliers: Multipliers of ``J_s a + εf``, shape of ``f``.
             compliance: ε, 1/kg.
         """
-        one, other = self._motion(a, -f), self._motion(b, multipliers)
+        under_a, under_b = self._motion(a, -f), self._motion(b, multipliers)
         nx, others = self._tree.chart.nx, a.numel() + f.numel()
         in_x = [slot.x.start for slot in self._beyond]
         J, held = self._at_feet(self._subspaces, self._of_v), compliance * ca.SX.eye(f.numel())
         by_x, mixed = ca.SX(others, nx), ca.SX(others, nx)
-        by_x[:, in_x] = ca.vertcat(self._of_momentum(one), self._at_feet(one.turned, self._of_u))
-        mixed[:, in_x] = ca.vertcat(self._of_momentum(other), -self._at_feet(other.turned, self._of_u))
-        products = one.changed.T @ other.turned + other.changed.T @ one.turned
+        by_x[:, in_x] = ca.vertcat(self._of_momentum(under_a), self._at_feet(under_a.turned, self._of_u))
+        mixed[:, in_x] = ca.vertcat(self._of_momentum(under_b), -self._at_feet(under_b.turned, self._of_u))
+        products = under_a.changed.T @ under_b.turned + under_b.changed.T @ under_a.turned
         curvature = ca.SX(nx, nx)
         curvature[in_x, in_x] = ca.tril2symm(_kept(products, self._lies_on(self._of_u, self._of_u)))
         return (
@@ -119,13 +119,13 @@ class JumpDerivatives:
         return ca.tril2symm(below) + ca.diag(self._tree.armature)
 
     def _of_momentum(self, motion: _Motion) -> ca.SX:
-        """Return the derivative of ``M x`` and of the impulses of the feet, shape (nv, joints)."""
+        """Return the derivative of ``M x`` with the impulses on the feet, shape (nv, joints)."""
         below = _kept(self._momenta.T @ motion.turned, self._lies_on(self._of_v, self._of_u))
         above = _kept(motion.changed.T @ self._subspaces, self._lies_on(self._of_u, self._of_v, itself=False))
         return below + above.T
 
     def _at_feet(self, motions: ca.SX, joints: Sequence[int]) -> ca.SX:
-        """Return the held entries of the feet under motions of all that lies beyond joints, shape (rows, joints)."""
+        """Return the held velocities of the feet under ``motions`` of the links beyond each joint."""
         rows = [ca.SX(0, len(joints))]
         for foot, X in zip(self._feet, self._foot_motions, strict=True):
             rows.append(_kept(X @ motions, np.tile(self._lies_on([foot.point.joint], joints), (foot.rows, 1))))
@@ -151,25 +151,25 @@ class JumpDerivatives:
     @cached_property
     def _inertias(self) -> ByJoint:
         """Mass, first moment and rotational inertia about the root of every link, in one matrix of shape (4, 4)."""
-        found: ByJoint = {}
+        inertias: ByJoint = {}
         for i, (R, p) in self._places.items():
             body = self._tree.model.inertias[i]
             numbers = (np.array(body.mass), body.lever, body.inertia)
-            found[i] = _inertia_of_link(R, p, *[ca.SX(np.array(part)) for part in numbers])
-        return found
+            inertias[i] = _inertia_of_link(R, p, *[ca.SX(np.array(part)) for part in numbers])
+        return inertias
 
     @cached_property
     def _subtrees(self) -> ByJoint:
-        """The same of the subtree of every joint."""
+        """The sum of these matrices over the subtree of every joint."""
         return self._gathered(self._inertias)
 
     def _gathered(self, of_links: ByJoint) -> ByJoint:
         """Return sums over the subtrees of all joints."""
-        found = dict(of_links)
-        for i in sorted(found, reverse=True):
+        sums = dict(of_links)
+        for i in sorted(sums, reverse=True):
             if parent := self._parents[i]:
-                found[parent] = found[parent] + found[i]
-        return found
+                sums[parent] = sums[parent] + sums[i]
+        return sums
 
     @cached_property
     def _momenta(self) -> ca.SX:
@@ -178,27 +178,27 @@ class JumpDerivatives:
 
     @cached_property
     def _foot_motions(self) -> list[ca.SX]:
-        """What takes the motion of its link to the held entries of every foot, shape (rows, 6)."""
-        found = []
+        """The matrix from the motion of a foot's link to the held velocities of the foot, shape (rows, 6)."""
+        motions = []
         for foot in self._feet:
             R, p = self._places[foot.point.joint]
             axes, position = R @ constant(foot.point.rotation), p + R @ constant(foot.point.position)
             X = ca.blockcat([[axes.T, -axes.T @ skew(position)], [ca.SX(3, 3), axes.T]])
-            found.append(X[: foot.rows, :])
-        return found
+            motions.append(X[: foot.rows, :])
+        return motions
 
     def _motion(self, x: ca.SX, impulses: ca.SX) -> _Motion:
-        """Return the motion of the velocity ``x``, with impulses of the feet beside the momentum."""
+        """Return ``U`` and ``A`` under the velocity ``x``, with ``impulses`` on the feet added to the momentum."""
         velocities: ByJoint = {}
         forces: ByJoint = {}
         turned: ByJoint = {}
         for slot in self._tree.chart.slots:
             i, S = slot.index, self._subspaces[:, slot.v]
-            own = S @ x[slot.v]
+            velocity = S @ x[slot.v]
             if parent := self._parents[i]:
                 turned[i] = -_motion_cross(S, velocities[parent])
-                own = own + velocities[parent]
-            velocities[i], forces[i] = own, _momentum(self._inertias[i], own)
+                velocity = velocity + velocities[parent]
+            velocities[i], forces[i] = velocity, _momentum(self._inertias[i], velocity)
         start = 0
         for foot, X in zip(self._feet, self._foot_motions, strict=True):
             forces[foot.point.joint] += X.T @ impulses[start : start + foot.rows]
@@ -241,7 +241,7 @@ def _momentum(inertia: ca.SX, motion: ca.SX) -> ca.SX:
 
 
 @template
-def _motion_cross(one: ca.SX, other: ca.SX) -> ca.SX:
+def _motion_cross(first: ca.SX, second: ca.SX) -> ca.SX:
     """Return the cross product of two motions, ``[w₁ × v₂ + v₁ × w₂; w₁ × w₂]``."""
-    v, w = one[:3], one[3:]
-    return ca.vertcat(cross(w, other[:3]) + cross(v, other[3:]), cross(w, other[3:]))
+    v, w = first[:3], first[3:]
+    return ca.vertcat(cross(w, second[:3]) + cross(v, second[3:]), cross(w, second[3:]))

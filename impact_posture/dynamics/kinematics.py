@@ -1,7 +1,4 @@
-"""The kinematic tree at one symbolic configuration: placements of links, points and frames.
-
-Everything is in link coordinates.  World placements are computed on demand.
-"""
+"""The kinematic tree at one symbolic configuration: placements of links, points and frames."""
 
 from __future__ import annotations
 
@@ -26,7 +23,7 @@ ByJoint = dict[int, ca.SX]
 
 @dataclass(frozen=True)
 class PointOnLink:
-    """A point and the axes of its frame, fixed to a link.
+    """A point with axes, fixed to a link.
 
     Attributes:
         joint: Index of the joint that moves the link.
@@ -40,7 +37,7 @@ class PointOnLink:
 
     @cached_property
     def placement(self) -> pin.SE3:
-        """Placement of the frame in the axes of the joint."""
+        """Placement of the point and its axes in the link."""
         return pin.SE3(self.rotation, self.position)
 
 
@@ -54,10 +51,10 @@ class Kinematics:
         model: The model, with joints of every type that the URDF parser of Pinocchio makes.  An infinite armature
             locks a joint: it does not move in an impact.
         q: Configuration, shape (nq, 1).
-        chart_x: The chart coordinates of ``q``; only :attr:`quaternions` needs them.
-        extra_inertia: Constant 6×6 matrices in link coordinates that ``M`` has beside the inertias of the model.  A
-            foot held with compliance ε is a foot with the point mass 1/ε.
-        limbs: Repeated limbs whose constants become parameters, so that their expressions are alike.
+        chart_x: The chart coordinates of ``q``, which only :attr:`quaternions` needs.
+        extra_inertia: Constant 6×6 matrices in link coordinates, added to the inertias of the model.  A foot held
+            with compliance ε is a foot with the point mass 1/ε.
+        limbs: Repeated limbs whose constants become parameters, so that their expressions have the same form.
     """
 
     def __init__(
@@ -96,7 +93,7 @@ class Kinematics:
         self.locked = tuple(int(k) for k in np.flatnonzero(locked))
 
     def _constant(self, joint: int, tag: str, of: Callable[[int], ArrayLike]) -> ca.SX:
-        """Return a constant of a joint as numbers, or as parameters where its counterparts have others."""
+        """Return a constant of a joint as numbers, or as parameters where the numbers of its counterparts differ."""
         return constant(of(joint)) if self.limbs is None else self.limbs.constant(joint, tag, of)
 
     def by_joint(self, tag: str, values: NDArray[np.float64]) -> ca.SX:
@@ -108,43 +105,43 @@ class Kinematics:
     @cached_property
     def rotations(self) -> ByJoint:
         """World rotation of every link."""
-        found: ByJoint = {0: ca.SX.eye(3)}
+        rotations: ByJoint = {0: ca.SX.eye(3)}
         for i in self._R:
-            found[i] = found[self._parents[i]] @ self._R[i]
-        return found
+            rotations[i] = rotations[self._parents[i]] @ self._R[i]
+        return rotations
 
     @cached_property
     def origins(self) -> ByJoint:
         """World position of the origin of every link."""
-        found: ByJoint = {0: ca.SX.zeros(3)}
+        origins: ByJoint = {0: ca.SX.zeros(3)}
         for i in self._R:
             parent = self._parents[i]
-            found[i] = found[parent] + self.rotations[parent] @ self._p[i]
-        return found
+            origins[i] = origins[parent] + self.rotations[parent] @ self._p[i]
+        return origins
 
     @cached_property
     def quaternions(self) -> ByJoint:
         """World orientation of every link as a quaternion x y z w, polynomial in half angles."""
         if self._x is None:
             raise ValueError("quaternions need chart_x")
-        found: ByJoint = {0: ca.SX([0, 0, 0, 1])}
+        quaternions: ByJoint = {0: ca.SX([0, 0, 0, 1])}
         for slot, i, parent in self._joints:
             rest = constant_quaternion(self.model.jointPlacements[i].rotation)
             turned = quaternion_product(rest, joint_quaternion(slot.kind, self._x[slot.x]))
-            found[i] = quaternion_product(found[parent], turned)
-        return found
+            quaternions[i] = quaternion_product(quaternions[parent], turned)
+        return quaternions
 
     def relative(self, base: int, joint: int) -> tuple[ca.SX, ca.SX]:
-        """Return rotation (3, 3) and origin (3,) of a link in the coordinates of another, along the way between them.
+        """Return rotation (3, 3) and origin (3,) of a link in the coordinates of the link ``base``.
 
-        They do not depend on the joints below both links, which world placements would bring in.
+        The expressions contain only the joints between the two links, unlike differences of world placements.
         """
         meeting = max({*self.model.supports[base]} & {*self.model.supports[joint]})
         (R_base, p_base), (R, p) = (self._below(meeting, i) for i in (base, joint))
         return R_base.T @ R, R_base.T @ (p - p_base)
 
     def _below(self, base: int, joint: int) -> tuple[ca.SX, ca.SX]:
-        """Placement of a link in the coordinates of a link below it."""
+        """Return the placement of a link in the coordinates of its ancestor ``base``."""
         if joint == base:
             return ca.SX.eye(3), ca.SX.zeros(3)
         if (base, joint) not in self._placed:
@@ -167,9 +164,8 @@ class Kinematics:
     def center_of_mass(self) -> ca.SX:
         """Return the world position of the center of mass, shape (3,)."""
         masses = {i: float(self.model.inertias[i].mass) for i in self._R} | {0: 0.0}
-        moments = {i: masses[i] * constant(np.array(self.model.inertias[i].lever)) for i in self._R} | {
-            0: ca.SX(3, 1)
-        }
+        moments = {i: masses[i] * constant(np.array(self.model.inertias[i].lever)) for i in self._R}
+        moments[0] = ca.SX(3, 1)
         for _, i, parent in reversed(self._joints):
             masses[parent] += masses[i]
             moments[parent] = moments[parent] + masses[i] * self._p[i] + self._R[i] @ moments[i]

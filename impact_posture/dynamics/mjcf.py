@@ -1,7 +1,7 @@
 """Build a MuJoCo model from a ``pin.Model``, with the same bodies, joints, inertias and armature.
 
-A URDF that MuJoCo reads itself loses package paths, the floating base and the armature, and gets another order of
-joints.  The model has no geometry.  A simulation adds it with :meth:`Mjcf.add_geom` and :meth:`Mjcf.add_plane`.
+MuJoCo's own URDF reader loses package paths, the floating base and the armature, and changes the order of joints.
+The model has no geometry.  A simulation adds it with :meth:`Mjcf.add_geom` and :meth:`Mjcf.add_plane`.
 """
 
 from __future__ import annotations
@@ -23,11 +23,11 @@ from impact_posture.system.escape import xml_name
 
 Geom = Literal["sphere", "box", "plane"]
 
-# Joint index that stands for the world.
+# Joint index of the world.
 WORLD = 0
 # MuJoCo refuses a moving body with less mass (kg) or moment (kg m²) than this.
 _LEAST = 1e-15
-# MuJoCo takes every inertia as it is.  It derives none, raises none, and merges or turns no body.
+# With these options MuJoCo keeps every inertia and every body as stated.
 _COMPILER = {
     "degree": False,
     "autolimits": True,
@@ -50,8 +50,8 @@ class Mjcf:
         bodies: Name of the body that each Pinocchio joint moves, by joint index.
         joints: Names of the MuJoCo joints that make up each Pinocchio joint, by joint index.
         sites: Name of the site of each frame, by frame index.  Of frames with the same name, only the first has one.
-        moments: Principal moments, kg·m², shape (3,), by body, that break the triangle inequality.  MuJoCo refuses
-            them, so the spec has the nearest moments that fulfill it, and :meth:`compile` sets the exact ones.
+        moments: Principal moments, kg·m², shape (3,), by body, that violate the triangle inequality.  MuJoCo refuses
+            them, so the spec has the nearest valid moments, and :meth:`compile` sets the exact ones.
     """
 
     spec: Any
@@ -66,7 +66,7 @@ class Mjcf:
         return self.spec.worldbody if joint == WORLD else self.spec.body(self.bodies[joint])
 
     def add_geom(self, joint: int, name: str, kind: Geom, size: Sequence[float], placement: pin.SE3) -> None:
-        """Add a massless shape, which only touches what a contact pair names.
+        """Add a massless shape, which collides only in contact pairs.
 
         Args:
             joint: Index of the Pinocchio joint that moves it, or :data:`WORLD`.
@@ -113,9 +113,8 @@ def import_mujoco() -> Any:
     try:
         import mujoco
     except ImportError:
-        raise InputError(
-            "MuJoCo is not installed", where="the extra 'sim'", hint="pip install 'impact-posture[sim]'"
-        ) from None
+        hint = "pip install 'impact-posture[sim]'"
+        raise InputError("MuJoCo is not installed", where="the extra 'sim'", hint=hint) from None
     return mujoco
 
 
@@ -128,19 +127,19 @@ def pose(placement: pin.SE3) -> dict[str, Array]:
 def build_mjcf(model: pin.Model, name: str = "robot") -> Mjcf:
     """Build the MuJoCo model of a Pinocchio model.
 
-    Each body has the name of the link at its origin, or else of its joint.  Every frame becomes a site of its name
-    (the frame of a link, where a joint has the same name).  A free-flyer on the world becomes a free joint, any
-    other free-flyer three slides and a ball.  A planar joint becomes two slides and a hinge, a translation three
-    slides.  A massless body gets the least mass and moments that MuJoCo takes, 1e-15.  The model has no friction,
-    damping and effort limits, because the dynamics of Pinocchio have none.
+    Each body has the name of the link at its origin, or else of its joint.  Every frame becomes a site with its name.
+    Where a link and a joint have the same name, it is the frame of the link.  A free-flyer on the world becomes a
+    free joint, and any other free-flyer three slides and a ball.  A planar joint becomes two slides and a hinge, and
+    a translation three slides.  A massless body gets the least mass and moments that MuJoCo accepts, 1e-15.  The
+    model has no friction, damping or effort limits, because the dynamics of Pinocchio have none.
 
     Args:
-        model: The model, which is only read.
+        model: The model, which is not changed.
         name: Name of the MuJoCo model.
 
     Raises:
-        UnsupportedJoint: No URDF makes such a joint.
-        InputError: MuJoCo is not installed, or has no place for an armature that differs between axes of a joint.
+        UnsupportedJoint: The joint type is not possible in a URDF.
+        InputError: MuJoCo is not installed, or the armature differs between axes that have one value in MuJoCo.
     """
     order = _depth_first(model)
     slots = Chart(model).slots
@@ -174,14 +173,14 @@ def _depth_first(model: pin.Model) -> list[int]:
 
 
 def _is_free(model: pin.Model, slot: JointSlot) -> bool:
-    """Whether a free-flyer can be a free joint, which hangs on the world and has one armature for all six axes."""
+    """Return whether a joint can be a free joint, which moves in the world and has one armature for all six axes."""
     if slot.kind.family != "free-flyer" or model.parents[slot.index] != 0:
         return False
     return bool(np.ptp(np.asarray(model.armature)[slot.v]) == 0)
 
 
 def _link_name(model: pin.Model, joint: int) -> str:
-    """Return the name of the link whose frame is that of the joint, or else of the joint."""
+    """Return the name of the link whose frame coincides with the joint's, or else the name of the joint."""
     for frame in model.frames:
         if frame.parentJoint == joint and frame.type == pin.FrameType.BODY and frame.placement.isIdentity(1e-12):
             return str(frame.name)
@@ -190,12 +189,12 @@ def _link_name(model: pin.Model, joint: int) -> str:
 
 def _unique(name: str, taken: set[str]) -> str:
     name = xml_name(name)
-    found, count = name, 1
-    while found in taken:
+    unique, count = name, 1
+    while unique in taken:
         count += 1
-        found = f"{name}_{count}"
-    taken.add(found)
-    return found
+        unique = f"{name}_{count}"
+    taken.add(unique)
+    return unique
 
 
 # ---- joints -----------------------------------------------------------------------------------------------------
@@ -204,7 +203,7 @@ def _unique(name: str, taken: set[str]) -> str:
 def _add_joints(body: Any, model: pin.Model, slot: JointSlot, free: bool, taken: set[str]) -> tuple[str, ...]:
     """Add the MuJoCo joints of a Pinocchio joint to its body and return their names.
 
-    A column of the motion subspace is a slide or a hinge.  Three columns of rotation are a ball.
+    A column of the motion subspace becomes a slide or a hinge, and three columns of rotation become a ball.
     """
     subspace, armature, types = slot.kind.subspace, np.asarray(model.armature)[slot.v], import_mujoco().mjtJoint
     names: list[str] = []
@@ -240,11 +239,10 @@ def _add_joints(body: Any, model: pin.Model, slot: JointSlot, free: bool, taken:
 
 
 def _alike(armature: Array, slot: JointSlot) -> None:
-    """Refuse different armatures of a ball, or of axes that turn against each other."""
+    """Refuse different armatures of the axes of a ball, or of slides that a rotation turns."""
     if armature.size and np.ptp(armature) > 0:
-        raise InputError(
-            f"the armature of joint '{slot.name}' differs between its axes", where="MJCF", hint="give it one value"
-        )
+        what = f"the armature of joint '{slot.name}' differs between its axes"
+        raise InputError(what, where="MJCF", hint="give it one value")
 
 
 # ---- inertias and sites -----------------------------------------------------------------------------------------
@@ -277,16 +275,12 @@ def _add_sites(elements: dict[int, Any], model: pin.Model) -> dict[int, str]:
     return sites
 
 
-def _ignore(message: str) -> None:
-    """Take a warning and do nothing."""
-
-
 @contextmanager
 def unwarned() -> Iterator[None]:
     """Keep MuJoCo from writing warnings to a log file in the working directory.  The state shows the problem."""
     mujoco = import_mujoco()
     before = mujoco.get_mju_user_warning()
-    mujoco.set_mju_user_warning(_ignore)
+    mujoco.set_mju_user_warning(lambda message: None)
     try:
         yield
     finally:

@@ -24,15 +24,15 @@ from impact_posture.system.arrays import Array
 
 @dataclass(frozen=True)
 class MjcfSlot:
-    """Place of one Pinocchio joint in the MuJoCo vectors.
+    """Entries of one Pinocchio joint in the MuJoCo vectors.
 
     Attributes:
-        joint: Type of the joint, and its place in the Pinocchio vectors.
+        joint: Type of the joint, and its entries in the Pinocchio vectors.
         qpos: Its entries of ``qpos``.
         qvel: Its entries of ``qvel``.
         placement: Rest frame of the joint in its parent.
-        moved: Whether it is a MuJoCo free joint, whose pose and linear velocity are in world axes, and its rest frame
-            is not that of the world.  Any other free-flyer is three slides and a ball in the rest frame of the joint.
+        moved: Whether it is a MuJoCo free joint with a rest frame other than the world.  MuJoCo has the pose and the
+            linear velocity of a free joint in world axes, and those of three slides and a ball in the rest frame.
     """
 
     joint: JointSlot
@@ -45,11 +45,12 @@ class MjcfSlot:
 class MjcfLayout:
     """Conversions between Pinocchio and MuJoCo coordinates of one model.
 
-    The velocity map ``T(q)``, ``qvel = T v``, is orthogonal, because it rotates linear parts and permutes entries.
+    The map ``T(q)`` of velocities, ``qvel = T v``, is orthogonal, because it rotates linear parts and permutes
+    entries.
 
     Args:
         model: The Pinocchio model.
-        order: Joint indices in the order of the MuJoCo bodies, which is depth first.
+        order: Joint indices in the (depth-first) order of the MuJoCo bodies.
         free: Indices of the joints that are free joints in MuJoCo.
     """
 
@@ -57,7 +58,7 @@ class MjcfLayout:
         self._chart = chart = Chart(model)
         self.nqpos, self.nv, self.nq = chart.nx, chart.nv, chart.nq
         self.slots: list[MjcfSlot] = []
-        # The place in the chart of each entry of qpos, which has the same numbers, and that in v of each of qvel.
+        # The index in the chart of each entry of qpos, which has the same value, and the index in v of each of qvel.
         places: list[int] = []
         rates: list[int] = []
         for i in order:
@@ -71,8 +72,8 @@ class MjcfLayout:
             self.slots.append(MjcfSlot(joint, *ends, place, moved))
             places += x
             rates += v
-        # A simulation converts in every tick, so all joints are converted at once, and only poses from another frame
-        # and linear velocities joint by joint.
+        # A simulation converts in every tick.  So all joints are converted at once, except poses in another frame and
+        # linear velocities.
         self._places, self._permutation = np.array(places, dtype=int), np.eye(self.nv)[rates]
         self._rates = np.argsort(rates)
         self._moved = [slot for slot in self.slots if slot.moved]
@@ -80,13 +81,13 @@ class MjcfLayout:
 
     @property
     def places(self) -> tuple[NDArray[np.int_], NDArray[np.int_]] | None:
-        """Return the places of ``q`` in ``qpos`` and of ``v`` in ``qvel`` where these are all that there is to know.
+        """Return the indices of ``q`` in ``qpos`` and of ``v`` in ``qvel`` where these define the conversion.
 
-        That is so for hinges and slides, and a floating base in front of them.  Its quaternion is normalized and its
-        linear velocity is turned.  It is ``None`` for a model with other joints.
+        This holds for hinges and slides, and a floating base before them.  The quaternion of the base is then
+        normalized and its linear velocity turned.  Return ``None`` for a model with other joints.
         """
         base = len(self._turning)
-        # Chart coordinates are those of q but for cosines and sines.
+        # Chart coordinates are equal to q apart from cosines and sines.
         plain = not self._moved and base <= 1 and self.nq == self.nqpos and self.slots[:base] == self._turning
         if not plain or any(slot.joint.kind.nv != 1 for slot in self.slots[base:]):
             return None
@@ -103,23 +104,23 @@ class MjcfLayout:
         """Return the configuration, shape (nq,), of a ``qpos``, shape (nqpos,), with quaternions normalized."""
         x = np.zeros(self.nqpos)
         x[self._places] = qpos
-        found = self._chart.to_q(x)
+        q = self._chart.to_q(x)
         for slot in self._moved:
-            pose = slot.placement.actInv(pin.XYZQUATToSE3(found[slot.joint.q]))
-            found[slot.joint.q] = pin.SE3ToXYZQUAT(pose)
-        return found
+            pose = slot.placement.actInv(pin.XYZQUATToSE3(q[slot.joint.q]))
+            q[slot.joint.q] = pin.SE3ToXYZQUAT(pose)
+        return q
 
     def velocity_map(self, q: Array) -> Array:
         """Return ``T(q)`` of ``qvel = T v``, orthogonal, shape (nv, nv).
 
         It follows that ``M = Tᵀ M_mj T``, ``J = J_mj T`` and ``τ = Tᵀ τ_mj``.
         """
-        found = self._permutation.copy()
+        T = self._permutation.copy()
         for slot in self._turning:
             turn = _turn(slot, q[slot.joint.q])
             row, column, size = slot.qvel.start, slot.joint.v.start, len(turn)
-            found[row : row + size, column : column + size] = turn
-        return found
+            T[row : row + size, column : column + size] = turn
+        return T
 
     def qvel(self, q: Array, v: Array) -> Array:
         """Return ``qvel`` of a velocity, shape (nv,)."""
@@ -127,7 +128,7 @@ class MjcfLayout:
 
     def state(self, qpos: Array, qvel: Array) -> tuple[Array, Array]:
         """Return the Pinocchio configuration, shape (nq,), and velocity, shape (nv,)."""
-        # A simulation does this in every tick, so the linear parts are turned without the whole map.
+        # This is faster than the whole map, for a simulation that calls it in every tick.
         q, v = self.q(qpos), qvel[self._rates]
         for slot in self._turning:
             turn = _turn(slot, q[slot.joint.q])

@@ -1,4 +1,4 @@
-"""Numbers of a model as parameters of expressions, so that models that differ in them have the same code."""
+"""Constants of a model as parameters of expressions, so that models with other constants have the same code."""
 
 from __future__ import annotations
 
@@ -18,7 +18,7 @@ from impact_posture.system.arrays import Array
 
 
 class ModelParameters(RepeatedLimbs):
-    """The armature and the places of the joints on their links, as far as they are not zero, without repeated limbs.
+    """The nonzero armatures and joint positions of a model as parameters, without repeated limbs.
 
     Attributes:
         symbol: The parameters, shape (n, 1) with n of at least one.
@@ -31,22 +31,22 @@ class ModelParameters(RepeatedLimbs):
         entries = np.concatenate([*numbers.values(), np.zeros(0)])
         self.values: Array = entries[entries != 0.0] if entries.any() else np.ones(1)
         self.symbol = ca.SX.sym("numbers", self.values.size)
-        self._found: dict[tuple[int, str], ca.SX] = {}
+        self._parameters: dict[tuple[int, str], ca.SX] = {}
         count = 0
         for key, values in numbers.items():
-            self._found[key] = ca.SX(values.size, 1)
+            self._parameters[key] = ca.SX(values.size, 1)
             for k in np.flatnonzero(values):
-                self._found[key][int(k)] = self.symbol[count]
+                self._parameters[key][int(k)] = self.symbol[count]
                 count += 1
 
     def constant(self, joint: int, tag: str, of: Callable[[int], ArrayLike]) -> ca.SX:
-        """Return a constant of a joint, with parameters for its armature and its place."""
-        found = self._found.get((joint, tag))
-        return constant(of(joint)) if found is None else found
+        """Return a constant of a joint, with parameters for its armature and its position."""
+        parameters = self._parameters.get((joint, tag))
+        return constant(of(joint)) if parameters is None else parameters
 
 
 def without_parameters(robot: Robot) -> Robot:
-    """Return the robot with ones for the numbers that are parameters: robots with the same code are equal there."""
+    """Return the robot with ones in place of its parameters, so that robots with the same code are equal."""
     model, armature = robot.model.copy(), np.array(robot.model.armature)
     finite = np.isfinite(armature)
     armature[finite] = rounded(armature[finite]) != 0.0
@@ -57,9 +57,9 @@ def without_parameters(robot: Robot) -> Robot:
 
 
 def _numbers(model: pin.Model) -> dict[tuple[int, str], Array]:
-    """Return the numbers that are parameters, by joint and kind of constant."""
-    armature, found = finite_armature(model)[0], dict[tuple[int, str], Array]()
+    """Return the constants that become parameters, by joint and kind of constant."""
+    armature, numbers = finite_armature(model)[0], dict[tuple[int, str], Array]()
     for joint in range(1, model.njoints):
-        found[joint, "translation"] = rounded(model.jointPlacements[joint].translation)
-        found[joint, "armature"] = rounded(armature[model.idx_vs[joint] : model.idx_vs[joint] + model.nvs[joint]])
-    return found
+        numbers[joint, "translation"] = rounded(model.jointPlacements[joint].translation)
+        numbers[joint, "armature"] = rounded(armature[model.idx_vs[joint] : model.idx_vs[joint] + model.nvs[joint]])
+    return numbers

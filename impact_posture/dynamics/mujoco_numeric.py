@@ -1,4 +1,4 @@
-"""Mass matrix and Jacobians from MuJoCo in Pinocchio coordinates, to check Pinocchio with independent code."""
+"""Mass matrix and Jacobians of MuJoCo in Pinocchio coordinates, as an independent check of Pinocchio."""
 
 from __future__ import annotations
 
@@ -13,8 +13,8 @@ from impact_posture.system.arrays import Array
 class MujocoNumeric:
     """A ``pin.Model`` in MuJoCo, at one configuration at a time.
 
-    Call :meth:`at` first, because the other methods use that configuration.  All vectors and matrices have the order
-    and the tangent space of Pinocchio.
+    Call :meth:`at` first, because the other methods use its configuration.  All vectors and matrices are in the order
+    and tangent space of Pinocchio.
 
     Raises:
         InputError: MuJoCo is not installed.
@@ -36,9 +36,9 @@ class MujocoNumeric:
 
     def mass_matrix(self) -> Array:
         """Return ``M(q)``, shape (nv, nv), including armature."""
-        found = np.zeros((self.model.nv, self.model.nv))
-        self._mujoco.mj_fullM(self.model, self.data, found)
-        return np.asarray(self._map.T @ found @ self._map)
+        M = np.zeros((self.model.nv, self.model.nv))
+        self._mujoco.mj_fullM(self.model, self.data, M)
+        return np.asarray(self._map.T @ M @ self._map)
 
     def rotation(self, site: str) -> Array:
         """Return the rotation of a frame in the world, shape (3, 3)."""

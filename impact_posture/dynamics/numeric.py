@@ -1,4 +1,4 @@
-"""Numbers of Pinocchio for the same model, an oracle for the symbolic results."""
+"""Kinematics and dynamics computed with Pinocchio, the reference for the symbolic results."""
 
 from __future__ import annotations
 
@@ -23,7 +23,7 @@ class Numeric:
     """
 
     def __init__(self, model: pin.Model) -> None:
-        # An impact has no gravity.  Without it, RNEA is exactly M(q) a.
+        # Gravity has no effect in an impact.  Without gravity, RNEA is exactly M(q) a.
         self.model = model.copy()
         self.model.gravity = pin.Motion.Zero()
         self.model.armature, self.locked = finite_armature(model)
@@ -38,7 +38,7 @@ class Numeric:
         return self
 
     def mass_matrix(self) -> Array:
-        """Return ``M(q)``, shape (nv, nv), armature included, as if no joint were locked."""
+        """Return ``M(q)`` with armature, shape (nv, nv).  Locked joints move in it."""
         M = np.array(pin.crba(self.model, self.data, self.q)).reshape(2 * (self.model.nv,))
         M[self._below] = M.T[self._below]
         return M
@@ -49,8 +49,8 @@ class Numeric:
 
     def jacobian(self, point: PointOnLink) -> Array:
         """Return ``J``, shape (6, nv), of the world linear and angular velocity (LOCAL_WORLD_ALIGNED)."""
-        found = pin.getFrameJacobian(self.model, self.data, point.joint, point.placement, pin.LOCAL_WORLD_ALIGNED)
-        return np.asarray(found).reshape(6, -1)
+        J = pin.getFrameJacobian(self.model, self.data, point.joint, point.placement, pin.LOCAL_WORLD_ALIGNED)
+        return np.asarray(J).reshape(6, -1)
 
     def center_of_mass(self) -> tuple[Array, Array]:
         """Return the world center of mass, shape (3,), and its Jacobian, shape (3, nv)."""
@@ -58,17 +58,17 @@ class Numeric:
         return np.array(self.data.com[0]), J
 
     def inertial_gradient(self, left: Array, right: Array) -> Array:
-        """Return the tangent gradient of ``leftᵀ M(q) right``, shape (nv,), by the RNEA derivatives of Pinocchio."""
+        """Return the tangent gradient of ``leftᵀ M(q) right``, shape (nv,), by derivatives of RNEA."""
         dtau_dq = pin.computeRNEADerivatives(self.model, self.data, self.q, self._zero, right)[0]
         gradient = np.asarray(dtau_dq).reshape(self.model.nv, -1).T @ left
-        self.at(self.q)  # the sweep of the derivatives has changed data
+        self.at(self.q)  # the derivatives have changed data
         return np.asarray(gradient)
 
     def coupling_gradient(self, point: PointOnLink, wrench: Array, v: Array, *, in_frame: bool = False) -> Array:
         """Return the tangent gradient of ``wᵀ J(q) v``, shape (nv,), with ``w`` constant in the world or the frame.
 
-        The LOCAL velocity derivatives of Pinocchio are true derivatives of the local velocity.  Those in the world
-        follow by rotation, because its LOCAL_WORLD_ALIGNED derivatives leave the rotation of the frame out.
+        Pinocchio's LOCAL_WORLD_ALIGNED derivatives omit the rotation of the frame.  So this method rotates its LOCAL
+        derivatives, which are complete.
         """
         pin.computeForwardKinematicsDerivatives(self.model, self.data, self.q, v, self._zero)
         frame = self.model, self.data, point.joint, point.placement, pin.LOCAL
@@ -89,9 +89,9 @@ class Numeric:
 
 
 def hold_locked(locked: NDArray[np.bool_], M: Array, *jacobians: Array) -> tuple[Array, ...]:
-    """Return ``M`` and Jacobians of a robot whose locked entries do not move: their rows and columns are zero.
+    """Return ``M`` and Jacobians with zero rows and columns at the locked entries.
 
-    The diagonal of ``M`` is one there, so that systems with ``M`` stay regular.
+    The diagonal of ``M`` is one there, so that ``M`` remains regular.
     """
     if not locked.any():
         return M, *jacobians
@@ -101,10 +101,10 @@ def hold_locked(locked: NDArray[np.bool_], M: Array, *jacobians: Array) -> tuple
 
 @cache
 def _below_diagonal(size: int) -> tuple[NDArray[np.intp], NDArray[np.intp]]:
-    """Return the places below the diagonal of a square matrix, which take NumPy longer than a copy of the model."""
+    """Return the indices below the diagonal of a square matrix, which NumPy computes slowly."""
     return np.tril_indices(size, -1)
 
 
 def _cross(a: Array, b: Array) -> Array:
-    """Return ``a × b``; ``numpy.cross`` takes twenty times as long on three numbers."""
+    """Return ``a × b`` of 3-vectors, twenty times as fast as ``numpy.cross``."""
     return np.array([a[1] * b[2] - a[2] * b[1], a[2] * b[0] - a[0] * b[2], a[0] * b[1] - a[1] * b[0]])

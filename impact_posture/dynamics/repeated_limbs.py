@@ -74,19 +74,19 @@ class RepeatedLimbs:
         if place is None:
             return constant(of(joint))
         dense = [(lane := rounded(of(other))).reshape(len(lane), -1) for other in self.counterparts(joint)]
-        own = dense[place.lane]
-        symmetric = own.shape[0] == own.shape[1] and all(np.array_equal(d, d.T) for d in dense)
-        found = ca.SX(*own.shape)
-        for i, j in np.ndindex(own.shape):
+        numbers = dense[place.lane]
+        symmetric = numbers.shape[0] == numbers.shape[1] and all(np.array_equal(d, d.T) for d in dense)
+        expression = ca.SX(*numbers.shape)
+        for i, j in np.ndindex(numbers.shape):
             entries = [d[i, j] for d in dense]
             if len(set(entries)) > 1:
                 row, column = (min(i, j), max(i, j)) if symmetric else (i, j)
                 # The name has all values, because a constant of the same kind may differ in another kernel.
                 name = f"{place.position}.{tag}.{row}.{column}.{entries}"
-                found[i, j] = self._parameter(place, name, float(own[i, j]))
+                expression[i, j] = self._parameter(place, name, float(numbers[i, j]))
             elif entries[0] != 0.0:
-                found[i, j] = entries[0]
-        return found
+                expression[i, j] = entries[0]
+        return expression
 
     def indicator(self, joint: int, of: int) -> ca.SX:
         """Return one for the joint ``of`` and zero for its counterparts, which makes their expressions alike."""
@@ -102,7 +102,7 @@ class RepeatedLimbs:
 
 def _groups(model: pin.Model) -> tuple[tuple[tuple[int, ...], ...], ...]:
     """Return the outermost repeated limbs; what hangs from a limb is a part of it."""
-    found: list[tuple[tuple[int, ...], ...]] = []
+    groups: list[tuple[tuple[int, ...], ...]] = []
     waiting = [0]
     while waiting:
         children = [int(c) for c in model.children[waiting.pop(0)]]
@@ -115,11 +115,11 @@ def _groups(model: pin.Model) -> tuple[tuple[tuple[int, ...], ...], ...]:
             alike = [child, *others]
             for width in _WIDTHS:
                 while len(alike) >= width:
-                    found.append(tuple(_limb(model, c) for c in alike[:width]))
+                    groups.append(tuple(_limb(model, c) for c in alike[:width]))
                     taken.update(alike[:width])
                     alike = alike[width:]
         waiting += [c for c in children if c not in taken]
-    return tuple(found)
+    return tuple(groups)
 
 
 def _limb(model: pin.Model, root: int) -> tuple[int, ...]:

@@ -37,8 +37,8 @@ def template(operation: Callable[P, Result]) -> Callable[P, Result]:
             symbols = [ca.SX.sym("argument", *argument.size()) for argument in arguments]
             results = operation(*symbols, **options)
             functions[key] = ca.Function("template", symbols, results if isinstance(results, tuple) else [results])
-        found = functions[key].call(arguments)
-        return found[0] if len(found) == 1 else tuple(found)
+        values = functions[key].call(arguments)
+        return values[0] if len(values) == 1 else tuple(values)
 
     return insert
 

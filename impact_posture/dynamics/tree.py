@@ -79,11 +79,11 @@ class Tree(Kinematics):
 
     def velocities(self, v: ca.SX) -> ByJoint:
         """Return the spatial velocity of every link, in link coordinates, for the generalized velocity ``v``."""
-        found: ByJoint = {}
+        velocities: ByJoint = {}
         for slot, i, parent in self._joints:
-            moved = motion_to_child(self._R[i], self._p[i], found.get(parent, _ZERO))
-            found[i] = moved + self._S[i] @ v[slot.v]
-        return found
+            moved = motion_to_child(self._R[i], self._p[i], velocities.get(parent, _ZERO))
+            velocities[i] = moved + self._S[i] @ v[slot.v]
+        return velocities
 
     def _accumulate(self, forces: ByJoint) -> ByJoint:
         total = dict(forces)
@@ -145,8 +145,8 @@ class Tree(Kinematics):
 
     def point_velocity(self, point: PointOnLink, velocities: ByJoint) -> ca.SX:
         """Return the world linear and angular velocity of a point, ``J v`` in LOCAL_WORLD_ALIGNED, shape (6,)."""
-        own, R = self.own_velocity(point, velocities), self.rotation(point)
-        return ca.vertcat(R @ own[:3], R @ own[3:])
+        local, R = self.own_velocity(point, velocities), self.rotation(point)
+        return ca.vertcat(R @ local[:3], R @ local[3:])
 
     def own_velocity(self, point: PointOnLink, velocities: ByJoint) -> ca.SX:
         """Return the linear and angular velocity of a point in its own axes, shape (6,)."""
@@ -169,15 +169,15 @@ class Tree(Kinematics):
         The pivot is ``D``, ``1/D`` for a joint with one axis, and zero for a locked joint, which has ``D⁻¹ = 0``.
         """
         articulated = dict(self._inertia)
-        found: dict[int, tuple[ca.SX, ...]] = {}
+        factors: dict[int, tuple[ca.SX, ...]] = {}
         for slot, i, parent in reversed(self._joints):
             D = step.pivot(articulated[i], self._S[i], self.armature[slot.v])
             # Not in a template, so that a constant becomes a factor and not a divisor.
             pivot = ca.SX(0) if slot.v.start in self.locked else 1 / D if slot.kind.nv == 1 else D
-            found[i] = pivot, *step.reduce(articulated[i], self._S[i], pivot)
+            factors[i] = pivot, *step.reduce(articulated[i], self._S[i], pivot)
             if parent:
-                articulated[parent] = articulated[parent] + self._inertia_to_parent(i, found[i][2])
-        return found
+                articulated[parent] = articulated[parent] + self._inertia_to_parent(i, factors[i][2])
+        return factors
 
     def respond(self, tau: ca.SX | None = None, wrenches: Sequence[Wrench] = ()) -> Response:
         """Solve ``M a = τ + Σ Jᵀ w`` by the articulated-body factorization, in O(n) and without forming ``M``.
@@ -191,8 +191,8 @@ class Tree(Kinematics):
         drive: ByJoint = {}
         passed: ByJoint = {}
         for slot, i, parent in reversed(self._joints):
-            own = tau[slot.v] if tau is not None else ca.SX(slot.kind.nv, 1)
-            drive[i], passed[i] = step.drive(self._S[i], own, bias[i], self._factor[i][1])
+            tau_i = tau[slot.v] if tau is not None else ca.SX(slot.kind.nv, 1)
+            drive[i], passed[i] = step.drive(self._S[i], tau_i, bias[i], self._factor[i][1])
             if parent:
                 bias[parent] = bias[parent] + force_to_parent(self._R[i], self._p[i], passed[i])
         velocities: ByJoint = {}

@@ -59,5 +59,5 @@ def _solve(pivot: ca.SX, rhs: ca.SX) -> ca.SX:
     if pivot.is_scalar():
         return pivot * rhs
     D, LT, order = ca.ldl(pivot, False)
-    found: ca.SX = ca.ldl_solve(rhs, D, LT, order)
-    return found
+    solution: ca.SX = ca.ldl_solve(rhs, D, LT, order)
+    return solution

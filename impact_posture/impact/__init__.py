@@ -1,1 +1,1 @@
-"""The impact: contacts, metric, objectives, ellipsoids and their two ways of being computed."""
+"""The impact: contacts, metric, quantities H, G, V, S, E, objectives and worst cases."""

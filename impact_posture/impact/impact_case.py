@@ -15,14 +15,14 @@ from impact_posture.robot.robot_spec import Support
 
 @dataclass(frozen=True)
 class ImpactCase:
-    """Everything except the posture that the velocity jump of a single impact depends on.
+    """Inputs of the velocity jump of a single impact, except the posture.
 
     Attributes:
         robot: The robot.
         contact: Point and normal of the impact.
         metric: Weight ``W`` of the squared norm of the jump.
         supports: Feet that stay on the ground; empty for a robot that flies or is bolted down.
-        compliance: ε of the supports, 1/kg; zero for
+        compliance: ε of the supports, 1/kg.  Zero stands for the
             :func:`~impact_posture.impact.support_compliance.default_compliance`.
     """
 
@@ -43,5 +43,5 @@ class ImpactCase:
 
     @property
     def in_contact_frame(self) -> bool:
-        """Whether the normal is given in the contact frame, and so turns with the robot."""
+        """Whether the normal is fixed in the contact frame, so that it turns with the robot."""
         return self.contact.normal_frame == "contact"

@@ -1,4 +1,4 @@
-"""Contacts of an impact, and the inertia of supports that stay on the ground."""
+"""The contact of an impact, and points on the links of a robot."""
 
 from __future__ import annotations
 
@@ -17,7 +17,7 @@ from impact_posture.robot.robot_spec import Support as Support
 
 # A normal whose length differs from 1 by less is a unit vector up to rounding.
 _UNIT = 1e-15
-# Largest impulse and speed.  Their squares, times the numbers of a robot, must stay within the range of doubles.
+# Largest impulse and speed.  Their squares times the quantities of a robot must stay within the range of doubles.
 LARGEST = 1e100
 
 
@@ -50,8 +50,8 @@ class ImpactContact:
 
     def __post_init__(self) -> None:
         n = np.array(self.normal, dtype=float)
-        # Divide by the largest entry first, because squares of long vectors overflow.  A unit normal stays as it is,
-        # so that a copy of a contact equals it to the last digit.
+        # Divide by the largest entry first, because squares of long vectors overflow.  A unit normal is not divided,
+        # so that the copy of a contact has exactly the same normal.
         if abs(np.linalg.norm(n / np.abs(n).max()) * np.abs(n).max() - 1) > _UNIT:
             n = n / np.abs(n).max()
             n = n / np.linalg.norm(n)
@@ -67,12 +67,12 @@ def point_on(robot: Robot, frame: str, offset: Vector3 = (0.0, 0.0, 0.0)) -> Poi
         FrameNotFound: There is no such frame.
         ContactError: The frame is welded to the world.
     """
-    found = robot.model.frames[robot.frame_id(frame)]
-    if found.parentJoint == 0:
+    carrier = robot.model.frames[robot.frame_id(frame)]
+    if carrier.parentJoint == 0:
         raise ContactError(
             f"frame '{frame}' is welded to the world and cannot move",
             where=robot.name,
             hint="choose a frame on a moving link, or `root` free-flyer",
         )
-    position = found.placement.act(np.array(offset, dtype=float))
-    return PointOnLink(int(found.parentJoint), np.array(position), np.array(found.placement.rotation))
+    position = carrier.placement.act(np.array(offset, dtype=float))
+    return PointOnLink(int(carrier.parentJoint), np.array(position), np.array(carrier.placement.rotation))

@@ -30,7 +30,7 @@ class Metric:
         source: Origin of the weights.
 
     Raises:
-        InputError: The kind is not one of them, or a weight is not above zero.
+        InputError: The kind is unknown, or a weight is not above zero.
         MetricError: The weights do not belong to the kind.
     """
 
@@ -43,11 +43,11 @@ class Metric:
             what = "needs weights" if self.weights is None else "takes no weights"
             raise MetricError(f"the {self.kind} metric {what}", where="metric", hint="see build_metric")
         if self.weights is not None:
-            # An array has neither truth value nor hash.
+            # Equality and hash of the dataclass need a tuple, not an array.
             object.__setattr__(self, "weights", tuple(float(weight) for weight in self.weights))
 
     def diagonal(self, nv: int) -> Array:
-        """Return the diagonal of ``W`` of a constant metric, shape (nv,)."""
+        """Return the diagonal of ``W``, shape (nv,), for a metric other than ``kinetic``."""
         return np.ones(nv) if self.weights is None else np.array(self.weights)
 
 
@@ -62,16 +62,12 @@ def build_metric(robot: Robot, kind: MetricKind, weights: str | tuple[float, ...
     """
     if kind != "weighted":
         if weights is not None and kind in get_args(MetricKind):
-            raise MetricError(
-                f"are given, but the metric is {kind}", where="weights", hint="remove them or add `metric` weighted"
-            )
+            what, hint = f"are given, but the metric is {kind}", "remove them or add `metric` weighted"
+            raise MetricError(what, where="weights", hint=hint)
         return Metric(kind)
     if weights is None:
-        raise MetricError(
-            "the weighted metric needs weights",
-            where="metric",
-            hint="add `weights` FILE or `weights` velocity-limits",
-        )
+        hint = "add `weights` FILE or `weights` velocity-limits"
+        raise MetricError("the weighted metric needs weights", where="metric", hint=hint)
     source = weights if isinstance(weights, str) else "numbers"
     if not isinstance(weights, str):
         check_weights(robot, weights)
@@ -82,9 +78,8 @@ def build_metric(robot: Robot, kind: MetricKind, weights: str | tuple[float, ...
         values = _from_file(robot, Path(weights))
     for name, value in zip(robot.tangent_names, values, strict=True):
         if not (np.isfinite(value) and value > 0):
-            raise MetricError(
-                f"the weight of '{name}' is {value:g}", where=source, hint="every weight must be above zero"
-            )
+            what, hint = f"the weight of '{name}' is {value:g}", "every weight must be above zero"
+            raise MetricError(what, where=source, hint=hint)
     return Metric("weighted", tuple(float(v) for v in values), source)
 
 
@@ -102,15 +97,12 @@ def check_weights(robot: Robot, weights: Sequence[float] | None) -> None:
 def _from_limits(robot: Robot) -> Array:
     limits = robot.velocity_limits
     base = 6 if robot.floating else 0
-    # A base has no velocity limits.  1 m/s and 1 rad/s keep it in the sum.
+    # A floating base has no velocity limits.  Limits of 1 m/s and 1 rad/s keep its velocities in the norm.
     limits[:base] = 1.0
     for name, limit in zip(robot.tangent_names[base:], limits[base:], strict=True):
         if not limit < 1e6:
-            raise MetricError(
-                f"joint '{name}' has no velocity limit",
-                where="weights",
-                hint="add it to robot.toml [limits.velocity] or give a file",
-            )
+            hint = "add it to robot.toml [limits.velocity] or give a file"
+            raise MetricError(f"joint '{name}' has no velocity limit", where="weights", hint=hint)
     return np.asarray(1.0 / limits**2)
 
 
@@ -125,7 +117,6 @@ def _from_file(robot: Robot, path: Path) -> Array:
             else:
                 values[v_slice(robot.model, robot.joint_id(key))] = float(value)  # type: ignore[arg-type]
         except (TypeError, ValueError, OverflowError):
-            raise MetricError(
-                f"key '{key}' holds no number", where=str(path), hint="joint = weight; base = [6 numbers]"
-            ) from None
+            hint = "joint = weight; base = [6 numbers]"
+            raise MetricError(f"key '{key}' holds no number", where=str(path), hint=hint) from None
     return values

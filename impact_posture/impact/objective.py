@@ -1,7 +1,4 @@
-"""The :class:`Objective` protocol, and the protocols of its parts.
-
-The program, its starts, the solver and the certificate know nothing but :class:`Objective`.
-"""
+"""The :class:`Objective` protocol and its parts, the only interface of an objective to the program and its solver."""
 
 from __future__ import annotations
 
@@ -23,11 +20,11 @@ from impact_posture.system.arrays import Array
 
 @dataclass(frozen=True, eq=False)
 class Subgradients:
-    """Points whose convex hull is a subdifferential, up to their gaps.
+    """Gradients whose convex hull is the subdifferential.
 
     Attributes:
-        gradients: Tangent gradients, shape (k, nv).
-        gaps: Distance of the value of each member below the objective, shape (k,).
+        gradients: Tangent gradients of the members of a maximum, shape (k, nv).
+        gaps: Objective minus the value of each member, ≥ 0, shape (k,).
     """
 
     gradients: Array
@@ -44,7 +41,7 @@ class Minimized(Protocol):
 
     @property
     def attempts(self) -> int:
-        """Number of guesses from which the lifted form may be tried."""
+        """Number of different guesses of :meth:`guess`."""
         ...
 
     def guess(self, q: Array, scale: float, attempt: int = 0) -> Guess:
@@ -52,7 +49,7 @@ class Minimized(Protocol):
         ...
 
     def value(self, q: Array) -> float:
-        """Return the value from Pinocchio's numbers, > 0.
+        """Return the value at ``q``, > 0, computed with Pinocchio.
 
         Raises:
             MetricError: The value does not exist at ``q``.
@@ -60,10 +57,10 @@ class Minimized(Protocol):
         ...
 
     def subgradients(self, q: Array, within: float = 0.0) -> Subgradients:
-        """Return vectors that span the subdifferential at ``q``, from Pinocchio's numbers.
+        """Return gradients that span the subdifferential at ``q``, computed with Pinocchio.
 
-        There is one gradient where the value is smooth.  Members of a maximum count if they are at most ``within``
-        below it, the leading member first.
+        There is one gradient where the value is smooth.  A member of a maximum contributes its gradient if its value
+        is at most ``within`` below the maximum.  The leading member comes first.
         """
         ...
 
@@ -73,11 +70,14 @@ class Minimized(Protocol):
 
 
 class WorstCase(Minimized, Protocol):
-    """The largest value that the impact may have at one posture; the parameters of ``lift`` are the normal."""
+    """The largest value that an uncertain impact can have at one posture.
+
+    The parameters of :meth:`lift` are the normal.
+    """
 
     @property
     def oracle(self) -> ImpactOracle:
-        """Pinocchio's numbers for the leading contact, on the robot as modeled."""
+        """The oracle of the leading contact, on the robot as modeled."""
         ...
 
     def expressions(self, k: ImpactKernel) -> tuple[ca.SX, ca.SX]:
@@ -86,7 +86,7 @@ class WorstCase(Minimized, Protocol):
 
 
 class Objective(Minimized, Protocol):
-    """The function that a posture problem minimizes, with the contacts and supports that the problem holds."""
+    """The function that a posture problem minimizes, with the contacts and supports of the problem."""
 
     @property
     def robot(self) -> Robot:
@@ -100,26 +100,26 @@ class Objective(Minimized, Protocol):
 
     @property
     def contacts(self) -> tuple[ImpactContact, ...]:
-        """Contacts whose frames the problem holds; empty for none."""
+        """Contacts whose frames the problem constrains; may be empty."""
         ...
 
     @property
     def supports(self) -> tuple[Support, ...]:
-        """Feet that the problem holds; empty for none."""
+        """Feet that the problem keeps in place; may be empty."""
         ...
 
     @property
     def structure(self) -> str:
-        """Text that determines its expressions besides the robot's dynamics; part of the compile cache's key."""
+        """Text that identifies the expressions of a robot, as part of the key of the compile cache."""
         ...
 
     @property
     def parameters(self) -> Array:
-        """Numbers of the lifted form that may change without rebuilding the program, shape (k,)."""
+        """Parameters of the lifted form, which may change without rebuilding the program, shape (k,)."""
         ...
 
     def movable(self, q: Array) -> bool:
-        """Return whether the value at ``q`` is more than rounding."""
+        """Return whether the contact can move at ``q``; otherwise the value is a rounding error."""
         ...
 
     def blind_motions(self) -> Array:

@@ -1,8 +1,4 @@
-"""Resolve settings to robot, contact, supports, metric and objective.
-
-``evaluate``, ``optimize``, ``codegen``, ``verify`` and Python all resolve their settings here, so that the same
-settings mean the same impact.
-"""
+"""Resolve settings to robot, contact, supports, metric and objective, for all commands and for Python."""
 
 from __future__ import annotations
 
@@ -31,10 +27,12 @@ FLOATS = "because its data name neither feet nor rotors"
 
 
 def resolve(settings: ImpactSettings, robot: Robot | None = None) -> ResolvedImpact:
-    """Load the robot, unless it is given, and check all settings against it; one that is ``None`` comes from it.
+    """Load the robot, unless it is passed, and check all settings against it.
+
+    A setting that is ``None`` takes its value from the robot.
 
     Raises:
-        ImpactPostureError: A setting is wrong; the first fault, in one line.
+        ImpactPostureError: A setting is wrong.  The error names the first.
     """
     robot = with_joint_model(load_robot(settings.robot, settings) if robot is None else robot, settings.joint_model)
     q = read_posture(robot, settings.posture)
@@ -66,7 +64,7 @@ def resolve(settings: ImpactSettings, robot: Robot | None = None) -> ResolvedImp
 
 
 def _choose(settings: ImpactSettings, *, several: bool) -> tuple[ObjectiveKind, str]:
-    """Return the objective of the settings; for ``auto`` with the reason in words."""
+    """Return the objective of the settings, and for ``auto`` the reason for the choice."""
     if settings.objective != "auto":
         return settings.objective, ""
     if several:
@@ -75,10 +73,8 @@ def _choose(settings: ImpactSettings, *, several: bool) -> tuple[ObjectiveKind, 
         return "impulse", "objective impulse: there is no approach speed"
     at = f"at {settings.speed:g} m/s with friction {settings.friction:g}"
     if settings.normal_cone:
-        return (
-            "sticking",
-            f"objective sticking: {at}, the jump with friction has no worst case over a cone of normals",
-        )
+        what = f"objective sticking: {at}, the jump with friction has no worst case over a cone of normals"
+        return "sticking", what
     if settings.friction == 0:
         return "speed", f"objective speed: {at} the contact slips freely"
     return "coulomb", f"objective coulomb: {at} the impact itself decides whether the contact sticks or slips"
@@ -93,9 +89,8 @@ def _contacts(settings: ImpactSettings, robot: Robot) -> list[ImpactContact]:
     if settings.frame is not None or settings.normal is not None:
         raise ContactError("stands instead of `frame` and `normal`", where="contact", hint="give one of the two")
     if len(texts) > 1 and settings.offset is not None:
-        raise ContactError(
-            "one offset for several contacts", where="offset", hint="leave it out, or add frames to the URDF"
-        )
+        hint = "leave it out, or add frames to the URDF"
+        raise ContactError("one offset for several contacts", where="offset", hint=hint)
     return [_contact(settings, robot, *parse_contact(text)) for text in texts]
 
 
@@ -119,13 +114,13 @@ class ResolvedImpact:
 
     Attributes:
         objective: Robot, contact, metric, kind, supports and compliance.
-        q: The given posture, shape (nq,).
-        posture: Name or file of the given posture.
+        q: The posture of the settings, shape (nq,).
+        posture: Name or file of this posture.
         speed: Approach speed, m/s.
         restitution: Coefficient of restitution.
-        missing_support: Hint how to state what holds a floating robot up, if nothing does; else empty.
+        missing_support: Hint how to state the supports of a floating robot without any; else empty.
         contact_stiffness: Elasticity of the contact; ``None`` if it is not known.
-        choice: Why ``auto`` chose this objective; empty if the user did.
+        choice: Why ``auto`` chose this objective; empty if the settings name it.
     """
 
     objective: WorstCaseObjective
@@ -154,28 +149,27 @@ class ResolvedImpact:
 
     @property
     def metric(self) -> Metric:
-        """Weight of the jump."""
+        """Metric of the velocity jump."""
         return self.objective.metric
 
     def evaluate(self, q: Array | None = None) -> Evaluation:
-        """Evaluate the impact at ``q``, by default at the given posture."""
-        return evaluate(
-            self.objective, self.q if q is None else q, self.speed, self.restitution, self.contact_stiffness
-        )
+        """Evaluate the impact at ``q``, by default at the posture of the settings."""
+        q = self.q if q is None else q
+        return evaluate(self.objective, q, self.speed, self.restitution, self.contact_stiffness)
 
     @property
     def warnings(self) -> tuple[str, ...]:
         """Warnings about the robot and about this objective."""
-        found = (*self.robot.warnings, *self.objective.warnings)
+        warnings = (*self.robot.warnings, *self.objective.warnings)
         if not self.missing_support:
-            return found
-        return (*found, f"{self.robot.name} is taken as floating freely, {FLOATS}; {self.missing_support}")
+            return warnings
+        return (*warnings, f"{self.robot.name} is taken as floating freely, {FLOATS}; {self.missing_support}")
 
     def to_dict(self, q: Array | None = None) -> dict[str, object]:
         """Return the blocks of ``result.json`` that state the impact: robot, contacts, supports, metric.
 
         Args:
-            q: Posture for the world axes of normals that turn with the robot; by default the given posture.
+            q: Posture at which normals that turn with the robot are stated in world axes; by default :attr:`q`.
         """
         q = self.q if q is None else q
         return {
@@ -198,7 +192,7 @@ class ResolvedImpact:
 
 
 def _contact_block(single: WorstCaseObjective, q: Array) -> dict[str, object]:
-    """The block of a contact, with its normal in world axes at ``q``."""
+    """Return the block of a contact, with its normal in world axes at ``q``."""
     contact = single.contact
     return {
         "frame": contact.frame,
@@ -213,8 +207,8 @@ def _contact_block(single: WorstCaseObjective, q: Array) -> dict[str, object]:
 def robot_block(robot: Robot) -> dict[str, object]:
     """Return the ``robot`` block of ``result.json``."""
     keys = ("name", "source", "model_sha256", "nq", "nv", "joint_names", "root", "convention", "joint_model")
-    found = {key: getattr(robot, key) for key in (*keys, "armature_source", "locked")}
-    return found | {
+    block = {key: getattr(robot, key) for key in (*keys, "armature_source", "locked")}
+    return block | {
         "joint_names": list(robot.joint_names),
         "armature": robot.armature.tolist(),
         "locked": list(robot.locked),
@@ -222,25 +216,20 @@ def robot_block(robot: Robot) -> dict[str, object]:
 
 
 def missing_support(robot: Robot) -> str:
-    """Return a hint how to state what holds the robot up, if it floats and its data name no feet and no rotors."""
+    """Return a hint how to state the supports of a floating robot whose data name neither feet nor rotors."""
     spec = robot.spec
     known = spec.propulsion is not None or spec.kind == "aerial" or spec.constraints.level_base
     if not robot.floating or known:
         return ""
-    found = feet(robot)
-    named = " ".join(f"`support` {frame}" for frame in found)
-    stand = f"{named} (its feet by name or geometry)" if found else "`support` FRAME for each foot"
-    return (
-        f"give {stand}, no `support` if it floats indeed, `base`, or a robot.toml "
-        "(inspect --write-robot-toml drafts one)"
-    )
+    guessed = feet(robot)
+    named = " ".join(f"`support` {frame}" for frame in guessed)
+    stand = f"{named} (its feet by name or geometry)" if guessed else "`support` FRAME for each foot"
+    draft = "(inspect --write-robot-toml drafts one)"
+    return f"give {stand}, no `support` if it floats indeed, `base`, or a robot.toml {draft}"
 
 
 def _default_frame(robot: Robot) -> str:
     if robot.spec.contact.frame is not None:
         return robot.spec.contact.frame
-    raise ContactError(
-        f"{robot.name} has no default contact frame",
-        where="frame",
-        hint=f"give one, for example {', '.join(tips(robot, feet(robot))[:3])}",
-    )
+    hint = f"give one, for example {', '.join(tips(robot, feet(robot))[:3])}"
+    raise ContactError(f"{robot.name} has no default contact frame", where="frame", hint=hint)

@@ -18,9 +18,9 @@ _DEFAULT_COMPLIANCE, _LEAST_COMPLIANCE = 1e-4, 1e-6
 def default_compliance(robot: Robot) -> float:
     """Return the default support compliance ε in 1/kg: a foot is held as if it weighed 10⁴ robots.
 
-    ``M a − J_sᵀ f = Jᵀ n, J_s a + ε f = 0`` is smooth in ``q`` for any ε > 0.  Its effect on the jump
-    differs from that of rigid feet by a share of at most ``ε/(σ + ε)``.  σ is the least eigenvalue of ``J_sM⁻¹J_sᵀ``
-    above zero.  The share is 1e-4 where the feet bear the mass of the robot.  It is larger where ``J_s`` nearly loses
+    The solution of ``M a − J_sᵀ f = Jᵀ n, J_s a + ε f = 0`` is smooth in ``q`` for any ε > 0.  The feet change the
+    jump by a share of at most ``ε/(σ + ε)`` less than rigid feet do, with σ the least eigenvalue of ``J_sM⁻¹J_sᵀ``
+    above zero.  This share is 1e-4 where the feet bear the mass of the robot, and larger where ``J_s`` nearly loses
     rank.
     """
     return _DEFAULT_COMPLIANCE / robot.mass
@@ -29,8 +29,8 @@ def default_compliance(robot: Robot) -> float:
 def least_compliance(robot: Robot) -> float:
     """Return the least compliance ε that the symbolic kernel and the C export allow, 1/kg.
 
-    Both add ``1/ε`` to the inertia of the feet and subtract it again on the way to the base.  This costs as many
-    digits as ``ε`` has zeros; about eight digits are left at this limit.
+    Both add ``1/ε`` to the inertia of the feet and subtract it again on the path to the base.  The difference loses
+    as many digits as ``ε`` has zeros.  About eight digits are left at this limit.
     """
     return _LEAST_COMPLIANCE / robot.mass
 
@@ -46,17 +46,17 @@ def check_compliance(robot: Robot, compliance: float) -> None:
         raise InputError(
             f"the compliance is {compliance:g} 1/kg",
             where="support_compliance",
-            hint=f"give at least {least:.3g}, 1e-6 over the mass, because rounding outweighs stiffer feet below it",
+            hint=f"give at least {least:.3g}, which is 1e-6 over the mass; stiffer feet are lost in rounding errors",
         )
 
 
 def heavy_feet_rounding(robot: Robot, compliance: float) -> float:
-    """Return the rounding error of ``M + J_sᵀJ_s/ε`` relative to the default compliance; it grows with ``1/ε``."""
+    """Return the rounding error of ``M + J_sᵀJ_s/ε`` relative to its error with the default compliance, ≥ 1."""
     return max(1.0, default_compliance(robot) / compliance)
 
 
 def support_inertia(robot: Robot, supports: tuple[Support, ...], compliance: float) -> dict[int, Array]:
-    """Return ``J_sᵀJ_s/ε`` by link, as 6×6 inertias: point masses ``1/ε``, and moments ``1/ε`` for a surface."""
+    """Return ``J_sᵀJ_s/ε`` by link, as 6×6 inertias: a point mass ``1/ε``, for a surface also moments ``1/ε``."""
     extra: dict[int, Array] = {}
     for support in supports:
         point = point_on(robot, support.frame, support.offset)

@@ -1,4 +1,4 @@
-"""Resolve the names of supports, and refuse impacts at a support."""
+"""Supports by name, and checks that an impact and its supports fit together."""
 
 from __future__ import annotations
 
@@ -18,19 +18,19 @@ from impact_posture.robot.robot_spec import Support
 def resolve_supports(robot: Robot, texts: Sequence[str] | None) -> tuple[Support, ...]:
     """Turn ``FRAME[:point|surface]`` into supports; ``None`` gives the supports of ``robot.toml``.
 
-    A frame that ``robot.toml`` lists keeps its offset and size, and its kind unless one is given.
+    A frame listed in ``robot.toml`` has the offset and size stated there, and the kind unless ``texts`` states it.
 
     Raises:
         FrameNotFound: There is no such frame; the error lists the nearest names.
         InputError: A frame is given twice.
     """
     known = {support.frame: support for support in robot.spec.supports}
-    found = robot.spec.supports if texts is None else tuple(_support(robot, text, known) for text in texts)
-    for support in found:
-        if sum(s.frame == support.frame for s in found) > 1:
+    supports = robot.spec.supports if texts is None else tuple(_support(robot, text, known) for text in texts)
+    for support in supports:
+        if sum(s.frame == support.frame for s in supports) > 1:
             raise InputError(f"frame '{support.frame}' is given twice", where="support", hint="remove one")
         point_on(robot, support.frame, support.offset)
-    return found
+    return supports
 
 
 def _support(robot: Robot, text: str, known: Mapping[str, Support]) -> Support:
@@ -46,7 +46,7 @@ def _support(robot: Robot, text: str, known: Mapping[str, Support]) -> Support:
 
 
 def refuse_held(robot: Robot, contact: ImpactContact, supports: Sequence[Support]) -> None:
-    """Refuse an impact at a point that a support holds, because only the compliance would respond.
+    """Refuse an impact at a point that a support holds, because the answer would depend on the compliance alone.
 
     Raises:
         ContactError: A support holds the contact point.
@@ -66,7 +66,7 @@ def refuse_held(robot: Robot, contact: ImpactContact, supports: Sequence[Support
 
 
 def refuse_rigid(robot: Robot, supports: Sequence[Support]) -> None:
-    """Refuse a robot that stands with all joints locked, because only the compliance of its feet would respond.
+    """Refuse a standing robot whose joints are all locked, because only the compliance of its feet would yield.
 
     Raises:
         InputError: No joint of the standing robot moves.

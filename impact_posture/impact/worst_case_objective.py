@@ -1,11 +1,4 @@
-"""The ``Objective`` protocol, and the worst case of an impact that implements it.
-
-The program, its starts, the solver and the certificate know nothing but :class:`Objective`.
-:class:`WorstCaseObjective` combines a kind (:mod:`impact_posture.impact.kinds.kinds_by_name`), a metric, supports,
-contacts, a cone of
-normals and model variants.  No combination is a class of its own.  Each shape of the inner maximum is a class
-(:mod:`impact_posture.impact.worst_case.model_set`).
-"""
+"""The objective of an impact in its worst case, over normals, impulses or robot models."""
 
 from __future__ import annotations
 
@@ -43,6 +36,10 @@ from impact_posture.system.arrays import Array
 class WorstCaseObjective:
     """Impulse ``λ̄²H``, speed ``V``, sticking ``S``, coulomb ``C`` or energy ``E`` of an impact, in its worst case.
 
+    It implements the :class:`~impact_posture.impact.objective.Objective` protocol for every combination of a kind
+    (:mod:`impact_posture.impact.kinds.kinds_by_name`), a metric, supports, contacts, a cone of normals and model
+    variants.  Each type of maximum is a class in :mod:`impact_posture.impact.worst_case`.
+
     Attributes:
         robot: The robot.
         contact: Point and normal of the impact.
@@ -50,10 +47,10 @@ class WorstCaseObjective:
         kind: ``impulse``, ``speed``, ``sticking``, ``coulomb`` or ``energy``.
         supports: Feet that stay on the ground.
         compliance: ε of the supports, 1/kg.
-        normal_cone_deg: Half angle of the cone of normals whose worst counts, degrees; 0 for the contact's normal.
-        others: More contacts at the same time, each with its own bound on its impulse.
+        normal_cone_deg: Half angle of the cone of possible normals, degrees; 0 for the contact's normal alone.
+        others: Further contacts at the same time, each with a bound on its impulse.
         bilateral: Whether several contacts can pull as well as push.
-        model_variants: Robot models whose worst counts, the robot as modeled first; empty for that one alone.
+        model_variants: Possible robot models, the robot as modeled first; empty for the robot as modeled alone.
     """
 
     robot: Robot
@@ -91,7 +88,7 @@ class WorstCaseObjective:
 
     @property
     def scale(self) -> float:
-        """The value divided by H, V, S or E: λ̄² for ``impulse``, else 1."""
+        """Ratio of the value to H, V, S or E: λ̄² for ``impulse``, else 1."""
         return self.impact_kind.factor
 
     @property
@@ -118,13 +115,13 @@ class WorstCaseObjective:
         """Messages about degenerate combinations."""
         if self.metric.kind != "kinetic":
             return ()
-        # With supports aᵀMa = G − ε‖f‖², with the impulse f of the feet.
+        # With the impulse f of supports, aᵀMa = G − ε‖f‖².
         rest = ", up to the compliance of the feet" if self.supports else ""
-        said = {
+        meanings = {
             "speed": f"is 1/G{rest}: the exact opposite of 'impulse' (G) and twice 'energy'",
             "impulse": f"is G = 1/m_eff{rest}: it only maximizes the effective mass",
         }
-        return (f"with the kinetic metric '{self.kind}' {said[self.kind]}",) if self.kind in said else ()
+        return (f"with the kinetic metric '{self.kind}' {meanings[self.kind]}",) if self.kind in meanings else ()
 
     @property
     def contacts(self) -> tuple[ImpactContact, ...]:
@@ -139,22 +136,22 @@ class WorstCaseObjective:
     @cached_property
     def singles(self) -> tuple[WorstCaseObjective, ...]:
         """The objective of each contact alone, on the robot as modeled."""
-        if not self.others:
-            return (replace(self, model_variants=()) if self.model_variants else self,)
+        if not self.others and not self.model_variants:
+            return (self,)
         return tuple(
             replace(self, contact=contact, others=(), bilateral=False, model_variants=()) for contact in self.contacts
         )
 
     @cached_property
     def by_variant(self) -> tuple[WorstCaseObjective, ...]:
-        """The objective on the robot of each model variant, or the objective itself if there is none."""
+        """The objective on the robot of each model variant, or the objective itself without variants."""
         if not self.model_variants:
             return (self,)
         return tuple(replace(self, robot=variant.robot, model_variants=()) for variant in self.model_variants)
 
     @cached_property
     def worst_case(self) -> WorstCase:
-        """The inner maximum."""
+        """The maximum over normals, impulses or models."""
         if self.model_variants:
             return ModelSet(tuple(member.worst_case for member in self.by_variant))
         if self.others:
@@ -163,7 +160,7 @@ class WorstCaseObjective:
 
     @cached_property
     def normal_cone(self) -> NormalCone | None:
-        """The cone around the normal of the leading contact, on the robot as modeled."""
+        """The cone around the normal of the leading contact, on the robot as modeled; ``None`` without a cone."""
         kind = self.impact_kind
         if not self.normal_cone_deg or not isinstance(kind, QuadraticKind):
             return None
@@ -178,7 +175,7 @@ class WorstCaseObjective:
 
     @cached_property
     def kernel(self) -> ImpactKernel:
-        """The expressions on new symbols q and n."""
+        """The expressions of H, G, V, S and E with symbols for q and n."""
         return ImpactKernel(self.case, ca.SX.sym("q", self.robot.nq), ca.SX.sym("n", 3))
 
     def value_fun(self) -> ca.Function:
@@ -190,7 +187,7 @@ class WorstCaseObjective:
     def gradient_fun(self) -> ca.Function:
         """Return ``(q, n) → value, gradient`` (nv), with ``n`` in the normal frame of the leading contact.
 
-        ``n`` is the axis of a cone of normals.  The gradient is a subgradient where the inner maximum is tied.
+        With a cone of normals, ``n`` is its axis.  The gradient is a subgradient where members of the maximum tie.
         """
         k = self.kernel
         value, gradient = self.worst_case.expressions(k)
@@ -214,11 +211,11 @@ class WorstCaseObjective:
 
     @cached_property
     def oracle(self) -> ImpactOracle:
-        """Pinocchio's numbers for the leading contact, on the robot as modeled."""
+        """The oracle of the leading contact, on the robot as modeled."""
         return ImpactOracle(self.case)
 
     def value(self, q: Array) -> float:
-        """Return the objective at ``q`` from Pinocchio's numbers.
+        """Return the objective at ``q``, computed with Pinocchio.
 
         Raises:
             MetricError: The kind is ``sticking`` or ``coulomb`` and has no value at ``q``.
@@ -226,23 +223,25 @@ class WorstCaseObjective:
         return self.worst_case.value(q)
 
     def gradient(self, q: Array) -> Array:
-        """Return the tangent gradient at ``q`` from Pinocchio's numbers, shape (nv,); a subgradient at a tie."""
+        """Return the tangent gradient at ``q``, computed with Pinocchio, shape (nv,); a subgradient at a tie."""
         return self.subgradients(q).first
 
     def subgradients(self, q: Array, within: float = 0.0) -> Subgradients:
-        """Return the gradients of all members of the maximum that tie or lie at most ``within`` below."""
+        """Return the gradients of all members of the maximum that tie or lie at most ``within`` below it."""
         return self.worst_case.subgradients(q, within)
 
     def movable(self, q: Array) -> bool:
-        """Return whether a contact can move along its normal at ``q``, or along another normal of its cone."""
+        """Return whether a contact can move at ``q`` along its normal, or along another normal of its cone."""
         if self.normal_cone_deg:
             return True
         return not all(single.oracle.quantities(q).blocked for single in self.singles)
 
     def blind_motions(self) -> Array:
-        """Return the translations, and the turn about the normal, because the base enters through ``R_bᵀn`` alone.
+        """Return base twists that do not change the value, world axes, linear first, shape (k, 6).
 
-        All turns are blind if the normal turns with the robot.  No turn is blind if contacts have different normals.
+        The pose of the base enters through ``R_bᵀn`` alone.  So all translations are blind, and so is the rotation
+        about the normal.  All rotations are blind if the normal turns with the robot, and none is if contacts have
+        different normals.
         """
         n = np.array(self.contact.normal)
         turns = n[None, :]

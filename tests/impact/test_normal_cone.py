@@ -310,7 +310,7 @@ def test_solved_from_and_at_mirror_symmetric_postures() -> None:
 
 def test_speed_has_no_dual_and_no_cone_is_half_open() -> None:
     contact = ImpactContact("ee", (0, 0, 1))
-    with pytest.raises(MetricError, match="no quadratic form") as caught:
+    with pytest.raises(MetricError, match="not a quadratic form") as caught:
         WorstCaseObjective(robot("tilthex_arm"), contact, kind="speed", normal_cone_deg=5.0)
     assert "\n" not in caught.value.line
     for degrees in (-1.0, 90.0, float("nan")):

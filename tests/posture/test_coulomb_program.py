@@ -120,7 +120,10 @@ def test_exported_code_agrees_and_names_the_gradient_at_the_switch(tmp_path: Pat
         (tmp_path / name).mkdir()
         export([objective], tmp_path / name, prefix=name, check=False)
         header = (tmp_path / name / f"{name}.h").read_text()
-        assert f"friction {friction:g}; where the contact point begins to slip, grad is that of sticking" in header
+        assert (
+            f"friction {friction:g}; where the contact point begins to slip, grad is the gradient of sticking"
+            in header
+        )
         manifest = json.loads((tmp_path / name / f"{name}.json").read_text())
         assert manifest["friction"] == friction and "sticking" in manifest["objective_kink"]
         with built(tmp_path / name, name) as code:
@@ -190,7 +193,7 @@ def test_optimize_writes_friction_and_reads_it_again(tmp_path: Path) -> None:
 def test_bad_input_gets_one_line() -> None:
     panda, hands = ("panda", "--normal", "0", "0", "1"), ("gripper_left_base_link", "gripper_right_base_link")
     both = [word for hand in hands for word in ("--contact", f"{hand}:-1,0,0")]
-    refused(run("optimize", *panda, "--objective", "coulomb", "--normal-cone", "5"), 1, "no quadratic form")
+    refused(run("optimize", *panda, "--objective", "coulomb", "--normal-cone", "5"), 1, "not a quadratic form")
     refused(run("evaluate", "talos", *both, "--objective", "coulomb"), 1, "one contact")
     refused(run("evaluate", *panda, "--friction", "1e300"), 1, "give 0 to 1e+100")
     for value in ("-1", "nan", "inf"):

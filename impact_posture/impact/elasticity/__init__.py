@@ -1,1 +1,1 @@
-"""Elastic joints and the compression of the contact."""
+"""Elastic joints, and the compression of the contact."""

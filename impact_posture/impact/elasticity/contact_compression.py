@@ -1,15 +1,16 @@
-"""How long a contact is compressed, how large its force grows, and which inertia it therefore meets at the joints.
+"""Compression time and peak force of a contact, and the inertia at the joints that responds to it.
 
-An effective mass ``m = 1/G`` that meets a contact at the speed v comes to rest against it at the time T, when the
-compression δ and the force are greatest:
+An effective mass ``m = 1/G`` that meets a contact at the speed v comes to rest after the time T.  The compression δ
+and the force are largest at T, with the peak force F:
 
-- linear, ``f = kδ``: ``T = (π/2)√(m/k)``, ``F = v√(km)``;
-- Hertzian, ``f = κδ^{3/2}`` (Johnson, Contact Mechanics, 1985, §11.4): ``δ = (5mv²/4κ)^{2/5}``, ``F = κδ^{3/2}``,
-  ``T = 1.472 δ/v``;
-- of known T: the linear contact with that T, ``F = (π/2) mv/T``.
+- linear contact, ``f = kδ``: ``T = (π/2)√(m/k)``, ``F = v√(km)``;
+- Hertzian contact, ``f = κδ^{3/2}`` (Johnson, Contact Mechanics, 1985, §11.4): ``δ = (5mv²/4κ)^{2/5}``,
+  ``F = κδ^{3/2}``, ``T = 1.472 δ/v``;
+- contact of known T: the linear contact with this T, ``F = (π/2) mv/T``.
 
-Whether the rotors behind elastic transmissions take part is decided by ``x = T √(G/C)`` with ``G = jM⁻¹jᵀ`` of the
-links alone and ``C = jK⁻¹jᵀ`` of the joint springs, ``j = nᵀJ``: T in units of the time in which the springs respond.
+The ratio ``x = T √(G/C)`` decides whether the rotors behind elastic transmissions take part.  It is T in units of the
+time in which the springs respond, with ``G = jM⁻¹jᵀ`` of the links alone, ``C = jK⁻¹jᵀ`` of the joint springs, and
+``j = nᵀJ``.
 """
 
 from __future__ import annotations
@@ -28,23 +29,23 @@ from impact_posture.impact.worst_case_objective import WorstCaseObjective
 from impact_posture.robot.joint_model import with_joint_model
 from impact_posture.system.arrays import Array
 
-# ∫₀¹ dz/√(1 − z^{5/2}), the time to greatest compression in units of δ/v for the force κδ^{3/2}.
+# ∫₀¹ dz/√(1 − z^{5/2}): the time T in units of δ/v for the force κδ^{3/2}.
 HERTZ_TIME = sqrt(pi) * gamma(7 / 5) / gamma(9 / 10)
 # Radius of the steel tip that touches a material, m.
 TIP_RADIUS = 0.01
-# Below the first x the links alone respond, above the second x the rotors go along (docs: which inertia).
+# Up to the first x only the links respond, from the second x also the rotors (docs: which inertia).
 SHORT, LONG = 0.2, 0.75
 
 
 @dataclass(frozen=True)
 class ContactStiffness:
-    """The elasticity of a contact: exactly one of its three numbers is given.
+    """The elasticity of a contact, by exactly one of three numbers.
 
     Attributes:
         linear: k, N/m.
         hertz: κ, N/m^{3/2}.
         duration: T, the time from touch to greatest compression, s.
-        material: Name of the material that κ belongs to, or empty.
+        material: Name of the material with this κ, or empty.
     """
 
     linear: float | None = None
@@ -54,7 +55,7 @@ class ContactStiffness:
 
     @staticmethod
     def of(stiffness: float | str | None, duration: float | None) -> ContactStiffness | None:
-        """Return the contact of the settings ``contact_stiffness`` and ``contact_duration``; ``None`` without any.
+        """Return the contact of the settings ``contact_stiffness`` and ``contact_duration``; ``None`` without both.
 
         Raises:
             InputError: Both are given.
@@ -84,22 +85,22 @@ class ContactStiffness:
         return float((self.hertz or 0.0) * self._depth(G, speed) ** 1.5)
 
     def _depth(self, G: float, speed: float) -> float:
-        """The greatest compression of a Hertzian contact, m."""
+        """Return the greatest compression of a Hertzian contact, m."""
         return float((5 * speed**2 / (4 * (self.hertz or 0.0) * G)) ** 0.4)
 
     def linear_stiffness(self, G: float, speed: float) -> float:
-        """Return k, N/m, of the linear contact that is compressed for the same time."""
+        """Return k, N/m, of the linear contact with the same compression time."""
         return self.linear or (pi / 2 / self.compression_time(G, speed)) ** 2 / G
 
     def least_mobility(self, force: float, speed: float) -> float:
         """Return the least G, 1/kg, with which the peak force stays at most ``force``."""
-        # The force falls with a power of G.
+        # The peak force is proportional to G^(−power).
         power = 1.0 if self.duration is not None else 0.5 if self.linear is not None else 0.6
         return float((self.peak_force(1.0, speed) / force) ** (1 / power))
 
     @property
     def words(self) -> str:
-        """The contact in words."""
+        """The contact as text."""
         if self.duration is not None:
             return f"compressed within {1e3 * self.duration:.3g} ms"
         if self.linear is not None:
@@ -108,12 +109,8 @@ class ContactStiffness:
 
     def to_dict(self) -> dict[str, object]:
         """Return JSON content."""
-        return {
-            "stiffness": self.linear,
-            "hertz_stiffness": self.hertz,
-            "duration": self.duration,
-            "material": self.material or None,
-        }
+        numbers = {"stiffness": self.linear, "hertz_stiffness": self.hertz, "duration": self.duration}
+        return {**numbers, "material": self.material or None}
 
 
 def hertz_stiffness(material: str) -> float:
@@ -124,14 +121,14 @@ def hertz_stiffness(material: str) -> float:
 
 @dataclass(frozen=True)
 class Compression:
-    """What the elasticity of contact and joints makes of an impact.
+    """Effects of the elasticity of contact and joints.
 
     Attributes:
-        contact: The contact; ``None`` if none is stated.
+        contact: The contact; ``None`` if its elasticity is not known.
         time: T with the inertia of the objective's joint model, s; ``None`` without a contact.
-        peak_force: Force at greatest compression with that inertia, N; ``None`` without a contact.
+        peak_force: Peak force F with this inertia, N; ``None`` without a contact.
         x: ``T √(G/C)`` with T and G of the links alone; ``None`` without a contact or without known springs.
-        by_material: x of each material of the table if no contact is stated and springs are known; else empty.
+        by_material: x of each material in the table, if springs are known and the contact is not; else empty.
         joint_model: The joint model of the objective.
     """
 
@@ -151,7 +148,7 @@ class Compression:
 
     @property
     def line(self) -> str:
-        """What x means, in words; empty where it is not known."""
+        """The meaning of x as text; empty where x is not known."""
         if self.x is None:
             if not self.by_material:
                 return ""
@@ -162,9 +159,9 @@ class Compression:
         elif self.fitting == "reflected":
             meaning = "the rotors move with the links: joint model 'reflected'"
         else:
-            meaning = "neither 'link' nor 'reflected' is right; "
             used = self.joint_model == "elastic"
-            meaning += "'elastic', as here, is" if used else "evaluate with `joint_model` elastic"
+            advice = "'elastic', as here, is" if used else "evaluate with `joint_model` elastic"
+            meaning = f"neither 'link' nor 'reflected' is right; {advice}"
         return f"x = {self.x:.2g}: {meaning}"
 
     def to_dict(self) -> dict[str, object]:
@@ -183,7 +180,7 @@ class Compression:
 def compression(
     objective: WorstCaseObjective, q: Array, speed: float, contact: ContactStiffness | None
 ) -> Compression | None:
-    """Return T, peak force and x of the impact at the leading contact; ``None`` if none of them is known.
+    """Return T, peak force and x of the impact at the leading contact; ``None`` if all of them are unknown.
 
     Args:
         objective: Robot, contact, metric, kind and supports.
@@ -192,13 +189,13 @@ def compression(
         contact: The contact; ``None`` gives x for each material.
     """
     springs = springs_along(objective.case, q)
-    found = objective.oracle.quantities(q)
-    if (contact is None and springs is None) or found.blocked:
+    quantities = objective.oracle.quantities(q)
+    if (contact is None and springs is None) or quantities.blocked:
         return None
     time = force = x = None
     by_material: dict[str, float] = {}
     if contact is not None:
-        numbers = contact.compression_time(found.G, speed), contact.peak_force(found.G, speed)
+        numbers = contact.compression_time(quantities.G, speed), contact.peak_force(quantities.G, speed)
         time, force = (value if np.isfinite(value) else None for value in numbers)
     if springs is not None:
         G, C = springs
@@ -206,17 +203,17 @@ def compression(
             x = contact.compression_time(G, speed) * sqrt(G / C)
         elif speed > 0:
             each = {name: ContactStiffness(hertz=hertz_stiffness(name)) for name in MATERIALS}
-            by_material = {name: one.compression_time(G, speed) * sqrt(G / C) for name, one in each.items()}
+            by_material = {name: steel.compression_time(G, speed) * sqrt(G / C) for name, steel in each.items()}
     if x is not None and not np.isfinite(x):
         x = None
     return Compression(contact, time, force, x, by_material, objective.robot.joint_model)
 
 
 def springs_along(case: ImpactCase, q: Array) -> tuple[float, float] | None:
-    """Return ``G = jM⁻¹jᵀ`` of the links alone, 1/kg, and the compliance C of the contact on the joint springs, m/N.
+    """Return ``G = jM⁻¹jᵀ`` of the links alone, 1/kg, and ``C = jK⁻¹jᵀ`` of the joint springs, m/N.
 
     Returns:
-        ``None`` if no spring of known stiffness gives way to the contact.
+        ``None`` if no spring of known stiffness yields to the contact.
     """
     try:
         compliance = ElasticImpact(case).compliance(q)

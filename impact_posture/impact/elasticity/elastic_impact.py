@@ -1,7 +1,7 @@
-"""Velocity jump of a robot whose rotors hang on springs, in a contact of known stiffness.
+"""Velocity jump of a robot with rotors on springs, in a contact of known stiffness.
 
-A short contact meets the links alone, and a long one takes the rotors along.  Between the two, links ``x``, rotors
-``y`` and contact respond as a linear system about the configuration ``q``, in increments over free flight:
+In a short contact only the links respond, in a long contact the rotors move with them.  Between the two, links ``x``,
+rotors ``y`` and contact are a linear system about the configuration ``q``, in increments over free flight:
 
     M ẍ = jᵀf − Eᵀτ,   B ÿ = τ,   s = Ex − y,   τ = K s + D ṡ,
     δ̇ = v − jẋ,   f = k δ,   j = nᵀJ,
@@ -10,12 +10,13 @@ with the elastic joints in the rows of ``E`` (m×nv) and their rotors in ``B`` (
 the links, and the rotors of all joints without a spring of known stiffness.  Supports enter as ``M + J_sᵀJ_s/ε``, and
 locked joints do not move.  The compression ends at the first time ``T`` with ``δ̇ = 0`` (plastic impact, e = 0).
 
-The system is no larger than its springs.  With ``c = (s, δ)``, ``C = [E; −j]``, ``κ = (K, k)`` and ``d = (D, 0)``,
+The springs and the contact determine the system.  With ``c = (s, δ)``, ``C = [E; −j]``, ``κ = (K, k)``, ``d = (D,
+0)``,
 
     c̈ = −A (κc + dċ),   A = C M⁻¹ Cᵀ + diag(B⁻¹, 0),   c(0) = 0,   ċ(0) = (0, v),
 
 and the impulses ``I = ∫(τ, f)dt = A⁻¹(ċ(0) − ċ)`` move the links by ``ẋ = −M⁻¹CᵀI``.  The state ``(κ^½c, L⁻¹ċ)`` with
-``A = LLᵀ`` holds the potential and the kinetic energy, so that its generator is skew but for the dampers.
+``A = LLᵀ`` has the total energy as its squared norm, so its generator is skew-symmetric apart from the dampers.
 """
 
 from __future__ import annotations
@@ -35,35 +36,35 @@ from impact_posture.impact.quantities.sticking_point import ImpulseResponse
 from impact_posture.robot.joint_model import transmissions, with_joint_model
 from impact_posture.system.arrays import Array
 
-# Contact stiffness, N/m: from below foam to above steel on steel.
+# Range of contact stiffness, N/m: from softer than foam to stiffer than steel on steel.
 _SOFTEST, _STIFFEST = 1.0, 1e12
-# Oscillations of the stiffest spring in a contact, in rad, that leave seven digits.
+# Largest phase of the fastest oscillation during a contact, rad.  Seven digits are left at this phase.
 _LONGEST = 1e8
 # Stiffness of held feet, relative to the stiffest spring.
 _HELD = 1e8
-# Step of the samples for the peaks, in rad of the stiffest spring, and the least and largest number of them.
+# Phase step of the samples for the peaks, rad of the fastest oscillation, and limits of the number of samples.
 _SAMPLE, _FEWEST, _MOST = 0.1, 100, 20_000
 
 
 @dataclass(frozen=True, eq=False)
 class ElasticResponse:
-    """Response of links, rotors and springs to a contact, until its greatest compression at the time ``T``.
+    """Response of links, rotors and springs to a contact, until the greatest compression at the time ``T``.
 
-    All quantities but ``duration``, ``compliance_ratio`` and ``value`` are proportional to ``speed``.
+    All quantities are proportional to ``speed``, except ``duration``, ``compliance_ratio`` and ``value``.
 
     Attributes:
         stiffness: ``k`` of the contact, N/m.
         speed: Approach speed ``v``, m/s.
         duration: ``T``, s.
         compliance_ratio: ``T√(G/C)`` with ``G = jM⁻¹jᵀ`` and the compliance ``C = jK⁻¹jᵀ`` of the contact point on
-            the springs.  The links alone respond where it is small, links and rotors where it is large.  Infinite if
-            no spring gives way to the contact.
+            the springs.  Only the links respond if it is small, links and rotors if it is large.  Infinite if no
+            spring yields to the contact.
         force: ``kδ(T)``, the largest force of the contact, N.
         impulse: ``∫f`` until ``T``, N·s.
         jump: ``ẋ(T)``, velocity jump of base and links, shape (nv,), with ``jump_norm`` ``‖ẋ(T)‖_W``.
         value: ``‖ẋ(T)‖²_W/v²``, which is V where the joints are rigid.
         peak_jump_norm: The largest ``‖ẋ(t)‖_W`` until ``T``.
-        rotor_jump: ``ẏ(T)``, shape (nv,); that of the link without a spring.
+        rotor_jump: ``ẏ(T)``, shape (nv,); for a joint without a spring equal to ``jump``.
         torque: ``τ(T)`` of the springs and dampers, N·m (N if prismatic), shape (nv,); zero without a spring.
         peak_torque: The largest ``|τ(t)|`` until ``T``, shape (nv,).
     """
@@ -83,16 +84,16 @@ class ElasticResponse:
     peak_torque: Array
 
     def to_dict(self) -> dict[str, object]:
-        """Return JSON content; ``None`` for a compliance ratio without a bound."""
+        """Return JSON content, with ``None`` for an infinite compliance ratio."""
         ratio = self.compliance_ratio if math.isfinite(self.compliance_ratio) else None
         return json_block(self) | {"compliance_ratio": ratio}
 
 
 class ElasticImpact:
-    """Response to a contact of given stiffness, and its tangent gradient, by the matrix exponential.
+    """Response to a contact of known stiffness, and its tangent gradient, by the matrix exponential.
 
-    The armature is that stated for the robot, whatever its joint model, and the springs are those of robot.toml
-    ``[transmission]``.  A metric W = M weighs the links and the rotors of rigid joints.
+    The rotors have the armature stated for the robot, whatever its joint model, and the springs of ``[transmission]``
+    in robot.toml.  The metric W = M weighs the links, and the rotors of joints without a spring.
 
     Raises:
         InputError: No joint has a rotor on a spring of known stiffness.
@@ -100,10 +101,10 @@ class ElasticImpact:
     """
 
     def __init__(self, case: ImpactCase) -> None:
-        robot, found = with_joint_model(case.robot, "elastic"), transmissions(case.robot)
-        self.joints = np.flatnonzero(found.elastic & (robot.armature > 0))
+        robot, table = with_joint_model(case.robot, "elastic"), transmissions(case.robot)
+        self.joints = np.flatnonzero(table.elastic & (robot.armature > 0))
         self.rotors = robot.armature[self.joints]
-        self.kappa, self.d = found.stiffness[self.joints], found.damping[self.joints]
+        self.kappa, self.d = table.stiffness[self.joints], table.damping[self.joints]
         self.oracle = ImpactOracle(replace(case, robot=robot))
 
     def response(self, q: Array, stiffness: float, speed: float = 1.0) -> ElasticResponse:
@@ -148,9 +149,9 @@ class ElasticImpact:
     def gradient(self, q: Array, stiffness: float) -> Array:
         """Return the tangent gradient of :meth:`value`, shape (nv,).
 
-        ``T`` moves with ``q`` so that ``δ̇(T) = 0``.  The gradient does not exist where ``δ̇`` touches zero without
-        changing sign, because ``T`` jumps there.  With ``P = −M⁻¹Cᵀ`` and the adjoint ``X`` of ``A``, it is that of
-        ``⟨X, A⟩ + 2 bᵀ(jᵀI_f − Mẋ)`` with ``b = M⁻¹Wẋ``, all but ``M`` and ``j`` held.
+        ``T`` depends on ``q`` by ``δ̇(T) = 0``.  The gradient does not exist where ``δ̇`` touches zero without changing
+        sign, because ``T`` jumps there.  With ``P = −M⁻¹Cᵀ`` and the adjoint ``X`` of ``A``, it is the gradient of
+        ``⟨X, A⟩ + 2 bᵀ(jᵀI_f − Mẋ)`` with ``b = M⁻¹Wẋ``, where only ``M`` and ``j`` depend on ``q``.
         """
         c = self._compression(q, stiffness)
         oracle, P, impulse = self.oracle, c.columns, c.impulse(c.state)
@@ -158,8 +159,8 @@ class ElasticImpact:
         weighed = oracle.weigh(x.a)
         b = oracle.respond(weighed)
         X = c.adjoint(P.a.T @ (2 * weighed))
-        own, pushed = np.array(oracle.contact.normal), 2 * (P.a @ X[:, -1] + impulse[-1] * b.a)
-        gradient = oracle.coupling(own, pushed, oracle.case.in_contact_frame) - 2 * oracle.inertial(b, x)
+        normal, pushed = np.array(oracle.contact.normal), 2 * (P.a @ X[:, -1] + impulse[-1] * b.a)
+        gradient = oracle.coupling(normal, pushed, oracle.case.in_contact_frame) - 2 * oracle.inertial(b, x)
         weights, axes = np.linalg.eigh(X)
         for weight, axis in zip(weights, axes.T, strict=True):
             mode = ImpulseResponse(P.a @ axis, P.f @ axis)
@@ -167,7 +168,7 @@ class ElasticImpact:
         return np.asarray(gradient + oracle.metric_gradient(x.a))
 
     def _compression(self, q: Array, stiffness: float) -> _Compression:
-        """Check the stiffness, and solve for a unit approach speed."""
+        """Check the stiffness, and compute the compression at unit approach speed."""
         if not _SOFTEST <= stiffness <= _STIFFEST:
             hint = f"give {_SOFTEST:g} to {_STIFFEST:g} N/m"
             raise InputError(f"is {stiffness:g} N/m", where="contact_stiffness", hint=hint)
@@ -182,7 +183,7 @@ class ElasticImpact:
         return _Compression((A + A.T) / 2, columns, kappa, d, oracle)
 
     def compliance(self, q: Array) -> float:
-        """Return ``C`` at ``q``, m/N: rotors and feet held, the base too unless it stands on feet."""
+        """Return ``C`` at ``q``, m/N, for fixed rotors and feet, and without feet also for a fixed base."""
         oracle = self.oracle.at(q)
         feet = oracle.Js
         moving = np.append(np.arange(6 if len(feet) else 0), self.joints)
@@ -199,8 +200,8 @@ class _Compression:
         mobility: ``A``, shape (m+1, m+1).
         columns: ``P = −M⁻¹Cᵀ``, shape (nv, m+1), with its support impulses.
         kappa: Stiffness of springs and contact, shape (m+1,).
-        d: Damping of the same.
-        oracle: Weighs velocities.
+        d: Damping of springs and contact, shape (m+1,).
+        oracle: The oracle of the impact.
     """
 
     def __init__(
@@ -215,7 +216,7 @@ class _Compression:
         R = np.sqrt(kappa)[:, None] * self._L
         self._generator = np.block([[np.zeros_like(R), R], [-R.T, -(self._L.T * d) @ self._L]])
         self._fastest = float(np.linalg.norm(self._generator, 2))
-        # Only the contact moves at touch, and the last row of L is its speed.
+        # At touch only δ has a rate, which is the last row of L times the state.
         self._row, self._start = np.append(np.zeros(len(R)), self._L[-1]), np.zeros(2 * len(R))
         self._start[-1] = 1 / self._L[-1, -1]
         self.duration, self.state = self._greatest_compression()
@@ -234,7 +235,8 @@ class _Compression:
         """Return the first root ``T`` of ``p = δ̇/v``, and the state there.
 
         ``|p̈| ≤ kG``, because the energy of the second derivative of ``c`` starts at ``k²v²G/2`` and never grows.  So
-        ``p(t+h) ≥ p + ṗh − kGh²/2``.  Steps to its root pass no root of ``p`` and converge quadratically.
+        ``p(t+h) ≥ p + ṗh − kGh²/2``.  Steps to the root of this bound cannot overshoot the first root of ``p``, and
+        converge quadratically.
         """
         bound = float(self.kappa[-1] * self.mobility[-1, -1])
         row, t, state = self._row, 0.0, self._start
@@ -252,7 +254,7 @@ class _Compression:
         return t, state
 
     def peaks(self) -> tuple[float, Array]:
-        """Return the largest ``‖ẋ‖²_W`` and the largest ``|τ|`` of each spring, by cubics between exact samples."""
+        """Return the largest ``‖ẋ‖²_W`` and the largest ``|τ|`` of each spring, by cubics through exact samples."""
         count = int(np.clip(self.duration * self._fastest / _SAMPLE, _FEWEST, _MOST))
         step, states = scipy.linalg.expm(self.duration / count * self._generator), [self._start]
         for _ in range(count - 1):
@@ -265,7 +267,7 @@ class _Compression:
         return _peak(times, np.sum(x * weighed, axis=0), slope), np.array(largest)
 
     def adjoint(self, g: Array) -> Array:
-        """Return the symmetric ``X`` with ``⟨X, dA⟩ = gᵀdI(T)``, shape (m+1, m+1), where ``T`` moves with ``A``."""
+        """Return the symmetric ``X`` with ``⟨X, dA⟩ = gᵀdI(T)``, shape (m+1, m+1), where ``T`` depends on ``A``."""
         r, L, T = len(self.kappa), self._L, self.duration
         weighed, rate = scipy.linalg.cho_solve((L, True), g), self._generator @ self.state
         seed = np.append(np.zeros(r), -L.T @ weighed)
@@ -278,8 +280,8 @@ class _Compression:
 
 
 def _peak(times: Array, values: Array, slopes: Array) -> float:
-    """Return the largest size of the piecewise cubic through values and slopes."""
-    # Imported here, because that takes a quarter of a second and few robots have elastic joints.
+    """Return the largest absolute value of the piecewise cubic through values and slopes."""
+    # Imported here, because the import takes a quarter of a second and few robots have elastic joints.
     from scipy.interpolate import CubicHermiteSpline
 
     cubic = CubicHermiteSpline(times, values, slopes)

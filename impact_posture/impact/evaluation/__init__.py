@@ -1,1 +1,1 @@
-"""All quantities of one impact at one posture."""
+"""All quantities and predictions of one impact at one posture."""

@@ -1,8 +1,8 @@
 """Velocity jumps with Coulomb friction, at one contact and at several contacts at once.
 
-Several contacts obey ``0 ≤ p_n ⊥ u_n ≥ 0``, ``‖p_t‖ ≤ μ p_n``, ``u_t = −κ p_t``, ``0 ≤ κ ⊥ μ p_n − ‖p_t‖ ≥ 0`` each,
-with impulses ``p_i`` and the velocities ``u = u⁻ + Bp`` after the impact.  Block Gauss–Seidel iterates their fixed
-point ``p_i = P(p_i − ρ(u_i + μ‖u_t‖n_i))``, with ``P`` the projection onto the friction cone.
+Each of several contacts obeys ``0 ≤ p_n ⊥ u_n ≥ 0``, ``‖p_t‖ ≤ μ p_n``, ``u_t = −κ p_t`` and ``0 ≤ κ ⊥ μ p_n − ‖p_t‖
+≥ 0``, with the impulses ``p`` and the velocities ``u = u⁻ + Bp`` after the impact.  Block Gauss–Seidel iterates the
+fixed point ``p_i = P(p_i − ρ(u_i + μ‖u_t‖n_i))``, with ``P`` the projection onto the friction cone.
 """
 
 from __future__ import annotations
@@ -17,9 +17,9 @@ from impact_posture.impact.friction.coulomb_impact import coulomb_impact
 from impact_posture.impact.worst_case_objective import WorstCaseObjective
 from impact_posture.system.arrays import Array
 
-# Sweeps over the contacts, steps at one contact in a sweep, and the error of an impulse that ends them, relative.
+# Limit of sweeps over the contacts, steps at one contact in a sweep, and the relative change of impulses that ends.
 _SWEEPS, _STEPS, _TOLERANCE = 5000, 20, 1e-11
-# Slip below this share of the approach speed is rounding.
+# Slip below this share of the approach speed is zero up to rounding.
 _SLIP = 1e-9
 
 
@@ -39,7 +39,7 @@ class CoulombJump(Jump):
 
     @staticmethod
     def of(jump: Jump, impulse: Array, friction: float, slip: Array) -> CoulombJump:
-        """Return a jump with the impulse of a contact and its slip per approach speed, both of shape (3,)."""
+        """Return a jump with the impulse and the slip (per approach speed) of a contact, both of shape (3,)."""
         size = float(np.linalg.norm(slip))
         direction = None if size <= _SLIP else slip / size
         return CoulombJump(
@@ -48,21 +48,21 @@ class CoulombJump(Jump):
 
 
 def coulomb_jump(objective: WorstCaseObjective, q: Array, rebound: float) -> CoulombJump | None:
-    """Return the jump of the leading contact with friction for ``rebound = (1 + e) v_n``, m/s; ``None`` for none."""
+    """Return the jump of the leading contact with friction for ``rebound = (1 + e) v_n``, m/s; ``None`` without S."""
     try:
-        found = coulomb_impact(objective.oracle, q)
+        impact = coulomb_impact(objective.oracle, q)
     except MetricError:
         return None
-    impulse = found.impulse * rebound
-    jump = weighed_jump(objective, found.jump * rebound, impulse)
-    return CoulombJump.of(jump, impulse, objective.contact.friction, found.slip)
+    impulse = impact.impulse * rebound
+    jump = weighed_jump(objective, impact.jump * rebound, impulse)
+    return CoulombJump.of(jump, impulse, objective.contact.friction, impact.slip)
 
 
 def coulomb_jumps(objective: WorstCaseObjective, q: Array, speed: float) -> tuple[CoulombJump, ...] | None:
-    """Return the jump of the plastic impact of several contacts at once, each with its own impulse and slip.
+    """Return the jump of the plastic impact of several contacts at once, with the impulse and slip of each contact.
 
-    Every contact point approaches along its own normal at ``speed``, m/s.  The jump and its norm are those of all
-    contacts together.  ``None`` if contacts can pull, or if the iteration does not converge.
+    Every contact point approaches along its normal at ``speed``, m/s.  All entries have the same velocity and norm.
+    ``None`` if contacts can pull, or if the iteration does not converge.
     """
     if objective.bilateral:
         return None
@@ -76,9 +76,9 @@ def coulomb_jumps(objective: WorstCaseObjective, q: Array, speed: float) -> tupl
         return None
     after = (B @ p.ravel()).reshape(p.shape) - normals
     slips = after - normals * (after * normals).sum(1, keepdims=True)
-    found = weighed_jump(objective, speed * (responses @ p.ravel()), speed * p[0])
+    jump = weighed_jump(objective, speed * (responses @ p.ravel()), speed * p[0])
     each = zip(speed * p, friction, slips, strict=True)
-    return tuple(CoulombJump.of(found, impulse, float(mu), slip) for impulse, mu, slip in each)
+    return tuple(CoulombJump.of(jump, impulse, float(mu), slip) for impulse, mu, slip in each)
 
 
 def contact_impulses(B: Array, normals: Array, friction: Array) -> Array | None:
@@ -91,12 +91,12 @@ def contact_impulses(B: Array, normals: Array, friction: Array) -> Array | None:
     for _ in range(_SWEEPS):
         before = p.copy()
         for i, (n, mu) in enumerate(zip(normals, friction, strict=True)):
-            own = blocks[i, :, i]
-            others = np.einsum("ajb,jb->a", blocks[i], p) - own @ p[i] - n
+            B_ii = blocks[i, :, i]
+            others = np.einsum("ajb,jb->a", blocks[i], p) - B_ii @ p[i] - n
             for _ in range(_STEPS):
-                u = own @ p[i] + others
+                u = B_ii @ p[i] + others
                 slip = np.linalg.norm(u - (n @ u) * n)
-                p[i] = _on_cone(p[i] - (u + mu * slip * n) / max(np.linalg.norm(own), 1e-300), n, mu)
+                p[i] = _on_cone(p[i] - (u + mu * slip * n) / max(np.linalg.norm(B_ii), 1e-300), n, mu)
         if np.abs(p - before).max() <= _TOLERANCE * np.abs(p).max():
             return p
     return None

@@ -1,4 +1,4 @@
-"""Ellipsoids by axes and radii, and the classical velocity and force ellipsoids."""
+"""Ellipsoids with axes and radii, and the classical velocity and force ellipsoids."""
 
 from __future__ import annotations
 
@@ -9,7 +9,7 @@ import numpy as np
 from impact_posture.impact.worst_case_objective import WorstCaseObjective
 from impact_posture.system.arrays import Array
 
-# An eigenvalue below this share of the largest one is zero: no motion along it, and no bound on the force.
+# An eigenvalue below this share of the largest one is zero.  The contact cannot move along it.
 _RANK = 1e-12
 
 
@@ -31,26 +31,21 @@ class Ellipsoid:
         return [float(r) if np.isfinite(r) else None for r in self.radii]
 
     def to_dict(self) -> dict[str, object]:
-        """Return JSON content; an infinite radius is ``None``."""
+        """Return JSON content, with ``None`` for an infinite radius."""
         return {"axes": self.axes.tolist(), "radii": self.finite_radii}
 
 
 def ellipsoid_of(matrix: Array) -> Ellipsoid:
-    """Return the ellipsoid ``{A^{1/2} u : |u| ≤ 1}`` of a symmetric PSD ``A``, shape (3, 3).
-
-    Its radii are ``√eigenvalues``.
-    """
+    """Return the ellipsoid ``{A^{1/2} u : |u| ≤ 1}`` of a PSD ``A``, shape (3, 3), with radii ``√eigenvalues``."""
     values, vectors = np.linalg.eigh((matrix + matrix.T) / 2)
     return Ellipsoid(_oriented(vectors[:, ::-1]), np.sqrt(np.clip(values[::-1], 0.0, None)))
 
 
 def force_ellipsoid(J: Array) -> Ellipsoid:
-    """Return the ellipsoid of ``(JJᵀ)⁻¹``: contact forces for joint torques ``|Jᵀf| ≤ 1``.
+    """Return the ellipsoid of ``(JJᵀ)⁻¹``, the contact forces for joint torques ``|Jᵀf| ≤ 1``.
 
-    It is infinite along directions in which J loses rank.
-
-    Args:
-        J: Linear contact Jacobian in world axes, shape (3, nv).
+    ``J`` is the linear Jacobian in world axes, shape (3, nv).  Radii are infinite along directions in which it loses
+    rank.
     """
     values, vectors = np.linalg.eigh(J @ J.T)
     kept = values > _RANK * max(float(values[-1]), 1e-300)
@@ -59,17 +54,17 @@ def force_ellipsoid(J: Array) -> Ellipsoid:
 
 
 def classical_ellipsoids(objective: WorstCaseObjective, q: Array) -> dict[str, Ellipsoid]:
-    """Return ``{"velocity", "force"}`` of the contact at ``q``.
+    """Return the ellipsoids ``velocity`` and ``force`` of the contact at ``q``.
 
-    The first, that of ``JJᵀ``, holds the contact velocities for ``|ν| ≤ 1`` (Yoshikawa 1985).  Both ignore inertia
-    and supports, and mix m/s with rad/s as ``|ν|`` does.
+    The velocity ellipsoid, of ``JJᵀ``, contains the contact velocities for ``|ν| ≤ 1`` (Yoshikawa 1985).  Both ignore
+    inertia and supports, and mix m/s with rad/s as ``|ν|`` does.
     """
     J = objective.oracle.at(q).J
     return {"velocity": ellipsoid_of(J @ J.T), "force": force_ellipsoid(J)}
 
 
 def _oriented(vectors: Array) -> Array:
-    """Fix the signs of eigenvectors: the largest entry is positive, and the axes are right-handed."""
+    """Return right-handed axes from eigenvectors, with positive largest entries in the first two."""
     axes = np.array(vectors, dtype=float)
     for k in range(2):
         axes[:, k] *= np.sign(axes[np.argmax(np.abs(axes[:, k])), k])

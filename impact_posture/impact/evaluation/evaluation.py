@@ -21,6 +21,7 @@ from impact_posture.impact.elasticity.contact_compression import (
 )
 from impact_posture.impact.elasticity.elastic_impact import ElasticImpact, ElasticResponse
 from impact_posture.impact.evaluation.coulomb_jump import CoulombJump, coulomb_jump, coulomb_jumps
+from impact_posture.impact.evaluation.dominance import Dominance, find_dominance
 from impact_posture.impact.evaluation.ellipsoids import Ellipsoid, ellipsoid_of
 from impact_posture.impact.evaluation.objective_value import (
     VariantValue,
@@ -29,7 +30,7 @@ from impact_posture.impact.evaluation.objective_value import (
     variant_values,
     worst_variant,
 )
-from impact_posture.impact.evaluation.velocity_jump import Dominance, Jump, find_dominance, weighed_jump
+from impact_posture.impact.evaluation.velocity_jump import Jump, frictionless_jump, sticking_jump
 from impact_posture.impact.friction.contact_stability import ContactStability, contact_stability
 from impact_posture.impact.impact_contact import LARGEST, point_on
 from impact_posture.impact.quantities.impact_oracle import ImpactOracle
@@ -54,7 +55,7 @@ class Evaluation:
         gradient: Tangent gradient of H, shape (nv,).
         objective_gradient: Tangent gradient of the objective, shape (nv,); ``None`` where it does not exist.
         normal: World unit normal of H, G, V, S, E and the jumps, shape (3,).
-        worst_normal: World unit normal of the objective, which is ``normal`` or the worst in the cone around it.
+        worst_normal: World unit normal of the objective: ``normal``, or the worst normal of the cone around it.
         cone: The worst normal of the cone, world; ``None`` without a cone, or where the objective does not exist.
         ellipsoid: Dynamic impact ellipsoid ``Λ_c``.
         pose: World placement of the contact frame.
@@ -64,18 +65,18 @@ class Evaluation:
         sticking: Jump of a contact point that sticks; ``None`` where it does not exist.
         coulomb: Jump with the friction of the contact, sticking or sliding; ``None`` where it does not exist.
         together: Jump with friction of the plastic impact of several contacts at once, with the impulse and slip of
-            each contact; ``None`` for one contact, for contacts that can pull, or where it was not found.
+            each contact; ``None`` for one contact, for contacts that can pull, or without convergence.
         energy_loss: Energy that the frictionless impact dissipates, J; ``None`` if the contact is blocked.
-        compression: Compression time, peak force and the number x; ``None`` if nothing is known of them.
+        compression: Compression time, peak force and the ratio x; ``None`` if all of them are unknown.
         elastic: Response of links, rotors and springs to the contact; only with the joint model ``elastic``.
         dominance: Whether one light joint makes up most of H.
-        without_supports: H, G, V, S, E of the same robot without its supports; ``None`` if it has none.
+        without_supports: H, G, V, S, E of the robot without its supports; ``None`` for a robot without supports.
         compliance_effect: Relative change of H with a tenth of the compliance; ``None`` without supports.
-        contact_stability: Whether the feet stay under the impact; ``None`` without supports.
+        contact_stability: Whether the feet stay on the ground in the impact; ``None`` without supports.
         contacts: Evaluation of each of several contacts alone, the leading contact first; empty for one contact.
         impulses: The worst impulses of several contacts; ``None`` for one contact.
-        model_variants: Objective and scalars for each model variant; empty if there is none.
-        warnings: Limits of these numbers, one line each.
+        model_variants: Objective and scalars for each model variant; may be empty.
+        warnings: Limits of validity, one line each.
     """
 
     q: Array
@@ -108,42 +109,42 @@ class Evaluation:
 
     H = property(attrgetter("scalars.H"), doc="Squared jump per squared impulse.")
     G = property(attrgetter("scalars.G"), doc="Inverse effective mass along the normal, 1/kg.")
-    V = property(
-        attrgetter("scalars.V"), doc="Squared jump per squared approach speed without friction, or ``None``."
-    )
+    V = property(attrgetter("scalars.V"), doc="Squared jump per squared approach speed, frictionless, or ``None``.")
     S = property(attrgetter("scalars.S"), doc="Squared jump per squared approach speed if sticking, or ``None``.")
     E = property(attrgetter("scalars.E"), doc="Energy lost per squared approach speed, kg, or ``None``.")
 
     def to_dict(self) -> dict[str, object]:
-        """Return the ``initial`` or ``optimal`` block of ``result.json``; a value that does not exist is ``None``."""
-        found, quaternion = json_block(self), pin.Quaternion(self.pose.rotation)
+        """Return the ``initial`` or ``optimal`` block of ``result.json``; undefined values are ``None``."""
+        content, quaternion = json_block(self), pin.Quaternion(self.pose.rotation)
         block: dict[str, object] = {
-            **{key: found[key] for key in ("q", "objective")},
-            **found["scalars"],
+            **{key: content[key] for key in ("q", "objective")},
+            **content["scalars"],
             "effective_mass": self.scalars.effective_mass,
-            **{key: found[key] for key in ("gradient", "objective_gradient", "worst_normal", "ellipsoid")},
+            **{key: content[key] for key in ("gradient", "objective_gradient", "worst_normal", "ellipsoid")},
             "pose": {"position": self.pose.translation.tolist(), "quaternion_xyzw": quaternion.coeffs().tolist()},
-            "jump": {key: found[key] for key in _JUMP},
-            **{key: found[key] for key in ("compression", "elastic", "dominance")},
+            "jump": {key: content[key] for key in _JUMP},
+            **{key: content[key] for key in ("compression", "elastic", "dominance")},
         }
         if self.cone is not None:
-            block["cone"] = found["cone"]
+            block["cone"] = content["cone"]
         if self.without_supports is not None:
-            block |= {"free": found["without_supports"], "compliance_effect": self.compliance_effect}
+            block |= {"free": content["without_supports"], "compliance_effect": self.compliance_effect}
         if self.contact_stability is not None:
-            block["footing"] = found["contact_stability"]
+            block["footing"] = content["contact_stability"]
         if self.impulses is not None:
-            block |= {"worst_impulses": found["impulses"], "coulomb_together": found["together"]}
-            block["by_contact"] = [{key: one[key] for key in _OWN if key in one} for one in found["contacts"]]
+            block |= {"worst_impulses": content["impulses"], "coulomb_together": content["together"]}
+            block["by_contact"] = [
+                {key: part[key] for key in _CONTACT if key in part} for part in content["contacts"]
+            ]
         if self.model_variants:
-            block["by_scenario"] = found["model_variants"]
+            block["by_scenario"] = content["model_variants"]
             block["worst_scenario"] = self.model_variants[worst_variant(self.model_variants)].name
         return block
 
 
 _JUMP = ("speed", "restitution", "frictionless", "sticking", "coulomb", "energy_loss")
-# Keys of one contact among several, without those of the posture and of the objective.
-_OWN = ("H", "G", "V", "S", "E", "effective_mass", "gradient", "ellipsoid", "pose", "free", "footing")
+# Keys of one contact among several.  Posture and objective belong to all contacts together.
+_CONTACT = ("H", "G", "V", "S", "E", "effective_mass", "gradient", "ellipsoid", "pose", "free", "footing")
 
 
 @checked
@@ -154,11 +155,7 @@ def evaluate(
     restitution: Share = 0.0,
     contact_stiffness: ContactStiffness | None = None,
 ) -> Evaluation:
-    """Compute all impact quantities at ``q`` from Pinocchio's numbers, and predict the jump of one impact.
-
-    The frictionless jump is ``Δν = a (1+e) v_n / G``, with the impulse ``(1+e) v_n / G`` along n.  The jump of a
-    contact that sticks is ``Δν = (1+e) v_n M⁻¹Jᵀ(JM⁻¹Jᵀ)⁻¹ n``.
-    :mod:`impact_posture.impact.friction.coulomb_impact` has that with the friction of the contact.
+    """Compute all impact quantities at ``q`` with Pinocchio, and predict the velocity jump.
 
     Args:
         objective: Robot, contact, metric, kind and supports.
@@ -171,10 +168,10 @@ def evaluate(
         InputError: The speed is negative or not finite, or the restitution lies outside [0, 1].
     """
     robot, oracle = objective.robot, objective.oracle
-    found = oracle.quantities(q)
-    scalars = Scalars.of(found)
+    quantities = oracle.quantities(q)
+    scalars = Scalars.of(quantities)
     rebound = (1 + restitution) * speed
-    without_supports, effect = _without_supports(objective, q, found.H)
+    without_supports, effect = _without_supports(objective, q, quantities.H)
     model_variants = variant_values(objective, q)
     member = objective.by_variant[worst_variant(model_variants)] if model_variants else objective
     value = objective_value(member, q)
@@ -187,27 +184,21 @@ def evaluate(
         objective=value,
         gradient=oracle.gradient_H(q),
         objective_gradient=objective_gradient(member, q, value),
-        normal=found.normal,
-        worst_normal=found.normal if cone is None else cone.normal,
+        normal=quantities.normal,
+        worst_normal=quantities.normal if cone is None else cone.normal,
         cone=cone,
-        ellipsoid=ellipsoid_of(found.ellipsoid),
+        ellipsoid=ellipsoid_of(quantities.ellipsoid),
         pose=oracle.numeric.at(q).placement(point_on(robot, objective.contact.frame)),
         speed=speed,
         restitution=restitution,
-        frictionless=(
-            None if scalars.E is None
-            else weighed_jump(objective, found.jump * rebound / found.G, found.normal * rebound / found.G)
-        ),
-        sticking=(
-            None if found.sticking_jump is None or found.sticking_impulse is None
-            else weighed_jump(objective, found.sticking_jump * rebound, found.sticking_impulse * rebound)
-        ),
+        frictionless=frictionless_jump(objective, quantities, rebound),
+        sticking=sticking_jump(objective, quantities, rebound),
         coulomb=None if scalars.E is None else coulomb_jump(objective, q, rebound),
         together=coulomb_jumps(objective, q, speed) if objective.others else None,
         energy_loss=None if scalars.E is None else scalars.E * speed**2 * (1 - restitution**2),
         compression=squeezed,
         elastic=_elastic(objective, q, speed, contact_stiffness),
-        dominance=find_dominance(objective, found),
+        dominance=find_dominance(objective, quantities),
         without_supports=without_supports,
         compliance_effect=effect,
         contact_stability=contact_stability(oracle, objective.supports, q) if objective.supports else None,
@@ -239,27 +230,28 @@ def _without_supports(objective: WorstCaseObjective, q: Array, H: float) -> tupl
 def _elastic(
     objective: WorstCaseObjective, q: Array, speed: float, contact: ContactStiffness | None
 ) -> ElasticResponse | None:
-    """Return the response of elastic joints to the stated contact, if the joint model asks for it."""
+    """Return the response of elastic joints to the contact; ``None`` for another joint model than ``elastic``."""
     if objective.robot.joint_model != "elastic":
         return None
     if contact is None:
-        raise InputError(
-            "elastic needs the elasticity of the contact",
-            where="joint_model",
-            hint="add `contact_stiffness` (N/m, or a material) or `contact_duration`",
-        )
+        hint = "add `contact_stiffness` (N/m, or a material) or `contact_duration`"
+        raise InputError("elastic needs the elasticity of the contact", where="joint_model", hint=hint)
     G = objective.oracle.quantities(q).G
     return ElasticImpact(objective.case).response(q, contact.linear_stiffness(G, speed), speed)
 
 
-def _joint_model_warning(objective: WorstCaseObjective, q: Array, found: Compression | None) -> tuple[str, ...]:
-    """Warn where the joint model does not fit x, with the answers of both models."""
-    if found is None or found.x is None or objective.robot.joint_model in (found.fitting, "locked", "elastic"):
+def _joint_model_warning(objective: WorstCaseObjective, q: Array, squeezed: Compression | None) -> tuple[str, ...]:
+    """Return a warning with the objective of both joint models where the joint model does not fit x."""
+    if (
+        squeezed is None
+        or squeezed.x is None
+        or objective.robot.joint_model in (squeezed.fitting, "locked", "elastic")
+    ):
         return ()
     values = {name: objective_value(other, q) for name, other in both_models(objective).items()}
     listed = ", ".join(f"{value:.4g} with '{name}'" for name, value in values.items() if value is not None)
-    advice = f"`joint_model` {found.fitting} fits" if found.fitting else "expect a value between the two"
-    return (f"{found.line}; the objective is {listed}: {advice}",)
+    advice = f"`joint_model` {squeezed.fitting} fits" if squeezed.fitting else "expect a value between the two"
+    return (f"{squeezed.line}; the objective is {listed}: {advice}",)
 
 
 def _warnings(scalars: Scalars, effect: float | None) -> tuple[str, ...]:

@@ -1,4 +1,4 @@
-"""The numbers H, G, V, S, E of an impact and the objective made of them, where they exist."""
+"""Value and gradient of an objective where they exist, and its value on each model variant."""
 
 from __future__ import annotations
 
@@ -20,8 +20,8 @@ class VariantValue:
 
     Attributes:
         name: Name of the model variant.
-        objective: The objective on it; ``None`` where it does not exist.
-        scalars: H, G, V, S, E of the leading contact on it.
+        objective: The objective on this variant; ``None`` where it does not exist.
+        scalars: H, G, V, S, E of the leading contact on this variant.
     """
 
     name: str
@@ -34,7 +34,7 @@ class VariantValue:
 
 
 def variant_values(objective: WorstCaseObjective, q: Array) -> tuple[VariantValue, ...]:
-    """Return the objective and its parts on each model variant; empty if there is none."""
+    """Return the objective and its parts on each model variant; empty without variants."""
     pairs = zip(objective.model_variants, objective.by_variant, strict=True) if objective.model_variants else ()
     return tuple(
         VariantValue(variant.name, objective_value(member, q), Scalars.of(member.oracle.quantities(q)))
@@ -43,7 +43,7 @@ def variant_values(objective: WorstCaseObjective, q: Array) -> tuple[VariantValu
 
 
 def worst_variant(variants: tuple[VariantValue, ...]) -> int:
-    """Return the index of the worst model variant; one without a value comes before all others."""
+    """Return the index of the worst model variant.  A variant without a value is worse than all others."""
     return int(np.argmax([np.inf if variant.objective is None else variant.objective for variant in variants]))
 
 
@@ -64,9 +64,9 @@ def objective_value(objective: WorstCaseObjective, q: Array) -> float | None:
 
 
 def objective_gradient(objective: WorstCaseObjective, q: Array, value: float | None) -> Array | None:
-    """Return the tangent gradient where the objective has ``value``, shape (nv,); a subgradient at a tie.
+    """Return the tangent gradient, shape (nv,), a subgradient at a tie; ``None`` where it does not exist.
 
-    It is ``None`` where it does not exist.
+    ``value`` is the objective at ``q`` from :func:`objective_value`.
     """
     values = np.linalg.eigvalsh(objective.oracle.quantities(q).mobility)
     singular = objective.kind == "sticking" and values[0] <= SINGULAR * values[-1]

@@ -1,4 +1,4 @@
-"""The velocity jump of an impact by name and unit, and the share of each joint in ``H``."""
+"""The predicted velocity jump of an impact at an approach speed, with the coefficient of restitution."""
 
 from __future__ import annotations
 
@@ -10,7 +10,6 @@ from impact_posture.config.json_block import json_block
 from impact_posture.dynamics.joints import joint_kind
 from impact_posture.impact.quantities.impact_quantities import ImpactQuantities
 from impact_posture.impact.worst_case_objective import WorstCaseObjective
-from impact_posture.robot.model_joints import v_slice
 from impact_posture.robot.robot import Robot
 from impact_posture.system.arrays import Array
 
@@ -23,7 +22,7 @@ class Jump:
         velocity: ``Δν``, shape (nv,), m/s and rad/s.
         norm: ``‖Δν‖_W``.
         impulse: Impulse of the surface on the robot, world, shape (3,), N·s.
-        largest: ``(name, value, unit)`` of the largest entries, largest first.
+        largest: ``(name, value, unit)`` of the largest entries in descending order.
     """
 
     velocity: Array
@@ -42,32 +41,6 @@ class Jump:
         return json_block(self) | {"largest": largest}
 
 
-@dataclass(frozen=True)
-class Dominance:
-    """Whether one light joint makes up most of ``H``.
-
-    Attributes:
-        joint: The joint with the largest share.
-        share: Its share of ``H = Σ a_i (Wa)_i``.
-        base: Share of the floating base; zero for a fixed base.
-        line: The finding in words.
-    """
-
-    joint: str
-    share: float
-    base: float
-    line: str
-
-    @property
-    def dominates(self) -> bool:
-        """Whether the joint carries more than half of ``H``."""
-        return self.share > 0.5
-
-    def to_dict(self) -> dict[str, object]:
-        """Return JSON content."""
-        return json_block(self) | {"dominates": self.dominates}
-
-
 def tangent_units(robot: Robot) -> tuple[str, ...]:
     """Return ``m/s`` or ``rad/s`` for each of the nv velocity entries."""
     units: list[str] = []
@@ -78,13 +51,13 @@ def tangent_units(robot: Robot) -> tuple[str, ...]:
 
 
 def largest_entries(robot: Robot, values: Array) -> tuple[tuple[str, float, str], ...]:
-    """Return ``(name, value, unit)`` of the five largest entries of a tangent vector, above 0.1 % of the first."""
+    """Return ``(name, value, unit)`` of the five largest entries of a tangent vector above 0.1 % of the largest."""
     units = tangent_units(robot)
     return tuple((robot.tangent_names[k], float(values[k]), units[k]) for k in _largest(np.abs(values), 5))
 
 
 def _largest(sizes: Array, count: int) -> list[int]:
-    """Return the indices of the largest sizes, largest first, above 0.1 % of the first."""
+    """Return the indices of the largest sizes above 0.1 % of the largest, in descending order."""
     order = np.argsort(-sizes, kind="stable")[:count]
     return [int(k) for k in order if sizes[k] > 1e-3 * sizes[order[0]]]
 
@@ -92,7 +65,7 @@ def _largest(sizes: Array, count: int) -> list[int]:
 def merged_entries(
     robot: Robot, *jumps: Jump | None, count: int = 6
 ) -> list[tuple[str, str, tuple[float | None, ...]]]:
-    """Return ``(name, unit, values)`` of the entries that are largest in any jump; ``None`` for a missing jump."""
+    """Return ``(name, unit, values)`` of the entries that are largest in any jump; value ``None`` for no jump."""
     units, names = tangent_units(robot), robot.tangent_names
     sizes = np.max([np.zeros(robot.nv), *(np.abs(j.velocity) for j in jumps if j is not None)], axis=0)
     return [
@@ -101,37 +74,28 @@ def merged_entries(
     ]
 
 
+def frictionless_jump(objective: WorstCaseObjective, quantities: ImpactQuantities, rebound: float) -> Jump | None:
+    """Return ``Δν = (1+e) v_n a/G`` with the impulse ``(1+e) v_n/G`` along n; ``None`` if the contact is blocked.
+
+    Args:
+        objective: Robot, contact, metric and supports.
+        quantities: Quantities at the posture.
+        rebound: ``(1+e) v_n`` with the coefficient of restitution e and the approach speed v_n, m/s.
+    """
+    if quantities.blocked:
+        return None
+    G = quantities.G
+    return weighed_jump(objective, quantities.jump * rebound / G, quantities.normal * rebound / G)
+
+
+def sticking_jump(objective: WorstCaseObjective, quantities: ImpactQuantities, rebound: float) -> Jump | None:
+    """Return ``Δν = (1+e) v_n M⁻¹Jᵀ(JM⁻¹Jᵀ)⁻¹ n``, arguments as :func:`frictionless_jump`; ``None`` without S."""
+    if quantities.sticking_jump is None or quantities.sticking_impulse is None:
+        return None
+    return weighed_jump(objective, quantities.sticking_jump * rebound, quantities.sticking_impulse * rebound)
+
+
 def weighed_jump(objective: WorstCaseObjective, velocity: Array, impulse: Array) -> Jump:
-    """Measure the jump ``velocity``, shape (nv,), in the metric at the posture of the oracle."""
+    """Return the jump ``velocity``, shape (nv,), with its norm at the last posture of the oracle."""
     norm = float(np.sqrt(max(float(velocity @ objective.oracle.weigh(velocity)), 0.0)))
     return Jump(velocity, norm, impulse, largest_entries(objective.robot, velocity))
-
-
-def find_dominance(objective: WorstCaseObjective, found: ImpactQuantities) -> Dominance:
-    """Find the joint with the largest share of H: the sum of ``a_i (Wa)_i / H`` over its entries."""
-    robot, oracle = objective.robot, objective.oracle
-    parts = found.jump * oracle.weigh(found.jump)
-    width = 6 if robot.floating else 0
-    if found.H <= 0 or not robot.joint_names:
-        return Dominance("", 0.0, float(found.H > 0), "no joint takes part in H")
-    base = float(parts[:width].sum() / found.H)
-    slots = {name: v_slice(robot.model, robot.joint_id(name)) for name in robot.joint_names}
-    shares = {name: float(parts[slot].sum() / found.H) for name, slot in slots.items()}
-    joint = max(shares, key=lambda name: shares[name])
-    share, k = shares[joint], slots[joint].start
-    percent = f"{100 * share:.0f} %"
-    if share > 0.5:
-        unit = "kg" if tangent_units(robot)[k] == "m/s" else "kg·m²"
-        line = (
-            f"joint '{joint}' carries {percent} of H (armature {robot.model.armature[k]:.3g} of the "
-            f"{oracle.M[k, k]:.3g} {unit} it moves)"
-        )
-        if objective.metric.kind != "kinetic":
-            line += ("; the rest of the robot hardly counts" if share > 0.9 else "") + ": compare `metric` kinetic"
-    elif base > 0.5:
-        line = (
-            f"no single joint dominates H (the base carries {100 * base:.0f} %; largest joint: '{joint}', {percent})"
-        )
-    else:
-        line = f"no single joint dominates H (largest: '{joint}', {percent})"
-    return Dominance(joint, share, base, line)

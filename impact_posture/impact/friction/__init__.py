@@ -1,1 +1,1 @@
-"""Coulomb friction at the contact and at the feet."""
+"""Coulomb friction at the contact and under the feet."""

@@ -1,8 +1,8 @@
 """Check whether support impulses within the friction cones can hold the feet during an impact.
 
 The metric holds the feet by any impulse, even a pull.  The impulses are not unique where ``J_s`` lacks rank.  They
-form the set ``f + N z``, where ``N`` is a basis of ``{f: J_sᵀ f = 0}``, impulses by which feet press against each
-other.  Weight has no effect within an impact.
+are the set ``f + N z``, where ``N`` is a basis of ``{f: J_sᵀ f = 0}``, impulses by which feet press against each
+other.  Weight has no effect, because the duration of an impact is zero.
 """
 
 from __future__ import annotations
@@ -18,11 +18,11 @@ from impact_posture.impact.quantities.impact_oracle import ImpactOracle
 from impact_posture.robot.robot_spec import Support
 from impact_posture.system.arrays import Array
 
-# A singular value of J_s below this share of the largest one is rounding.
+# A singular value of J_s below this share of the largest one is zero up to rounding.
 _RANK = 1e-9
 # An impulse below this share of the largest one is zero.
 _NONE = 1e-6
-# Sides of the pyramid that stands for a friction cone.  It lies inside the cone.
+# Sides of the pyramid, inside the friction cone, that replaces the cone.
 _SIDES = 16
 _MOST_FRICTION = 10.0
 
@@ -50,12 +50,12 @@ class FootImpulse:
 
 @dataclass(frozen=True)
 class ContactStability:
-    """Whether the feet can stay.
+    """Whether the feet can stay on the ground in an impact.
 
     Attributes:
         friction: Least friction coefficient with which all feet stay; infinite above ten; ``None`` if a foot lifts or
             a sole tips at any friction.
-        feet: Impulse on each foot: within the cones if possible, else with the least pull.
+        feet: Impulse on each foot, within the cones if possible, else with the least pull.
         freedom: Dimension of the set of impulses; zero if they are unique.
     """
 
@@ -65,7 +65,7 @@ class ContactStability:
 
     @property
     def line(self) -> str:
-        """The verdict in words."""
+        """The verdict as text."""
         lifting = [foot.frame for foot in self.feet if foot.lifts]
         if lifting:
             return f"the impact lifts {', '.join(lifting)}, although the metric assumes that all feet stay"
@@ -83,7 +83,7 @@ class ContactStability:
 
 
 def contact_stability(oracle: ImpactOracle, supports: tuple[Support, ...], q: Array) -> ContactStability:
-    """Find impulses within the friction cones at ``q``, shape (nq,), or impulses with the least pull.
+    """Compute impulses within the friction cones at ``q``, shape (nq,), or impulses with the least pull.
 
     The ground is level, so the axis of the cones is world z.  A sole with a ``size`` bears moments up to its edges.
     """
@@ -99,17 +99,17 @@ def contact_stability(oracle: ImpactOracle, supports: tuple[Support, ...], q: Ar
     lifting = cones.least_pull(particular, basis)
     if cones.pull(lifting) > none:
         return verdict(None, lifting)
-    found = cones.within(particular, basis, _MOST_FRICTION)
-    if found is None:
-        # At this friction no row limits sliding, so only a sole that tips is left as a reason.
+    held = cones.within(particular, basis, _MOST_FRICTION)
+    if held is None:
+        # Nothing slides at a friction coefficient of 1e6, so an infeasible system means that a sole tips.
         tips = cones.within(particular, basis, 1e6) is None
         return verdict(None if tips else float("inf"), lifting)
     low, high = 0.0, _MOST_FRICTION
     while high - low > 1e-4:
         middle = (low + high) / 2
-        tried = cones.within(particular, basis, middle)
-        low, high, found = (middle, high, found) if tried is None else (low, middle, tried)
-    return verdict(high, found)
+        impulse = cones.within(particular, basis, middle)
+        low, high, held = (middle, high, held) if impulse is None else (low, middle, impulse)
+    return verdict(high, held)
 
 
 class FrictionCones:
@@ -117,7 +117,7 @@ class FrictionCones:
 
     Args:
         supports: Feet that stay on the ground.
-        axes: World axes of the frame of each foot, along which its sole has a size, shape (3, 3).
+        axes: World axes of the frame of each foot, shape (3, 3).  The size of a sole is along them.
     """
 
     def __init__(self, supports: tuple[Support, ...], axes: Sequence[Array]) -> None:
@@ -171,8 +171,8 @@ class FrictionCones:
         cost = np.concatenate([np.zeros(count), [1.0]])
         A = np.hstack([up @ basis, -np.ones((len(up), 1))])
         bounds = [(None, None)] * count + [(0.0, None)]
-        found = scipy.optimize.linprog(cost, A_ub=A, b_ub=-up @ particular, bounds=bounds)
-        return particular if found.status != 0 else particular + basis @ found.x[:-1]
+        solution = scipy.optimize.linprog(cost, A_ub=A, b_ub=-up @ particular, bounds=bounds)
+        return particular if solution.status != 0 else particular + basis @ solution.x[:-1]
 
     def within(self, particular: Array, basis: Array, friction: float) -> Array | None:
         """Return the impulses within the cones whose largest entry is least, or ``None``."""
@@ -185,14 +185,16 @@ class FrictionCones:
         limits = np.vstack([np.hstack([sign * basis, -np.ones((len(particular), 1))]) for sign in (1.0, -1.0)])
         rows = np.vstack([np.hstack([A @ basis, np.zeros((len(A), 1))]), limits])
         right = np.concatenate([slack - A @ particular, -particular, particular])
-        found = scipy.optimize.linprog(cost, A_ub=rows, b_ub=right, bounds=[(None, None)] * (size + 1))
-        return particular + basis @ found.x[:-1] if found.status == 0 else None
+        solution = scipy.optimize.linprog(cost, A_ub=rows, b_ub=right, bounds=[(None, None)] * (size + 1))
+        return particular + basis @ solution.x[:-1] if solution.status == 0 else None
 
     def feet(self, impulse: Array, none: float) -> tuple[FootImpulse, ...]:
         """Return the impulse on each foot; a pull above ``none`` lifts it."""
-        found = []
+        feet = []
         for start, support, _ in self._feet:
-            own = impulse[start : start + support.rows]
-            moment = own[3:] if support.rows == 6 else np.zeros(3)
-            found.append(FootImpulse(support.frame, own[:3].copy(), moment.copy(), bool(own[2] < -none)))
-        return tuple(found)
+            foot_impulse = impulse[start : start + support.rows]
+            moment = foot_impulse[3:] if support.rows == 6 else np.zeros(3)
+            feet.append(
+                FootImpulse(support.frame, foot_impulse[:3].copy(), moment.copy(), bool(foot_impulse[2] < -none))
+            )
+        return tuple(feet)

@@ -1,8 +1,8 @@
-"""Stick or slip: the impulse of one contact with Coulomb friction, in numbers and as expressions.
+"""Stick or slip: the impulse of one contact with Coulomb friction, in numbers and as CasADi expressions.
 
 The contact point approaches along ``−n`` without tangential velocity.  While the normal impulse grows, the contact
-point sticks, or it slides along one fixed direction (:ref:`theory <coulomb>`).  With ``B = JM⁻¹Jᵀ``, its tangential
-part ``B_tt`` and ``g`` the tangential part of ``Bn``, the impulse is a multiple of ``n − w`` with
+point sticks, or it slides along one fixed direction (:ref:`theory <coulomb>`).  ``B = JM⁻¹Jᵀ`` has the tangential
+part ``B_tt``, and ``Bn`` the tangential part ``g``.  The impulse is a multiple of ``n − w`` with
 
     ``(B_tt + σI) w = g``,  ``σ ≥ 0``,  ``‖w‖ ≤ μ``,  ``σ(μ − ‖w‖) = 0``.
 """
@@ -22,11 +22,12 @@ from impact_posture.system.arrays import Array
 
 # An eigenvalue of B_tt below this share of the trace of B is zero.
 _RANK = 1e-9
-# Newton's method on 1/‖w‖ = 1/μ is monotone from its start.  Of 10⁵ random B with conditions up to 10⁶ one took ten.
+# Steps of Newton's method on 1/‖w‖ = 1/μ, which converges from below.  Of 10⁵ random B with conditions up to 10⁶, one
+# took ten steps, and all others fewer.
 _STEPS = 10
-# Most of its steps in numbers, where they end at rounding.
+# Limit of the steps in numbers, and the relative step that ends them.
 _MOST_STEPS, _ROUNDING = 60, 1e-15
-# Less friction than this changes no digit.
+# A smaller friction coefficient is zero up to rounding.
 NO_FRICTION = 1e-15
 
 
@@ -50,15 +51,16 @@ class CoulombImpact:
 
 
 def coulomb_impact(oracle: ImpactOracle, q: Array, *, other: bool = False) -> CoulombImpact:
-    """Compute the impact with the friction of the contact at ``q``, from Pinocchio's numbers.
+    """Compute the impact with the friction of the contact at ``q``, with Pinocchio.
 
-    With ``other``, compute the branch beyond the switch instead: sticking where it slides, sliding with ``σ < 0``.
+    With ``other``, continue the other branch: sticking where the contact point slides, and sliding with ``σ < 0``
+    where it sticks.
 
     Raises:
-        MetricError: The contact point has to stick and cannot, or the other branch does not reach this posture.
+        MetricError: The contact point has to stick and cannot, or the other branch does not exist at ``q``.
     """
-    found, friction = oracle.quantities(q), oracle.contact.friction
-    n, B = found.normal, found.mobility
+    quantities, friction = oracle.quantities(q), oracle.contact.friction
+    n, B = quantities.normal, quantities.mobility
     axes = np.linalg.svd(n[None, :])[2][1:].T
     values, vectors = np.linalg.eigh(axes.T @ B @ axes)
     kept = values > _RANK * np.trace(B)
@@ -69,9 +71,9 @@ def coulomb_impact(oracle: ImpactOracle, q: Array, *, other: bool = False) -> Co
         return float(np.linalg.norm(g / (values + sigma))) - friction
 
     if (excess(0.0) <= 0) != other:
-        if found.sticking_impulse is None or found.sticking_jump is None:
+        if quantities.sticking_impulse is None or quantities.sticking_jump is None:
             raise no_sticking()
-        return CoulombImpact(True, found.sticking_jump, found.sticking_impulse, np.zeros(3), 0.0)
+        return CoulombImpact(True, quantities.sticking_jump, quantities.sticking_impulse, np.zeros(3), 0.0)
     w, sigma = np.zeros(3), np.inf
     if friction > NO_FRICTION:
         least = -float(values[0]) * (1 - _RANK) if other and values.size else 0.0
@@ -84,10 +86,10 @@ def coulomb_impact(oracle: ImpactOracle, q: Array, *, other: bool = False) -> Co
 
 
 def _multiplier(values: Array, g: Array, friction: float, sigma: float) -> float:
-    """Return the ``σ`` at which ``‖g/(values + σ)‖ = μ``, from one where the norm is larger.
+    """Return the ``σ`` at which ``‖g/(values + σ)‖ = μ``, from a ``sigma`` at which the norm is larger.
 
-    Newton's steps on the inverse of the norm, which is concave in ``σ``, come from below and do not pass the root
-    (Moré and Sorensen, Computing a Trust Region Step, 1983).  SciPy's solvers would take 0.3 s to import.
+    The inverse of the norm is concave in ``σ``, so Newton's method on it converges from below without overshoot
+    (Moré and Sorensen, Computing a Trust Region Step, 1983).  The solvers of SciPy would take 0.3 s to import.
     """
     for _ in range(_MOST_STEPS):
         w = g / (values + sigma)
@@ -107,8 +109,8 @@ def coulomb_gradient(oracle: ImpactOracle, q: Array, impact: CoulombImpact) -> A
     """
     if impact.sticks or not np.isfinite(impact.sigma):
         return oracle.gradient_S(q) if impact.sticks else oracle.gradient_V(q)
-    found, p, weighed = oracle.quantities(q), impact.impulse, oracle.weigh(impact.jump)
-    n, B, value = found.normal, found.mobility, float(impact.jump @ weighed)
+    quantities, p, weighed = oracle.quantities(q), impact.impulse, oracle.weigh(impact.jump)
+    n, B, value = quantities.normal, quantities.mobility, float(impact.jump @ weighed)
     e = np.cross(n, p)
     K = np.outer(e, e) / (e @ B @ e + impact.sigma * e @ e)
     r = -value * n - K @ (oracle.J @ oracle.solve(weighed) - value * B @ n)
@@ -122,15 +124,16 @@ def coulomb_direction(B: ca.SX, n: ca.SX, friction: float | ca.SX) -> tuple[ca.S
     """Return ``n − w``, shape (3,), and ``K``, shape (3, 3), for ``B``, a unit normal, and friction above zero.
 
     ``w = ((τ + σ)g − B_tt g)/(σ² + τσ + δ)`` with trace ``τ`` and determinant ``δ`` of ``B_tt``.  Where ``B_tt`` is
-    singular, as in planar robots, the direction in which the point cannot move gets the mobility ``τ``, which
-    changes nothing because ``g`` has no part along it.  ``K`` is that of sticking at the switch.
+    singular, as in planar robots, the direction in which the point cannot move gets the mobility ``τ``.  This does
+    not change ``w``, because ``g`` has no component in this direction.  Where sticking and sliding meet, ``K`` is the
+    matrix of sticking.
     """
     size, Bn, across = ca.trace(B), B @ n, ca.SX.eye(3) - n @ n.T
     g, trace = across @ Bn, size - ca.dot(n, Bn)
     Bg = across @ (B @ g)
     rows = [B[k, :].T for k in range(3)]
     determinant = ca.dot(n, ca.horzcat(*[cross(rows[k - 2], rows[k - 1]) for k in range(3)]) @ n)
-    # A point that moves along the normal alone meets no friction.
+    # There is no friction on a point that can only move along the normal.
     fixed, flat = trace <= _RANK * size, determinant <= _RANK * size * trace
     determinant = ca.if_else(fixed, size**2, ca.if_else(flat, trace**2, determinant))
     trace = ca.if_else(fixed, 2 * size, ca.if_else(flat, 2 * trace, trace))

@@ -21,32 +21,32 @@ from impact_posture.impact.quantities.impact_kernel import ImpactKernel
 from impact_posture.impact.quantities.lifted_form import Guess, Lifted, UnknownJump, impact_at, in_world, unknown_jump
 from impact_posture.system.arrays import Array
 
-# Slip times distance from the edge of the cone is zero, and at most this in the program, which needs an inside.
+# Bound of κo, which is zero in theory.  The interior-point method of the program needs a positive bound.
 _CORNER = 1e-10
 
 
 class CoulombKind(ImpactKind):
     """``C = ‖M⁻¹Jᵀp‖²_W/v²``: the squared jump at a given approach speed with the friction ``μ`` of the contact.
 
-    The impulse ``p`` is that of :mod:`impact_posture.impact.friction.coulomb_impact`.  ``C`` is ``S`` where the
-    contact point sticks,
-    and ``V`` without friction.  It is continuous, with a kink where the contact point begins to slip.
+    :mod:`impact_posture.impact.friction.coulomb_impact` computes the impulse ``p``.  ``C`` is ``S`` where the contact
+    point sticks, and ``V`` without friction.  It is continuous, with a kink where the contact point begins to slip.
     """
 
     name, symbol = "coulomb", "C"
     units = "jump² per (m/s)² of approach, with friction"
-    kink = "where the contact point begins to slip, grad is that of sticking"
-    no_cone = "coulomb is no quadratic form of the normal: the exact worst case over a cone is not known for it"
+    kink = "where the contact point begins to slip, grad is the gradient of sticking"
+    no_cone = "coulomb is not a quadratic form of the normal, so its exact worst case over a cone is not known"
 
     def value(self, q: Array) -> float:
-        """Return the value from Pinocchio's numbers; see the base for errors."""
+        """Return the value, computed with Pinocchio; see the base for errors."""
         jump = coulomb_impact(self.oracle, q).jump
         return float(jump @ self.oracle.weigh(jump))
 
     def subgradients(self, q: Array, within: float = 0.0) -> Subgradients:
-        """Return the gradient, and that of the other branch where both nearly tie and the value is the larger.
+        """Return the gradient, and the gradient of the other branch where it is at most ``within`` below the value.
 
-        The first is that of sticking at the kink.  Where the value is the smaller of both, no optimum lies there.
+        At the kink the gradient of sticking comes first.  Where the value is the smaller of both branches, the kink
+        is not a minimum.
         """
         oracle, sides = self.oracle, [coulomb_impact(self.oracle, q)]
         if within > 0:
@@ -58,7 +58,7 @@ class CoulombKind(ImpactKind):
         return Subgradients(np.array([coulomb_gradient(oracle, q, sides[k]) for k in near]), gaps[near])
 
     def expressions(self, k: ImpactKernel) -> tuple[ca.SX, ca.SX]:
-        """Return value and tangent gradient (nv) in the symbols of a kernel; at the kink, that of sticking."""
+        """Return value and tangent gradient (nv) in the symbols of a kernel; at the kink, those of sticking."""
         case, n = self.case, k.n
         if case.contact.friction <= NO_FRICTION:
             return k.V, k.grad_V
@@ -94,11 +94,11 @@ class CoulombKind(ImpactKind):
     def jump(self, q: Array) -> tuple[Array, Array]:
         """Return the jump with friction, and ``λ``, ``d``, ``κ`` and ``o``."""
         oracle, friction = self.oracle, self.oracle.contact.friction
-        found = coulomb_impact(oracle, q)
-        n, p = oracle.n, found.impulse
-        size, slip = float(n @ p), float(np.linalg.norm(found.slip))
-        d = (n - p / size) / friction if found.sticks and friction > NO_FRICTION else found.slip / max(slip, 1e-300)
-        return found.jump, np.array([size, *(oracle.axes.T @ d), slip, max(1 - float(d @ d), 0.0)])
+        impact = coulomb_impact(oracle, q)
+        n, p = oracle.n, impact.impulse
+        size, slip = float(n @ p), float(np.linalg.norm(impact.slip))
+        d = (n - p / size) / friction if impact.sticks and friction > NO_FRICTION else impact.slip / max(slip, 1e-300)
+        return impact.jump, np.array([size, *(oracle.axes.T @ d), slip, max(1 - float(d @ d), 0.0)])
 
     def guess(self, q: Array, scale: float, attempt: int = 0) -> Guess:
         """Return the unknowns of :meth:`lift` that solve its equations at ``q``; ``κ`` and ``o`` are ≥ 0."""

@@ -17,7 +17,7 @@ from impact_posture.system.arrays import Array
 class EnergyKind(FrictionlessKind, QuadraticKind):
     """``E = 1/(2G)``: the energy that the contact dissipates at a given approach speed.
 
-    The form is ``K = −JM⁻¹Jᵀ``, which is largest where ``G`` is least.
+    The quadratic form of the normal is ``K = −JM⁻¹Jᵀ``, which is largest where ``G`` is least.
     """
 
     name, symbol = "energy", "E"
@@ -55,9 +55,9 @@ class EnergyKind(FrictionlessKind, QuadraticKind):
         """Return the jump under the unit impulse along the direction."""
         return unknown_jump(self.case, tree, impact_at(self.case, n), label)
 
-    def lift_entry(self, world: ca.SX, one: UnknownJump, other: UnknownJump) -> ca.SX:
+    def lift_entry(self, world: ca.SX, first: UnknownJump, second: UnknownJump) -> ca.SX:
         """Return ``−eᵀJa``."""
-        return -ca.dot(world, other.contact_velocity)
+        return -ca.dot(world, second.contact_velocity)
 
     def form_unit(self, value: Any) -> Any:
         """Return ``1/(2E)``."""

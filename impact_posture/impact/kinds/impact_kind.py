@@ -1,4 +1,4 @@
-"""The abstract bases of the kinds of objective: which scalar of an impact is minimized."""
+"""The abstract bases of the kinds of objective, each of which minimizes one scalar of an impact."""
 
 from __future__ import annotations
 
@@ -31,19 +31,19 @@ from impact_posture.system.arrays import Array
 class ImpactKind(ABC):
     """A multiple of H, G, V, S or E of one impact along one normal.
 
-    It is a :class:`~impact_posture.impact.objective.WorstCase` without a maximum, because ``λ = λ̄``.  Value,
-    gradient and expressions follow from :attr:`symbol`: the oracle and the kernel have an attribute of that name and
-    its gradient.  A kind adds the equations of its lifted form.
+    It implements :class:`~impact_posture.impact.objective.WorstCase` without a maximum, because ``λ = λ̄``.  Value,
+    gradient and expressions follow from the attributes of the oracle and the kernel with the name :attr:`symbol`.  A
+    kind adds the equations of its lifted form.
 
     Attributes:
-        oracle: Pinocchio's numbers.
+        oracle: The oracle of the impact.
         name: Name in options, files and outputs.
-        symbol: Scalar that it is a multiple of: H, G, V, S or E.
+        symbol: Name of the scalar: H, G, V, S or E.
         units: Units in words.
         adds_up: Whether the impulses of several contacts at once are known, so that their jumps add up.
-        kink: Where the value has a kink, and which gradient it has there; empty where it is smooth.
+        kink: Where the value has a kink, and which gradient it has there; empty for a smooth value.
         no_cone: Reason why no exact worst case over a cone of normals exists.
-        attempts: Guesses of the lifted form.
+        attempts: Number of guesses of the lifted form.
     """
 
     oracle: ImpactOracle
@@ -52,7 +52,7 @@ class ImpactKind(ABC):
     units: ClassVar[str]
     adds_up: ClassVar[bool] = False
     kink: ClassVar[str] = ""
-    no_cone: ClassVar[str] = "it is no quadratic form of the normal"
+    no_cone: ClassVar[str] = "it is not a quadratic form of the normal"
     attempts: ClassVar[int] = 1
 
     @property
@@ -62,22 +62,22 @@ class ImpactKind(ABC):
 
     @property
     def factor(self) -> float:
-        """The value divided by the scalar that :attr:`symbol` names."""
+        """Ratio of the value to the scalar :attr:`symbol`."""
         return 1.0
 
     def value(self, q: Array) -> float:
-        """Return the value from Pinocchio's numbers.
+        """Return the value, computed with Pinocchio.
 
         Raises:
             MetricError: The value does not exist at ``q``.
         """
-        found = getattr(self.oracle.quantities(q), self.symbol)
-        if found is None:
+        value = getattr(self.oracle.quantities(q), self.symbol)
+        if value is None:
             raise no_sticking()
-        return self.factor * float(found)
+        return self.factor * float(value)
 
     def subgradients(self, q: Array, within: float = 0.0) -> Subgradients:
-        """Return the tangent gradient from Pinocchio's numbers alone, because the value is smooth."""
+        """Return the tangent gradient, computed with Pinocchio, as the only member, because the value is smooth."""
         gradient = self.factor * getattr(self.oracle, f"gradient_{self.symbol}")(q)
         return Subgradients(gradient[None, :], np.zeros(1))
 
@@ -87,7 +87,7 @@ class ImpactKind(ABC):
 
     @abstractmethod
     def unknowns(self, tree: Tree, n: ca.SX, label: str = "") -> UnknownJump:
-        """Return the unknown jump at ``tree.q`` along the normal ``n``, with the equations that fix it."""
+        """Return the unknown jump at ``tree.q`` along the normal ``n``, with the equations that determine it."""
 
     @abstractmethod
     def jump(self, q: Array) -> tuple[Array, Array]:
@@ -98,7 +98,7 @@ class ImpactKind(ABC):
         return self.factor * weighed(self.case.metric, jump, jump)
 
     def lift(self, tree: Tree, parameters: ca.SX, scale: ca.SX) -> Lifted:
-        """Return the value with the linear solve left to the program, at ``tree.q`` and the normal ``parameters``."""
+        """Return the lifted form at ``tree.q`` and the normal ``parameters``."""
         jump = self.unknowns(tree, parameters)
         return Lifted.of([jump], self.lifted_value(jump))
 
@@ -109,7 +109,7 @@ class ImpactKind(ABC):
 
 
 class FrictionlessKind(ImpactKind):
-    """A kind of an impact at unit approach speed without friction, whose impulse ``λ`` is unknown."""
+    """A kind at unit approach speed without friction, with an unknown impulse ``λ``."""
 
     def unknowns(self, tree: Tree, n: ca.SX, label: str = "") -> UnknownJump:
         """Return ``M a − J_sᵀf − λJᵀn = 0``, ``J_s a + εf = 0``, ``nᵀJa = 1``; ``λ`` is the last unknown."""
@@ -119,23 +119,23 @@ class FrictionlessKind(ImpactKind):
 
     def jump(self, q: Array) -> tuple[Array, Array]:
         """Return ``a/G`` and ``λ = 1/G``."""
-        found = self.oracle.quantities(q)
-        return found.jump / found.G, np.array([1 / found.G])
+        quantities = self.oracle.quantities(q)
+        return quantities.jump / quantities.G, np.array([1 / quantities.G])
 
 
 class QuadraticKind(ImpactKind):
     """A kind whose value rises with one quadratic form ``nᵀK(q)n`` of the normal.
 
-    A quadratic form has an exact worst case over a cone of normals.  The defaults are those of ``K = Λ_c``.
+    A quadratic form has an exact worst case over a cone of normals.  By default ``K = Λ_c``.
 
     Attributes:
-        unknown_impulse: Whether :meth:`lift_direction` has the impulse of the direction among its unknowns.
+        unknown_impulse: Whether the unknowns of :meth:`lift_direction` include the impulse.
     """
 
     unknown_impulse: ClassVar[bool] = False
 
     def directions(self, mobility: Array, world: Array) -> Array:
-        """Return impulses whose jumps make up the form along world directions (columns), shape (3, 3).
+        """Return the impulses from whose jumps :meth:`form` follows along world directions (columns), shape (3, 3).
 
         Raises:
             MetricError: They do not exist with this ``JM⁻¹Jᵀ``, shape (3, 3).
@@ -155,7 +155,7 @@ class QuadraticKind(ImpactKind):
         """Return ``K`` in world axes, shape (3, 3)."""
 
     def of_form(self, form: Array) -> Array:
-        """Return the values of the objective for values of the form."""
+        """Return the objective for values of the form."""
         return self.factor * form
 
     def of_form_slope(self, form: Array) -> Array:
@@ -176,10 +176,10 @@ class QuadraticKind(ImpactKind):
         """
         return self.unknowns(tree, n, label)
 
-    def lift_entry(self, world: ca.SX, one: UnknownJump, other: UnknownJump) -> ca.SX:
+    def lift_entry(self, world: ca.SX, first: UnknownJump, second: UnknownJump) -> ca.SX:
         """Return an entry of ``K`` from the jumps of two directions; ``world`` is the first direction."""
-        return weighed(self.case.metric, one, other)
+        return weighed(self.case.metric, first, second)
 
     def form_unit(self, value: Any) -> Any:
-        """Return the size of the form where the objective has ``value``, a number or an expression."""
+        """Return the absolute value of the form where the objective has ``value``, a number or an expression."""
         return value / self.factor

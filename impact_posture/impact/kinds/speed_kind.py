@@ -10,4 +10,4 @@ class SpeedKind(FrictionlessKind):
 
     name, symbol = "speed", "V"
     units = "jump² per (m/s)² of approach, frictionless"
-    no_cone = "speed is H/G², no quadratic form of the normal: the exact worst case over a cone is not known for it"
+    no_cone = "speed is H/G², not a quadratic form of the normal, so its exact worst case over a cone is not known"

@@ -30,11 +30,11 @@ class StickingKind(QuadraticKind):
         return jump.with_impulse(impulse, jump.contact_velocity - in_world(self.case, tree, n))
 
     def jump(self, q: Array) -> tuple[Array, Array]:
-        """Return jump and impulse ``s``; without friction where ``S`` does not exist."""
-        found = self.oracle.quantities(q)
-        if found.sticking_jump is None or found.sticking_impulse is None:
-            return found.jump / found.G, found.normal / found.G
-        return found.sticking_jump, found.sticking_impulse
+        """Return jump and impulse ``s``; the frictionless ones where ``S`` does not exist."""
+        quantities = self.oracle.quantities(q)
+        if quantities.sticking_jump is None or quantities.sticking_impulse is None:
+            return quantities.jump / quantities.G, quantities.normal / quantities.G
+        return quantities.sticking_jump, quantities.sticking_impulse
 
     def directions(self, mobility: Array, world: Array) -> Array:
         """Return ``B⁻¹`` times the directions."""

@@ -1,1 +1,1 @@
-"""H, G, V, S and E of an impact: as expressions and from Pinocchio."""
+"""H, G, V, S and E of an impact, as CasADi expressions and computed with Pinocchio."""

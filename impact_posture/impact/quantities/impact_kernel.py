@@ -1,7 +1,7 @@
 """The impact quantities and their tangent gradients as expressions, by the adjoints of the theory page.
 
-With feet held at compliance ε every formula below holds with ``M + J_sᵀJ_s/ε`` for ``M``, the mass matrix of a robot
-whose feet carry the point mass 1/ε.  So there is one code path with and without supports.
+With feet held at compliance ε, every formula below holds with ``M + J_sᵀJ_s/ε`` in place of ``M``.  This is the mass
+matrix of a robot whose feet carry the point mass 1/ε.  So there is one code path with and without supports.
 """
 
 from __future__ import annotations
@@ -22,7 +22,7 @@ from impact_posture.impact.support_compliance import support_inertia
 from impact_posture.robot.robot import Robot
 from impact_posture.system.arrays import Array, null_space
 
-# Singular values of stacked Jacobians below this part of the largest are rounding.
+# Singular values of stacked Jacobians below this share of the largest are zero up to rounding.
 _FROZEN = 1e-9
 
 
@@ -33,8 +33,7 @@ class ImpactKernel:
         case: Robot, contact, metric and supports.
         q: Configuration symbols, shape (nq, 1).
         n: Normal symbols, shape (3, 1), in the axes of the contact's normal.
-        limbs: Repeated limbs whose expressions get one form
-            (:class:`~impact_posture.dynamics.repeated_limbs.RepeatedLimbs`).
+        limbs: Repeated limbs whose expressions take the same form.
     """
 
     def __init__(self, case: ImpactCase, q: ca.SX, n: ca.SX, limbs: RepeatedLimbs | None = None) -> None:
@@ -56,11 +55,11 @@ class ImpactKernel:
 
     @cached_property
     def jump(self) -> Response:
-        """Response of the robot to the impact; its ``a`` is ``M⁻¹Jᵀn``."""
+        """Response of the robot to the unit impulse, with ``a = M⁻¹Jᵀn``."""
         return self.respond([self.impact])
 
-    def _alike(self, wrench: Wrench) -> list[Wrench]:
-        """Return the wrench, or for a repeated limb a wrench on each limb of the group, zero on all but its own."""
+    def _on_all_limbs(self, wrench: Wrench) -> list[Wrench]:
+        """Return the wrench; for a repeated limb also wrenches on its counterparts, times a zero parameter."""
         limbs, joint = self.tree.limbs, wrench.point.joint
         if limbs is None or joint not in limbs.places:
             return [wrench]
@@ -93,21 +92,21 @@ class ImpactKernel:
         return self.grad_G if self.metric.kind == "kinetic" and not self._supported else self.size_gradient(self.jump)
 
     def respond(self, impacts: Sequence[Wrench]) -> Response:
-        """Return the response of the robot to several impulses at once, at any points."""
-        return self.tree.respond(wrenches=[part for impact in impacts for part in self._alike(impact)])
+        """Return the response of the robot to impulses at any points at once."""
+        return self.tree.respond(wrenches=[part for impact in impacts for part in self._on_all_limbs(impact)])
 
-    def product(self, one: Response, other: Response) -> ca.SX:
+    def product(self, first: Response, second: Response) -> ca.SX:
         """Return ``a₁ᵀWa₂`` of two responses."""
-        return ca.dot(one.a, self._weigh(other.a, other.velocities))
+        return ca.dot(first.a, self._weigh(second.a, second.velocities))
 
     def size_gradient(self, jump: Response, r: Wrench | None = None) -> ca.SX:
         """Return the tangent gradient of ``aᵀWa`` of a response, shape (nv,).
 
-        Its impulses are fixed, or there is one impulse ``p`` with ``∂pᵀJM⁻¹Wa = rᵀ∂B p``.
+        The impulses of the response are fixed.  With ``r`` there is one impulse ``p``, and ``∂pᵀJM⁻¹Wa = rᵀ∂B p``.
         """
         if self.metric.kind == "kinetic" and not self._supported and r is None:
             return self.tree.pair_gradient(jump, jump)
-        adjoint = self.tree.respond(self._weigh(jump.a, jump.velocities), [] if r is None else self._alike(r))
+        adjoint = self.tree.respond(self._weigh(jump.a, jump.velocities), [] if r is None else self._on_all_limbs(r))
         gradient = 2 * self.tree.pair_gradient(jump, adjoint)
         if self.metric.kind == "kinetic":
             gradient = gradient + self.tree.energy_gradient(jump.velocities)
@@ -164,7 +163,7 @@ class ImpactKernel:
 
     @cached_property
     def _mobility_inverse(self) -> ca.SX:
-        """``(JM⁻¹Jᵀ)⁻¹``, or the pseudo-inverse for a planar robot."""
+        """``(JM⁻¹Jᵀ)⁻¹``, or its pseudo-inverse for a planar robot."""
         frozen = frozen_directions(self.case.robot, self.point)
         return _inverse3(self.mobility + frozen if frozen.any() else self.mobility)
 
@@ -180,7 +179,7 @@ class ImpactKernel:
 
     @cached_property
     def S(self) -> ca.SX:
-        """``‖M⁻¹Jᵀ(JM⁻¹Jᵀ)⁻¹n‖²_W``: as V if the contact point sticks."""
+        """``‖M⁻¹Jᵀ(JM⁻¹Jᵀ)⁻¹n‖²_W``: squared jump per squared approach speed if the contact point sticks."""
         return self.product(self._sticking, self._sticking)
 
     @cached_property
@@ -209,11 +208,13 @@ class ImpactKernel:
 def frozen_directions(robot: Robot, point: PointOnLink) -> Array:
     """Return the projector on the world directions in which a point can never move, shape (3, 3).
 
-    It is zero except for planar robots.  Added to ``JM⁻¹Jᵀ``, it makes the inverse act as the pseudo-inverse.
+    It is zero except for planar robots.  The inverse of ``JM⁻¹Jᵀ`` plus this projector acts as the pseudo-inverse.
     """
     numeric, generator = Numeric(robot.model), np.random.default_rng(0)
-    drawn = [pin.integrate(robot.model, pin.neutral(robot.model), generator.normal(size=robot.nv)) for _ in range(3)]
-    missing = null_space(np.vstack([numeric.at(q).jacobian(point)[:3].T for q in drawn]), _FROZEN)
+    samples = [
+        pin.integrate(robot.model, pin.neutral(robot.model), generator.normal(size=robot.nv)) for _ in range(3)
+    ]
+    missing = null_space(np.vstack([numeric.at(q).jacobian(point)[:3].T for q in samples]), _FROZEN)
     return np.asarray(missing @ missing.T)
 
 

@@ -1,7 +1,7 @@
-"""The impact quantities from Pinocchio's numbers by dense linear algebra, independent of the symbolic kernel.
+"""The impact quantities by dense linear algebra on matrices from Pinocchio, independent of the symbolic kernel.
 
-Feet enter through the KKT system ``[M, −J_sᵀ; J_s, εI]``, not through the heavy feet of the symbolic kernel.  The
-support impulses ``f`` remain unknowns, because ``−J_s a/ε`` loses as many digits as ε has zeros.
+Feet enter through the KKT system ``[M, −J_sᵀ; J_s, εI]``, not as the heavy feet of the symbolic kernel.  The support
+impulses ``f`` are unknowns of this system, because ``−J_s a/ε`` loses as many digits as ε has zeros.
 """
 
 from __future__ import annotations
@@ -18,13 +18,13 @@ from impact_posture.impact.quantities.impact_quantities import ImpactQuantities
 from impact_posture.impact.quantities.sticking_point import ImpulseResponse, StickingPoint, no_sticking
 from impact_posture.system.arrays import Array
 
-# Postures whose factorization is kept, because a search comes back to its starts.
+# Number of postures whose factorization is kept, because a search returns to its starts.
 _KEPT = 32
 
 
 @dataclass(eq=False)
 class _Factorized:
-    """What an oracle knows of a posture; the quantities follow when they are needed."""
+    """Matrices at one posture, and its quantities once they are computed."""
 
     M: Array
     J: Array
@@ -35,7 +35,10 @@ class _Factorized:
 
 
 class ImpactOracle:
-    """Numeric ``H, G, V, S, E, Λ_c`` and tangent gradients of one impact."""
+    """Numeric ``H, G, V, S, E, Λ_c`` and tangent gradients of one impact.
+
+    Attributes ``M``, ``J``, ``Js`` and ``n`` (world normal) are at the posture of the last call of :meth:`at`.
+    """
 
     def __init__(self, case: ImpactCase) -> None:
         self.case, self.robot, self.contact, self.metric = case, case.robot, case.contact, case.metric
@@ -48,11 +51,11 @@ class ImpactOracle:
         self._known: dict[bytes, _Factorized] = {}
 
     def at(self, q: Array) -> ImpactOracle:
-        """Move to ``q`` and factorize there, unless it is one of the last postures."""
+        """Move to ``q``.  The matrices of the last postures are kept."""
         q = np.array(q, dtype=float)
         if (key := q.tobytes()) != self._key:
             self.numeric.at(q)
-            # The newest posture stands last.
+            # The posture of the latest call is last, and the first is dropped.
             self._known[key] = known = self._known.pop(key, None) or self._factorized()
             if len(self._known) > _KEPT:
                 del self._known[next(iter(self._known))]
@@ -76,8 +79,8 @@ class ImpactOracle:
         rhs[: self._nv] = (tau.T * ~self.numeric.locked).T
         if slip is not None:
             rhs[self._nv :] = slip
-        found = np.asarray(np.linalg.solve(self._kkt, rhs), dtype=np.float64)
-        return ImpulseResponse(found[: self._nv], found[self._nv :])
+        solution = np.asarray(np.linalg.solve(self._kkt, rhs), dtype=np.float64)
+        return ImpulseResponse(solution[: self._nv], solution[self._nv :])
 
     def solve(self, tau: Array) -> Array:
         """Return ``(M + J_sᵀJ_s/ε)⁻¹ τ`` for a vector or columns."""
@@ -104,8 +107,8 @@ class ImpactOracle:
         held = StickingPoint.of(self._kkt, self.J, mobility, ~self.numeric.locked)
         stuck, s = None, None
         if held.can_move(self.n):
-            found, s = held.respond(velocity=self.n)
-            stuck = found.a
+            response, s = held.respond(velocity=self.n)
+            stuck = response.a
         known.quantities = ImpactQuantities(
             H=H,
             G=G,
@@ -123,7 +126,7 @@ class ImpactOracle:
         return known.quantities
 
     def with_support_impulses(self, a: Array) -> Array:
-        """Return ``a`` and its support impulses ``−J_s a/ε``, in the axes of the feet at the last posture."""
+        """Return ``a`` followed by its support impulses ``−J_s a/ε``, in the axes of the feet at the last posture."""
         f = -self.Js @ a / self.compliance
         parts, start = [a], 0
         for foot in self.feet:
@@ -139,27 +142,27 @@ class ImpactOracle:
 
         Args:
             q: Configuration, shape (nq,).
-            normal: Another normal than that of the contact, in the same axes, shape (3,).
+            normal: Normal in the axes of the contact's normal, shape (3,); by default the contact's normal.
         """
         self.at(q)
-        own, n = self._normals(normal)
+        normal, n = self._normals(normal)
         x = self.respond(self.J.T @ n)
         y = self.respond(self.weigh(x.a))
-        gradient = 2 * (self.coupling(own, y.a, self.case.in_contact_frame) - self.inertial(y, x))
+        gradient = 2 * (self.coupling(normal, y.a, self.case.in_contact_frame) - self.inertial(y, x))
         return gradient + self.metric_gradient(x.a)
 
     def gradient_G(self, q: Array, normal: Array | None = None) -> Array:
         """Return the tangent gradient of G, shape (nv,), with ``normal`` as in :meth:`gradient_H`."""
         self.at(q)
-        own, n = self._normals(normal)
+        normal, n = self._normals(normal)
         x = self.respond(self.J.T @ n)
-        return 2 * self.coupling(own, x.a, self.case.in_contact_frame) - self.inertial(x, x)
+        return 2 * self.coupling(normal, x.a, self.case.in_contact_frame) - self.inertial(x, x)
 
     def gradient_S(self, q: Array, normal: Array | None = None) -> Array:
         """Return the tangent gradient of S, shape (nv,), with ``normal`` as in :meth:`gradient_H`.
 
-        Where ``JM⁻¹Jᵀ`` is singular, the point is held in its range.  That is right if the directions in which the
-        contact can move stay the same, as in a planar robot.
+        Where ``JM⁻¹Jᵀ`` is singular, the point is held in its range.  This is correct if the directions in which the
+        contact can move are constant, as in a planar robot.
 
         Raises:
             MetricError: S does not exist here.
@@ -178,8 +181,8 @@ class ImpactOracle:
 
     def gradient_V(self, q: Array) -> Array:
         """Return the tangent gradient of V, ``∇H/G² − 2H/G³ ∇G``, shape (nv,)."""
-        found = self.quantities(q)
-        return self.gradient_H(q) / found.G**2 - 2 * found.H / found.G**3 * self.gradient_G(q)
+        quantities = self.quantities(q)
+        return self.gradient_H(q) / quantities.G**2 - 2 * quantities.H / quantities.G**3 * self.gradient_G(q)
 
     def gradient_E(self, q: Array) -> Array:
         """Return the tangent gradient of E, ``−∇G/(2G²)``, shape (nv,)."""
@@ -187,13 +190,13 @@ class ImpactOracle:
 
     @property
     def axes(self) -> Array:
-        """World axes in which the contact's normal is given, at the last posture, as columns, shape (3, 3)."""
+        """Axes of the contact's normal in the world at the last posture, as columns, shape (3, 3)."""
         return np.asarray(self.numeric.placement(self.point).rotation) if self.case.in_contact_frame else np.eye(3)
 
-    def _normals(self, given: Array | None) -> tuple[Array, Array]:
-        """A normal (by default that of the contact) in the axes of the contact's normal, and in world axes."""
-        own = np.array(self.contact.normal) if given is None else given
-        return own, self.axes @ own if self.case.in_contact_frame else own
+    def _normals(self, normal: Array | None) -> tuple[Array, Array]:
+        """Return a normal, by default the contact's, in the axes of the contact's normal and in world axes."""
+        normal = np.array(self.contact.normal) if normal is None else normal
+        return normal, self.axes @ normal if self.case.in_contact_frame else normal
 
     def support_gradient(self, q: Array) -> Array:
         """Return the tangent Jacobian of the support impulses ``f``, shape (rows, nv).
@@ -213,9 +216,9 @@ class ImpactOracle:
 
     def _adjoint_rows(self, adjoints: ImpulseResponse) -> Array:
         """Return ``pᵀ∂(Jᵀn + J_sᵀf − M a) + rᵀ∂(J_s a)`` for each adjoint ``p, r``, shape (k, nv)."""
-        own, x = np.array(self.contact.normal), self.respond(self.J.T @ self.n)
+        normal, x = np.array(self.contact.normal), self.respond(self.J.T @ self.n)
         rows = [
-            self.coupling(own, p, self.case.in_contact_frame) - self.inertial(ImpulseResponse(p, r), x)
+            self.coupling(normal, p, self.case.in_contact_frame) - self.inertial(ImpulseResponse(p, r), x)
             for p, r in zip(adjoints.a.T, adjoints.f.T, strict=True)
         ]
         return np.array(rows).reshape(-1, self._nv)
@@ -226,15 +229,15 @@ class ImpactOracle:
         return self.numeric.coupling_gradient(self.point, wrench, v, in_frame=in_frame)
 
     def inertial(self, left: ImpulseResponse, right: ImpulseResponse) -> Array:
-        """Return ``∂_q [lᵀMr − f_lᵀJ_s r − f_rᵀJ_s l]`` with all four letters held: ``∂_q lᵀ(M + J_sᵀJ_s/ε)r``."""
+        """Return ``∂_q lᵀ(M + J_sᵀJ_s/ε)r = ∂_q [lᵀMr − f_lᵀJ_s r − f_rᵀJ_s l]`` for fixed l, r, f_l and f_r."""
         gradient = self.numeric.inertial_gradient(left.a, right.a)
-        first = 0
+        start = 0
         for foot in self.feet:
-            for one, other in ((left, right), (right, left)):
+            for held, moving in ((left, right), (right, left)):
                 wrench = np.zeros(6)
-                wrench[: foot.rows] = one.f[first : first + foot.rows]
-                gradient = gradient - self.numeric.coupling_gradient(foot.point, wrench, other.a)
-            first += foot.rows
+                wrench[: foot.rows] = held.f[start : start + foot.rows]
+                gradient = gradient - self.numeric.coupling_gradient(foot.point, wrench, moving.a)
+            start += foot.rows
         return gradient
 
     def metric_gradient(self, a: Array) -> Array:

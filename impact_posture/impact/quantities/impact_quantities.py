@@ -20,7 +20,7 @@ class ImpactQuantities:
         H: ``nᵀΛ_c n``, squared jump per squared impulse.
         G: ``nᵀJM⁻¹Jᵀn = 1/m_eff``, 1/kg.
         V: ``H/G²``, squared jump per squared approach speed (frictionless, e = 0).
-        S: The same if the contact sticks; ``None`` where it does not exist.
+        S: Squared jump per squared approach speed if the contact sticks; ``None`` where it does not exist.
         E: ``1/(2G)``, energy dissipated per squared approach speed, kg.
         jump: ``a = M⁻¹Jᵀn``, shape (nv,).
         sticking_jump: Jump per unit approach speed of a contact that sticks, shape (nv,), or ``None``.
@@ -52,13 +52,13 @@ class ImpactQuantities:
 
 @dataclass(frozen=True)
 class Scalars:
-    """The five numbers of an impact; ``None`` where one does not exist.
+    """H, G, V, S and E of an impact; ``None`` for a value that does not exist.
 
     Attributes:
         H: Squared jump per squared impulse.
         G: Inverse effective mass along the normal, 1/kg.
         V: Squared jump per squared approach speed, frictionless, e = 0.
-        S: The same if the contact point sticks.
+        S: Squared jump per squared approach speed if the contact point sticks.
         E: Energy dissipated per squared approach speed, e = 0, which is half the effective mass, kg.
     """
 
@@ -69,11 +69,10 @@ class Scalars:
     E: float | None
 
     @staticmethod
-    def of(found: ImpactQuantities) -> Scalars:
-        """Return the numbers; ``V`` and ``E`` do not exist if the contact cannot move along the normal."""
-        if found.blocked:
-            return Scalars(found.H, found.G, None, found.S, None)
-        return Scalars(found.H, found.G, found.V, found.S, found.E)
+    def of(quantities: ImpactQuantities) -> Scalars:
+        """Return the scalars; ``V`` and ``E`` do not exist if the contact cannot move along the normal."""
+        V, E = (None, None) if quantities.blocked else (quantities.V, quantities.E)
+        return Scalars(quantities.H, quantities.G, V, quantities.S, E)
 
     @property
     def effective_mass(self) -> float | None:

@@ -1,4 +1,4 @@
-"""The lifted form of an objective, which leaves linear solves to the program as unknowns and equations."""
+"""The lifted form of an objective, in which linear solves become unknowns and equations of the program."""
 
 from __future__ import annotations
 
@@ -16,20 +16,20 @@ from impact_posture.impact.impact_contact import point_on
 from impact_posture.impact.metric import Metric
 from impact_posture.system.arrays import Array
 
-# Start of t above its bounds by attempt, in units of the scale.  A barrier is finite inside only.
+# Distance of the start of t above its bounds by attempt, in units of the scale.  A barrier needs a start inside.
 ABOVE = (0.01, 1.0, 0.1)
 
 
 @dataclass(frozen=True)
 class Lifted:
-    """An objective with its inner linear solve left to the program.
+    """An objective whose linear solves are equations of the program.
 
     Attributes:
         variables: Auxiliary unknowns, shape (k, 1).
-        residual: Equations that fix them, ``= 0``, shape (r, 1).
-        value: The objective in terms of configuration and auxiliaries.
-        inequalities: Rows ``≤ 0`` that bound it from below, shape (i, 1).
-        jumps: Unknown jumps whose derivatives are known.
+        residual: Equations ``residual = 0`` that determine the unknowns, shape (r, 1).
+        value: The objective in terms of configuration and unknowns.
+        inequalities: Rows ``≤ 0`` that bound the value from below, shape (i, 1).
+        jumps: Unknown jumps whose derivatives are known in closed form.
     """
 
     variables: ca.SX
@@ -47,7 +47,7 @@ class Lifted:
         equations: Sequence[ca.SX] = (),
         inequalities: Sequence[ca.SX] = (),
     ) -> Lifted:
-        """Return a form over the unknowns, equations and inequalities of all parts, and more of each."""
+        """Return a form with the unknowns, equations and inequalities of all parts, followed by further ones."""
         row, column, placed = 0, 0, list[PlacedJump]()
         for part in parts:
             placed += [PlacedJump(jump, row + below, column + right) for jump, below, right in part.jumps]
@@ -63,21 +63,21 @@ class Lifted:
 
     @property
     def rest(self) -> ca.SX:
-        """The residual less the parts whose derivatives are known, shape (r, 1)."""
-        found = ca.SX(self.residual)
+        """The residual without the terms whose derivatives are known, shape (r, 1)."""
+        rest = ca.SX(self.residual)
         for jump, row, _ in self.jumps:
-            found[row : row + jump.rest.numel()] = jump.rest
-        return found
+            rest[row : row + jump.rest.numel()] = jump.rest
+        return rest
 
 
 @dataclass(frozen=True, eq=False)
 class Guess:
-    """Initial auxiliaries of a lifted form.
+    """Initial values and bounds of the unknowns of a lifted form.
 
     Attributes:
         values: Values, shape (k,).
-        lower: Lower bounds, shape (k,); minus infinity where there is none.
-        upper: Upper bounds, shape (k,); ``None`` for none.
+        lower: Lower bounds, shape (k,); minus infinity for an unbounded unknown.
+        upper: Upper bounds, shape (k,); ``None`` without upper bounds.
     """
 
     values: Array
@@ -96,7 +96,7 @@ class Guess:
 
     @staticmethod
     def joined(parts: Sequence[Guess]) -> Guess:
-        """Return the auxiliaries of several parts as one."""
+        """Return the guesses of several parts, one after the other."""
         keys = ("values", "lower", "above")
         return Guess(*(np.concatenate([np.zeros(0), *[getattr(part, key) for part in parts]]) for key in keys))
 
@@ -108,10 +108,10 @@ class UnknownJump:
     Attributes:
         a: Unknown jump, shape (nv,).
         f: Support impulses, in the axes of the feet.
-        variables: ``a``, the support impulses, and an unknown impulse of the impact if there is one.
-        residual: ``M a − J_sᵀf − (the impact)`` and ``J_s a + εf``, and equations that fix the unknown impulse.
-        rest: What :attr:`derivatives` leave of the residual: the impact, and the rows of locked joints.
-        derivatives: Derivatives of the equations.
+        variables: ``a``, the support impulses, and the impulse of the impact if it is unknown.
+        residual: ``M a − J_sᵀf − (the impact)`` and ``J_s a + εf``, and equations that determine the unknown impulse.
+        rest: The terms of the residual that :attr:`derivatives` do not cover: the impact and rows of locked joints.
+        derivatives: Closed derivatives of the other terms.
         compliance: ε, 1/kg.
         tree: The tree, whose locked joints have the equations ``a_k = 0``.
         contact_velocity: ``J a``, world, shape (3,).
@@ -129,16 +129,11 @@ class UnknownJump:
 
     @property
     def jumps(self) -> tuple[PlacedJump, ...]:
-        """Itself, as a part of a :class:`Lifted`, if its derivatives are known."""
+        """The jump itself as a part of a :class:`Lifted`, if its closed derivatives exist."""
         return (PlacedJump(self, 0, 0),) if self.derivatives.exist else ()
 
-    @property
-    def mass_a(self) -> ca.SX:
-        """``M a``."""
-        return self.tree.mass_times(self.a)
-
     def with_impulse(self, impulse: ca.SX, fixing: ca.SX) -> UnknownJump:
-        """Return the same jump with the impulse of the impact as an unknown, and the equations that fix it."""
+        """Return the same jump with the impulse of the impact as an unknown, and equations that determine it."""
         residual, rest = (ca.vertcat(rows, fixing) for rows in (self.residual, self.rest))
         return replace(self, variables=ca.vertcat(self.variables, impulse), residual=residual, rest=rest)
 
@@ -154,7 +149,7 @@ class UnknownJump:
 
 
 class PlacedJump(NamedTuple):
-    """An unknown jump, and where its rows and its unknowns begin in a lifted form."""
+    """An unknown jump, with its first row and its first unknown in a lifted form."""
 
     jump: UnknownJump
     row: int
@@ -200,20 +195,20 @@ def in_world(case: ImpactCase, tree: Tree, directions: ca.SX) -> ca.SX:
     return tree.rotation(case.point) @ directions if case.in_contact_frame else directions
 
 
-def weighed(metric: Metric, one: UnknownJump, other: UnknownJump) -> ca.SX:
+def weighed(metric: Metric, first: UnknownJump, second: UnknownJump) -> ca.SX:
     """Return ``a₁ᵀWa₂``."""
     if metric.kind == "kinetic":
-        # sᵀJa − ε|f|² is equal on the equations, but a small difference of large numbers if the feet are stiff.
-        return ca.dot(one.a, other.mass_a)
-    return ca.dot(one.a, ca.SX(metric.diagonal(one.a.numel())) * other.a)
+        # Not sᵀJa − ε|f|², which is equal where the equations hold.  With stiff feet it loses digits by cancellation.
+        return ca.dot(first.a, second.tree.mass_times(second.a))
+    return ca.dot(first.a, ca.SX(metric.diagonal(first.a.numel())) * second.a)
 
 
 def worst_of(parts: Sequence[Lifted | UnknownJump], values: Sequence[ca.SX], scale: ca.SX) -> Lifted:
-    """Return ``t`` with ``values[k] ≤ t · scale``, over the unknowns and equations of all parts."""
+    """Return the form of ``t · scale`` with ``values[k] ≤ t · scale`` and the unknowns and equations of all parts."""
     t = ca.SX.sym("t")
     return Lifted.of(parts, t * scale, others=[t], inequalities=[v / scale - t for v in values])
 
 
 def worst_of_guesses(parts: Sequence[Guess], largest: float, attempt: int) -> Guess:
-    """Return the start of :func:`worst_of`, with ``t`` above the largest value (in units of the scale)."""
+    """Return the guess for :func:`worst_of`, with ``t`` above the ``largest`` value, in units of the scale."""
     return Guess.joined([*parts, Guess.unbounded(np.array([largest + ABOVE[attempt]]))])

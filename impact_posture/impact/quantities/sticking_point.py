@@ -1,4 +1,4 @@
-"""The contact point held beside the feet: the jump and the impulse of a contact that sticks."""
+"""The jump and the impulse of a contact point that sticks."""
 
 from __future__ import annotations
 
@@ -10,13 +10,13 @@ from numpy.typing import NDArray
 from impact_posture.errors import MetricError
 from impact_posture.system.arrays import Array
 
-# Relative size of an eigenvalue of JM⁻¹Jᵀ, and of the part of n outside its range, that counts as zero.
+# Eigenvalues of JM⁻¹Jᵀ below this share of the largest are zero.
 SINGULAR = 1e-9
 
 
 @dataclass(frozen=True, eq=False)
 class ImpulseResponse:
-    """Jump of the robot under a generalized impulse, or under several.
+    """Velocity jump under one generalized impulse, or under several (columns).
 
     Attributes:
         a: ``(M + J_sᵀJ_s/ε)⁻¹ τ``, shape (nv,) or (nv, k).
@@ -29,10 +29,10 @@ class ImpulseResponse:
 
 @dataclass(frozen=True, eq=False)
 class StickingPoint:
-    """The contact point held beside the feet, in the directions in which it can move.
+    """A contact point held like the feet, in the directions in which it can move.
 
-    ``M a − J_sᵀf − Jᵀs = τ, J_s a + εf = 0, J a = v`` is factorized as it stands.  Through ``(JM⁻¹Jᵀ)⁻¹`` the adjoint
-    of ∇S would be a small difference of large numbers, with an error of the square of that matrix's condition.
+    The system ``M a − J_sᵀf − Jᵀs = τ, J_s a + εf = 0, J a = v`` is solved as a whole.  A solution by
+    ``(JM⁻¹Jᵀ)⁻¹`` would square the condition of this matrix in the adjoint of ∇S.
     """
 
     system: Array
@@ -42,7 +42,7 @@ class StickingPoint:
 
     @staticmethod
     def of(kkt: Array, J: Array, mobility: Array, mobile: NDArray[np.bool_]) -> StickingPoint:
-        """Hold a point beside the feet.
+        """Build the system.
 
         Args:
             kkt: ``[M, −J_sᵀ; J_s, εI]``.
@@ -65,15 +65,15 @@ class StickingPoint:
         return bool(np.linalg.norm(self.outside.T @ n) <= np.sqrt(SINGULAR))
 
     def respond(self, *, tau: Array | None = None, velocity: Array | None = None) -> tuple[ImpulseResponse, Array]:
-        """Return the jump under ``τ`` with the point moving at ``v``, and the impulse ``s`` of the point."""
+        """Return the jump under ``τ`` with the velocity ``v`` of the point, and the impulse ``s`` on the point."""
         right, nv = np.zeros(len(self.system)), len(self.mobile)
         size = len(right) - self.axes.shape[1]
         if tau is not None:
             right[:nv] = tau * self.mobile
         if velocity is not None:
             right[size:] = self.axes.T @ velocity
-        found = np.asarray(np.linalg.solve(self.system, right), dtype=np.float64)
-        return ImpulseResponse(found[:nv], found[nv:size]), np.asarray(self.axes @ found[size:])
+        solution = np.asarray(np.linalg.solve(self.system, right), dtype=np.float64)
+        return ImpulseResponse(solution[:nv], solution[nv:size]), np.asarray(self.axes @ solution[size:])
 
 
 def no_sticking() -> MetricError:

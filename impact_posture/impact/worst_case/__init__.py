@@ -1,1 +1,1 @@
-"""The inner maximum over normals, impulses or models."""
+"""The worst case of an impact: the maximum over normals, impulses or robot models."""

@@ -1,14 +1,15 @@
 """Several contacts at once: the largest jump under impulses within a box.
 
-``‖Σ λ_i a_i‖²_W`` with ``a_i = M⁻¹J_iᵀn_i`` is a convex quadratic ``λᵀKλ`` of the impulses, ``K_ij = a_iᵀWa_j``, so
-its maximum over ``0 ≤ λ_i ≤ λ̄_i`` (``|λ_i| ≤ λ̄_i`` where contacts can pull) is at one of the ``2^m − 1`` corners of
-the box (``2^(m−1)``, up to sign).  The program is ``min t`` with ``t ≥ λᵀKλ`` at every corner.
+``‖Σ λ_i a_i‖²_W`` with ``a_i = M⁻¹J_iᵀn_i`` is a convex quadratic ``λᵀKλ`` of the impulses, ``K_ij = a_iᵀWa_j``.  So
+its maximum over ``0 ≤ λ_i ≤ λ̄_i`` lies at one of the ``2^m − 1`` corners of the box other than the origin.  Where
+contacts can pull, ``|λ_i| ≤ λ̄_i``, and ``2^(m−1)`` corners differ by more than a sign.  The program is ``min t`` with
+``t ≥ λᵀKλ`` at every corner.
 """
 
 from __future__ import annotations
 
 from collections.abc import Callable, Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from functools import cached_property
 from itertools import product
 
@@ -44,9 +45,9 @@ class WorstImpulses:
     """The corner of the box of impulses with the largest jump.
 
     Attributes:
-        value: ``λᵀKλ`` at the corner, which is the objective.
+        value: The objective, which is ``λᵀKλ`` at the corner.
         impulses: λ of each contact, N·s, shape (m,).
-        tied: All corners with the same value, this corner first, shape (k, m).
+        tied: All corners with this value, shape (k, m); the first is ``impulses``.
         jump: ``Δν`` at the corner, shape (nv,).
     """
 
@@ -74,41 +75,33 @@ def check_contacts(contacts: Sequence[ImpactContact], kind: type[ImpactKind], *,
     """
     if len(contacts) == 1:
         if bilateral:
-            raise ContactError(
-                "there is one contact: pulling is as bad as pushing", where="bilateral", hint="leave it out"
-            )
+            what = "there is one contact, for which pulling is as bad as pushing"
+            raise ContactError(what, where="bilateral", hint="leave it out")
         return
     if len(contacts) > MOST_CONTACTS:
         raise ContactError(f"{len(contacts)} contacts", where="contact", hint=f"give up to {MOST_CONTACTS}")
-    for i, one in enumerate(contacts):
-        for other in contacts[:i]:
-            if (one.frame, one.offset, one.normal) == (other.frame, other.offset, other.normal):
-                raise ContactError(f"'{one.frame}' is given twice", where="contact", hint="remove one")
+    places = [(contact.frame, contact.offset, contact.normal) for contact in contacts]
+    for i, place in enumerate(places):
+        if place in places[:i]:
+            raise ContactError(f"'{place[0]}' is given twice", where="contact", hint="remove one")
     if not kind.adds_up:
-        raise MetricError(
-            f"{kind.name} is per approach speed of one contact: of several at once the impulses are not known "
-            "from it",
-            where="objective",
-            hint="choose impulse, whose bounds are given, or one `contact`",
-        )
+        what = f"{kind.name} is per approach speed of one contact, which does not determine the impulses of several"
+        raise MetricError(what, where="objective", hint="choose impulse, whose bounds are given, or one `contact`")
     if cone:
-        raise MetricError(
-            "the worst case over a cone of normals is exact for one contact only",
-            where="normal_cone",
-            hint="give one `contact`, or leave the cone out",
-        )
+        what = "the worst case over a cone of normals is exact for one contact only"
+        raise MetricError(what, where="normal_cone", hint="give one `contact`, or leave the cone out")
 
 
 def corners(count: int, bilateral: bool) -> Array:
     """Return the corners of the unit box as rows, shape (k, count).
 
-    The entries are 0 and 1, without the origin.  They are ±1 (up to sign) if the contacts are bilateral.
+    The entries are 0 and 1, without the origin.  For bilateral contacts they are ±1, and the first is 1.
     """
     if bilateral:
         return np.array([[1.0, *rest] for rest in product((1.0, -1.0), repeat=count - 1)])
-    # The corner of all contacts comes first, because a user expects it where corners tie.
-    found = sorted(product((1.0, 0.0), repeat=count), key=lambda corner: -sum(corner))
-    return np.array(found[:-1])
+    # The corner of all contacts comes first, because a user expects this corner where corners tie.
+    rows = sorted(product((1.0, 0.0), repeat=count), key=lambda corner: -sum(corner))
+    return np.array(rows[:-1])
 
 
 @dataclass(frozen=True)
@@ -116,9 +109,9 @@ class ImpulseBox:
     """The worst corner of ``0 ≤ λ_i ≤ λ̄_i``, or of ``|λ_i| ≤ λ̄_i``.
 
     Attributes:
-        oracles: Pinocchio's numbers for each contact, the leading contact first.
+        oracles: The oracle of each contact, the leading contact first.
         bilateral: Whether the contacts can pull as well as push.
-        attempts: Guesses of the lifted form.
+        attempts: Number of guesses of the lifted form.
     """
 
     oracles: tuple[ImpactOracle, ...]
@@ -137,7 +130,7 @@ class ImpulseBox:
         return np.asarray(corners(len(bounds), self.bilateral) * bounds)
 
     def worst(self, q: Array) -> WorstImpulses:
-        """Return the worst corner at ``q``, from Pinocchio's numbers."""
+        """Return the worst corner at ``q``, computed with Pinocchio."""
         jumps, values = self._jumps_and_values(q)
         tied = finite_maximum(values)[0]
         impulses = self.corners[tied[0]]
@@ -153,13 +146,13 @@ class ImpulseBox:
         return Subgradients(np.array([self._gradient(q, self.corners[k]) for k in tied]), gaps)
 
     def _jumps_and_values(self, q: Array) -> tuple[Array, Array]:
-        """``a_i`` as columns, shape (nv, m), and ``λᵀKλ`` at every corner, shape (k,)."""
+        """Return ``a_i`` as columns, shape (nv, m), and ``λᵀKλ`` at every corner, shape (k,)."""
         jumps = np.stack([oracle.quantities(q).jump for oracle in self.oracles], axis=1)
         K = jumps.T @ self.oracle.at(q).weigh(jumps)
         return jumps, np.asarray(np.einsum("ki,ij,kj->k", self.corners, K, self.corners))
 
     def _gradient(self, q: Array, impulses: Array) -> Array:
-        """``∂_q‖Σ λ_i a_i‖²_W = 2 ∂_q[Σ λ_i n_iᵀJ_i b − bᵀMa]``, shape (nv,)."""
+        """Return ``∂_q‖Σ λ_i a_i‖²_W = 2 ∂_q[Σ λ_i n_iᵀJ_i b − bᵀMa]``, shape (nv,)."""
         oracles = [oracle.at(q) for oracle in self.oracles]
         first = oracles[0]
         forces = np.stack([oracle.J.T @ oracle.n for oracle in oracles], axis=1)
@@ -167,20 +160,18 @@ class ImpulseBox:
         y = first.respond(first.weigh(x.a))
         gradient = -first.inertial(y, x)
         for weight, oracle in zip(impulses, oracles, strict=True):
-            own = np.array(oracle.contact.normal)
-            gradient = gradient + weight * oracle.coupling(own, y.a, oracle.case.in_contact_frame)
+            normal = np.array(oracle.contact.normal)
+            gradient = gradient + weight * oracle.coupling(normal, y.a, oracle.case.in_contact_frame)
         return np.asarray(2 * gradient + first.metric_gradient(x.a))
 
     def expressions(self, k: ImpactKernel) -> tuple[ca.SX, ca.SX]:
-        """See :class:`~impact_posture.impact.objective.WorstCase`; the gradient is that of the worst corner."""
+        """See :class:`~impact_posture.impact.objective.WorstCase`; the gradient at the worst corner."""
         impacts = self._impacts(k.n)
         jumps = [k.respond([impact]) for impact in impacts]
         K = _gram(len(jumps), lambda i, j: k.product(jumps[i], jumps[j]))
-        rows = [ca.DM(corner) for corner in self.corners]
-        _, impulses = first_of_largest([_form(K, row) for row in rows], [ca.SX(row) for row in rows])
-        worst = k.respond([
-            Wrench(one.point, one.force * impulses[i], one.moment, one.in_frame) for i, one in enumerate(impacts)
-        ])  # fmt: skip
+        rows = [ca.SX(corner) for corner in self.corners]
+        _, impulses = first_of_largest([ca.bilin(K, row, row) for row in rows], rows)
+        worst = k.respond([replace(impact, force=impact.force * impulses[i]) for i, impact in enumerate(impacts)])
         return k.product(worst, worst), k.size_gradient(worst)
 
     def lift(self, tree: Tree, parameters: ca.SX, scale: ca.SX) -> Lifted:
@@ -188,15 +179,15 @@ class ImpulseBox:
         case = self.oracle.case
         jumps = [unknown_jump(case, tree, impact, f"{i}_") for i, impact in enumerate(self._impacts(parameters))]
         K = _gram(len(jumps), lambda i, j: weighed(case.metric, jumps[i], jumps[j]))
-        return worst_of(jumps, [_form(K, ca.DM(corner)) for corner in self.corners], scale)
+        return worst_of(jumps, [ca.bilin(K, row, row) for row in map(ca.SX, self.corners)], scale)
 
     def guess(self, q: Array, scale: float, attempt: int = 0) -> Guess:
         """See :class:`~impact_posture.impact.objective.WorstCase`."""
-        parts = [Guess.unbounded(one.with_support_impulses(one.quantities(q).jump)) for one in self.oracles]
+        parts = [Guess.unbounded(o.with_support_impulses(o.quantities(q).jump)) for o in self.oracles]
         return worst_of_guesses(parts, self.value(q) / scale, attempt)
 
     def _impacts(self, n: ca.SX) -> list[Wrench]:
-        """Unit impulses of all contacts; the leading normal is an input, the other normals are constants."""
+        """Return the unit impulses of all contacts, with ``n`` as the leading normal."""
         leading, *others = [oracle.case for oracle in self.oracles]
         return [impact_at(leading, n), *[impact_at(c, ca.SX(np.array(c.contact.normal))) for c in others]]
 
@@ -207,7 +198,3 @@ def _gram(count: int, entry: Callable[[int, int], ca.SX]) -> ca.SX:
         for j in range(i, count):
             K[i, j] = K[j, i] = entry(i, j)
     return K
-
-
-def _form(K: ca.SX, row: ca.DM) -> ca.SX:
-    return ca.bilin(K, ca.SX(row), ca.SX(row))

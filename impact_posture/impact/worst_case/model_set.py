@@ -1,10 +1,4 @@
-"""The worst of several robot models, and the maximum of finitely many values.
-
-Each shape of the maximum has an exact form of its own.  One protocol hides which shape it is from the program, the
-C export and the certificate.  This module has the protocol, and the shape that needs no mathematics of its own:
-:class:`ModelSet` (the worst of several robot models).  No maximum at all is an
-:class:`~impact_posture.impact.kinds.impact_kind.ImpactKind`.
-"""
+"""The worst case over several robot models, and the maximum of finitely many values."""
 
 from __future__ import annotations
 
@@ -28,10 +22,10 @@ ACTIVE = 1e-6
 
 @dataclass(frozen=True)
 class ModelSet:
-    """The worst of the same worst case on several robot models.
+    """The maximum of one worst case over several robot models.
 
     ``min_q max_k f_k(q)``, where ``f_k`` is the objective on the k-th model, becomes ``min t`` with ``t ≥ f_k(q)``.
-    Models between the variants do not count.  :mod:`impact_posture.posture.analysis.robustness` samples them.
+    Models between the variants are not included.  :mod:`impact_posture.posture.analysis.robustness` samples them.
 
     Attributes:
         members: The worst case on each model, the robot as modeled first.
@@ -50,7 +44,7 @@ class ModelSet:
         return max(len(ABOVE), *[member.attempts for member in self.members])
 
     def values(self, q: Array) -> Array:
-        """Return the value on each model, from Pinocchio's numbers, shape (k,)."""
+        """Return the value on each model, computed with Pinocchio, shape (k,)."""
         return np.array([member.value(q) for member in self.members])
 
     def value(self, q: Array) -> float:
@@ -60,7 +54,7 @@ class ModelSet:
     def subgradients(self, q: Array, within: float = 0.0) -> Subgradients:
         """See :class:`Minimized`; all models that tie contribute."""
         tied, gaps = finite_maximum(self.values(q), within)
-        # The gap of a model below the worst model uses up that much of ``within``.
+        # The gap between a model and the worst model is a part of ``within``.
         parts = [self.members[k].subgradients(q, max(within - gap, 0.0)) for k, gap in zip(tied, gaps, strict=True)]
         return Subgradients(
             np.vstack([part.gradients for part in parts]),
@@ -68,16 +62,16 @@ class ModelSet:
         )
 
     def expressions(self, k: ImpactKernel) -> tuple[ca.SX, ca.SX]:
-        """See :class:`WorstCase`; the gradient is that of the worst model."""
+        """See :class:`WorstCase`; the gradient on the worst model."""
         pairs = []
         for member in self.members:
-            # Limbs repeat in the model as it stands.  A payload on one limb makes them differ.
+            # The kernel's repeated limbs belong to its own model.  A payload on one limb makes limbs differ.
             case = member.oracle.case
             pairs.append(member.expressions(k if case.robot is k.case.robot else ImpactKernel(case, k.q, k.n)))
         return first_of_largest([value for value, _ in pairs], [gradient for _, gradient in pairs])
 
     def lift(self, tree: Tree, parameters: ca.SX, scale: ca.SX) -> Lifted:
-        """See :class:`Minimized`; each model has unknowns of its own, and ``t`` bounds all values."""
+        """See :class:`Minimized`; each model has its own unknowns, and ``t`` bounds all values."""
         parts = []
         for member in self.members:
             model = member.oracle.robot.model
@@ -91,23 +85,23 @@ class ModelSet:
 
 
 def finite_maximum(values: Array, within: float = 0.0) -> tuple[NDArray[np.int_], Array]:
-    """Return the indices of the values that tie with the largest, the leading index first, and their gaps.
+    """Return the indices of the values that tie with the largest value, the leading index first, and their gaps.
 
     A value ties if it is at most a share :data:`ACTIVE`, or ``within``, below the largest value.
     """
     largest = float(values.max())
     near = np.flatnonzero(values >= largest - max(ACTIVE * abs(largest), within))
-    # The leading index must not depend on rounding, so it is the first of those that differ by rounding alone.
+    # The leading index must not depend on rounding, so it is the first of the values that differ by rounding alone.
     leading = int(np.flatnonzero(values >= largest - 1e-12 * abs(largest))[0])
     order = np.concatenate([[leading], near[near != leading]])
     return order, np.asarray(largest - values[order])
 
 
 def first_of_largest(values: Sequence[ca.SX], choices: Sequence[ca.SX]) -> tuple[ca.SX, ca.SX]:
-    """Return the largest expression and the choice that belongs to it, the first one at a tie."""
-    best, choice = values[0], choices[0]
+    """Return the largest expression and its choice; the first at a tie."""
+    largest, choice = values[0], choices[0]
     for value, other in zip(values[1:], choices[1:], strict=True):
-        larger = value > best
-        best = ca.if_else(larger, value, best)
+        larger = value > largest
+        largest = ca.if_else(larger, value, largest)
         choice = choice + larger * (other - choice)
-    return best, choice
+    return largest, choice

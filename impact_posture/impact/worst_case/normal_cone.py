@@ -2,16 +2,16 @@
 
 ``impulse``, ``sticking`` and ``energy`` depend on the normal through one quadratic form ``nᵀK(q)n``
 (:class:`~impact_posture.impact.kinds.impact_kind.QuadraticKind`).  Its largest value over a cone is known exactly
-(:mod:`impact_posture.impact.worst_case.worst_normal`).  ``speed`` is no quadratic form and has no such dual.
+(:mod:`impact_posture.impact.worst_case.worst_normal`).  ``speed`` is not a quadratic form and has no such dual.
 
 In the program the dual replaces the inner maximum.  In the axes of the cone (half angle α), with the quadratic form
 ``P(q) = [a, bᵀ; b, C]``, ``c = cos α``, ``s = sin α`` and everything divided by the first value of the form::
 
     min t,   t = a + sτ,   Z = [τ − ρ, −bᵀ; −b, (st + ρc²) I − sC] = L²,   ρ ≥ 0
 
-``Z`` is ``tI − P − μ(n₀n₀ᵀ − c²I)`` between two factors ``diag(s^-½, s^½, s^½)`` with ``μ = ρ/s``, which stays
-bounded as α goes to zero.  The symmetric root ``L`` keeps its gradient where eigenvalues of ``Z`` vanish together, as
-they do at mirror-symmetric postures.  ``det Z`` has no gradient there.
+``Z`` is ``D(tI − P − μ(n₀n₀ᵀ − c²I))D`` with ``D = diag(s^-½, s^½, s^½)`` and ``μ = ρ/s``, which stays bounded as α
+goes to zero.  At mirror-symmetric postures two eigenvalues of ``Z`` vanish together.  There the gradient of ``det Z``
+is zero, and the equations of the symmetric root ``L`` still have a gradient.
 """
 
 from __future__ import annotations
@@ -32,10 +32,10 @@ from impact_posture.impact.worst_case.worst_normal import WorstNormal, cone_axes
 from impact_posture.impact.worst_case.worst_normal_symbolic import cone_axes_symbolic, worst_normal_symbolic
 from impact_posture.system.arrays import Array
 
-# Normals whose value is within this share of the largest value are worst normals in a subdifferential.
+# Normals whose value is within this share of the largest value contribute to the subdifferential.
 _ACTIVE = 1e-7
-# Start of τ and ρ above their solution at the first posture, by attempt.  A root with a zero eigenvalue, on the
-# boundary, is a saddle point for Newton's method.
+# Distance of the start of τ and ρ above their solution at the first posture, by attempt.  At a root with a zero
+# eigenvalue, on the boundary, Newton's method would meet a saddle point.
 _INSIDE = ((0.03, 0.01), (0.3, 0.1), (0.003, 0.001))
 _UPPER = ((0, 0), (0, 1), (0, 2), (1, 1), (1, 2), (2, 2))
 
@@ -44,24 +44,21 @@ def check_cone(kind: type[ImpactKind], degrees: float) -> None:
     """Refuse a kind without an exact worst case over a cone.
 
     Raises:
-        MetricError: The kind is no quadratic form of the normal.
+        MetricError: The kind is not a quadratic form of the normal.
     """
     if degrees and not issubclass(kind, QuadraticKind):
-        raise MetricError(
-            kind.no_cone,
-            where="normal_cone",
-            hint="choose `objective` impulse, sticking or energy, or `normal_cone` 0",
-        )
+        hint = "choose `objective` impulse, sticking or energy, or `normal_cone` 0"
+        raise MetricError(kind.no_cone, where="normal_cone", hint=hint)
 
 
 @dataclass(frozen=True)
 class NormalCone:
-    """The worst normal within ``degrees`` of the contact's own normal.
+    """The worst normal within ``degrees`` of the contact's normal.
 
     Attributes:
-        kind: The scalar that is minimized.
+        kind: The kind of the objective.
         degrees: Half angle of the cone.
-        attempts: Guesses of the lifted form.
+        attempts: Number of guesses of the lifted form.
     """
 
     kind: QuadraticKind
@@ -75,13 +72,13 @@ class NormalCone:
 
     @property
     def axis(self) -> Array:
-        """The contact's own normal, shape (3,)."""
+        """The contact's normal, shape (3,)."""
         return np.array(self.oracle.contact.normal)
 
     def worst(self, q: Array) -> WorstNormal:
         """Return the worst normal at ``q``, in the axes of the contact's normal.
 
-        Its ``value`` is that of the form ``nᵀKn``.  :meth:`value` is that of the objective.
+        Its ``value`` is the form ``nᵀKn``.  :meth:`value` returns the objective.
 
         Raises:
             MetricError: The kind is ``sticking`` and the contact point cannot move in every direction.
@@ -99,17 +96,17 @@ class NormalCone:
     def subgradients(self, q: Array, within: float = 0.0) -> Subgradients:
         """Return the gradients at all worst normals, each held fixed (Danskin), the leading normal first.
 
-        An arc or a circle of worst normals gives a dense sample.  A normal counts if its objective is at most
+        An arc or a circle of worst normals is sampled densely.  A normal contributes if its objective is at most
         ``within`` below the maximum.
         """
         kind, axis = self.kind, self.axis
         form = self._form(q)[0]
-        found = worst_normal(form, axis, self.degrees)
-        size = max(float(np.abs(form).max() * kind.of_form_slope(np.array(found.value))), 1e-300)
-        normals = tied_normals(form, axis, self.degrees, found, max(_ACTIVE, within / size))
+        worst = worst_normal(form, axis, self.degrees)
+        size = max(float(np.abs(form).max() * kind.of_form_slope(np.array(worst.value))), 1e-300)
+        normals = tied_normals(form, axis, self.degrees, worst, max(_ACTIVE, within / size))
         values = np.einsum("ki,ij,kj->k", normals, form, normals)
         slopes = kind.of_form_slope(values)
-        gaps = np.maximum(kind.of_form(np.array(found.value)) - kind.of_form(values), 0.0)
+        gaps = np.maximum(kind.of_form(np.array(worst.value)) - kind.of_form(values), 0.0)
         if len(normals) <= 2:
             gradients = np.array([kind.form_gradient(q, n) for n in normals])
         else:
@@ -128,7 +125,7 @@ class NormalCone:
         return worst_normal_symbolic((K + K.T) / 2, k.n, self.degrees)
 
     def lift(self, tree: Tree, parameters: ca.SX, scale: ca.SX) -> Lifted:
-        """Return the dual over the cone: the unknowns are three jumps, ``τ``, ``ρ`` and the six entries of ``L``."""
+        """Return the dual over the cone, with three jumps, ``τ``, ``ρ`` and the six entries of ``L`` as unknowns."""
         kind, local = self.kind, cone_axes_symbolic(parameters)
         world = in_world(kind.case, tree, local)
         jumps = [kind.lift_direction(tree, local[:, k], str(k)) for k in range(3)]
@@ -152,7 +149,7 @@ class NormalCone:
         )
 
     def guess(self, q: Array, scale: float, attempt: int = 0) -> Guess:
-        """Return the auxiliaries of :meth:`lift` at ``q``, with ``Z`` inside the cone that it must stay in."""
+        """Return the unknowns of :meth:`lift` at ``q``, with a positive definite ``Z``."""
         form, jumps, impulses = self._form(q, cone_axes(self.axis))
         form = form / self.kind.form_unit(scale)
         parts: list[Array] = []
@@ -180,11 +177,11 @@ class NormalCone:
         return float(np.cos(alpha)), float(np.sin(alpha))
 
     def _form(self, q: Array, directions: Array | None = None) -> tuple[Array, Array, Array]:
-        """``K`` along three directions (columns in the axes of the normal, those axes by default), shape (3, 3).
+        """Compute ``K`` along three directions: columns in the axes of the normal, by default these axes.
 
         Returns:
-            The form, the velocity jumps along the directions (columns, shape (nv, 3)), and the impulses that cause
-            them (columns, world axes, shape (3, 3)).
+            ``K``, shape (3, 3), the velocity jumps along the directions (columns, shape (nv, 3)), and the impulses
+            that cause them (columns, world axes, shape (3, 3)).
 
         Raises:
             MetricError: The form does not exist at ``q``.
@@ -200,10 +197,10 @@ class NormalCone:
         return (K + K.T) / 2, jumps, impulses
 
     def _form_tensor(self, q: Array) -> Array:
-        """``∂K``, shape (3, 3, nv), from the gradients along six directions."""
+        """Return ``∂K``, shape (3, 3, nv), from the gradients along six directions."""
         axes = np.eye(3)
         tensor = np.zeros((3, 3, self.oracle.robot.nv))
-        # The diagonal comes first in the order of i, because the other entries need it.
+        # The diagonal comes first, because the other entries need it.
         for i, j in sorted(_UPPER, key=lambda entry: entry[0] != entry[1]):
             both = self.kind.form_gradient(q, axes[i] if i == j else axes[i] + axes[j])
             tensor[i, j] = tensor[j, i] = both if i == j else (both - tensor[i, i] - tensor[j, j]) / 2

@@ -1,4 +1,4 @@
-"""The worst normal of a cone, exactly: ``max nᵀAn`` over ``∠(n, n₀) ≤ α``, with the multiplier that proves it.
+"""The exact worst normal of a cone, ``max nᵀAn`` over ``∠(n, n₀) ≤ α``, with the multiplier that proves it.
 
 A quadratic on a cap of the sphere has its maximum at an eigenvector inside the cap or on the cap's edge, where it is
 a trigonometric polynomial of degree two.  ``bound = λ_max(A + μ(n₀n₀ᵀ − cos²α I)) ≥ nᵀAn`` for every normal of the
@@ -15,7 +15,7 @@ from impact_posture.system.arrays import Array
 
 # Values that differ by less, relative to the size of A times sin α (their possible range), are tied.
 TIED = 1e-6
-# Worst normals closer than this share of sin α count as the same normal.
+# Worst normals closer than this share of sin α are one normal.
 _APART = 1e-2
 # Values that differ by less, relative to the size of A, are equal up to rounding.
 _EQUAL = 1e-14
@@ -31,7 +31,7 @@ class WorstNormal:
     Attributes:
         value: The maximum.
         normal: Normal that attains the maximum, shape (3,); the first of ``normals``.
-        normals: All tied normals that stand apart, shape (k, 3); a few of an arc or a circle.
+        normals: All different tied normals, shape (k, 3); samples of an arc or a circle.
         angle_deg: Angle of ``normal`` from the cone's axis, degrees.
         multiplier: ``μ ≥ 0`` of the dual; zero if the edge of the cone is inactive.
         bound: ``λ_max(A + μ(n₀n₀ᵀ − cos²α I))``, an upper bound over the cone.
@@ -46,7 +46,7 @@ class WorstNormal:
 
     @property
     def tied(self) -> bool:
-        """Whether another normal has the same value; the value then has a kink here and no gradient."""
+        """Whether another normal has the same value, so that the value has a kink and no gradient."""
         return len(self.normals) > 1
 
     def turned(self, R: Array) -> WorstNormal:
@@ -86,16 +86,16 @@ def worst_normal(A: Array, axis: Array, cone_deg: float) -> WorstNormal:
     axes = cone_axes(axis)
     P = axes.T @ A @ axes
     size = max(float(np.abs(P).max()), _SMALL)
-    found = np.vstack([_inside(P, c, s * size), _on_edge(P, c, s, size)])
-    values = np.einsum("ki,ij,kj->k", found, P, found)
+    candidates = np.vstack([_inside(P, c, s * size), _on_edge(P, c, s, size)])
+    values = np.einsum("ki,ij,kj->k", candidates, P, candidates)
     best = float(values.max())
-    # The leading normal must not depend on rounding, so its coordinates decide a tie.
-    near = [k for k in range(len(found)) if values[k] >= best - TIED * s * size]
-    near.sort(key=lambda k: (round((best - values[k]) / (_EQUAL * size)), *(-found[k])))
+    # The leading normal must not depend on rounding, so coordinates decide at a tie.
+    near = [k for k in range(len(candidates)) if values[k] >= best - TIED * s * size]
+    near.sort(key=lambda k: (round((best - values[k]) / (_EQUAL * size)), *(-candidates[k])))
     apart: list[Array] = []
     for k in near:
-        if all(np.linalg.norm(found[k] - other) > _APART * s for other in apart):
-            apart.append(found[k])
+        if all(np.linalg.norm(candidates[k] - other) > _APART * s for other in apart):
+            apart.append(candidates[k])
     multiplier = _multiplier(P, apart[0], c, s)
     shifted = P + multiplier * np.diag([s * s, -c * c, -c * c])
     normals = np.array(apart) @ axes.T
@@ -110,9 +110,10 @@ def worst_normal(A: Array, axis: Array, cone_deg: float) -> WorstNormal:
 
 
 def tied_normals(A: Array, axis: Array, cone_deg: float, worst: WorstNormal, tolerance: float) -> Array:
-    """Return the normals whose value is within ``tolerance · |A|`` of the worst normal, it first, shape (k, 3).
+    """Return the normals whose value is within ``tolerance · |A|`` of the worst value, shape (k, 3).
 
-    An arc, a circle or a cap of tied normals gives a sample that is dense enough for its convex hull.
+    The worst normal is the first.  An arc, a circle or a cap of tied normals is sampled densely enough for its convex
+    hull.
     """
     alpha = np.deg2rad(cone_deg)
     size = float(np.abs(A).max())
@@ -120,7 +121,7 @@ def tied_normals(A: Array, axis: Array, cone_deg: float, worst: WorstNormal, tol
     circle = np.stack([np.cos(_GRID), np.sin(_GRID)])
     values, vectors = np.linalg.eigh(A)
     top = vectors[:, values >= values[-1] - tolerance * size]
-    # A plane of top eigenvectors cuts the cap in an arc.  If all eigenvectors are, every normal of the cap is tied.
+    # A plane of top eigenvectors cuts the cap in an arc.  Where all eigenvectors are top, the whole cap is tied.
     tilts = alpha * (np.linspace(0, 1, 9) if top.shape[1] == 3 else np.ones(1))
     rings = [np.vstack([np.full_like(_GRID, np.cos(tilt)), np.sin(tilt) * circle]) for tilt in tilts]
     planes = [top[:, [i, j]] @ circle for i in range(top.shape[1]) for j in range(i)]
@@ -131,7 +132,7 @@ def tied_normals(A: Array, axis: Array, cone_deg: float, worst: WorstNormal, tol
 
 
 def _multiplier(P: Array, n: Array, c: float, s: float) -> float:
-    """``μ`` of ``(P + μ diag(s², −c², −c²)) n = t n``, from its first row, in a form without cancellation."""
+    """Return ``μ`` of ``(P + μ diag(s², −c², −c²)) n = t n`` from its first row, without cancellation."""
     if n[0] > c * (1 + 1e-12):
         return 0.0
     w = n[1:] / np.linalg.norm(n[1:])
@@ -139,7 +140,7 @@ def _multiplier(P: Array, n: Array, c: float, s: float) -> float:
 
 
 def _inside(P: Array, c: float, size: float) -> Array:
-    """Top eigenvectors within the cap, in its axes; for a multiple eigenvalue also the nearest to the axis."""
+    """Return the top eigenvectors within the cap, in its axes, and the top eigenvector nearest to the axis."""
     values, vectors = np.linalg.eigh(P)
     top = vectors[:, values >= values[-1] - TIED * size]
     candidates = [*top.T]
@@ -151,12 +152,12 @@ def _inside(P: Array, c: float, size: float) -> Array:
 
 
 def _on_edge(P: Array, c: float, s: float, size: float) -> Array:
-    """Maxima on the edge of the cap ``n = (c, s cos φ, s sin φ)``; three of its points if the value is constant."""
+    """Return the maxima on the edge ``n = (c, s cos φ, s sin φ)`` of the cap; three points for a constant value."""
     # Divided by 2s, the value is Re(A z + B z²) plus a constant, with z = exp(iφ).
     A, B = c * complex(P[0, 1], -P[0, 2]), s * complex(P[1, 1] - P[2, 2], -2 * P[1, 2]) / 4
 
     def height(x: Array, order: int = 0) -> Array:
-        """The value without its constant, or a derivative of it."""
+        """Return the value without its constant, or its derivative of an order."""
         z = np.exp(1j * x)
         return np.asarray((1j**order * (A * z + 2**order * B * z * z)).real)
 
@@ -171,7 +172,7 @@ def _on_edge(P: Array, c: float, s: float, size: float) -> Array:
         if np.abs(step).max() < 1e-15:
             break
     kept = (height(phi, 2) < 0) & (np.abs(height(phi, 1)) <= 1e-10 * swing)
-    # A maximum that is flat to third order is no simple root, so the highest candidate is kept as well.
+    # A maximum that is flat to third order is not a simple root, so the highest candidate is kept as well.
     heights = height(phi)
     highest = int(heights.argmax())
     kept[highest] |= not (heights[kept] >= heights[highest] - _EQUAL * swing / 2).any()

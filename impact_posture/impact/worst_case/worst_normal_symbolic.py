@@ -1,7 +1,8 @@
 """The worst normal of a cone in closed form, as the expression that the C export evaluates.
 
-With ``A`` in the cone's axes as ``[a, bᵀ; b, diag(d₁, d₂)]`` (the last two turned to the principal axes, ``d₁ ≥ d₂``)
-the normal follows from the root of a function.  Newton's method climbs to it from the left without passing it:
+In the axes of the cone, with the last two turned to principal axes, ``A`` is ``[a, bᵀ; b, diag(d₁, d₂)]`` with
+``d₁ ≥ d₂``.  The normal follows from the root of a function.  Newton's method converges to it from the left without
+overshoot:
 
 - on the edge ``n = (c, s w)``, ``|w| = 1``: ``w_i = p_i/(ν − d_i)`` with ``p = b c/s`` (a trust-region problem in the
   plane; Moré and Sorensen 1983), solved for ``1/|w| = 1``;
@@ -16,7 +17,7 @@ import numpy as np
 
 # These steps of Newton's method give full precision over 16 decades of p, gap and a, and up to 89.9°.
 _EDGE_STEPS, _INSIDE_STEPS = 8, 14
-# Smaller than every number that matters, in single precision as well.
+# A divisor that replaces zero: smaller than all relevant values, in single precision as well.
 _TINY = 1e-30
 
 
@@ -30,10 +31,10 @@ def cone_axes_symbolic(n: ca.SX) -> ca.SX:
 
 
 def worst_normal_symbolic(A: ca.SX, axis: ca.SX, cone_deg: float) -> ca.SX:
-    """Return the normal, shape (3,), that maximizes ``nᵀAn`` within ``cone_deg`` of ``axis``; one normal at a tie.
+    """Return the normal, shape (3,), that maximizes ``nᵀAn`` within ``cone_deg`` of ``axis``; one of them at a tie.
 
-    The gradient of the maximum is that of ``nᵀA(q)n`` with this ``n`` held fixed (Danskin).  Do not differentiate the
-    expression itself.
+    The gradient of the maximum is the gradient of ``nᵀA(q)n`` with ``n`` held fixed (Danskin).  Do not differentiate
+    this expression.
     """
     alpha = np.deg2rad(cone_deg)
     c, s = float(np.cos(alpha)), float(np.sin(alpha))
@@ -61,15 +62,15 @@ def worst_normal_symbolic(A: ca.SX, axis: ca.SX, cone_deg: float) -> ca.SX:
 
 
 def _edge_root(p: ca.SX, gap: ca.SX) -> ca.SX:
-    """``η = ν − d₁ ≥ 0`` with ``p₁²/η² + p₂²/(η + gap)² = 1``; zero in the hard case."""
-    # Bounds from below; the last bound is for the corner where p₁ vanishes and |p₂| nears the gap (η ~ p₁^⅔ there).
+    """Return ``η = ν − d₁ ≥ 0`` with ``p₁²/η² + p₂²/(η + gap)² = 1``; zero in the hard case."""
+    # Start at the largest lower bound.  The last bound is for p₁ near zero and |p₂| near the gap, where η ~ p₁^⅔.
     x, y = ca.fabs(p[0]), ca.fabs(p[1])
     corner = ca.fmin((x * x * gap / 4) ** (1 / 3), x * ca.sqrt(gap / (4 * ca.fmax(gap - y, 0) + _TINY)))
     eta = ca.fmax(ca.fmax(ca.fmax(x, y - gap), corner), _TINY)
     for _ in range(_EDGE_STEPS):
         x, y = p[0] / eta, p[1] / (eta + gap)
         square = x * x + y * y
-        # Newton on 1/|w| − 1, concave and rising: from the left it never passes the root.
+        # Newton's method on 1/|w| − 1, which is concave and rises, cannot overshoot the root from the left.
         slope = x * x / eta + y * y / (eta + gap)
         step = square * (ca.sqrt(square) - 1) / ca.fmax(slope, _TINY)
         eta = eta + ca.fmax(step, 0)
@@ -77,7 +78,7 @@ def _edge_root(p: ca.SX, gap: ca.SX) -> ca.SX:
 
 
 def _on_circle(p: ca.SX, eta: ca.SX, gap: ca.SX) -> ca.SX:
-    """``w`` of length one; in the hard case ``p₁ = 0`` both signs are right and plus is chosen."""
+    """Return ``w`` of length one; in the hard case ``p₁ = 0`` both signs are right, and the sign is plus."""
     y = ca.fmin(ca.fmax(p[1] / ca.fmax(eta + gap, _TINY), -1), 1)
     rest = 1 - y * y
     # Use the sine where it is large, and the quotient where a root would lose its digits.
@@ -86,7 +87,6 @@ def _on_circle(p: ca.SX, eta: ca.SX, gap: ca.SX) -> ca.SX:
 
 
 def _secular(xi: ca.SX, above: ca.SX, b: ca.SX, gap: ca.SX) -> tuple[ca.SX, ca.SX]:
-    """``λ − a − Σ b_i²/(λ − d_i)`` at ``λ = d₁ + ξ``, and its slope."""
-    one, other = ca.fmax(xi, _TINY), ca.fmax(xi + gap, _TINY)
-    x, y = b[0] / one, b[1] / other
+    """Return ``λ − a − Σ b_i²/(λ − d_i)`` at ``λ = d₁ + ξ``, and its slope."""
+    x, y = b[0] / ca.fmax(xi, _TINY), b[1] / ca.fmax(xi + gap, _TINY)
     return xi + above - b[0] * x - b[1] * y, 1 + x * x + y * y
