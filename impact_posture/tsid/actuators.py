@@ -10,7 +10,7 @@ from impact_posture.system.arrays import Array
 
 
 class Actuators:
-    """Decompose ``G`` once into the forces that it makes, the forces that it cannot make, and its null space.
+    """Decomposition of ``G`` into the forces that it can produce, the forces that it cannot, and its null space.
 
     ``G = blkdiag(G_b, I)`` with ``G_b`` (6 × rotors) constant, because generalized forces are dual to ν.  For a
     generalized force ``p = Mν̇ + h − …``:
@@ -27,7 +27,7 @@ class Actuators:
         spare: Orthonormal basis of ``G_b``'s null space, shape (rotors, rotors − rank).
         rank: Rank of ``G_b``.
         lower: Rotor thrusts (N) and joint torques (N·m), shape (controls,).
-        upper: As ``lower``; infinite where the model states no effort limit (or zero).
+        upper: As ``lower``; infinite where the model has no effort limit (or zero).
         names: Names of the controls.
     """
 

@@ -15,11 +15,11 @@ from impact_posture.tsid.support_contact import ContactStack
 from impact_posture.tsid.task_formulation import TaskFormulation
 from impact_posture.tsid.tasks.task import TaskStack
 
-# Weight of an acceleration that no task weighs, because the cost always needs a minimum.
+# Weight of an acceleration without a task, so that the cost has a minimum.
 _IDLE = 1e-8
-# Weight of a moment (N·m) relative to that of a force (N).
+# Weight of a moment (N·m), relative to a force (N).
 _MOMENT = 100.0
-# Share of the largest singular value of the tasks up to which they leave a direction free.
+# Directions with a smaller singular value, relative to the largest of the tasks, are free.
 _REDUNDANT = 1e-6
 
 
@@ -27,7 +27,7 @@ class Assembly:
     """Buffers of the QP of a formulation, which each tick fills.
 
     The variables are ``z = [ν̇; w; f]``: accelerations, the choice of redundant rotors, contact forces in world axes.
-    Controls are no variables, because ``u`` follows from ``p = Mν̇ + h − Jᵀf − J_eᵀF̂`` (:class:`Actuators`).  The
+    Controls are not variables, because ``u`` follows from ``p = Mν̇ + h − Jᵀf − J_eᵀF̂`` (:class:`Actuators`).  The
     rows are, in order:
 
     - ``blind``: ``blindᵀ p_base = 0``, the unactuated part of the dynamics;
@@ -42,7 +42,7 @@ class Assembly:
     Attributes:
         formulation: The formulation.
         qp: The QP of the last :meth:`build_qp`.
-        rank: The independent rows of the levels, and the QP without the others.
+        rank: The independent rows of the levels, and the QP without the dependent rows.
         levels: Names and rows of the strict levels, the most important first; hard contacts come first of all, as
             ``contacts``.
         limits: Entries of ``[z; A z]`` that come from joint limits and row limits.
@@ -73,7 +73,8 @@ class Assembly:
         self._place_cost(robot)
         self.levels = self._name_levels(hard, levels)
         self.limits = np.concatenate([np.arange(nv), np.arange(qp.n + cones.stop, qp.n + m)])
-        # Forces count by the acceleration of the robot's mass, or lifting its weight would be the cheapest motion.
+        # The unit of forces is the mass times an acceleration of 1.  With a unit of 1 N, lifting the robot would cost
+        # least.
         units = np.ones(qp.n)
         units[self._f] = robot.mass
         self.rank = LevelRank(qp, blind.stop, [rows for _, rows in self.levels], nv, units)
@@ -95,17 +96,23 @@ class Assembly:
         self._free = np.zeros(nv)
 
     def reset(self, state: State) -> None:
-        """Read gains and weights again, and hold the contacts where they are."""
+        """Read gains and weights again, and hold the contacts at their present places."""
         self.strict.refresh(state)
         self.weighted.refresh(state)
         self.contacts.reset(state)
         self.qp.A[self._cones, self._f] = self.contacts.cone
         self.qp.lower[self._at(self._cones)] = self.contacts.least
-        self._set_weights()
+        count, posture = self.weighted.size, self.formulation.posture
+        self._root[:count, 0] = np.sqrt(self.weighted.weight)
+        self._root[count:, 0] = np.sqrt(self.contacts.weight[self._soft])
+        self._posture_weight[:] = 0.0 if posture is None else posture.weight
+        self._added = np.maximum(self._posture_weight, _IDLE)
+        self._H[:] = 0.0
+        self._diagonal[:] = self._added
         self.rank.reset()
 
     def build_qp(self, state: State) -> QP:
-        """Fill the buffers for the tasks, contacts and limits at ``state``, and return the same QP every time."""
+        """Fill the buffers at ``state``, and return the QP, which is the same object at each call."""
         self.strict.update(state)
         self.weighted.update(state)
         self.contacts.update(state)
@@ -126,11 +133,11 @@ class Assembly:
         return z[: self._nv]
 
     def forces(self, z: Array) -> Array:
-        """Return the contact forces in world axes, one contact after the other."""
+        """Return the contact forces in world axes, in the order of the contacts."""
         return z[self._f]
 
     def generalized_force(self, state: State, z: Array) -> Array:
-        """Return ``p = Mν̇ + h − Jᵀf − J_eᵀF̂``, the force that the actuators must make, shape (nv,)."""
+        """Return ``p = Mν̇ + h − Jᵀf − J_eᵀF̂``, the force that the actuators must produce, shape (nv,)."""
         force = state.M @ z[: self._nv]
         force += self._free
         if self.contacts.size:
@@ -140,7 +147,7 @@ class Assembly:
     def controls(self, state: State, z: Array) -> Array:
         """Return ``u``: rotor thrusts (N), then joint torques (N·m); a fresh array.
 
-        It is ``actuators.solve(generalized_force(state, z), w)``, computed by the rows that limit it.
+        The rows of the control limits give the same as ``actuators.solve(generalized_force(state, z), w)``.
         """
         u = self._A_controls @ z
         u += self._known
@@ -158,11 +165,11 @@ class Assembly:
     # ---- filling the QP -------------------------------------------------------------------------------------------
 
     def _at(self, rows: slice) -> slice:
-        """Return the places of rows of ``A`` among the bounds."""
+        """Return the indices of rows of ``A`` in the bounds."""
         return slice(self.qp.n + rows.start, self.qp.n + rows.stop)
 
     def _equate(self, rows: slice, value: Array) -> None:
-        """Set both bounds of equations."""
+        """Set both bounds of rows to a value."""
         at = self._at(rows)
         self.qp.lower[at] = value
         self.qp.upper[at] = value
@@ -177,7 +184,7 @@ class Assembly:
         qp.A[thrusts, self._w] = actuators.spare
         self._A_hard, self._A_controls = qp.A[hard, :nv], qp.A[controls]
         self._free_blind, self._known = np.zeros(actuators.blind.shape[1]), np.zeros(actuators.controls)
-        # Rows of the dynamics, where their constants go, their part of a generalized force, and what turns it.
+        # Rows of the dynamics, the buffer of their constants, their part of a generalized force, and its map to rows.
         base, joints = slice(actuators.base), slice(actuators.base, nv)
         parts: list[tuple[slice, Array, slice, Array | None]] = [
             (blind, self._free_blind, base, np.ascontiguousarray(actuators.blind.T) if actuators.rotors else None),
@@ -204,16 +211,6 @@ class Assembly:
         )
         self._H, self._g = self.qp.H[:nv, :nv], self.qp.g[:nv]
         self._posture_weight = np.zeros(nv)
-
-    def _set_weights(self) -> None:
-        count = self.weighted.size
-        self._root[:count, 0] = np.sqrt(self.weighted.weight)
-        self._root[count:, 0] = np.sqrt(self.contacts.weight[self._soft])
-        posture = self.formulation.posture
-        self._posture_weight[:] = 0.0 if posture is None else posture.weight
-        self._added = np.maximum(self._posture_weight, _IDLE)
-        self._H[:] = 0.0
-        self._diagonal[:] = self._added
 
     def _name_levels(self, hard: slice, levels: slice) -> tuple[tuple[str, slice], ...]:
         (_, *rows), _ = stacked_rows(

@@ -1,4 +1,4 @@
-"""The controller, which turns each measured state into a command."""
+"""Controller that computes a command from each measured state."""
 
 from __future__ import annotations
 
@@ -25,11 +25,11 @@ from impact_posture.tsid.task_formulation import TaskFormulation
 from impact_posture.tsid.tasks.impact_robust import ImpactRobustPosture
 from impact_posture.tsid.tasks.task import Task
 
-# Longest time step of ramps, in periods.  Longer pauses between ticks count as this.
+# Longest time step of ramps, in periods, after a longer pause between ticks.
 _LONGEST = 10
-# Least nv for which LAPACK whitens a dense cost; by measurement, a quadruped gains nothing.
+# Least nv for which LAPACK whitens a dense cost.  Measurements of a quadruped show no gain.
 _LARGE = 20
-# Largest sum of squares of a measurement (1e8 m, rad/s or N); a larger one is refused.
+# Largest sum of squares of a valid measurement (1e8 m, rad/s or N).
 _ABSURD = 1e16
 # Largest violation of a control limit, relative to the largest limit.
 _EXCESS = 1e-6
@@ -49,7 +49,7 @@ class Status(Enum):
     UNSOLVED = "unsolved"
     """The QP solver gave up, or its answer violates a control limit, and the previous command is held."""
     NON_FINITE = "non-finite"
-    """A measurement is not finite, exceeds 1e8, or is no rotation, and the previous command is held."""
+    """A measurement is not finite, exceeds 1e8, or is not a rotation, and the previous command is held."""
 
 
 @dataclass(frozen=True, slots=True, eq=False)
@@ -62,7 +62,7 @@ class Command:
         rotor_speed: Rotor speeds in the unit of ``speed_max`` in robot.toml, shape (rotors,).
         status: Result of the tick.
         acceleration: Planned ``ν̇``, shape (nv,); zero in a held command.
-        forces: Planned contact forces, world axes, one contact after the other, N and N·m.
+        forces: Planned contact forces, world axes, in the order of the contacts, N and N·m.
     """
 
     u: Array
@@ -80,8 +80,8 @@ class Report:
     Attributes:
         status: Result of the tick.
         relaxed: Levels and limits that gave way, the most important first.
-        deficient: Levels that miss because of their rank and not because of limits.  The levels above determine their
-            motion, they contradict themselves, or they are damped near a singularity (:class:`LevelRank`).
+        deficient: Levels that miss because of their rank and not because of limits.  Levels above determine their
+            motion, their rows contradict each other, or they are damped near a singularity (:class:`LevelRank`).
         residuals: ``ÿ − ÿ*`` of each task by name, and of ``contacts``.
         active: Names of the active bounds, with ``lower`` or ``upper``.
         dynamics: ``‖Mν̇ + h − Gu − Jᵀf − J_eᵀF̂‖_∞``.
@@ -115,12 +115,7 @@ class Controller:
     """
 
     def __init__(self, robot: Robot, formulation: TaskFormulation, *, period: Positive = 1e-3) -> None:
-        """Size all buffers.
-
-        Args:
-            robot: The robot.
-            formulation: Tasks, contacts and limits.
-            period: Expected time between ticks, s, which defines the first time step and the longest one.
+        """Size all buffers.  ``period`` is the first time step, s, and limits the longest time step.
 
         Raises:
             FrameNotFound: The frame of a task does not exist.
@@ -137,7 +132,7 @@ class Controller:
         # Most tasks have no memory to advance.
         self._advancing = [task for task in self._tasks if type(task).advance is not Task.advance]
         self._ready = False
-        # Square of the largest violation of a control limit.  More than the tolerance of a solver is no solution.
+        # Square of the largest violation of a control limit that is within the tolerance of the solver.
         limits = np.abs([self.actuators.lower, self.actuators.upper])
         self._excess = (_EXCESS * max(1.0, float(np.max(limits, where=np.isfinite(limits), initial=0.0)))) ** 2
 
@@ -148,12 +143,12 @@ class Controller:
             The first command, which is also held if the first tick fails.
 
         Raises:
-            PostureError: ``q`` is no configuration of the robot, ``v`` is no velocity, or their size is absurd.
+            PostureError: ``q`` is not a configuration, ``v`` is not a velocity, or an entry is too large.
         """
         q = self.robot.check_posture(np.asarray(q, dtype=float), limits=False)
         v = checked_velocity(self.robot, v)
         if not math.hypot(*q, *v) < math.sqrt(_ABSURD):
-            raise PostureError("q or ν is beyond all measurements", where="reset", hint="correct it; in SI units")
+            raise PostureError("q or ν is too large for a measurement", where="reset", hint="give SI units")
         state, assembly = self.state, self.assembly
         state.push(None)
         state.update(q, v)
@@ -195,12 +190,12 @@ class Controller:
         q, v = np.asarray(q, dtype=float), np.asarray(v, dtype=float)
         if q.shape != state.q.shape or v.shape != state.v.shape:
             raise ValueError(f"q and v have shapes {q.shape} and {v.shape}, not {state.q.shape} and {state.v.shape}")
-        # A sum of squares is finite and below a bound only if all numbers are.
+        # A sum of squares is finite and below a bound only if each number is.
         total = q.dot(q) + v.dot(v)
         if force is not None:
             force = np.asarray(force, dtype=float)
             total += force.dot(force)
-        if not (total < _ABSURD and math.isfinite(t)) or self._turned_wrong(q):
+        if not (total < _ABSURD and math.isfinite(t)) or self._far_from_unit(q):
             return self._held(Status.NON_FINITE, v)
         dt = self.period if self._t is None else min(max(t - self._t, 0.0), _LONGEST * self.period)
         self._t = t
@@ -271,16 +266,12 @@ class Controller:
         self._u[:] = u
         return self._command(u, self._status, assembly.acceleration(solved.z), assembly.forces(solved.z))
 
-    def _turned_wrong(self, q: Array) -> bool:
-        """Whether a quaternion, or a cosine with its sine, is far from unit length."""
-        for part in self.state.unit_parts:
-            unit = q[part]
-            if abs(unit.dot(unit) - 1.0) > 1e-2:
-                return True
-        return False
+    def _far_from_unit(self, q: Array) -> bool:
+        """Return whether a quaternion, or a cosine with its sine, is far from unit length."""
+        return any(abs(q[part].dot(q[part]) - 1.0) > 1e-2 for part in self.state.unit_parts)
 
     def _held(self, status: Status, v: Array) -> Command:
-        """Return the previous command, with damping of the joints whose rates can be measured."""
+        """Return the previous command, with damping of the joints whose measured rates are valid."""
         rotors, actuators = self.actuators.rotors, self.actuators
         self._status, self._outcome = status, Outcome(None)
         u = self._u.copy()

@@ -13,8 +13,8 @@ class JointRanges:
     Attributes:
         lower: Position, rad or m, shape (nv,).
         upper: As ``lower``.
-        velocity: rad/s or m/s, shape (nv,); infinite where the model states none (or zero).
-        index: Entry of ``q`` for each entry of ν with position limits (any entry for the others), shape (nv,).
+        velocity: rad/s or m/s, shape (nv,); infinite where the model has no limit (or zero).
+        index: Entry of ``q`` for each entry of ν with position limits, shape (nv,); arbitrary for the others.
     """
 
     def __init__(self, robot: Robot) -> None:

@@ -1,4 +1,4 @@
-"""Kinematics of a few points of the robot, all at once, from the joint Jacobians of Pinocchio."""
+"""Kinematics of points of the robot in one batch, from the joint Jacobians of Pinocchio."""
 
 from __future__ import annotations
 
@@ -12,7 +12,7 @@ from impact_posture.config.checked import checked
 from impact_posture.robot.robot import Robot
 from impact_posture.system.arrays import Array
 
-# p @ _SHIFT, shape (6, 6), holds -[p]x upper right, which shifts a body's velocity from the origin to p.
+# p @ _SHIFT, shape (6, 6), has -[p]x at the upper right, which shifts a body's velocity from the origin to p.
 _SHIFT = np.zeros((3, 6, 6))
 _SHIFT[[2, 0, 1], [0, 1, 2], [4, 5, 3]] = 1.0
 _SHIFT[[1, 2, 0], [0, 1, 2], [5, 3, 4]] = -1.0
@@ -35,7 +35,7 @@ class Point:
 
 @dataclass(frozen=True, eq=False)
 class PointState:
-    """Kinematics of a point in views on the buffers of the state, which its next update overwrites.
+    """Kinematics of a point, in views that the next update of the state overwrites.
 
     Attributes:
         position: World, meters, shape (3,).
@@ -60,17 +60,14 @@ class PointKinematics:
     def __init__(self, robot: Robot, data: pin.Data, points: Sequence[Point]) -> None:
         """Size the buffers.
 
-        Args:
-            robot: The robot.
-            data: Data on which the caller runs ``pin.computeJointJacobiansTimeVariation`` before each update.
-            points: The points.
+        Before each update, the caller runs ``pin.computeJointJacobiansTimeVariation`` on ``data``.
 
         Raises:
-            FrameNotFound: The robot has no such frame; carries the nearest names.
+            FrameNotFound: The robot lacks a frame; carries the nearest names.
         """
         model, nv, count = robot.model, robot.nv, len(points)
         frames = [model.frames[robot.frame_id(point.frame)] for point in points]
-        # Pinocchio gives vectors for a robot with one degree of freedom.
+        # Reshaped, because Pinocchio returns vectors for a robot with one degree of freedom.
         self._J, self._dJ_transposed = data.J.reshape(6, nv), data.dJ.reshape(6, nv).T
         mask = np.zeros((count, nv))
         for k, frame in enumerate(frames):
@@ -119,7 +116,7 @@ class PointKinematics:
                 rotation[:] = R
             else:
                 np.dot(R, turn, out=rotation)
-        # Pinocchio gives J for the body's point at the world origin: v_p = v + ω × p.
+        # J of Pinocchio is for the body's point at the world origin: v_p = v + ω × p.
         np.matmul(self._position, _FLAT, out=self._shift)
         self._shift += _EYE
         np.matmul(self._shift_rows, self._J, out=self._jacobian)
@@ -132,7 +129,7 @@ class PointKinematics:
         np.multiply(self._mask, v, out=self._masked)
         np.matmul(self._masked, self._dJ_transposed, out=self._world)
         np.matmul(self._shifts, self._worlds, out=self._spatials)
-        # ω × v_p by the same operator, applied to v_p.
+        # The same operator computes ω × v_p.
         np.matmul(self._linear, _FLAT, out=self._turn)
         np.matmul(self._turns, self._twists, out=self._drifts)
         self._drift += self._spatial

@@ -1,4 +1,4 @@
-"""Solution of the QP of a tick that never fails, because strict levels give way, the least important first."""
+"""Solution of the QP of a tick.  It never fails, because strict levels give way, the least important first."""
 
 from __future__ import annotations
 
@@ -6,7 +6,6 @@ from dataclasses import dataclass
 
 import daqp
 import numpy as np
-from numpy.typing import NDArray
 
 from impact_posture.system.arrays import Array, null_space
 from impact_posture.tsid.assembly import Assembly
@@ -14,15 +13,15 @@ from impact_posture.tsid.qp.daqp_solver import SOLVED, DaqpSolver
 from impact_posture.tsid.qp.hierarchy import Level, lexicographic
 from impact_posture.tsid.qp.quadratic_program import EQUALITY, QP, Solved
 
-# Miss that counts, relative to the terms of a row.
+# Least miss that counts, relative to the terms of a row.
 _OFF = 1e-6
-# A row that misses by more stays where it is, relative to the length of the row times the size of the point.
+# Least miss at which a row is held, relative to the length of the row times the size of the point.
 _MISSES = 1e-9
-# Largest violation of a bound in the end, in the same units.
+# Largest violation of a bound by the result, in the same units.
 _ROUNDING = 1e-13
-# Bounds beyond this are none, and settings of DAQP for the cost in the end, in numbers that were scaled.
+# Bound that DAQP takes for infinite, and its settings for the scaled program of the cost.
 _FAR, _SETTINGS = 1e30, {"primal_tol": 1e-11, "sing_tol": 1e-13, "iter_limit": 1000}
-# Least curvature of the cost in the end, relative to the largest.
+# Least curvature of the cost, relative to the largest.
 _FLATTEST = 1e-14
 # Weight of the proximal-point iterations with which DAQP decides whether strict levels can hold.
 _FLAT = 1e-6
@@ -43,10 +42,10 @@ class Relaxed:
 
 @dataclass(frozen=True, eq=False)
 class Outcome:
-    """Answer to the QP of a tick.
+    """Result of the QP of a tick.
 
     Attributes:
-        solved: Solution; ``None`` if the relaxed QPs have none either.
+        solved: Solution; ``None`` if the relaxed QPs have no solution either.
         relaxed: Levels and limits that gave way, the most important first.
     """
 
@@ -55,49 +54,40 @@ class Outcome:
 
 
 def solve(assembly: Assembly, solver: DaqpSolver) -> Outcome:
-    """Solve the QP of the assembly; if that fails, relax it lexicographically.
+    """Solve the QP of the assembly from the solver's active set; if this fails, relax it.
 
     Dynamics, control limits and friction always hold, because every state has an acceleration that satisfies them.
-    The acceleration bounds of joint limits are opened only as far as these rows demand.  Then each level, from the
-    most important down, holds if it can hold together with the levels above it.  Otherwise it comes as close as
-    possible in the least-squares sense and stays there for the levels below.  Last, the cost is minimized with all
-    of them held.
-
-    Args:
-        assembly: With :attr:`Assembly.qp` built.
-        solver: Solver of the ticks, which keeps its active set.
+    The acceleration bounds of joint limits open only as far as these rows demand.  Then each level, from the most
+    important down, holds if it can hold together with the levels above it.  Otherwise it comes as close as possible
+    in the least-squares sense and stays there for the levels below.  Last, the cost decides what is still free.
     """
     qp = assembly.rank.qp
     if assembly.rank.changed:
         solver.reset()
     solved = solver.solve(qp)
     if solved is None and not solver.infeasible:
-        # The solver gave up from its warm start.  Try once without.
+        # The solver gave up from its warm start, so try a cold start.
         solver.reset()
         solved = solver.solve(qp)
     if solved is None and qp.finite:
-        # Rows that are nearly dependent look infeasible.  Proximal steps decide, in a new workspace, because they
-        # start from its last answer.
+        # Nearly dependent rows look infeasible.  Proximal steps decide.  They start from the last answer of their
+        # workspace, hence a new one.
         solved = DaqpSolver(qp.n, qp.m, proximal=_FLAT).solve(qp)
     if solved is not None or not qp.finite:
         return Outcome(solved)
-    return _relax(assembly)
-
-
-def _relax(assembly: Assembly) -> Outcome:
     nearest = lexicographic(_hierarchy(assembly), assembly.rank.units)
     if nearest is None:
         return Outcome(None)
-    solved = _cheapest(assembly.rank.qp, assembly.rank.units, nearest)
+    solved = _cheapest(qp, assembly.rank.units, nearest)
     return Outcome(solved, _gave_way(assembly, solved.z))
 
 
 def _cheapest(qp: QP, units: Array, nearest: Array) -> Solved:
-    """Minimize the cost over what a lexicographic answer leaves free.
+    """Minimize the cost in the directions that a lexicographic answer leaves free.
 
-    Equations and missed rows stay where they are, so the cost moves in their null space: ``z = nearest + W y``, with
-    a basis ``W`` in which the cost is a sum of squares.  The other bounds hold.  Where they leave the solver no room
-    beyond rounding, the answer is ``nearest``.
+    Equations and missed rows keep their values, so the cost moves in their null space: ``z = nearest + W y``, with a
+    basis ``W`` in which the cost is a sum of squares.  The other bounds hold.  If they leave only rounding, return
+    ``nearest``.
     """
     values, rows = qp.values(nearest), np.vstack([np.eye(qp.n), qp.A]) * units
     size, lengths = max(1.0, float(np.max(np.abs(nearest / units)))), np.linalg.norm(rows, axis=1)
@@ -112,7 +102,7 @@ def _cheapest(qp: QP, units: Array, nearest: Array) -> Solved:
     curvatures, axes = np.linalg.eigh((free.T * units) @ qp.H @ (units[:, None] * free))
     largest = float(curvatures[-1])
     W = free @ (axes / np.sqrt(np.maximum(curvatures / largest, _FLATTEST)))
-    # A row that held rows determine sees the rest by rounding alone.
+    # The held rows determine a row that moves along the free directions by rounding only.
     sees = np.linalg.norm(rows @ free, axis=1) > _MISSES
     bound = np.flatnonzero(~held & sees & (np.isfinite(lower) | np.isfinite(upper)))
     seen, g = rows[bound] @ W, W.T @ (units * (qp.H @ nearest + qp.g)) / (size * largest)
@@ -121,27 +111,29 @@ def _cheapest(qp: QP, units: Array, nearest: Array) -> Solved:
     y, _, flag, info = daqp.solve(np.eye(g.size), g, seen / reach[:, None], *ends, senses, **_SETTINGS)
     if flag not in SOLVED:
         return only
-    # What is held, and active bounds, hold to the last digit.
-    way, multipliers = W @ y, np.zeros(qp.n + qp.m)
+    # A correction makes held rows and active bounds exact to the last digit.
+    step, multipliers = W @ y, np.zeros(qp.n + qp.m)
     multipliers[bound] = largest * size / (lengths[bound] * reach) * info["lam"]
     active = multipliers != 0.0
-    aim = np.where(multipliers > 0.0, upper, np.where(active, lower, 0.0)) - rows @ way
+    aim = np.where(multipliers > 0.0, upper, np.where(active, lower, 0.0)) - rows @ step
     exact = held | active
-    way += np.linalg.lstsq(rows[exact], aim[exact], rcond=1e-12)[0]
-    moved = rows @ way
+    step += np.linalg.lstsq(rows[exact], aim[exact], rcond=1e-12)[0]
+    moved = rows @ step
     if not (np.abs(moved - np.clip(moved, lower, upper))[~held] <= _ROUNDING).all():
         return only
-    return Solved(nearest + size * units * way, multipliers, int(info["iterations"]))
+    return Solved(nearest + size * units * step, multipliers, int(info["iterations"]))
 
 
 def missed(assembly: Assembly, z: Array, *, equations: bool) -> tuple[Relaxed, ...]:
-    """Return the levels that miss, in their rows that are equations or in those that lack rank."""
-    found = []
+    """Return the levels that miss in their equations, or with ``equations=False`` in their rows that lack rank."""
+    levels = []
     for name, level in assembly.levels:
-        off, size = _missed(assembly, z, assembly.rank.rows(level, equations))
+        rows = assembly.rank.rows(level, equations)
+        A = assembly.rank.qp.A[rows]
+        off, size = A @ z - assembly.rank.wanted[rows], 1.0 + float(np.max(np.abs(A) @ np.abs(z), initial=0.0))
         if float(np.max(np.abs(off), initial=0.0)) > _OFF * size:
-            found.append(Relaxed(name, float(np.linalg.norm(off))))
-    return tuple(found)
+            levels.append(Relaxed(name, float(np.linalg.norm(off))))
+    return tuple(levels)
 
 
 def _gave_way(assembly: Assembly, z: Array) -> tuple[Relaxed, ...]:
@@ -152,14 +144,8 @@ def _gave_way(assembly: Assembly, z: Array) -> tuple[Relaxed, ...]:
     return (*([Relaxed("joint limits", most)] if opened else []), *missed(assembly, z, equations=True))
 
 
-def _missed(assembly: Assembly, z: Array, rows: NDArray[np.intp]) -> tuple[Array, float]:
-    """Return ``Jν̇ − a`` of the given rows, and the size of its terms."""
-    A = assembly.rank.qp.A[rows]
-    return A @ z - assembly.rank.wanted[rows], 1.0 + float(np.max(np.abs(A) @ np.abs(z), initial=0.0))
-
-
 def _hierarchy(assembly: Assembly) -> list[Level]:
-    """Return the rows that always hold, the acceleration bounds, and the strict levels."""
+    """Return the hard rows, the acceleration bounds, and the strict levels."""
     qp, limits, rank = assembly.rank.qp, assembly.limits, assembly.rank
     n = qp.n
     always = np.ones(qp.m, dtype=bool)

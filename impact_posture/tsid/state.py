@@ -23,7 +23,7 @@ class State:
         points: Points whose kinematics the state holds.
         q: Configuration, shape (nq,), a copy with unit quaternions and cosine-sine pairs.
         v: ν, shape (nv,), a copy.
-        M: Mass matrix with armature, shape (nv, nv); a view on the data of Pinocchio, like ``h``.
+        M: Mass matrix with armature, shape (nv, nv); like ``h``, a view on the data of Pinocchio.
         h: Coriolis, centrifugal and gravity terms, shape (nv,).
         room: Distance of each joint to its upper, then to its lower limit, shape (2, nv); negative beyond a limit,
             infinite without one.
@@ -32,18 +32,14 @@ class State:
         force: Measured contact wrench on the robot ``[force (N); moment (N·m)]``, world axes, shape (6,).
         pushed: Whether a wrench is measured.
         mass: Total mass, kg.
-        unit_parts: Places of quaternions and cosine-sine pairs in ``q``.
+        unit_parts: Slices of quaternions and cosine-sine pairs in ``q``.
     """
 
     def __init__(self, robot: Robot, points: Iterable[Point] = ()) -> None:
-        """Size the buffers.
-
-        Args:
-            robot: The robot.
-            points: Points whose kinematics :meth:`at` returns.
+        """Size the buffers for a robot and the points whose kinematics :meth:`at` returns.
 
         Raises:
-            FrameNotFound: The robot has no such frame; carries the nearest names.
+            FrameNotFound: The robot lacks a frame; carries the nearest names.
         """
         self.robot, self.points = robot, tuple(points)
         self._model = robot.model
@@ -56,7 +52,7 @@ class State:
         self.room, self._joints, self.least_room = np.zeros((2, robot.nv)), np.zeros(robot.nv), np.inf
         self._above, self._below, self.rooms = self.room[0], self.room[1], self.room.reshape(-1)
         self.force, self.pushed, self.mass = np.zeros(6), False, robot.mass
-        # Pinocchio writes into the same memory on every call, hence views on it stay valid.
+        # Views stay valid, because Pinocchio writes into the same memory at each call.
         self.M, self.h = data.M, data.nle
         self._gravity = np.array(robot.model.gravity.linear)
         base = data.oMi[1]
@@ -111,17 +107,17 @@ class State:
             self.force[: force.size] = force
 
     def at(self, point: Point) -> PointState:
-        """Return the kinematics of a point given to the constructor.
+        """Return the kinematics of a point of the constructor.
 
         Raises:
-            InputError: The point was not given.
+            InputError: The constructor did not get this point.
         """
         try:
             return self._views[point]
         except KeyError:
             known = ", ".join(p.frame for p in self.points) or "none"
             raise InputError(
-                f"the state does not follow this point of '{point.frame}' (it follows: {known})",
+                f"the state has no kinematics of this point of '{point.frame}' (it has: {known})",
                 where="state",
                 hint="name the point in the task's `points`",
             ) from None
@@ -138,8 +134,8 @@ class State:
     def center_of_mass(self) -> tuple[Array, Array, Array]:
         """Return position (3,), Jacobian (3, nv) and drift ``J̇ν`` (3,) of the center of mass in the world.
 
-        For a floating base, ``M`` and ``h`` hold them, because the base's linear rows are the linear momentum in base
-        axes: ``m J_com = R M[:3]`` and ``m J̇_com ν = R h[:3] + m g``.
+        They follow from ``M`` and ``h``, because the base's linear rows are the linear momentum in base axes:
+        ``m J_com = R M[:3]`` and ``m J̇_com ν = R h[:3] + m g``.
 
         Raises:
             InputError: The base is fixed.
@@ -171,5 +167,6 @@ def checked_velocity(robot: Robot, v: ArrayLike) -> Array:
     """
     v = np.asarray(v, dtype=float)
     if v.shape != (robot.nv,) or not np.isfinite(v).all():
-        raise PostureError(f"no velocity of {robot.name}", where="reset", hint=f"give {robot.nv} finite numbers")
+        what = f"the velocity of {robot.name} has another shape or is not finite"
+        raise PostureError(what, where="reset", hint=f"give {robot.nv} finite numbers")
     return v

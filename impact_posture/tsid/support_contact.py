@@ -1,4 +1,4 @@
-"""Contacts that stay: the accelerations that they demand, and the friction pyramids of their forces."""
+"""Contacts that stay: their desired accelerations, and the friction pyramids of their forces."""
 
 from __future__ import annotations
 
@@ -65,8 +65,7 @@ class SupportContact:
     def cone(self, rotation: Array) -> Array:
         """Return the rows ``C f ≥ 0`` of the friction cone in world axes, shape (rows, size); normal force first.
 
-        Args:
-            rotation: World from frame, shape (3, 3); the x axis of the frame is the x axis of a sole.
+        ``rotation`` is world from frame, shape (3, 3).  The x axis of the frame is the x axis of a sole.
 
         Raises:
             ContactError: The sole stands on its edge.
@@ -79,11 +78,9 @@ class SupportContact:
 
 @checked
 def support_contacts(robot: Robot, *, friction: Positive = 0.7) -> tuple[SupportContact, ...]:
-    """Return the supports of ``robot.toml`` on level ground: soles are hard constraints, points have a weight.
+    """Return the supports of ``robot.toml`` on level ground with a Coulomb coefficient.
 
-    Args:
-        robot: The robot.
-        friction: Coulomb coefficient.
+    Soles are hard constraints, points have a weight.
     """
     return tuple(
         SupportContact(
@@ -94,7 +91,7 @@ def support_contacts(robot: Robot, *, friction: Positive = 0.7) -> tuple[Support
 
 
 class ContactStack:
-    """Stack contacts to ``J ν̇ = a`` and ``lower ≤ cone · f``, with forces ``f`` in world axes.
+    """Stack of contacts as ``J ν̇ = a`` and ``least ≤ cone · f``, with forces ``f`` in world axes.
 
     Attributes:
         contacts: Contacts from top to bottom.
@@ -124,7 +121,7 @@ class ContactStack:
         self.cone, self.least = np.zeros((count, self.size)), np.zeros(count)
 
     def reset(self, state: State) -> None:
-        """Hold the present places from now on."""
+        """Hold the contacts at their present places."""
         for k, (contact, rows, cone_rows) in enumerate(zip(self.contacts, self.rows, self.cone_rows, strict=True)):
             here = state.at(contact.point)
             self._home[k] = here.position.copy(), here.rotation.copy()
@@ -160,7 +157,7 @@ def point_cone(friction: float) -> Array:
 
 
 def surface_cone(friction: float, half_x: float, half_y: float) -> Array:
-    """Return the cone of wrenches that forces in the pyramids at the four corners make at a sole's center, (17, 6).
+    """Return the cone of wrenches at a sole's center from forces in the pyramids at its four corners, shape (17, 6).
 
     The rows are ``f_z ≥ 0``, four rows of friction, four rows that keep the center of pressure on the sole, and
     eight rows that bound the yaw moment (Caron, Pham, Nakamura 2015, "Stability of surface contacts for humanoid
@@ -180,7 +177,7 @@ def surface_cone(friction: float, half_x: float, half_y: float) -> Array:
 
 
 def to_world(cone: Array, normal: Array, heading: Array) -> Array:
-    """Return a cone in world axes, for forces (and moments): z is ``normal``, x the tangential part of ``heading``.
+    """Return a cone of forces (and moments) in world axes, with z along ``normal`` and x along ``heading``.
 
     Raises:
         ContactError: The heading of a sole points along the normal.

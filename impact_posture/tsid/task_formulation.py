@@ -26,7 +26,7 @@ END_EFFECTOR_KP = 60.0
 @checked
 @dataclass(frozen=True, eq=False)
 class TaskFormulation:
-    """Tasks, contacts and limits that a controller solves for at each tick.
+    """Tasks, contacts and limits of the QP of each tick.
 
     Attributes:
         levels: Tasks that hold as equalities, the most important level first (Afifi et al. 2026, Problems 2 and 3).
@@ -35,9 +35,9 @@ class TaskFormulation:
         contacts: Contacts with the ground.
         force_point: Point where a measured contact force acts; ``None`` leaves the force out of the dynamics.
         law: Law that stops joints at their limits; ``None`` leaves the accelerations unlimited.
-        row_limits: Limits of expected impacts, which give way like those of the joints.
-        force_weight: Weight of contact forces in the cost, 1/N² (a hundred times that for moments, 1/(N·m)²).
-        spare_weight: Weight of the choice that redundant rotors leave, 1/N².
+        row_limits: Limits of expected impacts, which give way like the joint limits.
+        force_weight: Weight of contact forces in the cost, 1/N²; moments have a hundred times as much, 1/(N·m)².
+        spare_weight: Weight of the free choice among redundant rotors, 1/N².
     """
 
     levels: tuple[tuple[Task, ...], ...] = ()
@@ -68,11 +68,9 @@ class TaskFormulation:
     @property
     def points(self) -> tuple[Point, ...]:
         """All points whose kinematics the state must hold, contacts first."""
-        found = [c.point for c in self.contacts] + [p for task in self.tasks for p in task.points]
-        found += [p for limit in self.row_limits for p in limit.points]
-        if self.force_point is not None:
-            found.append(self.force_point)
-        return tuple(dict.fromkeys(found))
+        points = [c.point for c in self.contacts] + [p for task in self.tasks for p in task.points]
+        points += [p for limit in self.row_limits for p in limit.points]
+        return tuple(dict.fromkeys(points if self.force_point is None else [*points, self.force_point]))
 
 
 @checked
@@ -94,7 +92,7 @@ def aerial_formulation(
             point.
         tilt: Task of the tilt, by default with ``kp = 100``.
         order: ``strict`` makes tilt and end effector equalities (Problems 2 and 3).  ``weighted`` puts all tasks into
-            the cost, with their own weights (Problem 1).
+            the cost, with their weights (Problem 1).
         law: Law of the joint limits.
 
     Raises:
@@ -118,13 +116,7 @@ def arm_formulation(
 ) -> TaskFormulation:
     """Return the stack of :func:`aerial_formulation` without the tilt, for an arm on a fixed base.
 
-    Args:
-        robot: The robot; the end effector is its default contact frame.
-        posture: Nominal or impact-robust.
-        end_effector: Task of the end effector, by default a pose with ``kp = 60``; the measured force acts at its
-            point.
-        order: ``strict`` makes the end effector an equality; ``weighted`` puts it into the cost, with its own weight.
-        law: Law of the joint limits.
+    The arguments are the same.
 
     Raises:
         InputError: The base floats, or the robot has no default contact frame.
@@ -151,13 +143,13 @@ def legged_formulation(
 
     Args:
         robot: The robot; it stands on the supports of its ``robot.toml``.
-        posture: Nominal or impact-robust; its weight compares with those of center of mass and base (10 and 1).
+        posture: Nominal or impact-robust.  The weights of center of mass and base are 10 and 1.
         kp: Stiffness of center of mass and base orientation, 1/s².
         friction: Coulomb coefficient of the ground.
         center_of_mass: Task of the center of mass, by default with weight 10.
         base: Task of the base orientation, by default with weight 1.
         contacts: Contacts, by default the robot's supports.
-        force_point: Point where a measured contact force acts, apart from the feet; ``None`` leaves the force out.
+        force_point: Point where a measured contact force acts, not at a foot; ``None`` leaves the force out.
         law: Law of the joint limits.
 
     Raises:
@@ -180,7 +172,7 @@ def _manipulator(
     order: Order,
     law: LimitLaw | None,
 ) -> TaskFormulation:
-    """Return the stack of the tasks ``above``, the end effector and the posture, one task per strict level."""
+    """Return the stack of the tasks ``above``, the end effector and the posture, with one task a strict level."""
     frame = robot.spec.contact.frame
     if end_effector is None:
         if frame is None:

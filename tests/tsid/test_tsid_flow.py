@@ -479,7 +479,7 @@ def test_a_gradient_that_fails_stops_the_flow_until_it_is_back() -> None:
 
 @pytest.mark.parametrize("options", [{"speed": 0.0}, {"share": 1.2}, {"tilt": float("nan")}], ids=str)
 def test_options_out_of_range_are_refused(options: dict[str, float]) -> None:
-    with pytest.raises(InputError, match="flow options"):
+    with pytest.raises(InputError):
         FlowOptions(**options)
 
 

@@ -22,9 +22,9 @@ class LimitLaw:
     """Law that stops joints at their limits.
 
     A joint at distance ``x`` from a limit may move towards it with at most ``φ(x) = min(approach·x,
-    √(2·deceleration·x), velocity limit)``.  Beyond the limit it must come back with ``φ``.  The acceleration brings
-    the joint to that speed at ``rate``: ``rate·(−φ(q − q_min) − q̇) ≤ q̈ ≤ rate·(φ(q_max − q) − q̇)``.  ``φ`` is odd
-    and increasing, hence the lower bound never exceeds the upper one, inside the limits or outside.
+    √(2·deceleration·x), velocity limit)``.  Beyond the limit, it must come back with ``φ``.  The acceleration reaches
+    this speed at ``rate``: ``rate·(−φ(q − q_min) − q̇) ≤ q̈ ≤ rate·(φ(q_max − q) − q̇)``.  ``φ`` is odd and
+    increasing, hence the lower bound never exceeds the upper bound, inside the limits or outside.
 
     Attributes:
         approach: Speed towards a limit per distance, 1/s.
@@ -59,7 +59,7 @@ class AccelerationBounds:
     """
 
     def __init__(self, robot: Robot, law: LimitLaw, lower: Array | None = None, upper: Array | None = None) -> None:
-        """Size the buffers, or take the given ones."""
+        """Size the buffers, or use ``lower`` and ``upper`` as buffers."""
         ranges, nv = JointRanges(robot), robot.nv
         self.law = law
         self.lower = np.full(nv, -np.inf) if lower is None else lower

@@ -1,4 +1,4 @@
-"""Limits of what an impact at the next tick would do to joint rates and torques."""
+"""Limits of the joint rates and torques in an impact at the next tick."""
 
 from __future__ import annotations
 
@@ -29,19 +29,19 @@ def supported_inverse(state: State, contacts: Sequence[SupportContact]) -> Array
 
 
 class ImpactLimits:
-    """Limit what an impact at the next tick would do (Wang et al. 2020, impact-aware constraints).
+    """Limit the effects of an impact at the next tick (Wang et al. 2020, impact-aware constraints).
 
-    The impact takes the velocity ``ν⁻ = ν + ν̇ dt`` of the next tick.  With restitution ``e`` and ``M_c⁻¹`` of
-    :func:`supported_inverse`, the contact gets the impulse ``λ = −(1 + e) (J M_c⁻¹Jᵀ)⁻¹ n nᵀJ ν⁻``, and the robot
-    jumps by ``Δν = M_c⁻¹Jᵀ λ``.  Both are linear in ``ν̇``.  For each joint, the limits are
+    The impact has the velocity ``ν⁻ = ν + ν̇ dt`` of the next tick.  With restitution ``e`` and ``M_c⁻¹`` of
+    :func:`supported_inverse`, the impulse is ``λ = −(1 + e) (J M_c⁻¹Jᵀ)⁻¹ n nᵀJ ν⁻``, and the velocity jump is
+    ``Δν = M_c⁻¹Jᵀ λ``.  Both are linear in ``ν̇``.  For each joint, the limits are
 
     - ``|q̇⁻ + Δq̇| ≤ q̇_max``, the rate after the impact;
     - ``|Jᵀλ|/δt ≤ τ_max``, the mean torque while the impact lasts ``δt``.
 
-    A tick can obey them only by a slower approach.  A joint without a stated limit has none here.
+    A tick can satisfy them only by a slower approach.  A joint without a limit in the model is not limited.
 
     Attributes:
-        active: Whether an impact may come.  Otherwise nothing is limited.
+        active: Whether an impact may come; otherwise, the limits are off.
         restitution: ``e``.
         duration: ``δt``, s.
         size: Number of rows.

@@ -1,4 +1,4 @@
-"""DAQP in one model that is kept across ticks, also in coordinates that make the Hessian the identity."""
+"""DAQP in a workspace that is kept across ticks, also in coordinates that make the Hessian the identity."""
 
 from __future__ import annotations
 
@@ -7,15 +7,15 @@ import numpy as np
 
 from impact_posture.tsid.qp.quadratic_program import QP, Solved
 
-# Exit flags of DAQP for a solution (2: soft constraints are active) and for a program without one.  4 is an answer
-# that violates bounds after it went in circles.  -6 (dependent equations) does not count, because DAQP also returns
-# it for bounds that were active before.
+# Exit flags of DAQP for a solution (2: soft constraints are active) and for an infeasible program.  4 is an answer
+# that violates bounds after a cycle.  -6 (dependent equations) does not mean infeasible, because DAQP also returns it
+# for bounds that were active before.
 SOLVED, _NONE = (1, 2), -1
 # Flag of a program that could not be solved for another reason.
 _FAILED = 0
-# Largest violation of a bound, largest number of iterations for one program, and squared sine of the angle between a
-# row and the active rows below which it depends on them.  The cost of a quadruped, with the condition 4e10, turns
-# rows so close to each other that DAQP's default, 3.7e-11, takes them for dependent, and finds no answer.
+# Largest violation of a bound, most iterations of a program, and squared sine of the least angle between a row and
+# the active rows.  The cost of a quadruped, with the condition 4e10, brings rows so close to each other that the
+# default of DAQP, 3.7e-11, takes them for dependent.
 _SETTINGS = {"primal_tol": 1e-9, "iter_limit": 1000, "sing_tol": 1e-13}
 
 
@@ -28,16 +28,13 @@ class DaqpSolver:
     def __init__(self, n: int, m: int, *, proximal: float | None = None) -> None:
         """Allocate a workspace for ``n`` variables and ``m`` rows.
 
-        Args:
-            n: Number of variables.
-            m: Number of rows.
-            proximal: Weight of proximal-point iterations, which solve programs whose cost is too flat for one
-                factorization, in more time.  DAQP decides by itself without it.
+        ``proximal`` is the weight of proximal-point iterations.  They take more time and solve programs whose cost
+        is too flat for one factorization.  With ``None``, DAQP decides.
         """
         self._flag = 1
         self._model = daqp.Model()
         self._model.settings = _SETTINGS if proximal is None else _SETTINGS | {"eps_prox": proximal}
-        # The first program only sets the dimensions.  None of its bounds can be active.
+        # The first program only sets the dimensions.  Its bounds cannot be active.
         blank, upper = QP.empty(n, m), np.full(n + m, 1e30)
         self._model.setup(blank.H, blank.g, blank.A, upper, -upper, blank.sense)
         self._cold = True
@@ -47,7 +44,7 @@ class DaqpSolver:
         self._cold = True
 
     def solve(self, qp: QP) -> Solved | None:
-        """Return the solution, or ``None`` if there is none or none was found (see :attr:`infeasible`)."""
+        """Return the solution, or ``None`` if the program is infeasible or the solver failed (:attr:`infeasible`)."""
         sense = qp.sense if self._cold else None
         self._flag = self._model.update(qp.H, qp.g, qp.A, qp.upper, qp.lower, sense)
         if self._flag >= 0:
@@ -60,15 +57,15 @@ class DaqpSolver:
 
     @property
     def infeasible(self) -> bool:
-        """Whether the last program had no solution, in contrast to a solver that found none."""
+        """Whether the last program had no solution; false where the solver failed."""
         return self._flag == _NONE
 
 
 class WhitenedSolver(DaqpSolver):
-    """DAQP behind a change of variables ``y = Rz``, ``H = RᵀR``, made by LAPACK.
+    """DAQP with a change of variables ``y = Rz``, ``H = RᵀR`` by LAPACK.
 
-    DAQP brings every program to this form by plain loops, which take most of its time for a humanoid.  LAPACK and one
-    matrix product take half as long.  Bounds on the dense variables become rows.  The rest of ``H`` must be diagonal.
+    DAQP computes this form by plain loops, which take most of its time for a humanoid.  LAPACK and one matrix product
+    take half as long.  Bounds on the dense variables become rows.  The rest of ``H`` must be diagonal.
     """
 
     def __init__(self, n: int, m: int, dense: int) -> None:
@@ -80,7 +77,7 @@ class WhitenedSolver(DaqpSolver):
         self._factorize, self._invert = dpotrf, dtrtri
         self._n, self._dense = n, dense
         self._qp = QP.empty(n, dense + m)
-        # Places of R⁻¹ and, below it, of A R⁻¹ in the whitened rows.
+        # Views of R⁻¹ and, below it, of A R⁻¹ in the whitened rows.
         self._bounds, self._rows = self._qp.A[:dense, :dense], self._qp.A[dense:, :dense]
         self._others = self._qp.A[dense:, dense:]
 

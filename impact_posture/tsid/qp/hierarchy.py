@@ -1,4 +1,4 @@
-"""Lexicographic least squares: each level comes as near to its bounds as the levels above permit."""
+"""Lexicographic least squares: each level comes as close to its bounds as the levels above permit."""
 
 from __future__ import annotations
 
@@ -13,8 +13,8 @@ from impact_posture.tsid.qp.quadratic_program import EQUALITY, INEQUALITY
 
 # Bounds are scaled below this, because the tolerances of DAQP are absolute.
 _LARGEST = 1e4
-# A row that is this near to its bound may be at it, relative to the length of the row times the size of the point.
-# The answer is refined with the first of these that does not make it worse.
+# Distances within which a row counts as at its bound, relative to the length of the row times the size of the point.
+# The refinement uses the first of them that does not make the answer worse.
 _AT = (1e-9, 1e-8, 1e-7, 1e-6, 1e-5, 1e-4)
 # Rank of rows, relative to the longest.
 _RANK = 1e-9
@@ -38,8 +38,8 @@ class Level:
 def lexicographic(levels: Sequence[Level], units: Array | float = 1.0) -> Array | None:
     """Return the ``z`` that violates the first level least, then the second, and so on (least squares).
 
-    DAQP finds which rows are missed and which bounds are met.  With these as equations, the answer is refined to the
-    last digits.
+    DAQP decides which rows are missed and which bounds are met.  With these as equations, a refinement gives the last
+    digits.
 
     Args:
         levels: The levels, the most important first.
@@ -48,25 +48,25 @@ def lexicographic(levels: Sequence[Level], units: Array | float = 1.0) -> Array 
     Returns:
         Shape (n,); ``None`` if the solver gave up.
     """
-    given = [level for level in levels if level.lower.size]
-    z = _nearest(given)
+    levels = [level for level in levels if level.lower.size]
+    z = _nearest(levels)
     if z is None:
         return None
-    y, scaled = z / units, [Level(level.A * units, level.lower, level.upper) for level in given]
+    y, scaled = z / units, [Level(level.A * units, level.lower, level.upper) for level in levels]
     refined = (_refined(scaled, y, at) for at in _AT)
-    best = next((one for one in refined if _no_worse(scaled, one, y)), None)
+    best = next((point for point in refined if _no_worse(scaled, point, y)), None)
     y = _onto(scaled[0], y) if best is None else best
     missed = next((k for k, level in enumerate(scaled) if k and not _holds(level, y)), 0)
     if missed:
         whole = _stacked(scaled[: missed + 1])
         if _holds(whole, _onto(whole, y)):
             # DAQP gave up a level that can hold.
-            return lexicographic([_stacked(given[: missed + 1]), *given[missed + 1 :]], units)
+            return lexicographic([_stacked(levels[: missed + 1]), *levels[missed + 1 :]], units)
     return np.asarray(units * y)
 
 
 def _stacked(levels: Sequence[Level]) -> Level:
-    """Return one level with the rows of all."""
+    """Return one level with the rows of all levels."""
     return Level(*(np.concatenate([getattr(level, key) for level in levels]) for key in ("A", "lower", "upper")))
 
 
@@ -89,9 +89,9 @@ def _lengths(level: Level) -> Array:
 
 
 def _refined(levels: Sequence[Level], y: Array, near: float) -> Array:
-    """Return the answer of the rows that are equations, missed or at a bound at ``y``, level by level.
+    """Solve for the rows that are equations, missed or at a bound at ``y``, level by level.
 
-    A bound that is met holds for all levels: the answer of each of them lies on it.
+    A bound that is met holds for the answers of all levels.
     """
     exact, targets, missed = list[Array](), list[Array](), list[tuple[Array, Array]]()
     for k, level in enumerate(levels):
@@ -99,7 +99,7 @@ def _refined(levels: Sequence[Level], y: Array, near: float) -> Array:
         at = near * _size(y) * lengths
         low, high = values < level.lower + at, values > level.upper - at
         target = np.where(low, level.lower, level.upper)
-        # What always holds is not missed but by rounding.
+        # The hard rows of the first level are missed by rounding only.
         off = equal | ((low | high) & (np.abs(values - target) > at)) if k else np.zeros_like(equal)
         met = (equal | low | high) & ~off
         exact.append(level.A[met] / lengths[met, None])
@@ -117,7 +117,7 @@ def _refined(levels: Sequence[Level], y: Array, near: float) -> Array:
 
 
 def _no_worse(levels: Sequence[Level], new: Array, old: Array) -> bool:
-    """Whether no level is violated more at ``new``, unless one above it is violated less."""
+    """Return whether ``new`` is lexicographically not worse than ``old``."""
     for level in levels:
         now, before = (float(np.linalg.norm(_violation(level, y))) for y in (new, old))
         if abs(now - before) > 1e-6 * before + 1e-10 * _size(old) * float(_lengths(level).max()):
@@ -126,23 +126,23 @@ def _no_worse(levels: Sequence[Level], new: Array, old: Array) -> bool:
 
 
 def _onto(level: Level, y: Array) -> Array:
-    """Return the point nearest to ``y`` at which a level holds; ``y`` itself if the solver finds none."""
+    """Project ``y`` onto the points at which a level holds; return ``y`` if the solver fails."""
     lengths, size = _lengths(level), _size(y)
     A = np.ascontiguousarray(level.A / lengths[:, None])
     high, low = (np.clip((bound / lengths - A @ y) / size, -1e30, 1e30) for bound in (level.upper, level.lower))
     sense = np.where(level.lower == level.upper, EQUALITY, INEQUALITY).astype(np.int32)
-    way, _, flag, _ = daqp.solve(np.eye(y.size), np.zeros(y.size), A, high, low, sense, primal_tol=1e-12)
-    return y + size * np.asarray(way) if flag > 0 else y
+    step, _, flag, _ = daqp.solve(np.eye(y.size), np.zeros(y.size), A, high, low, sense, primal_tol=1e-12)
+    return y + size * np.asarray(step) if flag > 0 else y
 
 
-def _nearest(given: Sequence[Level]) -> Array | None:
-    """Return the answer of the hierarchical programs of DAQP, which have one for all bounds, to about six digits.
+def _nearest(levels: Sequence[Level]) -> Array | None:
+    """Return the answer of the hierarchical programs of DAQP, which exists for all bounds, to about six digits.
 
-    DAQP measures a violation in units of the row's length.  The equations of a level are therefore rotated among
-    themselves (:func:`balanced`) until all its rows have the same length, which does not change the sum of squares.
+    DAQP measures a violation in units of the row's length.  Therefore, a rotation (:func:`balanced`) gives all
+    equations of a level the same length, which does not change the sum of squares.
     """
     blocks = []
-    for level in given:
+    for level in levels:
         equal, rows, low, high = level.lower == level.upper, level.A, level.lower, level.upper
         if equal.all():
             rows, low = balanced(rows, low)
@@ -151,16 +151,9 @@ def _nearest(given: Sequence[Level]) -> Array | None:
     A, low, high, sense = (np.concatenate(parts) for parts in zip(*blocks, strict=True))
     bounds = np.abs(np.concatenate([low, high]))
     scale = max(1.0, float(np.max(bounds, where=np.isfinite(bounds), initial=0.0)) / _LARGEST)
-    ends = np.cumsum([level.lower.size for level in given], dtype=np.int32)
-    z, _, flag, _ = daqp.solve(
-        None,
-        None,
-        np.ascontiguousarray(A),
-        np.clip(high / scale, -1e30, 1e30),
-        np.clip(low / scale, -1e30, 1e30),
-        sense,
-        ends,
-    )
+    ends = np.cumsum([level.lower.size for level in levels], dtype=np.int32)
+    high, low = (np.clip(bound / scale, -1e30, 1e30) for bound in (high, low))
+    z, _, flag, _ = daqp.solve(None, None, np.ascontiguousarray(A), high, low, sense, ends)
     z = scale * np.asarray(z)
     return z if flag > 0 and np.isfinite(z).all() else None
 

@@ -1,4 +1,4 @@
-"""Strict levels of any rank: dependent rows leave the QP of a tick, nearly dependent rows are damped."""
+"""Strict levels of any rank: dependent rows leave the QP of a tick, and nearly dependent rows are damped."""
 
 from __future__ import annotations
 
@@ -11,12 +11,12 @@ from impact_posture.system.arrays import Array
 from impact_posture.tsid.qp.quadratic_program import EQUALITY, INEQUALITY, QP
 from impact_posture.tsid.smooth_step import smooth
 
-# Singular value of a level's rows, over the length of its longest row, below which a direction is damped.  The
-# shipped robots stay above 0.03 in their postures.
+# Directions with a smaller singular value, over the length of the level's longest row, are damped.  The shipped
+# robots stay above 0.03 in their postures.
 SINGULAR = 2e-2
-# Share of SINGULAR below which a direction is dropped: far above rounding, far below a visible effect.
+# Directions below this share of SINGULAR are dropped.  It is far above rounding and far below a visible effect.
 _NOTHING = 1e-9
-# Least 1 − α, which keeps the weight of a damped row within the digits of the solver.
+# Least 1 − α, which bounds the weight of a damped row for the solver.
 _LEAST = 1e-8
 
 
@@ -28,42 +28,42 @@ class LevelRank:
     ``s``.  With ``x = s/s₀``, where ``s₀`` is :data:`SINGULAR` times the length of the level's longest row:
 
     - ``x ≥ 1``: the row is an equation.
-    - ``x = 0``: the levels above determine the row, or it contradicts its own level.  It leaves the QP.  The others
-      then give the least-squares answer of the level, which is exact where the rows agree.
+    - ``x = 0``: the levels above determine the row, or it contradicts other rows of its level.  It leaves the QP.
+      The other rows then give the least-squares answer of the level, which is exact where the rows agree.
     - Otherwise, the row is damped.  It moves into the cost as ``α/(1 − α) (q·ν̇ − c/s)²`` with ``α = x²(3 − 2x)`` and
       its direction of motion ``q``, together with ``x (q·ν̇)²``.  Both have the mean weight of the cost.  The row
       fades from an equation to nothing, so that accelerations are continuous through a singular posture.  They are at
       most ``3/s₀`` times the row's demand ``c``.  The levels below have ``√(1 − α)`` of the direction.
 
-    The result is a function of the present rows and of their lengths at reset, without hysteresis.  While all rows
-    are independent, the QP is the given one.  This needs no decomposition per tick, because no singular value moves
-    further than the matrix does (Weyl 1912).
+    The result depends only on the present rows and on their lengths at reset.  While all rows are independent, the QP
+    does not change.  Most ticks need no decomposition to decide this, because a singular value changes at most by the
+    change of the matrix (Weyl 1912).
 
     Attributes:
         qp: The QP to solve.
-        wanted: Right-hand sides of the first rows of ``qp.A``, also of rows that are no equations.
+        wanted: Right-hand sides of the first rows of ``qp.A``, also where a row is not an equation.
         units: Value of each variable that compares with an acceleration of 1, shape (n,).
-        changed: Whether the set of equations differs from that before the last :meth:`update`.
+        changed: Whether the last :meth:`update` changed the set of equations.
     """
 
     def __init__(self, qp: QP, always: int, levels: Sequence[slice], accelerations: int, units: Array) -> None:
         """Size the buffers.
 
         Args:
-            qp: The given QP in its buffers.
-            always: Number of rows that always hold; they come first.
-            levels: Rows of each level; they follow in order.
-            accelerations: Number of variables in the levels; they come first.
+            qp: The QP with all rows.
+            always: Number of its first rows, which always hold.
+            levels: Rows of each level, which follow.
+            accelerations: Number of its first variables, which are accelerations.
             units: Value of each variable that compares with an acceleration of 1, shape (n,).
         """
-        self._given, self._always, self._levels = qp, always, tuple(levels)
+        self._full, self._always, self._levels = qp, always, tuple(levels)
         self._accelerations, self.units = accelerations, units
         self._count = self._levels[-1].stop if levels else 0
         self._rows = qp.A[: self._count]
-        self._reference, self._way = np.zeros(self._rows.shape), np.zeros(self._rows.shape)
-        self._flat = self._way.reshape(-1)
-        self._asked = qp.lower[qp.n : qp.n + self._count]
-        self.qp, self.changed, self.wanted = qp, False, self._asked
+        self._reference, self._moved = np.zeros(self._rows.shape), np.zeros(self._rows.shape)
+        self._flat = self._moved.reshape(-1)
+        self._demanded = qp.lower[qp.n : qp.n + self._count]
+        self.qp, self.changed, self.wanted = qp, False, self._demanded
         self.reset()
 
     def reset(self) -> None:
@@ -76,22 +76,22 @@ class LevelRank:
             return
         if not self._begun:
             self._begin()
-        way = self._way
-        np.subtract(self._rows, self._reference, out=way)
-        way *= self._scale
+        moved = self._moved
+        np.subtract(self._rows, self._reference, out=moved)
+        moved *= self._scale
         # Not ">=", which is false for a NaN.
         if not self._flat.dot(self._flat) < self._room:
             self._measure()
         before = self.qp
         if self._independent:
-            self.qp, self.wanted = self._given, self._asked
+            self.qp, self.wanted = self._full, self._demanded
         else:
             self.qp = self._reduced()
         self.changed = self.qp is not before and not np.array_equal(self.qp.sense, before.sense)
 
     def rows(self, rows: slice, equations: bool) -> NDArray[np.intp]:
-        """Return the rows of a level that are equations, or those that are not."""
-        n = self._given.n
+        """Return the rows of a level that are equations, or with ``False`` its other rows."""
+        n = self._full.n
         held = self.qp.sense[n + rows.start : n + rows.stop] == EQUALITY
         return np.asarray(np.arange(rows.start, rows.stop)[held == equations])
 
@@ -104,25 +104,23 @@ class LevelRank:
         self._measure()
 
     def _measure(self) -> None:
-        """Measure the least singular value of all rows, which bounds those of each level from below."""
+        """Measure the least singular value of all rows, which bounds the singular values of each level from below."""
         self._reference[:] = self._rows
         self._independent, self._room = True, 0.0
         if np.isfinite(self._rows).all():
             values = np.linalg.svd(self._rows * self._scale, compute_uv=False)
-            least = float(values[-1]) if self._count <= self._given.n else 0.0
+            least = float(values[-1]) if self._count <= self._full.n else 0.0
             self._independent, self._room = least >= SINGULAR, (least - SINGULAR) ** 2
 
     def _reduced(self) -> QP:
-        given, lengths = self._given, self._lengths
-        n = given.n
-        qp = given.copy()
-        self.wanted = self._asked.copy()
+        lengths, n, qp = self._lengths, self._full.n, self._full.copy()
+        self.wanted = self._demanded.copy()
         Z = np.diag(self.units)
         if self._always:
             Z = Z @ np.linalg.svd((self._rows * self._scale)[: self._always])[2][self._always :].T
         for rows in self._levels:
-            U, s, Vt = np.linalg.svd(given.A[rows] @ Z)
-            qp.A[rows], self.wanted[rows] = U.T @ given.A[rows], U.T @ self.wanted[rows]
+            U, s, Vt = np.linalg.svd(self._full.A[rows] @ Z)
+            qp.A[rows], self.wanted[rows] = U.T @ self._full.A[rows], U.T @ self.wanted[rows]
             x = np.zeros(max(U.shape[0], Vt.shape[0]))
             x[: s.size] = np.minimum(s / (SINGULAR * lengths[rows.start]), 1.0)
             held = x[: U.shape[0]] == 1.0
@@ -134,7 +132,7 @@ class LevelRank:
             directions = Z @ Vt.T
             damped = np.flatnonzero((x > _NOTHING) & (x < 1.0))
             if damped.size:
-                weight = _mean_weight(given.H, Z, self._accelerations)
+                weight = _mean_weight(self._full.H, Z, self._accelerations)
                 strength = weight * alpha[damped] / np.maximum(1.0 - alpha[damped], _LEAST) / s[damped] ** 2
                 J, c = qp.A[rows][damped], self.wanted[rows][damped]
                 q = np.zeros((n, damped.size))

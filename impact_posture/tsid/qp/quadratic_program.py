@@ -1,4 +1,4 @@
-"""A quadratic program in buffers that are sized once."""
+"""Quadratic program in buffers that are sized once."""
 
 from __future__ import annotations
 
@@ -79,7 +79,7 @@ class QP:
 
 @dataclass(frozen=True, eq=False)
 class Solved:
-    """Answer of a solver.
+    """Solution of a quadratic program.
 
     Attributes:
         z: Shape (n,).
@@ -93,6 +93,6 @@ class Solved:
 
 
 def stacked_rows(sizes: Iterable[int]) -> tuple[tuple[slice, ...], int]:
-    """Return the rows of blocks that stand one below the other, and the number of all rows."""
+    """Return the rows of stacked blocks, and the number of all rows."""
     ends = list(accumulate(sizes, initial=0))
     return tuple(slice(start, stop) for start, stop in pairwise(ends)), ends[-1]

@@ -9,7 +9,7 @@ from impact_posture.tsid.smooth_step import smooth
 
 
 class Phase(Enum):
-    """Phase of the controller in the course of an anticipated impact."""
+    """Phase of the controller around an anticipated impact."""
 
     FREE = "free"
     BRACE = "brace"
@@ -17,7 +17,7 @@ class Phase(Enum):
     RELEASE = "release"
 
 
-# Phases that may follow each phase.  The end of a release also leads to FREE, without a call.
+# Phases that may follow each phase.  A release ends in FREE without a call.
 _FOLLOWS = {
     Phase.FREE: (Phase.BRACE,),
     Phase.BRACE: (Phase.CONTACT, Phase.RELEASE),
@@ -29,9 +29,8 @@ _FOLLOWS = {
 class Activation:
     """Level between 0 and 1 that moves along ``3x² − 2x³`` to the goal of the phase.
 
-    The goal is 0 in FREE, 1 in BRACE and 0 in RELEASE, which ends in FREE.  In CONTACT it is 1 if ``live``, and 0 if
-    the robot holds the reached posture during the impact.  Within ``dt`` the level moves by at most
-    ``1.5 dt/ramp`` in every phase.
+    The goal is 0 in FREE, 1 in BRACE and 0 in RELEASE, which ends in FREE.  In CONTACT it is 1 if ``live``; otherwise
+    it is 0 and the robot holds the reached posture during the impact.  The level moves by at most ``1.5 dt/ramp``.
 
     Attributes:
         phase: The present phase.
@@ -65,7 +64,7 @@ class Activation:
         if phase not in _FOLLOWS[self.phase]:
             names = " or ".join(p.value for p in _FOLLOWS[self.phase])
             raise InputError(
-                f"'{phase.value}' does not follow '{self.phase.value}'", where="activation", hint=f"ask for {names}"
+                f"'{phase.value}' does not follow '{self.phase.value}'", where="activation", hint=f"enter {names}"
             )
         self.phase = phase
         on = phase is Phase.BRACE or (phase is Phase.CONTACT and self.live)

@@ -15,7 +15,7 @@ from impact_posture.tsid.tasks.task import TargetTask
 
 
 class _BaseTurn(TargetTask[Array]):
-    """Base of the tasks that turn the base: ``J`` selects rows of ω from ν, in base axes, and ``J̇ν = 0``."""
+    """Base class of tasks that turn the base: ``J`` selects rows of ω from ν, in base axes, and ``J̇ν = 0``."""
 
     constant = True
 
@@ -25,13 +25,13 @@ class _BaseTurn(TargetTask[Array]):
 
 
 class Tilt(_BaseTurn):
-    """Regulate the reduced attitude of the base, the direction of its z axis; yaw stays free (2 × nv).
+    """Regulate the direction of the base's z axis (reduced attitude); yaw stays free (2 × nv).
 
-    ``e`` holds the x and y components, in base axes, of the shortest rotation that takes the base's z axis to
-    ``target`` (Brescianini and D'Andrea 2018).  ``J`` selects ``ω_x, ω_y`` from ν, hence ``J̇ν = 0``.
+    ``e`` has the x and y components, in base axes, of the shortest rotation from the base's z axis to ``target``
+    (Brescianini and D'Andrea 2018).  ``J`` selects ``ω_x, ω_y`` from ν, hence ``J̇ν = 0``.
 
     Attributes:
-        target: World unit vector to which the base's z axis is taken, shape (3,); up by default.
+        target: Direction of the base's z axis, unit vector in the world, shape (3,); up by default.
     """
 
     title, rows = "tilt", 2
@@ -48,19 +48,19 @@ class Tilt(_BaseTurn):
         """Check the length of the target.
 
         Raises:
-            InputError: The target is no unit vector, or the base is fixed.
+            InputError: The target is not a unit vector, or the base is fixed.
         """
         super().reset(state)
         length = float(np.linalg.norm(state.base_rotation.T @ self.required_target()))
         if not abs(length - 1.0) < 1e-9:
-            raise InputError("the target is no unit vector", where=self.name, hint="normalize it")
+            raise InputError("the target is not a unit vector", where=self.name, hint="normalize it")
 
     def error(self, state: State) -> Array:
         """Return angle (rad) times axis."""
         x, y, z = (state.base_rotation.T @ self.required_target()).tolist()
         sine = math.hypot(x, y)
         if sine < 1e-12:
-            # Aligned, or upside down, where rotations about all horizontal axes are equally short.
+            # Aligned or upside down.  Upside down, the rotations about all horizontal axes are equally short.
             return np.array([0.0 if z > 0 else math.pi, 0.0])
         scale = math.atan2(sine, z) / sine
         return np.array([-scale * y, scale * x])
@@ -111,16 +111,12 @@ class CenterOfMass(TargetTask[Array]):
 
 
 class BodyTaskLead:
-    """Sets the targets of body tasks to what they are in a motion.
-
-    Args:
-        model: The robot's model.
-    """
+    """Target of center of mass and base orientation that moves along with a reference motion."""
 
     def __init__(self, model: pin.Model) -> None:
         self._model, self._data = model, model.createData()
         self._led: tuple[BaseOrientation | CenterOfMass, ...] = ()
-        # Pinocchio writes here; asking it again takes longer than its computation.
+        # Views on the results of Pinocchio, because access to its attributes takes longer than its computation.
         data = self._data
         self._com, self._rotation = (data.com[0], data.vcom[0], data.acom[0]), data.oMi[1].rotation
 
@@ -138,7 +134,7 @@ class BodyTaskLead:
                 task.target_velocity, task.target_acceleration = v[3:6], a[3:6]
 
     def reset(self, state: State) -> None:
-        """Let the tasks that were led take their present output as target, at rest."""
+        """Give the tasks that moved along their present output as target, at rest."""
         for task in self._led:
             task.target, task.target_velocity, task.target_acceleration = None, 0.0, 0.0
             task.reset(state)

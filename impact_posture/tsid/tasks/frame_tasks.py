@@ -1,4 +1,4 @@
-"""Tasks of a frame: its position, its pose on SE(3), or its position with the direction of an axis."""
+"""Tasks of a frame: position, pose on SE(3), or position with the direction of an axis."""
 
 from __future__ import annotations
 
@@ -25,8 +25,7 @@ from impact_posture.tsid.tasks.task import Target, TargetTask
 class Impedance:
     """Apparent inertia by which a measured force accelerates a frame: ``M_d⁻¹ F̂``.
 
-    If a force enters the dynamics but not this law, the controller compensates it and pushes against the wall with a
-    growing force.
+    Without this law, the controller compensates a measured force and pushes against the wall with a growing force.
 
     Attributes:
         mass: Apparent mass, kg.
@@ -44,10 +43,10 @@ class Impedance:
 
 @checked
 class FrameTask(TargetTask[Target]):
-    """Base of the tasks of a point that moves with a frame.
+    """Base class of tasks of a point that moves with a frame.
 
     Attributes:
-        target: Target of the point, world; by default, its place at ``reset``.
+        target: Target of the point, world; by default, its position or pose at ``reset``.
         point: The point.
     """
 
@@ -61,7 +60,7 @@ class FrameTask(TargetTask[Target]):
         weight: ArrayLike = 1.0,
         impedance: Impedance | None = None,
     ) -> None:
-        """Set the point and the gains; see :class:`~impact_posture.tsid.tasks.task.Task`.
+        """Set the point and the gains.
 
         Args:
             point: The point.
@@ -80,7 +79,7 @@ class FrameTask(TargetTask[Target]):
 
     @abstractmethod
     def select(self, here: PointState, six: Array) -> Array:
-        """Select the task's rows of a linear and an angular part in world axes, shape (6,) or (6, nv)."""
+        """Select the task's rows from a linear and an angular part in world axes, shape (6,) or (6, nv)."""
 
     def jacobian(self, state: State) -> Array:
         """Return the task's rows of the point's Jacobian."""
@@ -124,8 +123,8 @@ class FramePosition(FrameTask[Array]):
 class FramePose(FrameTask[pin.SE3]):
     """Regulate the pose of a frame at one of its points: ``e = log₆(T⁻¹ T_des)`` in world axes (6 × nv).
 
-    The twist is the twist of the frame at the point in world axes.  ``ẏ`` is the frame's body twist, also turned
-    into world axes.  With an impedance, the law is ``M_d(ÿ − ÿ_des) + … = F̂``.
+    ``ẏ`` is the body twist of the frame at the point, expressed in world axes.  With an impedance, the law is
+    ``M_d(ÿ − ÿ_des) + … = F̂``.
 
     Attributes:
         target: ``T_des``, world from frame, with its origin at the point; by default, the pose at ``reset``.
@@ -138,11 +137,11 @@ class FramePose(FrameTask[pin.SE3]):
         return placement(state.at(self.point))
 
     def error(self, state: State) -> Array:
-        """Return ``log₆`` of the way to the target, linear part first, in world axes; a fresh array."""
+        """Return ``log₆(T⁻¹ T_des)``, linear part first, in world axes; a fresh array."""
         here, error = state.at(self.point), np.empty(6)
-        way = pin.log6(placement(here).actInv(self.required_target()))
-        # One product turns the linear and the angular part, which are the rows of a matrix.
-        np.matmul(way.vector.reshape(2, 3), here.rotation.T, out=error.reshape(2, 3))
+        local = pin.log6(placement(here).actInv(self.required_target()))
+        # One product turns both parts, which are the rows of a matrix.
+        np.matmul(local.vector.reshape(2, 3), here.rotation.T, out=error.reshape(2, 3))
         return error
 
     def drift(self, state: State) -> Array:
@@ -158,9 +157,9 @@ class FramePose(FrameTask[pin.SE3]):
 class FrameAligned(FrameTask[pin.SE3]):
     """Regulate the world position of a point and the direction of an axis; spin about the axis is free (5 × nv).
 
-    The first three rows are those of :class:`FramePosition`.  The other two are the shortest rotation that takes the
-    axis to its target direction, along two directions of the frame that are orthogonal to the axis.  ``J`` selects
-    the same two components of the frame's angular velocity.
+    The first three rows are the rows of :class:`FramePosition`.  The other two are the shortest rotation from the
+    axis to its target direction, along two directions of the frame orthogonal to the axis.  ``J`` selects the same
+    two components of the frame's angular velocity.
 
     Attributes:
         target: ``T_des``, world from frame, with its origin at the point; by default, the pose at ``reset``.
@@ -169,12 +168,7 @@ class FrameAligned(FrameTask[pin.SE3]):
     title, rows = "axis", 5
 
     def __init__(self, point: Point, axis: ArrayLike = (0.0, 0.0, 1.0), **gains: Any) -> None:
-        """Set the axis, in the frame and of any length.
-
-        Args:
-            point: The point.
-            axis: The axis.
-            gains: As of :class:`FrameTask`.
+        """Set the axis in the frame, of any length; ``gains`` are arguments of :class:`FrameTask`.
 
         Raises:
             InputError: The axis has no direction, or a gain is invalid.
@@ -193,7 +187,7 @@ class FrameAligned(FrameTask[pin.SE3]):
         return placement(state.at(self.point))
 
     def error(self, state: State) -> Array:
-        """Return ``p_des − p``, then angle (rad) times axis of the shortest rotation."""
+        """Return ``p_des − p``, then the two components of angle (rad) times axis of the shortest rotation."""
         here, target = state.at(self.point), self.required_target()
         wanted = here.rotation.T @ (target.rotation @ self._axis)
         turn = self._across @ np.cross(self._axis, wanted)
@@ -201,7 +195,7 @@ class FrameAligned(FrameTask[pin.SE3]):
         if sine >= 1e-12:
             turn *= math.atan2(sine, cosine) / sine
         elif cosine < 0:
-            # The axis points the opposite way, and rotations about all orthogonal axes are equally short.
+            # The axis points in the opposite direction, and rotations about all orthogonal axes are equally short.
             turn[0] = math.pi
         return np.concatenate([target.translation - here.position, turn])
 
@@ -214,12 +208,12 @@ EndEffector = FramePose | FramePosition | FrameAligned
 
 
 def pose_task(point: Point, pose: str, axis: Array | None, **options: Any) -> EndEffector:
-    """Return the task that holds of a point what a pose mode holds.
+    """Return the task that holds the rows of a pose mode at a point.
 
     Args:
         point: The point.
         pose: The pose mode.  ``box`` holds the position, as ``position`` does.
-        axis: Unit vector of ``aligned`` in the axes of the frame, shape (3,); without one, it is the whole pose.
+        axis: Unit vector of ``aligned`` in the frame, shape (3,); with ``None``, the task holds the whole pose.
         options: Gains, weight and name of the task.
     """
     if pose in ("position", "box"):

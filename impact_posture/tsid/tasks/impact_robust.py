@@ -1,4 +1,4 @@
-"""The impact-robust posture task, which adds ``−K ∇H(q)`` to the posture task."""
+"""Impact-robust posture task, which adds ``−K ∇H(q)`` to the posture task."""
 
 from __future__ import annotations
 
@@ -24,9 +24,9 @@ from impact_posture.tsid.tasks.joint_posture import JointPosture
 Gradient = Callable[[Array], tuple[float, Array]]
 Spring = Literal["keep", "release", "follow"]
 
-# Step of the central differences of the gradient that measure curvature, rad.
+# Step of the central differences of the gradient, rad.
 _STEP = 1e-5
-# Least curvature that counts, per rad² and as a share of H.
+# Least curvature that counts, per rad², as a share of H.
 _FLAT = 1e-3
 
 
@@ -34,24 +34,24 @@ def gradient_of(export: ImpactGradient, normal: ArrayLike | None = None) -> Grad
     """Return the gradient of a compiled export for the impact-robust term.
 
     Args:
-        export: Export for the robot in hand.  Load it with ``free=True`` for the robot without its supports.
-        normal: Normal at which ``H`` is evaluated (the export's ``_eval``).  With ``None``, the objective of the
-            exported problem at its own normal (``_objective``): ``impulse``, ``speed``, ``sticking``, ``energy``, a
-            cone, ….
+        export: Export of the robot.  Load it with ``free=True`` for the robot without its supports.
+        normal: Normal at which ``H`` is evaluated (function ``_eval`` of the export).  ``None`` evaluates the
+            objective of the exported problem at its normal (``_objective``): ``impulse``, ``speed``, ``sticking``,
+            ``energy``, ….
 
     Raises:
-        InputError: The normal is no unit vector.
+        InputError: The normal is not a unit vector.
     """
     if normal is None:
         return export.objective
     n = np.array(normal, dtype=float)
     if n.shape != (3,) or not abs(float(np.linalg.norm(n)) - 1) < 1e-6:
-        raise InputError("is no unit vector of three", where="normal", hint="normalize it")
+        raise InputError("is not a unit vector of three numbers", where="normal", hint="normalize it")
     return lambda q: export.value_and_gradient(q, n)
 
 
 def fitting_gradient(robot: Robot, gradient: Gradient | ImpactGradient) -> Gradient:
-    """Return the gradient as a function; an export of another robot raises :class:`ManifestMismatch`."""
+    """Return the gradient as a function; raise :class:`ManifestMismatch` for an export of another robot."""
     if not isinstance(gradient, ImpactGradient):
         return gradient
     gradient.check_robot(robot)
@@ -63,9 +63,9 @@ class ImpactRobustPosture(JointPosture):
     """``ν̇* = K_p (q_des ⊖ q) − K_d ν − α K s(q) ∇H(q)/λ`` (Afifi et al. 2026, impact-robust posture).
 
     - ``λ`` is the largest curvature of ``H`` along the redundancy at ``reset`` (:meth:`normalize`).  ``K`` is then a
-      stiffness like ``K_p``, in 1/s², on every robot, while ``H`` itself scales like 1/armature².  But ``λ`` is the
-      curvature at the start, where ``H`` may even be concave.  Near an optimum with the curvature ``λ*``, the term is
-      a spring ``K λ*/λ``, which can be several times as stiff as ``K``.
+      stiffness like ``K_p``, in 1/s², on every robot, although ``H`` scales like 1/armature².  Near an optimum with
+      the curvature ``λ*``, the term is a spring ``K λ*/λ``.  This can be several times as stiff as ``K``, because
+      ``λ`` is the curvature at the start, where ``H`` may even be concave.
     - ``K_d = 2√(K_p + K)`` by default, critical for both springs together where ``λ* = λ``.
     - The length of the term is at most ``K·reach``, like a spring ``K`` stretched by ``reach``.  A bound below
       ``K_p|q_des ⊖ q|`` would stall the flow on its way.
@@ -74,13 +74,13 @@ class ImpactRobustPosture(JointPosture):
       brace on its stops.
     - ``α`` is the level of :class:`~impact_posture.tsid.tasks.activation.Activation`.
 
-    ``spring`` tells what becomes of ``K_p`` while the term is on.  ``keep``: the flow rests where
-    ``K∇H/λ = K_p(q_des ⊖ q)``, short of the optimum.  ``release``: ``K_p`` is scaled by ``1 − α``, and the flow
-    reaches the optimum.  ``follow``: ``q_des`` follows ``q`` with the time constant ``follow`` (s), hence the spring
-    still resists fast motion.
+    ``spring`` says what happens to ``K_p`` while the term is on.  ``keep``: the robot rests where
+    ``K∇H/λ = K_p(q_des ⊖ q)``, short of the optimum.  ``release``: ``K_p`` is scaled by ``1 − α``, and the robot
+    reaches the optimum.  ``follow``: ``q_des`` follows ``q`` with the time constant ``follow`` (s), so that the
+    spring still resists fast motion.
 
-    With :meth:`contact` (unless the activation is ``live``) and :meth:`release`, the reached posture becomes
-    ``q_des``.  It is faded in while the term fades out.
+    :meth:`contact` (unless the activation is ``live``) and :meth:`release` make the reached posture ``q_des``.  It
+    fades in while the term fades out.
 
     Attributes:
         K: Gain, 1/s².
@@ -88,7 +88,7 @@ class ImpactRobustPosture(JointPosture):
         activation: The state machine.
         value: ``H`` (or the objective) at the last evaluation.
         term: ``−K s(q) ∇H/λ`` there, bounded, at full level, shape (nv,).
-        failed: Whether the last evaluation raised or was not finite, so that the term before it was kept.
+        failed: Whether the last evaluation raised or was not finite.  The previous term then stays.
     """
 
     def __init__(
@@ -112,18 +112,18 @@ class ImpactRobustPosture(JointPosture):
 
         Args:
             robot: The robot.
-            gradient: ``q → (H, ∇H)``, or a compiled export, whose own objective is then used.
+            gradient: ``q → (H, ∇H)``, or a compiled export, whose exported objective is then used.
             target: ``q_des``, shape (nq,); the posture at ``reset`` by default.
             K: Gain, 1/s².
             name: Name in reports.
-            spring: What becomes of ``K_p`` while the term is on.
+            spring: ``keep``, ``release`` or ``follow``.
             follow: Time constant of ``spring = "follow"``, s.
             reach: Bound of the term divided by ``K``, rad.
             fade: Distances from a position limit between which the term fades out, rad (m).
             every: Ticks between evaluations of the gradient.
-            scale: ``λ``, if it is not to be measured at ``reset``.
-            activation: The state machine; a new one by default.
-            gains: As of :class:`~impact_posture.tsid.tasks.joint_posture.JointPosture`.
+            scale: ``λ``; measured at ``reset`` by default.
+            activation: The state machine.
+            gains: Arguments of :class:`~impact_posture.tsid.tasks.joint_posture.JointPosture`.
 
         Raises:
             InputError: A number is out of range.
@@ -143,7 +143,7 @@ class ImpactRobustPosture(JointPosture):
         ranges = JointRanges(robot)
         width = ranges.upper - ranges.lower
         near, self._farthest = np.minimum(fade[0], width / 16), fade[1]
-        # Lists, because few joints are near a limit at a time, and a list gives a number faster than an array.
+        # Lists, because few joints are near a limit, and access to one number is faster in a list than in an array.
         self._near, self._band = near.tolist(), (np.minimum(fade[1], width / 4) - near).tolist()
         self._count, self._hold = 0, False
         self.value, self.term, self.failed = 0.0, np.zeros(robot.nv), False
@@ -181,20 +181,20 @@ class ImpactRobustPosture(JointPosture):
         self.value = self._function(state.q)[0]
 
     def normalize(self, state: State, redundancy: Array) -> None:
-        """Measure ``λ`` at ``state`` (:func:`curvature_scale`).  A ``scale`` given to the constructor is kept.
+        """Measure ``λ`` at ``state`` (:func:`curvature_scale`), unless the constructor got a ``scale``.
 
         Raises:
             MetricError: The gradient does not exist there, or ``H`` and its curvature vanish.
         """
-        if not self._measure:
-            return
-        self.scale = curvature_scale(self._function, self._model, state.q, redundancy, self.name)
+        if self._measure:
+            self.scale = curvature_scale(self._function, self._model, state.q, redundancy, self.name)
 
     def advance(self, state: State, dt: float) -> None:
         """Advance ramps, fades and a following ``q_des``; evaluate the gradient when it is due."""
         if self._hold:
             self._hold = False
-            # A released spring takes hold again at the reached posture.  A kept one lets go as slowly as the term.
+            # A released spring returns at the reached posture.  A kept spring moves there as slowly as the term
+            # fades.
             self._fade_to(state.q, self.activation.ramp)
         super().advance(state, dt)
         level = self.activation.advance(dt)
@@ -202,15 +202,15 @@ class ImpactRobustPosture(JointPosture):
             return
         if self.spring == "follow" and self._blend >= 1:
             share = level * (1 - math.exp(-dt / self._follow))
-            way = pin.difference(self._model, self._target, state.q)
-            self._target[:] = pin.integrate(self._model, self._target, share * way)
+            away = pin.difference(self._model, self._target, state.q)
+            self._target[:] = pin.integrate(self._model, self._target, share * away)
         self._count -= 1
         if self._count <= 0:
             self._count = self.every
             self._evaluate(state)
 
     def pull(self, state: State) -> Array:
-        """Return ``K_p (q_des ⊖ q)``, scaled by ``1 − α`` if the spring is released."""
+        """Return ``K_p (q_des ⊖ q)``, with the option ``release`` scaled by ``1 − α``."""
         pull = super().pull(state)
         if self.spring == "release" and self.activation.level > 0:
             pull *= 1.0 - self.activation.level
@@ -245,10 +245,10 @@ class ImpactRobustPosture(JointPosture):
         self.term, self._spare = term, self.term
 
     def _fade(self, term: Array, rooms: Array) -> None:
-        """Fade out the entries that push into a position limit nearby."""
+        """Fade out the entries that push towards a near position limit."""
         size = term.size
         for at in (rooms < self._farthest).nonzero()[0].tolist():
-            # The distances to the upper limits come first.
+            # The first half of the rooms belongs to the upper limits.
             below, k = divmod(at, size)
             push = term.item(k)
             if (push < 0) if below else (push > 0):
@@ -259,7 +259,7 @@ class ImpactRobustPosture(JointPosture):
 
 def curvature(gradient: Gradient, model: pin.Model, q: Array, directions: Array) -> Array:
     """Return ``∇²H Z`` at ``q`` by central differences of the gradient, for directions ``Z`` of shape (nv, r)."""
-    # A gradient may return the same buffer every time.
+    # Copies, because a gradient may return the same buffer at each call.
     ahead, behind = (
         np.column_stack([np.array(gradient(pin.integrate(model, q, step * z))[1]) for z in directions.T])
         for step in (_STEP, -_STEP)
@@ -270,14 +270,14 @@ def curvature(gradient: Gradient, model: pin.Model, q: Array, directions: Array)
 def curvature_scale(gradient: Gradient, model: pin.Model, q: Array, redundancy: Array, name: str) -> float:
     """Return ``λ`` at ``q``: the spectral norm of ``Zᵀ∇²H Z`` with ``Z`` = ``redundancy``, shape (nv, r).
 
-    It is at least a thousandth of ``H`` per rad², because a flat ``H`` leaves nothing to gain.  Without redundancy,
-    ``Z`` is the identity.
+    It is at least a thousandth of ``H`` per rad², because a flat ``H`` cannot be improved.  Without redundancy, ``Z``
+    is the identity.
 
     Raises:
         MetricError: The gradient does not exist there, or ``H`` and its curvature vanish.
     """
     Z = redundancy if redundancy.shape[1] else np.eye(model.nv)
-    # Along the axes, because differences along a basis of the redundancy would depend on how it is computed.
+    # Along the axes, because the error of differences along a basis would depend on the choice of the basis.
     change = curvature(gradient, model, q, np.eye(model.nv))
     scale = max(float(np.linalg.norm(Z.T @ change @ Z, 2)), _FLAT * abs(gradient(q)[0]))
     if not (np.isfinite(scale) and scale > 0):

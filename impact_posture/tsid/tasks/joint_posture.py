@@ -1,4 +1,4 @@
-"""The posture task on the configuration manifold."""
+"""Posture task on the configuration manifold."""
 
 from __future__ import annotations
 
@@ -20,14 +20,14 @@ class JointPosture(Task):
     """Regulate the posture by ``ν̇* = K_p (q_des ⊖ q) − K_d ν`` (Afifi et al. 2026, nominal posture).
 
     ``⊖`` is the difference on the manifold, in the tangent space at ``q``, and includes the base.  If other tasks
-    lead the base, give its six entries no weight (``base_weight = 0``).
+    control the base, set the weight of its six entries to zero (``base_weight = 0``).
 
-    A new ``q_des`` is faded in (:meth:`move_to`), hence ``ν̇*`` does not jump.
+    :meth:`move_to` fades in a new ``q_des``, so that ``ν̇*`` does not jump.
 
     Attributes:
         value: Objective at the last evaluation, if the task has one; else NaN.
         stiffness: Matrix ``K_p`` of :meth:`stiffen`, 1/s², shape (nv, nv), or ``None``.
-        damping: Matrix ``K_d`` that belongs to it, 1/s, shape (nv, nv), or ``None``.
+        damping: Matrix ``K_d`` of :meth:`stiffen`, 1/s, shape (nv, nv), or ``None``.
     """
 
     constant = True
@@ -53,10 +53,10 @@ class JointPosture(Task):
             kp: Stiffness, 1/s², one number or (nv,).
             kd: Damping, 1/s; critical by default.
             weight: Weight in the cost, one number or (nv,).
-            base_weight: Weight of the six base entries, if it differs.
+            base_weight: Weight of the six base entries; ``weight`` by default.
 
         Raises:
-            PostureError: The target is no configuration of the robot.
+            PostureError: The target is not a configuration of the robot.
             InputError: A gain or weight is negative, is not finite, or has another shape.
         """
         super().__init__(name, robot.nv, kp=kp, kd=kd, weight=weight)
@@ -71,10 +71,9 @@ class JointPosture(Task):
         self.damping: Array | None = None
 
     def stiffen(self, added: Array) -> None:
-        """Use ``K = K_p + added`` and the critical ``D = 2 K^½`` as gains from now on.
+        """Use ``K = K_p + added`` and the critical ``D = 2 K^½`` as gains.
 
-        Args:
-            added: Symmetric positive semidefinite stiffness, 1/s², shape (nv, nv).
+        ``added`` is a symmetric positive semidefinite stiffness, 1/s², shape (nv, nv).
         """
         self.stiffness = np.diag(self.kp) + added
         values, vectors = np.linalg.eigh(self.stiffness)
@@ -87,11 +86,11 @@ class JointPosture(Task):
 
     @property
     def level(self) -> float:
-        """Level at which the task prepares for an impact, 0 to 1; this one does not."""
+        """Level of the preparation for an impact, 0 to 1; always 0 here."""
         return 0.0
 
     def reset(self, state: State) -> None:
-        """Take the target of the constructor, or the present posture if there is none, at rest."""
+        """Take the target of the constructor at rest, or the present posture if the target is ``None``."""
         self.lead(state.q if self._given is None else self._given, 0.0, 0.0)
 
     @checked
@@ -101,7 +100,7 @@ class JointPosture(Task):
         A running fade stops where it is, and the new one starts there.
 
         Raises:
-            PostureError: The target is no configuration of the robot.
+            PostureError: The target is not a configuration of the robot.
             InputError: The time is not positive.
         """
         self._fade_to(self._robot.check_posture(np.asarray(target), limits=False), over)
@@ -140,11 +139,11 @@ class JointPosture(Task):
         return np.asarray(self.kp * error if self.stiffness is None else self.stiffness @ error)
 
     def desired(self, state: State) -> Array:
-        """Return ``ν̇*``, shape (nv,), without the product of ``J``, which is the identity."""
+        """Return ``ν̇*``, shape (nv,)."""
         wanted = self.pull(state)
         wanted += self._acceleration
-        slow = self._velocity - state.v
-        wanted += self.kd * slow if self.damping is None else self.damping @ slow
+        error = self._velocity - state.v
+        wanted += self.kd * error if self.damping is None else self.damping @ error
         more = self.feedforward(state)
         if more is not None:
             wanted += more
@@ -156,7 +155,7 @@ class JointPosture(Task):
         self._next[:], self._blend, self._over = target, 0.0, over
 
     def _reached(self) -> Array:
-        """Return where a fade is, or ``q_des``, shape (nq,)."""
+        """Return the present posture of a fade, or ``q_des``, shape (nq,)."""
         if self._blend < 1:
             return np.asarray(pin.interpolate(self._model, self._target, self._next, smooth(self._blend)))
         return self._target

@@ -1,4 +1,4 @@
-"""Base classes of tasks: a task defines an error and a Jacobian, and everything else is derived here."""
+"""Base classes of tasks.  A task defines an error and a Jacobian, and the base class derives the rest."""
 
 from __future__ import annotations
 
@@ -27,8 +27,8 @@ class Task(ABC):
     """Accelerate an output ``y(q)`` with ``ÿ* = ÿ_des + K_p e + K_d (ẏ_des − Jν)``.
 
     A task defines two methods, :meth:`error` and :meth:`jacobian`.  By default, :meth:`drift` computes ``J̇ν`` by
-    central differences of the Jacobian along the motion, which costs two more evaluations of the kinematics.
-    Override it to save them.  A controller reads gains and weights at ``reset``, and targets at every tick.
+    central differences of the Jacobian along the motion, which takes two more evaluations of the kinematics.
+    Override it to save time.  A controller reads gains and weights at ``reset``, and targets at each tick.
 
     Attributes:
         name: Name in reports.
@@ -66,7 +66,7 @@ class Task(ABC):
 
     @abstractmethod
     def error(self, state: State) -> Array:
-        """Return ``e``, shape (k,): the way from ``y`` to its target, so that ``ė = ẏ_des − Jν`` to first order."""
+        """Return ``e``, shape (k,), from ``y`` to its target, so that ``ė = ẏ_des − Jν`` to first order."""
 
     @abstractmethod
     def jacobian(self, state: State) -> Array:
@@ -123,9 +123,9 @@ class Task(ABC):
 
 @checked
 class TargetTask(Task, Generic[Target]):
-    """Base of the tasks that lead an output to a target, by default to the output at ``reset``.
+    """Base class of tasks that move an output to a target, by default the output at ``reset``.
 
-    A subclass defines ``title`` and ``rows``, its default name and its size.
+    A subclass defines its default name ``title`` and its size ``rows``.
 
     Attributes:
         target: Target of the output.
@@ -161,7 +161,7 @@ class TargetTask(Task, Generic[Target]):
         """Return the target.
 
         Raises:
-            InputError: There is none yet.
+            InputError: The task has no target yet.
         """
         if self.target is None:
             raise InputError("has no target", where=self.name, hint="set `target`, or reset the controller first")
@@ -169,7 +169,7 @@ class TargetTask(Task, Generic[Target]):
 
 
 class TaskStack:
-    """Stack tasks to ``J ν̇ = a`` with ``a = ÿ* − J̇ν``, updated once a tick.
+    """Stack of tasks as ``J ν̇ = a`` with ``a = ÿ* − J̇ν``, updated once a tick.
 
     Attributes:
         tasks: Tasks from top to bottom.
@@ -187,7 +187,7 @@ class TaskStack:
         self.a, self._e, self._drift, self._work, self._yd, self._ydd = np.zeros((6, self.size))
         for task, rows in zip(self.tasks, self.rows, strict=True):
             task.bind(self._yd[rows], self._ydd[rows])
-        # Views that the loop over the tasks writes into, sliced only once.
+        # Views for the loop over the tasks, sliced only once.
         self._parts = [
             (task, self.J[rows], self._e[rows], self._drift[rows], self.a[rows])
             for task, rows in zip(self.tasks, self.rows, strict=True)
@@ -238,9 +238,9 @@ def gain(value: ArrayLike, size: int, where: str) -> Array:
     Raises:
         InputError: The value has another shape, is negative, or is not finite.
     """
-    given = np.asarray(value, dtype=float)
-    if given.shape not in ((), (size,)):
-        raise InputError(f"has shape {given.shape}", where=where, hint=f"give one number or {size}")
-    if not (np.isfinite(given).all() and (given >= 0).all()):
+    values = np.asarray(value, dtype=float)
+    if values.shape not in ((), (size,)):
+        raise InputError(f"has shape {values.shape}", where=where, hint=f"give one number or {size}")
+    if not (np.isfinite(values).all() and (values >= 0).all()):
         raise InputError("is negative or not finite", where=where, hint="give finite numbers from zero up")
-    return np.array(np.broadcast_to(given, (size,)))
+    return np.array(np.broadcast_to(values, (size,)))
