@@ -12,13 +12,13 @@ from typing import Annotated, Any, TypeVar, Union, get_args, get_origin, get_typ
 
 import typer
 
-from impact_posture.config.setting import CONTACT, METRIC, ROBOT, SEARCH, TASK, Setting
+from impact_posture.config.setting import CONTACT, LIMITS, METRIC, ROBOT, SEARCH, TASK, Setting
 from impact_posture.config.settings import RobotSettings
 from impact_posture.config.table_validation import validate
 from impact_posture.errors import ImpactPostureError
 from impact_posture_cli.error_boundary import UsageError
 
-_PANELS = (CONTACT, METRIC, ROBOT, TASK, SEARCH)
+_PANELS = (CONTACT, METRIC, ROBOT, TASK, LIMITS, SEARCH)
 _Settings = TypeVar("_Settings", bound=RobotSettings)
 
 NoSupport = Annotated[bool, typer.Option("--no-support", rich_help_panel=ROBOT, help="Nothing stays on the ground.")]

@@ -6,7 +6,8 @@ from collections.abc import Callable
 from dataclasses import dataclass, field
 from typing import Any
 
-CONTACT, METRIC, ROBOT, TASK, SEARCH, OUTPUT = "Contact", "Measure", "Robot", "Task", "Search", "Output"
+CONTACT, METRIC, ROBOT = "Contact", "Measure", "Robot"
+TASK, LIMITS, SEARCH, OUTPUT = "Task", "Limits of the task", "Search", "Output"
 
 
 @dataclass(frozen=True)

@@ -32,7 +32,7 @@ from impact_posture.config.demand import (
 )
 from impact_posture.config.demand import Vector3 as Vector3
 from impact_posture.config.obstacle import Obstacle
-from impact_posture.config.setting import CONTACT, METRIC, ROBOT, SEARCH, TASK, setting
+from impact_posture.config.setting import CONTACT, LIMITS, METRIC, ROBOT, SEARCH, TASK, setting
 from impact_posture.config.table_validation import StrictTable
 from impact_posture.config.text_parsers import parse_armature, parse_number_or_name, parse_payloads
 
@@ -79,8 +79,8 @@ class LoadOptions(StrictTable):
     """
 
     lock: tuple[str, ...] = setting(
-        (), "Make a joint rigid, or all that fit a pattern such as 'gripper_*' (in quotes); repeatable.", ROBOT,
-        "JOINT", repeatable=True,
+        (), "Make a joint rigid, or all that fit a pattern such as 'gripper_*'; repeatable.", ROBOT, "JOINT",
+        repeatable=True,
     )  # fmt: skip
     lock_massless: bool = setting(False, "Make all joints that move no mass rigid.", ROBOT)
     root: Root | None = setting(None, "Joint between the world and the base.", ROBOT, words="robot.toml's")
@@ -88,9 +88,7 @@ class LoadOptions(StrictTable):
         None, "Rotor inertia at the joint, kg·m²; JOINT=VALUE is repeatable.", ROBOT, "none|FILE|JOINT=VALUE",
         "robot.toml's, else the SRDF's", parse=parse_armature, repeatable=True,
     )  # fmt: skip
-    config: str | None = setting(
-        None, "File of data that the URDF cannot hold.", ROBOT, "ROBOT.TOML", "beside the URDF"
-    )
+    config: str | None = setting(None, "Data that the URDF cannot hold.", ROBOT, "ROBOT.TOML", "beside the URDF")
     srdf: str | None = setting(
         None, "Named postures and rotor data: a path, or example-robot-data:PATH.", ROBOT, "FILE", "robot.toml's"
     )
@@ -117,15 +115,12 @@ class ImpactSettings(RobotSettings):
 
     frame: str | None = setting(None, "Contact frame.", CONTACT, "F", "the robot's")
     normal: Direction | None = setting(
-        None, "Direction out of the surface, towards the robot, of any length. Required unless --contact is given.",
-        CONTACT, "X Y Z",
-    )  # fmt: skip
-    offset: Position | None = setting(
-        None, "Contact point from the frame's origin, in the frame, m.", CONTACT, "X Y Z", "0 0 0"
+        None, "Direction out of the surface, of any length; required without --contact.", CONTACT, "X Y Z"
     )
-    normal_frame: NormalFrame = setting("world", "Axes in which the normal is given.", CONTACT)
+    offset: Position | None = setting(None, "Contact point in the contact frame, m.", CONTACT, "X Y Z", "0 0 0")
+    normal_frame: NormalFrame = setting("world", "Axes of the normal.", CONTACT)
     contact: Contacts | None = setting(
-        None, "Contact, in place of --frame and --normal; repeatable for up to 6 contacts at once.", CONTACT,
+        None, "Replaces --frame and --normal; repeatable for up to 6 contacts at once.", CONTACT,
         "FRAME:NX,NY,NZ[:IMPULSE]", repeatable=True,
     )  # fmt: skip
     bilateral: bool = setting(False, "Contacts can also pull, as in a grasp.", CONTACT)
@@ -133,41 +128,30 @@ class ImpactSettings(RobotSettings):
     speed: NonNegative = setting(1.0, "Approach speed, m/s.", CONTACT)
     restitution: Share = setting(0.0, "Coefficient of restitution, 0 (plastic) to 1 (elastic).", CONTACT)
     contact_stiffness: Annotated[str | float, between(1.0, 1e12, "N/m", tuple(MATERIALS))] | None = setting(
-        None, f"Stiffness of the contact, or the material that a steel tip touches: {', '.join(MATERIALS)}.",
-        CONTACT, "N/M|MATERIAL", "not known", parse=parse_number_or_name,
+        None, f"Stiffness of the contact, or the material of the surface: {', '.join(MATERIALS)}.", CONTACT,
+        "N/M|MATERIAL", "not known", parse=parse_number_or_name,
     )  # fmt: skip
     contact_duration: Annotated[float, between(1e-7, 100.0, "s")] | None = setting(
-        None, "Time from touch to greatest compression, s.", CONTACT, words="not known",
-    )  # fmt: skip
-    friction: NonNegative = setting(FRICTION, "Friction coefficient at the impact and at the feet.", CONTACT)
-    metric: MetricKind = setting(
-        "euclidean", "Norm of the velocity jump: euclidean, kinetic or weighted.", METRIC, "KIND"
+        None, "Time from touch to greatest compression, s.", CONTACT, words="not known"
     )
+    friction: NonNegative = setting(FRICTION, "Friction coefficient at the impact and at the feet.", CONTACT)
+    metric: MetricKind = setting("euclidean", "Norm of the velocity jump.", METRIC)
     weights: str | tuple[float, ...] | None = setting(
         None, "Weights of the weighted metric: TOML of joint = weight, or 1/limit².", METRIC, "FILE|velocity-limits"
     )
     objective: ObjectiveChoice = setting(
-        "impulse",
-        "impulse (jump per impulse, H), speed (jump per approach speed without friction, V), sticking (without "
-        "slip, S), coulomb (with --friction: sticks or slips, C), energy (E), or auto (by speed and friction).",
-        METRIC, "KIND",
-    )  # fmt: skip
+        "impulse", "Minimize H (impulse), V (speed), S (sticking), C (coulomb) or E (energy).", METRIC
+    )
     joint_model: JointModel = setting(
-        "reflected",
-        "Inertia at the joints: reflected (links and rotors), link (without the rotors behind elastic "
-        "transmissions), locked (rigid joints) or elastic (rotors on springs; evaluate only).",
-        METRIC, "KIND",
-    )  # fmt: skip
-    normal_cone: HalfAngle = setting(
-        0.0, "Half angle of the cone of normals that are possible; the worst normal counts.", METRIC, "DEG",
-    )  # fmt: skip
+        "reflected", "Inertia of the rotors at the joints; elastic only with evaluate.", METRIC
+    )
+    normal_cone: HalfAngle = setting(0.0, "Half angle of a cone of normals; the worst counts.", METRIC, "DEG")
     armature_range: Factors | None = setting(
-        None, "Lowest and highest factor on the armature that are possible; the worst case counts.", METRIC,
-        "LOW HIGH", "as stated",
-    )  # fmt: skip
+        None, "Lowest and highest factor on the armature; the worst case counts.", METRIC, "LOW HIGH", "as stated"
+    )
     payload: Payloads = setting(
-        (), "Mass in kg that the robot may carry at the frame; repeatable; the worst case counts.", METRIC,
-        "FRAME MASS", parse=parse_payloads, repeatable=True,
+        (), "Mass at a frame that the robot may carry, kg; the worst case counts; repeatable.", METRIC, "FRAME MASS",
+        parse=parse_payloads, repeatable=True,
     )  # fmt: skip
     posture: str | None = setting(
         None, "Named posture, posture.json, or a JointState as .yaml.", ROBOT, "NAME|FILE", "the robot's"
@@ -186,16 +170,14 @@ class ProblemSettings(ImpactSettings):
     schema: Literal["impact-posture/problem/1"] = "impact-posture/problem/1"
     q: tuple[float, ...] | None = None
     target_position: Position | None = setting(
-        None, "Contact frame's position, world, m.", TASK, "X Y Z", "where it is"
+        None, "Position of the contact frame, world, m.", TASK, "X Y Z", "where it is"
     )
     target_quaternion: UnitQuaternion | None = setting(
-        None, "Contact frame's orientation, scalar last.", TASK, "X Y Z W", "as it is"
+        None, "Orientation of the contact frame, world, scalar last.", TASK, "X Y Z W", "as it is"
     )
     contact_pose: Annotated[str, kind_or_tilt(get_args(ContactPose), "aligned")] | None = setting(
-        None,
-        "Constraint on the contact frame: full, position, aligned (spin free), aligned:DEG (and tilted by up to "
-        "DEG), free or box.",
-        TASK, "KIND", "robot.toml's, else full",
+        None, "Hold the contact frame: full, position, aligned, aligned:DEG, free or box.", TASK, "KIND",
+        "robot.toml's, else full",
     )  # fmt: skip
     box: Lengths = setting((0.05, 0.05, 0.05), "Half extents of --contact-pose box, m.", TASK, "X Y Z")
     keep: tuple[str, ...] = setting((), "Hold the pose of another frame; repeatable.", TASK, "FRAME", repeatable=True)
@@ -204,81 +186,60 @@ class ProblemSettings(ImpactSettings):
         repeatable=True,
     )  # fmt: skip
     base: Annotated[str, kind_or_tilt(get_args(BaseMode), "level")] | None = setting(
-        None,
-        "Constraint on a floating base: free, level (yaw free), level:DEG (and tilted by up to DEG), fixed or "
-        "box.",
-        TASK, "KIND", "robot.toml's, else free",
-    )  # fmt: skip
+        None, "Hold a floating base: free, level, level:DEG, fixed or box.", TASK, "KIND", "robot.toml's, else free"
+    )
     base_box: Lengths = setting((0.2, 0.2, 0.2), "Half extents of --base box, m.", TASK, "X Y Z")
     com: bool | None = setting(
-        None, "Keep the center of mass above the feet.", TASK, words="robot.toml's", option="--com/--no-com"
+        None, "Keep the center of mass above the feet.", LIMITS, words="robot.toml's", option="--com/--no-com"
     )
     com_margin: NonNegative | None = setting(
-        None, "Distance of the center of mass from the support polygon's edges, m.", TASK, words="robot.toml's",
-    )  # fmt: skip
-    keep_contacts: bool = setting(False, "The impact must neither lift nor slide a foot.", TASK)
-    holdable: bool = setting(
-        True,
-        "Keep joint torques, rotor thrusts and forces of the feet within their limits at rest, where the robot's "
-        "data say them.",
-        TASK, option="--holdable/--no-holdable",
-    )  # fmt: skip
-    approach: bool = setting(
-        False, "The joints can bring the contact to the surface at --speed within their velocity limits.", TASK
+        None, "Distance of the center of mass from the support polygon's edges, m.", LIMITS, words="robot.toml's"
     )
+    keep_contacts: bool = setting(False, "The impact must neither lift nor slide a foot.", LIMITS)
+    holdable: bool = setting(
+        True, "Keep joint torques, thrusts and foot forces within their limits at rest.", LIMITS,
+        option="--holdable/--no-holdable",
+    )  # fmt: skip
+    approach: bool = setting(False, "Joint velocity limits must allow --speed at the contact.", LIMITS)
     hold_force: Annotated[float, between(0.0, 1e6, "N")] = setting(
-        0.0, "Force along the normal that the robot also has to hold after the impact, N.", TASK, "N",
-    )  # fmt: skip
+        0.0, "Force along the normal that the robot also holds after the impact, N.", LIMITS, "N"
+    )
     max_force: Annotated[float, between(1e-6, 1e9, "N")] | None = setting(
-        None, "Largest allowed peak force, N, without friction; needs --contact-stiffness or --contact-duration.",
-        TASK, words="no bound",
-    )  # fmt: skip
+        None, "Bound on the peak force, N; needs --contact-stiffness or --contact-duration.", LIMITS, words="no bound"
+    )
     max_joint_jump: Annotated[float, between(1e-6, 1e9, "rad/s or m/s")] | None = setting(
-        None, "Largest allowed velocity jump of a joint without friction, rad/s or m/s.", TASK, words="no bound",
-    )  # fmt: skip
+        None, "Bound on the velocity jump of each joint without friction, rad/s or m/s.", LIMITS, words="no bound"
+    )
     max_torque: Annotated[float, between(1e-6, 1e9, "N·m")] | None = setting(
-        None, "Largest torque with which the controller may answer the jump, N·m; needs --velocity-gain.", TASK,
-        words="no bound",
-    )  # fmt: skip
+        None, "Bound on the controller's torque after the jump, N·m; needs --velocity-gain.", LIMITS, words="no bound"
+    )
     velocity_gain: Annotated[float, between(1e-6, 1e9, "N·m·s/rad")] | None = setting(
-        None, "Gain K_d of the controller for --max-torque, N·m·s/rad.", TASK, words="not known",
-    )  # fmt: skip
+        None, "Gain K_d of the controller for --max-torque, N·m·s/rad.", LIMITS, words="not known"
+    )
     collision: bool = setting(
-        True, "Keep the links clear of each other, the surface, the ground and obstacles.", TASK,
+        True, "Keep the links clear of each other, the surface, the ground and obstacles.", LIMITS,
         option="--collision/--no-collision",
     )  # fmt: skip
     clearance: Annotated[float, between(1e-4, 1.0, "m")] = setting(
-        CLEARANCE, "Least distance of links that stay apart, m.", TASK
+        CLEARANCE, "Least distance of links that stay apart, m.", LIMITS
     )
     surface: Annotated[str | float, between(1e-3, 1e3, "m", ("plane", "none"))] | None = setting(
-        None, "Surface at the contact: an endless plane, none, or a square of this edge length, m.", TASK,
+        None, "Surface at the contact: an endless plane, none, or a square of this edge length, m.", LIMITS,
         "plane|none|M", f"the plane, or {PATCH:g} where the robot stands behind it", parse=parse_number_or_name,
     )  # fmt: skip
     obstacles: tuple[Obstacle, ...] = ()
     limit_margin: NonNegative | None = setting(
-        None, "Distance from the joint limits, rad or m.", TASK, words="robot.toml's"
+        None, "Distance from the joint limits, rad or m.", LIMITS, words="robot.toml's"
     )
     regularization: NonNegative = setting(0.0, "Weight of the distance from the start.", TASK)
     tradeoff: ZeroOrMore = setting(
-        0,
-        "Also find the best posture within each of K distances from the start, which shows what a smaller change "
-        f"gains; {TRADEOFF_POINTS} distances without K, none for 0.",
-        TASK, "[K]",
-    )  # fmt: skip
-    tradeoff_against: Against = setting(
-        "distance", "What --tradeoff bounds: the distance from the start, or the peak force of the impact.", TASK,
-        "WHAT",
-    )  # fmt: skip
+        0, f"Best posture within each of K distances from the start; K is {TRADEOFF_POINTS} if left out.", TASK, "[K]"
+    )
+    tradeoff_against: Against = setting("distance", "What --tradeoff bounds: distance, or peak force.", TASK)
     path: bool = setting(
-        False, "Also find and time a path from the start to the optimum on which all constraints hold.", TASK
+        False, "Find a timed path from the start to the optimum, on which all constraints hold.", TASK
     )
-    search: Search = setting(
-        "multistart",
-        "multistart, or global: maps self-motions of 1 or 2 degrees of freedom, else hops from the best optimum.",
-        SEARCH, "HOW",
-    )  # fmt: skip
+    search: Search = setting("multistart", "global also maps self-motions, or hops from the best optimum.", SEARCH)
     starts: OneOrMore = setting(16, "Number of starting points of the search.", SEARCH)
-    finish_all: bool = setting(
-        False, "Finish starts of large programs that can no longer be the best: lists all optima.", SEARCH
-    )
+    finish_all: bool = setting(False, "Finish starts that can no longer be the best; lists all optima.", SEARCH)
     seed: ZeroOrMore = setting(0, "Seed of the random starts.", SEARCH)
