@@ -1,4 +1,4 @@
-"""Bad models and specs: each one line that says what, where and what to do."""
+"""Bad models and specs: each error is a line with the fault, the place and a hint."""
 
 from __future__ import annotations
 
@@ -52,12 +52,10 @@ Load = Callable[..., object]
 
 
 def one_line(error: ImpactPostureError, *words: str) -> None:
-    """Check that the error is one complete line with all the words, an exit code, and survives a process border."""
+    """Check that the error is a complete line with all words and an exit code, and that it can be pickled."""
     assert "\n" not in error.line
     assert str(error) == error.line
-    assert error.what
-    assert error.where
-    assert error.hint
+    assert error.what and error.where and error.hint
     assert error.exit_code == 1
     for word in words:
         assert word in error.line, error.line
@@ -76,7 +74,7 @@ def test_the_good_model_of_these_tests_loads(load: Load) -> None:
 @pytest.mark.parametrize(
     ("text", "words"),
     [
-        ("this is no XML", ("is not XML", "bad.urdf")),
+        ("this is not XML", ("is not XML", "bad.urdf")),
         ("", ("is not XML",)),
         ("<robot name='r'><link name='a'>", ("is not XML",)),
         ("<sdf version='1.7'><model name='m'/></sdf>", ("not a URDF", "<sdf>")),
@@ -98,13 +96,12 @@ def test_files_that_are_no_robot(
     with pytest.raises(UrdfError) as caught:
         load(text=text)
     one_line(caught.value, *words)
-    # The parser's own words do not reach the terminal.
-    out, err = capfd.readouterr()
-    assert (out, err) == ("", "")
+    # Messages of the parser do not reach the terminal.
+    assert capfd.readouterr() == ("", "")
 
 
-def test_a_joint_that_mimics_no_joint_is_warned_about(load: Load) -> None:
-    """Pinocchio ignores whatever stands there, and published robots have such joints."""
+def test_a_mimic_of_a_joint_that_does_not_exist_is_a_warning(load: Load) -> None:
+    """Pinocchio ignores it, and published robots have such joints."""
     parts = link("a", GOOD), link("b", OFF_AXIS), link("c", OFF_AXIS), joint("a", "b")
     for other in ("a_bb", ""):
         loaded = load(*parts, joint("b", "c").replace("</joint>", f'<mimic joint="{other}"/></joint>'))
@@ -113,14 +110,14 @@ def test_a_joint_that_mimics_no_joint_is_warned_about(load: Load) -> None:
         assert f"'b_c' mimics '{other}', which is not a joint of the URDF (did you mean a_b?)" in warnings[0]
 
 
-def test_a_joint_whose_coupling_is_left_out_is_warned_about(load: Load) -> None:
+def test_a_mimic_joint_that_moves_by_itself_is_a_warning(load: Load) -> None:
     parts = link("a", GOOD), link("b", OFF_AXIS), link("c", OFF_AXIS), joint("a", "b")
     coupled = joint("b", "c").replace("</joint>", '<mimic joint="a_b" multiplier="2"/></joint>')
-    for toml, said in (("", True), ('[model]\nlock = ["b_c"]', False), ('[constraints]\nhold = ["b_c"]', False)):
+    for toml, warned in (("", True), ('[model]\nlock = ["b_c"]', False), ('[constraints]\nhold = ["b_c"]', False)):
         loaded = load(*parts, coupled, toml=toml)
         warnings = [line for line in loaded.warnings if "mimics" in line]  # type: ignore[attr-defined]
-        assert len(warnings) == said
-        assert not said or "'b_c' mimics 'a_b' but moves by itself here" in warnings[0]
+        assert len(warnings) == warned
+        assert not warned or "'b_c' mimics 'a_b' but moves by itself here" in warnings[0]
 
 
 def test_swapped_limits(load: Load) -> None:
@@ -171,22 +168,22 @@ def test_bad_srdf(tmp_path: Path, load: Load) -> None:
         (GOOD.replace('ixx="0.01"', 'ixx="inf"'), ("link 'b'", "is not a number")),
     ],
 )
-def test_inertias_of_no_rigid_body(load: Load, inertial: str, words: tuple[str, ...]) -> None:
+def test_impossible_inertias(load: Load, inertial: str, words: tuple[str, ...]) -> None:
     with pytest.raises(UrdfError) as caught:
         load(link("a", GOOD), link("b", inertial), joint("a", "b"))
     one_line(caught.value, *words)
     assert isinstance(caught.value, InertiaError) or "makes no robot" in caught.value.line
 
 
-def test_rounding_in_an_inertia_is_no_fault(load: Load) -> None:
-    # A thin plate printed with four digits: izz = ixx + iyy up to the last one.
+def test_rounding_in_an_inertia_is_allowed(load: Load) -> None:
+    # A thin plate printed with four digits: izz = ixx + iyy up to the last digit.
     load(link("a", GOOD), link("b", inertia(0.01234, 0.02345, 0.0358)), joint("a", "b"))
 
 
 def test_a_fault_too_small_to_matter_is_a_warning(load: Load) -> None:
     speck = link("c", inertia(1e-7, 1e-7, 1e-6, mass=0.01))
-    found = load(link("a", None), link("b", OFF_AXIS), speck, joint("a", "b"), joint("b", "c", kind="fixed"))
-    assert any("link 'c'" in w and "too small to matter" in w for w in found.warnings)  # type: ignore[attr-defined]
+    loaded = load(link("a", None), link("b", OFF_AXIS), speck, joint("a", "b"), joint("b", "c", kind="fixed"))
+    assert any("link 'c'" in w and "too small to matter" in w for w in loaded.warnings)  # type: ignore[attr-defined]
 
 
 def test_a_welded_link_may_be_anything(load: Load) -> None:
@@ -196,8 +193,8 @@ def test_a_welded_link_may_be_anything(load: Load) -> None:
 def test_accept_inertias_turns_refusals_into_warnings(load: Load) -> None:
     elements = (link("a", None), link("b", inertia(0.01, 0.01, 0.05)), joint("a", "b"))
     toml = "[model]\naccept_inertias = true"
-    found = load(*elements, toml=toml)
-    assert any("triangle" in w and "robot.toml" in w for w in found.warnings)  # type: ignore[attr-defined]
+    loaded = load(*elements, toml=toml)
+    assert any("triangle" in w and "robot.toml" in w for w in loaded.warnings)  # type: ignore[attr-defined]
 
 
 # ---- mass matrices that cannot be inverted ------------------------------------------------------------------------
@@ -208,7 +205,7 @@ def test_a_joint_that_moves_no_mass(load: Load) -> None:
     with pytest.raises(InertiaError) as caught:
         load(*elements)
     one_line(caught.value, "joint 'b_c' moves no mass", "`lock_massless`")
-    # Armature gives it something to turn; locking removes it.
+    # An armature gives the joint an inertia, and a lock removes the joint.
     load(*elements, armature={"b_c": 0.01})
     load(*elements, lock=("b_c",))
 
@@ -219,7 +216,7 @@ def test_a_chain_of_massless_links_is_named_whole(load: Load) -> None:
         load(*elements)
 
 
-def test_a_base_that_the_urdf_itself_lets_float(load: Load) -> None:
+def test_a_floating_joint_in_the_urdf(load: Load) -> None:
     elements = (link("world", None), link("a", OFF_AXIS), link("b", OFF_AXIS))
     joints = (joint("world", "a", kind="floating"), joint("a", "b", "0 1 0"))
     for root in (None, "fixed", "free-flyer"):
@@ -250,7 +247,7 @@ def test_a_joint_through_a_point_mass(load: Load) -> None:
     with pytest.raises(InertiaError) as caught:
         load(link("a", GOOD), link("b", OFF_AXIS), link("c", on_axis), joint("a", "b"), joint("b", "c"))
     one_line(caught.value, "b_c moves no inertia")
-    # Off the axis a point mass is as good as any.
+    # Off the axis, a point mass has inertia.
     load(link("a", GOOD), link("b", OFF_AXIS), link("c", on_axis), joint("a", "b"), joint("b", "c", "1 0 0"))
 
 
@@ -264,7 +261,7 @@ def test_two_joints_about_one_axis_without_mass_between(load: Load) -> None:
 
 
 def test_units_do_not_make_a_mass_matrix_singular(load: Load) -> None:
-    # Grams behind tons: badly scaled, but every joint moves what it moves.
+    # Grams behind tons are badly scaled, but every joint moves an inertia.
     tiny = '<origin xyz="0.001 0 0"/>' + inertia(1e-9, 1e-9, 1e-9, mass=1e-3)
     heavy = inertia(500.0, 500.0, 500.0, mass=2000.0)
     load(link("a", heavy), link("b", tiny), joint("a", "b"), root="free-flyer")

@@ -1,4 +1,4 @@
-"""What names and geometry suggest of a robot, and the ``robot.toml`` that is drafted from it."""
+"""Guesses from names and geometry of a robot, and the drafted ``robot.toml``."""
 
 from __future__ import annotations
 
@@ -57,12 +57,12 @@ CATALOGUE: dict[str, RobotSpec] = {
     ],
 )  # fmt: skip
 def test_feet_and_tips_by_names_and_geometry(path: str, expected: tuple[str, ...], tip: str) -> None:
-    found = load_robot(uri(path), LoadOptions(root="free-flyer", lock_massless=True))
-    assert feet(found) == expected
-    ordered = tips(found, feet(found))
+    loaded = load_robot(uri(path), LoadOptions(root="free-flyer", lock_massless=True))
+    assert feet(loaded) == expected
+    ordered = tips(loaded, feet(loaded))
     assert ordered[0] == tip
     # Nothing that moves is left out.
-    assert set(ordered) == {str(f.name) for f in found.model.frames if f.parentJoint > 0} - {"root_joint"}
+    assert set(ordered) == {str(f.name) for f in loaded.model.frames if f.parentJoint > 0} - {"root_joint"}
 
 
 @pytest.mark.parametrize(
@@ -75,22 +75,22 @@ def test_feet_and_tips_by_names_and_geometry(path: str, expected: tuple[str, ...
     ],
 )
 def test_a_sole_is_read_from_balls_and_boxes(path: str, foot: str, kind: str, size: tuple[float, float]) -> None:
-    """A ball on b1, a box on talos, four balls at the corners of g1's sole, a mesh on go2: not opened."""
-    found = load_robot(uri(path), LoadOptions(root="free-flyer"))
-    spec = support(found, foot, example_robot_data() / path, flat=False)
+    """A foot is a ball on b1, a box on talos, four balls on g1, and a mesh, which is not opened, on go2."""
+    loaded = load_robot(uri(path), LoadOptions(root="free-flyer"))
+    spec = support(loaded, foot, example_robot_data() / path, flat=False)
     assert spec.kind == kind
     assert spec.size == pytest.approx(size, abs=1e-3)
     assert any(spec.offset) == ("go2" not in path)
     if kind == "point" and any(spec.offset):
         # The lowest point of a ball lies straight below its center, one radius down.
-        data = found.model.createData()
-        pin.framesForwardKinematics(found.model, data, found.posture())
-        down = data.oMf[found.frame_id(foot)].rotation @ np.array(spec.offset)
+        data = loaded.model.createData()
+        pin.framesForwardKinematics(loaded.model, data, loaded.posture())
+        down = data.oMf[loaded.frame_id(foot)].rotation @ np.array(spec.offset)
         np.testing.assert_allclose(down, [0, 0, -0.04], atol=2e-4)
 
 
 def commented(text: str) -> list[str]:
-    """Lines with a key that neither say where its value comes from nor stand below a line that does."""
+    """Return the lines with a key without a comment, neither beside nor above the key."""
     lines = text.splitlines()
     keys = [k for k, line in enumerate(lines) if " = " in line and not line.startswith(("#", "schema"))]
     return [lines[k] for k in keys if "  # " not in lines[k] and not lines[k - 1].startswith("# ")]
@@ -98,24 +98,24 @@ def commented(text: str) -> list[str]:
 
 @pytest.mark.parametrize("name", [*CATALOGUE, "b1-z1"])
 def test_a_draft_loads_without_change(name: str, tmp_path: Path) -> None:
-    """Of every robot of the catalogue, from its URDF alone: root and feet as the catalogue's file says."""
+    """The draft from the URDF alone has the root and the feet of the known robot."""
     known = CATALOGUE.get(name)
     source = B1_Z1 if known is None else known.model.urdf
     assert source is not None
     out, draft = write_draft(source, LoadOptions(), tmp_path / "draft.toml")
     assert [p.name for p in tmp_path.iterdir()] == ["draft.toml"]
     assert tomllib.loads(draft.text) and out.read_text(encoding="utf-8") == draft.text
-    found = load_robot(source, LoadOptions(config=str(out)))
-    found.check_posture(found.posture())
+    loaded = load_robot(source, LoadOptions(config=str(out)))
+    loaded.check_posture(loaded.posture())
     assert commented(draft.text) == []
     assert max(len(line) for line in draft.text.splitlines() if line.startswith("#")) <= 100
-    assert found.spec.contact.frame in found.frame_names
+    assert loaded.spec.contact.frame in loaded.frame_names
     expected = FOUR if known is None else [s.frame for s in known.supports]
-    assert sorted(s.frame for s in found.spec.supports) == sorted(expected)
-    assert found.root == ("free-flyer" if known is None else known.model.root)
+    assert sorted(s.frame for s in loaded.spec.supports) == sorted(expected)
+    assert loaded.root == ("free-flyer" if known is None else known.model.root)
     if known is not None and known.kind != "other":
-        assert found.spec.kind == known.kind
-    assert not set(found.spec.constraints.hold) & set(found.locked)
+        assert loaded.spec.kind == known.kind
+    assert not set(loaded.spec.constraints.hold) & set(loaded.locked)
 
 
 def test_a_draft_beside_the_urdf_is_found_by_itself(tmp_path: Path) -> None:
@@ -126,9 +126,9 @@ def test_a_draft_beside_the_urdf_is_found_by_itself(tmp_path: Path) -> None:
     options = LoadOptions(srdf=str(tmp_path / "srdf" / "other.srdf"), armature={"joint1": 0.02}, lock=("jointGri*",))
     out, draft = write_draft(urdf, options, None)
     assert out == tmp_path / "robot.toml"
-    found = load_robot(urdf)
-    assert found.default_posture.startswith("standing") and found.locked == ("jointGripper",)
-    assert found.armature[found.model.idx_vs[found.joint_id("joint1")]] == 0.02
+    loaded = load_robot(urdf)
+    assert loaded.default_posture.startswith("standing") and loaded.locked == ("jointGripper",)
+    assert loaded.armature[loaded.model.idx_vs[loaded.joint_id("joint1")]] == 0.02
     assert 'srdf = "srdf/other.srdf"  # as --srdf says' in draft.text
     with pytest.raises(OutputError, match="`force`"):
         write_draft(urdf, LoadOptions(), None)
@@ -138,7 +138,7 @@ def test_a_draft_beside_the_urdf_is_found_by_itself(tmp_path: Path) -> None:
     assert sorted(p.name for p in tmp_path.iterdir()) == ["b1-z1.urdf", "robot.toml", "srdf"]
 
 
-def test_what_a_draft_refuses(tmp_path: Path) -> None:
+def test_refused_drafts(tmp_path: Path) -> None:
     with pytest.raises(InputError, match=r"panda: has its robot\.toml already"):
         write_draft("panda", LoadOptions(), tmp_path / "panda.toml")
     with pytest.raises(OutputError, match="cannot be written"):
@@ -153,7 +153,7 @@ def test_names_cannot_break_out_of_a_comment() -> None:
 
 
 def test_b1_z1_stays_upright_with_its_draft(tmp_path: Path) -> None:
-    """By its bare URDF it was turned upside down, feet a meter above the tip."""
+    """Without a robot.toml, the optimal posture was upside down."""
     out, _ = write_draft(B1_Z1, LoadOptions(), tmp_path / "b1-z1.toml")
     prepared = prepare(make_settings({"robot": B1_Z1, "config": str(out), "normal": (-1, 0, 0)}))
     solution = solve(prepared.problem, starts=2, jobs=1, compile="never")

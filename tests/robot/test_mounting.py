@@ -1,4 +1,4 @@
-"""A joint put elsewhere than where the URDF has it (``LoadOptions.mounting``, ``mounting`` in scenario.toml)."""
+"""Joints at another place than in the URDF (``LoadOptions.mounting``, ``mounting`` in scenario.toml)."""
 
 from __future__ import annotations
 
@@ -22,7 +22,7 @@ MOVED = (-0.08, 0.02, 0.01)
     ("name", "joint"),
     [("tilthex_arm", "shoulder_roll"), ("panda", "panda_joint4"), ("talos", "arm_left_1_joint")],
 )
-def test_the_joint_moves_with_all_that_hangs_on_it(name: str, joint: str) -> None:
+def test_a_joint_moves_with_its_subtree(name: str, joint: str) -> None:
     plain, moved = load_robot(name), load_robot(name, LoadOptions(mounting={joint: MOVED}))
     step = 0.2 * rng(name, joint).normal(size=plain.nv)
     q = np.array(pin.integrate(plain.model, plain.posture(), step))
@@ -49,7 +49,7 @@ def test_masses_and_inertias_stay_and_the_dynamics_follow() -> None:
     np.testing.assert_array_equal(plain.armature, moved.armature)
     np.testing.assert_array_equal(plain.model.lowerPositionLimit, moved.model.lowerPositionLimit)
     M, N = (mass_matrix(r.model, plain.posture()) for r in (plain, moved))
-    # The arm's own inertia is the same wherever it hangs; what it means for the base is not.
+    # The inertia of the arm does not depend on its place, but its coupling with the base does.
     np.testing.assert_allclose(N[6:, 6:], M[6:, 6:], atol=1e-12)
     assert np.abs(N[:6, :6] - M[:6, :6]).max() > 1e-3
 
@@ -78,16 +78,11 @@ def test_an_unknown_joint_is_named_with_its_nearest() -> None:
     assert "\n" not in caught.value.line and "mounting" in caught.value.line
 
 
-@pytest.mark.parametrize("offset", [(np.nan, 0.0, 0.0), (0.0, np.inf, 0.0)])
-def test_an_offset_that_is_not_finite_is_one_line(offset: tuple[float, float, float]) -> None:
-    with pytest.raises(InputError, match="offset of 'elbow_pitch' is not finite") as caught:
-        load_robot("tilthex_arm", LoadOptions(mounting={"elbow_pitch": offset}))
-    assert "\n" not in caught.value.line
-
-
-@pytest.mark.parametrize("offset", [(0.1, 0.2), (0.1,), ()])
-def test_an_offset_of_other_than_three_numbers_is_one_line(offset: tuple[float, ...]) -> None:
-    with pytest.raises(InputError, match="three") as caught:
+@pytest.mark.parametrize(
+    ("offset", "fault"), [((np.nan, 0.0, 0.0), "offset of 'elbow_pitch' is not finite"), ((0.1, 0.2), "three")]
+)
+def test_a_wrong_offset_is_refused(offset: tuple[float, ...], fault: str) -> None:
+    with pytest.raises(InputError, match=fault) as caught:
         load_robot("tilthex_arm", LoadOptions(mounting={"elbow_pitch": offset}))  # type: ignore[dict-item]
     assert "\n" not in caught.value.line
 
@@ -98,20 +93,19 @@ def test_the_floating_base_itself_is_not_mounted() -> None:
     assert "\n" not in caught.value.line
 
 
-def test_a_scenarios_mounting_reaches_the_robot(tmp_path: Path) -> None:
-    found = read_scenario("aerial-vertical")
-    assert found.mounting == {"shoulder_roll": (-0.08, 0.0, 0.0)}
-    text = Path(found.source).read_text(encoding="utf-8")
-    assert "mounting = " in text
+def test_the_mounting_of_a_scenario_reaches_the_robot(tmp_path: Path) -> None:
+    scenario = read_scenario("aerial-vertical")
+    assert scenario.mounting == {"shoulder_roll": (-0.08, 0.0, 0.0)}
+    text = Path(scenario.source).read_text(encoding="utf-8")
     without = tmp_path / "plain.toml"
     lines = [line for line in text.splitlines() if not line.startswith("mounting")]
     without.write_text("\n".join(lines), encoding="utf-8")
     assert dict(read_scenario(without).mounting) == {}
-    mounted, plain = (load_robot(found.robot, scenario) for scenario in (found, replace(found, mounting={})))
+    mounted, plain = (load_robot(scenario.robot, each) for each in (scenario, replace(scenario, mounting={})))
     assert mounted.model_sha256 != plain.model_sha256
 
 
-def test_a_scenarios_mounting_of_two_numbers_is_one_line(tmp_path: Path) -> None:
+def test_a_mounting_of_two_numbers_in_a_scenario_is_refused(tmp_path: Path) -> None:
     text = Path(read_scenario("aerial-vertical").source).read_text(encoding="utf-8")
     path = tmp_path / "short.toml"
     path.write_text(text.replace("[-0.08, 0.0, 0.0]", "[-0.08, 0.0]"), encoding="utf-8")

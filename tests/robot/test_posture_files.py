@@ -1,4 +1,4 @@
-"""Postures by name and by file: what is written is read back, and every fault is one line with what to do."""
+"""Postures by name and by file: written postures are read back, and each fault is a line with a hint."""
 
 from __future__ import annotations
 
@@ -29,7 +29,7 @@ def save(path: Path, data: object) -> str:
 
 
 def inside_limits(loaded: Robot) -> np.ndarray:
-    """A random posture with every joint within its limits."""
+    """Return a random posture with every joint within its limits."""
     (q,) = random_configurations(loaded.model, 1, "posture", loaded.name)
     start = 7 if loaded.floating else 0
     low, high = np.array(loaded.model.lowerPositionLimit), np.array(loaded.model.upperPositionLimit)
@@ -44,7 +44,7 @@ def test_a_written_posture_is_read_back(name: str, tmp_path: Path) -> None:
     loaded = robot(name)
     q = inside_limits(loaded)
     path = save(tmp_path / "posture.json", write_posture(loaded, q))
-    # Quaternions and angles are normalized once more: their last digit may move.
+    # Quaternions and angles are normalized again, so their last digit may change.
     assert np.allclose(read_posture(loaded, path), q, rtol=0, atol=1e-15)
 
 
@@ -66,7 +66,7 @@ def test_a_name_and_the_default() -> None:
     assert caught.value.where == "posture"
 
 
-def test_a_file_is_told_from_a_name(tmp_path: Path) -> None:
+def test_a_file_is_distinguished_from_a_name(tmp_path: Path) -> None:
     assert posture_path("home") is None
     assert posture_path("nowhere.json") == Path("nowhere.json")
     plain = tmp_path / "plain"

@@ -1,4 +1,4 @@
-"""From a name or a path to a robot: what loads, what wrong names get, locking, armature."""
+"""Load robots by name or path: files, wrong names, locked joints, armature."""
 
 from __future__ import annotations
 
@@ -66,40 +66,36 @@ def spec(folder: Path, text: str, name: str = "robot.toml") -> str:
     return str(path)
 
 
-# ---- what loads -------------------------------------------------------------------------------------------------
+# ---- files ------------------------------------------------------------------------------------------------------
 
 
 @pytest.mark.parametrize("name", NAMES)
 def test_every_known_robot_loads(name: str) -> None:
-    found = robot(name)
-    assert found.name == name
-    assert found.default_posture in found.postures
-    for posture, q in found.postures.items():
-        assert q.shape == (found.nq,)
-        np.testing.assert_allclose(pin.normalize(found.model, q), q, atol=1e-12, err_msg=posture)
-    checked = found.check_posture(found.posture())
-    np.testing.assert_array_equal(checked, found.posture())
-    assert len(found.tangent_names) == found.nv
-    assert len(set(found.tangent_names)) == found.nv
-    assert found.armature.shape == (found.nv,)
-    assert not found.armature[: 6 * found.floating].any()
-    assert found.mass > 0.5
-    assert found.spec.contact.frame in found.frame_names
-    for support in found.spec.supports:
-        found.frame_id(support.frame)
-    assert found.floating == (found.model.joints[1].shortname() == "JointModelFreeFlyer")
-    assert len(found.joint_names) == found.model.njoints - 1 - found.floating
-    assert found.source.startswith(("example-robot-data:", "impact-posture:"))
+    loaded = robot(name)
+    assert loaded.name == name
+    assert loaded.default_posture in loaded.postures
+    for posture, q in loaded.postures.items():
+        assert q.shape == (loaded.nq,)
+        np.testing.assert_allclose(pin.normalize(loaded.model, q), q, atol=1e-12, err_msg=posture)
+    checked = loaded.check_posture(loaded.posture())
+    np.testing.assert_array_equal(checked, loaded.posture())
+    assert len(set(loaded.tangent_names)) == len(loaded.tangent_names) == loaded.nv
+    assert loaded.armature.shape == (loaded.nv,)
+    assert not loaded.armature[: 6 * loaded.floating].any()
+    assert loaded.mass > 0.5
+    assert loaded.floating == (loaded.model.joints[1].shortname() == "JointModelFreeFlyer")
+    assert len(loaded.joint_names) == loaded.model.njoints - 1 - loaded.floating
+    assert loaded.source.startswith(("example-robot-data:", "impact-posture:"))
 
 
-def test_a_robot_without_any_file_of_ours_loads_by_path() -> None:
-    found = load_robot(UR5)
-    assert found.source == UR5
-    assert found.root == "fixed"
-    assert found.default_posture == "neutral"
+def test_a_robot_without_a_robot_toml_loads_by_path() -> None:
+    loaded = load_robot(UR5)
+    assert loaded.source == UR5
+    assert loaded.root == "fixed"
+    assert loaded.default_posture == "neutral"
     floating = load_robot(str(example_robot_data() / UR5.partition(":")[2]), LoadOptions(root="free-flyer"))
-    assert floating.nv == found.nv + 6
-    assert floating.joint_names == found.joint_names
+    assert floating.nv == loaded.nv + 6
+    assert floating.joint_names == loaded.joint_names
     assert floating.tangent_names[:6] == ("base vx", "base vy", "base vz", "base wx", "base wy", "base wz")
 
 
@@ -108,14 +104,14 @@ def test_every_other_robot_of_example_robot_data_loads_or_says_why_not() -> None
     paths = sorted(example_robot_data().rglob("*.urdf"))
     for path in paths:
         try:
-            found = load_robot(f"example-robot-data:{path.relative_to(example_robot_data()).as_posix()}")
+            loaded = load_robot(f"example-robot-data:{path.relative_to(example_robot_data()).as_posix()}")
         except UrdfError as error:
             refused[path.name] = error
             assert "\n" not in error.line
             assert error.hint
         else:
-            assert np.isfinite(mass_matrix(found.model, found.posture())).all()
-    # Its neck turns about an axis through a point mass, and nobody's solver can tell neck_roll from neck_yaw there.
+            assert np.isfinite(mass_matrix(loaded.model, loaded.posture())).all()
+    # The neck turns about an axis through a point mass, so that neck_roll and neck_yaw are the same motion there.
     assert "neck_roll" in refused.pop("icub.urdf").line
     assert len(refused) < len(paths) / 5
 
@@ -127,9 +123,9 @@ def test_no_mesh_is_needed(arm: Path) -> None:
 
 
 def test_neutral_moves_into_the_limits(arm: Path) -> None:
-    found = load_robot(str(arm))
-    np.testing.assert_allclose(found.posture(), [0.0, 0.5, 1.0, 0.0])
-    found.check_posture(found.posture())
+    loaded = load_robot(str(arm))
+    np.testing.assert_allclose(loaded.posture(), [0.0, 0.5, 1.0, 0.0])
+    loaded.check_posture(loaded.posture())
 
 
 def test_a_robot_toml_beside_the_urdf_is_read(arm: Path) -> None:
@@ -138,13 +134,13 @@ def test_a_robot_toml_beside_the_urdf_is_read(arm: Path) -> None:
         'name = "mine"\ndefault_posture = "up"\n[postures.up.joints]\nelbow = 1.0\nwheel_mount = 0.5\n'
         '[limits.position]\nshoulder = [-1.0, 1.0]\n[limits.velocity]\nelbow = 7.0\n[limits.effort]\nelbow = 9.0\n',
     )  # fmt: skip
-    found = load_robot(str(arm))
-    assert found.name == "mine"
-    np.testing.assert_allclose(found.posture(), [0.0, 1.0, np.cos(0.5), np.sin(0.5)])
-    assert found.model.upperPositionLimit[0] == 1.0
-    assert found.model.lowerPositionLimit[0] == -1.0
-    assert found.model.upperVelocityLimit[1] == 7.0
-    assert found.model.upperEffortLimit[1] == 9.0
+    loaded = load_robot(str(arm))
+    assert loaded.name == "mine"
+    np.testing.assert_allclose(loaded.posture(), [0.0, 1.0, np.cos(0.5), np.sin(0.5)])
+    assert loaded.model.upperPositionLimit[0] == 1.0
+    assert loaded.model.lowerPositionLimit[0] == -1.0
+    assert loaded.model.upperVelocityLimit[1] == 7.0
+    assert loaded.model.upperEffortLimit[1] == 9.0
     other = spec(arm.parent, 'name = "other"', "other.toml")
     assert load_robot(str(arm), LoadOptions(config=other)).name == "other"
 
@@ -155,31 +151,31 @@ def test_config_paths_start_from_the_config(arm: Path, tmp_path: Path) -> None:
     (folder / "two.srdf").write_text(SRDF, encoding="utf-8")
     config = spec(folder, 'name = "panda2"\n[model]\nurdf = "../two.urdf"\nsrdf = "two.srdf"')
     for named in (str(arm), "panda"):
-        found = load_robot(named, LoadOptions(config=config))
-        assert found.name == "panda2"
-        assert found.joint_names == ("shoulder", "elbow", "wheel_mount")
-        np.testing.assert_allclose(found.posture("folded")[:2], [1.0, 1.5])
+        loaded = load_robot(named, LoadOptions(config=config))
+        assert loaded.name == "panda2"
+        assert loaded.joint_names == ("shoulder", "elbow", "wheel_mount")
+        np.testing.assert_allclose(loaded.posture("folded")[:2], [1.0, 1.5])
 
 
 def test_config_without_urdf_keeps_the_known_robots_own(tmp_path: Path) -> None:
-    found = load_robot("ur5", LoadOptions(config=spec(tmp_path, 'name = "ours"')))
-    assert found.name == "ours"
-    assert found.joint_names == robot("ur5").joint_names
+    loaded = load_robot("ur5", LoadOptions(config=spec(tmp_path, 'name = "ours"')))
+    assert loaded.name == "ours"
+    assert loaded.joint_names == robot("ur5").joint_names
 
 
 def test_srdf_by_option(arm: Path) -> None:
     path = arm.with_suffix(".srdf")
     path.write_text(SRDF, encoding="utf-8")
-    found = load_robot(str(arm), LoadOptions(srdf=str(path)))
-    np.testing.assert_allclose(found.posture("folded")[:2], [1.0, 1.5])
+    loaded = load_robot(str(arm), LoadOptions(srdf=str(path)))
+    np.testing.assert_allclose(loaded.posture("folded")[:2], [1.0, 1.5])
     with pytest.raises(UrdfError, match="no such file"):
         load_robot(str(arm), LoadOptions(srdf=str(path) + "x"))
 
 
-def test_a_floating_robot_can_be_bolted_down() -> None:
-    found = load_robot("solo8", LoadOptions(root="fixed"))
-    assert found.nv == 8
-    np.testing.assert_allclose(found.posture(), robot("solo8").posture()[7:])
+def test_the_root_can_be_fixed_or_floating() -> None:
+    loaded = load_robot("solo8", LoadOptions(root="fixed"))
+    assert loaded.nv == 8
+    np.testing.assert_allclose(loaded.posture(), robot("solo8").posture()[7:])
     flying = load_robot("panda", LoadOptions(root="free-flyer"))
     np.testing.assert_allclose(flying.posture()[7:], robot("panda").posture())
     np.testing.assert_allclose(flying.posture()[:7], [0, 0, 0, 0, 0, 0, 1])
@@ -199,11 +195,11 @@ def test_wrong_robot_names_get_the_nearest() -> None:
 
 
 def test_wrong_names_inside_a_robot() -> None:
-    found = robot("panda")
+    loaded = robot("panda")
     cases = [
-        (FrameNotFound, lambda: found.frame_id("panda_hnd"), "panda_hand"),
-        (JointNotFound, lambda: found.joint_id("panda_jiont3"), "panda_joint3"),
-        (PostureNotFound, lambda: found.posture("defualt"), "default"),
+        (FrameNotFound, lambda: loaded.frame_id("panda_hnd"), "panda_hand"),
+        (JointNotFound, lambda: loaded.joint_id("panda_jiont3"), "panda_joint3"),
+        (PostureNotFound, lambda: loaded.posture("defualt"), "default"),
     ]
     for error, call, right in cases:
         with pytest.raises(error) as caught:
@@ -213,15 +209,15 @@ def test_wrong_names_inside_a_robot() -> None:
         assert "panda" in caught.value.where
         assert "\n" not in str(caught.value)
     with pytest.raises(FrameNotFound):
-        found.frame_id("universe")
+        loaded.frame_id("universe")
     with pytest.raises(JointNotFound):
         robot("solo8").joint_id("root_joint")
 
 
 def test_a_locked_joint_is_said_to_be_locked() -> None:
-    found = load_robot("panda", LoadOptions(lock=("panda_joint1",)))
+    loaded = load_robot("panda", LoadOptions(lock=("panda_joint1",)))
     with pytest.raises(JointLocked, match="joint 'panda_joint1' is locked"):
-        found.joint_id("panda_joint1")
+        loaded.joint_id("panda_joint1")
 
 
 def test_wrong_paths_get_the_nearest(arm: Path) -> None:
@@ -272,7 +268,7 @@ def test_nearest_prefers_close_then_contained_then_any() -> None:
     ("name", "lock"), [("talos", ("torso_1_joint", "torso_2_joint")), ("panda", ("panda_joint3",))]
 )
 def test_locking_reduces(name: str, lock: tuple[str, ...]) -> None:
-    """The locked robot's H is that of the whole robot whose locked joints resist without bound."""
+    """Locked joints give the same H as joints with a huge armature."""
     whole, locked = robot(name), load_robot(name, LoadOptions(lock=lock))
     assert locked.nv == whole.nv - len(lock)
     assert set(lock) <= set(locked.locked)
@@ -292,14 +288,14 @@ def test_locking_reduces(name: str, lock: tuple[str, ...]) -> None:
     assert whole.spec.contact.frame is not None
     contact = ImpactContact(whole.spec.contact.frame, (0.3, -0.5, 0.8))
     resisting = load_robot(name, LoadOptions(armature=dict.fromkeys(lock, 1e9)))
-    found = ImpactOracle(ImpactCase(locked, contact)).quantities(q_locked)
+    reduced = ImpactOracle(ImpactCase(locked, contact)).quantities(q_locked)
     expected = ImpactOracle(ImpactCase(resisting, contact)).quantities(q)
-    assert_close(found.H, expected.H, 1e-6, "H")
-    assert_close(found.G, expected.G, 1e-6, "G")
-    assert_close(found.jump, expected.jump[kept], 1e-6, "jump")
+    assert_close(reduced.H, expected.H, 1e-6, "H")
+    assert_close(reduced.G, expected.G, 1e-6, "G")
+    assert_close(reduced.jump, expected.jump[kept], 1e-6, "jump")
     assert np.abs(expected.jump[dropped_v]).max() < 1e-8
     free = ImpactOracle(ImpactCase(whole, contact)).quantities(q)
-    assert free.G > found.G
+    assert free.G > reduced.G
 
 
 def test_locking_twice_and_locking_all(arm: Path) -> None:
@@ -325,40 +321,30 @@ def test_locked_joints_stay_where_the_default_posture_has_them(arm: Path) -> Non
 
 
 def test_armature_order(arm: Path) -> None:
-    """Option over robot.toml over the SRDF's rotors over zero; a joint that stays without any is warned about."""
+    """The option wins over robot.toml, then come rotors of the SRDF, then zero with a warning."""
     (arm.parent / "two.srdf").write_text(SRDF, encoding="utf-8")
 
     def load(text: str, option: dict[str, float] | str | None = None) -> tuple[list[float], str, bool]:
         config = spec(arm.parent, text, "case.toml")
-        found = load_robot(str(arm), LoadOptions(config=config, armature=option))
-        warned = any("armature is zero" in warning for warning in found.warnings)
-        np.testing.assert_array_equal(found.armature, found.model.armature)
-        return [float(v) for v in found.armature], found.armature_source, warned
+        loaded = load_robot(str(arm), LoadOptions(config=config, armature=option))
+        warned = any("armature is zero" in warning for warning in loaded.warnings)
+        np.testing.assert_array_equal(loaded.armature, loaded.model.armature)
+        return [float(v) for v in loaded.armature], loaded.armature_source, warned
 
     srdf = '[model]\nsrdf = "two.srdf"\n'
     ours = '[armature]\ndefault = 0.02\nsource = "a data sheet"\n[armature.joints]\nelbow = 0.03\n'
-    values, source, warned = load("")
-    assert (values, warned) == ([0.0, 0.0, 0.0], True)
-    assert source == "none"
+    assert load("") == ([0.0, 0.0, 0.0], "none", True)
     values, source, warned = load(srdf)
     np.testing.assert_allclose(values, [1.0, 0.125, 0.0])
-    assert source == "rotor data in the SRDF"
-    assert warned
-    values, source, warned = load(srdf + ours)
-    np.testing.assert_allclose(values, [0.02, 0.03, 0.02])
-    assert source == "robot.toml (a data sheet)"
-    assert not warned
-    values, source, warned = load(srdf + ours, {"elbow": 0.5})
-    np.testing.assert_allclose(values, [0.02, 0.5, 0.02])
-    assert source.startswith("given values over robot.toml")
+    assert (source, warned) == ("rotor data in the SRDF", True)
+    assert load(srdf + ours) == ([0.02, 0.03, 0.02], "robot.toml (a data sheet)", False)
+    values, source, _ = load(srdf + ours, {"elbow": 0.5})
+    assert values == [0.02, 0.5, 0.02] and source.startswith("given values over robot.toml")
     values, source, warned = load(srdf + ours, "none")
     assert (values, warned) == ([0.0, 0.0, 0.0], True)
     file = arm.parent / "armature.toml"
     file.write_text("shoulder = 0.7\n", encoding="utf-8")
-    values, source, warned = load(srdf + ours, str(file))
-    np.testing.assert_allclose(values, [0.7, 0.0, 0.0])
-    assert source == str(file)
-    assert warned
+    assert load(srdf + ours, str(file)) == ([0.7, 0.0, 0.0], str(file), True)
 
 
 def test_armature_adds_to_the_mass_matrix(arm: Path) -> None:
@@ -368,7 +354,7 @@ def test_armature_adds_to_the_mass_matrix(arm: Path) -> None:
     np.testing.assert_allclose(added, np.diag([0.0, 0.25, 0.0]), atol=1e-14)
 
 
-def test_talos_has_its_srdfs_rotors_and_no_other_robot_a_base_armature() -> None:
+def test_the_srdf_of_talos_has_rotors() -> None:
     talos = robot("talos")
     assert talos.armature_source == "rotor data in the SRDF"
     assert np.median(talos.armature[6:]) == pytest.approx(0.1, rel=1.0)
@@ -398,6 +384,6 @@ def test_an_armature_file_without_numbers_is_refused(arm: Path) -> None:
 
 
 def test_a_robot_prints_in_one_line() -> None:
-    """Not the whole of its model and its data file, which an objective would repeat."""
+    """The model and the data file are too long for the representation of an objective."""
     robot = load_robot("panda")
     assert repr(robot).startswith("Robot('panda', root='fixed', nq=9, nv=9, source=") and "\n" not in repr(robot)
