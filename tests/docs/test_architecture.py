@@ -1,4 +1,4 @@
-"""What no linter says of the files: they are short, and none knows the machine that it was written on."""
+"""Rules for files that linters do not check: short files, no paths of a machine, no options in library errors."""
 
 from __future__ import annotations
 
@@ -16,30 +16,29 @@ MACHINE = re.compile(r"(?<![\w.:/$~}])/(?:home|root|work|tmp|Users|opt|mnt|usr/(
 
 
 def texts() -> list[Path]:
-    found = [*ROOT.glob("*"), *(path for folder in FOLDERS for path in (ROOT / folder).rglob("*"))]
-    return [p for p in found if p.suffix in SUFFIXES and p.is_file() and "_build" not in p.parts]
+    paths = [*ROOT.glob("*"), *(path for folder in FOLDERS for path in (ROOT / folder).rglob("*"))]
+    return [p for p in paths if p.suffix in SUFFIXES and p.is_file() and "_build" not in p.parts]
 
 
 def test_files_are_short() -> None:
-    # Wherever they are installed.
     code = [p for package in (impact_posture, impact_posture_cli) for p in Path(package.__path__[0]).rglob("*.py")]
     long = [p for p in code if len(p.read_text(encoding="utf-8").splitlines()) >= 500]
     assert code and not long
 
 
 def test_no_path_of_one_machine() -> None:
-    own = Path(__file__).resolve()
-    found = [
+    this_file = Path(__file__).resolve()
+    lines = [
         f"{path.relative_to(ROOT)}:{number}: {line.strip()}"
         for path in texts()
-        if path != own
+        if path != this_file
         for number, line in enumerate(path.read_text(encoding="utf-8").splitlines(), start=1)
         if MACHINE.search(line)
     ]
-    assert not found, "\n".join(found)
+    assert not lines, "\n".join(lines)
 
 
-def test_the_machine_path_pattern_finds_them_and_spares_others() -> None:
+def test_the_pattern_of_machine_paths() -> None:
     for bad in ("x = '/home/someone/a.urdf'", "see /tmp/scratch/a", r"C:\\Users", "'/root/.ssh/k'"):
         assert MACHINE.search(bad), bad
     for good in ("https://a.b/home/x", "m/s, N·m/work", "robots/tmp/x", "$ROOT/opt/x"):
@@ -47,8 +46,8 @@ def test_the_machine_path_pattern_finds_them_and_spares_others() -> None:
 
 
 def test_errors_of_the_library_name_parameters_and_no_options() -> None:
-    """The command line writes `parameter` as an option (``as_options``); in Python there are no options."""
-    found = [
+    """The command line turns parameter names into options (``as_options``).  Python has no options."""
+    messages = [
         f"{path.name}:{text.lineno}: {text.value}"
         for path in Path(impact_posture.__path__[0]).rglob("*.py")
         for node in ast.walk(ast.parse(path.read_text(encoding="utf-8")))
@@ -56,4 +55,4 @@ def test_errors_of_the_library_name_parameters_and_no_options() -> None:
         for text in ast.walk(node)
         if isinstance(text, ast.Constant) and isinstance(text.value, str) and re.search(r"--[a-z]", text.value)
     ]
-    assert not found, "\n".join(found)
+    assert not messages, "\n".join(messages)

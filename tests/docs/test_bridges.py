@@ -1,4 +1,4 @@
-"""The examples of docs/bridges.md: the term inside pink, inside TSID and in C++, against numbers from elsewhere."""
+"""Examples of docs/bridges.md: the impact term in pink and in C++, against independent numbers."""
 
 from __future__ import annotations
 
@@ -31,15 +31,15 @@ EXAMPLES = DOCS / "examples"
 
 
 def shown_output() -> dict[str, list[str]]:
-    """The lines that the page shows of pink's output, by the contact that they are about."""
+    """Return the lines of pink's output on the page, by contact."""
     page = (DOCS / "bridges.md").read_text(encoding="utf-8")
-    found: dict[str, list[str]] = {}
+    lines: dict[str, list[str]] = {}
     for line in re.findall(r"^```text\n(.*?)^```", page, re.MULTILINE | re.DOTALL)[0].splitlines():
         if line.startswith(" "):
-            found[list(found)[-1]].append(line.strip())
+            lines[list(lines)[-1]].append(line.strip())
         else:
-            found[line] = []
-    return found
+            lines[line] = []
+    return lines
 
 
 @pytest.mark.parametrize("file", sorted(EXAMPLES.rglob("*.py")), ids=lambda p: p.stem)
@@ -57,7 +57,7 @@ def example() -> ModuleType:
     spec = importlib.util.spec_from_file_location("pink_impact", EXAMPLES / "pink_impact.py")
     assert spec is not None and spec.loader is not None
     module = importlib.util.module_from_spec(spec)
-    # Where dataclasses look their module up.
+    # Dataclasses look up their module here.
     sys.modules[spec.name] = module
     spec.loader.exec_module(module)
     return module
@@ -93,20 +93,20 @@ def test_pink_lowers_H_at_every_tick(pink_run: PinkRun, name: str, fall: float) 
 @pytest.mark.parametrize("name", [FLOOR, WALL, TABLE])
 def test_pink_holds_the_frame(pink_run: PinkRun, name: str) -> None:
     outcome = pink_run.outcomes[name]
-    found, start = outcome.prepared.impact.robot, outcome.offline.initial
-    model, frame = found.model, found.frame_id(outcome.prepared.impact.contact.frame)
+    arm, start = outcome.prepared.impact.robot, outcome.offline.initial
+    model, frame = arm.model, arm.frame_id(outcome.prepared.impact.contact.frame)
     before, after = (frame_placement(model, q, frame) for q in (start, outcome.q))
     turned = np.linalg.norm(pin.log3(before.rotation.T @ after.rotation))
     assert np.abs(after.translation - before.translation).max() <= 1e-9
-    # Between: what one tick of linearization leaves.
+    # Within a tick, linearization leaves a small error.
     assert 0 < outcome.errors.max() <= 1e-5
     if name == TABLE:
-        assert turned > 0.5, "the ball tip turns: that is the redundancy"
+        assert turned > 0.5, "the ball tip must turn, because it is redundant"
     else:
         assert turned <= 1e-9
-        tilt = frame_placement(model, outcome.q, found.frame_id("base_link")).rotation[:, 2]
+        tilt = frame_placement(model, outcome.q, arm.frame_id("base_link")).rotation[:, 2]
         np.testing.assert_allclose(tilt, [0, 0, 1], rtol=0, atol=1e-9)
-    joints = slice(7 if found.floating else 0, None)
+    joints = slice(7 if arm.floating else 0, None)
     margin = outcome.prepared.problem.requirements.limit_margin - 1e-6
     assert (outcome.q[joints] >= model.lowerPositionLimit[joints] + margin).all()
     assert (outcome.q[joints] <= model.upperPositionLimit[joints] - margin).all()
@@ -120,19 +120,12 @@ def test_pink_rests_at_an_offline_optimum(pink_run: PinkRun, name: str, rad: flo
     assert distances[k] <= rad
     assert outcome.H[-1] == pytest.approx(optima[k].objective, rel=1e-5)
     moved = np.linalg.norm(pin.difference(outcome.prepared.impact.robot.model, outcome.offline.initial, outcome.q))
-    assert moved > 1, "a posture that was optimal all along shows nothing"
+    assert moved > 1, "the start must not be optimal"
     if name == TABLE:
-        assert optima[0].objective < 0.5 * outcome.H[-1], "the page says that it is a local one"
+        assert optima[0].objective < 0.5 * outcome.H[-1], "the page says that this optimum is local"
     else:
         assert k == 0
         assert outcome.speed < 1e-6
-
-
-def test_pink_stays_without_the_term(example: ModuleType) -> None:
-    need_compiler()
-    outcome = example.follow(example.CONTACTS[0], speed=0.0)
-    assert len(outcome.H) == 2
-    np.testing.assert_allclose(outcome.q, outcome.offline.initial, rtol=0, atol=1e-9)
 
 
 def test_pink_prints_what_the_page_shows(pink_run: PinkRun) -> None:
@@ -146,11 +139,11 @@ def test_pink_prints_what_the_page_shows(pink_run: PinkRun) -> None:
 
 
 def test_held_tasks_have_the_jacobian_of_their_error(example: ModuleType) -> None:
-    """pink asks for ``J Δq = −e``: J is the derivative of e on the manifold."""
-    found = robot("tilthex_arm")
-    model = found.model.copy()
+    """In pink, ``J Δq = −e``, so J is the derivative of e on the manifold."""
+    arm = robot("tilthex_arm")
+    model = arm.model.copy()
     pink = importlib.import_module("pink")
-    q = np.array(pin.integrate(model, found.posture(), np.random.default_rng(3).uniform(-0.5, 0.5, model.nv)))
+    q = np.array(pin.integrate(model, arm.posture(), np.random.default_rng(3).uniform(-0.5, 0.5, model.nv)))
     configuration = pink.Configuration(model, model.createData(), q)
     for task in (example.PointTask("ee", configuration), example.LevelTask("base_link")):
 
@@ -164,7 +157,7 @@ def test_held_tasks_have_the_jacobian_of_their_error(example: ModuleType) -> Non
 
 
 def eigen_program(folder: Path, floating: bool) -> Path:
-    """The C++ example, built against the export in ``folder``; skips where a compiler or Eigen is missing."""
+    """Build the C++ example with the export in a folder; skip without a compiler or Eigen."""
     compiler, eigen = cxx_compiler(), eigen_headers()
     if compiler is None or eigen is None:
         pytest.skip("no C++ compiler (g++, clang++, $CXX), or no Eigen headers (cmeel-eigen, $EIGEN3_INCLUDE_DIR)")
@@ -190,7 +183,7 @@ def exported(name: str, frame: str, folder: Path, real: Real) -> WorstCaseObject
 
 
 def pairs(model: pin.Model, floating: bool) -> list[tuple[Vector, Vector]]:
-    """``(q, q_des)``, with every branch of the logarithm among the bases."""
+    """Return pairs ``(q, q_des)`` whose bases cover every branch of the logarithm."""
     rng = np.random.default_rng(11)
 
     def step(q: Vector, angle: float) -> Vector:
@@ -199,51 +192,48 @@ def pairs(model: pin.Model, floating: bool) -> list[tuple[Vector, Vector]]:
             v[3:6] = angle * unit(rng)
         return np.array(pin.integrate(model, q, v))
 
-    found = []
+    states = []
     for angle in (0.0, 1e-12, 1e-6, 0.0499, 0.0501, 1.0, 3.0, 3.14159):
         q = step(pin.neutral(model), 2.0)
-        found.append((q, step(q, angle)))
-    q, q_des = found[5]
+        states.append((q, step(q, angle)))
+    q, q_des = states[5]
     if floating:
         other = q_des.copy()
         other[3:7] *= -1
-        found.append((q, other))
-    return [*found, (q, q)]
+        states.append((q, other))
+    return [*states, (q, q)]
 
 
 @pytest.mark.parametrize(
     ("name", "frame", "real", "tolerance"),
-    [
-        ("tilthex_arm", "ee", DOUBLE, 1e-10),
-        ("panda", "panda_hand_tcp", FLOAT, 1e-4),
-    ],
+    [("tilthex_arm", "ee", DOUBLE, 1e-10), ("panda", "panda_hand_tcp", FLOAT, 1e-4)],
     ids=["floating base, double", "fixed base, float"],
 )
 def test_cpp_computes_the_posture_acceleration(
     name: str, frame: str, real: Real, tolerance: float, tmp_path: Path
 ) -> None:
     objective = exported(name, frame, tmp_path, real)
-    found, rng = objective.robot, np.random.default_rng(12)
-    program = eigen_program(tmp_path, found.floating)
+    arm, rng = objective.robot, np.random.default_rng(12)
+    program = eigen_program(tmp_path, arm.floating)
     n, gains = np.array([0.0, 0.0, 1.0]), np.array([20.0, 9.0, 0.3])
-    states = [(q, rng.normal(size=found.nv), q_des) for q, q_des in pairs(found.model, found.floating)]
+    states = [(q, rng.normal(size=arm.nv), q_des) for q, q_des in pairs(arm.model, arm.floating)]
     printed = accelerations(program, [(*state, n, gains) for state in states])
     assert len(printed) == len(states)
     for (q, v, q_des), line in zip(states, printed, strict=True):
-        expected = gains[0] * pin.difference(found.model, q, q_des) - gains[1] * v
-        # Pinocchio's gradient, not the export's.
+        expected = gains[0] * pin.difference(arm.model, q, q_des) - gains[1] * v
+        # The gradient comes from Pinocchio, not from the export.
         expected -= gains[2] * objective.oracle.gradient_H(q)
         assert_close(np.array(line.split(), dtype=float), expected, tolerance, f"{name}, {line}")
-    if found.floating:
+    if arm.floating:
         broken = states[0][0].copy()
         broken[3:7] *= 1.1
         assert accelerations(program, [(broken, *states[0][1:], n, gains)]) == ["code 2"]
-    if found.floating and real is DOUBLE:
+    if arm.floating and real is DOUBLE:
         with pytest.raises(CompilerError, match="FLOATING_BASE does not fit"):
             eigen_program(tmp_path, floating=False)
 
 
-def test_cpp_goes_on_without_a_gradient_that_does_not_exist(tmp_path: Path) -> None:
+def test_cpp_leaves_out_a_gradient_that_does_not_exist(tmp_path: Path) -> None:
     (tmp_path / "arm.h").write_text(
         "#define ARM_NQ 2\n#define ARM_NV 2\ntypedef double arm_real;\n"
         "static inline int arm_eval(const double *, const double *, double *H, double *grad)\n"

@@ -1,4 +1,4 @@
-"""The documentation: every command that it shows runs as it says.  ``make docs`` builds the site."""
+"""Documentation: every shown command runs and prints what the page shows.  ``make docs`` builds the site."""
 
 from __future__ import annotations
 
@@ -30,7 +30,7 @@ _EXAMPLE = re.compile(r"[\w./-]*examples/[\w./-]+")
 
 @dataclass(frozen=True)
 class Shown:
-    """A command of a page: its arguments, exit code, and output lines that the page shows."""
+    """A command on a page: its arguments, its exit code, and the output lines that the page shows."""
 
     arguments: tuple[str, ...]
     code: int
@@ -38,8 +38,8 @@ class Shown:
 
 
 def shown_commands(page: Path) -> list[Shown]:
-    """The commands of a page's ``console`` blocks, in order."""
-    found: list[Shown] = []
+    """Return the commands in the ``console`` blocks of a page, in order."""
+    commands: list[Shown] = []
     for block in _BLOCK.findall(page.read_text(encoding="utf-8")):
         current: Shown | None = None
         for line in block.replace("\\\n", " ").splitlines():
@@ -49,15 +49,15 @@ def shown_commands(page: Path) -> list[Shown]:
                     stated = _EXIT.search(line)
                     words = shlex.split(_EXIT.sub("", line))[2:]
                     current = Shown(tuple(words), int(stated[1]) if stated else 0, ())
-                    found.append(current)
+                    commands.append(current)
             elif current is not None and line.strip():
                 current = Shown(current.arguments, current.code, (*current.output, line))
-                found[-1] = current
-    return found
+                commands[-1] = current
+    return commands
 
 
 def example_files(page: Path) -> Iterator[Path]:
-    """Files of ``docs/examples`` that a page shows or offers."""
+    """Yield files of ``docs/examples`` that a page shows or offers."""
     for text in dict.fromkeys(_EXAMPLE.findall(page.read_text(encoding="utf-8"))):
         path = (page.parent / text).resolve()
         if path.is_file() and path.is_relative_to(DOCS / "examples"):
@@ -70,7 +70,7 @@ def squeezed(text: str) -> str:
 
 @dataclass(frozen=True)
 class Ran:
-    """A shown command, what came of it, and the words for a failure."""
+    """A shown command with its exit code and output."""
 
     shown: Shown
     code: int
@@ -82,7 +82,7 @@ class Ran:
 
 
 def run_page(page: Path, folder: Path) -> Iterator[Ran]:
-    """Run a page's commands in ``folder``, one after the other."""
+    """Run the commands of a page in a folder, one after the other."""
     for file in dict.fromkeys(example_files(page)):
         shutil.copy(file, folder / file.name)
     for shown in shown_commands(page):
@@ -107,11 +107,11 @@ def test_shown_commands_run(page: Path, tmp_path: Path) -> None:
         assert all(change[k] > 1.01 for k in rises), f"{page.name}: {result} {change}"
 
 
-# What the tutorials say of their results in words: result folder, what falls, what rises.
+# Statements of the tutorials about results: result folder, quantities that fall, quantities that rise.
 CLAIMS: dict[str, list[tuple[str, str, str]]] = {
     "aerial": [("floor", "HVS", "G"), ("wall", "HV", "S"), ("wall-sticking", "S", "")],
     "arm": [("box", "HGV", "S")],
-    # Which optimum of the hand is found depends on rounding, and V with it.
+    # The optimum of the hand, and V with it, depends on rounding.
     "humanoid": [("hand", "H", "S")],
 }
 
@@ -124,7 +124,7 @@ def test_claims_are_about_results_of_shown_commands() -> None:
 
 
 def test_commands_are_shown_at_all() -> None:
-    """The extraction finds what a reader sees: each tutorial has commands, and each command of the app is shown."""
+    """Each tutorial shows commands, and each command of the app is shown."""
     tutorials = [p for p in PAGES if p.parent.name == "tutorials"]
     assert len(tutorials) >= 5
     assert all(shown_commands(p) for p in tutorials)
@@ -133,7 +133,7 @@ def test_commands_are_shown_at_all() -> None:
 
 
 def test_no_command_escapes_the_convention() -> None:
-    """A command in a block of another kind, or after another prompt, would never be run."""
+    """Commands in other blocks or after other prompts would not be tested."""
     fence = re.compile(r"^```(\{?[\w-]*\}?)[^\n]*\n(.*?)^```", re.MULTILINE | re.DOTALL)
     for page in PAGES:
         for kind, body in fence.findall(page.read_text(encoding="utf-8")):

@@ -1,4 +1,4 @@
-"""The reference pages: every key and option that exists has its row, with its default, and no row is stale."""
+"""Reference pages: every key and option has its row with its default, and every row has its key."""
 
 from __future__ import annotations
 
@@ -28,68 +28,59 @@ DOCS = Path(__file__).parents[2] / "docs"
 
 
 def rows(page: Path) -> dict[str, list[str]]:
-    """Table rows of a page whose first cell is code: that code to the other cells."""
-    found: dict[str, list[str]] = {}
+    """Map the code in the first cell of each table row of a page to the other cells."""
+    cells_of: dict[str, list[str]] = {}
     for line in page.read_text(encoding="utf-8").splitlines():
         if not line.startswith("| `"):
             continue
         cells = [c.strip() for c in re.split(r"(?<!\\)\|", line.strip().strip("|"))]
         for key in re.findall(r"`([^`]+)`", cells[0]):
-            assert key not in found, f"{page.name} has two rows for '{key}'"
-            found[key] = cells[1:]
-    return found
+            assert key not in cells_of, f"{page.name} has two rows for '{key}'"
+            cells_of[key] = cells[1:]
+    return cells_of
 
 
 def nested(annotation: object) -> type | None:
-    """The dataclass inside ``Table``, ``Table | None``, ``tuple[Table, ...]`` or ``dict[str, Table]``."""
+    """Return the dataclass in ``Table``, ``Table | None``, ``tuple[Table, ...]`` or ``dict[str, Table]``."""
     if inspect.isclass(annotation) and is_dataclass(annotation):
         return annotation
     return next((m for a in getattr(annotation, "__args__", ()) if (m := nested(a)) is not None), None)
 
 
 def keys(table: type, prefix: str = "") -> dict[str, object]:
-    """Dotted keys of a dataclass and their defaults; ``...`` where there is none."""
-    found: dict[str, object] = {}
+    """Map the dotted keys of a dataclass to their defaults, or to ``...`` for required keys."""
+    defaults: dict[str, object] = {}
     hints = get_type_hints(table)
-    for one in fields(table):
-        inner = nested(hints[one.name])
-        default = one.default if one.default_factory is MISSING else one.default_factory()
+    for key in fields(table):
+        inner = nested(hints[key.name])
+        default = key.default if key.default_factory is MISSING else key.default_factory()
         if inner is not None:
-            named = str(hints[one.name]).startswith("dict")
-            found |= keys(inner, f"{prefix}{one.name}.NAME." if named else f"{prefix}{one.name}.")
+            named = str(hints[key.name]).startswith("dict")
+            defaults |= keys(inner, f"{prefix}{key.name}.NAME." if named else f"{prefix}{key.name}.")
         else:
-            found[prefix + one.name] = ... if default is MISSING else default
-    return found
-
-
-def test_keys_are_found_in_nested_models() -> None:
-    found = keys(RobotSpec)
-    assert {"schema", "model.root", "postures.NAME.base", "supports.kind", "propulsion.rotors.spin"} <= set(found)
+            defaults[prefix + key.name] = ... if default is MISSING else default
+    return defaults
 
 
 def shown_default(value: object) -> str:
-    """A default as the pages write it."""
-    if value is ...:
-        return "required"
-    if value is None:
-        return "none"
+    """Write a default as the pages do."""
+    if value is ... or value is None:
+        return "required" if value is ... else "none"
     if isinstance(value, tuple):
         return f"`{list(value)}`"
-    if isinstance(value, str):
-        return f'`"{value}"`'
-    return f"`{json.dumps(value)}`"
+    return f'`"{value}"`' if isinstance(value, str) else f"`{json.dumps(value)}`"
 
 
-def test_every_robot_toml_key_has_its_row() -> None:
-    expected = keys(RobotSpec)
-    found = {
-        key: cells for key, cells in rows(DOCS / "reference" / "robot-toml.md").items()
-        if "." in key or key in RobotSpec.__dataclass_fields__ or key == "schema"
-    }  # fmt: skip
-    assert set(found) == set(expected)
+@pytest.mark.parametrize(("page", "table"), [("robot-toml.md", RobotSpec), ("scenario-toml.md", ScenarioTable)])
+def test_every_key_has_its_row(page: str, table: type) -> None:
+    expected = keys(table)
+    assert {"schema", "name"} <= set(expected) and any(key.count(".") == 2 for key in expected)
+    # Rows of other tables have names of poses.
+    shown = {key: cells for key, cells in rows(DOCS / "reference" / page).items() if key not in get_args(ContactPose)}
+    assert set(shown) == set(expected)
     for key, value in expected.items():
-        assert found[key][1] == shown_default(value), f"default of {key}"
-        assert len(found[key][2]) > 8, f"{key} is not explained"
+        assert shown[key][1] == shown_default(value), f"default of {key}"
+        assert len(shown[key][2]) > 3, f"{key} is not explained"
 
 
 def test_contact_poses_are_explained() -> None:
@@ -99,27 +90,19 @@ def test_contact_poses_are_explained() -> None:
 
 def test_every_problem_toml_key_has_its_row() -> None:
     expected = keys(ProblemSettings)
-    found = rows(DOCS / "reference" / "problem-toml.md")
-    assert set(found) == set(expected)
+    cells = rows(DOCS / "reference" / "problem-toml.md")
+    assert set(cells) == set(expected)
     for key, value in expected.items():
-        shown = found[key][1]
-        # None means: from the robot, or where it is.  Such a default is said in words.
+        shown = cells[key][1]
+        # None means "from the robot" or "where it is", which the page says in words.
         if value is None:
             assert not shown.startswith("`"), f"default of {key}"
         elif key != "normal":
             assert shown == shown_default(value), f"default of {key}"
 
 
-def test_every_scenario_toml_key_has_its_row() -> None:
-    expected, found = keys(ScenarioTable), rows(DOCS / "reference" / "scenario-toml.md")
-    assert set(found) == set(expected)
-    for key, value in expected.items():
-        assert found[key][1] == shown_default(value), f"default of {key}"
-        assert len(found[key][2]) > 3, f"{key} is not explained"
-
-
 def test_every_option_is_in_the_reference(monkeypatch: pytest.MonkeyPatch) -> None:
-    """The reference reads signatures, the parser is Typer's: what one has the other must have."""
+    """The reference reads signatures, so it must agree with the parser of Typer."""
     monkeypatch.syspath_prepend(str(DOCS / "_ext"))
     reference = importlib.import_module("cli_reference").markdown()
     sections = dict(re.findall(r"^## (\S+)\n(.*?)(?=^## |\Z)", reference, re.MULTILINE | re.DOTALL))
@@ -134,11 +117,10 @@ def test_every_option_is_in_the_reference(monkeypatch: pytest.MonkeyPatch) -> No
 
 
 def test_every_problem_key_is_an_option() -> None:
-    """``problem.toml`` says that each of its keys is an option."""
     command = build("optimize")
     names = {o[2:].replace("-", "_") for p in command.params for o in p.opts if o.startswith("--")}
     names |= {"schema", "robot"}
-    # Written by the tool itself: the start as numbers, and the compliance in force.
+    # These keys have no option: the page says so, or the tool writes them itself.
     without = {key.partition(".")[0] for key in set(keys(ProblemSettings)) - names}
     assert without == {"q", "support_compliance", "mounting", "obstacles"}
 
@@ -168,25 +150,12 @@ def test_tradeoff_keys_are_in_their_row() -> None:
         assert f"`{key}`" in row, key
 
 
-def test_certificate_tolerances_are_those_of_the_theory_page() -> None:
-    text = (DOCS / "theory.md").read_text(encoding="utf-8")
-    table = {k: v[-1] for k, v in rows_of(text, "## The certificate").items()}
-    defaults = {k: p.default for k, p in inspect.signature(Certificate.holds).parameters.items() if k != "self"}
-    shown = {"pose": table["pose_error_m"], **{k: table[k] for k in ("stationarity", "primal", "complementarity")}}
-    assert {k: power(v) for k, v in shown.items()} == defaults
-
-
-def rows_of(text: str, heading: str) -> dict[str, list[str]]:
-    """First code of each table row below a heading to its other cells."""
-    section = text.split(heading, 1)[1].split("\n## ", 1)[0]
-    lines = [line for line in section.splitlines() if line.startswith("| `")]
-    return {re.findall(r"`([^`]+)`", line)[0]: [c.strip() for c in line.strip("| ").split("|")] for line in lines}
-
-
-def power(text: str) -> float:
-    found = re.fullmatch(r"\$10\^\{(-\d+)\}\$", text)
-    assert found, text
-    return float(f"1e{found[1]}")
+def test_the_theory_page_states_the_tolerances_of_the_certificate() -> None:
+    section = (DOCS / "theory.md").read_text(encoding="utf-8").split("## The certificate", 1)[1].split("\n## ", 1)[0]
+    shown = dict(re.findall(r"^\| `(\w+)`.*\| \$10\^\{(-\d+)\}\$ \|$", section, re.MULTILINE))
+    for name, parameter in inspect.signature(Certificate.holds).parameters.items():
+        if name != "self":
+            assert float(f"1e{shown['pose_error_m' if name == 'pose' else name]}") == parameter.default, name
 
 
 def test_every_controller_is_in_the_help_and_on_the_page() -> None:

@@ -1,4 +1,4 @@
-"""The developer notes walk one normal from the command line to the C code: every stop is passed, in that order."""
+"""Check the walk of the developer notes, from a normal on the command line to the C code: every stop, in order."""
 
 from __future__ import annotations
 

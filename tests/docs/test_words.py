@@ -1,17 +1,18 @@
-"""One word for one thing: words that the project has left behind come back nowhere that a user or developer reads."""
+"""Plain words: old names do not come back, and phrases that are hard to read stay rare."""
 
 from __future__ import annotations
 
 import re
-from collections.abc import Iterator
+from collections.abc import Iterable, Iterator
 from pathlib import Path
 
 import pytest
 
 ROOT = Path(__file__).parents[2]
-READ = ("impact_posture", "cli", "robots", "docs", "README.md")
-SUFFIXES = {".py", ".md", ".toml", ".c", ".h", ".cpp", ".hpp", ".txt", ".rst"}
-# What is left behind, and the word for it.
+CODE = ("impact_posture", "cli")
+READ = (*CODE, "robots", "docs", "README.md", "CHANGELOG.md")
+SUFFIXES = {".py", ".md", ".toml", ".c", ".h", ".cpp", ".hpp", ".txt", ".jinja"}
+# Old names and their replacements.
 LEFT = {
     r"blows?": "impact",
     r"mends?": "hint",
@@ -22,10 +23,16 @@ LEFT = {
     r"ImpactScenario": "Scenario",
     r"Footing": "ContactStability, StanceGains",
 }
+# Phrases that are hard to read, where they are counted, and the largest number of lines with them.
+RARE = {
+    r"found": (CODE, 1000),
+    r"that of|those of|is no \w+": (READ, 300),
+}
+pytestmark = pytest.mark.skipif(not (ROOT / "docs").is_dir(), reason="not in a checkout")
 
 
-def texts() -> Iterator[tuple[Path, str]]:
-    for name in READ:
+def texts(names: Iterable[str]) -> Iterator[tuple[Path, str]]:
+    for name in names:
         place = ROOT / name
         for path in [place] if place.is_file() else sorted(place.rglob("*")):
             parts = path.relative_to(ROOT).parts
@@ -33,19 +40,31 @@ def texts() -> Iterator[tuple[Path, str]]:
                 yield path, path.read_text(encoding="utf-8")
 
 
-@pytest.mark.skipif(not (ROOT / "docs").is_dir(), reason="not in a checkout")
-@pytest.mark.parametrize("word", LEFT)
-def test_words_that_are_left_behind(word: str) -> None:
-    found = [
+def lines_with(words: str, names: Iterable[str], flags: int = 0) -> list[str]:
+    pattern = re.compile(rf"\b({words})\b", flags)
+    return [
         f"{path.relative_to(ROOT)}:{number}: {line.strip()}"
-        for path, text in texts()
+        for path, text in texts(names)
         for number, line in enumerate(text.splitlines(), start=1)
-        if re.search(rf"\b({word})\b", line)
+        if pattern.search(line)
     ]
-    assert not found, f"say '{LEFT[word]}': " + "\n".join(found)
 
 
-def test_the_glossary_is_sorted_and_says_each_word_once() -> None:
+@pytest.mark.parametrize("word", LEFT)
+def test_old_names_do_not_come_back(word: str) -> None:
+    # The changelog names what was renamed.
+    lines = lines_with(word, [name for name in READ if name != "CHANGELOG.md"])
+    assert not lines, f"say '{LEFT[word]}': " + "\n".join(lines)
+
+
+@pytest.mark.parametrize("words", RARE)
+def test_phrases_that_are_hard_to_read_are_rare(words: str) -> None:
+    names, most = RARE[words]
+    lines = lines_with(words, names, re.IGNORECASE)
+    assert len(lines) <= most, "\n".join([f"{len(lines)} lines with '{words}', at most {most}:", *lines])
+
+
+def test_the_glossary_is_sorted_and_has_each_word_once() -> None:
     page = ROOT / "docs" / "glossary.md"
     words = re.findall(r"^\| ([^|]+?) \|", page.read_text(encoding="utf-8"), re.MULTILINE)[1:]
     assert words == sorted(set(words), key=str.lower) and len(words) > 30

@@ -26,13 +26,13 @@ pytest.importorskip("mujoco")
 def test_mujoco_finds_the_same(name: str, stiffness: float) -> None:
     """Slowly, so that the arm hardly moves: dampers, one rigid joint and one stiffer spring as well."""
     studied, generator = STUDIED[name], rng(name, "MuJoCo")
-    found = studied.robot()
+    plain = studied.robot()
     first, *others = studied.joints
     springs = {joint: JointTransmissionSpec("elastic", 200.0, 0.1) for joint in others}
     springs |= {first: JointTransmissionSpec("rigid"), others[1]: JointTransmissionSpec("elastic", 5e3)}
-    made = replace(found, spec=replace(found.spec, transmission=TransmissionSpec(joints=springs)))
-    impact = ElasticImpact(ImpactCase(made, ImpactContact(studied.frame, tuple(unit(generator)))))
-    q, speed = made.posture(), 0.02
+    arm = replace(plain, spec=replace(plain.spec, transmission=TransmissionSpec(joints=springs)))
+    impact = ElasticImpact(ImpactCase(arm, ImpactContact(studied.frame, tuple(unit(generator)))))
+    q, speed = arm.posture(), 0.02
     response = impact.response(q, stiffness, speed)
     measured = ElasticWorld(impact).compress(q, stiffness, speed, response.duration)
     assert measured.duration == pytest.approx(response.duration, rel=0.005)
@@ -45,10 +45,10 @@ def test_mujoco_finds_the_same(name: str, stiffness: float) -> None:
 def test_an_error_of_the_model_shows() -> None:
     """Another spring than that of the world is off by more than the goals of the study allow."""
     studied = STUDIED["own arm"]
-    found = studied.robot()
-    case = ImpactCase(found, ImpactContact(studied.frame, (0.0, 0.0, 1.0)))
-    impact, q = ElasticImpact(case), found.posture()
-    stiff = replace(found, spec=replace(found.spec, transmission=TransmissionSpec("elastic", 600.0)))
+    arm = studied.robot()
+    case = ImpactCase(arm, ImpactContact(studied.frame, (0.0, 0.0, 1.0)))
+    impact, q = ElasticImpact(case), arm.posture()
+    stiff = replace(arm, spec=replace(arm.spec, transmission=TransmissionSpec("elastic", 600.0)))
     other = ElasticImpact(replace(case, robot=stiff)).response(q, 2e3, 0.1)
     measured = ElasticWorld(impact).compress(q, 2e3, 0.1, other.duration)
     assert abs(other.peak_jump_norm / measured.peak - 1) > 0.1
@@ -65,9 +65,9 @@ def test_the_page_in_short(capsys: pytest.CaptureFixture[str]) -> None:
 
 def test_the_figure_has_every_impact() -> None:
     rows = list(rows_of("own arm", 1, 0))
-    made = figure(rows)
-    assert len(made.axes) == 2
-    for axes in made.axes:
+    drawing = figure(rows)
+    assert len(drawing.axes) == 2
+    for axes in drawing.axes:
         marks = [line for line in axes.lines if line.get_linestyle() == "None"]
         assert [len(line.get_xdata()) for line in marks] == [len(rows)] * 3
     assert all(0.05 <= row.x <= 2.0 for row in rows)

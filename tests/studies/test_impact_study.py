@@ -23,9 +23,9 @@ POSTURES = 3
 
 @functools.cache
 def dropped(name: str) -> Dropped:
-    found = Dropped.prepare(name, POSTURES, seed=0)
-    assert len(found.scenes) == POSTURES
-    return found
+    robot = Dropped.prepare(name, POSTURES, seed=0)
+    assert len(robot.scenes) == POSTURES
+    return robot
 
 
 @pytest.mark.parametrize("name", [FLYING, ARM, STANDING])

@@ -1,4 +1,4 @@
-"""The robustness study in short: draws, what goes wrong, going on where it was, statistics; and its page."""
+"""The robustness study in short: draws, failures, interruption, statistics, and the page."""
 
 from __future__ import annotations
 
@@ -17,30 +17,12 @@ import pytest
 pytest.importorskip("mujoco", reason="mujoco is not installed (the extra 'sim')")
 
 from docs.studies.core import STUDIES, page_of
-from docs.studies.robustness import envelope, outcomes
+from docs.studies.robustness import envelope, outcomes, statistics
 from docs.studies.robustness.draws import Draw, draw, prepare
 from docs.studies.robustness.envelope import percent
-from docs.studies.robustness.outcomes import (
-    ATTEMPTS,
-    COMPARED,
-    NOMINAL,
-    NotAdmissible,
-    Record,
-    is_complete,
-    point,
-)
+from docs.studies.robustness.outcomes import ATTEMPTS, COMPARED, NOMINAL, NotAdmissible, Record, is_complete, point
 from docs.studies.robustness.page import MARK, page, range_table
-from docs.studies.robustness.statistics import (
-    agreement,
-    change,
-    misled,
-    quantile,
-    rank,
-    ranks_of_jumps,
-    split,
-    summarize,
-    worst,
-)
+from docs.studies.robustness.statistics import change, rank, summarize
 from docs.studies.robustness.study import Store, study
 from docs.studies.robustness.variations import OWN_ARMATURE, OWN_MOUNTING, RANGES, SHIPPED, VARIATIONS
 from impact_posture.dynamics.numeric import Numeric
@@ -63,8 +45,7 @@ def test_draws_are_the_same_every_time_and_within_their_ranges(scenario: str) ->
     first = len(VARIATIONS[scenario])
     draws = [draw(scenario, first + k) for k in range(300)]
     assert draws[:3] == [draw(scenario, first + k) for k in range(3)]
-    for other in (draw(scenario, first + 1), draw(scenario, first, attempt=1), draw(scenario, first, seed=1)):
-        assert other.values != draws[0].values
+    assert len({str(d.values) for d in (*draws[:2], draw(scenario, first, 1), draw(scenario, first, seed=1))}) == 4
     for each in RANGES[scenario]:
         values = np.array([d.values[each.name] for d in draws])
         assert each.low <= values.min() <= values.max() <= each.high
@@ -104,21 +85,20 @@ def test_a_standing_draw_stands_where_the_robot_stood(scenario: str) -> None:
     for shape in setup.scenario.shapes:
         point = point_on(setup.robot, shape.frame, shape.center or (0.0, 0.0, 0.0))
         feet = [n.placement(point).translation for n in (here, there)]
-        # A foot is held at the point under it: its center may roll by that.
+        # A foot is held at the point under it, so its center may roll a little.
         np.testing.assert_allclose(feet[0], feet[1], atol=2e-2)
         gap = setup.world.built.gaps["ground", shape.frame]
         assert gap == pytest.approx(0, abs=2e-3)
     assert np.abs(pin.difference(setup.robot.model, shipped.q, setup.q)[6:]).max() > 0.01
-    task, own = setup.scenario.task, shipped.scenario.task
-    assert isinstance(task, SinglePush)
-    assert isinstance(own, SinglePush)
-    np.testing.assert_allclose(task.force, chosen.values["force"] * np.array(own.force))
-    bare = np.asarray(shipped.robot.model.armature)
-    np.testing.assert_allclose(setup.robot.model.armature, chosen.values["armature"] * bare)
+    task, shipped_task = setup.scenario.task, shipped.scenario.task
+    assert isinstance(task, SinglePush) and isinstance(shipped_task, SinglePush)
+    np.testing.assert_allclose(task.force, chosen.values["force"] * np.array(shipped_task.force))
+    armature = np.asarray(shipped.robot.model.armature)
+    np.testing.assert_allclose(setup.robot.model.armature, chosen.values["armature"] * armature)
 
 
 def short(chosen: Draw) -> Setup:
-    """The draw with one contact, at once."""
+    """Build a draw with one contact that begins at once."""
     scenario = prepare(chosen).scenario
     assert isinstance(scenario.task, RepeatedContacts)
     brief = replace(scenario.task, count=1, settle=0.2, speed=0.5, dwell=0.3, pause=0.1)
@@ -154,17 +134,16 @@ def test_the_robots_own_data_are_among_the_variations() -> None:
     vertical, lateral = (read_scenario(name) for name in ("aerial-vertical", "aerial-lateral"))
     own = load_robot(vertical.robot)
     for scenario, name in ((vertical, OWN_MOUNTING), (lateral, OWN_ARMATURE)):
-        made = prepare(draw(scenario.name, list(VARIATIONS[scenario.name]).index(name)))
-        np.testing.assert_allclose(made.robot.model.armature, own.model.armature, rtol=1e-12)
-        for mine, its in zip(made.robot.model.jointPlacements, own.model.jointPlacements, strict=True):
+        setup = prepare(draw(scenario.name, list(VARIATIONS[scenario.name]).index(name)))
+        np.testing.assert_allclose(setup.robot.model.armature, own.model.armature, rtol=1e-12)
+        for mine, its in zip(setup.robot.model.jointPlacements, own.model.jointPlacements, strict=True):
             np.testing.assert_allclose(mine.translation, its.translation, atol=1e-12)
 
 
-def test_what_goes_wrong_is_an_outcome(monkeypatch: pytest.MonkeyPatch) -> None:
-    """The first draw is not admissible; in the second one controller runs away, another has no optimum."""
+def test_a_failure_is_an_outcome(monkeypatch: pytest.MonkeyPatch) -> None:
+    """The first draw is not admissible.  In the second, a controller runs away, and another has no optimum."""
     monkeypatch.setattr(outcomes, "prepare", short)
     tried: list[str] = []
-
     ran: list[tuple[tuple[Run, ...], dict[str, Any]]] = []
 
     def play(job: Job, factory: ControllerFactory) -> tuple[tuple[Run, ...], dict[str, Any]]:
@@ -184,7 +163,7 @@ def test_what_goes_wrong_is_an_outcome(monkeypatch: pytest.MonkeyPatch) -> None:
     assert record.draw == draw(AERIAL, number, attempt=1)
     assert {c for c in COMPARED if record.failure(c)} == {"robust", "posture"}
     assert all(record.missed(c) == {"completed": "no completed run"} for c in ("robust", "posture"))
-    # The same run as nominal's.
+    # `stiff` got the run of `nominal`.
     assert record.documents["stiff"]["metrics"] == record.documents[NOMINAL]["metrics"]
     assert record.documents[NOMINAL]["metrics"]["contacts"] == 1
     assert record.documents[NOMINAL]["offset"] is not None
@@ -197,7 +176,7 @@ def test_what_goes_wrong_is_an_outcome(monkeypatch: pytest.MonkeyPatch) -> None:
     assert "control lost 1" in text
     assert "nominal control lost: 1" in text
     assert f"- `robust` fails in `{AERIAL}` number {number}" in text
-    # A record that lacks a controller runs that one alone.
+    # If a record lacks a controller, only this controller runs.
     tried.clear()
     known = replace(record, documents={c: d for c, d in record.documents.items() if c != "stiff"})
     assert not is_complete(known)
@@ -205,14 +184,14 @@ def test_what_goes_wrong_is_an_outcome(monkeypatch: pytest.MonkeyPatch) -> None:
     assert tried == ["stiff"]
 
 
-def test_a_point_that_never_works_says_why() -> None:
+def test_a_point_without_an_admissible_draw_says_why() -> None:
     def play(job: Job, factory: ControllerFactory) -> tuple[tuple[Run, ...], dict[str, Any]]:
         raise SimulationDiverged(1.0)
 
     number = len(VARIATIONS[AERIAL]) + 5
     with pytest.raises(NotAdmissible, match=rf"{AERIAL} {number}: none of {ATTEMPTS} draws .*nominal control lost"):
         point(AERIAL, number, 0, play=play)
-    # A variation is not replaced by another one.
+    # A variation is not replaced.
     record = point(AERIAL, 1, 0, play=play)
     assert record.rejected == ("nominal control lost",) and not record.documents and is_complete(record)
     assert "K × 0.5 (nominal control lost)" in "\n".join(envelope.page({AERIAL: [record, *five()]}))
@@ -221,88 +200,85 @@ def test_a_point_that_never_works_says_why() -> None:
 METRICS = Metrics(1.0, 0.5, 0.8, 2.0, 1.0, 1.0, 1.0, 1.0, 100.0, 0.0, 0.0, 0.0, 0, 0, 0.01, (), 5, 5)
 
 
-def made(scenario: str, number: int, of: dict[str, tuple[float, float] | str], **more: float) -> Record:
-    """A random draw with (motion, jump) of each controller, or its failure."""
-    found = {}
+def make_record(scenario: str, number: int, of: dict[str, tuple[float, float] | str], **more: float) -> Record:
+    """Make up a record of a random draw with (motion, jump) of each controller, or its failure."""
+    documents = {}
     number += len(VARIATIONS[scenario])
     for name in COMPARED:
-        given = of.get(name, (1.0, 1.0))
+        result = of.get(name, (1.0, 1.0))
         document: dict[str, Any] = {"scenario": scenario, "controller": name, "seed": 0, "runs": [], "events": []}
         document |= {"duration": 1.0, "offset": 0.01 * number}
-        if isinstance(given, str):
-            events = [{"status": given, "time": 1.0, "what": "made", "sign": 1}]
-            found[name] = document | {"status": given, "metrics": None, "prediction": None, "events": events}
+        if isinstance(result, str):
+            events = [{"status": result, "time": 1.0, "what": "made", "sign": 1}]
+            documents[name] = document | {"status": result, "metrics": None, "prediction": None, "events": events}
             continue
         metrics = replace(
-            METRICS, q_total_impact=given[0], q_total_recovery=2 * given[0], peak_jump=given[1],
-            peak_recovery=given[1], saturation_inside=given[0] / 10,
+            METRICS, q_total_impact=result[0], q_total_recovery=2 * result[0], peak_jump=result[1],
+            peak_recovery=result[1], saturation_inside=result[0] / 10,
         )  # fmt: skip
         H, S = (more.get(f"{key}_{name}", 4.0) for key in "HS")
         jumps = {"frictionless": 1.0, "sticking": S, "coulomb": S}
         prediction = {"H": H, "ratio": 1.0, "impacts": 5, **jumps}
-        found[name] = document | {
+        documents[name] = document | {
             "status": "completed", "metrics": jsonable(metrics.to_dict()), "prediction": prediction,
         }  # fmt: skip
-    return Record(draw(scenario, number), (), (0.0,), found)
+    return Record(draw(scenario, number), (), (0.0,), documents)
 
 
 def five() -> list[Record]:
-    """Motion against nominal's 2.0: halved, a quarter less, the same, half more, failed."""
+    """Make up five records: the motion is halved, a quarter less, equal, half more, or the run failed."""
     return [
-        made(AERIAL, 0, {NOMINAL: (2.0, 4.0), "robust": (0.9, 5.0)}, H_robust=1.0, S_robust=5.0),
-        made(AERIAL, 1, {NOMINAL: (2.0, 4.0), "robust": (1.5, 3.0)}, H_robust=2.0, S_robust=3.0),
-        made(AERIAL, 2, {NOMINAL: (2.0, 4.0), "robust": (2.0, 2.0)}, H_robust=3.0, S_robust=2.0),
-        made(AERIAL, 3, {NOMINAL: (2.0, 4.0), "robust": (3.0, 6.0)}, H_robust=8.0, S_robust=6.0),
-        made(AERIAL, 4, {NOMINAL: (2.0, 4.0), "robust": "fell"}),
+        make_record(AERIAL, 0, {NOMINAL: (2.0, 4.0), "robust": (0.9, 5.0)}, H_robust=1.0, S_robust=5.0),
+        make_record(AERIAL, 1, {NOMINAL: (2.0, 4.0), "robust": (1.5, 3.0)}, H_robust=2.0, S_robust=3.0),
+        make_record(AERIAL, 2, {NOMINAL: (2.0, 4.0), "robust": (2.0, 2.0)}, H_robust=3.0, S_robust=2.0),
+        make_record(AERIAL, 3, {NOMINAL: (2.0, 4.0), "robust": (3.0, 6.0)}, H_robust=8.0, S_robust=6.0),
+        make_record(AERIAL, 4, {NOMINAL: (2.0, 4.0), "robust": "fell"}),
     ]
 
 
 def test_statistics_by_hand() -> None:
     records = five()
-    found = summarize(records, "robust")
-    assert (found.count, found.helps, found.gentler) == (5, 2, 2)
+    summary = summarize(records, "robust")
+    assert (summary.count, summary.helps, summary.gentler) == (5, 2, 2)
     # Changes −0.55, −0.25, 0, 0.5, failed: the quartiles are the second and the fourth.
-    assert found.motion == found.recovery == pytest.approx((-0.25, 0.0, 0.5))
-    # Of the jump 0.25, −0.25, −0.5, 0.5, failed.
-    assert found.jump == pytest.approx(0.25)
-    assert found.force == pytest.approx((1.0, 1.0))
-    assert found.failures == Counter(fell=1)
-    assert found.saturation == pytest.approx((0.74, 0.0))
+    assert summary.motion == summary.recovery == pytest.approx((-0.25, 0.0, 0.5))
+    # Changes of the jump: 0.25, −0.25, −0.5, 0.5, failed.
+    assert summary.jump == pytest.approx(0.25)
+    assert summary.force == pytest.approx((1.0, 1.0))
+    assert summary.failures == Counter(fell=1)
+    assert summary.saturation == pytest.approx((0.74, 0.0))
     assert summarize(records, NOMINAL).saturation == pytest.approx((1.0, 0.0))
-    # The first has the paper's reduction, but a higher jump; no reduction, no lower jump, more saturation.
-    assert set(records[0].missed("robust")) == {"peak_jump", "peak_recovery"}
-    assert set(records[1].missed("robust")) == {"reduction"}
-    assert set(records[2].missed("robust")) == {"reduction", "recovery"}
-    assert {"reduction", "recovery", "peak_jump", "peak_recovery", "saturation"} == set(records[3].missed("robust"))
-    assert found.kept == 0 and found.missed["reduction"] == 3 and found.missed["completed"] == 1
-    assert quantile([0.0, 1.0, math.inf], 0.75) == math.inf
-    assert quantile([0.0, 1.0], 0.5) == 0.5
+    # The first record has the reduction of the paper, but a higher jump.
+    missed = [set(record.missed("robust")) for record in records[:4]]
+    assert missed[:3] == [{"peak_jump", "peak_recovery"}, {"reduction"}, {"reduction", "recovery"}]
+    assert missed[3] == {"reduction", "recovery", "peak_jump", "peak_recovery", "saturation"}
+    assert summary.kept == 0 and summary.missed["reduction"] == 3 and summary.missed["completed"] == 1
+    assert statistics.quantile([0.0, 1.0, math.inf], 0.75) == math.inf
+    assert statistics.quantile([0.0, 1.0], 0.5) == 0.5
     assert (percent(-0.254), percent(math.inf)) == ("−25 %", "fails")
 
 
-def test_what_goes_with_success_by_hand() -> None:
+def test_correlations_and_splits_by_hand() -> None:
     records = five()
-    # The more H fell, the less motion; what is constant has no rank.
+    # The more H fell, the less motion.  A constant has no rank.
     assert rank(records, "robust", lambda r: -(r.documents["robust"]["prediction"]["H"])) == pytest.approx(1)
     assert rank(records, "robust", lambda r: float(r.draw.number)) == pytest.approx(-1)
     assert math.isnan(rank(records, "robust", lambda r: 1.0))
     first = len(VARIATIONS[AERIAL])
-    chosen, others = split(records, "robust", lambda r: r.draw.number < first + 2)
+    chosen, others = statistics.split(records, "robust", lambda r: r.draw.number < first + 2)
     assert (chosen.count, chosen.helps, chosen.median) == (2, 2, pytest.approx(-0.4))
     assert (others.count, others.helps, others.median) == (3, 0, pytest.approx(0.5))
-    # H fell in the first three and rose in the fourth: the motion went with it but in the third, the jump but in the
-    # first.
-    assert agreement(records, ["robust"], "H", "q_total_impact") == (3, 4)
-    assert agreement(records, ["robust"], "H", "peak_jump") == (3, 4)
-    # S was made from the jump of robust; all else has a jump of 1 or 4 at S = 4.
+    # H fell in the first three records and rose in the fourth.  One motion and one jump disagree.
+    for metric in ("q_total_impact", "peak_jump"):
+        assert statistics.agreement(records, ["robust"], "H", metric) == (3, 4)
+    # S follows the jump of robust.
     alone = [replace(r, documents={"robust": r.documents["robust"]}) for r in records]
-    assert ranks_of_jumps(alone, ("H", "V", "S")) == pytest.approx(
+    assert statistics.ranks_of_jumps(alone, ("H", "V", "S")) == pytest.approx(
         {"n": 4, "H": 0.2, "V": math.nan, "S": 1.0}, nan_ok=True
     )
-    bad, wrong = worst(records, "robust"), misled(records, "robust")
-    assert bad is records[3]
-    # H fell in three; in the first of them the jump rose.
-    assert wrong is records[0]
+    assert statistics.worst(records, "robust") is records[3]
+    # H fell in three records.  In the first of them, the jump rose.
+    assert statistics.misled(records, "robust") is records[0]
     text = "\n".join(page({AERIAL: records}, 0))
     assert f"`robust` moves the robot most, compared with nominal, in `{AERIAL}` number {first + 3}" in text
     assert f"The jump rises although H falls most in `{AERIAL}` number {first}" in text
@@ -310,26 +286,23 @@ def test_what_goes_with_success_by_hand() -> None:
 
 
 def test_the_advice_follows_the_numbers() -> None:
-    good = [made(AERIAL, k, {"robust": (0.9, 1.0), "posture": (0.4, 0.5)}) for k in range(4)]
-    poor = [made(AERIAL, k, {"robust": (1.1, 1.0), "posture": "fell"}) for k in range(4)]
+    good = [make_record(AERIAL, k, {"robust": (0.9, 1.0), "posture": (0.4, 0.5)}) for k in range(4)]
+    poor = [make_record(AERIAL, k, {"robust": (1.1, 1.0), "posture": "fell"}) for k in range(4)]
     advice = "\n".join(page({AERIAL: good}, 0)).partition(MARK)[0]
     assert "Take `posture`" in advice and "It keeps every target at 4 of 4 points" in advice
     assert "−60 % at the median" in advice
     advice = "\n".join(page({AERIAL: poor}, 0)).partition(MARK)[0]
     assert "No controller keeps its targets reliably" in advice and "Take" not in advice
     assert f"**What failed:** `posture` in `{AERIAL}` at 4 of 4 points (fell 4)." in advice
-    live = [made(STANDING, k, {"robust": (0.7, 1.0), "stiff": (0.6, 1.0), "posture": (1.0, 1.0)}) for k in range(4)]
-    text = "\n".join(page({STANDING: live}, 0))
-    assert (
-        f"In `{STANDING}` the median motion changes by −40 % with `stiff` and by +0 % with `posture`: the stiffness"
-        in text
-    )
+    stiff = {"robust": (0.7, 1.0), "stiff": (0.6, 1.0), "posture": (1.0, 1.0)}
+    text = "\n".join(page({STANDING: [make_record(STANDING, k, stiff) for k in range(4)]}, 0))
+    assert "the median motion changes by −40 % with `stiff` and by +0 % with `posture`: the stiffness" in text
     kept, missed = ("\n".join(envelope.page({AERIAL: records})) for records in (good, poor))
     assert "Take `posture`" in kept and "failed 4" in missed
     assert "0 variations one at a time and 4 random draws" in kept and "Its effect is not known" in kept
 
 
-def test_an_interrupted_study_goes_on_and_says_the_same(tmp_path: Path) -> None:
+def test_an_interrupted_study_continues_with_the_same_page(tmp_path: Path) -> None:
     scenarios, ran = [AERIAL, STANDING], []
 
     def runner(limit: int) -> Callable[..., Record]:
@@ -337,8 +310,8 @@ def test_an_interrupted_study_goes_on_and_says_the_same(tmp_path: Path) -> None:
             if len(ran) == limit:
                 raise KeyboardInterrupt
             ran.append((scenario, number))
-            found = made(scenario, number, {"robust": (0.5 + 0.2 * number, 0.9), "posture": "fell"})
-            return replace(found, draw=draw(scenario, number))
+            record = make_record(scenario, number, {"robust": (0.5 + 0.2 * number, 0.9), "posture": "fell"})
+            return replace(record, draw=draw(scenario, number))
 
         return run
 
@@ -348,21 +321,21 @@ def test_an_interrupted_study_goes_on_and_says_the_same(tmp_path: Path) -> None:
     first, ran = ran, []
     with pytest.raises(KeyboardInterrupt):
         study(counts, 0, 1, parts, run=runner(4))
-    # Cut short, it has as many points of each scenario, with every controller.
+    # An interrupted study has equally many points of each scenario, with every controller.
     assert [len(own) for own in parts.complete(scenarios).values()] == [2, 2]
     said: list[str] = []
     study(counts, 0, 1, parts, run=runner(9), tell=said.append)
     assert ran == first
     assert len(said) == 2
     assert "\n".join(page(parts.complete(scenarios), 0)) == "\n".join(page(whole.complete(scenarios), 0))
-    # Another seed, and records of a study with other ranges, are other studies.
+    # Records with another seed or other ranges do not count.
     assert Store(tmp_path / "parts", 1).get(AERIAL, 0) is None
     [file] = (tmp_path / "parts").rglob(f"{AERIAL}/000.json")
     file.write_text(file.read_text(encoding="utf-8").replace("'speed', 0.25", "'speed', 0.3"), encoding="utf-8")
     assert Store(tmp_path / "parts", 0).get(AERIAL, 0) is None
 
 
-def test_the_page_is_the_studys_and_the_prose_has_no_numbers_of_its_own() -> None:
+def test_the_page_has_every_range_and_controller_and_the_prose_no_numbers() -> None:
     written = page_of("robustness").read_text(encoding="utf-8")
     assert written.startswith(STUDIES["robustness"].head)
     assert MARK in written
@@ -373,7 +346,7 @@ def test_the_page_is_the_studys_and_the_prose_has_no_numbers_of_its_own() -> Non
             assert f"| `{scenario}` | `{controller}` |" in written
     targets = page_of("envelope").read_text(encoding="utf-8")
     assert targets.startswith(STUDIES["envelope"].head)
-    # The study may have been stopped, so later variations may lack.
+    # The study may have been stopped before the later variations.
     for scenario, variations in VARIATIONS.items():
         rows = targets.partition(f"`{scenario}`:\n")[2].partition("\n\n`")[0]
         for name in list(variations)[:3]:

@@ -52,16 +52,16 @@ class Tab:
                 assert part, "the browser has gone"
                 self.said += part
             text, _, self.said = self.said.partition(b"\0")
-            found: dict[str, Any] = json.loads(text)
-            if found.get("id") == number:
-                assert "error" not in found, found
-                return dict(found["result"])
-            self.events.append(found)
+            reply: dict[str, Any] = json.loads(text)
+            if reply.get("id") == number:
+                assert "error" not in reply, reply
+                return dict(reply["result"])
+            self.events.append(reply)
 
     def evaluate(self, expression: str) -> Any:
-        found = self.send("Runtime.evaluate", expression=expression, awaitPromise=True, returnByValue=True)
-        assert "exceptionDetails" not in found, found
-        return found["result"].get("value")
+        answer = self.send("Runtime.evaluate", expression=expression, awaitPromise=True, returnByValue=True)
+        assert "exceptionDetails" not in answer, answer
+        return answer["result"].get("value")
 
     def resize(self, width: int, height: int) -> None:
         self.send("Emulation.setDeviceMetricsOverride", width=width, height=height, deviceScaleFactor=1, mobile=False)
@@ -89,16 +89,16 @@ class Tab:
 
     def complaints(self) -> list[str]:
         """Return errors of scripts, refusals of the security policy, and requests that left the page."""
-        found = []
+        complaints = []
         for event in self.events:
             kind, about = event.get("method"), event.get("params", {})
             if kind == "Runtime.exceptionThrown" or (kind == "Log.entryAdded" and about["entry"]["level"] == "error"):
-                found.append(str(about))
+                complaints.append(str(about))
             if kind == "Network.requestWillBeSent" and not about["request"]["url"].startswith(
                 ("file:", "data:", "blob:")
             ):
-                found.append(about["request"]["url"])
-        return found
+                complaints.append(about["request"]["url"])
+        return complaints
 
 
 @contextmanager

@@ -21,7 +21,7 @@ typedef struct {
   long ticks, before[2], after[2], seen[5];
   int failed;
   double sum;
-  ctl_context c, twin;
+  ctl_context c, copy;
   ctl_params p;
   ctl_report report;
   pthread_t thread;
@@ -45,14 +45,14 @@ static int within(const ctl_command *out, const ctl_params *p)
 }
 
 /* Bytes that are allocated, and the most memory that the process ever had, kB. */
-static void memory(long found[2])
+static void memory(long bytes[2])
 {
   struct rusage usage;
   getrusage(RUSAGE_SELF, &usage);
-  found[1] = usage.ru_maxrss;
-  found[0] = 0;
+  bytes[1] = usage.ru_maxrss;
+  bytes[0] = 0;
 #if defined(__GLIBC__) && (__GLIBC__ > 2 || __GLIBC_MINOR__ >= 33)
-  found[0] = (long)mallinfo2().uordblks;
+  bytes[0] = (long)mallinfo2().uordblks;
 #endif
 }
 
@@ -130,9 +130,9 @@ static int abuse(run *r)
     default:
       break;
     }
-    memcpy(&r->twin, &r->c, sizeof r->twin);
+    memcpy(&r->copy, &r->c, sizeof r->copy);
     ++r->seen[ctl_tick(&r->c, 1e-3 * (double)k, q, v, k % 3 ? force : NULL, &out)];
-    ctl_tick(&r->twin, 1e-3 * (double)k, q, v, k % 3 ? force : NULL, &other);
+    ctl_tick(&r->copy, 1e-3 * (double)k, q, v, k % 3 ? force : NULL, &other);
     if (!within(&out, &r->p)) {
       printf("tick %ld, status %d: a control is out of its limits\n", k, out.status);
       return 3;

@@ -36,10 +36,10 @@ def digits(count: int = DIGITS) -> Iterator[None]:
 def exact(values: object) -> Exact:
     """Doubles as the decimal numbers that they are."""
     doubles = np.asarray(values, dtype=float)
-    found = np.empty(doubles.shape, dtype=object)
+    decimals = np.empty(doubles.shape, dtype=object)
     for index in np.ndindex(doubles.shape):
-        found[index] = Decimal(float(doubles[index]))
-    return found
+        decimals[index] = Decimal(float(doubles[index]))
+    return decimals
 
 
 def rounded(values: Exact) -> Vector:
@@ -47,9 +47,9 @@ def rounded(values: Exact) -> Vector:
     return np.asarray(values, dtype=float)
 
 
-def distance(found: object, expected: Exact) -> Vector:
-    """``|found − expected|``, subtracted before it is rounded."""
-    return rounded(abs(exact(found).reshape(np.shape(expected)) - expected))
+def distance(value: object, expected: Exact) -> Vector:
+    """``|value − expected|``, subtracted before it is rounded."""
+    return rounded(abs(exact(value).reshape(np.shape(expected)) - expected))
 
 
 def solve(matrix: Exact, right: Exact) -> Exact:
@@ -102,8 +102,8 @@ class ExactImpact:
 
     def answer(self, tau: Exact) -> tuple[Exact, Exact]:
         """``a`` and ``f`` for ``τ``."""
-        found = self.inverse[:, : self.nv] @ tau
-        return found[: self.nv], found[self.nv :]
+        solution = self.inverse[:, : self.nv] @ tau
+        return solution[: self.nv], solution[self.nv :]
 
     # ---- quantities -------------------------------------------------------------------------------------------
 
@@ -149,8 +149,8 @@ class ExactImpact:
         return K
 
     def _held(self, right: Exact) -> tuple[Exact, Exact, Exact]:
-        found = solve(self.K_held, right[:, None])[:, 0]
-        return found[-3:], found[: self.nv], found[self.nv : -3]
+        solution = solve(self.K_held, right[:, None])[:, 0]
+        return solution[-3:], solution[: self.nv], solution[self.nv : -3]
 
     @cached_property
     def sticking(self) -> tuple[Exact, Exact, Exact]:

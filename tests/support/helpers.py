@@ -47,12 +47,12 @@ def unit(generator: np.random.Generator, size: int = 3) -> Vector:
     return v / np.linalg.norm(v)
 
 
-def relative(found: ArrayLike, expected: ArrayLike, scale: float = 0.0) -> float:
+def relative(actual: ArrayLike, expected: ArrayLike, scale: float = 0.0) -> float:
     """Largest deviation over the largest expected entry, or over ``scale`` if that is larger.
 
     A scale is for what may vanish: a gradient that is zero is judged against the value that it belongs to.
     """
-    x, y = np.array(found, dtype=float), np.array(expected, dtype=float)
+    x, y = np.array(actual, dtype=float), np.array(expected, dtype=float)
     assert x.size == y.size, (x.shape, y.shape)
     x = x.reshape(y.shape)
     if not np.isfinite(x).all():
@@ -60,9 +60,9 @@ def relative(found: ArrayLike, expected: ArrayLike, scale: float = 0.0) -> float
     return float(np.abs(x - y).max() / max(np.abs(y).max(), scale))
 
 
-def assert_close(found: ArrayLike, expected: ArrayLike, tolerance: float, what: str, scale: float = 0.0) -> None:
+def assert_close(actual: ArrayLike, expected: ArrayLike, tolerance: float, what: str, scale: float = 0.0) -> None:
     """Fail unless the relative error (:func:`relative`) is within the tolerance."""
-    error = relative(found, expected, scale)
+    error = relative(actual, expected, scale)
     assert error <= tolerance, f"{what}: relative error {error:.2e} above {tolerance:.0e}"
 
 

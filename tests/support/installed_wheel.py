@@ -94,10 +94,10 @@ def sdist_files(sdist: Path) -> dict[str, str]:
         return digests((name, file.read()) for name, file in members if file is not None)
 
 
-def compare(what: str, found: dict[str, str], expected: dict[str, str]) -> None:
-    faults = [f"not in it: {n}" for n in sorted(expected.keys() - found.keys())]
-    faults += [f"not tracked by git: {n}" for n in sorted(found.keys() - expected.keys())]
-    faults += [f"not the same: {n}" for n in sorted(found.keys() & expected.keys()) if found[n] != expected[n]]
+def compare(what: str, content: dict[str, str], expected: dict[str, str]) -> None:
+    faults = [f"not in it: {n}" for n in sorted(expected.keys() - content.keys())]
+    faults += [f"not tracked by git: {n}" for n in sorted(content.keys() - expected.keys())]
+    faults += [f"not the same: {n}" for n in sorted(content.keys() & expected.keys()) if content[n] != expected[n]]
     if faults:
         raise Failed(f"{what} does not hold what git tracks:\n  " + "\n  ".join(faults))
 
@@ -182,7 +182,7 @@ def planted(file: Path, text: str) -> Iterator[None]:
 
 
 def types(work: Path, programs: Path) -> None:
-    """Let mypy read the installed copy, and prove that it does: an error planted there must be found."""
+    """Let mypy read the installed copy.  It must report an error that is planted there."""
     command = [str(programs / "mypy"), "--config-file", str(ROOT / "pyproject.toml"), "--cache-dir", "mypy"]
     for package in PACKAGES.values():
         command += ["-p", package]

@@ -114,8 +114,8 @@ def violations(tick: RelaxedTick, z: np.ndarray) -> tuple[np.ndarray, np.ndarray
 def missed(tick: RelaxedTick, z: np.ndarray) -> list[float]:
     """Return the largest violation of each level, level 0 first, in units of the size of the point."""
     over, counts = violations(tick, z)
-    found = COUNTS * np.abs(over) / np.where(counts > 0, counts, np.inf)
-    return [float(np.max(found[tick.level == k], initial=0.0)) for k in range(int(tick.level.max()) + 1)]
+    sizes = COUNTS * np.abs(over) / np.where(counts > 0, counts, np.inf)
+    return [float(np.max(sizes[tick.level == k], initial=0.0)) for k in range(int(tick.level.max()) + 1)]
 
 
 def stationarity(tick: RelaxedTick, z: np.ndarray) -> list[float]:
@@ -129,11 +129,11 @@ def stationarity(tick: RelaxedTick, z: np.ndarray) -> list[float]:
     lengths = np.linalg.norm(rows, axis=1)
     lengths[lengths == 0.0] = 1.0
     over, counts = violations(tick, z)
-    values, levels, found = np.concatenate([z, tick.A @ z]), int(tick.level.max()), []
+    values, levels, distances = np.concatenate([z, tick.A @ z]), int(tick.level.max()), []
     for k in range(1, levels + 2):
         own = tick.level == k
         if k <= levels and (np.abs(over) <= counts)[own].all():
-            found.append(0.0)
+            distances.append(0.0)
             continue
         if k <= levels:
             gradient, terms = rows[own].T @ over[own], float(np.abs(over[own]) @ lengths[own])
@@ -149,8 +149,8 @@ def stationarity(tick: RelaxedTick, z: np.ndarray) -> list[float]:
         normals = kept @ np.vstack([unit[upper], -unit[lower]]).T
         left = kept @ -gradient
         rest = scipy.optimize.nnls(normals, left, maxiter=10_000)[1] if normals.size else np.linalg.norm(left)
-        found.append(float(rest) / max(terms, 1e-300))
-    return found
+        distances.append(float(rest) / max(terms, 1e-300))
+    return distances
 
 
 def _complement(rows: np.ndarray) -> np.ndarray:

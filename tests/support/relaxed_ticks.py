@@ -66,16 +66,16 @@ def problem_of(assembly: Assembly, z: np.ndarray | None) -> RelaxedTick:
 @contextmanager
 def recording() -> Iterator[list[RelaxedTick]]:
     """Record each relaxed tick of any controller."""
-    found, relax = list[RelaxedTick](), relaxation._relax
+    ticks, relax = list[RelaxedTick](), relaxation._relax
 
     def recorded(assembly: Assembly) -> relaxation.Outcome:
         outcome = relax(assembly)
-        found.append(problem_of(assembly, None if outcome.solved is None else outcome.solved.z))
+        ticks.append(problem_of(assembly, None if outcome.solved is None else outcome.solved.z))
         return outcome
 
     with pytest.MonkeyPatch.context() as patch:
         patch.setattr(relaxation, "_relax", recorded)
-        yield found
+        yield ticks
 
 
 def pushed(name: str) -> tuple[list[RelaxedTick], int]:
@@ -88,7 +88,7 @@ def pushed(name: str) -> tuple[list[RelaxedTick], int]:
     setup = set_up(read_scenario(scenario))
     driver, world, period = ControllerFactory(setup).driver("nominal"), setup.world, setup.scenario.control.period
     standing = None
-    with recording() as found:
+    with recording() as ticks:
         command = driver.reset(setup.q)
         world.reset(setup.q, seed=0, rotor_speed=command.rotor_speed)
         for k in range(round(seconds / period)):
@@ -96,10 +96,10 @@ def pushed(name: str) -> tuple[list[RelaxedTick], int]:
                 world.push(Push(frame, force, 0.4))
             reading = world.read()
             if standing is None and setup.scenario.control.footing and reading.q[2] < setup.q[2] * 2 / 3:
-                standing = len(found)
+                standing = len(ticks)
             command = driver.tick(reading, None)
             try:
                 world.step(command, round(period / world.timestep))
             except SimulationDiverged:
                 break
-    return found, len(found) if standing is None else standing
+    return ticks, len(ticks) if standing is None else standing

@@ -81,14 +81,14 @@ def measure_restitution(
     Raises:
         InputError: The ball stays on the surface, or the law does not fit the time step.
     """
-    found = [_one(law, speed, timestep, mass, phase) for phase in _PHASES]
-    restitutions = [b.restitution for b in found]
+    bounces = [_one(law, speed, timestep, mass, phase) for phase in _PHASES]
+    restitutions = [b.restitution for b in bounces]
     return Bounce(
         restitution=float(np.mean(restitutions)),
         spread=float(np.ptp(restitutions)),
-        duration=_mean(found, "duration"),
-        depth=_mean(found, "depth"),
-        peak=_mean(found, "peak"),
+        duration=_mean(bounces, "duration"),
+        depth=_mean(bounces, "depth"),
+        peak=_mean(bounces, "peak"),
     )
 
 
@@ -126,5 +126,5 @@ def _follow(world: World, surface: Surface, speed: float) -> Bounce:
     return Bounce(after / speed, 0.0, duration, depth, max(forces) * duration / impulse)
 
 
-def _mean(found: Sequence[Bounce], name: str) -> float:
-    return float(np.mean([getattr(bounce, name) for bounce in found]))
+def _mean(bounces: Sequence[Bounce], name: str) -> float:
+    return float(np.mean([getattr(bounce, name) for bounce in bounces]))
