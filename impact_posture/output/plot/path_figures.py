@@ -14,7 +14,14 @@ from matplotlib.lines import Line2D
 from matplotlib.ticker import FuncFormatter, NullFormatter
 
 from impact_posture.errors import InputError
-from impact_posture.output.plot.result_view import ResultView, TradeOffData, header_lines, number, objective_unit
+from impact_posture.output.plot.result_view import (
+    ResultView,
+    TradeOffData,
+    header_lines,
+    number,
+    objective_unit,
+    required,
+)
 from impact_posture.output.plot.style import BLUE, GRAY, GREEN, INK, PURPLE, VERMILLION, framed
 from impact_posture.system.arrays import Array
 from impact_posture.system.escape import plot_label
@@ -52,11 +59,26 @@ def path_figure(view: ResultView) -> Figure:
     Raises:
         InputError: The view has no path, or its arrays do not fit together.
     """
-    path = _checked(view.path)
+    path = required(view.path, "path", "nullspace", "give ResultView.path")
+    sizes = {name: np.shape(getattr(path, name)) for name in ("s", *QUANTITIES)}
+    if len(path.s) < 2 or set(sizes.values()) != {(len(path.s),)}:
+        raise InputError(
+            f"the path's arrays have shapes {', '.join(f'{k} {v}' for k, v in sizes.items())}",
+            where="figure nullspace",
+            hint="give at least two postures and one number of each quantity for each",
+        )
     with framed(*header_lines(view), 3.1, [share_notes("along the path", path)]) as (figure, body):
         axes = body.subplots()
         drawn = draw_shares(axes, path.s, path)
-        _mark(axes, path)
+        for word, s, align in (("start", path.s[0], "left"), ("optimum", path.s[-1], "right")):
+            axes.axvline(s, **_MARK)
+            look = {
+                "xycoords": ("data", "axes fraction"),
+                "textcoords": "offset points",
+                "ha": align,
+                "fontsize": 7.5,
+            }
+            axes.annotate(word, (s, 1.0), (0, 3), **look)
         axes.set_xlabel("path length in the null space, ∫‖dq‖  [rad, mixed with m]")
         if drawn:
             body.legend(loc="outside right center", title="value / start", title_fontsize=7.5, handlelength=3.2)
@@ -65,7 +87,7 @@ def path_figure(view: ResultView) -> Figure:
 
 def draw_shares(axes: Any, x: Array, data: NullSpacePath | TradeOffData) -> bool:
     """Draw H, G, V and S over ``x``, each divided by its value at the start; return whether any was drawn."""
-    drawn = {name: found for name in QUANTITIES if (found := normalized(data, name)) is not None}
+    drawn = {name: share for name in QUANTITIES if (share := normalized(data, name)) is not None}
     values = np.concatenate([curve[np.isfinite(curve)] for curve, _ in drawn.values()]) if drawn else np.ones(1)
     log = spreads(values)
     every = max(len(x) // 10, 1)
@@ -84,7 +106,7 @@ def draw_shares(axes: Any, x: Array, data: NullSpacePath | TradeOffData) -> bool
 
 
 def spreads(values: Array, ratio: float = _SPREAD) -> bool:
-    """Return whether positive values spread by more than ``ratio``, so that they need a log axis."""
+    """Return whether positive values need a log axis, because they spread by more than ``ratio``."""
     positive = values[values > 0]
     return bool(positive.size) and float(positive.max() / positive.min()) > ratio
 
@@ -97,37 +119,10 @@ def log_axis(axes: Any) -> None:
 
 
 def normalized(data: NullSpacePath | TradeOffData, name: str) -> tuple[Array, float] | None:
-    """Return a quantity divided by its value at the start, or by its nearest value, and that value.
-
-    ``None`` where it is undefined or zero there.
-    """
+    """Return a quantity divided by its first finite value, and this value; ``None`` if it is zero or undefined."""
     values = np.asarray(getattr(data, name), dtype=float)
     first = next(iter(values[np.isfinite(values)]), 0.0)
     return (values / first, float(first)) if first > 0 else None
-
-
-def _checked(path: NullSpacePath | None) -> NullSpacePath:
-    if path is None:
-        raise InputError("there is no path to draw", where="figure nullspace", hint="give ResultView.path")
-    sizes = {name: np.shape(getattr(path, name)) for name in ("s", *QUANTITIES)}
-    count = len(path.s)
-    if count < 2 or set(sizes.values()) != {(count,)}:
-        raise InputError(
-            f"the path's arrays have shapes {', '.join(f'{k} {v}' for k, v in sizes.items())}",
-            where="figure nullspace",
-            hint="give at least two postures and one number of each quantity for each",
-        )
-    return path
-
-
-def _mark(axes: Any, path: NullSpacePath) -> None:
-    """Draw upright lines at the start and the optimum, named above the axes."""
-    for word, index, align in (("start", 0, "left"), ("optimum", -1, "right")):
-        axes.axvline(path.s[index], **_MARK)
-        axes.annotate(
-            word, (path.s[index], 1.0), (0, 3), xycoords=("data", "axes fraction"), textcoords="offset points",
-            ha=align, fontsize=7.5,
-        )  # fmt: skip
 
 
 def share_notes(where: str, data: NullSpacePath | TradeOffData) -> str:
@@ -153,11 +148,7 @@ def tradeoff_figure(view: ResultView) -> Figure:
     Raises:
         InputError: The view has no trade-off.
     """
-    data = view.tradeoff
-    if data is None:
-        raise InputError(
-            "there is no trade-off to draw", where="figure tradeoff", hint="run optimize again with `tradeoff`"
-        )
+    data = required(view.tradeoff, "trade-off", "tradeoff", "run optimize again with `tradeoff`")
     knee = [_KNEE.format(_EXTRA[data.against])] if data.knee is not None else []
     notes = [NOTES[data.against] + _LINES, *knee, share_notes("at these postures", data)]
     with framed(*header_lines(view), 5.6, notes) as (figure, body):
@@ -169,7 +160,7 @@ def tradeoff_figure(view: ResultView) -> Figure:
             lower.axvline(data.within[data.knee], **_MARK)
         handles = upper.get_legend_handles_labels()[0]
         if drawn:
-            # A heading separates these entries from those of the panel below.
+            # A heading separates the entries of the two panels.
             handles += [Line2D([], [], linestyle="", label="value / start:"), *lower.get_legend_handles_labels()[0]]
         body.legend(handles=handles, loc="outside right center", handlelength=3.2)
         body.align_ylabels([upper, lower])
@@ -248,9 +239,8 @@ def motion_figure(view: ResultView) -> Figure:
     Raises:
         InputError: The view has no motion.
     """
-    motion = view.motion
-    if motion is None or motion.use is None:
-        raise InputError("there is no motion to draw", where="figure path", hint="run optimize again with `path`")
+    motion = required(view.motion, "motion", "path", "run optimize again with `path`")
+    use = required(motion.use, "motion", "path", "run optimize again with `path`")
     notes = [_NOTES.get(motion.timing, "")]
     notes += [f"Note: {motion.reason}."] if motion.reason else []
     with framed(*header_lines(view), 6.2, notes) as (figure, body):
@@ -263,17 +253,17 @@ def motion_figure(view: ResultView) -> Figure:
         for rank, k in enumerate(most):
             look: dict[str, Any] = {"color": GRAY, "linewidth": 0.6}
             if rank < _NAMED:
-                name = re.sub(r"^base ([vw])", lambda one: _MOVED[one[1]], view.robot.tangent_names[k])
+                name = re.sub(r"^base ([vw])", lambda match: _MOVED[match[1]], view.robot.tangent_names[k])
                 look = {"color": f"C{rank}", "linewidth": 1.3, "label": plot_label(name)}
             joints.plot(motion.t, moved[:, k], **look)
         joints.set_ylabel("moved by  [rad or m]")
         joints.legend(loc="center left", bbox_to_anchor=(1.01, 0.5), handlelength=2.4)
-        objective.plot(motion.use.at, motion.objectives, color=BLUE, linewidth=1.6)
+        objective.plot(use.at, motion.objectives, color=BLUE, linewidth=1.6)
         objective.set_ylabel(f"objective  [{objective_unit(view)}]")
         for name, style in _SHARES.items():
-            values = getattr(motion.use, name)
+            values = getattr(use, name)
             if np.isfinite(values).any():
-                shares.plot(motion.use.at, values, label=name, linewidth=1.5, **style)
+                shares.plot(use.at, values, label=name, linewidth=1.5, **style)
         shares.axhline(1.0, color=GRAY, linewidth=0.8, zorder=0)
         shares.set_ylim(0.0, None)
         shares.set_ylabel("share of the limit  [1]")

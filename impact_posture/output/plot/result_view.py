@@ -5,13 +5,13 @@ from __future__ import annotations
 from collections.abc import Sequence
 from dataclasses import dataclass, replace
 from functools import cached_property
-from typing import TYPE_CHECKING
+from typing import TYPE_CHECKING, TypeVar
 
 import numpy as np
 from numpy.typing import NDArray
 
 from impact_posture.config.settings import Against
-from impact_posture.errors import MetricError
+from impact_posture.errors import InputError, MetricError
 from impact_posture.impact.evaluation.objective_value import objective_value
 from impact_posture.impact.evaluation.velocity_jump import tangent_units
 from impact_posture.impact.impact_contact import point_on
@@ -23,14 +23,15 @@ from impact_posture.impact.worst_case_objective import WorstCaseObjective
 from impact_posture.robot.robot import Robot
 from impact_posture.system.arrays import Array
 
-# Imported for its name alone, because the figures need no solver.
 if TYPE_CHECKING:
     from impact_posture.path.posture_path import PosturePath
     from impact_posture.posture.manifold.null_space_path import NullSpacePath
     from impact_posture.posture.search.global_search import SelfMotionMap
 
+_Data = TypeVar("_Data")
+
 ALONE = "numbers and ellipsoids"
-"""Begin of the fact that says which of several contacts the figures show."""
+"""Begin of the fact that names the contact of the figures, if there are several contacts."""
 
 SEPARATOR = "  ·  "
 """Separator of the facts in a header line."""
@@ -40,10 +41,12 @@ _UNITS = {"H": "‖Δν‖²/(N·s)²", "G": "1/kg", "V": "‖Δν‖²/(m/s)²"
 
 @dataclass(frozen=True, eq=False)
 class TradeOffData:
-    """Best posture within each distance from the initial posture, which comes first, or within each peak force.
+    """The best posture within each distance from the initial posture, or within each peak force.
+
+    The initial posture comes first.
 
     Attributes:
-        within: The bounds on the distance (rad mixed with m) or force (N), increasing, shape (k,).
+        within: Bounds on the distance (rad mixed with m) or force (N), increasing, shape (k,).
         distance: Distance or force of each posture, at most ``within``, shape (k,).
         objective: Objective of each posture, shape (k,).
         H: ``nᵀΛ_c n``, shape (k,).
@@ -52,7 +55,7 @@ class TradeOffData:
         S: The sticking counterpart of V, shape (k,); NaN where it does not exist.
         certified: Whether the certificate of each posture holds, shape (k,).
         knee: Index of the knee, if there is one.
-        against: What the points bound.
+        against: The bounded quantity.
     """
 
     within: Array
@@ -81,9 +84,9 @@ class ResultView:
         tradeoff: The trade-off of objective against distance, if it was computed.
         motion: The path to the optimum over time, if it was searched.
         self_motion: The map of the self-motion manifold, if it was computed.
-        collisions: Names of the shapes that collide, in pairs, before and after.
-        depths: How far behind its contact point each surface lies, m; empty for none.
-        pushed: Whether the robot is pushed anywhere (a free contact pose) and strikes no surface.
+        collisions: Pairs of names of colliding shapes, before and after.
+        depths: Distance of each surface behind its contact point, m; empty for none.
+        pushed: Whether the robot is pushed (free contact pose) instead of striking a surface.
     """
 
     objective: WorstCaseObjective
@@ -124,17 +127,16 @@ class ResultView:
 
     @cached_property
     def worst(self) -> tuple[WorstNormal | None, WorstNormal | None]:
-        """World worst normals of the cone before and after; ``None`` without a cone or where none exists."""
-        return self._worst(self.q_initial), self._worst(self.q_optimal)
+        """Worst normals of the cone before and after, in the world; ``None`` without a cone or where undefined."""
 
-    def _worst(self, q: Array) -> WorstNormal | None:
+        def worst(q: Array) -> WorstNormal | None:
+            try:
+                return cone.worst_in_world(q) if cone is not None else None
+            except MetricError:
+                return None
+
         cone = self.objective.normal_cone
-        if cone is None:
-            return None
-        try:
-            return cone.worst_in_world(q)
-        except MetricError:
-            return None
+        return worst(self.q_initial), worst(self.q_optimal)
 
     def jacobian(self, q: Array) -> Array:
         """Return ``J(q)``, shape (3, nv), of the world velocity of the contact point without supports."""
@@ -161,22 +163,19 @@ def objective_unit(view: ResultView) -> str:
 
 
 def mixed_unit(robot: Robot) -> str:
-    """Return the unit of the Euclidean ``‖ν‖``, which is both units where it mixes them."""
+    """Return the unit of the Euclidean ``‖ν‖``; both units if ν mixes m/s and rad/s."""
     kinds = [u for u in ("m/s", "rad/s") if u in tangent_units(robot)]
     return kinds[0] if len(kinds) == 1 else f"({', '.join(kinds)})"
 
 
 def contact_letters(view: ResultView) -> list[str]:
-    """Return a letter for each contact of a figure; an empty text for a single contact."""
+    """Return a letter for each of several contacts; an empty text for a single contact."""
     count = len(view.objective.contacts)
     return [f" {letter}" for letter in "ABCDEFGHIJKLMNOPQRSTUVWXYZ"[:count]] if count > 1 else [""]
 
 
 def header_lines(view: ResultView) -> tuple[str, list[str]]:
-    """Return the title and the small lines below it: robot, contact, settings and all five quantities.
-
-    H never stands alone: G, V, S and E stand beside it.
-    """
+    """Return the title and the small lines below it: robot, contact, settings, and H, G, V, S and E."""
     contact, metric, robot = view.objective.contact, view.objective.metric, view.robot
     named = zip(view.objective.contacts, contact_letters(view), strict=True)
     frames = ", ".join(f"{one.frame}{letter and f' ({letter.strip()})'}" for one, letter in named)
@@ -206,11 +205,21 @@ def header_lines(view: ResultView) -> tuple[str, list[str]]:
 
 
 def _worst_values(view: ResultView) -> str:
-    """Return the objective before and after, where it is the worst of several impacts."""
+    """Return the objective before and after if it is the worst of several impacts, else an empty text."""
     if isinstance(view.objective.worst_case, ImpactKind):
         return ""
-    found = [objective_value(view.objective, q) for q in (view.q_initial, view.q_optimal)]
-    return " " + " → ".join(number(value) for value in found)
+    return " " + " → ".join(number(objective_value(view.objective, q)) for q in (view.q_initial, view.q_optimal))
+
+
+def required(data: _Data | None, name: str, figure: str, hint: str) -> _Data:
+    """Return the data of a figure.
+
+    Raises:
+        InputError: The view has no such data.
+    """
+    if data is None:
+        raise InputError(f"there is no {name} to draw", where=f"figure {figure}", hint=hint)
+    return data
 
 
 def number(value: float | None) -> str:
@@ -226,7 +235,7 @@ def number(value: float | None) -> str:
 
 
 def _short(source: str) -> str:
-    """Return a source without its explanation in parentheses, and a path without its folders."""
+    """Return a source without the explanation in parentheses and without folders."""
     return source.split(" (")[0].rsplit("/", 1)[-1]
 
 
@@ -236,5 +245,5 @@ def _armature(robot: Robot) -> str:
     if not joints.size or not joints.any():
         return "zero" if source == "none" else f"zero ({source})"
     low, high = f"{joints.min():.2g}", f"{joints.max():.2g}"
-    felt = "" if robot.joint_model == "reflected" else f", joint model {robot.joint_model}"
-    return f"{low if low == high else f'{low}–{high}'} kg·m² ({source}){felt}"
+    model = "" if robot.joint_model == "reflected" else f", joint model {robot.joint_model}"
+    return f"{low if low == high else f'{low}–{high}'} kg·m² ({source}){model}"

@@ -1,4 +1,4 @@
-"""Axes over time of the figures of runs: shaded windows, limits, curves, a legend."""
+"""Axes over time for figures of runs: shaded windows, limits, curves and a legend."""
 
 from __future__ import annotations
 
@@ -37,13 +37,13 @@ _BINS = 1000
 
 @dataclass(frozen=True)
 class Cell:
-    """Panel in a place of a figure.
+    """A panel at a place of a figure.
 
     Attributes:
-        panel: Its curves.
-        clips: Stretch of time that is drawn of each run, by the index of the run.
-        frame: The run whose windows are shaded, and the stretch of time of the axis.
-        title: Line above it.
+        panel: The curves.
+        clips: Stretch of time to draw of each run, by the index of the run.
+        frame: Index of the run whose windows are shaded, and the stretch of time of the axis.
+        title: Line above the panel.
     """
 
     panel: Panel
@@ -53,7 +53,7 @@ class Cell:
 
     @classmethod
     def of(cls, panel: Panel, which: int, clip: Clip, title: str = "") -> Cell:
-        """Cell of a single run."""
+        """Return the cell of a single run."""
         return cls(panel, {which: clip}, (which, clip), title)
 
 
@@ -67,9 +67,9 @@ def time_figure(
     title_at: str = "center",
     air: float = 0.75,
 ) -> Figure:
-    """Draw rows of cells with the header of the runs above and the only legend beside them.
+    """Draw rows of cells with the header of the runs above and the legend beside them.
 
-    Cells of the same panel share their upright axis.  An axis of time is named where the next cell below has another.
+    Cells of the same panel share their upright axis.  Cells of a column with the same axis of time name it once.
 
     Args:
         views: The runs.
@@ -86,27 +86,26 @@ def time_figure(
         ratios = list(widths[:columns]) or None
         axes = body.subplots(len(cells), columns, squeeze=False, width_ratios=ratios)
         for row, column in np.ndindex(*axes.shape):
-            cell, own = cells[row][column], axes[row, column]
+            cell, place = cells[row][column], axes[row, column]
             if cell is None:
-                # The place stays free for the legend.
-                own.set_axis_off()
+                place.set_axis_off()
                 continue
-            _draw(own, cell, views)
-            shown.setdefault(cell.panel, []).append(own)
-            own.set_title(cell.title, loc=title_at, fontweight="bold")
+            _draw(place, cell, views)
+            shown.setdefault(cell.panel, []).append(place)
+            place.set_title(cell.title, loc=title_at, fontweight="bold")
             below = cells[row + 1][column] if row + 1 < len(cells) else None
             if below is None or below.frame != cell.frame:
-                own.set_xlabel(cell.frame[1].label)
+                place.set_xlabel(cell.frame[1].label)
             else:
-                own.tick_params(labelbottom=False)
+                place.tick_params(labelbottom=False)
             if column == 0:
-                own.set_ylabel(cell.panel.label)
+                place.set_ylabel(cell.panel.label)
             else:
-                own.tick_params(labelleft=False)
+                place.tick_params(labelleft=False)
         for same in shown.values():
-            limits = np.array([own.get_ylim() for own in same])
-            for own in same:
-                own.set_ylim(limits.min(), limits.max())
+            limits = np.array([place.get_ylim() for place in same])
+            for place in same:
+                place.set_ylim(limits.min(), limits.max())
         body.align_ylabels(list(axes[:, 0]))
         heads = [(panel.label.split("  [")[0] + ":", same[0]) for panel, same in shown.items()]
         _legend(body, _common_handles(views, list(shown)), heads)
@@ -128,7 +127,7 @@ def _draw(axes: Any, cell: Cell, views: Sequence[RunView]) -> None:
             _band(axes, view, panel.ranges[which], clip)
         for k, values in enumerate(panel.values[which].T):
             looks, entry = (RUNS, which) if panel.overlay else (LINES, k)
-            # Commands carry the noise of the sensors, of which dashes make a blot.
+            # Dashes of a noisy curve would run together.
             look = looks[entry % len(looks)] | ({"linestyle": "-", "linewidth": 0.7} if panel.noisy else {})
             name = panel.names[entry] if panel.names else ""
             _curve(axes, view, values, clip, label=plot_label(name) if name else None, **look)
@@ -155,7 +154,7 @@ def _curve(axes: Any, view: RunView, values: Array, clip: Clip, **look: Any) -> 
 
 
 def _saturation(axes: Any, panel: Panel, which: int, view: RunView, clip: Clip) -> None:
-    """Mark on a limit when a command was at it, because a single tick is too short to be seen."""
+    """Mark the ticks with a command at a limit, because a single tick is too short to be seen."""
     for limit, flags in zip(panel.limits, panel.saturated(which), strict=True):
         times = view.t[flags & (view.t >= clip.begin) & (view.t <= clip.end)]
         # Closer marks would cover each other.
@@ -174,7 +173,7 @@ def _band(axes: Any, view: RunView, bounds: Array, clip: Clip) -> None:
 
 
 def _scale_metric(axes: Any, values: Sequence[Array]) -> None:
-    """Make the axis of H logarithmic where H spans more than a decade; else let it begin at zero."""
+    """Make the axis of H logarithmic if H spans more than a decade; else let it begin at zero."""
     every = np.concatenate([value[np.isfinite(value)] for value in values])
     if every.size and (every > 0).all() and spreads(every, 10.0):
         log_axis(axes)
@@ -187,7 +186,7 @@ def _scale_metric(axes: Any, values: Sequence[Array]) -> None:
 
 
 def _common_handles(views: Sequence[RunView], panels: Sequence[Panel]) -> list[Any]:
-    """Return the legend entries of what all panels share: shades, limits, stops."""
+    """Return the legend entries that all panels share: shades, limits and stops."""
     words = {"impact": "impact window" if not views[0].pushed else "push", "dwell": "dwell"}
     kinds = {span.kind for view in views for span in view.windows}
     handles: list[Any] = [Patch(label=words[kind], **SHADES[kind]) for kind in words if kind in kinds]
@@ -204,22 +203,20 @@ def _common_handles(views: Sequence[RunView], panels: Sequence[Panel]) -> list[A
 
 
 def _legend(body: Any, shared: Sequence[Any], named: Sequence[tuple[str, Any]]) -> None:
-    """Put the only legend right of the panels, or below them where no curve has a name.
+    """Put the legend right of the panels, or below them if no curve has a name.
 
     Args:
-        body: The part of the figure that the panels are in.
-        shared: Legend entries of what all panels share.
-        named: Heading of curves, and axes that have them; a single kind of curves needs no heading.
+        body: The part of the figure with the panels.
+        shared: Legend entries that all panels share.
+        named: Headings, each with the axes of its curves.  A single group of curves gets no heading.
     """
     groups = [(what, handles) for what, axes in named if (handles := axes.get_legend_handles_labels()[0])]
     if not groups:
         if shared:
             shared_legend(body, shared, "lower")
         return
-    entries: list[Any] = []
-    if len(groups) == 1:
-        entries = [*groups[0][1], *shared]
-    else:
+    entries: list[Any] = [*groups[0][1], *shared] if len(groups) == 1 else []
+    if not entries:
         for what, handles in [*groups, ("", shared)]:
             entries += [Line2D([], [], linestyle="", label=what or " "), *handles]
     body.legend(handles=entries, loc="outside right center", handlelength=2.6, fontsize=7)

@@ -15,6 +15,7 @@ from impact_posture.output.plot.run_panels import (
     first_impact,
     impacts,
     joint_panels,
+    metric_panel,
     metric_panels,
     speed_panel,
     whole,
@@ -45,9 +46,7 @@ def figures_of_run(view: RunView) -> dict[str, Figure]:
 
 
 def figures_of_comparison(views: Sequence[RunView]) -> dict[str, Figure]:
-    """Return the figures of several controllers in a scenario by name.
-
-    They are ``comparison-metric``, ``comparison-controls``, ``comparison-joints`` and ``snapshots``.
+    """Return the figures ``comparison-metric``, ``-controls``, ``-joints`` and ``snapshots`` of several controllers.
 
     Args:
         views: A run of each controller (of a push: with the same sign). The nominal controller is drawn first.
@@ -66,41 +65,39 @@ def figures_of_comparison(views: Sequence[RunView]) -> dict[str, Figure]:
 def metric_figure(view: RunView) -> Figure:
     """Draw H, ``‖ν‖``, the contact force, and the level of the impact-robust term where it changes, over time."""
     panels = metric_panels(view)
-    cells = [_beside(panel, 0, view) for panel in panels]
+    cells = [_run_and_impact(panel, 0, view) for panel in panels]
     return time_figure([view], cells, 1.25, [HINT, *_notes(panels, cells)], widths=_WIDTHS)
 
 
 def controls_figure(view: RunView) -> Figure:
     """Draw the rotor speeds and commanded joint torques of a run with actuators, and their limits (dashed)."""
     panels = control_panels([view])
-    cells = [_beside(panel, 0, view) for panel in panels]
+    cells = [_run_and_impact(panel, 0, view) for panel in panels]
     return time_figure([view], cells, 1.9, _notes(panels, cells), widths=_WIDTHS)
 
 
 def joints_figure(views: Sequence[RunView]) -> Figure:
-    """Draw the joint positions with shaded windows, the controllers below each other (nominal first).
-
-    The robot has joints of one degree of freedom.
+    """Draw the positions of joints of one degree of freedom, the controllers below each other (nominal first).
 
     Raises:
         InputError: No view, or views of different scenarios or robots.
     """
     views = check_same(views, "figure joints")
     panels = joint_panels(views)
-    cells = [_beside(panel, k, view) for k, view in enumerate(views) for panel in panels]
+    cells = [_run_and_impact(panel, k, view) for k, view in enumerate(views) for panel in panels]
     columns = min(len(row) for row in cells)
     cells = [row[:columns] for row in cells]
-    titles = {row: view.name for row, view in zip(range(0, len(cells), len(panels)), views, strict=True)}
-    for row, name in titles.items() if len(views) > 1 else ():
-        cells[row][0] = replace(cells[row][0], title=plot_label(name))
+    for k, view in enumerate(views if len(views) > 1 else ()):
+        row = cells[k * len(panels)]
+        row[0] = replace(row[0], title=plot_label(view.name))
     notes, height = _notes(panels, cells), 1.6 if len(cells) > 1 else 2.6
     return time_figure(views, cells, height, notes, widths=_WIDTHS, title_at="left")
 
 
 def comparison_figure(views: Sequence[RunView]) -> Figure:
-    """Draw H over time of all controllers, and below it ``‖ν‖`` around the first impact.
+    """Draw H of all controllers over time, and below it ``‖ν‖`` around the first impact.
 
-    Below, and for pushes above, time counts from each controller's own impact.
+    In the lower panel, time counts from the impact of each run.  For pushes, it does so in the upper panel as well.
 
     Raises:
         InputError: No view, or views of different scenarios or robots.
@@ -108,15 +105,12 @@ def comparison_figure(views: Sequence[RunView]) -> Figure:
     views = check_same(views, "figure comparison-metric")
     spans = [_since_impact(view) for view in views]
     names = [plot_label(view.name) for view in views]
-    every = replace(
-        spans[0],
-        begin=spans[0].origin + min(span.begin - span.origin for span in spans),
-        end=spans[0].origin + max(span.end - span.origin for span in spans),
-    )
-    values = [view.objective[:, None] for view in views]
-    panel = replace(metric_panels(views[0])[0], names=names, values=values, overlay=True)
-    # The shaded windows are those of the first run, on the axis of all.
-    cells = [[Cell(panel, dict(enumerate(spans)), (0, every))]]
+    origin = spans[0].origin
+    begin = origin + min(span.begin - span.origin for span in spans)
+    end = origin + max(span.end - span.origin for span in spans)
+    # The axis shows all runs, and the shaded windows belong to the first run.
+    frame = (0, replace(spans[0], begin=begin, end=end))
+    cells = [[Cell(metric_panel(views, names), dict(enumerate(spans)), frame)]]
     notes, clips = [HINT], {k: clip for k, view in enumerate(views) if (clip := first_impact(view)) is not None}
     if len(clips) == len(views):
         longest = max(clips.items(), key=lambda item: item[1].end - item[1].begin)
@@ -137,27 +131,27 @@ def controls_comparison_figure(views: Sequence[RunView]) -> Figure:
     columns = min(len(views), COLUMNS)
     cells: list[list[Cell | None]] = []
     for first in range(0, len(views), columns):
-        block = list(enumerate(views))[first : first + columns]
+        block = range(first, min(first + columns, len(views)))
         for panel in panels:
-            titles = [plot_label(view.name) if panel is panels[0] else "" for _, view in block]
-            row = [Cell.of(panel, k, impacts(view), title) for (k, view), title in zip(block, titles, strict=True)]
+            titles = {k: plot_label(views[k].name) if panel is panels[0] else "" for k in block}
+            row = [Cell.of(panel, k, impacts(views[k]), titles[k]) for k in block]
             cells.append([*row, *[None] * (columns - len(row))])
     return time_figure(views, cells, 1.7, _notes(panels, cells))
 
 
-def _beside(panel: Panel, which: int, view: RunView) -> list[Cell]:
-    """Cells of the whole run and, where there is an impact, of the first impact."""
+def _run_and_impact(panel: Panel, which: int, view: RunView) -> list[Cell]:
+    """Return the cells of the whole run and, if there is an impact, of the first impact."""
     return [Cell.of(panel, which, clip) for clip in (whole(view), first_impact(view)) if clip is not None]
 
 
 def _notes(panels: Sequence[Panel], cells: Sequence[Sequence[Cell | None]]) -> list[str]:
-    """Notes of the panels, and what the columns are where the first impact stands beside the whole run."""
+    """Return the notes of the panels, and the meaning of the columns if there are two."""
     left = any(cell is not None and cell.frame[1].scale != 1.0 for cell in cells[0])
     return [*dict.fromkeys(panel.note for panel in panels if panel.note), *[LEFT] * left]
 
 
 def _since_impact(view: RunView) -> Clip:
-    """Clip of a whole run; for a push in seconds from its begin, because runs wait for rest differently long."""
+    """Return the clip of a whole run; time counts from a push, because the robot comes to rest at another time."""
     clip = whole(view)
     if not (view.pushed and view.impacts):
         return clip

@@ -1,4 +1,4 @@
-"""Content of the panels over time: stretches of time, curves and limits."""
+"""Panels over time: stretches of time, curves and limits."""
 
 from __future__ import annotations
 
@@ -26,17 +26,17 @@ LINES: tuple[dict[str, Any], ...] = (
     {"color": ORANGE, "linestyle": (0, (3, 1, 1, 1, 1, 1)), "linewidth": 1.3},
     {"color": GRAY, "linestyle": (0, (2, 2)), "linewidth": 1.0},
 )
-# Looks of runs in a panel. The others are compared with the first, as after is with before elsewhere.
+# Looks of runs in a panel.  The first run looks like the posture before, and the second like the posture after.
 RUNS: tuple[dict[str, Any], ...] = (LINES[1] | {"zorder": 3.5}, LINES[0] | {"linewidth": 1.6}, *LINES[2:])
-# A limit farther away than this many times the largest value is named, not drawn.
+# A limit above this multiple of the largest value is named below the figure, not drawn.
 _FAR = 4.0
-# A command counts as at its limit within this share of the range.
+# A command within this share of the range from a limit counts as at the limit.
 _NEAR = 1e-3
 
 
 @dataclass(frozen=True)
 class Clip:
-    """Stretch of time of a run on an axis, which shows ``scale (t − origin)`` from ``begin`` to ``end``.
+    """A stretch of time of a run.  The axis shows ``scale (t − origin)``.
 
     Attributes:
         begin: First time, s.
@@ -66,13 +66,11 @@ def first_impact(view: RunView) -> Clip | None:
     """Return the clip of the first impact window with a margin, in ms from its begin; ``None`` without impact."""
     if not view.impacts:
         return None
-    span = view.impacts[0]
-    length = span.end - span.begin
-    what = "push" if view.pushed else ("first touch" if span.touched else "expected touch")
-    begin = max(span.begin - 0.2 * length, float(view.t[0]))
-    return Clip(
-        begin, min(span.end + 0.35 * length, float(view.t[-1])), span.begin, 1000.0, f"time since {what}  [ms]"
-    )
+    window = view.impacts[0]
+    length = window.end - window.begin
+    what = "push" if view.pushed else ("first touch" if window.touched else "expected touch")
+    begin, end = max(window.begin - 0.2 * length, view.t[0]), min(window.end + 0.35 * length, view.t[-1])
+    return Clip(float(begin), float(end), window.begin, 1000.0, f"time since {what}  [ms]")
 
 
 def impacts(view: RunView) -> Clip:
@@ -90,15 +88,15 @@ class Panel:
 
     Attributes:
         label: Name of the upright axis.
-        names: Names of the curves, of the runs where they are overlaid, or none.
+        names: Names of the curves, or of the runs if they are overlaid; may be empty.
         values: Curves of each run, shape (n, curves).
         limits: Lower and upper limit of the commands, drawn as dashed lines; empty for none.
         ranges: Lower and upper bound to shade between, for each run, shape (n, 2).
         stopped: Whether the joint of a curve was at its stop, for each run, shape (n, curves).
         note: Sentence below the figure.
-        noisy: Whether the curves carry noise, as those of flying robots do.
+        noisy: Whether the curves carry noise, as the commands of flying robots do.
         scale: Scale of the upright axis: ``auto``, ``from zero``, or ``metric`` (logarithmic where it spreads).
-        overlay: Whether all runs are drawn in the same panel, in looks of their own.
+        overlay: Whether all runs are drawn in the same panel, each with its own look.
     """
 
     label: str
@@ -113,7 +111,7 @@ class Panel:
     overlay: bool = False
 
     def saturated(self, which: int) -> list[Flags]:
-        """Return for each limit when a command of run ``which`` was at it, up to 1/1000 of the range, shape (n,)."""
+        """Return for each limit the ticks in which a command of run ``which`` was at the limit, shape (n,)."""
         if not self.limits:
             return []
         commands = self.values[which] if self.ranges is None else self.ranges[which]
@@ -123,7 +121,7 @@ class Panel:
 
 
 def metric_panels(view: RunView) -> list[Panel]:
-    """H, ``‖ν‖``, the contact force, and the level of the impact-robust term where it changes."""
+    """Return the panels of H, ``‖ν‖``, the contact force, and the level of the impact-robust term if it changes."""
     n = np.array(view.contact.normal)
     normal = view.force @ n
     if view.pushed:
@@ -133,56 +131,60 @@ def metric_panels(view: RunView) -> list[Panel]:
         names = ("force: normal, peak", "force: friction")
         note = "The normal force is the largest one within each tick of the controller."
         force = Panel("force  [N]", names, [np.stack([view.peak, friction], axis=1)], note=note)
-    panels = [Panel("H  [‖Δν‖²/(N·s)²]", (), [view.objective[:, None]], scale="metric")]
-    panels += [replace(speed_panel([view]), scale="auto", overlay=False), force]
+    panels = [metric_panel([view]), replace(speed_panel([view]), scale="auto", overlay=False), force]
     if np.ptp(view.level) > 1e-9:
         panels.append(Panel("activation of\nthe term  [1]", (), [view.level[:, None]]))
     return panels
 
 
+def metric_panel(views: Sequence[RunView], names: Sequence[str] = ()) -> Panel:
+    """Return the panel of H of all runs."""
+    values = [view.objective[:, None] for view in views]
+    return Panel("H  [‖Δν‖²/(N·s)²]", names, values, scale="metric", overlay=bool(names))
+
+
 def speed_panel(views: Sequence[RunView]) -> Panel:
-    """``‖ν‖`` of all runs in the same panel."""
+    """Return the panel of ``‖ν‖`` of all runs."""
     label = f"‖ν‖  [{mixed_unit(views[0].robot).strip('()')}]"
     return Panel(label, (), [view.speed[:, None] for view in views], scale="from zero", overlay=True)
 
 
 def rotor_panel(views: Sequence[RunView]) -> Panel | None:
-    """Rotor speeds, the range of their commands, and the limits, as shares of the highest speed.
+    """Return the panel of rotor speeds, the range of their commands, and the limits, as shares of the highest speed.
 
-    ``None`` for a robot without rotors.  Commands carry the noise of the sensors. Six noisy curves could not
-    be told apart.
+    Return ``None`` for a robot without rotors.  The commands carry the noise of the sensors, so single curves of them
+    could not be told apart.
     """
-    one = views[0]
-    count = one.rotor_command.shape[1]
+    bounds, count = views[0].rotor_limits, views[0].rotor_command.shape[1]
     if not count:
         return None
     # A robot.toml does not name the unit of rotor speeds.
-    low, high = one.rotor_limits or (0.0, 1.0)
+    low, high = bounds or (0.0, 1.0)
     names = [f"rotor {k + 1}" for k in range(count)]
     commands = [view.rotor_command / high for view in views]
     ranges = [np.stack([command.min(axis=1), command.max(axis=1)], axis=1) for command in commands]
     note = "Rotors: the lines are measured speeds, and the band contains all commands."
-    speeds, limits = [view.rotor_speed / high for view in views], (low / high, 1.0) if one.rotor_limits else ()
+    speeds, limits = [view.rotor_speed / high for view in views], (low / high, 1.0) if bounds else ()
     return Panel("rotor speed / highest  [1]", names, speeds, limits, ranges, note=note, noisy=True)
 
 
 def control_panels(views: Sequence[RunView]) -> list[Panel]:
-    """Panels of the rotor and joint commands with their limits."""
+    """Return the panels of the rotor and joint commands with their limits."""
     return [panel for panel in (rotor_panel(views), torque_panel(views)) if panel is not None]
 
 
 def torque_panel(views: Sequence[RunView]) -> Panel | None:
-    """Commanded joint torques; of many joints, those that come closest to their limits.
+    """Return the panel of commanded joint torques; ``None`` for a robot without joints.
 
-    They are in N·m where all shown joints have the same limit or none, else shares of the limit of each joint.
-    ``None`` for a robot without joints.
+    Of many joints, it shows the joints that come closest to their limits.  Torques are in N·m if all shown joints
+    have the same limit or none; else each torque is divided by the limit of its joint.
     """
-    one, limits = views[0], views[0].torque_limits
+    first, limits = views[0], views[0].torque_limits
     if not limits.size:
         return None
     largest = np.max([np.abs(view.torque).max(axis=0) for view in views], axis=0)
     bounded = np.flatnonzero(np.isfinite(limits))
-    # Joints without a limit cannot come close to it. They are shown only where no joint has a limit.
+    # Joints without a limit are shown only if no joint has a limit.
     eligible = bounded if bounded.size else np.arange(limits.size)
     shown = eligible[_largest((largest / limits if bounded.size else largest)[eligible])]
     notes = []
@@ -191,13 +193,13 @@ def torque_panel(views: Sequence[RunView]) -> Panel | None:
         notes.append(f"Torques of the {SHOWN} of {len(eligible)} joints that {which}.")
     if 0 < bounded.size < limits.size:
         notes.append("Torques without a limit are left out.")
-    units = sorted({"N·m" if one.joint_units[k] == "rad" else "N" for k in shown}, reverse=True)
-    own, unit = limits[shown], ", ".join(units)
-    if bounded.size and (len(set(own)) > 1 or len(units) > 1):
+    units = sorted({"N·m" if first.joint_units[k] == "rad" else "N" for k in shown}, reverse=True)
+    scale, unit = limits[shown], ", ".join(units)
+    if bounded.size and (len(set(scale)) > 1 or len(units) > 1):
         notes.append("Each torque is divided by the joint's own limit.")
-        scale, label, unit, limit = own, "torque / limit  [1]", "", 1.0
+        label, unit, limit = "torque / limit  [1]", "", 1.0
     else:
-        scale, label, limit = np.ones(len(shown)), f"joint torque  [{unit}]", float(own[0])
+        scale, label, limit = np.ones(len(shown)), f"joint torque  [{unit}]", float(scale[0])
     values = [view.torque[:, shown] / scale for view in views]
     lines: tuple[float, float] | tuple[()] = (-limit, limit) if bounded.size else ()
     peak = max(float(np.abs(value).max()) for value in values)
@@ -205,19 +207,13 @@ def torque_panel(views: Sequence[RunView]) -> Panel | None:
         named = f"The torque limits (±{number(limit)} {unit}) lie outside of the panels."
         notes.append(named if unit else f"All stay within {number(100 * peak)} % of it.")
         lines = ()
-    return Panel(
-        label,
-        [one.joint_names[k] for k in shown],
-        values,
-        lines,
-        note=" ".join(notes),
-        noisy=one.rotor_limits is not None,
-    )
+    names = [first.joint_names[k] for k in shown]
+    return Panel(label, names, values, lines, note=" ".join(notes), noisy=first.rotor_limits is not None)
 
 
 def joint_panels(views: Sequence[RunView]) -> list[Panel]:
-    """Panels of the positions of the joints that move most: those in rad, and those in m."""
-    one = views[0]
+    """Return the panels of the joints that move most: a panel of positions in rad, and a panel of positions in m."""
+    first = views[0]
     moved = np.max([np.ptp(view.positions, axis=0) for view in views], axis=0)
     single = np.flatnonzero(np.isfinite(moved))
     shown = single[_largest(moved[single])]
@@ -228,11 +224,11 @@ def joint_panels(views: Sequence[RunView]) -> list[Panel]:
         notes.append("Joints of several degrees of freedom have no curve.")
     panels = []
     for unit, label in (("rad", "joint angle  [rad]"), ("m", "sliding joint  [m]")):
-        own = [int(k) for k in shown if one.joint_units[k] == unit]
-        if own:
-            stopped = [view.at_stop[:, view.first_joint :][:, own] for view in views]
-            values = [view.positions[:, own] for view in views]
-            names = [one.joint_names[k] for k in own]
+        joints = [int(k) for k in shown if first.joint_units[k] == unit]
+        if joints:
+            stopped = [view.at_stop[:, view.first_joint :][:, joints] for view in views]
+            values = [view.positions[:, joints] for view in views]
+            names = [first.joint_names[k] for k in joints]
             panels.append(Panel(label, names, values, stopped=stopped, note=" ".join(notes)))
     return panels
 

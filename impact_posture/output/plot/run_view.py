@@ -18,7 +18,6 @@ from impact_posture.robot.robot import Robot
 from impact_posture.robot.robot_spec import Support
 from impact_posture.system.arrays import Array
 
-# Imported for its name alone, because the figures need no simulation.
 if TYPE_CHECKING:
     from impact_posture.simulation.series import Window
 
@@ -27,7 +26,7 @@ Flags = NDArray[np.bool_]
 
 @dataclass(frozen=True, eq=False)
 class RunView:
-    """Run of a controller in a scenario, with n ticks and the states at the end of each tick.
+    """A run of a controller in a scenario, with n ticks and the states at the end of each tick.
 
     The robot holds the limits of the commands: ``model.effortLimit`` and the rotor speeds of its propulsion.
 
@@ -47,7 +46,7 @@ class RunView:
         objective: H of the impact, shape (n,); NaN where it was not evaluated.
         level: Level of the impact-robust term, 0 to 1, shape (n,).
         at_stop: Whether a joint is at a position limit, shape (n, nv).
-        windows: Windows of time, of which those of kind ``impact`` and ``dwell`` are shaded.
+        windows: Windows of time.  Figures shade the kinds ``impact`` and ``dwell``.
         surface: A point on the surface that is hit, world, m, shape (3,); ``None`` for a push.
         supports: Feet that stay.
         label: Name of the run beside others; the name of the controller if empty.
@@ -83,19 +82,20 @@ class RunView:
         """
         n, nv = len(self.t), self.robot.nv
         rotors = np.shape(self.rotor_command)[1:]
-        wanted: dict[str, tuple[int, ...]] = {
+        shapes: dict[str, tuple[int, ...]] = {
             "t": (n,), "q": (n, self.robot.nq), "v": (n, nv), "torque": (n, nv - self.first_joint),
             "rotor_command": (n, *rotors), "rotor_speed": (n, *rotors), "force": (n, 3), "peak": (n,),
             "objective": (n,), "level": (n,), "at_stop": (n, nv),
         }  # fmt: skip
-        for name, shape in wanted.items():
+        where = f"run view {self.scenario}, {self.controller}"
+        for name, shape in shapes.items():
             if np.shape(getattr(self, name)) != shape:
-                raise self._wrong(f"{name} has the shape {np.shape(getattr(self, name))}", f"give {shape}")
+                actual = np.shape(getattr(self, name))
+                raise InputError(f"{name} has the shape {actual}", where=where, hint=f"give {shape}")
         if len(rotors) != 1 or n < 2 or not (np.diff(self.t) > 0).all():
-            raise self._wrong("there is no course of time", "give at least two ticks at increasing times")
-
-    def _wrong(self, what: str, hint: str) -> InputError:
-        return InputError(what, where=f"run view {self.scenario}, {self.controller}", hint=hint)
+            raise InputError(
+                "there is no course of time", where=where, hint="give at least two ticks at increasing times"
+            )
 
     @property
     def name(self) -> str:
@@ -136,17 +136,17 @@ class RunView:
     def positions(self) -> Array:
         """Position of each joint, shape (n, joints): rad (of endless joints unwrapped) or m.
 
-        NaN for the entries of joints of several degrees of freedom, which have no angle of their own.
+        Joints of several degrees of freedom have no single position.  Their entries are NaN.
         """
         model, q = self.robot.model, np.asarray(self.q)
-        found = np.full((len(self.t), self.robot.nv), np.nan)
+        positions = np.full((len(self.t), self.robot.nv), np.nan)
         for joint in range(1, model.njoints):
-            at, size, entry = int(model.idx_qs[joint]), int(model.nqs[joint]), int(model.idx_vs[joint])
-            if int(model.nvs[joint]) != 1:
-                continue
-            # Pinocchio stores cosine and sine of an endless joint.
-            found[:, entry] = q[:, at] if size == 1 else np.unwrap(np.arctan2(q[:, at + 1], q[:, at]))
-        return found[:, self.first_joint :]
+            if int(model.nvs[joint]) == 1:
+                at, v = int(model.idx_qs[joint]), int(model.idx_vs[joint])
+                # Pinocchio stores cosine and sine of an endless joint.
+                endless = int(model.nqs[joint]) == 2
+                positions[:, v] = np.unwrap(np.arctan2(q[:, at + 1], q[:, at])) if endless else q[:, at]
+        return positions[:, self.first_joint :]
 
     @property
     def torque_limits(self) -> Array:
@@ -167,19 +167,19 @@ class RunView:
 
 def run_header(views: Sequence[RunView]) -> tuple[str, list[str]]:
     """Return title and small print of a figure of runs of a scenario."""
-    one = views[0]
+    first = views[0]
     names = ", ".join(view.name for view in views) if len(views) < 5 else f"{len(views)} controllers"
-    n = ", ".join(number(value) for value in one.contact.normal)
-    facts = [f"robot {one.robot.name}"]
-    if one.pushed:
-        facts += [f"pushed at {one.contact.frame}", f"H along ({n})"]
+    n = ", ".join(number(value) for value in first.contact.normal)
+    facts = [f"robot {first.robot.name}"]
+    if first.pushed:
+        facts += [f"pushed at {first.contact.frame}", f"H along ({n})"]
     else:
         touched = [sum(w.touched for w in view.impacts) for view in views]
         counts = ", ".join(str(count) for count in (touched if len(set(touched)) > 1 else touched[:1]))
-        facts += [f"contact {one.contact.frame}", f"n = ({n})", f"contacts {counts} of {len(one.impacts)}"]
-    facts.append(f"on {', '.join(s.frame for s in one.supports)}" if one.supports else "no supports")
-    shared = [fact for fact in one.facts if all(fact in view.facts for view in views)]
-    return f"{one.scenario}: {names}", [SEPARATOR.join([*facts, *shared])]
+        facts += [f"contact {first.contact.frame}", f"n = ({n})", f"contacts {counts} of {len(first.impacts)}"]
+    facts.append(f"on {', '.join(s.frame for s in first.supports)}" if first.supports else "no supports")
+    facts += [fact for fact in first.facts if all(fact in view.facts for view in views)]
+    return f"{first.scenario}: {names}", [SEPARATOR.join(facts)]
 
 
 def check_same(views: Sequence[RunView], where: str) -> tuple[RunView, ...]:
@@ -192,16 +192,16 @@ def check_same(views: Sequence[RunView], where: str) -> tuple[RunView, ...]:
         raise InputError("there is no run to draw", where=where, hint="give at least one view")
     first = views[0]
     for view in views:
-        other: dict[str, Any] = {
+        compared: dict[str, Any] = {
             "scenario": (view.scenario, first.scenario),
             "robot": (view.robot.name, first.robot.name),
             "number of joint speeds": (view.robot.nv, first.robot.nv),
             "number of rotors": (view.rotor_command.shape[1], first.rotor_command.shape[1]),
         }
-        for what, (own, theirs) in other.items():
-            if own != theirs:
+        for what, (value, expected) in compared.items():
+            if value != expected:
                 raise InputError(
-                    f"the {what} of {view.name} is {own}, of {first.name} {theirs}",
+                    f"the {what} of {view.name} is {value}, of {first.name} {expected}",
                     where=where,
                     hint="compare runs of the same scenario",
                 )

@@ -1,4 +1,4 @@
-"""Figure ``self_motion``: the objective over all postures that the equalities leave, with one or two free motions."""
+"""Figure ``self_motion``: the objective over the self-motion manifold, with one or two free motions."""
 
 from __future__ import annotations
 
@@ -10,9 +10,9 @@ from matplotlib.figure import Figure
 from numpy.typing import NDArray
 
 from impact_posture.dynamics.chart import Chart
-from impact_posture.errors import InputError, printable
+from impact_posture.errors import printable
 from impact_posture.output.plot.path_figures import log_axis, spreads
-from impact_posture.output.plot.result_view import ResultView, header_lines, objective_unit
+from impact_posture.output.plot.result_view import ResultView, header_lines, objective_unit, required
 from impact_posture.output.plot.style import BLUE, GRAY, INK, PALE, VERMILLION, framed, shared_legend
 from impact_posture.system.arrays import Array
 
@@ -33,16 +33,12 @@ _LABELS = {"ends": "optima of multi-start", "start": "start", "optimum": "optimu
 
 
 def self_motion_figure(view: ResultView) -> Figure:
-    """Draw the objective over the path length of every component, or as a map of every surface.
+    """Draw the objective over the path length of each curve, or as a map of each surface.
 
     Raises:
         InputError: The view has no map.
     """
-    data = view.self_motion
-    if data is None:
-        raise InputError(
-            "there is no map to draw", where="figure self_motion", hint="run optimize again with `search` global"
-        )
+    data = required(view.self_motion, "map", "self_motion", "run optimize again with `search` global")
     curves = bool(data.s.any())
     with framed(*header_lines(view), 3.4, [_CURVES if curves else _SURFACES, _GRAY]) as (figure, body):
         label = f"objective ({view.objective.kind})  [{objective_unit(view)}]"
