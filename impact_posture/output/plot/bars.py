@@ -20,7 +20,7 @@ NOTES = (
     "∫‖ν‖dt mixes meters and radians, as in the paper. Intervals: 95 % of the mean over the seeds. The paper prints "
     "no gains. Compare its numbers with each other only.",
 )
-# Largest ratio of a number of the paper to the largest mean, at which the axis includes it.
+# The axis includes numbers of the paper up to this multiple of the largest mean.
 _FAR = 2.0
 
 
@@ -29,11 +29,11 @@ class Bar:
     """``q_total_impact`` of a controller in a scenario.
 
     Attributes:
-        scenario: Name of the scenario. Rows of the same scenario share a panel.
+        scenario: Name of the scenario; bars of a scenario share a panel.
         controller: Name of the controller.
         mean: ``∫‖ν‖dt`` over the impact windows, mean over the runs; NaN where no run completed.
         half_width: Half of the 95 % interval; 0 for a single run.
-        paper: Number of the paper for the same controller, if there is one.
+        paper: Number of the paper for the same controller, if the paper has it.
     """
 
     scenario: str
@@ -44,9 +44,7 @@ class Bar:
 
 
 def bars_figure(rows: Sequence[Bar]) -> Figure:
-    """Draw horizontal bars with intervals in the given order, in rows of two panels.
-
-    Marks show the numbers of the paper.
+    """Draw horizontal bars with intervals and the numbers of the paper, in rows of two panels.
 
     Raises:
         InputError: No rows.
@@ -73,7 +71,7 @@ def bars_figure(rows: Sequence[Bar]) -> Figure:
 def _panel(axes: Any, name: str, group: Sequence[Bar], room: int) -> None:
     ours = max((row.mean + row.half_width for row in group if np.isfinite(row.mean)), default=0.0)
     papers = [row.paper for row in group if row.paper is not None]
-    # The robot of the paper differs. Its numbers must not shorten the bars.
+    # The paper used another robot.  Its numbers must not shorten the bars.
     near = [paper for paper in papers if paper <= _FAR * ours or ours == 0]
     end = 1.08 * (max([ours, *near]) or 1.0)
     for place, row in enumerate(group):

@@ -34,14 +34,14 @@ _ENDLESS = 1e3
 
 @dataclass(frozen=True, eq=False)
 class Kind:
-    """Kind of ellipsoid in both postures.
+    """A kind of ellipsoid in both postures.
 
     Attributes:
         name: ``velocity``, ``force`` or ``impact``.
-        formula: Formula of its matrix.
-        unit: Unit of its semi-axes.
-        scale: Its longest finite semi-axis before, by which it is divided.
-        matrices: Before and after, divided by ``scale²``, cut far outside of the panel where unbounded.
+        formula: Formula of the matrix.
+        unit: Unit of the semi-axes.
+        scale: The longest finite semi-axis before.
+        matrices: Before and after, divided by ``scale²``; unbounded directions are cut far outside of the panel.
         finite: The same without the unbounded directions.
         endless: Unbounded directions as columns, before and after.
     """
@@ -65,7 +65,7 @@ def kinds_of(view: ResultView) -> list[Kind]:
     products = [J @ J.T for J in (view.jacobian(view.q_initial), view.jacobian(view.q_optimal))]
     impact = [view.before.ellipsoid, view.after.ellipsoid]
     bounded = np.zeros((3, 0))
-    found = []
+    kinds = []
     for name, formula, unit, matrices, dual in (
         ("velocity", "J Jᵀ", "m/s", products, False),
         ("force", "(J Jᵀ)⁻¹", "N", products, True),
@@ -76,15 +76,15 @@ def kinds_of(view: ResultView) -> list[Kind]:
         cut = [polar(matrix, _ENDLESS * scale) if dual else (matrix, bounded) for matrix in matrices]
         drawn = [matrix / scale**2 for matrix, _ in cut]
         shown = [matrix / scale**2 for matrix in finite]
-        found.append(Kind(name, formula, unit, scale, drawn, shown, [endless for _, endless in cut]))
-    return found
+        kinds.append(Kind(name, formula, unit, scale, drawn, shown, [endless for _, endless in cut]))
+    return kinds
 
 
 def classical_figure(view: ResultView) -> Figure:
     """Draw the shadows of ``JJᵀ``, ``(JJᵀ)⁻¹`` and ``Λ_c`` on the coordinate planes: before above, after below.
 
-    All panels share a scale, and each kind has its own unit.  Where ``JJᵀ`` is singular the force ellipsoid is
-    unbounded: it leaves the panel, whose label says so.
+    All panels share a scale, and each kind has its own unit.  If ``JJᵀ`` is singular, the force ellipsoid is
+    unbounded and leaves the panel.  The label of the panel says so.
     """
     kinds = kinds_of(view)
     limit = 1.18 * max(1.0, *(_longest(matrix) for kind in kinds for matrix in kind.finite))
@@ -92,14 +92,14 @@ def classical_figure(view: ResultView) -> Figure:
     with framed(*header_lines(view), 5.2, NOTES) as (figure, body):
         panels = body.subplots(2, 3)
         for row, word, which in ((panels[0], "before", 0), (panels[1], "after", 1)):
-            own = named[min(which, len(named) - 1)]
+            normal = named[min(which, len(named) - 1)]
             for axes, plane in zip(row, COORDINATE_PLANES, strict=True):
                 square_panel(axes, plane, limit, "1")
                 axes.set_title(f"{word},  shadow on {plane.name}")
                 for kind in kinds:
                     points = 721 if kind.endless[which].size else 181
                     axes.plot(*shadow(kind.matrices[which], plane.axes, points), **_LOOKS[kind.name])
-                draw_normals(axes, plane, [own], limit)
+                draw_normals(axes, plane, [normal], limit)
                 axes.set_xlabel(axes.get_xlabel() + "".join(_unbounded(plane, kind, which) for kind in kinds))
         handles = [Line2D([], [], label=kind.label, **_LOOKS[kind.name]) for kind in kinds]
         handles.append(Line2D([], [], label=normal_label(named).split(", out")[0], color=INK, linewidth=1.1))
@@ -112,7 +112,7 @@ def _longest(matrix: Array) -> float:
 
 
 def _unbounded(plane: Plane, kind: Kind, which: int) -> str:
-    """Return a line that says where a kind is unbounded in the plane."""
+    """Return a line on the unbounded directions of a kind in the plane; empty if there are none."""
     directions = kind.endless[which]
     seen = np.linalg.svd(plane.axes @ directions, compute_uv=False) if directions.shape[1] else np.zeros(0)
     rank = int((seen > 1e-6).sum())

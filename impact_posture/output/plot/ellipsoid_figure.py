@@ -1,7 +1,4 @@
-"""Figure ``ellipsoid``: the dynamic impact ellipsoid Λ_c before and after, as shadows and in space.
-
-Of an uncertain normal it shows the cone and the worst normals, too.
-"""
+"""Figure ``ellipsoid``: the dynamic impact ellipsoid Λ_c before and after, as shadows and in space."""
 
 from __future__ import annotations
 
@@ -45,7 +42,7 @@ from impact_posture.output.plot.style import (
 )
 from impact_posture.system.arrays import Array
 
-# Length of arrows as a part of the limit of the panel. A worst normal on the edge of the cone ends on the rim.
+# Length of arrows as a share of the panel's limit.  Worst normals on the edge of the cone end on its rim.
 REACH = 0.92
 _FREE = "Free (thin): the same robot with feet that are not held."
 _CONE = "The objective counts the worst normal of the cone. All equally bad normals are drawn."
@@ -58,10 +55,10 @@ NOTES = (
 
 @dataclass(frozen=True, eq=False)
 class _State:
-    """Curve of a posture: name in the legend, quantities, line, and whether the feet are free."""
+    """A curve: name in the legend, quantities of the posture, line, and whether the feet are free."""
 
     word: str
-    found: ImpactQuantities
+    at: ImpactQuantities
     line: dict[str, Any]
     free: bool = False
 
@@ -69,18 +66,17 @@ class _State:
 def ellipsoid_figure(view: ResultView) -> Figure:
     """Draw Λ_c before (dashed) and after (solid): shadows on the coordinate planes, and in 3-D with √H along n.
 
-    A shadow on a plane that contains n has its tangent lines at ±√H drawn; where no coordinate plane contains n, the
-    upright plane through n is added.  Equal axes; all panels share one scale.  Of a robot that stands, the ellipsoids
-    without its feet are drawn thin beside the contact-consistent ones; of an uncertain normal, its cone and the worst
-    normals in it.
+    Shadows on planes that contain n have tangent lines at ±√H.  If no coordinate plane contains n, the upright plane
+    through n is added.  All axes are equal and share one scale.  Thin lines show the ellipsoids without the feet.  An
+    uncertain normal has a cone and its worst normals.
     """
     states = [_State("before", view.before, BEFORE), _State("after", view.after, AFTER)]
-    for word, found, line in zip(("before", "after"), view.free, (FREE_BEFORE, FREE_AFTER), strict=False):
-        states.append(_State(f"{word}, free", found, line, free=True))
+    for word, free, line in zip(("before", "after"), view.free, (FREE_BEFORE, FREE_AFTER), strict=False):
+        states.append(_State(f"{word}, free", free, line, free=True))
     unit = f"{jump_unit(view)}/(N·s)"
-    limit = common_limit([state.found.ellipsoid for state in states])
+    limit = common_limit([state.at.ellipsoid for state in states])
     n = view.after.normal
-    notes = [*NOTES, *([_FREE] if view.objective.supports else []), *([_CONE] if has_cone(view) else [])]
+    notes = [*NOTES, *([_FREE] if view.objective.supports else []), *([_CONE] if _cones(view) else [])]
     with framed(*header_lines(view), 5.8, notes) as (figure, body):
         grid = body.add_gridspec(2, 3, height_ratios=[1, 1.4])
         oblique = not any(plane.contains(n) for plane in COORDINATE_PLANES)
@@ -132,24 +128,24 @@ def draw_normals(axes: Any, plane: Plane, named: list[tuple[str, Array]], limit:
 def _panel(axes: Any, plane: Plane, states: list[_State], limit: float, unit: str) -> None:
     square_panel(axes, plane, limit, unit)
     for state in states:
-        axes.plot(*shadow(state.found.ellipsoid, plane.axes), solid_joinstyle="round", **state.line)
-        if plane.contains(state.found.normal) and not state.free:
-            _tangents(axes, plane, state.found, state.line, limit)
+        axes.plot(*shadow(state.at.ellipsoid, plane.axes), solid_joinstyle="round", **state.line)
+        if plane.contains(state.at.normal) and not state.free:
+            _tangents(axes, plane, state, limit)
 
 
-def _tangents(axes: Any, plane: Plane, state: ImpactQuantities, line: dict[str, Any], limit: float) -> None:
+def _tangents(axes: Any, plane: Plane, state: _State, limit: float) -> None:
     """Draw the two tangent lines of the shadow across n."""
-    flat = plane.axes @ state.normal
+    flat = plane.axes @ state.at.normal
     flat = flat / np.linalg.norm(flat)
     along = np.array([-flat[1], flat[0]]) * 3 * limit
-    width = half_width(state.ellipsoid, state.normal)
+    width = half_width(state.at.ellipsoid, state.at.normal)
+    look = {"color": state.line["color"], "linestyle": state.line["linestyle"], "linewidth": 0.7, "zorder": 2}
     for sign in (1, -1):
-        ends = np.array([sign * width * flat - along, sign * width * flat + along])
-        axes.plot(ends[:, 0], ends[:, 1], color=line["color"], linestyle=line["linestyle"], linewidth=0.7, zorder=2)
+        axes.plot(*np.array([sign * width * flat - along, sign * width * flat + along]).T, **look)
 
 
 def normals(before: ImpactQuantities, after: ImpactQuantities) -> list[tuple[str, Array]]:
-    """Return name and direction of n, or of both normals where n turned with the contact frame."""
+    """Return name and direction of n, or of both normals if n turned with the contact frame."""
     if np.linalg.norm(before.normal - after.normal) < 1e-3:
         return [("n", after.normal)]
     return [("n₀", before.normal), ("n₁", after.normal)]
@@ -163,19 +159,15 @@ def normal_label(named: list[tuple[str, Array]]) -> str:
 def _space(axes: Any, states: list[_State], limit: float, unit: str) -> None:
     frame_space(axes, np.full(3, -limit), np.full(3, limit), unit, 4, azimuth=-55)
     axes.plot_surface(
-        *surface(states[1].found.ellipsoid), color=BLUE, alpha=0.12, shade=False, linewidth=0, antialiased=True
+        *surface(states[1].at.ellipsoid), color=BLUE, alpha=0.12, shade=False, linewidth=0, antialiased=True
     )
-    for one in states:
-        state, line = one.found, one.line
-        for section in principal_sections(state.ellipsoid):
-            axes.plot(*section, **(line | {"linewidth": 0.7 if one.free else 1.0}))
-        if one.free:
-            continue
-        width = half_width(state.ellipsoid, state.normal)
-        for sign in (1, -1):
-            corners = square(sign * width * state.normal, state.normal, 0.7 * limit)
-            axes.plot(*corners, **(line | {"linewidth": 0.7}))
-    for name, n in normals(states[0].found, states[1].found):
+    for state in states:
+        for section in principal_sections(state.at.ellipsoid):
+            axes.plot(*section, **(state.line | {"linewidth": 0.7 if state.free else 1.0}))
+        width, n = half_width(state.at.ellipsoid, state.at.normal), state.at.normal
+        for sign in () if state.free else (1, -1):
+            axes.plot(*square(sign * width * n, n, 0.7 * limit), **(state.line | {"linewidth": 0.7}))
+    for name, n in normals(states[0].at, states[1].at):
         axes.plot(*np.outer(n, [-limit, limit]), color=GRAY, linewidth=0.6)
         axes.quiver(0, 0, 0, *(n * limit), color=INK, linewidth=1.1, arrow_length_ratio=0.12)
         axes.add_artist(Label(name, n * limit))
@@ -187,7 +179,7 @@ def _legend(axes: Any, states: list[_State], unit: str, view: ResultView) -> Non
     named = normals(view.before, view.after)
     handles = []
     for state in states:
-        width = half_width(state.found.ellipsoid, state.found.normal)
+        width = half_width(state.at.ellipsoid, state.at.normal)
         handles.append(Line2D([], [], label=f"{state.word}:  √H = {number(width)}", **state.line))
     handles.append(Line2D([], [], color=GRAY, linewidth=0.7, label="tangents at ±√H along n"))
     handles.append(Line2D([], [], color=INK, linewidth=1.1, label=normal_label(named)))
@@ -197,7 +189,7 @@ def _legend(axes: Any, states: list[_State], unit: str, view: ResultView) -> Non
     )
     rows = [f"semi-axes of Λ$_c$  [{unit}]"]
     for state in states:
-        radii = np.sqrt(np.maximum(np.linalg.eigvalsh(state.found.ellipsoid)[::-1], 0.0))
+        radii = np.sqrt(np.maximum(np.linalg.eigvalsh(state.at.ellipsoid)[::-1], 0.0))
         largest = max(float(radii[0]), 1e-300)
         rows.append(f"{state.word}  " + "  ".join(number(r if r > 1e-7 * largest else 0.0) for r in radii))
     # Below the legend, whatever its length.
@@ -205,19 +197,14 @@ def _legend(axes: Any, states: list[_State], unit: str, view: ResultView) -> Non
     axes.annotate("\n".join(rows), (0, 0), (0, -8), **look)
 
 
-def has_cone(view: ResultView) -> bool:
-    """Return whether the normal is uncertain."""
-    return view.objective.normal_cone_deg > 0
-
-
 def draw_uncertainty(axes: Any, plane: Plane, view: ResultView, limit: float) -> None:
-    """Draw the shadow of the cone (two cones where n turned) and the worst normals before and after."""
-    for n in _axes_of_cones(view):
+    """Draw the shadow of the cone (two cones if n turned) and the worst normals before and after."""
+    for n in _cones(view):
         outline = cone_shadow(n, view.objective.normal_cone_deg, REACH * limit, plane.axes)
         axes.fill(*outline, facecolor=PALE, edgecolor="none", alpha=0.55, zorder=0.5)
         axes.plot(*outline, color=GRAY, linewidth=0.6, zorder=0.6)
-    for word, found, _, line in _worst(view):
-        for normal in found.normals:
+    for word, worst, _, line in _worst(view):
+        for normal in worst.normals:
             # The dashes lie on top, as with the ellipsoids.
             zorder = 4.6 if word == "before" else 4.5
             draw_arrow(axes, np.zeros(2), plane.axes @ normal * REACH * limit, zorder, mutation_scale=8, **line)
@@ -225,39 +212,36 @@ def draw_uncertainty(axes: Any, plane: Plane, view: ResultView, limit: float) ->
 
 def draw_uncertainty_3d(axes: Any, view: ResultView, limit: float) -> None:
     """Draw the surface and rim of the cone, and the worst normals."""
-    for n in _axes_of_cones(view):
+    for n in _cones(view):
         rim = cone_rim(n, view.objective.normal_cone_deg, limit, 49)
         sheet = [row[None] * [[0.0], [1.0]] for row in rim]
         axes.plot_surface(*sheet, color=GRAY, alpha=0.15, shade=False, linewidth=0)
         axes.plot(*rim, color=GRAY, linewidth=0.6)
-    for _, found, _, line in _worst(view):
-        for normal in found.normals:
+    for _, worst, _, line in _worst(view):
+        for normal in worst.normals:
             axes.quiver(0, 0, 0, *(normal * limit), arrow_length_ratio=0.12, **line)
 
 
 def uncertainty_handles(view: ResultView) -> list[Any]:
     """Return the legend entries of the cone and of the worst normals with the half-width of Λ_c along them."""
-    if not has_cone(view):
+    if not _cones(view):
         return []
     cone = f"cone of {view.objective.normal_cone_deg:g}° about n"
     handles: list[Any] = [Patch(facecolor=PALE, edgecolor=GRAY, linewidth=0.6, label=cone)]
-    for word, found, ellipsoid, line in _worst(view):
-        width = number(half_width(ellipsoid, found.normal))
-        tied = f", {len(found.normals)} tied" if found.tied else ""
-        label = f"worst {word}: {number(found.angle_deg)}° off{tied},\njump {width} per N·s"
+    for word, worst, ellipsoid, line in _worst(view):
+        tied = f", {len(worst.normals)} tied" if worst.tied else ""
+        jump = number(half_width(ellipsoid, worst.normal))
+        label = f"worst {word}: {number(worst.angle_deg)}° off{tied},\njump {jump} per N·s"
         handles.append(Line2D([], [], label=label, **line))
     return handles
 
 
-def _axes_of_cones(view: ResultView) -> list[Array]:
-    """Return the world axis of the cone, or both axes where it turned with the contact frame; none without a cone."""
-    return [n for _, n in normals(view.before, view.after)] if has_cone(view) else []
+def _cones(view: ResultView) -> list[Array]:
+    """Return the world axes of the cones, as many as :func:`normals`; none if the normal is certain."""
+    return [n for _, n in normals(view.before, view.after)] if view.objective.normal_cone_deg > 0 else []
 
 
 def _worst(view: ResultView) -> list[tuple[str, WorstNormal, Array, dict[str, Any]]]:
     """Return name, worst normals, ellipsoid and line of each posture that has worst normals."""
-    found = [
-        ("before", view.worst[0], view.before.ellipsoid, WORST_BEFORE),
-        ("after", view.worst[1], view.after.ellipsoid, WORST_AFTER),
-    ]
-    return [(word, worst, ellipsoid, line) for word, worst, ellipsoid, line in found if worst is not None]
+    states = zip(("before", "after"), view.worst, (view.before, view.after), (WORST_BEFORE, WORST_AFTER), strict=True)
+    return [(word, worst, at.ellipsoid, line) for word, worst, at, line in states if worst is not None]

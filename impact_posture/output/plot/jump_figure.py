@@ -12,7 +12,6 @@ from matplotlib.patches import Patch
 
 from impact_posture.impact.evaluation.coulomb_jump import CoulombJump, coulomb_jump
 from impact_posture.impact.evaluation.velocity_jump import tangent_units
-from impact_posture.impact.quantities.impact_quantities import ImpactQuantities
 from impact_posture.output.plot.result_view import ResultView, header_lines, jump_unit, number
 from impact_posture.output.plot.style import AFTER_BAR, BEFORE_BAR, INK, VERMILLION, framed, shared_legend
 from impact_posture.system.arrays import Array
@@ -24,8 +23,8 @@ _ROW = 0.17
 def jump_figure(view: ResultView) -> Figure:
     """Draw Δν as horizontal bars: left ``a = M⁻¹Jᵀn`` per N·s, right ``a(1+e)v/G`` for the approach speed v.
 
-    Velocities of different units (base linear, base angular, turning and sliding joints) have panels of their own.
-    Diamonds on the right show the jump with the friction of the contact, where that exists.
+    Linear and angular velocities of the base, turning joints and sliding joints have separate panels.  Diamonds on
+    the right show the jump with the friction of the contact, if it is defined.
     """
     groups = groups_of(view)
     gain = (1 + view.restitution) * view.speed
@@ -88,16 +87,14 @@ def _bars(axes: Any, jumps: list[Array], points: list[Array | None]) -> None:
 
 
 def _norms(view: ResultView, name: str, gain: float) -> str:
-    def norm(state: ImpactQuantities) -> str:
-        return number(gain * float(np.sqrt(max(getattr(state, name), 0.0))))
-
-    # The unit of both columns stands once, in the narrower title.
+    first, last = (number(gain * float(np.sqrt(max(getattr(at, name), 0.0)))) for at in (view.before, view.after))
+    # The narrower title names the unit of both columns.
     factor, unit = ("", f" {jump_unit(view)}") if gain == 1 else (f"{gain:g} m/s · ", "")
-    return f"‖Δν‖ = {factor}√{name} = {norm(view.before)} → {norm(view.after)}{unit}"
+    return f"‖Δν‖ = {factor}√{name} = {first} → {last}{unit}"
 
 
 def _with_friction(jumps: Sequence[CoulombJump | None]) -> str:
-    """Return the norms of the diamonds."""
+    """Return the norms of the jumps with friction."""
     first, second = jumps
     if first is None or second is None:
         return ""

@@ -1,4 +1,4 @@
-"""Letters beside points, each at the nearest place around its point where nothing else is drawn."""
+"""Letters beside points, each at the nearest free place around its point."""
 
 from __future__ import annotations
 
@@ -14,7 +14,7 @@ from numpy.typing import NDArray
 from impact_posture.output.plot.ellipsoid_shapes import Plane
 from impact_posture.system.arrays import Array
 
-# Distances from the point and directions to try; least distance of a letter from lines. All in points.
+# Distances from the point, points; directions to try, rad; least distance of a letter from lines, points.
 _GAPS = (2.0, 5.0, 9.0, 14.0, 20.0, 27.0, 36.0)
 _ANGLES = np.linspace(0.0, 2 * np.pi, 24, endpoint=False)
 _CLEAR = 1.4
@@ -23,9 +23,9 @@ _INK = 205
 
 
 class Label(Annotation):
-    """Letter at a point of an axes, in data coordinates, shape (2,) or (3,).
+    """A letter beside a point, shape (2,) or (3,) in data coordinates, preferably in the direction ``toward``.
 
-    :func:`draw_with_labels` finds its place.  ``toward`` is the preferred direction in the figure.
+    :func:`draw_with_labels` finds the place.
     """
 
     def __init__(
@@ -37,7 +37,7 @@ class Label(Annotation):
         )  # fmt: skip
         self.point = np.asarray(point, dtype=float)
         self.toward = toward
-        # Its place is not known yet, so that the layout must not make room for it.
+        # The layout must not make room for a letter whose place is not known yet.
         self.set_in_layout(False)
 
 
@@ -48,7 +48,7 @@ def draw_arrow(axes: Any, tail: Array, tip: Array, zorder: float, **look: Any) -
 
 
 def draw_end_on(axes: Any, name: str, plane: Plane, n: Array, at: Array, color: str = "black") -> None:
-    """Draw a normal across the plane of the figure as a dot (towards the reader) or a cross (away) in a ring."""
+    """Draw a normal of the picture plane as a dot (towards the reader) or a cross (away) in a ring."""
     toward = float(np.cross(plane.axes[0], plane.axes[1]) @ n)
     look = {"linestyle": "", "markeredgecolor": color, "zorder": 6.5}
     axes.plot(*at[:, None], marker="o", markersize=8, markerfacecolor="white", markeredgewidth=1, **look)
@@ -57,7 +57,7 @@ def draw_end_on(axes: Any, name: str, plane: Plane, n: Array, at: Array, color: 
 
 
 def draw_with_labels(figure: Figure) -> FigureCanvasAgg:
-    """Draw a figure that has been laid out, and its letters at places where nothing else is; return the image."""
+    """Draw a figure after its layout, with its letters at free places; return the image."""
     labels = [(axes, text) for axes in figure.axes for text in axes.texts if isinstance(text, Label)]
     for _, label in labels:
         label.set_visible(False)
