@@ -1,4 +1,4 @@
-"""Ellipsoids as points and lines: shadows on planes, half-widths, surfaces.  No drawing here."""
+"""Ellipsoids as points and lines: shadows on planes, half-widths and surfaces."""
 
 from __future__ import annotations
 
@@ -9,11 +9,11 @@ import numpy as np
 from impact_posture.robot.support_polygon import convex_ring
 from impact_posture.system.arrays import Array
 
-# A direction within 1° of a plane counts as in it: its half-width differs there by less than 2e-4 of itself.
+# A direction within 1° of a plane counts as in the plane: its half-width differs by less than 2e-4.
 IN_PLANE = float(np.cos(np.radians(1.0)))
-# A semi-axis this much shorter than the longest is a rounding error (or cannot be seen).
+# A semi-axis below this share of the longest is a rounding error, or too short to be seen.
 _NEGLIGIBLE = 1e-6
-# Directions around a point of the plane, in which a hull has its extreme points, shape (16, 2).
+# Directions in which :func:`outline` looks for extreme points, shape (16, 2).
 _AROUND = np.array([[np.cos(angle), np.sin(angle)] for angle in np.arange(16) * np.pi / 8])
 
 
@@ -62,14 +62,15 @@ def root(matrix: Array) -> Array:
 
 
 def half_width(matrix: Array, direction: Array) -> float:
-    """Half-width ``√(dᵀΛd)`` of ``{x: xᵀΛ⁻¹x ≤ 1}`` along a unit ``d``, the distance of its tangent planes."""
+    """Return the half-width ``√(dᵀΛd)`` of ``{x: xᵀΛ⁻¹x ≤ 1}`` along a unit ``d``: half the gap of tangent planes."""
     return float(np.sqrt(max(float(direction @ matrix @ direction), 0.0)))
 
 
 def shadow(matrix: Array, axes: Array, points: int = 181) -> Array:
-    """Edge of the projection of ``{x: xᵀΛ⁻¹x ≤ 1}`` on the plane of ``axes`` (rows, orthonormal), shape (2, points).
+    """Return the edge of the projection of ``{x: xᵀΛ⁻¹x ≤ 1}`` on the plane of ``axes``, shape (2, points).
 
-    The projection is the ellipse of ``P Λ Pᵀ``; a degenerate one is a segment from end to end, or a point.
+    The projection is the ellipse of ``P Λ Pᵀ``, where the rows of ``P = axes`` are orthonormal.  A degenerate ellipse
+    is a segment or a point.
     """
     return _ring(_semi_axes(axes @ matrix @ axes.T), points)
 
@@ -82,7 +83,7 @@ def surface(matrix: Array, rings: int = 25) -> Array:
 
 
 def principal_sections(matrix: Array, points: int = 121) -> list[Array]:
-    """Return the ellipses through two principal axes each, shape (3, points), without those that are a point."""
+    """Return the ellipses through two principal axes each, shape (3, points), without ellipses that are points."""
     axes = _semi_axes(matrix)
     flat = _NEGLIGIBLE * np.linalg.norm(axes[:, 2])
     pairs = [pair for pair in ([0, 1], [0, 2], [1, 2]) if np.linalg.norm(axes[:, pair[1]]) > flat]
@@ -92,17 +93,15 @@ def principal_sections(matrix: Array, points: int = 121) -> list[Array]:
 
 
 def _semi_axes(matrix: Array) -> Array:
-    """Semi-axes as columns, the longest last."""
+    """Return the semi-axes as columns, the longest last."""
     values, vectors = np.linalg.eigh((matrix + matrix.T) / 2)
     return np.asarray(vectors * np.sqrt(np.maximum(values, 0.0)))
 
 
 def _ring(axes: Array, points: int) -> Array:
-    """The ellipse with two semi-axes (columns, the longer last); a segment if the shorter is negligible.
-
-    There and back would put the gaps of a dashed line under its dashes.
-    """
+    """Return the ellipse with two semi-axes (columns, the longer last); a segment if the shorter is negligible."""
     angle = np.linspace(0.0, 2 * np.pi, points)
+    # A segment is drawn once: there and back, the dashes of a line would fill its gaps.
     if np.linalg.norm(axes[:, 0]) <= _NEGLIGIBLE * np.linalg.norm(axes[:, 1]):
         angle = np.linspace(0.0, np.pi, points)
         return np.asarray(axes[:, 1:] * np.cos(angle))
@@ -110,11 +109,11 @@ def _ring(axes: Array, points: int) -> Array:
 
 
 def polar(matrix: Array, infinite: float) -> tuple[Array, Array]:
-    """The matrix of the polar dual ``{f: fᵀAf ≤ 1}`` of ``{x: xᵀA⁻¹x ≤ 1}``, and where it has no end.
+    """Return the matrix of the polar dual ``{f: fᵀAf ≤ 1}`` of ``{x: xᵀA⁻¹x ≤ 1}``, and its unbounded directions.
 
     Args:
         matrix: ``A``, positive semidefinite, shape (3, 3).
-        infinite: Half-length to draw in the directions in which the dual is unbounded.
+        infinite: Half-length to draw in unbounded directions.
 
     Returns:
         ``A⁻¹`` with those directions cut at ``infinite``, and the unbounded directions as columns, shape (3, k).
@@ -126,7 +125,7 @@ def polar(matrix: Array, infinite: float) -> tuple[Array, Array]:
 
 
 def cone_rim(axis: Array, degrees: float, length: float, points: int = 73) -> Array:
-    """Ends of the lines of ``length`` at ``degrees`` from a unit ``axis``, a closed circle, shape (3, points)."""
+    """Return the closed circle of points at ``length`` and ``degrees`` from a unit ``axis``, shape (3, points)."""
     across = np.linalg.svd(axis[None])[2][1:]
     angle, tilt = np.linspace(0.0, 2 * np.pi, points), np.radians(degrees)
     around = across.T @ np.array([np.cos(angle), np.sin(angle)])
@@ -134,27 +133,25 @@ def cone_rim(axis: Array, degrees: float, length: float, points: int = 73) -> Ar
 
 
 def cone_shadow(axis: Array, degrees: float, length: float, axes: Array) -> Array:
-    """Outline of the projection of the cone from the origin to :func:`cone_rim`, closed, shape (2, k)."""
-    flat = np.column_stack([np.zeros(2), axes @ cone_rim(axis, degrees, length)[:, :-1]])
-    return outline(flat)
+    """Return the closed outline of the projected cone from the origin to :func:`cone_rim`, shape (2, k)."""
+    return outline(np.column_stack([np.zeros(2), axes @ cone_rim(axis, degrees, length)[:, :-1]]))
 
 
 def outline(points: Array) -> Array:
-    """Return the convex hull of points of shape (2, k), closed."""
+    """Return the closed convex hull of points of shape (2, k)."""
     extreme = points[:, (_AROUND @ points).argmax(axis=1)]
     steps = np.roll(extreme, -1, axis=1) - extreme
     sides = np.flatnonzero(steps.any(axis=0))
-    # Most points are inside of the polygon of the extreme ones.
-    left = steps[0, sides, None] * (points[1] - extreme[1, sides, None]) - steps[1, sides, None] * (
-        points[0] - extreme[0, sides, None]
-    )
+    # Most points are inside the polygon of the extreme points and cannot be corners.
+    dx, dy = points[:, None] - extreme[:, sides, None]
+    left = steps[0, sides, None] * dy - steps[1, sides, None] * dx
     points = points[:, (left <= 0).any(axis=0) | (sides.size == 0)]
     edge = convex_ring(points.T)
     return np.asarray(points[:, [*edge, edge[0]]])
 
 
 def square(center: Array, n: Array, side: float) -> Array:
-    """Corners of a square perpendicular to the unit vector ``n``, closed, shape (3, 5)."""
+    """Return the corners of a square perpendicular to the unit vector ``n``, closed, shape (3, 5)."""
     # The edges follow the world axis that n is farthest from.
     first = np.eye(3)[int(np.argmin(np.abs(n)))]
     first = first - (first @ n) * n

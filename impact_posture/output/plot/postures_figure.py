@@ -44,16 +44,16 @@ _FRONT = 50.0
 
 @dataclass(frozen=True, eq=False)
 class DrawnSurface:
-    """Contact plane to draw.
+    """A contact plane.
 
     Attributes:
         point: Middle of the plane, shape (3,).
-        normal: Unit normal, shape (3,).
+        normal: Unit normal n, shape (3,).
         side: Side of the square, m.
-        contact: Where n begins, shape (3,).
-        reach: Length of n, m.
-        name: Name of n.
-        color: Color of its posture; gray for a plane of both postures.
+        contact: Tail of the arrow n, shape (3,).
+        reach: Length of the arrow n, m.
+        name: Name of the arrow.
+        color: Color of the posture; gray for a plane of both postures.
     """
 
     point: Array
@@ -66,11 +66,16 @@ class DrawnSurface:
 
     @property
     def tip(self) -> Array:
-        """Tip of n, shape (3,)."""
+        """Tip of the arrow n, shape (3,)."""
         return np.asarray(self.contact + self.reach * self.normal)
 
+    @property
+    def ink(self) -> str:
+        """Color of lines; black for a plane of both postures."""
+        return INK if self.color == GRAY else self.color
+
     def outline(self, plane: Plane) -> Array:
-        """Return the corners of the strip of matter below the plane as seen from the side, shape (4, 2)."""
+        """Return the corners of the hatched strip behind the plane as seen from the side, shape (4, 2)."""
         middle, n = plane.axes @ self.point, plane.axes @ self.normal
         along, deep = np.array([-n[1], n[0]]) * self.side / 2, -0.22 * self.side * n
         return np.array([middle + along, middle - along, middle - along + deep, middle + along + deep])
@@ -79,8 +84,8 @@ class DrawnSurface:
 def postures_figure(view: ResultView) -> Figure:
     """Draw both postures in the same axes: in 3-D, and from the side that shows n and most of the motion.
 
-    Equal axes in meters; each contact plane as a square (from the side: an edge with hatched matter below it), both
-    where it moves or turns; feet and rotors where there are any.
+    The axes are equal, in meters.  A contact plane is a square in 3-D, and a hatched edge from the side.  If it moves
+    or turns, both planes are drawn.
     """
     first, second = (
         build_skeleton(view.robot, q, view.objective.contacts, view.objective.supports, collisions)
@@ -94,12 +99,16 @@ def postures_figure(view: ResultView) -> Figure:
     normal = _PUSHED if view.pushed else _NORMAL
     notes = [*stick_notes(first), _ENDS, normal, *([_BEHIND] if any(view.depths) and not view.pushed else [])]
     low, high = _window([first, second], plane, surfaces)
-    # As high as the view from the side needs, within the limits of a page.
+    # The view from the side sets the height, within the limits of a page.
     height = float(np.clip(3.1 * (high - low)[1] / (high - low)[0], 2.3, 3.6)) + 1.0
     with framed(*header_lines(view), height, notes) as (figure, body):
         grid = body.add_gridspec(1, 2)
         space, flat = body.add_subplot(grid[0, 0], axes_class=Space), body.add_subplot(grid[0, 1])
-        _box(space, np.vstack([points, *[np.vstack([square(s.point, s.normal, s.side).T, s.tip]) for s in surfaces]]))
+        every = np.vstack([points, *[np.vstack([square(s.point, s.normal, s.side).T, s.tip]) for s in surfaces]])
+        size, middle = np.ptp(every, axis=0), (every.min(axis=0) + every.max(axis=0)) / 2
+        # The box of a planar robot keeps some depth.
+        half = np.maximum(0.54 * size, 0.2 * float(size.max()))
+        frame_space(space, middle - half, middle + half, "m", 5, azimuth=-60)
         for surface in surfaces:
             _plane_3d(space, surface, matter=not view.pushed)
             _plane_2d(flat, surface, plane, matter=not view.pushed)
@@ -128,14 +137,14 @@ def side_plane(first: Skeleton, second: Skeleton) -> Plane:
         return upright_plane(n)
     motion = second.points - first.points
     size = second.points - second.points.mean(axis=0)
-    # A planar robot is seen edge-on in the planes across its own.
+    # In the planes across its own plane, a planar robot is seen edge-on.
     if second.across is not None:
         candidates = [plane for plane in candidates if not plane.contains(second.across)] or candidates
 
     def shown(plane: Plane) -> float:
-        # The size of the robot decides where there is little motion.
+        # If there is little motion, the size of the robot decides.
         seen = float(np.linalg.norm(motion @ plane.axes.T) + 0.2 * np.linalg.norm(size @ plane.axes.T))
-        # A view from above is harder to read, so that it has to show much more.
+        # A view from above is harder to read, so it must show much more.
         return seen / 2 if plane is XY else seen
 
     return max(candidates, key=shown)
@@ -144,31 +153,21 @@ def side_plane(first: Skeleton, second: Skeleton) -> Plane:
 def surfaces_of(
     first: Skeleton, second: Skeleton, letters: list[str], side: float, depths: Sequence[float] = ()
 ) -> list[DrawnSurface]:
-    """Return the planes of each contact, at their depths; both where the plane moves along n or turns."""
-    found = []
+    """Return the planes of each contact at their depths; two planes if the contact moves along n or n turns."""
+    surfaces = []
     depths = depths or [0.0] * len(letters)
     pairs = zip(first.contacts, second.contacts, first.normals, second.normals, letters, depths, strict=True)
     for before, after, n_before, n_after, letter, depth in pairs:
         below, above = before - depth * n_before, after - depth * n_after
-        way, turned = after - before, float(np.linalg.norm(n_before - n_after)) > 0.01
-        if not turned and abs(float(way @ n_after)) < 0.03 * side:
+        step, turned = after - before, float(np.linalg.norm(n_before - n_after)) > 0.01
+        if not turned and abs(float(step @ n_after)) < 0.03 * side:
             # The same surface, touched at another place, is wide enough for both places.
-            wide = side + float(np.linalg.norm(way))
-            found.append(DrawnSurface((below + above) / 2, n_after, wide, after, 0.8 * side, f"n{letter}", GRAY))
-            continue
-        names = (f"n₀{letter}", f"n₁{letter}")
-        found.append(DrawnSurface(below, n_before, side, before, 0.8 * side, names[0], VERMILLION))
-        found.append(DrawnSurface(above, n_after, side, after, 0.8 * side, names[1], BLUE))
-    return found
-
-
-def _box(axes: Any, points: Array) -> None:
-    """Give 3-D axes equal scales around the points."""
-    low, high = points.min(axis=0), points.max(axis=0)
-    # The box of a planar robot keeps some depth.
-    half = np.maximum(0.54 * (high - low), 0.2 * float((high - low).max()))
-    middle = (low + high) / 2
-    frame_space(axes, middle - half, middle + half, "m", 5, azimuth=-60)
+            wide = side + float(np.linalg.norm(step))
+            surfaces.append(DrawnSurface((below + above) / 2, n_after, wide, after, 0.8 * side, f"n{letter}", GRAY))
+        else:
+            surfaces.append(DrawnSurface(below, n_before, side, before, 0.8 * side, f"n₀{letter}", VERMILLION))
+            surfaces.append(DrawnSurface(above, n_after, side, after, 0.8 * side, f"n₁{letter}", BLUE))
+    return surfaces
 
 
 def _window(states: list[Skeleton], plane: Plane, surfaces: list[DrawnSurface]) -> tuple[Array, Array]:
@@ -176,8 +175,7 @@ def _window(states: list[Skeleton], plane: Plane, surfaces: list[DrawnSurface]) 
     drawn = [plane.axes @ state.points.T for state in states]
     for s in surfaces:
         drawn += [s.outline(plane).T, plane.axes @ s.tip[:, None]]
-    low, high = np.hstack(drawn).min(axis=1), np.hstack(drawn).max(axis=1)
-    return padded(low, high)
+    return padded(np.hstack(drawn).min(axis=1), np.hstack(drawn).max(axis=1))
 
 
 def padded(low: Array, high: Array) -> tuple[Array, Array]:
@@ -202,26 +200,24 @@ def depth_of(plane: Plane) -> str:
 
 
 def _draw(axes: Any, points: Array, plane: Plane | None, **look: Any) -> None:
-    """Plot points of shape (3, k), projected where there is a plane."""
+    """Plot points of shape (3, k) in 3-D, or projected onto a plane."""
     if plane is None:
         look["zorder"] += _FRONT
     axes.plot(*(points if plane is None else plane.axes @ points), **look)
 
 
 def _fill(axes: Any, faces: list[Array], plane: Plane | None, color: str, zorder: float) -> None:
-    """Fill polygons of shape (3, k) faintly, projected where there is a plane."""
+    """Fill polygons of shape (3, k) faintly in 3-D, or projected onto a plane."""
+    look = {"facecolor": color, "alpha": 0.1, "linewidth": 0}
     if plane is None:
-        axes.add_collection3d(Poly3DCollection([face.T for face in faces], facecolor=color, alpha=0.1, linewidth=0))
+        axes.add_collection3d(Poly3DCollection([face.T for face in faces], **look))
         return
     for face in faces:
-        axes.fill(*(plane.axes @ face), facecolor=color, alpha=0.1, linewidth=0, zorder=zorder)
+        axes.fill(*(plane.axes @ face), zorder=zorder, **look)
 
 
 def draw_sticks(axes: Any, state: Skeleton, line: dict[str, Any], plane: Plane | None) -> None:
-    """Draw a robot; in 3-D, or projected where there is a plane.
-
-    It has links, shapes (a body without them), rotors, joints, base, feet and contacts.
-    """
+    """Draw links, shapes (or the body), rotors, joints, base, feet and contacts in 3-D, or projected onto a plane."""
     for bone in state.bones:
         _draw(axes, bone.T, plane, solid_capstyle="round", **line)
     color, thin = line["color"], line | {"linewidth": 0.8, "zorder": 2.0}
@@ -232,7 +228,7 @@ def draw_sticks(axes: Any, state: Skeleton, line: dict[str, Any], plane: Plane |
     for circle, arm in zip(state.rotors, state.arms, strict=True):
         _fill(axes, [circle], plane, color, 1.5)
         _draw(axes, np.hstack([circle, circle[:, :1]]), plane, **thin)
-        # Straight lines, thinner than a link, because they lie on each other in the side view.
+        # Arms are thinner than links, because they overlap in the side view.
         _draw(axes, arm.T, plane, **(thin | {"linestyle": "-"}))
     _draw(axes, state.joints.T, plane, linestyle="", marker="o", markersize=2.6, color=color, zorder=4)
     look = {"linestyle": "", "markeredgecolor": "white", "color": color}
@@ -244,7 +240,7 @@ def draw_sticks(axes: Any, state: Skeleton, line: dict[str, Any], plane: Plane |
 
 
 def _body(axes: Any, corners: Array, line: dict[str, Any], plane: Plane | None) -> None:
-    """Draw a box by its corners; from the side its outline."""
+    """Draw a box by its corners in 3-D, or its outline on a plane."""
     if plane is not None:
         around = outline(plane.axes @ corners.T)
         axes.fill(*around, facecolor=line["color"], alpha=0.12, linewidth=0, zorder=1.5)
@@ -262,24 +258,22 @@ def _plane_3d(axes: Any, surface: DrawnSurface, *, matter: bool) -> None:
         corners = square(surface.point, surface.normal, surface.side)
         _fill(axes, [corners], None, surface.color, 1.0)
         axes.plot(*corners, color=surface.color, linewidth=0.8)
-    color = INK if surface.color == GRAY else surface.color
     n = surface.tip - surface.contact
-    axes.quiver(*surface.contact, *n, color=color, linewidth=1.2, arrow_length_ratio=0.2)
-    axes.add_artist(Label(surface.name, surface.tip, color=color))
+    axes.quiver(*surface.contact, *n, color=surface.ink, linewidth=1.2, arrow_length_ratio=0.2)
+    axes.add_artist(Label(surface.name, surface.tip, color=surface.ink))
 
 
 def _plane_2d(axes: Any, surface: DrawnSurface, plane: Plane, *, matter: bool) -> None:
-    color = INK if surface.color == GRAY else surface.color
     if np.linalg.norm(plane.axes @ surface.normal) < 0.05:
-        draw_end_on(axes, surface.name, plane, surface.normal, plane.axes @ surface.contact, color)
+        draw_end_on(axes, surface.name, plane, surface.normal, plane.axes @ surface.contact, surface.ink)
         return
     if matter:
         outline = surface.outline(plane)
         axes.fill(*outline.T, facecolor="none", edgecolor=surface.color, hatch=HATCH, linewidth=0, zorder=1)
-        axes.plot(*outline[:2].T, color=color, linewidth=1.0, zorder=1)
+        axes.plot(*outline[:2].T, color=surface.ink, linewidth=1.0, zorder=1)
     tip = plane.axes @ surface.tip
-    draw_arrow(axes, plane.axes @ surface.contact, tip, 7, color=color, linewidth=1.2)
-    axes.add_artist(Label(surface.name, tip, tuple(plane.axes @ surface.normal), color))
+    draw_arrow(axes, plane.axes @ surface.contact, tip, 7, color=surface.ink, linewidth=1.2)
+    axes.add_artist(Label(surface.name, tip, tuple(plane.axes @ surface.normal), surface.ink))
 
 
 def robot_handles(state: Skeleton, lines: dict[str, dict[str, Any]], color: str) -> list[Any]:

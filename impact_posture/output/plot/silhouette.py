@@ -21,7 +21,7 @@ from impact_posture.system.arrays import Array
 NOTE = "Light areas show the collision shapes, each with the hull around it."
 _FILL: dict[str, Any] = {"alpha": 0.14, "linewidth": 0.3, "zorder": 1.2}
 _HIT: dict[str, Any] = {"facecolor": ORANGE, "edgecolor": ORANGE, "alpha": 0.55, "linewidth": 0.8, "zorder": 1.4}
-# A sweep smaller than this (m) is drawn with a few directions, a larger one as round.
+# A sweep smaller than this (m) is drawn with few directions, a larger sweep as round.
 _ROUND = 0.01
 # Least sweep drawn (m), because a point or a line has no outline.
 _LEAST = 1e-4
@@ -32,9 +32,9 @@ class PlacedHull:
     """A swept hull in the world.
 
     Attributes:
-        vertices: Its corners, shape (k, 3), m.
+        vertices: Corners, shape (k, 3), m.
         radius: Sweep radius, m.
-        hit: Whether it is in a collision.
+        hit: Whether the hull is in a collision.
     """
 
     vertices: Array
@@ -43,7 +43,7 @@ class PlacedHull:
 
 
 class _Silhouette(PathPatch):
-    """A patch in the coordinates of the picture, which 3-D axes draw behind all else."""
+    """A patch in picture coordinates, which 3-D axes draw behind everything else."""
 
     def do_3d_projection(self) -> float:
         """Return the depth by which 3-D axes sort."""
@@ -51,7 +51,7 @@ class _Silhouette(PathPatch):
 
 
 def place_hulls(robot: Robot, data: pin.Data, collisions: Iterable[tuple[str, str]] = ()) -> tuple[PlacedHull, ...]:
-    """Place the hulls of a robot at the joint placements in the data; none for a robot without shapes.
+    """Place the hulls of a robot at the joint placements in ``data``.
 
     Args:
         robot: The robot.
@@ -61,7 +61,7 @@ def place_hulls(robot: Robot, data: pin.Data, collisions: Iterable[tuple[str, st
     shapes = load_shapes(robot)
     links = {name.partition("[")[0] for pair in collisions for name in pair}
     joints = {robot.model.frames[robot.frame_id(link)].parentJoint for link in links if robot.model.existFrame(link)}
-    # The shape of a link may be part of another link's hull, which moves with it.
+    # A link without its own hull may be part of another hull on the same joint.
     alone = {body.joint for body in shapes.bodies if body.link in links}
     return tuple(
         PlacedHull(
@@ -74,7 +74,7 @@ def place_hulls(robot: Robot, data: pin.Data, collisions: Iterable[tuple[str, st
 
 
 def draw_silhouettes(axes: Any, hulls: Iterable[PlacedHull], color: str, plane: Plane | None) -> None:
-    """Draw the outlines of hulls; in 3-D, or projected where there is a plane."""
+    """Draw the outlines of hulls in 3-D, or projected onto a plane."""
     if plane is None:
         across, up, project = _view(axes)
     else:
@@ -87,9 +87,9 @@ def draw_silhouettes(axes: Any, hulls: Iterable[PlacedHull], color: str, plane: 
             if hull.hit is hit
         ]
         if rings:
-            # As one path, because areas that lie on each other would get darker.
+            # One path for all, because overlapping patches would get darker.
             patch = _Silhouette(Path.make_compound_path(*[Path(ring, closed=True) for ring in rings]), **look)
-            # The layout would measure it for long, and the panel has its limits.
+            # Measuring it would take the layout long, and the limits of the panel are known.
             patch.set_in_layout(False)
             axes.add_artist(patch)
 
@@ -114,6 +114,6 @@ def _view(axes: Any) -> tuple[Array, Array, Callable[[Array], Array]]:
 
 
 def silhouette_handles(hulls: Sequence[PlacedHull], color: str) -> list[Any]:
-    """Return the legend entries of shapes, and of those in a collision."""
+    """Return the legend entries of shapes and of shapes in a collision."""
     handles = [Patch(label="shapes", facecolor=color, edgecolor=color, **_FILL)] if hulls else []
     return [*handles, *([Patch(label="in collision", **_HIT)] if any(hull.hit for hull in hulls) else [])]

@@ -1,4 +1,4 @@
-"""Sticks of the robot from the model alone, and the hulls of its shapes where it has any."""
+"""Sticks of a robot from its model, and the hulls of its collision shapes."""
 
 from __future__ import annotations
 
@@ -8,7 +8,6 @@ from dataclasses import dataclass
 import numpy as np
 import pinocchio as pin
 
-from impact_posture.dynamics.tree import PointOnLink
 from impact_posture.impact.impact_contact import ImpactContact, point_on
 from impact_posture.output.plot.ellipsoid_shapes import cone_rim
 from impact_posture.output.plot.silhouette import PlacedHull, place_hulls
@@ -16,28 +15,28 @@ from impact_posture.robot.robot import Robot
 from impact_posture.robot.robot_spec import Support
 from impact_posture.system.arrays import Array
 
-# Least height of a body, as a part of its shorter side.
+# Least height of a body as a share of its shorter side.
 _LEAST_HEIGHT = 0.35
-# Sine of the angle between axes that count as parallel.
+# Axes count as parallel up to this sine of their angle.
 _PARALLEL = 1e-3
 _AROUND = np.array([[0, 0], [1, 0], [1, 1], [0, 1]])
 
 
 @dataclass(frozen=True, eq=False)
 class Skeleton:
-    """Sticks of a robot in a posture, world, meters.
+    """Sticks of a robot in a posture, in the world, m.
 
     Attributes:
         bones: Pairs of points to join, shape (k, 2, 3).
         joints: Origins of the moving joints, shape (j, 3).
-        base: Placement of the base: the free-flyer, or the world for a fixed root.
+        base: Placement of the free-flyer; the identity for a fixed root.
         body: Corners of the box between the hips, low corners first, shape (8, 3); (0, 3) without a box.
         contacts: The contact points, shape (c, 3).
         normals: World unit normals, shape (c, 3).
         feet: Contact points of the supports, shape (f, 3).
         rotors: Circles of the propellers, shape (r, 3, points).
         hulls: Hulls of the collision shapes; empty for a robot without shapes.
-        across: Unit direction across the plane in which a planar robot moves, shape (3,); ``None`` for another robot.
+        across: Unit normal of the plane of a planar robot, shape (3,); ``None`` for other robots.
     """
 
     bones: Array
@@ -85,9 +84,9 @@ def build_skeleton(
 ) -> Skeleton:
     """Place the sticks at ``q``, shape (nq,).
 
-    A bone joins a joint's origin to its parent's; a base that carries four joints or more is a box instead.  Contacts
-    and feet hang on their links; the last link of a chain without one goes on to its farthest frame, or to its center
-    of mass where it has none.  Shapes in ``collisions``, pairs of names, are marked.
+    A bone joins the origins of a joint and its parent.  A base with four joints or more is a box instead.  Further
+    bones lead to contacts and feet, and from other last links of chains to :func:`link_tip`.  Shapes in
+    ``collisions``, pairs of names, are marked.
     """
     model = robot.model
     data = model.createData()
@@ -102,9 +101,9 @@ def build_skeleton(
         for i in range(first, model.njoints)
         if model.parents[i] >= first or not len(body)
     ]
-    held: list[ImpactContact | Support] = [*contacts, *supports]
-    hanging = [point_on(robot, one.frame, one.offset) for one in held]
-    frames = [_placed(places, point) for point in hanging]
+    touching: list[ImpactContact | Support] = [*contacts, *supports]
+    hanging = [point_on(robot, contact.frame, contact.offset) for contact in touching]
+    frames = [places[point.joint] * pin.SE3(point.rotation, point.position) for point in hanging]
     ends = [np.array(frame.translation) for frame in frames]
     normals = [
         (np.asarray(frame.rotation) if contact.normal_frame == "contact" else np.eye(3)) @ np.array(contact.normal)
@@ -115,7 +114,7 @@ def build_skeleton(
         for point, end in zip(hanging, ends, strict=True)
         if point.joint >= first or not len(body)
     ]
-    # A link with a stick to its foot or contact needs no other tip.
+    # A link with a stick to its foot or contact needs no tip.
     done = {int(model.parents[i]) for i in range(1, model.njoints)}
     done |= {point.joint for point in hanging if np.linalg.norm(point.position) > 1e-3}
     for leaf in range(first, model.njoints):
@@ -136,8 +135,8 @@ def build_skeleton(
 
 
 def _across(model: pin.Model, q: Array) -> Array | None:
-    """Return the direction about which all joints turn and along which none slides; ``None`` if there is none."""
-    # Of a single joint, Pinocchio returns a vector.
+    """Return the direction about which all joints turn and along which none slides; ``None`` for other robots."""
+    # Pinocchio returns a vector for a single joint.
     linear, angular = np.split(pin.computeJointJacobians(model, model.createData(), q).reshape(6, -1), 2)
     _, sizes, directions = np.linalg.svd(angular.T)
     across = np.asarray(directions[0])
@@ -146,32 +145,27 @@ def _across(model: pin.Model, q: Array) -> Array | None:
 
 
 def _body(model: pin.Model, base: pin.SE3) -> Array:
-    """Return the corners of the box between the joints on the base; none for fewer than four joints."""
+    """Return the corners of the box around the joints on the base; no corners for fewer than four joints."""
     hips = np.array([model.jointPlacements[i].translation for i in range(2, model.njoints) if model.parents[i] == 1])
     if len(hips) < 4:
         return np.zeros((0, 3))
     low, high = hips.min(axis=0), hips.max(axis=0)
-    # Hips at the same height span no box, and the model does not contain the height of the body.
+    # Hips at the same height span a flat box, and the model does not contain the height of the body.
     lacking = max(_LEAST_HEIGHT * float((high - low)[:2].min()) - float((high - low)[2]), 0.0)
     low[2], high[2] = low[2] - lacking / 2, high[2] + lacking / 2
     corners = [(x, y, z) for z in (low[2], high[2]) for x, y in _AROUND * (high - low)[:2] + low[:2]]
     return np.array([base.act(np.array(corner)) for corner in corners])
 
 
-def _placed(places: Sequence[pin.SE3], point: PointOnLink) -> pin.SE3:
-    """Return the world placement of the frame of a point."""
-    return places[point.joint] * pin.SE3(point.rotation, point.position)
-
-
 def link_tip(model: pin.Model, joint: int) -> Array:
-    """Return the frame of a link that is farthest from its joint, in joint axes; else the center of mass."""
+    """Return the frame of a link farthest from its joint, or else the center of mass, in joint axes."""
     places = [np.array(f.placement.translation) for f in model.frames if f.parentJoint == joint]
     tip = max(places, key=lambda place: float(np.linalg.norm(place)), default=np.zeros(3))
     return tip if np.linalg.norm(tip) > 1e-3 else np.array(model.inertias[joint].lever)
 
 
 def _rotors(robot: Robot, places: list[pin.SE3]) -> Array:
-    """Return circles across the thrust directions, as large as the spacing of the rotors allows."""
+    """Return circles perpendicular to the thrust, as large as the spacing of the rotors allows."""
     propulsion = robot.spec.propulsion
     if propulsion is None:
         return np.zeros((0, 3, 24))
@@ -182,7 +176,7 @@ def _rotors(robot: Robot, places: list[pin.SE3]) -> Array:
     radius = 0.4 * min(gaps, default=0.5)
     circles = []
     for center, rotor in zip(centers, propulsion.rotors, strict=True):
-        # Across the thrust; the last point is the first one again.
+        # The last point repeats the first.
         ring = cone_rim(np.array(rotor.direction) / np.linalg.norm(rotor.direction), 90.0, radius, 25)[:, :-1]
         circles.append(place.rotation @ (center[:, None] + ring) + np.asarray(place.translation)[:, None])
     return np.array(circles)

@@ -32,14 +32,16 @@ from impact_posture.system.escape import plot_label
 _START_NOTE = "Gray sticks show the robot at the start of the run."
 _NOW: dict[str, Any] = {"color": BLUE, "linestyle": "-", "linewidth": 1.5, "zorder": 3.0}
 _START: dict[str, Any] = {"color": "#a9a9a9", "linestyle": "-", "linewidth": 1.0, "zorder": 2.0}
-# Time before the impact at which no tick contains it, s.
+# The arrow of a push that is to come, and of a push that acts.
+_PUSH: dict[int, dict[str, Any]] = {1: {"linestyle": (0, (2, 1.5)), "linewidth": 1.2}, 2: {"linewidth": 1.8}}
+# This long before the impact, no tick contains it, s.
 _BEFORE = 0.005
 
 
 def instants(view: RunView) -> list[tuple[str, float]]:
-    """Return the start, the moment before the first impact and the end of its window: name and time in s.
+    """Return name and time (s) of the start, of the moment before the first impact, and of the end of its window.
 
-    Without an impact these are the start and the end of the run.
+    Without an impact, return the start, the half and the end of the run.
     """
     start = ("start", float(view.t[0]))
     if not view.impacts:
@@ -50,34 +52,34 @@ def instants(view: RunView) -> list[tuple[str, float]]:
 
 
 def snapshots_figure(views: Sequence[RunView]) -> Figure:
-    """Draw the robot from the side that shows n and most of the motion; all panels to one scale, in meters.
+    """Draw the robot from the side that shows n and most of the motion, with the surface, or the push as an arrow.
 
-    With the surface that is hit, or the push as an arrow, the contact point, feet and rotors.
+    All panels share a scale, in meters.
 
     Raises:
         InputError: No view, or views of different scenarios or robots.
     """
     views = check_same(views, "figure snapshots")
-    rows = [[_skeleton(view, view.index(time)) for _, time in instants(view)] for view in views]
+    rows = [
+        [build_skeleton(v.robot, v.q[v.index(time)], [v.contact], v.supports) for _, time in instants(v)]
+        for v in views
+    ]
     plane = side_plane(rows[-1][0], rows[-1][1])
     every = np.hstack([plane.axes @ state.points.T for row in rows for state in row])
     low, high = every.min(axis=1), every.max(axis=1)
     reach = 0.22 * float((high - low).max())
     arrows = [_arrow(view, row[0], plane, reach) for view, row in zip(views, rows, strict=True)]
     for arrow, row in zip(arrows, rows, strict=True):
-        if arrow is None:
-            continue
-        for state in row[1:]:
-            tails = np.stack([plane.axes @ state.contact - arrow, plane.axes @ state.contact], axis=1)
-            low, high = np.minimum(low, tails.min(axis=1)), np.maximum(high, tails.max(axis=1))
+        if arrow is not None:
+            tips = np.array([plane.axes @ state.contact for state in row[1:]])
+            ends = np.vstack([tips, tips - arrow])
+            low, high = np.minimum(low, ends.min(axis=0)), np.maximum(high, ends.max(axis=0))
     low, high = _window(low, high, views[0], plane)
-    # As high as the robot needs, within the limits of a page.
+    # The robot sets the height, within the limits of a page.
     highest = float(np.clip(8.5 / len(views), 1.2, 3.0))
     height = float(np.clip(2.1 * (high - low)[1] / (high - low)[0], 1.2, highest)) + 0.2
-    with framed(*run_header(views), height * len(views) + 0.85, [*stick_notes(rows[0][0]), _START_NOTE]) as (
-        figure,
-        body,
-    ):
+    notes = [*stick_notes(rows[0][0]), _START_NOTE]
+    with framed(*run_header(views), height * len(views) + 0.85, notes) as (figure, body):
         panels = body.subplots(len(views), 3, squeeze=False, sharex=True, sharey=True)
         for axes_row, row, view, arrow in zip(panels, rows, views, arrows, strict=True):
             for column, (axes, state, (word, time)) in enumerate(zip(axes_row, row, instants(view), strict=True)):
@@ -86,7 +88,8 @@ def snapshots_figure(views: Sequence[RunView]) -> Figure:
                     draw_sticks(axes, row[0], _START, plane)
                 draw_sticks(axes, state, _NOW, plane)
                 if arrow is not None and column:
-                    _push(axes, plane.axes @ state.contact, arrow, acting=column == 2)
+                    contact = plane.axes @ state.contact
+                    draw_arrow(axes, contact - arrow, contact, 7, color=VERMILLION, shrinkB=3, **_PUSH[column])
                 frame_flat(axes, low, high, 5)
                 first = f"{word}\n" * (view is views[0])
                 axes.set_title(f"{first}t = {max(time, 0.0):.2f} s", fontsize=8)
@@ -99,16 +102,12 @@ def snapshots_figure(views: Sequence[RunView]) -> Figure:
     return figure
 
 
-def _skeleton(view: RunView, tick: int) -> Skeleton:
-    return build_skeleton(view.robot, view.q[tick], [view.contact], view.supports)
-
-
 def _window(low: Array, high: Array, view: RunView, plane: Plane) -> tuple[Array, Array]:
-    """Return the corners of a panel, which shows all sticks, and the surface where it is seen from its edge."""
+    """Return the corners of a panel that shows all sticks, and the surface if it is seen from its edge."""
     if view.surface is not None:
         touched = plane.axes @ view.surface
         n = plane.axes @ np.array(view.contact.normal)
-        # Only the place of the surface along its normal counts, because it has no end across.
+        # Across its normal, the surface has no end.
         edge = touched - 0.05 * float((high - low).max()) * n
         for axis in range(2):
             if abs(n[axis]) > 0.5:
@@ -117,11 +116,9 @@ def _window(low: Array, high: Array, view: RunView, plane: Plane) -> tuple[Array
 
 
 def _surface(axes: Any, view: RunView, plane: Plane, low: Array, high: Array) -> None:
-    """Draw the surface as seen from its edge, hatched behind it."""
-    if view.surface is None:
-        return
+    """Draw the edge of the surface, hatched behind it, unless the surface faces the reader."""
     n = plane.axes @ np.array(view.contact.normal)
-    if np.linalg.norm(n) < 1e-6:
+    if view.surface is None or np.linalg.norm(n) < 1e-6:
         return
     n = n / np.linalg.norm(n)
     size = 2 * float((high - low).max())
@@ -140,11 +137,6 @@ def _arrow(view: RunView, state: Skeleton, plane: Plane, reach: float) -> Array 
     if not view.pushed or size == 0:
         return None
     return np.asarray(plane.axes @ largest / size * reach)
-
-
-def _push(axes: Any, contact: Array, arrow: Array, *, acting: bool) -> None:
-    look = {"linewidth": 1.8} if acting else {"linestyle": (0, (2, 1.5)), "linewidth": 1.2}
-    draw_arrow(axes, contact - arrow, contact, 7, color=VERMILLION, shrinkB=3, **look)
 
 
 def _handles(state: Skeleton, view: RunView) -> list[Any]:

@@ -12,20 +12,20 @@ from impact_posture.output.plot.style import text_width
 from impact_posture.system.arrays import Array
 
 _TICKS = 6.5
-# Part of an axis without ticks at each end, where two axes meet.
+# Share of an axis without ticks at each end, where two axes meet.
 _CORNER = 0.07
 
 
 class Space(Axes3D):  # type: ignore[misc]
-    """3-D axes whose names the layout leaves room for."""
+    """3-D axes with room for their names in the layout."""
 
     def get_tightbbox(self, renderer: Any = None, **more: Any) -> Any:
-        """Return the box of all that is drawn, with the names, which matplotlib leaves out for the layout."""
+        """Return the box around everything drawn, with the names, which matplotlib leaves out for the layout."""
         return super().get_tightbbox(renderer, **(more | {"for_layout_only": False}))
 
 
 def frame_space(axes: Any, low: Array, high: Array, unit: str, bins: int, *, azimuth: float) -> None:
-    """Give 3-D axes the limits ``low`` to ``high``, one scale, few ticks, and names with the unit."""
+    """Give 3-D axes the limits ``low`` to ``high``, the same scale, few ticks, and names with the unit."""
     size = high - low
     axes.set_box_aspect(tuple(size))
     axes.view_init(elev=21, azim=azimuth)
@@ -41,7 +41,7 @@ def frame_space(axes: Any, low: Array, high: Array, unit: str, bins: int, *, azi
 
 
 def _set_ticks(axis: Any, low: float, high: float, bins: int, room: float) -> float:
-    """Set few ticks whose numbers fit ``room`` (points), none at the ends; return the width of the longest number."""
+    """Set few ticks whose numbers fit into ``room`` (points); return the width of the longest number, points."""
     air = _CORNER * (high - low)
     for count in range(max(bins, 3), 0, -1):
         ticks = np.asarray(MaxNLocator(count, steps=[1, 2, 2.5, 5, 10]).tick_values(low, high))

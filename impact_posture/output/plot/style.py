@@ -30,7 +30,7 @@ VERMILLION, BLUE, GREEN, SKY, PURPLE, ORANGE = "#D55E00", "#0072B2", "#009E73", 
 INK, GRAY, PALE = "#000000", "#6b6b6b", "#d9d9d9"
 
 # Before and after differ by line and hatch as well, so that a gray print tells them apart.
-# The dashes lie on top, so that the solid line shows in their gaps where both coincide.
+# The dashed line lies on top, so the solid line shows in its gaps if both coincide.
 BEFORE: dict[str, Any] = {"color": VERMILLION, "linestyle": (0, (4, 2)), "linewidth": 1.4, "zorder": 3.5}
 AFTER: dict[str, Any] = {"color": BLUE, "linestyle": "-", "linewidth": 1.6, "zorder": 3.0}
 # Lines of the robot without supports are thinner and have other dashes.
@@ -68,7 +68,7 @@ _RC: dict[str, Any] = {
     "hatch.linewidth": 0.5,
     "legend.frameon": False,
     "figure.dpi": 200,
-    # At this resolution letters need no fitting to the pixels, which takes a third of the time to draw them.
+    # At this resolution letters need no hinting, which takes a third of the time to draw them.
     "text.hinting": "none",
     # TrueType in the PDF (publishers refuse Type 3), and files that do not change when nothing changed.
     "pdf.fonttype": 42,
@@ -78,7 +78,7 @@ _RC: dict[str, Any] = {
 
 @contextmanager
 def style() -> Iterator[None]:
-    """Draw and save with these settings, and restore the settings of the user afterwards."""
+    """Draw and save with the settings of this package, and restore the settings of the user afterwards."""
     with matplotlib.rc_context(), warnings.catch_warnings():
         # Matplotlib draws a box for a letter that the font lacks.
         warnings.filterwarnings("ignore", "Glyph .* missing from font")
@@ -91,13 +91,13 @@ def style() -> Iterator[None]:
 def framed(
     title: str, lines: Sequence[str], height: float, notes: Sequence[str] = ()
 ) -> Iterator[tuple[Figure, Any]]:
-    """Yield a figure with the header above and ``notes`` below, and the part to draw in; apply :func:`style`.
+    """Yield a figure with a header and notes, and the part to draw in; apply :func:`style`.
 
     Args:
-        title: First line.
-        lines: Small print below the title, broken between its facts where a line is too long.
+        title: First line of the header.
+        lines: Small print below the title; long lines break between facts.
         height: Height of the part to draw in, inches.
-        notes: Sentences of the paragraph below.
+        notes: Sentences below the figure.
     """
     title = printable(title, longest=_LONGEST_TITLE)
     small = [part for line in lines for part in wrap(printable(line), SEPARATOR)]
@@ -118,7 +118,7 @@ def wrap(line: str, separator: str) -> list[str]:
     """Break a line of small print at separators so that it fits the page, by the widths of the font."""
     parts, room, used = [""], 72 * WIDTH * 0.975, 0.0
     for piece in line.split(separator):
-        # Pieces are measured one by one, because most of them come again.
+        # Widths of single pieces are cached, because most pieces come again.
         width = text_width(f"{separator}{piece}".replace("$", ""), _SMALL)
         if parts[-1] and used + width > room:
             parts.append("")
@@ -136,7 +136,7 @@ def text_width(text: str, size: float) -> float:
 
 
 def shared_legend(body: Any, handles: Sequence[Any], place: str) -> None:
-    """Put the legend of a figure above (``upper``) or below (``lower``) its panels, as wide as the page."""
+    """Put the legend of a figure above (``upper``) or below (``lower``) its panels, across the page."""
     size, handle, gap, room = float(_RC["legend.fontsize"]), 2.2, 1.4, 72 * WIDTH * 0.96
     widths = [text_width(str(h.get_label()).replace("$", ""), size) + size * (handle + 0.8 + gap) for h in handles]
 
@@ -153,7 +153,7 @@ def shared_legend(body: Any, handles: Sequence[Any], place: str) -> None:
 
 
 def lay_out(figure: Figure) -> FigureCanvasAgg:
-    """Lay out a figure once, so that every format shows the same figure; return its image."""
+    """Lay out a figure once, so that it looks the same in every format; return its image."""
     engine: Any = figure.get_layout_engine()
     if engine is not None:
         # Panels with equal axes change their size in the first round and are placed in the others.
@@ -176,9 +176,9 @@ def lay_out(figure: Figure) -> FigureCanvasAgg:
 
 
 def _measure_once(axes: Any) -> None:
-    """Let the layout measure the texts around a panel in its first round only, because that is what takes long.
+    """Let the layout measure the texts around a flat panel in its first round only, because measuring takes long.
 
-    The space around a flat panel depends on its ticks, which stay as they are after the first round.
+    The space around a flat panel depends on its ticks, which do not change after the first round.
     """
     measure = axes.get_tightbbox
     around: list[Any] = []
@@ -187,9 +187,9 @@ def _measure_once(axes: Any) -> None:
         if axes.name != "3d" and len(around) == 2:
             axes.apply_aspect()
             return Bbox.from_extents(*(axes.bbox.extents + around[-1]))
-        found = measure(renderer, **more)
-        around.append(found.extents - axes.bbox.extents)
-        return found
+        box = measure(renderer, **more)
+        around.append(box.extents - axes.bbox.extents)
+        return box
 
     axes.get_tightbbox = get_tightbbox
 
@@ -201,54 +201,44 @@ def check_formats(formats: Iterable[str]) -> tuple[str, ...]:
         InputError: An unknown format.
     """
     wanted = tuple(dict.fromkeys(f.lower().lstrip(".") for f in formats))
-    for one in wanted:
-        if one not in FORMATS:
-            raise InputError(f"no format '{one}'", where="plot", hint=f"choose from {', '.join(FORMATS)}")
+    for extension in wanted:
+        if extension not in FORMATS:
+            raise InputError(f"no format '{extension}'", where="plot", hint=f"choose from {', '.join(FORMATS)}")
     return wanted
 
 
 def save_all(figures: Mapping[str, Figure], out_dir: Path, formats: Iterable[str] = DEFAULT_FORMATS) -> list[Path]:
-    """Write each figure under its name; return the paths.
-
-    Raises:
-        InputError: As :func:`save`.
-        OutputError: As :func:`save`.
-    """
+    """Write each figure under its name as :func:`save` does; return the paths."""
     return [path for name, figure in figures.items() for path in save(figure, out_dir, name, formats)]
 
 
 def save(figure: Figure, out_dir: Path, name: str, formats: Iterable[str] = DEFAULT_FORMATS) -> list[Path]:
-    """Write ``figure`` as ``out_dir/name.<format>`` for each format, each file completely or not at all.
-
-    Return the paths.
+    """Write ``out_dir/name.<format>`` for each format, each file completely or not at all; return the paths.
 
     Raises:
         InputError: An unknown format.
         OutputError: The folder or a file cannot be written.
     """
-    paths = []
-    wanted = check_formats(formats)
+    paths = [Path(out_dir) / f"{name}.{extension}" for extension in check_formats(formats)]
     check_name(Path(out_dir))
     with style():
         canvas = lay_out(figure)
-    for extension in wanted:
-        path = Path(out_dir) / f"{name}.{extension}"
+    for path in paths:
         try:
             path.parent.mkdir(parents=True, exist_ok=True)
             with scratch_folder(path.parent) as beside, style():
-                if extension == "png":
-                    # It is drawn already, and `savefig` would draw it twice.  A higher level takes long for 3 %.
-                    # Nothing shows through, and three channels take a quarter less time to write and to read.
+                if path.suffix == ".png":
+                    # `savefig` would draw the figure again.  Three channels suffice and take a quarter less time.
+                    # A higher level of compression takes long for 3 %.
                     picture = Image.fromarray(np.asarray(canvas.buffer_rgba())).convert("RGB")
                     picture.save(beside / path.name, compress_level=3, dpi=(figure.dpi, figure.dpi))
                 else:
-                    # Without a date, so that the same result gives the same file.
-                    metadata = {"Date" if extension == "svg" else "CreationDate": None}
+                    # Without a date, the same result gives the same file.
+                    metadata = {"Date" if path.suffix == ".svg" else "CreationDate": None}
                     figure.savefig(beside / path.name, metadata=metadata)
                 os.replace(beside / path.name, path)
         except OSError as error:
             raise OutputError(
                 f"cannot be written ({error.strerror or error})", where=str(path), hint="choose another folder"
             ) from None
-        paths.append(path)
     return paths
