@@ -4,7 +4,7 @@ from __future__ import annotations
 
 from collections.abc import Sequence
 from dataclasses import fields
-from typing import TYPE_CHECKING, Any
+from typing import Any
 
 import numpy as np
 
@@ -26,11 +26,6 @@ from impact_posture.posture.program.constrained_problem import ConstrainedProble
 from impact_posture.robot.posture_files import read_posture
 from impact_posture.system.arrays import Array
 
-# The C export is imported where it is used, because that takes longer than a small problem.
-if TYPE_CHECKING:
-    pass
-
-
 # Settings that the objective and its robot hold already.
 _OF_THE_OBJECTIVE = {field.name for field in fields(ImpactSettings)} - {"contact_stiffness", "contact_duration"}
 
@@ -50,7 +45,7 @@ class PostureProblem:
 
     Attributes:
         problem: Constraints and bounds, before any solver sees them.
-        prepared: The problem with its settings; ``None`` for an objective that is not that of an impact.
+        prepared: The problem with its settings; ``None`` unless the objective is an impact objective.
 
     Raises:
         ImpactPostureError: An argument is wrong.
@@ -71,15 +66,15 @@ class PostureProblem:
         else:
             q, name = robot.check_posture(np.asarray(posture, dtype=float), where="posture"), "a configuration"
         loaded = robot.settings or RobotSettings(robot=robot.source)
-        given = {field.name: getattr(loaded, field.name) for field in fields(RobotSettings)}
-        given |= {"speed": speed, "restitution": restitution, "joint_model": robot.joint_model}
+        values = {field.name: getattr(loaded, field.name) for field in fields(RobotSettings)}
+        values |= {"speed": speed, "restitution": restitution, "joint_model": robot.joint_model}
         if isinstance(objective, WorstCaseObjective):
-            given["friction"] = objective.contact.friction
+            values["friction"] = objective.contact.friction
         for name in _OF_THE_OBJECTIVE & set(task):
             raise InputError(
                 "belongs to the objective", where=name, hint="give it to ImpactObjective or ImpactContact"
             )
-        settings = validate(ProblemSettings, given | task, "PostureProblem")
+        settings = validate(ProblemSettings, values | task, "PostureProblem")
         self.prepared: Prepared | None = None
         if isinstance(objective, WorstCaseObjective):
             missing = getattr(objective, "_missing", "")
@@ -93,9 +88,9 @@ class PostureProblem:
     @classmethod
     def of(cls, prepared: Prepared) -> PostureProblem:
         """Return the problem of settings from a file or a command line."""
-        made = cls.__new__(cls)
-        made.prepared, made.problem = prepared, prepared.problem
-        return made
+        problem = cls.__new__(cls)
+        problem.prepared, problem.problem = prepared, prepared.problem
+        return problem
 
     def describe(self) -> list[str]:
         """Describe the constraints, one line each."""

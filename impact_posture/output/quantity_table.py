@@ -1,4 +1,4 @@
-"""Rows of the table of an impact before and after: keys, units and meanings, alike wherever they are shown."""
+"""Rows of the table of an impact before and after: keys, units and meanings for terminal and report."""
 
 from __future__ import annotations
 
@@ -41,9 +41,9 @@ def quantities(metric: Metric) -> list[tuple[str, str, str]]:
 
 
 def quantity_rows(impact: ResolvedImpact, initial: dict[str, Any], optimal: dict[str, Any]) -> list[QuantityRow]:
-    """Return objective, H to E, impulse with friction, peak force without, and fastest approach, where known.
+    """Return the rows of the objective, H to E, impulse (friction), peak force (no friction) and approach speed.
 
-    They come from the blocks ``initial`` and ``optimal`` of ``result.json``.
+    Unknown quantities have no row.  ``initial`` and ``optimal`` are the blocks of ``result.json``.
     """
     named = quantities(impact.metric)
     kind, per_speed = impact.objective.kind, named[2][1]

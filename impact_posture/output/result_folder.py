@@ -73,21 +73,14 @@ def finish_result(
         progress: Called with the numbers of finished files and of all files.
     """
     from impact_posture.output.plot import draw_all, drawable
-    from impact_posture.output.report.report_page import figures
     from impact_posture.output.report.result_report import result_scene, write_result_report
 
     view = result_view(prepared, postures, motion_of(folder, postures.document, prepared.impact.robot))
-
-    def draw(name: str) -> list[tuple[str, str]]:
-        drawn = draw_all(view, folder, formats, [name])
-        return figures(folder, drawn) if report else []
-
     # The C code comes first, because it takes longest.
     tasks: list[Callable[[], Any]] = [partial(_export, folder, prepared, postures)] if codegen else []
-    tasks += [partial(draw, name) for name in drawable(view)]
+    tasks += [partial(draw_all, view, folder, formats, [name]) for name in drawable(view)]
     count, written = len(tasks) + report, Written(folder)
     scene: ReportScene | None = None
-    pictures: list[tuple[str, str]] = []
     with fork_map(lambda index: tasks[index](), len(tasks), jobs) as results:
         if report:
             # This process would only wait.  An error occurs again when the report is written.
@@ -97,8 +90,6 @@ def finish_result(
         for done, (index, result) in enumerate(results, start=1):
             if codegen and index == 0:
                 written = result
-            else:
-                pictures += result
             if progress:
                 progress(done, count)
     if not report:
@@ -106,9 +97,7 @@ def finish_result(
     report_error = ""
     try:
         # The report shows the figures, so it comes last.
-        write_result_report(
-            folder, prepared, view, postures.document, meshes=meshes, scene=scene, pictures=sorted(pictures)
-        )
+        write_result_report(folder, prepared, view, postures.document, meshes=meshes, scene=scene)
     except Exception as error:
         # A result is kept without its report.
         report_error = one_line(f"{type(error).__name__}: {error}")

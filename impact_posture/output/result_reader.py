@@ -1,4 +1,4 @@
-"""Read a result folder, and make the view of a result from which figures and report are drawn."""
+"""Read a result folder, and build the view of a result for figures and report."""
 
 from __future__ import annotations
 
@@ -33,12 +33,12 @@ _BROKEN = (LookupError, ValueError, TypeError, AttributeError, OSError, Recursio
 
 @dataclass(frozen=True, eq=False)
 class SolvedPostures:
-    """What a result folder holds of a solved problem.  It can be sent to a process.
+    """The postures and numbers of a result folder.
 
     Attributes:
         initial: Posture before, shape (nq,).
         optimal: Posture after, shape (nq,).
-        path: The null-space path between them.
+        path: The null-space path between the postures.
         document: The content of ``result.json``.
         mapped: The self-motion map, if it was computed.
     """
@@ -51,10 +51,10 @@ class SolvedPostures:
 
 
 def load_view(folder: Path) -> ResultView:
-    """Read the view of a result folder, from which its figures are drawn.
+    """Read the view of a result folder.
 
     Raises:
-        SpecError: The folder is no result folder, or was made with another robot model.
+        SpecError: As :func:`load_result`.
     """
     return load_result(folder)[1]
 
@@ -63,8 +63,8 @@ def rewrite_report(folder: Path, *, meshes: bool = False) -> Path:
     """Write ``report.html`` of a result folder again; return its path.
 
     Raises:
-        SpecError: As :func:`load_view`.
-        OutputError: It cannot be written.
+        SpecError: As :func:`load_result`.
+        OutputError: The report cannot be written.
     """
     from impact_posture.output.report.result_report import write_result_report
 
@@ -79,7 +79,7 @@ def load_result(folder: Path) -> tuple[Prepared, ResultView, dict[str, Any]]:
     """Read problem, view and ``result.json`` of a result folder.
 
     Raises:
-        SpecError: As :func:`load_view`.
+        SpecError: The folder is not a whole result, or was made with another robot model.
     """
     if not os.path.isfile(folder / "result.json"):
         raise SpecError("holds no result.json", where=str(folder), hint="name a folder that optimize wrote")
@@ -105,18 +105,18 @@ def load_result(folder: Path) -> tuple[Prepared, ResultView, dict[str, Any]]:
             robot.check_posture(document[key]["q"], limits=False, where=f"{folder / 'result.json'}: {key}.q")
             for key in ("initial", "optimal")
         )
-        found = SolvedPostures(initial, optimal, path, document, mapped)
-        return prepared, result_view(prepared, found, motion_of(folder, document, robot)), document
+        postures = SolvedPostures(initial, optimal, path, document, mapped)
+        return prepared, result_view(prepared, postures, motion_of(folder, document, robot)), document
     except _BROKEN as error:
         raise _broken(folder, error) from None
 
 
 def _refuse_constant(text: str) -> None:
-    raise ValueError(f"{text} is no number of JSON")
+    raise ValueError(f"{text} is not a JSON number")
 
 
 def _broken(folder: Path, error: Exception) -> SpecError:
-    what = f"is no whole result ({type(error).__name__}: {error})"
+    what = f"is not a whole result ({type(error).__name__}: {error})"
     return SpecError(what, where=str(folder), hint="run optimize again")
 
 
@@ -129,35 +129,29 @@ def motion_of(folder: Path, document: dict[str, Any], robot: Robot) -> PosturePa
     return read_path(folder, document["path"], robot)
 
 
-def result_view(prepared: Prepared, found: SolvedPostures, motion: PosturePath | None) -> ResultView:
-    """Return the view of a result, from which its figures and its report are drawn.
-
-    Args:
-        prepared: The problem.
-        found: Its solution.
-        motion: The path to the optimum, if it was searched.
-    """
+def result_view(prepared: Prepared, postures: SolvedPostures, motion: PosturePath | None) -> ResultView:
+    """Return the view of a result for its figures and report; ``motion`` is the path to the optimum, if searched."""
     from impact_posture.output.plot import ResultView
 
-    impact, around, document = prepared.impact, prepared.problem.surroundings, found.document
+    impact, around, document = prepared.impact, prepared.problem.surroundings, postures.document
     return ResultView(
         objective=impact.objective,
-        q_initial=found.initial,
-        q_optimal=found.optimal,
+        q_initial=postures.initial,
+        q_optimal=postures.optimal,
         speed=impact.speed,
         restitution=impact.restitution,
-        path=found.path,
+        path=postures.path,
         tradeoff=_tradeoff_data(document.get("tradeoff", []), document.get("tradeoff_against", "distance")),
-        collisions=_collisions(prepared, found.initial, found.optimal),
+        collisions=_collisions(prepared, postures.initial, postures.optimal),
         depths=() if around is None else tuple(around.depth(c) for c in impact.objective.contacts),
         pushed=prepared.problem.requirements.contact_pose == "free",
         motion=motion,
-        self_motion=found.mapped,
+        self_motion=postures.mapped,
     )
 
 
 def _collisions(prepared: Prepared, *postures: Array) -> Any:
-    """Shapes that touch at each of two postures, for an optimization that does not keep them apart."""
+    """Return the colliding shapes at each posture.  An optimization with surroundings has none."""
     if prepared.problem.surroundings is not None:
         return (), ()
     from impact_posture.collision.mesh_check import mesh_collisions
@@ -174,7 +168,8 @@ def _tradeoff_data(points: Sequence[dict[str, Any]], against: Against) -> TradeO
     if len(points) < 2:
         return None
     keys = ("within", "distance", "objective", "H", "G", "V", "S")
-    columns = {key: np.array([np.nan if p[key] is None else p[key] for p in points], dtype=float) for key in keys}
+    # A missing S becomes NaN.
+    columns = {key: np.array([p[key] for p in points], dtype=float) for key in keys}
     knee = next((k for k, p in enumerate(points) if p["knee"]), None)
     certified = np.array([bool(p["certified"]) for p in points])
     return TradeOffData(**columns, certified=certified, knee=knee, against=against)

@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-from collections.abc import Iterator
 from pathlib import Path
 from xml.etree import ElementTree
 
@@ -19,7 +18,6 @@ from impact_posture.output.plot.jump_figure import jump_figure
 from impact_posture.output.plot.path_figures import path_figure, tradeoff_figure
 from impact_posture.output.plot.self_motion_figure import self_motion_figure
 from impact_posture.output.plot.style import WIDTH
-from impact_posture.output.report.report_page import figures
 from tests.output.page import defects
 from tests.output.views import PENDULUM, make_view, text_of
 
@@ -175,16 +173,3 @@ def test_bad_input(pendulum: ResultView, panda: ResultView, tmp_path: Path) -> N
     with pytest.raises(OutputError, match="cannot be written"):
         draw_all(pendulum, tmp_path / "file", ("png",), only=["jump"])
     assert [p.name for p in tmp_path.iterdir()] == ["file"]
-
-
-def test_a_figure_is_read_while_the_temporary_folders_of_others_vanish(
-    tmp_path: Path, pendulum: ResultView, monkeypatch: pytest.MonkeyPatch
-) -> None:
-    """Searching the folder fails where another process has just removed a temporary folder in it."""
-
-    def vanished(folder: Path, pattern: str) -> Iterator[Path]:
-        raise FileNotFoundError(folder / f".impact-posture-gone/{pattern}")
-
-    monkeypatch.setattr(Path, "rglob", vanished)
-    ((name, address),) = figures(tmp_path, draw_all(pendulum, tmp_path, only=["jump"]))
-    assert name == "jump" and address.startswith("data:image/png;base64,")

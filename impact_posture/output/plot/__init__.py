@@ -44,7 +44,7 @@ __all__ = [
     "save_all",
 ]
 
-# What takes longest comes first, so that processes that draw side by side end together.
+# The slowest figures come first, so that parallel processes end together.
 FIGURES: dict[str, Callable[[ResultView], Figure]] = {
     "jump": jump_figure.jump_figure,
     "ellipsoid": ellipsoid_figure.ellipsoid_figure,
@@ -56,17 +56,15 @@ FIGURES: dict[str, Callable[[ResultView], Figure]] = {
     "nullspace": path_figures.path_figure,
 }
 
-# Figures that are drawn only if the view has this field.
-_NEEDED = {"nullspace": "path", "tradeoff": "tradeoff", "self_motion": "self_motion"}
-
 
 def drawable(view: ResultView) -> list[str]:
-    """Return the names of the figures that the view has data for.
-
-    ``nullspace`` needs a path, ``tradeoff`` a trade-off, ``path`` a motion, and ``self_motion`` a map.
-    """
-    lacking = {name: getattr(view, field) is None for name, field in _NEEDED.items()}
-    lacking["path"] = view.motion is None or view.motion.use is None
+    """Return the names of the figures that the view has data for."""
+    lacking = {
+        "nullspace": view.path is None,
+        "tradeoff": view.tradeoff is None,
+        "self_motion": view.self_motion is None,
+        "path": view.motion is None or view.motion.use is None,
+    }
     return [name for name in FIGURES if not lacking.get(name)]
 
 

@@ -1,7 +1,4 @@
-"""Figures ``nullspace``, ``path`` and ``tradeoff``: along a path, over its time, and over the distance moved.
-
-The trade-off is computed by :mod:`impact_posture.posture.analysis.pareto_front`.
-"""
+"""Figures ``nullspace``, ``path`` and ``tradeoff``: along a path, over its time, and over the distance moved."""
 
 from __future__ import annotations
 
@@ -41,7 +38,7 @@ _KNEE = (
 )
 
 
-# Ratio of the largest to the smallest value above which the axis is logarithmic.
+# An axis is logarithmic if the ratio of the largest to the smallest value is above this.
 _SPREAD = 30.0
 # Upright line at a posture.
 _MARK: dict[str, Any] = {"color": INK, "linewidth": 0.8, "linestyle": ":", "zorder": 1}
@@ -202,28 +199,28 @@ def _objective(axes: Any, data: TradeOffData, view: ResultView) -> None:
 
 
 def _title(data: TradeOffData) -> str:
-    """Return the gain at the knee, or at half of the distance."""
+    """Return a line on the gain at the knee, or else at half of the price."""
     y, x = data.objective, data.within - data.within[0]
     gain = float(y[0] - y[-1])
     if not gain > 0:
         return "nothing is gained"
     if data.knee is not None:
-        share, way = (y[0] - y[data.knee]) / gain, x[data.knee] / x[-1]
-        return f"knee: {100 * share:.0f} % of the gain for {100 * way:.0f} % of the {_EXTRA[data.against]}"
+        share, price = (y[0] - y[data.knee]) / gain, x[data.knee] / x[-1]
+        return f"knee: {100 * share:.0f} % of the gain for {100 * price:.0f} % of the {_EXTRA[data.against]}"
     half = float(np.interp(x[-1] / 2, x, y))
     return f"half of the {_EXTRA[data.against]} yields {100 * (y[0] - half) / gain:.0f} % of the gain; no knee"
 
 
-# Joints that move most get a curve in color and a name; the others are gray.
+# Number of joints with a color and a name, which move most.  The other joints are gray.
 _NAMED = 8
-# A joint that moves less is not drawn, rad or m.
+# Joints that move less are not drawn, rad or m.
 _MOVES = 1e-4
 _SHARES: dict[str, dict[str, Any]] = {
     "velocity": {"color": BLUE, "linestyle": "-"},
     "torque": {"color": VERMILLION, "linestyle": (0, (5, 2))},
     "thrust": {"color": GREEN, "linestyle": (0, (1, 1))},
 }
-# A velocity of the base, integrated.
+# Names of the integrated velocities of the base.
 _MOVED = {"v": "base along ", "w": "base about "}
 _LEAST = "Torques, thrusts and forces on the feet that are not determined are those whose largest share is least."
 _NOTES = {
@@ -245,7 +242,7 @@ def motion_figure(view: ResultView) -> Figure:
     notes += [f"Note: {motion.reason}."] if motion.reason else []
     with framed(*header_lines(view), 6.2, notes) as (figure, body):
         joints, objective, shares = body.subplots(3, 1, sharex=True, height_ratios=[1.4, 1, 1])
-        # The integral of the velocities, which has no jump where an angle wraps.
+        # Unlike angles, the integral of the velocities has no jump at a full turn.
         steps = np.diff(motion.t)[:, None] * (motion.v[1:] + motion.v[:-1]) / 2
         moved = np.vstack([np.zeros_like(motion.v[:1]), np.cumsum(steps, axis=0)])
         span = np.ptp(moved, axis=0)

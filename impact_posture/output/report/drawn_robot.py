@@ -1,4 +1,4 @@
-"""The shapes of a robot as the page draws them: small meshes, each stored once, and the terms of their authors."""
+"""The shapes of a robot on the page: small meshes, each stored once, with their licenses."""
 
 from __future__ import annotations
 
@@ -26,17 +26,17 @@ from impact_posture.system.libraries import source_key
 
 # Most triangles of all meshes of a page, which bounds its size and the time to draw it in software.
 _MOST_TRIANGLES = 150_000
-# Corners of a mesh are whole multiples of its extent over this.
+# Corners of a mesh are integer multiples of its extent divided by this.
 _LEVELS = 65535
 _GRAY = (0.72, 0.74, 0.77, 1.0)
 # Darker colors would hide the form.
 _DARKEST = 0.2
-# Triangles of a box whose corner k has the upper end of an axis where that bit of k is set.
+# Triangles of a box.  Corner k is at the upper end of an axis if the bit of this axis is set in k.
 _BOX_FACES = np.array(
     [[0, 2, 1, 1, 2, 3, 4, 5, 6, 5, 7, 6, 0, 1, 4, 1, 5, 4], [2, 6, 3, 3, 6, 7, 0, 4, 2, 2, 4, 6, 1, 3, 5, 3, 7, 5]],
     dtype=np.uint32,
 ).reshape(-1, 3)
-# Bytes of a COLLADA file in which its colors are sought.
+# Bytes at the begin of a COLLADA file in which its colors are sought.
 _HEAD = 200_000
 
 Color = tuple[float, ...]
@@ -49,7 +49,7 @@ _Placement = Annotated[
 
 @dataclass(frozen=True, eq=False)
 class Solid:
-    """A triangle mesh with whole coordinates.
+    """A triangle mesh with integer coordinates.
 
     Attributes:
         corners: Corners as multiples of ``step`` from ``low``, shape (k, 3).
@@ -71,11 +71,11 @@ class Solid:
 
 @dataclass(frozen=True, eq=False)
 class PlacedSolids:
-    """Meshes, and where they are.
+    """Meshes and their placements.
 
     Attributes:
         solids: The meshes.
-        places: Name of a shape, joint, index of its mesh, and placement in the axes of the joint.
+        places: For each shape: name, joint, index of its mesh, and placement in the axes of the joint.
         warnings: Shapes that are left out, one line each.
     """
 
@@ -102,7 +102,7 @@ class MeshLicense:
 
     @property
     def allows(self) -> bool:
-        """Whether simplified meshes may be passed on: a license is stated, and permits changed copies."""
+        """Whether simplified meshes may be passed on: the package states a license that permits changed copies."""
         return bool(self.license) and "-ND" not in self.license.upper()
 
 
@@ -112,9 +112,9 @@ class DrawnRobot:
 
     Attributes:
         solids: The meshes.
-        parts: Joint, index of a mesh, placement in the axes of the joint, and color (red, green, blue, opacity).
-        licenses: Where meshes of others come from, and on what terms.
-        notes: What is drawn in place of something else, one line each.
+        parts: For each shape: joint, index of its mesh, placement in the axes of the joint, and color (RGB, opacity).
+        licenses: Licenses of the meshes.
+        notes: Notes on replaced or missing shapes, one line each.
     """
 
     solids: tuple[Solid, ...]
@@ -125,28 +125,26 @@ class DrawnRobot:
 
 @lru_cache(maxsize=4)
 def draw_robot(robot: Robot, meshes: bool = False) -> DrawnRobot:
-    """Return the visual shapes of a robot; hulls for meshes that may not be passed on; sticks where nothing is there.
+    """Return the visual shapes of a robot, with hulls for meshes that may not be passed on.
 
-    Args:
-        robot: The robot.
-        meshes: Pass on the meshes of the user's own URDF, too.
+    A robot without shapes gets sticks.  ``meshes`` permits to pass on the meshes of the user's own URDF.
     """
     described, warnings = read_urdf_shapes(robot, "visual")
     by_name = {shape.name: shape for shape in described}
     known = {shape.name: license_of(shape.mesh) for shape in described if shape.mesh is not None}
     hulls = {name for name, terms in known.items() if not (meshes or (terms and terms.allows))}
     key = source_key([geometry_key(robot, described), repr(sorted(hulls))], "report")
-    found = read_stored("solids", key, PlacedSolids)
-    if found is None:
-        found = _placed_solids(robot, described, hulls)
-        write_stored("solids", key, found)
-    parts = [(joint, k, at, _color(by_name[name])) for name, joint, k, at in found.places]
-    drawn = {name for name, *_ in found.places}
+    placed = read_stored("solids", key, PlacedSolids)
+    if placed is None:
+        placed = _placed_solids(robot, described, hulls)
+        write_stored("solids", key, placed)
+    parts = [(joint, k, at, _color(by_name[name])) for name, joint, k, at in placed.places]
+    drawn = {name for name, *_ in placed.places}
     licenses = {terms.package: terms for name, terms in known.items() if terms and name in drawn - hulls}
-    notes = [*warnings, *found.warnings]
+    notes = [*warnings, *placed.warnings]
     if hulls & drawn:
         notes.append("meshes are drawn as their convex hulls, because a page passes them on (`meshes`)")
-    solids = list(found.solids)
+    solids = list(placed.solids)
     if not parts:
         solids, parts = _sticks(robot)
         notes.append("the robot has no shapes that can be drawn: sticks join its joints")
@@ -154,14 +152,14 @@ def draw_robot(robot: Robot, meshes: bool = False) -> DrawnRobot:
 
 
 def _placed_solids(robot: Robot, described: list[UrdfShape], hulls: set[str]) -> PlacedSolids:
-    """Return the meshes of shapes, or their hulls, where they can be loaded."""
+    """Return the meshes of shapes, or their hulls."""
     loaded = load_geometry(robot, described)
     by_name = {shape.name: shape for shape in described}
     solids: dict[tuple[object, ...], Solid] = {}
     places = []
     for placed in loaded.model.geometryObjects:
         shape, hull = by_name[placed.name], placed.name in hulls
-        # The same file at the same scale is the same mesh; an address in memory would name another one later.
+        # The same file at the same scale is the same mesh.
         key = (shape.kind, shape.sizes, shape.mesh, hull)
         if key not in solids:
             solids[key] = hull_of(shape_points(placed.geometry)) if hull else _quantized(*surface_of(placed.geometry))
@@ -181,12 +179,12 @@ def _quantized(points: Array, faces: Triangles) -> Solid:
 
 
 def _welded(solid: Solid, bits: int) -> Solid:
-    """Join the corners that agree but for their last ``bits``, and drop the triangles that vanish."""
+    """Join corners that agree except for their last ``bits``, and drop triangles that vanish."""
     keys = (solid.corners >> bits).astype(np.int64) @ (1 << np.array([32, 16, 0]))
     _, first, merged = np.unique(keys, return_index=True, return_inverse=True)
     faces = merged[solid.faces]
     faces = faces[(faces[:, 0] != faces[:, 1]) & (faces[:, 1] != faces[:, 2]) & (faces[:, 2] != faces[:, 0])]
-    # In the order of their first use corners differ little from the last ones, so that they compress well.
+    # In the order of first use, neighboring corners are close, which compresses well.
     used, at = np.unique(faces, return_index=True)
     order = used[np.argsort(at)]
     renamed = np.empty(len(first), dtype=np.uint32)
@@ -195,7 +193,7 @@ def _welded(solid: Solid, bits: int) -> Solid:
 
 
 def _reduced(solids: list[Solid]) -> list[Solid]:
-    """Weld the corners within a length that grows until all meshes together have few enough triangles."""
+    """Weld corners within a growing length until all meshes together have few enough triangles."""
     length = max((solid.step for solid in solids), default=0.0)
     while sum(len(solid.faces) for solid in solids) > _MOST_TRIANGLES:
         length *= 2
@@ -205,7 +203,7 @@ def _reduced(solids: list[Solid]) -> list[Solid]:
 
 
 def _coarser(solid: Solid, bits: int) -> Solid:
-    """Return a mesh without the last ``bits`` of its corners, or its bounding box if all triangles would vanish."""
+    """Return a mesh without the last ``bits`` of its corners, or the bounding box if all triangles vanish."""
     welded = _welded(solid, bits)
     if len(welded.faces):
         return welded
@@ -215,7 +213,7 @@ def _coarser(solid: Solid, bits: int) -> Solid:
 
 
 def _sticks(robot: Robot) -> tuple[list[Solid], list[tuple[int, int, pin.SE3, Color]]]:
-    """Return rods from each joint to the next ones, and from the last joint of each chain to the tip of its link."""
+    """Return rods from each joint to the next joints, and from the last joint of a chain to the tip of its link."""
     model = robot.model
     spans = [(int(model.parents[k]), np.array(model.jointPlacements[k].translation)) for k in range(1, model.njoints)]
     inner = {parent for parent, _ in spans}
@@ -227,18 +225,18 @@ def _sticks(robot: Robot) -> tuple[list[Solid], list[tuple[int, int, pin.SE3, Co
 
 
 def _color(shape: UrdfShape) -> Color:
-    """Return the color of a shape: that of the URDF, the mean of a COLLADA file (which coal drops), or gray."""
+    """Return the color in the URDF, or the mean color of a COLLADA file (which coal drops), or gray."""
     *color, opacity = shape.color or _GRAY
     if shape.color is None and shape.mesh is not None and shape.mesh.suffix.lower() == ".dae":
         with shape.mesh.open("rb") as file:
             head = file.read(_HEAD)
-        found = re.findall(rb"<diffuse>\s*<color[^>]*>\s*([\d.eE+-]+)\s+([\d.eE+-]+)\s+([\d.eE+-]+)\s", head)
-        color = np.mean([[float(v) for v in one] for one in found] or [color], axis=0).tolist()
+        colors = re.findall(rb"<diffuse>\s*<color[^>]*>\s*([\d.eE+-]+)\s+([\d.eE+-]+)\s+([\d.eE+-]+)\s", head)
+        color = np.mean([[float(v) for v in values] for values in colors] or [color], axis=0).tolist()
     return (*np.clip(color, _DARKEST, 1.0).tolist(), opacity)
 
 
 def license_of(mesh: Path) -> MeshLicense | None:
-    """Return the terms of a mesh of example-robot-data; ``None`` for a mesh of another origin."""
+    """Return the license of a mesh of example-robot-data; ``None`` for other meshes."""
     try:
         root = example_robot_data().resolve()
     except PackageNotFound:
@@ -254,6 +252,6 @@ def _read_license(folder: Path) -> MeshLicense:
         path.read_text(encoding="utf-8", errors="replace") if path.is_file() else ""
         for path in (folder / "README.md", folder / "LICENSE")
     )
-    found = (re.search(rf"^{key}:\s*(\S.*)$", readme, re.I | re.M) for key in ("license", "upstream"))
-    license, upstream = ("" if match is None else match[1].strip() for match in found)
+    matches = (re.search(rf"^{key}:\s*(\S.*)$", readme, re.I | re.M) for key in ("license", "upstream"))
+    license, upstream = ("" if match is None else match[1].strip() for match in matches)
     return MeshLicense(folder.name, license, upstream, text)

@@ -30,7 +30,7 @@ _TYPES = {"uint16": "u2", "uint32": "u4", "float32": "f4"}
 _EYES = np.array([[x, y, 0.55] for x in (1.1, -1.1) for y in (-1.25, 1.25)])
 # The camera sees the surface under this cosine with its normal best: neither edge-on nor from behind.
 _SLANT = 0.35
-# Name, unit and values at the frames of a curve.
+# A curve: name, unit, and values at the frames.
 Curve = tuple[str, str, Array]
 
 
@@ -39,11 +39,11 @@ class Track:
     """A motion of the robot, frame by frame.
 
     Attributes:
-        name: Name where there are several.
-        times: Times, s, or the way along a path, rad mixed with m, increasing, shape (frames,).
-        unit: ``s`` for times; empty for a way.
+        name: Name of the track beside others.
+        times: Times, s, or path lengths, rad mixed with m, increasing, shape (frames,).
+        unit: ``s`` for times; empty for path lengths.
         q: Configurations, shape (frames, nq).
-        found: Quantities of the impact at each frame, for each contact.
+        impacts: Quantities of the impact of each contact, frame by frame.
         jumps: Velocity jump ``Δν``, shape (frames, nv).
         curves: Curves, NaN where undefined.
         forces: Contact force on the robot, world, N, shape (frames, 3); ``None`` to show none.
@@ -53,7 +53,7 @@ class Track:
     times: Array
     unit: str
     q: Array
-    found: Sequence[Sequence[ImpactQuantities]]
+    impacts: Sequence[Sequence[ImpactQuantities]]
     jumps: Array
     curves: tuple[Curve, ...]
     forces: Array | None = None
@@ -61,14 +61,14 @@ class Track:
 
 @dataclass(frozen=True, eq=False)
 class ReportScene:
-    """All that the viewer draws.
+    """Everything that the viewer draws.
 
     Attributes:
         drawn: The shapes of the robot.
         objective: The impact.
         tracks: Motions to choose from.
         planes: Name (``surface`` or ``ground``), point (m) and unit normal of each plane, world.
-        bodies: Points of each convex body that stands in the world, shape (k, 3), m.
+        bodies: Points of each convex body in the world, shape (k, 3), m.
         ghost: Whether the first frame stays visible while the robot moves on.
     """
 
@@ -90,13 +90,13 @@ class ReportScene:
         for kind, point, n in self.planes:
             at = center + n * ((point - center) @ n) if kind == "ground" else point
             walls.append({"kind": kind, "point": at, "normal": n, "size": 0.75 * size})
-        slants = np.abs(_EYES @ self.tracks[0].found[0][0].normal / np.linalg.norm(_EYES[0]) - _SLANT)
-        each = (one for track in self.tracks for found in track.found for one in found)
-        axes = (float(np.linalg.norm(one.ellipsoid, 2)) ** 0.5 for one in each)
+        slants = np.abs(_EYES @ self.tracks[0].impacts[0][0].normal / np.linalg.norm(_EYES[0]) - _SLANT)
+        impacts = (impact for track in self.tracks for frames in track.impacts for impact in frames)
+        axes = (float(np.linalg.norm(impact.ellipsoid, 2)) ** 0.5 for impact in impacts)
         feet = [point_on(self.objective.robot, foot.frame, foot.offset) for foot in self.objective.supports]
         joints = zip(model.parents, model.inertias, strict=True)
         jump = 0.3 * size / _largest(track["largest_jump"] for track in tracks)
-        # The camera sees the tips of the arrows, too.
+        # The camera sees the tips of the arrows as well.
         radius = max(size / 2, *(_norm(centers + jump * arrows - center) for centers, arrows in arrows_of))
         content = {
             "joints": [{"parent": int(parent), "center": inertia.lever} for parent, inertia in joints],
@@ -136,18 +136,17 @@ class ReportScene:
                 twist, lever = data.v[j], robot.model.inertias[j].lever
                 arrows[k, j] = data.oMi[j].rotation @ (twist.linear + np.cross(twist.angular, lever))
                 centers[k, j] = data.oMi[j].act(lever)
-        # The viewer goes straight from frame to frame, so a quaternion takes the sign that is nearer to the last one.
+        # The viewer interpolates linearly, so each quaternion takes the sign nearer to the quaternion before.
         for before, now in pairwise(poses[:, :, 3:]):
             now[(before * now).sum(axis=-1) < 0] *= -1
+        frame_impacts, upper = list(zip(*track.impacts, strict=True)), np.triu_indices(3)
         content = {
             "unit": track.unit,
             "times": track.times.astype(np.float32),
             "poses": _levels(poses.reshape(frames, -1)),
             "points": _levels(at.reshape(frames, -1)),
-            "normals": _rows([one.normal for one in found] for found in zip(*track.found, strict=True)),
-            "ellipsoids": _rows(
-                [root(one.ellipsoid)[np.triu_indices(3)] for one in found] for found in zip(*track.found, strict=True)
-            ),
+            "normals": _rows([impact.normal for impact in frame] for frame in frame_impacts),
+            "ellipsoids": _rows([root(impact.ellipsoid)[upper] for impact in frame] for frame in frame_impacts),
             "jumps": _levels(arrows.reshape(frames, -1)),
             "largest_jump": _norm(arrows),
             "forces": None if track.forces is None else _levels(track.forces),
@@ -158,21 +157,23 @@ class ReportScene:
     def _box(self) -> tuple[Array, Array]:
         """Return the corners of the box around the robot at the first and last frame of each track."""
         robot: Robot = self.objective.robot
-        data, found = robot.model.createData(), []
+        data, corners = robot.model.createData(), []
         for q in (q for track in self.tracks for q in track.q[[0, -1]]):
             pin.forwardKinematics(robot.model, data, q)
             for joint, solid, placement, _ in self.drawn.parts:
                 at = data.oMi[joint] * placement
                 points = self.drawn.solids[solid].points @ at.rotation.T + at.translation
-                found += [points.min(axis=0), points.max(axis=0)]
-        return np.min(found, axis=0), np.max(found, axis=0)
+                corners += [points.min(axis=0), points.max(axis=0)]
+        return np.min(corners, axis=0), np.max(corners, axis=0)
 
 
-def impact_curves(found: Sequence[ImpactQuantities], metric: Metric, where: str = "") -> list[Curve]:
-    """Return the curves of H, V and S of a contact, with ``where`` behind their names."""
+def impact_curves(impacts: Sequence[ImpactQuantities], metric: Metric, where: str = "") -> list[Curve]:
+    """Return the curves of H, V and S of a contact; ``where`` follows their names."""
     units = {key: unit for key, unit, _ in quantities(metric)}
-    columns = {name: np.array([getattr(one, name) for one in found], dtype=float) for name in "HVS"}
-    return [(name + where, units[name], values) for name, values in columns.items()]
+    return [
+        (name + where, units[name], np.array([getattr(impact, name) for impact in impacts], dtype=float))
+        for name in "HVS"
+    ]
 
 
 def _norm(vectors: Array) -> float:
@@ -181,7 +182,7 @@ def _norm(vectors: Array) -> float:
 
 
 def _largest(values: Iterable[float]) -> float:
-    """Return the largest value, or one where all are zero, so that a scale stays finite."""
+    """Return the largest value, or 1 if it is zero, so that a scale stays finite."""
     return max(values, default=0.0) or 1.0
 
 
@@ -197,16 +198,16 @@ def _rows(frames: Iterable[list[Array]]) -> dict[str, Any]:
 
 
 def _levels(columns: Array) -> dict[str, Any]:
-    """Return columns as whole levels between the least and the largest value of each."""
+    """Return columns as integer levels between the least and the largest value of each column."""
     low, step = columns.min(axis=0), np.maximum(np.ptp(columns, axis=0), 1e-12) / 65535
     values = np.round((columns - low) / step).astype(np.uint16)
     return {"values": _differences(values), "low": low, "step": step}
 
 
 def _differences(rows: NDArray[Any]) -> NDArray[Any]:
-    """Return the differences between rows of whole numbers, the first from zero, which compress better.
+    """Return the differences between rows of integers, the first from zero, because they compress better.
 
-    They wrap around, and the sums of the viewer wrap back.
+    They wrap around, and the sums in the viewer wrap back.
     """
     return np.diff(rows, axis=0, prepend=np.zeros_like(rows[:1]))
 
@@ -222,11 +223,11 @@ def _packed(content: dict[str, Any]) -> tuple[str, str]:
         buffer.extend(array.tobytes())
         return [_TYPES[array.dtype.name], at, array.size]
 
-    # NaN is no JSON.
+    # JSON has no NaN.
     return json.dumps(content, default=place, allow_nan=False), zipped(bytes(buffer))
 
 
 def zipped(content: bytes) -> str:
-    """Return base64 of gzip, which the page unpacks; without the time, so that equal results have equal pages."""
-    # The highest level takes three times as long for half a percent.
+    """Return base64 of gzip without a time stamp, so that equal results have equal pages."""
+    # The highest level takes three times as long and saves half a percent.
     return base64.b64encode(gzip.compress(content, 6, mtime=0)).decode("ascii")

@@ -1,8 +1,8 @@
-"""The report of a posture optimization: the robot on its way from the initial posture to the optimum."""
+"""The report of a posture optimization: the robot from the initial posture to the optimum."""
 
 from __future__ import annotations
 
-from collections.abc import Iterator, Sequence
+from collections.abc import Iterator
 from pathlib import Path
 from typing import Any
 
@@ -20,7 +20,7 @@ from impact_posture.posture.formulation.problem_file import Prepared
 from impact_posture.system.arrays import Array
 from impact_posture.system.output_folder import typed_command
 
-# Most frames of a way: more are not seen.
+# Most frames of a motion.
 _MOST = 121
 
 
@@ -32,7 +32,6 @@ def write_result_report(
     *,
     meshes: bool = False,
     scene: ReportScene | None = None,
-    pictures: Sequence[tuple[str, str]] | None = None,
 ) -> Path:
     """Write ``report.html`` of a result into its folder; return its path.
 
@@ -42,28 +41,27 @@ def write_result_report(
         view: Its solution.
         document: The content of ``result.json``.
         meshes: Pass on the meshes of the user's own URDF, too.
-        scene: What :func:`result_scene` returns, if it is known.
-        pictures: What :func:`~impact_posture.output.report.report_page.figures` returns, if it is known.
+        scene: The result of :func:`result_scene`, if the caller has it.
 
     Raises:
         OutputError: It cannot be written.
     """
     scene = scene or result_scene(prepared, view, meshes)
-    return write_page(folder, _content(folder, prepared, view, document), scene, pictures)
+    return write_page(folder, _content(folder, prepared, view, document), scene)
 
 
 def result_scene(prepared: Prepared, view: ResultView, meshes: bool = False) -> ReportScene:
-    """Return the scene of a result, with the surface where the problem has it: behind the link that touches it."""
+    """Return the scene of a result, with the surface at its depth behind the contact point."""
     around, q = prepared.problem.surroundings, view.q_initial
     if around is not None:
         walls, solids = around.walls_at(q)
         planes = [("ground" if wall.name == "ground" else "surface", wall.point, wall.normal) for wall in walls]
     else:
         numeric, planes, solids = Numeric(view.robot.model).at(q), [], []
-        for one in view.objective.contacts:
-            at = numeric.placement(point_on(view.robot, one.frame, one.offset))
-            turn = at.rotation if one.normal_frame == "contact" else np.eye(3)
-            planes.append(("surface", at.translation, turn @ one.normal))
+        for contact in view.objective.contacts:
+            at = numeric.placement(point_on(view.robot, contact.frame, contact.offset))
+            turn = at.rotation if contact.normal_frame == "contact" else np.eye(3)
+            planes.append(("surface", at.translation, turn @ contact.normal))
     bodies = tuple(hull.vertices @ at.rotation.T + at.translation for hull, at, _ in solids)
     return ReportScene(
         draw_robot(view.robot, meshes), view.objective, (_track(prepared, view),), tuple(planes), bodies, True
@@ -71,25 +69,25 @@ def result_scene(prepared: Prepared, view: ResultView, meshes: bool = False) -> 
 
 
 def _track(prepared: Prepared, view: ResultView) -> Track:
-    times, unit, q = _way(view)
+    times, unit, q = _frames(view)
     objective, stiffness = view.objective, prepared.impact.contact_stiffness
-    found = [[single.oracle.quantities(at) for at in q] for single in objective.singles]
+    impacts = [[single.oracle.quantities(at) for at in q] for single in objective.singles]
     jumps, impulses = _jumps(view, q)
     curves: list[Curve] = []
-    for contact, own, sizes in zip(objective.contacts, found, impulses.T, strict=True):
+    for contact, frames, sizes in zip(objective.contacts, impacts, impulses.T, strict=True):
         where = f" at {contact.frame}" if objective.others else ""
-        curves += [*impact_curves(own, prepared.impact.metric, where), (f"impulse{where}", "N·s", sizes)]
+        curves += [*impact_curves(frames, prepared.impact.metric, where), (f"impulse{where}", "N·s", sizes)]
         if stiffness is not None:
-            peaks = np.array([stiffness.peak_force(one.G, view.speed) for one in own])
+            peaks = np.array([stiffness.peak_force(impact.G, view.speed) for impact in frames])
             curves.append((f"peak force{where}", "N", peaks))
-    return Track("", times, unit, q, found, jumps, tuple(curves))
+    return Track("", times, unit, q, impacts, jumps, tuple(curves))
 
 
 def _jumps(view: ResultView, postures: Array) -> tuple[Array, Array]:
     """Return the jumps at postures, shape (n, nv), and the impulse of each contact, N·s, shape (n, contacts).
 
-    They are those of all contacts at once, or else of the leading contact alone.  What is unknown is a jump of zero
-    and an impulse of NaN.
+    All contacts act at once, or else the leading contact alone.  Where the impact is undefined, the jump is zero and
+    the impulse NaN.
     """
     objective, rebound, together = view.objective, (1 + view.restitution) * view.speed, _together(view)
     jumps = np.zeros((len(postures), objective.robot.nv))
@@ -97,28 +95,28 @@ def _jumps(view: ResultView, postures: Array) -> tuple[Array, Array]:
     for k, q in enumerate(postures):
         if together:
             several = coulomb_jumps(objective, q, view.speed) or ()
-            for i, one in enumerate(several):
-                jumps[k], impulses[k, i] = one.velocity, one.impulse_size
-        elif (jump := coulomb_jump(objective, q, rebound)) is not None:
-            jumps[k], impulses[k, 0] = jump.velocity, jump.impulse_size
-        elif (alone := objective.oracle.quantities(q)).G > 0:
-            jumps[k], impulses[k, 0] = rebound / alone.G * alone.jump, rebound / alone.G
+            for i, jump in enumerate(several):
+                jumps[k], impulses[k, i] = jump.velocity, jump.impulse_size
+        elif (single := coulomb_jump(objective, q, rebound)) is not None:
+            jumps[k], impulses[k, 0] = single.velocity, single.impulse_size
+        elif (impact := objective.oracle.quantities(q)).G > 0:
+            jumps[k], impulses[k, 0] = rebound / impact.G * impact.jump, rebound / impact.G
     return jumps, impulses
 
 
 def _together(view: ResultView) -> bool:
-    """Tell whether the jump of several contacts at once is known at the first and the last posture."""
+    """Return whether several contacts have a common jump at the first and the last posture."""
     ends = (view.q_initial, view.q_optimal)
     return bool(view.objective.others) and all(coulomb_jumps(view.objective, q, view.speed) for q in ends)
 
 
-def _way(view: ResultView) -> tuple[Array, str, Array]:
-    """Return the places on the way that the slider takes, their unit, and the postures there."""
+def _frames(view: ResultView) -> tuple[Array, str, Array]:
+    """Return the times or path lengths of the slider, their unit, and the postures there."""
     if view.motion is not None and len(view.motion.t) > 1:
         kept = np.unique(np.linspace(0, len(view.motion.t) - 1, _MOST).astype(int))
         return view.motion.t[kept], "s", view.motion.q[kept]
     if view.path is not None and view.path.s[-1] > 0:
-        # Points that fall on one another would have no order.
+        # Repeated points would have no order.
         kept = np.flatnonzero(np.diff(view.path.s, prepend=-1.0) > 0)
         return view.path.s[kept], "", view.path.q[kept]
     return np.array([0.0, 1.0]), "", np.array([view.q_initial, view.q_optimal])
@@ -128,8 +126,8 @@ def _content(folder: Path, prepared: Prepared, view: ResultView, document: dict[
     title, small = header_lines(view)
     facts = [fact for fact in small[0].split(SEPARATOR) if not fact.startswith(ALONE)]
     certificate, solver = document["certificate"], document["solver"]
-    # Results of former versions have no such number.
-    left = solver.get("dominated_starts", 0)
+    # Results of former versions lack this number.
+    dominated = solver.get("dominated_starts", 0)
     checks = [
         ("stationarity", certificate["stationarity"], ""),
         ("violation of the constraints", certificate["primal"], ""),
@@ -137,7 +135,7 @@ def _content(folder: Path, prepared: Prepared, view: ResultView, document: dict[
         ("pose error", certificate["pose_error_m"], "m"),
         ("pose error", certificate["pose_error_rad"], "rad"),
     ]
-    active = [f"active: {one['constraint']}, {one['side']}" for one in document["active"]]
+    active = [f"active: {bound['constraint']}, {bound['side']}" for bound in document["active"]]
     return Content(
         title=title,
         command=typed_command(folder) or "impact-posture optimize problem.toml",
@@ -154,7 +152,7 @@ def _content(folder: Path, prepared: Prepared, view: ResultView, document: dict[
         moves=_moves(view, document),
         notes=(
             f"{solver['certified_starts']} of {solver['starts']} starts ended at a certified posture."
-            + (f" {left} were left on the way, because they could not become the best." if left else ""),
+            + (f" {dominated} were left on the way, because they could not become the best." if dominated else ""),
             f"{document['redundancy']} degrees of freedom are left by the constraints at the optimum.",
             *document["constraints"], *active, *document["notes"], *document["warnings"],
         ),
@@ -163,25 +161,22 @@ def _content(folder: Path, prepared: Prepared, view: ResultView, document: dict[
 
 
 def _before_and_after(prepared: Prepared, document: dict[str, Any]) -> Iterator[Table]:
-    """Yield the table of the impact, and that of each further contact."""
+    """Yield the table of the impact, and a table of each further contact."""
     blocks, contacts = [document[key] for key in ("initial", "optimal")], prepared.impact.objective.contacts
     for k, contact in enumerate(contacts):
         if k == 0:
             rows = quantity_rows(prepared.impact, *blocks)
         else:
-            own = [block["by_contact"][k] for block in blocks]
+            before, after = (block["by_contact"][k] for block in blocks)
             named = quantities(prepared.impact.metric)
-            rows = [QuantityRow(key, own[0][key], own[1][key], unit, words) for key, unit, words in named]
+            rows = [QuantityRow(key, before[key], after[key], unit, meaning) for key, unit, meaning in named]
+        alone = f", of an impact at {contact.frame} alone" if len(contacts) > 1 else ""
+        alone += "; the objective is of all contacts" if alone and k == 0 else ""
         yield Table(
-            f"Before and after{_alone(contact.frame, k) if len(contacts) > 1 else ''}",
+            f"Before and after{alone}",
             ("", "before", "after", "unit", "meaning"),
             tuple((row.key, number(row.before), number(row.after), row.unit, row.meaning) for row in rows),
         )
-
-
-def _alone(frame: str, index: int) -> str:
-    """Say what a table of one of several contacts is about."""
-    return f", of an impact at {frame} alone" + ("; the objective is of all contacts" if index == 0 else "")
 
 
 def _moves(view: ResultView, document: dict[str, Any]) -> str:
