@@ -1,4 +1,4 @@
-"""Arguments of the command line put into the form that Typer reads."""
+"""Rewrite arguments of the command line to the form that Typer reads."""
 
 from __future__ import annotations
 
@@ -8,7 +8,7 @@ from itertools import zip_longest
 
 # Options whose value may be left out, and the pattern of a value.
 _OPTIONAL = {
-    # Any number; the option itself refuses what is no whole number.
+    # Any number, because the option itself refuses a fraction.
     "--tradeoff": re.compile(r"[+-]?[0-9.]+$"),
     "--write-robot-toml": re.compile(r".*\.toml$"),
 }
@@ -21,13 +21,13 @@ def put_right(arguments: Sequence[str]) -> list[str]:
 
 def _in_pairs(arguments: Sequence[str]) -> list[str]:
     """Write ``--payload FRAME MASS`` as ``--payload FRAME:MASS``: Typer has no repeatable options of two values."""
-    found, rest = [], list(arguments)
+    words, rest = [], list(arguments)
     while rest:
         word = rest.pop(0)
-        found.append(word)
+        words.append(word)
         if word == "--payload" and len(rest) > 1 and not rest[1].startswith("--"):
-            found.append(f"{rest.pop(0)}:{rest.pop(0)}")
-    return found
+            words.append(f"{rest.pop(0)}:{rest.pop(0)}")
+    return words
 
 
 def fill_optional(arguments: Sequence[str]) -> list[str]:
@@ -41,7 +41,7 @@ def fill_optional(arguments: Sequence[str]) -> list[str]:
 
 
 def _default(option: str) -> str:
-    """Value of an option that is given without one."""
+    """Return the value of an option that stands without a value."""
     if option != "--tradeoff":
         return ""
     from impact_posture.config.settings import TRADEOFF_POINTS

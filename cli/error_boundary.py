@@ -57,7 +57,7 @@ def run(command: Any, arguments: Sequence[str]) -> int:
         return error.code if isinstance(error.code, int) else 1
     except Exception as error:
         if isinstance(error, BrokenPipeError) or getattr(error, "errno", None) == errno.EPIPE:
-            # The reader has closed the pipe (``| head``), which is no fault.
+            # The reader has closed the pipe (``| head``), which is not a fault.
             _discard_output()
             return 1
         if os.environ.get(DEBUG_VARIABLE):
@@ -71,7 +71,7 @@ def run(command: Any, arguments: Sequence[str]) -> int:
 
 @dataclass(frozen=True)
 class _Fault:
-    """Exit code of an error, and what is said of it."""
+    """Exit code and message of an error."""
 
     code: int
     kind: str
@@ -105,11 +105,11 @@ def _explain(error: Exception, arguments: Sequence[str]) -> _Fault:
 def _usage(error: Any, wants_json: bool) -> int:
     """Print the message of Typer without colors: the usage and the error."""
     code = int(getattr(error, "exit_code", 2))
-    _in_our_words(error)
-    shown = io.StringIO()
-    error.show(file=shown)
+    _reword_choice(error)
+    text = io.StringIO()
+    error.show(file=text)
     with contextlib.suppress(OSError):
-        sys.stderr.write(printable(shown.getvalue(), keep="\n"))
+        sys.stderr.write(printable(text.getvalue(), keep="\n"))
     if wants_json:
         context = getattr(error, "ctx", None)
         where = context.command_path if context is not None else "command line"
@@ -117,14 +117,14 @@ def _usage(error: Any, wants_json: bool) -> int:
     return code
 
 
-def _in_our_words(error: Any) -> None:
-    """Give the message of an invalid choice the words that the library has for a key in a file."""
+def _reword_choice(error: Any) -> None:
+    """Reword the message of an invalid choice as for a key of a file."""
     # Typer has no hook for this. The wording differs between versions; all contain the value and the choices.
-    given = re.search(r"'(.*?)' is not one of ('.*)", str(getattr(error, "message", "")))
-    if given:
+    match = re.search(r"'(.*?)' is not one of ('.*)", str(getattr(error, "message", "")))
+    if match:
         from impact_posture.errors import not_one_of
 
-        error.message = "; ".join(not_one_of(given[1], re.findall(r"'(.*?)'", given[2])))
+        error.message = "; ".join(not_one_of(match[1], re.findall(r"'(.*?)'", match[2])))
 
 
 def _report(fault: _Fault, wants_json: bool) -> int:

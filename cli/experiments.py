@@ -53,7 +53,7 @@ def rows_table(page: Page, rows: tuple[ControllerRow, ...] | list[ControllerRow]
     page.line("  q_total: motion in the impact windows (rad, m); peak jump in rad/s and m/s", style="dim")
     page.line("  less %: reduction of q_total; in 1 s %: from each impact until 1 s later", style="dim")
     if any(row.failed for row in rows):
-        page.line("  no reduction if a run of either controller did not complete; means are those of completed runs",
+        page.line("  no reduction if a run of either controller did not complete; means are over completed runs",
                   style="dim")  # fmt: skip
     for row in rows:
         for line in row.failed:

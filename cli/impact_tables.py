@@ -1,4 +1,4 @@
-"""Summary of an impact, alike for every command: what it is, its quantities, and its worst cases."""
+"""Summary of an impact for every command: description, quantities and worst cases."""
 
 from __future__ import annotations
 
@@ -27,12 +27,12 @@ def impact_rows(impact: ResolvedImpact, normals: Sequence[Iterable[Any]], axes: 
     Args:
         impact: The impact.
         normals: Normal of each contact.
-        axes: What the normals are given in.
+        axes: Frame of the normals, in words.
     """
     objective, contact, metric = impact.objective, impact.contact, impact.metric
     rows = []
-    for name, one, normal in zip(contact_names(objective.contacts), objective.contacts, normals, strict=True):
-        limit = f", up to {one.impulse:g} N·s" if objective.others else ""
+    for name, struck, normal in zip(contact_names(objective.contacts), objective.contacts, normals, strict=True):
+        limit = f", up to {struck.impulse:g} N·s" if objective.others else ""
         rows.append((f"normal at {name}" if objective.others else "normal", f"{vector(normal)} ({axes}){limit}"))
     if any(contact.offset):
         offset = ", ".join(f"{v:g}" for v in contact.offset)
@@ -74,7 +74,7 @@ def worst_tables(page: Page, frames: Sequence[str], blocks: Mapping[str, Mapping
 
 
 def worst_lines(page: Page, frames: Sequence[str], blocks: Mapping[str, Mapping[str, Any]]) -> None:
-    """Say the worst normal, the worst impulses and whether the feet stay, for each evaluation by name."""
+    """Print the worst normal, the worst impulses and whether the feet stay, for each evaluation by name."""
     named = {f" {name}" if len(blocks) > 1 else "": block for name, block in blocks.items()}
     for when, block in named.items():
         if "cone" in block:
@@ -82,10 +82,10 @@ def worst_lines(page: Page, frames: Sequence[str], blocks: Mapping[str, Mapping[
         if "worst_impulses" in block:
             page.line(f"worst impulses{when}: {_impulses(frames, block['worst_impulses'])}")
     for when, block in named.items():
-        for name, one in zip(frames, block.get("by_contact", [block]), strict=True):
-            if "footing" in one:
+        for name, part in zip(frames, block.get("by_contact", [block]), strict=True):
+            if "footing" in part:
                 where = f" (impact at {name})" if "by_contact" in block else ""
-                page.line(f"feet{when}{where}: {one['footing']['verdict']}")
+                page.line(f"feet{when}{where}: {part['footing']['verdict']}")
 
 
 def _impulses(frames: Sequence[str], worst: Mapping[str, Any]) -> str:
@@ -97,6 +97,6 @@ def _impulses(frames: Sequence[str], worst: Mapping[str, Any]) -> str:
 
 
 def alone_line(page: Page, frames: Sequence[str], what: str) -> None:
-    """Say of which contact the numbers are, where there are several."""
+    """Name the contact whose numbers are shown, if there are several contacts."""
     if len(frames) > 1:
         page.line(f"  ({what}: of an impact at {frames[0]} alone)", style="dim")

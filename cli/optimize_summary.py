@@ -1,4 +1,4 @@
-"""What ``optimize`` says of a problem and of its answer."""
+"""Print a problem and its result for ``optimize``."""
 
 from __future__ import annotations
 
@@ -12,7 +12,7 @@ if TYPE_CHECKING:
     from impact_posture.posture.formulation.problem_file import Prepared
     from impact_posture.posture.search.multistart import PostureSolution
 
-# Actuators in the table of what holding a posture takes.
+# Number of actuators in the table of loads.
 _TIGHTEST = 3
 
 
@@ -46,7 +46,7 @@ def announce(page: Page, prepared: Prepared) -> None:
 
 
 def summarize(page: Page, prepared: Prepared, solution: PostureSolution, document: dict[str, Any]) -> None:
-    """Show the answer: verdict, table before and after, certificate, and what else was asked for."""
+    """Show the result: verdict, table before and after, certificate, trade-off and path."""
     from impact_posture.output.quantity_table import quantity_rows
     from impact_posture.posture.search.impact_notes import percent
 
@@ -77,15 +77,16 @@ def summarize(page: Page, prepared: Prepared, solution: PostureSolution, documen
         page.line(f"the given posture did not satisfy the constraints: moved by {solution.moved:.3g} first")
     if document["active"]:
         page.line("active: " + ", ".join(dict.fromkeys(_active(a) for a in document["active"])))
-    found = solution.certificate
+    certificate = solution.certificate
     page.line(
-        f"certificate ({found.recomputed_with}): stationarity {found.stationarity:.1e}, "
-        f"violation {found.primal:.1e}, pose error {found.pose_error_m:.1e} m, {found.pose_error_rad:.1e} rad"
+        f"certificate ({certificate.recomputed_with}): stationarity {certificate.stationarity:.1e}, "
+        f"violation {certificate.primal:.1e}, "
+        f"pose error {certificate.pose_error_m:.1e} m, {certificate.pose_error_rad:.1e} rad"
     )
     if "collision" in document:
         at = document["collision"]["optimal"]
         page.line(f"no collision; closest: {at['closest']}, {1e3 * at['distance']:.3g} mm")
-    # Mirrored postures are optima of one value.
+    # Mirrored postures have the same value.
     hits = Counter[str]()
     for optimum in solution.optima:
         hits[number(optimum.objective)] += optimum.hits
@@ -112,12 +113,12 @@ def _holding(page: Page, before: dict[str, Any] | None, after: dict[str, Any] | 
     if before is None or after is None:
         return
     rows = []
-    for one, other in zip((before, *before["other_loads"]), (after, *after["other_loads"]), strict=True):
-        shares = {name: (load["share"], other["actuators"][name]["share"]) for name, load in one["actuators"].items()}
+    for old, new in zip((before, *before["other_loads"]), (after, *after["other_loads"]), strict=True):
+        shares = {name: (load["share"], new["actuators"][name]["share"]) for name, load in old["actuators"].items()}
         for name in sorted(shares, key=lambda name: -max(shares[name]))[:_TIGHTEST]:
             used = (f"{share:.0%}" for share in shares[name])
-            load = other["actuators"][name]
-            rows.append((f"  {name}", *used, f"{number(load['low'])} to {number(load['high'])}", one["load"]))
+            load = new["actuators"][name]
+            rows.append((f"  {name}", *used, f"{number(load['low'])} to {number(load['high'])}", new["load"]))
     page.line("share of the limits of the actuators that hold the posture (0% is mid-range)")
     page.table(("", "before", "after", "range, N·m or N", ""), rows, right=(1, 2))
     page.gap()

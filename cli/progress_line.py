@@ -1,4 +1,4 @@
-"""Progress line on standard error for what takes long; nothing where standard error is no terminal."""
+"""Progress line on standard error, if standard error is a terminal."""
 
 from __future__ import annotations
 

@@ -1,10 +1,10 @@
-"""Options made from the fields of the settings, and settings read back from the options."""
+"""Make options of the fields of settings, and settings of the options."""
 
 from __future__ import annotations
 
 import inspect
 import os
-from collections.abc import Callable, Collection, Mapping
+from collections.abc import Callable, Collection
 from dataclasses import MISSING, dataclass, fields
 from pathlib import Path
 from types import UnionType
@@ -25,7 +25,7 @@ NoSupport = Annotated[bool, typer.Option("--no-support", rich_help_panel=ROBOT, 
 
 
 @dataclass(frozen=True)
-class Given:
+class TypedSettings:
     """Settings that stand on the command line, without defaults.
 
     Attributes:
@@ -37,7 +37,7 @@ class Given:
     values: dict[str, Any]
 
     def fill(self, settings: type[_Settings], **more: Any) -> _Settings:
-        """Make settings of these values and ``more``, which has priority."""
+        """Make settings of these values and of ``more``, which has priority."""
         return validate(settings, self.values | more, "options")
 
     def check_contact(self) -> None:
@@ -52,7 +52,7 @@ class Given:
             raise UsageError("--contact stands instead of --frame and --normal: give one of the two.")
 
     def is_result(self, robot: str, free: Collection[str]) -> bool:
-        """Return whether ROBOT|RESULT_DIR is a result folder; ``free`` are the options that go with a result folder.
+        """Return whether ROBOT|RESULT_DIR is a result folder; only the options ``free`` go with one.
 
         Raises:
             UsageError: An option contradicts the result folder; exit code 2.
@@ -70,35 +70,39 @@ class Given:
 def with_settings(
     settings: type[RobotSettings], *, without: Collection[str] = (), **changed: Any
 ) -> Callable[[Callable[..., None]], Callable[..., None]]:
-    """Give a command the options of all settings. The command receives ``given`` and its own parameters.
+    """Give a command the options of all settings. The command receives ``typed`` and its own parameters.
 
     Args:
         settings: The dataclass whose annotated fields become options.
         without: Fields that the command does not take.
         changed: Annotations of the fields whose options differ in this command.
     """
-    made = _options(settings, without) | {name: (hint, None) for name, hint in changed.items()}
-    if "support" in made:
-        made["no_support"] = (NoSupport, False)
+    options = _options(settings, without) | {name: (hint, None) for name, hint in changed.items()}
+    if "support" in options:
+        options["no_support"] = (NoSupport, False)
 
     def decorate(command: Callable[..., None]) -> Callable[..., None]:
         hints = get_type_hints(command, include_extras=True)
-        own = {name: p for name, p in inspect.signature(command).parameters.items() if name != "given"}
+        keyword = inspect.Parameter.KEYWORD_ONLY
+        others = [
+            parameter.replace(kind=keyword, annotation=hints[name])
+            for name, parameter in inspect.signature(command).parameters.items()
+            if name != "typed"
+        ]
 
         def run(context: typer.Context, **values: Any) -> None:
-            command(given=Given(context, _given(context, made, settings)), **{name: values[name] for name in own})
+            typed = TypedSettings(context, _typed_values(context, options, settings))
+            command(typed=typed, **{parameter.name: values[parameter.name] for parameter in others})
 
-        keyword = inspect.Parameter.KEYWORD_ONLY
-        arguments = [p for p in own.values() if p.default is p.empty]
         parameters = [
             inspect.Parameter("context", keyword, annotation=typer.Context),
-            *(p.replace(kind=keyword, annotation=hints[p.name]) for p in arguments),
-            *(inspect.Parameter(n, keyword, default=default, annotation=hint) for n, (hint, default) in made.items()),
-            *(p.replace(kind=keyword, annotation=hints[p.name]) for p in own.values() if p not in arguments),
+            *(parameter for parameter in others if parameter.default is parameter.empty),
+            *(inspect.Parameter(n, keyword, default=default, annotation=a) for n, (a, default) in options.items()),
+            *(parameter for parameter in others if parameter.default is not parameter.empty),
         ]
         # Typer reads the signature and, in some versions, the annotations.
         run.__signature__ = inspect.Signature(parameters)  # type: ignore[attr-defined]
-        run.__annotations__ = {p.name: p.annotation for p in parameters}
+        run.__annotations__ = {parameter.name: parameter.annotation for parameter in parameters}
         run.__name__, run.__doc__, run.__module__ = command.__name__, command.__doc__, command.__module__
         return run
 
@@ -166,9 +170,7 @@ def _value(setting: Setting | None, value: Any) -> Any:
     return tuple(value) if isinstance(value, list) else value
 
 
-def _given(
-    context: typer.Context, options: Mapping[str, tuple[Any, Any]], settings: type[RobotSettings]
-) -> dict[str, Any]:
+def _typed_values(context: typer.Context, options: Collection[str], settings: type[RobotSettings]) -> dict[str, Any]:
     described, values = settings_of(settings), {}
     for name in options:
         if name in described and _on_command_line(context, name):

@@ -15,7 +15,7 @@ from impact_posture_cli import options
 from impact_posture_cli.error_boundary import UsageError
 from impact_posture_cli.output import Page, print_json
 from impact_posture_cli.progress_line import progress
-from impact_posture_cli.settings_options import Given, with_settings
+from impact_posture_cli.settings_options import TypedSettings, with_settings
 
 if TYPE_CHECKING:
     from impact_posture.codegen.export import Export
@@ -32,7 +32,7 @@ _IMPACT = {"speed", "restitution", "posture"}
 
 @with_settings(ImpactSettings, without=_IMPACT, frame=options.FrameList)
 def codegen(
-    given: Given,
+    typed: TypedSettings,
     robot: options.RobotOrResult,
     prefix: options.Prefix = None,
     out: options.ExportOut = None,
@@ -48,12 +48,12 @@ def codegen(
     quiet: options.Quiet = False,
 ) -> None:
     """Run ``impact-posture codegen``."""
-    from_result = given.is_result(robot, {"prefix", "out", "float_", "portable", "compile", "force"})
+    from_result = typed.is_result(robot, {"prefix", "out", "float_", "portable", "compile", "force"})
     if controller is None:
         if flow or scenario is not None or daqp is not None:
             raise UsageError("--flow, --scenario and --daqp belong to --controller: give aerial, legged or arm.")
         if not from_result:
-            _check_problem(given, robot)
+            _check_problem(typed, robot)
     elif float_ or portable:
         raise UsageError("--controller is double and plain C99: leave --float and --portable out.")
     warnings: tuple[str, ...] = ()
@@ -62,7 +62,7 @@ def codegen(
     if controller is not None:
         from impact_posture.controller_export.export_controller import export_controller
 
-        made, formulation, objective = _controller_parts(given, robot, controller, flow, scenario)
+        made, formulation, objective = _controller_parts(typed, robot, controller, flow, scenario)
         written = export_controller(
             made, formulation, place, objective=objective, prefix=prefix, daqp=daqp,
             build=compile, force=force,
@@ -74,7 +74,7 @@ def codegen(
     else:
         from impact_posture.codegen.export import write_export
 
-        objectives, optimum, squeezed, warnings = _objectives(given, robot, from_result)
+        objectives, optimum, squeezed, warnings = _objectives(typed, robot, from_result)
         with progress("writing and compiling" if compile else "writing", shown=not (quiet or json)):
             written = write_export(
                 objectives, place, prefix=prefix, posture=optimum, compression=squeezed, single=float_,
@@ -98,19 +98,19 @@ def codegen(
     page.line(written.verdict)
 
 
-def _check_problem(given: Given, robot: str) -> None:
+def _check_problem(typed: TypedSettings, robot: str) -> None:
     """Check that there is a contact. Without one, a folder or a path to one is meant as a result folder."""
-    if not {"contact", "normal"} & given.values.keys() and (os.path.isdir(robot) or robot.endswith(os.sep)):
+    if not {"contact", "normal"} & typed.values.keys() and (os.path.isdir(robot) or robot.endswith(os.sep)):
         from impact_posture.output.result_reader import load_view
         from impact_posture.robot.robot_loader import known_robots
 
         if robot not in known_robots():
             load_view(Path(robot))
-    given.check_contact()
+    typed.check_contact()
 
 
 def _objectives(
-    given: Given, robot: str, from_result: bool
+    typed: TypedSettings, robot: str, from_result: bool
 ) -> tuple[list[WorstCaseObjective], Array | None, Compression | None, tuple[str, ...]]:
     """Return objectives, the optimum of a result, the first known compression of a contact, and warnings."""
     if from_result:
@@ -121,14 +121,14 @@ def _objectives(
     from impact_posture.impact.elasticity.contact_compression import compression
     from impact_posture.impact.resolved_impact import resolve
 
-    frames = given.values.get("frame", (None,))
-    impacts = [resolve(given.fill(ImpactSettings, robot=robot, frame=frame)) for frame in frames]
+    frames = typed.values.get("frame", (None,))
+    impacts = [resolve(typed.fill(ImpactSettings, robot=robot, frame=frame)) for frame in frames]
     known = (compression(one.objective, one.q, one.speed, one.contact_stiffness) for one in impacts)
     return [one.objective for one in impacts], None, next(filter(None, known), None), impacts[-1].warnings
 
 
 def _controller_parts(
-    given: Given, robot: str, kind: ControllerKind, flow: bool, scenario: str | None
+    typed: TypedSettings, robot: str, kind: ControllerKind, flow: bool, scenario: str | None
 ) -> tuple[Robot, TaskFormulation, WorstCaseObjective | None]:
     """Return the robot, its tasks, and the objective that the posture task follows."""
     if scenario is not None:
@@ -137,8 +137,8 @@ def _controller_parts(
         from impact_posture.simulation.scenario_objective import interpreted
         from impact_posture.simulation.setup import set_up
 
-        if given.values:
-            raise UsageError(f"--{next(iter(given.values))} contradicts --scenario, which has robot and impact.")
+        if typed.values:
+            raise UsageError(f"--{next(iter(typed.values))} contradicts --scenario, which has robot and impact.")
         setup = set_up(read_scenario(scenario))
         known = {setup.robot.name, setup.robot.source}
         if robot not in known and Path(robot).resolve() != Path(setup.robot.source).resolve():
@@ -148,21 +148,21 @@ def _controller_parts(
         return setup.robot, driver.controller.formulation, factory.objective()
     from impact_posture.controller_export.default_formulation import default_formulation
 
-    if "normal" in given.values:
+    if "normal" in typed.values:
         from impact_posture.impact.resolved_impact import resolve
 
-        frames = given.values.get("frame", (None,))
+        frames = typed.values.get("frame", (None,))
         if len(frames) > 1:
             raise UsageError("--controller follows the gradient of one impact: give one --frame.")
-        objective = resolve(given.fill(ImpactSettings, robot=robot, frame=frames[0])).objective
+        objective = resolve(typed.fill(ImpactSettings, robot=robot, frame=frames[0])).objective
         return objective.robot, default_formulation(objective.robot, kind, objective, flow=flow), objective
     from impact_posture.robot.robot_loader import load_robot
 
     if flow:
         raise UsageError("--flow lowers impacts: give --normal X Y Z, or --scenario.")
     known = {field.name for field in fields(LoadOptions)}
-    for name in given.values:
+    for name in typed.values:
         if name not in known:
             raise UsageError(f"--{name.replace('_', '-')} belongs to an impact: give --normal X Y Z too.")
-    loaded = load_robot(robot, given.fill(RobotSettings, robot=robot))
+    loaded = load_robot(robot, typed.fill(RobotSettings, robot=robot))
     return loaded, default_formulation(loaded, kind), None

@@ -53,21 +53,21 @@ def compare(
     failure = ""
     beside = nullcontext() if folder is None else store_beside(folder)
     with beside as store, progress("running", "runs", shown=not (quiet or json)) as advance:
-        found = reproduce(plan, seeds=seeds, processes=jobs, store=store, progress=advance, compile=compile)
+        reproduction = reproduce(plan, seeds=seeds, processes=jobs, store=store, progress=advance, compile=compile)
         if folder is not None and store is not None:
             output = Output(folder, force, format or FORMATS, not no_report, meshes)
-            failure = write_comparison(output, found, store)
+            failure = write_comparison(output, reproduction, store)
     if failure and not quiet:
         complain(f"warning: there is no report.html: {failure}")
     if json:
-        print_json(found.comparison())
+        print_json(reproduction.comparison())
         return
     page = Page(quiet=quiet)
-    shown = "mean ± half of the 95 % interval" if seeds >= FEWEST else f"means (intervals from {FEWEST} seeds on)"
-    if without_noise(one for row in found.rows for one in row.metrics.values()):
-        shown = "all alike, because the scenario has no noise"
-    page.title(found.rows[0].scenario, f"{seeds} seeds, {shown}" if seeds > 1 else "1 seed")
-    rows_table(page, found.rows)
+    statistic = "mean ± half of the 95 % interval" if seeds >= FEWEST else f"means (intervals from {FEWEST} seeds on)"
+    if without_noise(metric for row in reproduction.rows for metric in row.metrics.values()):
+        statistic = "all alike, because the scenario has no noise"
+    page.title(reproduction.rows[0].scenario, f"{seeds} seeds, {statistic}" if seeds > 1 else "1 seed")
+    rows_table(page, reproduction.rows)
     if folder is not None:
         page.gap()
         page.line(f"written: {folder}")

@@ -10,7 +10,7 @@ from impact_posture.config.settings import RobotSettings
 from impact_posture_cli import options
 from impact_posture_cli.error_boundary import UsageError
 from impact_posture_cli.output import Page, number, print_json
-from impact_posture_cli.settings_options import Given, with_settings
+from impact_posture_cli.settings_options import TypedSettings, with_settings
 
 if TYPE_CHECKING:
     from impact_posture.config.settings import LoadOptions
@@ -29,7 +29,7 @@ ForceFile = Annotated[bool, options.option("--force", panel=OUTPUT, help="Replac
 
 @with_settings(RobotSettings)
 def inspect(
-    given: Given,
+    typed: TypedSettings,
     robot: options.RobotName,
     write_robot_toml: WriteRobotToml = None,
     force: ForceFile = False,
@@ -40,7 +40,7 @@ def inspect(
     from impact_posture.robot.robot_loader import load_robot
     from impact_posture.robot.robot_summary import summarize
 
-    load = given.fill(RobotSettings, robot=robot)
+    load = typed.fill(RobotSettings, robot=robot)
     if write_robot_toml is not None:
         if load.config is not None:
             raise UsageError("--config contradicts --write-robot-toml, which drafts one: leave it out.")
@@ -142,7 +142,7 @@ def _frames(page: Page, summary: dict[str, Any]) -> None:
     for frame in links:
         by_joint.setdefault(frame["joint"], []).append(frame["name"])
     page.gap()
-    page.title(f"Link frames ({len(links)})", "by the joint that moves them; those of 'universe' never move")
+    page.title(f"Link frames ({len(links)})", "by the joint that moves them; frames of 'universe' never move")
     page.table(("moved by", "frames"), [(joint, ", ".join(names)) for joint, names in by_joint.items()])
     if not page.quiet:
         page.line("  joints' own frames have the joints' names; --json lists every frame", style="dim")

@@ -14,7 +14,7 @@ from impact_posture_cli import options
 from impact_posture_cli.optimize_summary import announce, summarize
 from impact_posture_cli.output import Page, print_json
 from impact_posture_cli.progress_line import progress
-from impact_posture_cli.settings_options import Given, with_settings
+from impact_posture_cli.settings_options import TypedSettings, with_settings
 
 if TYPE_CHECKING:
     from impact_posture.output.result_folder import Written
@@ -32,7 +32,7 @@ RobotOrProblem = Annotated[
 
 @with_settings(ProblemSettings)
 def optimize(
-    given: Given,
+    typed: TypedSettings,
     robot: RobotOrProblem,
     jobs: options.Jobs = 2,
     compile: options.Compile = "auto",
@@ -46,10 +46,10 @@ def optimize(
     quiet: options.Quiet = False,
 ) -> None:
     """Run ``impact-posture optimize``."""
-    # Most of what is made here lives until the answer is printed, so that to look for garbage only takes time.
+    # Most objects live until the result is printed, so garbage collection only takes time.
     gc.set_threshold(*_RARELY)
-    settings = _settings(robot, given)
-    _refuse_idle(given, settings)
+    settings = _settings(robot, typed)
+    _refuse_idle(typed, settings)
     from impact_posture.api.posture_problem import PostureProblem
     from impact_posture.api.posture_result import optimize as solve
     from impact_posture.output.result_folder import FORMATS, default_out
@@ -110,23 +110,25 @@ def optimize(
         page.line(f"written to {written.out}: {_contents(written)}")
 
 
-def _settings(robot: str, given: Given) -> ProblemSettings:
+def _settings(robot: str, typed: TypedSettings) -> ProblemSettings:
     from_file = robot.endswith(".toml")
     if not from_file and os.path.isfile(problem := Path(robot) / "problem.toml"):
         from impact_posture.robot.robot_loader import known_robots
 
         if robot not in known_robots():
-            raise typer.BadParameter(f"a result folder is no robot; its problem is {problem}", param_hint="'ROBOT'")
-    if not from_file or "contact" in given.values:
-        given.check_contact()
+            raise typer.BadParameter(
+                f"a result folder is not a robot; its problem is {problem}", param_hint="'ROBOT'"
+            )
+    if not from_file or "contact" in typed.values:
+        typed.check_contact()
     if not from_file:
-        return given.fill(ProblemSettings, robot=robot)
+        return typed.fill(ProblemSettings, robot=robot)
     from impact_posture.posture.formulation.problem_file import read_settings
 
-    return read_settings(Path(robot), given.values)
+    return read_settings(Path(robot), typed.values)
 
 
-def _refuse_idle(given: Given, settings: ProblemSettings) -> None:
+def _refuse_idle(typed: TypedSettings, settings: ProblemSettings) -> None:
     """Refuse options that have no effect without another option."""
     for name, used, hint in (
         ("box", settings.contact_pose == "box", "--contact-pose box"),
@@ -137,7 +139,7 @@ def _refuse_idle(given: Given, settings: ProblemSettings) -> None:
         ("clearance", settings.collision, "--collision"),
         ("surface", settings.collision, "--collision"),
     ):
-        if name in given.values and not used:
+        if name in typed.values and not used:
             raise typer.BadParameter(f"does nothing without {hint}", param_hint=f"'--{name.replace('_', '-')}'")
 
 

@@ -52,8 +52,10 @@ def reproduce(
     check_output(folder, force=force, kind="reproduction")
     with store_beside(folder) as store, progress("running", "runs", shown=not (quiet or json)) as advance:
         plan = {name: controllers_of(name, all_) for name in scenarios}
-        found = reproduce_all(plan, seeds=seeds, processes=jobs, store=store, progress=advance, compile=compile)
-        document = write_reproduction(Output(folder, force, format or FORMATS), found, store)
+        reproduction = reproduce_all(
+            plan, seeds=seeds, processes=jobs, store=store, progress=advance, compile=compile
+        )
+        document = write_reproduction(Output(folder, force, format or FORMATS), reproduction, store)
     if json:
         print_json(document)
         return
@@ -61,9 +63,9 @@ def reproduce(
     for name in scenarios:
         paper = PAPER[name]
         page.title(name, f"the paper: {paper.nominal:g} to {paper.robust:g}, {100 * paper.reduction:.1f} % less")
-        rows_table(page, found.of(name))
+        rows_table(page, reproduction.of(name))
         page.gap()
-    for line in advice(found):
+    for line in advice(reproduction):
         page.line(line.replace("**", "").replace("`", ""))
     page.gap()
     page.line(f"written: {folder}; read {folder / 'SUMMARY.md'}")

@@ -24,5 +24,5 @@ def robots(json: options.Json = False, quiet: options.Quiet = False) -> None:
         page.line("ROBOT is one of:")
         page.table((), [("  -", way) for way in WAYS_TO_NAME])
         page.line("Models come from the example-robot-data package, except:")
-        own = [e["name"] for e in entries if e["from"] != "example-robot-data"]
-        page.line(f"  {', '.join(own)} (impact-posture's own). --json has every source.")
+        bundled = [e["name"] for e in entries if e["from"] != "example-robot-data"]
+        page.line(f"  {', '.join(bundled)} (bundled with impact-posture). --json has every source.")

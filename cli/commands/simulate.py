@@ -87,7 +87,7 @@ def simulate(
     from impact_posture.simulation.scenario_file import read_scenario
 
     # A name that is none is refused before all that takes long to import.
-    given = read_scenario(scenario)
+    experiment = read_scenario(scenario)
     from impact_posture.experiment.experiment_folders import FORMATS, Output, write_simulation
     from impact_posture.experiment.jobs import Job, execute, worth_compiling
     from impact_posture.experiment.seed_statistics import fate
@@ -97,12 +97,12 @@ def simulate(
     from impact_posture.system.output_folder import check_output
 
     if export_world is not None:
-        _export_world(Page(quiet=quiet or json), given, Path(export_world), force)
+        _export_world(Page(quiet=quiet or json), experiment, Path(export_world), force)
         return
     check_gain(controller, gain)
     only, code = None if sign is None else int(sign), worth_compiling(compile, 1)
     job = Job(scenario, controller, seed, mode, free, gain, only, code)
-    folder = Path(out) if out else Path(file_name(f"{given.name}-{job.label.replace(':', '-')}"))
+    folder = Path(out) if out else Path(file_name(f"{experiment.name}-{job.label.replace(':', '-')}"))
     check_output(folder, force=force, kind="run")
     with progress("running", shown=not (quiet or json)):
         with one_blas_thread():
@@ -117,7 +117,7 @@ def simulate(
         _show(Page(quiet=quiet), document, job.label, folder)
     if document["status"] != "completed":
         sys.stdout.flush()
-        complain(f"error: {given.name}, {job.label}: {fate(document)}; its numbers are no result")
+        complain(f"error: {experiment.name}, {job.label}: {fate(document)}; its numbers are not a result")
         raise typer.Exit(_FAILED)
 
 
@@ -134,7 +134,11 @@ def _export_world(page: Page, scenario: Scenario, out: Path, force: bool) -> Non
 def _rigid(prediction: dict[str, Any]) -> str:
     if prediction["sticking"] is None:
         return f"{number(prediction['frictionless'], missing='–')} without a controller"
-    named = {"frictionless": "without friction", "coulomb": "with that of the surface", "sticking": "sticking"}
+    named = {
+        "frictionless": "without friction",
+        "coulomb": "with the friction of the surface",
+        "sticking": "sticking",
+    }
     return ", ".join(f"{number(prediction[key], missing='–')} {words}" for key, words in named.items())
 
 
@@ -147,8 +151,8 @@ def _show(page: Page, document: dict[str, Any], label: str, folder: Path) -> Non
     counted = ("relaxed_ticks", "failed_ticks", "contacts", "contacts_asked")
     count = {key: sum(part["metrics"][key] for part in runs) for key in counted}
     ticks = sum(part["ticks"] for part in runs)
-    given_way = f"{count['relaxed_ticks']} of {ticks} ticks, in which limits made a task give way"
-    rows.append(("relaxed", given_way))
+    relaxed = f"{count['relaxed_ticks']} of {ticks} ticks, in which limits made a task give way"
+    rows.append(("relaxed", relaxed))
     held = f"{count['failed_ticks']} ticks, in which no command was found and the last one was kept"
     rows.append(("held", held))
     if any(window["kind"] == "dwell" for window in document["windows"]):

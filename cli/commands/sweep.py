@@ -71,7 +71,7 @@ def sweep(
     from impact_posture.system.escape import file_name
 
     path = Path(target)
-    asked = read_sweep(path)
+    request = read_sweep(path)
     place = Path(out) if out else Path(file_name(path.stem))
     began = time.perf_counter()
     where = _executor(workers, scheduler, slurm, place, mpi=mpi)
@@ -79,28 +79,28 @@ def sweep(
         where as executor,
         progress("solving", "points in all passes", shown=not (quiet or json), first="checking") as advance,
     ):
-        done = run_sweep(asked, place, executor, progress=advance)
-    found: dict[str, Any] = {
+        run = run_sweep(request, place, executor, progress=advance)
+    document: dict[str, Any] = {
         "schema": "impact-posture/sweep-run/1",
         "folder": str(place),
-        "points": done.points,
-        "solved": done.counts,
-        "shards_written": done.shards,
-        "solver_s": done.solver_s,
-        "total_s": done.total_s,
+        "points": run.points,
+        "solved": run.counts,
+        "shards_written": run.shards,
+        "solver_s": run.solver_s,
+        "total_s": run.total_s,
         "wall_s": time.perf_counter() - began,
     }
     if json:
-        print_json(found)
+        print_json(document)
         return
     page = Page(quiet=quiet)
-    solved = sum(done.counts.values())
-    page.title(path.name, f"{done.points} problems, {solved} solved now")
-    page.table(("status", "problems"), [(k, str(v)) for k, v in done.counts.items() if v], right=(1,))
+    solved = sum(run.counts.values())
+    page.title(path.name, f"{run.points} problems, {solved} solved now")
+    page.table(("status", "problems"), [(k, str(v)) for k, v in run.counts.items() if v], right=(1,))
     if solved:
         page.line(
-            f"{number(1e3 * done.total_s / solved, 'ms')} of a worker's time for each problem, "
-            f"{100 * done.solver_s / max(done.total_s, 1e-9):.0f} % of it in the solver"
+            f"{number(1e3 * run.total_s / solved, 'ms')} of a worker's time for each problem, "
+            f"{100 * run.solver_s / max(run.total_s, 1e-9):.0f} % of it in the solver"
         )
     page.line(f"written to {place}")
 

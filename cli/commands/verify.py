@@ -14,7 +14,7 @@ from impact_posture.config.settings import ImpactSettings
 from impact_posture_cli import options
 from impact_posture_cli.output import Page, complain, print_json
 from impact_posture_cli.progress_line import progress
-from impact_posture_cli.settings_options import Given, demanding, with_settings
+from impact_posture_cli.settings_options import TypedSettings, demanding, with_settings
 
 if TYPE_CHECKING:
     from impact_posture.impact.resolved_impact import ResolvedImpact
@@ -40,7 +40,7 @@ _WITHOUT = {
 
 @with_settings(ImpactSettings, without=_WITHOUT, normal=NormalOfFirst)
 def verify(
-    given: Given,
+    typed: TypedSettings,
     robot: options.RobotOrResult,
     samples: Samples = 10,
     seed: SampleSeed = 0,
@@ -48,14 +48,14 @@ def verify(
     quiet: options.Quiet = False,
 ) -> None:
     """Run ``impact-posture verify``."""
-    from_result = given.is_result(robot, {"samples", "seed"})
-    if "contact" in given.values:
-        given.check_contact()
+    from_result = typed.is_result(robot, {"samples", "seed"})
+    if "contact" in typed.values:
+        typed.check_contact()
     from impact_posture.impact.resolved_impact import resolve
     from impact_posture.verification.verification import verify as verify_objective
 
-    normal = {} if "contact" in given.values else {"normal": given.values.get("normal", (0.0, 0.0, 1.0))}
-    impact = _of_result(Path(robot)) if from_result else resolve(given.fill(ImpactSettings, robot=robot, **normal))
+    normal = {} if "contact" in typed.values else {"normal": typed.values.get("normal", (0.0, 0.0, 1.0))}
+    impact = _of_result(Path(robot)) if from_result else resolve(typed.fill(ImpactSettings, robot=robot, **normal))
     with progress("comparing", shown=not (quiet or json)) as advance:
         report = verify_objective(impact.objective.singles[0], samples, seed, advance)
     if json:
