@@ -1,4 +1,4 @@
-"""An exported controller in Python, with the interface of ``tsid.Controller``.  This module needs no CasADi."""
+"""Exported controller in Python, with the interface of ``tsid.Controller``.  This module needs no CasADi."""
 
 from __future__ import annotations
 
@@ -23,7 +23,7 @@ from impact_posture.system.libraries import library_path, load_library
 from impact_posture.tsid.controller import Command, Report
 
 _FUNCTIONS = ("init", "reset", "tick", "last_report", "move_to", "lead_posture", "brace", "contact", "release")
-# Numbers of a target: set, position, rotation, velocity, acceleration.
+# Number of doubles of a target: set, position, rotation, velocity, acceleration.
 TARGET = 25
 
 
@@ -47,12 +47,8 @@ class CompiledController:
         arrays = [("u", "CONTROLS"), ("rotor_speed", "ROTORS"), ("acceleration", "NV"), ("forces", "FORCES")]
         self._command, self._out = _structure([(n, room(s)) for n, s in arrays], ["status", "iterations"])
         rows = [("rows", room("ROWS")), ("contacts", room("FORCES")), ("posture", room("NV"))]
-        rows += [
-            ("multipliers", max(1, bounds)),
-            ("relaxed", 1 + len(manifest.levels)),
-            ("deficient", room("LEVELS")),
-        ]
-        rows += [("dynamics", 1), ("level", 1), ("value", 1), ("target", manifest.nq)]
+        rows += [("multipliers", max(1, bounds)), ("relaxed", 1 + len(manifest.levels))]
+        rows += [("deficient", room("LEVELS")), ("dynamics", 1), ("level", 1), ("value", 1), ("target", manifest.nq)]
         self._report, self._diagnosis = _structure(rows, ["status", "iterations", "resting", "flow_failures"])
         self._given, self.parameters = _structure([*manifest.parameters.items()], [])
         bytes_ = ctypes.c_ulong.in_dll(library, f"{prefix}_context_bytes").value
@@ -60,7 +56,7 @@ class CompiledController:
         tasks = len(manifest.tasks)
         memory = memoryview(self._context)
         targets = np.frombuffer(memory, dtype=float, count=TARGET * tasks).reshape(tasks, TARGET)
-        # The level stands behind the targets; C has no arrays of length zero.
+        # The level follows the targets.  C has no arrays of length zero.
         self._level = np.frombuffer(memory, dtype=float, count=1, offset=8 * TARGET * max(1, tasks))
         self.targets = {task.name: row for task, row in zip(manifest.tasks, targets, strict=True)}
         self._q, self._v, self._force = np.zeros(manifest.nq), np.zeros(manifest.nv), np.zeros(6)
@@ -75,16 +71,16 @@ class CompiledController:
     def load(cls, path: str | Path, *, robot: Robot | None = None) -> CompiledController:
         """Load an exported controller.  **This runs its code**, so load only what you would run as a program.
 
-        Where ``lib<prefix>.so`` is missing, the method builds it there.  It must name this manifest.
+        The method builds a missing ``lib<prefix>.so``.  The library must contain the identity of this manifest.
 
         Args:
             path: The folder of the export, or its ``<prefix>.json``.
-            robot: The robot in hand; the export must be of this model.
+            robot: The robot; the export must be of this model.
 
         Raises:
-            SpecError: There is no export, or it is broken.
+            SpecError: The export is missing or broken.
             ManifestMismatch: The export is of another robot, or the library belongs to another manifest.
-            CompilerError: There is no library, and none can be built.
+            CompilerError: The library is missing and cannot be built.
         """
         document, manifest, folder = read_controller(Path(path))
         if robot is not None:
@@ -104,9 +100,9 @@ class CompiledController:
 
         Raises:
             InputError: A parameter is out of range; names it.
-            PostureError: ``q`` is no configuration of the robot, or ``v`` is no velocity.
+            PostureError: ``q`` is not a configuration of the robot, or ``v`` is not a velocity.
             ValueError: An array has another shape.
-            MetricError: The gradient that the posture task follows does not exist there, or vanishes.
+            MetricError: The gradient of the posture task does not exist there, or vanishes.
             ContactError: A sole stands on its edge.
         """
         self._measure(q, v)
@@ -123,7 +119,8 @@ class CompiledController:
             self.targets[name][:] = row
         code = self._call("reset", *self._pointers[:2], ctypes.byref(self._command))
         if code == 1:
-            raise PostureError("no state of the robot", where="reset", hint="give finite numbers, unit quaternions")
+            what = "(q, v) is not a state of the robot"
+            raise PostureError(what, where="reset", hint="give finite numbers and unit quaternions")
         if code == 3:
             raise ContactError("the sole stands on its edge", where="contact", hint="put the sole on the ground")
         if code:
@@ -143,11 +140,11 @@ class CompiledController:
         self._measure(q, v)
         q_at, v_at, force_at = self._pointers
         if force is not None:
-            given = np.asarray(force, dtype=float)
-            if given.shape not in ((3,), (6,)):
-                raise ValueError(f"a measured force has 3 or 6 numbers, not shape {given.shape}")
+            measured = np.asarray(force, dtype=float)
+            if measured.shape not in ((3,), (6,)):
+                raise ValueError(f"a measured force has 3 or 6 numbers, not shape {measured.shape}")
             self._force[:] = 0.0
-            self._force[: given.size] = given
+            self._force[: measured.size] = measured
         pushed = None if force is None else force_at
         self._call("tick", ctypes.c_double(t), q_at, v_at, pushed, ctypes.byref(self._command))
         return self._commanded()
@@ -162,15 +159,15 @@ class CompiledController:
         return self._q.copy(), self._v.copy()
 
     def addresses(self) -> dict[str, int]:
-        """Return the number of targets, and where C finds what a loop of ticks in C needs."""
+        """Return the number of targets, and the addresses that a loop of ticks in C needs."""
         arrays = {"q": self._q, "v": self._v, "force": self._force, "level": self._level}
         arrays |= {"u": self._out["u"], "rotor_speed": self._out["rotor_speed"]}
-        found = {name: int(array.ctypes.data) for name, array in arrays.items()}
-        found["tick"] = ctypes.cast(self._functions["tick"], ctypes.c_void_p).value or 0
-        found["context"] = found["target"] = ctypes.addressof(self._context)
-        found["command"] = ctypes.addressof(self._command)
-        found["status"] = found["command"] + type(self._command).status.offset
-        return found | {"targets": len(self.targets)}
+        addresses = {name: int(array.ctypes.data) for name, array in arrays.items()}
+        addresses["tick"] = ctypes.cast(self._functions["tick"], ctypes.c_void_p).value or 0
+        addresses["context"] = addresses["target"] = ctypes.addressof(self._context)
+        addresses["command"] = ctypes.addressof(self._command)
+        addresses["status"] = addresses["command"] + type(self._command).status.offset
+        return addresses | {"targets": len(self.targets)}
 
     def report(self) -> Report:
         """Return the diagnosis of the last tick."""
@@ -181,11 +178,11 @@ class CompiledController:
     def set_target(
         self, task: str, target: pin.SE3 | ArrayLike, velocity: ArrayLike = 0.0, acceleration: ArrayLike = 0.0
     ) -> None:
-        """Set the target of a task by name, as its class in ``tsid`` takes it, between ticks.
+        """Set the target of a task by name, in the form of its class in ``tsid``, between ticks.
 
         Raises:
-            InputError: There is no such task.
-            ValueError: The target of a pose is no ``pin.SE3``, or that of another task has neither shape (3,) nor,
+            InputError: The controller has no such task.
+            ValueError: The target of a pose is not a ``pin.SE3``, or another target has neither the shape (3,) nor,
                 for an orientation, (3, 3).
         """
         row = self._target(task)
@@ -193,18 +190,18 @@ class CompiledController:
         if isinstance(target, pin.SE3):
             row[1:4], row[4:13] = target.translation, target.rotation.ravel()
         else:
-            given = np.asarray(target, dtype=float)
-            if rows > 3 or given.shape not in ((3,), (3, 3)):
-                wanted = "a pin.SE3" if rows > 3 else "of shape (3,) or (3, 3)"
-                raise ValueError(f"the target of '{task}' is {wanted}")
-            row[slice(1, 4) if given.size == 3 else slice(4, 13)] = given.ravel()
+            numbers = np.asarray(target, dtype=float)
+            if rows > 3 or numbers.shape not in ((3,), (3, 3)):
+                wanted = "a pin.SE3" if rows > 3 else "an array of shape (3,) or (3, 3)"
+                raise ValueError(f"the target of '{task}' must be {wanted}")
+            row[slice(1, 4) if numbers.size == 3 else slice(4, 13)] = numbers.ravel()
         row[0], row[13 : 13 + rows], row[19 : 19 + rows] = 1.0, velocity, acceleration
 
     def forget_target(self, task: str) -> None:
         """Let the next :meth:`reset` take the present output as the target of a task.
 
         Raises:
-            InputError: There is no such task.
+            InputError: The controller has no such task.
         """
         self._target(task)[:] = 0.0
 
@@ -223,7 +220,8 @@ class CompiledController:
         """
         q = _shaped(q, self._q.shape, "q")
         if self._call("move_to", _pointer(q), ctypes.c_double(over)):
-            raise InputError("is no posture or no time", where="move_to", hint="give finite numbers, seconds above 0")
+            what = "the posture or the time is invalid"
+            raise InputError(what, where="move_to", hint="give finite numbers and seconds above zero")
 
     def lead_posture(self, q: ArrayLike, v: ArrayLike, a: ArrayLike) -> None:
         """Set ``q_des`` of the posture task, shape (nq,), with its velocity and acceleration, shape (nv,) each.
@@ -233,9 +231,9 @@ class CompiledController:
             ValueError: An array has another shape.
         """
         n, nv = self._q.shape, self._v.shape
-        given = [_shaped(q, n, "q"), _shaped(v, nv, "v"), _shaped(a, nv, "a")]
-        if self._call("lead_posture", *map(_pointer, given)):
-            raise InputError("is no reference", where="lead_posture", hint="give a posture and finite numbers")
+        arrays = [_shaped(q, n, "q"), _shaped(v, nv, "v"), _shaped(a, nv, "a")]
+        if self._call("lead_posture", *map(_pointer, arrays)):
+            raise InputError("a number is invalid", where="lead_posture", hint="give a posture and finite numbers")
 
     @property
     def target(self) -> Array:
@@ -245,25 +243,25 @@ class CompiledController:
 
     @property
     def flow_failures(self) -> int:
-        """Steps since the reset that the solver of a reference flow did not find.  The flow then comes to rest."""
+        """Number of steps since the reset at which the solver of a reference flow failed.  The flow then rests."""
         self._call("last_report", ctypes.byref(self._report))
         return int(self._report.flow_failures)
 
     def brace(self, t: float = -math.inf, *, t_impact: float | None = None) -> None:
-        """Switch the impact-robust term on, or let the reference flow go, from the first tick at ``t``, s, or later.
+        """Switch the impact-robust term on, or start the reference flow, at the first tick at ``t``, s, or later.
 
         Args:
             t: Time on the clock of the ticks, s.
-            t_impact: Time from then until the impact, s, before which a reference flow comes to rest.
+            t_impact: Time from then until the impact, s, before which a reference flow rests.
 
         Raises:
-            InputError: This phase does not follow the present one, or ``t`` is before that of a
-                phase that waits; or the time is not finite, or there is no flow.
+            InputError: This phase does not follow the present phase, ``t`` is before the time of a waiting phase,
+                ``t_impact`` is not finite, or the controller has no flow.
         """
         if t_impact is None:
             self._enter("brace", t)
         elif not math.isfinite(t_impact) or "brace_before" not in self._functions:
-            raise InputError("no flow can rest before that time", where="brace", hint="give finite seconds")
+            raise InputError("no flow can rest before this time", where="brace", hint="give finite seconds")
         else:
             self._enter("brace_before", t, t_impact)
 
@@ -282,8 +280,8 @@ class CompiledController:
 
     def _enter(self, function: str, *times: float) -> None:
         if self._call(function, *map(ctypes.c_double, times)):
-            words = f"'{function.partition('_')[0]}' at {times[0]:g} s does not follow the phase before it"
-            raise InputError(words, where="controller", hint="give phases in the order of their times, or reset it")
+            what = f"'{function.partition('_')[0]}' at {times[0]:g} s does not follow the phase before it"
+            raise InputError(what, where="controller", hint="give phases in the order of their times, or reset it")
 
     def _call(self, name: str, *arguments: Any) -> int:
         return int(self._functions[name](self._context, *arguments))
@@ -296,11 +294,11 @@ class CompiledController:
         return Command(u, u[rotors:], speeds, status, out["acceleration"].copy(), forces)
 
 
-def _shaped(given: ArrayLike, shape: tuple[int, ...], name: str) -> Array:
-    found = np.asarray(given, dtype=float, order="C")
-    if found.shape != shape:
-        raise ValueError(f"{name} has shape {found.shape}, not {shape}")
-    return found
+def _shaped(values: ArrayLike, shape: tuple[int, ...], name: str) -> Array:
+    array = np.asarray(values, dtype=float, order="C")
+    if array.shape != shape:
+        raise ValueError(f"{name} has shape {array.shape}, not {shape}")
+    return array
 
 
 def _pointer(array: Array) -> Any:

@@ -1,4 +1,4 @@
-"""The report of a controller in C, in the words of :class:`~impact_posture.tsid.controller.Report`."""
+"""Report of a controller in C as a :class:`~impact_posture.tsid.controller.Report`."""
 
 from __future__ import annotations
 
@@ -13,27 +13,27 @@ from impact_posture.tsid.relaxation import Relaxed
 STATUSES = tuple(Status)
 
 
-def read_report(manifest: Manifest, status: Status, iterations: int, found: Mapping[str, Array]) -> Report:
-    """Return a report from the arrays of the structure in C, by the names of its members."""
+def read_report(manifest: Manifest, status: Status, iterations: int, values: Mapping[str, Array]) -> Report:
+    """Return a report from the arrays of the structure in C, by their names."""
     residuals: dict[str, Array] = {}
     active: list[tuple[str, str]] = []
     if status in (Status.SOLVED, Status.RELAXED):
         start = 0
         for task in manifest.tasks:
-            residuals[task.name] = found["rows"][start : start + task.rows].copy()
+            residuals[task.name] = values["rows"][start : start + task.rows].copy()
             start += task.rows
         if manifest.posture is not None:
-            residuals[manifest.posture] = found["posture"].copy()
+            residuals[manifest.posture] = values["posture"].copy()
         if manifest.sizes["FORCES"]:
-            residuals["contacts"] = found["contacts"].copy()
+            residuals["contacts"] = values["contacts"].copy()
         first = manifest.sizes["SIMPLE"]
         equations = range(first, first + manifest.sizes["EQUATIONS"])
-        for k, (name, multiplier) in enumerate(zip(manifest.bounds, found["multipliers"], strict=True)):
+        for k, (name, multiplier) in enumerate(zip(manifest.bounds, values["multipliers"], strict=True)):
             if multiplier and k not in equations:
                 active.append((name, "upper" if multiplier > 0 else "lower"))
-    dynamics, level, value = (float(found[name][0]) for name in ("dynamics", "level", "value"))
+    dynamics, level, value = (float(values[name][0]) for name in ("dynamics", "level", "value"))
     names = ("joint limits", *(name for name, _ in manifest.levels))
-    relaxed = tuple(Relaxed(n, float(x)) for n, x in zip(names, found["relaxed"], strict=True) if x > 0)
-    missed = zip(names[1:], found["deficient"], strict=False)
+    relaxed = tuple(Relaxed(n, float(x)) for n, x in zip(names, values["relaxed"], strict=True) if x > 0)
+    missed = zip(names[1:], values["deficient"], strict=False)
     deficient = tuple(Relaxed(n, float(x)) for n, x in missed if x > 0)
     return Report(status, relaxed, deficient, residuals, tuple(active), dynamics, level, value, iterations)

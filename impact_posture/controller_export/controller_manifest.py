@@ -1,4 +1,4 @@
-"""Manifest of an exported controller: read, check and build what it names.  This module needs no CasADi."""
+"""Manifest of an exported controller: reading, checks, and the build of its library.  This module needs no CasADi."""
 
 from __future__ import annotations
 
@@ -12,7 +12,7 @@ from impact_posture.codegen.manifest_reader import Loose, read_checked
 from impact_posture.system.libraries import build_parts, library_path
 
 SCHEMA = "impact-posture/controller/1"
-# Most numbers of one kind.  A larger size is no robot, and would only ask for memory.
+# Largest size in a manifest.  A larger size would only waste memory.
 _MOST = 100_000
 
 Size = Annotated[int, Field(ge=-1, le=_MOST)]
@@ -25,7 +25,7 @@ class _Task(Loose):
 
 
 class Manifest(Loose):
-    """The keys that a loader needs; the library vouches for all of them."""
+    """Keys that a loader needs.  The library identifies its manifest, hence all of them."""
 
     prefix: Name
     real: Literal["double"]
@@ -46,13 +46,10 @@ class Manifest(Loose):
 
 
 def read_controller(path: Path) -> tuple[dict[str, Any], Manifest, Path]:
-    """Read the manifest of an exported controller; return it, its checked keys, and the folder.
-
-    Args:
-        path: The folder, or the manifest itself.
+    """Read the manifest in a folder, or at a path; return it, its checked keys, and the folder.
 
     Raises:
-        SpecError: There is no manifest, there are several, or it is broken.
+        SpecError: There is not exactly one manifest, or it is broken.
     """
     document, checked, file = read_checked(path, SCHEMA, Manifest, "exported controller", "codegen --controller")
     return document, checked, file.parent
@@ -61,16 +58,14 @@ def read_controller(path: Path) -> tuple[dict[str, Any], Manifest, Path]:
 def build_controller(folder: Path, manifest: dict[str, Any], generated: Sequence[str] = ()) -> Path:
     """Build ``lib<prefix>.so`` in the folder of an exported controller.
 
-    Args:
-        folder: The folder.
-        manifest: The content of its manifest.
-        generated: Further flags of the compiler for what is generated from the model, in long sources without loops.
+    ``generated`` are further flags of the compiler for the long sources without loops that come from the model.
 
     Raises:
-        CompilerError: There is no compiler, or it failed.
+        CompilerError: The compiler failed or is missing.
         OutputError: The library or the cache cannot be written.
     """
-    prefix, shared = str(manifest["prefix"]), ["-isystem", "daqp"]
-    own = {f"{prefix}_dynamics.c", f"{prefix}_metric.c"}
-    parts = {name: [*shared, *generated] if name in own else shared for name in (f"{prefix}.c", *manifest["sources"])}
+    prefix, flags = str(manifest["prefix"]), ["-isystem", "daqp"]
+    straight = {f"{prefix}_dynamics.c", f"{prefix}_metric.c"}
+    sources = (f"{prefix}.c", *manifest["sources"])
+    parts = {name: [*flags, *generated] if name in straight else flags for name in sources}
     return build_parts(folder, library_path(folder, prefix), parts)

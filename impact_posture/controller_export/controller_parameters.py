@@ -38,9 +38,7 @@ class Field(NamedTuple):
 def parameters(s: Structure, period: float) -> Iterator[Field]:
     """Yield the parameters of a formulation with their values, in the order of the C structure.
 
-    Args:
-        s: Structure of the formulation.
-        period: Expected time between ticks, s.
+    ``period`` is the expected time between ticks, s.
     """
     formulation, actuators, ranges = s.formulation, s.actuators, JointRanges(s.robot)
     posture, robust, contacts = formulation.posture, s.robust, formulation.contacts
@@ -52,25 +50,25 @@ def parameters(s: Structure, period: float) -> Iterator[Field]:
         # C has no arrays of length zero.
         return Field(name, rule, text, values if values.size else np.ones(1))
 
+    gains = (("kp", "stiffness, 1/s2"), ("kd", "damping, 1/s"), ("weight", "weight in the cost"))
     yield field("period", "positive", "expected time between ticks, s", period)
-    for name, text in (("kp", "stiffness, 1/s2"), ("kd", "damping, 1/s"), ("weight", "weight in the cost")):
+    for name, text in gains:
         rows = [getattr(task, name) for task in s.tasks]
         yield field(
             f"task_{name}", "nonnegative", f"{text}, of each row of the tasks", np.hstack([np.zeros(0), *rows])
         )
     soft = [t._soften if isinstance(t, FrameTask) and t._soften is not None else np.zeros(6) for t in s.tasks]
     yield field("task_softness", "nonnegative", "inverse apparent inertia of each task, 1/kg and 1/(kg m2)", soft)
-    for name, text in (("kp", "stiffness, 1/s2"), ("kd", "damping, 1/s"), ("weight", "weight in the cost")):
+    for name, text in gains:
         value = np.zeros(nv) if posture is None else getattr(posture, name)
         yield field(f"posture_{name}", "nonnegative", f"{text}, of the posture task", value)
     if posture is not None and posture.stiffness is not None and posture.damping is not None:
         yield field("stiffness", "finite", "K_p of the posture task as a matrix, 1/s2", posture.stiffness)
-        yield field("damping", "finite", "K_d that belongs to it, 1/s", posture.damping)
-    given = None if posture is None else posture._given
-    yield field(
-        "posture_given", "nonnegative", "1: reset takes posture_target; 0: the present posture", given is not None
-    )
-    yield field("posture_target", "finite", "q_des at reset", s.robot.posture() if given is None else given)
+        yield field("damping", "finite", "K_d of the posture task as a matrix, 1/s", posture.damping)
+    target = None if posture is None else posture._given
+    text = "1: reset takes posture_target; 0: the present posture"
+    yield field("posture_given", "nonnegative", text, target is not None)
+    yield field("posture_target", "finite", "q_des at reset", s.robot.posture() if target is None else target)
     for name, rule, text in (
         ("kp", "nonnegative", "stiffness, 1/s2"),
         ("kd", "nonnegative", "damping, 1/s"),
@@ -104,12 +102,12 @@ def parameters(s: Structure, period: float) -> Iterator[Field]:
             ("rho", "nonnegative", "pull of the joints towards the start, 1/rad2"),
             ("mu", "amount", "least curvature, 1/rad2"),
             ("epsilon", "amount", "predicted decrease of H/H0 below which the flow rests"),
-            ("duration", "amount", "longest time that it moves after a brace, without that on a path and at rest, s"),
+            ("duration", "amount", "longest time that it moves after a brace, not counting a path and rest, s"),
             ("joint_margin", "nonnegative", "distance from the joint limits, rad or m"),
             ("com_margin", "nonnegative", "distance of the center of mass from the edges of the support polygon, m"),
             ("tilt", "amount", "largest tilt of the base from the default posture, rad"),
-            ("share", "share", "share of the limits of the actuators that rest may take"),
-            ("haste", "share", "share of what is left of them for accelerating; braking may take (1 + haste)/2"),
+            ("share", "share", "share of the limits of the actuators that rest may use"),
+            ("haste", "share", "share of the rest of them for acceleration; braking may use (1 + haste)/2"),
             ("tracking", "amount", "error of the joints at which the flow waits, rad or m"),
         ):
             yield field(f"flow_{name}", rule, f"{text}, of the flow", getattr(s.flow.options, name))  # type: ignore[arg-type]
@@ -118,11 +116,12 @@ def parameters(s: Structure, period: float) -> Iterator[Field]:
     if robust is not None:
         springs = ("keep", "release", "follow")
         yield field("robust_gain", "nonnegative", "K, 1/s2", robust.K)
-        yield field(
-            "robust_scale", "nonnegative", "lambda; 0: measured at reset", 0 if robust._measure else robust.scale
-        )
+        scale = 0 if robust._measure else robust.scale
+        yield field("robust_scale", "nonnegative", "lambda; 0: measured at reset", scale)
         yield field("robust_reach", "positive", "bound of the term over K, rad", robust.reach)
-        yield field("robust_near", "nonnegative", "distance of each joint where the term is gone", robust._near)
+        yield field(
+            "robust_near", "nonnegative", "distance of each joint from a limit where the term vanishes", robust._near
+        )
         yield field("robust_band", "positive", "width of the fade of each joint; may be infinite", robust._band)
         yield field("robust_far", "positive", "distance from which joints are looked at, rad", robust._farthest)
         yield field("robust_every", "positive", "ticks between evaluations of the gradient", robust.every)

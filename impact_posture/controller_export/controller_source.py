@@ -1,4 +1,4 @@
-"""C text of a controller: generated dynamics, the tables of its structure, and the files of ``c/`` around them."""
+"""C text of a controller: generated dynamics, the tables of its structure, and the files of ``c/``."""
 
 from __future__ import annotations
 
@@ -32,7 +32,7 @@ from impact_posture.system.arrays import Array
 from impact_posture.system.escape import c_comment
 from impact_posture.version import __version__
 
-# Files in c/, in the order in which one source has them.
+# Files of c/ in the order of the source.
 _CORE = (
     "vector.c", "eigen.c", "algebra.c", "tasks.c", "contacts.c", "posture.c", "qp.c", "rank.c", "solve.c",
     "give_way.c", "reference_flow_space.c", "reference_flow_limits.c", "reference_flow_zmp.c",
@@ -42,20 +42,20 @@ _RELAXATION = (
     "relaxation_memory.c", "vector.c", "relaxation_rows.c", "relaxation_elimination.c", "relaxation_level.c",
     "relaxation_cost.c", "relaxation.c",
 )  # fmt: skip
-# Parameters that init compares with others.
+# Parameters that init compares with other parameters.
 _NAMED = ("control_upper", "joint_upper", "contact_normal", "law_rate", "posture_weight", "task_weight")
-# Bytes of variables, saved registers and return addresses of all functions below a tick, beside the arrays.
+# Bytes of variables, saved registers and return addresses of all functions in a tick, without the arrays.
 _FRAMES = 4096
 
 
 @dataclass(frozen=True)
 class GeneratedCode:
-    """C of quantities of the robot: those in ``ip_model``, or its objective.
+    """C code of the quantities in ``ip_model``, or of an objective.
 
     Attributes:
         constants: Tables of numbers.
         blocks: Functions that compute parts.
-        angles: Entries of ``q`` whose sine and cosine are taken.
+        angles: Entries of ``q`` with a sine and a cosine.
         work: Length of the work array.
         outputs: Assignments after the blocks, target and value.
         constant_outputs: Assignments that do not depend on the state.
@@ -75,50 +75,50 @@ class GeneratedCode:
 def dynamics_code(
     robot: Robot, points: tuple[tuple[str, Vector3, bool], ...], *, shared: bool = False
 ) -> GeneratedCode:
-    """Generate the dynamics of points of a robot: frame, offset, and whether a rotation is needed.
+    """Generate the dynamics of points of a robot, each with frame, offset, and whether it needs a rotation.
 
     ``shared`` code reads the numbers of :class:`~impact_posture.dynamics.model_parameters.ModelParameters`.
     """
     q, v = ca.SX.sym("q", robot.nq), ca.SX.sym("v", robot.nv)
     numbers = ModelParameters(robot.model) if shared else None
     tree = MovingTree(robot.model, q, v, numbers)
-    found: dict[str, ca.SX] = {"M": tree.mass_matrix(), "h": tree.bias()}
+    quantities: dict[str, ca.SX] = {"M": tree.mass_matrix(), "h": tree.bias()}
     if robot.floating:
-        found["base"] = tree.rotations[1]
+        quantities["base"] = tree.rotations[1]
     for k, (frame, offset, turns) in enumerate(points):
         on, rows = point_on(robot, frame, offset), 6 if turns else 3
         spatial, velocity = tree.spatial_drift(on), tree.velocity(on)
         drift = spatial + ca.vertcat(ca.cross(velocity[3:], velocity[:3]), ca.SX(3, 1))
-        found[f"position[{k}]"] = tree.position(on)
-        found[f"jacobian[{k}]"] = tree.jacobian(on)[:rows, :]
-        found[f"velocity[{k}]"], found[f"drift[{k}]"] = velocity[:rows], drift[:rows]
+        quantities[f"position[{k}]"] = tree.position(on)
+        quantities[f"jacobian[{k}]"] = tree.jacobian(on)[:rows, :]
+        quantities[f"velocity[{k}]"], quantities[f"drift[{k}]"] = velocity[:rows], drift[:rows]
         if rows == 6:
-            found[f"rotation[{k}]"], found[f"spatial[{k}]"] = tree.rotation(on), spatial
-    # C has matrices row by row, and CasADi column by column.
-    targets = {f"d->{name}[{{}}]": x.T for name, x in found.items()}
+            quantities[f"rotation[{k}]"], quantities[f"spatial[{k}]"] = tree.rotation(on), spatial
+    # Transposed, because C stores matrices by rows, and CasADi by columns.
+    targets = {f"d->{name}[{{}}]": x.T for name, x in quantities.items()}
     return _generated({"q": q, "v": v} | ({} if numbers is None else {"numbers": numbers.symbol}), targets)
 
 
 @lru_cache(maxsize=2)
 def objective_code(objective: WorstCaseObjective) -> GeneratedCode:
-    """Generate an objective and its gradient, of numbers as in shared :func:`dynamics_code`."""
+    """Generate an objective and its gradient, with numbers as in the shared :func:`dynamics_code`."""
     q, numbers = ca.SX.sym("q", objective.robot.nq), ModelParameters(objective.robot.model)
     kernel = ImpactKernel(objective.case, q, ca.SX(ca.DM(objective.contact.normal)), numbers)
     targets = dict(zip(("value[{}]", "gradient[{}]"), objective.worst_case.expressions(kernel), strict=True))
     return _generated({"q": q, "numbers": numbers.symbol}, targets)
 
 
-def _generated(inputs: dict[str, ca.SX], found: dict[str, ca.SX]) -> GeneratedCode:
-    """Generate C for the entries of outputs, by their targets in C."""
-    names = [f"o{k}" for k in range(len(found))]
-    function = ca.Function("code", [*inputs.values()], [*found.values()], [*inputs], names, {"cse": True})
+def _generated(inputs: dict[str, ca.SX], targets: dict[str, ca.SX]) -> GeneratedCode:
+    """Generate C that assigns expressions to targets in C."""
+    names = [f"o{k}" for k in range(len(targets))]
+    function = ca.Function("code", [*inputs.values()], [*targets.values()], [*inputs], names, {"cse": True})
     graph = reorder_sums(graph_of(function))
     layout = lay_out(graph, [names])
     constants = Constants("ip", DOUBLE)
     emitter = Emitter(layout, "ip", DOUBLE, {1: "double"}, constants)
     outputs: list[tuple[str, str]] = []
     fixed: list[tuple[str, str]] = []
-    for name, target in zip(names, found, strict=True):
+    for name, target in zip(names, targets, strict=True):
         for k, node in enumerate(graph.outputs[name]):
             known = graph.nodes[node].op == "const"
             (fixed if known else outputs).append((target.format(k), emitter.output(node)))
@@ -140,16 +140,16 @@ def render(
     *,
     shared: bool = False,
 ) -> dict[str, str]:
-    """Return file name → text of the header and the source.
+    """Return file name → text of the header and the sources.
 
     Args:
         s: Structure of the controller.
         fields: Parameters.
         prefix: Beginning of the C names.
-        identity: Words of the library about its manifest.
-        metric: Prefix of the export of the gradient, if the controller has one.
-        objective: The objective, where its code is :func:`objective_code` and not an export of its own.
-        shared: Whether the last parameter is ``numbers``, which models with the same code do not share.
+        identity: Identity of the manifest, which the library contains.
+        metric: Prefix of the C names of the gradient, if the controller has one.
+        objective: The objective, if its code is :func:`objective_code` and not an exported gradient.
+        shared: Whether the last parameter is ``numbers``, in which models with the same code differ.
     """
     points, robot = tuple((p.frame, p.offset, p in s.turning) for p in s.points), s.robot
     code = dynamics_code(robot, points, shared=shared)
@@ -181,7 +181,7 @@ def render(
         "stack_bytes": -(-max(code.stack_bytes, solver + 16 * nv * 8) // 64) * 64 + _FRAMES,
         "identity": identity, "tables": tables, "named": named_fields, "literals": _initializer,
         "rules": _braced(str(x) for f in fields for x in (f.value.size, RULES[f.rule])),
-        "core": "\n".join(_own(name) for name in _files(sizes)),
+        "core": "\n".join(_core_text(name) for name in _files(sizes)),
     }  # fmt: skip
     templates = environment("impact_posture.controller_export", c_comment)
     files = [
@@ -193,15 +193,19 @@ def render(
         *([] if objective is None else [(f"{metric}.c", "dynamics.c", objective_code(objective))]),
     ]
     texts = {}
-    for name, template, own in files:
-        generated: dict[str, Any] = {"objective": own is not code}
-        generated |= {} if own is None else {"code": own, "places": _braced(map(str, own.angles))}
+    for name, template, part in files:
+        generated: dict[str, Any] = {"objective": part is not code}
+        generated |= {} if part is None else {"code": part, "places": _braced(map(str, part.angles))}
         texts[name] = templates.get_template(f"{template}.jinja").render(context | generated)
-    return {name: named(text, prefix) for name, text in texts.items()} | _relaxation(prefix)
+    texts = {name: named(text, prefix) for name, text in texts.items()}
+    for name, text in relaxation().items():
+        text = re.sub(r"\b(daqp\.h|relaxation\.h)", rf"{prefix}_\1", text)
+        texts[f"{prefix}_{name}"] = named(text, prefix)
+    return texts
 
 
 def _files(sizes: dict[str, int]) -> list[str]:
-    """Return the files of ``c/`` that a structure needs."""
+    """Return the files of ``c/`` for a structure."""
     needed = {"eigen.c": sizes["ROBUST"] or sizes["FLOW"]}
     needed |= {name: sizes["FLOW"] for name in _CORE if name.startswith("reference_flow")}
     return [name for name in _CORE if needed.get(name, True)]
@@ -215,23 +219,20 @@ def _relaxation_room(n: int, m: int, levels: int) -> int:
 
 
 def relaxation() -> dict[str, str]:
-    """Return file name → text of the relaxation, before its names have a prefix."""
-    return {"relaxation.h": _own("relaxation.h"), "relaxation.c": "\n".join(_own(name) for name in _RELAXATION)}
-
-
-def _relaxation(prefix: str) -> dict[str, str]:
-    """Return the files of the relaxation, with names that another controller in the program does not have."""
-    texts = {name: re.sub(r"\b(daqp\.h|relaxation\.h)", rf"{prefix}_\1", text) for name, text in relaxation().items()}
-    return {f"{prefix}_{name}": named(text, prefix) for name, text in texts.items()}
+    """Return file name → text of the relaxation, with names without a prefix."""
+    return {
+        "relaxation.h": _core_text("relaxation.h"),
+        "relaxation.c": "\n".join(_core_text(name) for name in _RELAXATION),
+    }
 
 
 def named(text: str, prefix: str) -> str:
-    """Return C text in which all names begin with the prefix."""
+    """Return C text with the prefix before all names."""
     text = re.sub(r"\brelaxation_([a-z])", rf"{prefix}_relaxation_\1", text)
     return re.sub(r"\bip_", f"{prefix}_", re.sub(r"\bIP_", f"{prefix.upper()}_", text))
 
 
-def _own(name: str) -> str:
+def _core_text(name: str) -> str:
     return (resources.files(__package__) / "c" / name).read_text(encoding="utf-8")
 
 

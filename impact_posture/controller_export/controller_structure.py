@@ -1,4 +1,4 @@
-"""Structure of a controller that its C code compiles in: sizes, tasks, contacts and the order of the rows."""
+"""Structure of a controller that its C code contains: sizes, tasks, contacts and the order of the rows."""
 
 from __future__ import annotations
 
@@ -34,7 +34,7 @@ _FAMILIES = {"revolute": 0, "prismatic": 0, "continuous": 1, "free-flyer": 2, "s
 
 @dataclass(frozen=True, eq=False)
 class Structure:
-    """A formulation, and the numbers and tables of it that C code needs.
+    """Formulation, with the numbers and tables that its C code needs.
 
     Attributes:
         robot: The robot.
@@ -60,13 +60,13 @@ class Structure:
 
     @property
     def robust(self) -> ImpactRobustPosture | None:
-        """The impact-robust posture task, if it is one."""
+        """The posture task, if it is impact-robust."""
         posture = self.formulation.posture
         return posture if isinstance(posture, ImpactRobustPosture) else None
 
     @property
     def flow(self) -> ReferenceFlowPosture | None:
-        """The posture task with a reference flow, if it is one."""
+        """The posture task, if it has a reference flow."""
         posture = self.formulation.posture
         return posture if isinstance(posture, ReferenceFlowPosture) else None
 
@@ -83,13 +83,13 @@ def structure_of(robot: Robot, formulation: TaskFormulation) -> Structure:
     """Return the structure of a formulation.
 
     Raises:
-        InputError: A task, a posture task, a limit or a joint has no C code; names it.
+        InputError: A task, a limit or a joint has no C code; names it.
     """
     _check(robot, formulation)
     actuators = Actuators(robot)
     strict = tuple(task for level in formulation.levels for task in level)
     tasks, contacts, points = (*strict, *formulation.weighted), formulation.contacts, formulation.points
-    # An assembly moves the targets of its tasks into its own buffers, and a controller may run with these tasks.
+    # Copies, because an assembly binds the targets of its tasks, and a controller may run with these tasks.
     copied = tuple(tuple(map(copy, level)) for level in formulation.levels)
     copies = replace(formulation, levels=copied, weighted=tuple(map(copy, formulation.weighted)))
     assembly = Assembly(robot, copies, actuators)
@@ -164,13 +164,13 @@ def structure_of(robot: Robot, formulation: TaskFormulation) -> Structure:
     }
     if sizes["FLOW"] and robot.floating:
         doubles["upright"] = robot.upright
-    found: dict[str, NDArray[Any]] = {name: np.array(v, dtype=np.int64) for name, v in tables.items()}
-    found |= {name: np.array(values, dtype=float).ravel() for name, values in doubles.items()}
-    # Bounds on joints are simple ones, which come first, or the last rows.
+    arrays: dict[str, NDArray[Any]] = {name: np.array(v, dtype=np.int64) for name, v in tables.items()}
+    arrays |= {name: np.array(values, dtype=float).ravel() for name, values in doubles.items()}
+    # Bounds on joints are either simple bounds, which come first, or the last rows.
     bounded, rows = assembly.names[actuators.base : nv], assembly.names[assembly.qp.n :]
     names = (*(bounded if sizes["SIMPLE"] else ()), *rows, *(bounded if bounds else ()))
     levels = tuple(name for name, _ in assembly.levels)
-    return Structure(robot, formulation, actuators, tasks, points, sizes, found, levels, names)
+    return Structure(robot, formulation, actuators, tasks, points, sizes, arrays, levels, names)
 
 
 def _add_flow(
@@ -178,8 +178,8 @@ def _add_flow(
 ) -> None:
     """Add sizes and tables of a reference flow.
 
-    ``HELD`` rows stay where they are: contacts, tasks and joints.  ``flow_led`` counts the tasks that the flow leads
-    instead, and is zero for the others.
+    ``HELD`` is the number of rows that the flow does not move: contacts, tasks and joints.  ``flow_led`` numbers the
+    tasks that it moves, from 1, and is zero for the other tasks.
     """
     posture = formulation.posture
     flow = posture if isinstance(posture, ReferenceFlowPosture) else None
@@ -189,7 +189,7 @@ def _add_flow(
     held = [task.size for task, leading in zip(tasks, leads, strict=True) if not leading]
     fixed = [robot.tangent_names.index(j) for j in robot.spec.constraints.hold if j in robot.tangent_names]
     edges = max(4, 4 * sizes["CONTACTS"]) if sizes["CONTACTS"] else 0
-    # And the tilt of the base.
+    # The tilt of the base is one more row.
     placed = edges + int(robot.floating)
     size = int(flow is not None)
     if flow is not None:
@@ -222,7 +222,7 @@ def _is_diagonal_in_momentum(robot: Robot, formulation: TaskFormulation) -> bool
 
 
 def _check(robot: Robot, formulation: TaskFormulation) -> None:
-    """Refuse what has no C code."""
+    """Refuse tasks, limits and joints without C code."""
 
     def refuse(what: str) -> InputError:
         return InputError(what, where="controller export", hint="run it in Python, or use tasks of this package")

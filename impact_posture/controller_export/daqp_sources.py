@@ -1,6 +1,6 @@
-"""Sources of DAQP in C, the QP solver of an exported controller: one version, whose content is checked.
+"""C sources of DAQP, the QP solver of an exported controller, in one version with a checked content.
 
-They come from the source distribution, which pip downloads once.  Nothing of it is built or run.
+They come from the source distribution, which pip downloads once and neither builds nor runs.
 """
 
 from __future__ import annotations
@@ -24,44 +24,44 @@ _HEADERS = ("auxiliary.h", "constants.h", "daqp.h", "factorization.h", "types.h"
 # SHA-256 of the distribution, which pip compares, and of the contents of the needed files, in the order of FILES.
 _ARCHIVE_SHA256 = "2f27baf18d2acca14186498e651b34e0bed455627e777d3fd8ba655e7e40f920"
 _CONTENT_SHA256 = "7cce7844f7cf515e8c1fe9208e3996b0569c954ef641ad5b3478657ee23a6e9d"
-# Where a file is in the distribution.  In the folder of an exported controller all lie side by side.
+# Path of each file in the distribution.  An exported controller has all files in one folder.
 FILES = {
     **{name: f"csrc/src/{name}" for name in SOURCES},
     **{name: f"csrc/include/{name}" for name in _HEADERS},
     "LICENSE": "LICENSE",
 }
-# None of the files is larger, B.
+# Largest size of a file, B.
 _LARGEST = 1 << 20
-# A build backend for pip, which always asks for metadata.  It keeps pip from installing the real one and from running
+# A build backend for pip, which always requires metadata.  With it, pip neither installs the real backend nor runs
 # the code of the distribution, which takes minutes.
 _BACKEND = f"""
 import pathlib
 def prepare_metadata_for_build_wheel(folder, settings=None):
-    made = pathlib.Path(folder, "daqp-{VERSION}.dist-info")
-    made.mkdir()
-    (made / "METADATA").write_text("Metadata-Version: 2.1\\nName: daqp\\nVersion: {VERSION}\\n")
-    return made.name
+    info = pathlib.Path(folder, "daqp-{VERSION}.dist-info")
+    info.mkdir()
+    (info / "METADATA").write_text("Metadata-Version: 2.1\\nName: daqp\\nVersion: {VERSION}\\n")
+    return info.name
 """
-_GIVE_FOLDER = f"give the folder of DAQP {VERSION}'s sources with `daqp`"
+_FOLDER_HINT = f"give the folder of DAQP {VERSION}'s sources with `daqp`"
 
 
-def daqp_sources(given: Path | None = None) -> dict[str, bytes]:
+def daqp_sources(folder: Path | None = None) -> dict[str, bytes]:
     """Return the content of each of :data:`FILES`.
 
     Args:
-        given: Unpacked source distribution, or a folder that has the files side by side; by default, the distribution
-            in the cache, which pip downloads if it is missing.
+        folder: Unpacked source distribution, or a folder that directly contains the files; by default, the
+            distribution in the cache, which pip downloads if it is missing.
 
     Raises:
-        InputError: The sources cannot be had, or differ from those of :data:`VERSION`.
-        OutputError: The cache cannot be written, or others may write it.
+        InputError: The sources are not available, or differ from :data:`VERSION`.
+        OutputError: The cache cannot be written, or other users may write it.
     """
-    if given is not None:
-        return _checked(lambda name: _from_folder(given, name), str(given), _GIVE_FOLDER)
+    if folder is not None:
+        return _checked(lambda name: _from_folder(folder, name), str(folder), _FOLDER_HINT)
     archive, again = cache_folder() / f"daqp-{VERSION}.tar.gz", "delete it: it is loaded again"
     if not is_cached(archive):
-        with building(archive) as folder:
-            _download(folder)
+        with building(archive) as place:
+            _download(place)
     try:
         with tarfile.open(archive) as tar:
             return _checked(lambda name: _from_archive(tar, name), str(archive), again)
@@ -70,13 +70,9 @@ def daqp_sources(given: Path | None = None) -> dict[str, bytes]:
 
 
 def renamed(sources: dict[str, bytes], prefix: str) -> dict[str, str]:
-    """Return a header and a source that give all functions of DAQP names of their own.
+    """Return a header and a source that rename all functions of DAQP with a prefix.
 
-    Two controllers in one program, and a DAQP of the program itself, then share and collide in nothing.
-
-    Args:
-        sources: From :func:`daqp_sources`.
-        prefix: Beginning of the new names.
+    Two controllers in one program, and a DAQP of the program itself, then do not collide.
     """
     headers = "".join(sources[name].decode() for name in _HEADERS)
     names = re.findall(r"^(?:void|int|c_float) (\w+)\(", headers, re.MULTILINE)
@@ -91,17 +87,17 @@ def renamed(sources: dict[str, bytes], prefix: str) -> dict[str, str]:
 
 
 def _checked(read: Callable[[str], bytes | None], where: str, hint: str) -> dict[str, bytes]:
-    """Read all files, and refuse other contents than those of the version."""
-    found, digest = dict[str, bytes](), hashlib.sha256()
+    """Read all files, and refuse contents that differ from the version."""
+    sources, digest = dict[str, bytes](), hashlib.sha256()
     for name in FILES:
         content = read(name)
         if content is None:
             raise InputError(f"has no file {FILES[name]}", where=where, hint=hint)
-        found[name] = content
+        sources[name] = content
         digest.update(content)
     if digest.hexdigest() != _CONTENT_SHA256:
         raise InputError(f"is not DAQP {VERSION} (another SHA-256 of its sources)", where=where, hint=hint)
-    return found
+    return sources
 
 
 def _from_folder(folder: Path, name: str) -> bytes | None:
@@ -110,12 +106,12 @@ def _from_folder(folder: Path, name: str) -> bytes | None:
             if path.is_file() and path.stat().st_size <= _LARGEST:
                 return path.read_bytes()
         except OSError as error:
-            raise InputError(f"cannot be read ({error.strerror})", where=str(path), hint=_GIVE_FOLDER) from None
+            raise InputError(f"cannot be read ({error.strerror})", where=str(path), hint=_FOLDER_HINT) from None
     return None
 
 
 def _from_archive(tar: tarfile.TarFile, name: str) -> bytes | None:
-    """Return a plain member.  Nothing is unpacked, so that no name or link in the archive reaches the disk."""
+    """Return a plain member without unpacking, so that no name or link in the archive reaches the disk."""
     try:
         member = tar.getmember(f"daqp-{VERSION}/{FILES[name]}")
     except KeyError:
@@ -125,13 +121,13 @@ def _from_archive(tar: tarfile.TarFile, name: str) -> bytes | None:
 
 
 def _download(folder: Path) -> None:
-    """Put the distribution into a folder.
+    """Download the distribution into a folder.
 
     Raises:
-        InputError: There is no pip, or it failed; with its last error.
+        InputError: pip is missing or failed; with its last error.
     """
     if importlib.util.find_spec("pip") is None:
-        raise InputError("pip is missing", where=f"DAQP {VERSION}", hint=f"install pip, or {_GIVE_FOLDER}")
+        raise InputError("pip is missing", where=f"DAQP {VERSION}", hint=f"install pip, or {_FOLDER_HINT}")
     backend, wanted = folder / "backend" / "setuptools", folder / "wanted.txt"
     backend.mkdir(parents=True)
     (backend / "__init__.py").touch()
@@ -150,5 +146,5 @@ def _download(folder: Path) -> None:
         raise InputError(
             f"its sources cannot be downloaded ({lines[-1].removeprefix('ERROR: ')})",
             where=f"DAQP {VERSION}",
-            hint=f"connect to the network once, or {_GIVE_FOLDER}",
+            hint=f"connect to the network once, or {_FOLDER_HINT}",
         )

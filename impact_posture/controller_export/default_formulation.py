@@ -12,7 +12,6 @@ from impact_posture.errors import InputError
 from impact_posture.impact.impact_contact import point_on
 from impact_posture.impact.worst_case_objective import WorstCaseObjective
 from impact_posture.robot.robot import Robot
-from impact_posture.system.arrays import Array
 from impact_posture.tsid.flow.reference_flow_posture import ReferenceFlowPosture
 from impact_posture.tsid.point_kinematics import Point
 from impact_posture.tsid.task_formulation import (
@@ -35,30 +34,26 @@ def default_formulation(
 ) -> TaskFormulation:
     """Return the formulation of a kind of robot with default gains.
 
-    The task of the end effector (``aerial`` and ``arm``) holds what ``optimize`` holds by default, so that the same
-    redundancy is left.
+    The task of the end effector (``aerial`` and ``arm``) holds the same rows as ``optimize`` by default, so that the
+    redundancy is the same.
 
     Args:
         robot: The robot.
         kind: ``aerial``, ``legged`` or ``arm``.
-        objective: The objective whose gradient the posture task follows; ``None`` for a posture task without one.
-        flow: Follow it by a reference flow, and not by the impact-robust term.
+        objective: The objective whose gradient the posture task follows; ``None`` for a nominal posture task.
+        flow: Follow it by a reference flow instead of the impact-robust term.
 
     Raises:
-        InputError: The robot is of another kind, or nothing names its end effector.
+        InputError: The robot is of another kind, or its data do not name an end effector.
     """
-    # The posture of a robot that stands is light beside the tasks of its center of mass and base (10 and 1).
+    # The posture of a standing robot has little weight beside its center of mass and base (10 and 1).
     kp, weight, base = (20.0, 0.1, 0.0) if kind == "legged" else (10.0, 1.0, None)
     if objective is None:
         posture = JointPosture(robot, kp=kp, weight=weight, base_weight=base)
     else:
-        found = objective
-
-        def gradient(q: Array) -> tuple[float, Array]:
-            return found.value(q), found.gradient(q)
-
+        value, slope = objective.value, objective.gradient
         law = ReferenceFlowPosture if flow else ImpactRobustPosture
-        posture = law(robot, gradient, kp=kp, weight=weight, base_weight=base)
+        posture = law(robot, lambda q: (value(q), slope(q)), kp=kp, weight=weight, base_weight=base)
     try:
         if kind == "legged":
             return legged_formulation(robot, posture)
@@ -68,11 +63,11 @@ def default_formulation(
 
 
 def _end_effector(robot: Robot, objective: WorstCaseObjective | None) -> EndEffector | None:
-    """Return the task of the frame that an impact meets, else of the default contact frame; ``None`` without one.
+    """Return the task of the impact's frame, or of the default contact frame; ``None`` without a frame.
 
-    It has the rows of the frame's default pose mode.  ``aligned`` takes the normal at the default posture; without an
-    impact there is none, so the task holds the whole pose.  A frame whose pose is free is pushed, so the task holds
-    the default contact frame, as a whole pose if that is free, too.
+    It has the rows of the frame's default pose mode.  ``aligned`` uses the normal at the default posture, or holds
+    the whole pose without an impact.  A frame with the pose mode ``free`` is pushed, so the task then holds the
+    default contact frame, as a whole pose if its mode is ``free``, too.
     """
     frame, offset = robot.spec.contact.frame, robot.spec.contact.offset
     aligned = None
@@ -89,7 +84,7 @@ def _end_effector(robot: Robot, objective: WorstCaseObjective | None) -> EndEffe
 
 
 def _hint(robot: Robot, kind: ControllerKind, error: InputError) -> str:
-    """Return which kind the robot is, or what its data lack for the one that was given."""
+    """Return a hint: the kind of the robot, or the data that its kind needs."""
     if robot.floating and not robot.spec.supports and robot.spec.propulsion is None:
         return "name [propulsion] or [[supports]] in robot.toml"
     fits = "legged" if robot.spec.supports else "aerial" if robot.spec.propulsion else "arm"

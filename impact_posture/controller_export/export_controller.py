@@ -1,4 +1,4 @@
-"""Write the C of a controller into a folder: source, header, DAQP, the gradient it needs, and a manifest."""
+"""Export of a controller as C into a folder: source, header, DAQP, the gradient, and a manifest."""
 
 from __future__ import annotations
 
@@ -39,11 +39,11 @@ RUN_SCHEMA = "impact-posture/controller-run/1"
 
 @dataclass(frozen=True)
 class ControllerExport(WrittenCode):
-    """Written C of a controller."""
+    """Exported C of a controller."""
 
     @property
     def verdict(self) -> str:
-        """The outcome, on one line."""
+        """Outcome in one line."""
         if self.library is not None:
             return f"{self.library.name}: built"
         return f"build: make -C {self.out} (or codegen --compile)"
@@ -62,7 +62,7 @@ class ControllerExport(WrittenCode):
         }
 
     def load(self) -> CompiledController:
-        """Load the library, which runs its code; build it where it is missing."""
+        """Load the library, which runs its code; build it if it is missing."""
         return CompiledController.load(self.out, robot=self.robot)
 
 
@@ -81,9 +81,9 @@ def export_controller(
     generated: Sequence[str] = (),
     shared: bool = False,
 ) -> ControllerExport:
-    """Write the controller of a formulation as C99 into a folder, whole or not at all.
+    """Write the controller of a formulation as C99 into a folder, completely or not at all.
 
-    The structure of the formulation is compiled in.  Its gains, weights, limits and targets are the defaults of
+    The code has the structure of the formulation.  Its gains, weights, limits and targets are the defaults of
     parameters that a program can set.
 
     Args:
@@ -93,16 +93,16 @@ def export_controller(
         objective: The objective whose gradient an impact-robust posture task or a reference flow follows.
         prefix: Beginning of the C names; by default, the robot and ``controller``.
         period: Expected time between ticks, s.
-        daqp: Folder of the sources of DAQP, where they cannot be downloaded.
+        daqp: Folder of the sources of DAQP, if they cannot be downloaded.
         build: Leave ``lib<prefix>.so`` in the folder.
         force: Replace an earlier export.
-        generated: Further flags of the compiler for what is generated from the model.
-        shared: Make the armature and the places of the joints a parameter, ``numbers``, so that robots which differ
-            in them have the same code.  Its gradient is no export of its own.
+        generated: Further flags of the compiler for the sources that come from the model.
+        shared: Make armature and joint placements a parameter, ``numbers``, so that robots that differ only in them
+            have the same code.  The gradient then is a part of this code.
 
     Raises:
-        InputError: A task or joint has no C code, the gradient is missing, or there are no sources of DAQP.
-        OutputError: The folder exists without ``force``, is no export, or cannot be written.
+        InputError: A task or joint has no C code, or the gradient or the sources of DAQP are missing.
+        OutputError: The folder exists without ``force``, is not an export, or cannot be written.
         CompilerError: The compiler failed.
     """
     prefix = c_identifier(robot.name, "controller") if prefix is None else check_prefix(prefix)
@@ -115,14 +115,11 @@ def export_controller(
     fields = tuple(parameters(structure, period))
     if shared:
         numbers = ModelParameters(robot.model).values
-        fields = (*fields, Field("numbers", "finite", "armature and places of the joints", numbers))
+        fields = (*fields, Field("numbers", "finite", "armature and placements of the joints", numbers))
     manifest = _manifest(structure, fields, prefix)
     metric = f"{prefix}_metric" if objective is not None else None
-    own = [
-        *(f"{prefix}_{name}.c" for name in ("defaults", "dynamics", "relaxation")),
-        *([] if metric is None else [f"{metric}.c"]),
-    ]
-    manifest["sources"] = [*own, f"{prefix}_daqp.c"]
+    parts = ("defaults", "dynamics", "relaxation", *([] if metric is None else ["metric"]), "daqp")
+    manifest["sources"] = [f"{prefix}_{name}.c" for name in parts]
     lean = objective if shared else None
     texts = render(structure, fields, prefix, identity(manifest), metric, lean, shared=shared)
     texts |= renamed(sources, prefix)
@@ -147,7 +144,7 @@ def export_controller(
 
 @lru_cache(maxsize=2)
 def _metric(objective: WorstCaseObjective, prefix: str) -> dict[str, str]:
-    """Return file name → text of the gradient, without the examples that a gradient alone has."""
+    """Return file name → text of the gradient, without the examples of an exported gradient."""
     with TemporaryDirectory() as folder:
         export_gradient(objective, Path(folder), prefix=prefix, check=False)
         names = [f"{prefix}.{ending}" for ending in ("c", "h", "json")]
@@ -155,7 +152,7 @@ def _metric(objective: WorstCaseObjective, prefix: str) -> dict[str, str]:
 
 
 def _manifest(s: Structure, fields: Sequence[Field], prefix: str) -> dict[str, Any]:
-    """Return all that a loader needs to size buffers and to name what is in them."""
+    """Return the manifest: sizes of buffers and names of their entries."""
     robot = s.robot
     return {
         "schema": SCHEMA,

@@ -1,4 +1,4 @@
-"""Symbolic dynamics that a tick needs: ``M``, ``h``, and the kinematics of points with their drifts."""
+"""Symbolic dynamics of a tick: ``M``, ``h``, and the kinematics of points with their drifts."""
 
 from __future__ import annotations
 
@@ -21,14 +21,7 @@ from impact_posture.dynamics.tree import Tree
 
 
 class MovingTree(Tree):
-    """A tree at ``(q, ν)``.
-
-    Args:
-        model: The model, a ``pin.Model``.
-        q: Configuration, shape (nq, 1).
-        v: ν, shape (nv, 1).
-        numbers: Numbers of the model that are parameters.
-    """
+    """Tree of a ``pin.Model`` at ``(q, ν)``, shapes (nq, 1) and (nv, 1); ``numbers`` of the model are parameters."""
 
     def __init__(self, model: object, q: ca.SX, v: ca.SX, numbers: ModelParameters | None = None) -> None:
         super().__init__(model, q, limbs=numbers)
@@ -54,7 +47,7 @@ class MovingTree(Tree):
         return ca.triu2symm(ca.triu(M))
 
     def bias(self) -> ca.SX:
-        """Return ``h``, the force that ``ν̇ = 0`` takes against gravity, shape (nv,)."""
+        """Return ``h``, the generalized force at ``ν̇ = 0`` with gravity, shape (nv,)."""
         forces: ByJoint = {}
         for i, acceleration in self._accelerations.items():
             momentum = self._inertia[i] @ self._moving[i]
@@ -79,20 +72,19 @@ class MovingTree(Tree):
 
     def spatial_drift(self, point: PointOnLink) -> ca.SX:
         """Return the spatial acceleration of a point at ``ν̇ = 0``, world axes, shape (6,)."""
-        found = self.point_velocity(point, self._accelerations)
-        return found + ca.vertcat(self._gravity, ca.SX(3, 1))
+        return self.point_velocity(point, self._accelerations) + ca.vertcat(self._gravity, ca.SX(3, 1))
 
     @cached_property
     def _accelerations(self) -> ByJoint:
         """Spatial acceleration of every link at ``ν̇ = 0``, minus gravity, in link coordinates."""
-        found: ByJoint = {}
+        accelerations: ByJoint = {}
         for slot, i, parent in self._joints:
-            start = found[parent] if parent else ca.vertcat(-self._gravity, ca.SX(3, 1))
-            found[i] = motion_to_child(self._R[i], self._p[i], start)
+            start = accelerations[parent] if parent else ca.vertcat(-self._gravity, ca.SX(3, 1))
+            accelerations[i] = motion_to_child(self._R[i], self._p[i], start)
             if parent:
-                # A joint that moves against the world has no v × S ν of its own motion.
-                found[i] = found[i] + _motion_cross(self._moving[i], self._S[i] @ self._v[slot.v])
-        return found
+                # For a joint on the world, v × S ν vanishes, because v is S ν.
+                accelerations[i] += _motion_cross(self._moving[i], self._S[i] @ self._v[slot.v])
+        return accelerations
 
 
 def _motion_cross(a: ca.SX, b: ca.SX) -> ca.SX:

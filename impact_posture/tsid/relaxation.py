@@ -75,10 +75,15 @@ def solve(assembly: Assembly, solver: DaqpSolver) -> Outcome:
         solved = DaqpSolver(qp.n, qp.m, proximal=_FLAT).solve(qp)
     if solved is not None or not qp.finite:
         return Outcome(solved)
+    return _relax(assembly)
+
+
+def _relax(assembly: Assembly) -> Outcome:
+    """Solve the QP of the assembly lexicographically."""
     nearest = lexicographic(_hierarchy(assembly), assembly.rank.units)
     if nearest is None:
         return Outcome(None)
-    solved = _cheapest(qp, assembly.rank.units, nearest)
+    solved = _cheapest(assembly.rank.qp, assembly.rank.units, nearest)
     return Outcome(solved, _gave_way(assembly, solved.z))
 
 
