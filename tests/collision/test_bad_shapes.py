@@ -1,4 +1,4 @@
-"""Shapes that cannot be used, caches that cannot be trusted, and obstacles that are none."""
+"""Unusable shapes, damaged caches, and impossible obstacles."""
 
 from __future__ import annotations
 
@@ -10,6 +10,7 @@ import time
 from pathlib import Path
 
 import numpy as np
+import pinocchio as pin
 import pytest
 from hypothesis import given
 from hypothesis import strategies as st
@@ -54,14 +55,14 @@ def joint(parent: str, child: str) -> str:
 
 
 def arm(folder: Path, *shapes: str, tag: str = "collision") -> RobotShapes:
-    """Shapes of an arm with three links: a box, these shapes, and a box."""
+    """Return the shapes of an arm with three links: a box, these shapes, and a box."""
     text = f'<robot name="arm">{link("base", BOX)}{link("middle", *shapes, tag=tag)}{link("tip", BOX)}'
     (folder / "arm.urdf").write_text(f"{text}{joint('base', 'middle')}{joint('middle', 'tip')}</robot>")
     return load_shapes(load_robot(str(folder / "arm.urdf"), armature="none"))
 
 
 def fresh() -> None:
-    """Forget what is in memory, as another process has."""
+    """Clear the cache in memory, as in a new process."""
     collision_shapes._shapes.cache_clear()
 
 
@@ -107,7 +108,7 @@ def test_a_bad_mesh_is_left_out_by_name(
     shapes = arm(tmp_path, mesh("bad.stl"), BOX)
     (line,) = shapes.warnings
     assert line.startswith("shape middle[0] is left out: ") and fault in line and "\n" not in line
-    # The robot goes on with the other shapes, and nothing is printed.
+    # The other shapes are used, and nothing is printed.
     assert {body.name for body in shapes.bodies} == {"base", "middle[1]", "tip"}
     assert capfd.readouterr() == ("", "")
 
@@ -133,7 +134,7 @@ def test_a_bad_description_is_left_out_by_name(tmp_path: Path, geometry: str, fa
     urdf = tmp_path / "arm.urdf"
     urdf.write_text(text)
     robot = load_robot(str(urdf), armature="none")
-    # Pinocchio refuses some of these itself when it reads the joints, and others not, by its version.
+    # Some versions of Pinocchio refuse some of these shapes when they read the joints.
     urdf.write_text(text.replace(link("middle", BOX), link("middle", geometry)))
     shapes, (line,) = read_urdf_shapes(robot)
     assert [shape.name for shape in shapes] == ["base"]
@@ -202,10 +203,9 @@ def test_meshes_of_packages_and_visual_shapes(tmp_path: Path) -> None:
     stl(tmp_path / "elsewhere" / "parts" / "a b.stl", TETRAHEDRON[FACES])
     text = f'<robot name="arm">{link("base", BOX)}' + link("middle", mesh("package://parts/a b.stl"), tag="visual")
     (tmp_path / "arm.urdf").write_text(f"{text}{joint('base', 'middle')}</robot>")
-    found = load_shapes(
-        load_robot(str(tmp_path / "arm.urdf"), armature="none", package_dir=(str(tmp_path / "elsewhere"),))
-    )
-    assert [body.link for body in found.bodies] == ["base", "middle"] and not found.warnings
+    folder = str(tmp_path / "elsewhere")
+    shapes = load_shapes(load_robot(str(tmp_path / "arm.urdf"), armature="none", package_dir=(folder,)))
+    assert [body.link for body in shapes.bodies] == ["base", "middle"] and not shapes.warnings
 
 
 def test_a_robot_without_shapes_says_so(tmp_path: Path) -> None:
@@ -217,8 +217,8 @@ def test_a_robot_without_shapes_says_so(tmp_path: Path) -> None:
     assert mesh_collisions(robot, shapes, robot.posture()) == []
 
 
-def test_a_million_faces_take_seconds(tmp_path: Path) -> None:
-    """A tenth of a million, in a tenth of the time: the surface of a wavy ball."""
+def test_a_hundred_thousand_faces_take_less_than_five_seconds(tmp_path: Path) -> None:
+    """The mesh is the surface of a wavy ball."""
     count = 224
     polar, around = np.meshgrid(np.linspace(0, np.pi, count), np.linspace(0, 2 * np.pi, count), indexing="ij")
     radius = 0.1 * (1 + 0.1 * np.sin(5 * polar) * np.cos(4 * around))
@@ -232,7 +232,7 @@ def test_a_million_faces_take_seconds(tmp_path: Path) -> None:
     assert time.process_time() - start < 5
     body = next(body for body in shapes.bodies if body.link == "middle")
     assert len(body.vertices) <= 40 and body.radius < 0.02
-    # Fitted once: the second robot of the same content has the same shapes.
+    # A second robot with the same content has the same shapes.
     assert arm(tmp_path, mesh("fine.stl")) is shapes
 
 
@@ -261,27 +261,21 @@ def test_the_cache_is_used_and_depends_on_content(tmp_path: Path, own_cache: Pat
     assert len(list(own_cache.glob("*.json"))) == 2
 
 
-@pytest.mark.parametrize("damage", ["cut", "empty", "binary", "number", "fields", "array", "folder"])
+@pytest.mark.parametrize("damage", ["cut", "binary", "number", "fields"])
 def test_a_damaged_cache_is_fitted_again(tmp_path: Path, own_cache: Path, damage: str) -> None:
     first = arm(tmp_path, BOX)
     path = stored(own_cache)
     raw = path.read_bytes()
-    if damage == "folder":
-        path.unlink()
-        path.mkdir()
-    elif damage in ("fields", "array"):
-        # Whole, with its seal, and yet no shapes.
+    if damage == "fields":
+        # The checksum fits, but a field is missing.
         content = json.loads(raw.split(b"\n", 1)[1])
-        if damage == "fields":
-            del content["pairs"]
-        else:
-            content["pairs"] = [[0, 1]] * 3
+        del content["pairs"]
         changed = json.dumps(content)
         path.write_text(f"{cached_values._seal(changed)}\n{changed}")
     else:
         other = raw.replace(b'"radius":', b'"radius":1')
         assert other != raw
-        path.write_bytes({"cut": raw[:-9], "empty": b"", "binary": os.urandom(999), "number": other}[damage])
+        path.write_bytes({"cut": raw[:-9], "binary": os.urandom(999), "number": other}[damage])
     fresh()
     again = arm(tmp_path, BOX)
     np.testing.assert_array_equal(first.bodies[0].vertices, again.bodies[0].vertices)
@@ -310,20 +304,12 @@ def test_a_cache_that_others_may_write_is_not_read(tmp_path: Path, own_cache: Pa
 
 
 @given(st.integers(0, 2**32 - 1))
-def test_a_box_stands_where_it_is_put(seed: int) -> None:
-    import pinocchio as pin
-
+def test_a_box_has_its_pose(seed: int) -> None:
     random = np.random.default_rng(seed)
     edges, position, quaternion = random.uniform(0.1, 2, 3), random.normal(size=3), random.normal(size=4)
     quaternion /= np.linalg.norm(quaternion)
-    box = obstacle_hull(
-        Obstacle(
-            name="box",
-            box=tuple(edges.tolist()),
-            position=tuple(position.tolist()),
-            quaternion=tuple(quaternion.tolist()),
-        )
-    )
+    numbers = {"box": edges, "position": position, "quaternion": quaternion}
+    box = obstacle_hull(Obstacle(name="box", **{key: tuple(array.tolist()) for key, array in numbers.items()}))
     local = (box.vertices - position) @ pin.XYZQUATToSE3(np.r_[position, quaternion]).rotation
     np.testing.assert_allclose(np.abs(local), np.tile(edges / 2, (8, 1)), atol=1e-12)
     assert box.joint == 0 and box.name == "box"
@@ -345,7 +331,7 @@ def test_an_impossible_obstacle_is_refused(values: dict[str, object], words: str
 
 
 def test_an_obstacle_of_a_file_is_checked() -> None:
-    made = validate(Obstacle, {"name": "ball", "sphere": 0.5, "position": [0, 0, 1]}, "problem.toml")
-    assert obstacle_hull(made).radius == 0.5 and obstacle_hull(made).vertices.tolist() == [[0, 0, 1]]
+    ball = obstacle_hull(validate(Obstacle, {"name": "ball", "sphere": 0.5, "position": [0, 0, 1]}, "problem.toml"))
+    assert ball.radius == 0.5 and ball.vertices.tolist() == [[0, 0, 1]]
     with pytest.raises(SpecError, match="did you mean position"):
         validate(Obstacle, {"name": "ball", "sphere": 0.5, "positon": [0, 0, 1]}, "problem.toml")

@@ -1,4 +1,4 @@
-"""Collision shapes of robots: hulls that hold every shape, pairs that have to keep apart, and the check on meshes."""
+"""Collision shapes of robots: hulls that contain all shapes, pairs that must not touch, and the check of meshes."""
 
 from __future__ import annotations
 
@@ -38,7 +38,7 @@ def check_of(name: str) -> MeshCheck:
 
 
 def surface(shape: pin.GeometryObject, random: np.random.Generator, count: int) -> Array:
-    """Points on the surface of a shape in the axes of its joint, by formulas of their own."""
+    """Return points on the surface of a shape in the axes of its joint, by independent formulas."""
     solid, unit = shape.geometry, random.normal(size=(count, 3))
     unit /= np.linalg.norm(unit, axis=1)[:, None]
     match solid:
@@ -60,7 +60,7 @@ def surface(shape: pin.GeometryObject, random: np.random.Generator, count: int) 
 
 
 def outside(body: SweptHull, points: Array) -> Array:
-    """Distance of points from a swept hull, m."""
+    """Return the distances of points outside a swept hull, m."""
     if len(body.vertices) > 3:
         planes = ConvexHull(body.vertices).equations
         points = points[np.max(points @ planes[:, :3].T + planes[:, 3], axis=1) > 0]
@@ -68,7 +68,7 @@ def outside(body: SweptHull, points: Array) -> Array:
 
 
 @pytest.mark.parametrize("name", ROBOTS)
-def test_every_shape_is_held_by_one_body(name: str) -> None:
+def test_a_body_contains_each_shape(name: str) -> None:
     shapes, random = load_shapes(robot_of(name)), np.random.default_rng(0)
     for shape in shapes.geometry.geometryObjects:
         points = surface(shape, random, 30)
@@ -83,7 +83,7 @@ def test_every_shape_is_held_by_one_body(name: str) -> None:
 
 
 @pytest.mark.parametrize("name", ROBOTS)
-def test_pairs_leave_out_neighbors_and_what_the_srdf_allows(name: str) -> None:
+def test_pairs_leave_out_neighbors_and_links_that_the_srdf_allows_to_touch(name: str) -> None:
     robot = robot_of(name)
     shapes, parents = load_shapes(robot), list(robot.model.parents)
     srdf = pin.GeometryModel(shapes.geometry)
@@ -95,12 +95,11 @@ def test_pairs_leave_out_neighbors_and_what_the_srdf_allows(name: str) -> None:
     for i, j in shapes.pairs:
         a, b = shapes.bodies[i].joint, shapes.bodies[j].joint
         assert a != b and parents[a] != b and parents[b] != a
-    # A pair of bodies for every pair of shapes that has to keep apart, and none for others.
+    # There is a pair of bodies for each pair of shapes that must not touch, and no other pair.
     joints = {(shapes.bodies[i].joint, shapes.bodies[j].joint) for i, j in shapes.pairs}
     named = {body.name: body.joint for body in shapes.bodies}
-    joints |= {
-        (named[a], named[b]) for a, b in (*shapes.hulls_touching, *(one.bodies for one in shapes.joint_planes))
-    }
+    nested = (*shapes.hulls_touching, *(planes.bodies for planes in shapes.joint_planes))
+    joints |= {(named[a], named[b]) for a, b in nested}
     objects = shapes.geometry.geometryObjects
     of_shapes = {
         (objects[p.first].parentJoint, objects[p.second].parentJoint) for p in shapes.geometry.collisionPairs
@@ -152,27 +151,27 @@ def test_obstacles_and_planes_are_found_by_name() -> None:
     )
     assert {name for _, name in hits} == {"ball"}
     assert {shape.partition("[")[0] for shape, _ in hits} <= {"panda_hand", "panda_leftfinger", "panda_rightfinger"}
-    # The whole robot is above its base, but for what the base itself reaches below.
+    # The whole robot is above the ground, but parts of its base reach below.
     base = {0}
     ground = SimpleNamespace(name="ground", point=np.zeros(3), normal=np.array([0.0, 0.0, 1.0]), exempt=base)
     assert mesh_collisions(robot, shapes, q, planes=[ground]) == []
     ceiling = SimpleNamespace(name="ceiling", point=hand, normal=np.array([0.0, 0.0, -1.0]), exempt=base)
-    found = {shape for shape, plane in mesh_collisions(robot, shapes, q, planes=[ceiling]) if plane == "ceiling"}
-    assert "panda_link4" in found and not any(shape.startswith("panda_link0") for shape in found)
+    above = {shape for shape, plane in mesh_collisions(robot, shapes, q, planes=[ceiling]) if plane == "ceiling"}
+    assert "panda_link4" in above and not any(shape.startswith("panda_link0") for shape in above)
 
 
 @pytest.mark.parametrize("name", ["solo8", "panda"])
 @given(seed=st.integers(0, 2**32 - 1))
 @settings(max_examples=12)
-def test_a_kept_check_finds_what_coal_finds_of_every_shape(name: str, seed: int) -> None:
+def test_a_check_of_many_postures_equals_coal_on_each_shape(name: str, seed: int) -> None:
     robot, random = robot_of(name), np.random.default_rng(seed)
     shapes, data, check = load_shapes(robot), robot.model.createData(), check_of(name)
     check.collisions(random_posture(robot, seed + 1))
     q = random_posture(robot, seed)
-    found = check.collisions(q)
-    assert found == mesh_collisions(robot, shapes, q)
+    collisions = check.collisions(q)
+    assert collisions == mesh_collisions(robot, shapes, q)
     pin.forwardKinematics(robot.model, data, q)
-    # Meshes do not meet a swept hull in coal.
+    # coal finds no collisions of meshes with swept hulls, so the radius is zero.
     body = replace(shapes.bodies[int(random.integers(len(shapes.bodies)))], name="body", radius=0.0)
     at = pin.SE3(pin.exp3(random.normal(size=3)), random.normal(size=3) * 0.3)
     normal = random.normal(size=3)
@@ -194,11 +193,11 @@ def test_a_kept_check_finds_what_coal_finds_of_every_shape(name: str, seed: int)
             coal.CollisionRequest(), coal.CollisionResult(),
         )
     ]  # fmt: skip
-    assert check.collisions(q, [(body, at, {2})], [plane]) == found + wanted
+    assert check.collisions(q, [(body, at, {2})], [plane]) == collisions + wanted
 
 
 @pytest.mark.parametrize("depth, hit", [(5e-7, False), (2e-6, True), (-1e-9, False)])
-def test_a_micrometer_of_contact_is_none(depth: float, hit: bool) -> None:
+def test_a_collision_counts_from_a_micrometer(depth: float, hit: bool) -> None:
     robot = robot_of("tilthex_arm")
     shapes, q = load_shapes(robot), robot.posture()
     data = robot.model.createData()
@@ -221,7 +220,7 @@ def _lowest(shape: pin.GeometryObject, at: pin.SE3) -> float:
 
 @pytest.mark.parametrize("name", ["icub", "hextilt"])
 def test_default_postures_of_robots_with_turned_meshes_are_free(name: str) -> None:
-    """Both have COLLADA files with y up; the URDF of icub is written for turned meshes, that of hextilt is not."""
+    """Both have COLLADA files with y up, but only the URDF of icub needs turned meshes."""
     robot = robot_of(name)
     shapes = load_shapes(robot)
     assert mesh_collisions(robot, shapes, robot.posture()) == []
@@ -233,7 +232,7 @@ def test_overlaps_by_design_are_reported_by_name() -> None:
     assert shapes.always_touching == (("flying_arm_5__link_2", "flying_arm_5__link_4"),)
     pairs = {(shapes.bodies[i].name, shapes.bodies[j].name) for i, j in shapes.pairs}
     assert not pairs & {*shapes.always_touching, *shapes.hulls_touching}
-    # The shapes of hulls in each other's hollows are checked all the same.
+    # The shapes of nested bodies are checked as well.
     objects = shapes.geometry.geometryObjects
     checked = {(objects[p.first].name, objects[p.second].name) for p in shapes.geometry.collisionPairs}
     nested = {planes.bodies for planes in shapes.joint_planes}

@@ -1,4 +1,4 @@
-"""Meshes of several parts: coal numbers their triangles wrongly; all else gets them as the file describes them."""
+"""Meshes of several parts, whose triangles coal numbers wrongly, have the triangles of their files."""
 
 from __future__ import annotations
 
@@ -31,7 +31,7 @@ PARTS = ((0.0, 0.0, 0.0), (0.3, 0.0, 0.0), (0.6, 0.0, 0.1))
 
 
 def collada(path: Path) -> Path:
-    """A mesh of three cubes, a material each."""
+    """Write a mesh of three cubes with different materials."""
     points = np.concatenate([CUBE + part for part in PARTS])
     numbers = " ".join(map(str, points.ravel()))
     triangles = "".join(
@@ -67,40 +67,38 @@ def test_the_check_sees_every_part_of_a_mesh(tmp_path: Path, monkeypatch: pytest
     q, seen = shapes.robot.posture(), []
     middle = np.array([0.0, 0.0, 0.3])
     for part in PARTS:
-        # A plate through the part, that no other part touches.
-        plate = Obstacle(name="plate", box=(0.02, 0.2, 0.02), position=tuple((middle + part).tolist()))
-        seen.append(
-            bool(mesh_collisions(shapes.robot, shapes, q, obstacles=[(obstacle_hull(plate), pin.SE3.Identity(), ())]))
-        )
+        # A plate through this part alone.
+        plate = obstacle_hull(Obstacle(name="plate", box=(0.02, 0.2, 0.02), position=tuple((middle + part).tolist())))
+        seen.append(bool(mesh_collisions(shapes.robot, shapes, q, obstacles=[(plate, pin.SE3.Identity(), ())])))
     assert seen == [True, right, right]
-    # Right triangles reach as far as the corners.
+    # The correct triangles reach as far as the corners.
     reach = mesh_points(solid)[mesh_triangles(solid)][..., 0].max()
     assert bool(np.isclose(reach, PARTS[-1][0] + 0.05)) is right
     assert not shapes.warnings
 
 
 def probes(triangles: Array, shape: coal.BVHModelBase) -> Array:
-    """Whether a ball of 10 µm at the middle of each triangle, shape (n, 3, 3), touches a mesh."""
-    ball, here, found = coal.Sphere(1e-5), coal.Transform3s(), []
-    for middle in triangles.mean(axis=1):
-        at = coal.Transform3s(np.eye(3), middle)
-        found.append(coal.collide(shape, here, ball, at, coal.CollisionRequest(), coal.CollisionResult()) > 0)
-    return np.array(found)
+    """Return whether a ball of 10 µm at the center of each triangle, shape (n, 3, 3), touches a mesh."""
+    ball, here, touching = coal.Sphere(1e-5), coal.Transform3s(), []
+    for center in triangles.mean(axis=1):
+        at = coal.Transform3s(np.eye(3), center)
+        touching.append(coal.collide(shape, here, ball, at, coal.CollisionRequest(), coal.CollisionResult()) > 0)
+    return np.array(touching)
 
 
 @pytest.mark.parametrize(("name", "changed"), [("go2", 2), ("icub", 1), ("panda", 0), ("talos", 0)])
 def test_meshes_of_robots(name: str, changed: int, monkeypatch: pytest.MonkeyPatch) -> None:
     robot = load_robot(name)
     described = [shape for shape in read_urdf_shapes(robot)[0] if shape.kind == "mesh"]
-    now = [one.geometry for one in load_geometry(robot, described).model.geometryObjects]
+    now = [shape.geometry for shape in load_geometry(robot, described).model.geometryObjects]
     as_coal_reads_it(monkeypatch)
-    before = [one.geometry for one in load_geometry(robot, described).model.geometryObjects]
+    before = [shape.geometry for shape in load_geometry(robot, described).model.geometryObjects]
     different = [
         (a, b) for a, b in zip(now, before, strict=True) if not np.array_equal(mesh_triangles(a), mesh_triangles(b))
     ]
     assert len(different) == changed
     for a, b in different:
-        # The same corners, so that a hull around them is the same; but coal left out most of the surface.
+        # The corners are the same, and so is their hull, but coal leaves out most of the surface.
         assert np.array_equal(mesh_points(a), mesh_points(b))
         assert np.array_equal(np.unique(mesh_triangles(a)), np.arange(len(mesh_points(a))))
         surface = mesh_points(a)[mesh_triangles(a)][:: max(1, a.num_tris // 200)]
@@ -109,8 +107,8 @@ def test_meshes_of_robots(name: str, changed: int, monkeypatch: pytest.MonkeyPat
 
 
 @given(st.lists(st.lists(st.integers(3, 30), min_size=1, max_size=4), min_size=1, max_size=3))
-def test_parts_of_a_file_are_told_apart(nodes: list[list[int]]) -> None:
-    """Nodes of several parts each, numbered as coal does: each part from the first corner of its node."""
+def test_parts_of_a_file_are_separated(nodes: list[list[int]]) -> None:
+    """The nodes have several parts; coal numbers each part from the first corner of its node."""
     numbered, true, base = [], [], 0
     for parts in nodes:
         node = base
@@ -119,15 +117,12 @@ def test_parts_of_a_file_are_told_apart(nodes: list[list[int]]) -> None:
             numbered.append(fan + node)
             true.append(fan + base)
             base += count
-    found = renumbered(base, np.concatenate(numbered))
-    assert found is not None and np.array_equal(found, np.concatenate(true))
-    # What cannot be told apart is not guessed.
+    triangles = renumbered(base, np.concatenate(numbered))
+    assert triangles is not None and np.array_equal(triangles, np.concatenate(true))
     assert renumbered(base + 1, np.concatenate(numbered)) is None
 
 
-def test_the_hull_takes_the_place_of_parts_that_cannot_be_told_apart(
-    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
-) -> None:
+def test_the_hull_replaces_parts_that_cannot_be_separated(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     monkeypatch.setattr("impact_posture.collision.shape_corners.renumbered", lambda *_: None)
     collada(tmp_path / "cubes.dae")
     shapes = arm(tmp_path, mesh("cubes.dae"))
@@ -136,7 +131,7 @@ def test_the_hull_takes_the_place_of_parts_that_cannot_be_told_apart(
         "export it as one part"
     )
     (solid,) = [shape.geometry for shape in shapes.geometry.geometryObjects if shape.name == "middle"]
-    # The hull of the cubes holds what is between them.
+    # The hull of the cubes contains the space between them.
     ball, at = coal.Sphere(0.04), coal.Transform3s(np.eye(3), np.array([0.15, 0.06, 0.0]))
     assert coal.collide(solid, coal.Transform3s(), ball, at, coal.CollisionRequest(), coal.CollisionResult())
     (drawn,) = [s for s in draw_robot(shapes.robot, True).solids if np.ptp(s.points[:, 0]) > 0.5]

@@ -1,4 +1,4 @@
-"""Swept hulls: their distance against a quadratic program, and the fit that holds every point."""
+"""Swept hulls: distances against a quadratic program, and fits that contain all points."""
 
 from __future__ import annotations
 
@@ -26,7 +26,7 @@ SEEDS = st.integers(0, 2**32 - 1)
 
 
 def distance_of_hulls(a: Array, b: Array) -> float:
-    """Distance of the hulls of two sets of points: convex weights by non-negative least squares."""
+    """Return the distance of the hulls of two sets of points, by non-negative least squares of convex weights."""
     weight = 1e4
     rows = np.vstack([np.hstack([a.T, -b.T]), weight * np.r_[np.ones(len(a)), np.zeros(len(b))],
                       weight * np.r_[np.zeros(len(a)), np.ones(len(b))]])  # fmt: skip
@@ -45,35 +45,35 @@ def placement(random: np.random.Generator) -> pin.SE3:
 
 
 @given(SEEDS, st.sampled_from([1, 2, 3, 4, 12, 40]), st.sampled_from([1, 2, 4, 40]))
-def test_distance_is_that_of_the_quadratic_program(seed: int, count_a: int, count_b: int) -> None:
+def test_distance_equals_the_quadratic_program(seed: int, count_a: int, count_b: int) -> None:
     random = np.random.default_rng(seed)
     a, b = random.normal(size=(count_a, 3)) * 0.2, random.normal(size=(count_b, 3)) * 0.2
     at_a, at_b = placement(random), placement(random)
-    found = separation(hull(a, 0.01), at_a, hull(b, 0.02), at_b)
+    result = separation(hull(a, 0.01), at_a, hull(b, 0.02), at_b)
     world_a, world_b = (p @ at.rotation.T + at.translation for p, at in ((a, at_a), (b, at_b)))
     apart = distance_of_hulls(world_a, world_b)
     if apart < 1e-6:
-        assert found.distance <= -0.03 + 1e-6
+        assert result.distance <= -0.03 + 1e-6
         return
-    # The penalty on the weights costs the program about 1e-8.
-    assert found.distance == pytest.approx(apart - 0.03, abs=1e-7)
-    assert np.linalg.norm(found.normal) == pytest.approx(1, abs=1e-9)
-    np.testing.assert_allclose(found.point_a - found.point_b, found.distance * found.normal, atol=1e-8)
+    # The penalty on the weights causes an error of about 1e-8.
+    assert result.distance == pytest.approx(apart - 0.03, abs=1e-7)
+    assert np.linalg.norm(result.normal) == pytest.approx(1, abs=1e-9)
+    np.testing.assert_allclose(result.point_a - result.point_b, result.distance * result.normal, atol=1e-8)
     # The normal from b to a separates the two.
-    assert np.min(world_a @ found.normal) - np.max(world_b @ found.normal) == pytest.approx(apart, abs=1e-7)
+    assert np.min(world_a @ result.normal) - np.max(world_b @ result.normal) == pytest.approx(apart, abs=1e-7)
 
 
 def test_penetration_is_the_shortest_way_out() -> None:
-    """Two boxes 1 m wide, 0.9 m apart along x, with 2 cm of sweep in all."""
+    """Two boxes are 1 m wide, 0.9 m apart along x, and swept by 2 cm together."""
     box = obstacle_hull(Obstacle(name="box", box=(1.0, 1.0, 1.0)))
     swept = hull(box.vertices, 0.01)
-    found = separation(swept, pin.SE3(np.eye(3), np.array([0.9, 0.1, 0.2])), swept, pin.SE3.Identity())
-    assert found.distance == pytest.approx(-0.12, abs=1e-6)
-    np.testing.assert_allclose(found.normal, [1, 0, 0], atol=1e-6)
+    result = separation(swept, pin.SE3(np.eye(3), np.array([0.9, 0.1, 0.2])), swept, pin.SE3.Identity())
+    assert result.distance == pytest.approx(-0.12, abs=1e-6)
+    np.testing.assert_allclose(result.normal, [1, 0, 0], atol=1e-6)
 
 
 @given(SEEDS, st.integers(1, 300), st.sampled_from(["ball", "rod", "plate", "line", "point"]))
-def test_fit_holds_every_point(seed: int, count: int, form: str) -> None:
+def test_fit_contains_all_points(seed: int, count: int, form: str) -> None:
     random = np.random.default_rng(seed)
     extent = {
         "ball": (0.2, 0.2, 0.2), "rod": (0.5, 0.02, 0.02), "plate": (0.3, 0.2, 0.0), "line": (0.4, 0, 0),
@@ -84,13 +84,13 @@ def test_fit_holds_every_point(seed: int, count: int, form: str) -> None:
     vertices, radius = fit_hull(points)
     assert len(vertices) <= MOST_VERTICES
     assert max(distance_of_hulls(vertices, p[None]) for p in points[:60]) <= radius + 1e-7
-    # The sweep radius is no larger than what is left outside, but for the thickness that a flat hull gets.
+    # The sweep radius is the largest distance outside, plus the thickness of a flat hull.
     outside = max(distance_of_hulls(vertices, p[None]) for p in points)
     assert radius <= outside + 2.1e-4
 
 
 def test_fit_stops_at_the_tolerance() -> None:
-    """A coarse ball needs 40 corners; a box with rounded edges of 3 mm needs its 8."""
+    """A box with edges rounded by 3 mm needs hardly more than its 8 corners."""
     random = np.random.default_rng(0)
     box = np.array(np.meshgrid(*[[-0.1, 0.1]] * 3)).reshape(3, -1).T
     edges = random.normal(size=(3000, 3))
@@ -101,8 +101,8 @@ def test_fit_stops_at_the_tolerance() -> None:
 
 
 @pytest.mark.parametrize("kind", ["Box", "Sphere", "Cylinder", "Capsule"])
-def test_points_hold_a_primitive_shape(kind: str) -> None:
-    """Supporting planes in many directions: none of the shape is beyond its points, and those are hardly larger."""
+def test_points_contain_a_primitive_shape(kind: str) -> None:
+    """In many directions, the points reach as far as the shape, or up to 3 % farther."""
     import coal
 
     sizes = {"Box": (0.2, 0.3, 0.4), "Sphere": (0.2,), "Cylinder": (0.1, 0.6), "Capsule": (0.1, 0.6)}[kind]
@@ -121,7 +121,7 @@ def test_points_hold_a_primitive_shape(kind: str) -> None:
     assert np.all(reached <= support * 1.03 + 1e-12)
 
 
-def test_faces_are_those_of_the_hull() -> None:
+def test_faces_center_and_reach_of_a_box() -> None:
     box = obstacle_hull(Obstacle(name="box", box=(0.2, 0.4, 0.6), position=(1.0, 0.0, 0.0)))
     assert ConvexHull(box.vertices).volume == pytest.approx(0.048)
     assert box.faces.shape == (12, 3)
@@ -131,10 +131,10 @@ def test_faces_are_those_of_the_hull() -> None:
 
 
 def test_a_corner_on_a_corner_has_a_distance() -> None:
-    """All pairs of corners of two boxes that touch there, with the first corner at the origin."""
+    """Points at all corners of a box touch it, also with a sweep radius."""
     box = obstacle_hull(Obstacle(name="box", box=(1.0, 1.0, 1.0), position=(0.5, 0.5, 0.5)))
     for corner in box.vertices:
         for point in (hull(corner[None], 0.01), hull(corner[None])):
-            found = separation(point, pin.SE3.Identity(), box, pin.SE3.Identity())
-            assert found.distance == pytest.approx(-point.radius, abs=2e-9)
-            assert np.linalg.norm(found.normal) == pytest.approx(1)
+            result = separation(point, pin.SE3.Identity(), box, pin.SE3.Identity())
+            assert result.distance == pytest.approx(-point.radius, abs=2e-9)
+            assert np.linalg.norm(result.normal) == pytest.approx(1)
