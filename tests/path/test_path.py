@@ -1,4 +1,4 @@
-"""Paths on the constraints: around a disc, on a curve of two components, by samples, and what is said without one."""
+"""Paths on the constraints: around a disc, on a curve of two components, by sampling, and reasons without a path."""
 
 from __future__ import annotations
 
@@ -17,7 +17,7 @@ from impact_posture.dynamics.tree import Tree
 from impact_posture.errors import InputError
 from impact_posture.impact.impact_contact import ImpactContact, point_on
 from impact_posture.impact.worst_case_objective import WorstCaseObjective
-from impact_posture.path import posture_path as home
+from impact_posture.path import posture_path as module
 from impact_posture.path.path_search import connect, shortened
 from impact_posture.path.path_space import CHECK_DISTANCE, PathSpace
 from impact_posture.path.posture_path import posture_path
@@ -51,10 +51,10 @@ class OutsideDisc(ExpressionConstraint):
 
 
 def planar(rods: list[float], joints: list[float]) -> ConstrainedProblem:
-    """A planar arm whose tip is held in position."""
-    made = arm([Z] * len(rods), joints, floating=False, rods=[(length, 0, 0) for length in rods])
-    objective = WorstCaseObjective(made, ImpactContact(TIP, (0.6, 0.8, 0.0)))
-    return build_problem(made, objective, made.posture(), Requirements(contact_pose="position"))
+    """Return the problem of a planar arm whose tip is held in position."""
+    loaded = arm([Z] * len(rods), joints, floating=False, rods=[(length, 0, 0) for length in rods])
+    objective = WorstCaseObjective(loaded, ImpactContact(TIP, (0.6, 0.8, 0.0)))
+    return build_problem(loaded, objective, loaded.posture(), Requirements(contact_pose="position"))
 
 
 def with_disc(problem: ConstrainedProblem, frame: str, center: Array, radius: float) -> ConstrainedProblem:
@@ -64,27 +64,23 @@ def with_disc(problem: ConstrainedProblem, frame: str, center: Array, radius: fl
 
 
 def elbows(rods: list[float], q: Array) -> Array:
-    """All joints and the tip of a planar arm, written down anew, shape (n + 1, 2)."""
+    """Return all joints and the tip of a planar arm by an independent formula, shape (n + 1, 2)."""
     angles = np.cumsum(q)
     steps = np.array(rods)[:, None] * np.column_stack([np.cos(angles), np.sin(angles)])
     return np.vstack([np.zeros(2), np.cumsum(steps, axis=0)])
 
 
 def solution_of(problem: ConstrainedProblem, start: Array, end: Array) -> PostureSolution:
-    """A solution whose search is not what is tested."""
+    """Return a solution without a search."""
     values = {name: None for name in PostureSolution.__dataclass_fields__}
     return PostureSolution(**values | {"problem": problem, "initial": start, "q": end, "optima": ()})  # type: ignore[arg-type]
 
 
 def dense(problem: ConstrainedProblem, postures: list[Array], parts: int = 5) -> list[Array]:
-    """Postures between those of a path, on the constraints."""
+    """Return a path with more postures on the constraints between its postures."""
     space = PathSpace(problem)
-    found = []
-    for a, b in pairwise(postures):
-        found += [
-            space.projector.project(np.asarray(pin.interpolate(space.model, a, b, k / parts))).q for k in range(parts)
-        ]
-    return [*found, postures[-1]]
+    between = [pin.interpolate(space.model, a, b, k / parts) for a, b in pairwise(postures) for k in range(parts)]
+    return [*(space.projector.project(np.asarray(q)).q for q in between), postures[-1]]
 
 
 RODS = [0.4, 0.3, 0.3, 0.2]
@@ -112,8 +108,8 @@ def test_a_walk_around_a_disc_holds_the_tip_and_stays_outside(seed: int, place: 
         assert (np.abs(q) <= 5 + 1e-9).all()
 
 
-def test_a_disc_on_the_straight_walk_is_met_and_passed() -> None:
-    """The test above would pass if nothing were ever in the way."""
+def test_a_path_passes_a_disc_on_the_straight_walk() -> None:
+    """The test above would also pass if the disc were never in the way."""
     problem = planar(RODS, [0.4, 0.5, -0.9, 0.6])
     space, start = PathSpace(problem), problem.given
     end = space.projector.project(start + np.array([0.9, -1.2, 0.5, 0.3])).q
@@ -131,13 +127,10 @@ def test_no_frame_moves_more_than_the_check_distance_between_two_checks() -> Non
     for name in ("panda", "tiago", "solo8", "tilthex_arm"):
         loaded = robot(name)
         frame = next(f.name for f in loaded.model.frames if f.parentJoint == loaded.model.njoints - 1)
-        problem = build_problem(
-            loaded,
-            WorstCaseObjective(loaded, ImpactContact(frame, (0, 0, 1))),
-            loaded.posture(),
-            Requirements(contact_pose="free", com_over_feet=False),
-        )
-        # Any inequality makes the checks those of distance.
+        objective = WorstCaseObjective(loaded, ImpactContact(frame, (0, 0, 1)))
+        requirements = Requirements(contact_pose="free", com_over_feet=False)
+        problem = build_problem(loaded, objective, loaded.posture(), requirements)
+        # The distance of frames counts only with an inequality.
         space = PathSpace(with_disc(problem, frame, np.full(2, 9.0), 0.1))
         data = loaded.model.createData()
         for seed in range(5):
@@ -153,7 +146,7 @@ def test_no_frame_moves_more_than_the_check_distance_between_two_checks() -> Non
                 before = now
 
 
-def test_the_same_holds_for_postures_that_a_disc_deflects() -> None:
+def test_no_frame_moves_more_than_the_check_distance_beside_a_disc() -> None:
     problem = planar(RODS, [0.4, 0.5, -0.9, 0.6])
     end = PathSpace(problem).projector.project(problem.given + np.array([0.9, -1.2, 0.5, 0.3])).q
     straight = PathSpace(problem).walk(problem.given, end)
@@ -162,9 +155,9 @@ def test_the_same_holds_for_postures_that_a_disc_deflects() -> None:
 
     class Recorded(PathSpace):
         def pulled(self, q: Array, step: Array | None = None) -> Array | None:
-            found = super().pulled(q, step)
-            checked.extend([] if found is None else [found])
-            return found
+            pulled = super().pulled(q, step)
+            checked.extend([] if pulled is None else [pulled])
+            return pulled
 
     space = Recorded(blocked)
     path = connect(space, problem.given, end).path
@@ -179,18 +172,18 @@ def test_the_same_holds_for_postures_that_a_disc_deflects() -> None:
     assert count > len(path)
 
 
-# A crank that turns fully (0.1 + 0.5 < 0.4 + 0.4), so the two ways to assemble the linkage are two components.
+# The crank turns fully (0.1 + 0.5 < 0.4 + 0.4), so the two assemblies of the linkage are two components.
 CRANK = [0.1, 0.4, 0.4]
 
 
 def crank() -> tuple[ConstrainedProblem, Array, Array]:
-    """The linkage with its tip at (0.5, 0), a posture of each component."""
+    """Return the linkage with its tip at (0.5, 0), and a posture of each component."""
     up = assembled(0.3, 1.0)
     return planar(CRANK, up.tolist()), up, assembled(2.0, -1.0)
 
 
 def assembled(crank_angle: float, side: float) -> Array:
-    """The posture at a crank angle with the elbow on a side of the diagonal, by the law of cosines."""
+    """Return the posture at a crank angle with the elbow on a side of the diagonal, by the law of cosines."""
     pivot = 0.1 * np.array([np.cos(crank_angle), np.sin(crank_angle)])
     diagonal = np.array([0.5, 0.0]) - pivot
     size = float(np.linalg.norm(diagonal))
@@ -201,7 +194,7 @@ def assembled(crank_angle: float, side: float) -> Array:
     return np.array([turns[0], *((np.array(turns[1:]) + np.pi) % (2 * np.pi) - np.pi)])
 
 
-def test_without_a_path_this_is_said_and_the_best_of_the_component_is_reached() -> None:
+def test_without_a_path_the_best_posture_of_the_component_is_reached() -> None:
     problem, up, down = crank()
     path = posture_path(solution_of(problem, up, down), effort=1500)
     assert not path.found
@@ -216,7 +209,7 @@ def test_without_a_path_this_is_said_and_the_best_of_the_component_is_reached() 
     assert np.linalg.norm(ends[-1] - [0.5, 0]) < 1e-6
 
 
-def test_a_curve_that_is_cut_on_both_sides_proves_it_and_one_open_side_is_taken() -> None:
+def test_a_path_takes_the_open_side_and_two_cuts_prove_that_none_exists() -> None:
     problem, up, _ = crank()
     target = assembled(2.6, 1.0)
     for cuts, cut in (((1.2,), False), ((1.2, 4.5), True)):
@@ -230,16 +223,16 @@ def test_a_curve_that_is_cut_on_both_sides_proves_it_and_one_open_side_is_taken(
             assert path.q[-1][0] - up[0] == pytest.approx(2.3 - 2 * np.pi, abs=1e-6) and path.max_violation < 1e-8
 
 
-def test_an_optimum_of_an_arm_on_another_component_is_out_of_reach() -> None:
+def test_an_optimum_on_another_component_cannot_be_reached() -> None:
     problem = prepare(make_settings({"robot": "xarm7", "normal": (0, 0, 1), "collision": False})).problem
-    found = solve(problem, starts=8, jobs=1)
-    path = posture_path(found)
+    solution = solve(problem, starts=8, jobs=1)
+    path = posture_path(solution)
     assert not path.found and "(the optimum is on another component of the self-motion)" in path.reason
-    assert path.objective < problem.objective.value(found.initial) and path.max_violation < 1e-8
+    assert path.objective < problem.objective.value(solution.initial) and path.max_violation < 1e-8
     # A walk along the null space of Pinocchio's Jacobian, all around or to both limits, does not come near.
     space, known = PathSpace(problem), list[Array]()
     for side in (1.0, -1.0):
-        q, ahead = found.initial, np.zeros(problem.robot.nv)
+        q, ahead = solution.initial, np.zeros(problem.robot.nv)
         for _ in range(400):
             tangent = np.linalg.svd(equality_jacobian(problem, space.projector.numeric.at(q)))[2][-1]
             ahead = tangent * (side if not ahead.any() else np.sign(tangent @ ahead))
@@ -247,11 +240,11 @@ def test_an_optimum_of_an_arm_on_another_component_is_out_of_reach() -> None:
             if moved is None or space.distance(moved, q) < 0.02:
                 break
             known.append(q := moved)
-    assert min(np.linalg.norm(np.exp(1j * found.q) - np.exp(1j * q)) for q in known) > 0.3
+    assert min(np.linalg.norm(np.exp(1j * solution.q) - np.exp(1j * q)) for q in known) > 0.3
     assert min(np.linalg.norm(np.exp(1j * path.q[-1]) - np.exp(1j * q)) for q in known) < 0.05
 
 
-def test_a_start_on_the_constraints_alone_is_named() -> None:
+def test_a_start_that_violates_a_constraint_names_it() -> None:
     problem, up, _ = crank()
     blocked = with_disc(problem, "link_2", elbows(CRANK, up)[2], 0.05)
     path = posture_path(solution_of(blocked, up, up))
@@ -265,38 +258,37 @@ def test_a_start_that_is_the_optimum_needs_no_motion() -> None:
     assert path.found and not path.reason and path.length == 0 and len(path.q) == 1
 
 
-def test_samples_reach_what_they_can_and_depend_on_the_seed_alone() -> None:
+def test_sampling_finds_a_path_and_depends_only_on_the_seed() -> None:
     problem = planar(RODS, [0.4, 0.5, -0.9, 0.6])
     space, start = PathSpace(problem), problem.given
     end = space.projector.project(start + np.array([-1.2, 0.3, 1.8, 0.5])).q
     middle = elbows(RODS, space.walk(start, end)[15])[2]
     space = PathSpace(with_disc(problem, "link_2", middle, 0.03))
-    found, once_more, with_other_seed = (connect(space, start, end, seed) for seed in (2, 2, 6))
-    one, again, other = found.path, once_more.path, with_other_seed.path
-    assert one is not None and again is not None and other is not None and found.method == "sampling"
-    assert np.array_equal(one, again) and not (len(one) == len(other) and np.array_equal(one, other))
-    assert one[0] is start and one[-1] is end and space.clear_path(one)
-    for q in dense(space.problem, one, 3):
+    connections = [connect(space, start, end, seed) for seed in (2, 2, 6)]
+    path, again, other = (connection.path for connection in connections)
+    assert path is not None and again is not None and other is not None and connections[0].method == "sampling"
+    assert np.array_equal(path, again) and not (len(path) == len(other) and np.array_equal(path, other))
+    assert path[0] is start and path[-1] is end and space.clear_path(path)
+    for q in dense(space.problem, path, 3):
         points = elbows(RODS, q)
         assert np.linalg.norm(points[-1] - elbows(RODS, start)[-1]) < 1e-6
         assert np.linalg.norm(points[2] - middle) > 0.03 - 1e-6
-    short = shortened(space, one)
-    assert space.length(short) < space.length(one) and space.clear_path(short)
+    short = shortened(space, path)
+    assert space.length(short) < space.length(path) and space.clear_path(short)
     assert short[0] is start and short[-1] is end
 
 
-def test_samples_end_where_there_is_no_path() -> None:
+def test_sampling_ends_without_a_path() -> None:
     problem, up, down = crank()
-    found = connect(PathSpace(problem), up, down, effort=1000)
-    assert found.path is None and 1 < len(found.reached) <= 2100
+    connection = connect(PathSpace(problem), up, down, effort=1000)
+    assert connection.path is None and 1 < len(connection.reached) <= 2100
 
 
 @pytest.mark.parametrize("name", ["tilthex_arm", "solo8", "g1"])
 def test_random_postures_of_robots_are_reached_on_the_constraints(name: str) -> None:
-    """Floating bases, redundant rows of two feet: a reached target has been reached on the constraints."""
-    loaded = robot(name)
-    spec = loaded.spec
-    problem = prepare(make_settings({"robot": name, "normal": (-1, 0, 0), "frame": spec.contact.frame})).problem
+    """The robots have floating bases, and g1 redundant rows of two feet."""
+    frame = robot(name).spec.contact.frame
+    problem = prepare(make_settings({"robot": name, "normal": (-1, 0, 0), "frame": frame})).problem
     space = PathSpace(problem)
     start = feasible_start(problem, 0, 0)
     assert start is not None
@@ -305,22 +297,22 @@ def test_random_postures_of_robots_are_reached_on_the_constraints(name: str) -> 
         end = space.projector.project(random_posture(problem, space.projector.chart, generator, problem.given)).q
         if not space.valid(end):
             continue
-        way = space.walk(start, end)
-        assert all(space.valid(q) for q in way)
-        assert space.distance(way[-1], end) < space.distance(start, end)
+        walk = space.walk(start, end)
+        assert all(space.valid(q) for q in walk)
+        assert space.distance(walk[-1], end) < space.distance(start, end)
 
 
 def test_the_optimum_of_a_solved_problem_is_reached() -> None:
     problem = planar(RODS, [0.4, 0.5, -0.9, 0.6])
-    found = solve(problem, starts=4, jobs=1)
-    path = posture_path(found)
+    solution = solve(problem, starts=4, jobs=1)
+    path = posture_path(solution)
     assert path.found and path.max_violation < 1e-8
-    assert problem.objective.value(path.q[-1]) == pytest.approx(found.optima[0].objective, rel=1e-6)
-    assert path.objectives[0] == pytest.approx(problem.objective.value(found.initial))
+    assert problem.objective.value(path.q[-1]) == pytest.approx(solution.optima[0].objective, rel=1e-6)
+    assert path.objectives[0] == pytest.approx(problem.objective.value(solution.initial))
 
 
 def test_a_missing_package_is_one_line(monkeypatch: pytest.MonkeyPatch) -> None:
-    monkeypatch.setattr(home, "find_spec", lambda asked: None)
+    monkeypatch.setattr(module, "find_spec", lambda _: None)
     problem, up, _ = crank()
     with pytest.raises(InputError) as caught:
         posture_path(solution_of(problem, up, up))

@@ -1,4 +1,4 @@
-"""What ``--path`` writes: files that agree, a block of ``result.json``, a figure, and one line without the extra."""
+"""Output of ``--path``: files that agree, a block of ``result.json``, a figure, and an error without the extra."""
 
 from __future__ import annotations
 
@@ -28,7 +28,7 @@ BLOCK = set("found reason method timing duration_s length points max_violation o
 LIMITS = {"velocity", "velocity_of", "torque", "torque_of", "thrust", "thrust_of", "active"}
 
 
-def found(**settings: object) -> tuple[Robot, PosturePath]:
+def solved_path(**settings: object) -> tuple[Robot, PosturePath]:
     solution = solve(prepare(make_settings({"normal": (0, 0, 1), **settings})).problem, starts=2, jobs=1)
     return solution.problem.robot, posture_path(solution, effort=500)
 
@@ -39,7 +39,7 @@ def found(**settings: object) -> tuple[Robot, PosturePath]:
     ids=lambda s: str(s["robot"]),
 )
 def test_csv_npz_and_yaml_agree(settings: dict[str, object], tmp_path: Path) -> None:
-    loaded, path = found(**settings)
+    loaded, path = solved_path(**settings)
     write_path(tmp_path, loaded, path)
     with (tmp_path / "path.csv").open(newline="") as file:
         head, *rows = list(csv.reader(file))
@@ -67,7 +67,7 @@ def test_csv_npz_and_yaml_agree(settings: dict[str, object], tmp_path: Path) -> 
             column = head.index(f"q:{name}")
             assert angle == values[k, column]
             assert (speed, gain) == (values[k, head.index(f"v:{name}")], values[k, head.index(f"a:{name}")])
-            # The angle is that of q, whether q has it as it is or as a cosine and a sine.
+            # The angle equals the entry of q, which may be a cosine and a sine.
             index = loaded.model.getJointId(name)
             entries = path.q[k][loaded.model.idx_qs[index] :][: loaded.model.nqs[index]]
             of_q = entries[0] if len(entries) == 1 else np.arctan2(entries[1], entries[0])
@@ -90,22 +90,21 @@ def test_a_joint_that_turns_more_than_once_is_one_angle() -> None:
     loaded = robot("kinova")
     turning = loaded.tangent_names.index(loaded.joint_names[0])
     steps = [np.eye(loaded.nv)[turning] * x for x in np.linspace(0, 9, 40)]
-    names, angles = positions(
-        loaded, np.array([pin.integrate(loaded.model, loaded.posture(), step) for step in steps])
-    )
+    q = np.array([pin.integrate(loaded.model, loaded.posture(), step) for step in steps])
+    names, angles = positions(loaded, q)
     assert names == list(loaded.joint_names)
     assert np.ptp(angles[:, 0]) == pytest.approx(9.0)
 
 
-def test_names_that_would_break_a_file_come_back(tmp_path: Path) -> None:
-    made = arm([Z, Z, Z], [0.3, 0.5, 0.4], floating=False, rods=[(0.3, 0, 0)] * 3)
+def test_files_escape_strange_names(tmp_path: Path) -> None:
+    loaded = arm([Z, Z, Z], [0.3, 0.5, 0.4], floating=False, rods=[(0.3, 0, 0)] * 3)
     strange = ['a,"b', "c: d\x1b[31m", "e\nf"]
     for index, name in enumerate(strange, start=1):
-        made.model.names[index] = name
-    objective = ip.ImpactObjective(made, ip.ImpactContact("tip", (0.6, 0.8, 0)))
+        loaded.model.names[index] = name
+    objective = ip.ImpactObjective(loaded, ip.ImpactContact("tip", (0.6, 0.8, 0)))
     result = ip.optimize(ip.PostureProblem(objective, contact_pose="position"), starts=2, jobs=1).path()
     assert result.motion is not None
-    write_path(tmp_path, made, result.motion)
+    write_path(tmp_path, loaded, result.motion)
     with (tmp_path / "path.csv").open(newline="") as file:
         head = next(csv.reader(file))
     assert head[1:4] == ['q:a,"b', r"q:c: d\x1b[31m", r"q:e\nf"]
@@ -137,7 +136,7 @@ def test_the_command_leaves_the_path_in_its_folder(folder: Path) -> None:
     assert "path = true" in (folder / "problem.toml").read_text()
 
 
-def test_solved_again_from_its_problem_the_path_is_the_same(folder: Path, tmp_path: Path) -> None:
+def test_the_same_problem_gives_the_same_path(folder: Path, tmp_path: Path) -> None:
     done = run("optimize", folder / "problem.toml", "--out", "again", "--json", *FAST[2:], cwd=tmp_path)
     assert done.returncode == 0, done.stderr
     assert json.loads(done.stdout)["path"] == json.loads((folder / "result.json").read_text())["path"]
@@ -146,8 +145,7 @@ def test_solved_again_from_its_problem_the_path_is_the_same(folder: Path, tmp_pa
 
 TAMPERED = {
     "fewer postures": lambda arrays: {**arrays, "q": arrays["q"][1:]},
-    "columns": lambda arrays: {**arrays, "q": arrays["q"][:, :3]},
-    "no numbers": lambda arrays: {**arrays, "v": np.full_like(arrays["v"], np.nan)},
+    "not finite": lambda arrays: {**arrays, "v": np.full_like(arrays["v"], np.nan)},
     "huge": lambda arrays: {**arrays, "q": arrays["q"] * 1e300},
     "times": lambda arrays: {**arrays, "t": 0 * arrays["t"]},
     "shares": lambda arrays: {**arrays, "share_at": np.array(1.0)},
@@ -169,7 +167,7 @@ def test_plot_draws_the_path_of_a_folder(folder: Path, tmp_path: Path) -> None:
     assert (tmp_path / "again" / "path.png").stat().st_size > 30_000
 
 
-def test_without_the_extra_the_command_says_so_before_it_solves(tmp_path: Path) -> None:
+def test_without_the_extra_the_command_stops_before_it_solves(tmp_path: Path) -> None:
     def hide() -> None:
         sys.modules["toppra"] = None  # type: ignore[assignment]
 

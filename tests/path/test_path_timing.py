@@ -1,7 +1,8 @@
-"""Motions along paths: analytic times, limits by plain RNEA at ten times the resolution, forces that exist."""
+"""Motions along paths: analytic durations, limits by RNEA at ten times the resolution, forces that exist."""
 
 from __future__ import annotations
 
+from dataclasses import replace
 from functools import cache
 
 import numpy as np
@@ -23,6 +24,7 @@ from impact_posture.posture.formulation.problem_file import prepare
 from impact_posture.posture.search.multistart import PostureSolution, solve
 from impact_posture.robot.actuation import allocation_matrix, thrust_limits
 from impact_posture.robot.robot import Robot
+from impact_posture.robot.robot_spec import RobotSpec
 from impact_posture.system.arrays import Array
 from tests.support.arms import TIP, Z, arm, yaw_and_pitches
 from tests.support.helpers import robot
@@ -55,7 +57,7 @@ def dense(request: pytest.FixtureRequest) -> tuple[Robot, PosturePath]:
     return solution.problem.robot, fine
 
 
-def test_positions_velocities_and_accelerations_belong_together(dense: tuple[Robot, PosturePath]) -> None:
+def test_positions_velocities_and_accelerations_agree(dense: tuple[Robot, PosturePath]) -> None:
     loaded, path = dense
     dt = np.diff(path.t)[:, None]
     steps = np.array([pin.difference(loaded.model, a, b) for a, b in zip(path.q, path.q[1:], strict=False)])
@@ -68,7 +70,7 @@ def test_positions_velocities_and_accelerations_belong_together(dense: tuple[Rob
 
 
 def test_limits_hold_at_ten_times_the_resolution(dense: tuple[Robot, PosturePath]) -> None:
-    """By RNEA on the robot's own model, and by forces that are searched anew as a sum of rays in the cones."""
+    """The oracle is RNEA on the model of the robot, and forces as sums of rays in the friction cones."""
     loaded, path = dense
     model, data = loaded.model, loaded.model.createData()
     base = 6 if loaded.floating else 0
@@ -84,18 +86,18 @@ def test_limits_hold_at_ten_times_the_resolution(dense: tuple[Robot, PosturePath
             continue
         matrix, low, high = forces(loaded, q)
         limits = np.concatenate([np.asarray(effort), high])
-        found = lsq_linear(
+        fit = lsq_linear(
             np.hstack([np.eye(model.nv)[:, base:], matrix]), load,
             bounds=(np.concatenate([-effort, low]) - 0.01 * np.abs(limits).clip(max=1e3), allowed * limits),
         )  # fmt: skip
-        assert np.abs(found.fun).max() < 1e-5 * loaded.mass * 9.81
+        assert np.abs(fit.fun).max() < 1e-5 * loaded.mass * 9.81
     if not base:
-        # Nor does the motion dawdle: some limit is met.
+        # The motion is fast, because it reaches a limit.
         assert max(largest, float((np.abs(path.v) / model.velocityLimit).max())) > 0.98
 
 
 def forces(loaded: Robot, q: Array) -> tuple[Array, Array, Array]:
-    """Generalized forces of rotors, or of rays on the edge of the friction cones of the feet, and their bounds."""
+    """Return generalized forces of rotors, or of rays on the friction cones of the feet, and their bounds."""
     if loaded.spec.propulsion is not None:
         matrix = np.vstack([allocation_matrix(loaded.model, loaded.spec.propulsion), np.zeros((loaded.nv - 6, 6))])
         low, high = thrust_limits(loaded.spec.propulsion)
@@ -115,10 +117,10 @@ def forces(loaded: Robot, q: Array) -> tuple[Array, Array, Array]:
 
 
 def pendulum(effort: float, *, gravity: float = 0.0) -> PathSpace:
-    """A single hinge; its axis is upright without gravity, else level."""
-    made = arm([(0, 1, 0) if gravity else Z], [0.0], floating=False, rods=[(0.5, 0, 0)], effort=effort)
-    objective = WorstCaseObjective(made, ImpactContact(TIP, (0, 0, 1) if gravity else (0, 1, 0)))
-    return PathSpace(build_problem(made, objective, made.posture(), Requirements(contact_pose="free")))
+    """Return the postures of a hinge, whose axis is vertical without gravity, else level."""
+    loaded = arm([(0, 1, 0) if gravity else Z], [0.0], floating=False, rods=[(0.5, 0, 0)], effort=effort)
+    objective = WorstCaseObjective(loaded, ImpactContact(TIP, (0, 0, 1) if gravity else (0, 1, 0)))
+    return PathSpace(build_problem(loaded, objective, loaded.posture(), Requirements(contact_pose="free")))
 
 
 def limits_of(space: PathSpace) -> ActuatorLimits:
@@ -130,8 +132,8 @@ def curve_of(space: PathSpace, angle: float) -> PathCurve:
 
 
 @pytest.mark.parametrize(("effort", "angle"), [(0.5, 1.0), (2.0, -0.7)])
-def test_a_pendulum_takes_the_time_of_bang_bang(effort: float, angle: float) -> None:
-    """T = 2 √(I Δ/τ); with the smooth law the largest acceleration is 10/√3 Δ/T²."""
+def test_a_pendulum_has_the_duration_of_bang_bang_control(effort: float, angle: float) -> None:
+    """T = 2 √(I Δ/τ).  With the smooth law, the largest acceleration is 10/√3 Δ/T²."""
     space = pendulum(effort)
     inertia = float(pin.crba(space.model, space.model.createData(), space.problem.given)[0, 0])
     limits = limits_of(space)
@@ -144,7 +146,7 @@ def test_a_pendulum_takes_the_time_of_bang_bang(effort: float, angle: float) -> 
 
 
 @pytest.mark.parametrize("name", ["panda", "tilthex_arm"])
-def test_a_corner_is_passed_slowly_and_the_rest_is_not(name: str, monkeypatch: pytest.MonkeyPatch) -> None:
+def test_a_motion_is_slow_only_at_a_corner(name: str, monkeypatch: pytest.MonkeyPatch) -> None:
     monkeypatch.setattr(timed_curve, "SAMPLE_TIME", timed_curve.SAMPLE_TIME / 10)
     loaded = robot(name)
     objective = WorstCaseObjective(loaded, ImpactContact(loaded.spec.contact.frame, (0, 0, 1)))
@@ -153,7 +155,7 @@ def test_a_corner_is_passed_slowly_and_the_rest_is_not(name: str, monkeypatch: p
     first, other = (6, 7) if loaded.floating else (0, 1)
     moves[:, first] = np.interp(np.arange(129), [0, 48], [0, 0.4])
     moves[48:, other] = np.linspace(0, 0.7, 81)
-    curve = PathCurve(space, [np.array(pin.integrate(loaded.model, space.problem.given, way)) for way in moves])
+    curve = PathCurve(space, [np.array(pin.integrate(loaded.model, space.problem.given, move)) for move in moves])
     motion = timing.timed(space, curve, limits_of(space))
     assert motion.method == "slowed" and not motion.notes
     limits, largest = limits_of(space), 0.0
@@ -163,12 +165,12 @@ def test_a_corner_is_passed_slowly_and_the_rest_is_not(name: str, monkeypatch: p
         assert shares is not None
         largest = max(largest, float(np.abs(shares).max()), float((np.abs(v) / loaded.velocity_limits).max()))
     assert 0.5 < largest < 1.0
-    # Where the curve is straight, the motion is much faster than at the corner.
+    # On straight parts of the curve, the motion is much faster than at the corner.
     slow = np.linalg.norm(motion.z - curve.z[48], axis=1).argmin()
     assert np.abs(motion.v[slow]).max() < 0.3 * np.abs(motion.v).max()
 
 
-def test_without_a_torque_limit_velocities_count_and_this_is_said() -> None:
+def test_without_a_torque_limit_only_velocities_count() -> None:
     space = pendulum(0.0)
     limits = limits_of(space)
     motion = timing.timed(space, curve_of(space, 1.0), limits)
@@ -180,12 +182,12 @@ def test_without_a_torque_limit_velocities_count_and_this_is_said() -> None:
     assert motion.t[-1] == pytest.approx(15 / 8 / 10.0, rel=1e-3)
 
 
-def test_a_joint_without_a_torque_limit_leaves_those_of_the_others() -> None:
-    """Of two upright hinges the first has a motor of known torque, and takes the time of bang-bang."""
-    made = arm([Z, Z], [0.0, 0.0], floating=False, rods=[(0.5, 0, 0)] * 2, effort=0.5)
-    made.model.effortLimit = np.array([0.5, 0.0])
-    objective = WorstCaseObjective(made, ImpactContact(TIP, (0, 1, 0)))
-    space = PathSpace(build_problem(made, objective, made.posture(), Requirements(contact_pose="free")))
+def test_the_known_torque_limits_count_beside_an_unknown_limit() -> None:
+    """The first of two vertical hinges has a known torque limit and the duration of bang-bang control."""
+    loaded = arm([Z, Z], [0.0, 0.0], floating=False, rods=[(0.5, 0, 0)] * 2, effort=0.5)
+    loaded.model.effortLimit = np.array([0.5, 0.0])
+    objective = WorstCaseObjective(loaded, ImpactContact(TIP, (0, 1, 0)))
+    space = PathSpace(build_problem(loaded, objective, loaded.posture(), Requirements(contact_pose="free")))
     inertia = float(pin.crba(space.model, space.model.createData(), space.problem.given)[0, 0])
     curve = PathCurve(space, [space.problem.given + np.array([x, 0.0]) for x in np.linspace(0, 1.0, 6)])
     limits = limits_of(space)
@@ -204,21 +206,16 @@ def test_a_posture_that_the_motor_cannot_hold_is_named() -> None:
                             "timed by velocities alone",)  # fmt: skip
 
 
-def test_a_floating_base_without_rotors_or_feet_is_said() -> None:
-    made = yaw_and_pitches()
-    loose = Robot(**{**vars_of(made), "spec": type(made.spec)()})
+def test_a_floating_base_without_rotors_or_feet_has_no_limits() -> None:
+    loose = replace(yaw_and_pitches(), spec=RobotSpec())
     objective = WorstCaseObjective(loose, ImpactContact(TIP, (0, 0, 1)))
     limits = ActuatorLimits(objective, loose.posture(), Requirements())
     assert limits.missing == "there are neither rotors nor feet that could hold it up"
 
 
-def vars_of(made: Robot) -> dict[str, object]:
-    return {name: getattr(made, name) for name in made.__dataclass_fields__}
-
-
 @pytest.mark.parametrize("name", ["solo8", "go2", "anymal_c"])
 def test_a_light_standing_robot_rests_and_a_slippery_one_does_not(name: str) -> None:
-    """Level ground needs no friction at rest in a symmetric stance, but some for a push sideways."""
+    """On level ground, a symmetric stance needs no friction at rest, but a push sideways needs friction."""
     loaded = robot(name)
     supports = loaded.spec.supports
     objective = WorstCaseObjective(loaded, ImpactContact(loaded.spec.contact.frame, (1, 0, 0)), supports=supports)
@@ -230,7 +227,7 @@ def test_a_light_standing_robot_rests_and_a_slippery_one_does_not(name: str) -> 
     assert shares is not None and np.abs(shares).max() < 1
     rate = limits.largest_rate(q, rest, sideways)
     assert rate is not None
-    # μ g bounds the acceleration of the mass center, whatever the motors can do.
+    # μ g bounds the acceleration of the center of mass, even with unlimited motors.
     assert 0 < rate < 0.7 * 9.81 * 1.5
     slippery = ActuatorLimits(objective, q, Requirements(friction=0.07)).largest_rate(q, rest, sideways)
     assert slippery is None or slippery < 0.3 * rate
