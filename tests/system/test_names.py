@@ -1,4 +1,4 @@
-"""Names are data: whatever a robot, link, frame, joint, file or folder is called is text wherever it is written."""
+"""Names of robots, links, frames, joints, files and folders are escaped in every output."""
 
 from __future__ import annotations
 
@@ -68,7 +68,7 @@ JOINT += '<axis xyz="0 {y} {z}"/><limit lower="-2" upper="2" effort="9" velocity
 
 
 def urdf(links: list[str], *, moving: int = 3, name: str = "arm") -> str:
-    """A chain; the joint before a link has the link's name and a word."""
+    """Return the URDF of a chain; the joint before a link has the name of the link and a j."""
     parts = [LINK.format(name=quoteattr(link)) for link in links]
     for k, (parent, child) in enumerate(pairwise(links)):
         kind = "revolute" if k < moving else "fixed"
@@ -86,14 +86,14 @@ def arm(tmp_path_factory: pytest.TempPathFactory) -> Robot:
 
 @pytest.fixture(scope="module")
 def many(tmp_path_factory: pytest.TempPathFactory) -> Robot:
-    """One robot whose links, joints and frames have all the names that XML allows."""
+    """Load a robot whose links, joints and frames have all names that XML allows."""
     folder = tmp_path_factory.mktemp("many")
     (folder / "many.urdf").write_text(urdf(["base", *filter(None, IN_XML)], moving=len(IN_XML)), encoding="utf-8")
     return load_robot(str(folder / "many.urdf"))
 
 
 def renamed(robot: Robot, name: str) -> Robot:
-    """The robot, its last joint and its tip under a name; Pinocchio takes any."""
+    """Return the robot with a name for itself, its last joint and its tip."""
     model = robot.model.copy()
     model.names[model.njoints - 1] = f"{name}j"
     for frame in model.frames:
@@ -103,13 +103,9 @@ def renamed(robot: Robot, name: str) -> Robot:
 
 
 def assert_plain(text: str) -> None:
-    """Nothing in it steers a terminal or turns the direction of writing."""
+    """Check that no character controls a terminal or changes the writing direction."""
     bad = {c for c in text if c != "\n" and (unicodedata.category(c)[0] == "C" or c in "\u2028\u2029")}
     assert not bad, ascii(bad)
-
-
-def test_enough_names() -> None:
-    assert len(set(NASTY)) == len(NASTY) >= 40
 
 
 # ---- the C export -------------------------------------------------------------------------------------------------
@@ -117,8 +113,8 @@ def test_enough_names() -> None:
 
 @pytest.fixture(scope="module")
 def exports(arm: Robot, tmp_path_factory: pytest.TempPathFactory) -> dict[str, Path]:
-    """A folder of C for each name, and for one that is harmless."""
-    # Names are no part of the functions: they are made once.
+    """Write an export for each name and for a harmless name."""
+    # The functions do not depend on names and are built once.
     point = (0.3, 0.0, 0.0)
     harmless = WorstCaseObjective(arm, ImpactContact("tip", (0, 0.6, 0.8), point))
     code = build_c_source(named_objectives([harmless], "arm"), "arm", DOUBLE)
@@ -134,14 +130,14 @@ def exports(arm: Robot, tmp_path_factory: pytest.TempPathFactory) -> dict[str, P
 
 
 def code_of(folder: Path) -> dict[str, str]:
-    """Every file that a compiler or a build tool reads, without comments."""
-    found = {}
+    """Return the files for a compiler or a build tool, without comments."""
+    files = {}
     for path in sorted(folder.iterdir()):
         if path.suffix not in (".json", ".md"):
             text = path.read_text(encoding="ascii")
             text = re.sub(r"/\*.*?\*/", "", text, flags=re.S) if path.suffix in (".c", ".h") else text
-            found[path.name] = re.sub(r"\b[0-9a-f]{64}\b", "HASH", text)
-    return found
+            files[path.name] = re.sub(r"\b[0-9a-f]{64}\b", "HASH", text)
+    return files
 
 
 def test_names_change_nothing_but_comments(exports: dict[str, Path]) -> None:
@@ -153,7 +149,7 @@ def test_names_change_nothing_but_comments(exports: dict[str, Path]) -> None:
 
 def test_everything_compiles(exports: dict[str, Path]) -> None:
     compiler = need_compiler()
-    # All examples, with the header; the source has no comment of its own but its title.
+    # All examples with the header, and some sources, which differ only in their titles.
     sources = [str(folder / "example.c") for folder in exports.values()]
     sources += [str(exports[name] / "arm.c") for name in NASTY[::6]]
     flags = ["-std=c99", "-trigraphs", "-fsyntax-only", "-Wall", "-Wextra", "-pedantic", "-Werror"]
@@ -161,7 +157,7 @@ def test_everything_compiles(exports: dict[str, Path]) -> None:
     assert done.returncode == 0, done.stderr[:2000]
 
 
-def test_manifests_hold_the_names_themselves(exports: dict[str, Path]) -> None:
+def test_manifests_have_the_names_without_escapes(exports: dict[str, Path]) -> None:
     for name in NASTY:
         manifest = json.loads((exports[name] / "arm.json").read_text(encoding="ascii"))
         assert (manifest["robot"], manifest["frame"], manifest["joint_names"][-1]) == (name, name, f"{name}j")
@@ -260,7 +256,7 @@ def test_mujoco_loads_every_name(arm: Robot, many: Robot) -> None:
         assert len(set(written.sites.values())) == len(written.sites)
 
 
-def test_mujoco_loads_a_scene_with_such_surfaces_and_shapes(arm: Robot) -> None:
+def test_mujoco_loads_a_scene_with_these_names(arm: Robot) -> None:
     pytest.importorskip("mujoco")
     for name in NASTY:
         robot = renamed(arm, name)
@@ -273,7 +269,7 @@ def test_mujoco_loads_a_scene_with_such_surfaces_and_shapes(arm: Robot) -> None:
 # ---- pictures -----------------------------------------------------------------------------------------------------
 
 
-def test_figure_of_such_a_robot(arm: Robot, tmp_path: Path) -> None:
+def test_a_figure_with_a_long_name(arm: Robot, tmp_path: Path) -> None:
     name = "$\\frac{$\x1b[31m]]>\n--" * 500
     robot = renamed(arm, name)
     objective = WorstCaseObjective(robot, ImpactContact(name, (0, 1, 0), (0.3, 0, 0), "contact"))
@@ -283,7 +279,7 @@ def test_figure_of_such_a_robot(arm: Robot, tmp_path: Path) -> None:
     assert_plain(path.read_text(encoding="utf-8"))
 
 
-def test_labels_are_no_mathematics(tmp_path: Path) -> None:
+def test_labels_are_not_read_as_math(tmp_path: Path) -> None:
     figure = Figure(figsize=(6, 30))
     axes = figure.add_subplot()
     for k, name in enumerate(NASTY):
@@ -307,7 +303,7 @@ def command(*words: str) -> tuple[int, str, str]:
 
 @pytest.fixture
 def shown(many: Robot, tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> str:
-    """The robot's file under a name and in a folder that would steer the terminal."""
+    """Return the file of a robot whose name and folder would control the terminal."""
     monkeypatch.setenv("COLUMNS", "80")
     folder = tmp_path / "\x1b]0;x\x07[red]\n*"
     folder.mkdir()
@@ -361,7 +357,7 @@ def test_every_error_is_one_safe_line() -> None:
         assert_plain(errors.ManifestMismatch(name, name, name, where=name).line)
 
 
-# ---- the three ways to C, through files ----------------------------------------------------------------------------
+# ---- files of optimize and codegen ---------------------------------------------------------------------------------
 
 
 def test_optimize_and_codegen_of_a_file(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
@@ -375,16 +371,16 @@ def test_optimize_and_codegen_of_a_file(tmp_path: Path, monkeypatch: pytest.Monk
     problem = [str(robot), "--frame", names[1], "--offset", "0.3", "0", "0", "--normal", "0", "1", "0"]
     out = folder / "out\x1b[31m"
     pose = ["--contact-pose", "free", "--starts", "1", "--jobs", "1", "--format", "svg"]
-    code, said, err = command("optimize", *problem, *pose, "--out", str(out))
+    code, printed, err = command("optimize", *problem, *pose, "--out", str(out))
     assert code == 0, err
-    assert_plain(said + err)
+    assert_plain(printed + err)
     assert tomllib.loads((out / "problem.toml").read_text(encoding="utf-8"))["robot"] == str(robot)
     for picture in out.glob("*.svg"):
         ElementTree.parse(picture)
     for words in ((str(out),), tuple(problem)):
-        code, said, err = command("codegen", *words, "--out", str(folder / f"c{len(words)}"))
+        code, printed, err = command("codegen", *words, "--out", str(folder / f"c{len(words)}"))
         assert code == 0, err
-        assert_plain(said + err)
+        assert_plain(printed + err)
     for written in (out / "c", folder / "c1", folder / f"c{len(problem)}"):
         sources = [str(path) for path in written.glob("*.c")]
         assert len(sources) == 2
@@ -393,6 +389,6 @@ def test_optimize_and_codegen_of_a_file(tmp_path: Path, monkeypatch: pytest.Monk
     assert sorted(path.name for path in folder.iterdir()) == sorted([robot.name, out.name, "c1", f"c{len(problem)}"])
 
 
-def test_a_robot_toml_may_call_it_anything(arm: Robot) -> None:
+def test_a_robot_toml_accepts_every_name() -> None:
     for name in NASTY:
         assert validate(RobotSpec, {"name": name}, "test").name == name
