@@ -1,4 +1,4 @@
-"""Arms made up for a test, on a fixed base or below the hexarotor of ``tilthex_arm``."""
+"""Arms for tests, on a fixed base or below the hexarotor of ``tilthex_arm``."""
 
 from __future__ import annotations
 
@@ -24,14 +24,14 @@ def arm(
     rods: Sequence[ArrayLike] | None = None,
     effort: float = 5.0,
 ) -> Robot:
-    """A serial arm of hinges; frames ``link_0``, ``link_1``, … turn with them, ``tip`` with the last.
+    """Build a serial arm of hinges with frames ``link_0``, ``link_1``, …, and ``tip`` on the last link.
 
     Args:
-        axes: Of the hinges, each in the frame of the body before it.
+        axes: Axis of each hinge in the frame of the body before it.
         joints: Angles of the default posture.
-        floating: Below the hexarotor of ``tilthex_arm``; else hinged to the world.
-        rods: From each hinge to the next, the last one to the tip, m; 0.3 straight down by default.
-        effort: Of the motors, N·m; zero for no limit.
+        floating: Whether the arm hangs below the hexarotor of ``tilthex_arm``, or is hinged to the world.
+        rods: Vector from each hinge to the next, and from the last hinge to the tip, m; by default 0.3 m down.
+        effort: Torque limit of the motors, N·m; zero for no limit.
     """
     rods = [(0, 0, -0.3)] * len(axes) if rods is None else rods
     hexarotor, model, parent, start = robot("tilthex_arm"), pin.Model(), 0, np.zeros(3)
@@ -61,11 +61,11 @@ def arm(
 
 
 def yaw_and_pitches() -> Robot:
-    """Yaw, pitch, pitch, pitch below a hexarotor: nothing but the base rolls the tip."""
+    """Build yaw, pitch, pitch, pitch below a hexarotor, so that only the base can roll the tip."""
     return arm([Z, Y, Y, Y], [0.3, -0.8, 1.2, -0.5], floating=True)
 
 
 def seven_joints() -> Robot:
-    """Seven hinges between rods of 0.15 m and 0.2 kg on a fixed base, bent."""
+    """Build seven hinges between rods of 0.15 m and 0.2 kg on a fixed base, bent."""
     bent = [0.3, -0.7, 0.5, 1.1, -0.4, 0.8, 0.2]
     return arm([Z, Y, Z, Y, Z, Y, X], bent, floating=False, rods=[(0.02, 0.01, -0.15)] * 7)

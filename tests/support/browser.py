@@ -1,4 +1,4 @@
-"""A headless Chromium without a network, spoken to through a pipe (Chrome DevTools Protocol)."""
+"""A headless Chromium without a network, controlled through a pipe (Chrome DevTools Protocol)."""
 
 from __future__ import annotations
 
@@ -25,7 +25,7 @@ SIZE = (640, 480)
 
 
 class Tab:
-    """A tab; ``events`` holds what the browser reported about it."""
+    """A tab; ``events`` holds the reports of the browser about it."""
 
     def __init__(self, write: int, read: int) -> None:
         self.write, self.read, self.count, self.session, self.said = write, read, itertools.count(1), "", b""
@@ -103,7 +103,7 @@ class Tab:
 
 @contextmanager
 def browser(folder: Path) -> Iterator[Tab]:
-    """Start Chromium with its profile in a folder; skip where there is none."""
+    """Start Chromium with its profile in a folder; skip the test without a browser."""
     program = next((path for name in NAMES if (path := shutil.which(name))), None)
     if program is None:
         pytest.skip(f"no browser is installed ({', '.join(NAMES)})")

@@ -1,4 +1,4 @@
-"""The command line in a process of its own that need not import everything again: a fork of the test's."""
+"""Run the command line in a fork of the test process, which need not import everything again."""
 
 from __future__ import annotations
 
@@ -26,7 +26,7 @@ import rich.table
 import typer.rich_utils
 from matplotlib.figure import Figure
 
-# What the commands import when they run, once for all of them.
+# Modules that the commands import when they run, imported once here.
 import impact_posture.codegen.export
 import impact_posture.experiment.experiment_folders
 import impact_posture.experiment.jobs
@@ -48,7 +48,7 @@ from impact_posture_cli.app import COMMANDS, app, load
 with contextlib.suppress(ImportError):
     import mujoco  # noqa: F401
 
-# What these read or build once in a process.
+# These libraries read or build data once in a process.
 PIL.Image.preinit()
 rich.cells.cell_len("×")
 PARSER = typer.main.get_command(app)
@@ -72,8 +72,8 @@ def run(
 ) -> subprocess.CompletedProcess[str]:
     """Run ``impact-posture`` with arguments, as its entry point does; ``env`` is added to the environment.
 
-    Figures but the named ``pictures`` are blank: to draw them takes most of the time of a small robot's answer.
-    The timeout ends what hangs; it is no bound on how long a command takes.
+    All figures except the named ``pictures`` are blank, because drawing takes most of the time of a small robot.
+    The timeout ends commands that hang.  It does not bound how long a command may take.
     """
     with tempfile.TemporaryFile() as out, tempfile.TemporaryFile() as errors:
         child = start(arguments, out.fileno(), errors.fileno(), cwd, env, prepare, pictures)
@@ -89,7 +89,7 @@ def run(
 
 
 def refused(done: subprocess.CompletedProcess[str], code: int, *words: str) -> None:
-    """One line, the right code, no traceback."""
+    """Check that a command failed with this code and one error line, without a traceback."""
     assert done.returncode == code, (done.returncode, done.stdout, done.stderr)
     lines = [line for line in done.stderr.splitlines() if line.startswith("error:")]
     assert len(lines) == 1, done.stderr
@@ -99,7 +99,7 @@ def refused(done: subprocess.CompletedProcess[str], code: int, *words: str) -> N
 
 
 def on_terminal(*arguments: object, cwd: Path) -> str:
-    """Run with standard error on a terminal; return what came there."""
+    """Run with standard error on a terminal, and return the text on it."""
     ours, theirs = os.openpty()
     with tempfile.TemporaryFile() as out:
         child = start(arguments, out.fileno(), theirs, cwd, {"TERM": "xterm"})
@@ -111,7 +111,7 @@ def on_terminal(*arguments: object, cwd: Path) -> str:
 
 
 def read_terminal(ours: int) -> str:
-    """What comes on a terminal until nobody has it open any more; ``ours`` is then closed."""
+    """Read a terminal until no process has it open, then close ``ours``."""
     said = b""
     with contextlib.suppress(OSError):
         while part := os.read(ours, 65536):
@@ -129,17 +129,10 @@ def start(
     prepare: Callable[[], None] | None = None,
     pictures: Collection[str] = (),
 ) -> BaseProcess:
-    """Start what :func:`run` waits for, its standard output and error on these descriptors."""
+    """Start a command for :func:`run`, with standard output and error on these descriptors."""
     words = [str(argument) for argument in arguments]
-    target = (
-        words,
-        cwd,
-        {"COLUMNS": "80", "NO_COLOR": "1", "BROWSER": "true", **(env or {})},
-        prepare,
-        out,
-        errors,
-        pictures,
-    )
+    variables = {"COLUMNS": "80", "NO_COLOR": "1", "BROWSER": "true", **(env or {})}
+    target = words, cwd, variables, prepare, out, errors, pictures
     child = multiprocessing.get_context("fork").Process(target=_command, args=target)
     child.start()
     return child
@@ -154,10 +147,10 @@ def _command(
     errors: int,
     pictures: Collection[str],
 ) -> None:
-    """Become what a shell would have started: streams, folder, signals and warnings are those of a new program."""
-    # The test's objects are left alone: a page that is looked at is a page that is copied.
+    """Run the command with streams, folder, signals and warnings of a new program."""
+    # Without this, the garbage collector would touch and so copy the memory of the test.
     gc.freeze()
-    # A new program has made no controllers, nor compiled anything for them.
+    # A new program starts without cached controllers.
     impact_posture.experiment.jobs.controller_factory.cache_clear()
     os.dup2(out, 1)
     os.dup2(errors, 2)
@@ -171,11 +164,11 @@ def _command(
         warnings.simplefilter("ignore", category)
     impact_posture.output.plot.FIGURES.update(dict.fromkeys(set(ALL_PICTURES) - set(pictures), blank))
     if not pictures:
-        # Of a run the snapshots stay, as blank.
+        # Runs keep their snapshots, as blank figures.
         figures = impact_posture.experiment.experiment_folders
         figures.figures_of_run = figures.figures_of_comparison = lambda views: {"snapshots": blank(views)}
         if words[0] != "report":
-            # A page without figures is made where it is what a test is about.
+            # Only tests of reports write the page.
             impact_posture.output.report.result_report.write_result_report = lambda *arguments, **options: None
             impact_posture.output.report.result_report.result_scene = lambda *arguments: None
             impact_posture.experiment.experiment_folders.try_report = lambda *arguments, **options: ""

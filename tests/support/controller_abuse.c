@@ -1,6 +1,6 @@
-/* An exported controller under states that no robot has: each command is finite and within its limits, also where these
- * permit nearly nothing, a context that was copied gives the same answers, and so do contexts in threads.  Prints what
- * memory it took meanwhile, and the statuses.  Built with sanitizers, run by valgrind.
+/* Run an exported controller at states that are impossible for a robot.  Each command must be finite and within its
+ * limits, also where these permit almost nothing.  A copied context and contexts in threads must give the same answers.
+ * Prints the growth of memory, and the statuses.  Built with sanitizers, run by valgrind.
  * Arguments: number of ticks, number of threads. */
 #include <math.h>
 #include <pthread.h>
@@ -44,7 +44,7 @@ static int within(const ctl_command *out, const ctl_params *p)
   return 1;
 }
 
-/* Bytes that are allocated, and the most memory that the process ever had, kB. */
+/* Store the allocated bytes, and the largest memory of the process so far, kB. */
 static void memory(long bytes[2])
 {
   struct rusage usage;
@@ -56,7 +56,7 @@ static void memory(long bytes[2])
 #endif
 }
 
-/* Start with limits that permit nearly nothing. */
+/* Start with limits that permit almost nothing. */
 static int start_narrow(run *r, const double *still, ctl_command *out)
 {
   int i;

@@ -12,7 +12,7 @@ from impact_posture.errors import InputError
 
 
 def sources_or_skip() -> dict[str, bytes]:
-    """Return the sources in ``$DAQP_SOURCES``, or those that pip has; skip the test where there are none."""
+    """Return the sources in ``$DAQP_SOURCES`` or from pip; skip the test without sources."""
     folder = os.environ.get("DAQP_SOURCES")
     if folder:
         return daqp_sources(Path(folder))

@@ -1,7 +1,7 @@
 """The contact-consistent quantities to sixty digits.
 
-The system ``[M, −J_sᵀ; J_s, εI]`` with Pinocchio's doubles for ``M, J, J_s`` is solved in decimal arithmetic (the
-standard library's, compiled), so that what is solved is exactly what the oracle is given.
+The system ``[M, −J_sᵀ; J_s, εI]`` with Pinocchio's doubles for ``M, J, J_s`` is solved in decimal arithmetic, so that
+both this solution and the oracle use exactly the same numbers.
 """
 
 from __future__ import annotations
@@ -27,14 +27,14 @@ DIGITS = 60
 
 @contextmanager
 def digits(count: int = DIGITS) -> Iterator[None]:
-    """Decimal arithmetic of so many digits within."""
+    """Use decimal arithmetic with this number of digits."""
     with decimal.localcontext() as context:
         context.prec = count
         yield
 
 
 def exact(values: object) -> Exact:
-    """Doubles as the decimal numbers that they are."""
+    """Convert doubles to decimal numbers without rounding."""
     doubles = np.asarray(values, dtype=float)
     decimals = np.empty(doubles.shape, dtype=object)
     for index in np.ndindex(doubles.shape):
@@ -43,17 +43,17 @@ def exact(values: object) -> Exact:
 
 
 def rounded(values: Exact) -> Vector:
-    """To doubles."""
+    """Round to doubles."""
     return np.asarray(values, dtype=float)
 
 
 def distance(value: object, expected: Exact) -> Vector:
-    """``|value − expected|``, subtracted before it is rounded."""
+    """Return ``|value − expected|``, rounded after the subtraction."""
     return rounded(abs(exact(value).reshape(np.shape(expected)) - expected))
 
 
 def solve(matrix: Exact, right: Exact) -> Exact:
-    """Gaussian elimination with partial pivoting; ``right`` by columns."""
+    """Solve by Gaussian elimination with partial pivoting, for each column of ``right``."""
     A, B = matrix.copy(), right.copy()
     size = len(A)
     for k in range(size):
@@ -72,11 +72,11 @@ def solve(matrix: Exact, right: Exact) -> Exact:
 
 @dataclass(frozen=True, eq=False)
 class ExactImpact:
-    """Everything about one posture, W = I, a normal in the world.
+    """Quantities and gradients at one posture, W = I, with a normal in the world.
 
     Attributes:
-        oracle: At the posture; gives ``M, J, J_s, n`` and their derivatives as doubles.
-        compliance: ε, 1/kg; any, the oracle's own or another.
+        oracle: Oracle at the posture, which gives ``M, J, J_s, n`` and their derivatives as doubles.
+        compliance: ε, 1/kg, which may differ from the oracle's.
     """
 
     oracle: ImpactOracle
@@ -93,7 +93,7 @@ class ExactImpact:
 
     @cached_property
     def inverse(self) -> Exact:
-        """``K⁻¹``; its first nv rows and columns are ``M̃⁻¹``."""
+        """Inverse ``K⁻¹``, whose first nv rows and columns are ``M̃⁻¹``."""
         return solve(self.K, exact(np.eye(len(self.K))))
 
     @property
@@ -101,7 +101,7 @@ class ExactImpact:
         return len(self.oracle.M)
 
     def answer(self, tau: Exact) -> tuple[Exact, Exact]:
-        """``a`` and ``f`` for ``τ``."""
+        """Return ``a`` and ``f`` for ``τ``."""
         solution = self.inverse[:, : self.nv] @ tau
         return solution[: self.nv], solution[self.nv :]
 
@@ -125,7 +125,7 @@ class ExactImpact:
 
     @cached_property
     def second(self) -> tuple[Exact, Exact]:
-        """``b`` and ``g``: the answer to ``a``."""
+        """Solutions ``b`` and ``g`` for ``τ = a``."""
         return self.answer(self.jump)
 
     @property
@@ -142,7 +142,7 @@ class ExactImpact:
 
     @cached_property
     def K_held(self) -> Exact:
-        """K with the contact point held too: ``J a = v`` in three more rows, ``−Jᵀs`` in three more columns."""
+        """Matrix K with the contact point held too: three more rows ``J a = v`` and columns ``−Jᵀs``."""
         size = len(self.K)
         K = exact(np.zeros((size + 3, size + 3)))
         K[:size, :size], K[: self.nv, size:], K[size:, : self.nv] = self.K, -self.J.T, self.J
@@ -154,7 +154,7 @@ class ExactImpact:
 
     @cached_property
     def sticking(self) -> tuple[Exact, Exact, Exact]:
-        """The impulse ``s``, and the jump and the feet's impulses that belong to it."""
+        """Sticking impulse ``s``, with its jump and the impulses of the feet."""
         return self._held(np.concatenate([exact(np.zeros(len(self.K))), self.n]))
 
     @property

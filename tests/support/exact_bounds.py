@@ -1,16 +1,17 @@
-"""How far double precision may be from the exact contact-consistent quantities.
+"""Error bounds of double precision for the contact-consistent quantities.
 
 Backward error analysis (N. J. Higham, *Accuracy and Stability of Numerical Algorithms*, 2002), with the inverse known
 to sixty digits:
 
-- Gaussian elimination with pivoting solves ``(K + ΔK)x = b`` with ``|ΔK| ≤ γ_3n |L||U|`` (theorem 9.4): the oracle;
-- a Cholesky factorization of ``M̃ = M + J_sᵀJ_s/ε`` solves ``(M̃ + ΔM̃)x = b`` with ``|ΔM̃| ≤ γ_(3n+1) d dᵀ``,
-  ``d_i² = M̃_ii`` (theorem 10.4): the most that a factorization with 1/ε added to the feet can promise, as is the
-  articulated bodies' of the kernel.
+- The oracle uses Gaussian elimination with pivoting, which solves ``(K + ΔK)x = b`` with ``|ΔK| ≤ γ_3n |L||U|``
+  (theorem 9.4).
+- A Cholesky factorization of ``M̃ = M + J_sᵀJ_s/ε`` solves ``(M̃ + ΔM̃)x = b`` with ``|ΔM̃| ≤ γ_(3n+1) d dᵀ``,
+  ``d_i² = M̃_ii`` (theorem 10.4).  A factorization with 1/ε added to the feet, such as the articulated bodies of the
+  kernel, cannot promise more.
 
-Each bound is the condition of a quantity with respect to such a change of its matrix.  Where a quantity takes several
-solves, one after the other, the sum of their bounds is far from what can happen: its condition then is how far the
-exact quantity moves when the doubles that it is computed from are rounded once more.
+Each bound is the condition of a quantity with respect to such a change of its matrix.  If a quantity takes several
+solves, the sum of their bounds would be far too large.  Its bound is the change of the exact quantity when its input
+doubles are rounded once more.
 """
 
 from __future__ import annotations
@@ -33,13 +34,13 @@ def gamma(count: int) -> float:
 
 
 def eliminated(matrix: Exact) -> Vector:
-    """``|L||U|`` in the rows of the matrix: what elimination rounds."""
+    """Return ``|L||U|`` in the rows of the matrix, which elimination rounds."""
     P, L, U = scipy.linalg.lu(rounded(matrix))
     return np.asarray(P @ np.abs(L) @ np.abs(U))
 
 
 class RoundedOnce(ExactImpact):
-    """The exact impact where ``|L||U|`` of the held point's system is rounded once, up or down as the seed says."""
+    """Exact impact in which ``|L||U|`` of the system with the held point is rounded once, with signs from a seed."""
 
     def __init__(self, oracle: ImpactOracle, compliance: float, seed: int) -> None:
         super().__init__(oracle, compliance)
@@ -49,16 +50,16 @@ class RoundedOnce(ExactImpact):
 
 
 class Bounded(ExactImpact):
-    """An exact impact with the errors that two ways of solving it may make."""
+    """Exact impact with error bounds of two solution methods."""
 
     @cached_property
     def share(self) -> float:
-        """``ε/(σ+ε)`` with σ the least eigenvalue of ``J_sM⁻¹J_sᵀ`` above zero: what ε takes of the feet's effect."""
+        """Bias ``ε/(σ+ε)`` relative to the effect of the feet.  σ is the least positive eigenvalue of ``J_sM⁻¹J_sᵀ``."""
         root = np.linalg.cholesky(self.oracle.M)
         held = np.linalg.svd(np.linalg.solve(root, self.oracle.Js.T), compute_uv=False) ** 2
         return float(self.compliance / (held[held > 1e-12 * held[0]][-1] + self.compliance))
 
-    # ---- what elimination on K may lose -----------------------------------------------------------------------
+    # ---- errors of elimination on K ---------------------------------------------------------------------------
 
     @cached_property
     def _backward(self) -> Vector:
@@ -112,7 +113,7 @@ class Bounded(ExactImpact):
         moved_gradient = max(float(rounded(abs(o.grad_S - self.grad_S)).max()) for o in others)
         return roundings * moved_S, roundings * moved_gradient
 
-    # ---- what a factorization of M̃ may lose -------------------------------------------------------------------
+    # ---- errors of a factorization of M̃ -----------------------------------------------------------------------
 
     @cached_property
     def _scale(self) -> Vector:

@@ -1,4 +1,4 @@
-"""The C functions of a built export with their codes, for tests."""
+"""Call the C functions of a built export and return their codes, for tests."""
 
 from __future__ import annotations
 
@@ -21,14 +21,14 @@ Vector = NDArray[Any]
 
 @dataclass(frozen=True)
 class Exported:
-    """The functions of one frame.  Every result is NaN before its call and a copy after it."""
+    """Functions of one frame.  Results are NaN before a call and copied after it."""
 
     gradient: ImpactGradient
 
     def free(self) -> Exported:
-        """The same frame without its supports."""
-        own = self.gradient
-        return Exported(ImpactGradient(own._library, own.manifest, own.frame, free=True))
+        """Return the same frame without its supports."""
+        gradient = self.gradient
+        return Exported(ImpactGradient(gradient._library, gradient.manifest, gradient.frame, free=True))
 
     def eval(self, q: Vector, n: Vector) -> tuple[int, float, Vector]:
         code, (H, gradient) = self._call("eval", q, n)
@@ -47,11 +47,11 @@ class Exported:
         return code, a, float(G[0]), float(V[0])
 
     def _call(self, name: str, *inputs: Vector) -> tuple[int, tuple[Vector, ...]]:
-        # A copy has buffers of its own, so that threads may call at once.
-        own = self.gradient.copy()
-        for result in own._functions[name][1]:
+        # A copy has separate buffers, so that threads may call at once.
+        gradient = self.gradient.copy()
+        for result in gradient._functions[name][1]:
             result[:] = np.nan
-        return own.call(name, *inputs)
+        return gradient.call(name, *inputs)
 
 
 @contextmanager

@@ -1,4 +1,4 @@
-"""Exported controllers for tests, each built once a run, without optimization for the time it takes."""
+"""Exported controllers for tests, each built once a run, without optimization to save time."""
 
 from __future__ import annotations
 
@@ -43,7 +43,7 @@ def exported(
 
     Args:
         name: The robot.
-        objective: What the posture task follows.
+        objective: Objective whose gradient the posture task follows.
         flags: Flags for the compiler.
         path: Follow by a reference flow that visits this posture first; empty for none.
     """
@@ -60,8 +60,8 @@ def _exported(name: str, objective: WorstCaseObjective | None, flags: str, path:
         flow = formulation.posture
         assert isinstance(flow, ReferenceFlowPosture)
         flow._path = [np.array(path)]
-    given = os.environ.get("DAQP_SOURCES")
-    daqp = Path(given) if given else None
+    sources = os.environ.get("DAQP_SOURCES")
+    daqp = Path(sources) if sources else None
     with pytest.MonkeyPatch.context() as patch:
         patch.setenv("CFLAGS", flags)
         export_controller(robot, formulation, out, objective=objective, prefix="ctl", daqp=daqp, build=True)

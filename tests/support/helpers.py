@@ -1,6 +1,6 @@
-"""What the tests of the mathematics share: robots, random configurations, errors, finite differences, raw Pinocchio.
+"""Helpers of the mathematical tests: robots, random configurations, errors, finite differences, raw Pinocchio.
 
-Nothing here calls the code under test except to load a robot.
+The helpers do not call the code under test except to load a robot.
 """
 
 from __future__ import annotations
@@ -28,12 +28,12 @@ def robot(name: str) -> Robot:
 
 
 def rng(*key: object) -> np.random.Generator:
-    """A generator of one's own for each test, the same on every run and machine."""
+    """Return a generator for a key, the same on every run and machine."""
     return np.random.default_rng(zlib.crc32(repr(key).encode()))
 
 
 def random_configurations(model: pin.Model, count: int, *key: object, spread: float = 1.0) -> list[Vector]:
-    """Configurations ``neutral ⊕ v`` with ``v`` normal."""
+    """Draw configurations ``neutral ⊕ v`` with normal ``v``."""
     generator = rng(*key)
     return [
         np.array(pin.integrate(model, pin.neutral(model), spread * generator.normal(size=model.nv)))
@@ -42,15 +42,15 @@ def random_configurations(model: pin.Model, count: int, *key: object, spread: fl
 
 
 def unit(generator: np.random.Generator, size: int = 3) -> Vector:
-    """A random unit vector."""
+    """Draw a unit vector."""
     v = generator.normal(size=size)
     return v / np.linalg.norm(v)
 
 
 def relative(actual: ArrayLike, expected: ArrayLike, scale: float = 0.0) -> float:
-    """Largest deviation over the largest expected entry, or over ``scale`` if that is larger.
+    """Return the largest deviation over the largest expected entry, or over ``scale`` if this is larger.
 
-    A scale is for what may vanish: a gradient that is zero is judged against the value that it belongs to.
+    Use a scale for values that may vanish, such as the value that belongs to a gradient.
     """
     x, y = np.array(actual, dtype=float), np.array(expected, dtype=float)
     assert x.size == y.size, (x.shape, y.shape)
@@ -67,7 +67,7 @@ def assert_close(actual: ArrayLike, expected: ArrayLike, tolerance: float, what:
 
 
 def central_gradient(f: Callable[[Vector], ArrayLike], model: pin.Model, q: Vector, step: float) -> Vector:
-    """Fourth-order central differences of ``f(q ⊕ ε e_i)``; the last axis is i."""
+    """Compute fourth-order central differences of ``f(q ⊕ ε e_i)``; the last axis is i."""
 
     def along(direction: Vector) -> Vector:
         def at(k: int) -> Vector:
@@ -79,13 +79,13 @@ def central_gradient(f: Callable[[Vector], ArrayLike], model: pin.Model, q: Vect
 
 
 def mass_matrix(model: pin.Model, q: Vector) -> Vector:
-    """Pinocchio's ``M``; its C++ CRBA fills the upper triangle only."""
+    """Return Pinocchio's ``M``, whose CRBA fills only the upper triangle."""
     upper = np.triu(pin.crba(model, model.createData(), q))
     return np.asarray(upper + np.triu(upper, 1).T)
 
 
 def frame_jacobian(model: pin.Model, q: Vector, frame: int, offset: ArrayLike = (0, 0, 0)) -> Vector:
-    """Pinocchio's 6 × nv Jacobian of a point given in a frame, LOCAL_WORLD_ALIGNED, by adding a frame there."""
+    """Return Pinocchio's 6 × nv Jacobian of a point in a frame, LOCAL_WORLD_ALIGNED, from an added frame."""
     copy = model.copy()
     old = copy.frames[frame]
     placement = old.placement * pin.SE3(np.eye(3), np.array(offset, dtype=float))
@@ -95,7 +95,7 @@ def frame_jacobian(model: pin.Model, q: Vector, frame: int, offset: ArrayLike = 
 
 
 def frame_placement(model: pin.Model, q: Vector, frame: int) -> pin.SE3:
-    """World placement of a frame."""
+    """Return the world placement of a frame."""
     data = model.createData()
     pin.framesForwardKinematics(model, data, q)
     return pin.SE3(data.oMf[frame])

@@ -1,9 +1,8 @@
-"""Check what a user gets: build sdist and wheel, install them far from the checkout, and use them there.
+"""Build sdist and wheel, install the wheel far from the checkout, and use it there as a user would.
 
-``python -m tests.support.installed_wheel`` compares the content with ``git ls-files``, runs every command of the
-command line
-once, and lets mypy read the installed copy.  ``--tests`` then runs tests against that copy, ``--lowest`` installs the
-lowest versions that ``pyproject.toml`` allows, ``--python`` takes another interpreter.
+``python -m tests.support.installed_wheel`` compares the content with ``git ls-files``, runs every command once, and
+lets mypy read the installed copy.  ``--tests`` then runs tests against this copy, ``--lowest`` installs the lowest
+versions that ``pyproject.toml`` allows, and ``--python`` takes another interpreter.
 """
 
 from __future__ import annotations
@@ -25,10 +24,10 @@ from pathlib import Path
 
 ROOT = Path(__file__).resolve().parents[2]
 PACKAGES = {"impact_posture": "impact_posture", "cli": "impact_posture_cli", "robots": "impact_posture_robots"}
-# What only a checkout has.
+# Files that only a checkout has.
 UNSHIPPED = (".ci/", ".gitignore")
 
-# Every command of the app, as cheap as it can be; those of one row follow on one another.
+# Every command of the app, as cheap as possible.  Commands of one row run one after the other.
 COMMANDS = [
     ["simulate solo8-push --format png --out run"],
     ["compare solo8-push --controllers nominal --seeds 1 --jobs 1 --format png --out comparison"],
@@ -43,7 +42,7 @@ COMMANDS = [
     ["codegen ur5 --normal 0 0 1 --compile --out exported", "codegen ur5 --controller arm --out arm"],
     ["sweep grid.toml --workers 1 --out grid", "sweep show grid"],
 ]
-# What the command `sweep` above solves.
+# Input of the command `sweep`.
 GRID = """grid = { x = [0.0, 0.05] }
 [problem]
 robot = "ur5"
@@ -54,11 +53,11 @@ starts = 1
 
 
 class Failed(Exception):
-    """A check that did not hold, in words."""
+    """A check failed; the message says which."""
 
 
 def run(command: list[str], folder: Path, fine: tuple[int, ...] = (0,)) -> subprocess.CompletedProcess[str]:
-    """Run a command outside the tree; nothing of the caller's Python leads back into it."""
+    """Run a command outside the checkout, without variables of Python that lead back into it."""
     environment = {k: v for k, v in os.environ.items() if not k.startswith("PYTHON") and k != "MYPYPATH"}
     environment |= {"IMPACT_POSTURE_CACHE": str(folder / "cache"), "COLUMNS": "100", "BROWSER": "true"}
     done = subprocess.run(command, cwd=folder, env=environment, capture_output=True, text=True, check=False)
@@ -95,15 +94,15 @@ def sdist_files(sdist: Path) -> dict[str, str]:
 
 
 def compare(what: str, content: dict[str, str], expected: dict[str, str]) -> None:
-    faults = [f"not in it: {n}" for n in sorted(expected.keys() - content.keys())]
+    faults = [f"missing: {n}" for n in sorted(expected.keys() - content.keys())]
     faults += [f"not tracked by git: {n}" for n in sorted(content.keys() - expected.keys())]
-    faults += [f"not the same: {n}" for n in sorted(content.keys() & expected.keys()) if content[n] != expected[n]]
+    faults += [f"different: {n}" for n in sorted(content.keys() & expected.keys()) if content[n] != expected[n]]
     if faults:
-        raise Failed(f"{what} does not hold what git tracks:\n  " + "\n  ".join(faults))
+        raise Failed(f"{what} differs from the files in git:\n  " + "\n  ".join(faults))
 
 
 def build(work: Path) -> Path:
-    """Build the sdist from this tree as it is, the wheel from the sdist and from a clean copy; compare all three."""
+    """Build the sdist from this checkout, and the wheel from the sdist and from a clean copy; compare all three."""
     names, builder = tracked(), [sys.executable, "-m", "build", "--quiet"]
     source = copy(names, work / "source")
     with ThreadPoolExecutor() as pool:
@@ -128,16 +127,16 @@ def build(work: Path) -> Path:
     content = wheel_files(wheel)
     compare(wheel.name, {n: d for n, d in content.items() if ".dist-info/" not in n}, packaged)
     compare("the wheel made without the sdist", wheel_files(direct), content)
-    print(f"  {len(shipped)} files in the sdist, {len(packaged)} in the wheel, as git tracks them")
+    print(f"  {len(shipped)} files in the sdist, {len(packaged)} in the wheel, as in git")
     return wheel
 
 
 def install(work: Path, wheel: Path, extras: str, lowest: bool) -> None:
-    """Install the wheel with extras, and nothing but what they name."""
+    """Install the wheel with extras only."""
     python = str(work / "env" / "bin" / "python")
     pip = [python, "-m", "pip", "install", "--quiet", "--no-compile", "--disable-pip-version-check"]
     if lowest:
-        # pip has no way to ask for the lowest versions.
+        # pip cannot install the lowest versions.
         run([*pip, "uv"], work)
         uv = [python, "-m", "uv", "pip", "install", "--quiet", "--python", python, "--resolution", "lowest-direct"]
         named = [word for extra in extras.split(",") for word in ("--extra", extra)]
@@ -149,14 +148,14 @@ def install(work: Path, wheel: Path, extras: str, lowest: bool) -> None:
 
 
 def commands(work: Path, programs: Path) -> None:
-    """Run every command of the app once, for real."""
+    """Run every command of the app once."""
     ask = "import typer, impact_posture_cli.app as m; print(m.__file__, *typer.main.get_command(m.app).commands)"
     where, *names = run([str(programs / "python"), "-c", ask], work).stdout.split()
     if not Path(where).is_relative_to(programs.parent):
         raise Failed(f"the command line that ran is {where}")
-    given = {line.split()[0] for row in COMMANDS for line in row}
-    if given != set(names):
-        raise Failed(f"commands that are not run here, or are no more: {sorted(given ^ set(names))}")
+    listed = {line.split()[0] for row in COMMANDS for line in row}
+    if listed != set(names):
+        raise Failed(f"COMMANDS and the commands of the app differ: {sorted(listed ^ set(names))}")
 
     (work / "grid.toml").write_text(GRID, encoding="utf-8")
 
@@ -196,7 +195,7 @@ def types(work: Path, programs: Path) -> None:
 
 
 def suite(work: Path, programs: Path, arguments: list[str]) -> None:
-    """Run tests from a copy of the checkout that lacks the packages, so that only the installed ones can be met."""
+    """Run tests from a copy of the checkout without the packages, so that they import the installed packages."""
     folder = copy([n for n in tracked() if n.split("/")[0] not in PACKAGES], work / "tests")
     done = subprocess.run([str(programs / "python"), "-m", "pytest", "-q", *arguments], cwd=folder, check=False)
     if done.returncode:
@@ -205,7 +204,7 @@ def suite(work: Path, programs: Path, arguments: list[str]) -> None:
 
 @contextmanager
 def step(what: str) -> Iterator[None]:
-    """Say what is done, and how long it took."""
+    """Print a step and its duration."""
     print(f"{what} …", flush=True)
     start = time.monotonic()
     yield
@@ -230,8 +229,8 @@ def main() -> None:
             commands(work, programs)
         with step("install, with all extras"):
             install(work, wheel, "sim,sweep,test,docs", options.lowest)
-        # What mypy finds hangs on the types that other packages came with: those of today, for the Python that
-        # pyproject.toml tells mypy (NumPy's for newer ones do not read as 3.11).
+        # mypy needs current types of other packages, for the Python version in pyproject.toml.
+        # It cannot read NumPy's types for newer versions as 3.11.
         if not options.lowest and options.python == sys.executable:
             with step("types"):
                 types(work, programs)

@@ -1,4 +1,4 @@
-"""Any solver of the qpsolvers package on the programs of the online controllers, to hold DAQP against."""
+"""Solvers of the qpsolvers package on the programs of the online controllers, to compare DAQP with."""
 
 from __future__ import annotations
 
@@ -9,13 +9,13 @@ from impact_posture.tsid.qp.quadratic_program import EQUALITY, QP, Solved
 
 
 class QpsolversSolver:
-    """A solver by its name in qpsolvers (``proxqp``, ``quadprog``, …), cold at every program."""
+    """Solver with a name in qpsolvers (``proxqp``, ``quadprog``, …), cold at every program."""
 
     def __init__(self, name: str, **settings: float) -> None:
         self._name, self._settings = name, settings
 
     def solve(self, qp: QP) -> Solved | None:
-        """The solution, or ``None``.
+        """Return the solution, or ``None``.
 
         Raises:
             qpsolvers.SolverNotFound: No solver of that name is installed.
@@ -34,7 +34,7 @@ class QpsolversSolver:
         try:
             answer = qpsolvers.solve_problem(problem, solver=self._name, **self._settings)
         except ValueError:
-            # quadprog's word for a program without a solution.
+            # quadprog raises this for a program without a solution.
             return None
         if not answer.found or answer.x is None:
             return None

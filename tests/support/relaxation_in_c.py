@@ -1,4 +1,4 @@
-"""The relaxation in C for tests: its library, a call, and a certificate of what it returns."""
+"""The relaxation in C for tests: its library, a call, and a certificate of its solutions."""
 
 from __future__ import annotations
 
@@ -52,7 +52,7 @@ class Relaxation:
     """The compiled relaxation with a workspace for each size, which keeps the active rows."""
 
     def __init__(self, folder: Path, *flags: str) -> None:
-        """Compile in a folder; our own code without a warning."""
+        """Compile in a folder; warnings of our code are errors."""
         for name, content in sources_or_skip().items():
             (folder / name).write_bytes(content)
         for name, text in render.relaxation().items():
@@ -77,7 +77,7 @@ class Relaxation:
         self._work.clear()
 
     def solve(self, tick: RelaxedTick, budget: int = 2000, repeats: int = 1) -> Answer:
-        """Solve the program of a tick, as often as told from the same active rows."""
+        """Solve the program of a tick, each time from the same active rows."""
         m, n = tick.A.shape
         levels = int(tick.level.max())
         values = {name: np.ascontiguousarray(getattr(tick, name), dtype=float) for name in _ARRAYS}
@@ -107,7 +107,7 @@ def violations(tick: RelaxedTick, z: np.ndarray) -> tuple[np.ndarray, np.ndarray
     values = np.concatenate([z, tick.A @ z])
     rows = np.vstack([np.diag(tick.unit), tick.A * tick.unit])
     size, lengths = max(1.0, float(np.max(np.abs(z) / tick.unit))), np.linalg.norm(rows, axis=1)
-    # No point changes what a vanishing row misses.
+    # A vanishing row cannot be satisfied, so it does not count.
     return np.where(lengths > 0, values - np.clip(values, tick.lower, tick.upper), 0.0), COUNTS * size * lengths
 
 
@@ -119,11 +119,11 @@ def missed(tick: RelaxedTick, z: np.ndarray) -> list[float]:
 
 
 def stationarity(tick: RelaxedTick, z: np.ndarray) -> list[float]:
-    """Return how far the gradient of each level's sum of squares, and last of the cost, is from its constraints.
+    """Return the stationarity residual of each level's sum of squares, and last of the cost.
 
-    At the lexicographic answer, the negative gradient is a combination of the rows above: of any sign for equations
-    and missed rows, non-negative for active bounds.  The distance is relative to the terms of the gradient; it is 0
-    for a level that holds.  Nothing here is shared with the code in C.
+    At the lexicographic solution, the negative gradient is a combination of the rows above: of any sign for equations
+    and missed rows, non-negative for active bounds.  The residual is relative to the terms of the gradient.  It is 0
+    for a level that holds.  This function shares no code with C.
     """
     rows = np.vstack([np.diag(tick.unit), tick.A * tick.unit])
     lengths = np.linalg.norm(rows, axis=1)
@@ -131,12 +131,12 @@ def stationarity(tick: RelaxedTick, z: np.ndarray) -> list[float]:
     over, counts = violations(tick, z)
     values, levels, distances = np.concatenate([z, tick.A @ z]), int(tick.level.max()), []
     for k in range(1, levels + 2):
-        own = tick.level == k
-        if k <= levels and (np.abs(over) <= counts)[own].all():
+        here = tick.level == k
+        if k <= levels and (np.abs(over) <= counts)[here].all():
             distances.append(0.0)
             continue
         if k <= levels:
-            gradient, terms = rows[own].T @ over[own], float(np.abs(over[own]) @ lengths[own])
+            gradient, terms = rows[here].T @ over[here], float(np.abs(over[here]) @ lengths[here])
         else:
             gradient = (tick.H @ z + tick.g) * tick.unit
             terms = float(np.linalg.norm((np.abs(tick.H) @ np.abs(z) + np.abs(tick.g)) * tick.unit))
@@ -154,7 +154,7 @@ def stationarity(tick: RelaxedTick, z: np.ndarray) -> list[float]:
 
 
 def _complement(rows: np.ndarray) -> np.ndarray:
-    """Return an orthonormal basis, as rows, of what is orthogonal to the given rows."""
+    """Return an orthonormal basis, as rows, of the space orthogonal to the rows."""
     if not rows.size:
         return np.eye(rows.shape[1])
     return scipy.linalg.null_space(rows, rcond=1e-9).T

@@ -1,4 +1,4 @@
-"""Ticks that need the relaxation, as Python solves them, recorded from simulated robots and from random states."""
+"""Ticks that need the relaxation, with Python's solution, recorded from simulated robots and random states."""
 
 from __future__ import annotations
 
@@ -28,7 +28,7 @@ RUNS = {
 
 @dataclass(frozen=True, eq=False)
 class RelaxedTick:
-    """Program of a tick, with Python's answer.
+    """Program of a tick, with Python's solution.
 
     Attributes:
         H: Shape (n, n).
@@ -36,9 +36,9 @@ class RelaxedTick:
         A: Shape (m, n).
         lower: Shape (n + m,).
         upper: Shape (n + m,).
-        level: 0 for what always holds, 1 for joint limits, then the strict levels, shape (n + m,).
+        level: 0 for hard constraints, 1 for joint limits, then the strict levels, shape (n + m,).
         unit: Value of each variable that compares with an acceleration of 1, shape (n,).
-        z: Python's answer, shape (n,); NaN where it has none.
+        z: Python's solution, shape (n,); NaN if Python has none.
     """
 
     H: np.ndarray
@@ -82,7 +82,7 @@ def pushed(name: str) -> tuple[list[RelaxedTick], int]:
     """Push a simulated robot with its nominal controller.
 
     Returns:
-        Its relaxed ticks, and how many of them come before it falls: before its base has sunk by a third.
+        Its relaxed ticks, and the number of them before it falls, which means that its base has sunk by a third.
     """
     scenario, frame, force, seconds = RUNS[name]
     setup = set_up(read_scenario(scenario))

@@ -1,4 +1,4 @@
-"""Restitution of a contact law, measured with a ball in the world that robots are simulated in."""
+"""Restitution of a contact law, measured with a ball in the simulated world."""
 
 from __future__ import annotations
 
@@ -19,7 +19,7 @@ from impact_posture.simulation.world.world import World, build_world
 _RADIUS = 0.02
 # Number of time constants of the law after which a contact counts as endless.
 _PATIENCE = 200
-# Shares of a time step after which the ball touches, because restitution depends on that a little.
+# Shares of a time step after which the ball touches, because restitution depends on it a little.
 _PHASES = (0.1, 0.3, 0.5, 0.7, 0.9)
 
 
@@ -43,7 +43,7 @@ class Bounce:
 
 
 def ideal_restitution(damping: float) -> float:
-    """Return the restitution of ``r'' = −2ζω r' − ω² r`` at any ω, where the contact ends when it would have to pull.
+    """Return the restitution of ``r'' = −2ζω r' − ω² r`` at any ω; the contact ends when it would have to pull.
 
     ``exp(−2ζ arccos ζ/√(1 − ζ²))`` below ζ = 1, ``e⁻²`` there, ``exp(−2ζ arcosh ζ/√(ζ² − 1))`` above.  A
     :class:`ContactLaw` approaches it when its share d is near 1 and its time constant is many time steps.

@@ -1,4 +1,4 @@
-"""The impact of a robot whose feet are held exactly, by Pinocchio's own impulse dynamics."""
+"""Impact of a robot whose feet are held exactly, by Pinocchio's impulse dynamics."""
 
 from __future__ import annotations
 
@@ -10,7 +10,7 @@ from tests.support.helpers import Vector, frame_jacobian, mass_matrix
 
 
 class Rigid:
-    """Jumps and feet's impulses of the three unit impacts along the world's axes, by ``pin.impulseDynamics``."""
+    """Jumps and impulses of the feet for unit impacts along the three world axes, by ``pin.impulseDynamics``."""
 
     def __init__(self, base: WorstCaseObjective, q: Vector) -> None:
         self._base = base

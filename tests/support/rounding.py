@@ -1,8 +1,8 @@
 """Linear algebra as another processor may round it.
 
-OpenBLAS has a kernel for each family of processors; they sum in other orders and with other instructions.  What any
-of them returns is the exact answer to a matrix that differs in the last digits, so a matrix that is changed in its
-last digits before a factorization stands for all of them.  A test that holds here by luck fails with such a matrix.
+OpenBLAS has a kernel for each family of processors, and kernels round differently.  The result of each is the exact
+solution for a matrix that differs in the last digits.  So a matrix whose last digits change before a factorization
+stands for all kernels.  A test that passes on one processor by luck fails with such a matrix.
 """
 
 from __future__ import annotations
@@ -25,19 +25,19 @@ _SCIPY = ("lu_factor", "null_space", "orth", "qr")
 
 @contextmanager
 def other_rounding(seed: int) -> Iterator[None]:
-    """Within, the factorizations of NumPy and SciPy get matrices that are rounded once more; the same for a seed."""
+    """Round the matrices of NumPy's and SciPy's factorizations once more, in the same way for the same seed."""
     rng = np.random.default_rng(seed)
 
     def rounded(function: Callable[..., Any], symmetric: bool) -> Callable[..., Any]:
         @functools.wraps(function)
         def call(matrix: Any, *others: Any, **options: Any) -> Any:
-            given = np.asarray(matrix)
-            if given.dtype != np.float64:
+            values = np.asarray(matrix)
+            if values.dtype != np.float64:
                 return function(matrix, *others, **options)
-            signs = rng.choice([-1.0, 0.0, 1.0], given.shape)
+            signs = rng.choice([-1.0, 0.0, 1.0], values.shape)
             if symmetric:
                 signs = np.tril(signs) + np.swapaxes(np.tril(signs, -1), -1, -2)
-            return function(given * (1 + _ULP * np.finfo(float).eps * signs), *others, **options)
+            return function(values * (1 + _ULP * np.finfo(float).eps * signs), *others, **options)
 
         return call
 

@@ -1,4 +1,4 @@
-"""The most that ramps and fades of the posture tasks change within a time step."""
+"""Largest changes of the posture tasks within a time step by ramps and fades."""
 
 from __future__ import annotations
 
@@ -14,19 +14,19 @@ STEEPEST = 1.5
 
 
 def level_bound(activation: Activation, dt: float) -> float:
-    """The largest change of the level within ``dt`` seconds."""
+    """Return the largest change of the level within ``dt`` seconds."""
     return min(1.0, STEEPEST * dt / activation.ramp)
 
 
 def step_bound(posture: ip.tsid.JointPosture, state: State, dt: float) -> float:
-    """The largest change of an entry of ``ν̇*`` within ``dt`` by ramps and fades alone (``q``, ν, ∇H held).
+    """Return the largest change of an entry of ``ν̇*`` within ``dt`` by ramps and fades alone (``q``, ν, ∇H fixed).
 
     It is ``1.5 dt/ramp·(K·reach + K_p|q_des ⊖ q|)`` for the level, plus the fade of the posture.
     """
     bound, model = 0.0, posture._model
     if posture._blend < 1:
-        way = pin.difference(model, state.q, posture._next) - pin.difference(model, state.q, posture._target)
-        bound = float(np.max(posture.kp * np.abs(way))) * STEEPEST * dt / posture._over
+        step = pin.difference(model, state.q, posture._next) - pin.difference(model, state.q, posture._target)
+        bound = float(np.max(posture.kp * np.abs(step))) * STEEPEST * dt / posture._over
     if isinstance(posture, ip.tsid.ImpactRobustPosture):
         released = posture.spring == "release"
         pull = float(np.max(np.abs(posture.kp * posture.error(state)))) if released else 0.0

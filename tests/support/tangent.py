@@ -1,4 +1,4 @@
-"""The tangent map of the configuration manifold as an expression, to differentiate by CasADi on the tangent space."""
+"""Tangent map of the configuration manifold as an expression, for derivatives by CasADi on the tangent space."""
 
 from __future__ import annotations
 

@@ -1,4 +1,4 @@
-"""Tools that a test may need and a machine may lack: the test then skips and names the tool."""
+"""Tools that a machine may lack.  A test that needs a missing tool skips and names it."""
 
 from __future__ import annotations
 
@@ -30,13 +30,13 @@ def need(tool: str) -> str:
 
 
 def cxx_compiler() -> list[str] | None:
-    """``$CXX``, g++, clang++ or c++."""
+    """Return ``$CXX``, g++, clang++ or c++, or ``None``."""
     candidates = (words_of("CXX"), ["g++"], ["clang++"], ["c++"])
     return next((words for words in candidates if words and shutil.which(words[0])), None)
 
 
 def eigen_headers() -> Path | None:
-    """``$EIGEN3_INCLUDE_DIR``, the wheel cmeel-eigen, the distribution's, or what CasADi's wheel brings."""
+    """Return the headers of ``$EIGEN3_INCLUDE_DIR``, the wheel cmeel-eigen, the system, or the wheel of CasADi."""
     installed = [Path(folder) for folder in sys.path]
     folders = [folder / "cmeel.prefix" / "include" for folder in installed]
     folders += [
