@@ -54,7 +54,7 @@ class Bounded(ExactImpact):
 
     @cached_property
     def share(self) -> float:
-        """Bias ``ε/(σ+ε)`` relative to the effect of the feet.  σ is the least positive eigenvalue of ``J_sM⁻¹J_sᵀ``."""
+        """Bias ``ε/(σ+ε)`` of the effect of the feet, with the least positive eigenvalue σ of ``J_sM⁻¹J_sᵀ``."""
         root = np.linalg.cholesky(self.oracle.M)
         held = np.linalg.svd(np.linalg.solve(root, self.oracle.Js.T), compute_uv=False) ** 2
         return float(self.compliance / (held[held > 1e-12 * held[0]][-1] + self.compliance))

@@ -14,8 +14,10 @@ from impact_posture.simulation.scenario_file import read_scenario
 from impact_posture.simulation.setup import set_up
 from impact_posture.simulation.world.actuator_command import Push
 from impact_posture.simulation.world.world import SimulationDiverged
-from impact_posture.tsid import relaxation
+from impact_posture.tsid import controller, relaxation
 from impact_posture.tsid.assembly import Assembly
+from impact_posture.tsid.qp.daqp_solver import DaqpSolver
+from impact_posture.tsid.qp.hierarchy import Level
 
 # Scenario, force (N) on the frame of the push from 0.2 s to 0.6 s, seconds.
 RUNS = {
@@ -66,15 +68,23 @@ def problem_of(assembly: Assembly, z: np.ndarray | None) -> RelaxedTick:
 @contextmanager
 def recording() -> Iterator[list[RelaxedTick]]:
     """Record each relaxed tick of any controller."""
-    ticks, relax = list[RelaxedTick](), relaxation._relax
+    ticks, relaxed = list[RelaxedTick](), list[Assembly]()
+    solve, hierarchy = relaxation.solve, relaxation._hierarchy
 
-    def recorded(assembly: Assembly) -> relaxation.Outcome:
-        outcome = relax(assembly)
-        ticks.append(problem_of(assembly, None if outcome.solved is None else outcome.solved.z))
+    def noted(assembly: Assembly) -> list[Level]:
+        relaxed.append(assembly)
+        return hierarchy(assembly)
+
+    def recorded(assembly: Assembly, solver: DaqpSolver) -> relaxation.Outcome:
+        relaxed.clear()
+        outcome = solve(assembly, solver)
+        if relaxed:
+            ticks.append(problem_of(assembly, None if outcome.solved is None else outcome.solved.z))
         return outcome
 
     with pytest.MonkeyPatch.context() as patch:
-        patch.setattr(relaxation, "_relax", recorded)
+        patch.setattr(relaxation, "_hierarchy", noted)
+        patch.setattr(controller, "solve", recorded)
         yield ticks
 
 
