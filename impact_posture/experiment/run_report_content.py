@@ -34,7 +34,7 @@ _PUSH_MEANINGS = {
 }
 _MOVES = (
     "The slider goes through time: every millisecond within the impact windows, every 25 ms elsewhere. Within a "
-    "window, the orange arrows show the change of velocity since it began. H, V, S and the ellipsoid are those of "
+    "window, the orange arrows show the change of velocity since it began. H, V, S and the ellipsoid are values of "
     "the rigid model at the state of the robot."
 )
 
@@ -48,7 +48,7 @@ def run_content(folder: Path, document: Document, view: RunView, job: Job) -> Co
     if scenario.push and len(document["runs"]) < len(scenario.push.signs):
         options += ["--sign", f"{document['runs'][0]['sign']:+d}"]
     metrics, status = document["metrics"], document["status"]
-    verdict = [f"{status}: its numbers are no result" if metrics is None else f"{status}: {_summary(metrics)}"]
+    verdict = [f"{status}: its numbers are not a result" if metrics is None else f"{status}: {_summary(metrics)}"]
     verdict += [f"t = {event['time']:.2f} s: {event['what']}" for event in document["events"]]
     rows = (
         []

@@ -1,4 +1,4 @@
-"""Many ticks of a world under a controller in C, in a loop in C that calls MuJoCo and the controller."""
+"""Ticks of a world under a controller in C, in a C loop that calls MuJoCo and the controller."""
 
 from __future__ import annotations
 
@@ -29,7 +29,7 @@ from impact_posture.system.libraries import (
 )
 
 _NAME = "world_ticks"
-# Most propellers, as in C.
+# Most propellers, as in ``world_ticks.c``.
 _ROTORS = 64
 
 
@@ -40,7 +40,7 @@ class Ticks(NamedTuple):
         trace: True states after the ticks.
         rotor_speed: Commanded rotor speeds, shape (n, rotors).
         level: Level of the impact-robust term, shape (n,).
-        status: Number of the status, shape (n,).
+        status: Status number, shape (n,).
     """
 
     trace: Trace
@@ -50,14 +50,14 @@ class Ticks(NamedTuple):
 
 
 class CompiledWorld:
-    """A world that has been reset, and the controller in C that acts in it.
+    """Loop of a world and its controller in C.
 
-    The loop does what :class:`World` and :class:`CompiledTick` do, but for the order of some sums.  Pushes and throws
-    still go to the world, which knows the time; nothing else of it may be used before the next reset.
+    The loop computes the same as :class:`World` and :class:`CompiledTick`, except for the order of some sums.  Pushes
+    and throws still go to the world, which knows the time.  Other methods of the world need a reset first.
     """
 
     def __init__(self, world: World, tick: CompiledTick, contents: dict[str, Any], library: ctypes.CDLL) -> None:
-        """Take over a world; use :func:`compiled_world`."""
+        """Take over a world (:func:`compiled_world`)."""
         self._world, self._tick, self._run = world, tick, library.world_ticks
         self._members, self._arrays = _members(), dict[str, Array]()
         kinds = {"int": ctypes.c_int, "double": ctypes.c_double}
@@ -67,12 +67,10 @@ class CompiledWorld:
 
     def _command(self) -> ActuatorCommand:
         """Return the last command of the controller."""
-        own = self._struct
-        u, speed = (
-            np.array((ctypes.c_double * size).from_address(at))
-            for at, size in ((own.u, own.rotors + own.joints), (own.rotor_speed, own.rotors))
-        )
-        return ActuatorCommand(u[own.rotors :], speed)
+        struct = self._struct
+        places = (struct.u, struct.rotors + struct.joints), (struct.rotor_speed, struct.rotors)
+        u, speed = (np.array((ctypes.c_double * size).from_address(address)) for address, size in places)
+        return ActuatorCommand(u[struct.rotors :], speed)
 
     def _give(self, **values: Any) -> None:
         for name, value in values.items():
@@ -84,27 +82,28 @@ class CompiledWorld:
                 setattr(self._struct, name, self._arrays[name].ctypes.data)
 
     def take(self, n: int, lead: Callable[[float], None]) -> Ticks:
-        """Take n ticks, or fewer if the state runs away.
+        """Run n ticks, or fewer if the state diverges.
 
         Args:
             n: Number of ticks.
             lead: Moves the targets of the controller before a tick at a time, s.
 
         Raises:
-            InputError: A command is not finite, or has a torque without end.
+            InputError: A command is not finite, or an unlimited torque is absurdly large.
         """
-        world, own = self._world, self._struct
-        led, leads = self._tick.plan([(own.steps + k * own.count) * own.timestep for k in range(n)], lead)
+        world, struct = self._world, self._struct
+        times = [(struct.steps + k * struct.count) * struct.timestep for k in range(n)]
+        led, leads = self._tick.plan(times, lead)
         self._give(led=led, lead=leads, **world.next_in_c(n))
-        each, rotors = (own.shapes,), (own.rotors,)
-        shapes = {"t": (), "q": (own.nq,), "v": (own.nv,), "rotor_speeds": rotors, "torques": (own.joints,),
-                  "qpos": (own.nqpos,), "touching": each, "force": (*each, 3), "impulse": (*each, 3), "peak": each,
+        each, rotors = (struct.shapes,), (struct.rotors,)
+        shapes = {"t": (), "q": (struct.nq,), "v": (struct.nv,), "rotor_speeds": rotors, "torques": (struct.joints,),
+                  "qpos": (struct.nqpos,), "touching": each, "force": (*each, 3), "impulse": (*each, 3), "peak": each,
                   "began": each, "slip": each, "command": rotors, "level": (), "status": ()}  # fmt: skip
         self._give(**{f"row_{name}": np.zeros((n, *shape)) for name, shape in shapes.items()})
         with unwarned():
-            done = int(self._run(ctypes.byref(own), n))
-        world.go_to(own.steps)
-        if own.refused:
+            done = int(self._run(ctypes.byref(struct), n))
+        world.go_to(struct.steps)
+        if struct.refused:
             world.limits.within(self._command())
         row: dict[str, Any] = {name: self._arrays[f"row_{name}"][:done] for name in shapes}
         row["stopped"], row["touching"] = world.stops.reached(row["qpos"]), row["touching"] > 0
@@ -113,9 +112,10 @@ class CompiledWorld:
 
 
 def compiled_world(world: World, tick: CompiledTick | None, count: int) -> CompiledWorld | None:
-    """Return the loop for a world that has been reset, or ``None`` where Python has to take the ticks.
+    """Return the loop for a world after its reset, or ``None`` where Python has to run the ticks.
 
-    That is so without a controller in C, without the headers of MuJoCo, and for some worlds (:meth:`World.in_c`).
+    Python runs them without a controller in C, without the headers of MuJoCo, and for some worlds
+    (:meth:`World.in_c`).
 
     Args:
         world: The world.
@@ -134,17 +134,17 @@ def compiled_world(world: World, tick: CompiledTick | None, count: int) -> Compi
 
 @cache
 def _members() -> dict[str, str]:
-    """Return the members of the struct in C with their types, in order."""
+    """Return the types of the members of the C struct by name, in order."""
     struct = re.sub(r"/\*.*?\*/", "", _source(), flags=re.DOTALL).partition("typedef struct {")[2].partition("}")[0]
-    found = {}
+    members = {}
     for declaration in filter(None, map(str.strip, struct.split(";"))):
         if function := re.search(r"\(\*(\w+)\)\(", declaration):
-            found[function[1]] = "function"
+            members[function[1]] = "function"
             continue
         kind, names = declaration.removeprefix("const ").split(maxsplit=1)
         for name in map(str.strip, names.split(",")):
-            found[name.lstrip("*")] = f"{kind} *" if name.startswith("*") else kind
-    return found
+            members[name.lstrip("*")] = f"{kind} *" if name.startswith("*") else kind
+    return members
 
 
 @cache
@@ -154,14 +154,14 @@ def _source() -> str:
 
 @cache
 def _functions() -> dict[str, int]:
-    """Return the addresses of the functions of MuJoCo, by the names of the members."""
+    """Return the addresses of the MuJoCo functions by member name."""
     library = ctypes.CDLL(str(next(Path(import_mujoco().__file__).parent.glob("libmujoco.*"))))
     names = {"step1": library.mj_step1, "step2": library.mj_step2, "apply": library.mj_applyFT}
     return {name: ctypes.cast(function, ctypes.c_void_p).value or 0 for name, function in names.items()}
 
 
 def _library() -> ctypes.CDLL | None:
-    """Return the loop, which is built once and cached, or ``None`` where MuJoCo has no headers."""
+    """Build the loop once, cache and load it; return ``None`` if the headers of MuJoCo are missing."""
     headers = Path(import_mujoco().__file__).parent / "include"
     if not (headers / "mujoco" / "mujoco.h").is_file():
         return None

@@ -1,4 +1,4 @@
-"""Gains that all controllers of an experiment share."""
+"""Gains of a scenario, which all controllers share."""
 
 from __future__ import annotations
 
@@ -19,9 +19,9 @@ class Gains(StrictTable):
     """Gains of one task.
 
     Attributes:
-        kp: Stiffness, 1/s², one number or one for each row of the task.
+        kp: Stiffness, 1/s², one number or a number for each row of the task.
         kd: Damping, 1/s.  ``None`` is critical, ``2√kp``.
-        weight: Weight in the cost, if the task has no level of its own.
+        weight: Weight in the cost, if the task is not a strict level.
     """
 
     kp: OneOrEach
@@ -35,8 +35,8 @@ class EndEffectorGains(Gains):
     """Gains of the end effector task.
 
     Attributes:
-        pose: What the task controls.  ``full`` is the pose of the frame, ``position`` its position.  ``aligned`` is
-            its position and the direction that is the normal of the surface at the start, with free spin about it.
+        pose: What the task controls: the pose of the frame (``full``), its position (``position``), or its position
+            and the direction of the surface normal, with free spin about it (``aligned``).
     """
 
     pose: EndEffectorPose = "full"
@@ -45,12 +45,12 @@ class EndEffectorGains(Gains):
 @checked
 @dataclass(frozen=True)
 class RobustTerm(StrictTable):
-    """The impact-robust term of the posture task.
+    """Impact-robust term of the posture task.
 
     Attributes:
         gain: K of the term, scaled by the curvature of the objective, 1/s².  It compares to ``kp`` of the posture.
         ramp: Time from off to on, s.
-        fade: Distances from a position limit between which the term fades out, rad (m).
+        fade: The term fades out between these distances from a position limit, rad (m).
     """
 
     gain: Positive
@@ -61,13 +61,13 @@ class RobustTerm(StrictTable):
 @checked
 @dataclass(frozen=True)
 class StanceGains(StrictTable):
-    """Contact constraints of a controller for a standing robot.
+    """Contact constraints of the controller of a standing robot.
 
     Attributes:
         friction: Coulomb coefficient that the controller assumes.
-        least: Least normal force of a contact (for a sole, of the whole sole), N.
+        least: Least normal force of a contact point or of a whole sole, N.
         force_weight: Weight of contact forces in the cost, 1/N².
-        lifted: Frames of supports that do not stand, for example the foot that hits the ground.
+        lifted: Frames of supports that are in the air, for example the foot that hits the ground.
     """
 
     friction: Positive = 0.5
@@ -79,15 +79,15 @@ class StanceGains(StrictTable):
 @checked
 @dataclass(frozen=True)
 class Control(StrictTable):
-    """Gains that all controllers of an experiment share.  A task without gains is not there.
+    """Gains that all controllers of a scenario share.  A task without gains does not exist.
 
     Attributes:
         posture: Gains of the posture task.
         robust: The impact-robust term.
         period: Time from tick to tick, s, up to an hour.
-        tilt: Gains of the level base, first priority.
-        end_effector: Gains of the end effector, second priority, linear rows first.
-        apparent_mass: M_d of ``F̂/M_d`` in the law of the end effector, kg.  ``None`` leaves the force out.
+        tilt: Gains of the level base, which has the first priority.
+        end_effector: Gains of the end effector, which has the second priority; linear rows first.
+        apparent_mass: M_d of ``F̂/M_d`` in the law of the end effector, kg.  ``None`` ignores the force.
         center_of_mass: Gains of the center of mass.
         base: Gains of the base orientation.
         footing: Contact constraints of a standing robot.

@@ -1,4 +1,4 @@
-"""Metrics of a run: those of the paper, and those without which they mislead."""
+"""Metrics of a run: the metrics of the paper, and metrics without which they would mislead."""
 
 from __future__ import annotations
 
@@ -25,10 +25,10 @@ class Metrics:
         q_total_impact_base: The same for the six entries of the floating base.
         q_total_impact_joints: The same for the joints.
         q_total_dwell: ``∫‖ν‖dt`` over the dwell windows, 0 for pushes.
-        q_total_recovery: ``∫‖ν‖dt`` over the recovery windows, which includes a motion that only comes later.
-        peak_jump: Largest ``‖ν(t) − ν⁻‖`` within 15 ms of the first touch, mean over the contacts that were made (0
-            without any).  For pushes, the largest ``‖ν‖`` within the window.
-        peak_jump_max: Largest instead of mean over the contacts.
+        q_total_recovery: ``∫‖ν‖dt`` over the recovery windows, which includes a delayed motion.
+        peak_jump: Largest ``‖ν(t) − ν⁻‖`` within 15 ms of the first touch, mean over the contacts (0 without
+            contact).  For pushes, the largest ``‖ν‖`` within the window.
+        peak_jump_max: As ``peak_jump``, but the largest value over the contacts.
         peak_recovery: As ``peak_jump``, but over the whole recovery window.
         peak_force: Largest normal force within the impact windows, N.  For pushes, the push.
         saturation_inside: Time within the impact windows with a rotor or a joint at a control limit, s.
@@ -36,9 +36,9 @@ class Metrics:
         saturation_rotors: Time within the impact windows with a rotor at a limit, s.
         relaxed_ticks: Number of ticks in which a level gave way.
         failed_ticks: Number of ticks that held the last command.
-        slip: Distance that the shape that hits (for pushes, the fastest foot) slid within the impact windows, m.
-        stops: Joints that reached a position limit within the impact windows, and were not there at the start.
-        contacts: Number of contacts (or pushes) that were made.
+        slip: Sliding distance of the shape (for pushes, of the fastest foot) within the impact windows, m.
+        stops: Joints that reached a position limit within the impact windows and did not start at it.
+        contacts: Number of contacts (or pushes) that happened.
         contacts_asked: Number of contacts in the scenario.
         rested: Whether the robot was at rest before it was pushed.  True for contacts.
     """
@@ -64,10 +64,10 @@ class Metrics:
     rested: bool = True
 
     def to_dict(self) -> dict[str, object]:
-        """Return the JSON content, with the saturations in a table of their own."""
-        found = asdict(self)
-        saturation = {key: found.pop(f"saturation_{key}") for key in ("inside", "outside", "rotors")}
-        return {**found, "saturation_s": saturation}
+        """Return the JSON content, with the saturations in a separate table."""
+        content = asdict(self)
+        saturation = {key: content.pop(f"saturation_{key}") for key in ("inside", "outside", "rotors")}
+        return {**content, "saturation_s": saturation}
 
 
 def measure(setup: Setup, run: Run) -> Metrics:
@@ -83,22 +83,22 @@ def measure(setup: Setup, run: Run) -> Metrics:
     def integral(values: Array) -> float:
         return float(values.sum() * period)
 
-    def way(v: Array) -> float:
+    def distance(v: Array) -> float:
         return integral(np.linalg.norm(v, axis=1))
 
-    def ways(kind: str) -> float:
-        return sum(way(series.v[series.slice(w.begin, w.end)]) for w in run.of(kind))
+    def distance_in(kind: str) -> float:
+        return sum(distance(series.v[series.slice(w.begin, w.end)]) for w in run.of(kind))
 
-    # A contact that was never made is no small impact.
+    # A missed contact must not count as a small impact.
     jumps = [jump(setup, series, w) for w in impacts if w.touched] or [0.0]
     later = [_peak(setup, series, w, w.end) for w in run.of("recovery") if w.touched] or [0.0]
     stopped = (series.at_stop[inside] & ~series.at_stop[0]).any(axis=0)
     return Metrics(
-        q_total_impact=way(series.v[inside]),
-        q_total_impact_base=way(series.v[inside, :base]),
-        q_total_impact_joints=way(series.v[inside, base:]),
-        q_total_dwell=ways("dwell"),
-        q_total_recovery=ways("recovery"),
+        q_total_impact=distance(series.v[inside]),
+        q_total_impact_base=distance(series.v[inside, :base]),
+        q_total_impact_joints=distance(series.v[inside, base:]),
+        q_total_dwell=distance_in("dwell"),
+        q_total_recovery=distance_in("recovery"),
         peak_jump=float(np.mean(jumps)),
         peak_jump_max=float(np.max(jumps)),
         peak_recovery=float(np.mean(later)),

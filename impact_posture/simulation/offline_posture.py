@@ -24,25 +24,25 @@ from impact_posture.tsid.flow.flow_direction import FlowOptions
 
 # Share of the limits that holding a posture may take.
 SHARE = 0.8
-# Weight of the squared distance from the start, relative to the objective there.  A humanoid goes half as far for a
-# hundredth of the objective, and so stays clear of postures whose load its controller shares badly between the legs.
+# Weight of the squared distance from the start, relative to the objective there.  With it, a humanoid moves half as
+# far and gives up 1 % of the objective.  So it avoids postures in which its controller loads the legs unevenly.
 _NEARNESS = 0.005
-# Distances that the start may make impossible, most wanted first: from the joint stops, rad (m), because a robot on
-# a stop braces on it, and of the center of mass from the edges of the support polygon, m, because an impact tips a
-# robot that stands on its heels.
+# Margins in the order of preference, because not every start allows them.  The first is the distance from the joint
+# stops, rad (m), because a joint at a stop rests on it.  The second is the distance of the center of mass from the
+# edges of the support polygon, m, because an impact tips a robot that stands near an edge.
 _MARGINS = ((0.1, 0.05), (0.0, 0.05), (0.0, 0.025), (0.0, 0.0))
 
 
 @dataclass(frozen=True, eq=False)
 class OfflinePosture:
-    """The posture that was found.
+    """Offline optimum of a scenario.
 
     Attributes:
-        solution: What the optimizer found.
+        solution: Solution of the optimizer.
         objective: Objective at the posture.
-        initial: Objective at the start posture of the scenario, after it was put on the constraints.
-        distance: Distance from the posture there, rad (m).
-        note: What could not be demanded of the posture, and why.
+        initial: Objective at the start posture after its projection onto the constraints.
+        distance: Distance from the projected start, rad (m).
+        note: Requirement that was dropped, and the reason.
     """
 
     solution: PostureSolution
@@ -68,51 +68,51 @@ def offline_posture(
     """Optimize the posture for the impact of a scenario.
 
     The constraints are those of ``impact-posture optimize``: no collision with itself, the surface or the ground, and
-    at most :data:`SHARE` of the limits of motors and rotors to hold the posture.  The end effector is where it meets
-    the surface, as far as its task holds it.  The base of a robot that flies stays level.  The feet of a robot that
-    stands stay where they are, with the center of mass above them, and its base tilts as far as the reference flow
-    may tilt it.  Where no posture is free of collisions, the best one with them is taken, and a note says so.
+    at most :data:`SHARE` of the limits of motors and rotors to hold the posture.  The end effector is at the surface,
+    as far as its task controls it.  The base of a flying robot stays level.  The feet of a standing robot stay in
+    place, the center of mass is above them, and the base tilts no further than the reference flow may tilt it.  If
+    every posture has collisions, the best one is taken with a note.
 
     Args:
-        setup: The experiment.
+        setup: The scenario.
         objective: The objective.
         starts: Number of starts of the optimizer.
-        at_contact: Whether the end effector is where it meets the surface, else where it starts.
+        at_contact: Whether the end effector is at the surface; otherwise it is at its start.
 
     Raises:
         Infeasible, SolverFailed: As :func:`impact_posture.posture.search.multistart.solve`.
     """
     tell("looking for the offline posture")
     wanted, note = scenario_requirements(setup, objective, at_contact=at_contact), ""
-    # Margins of the center of mass are none for a robot that does not stand.
+    # For a robot that does not stand, the margin of the center of mass has no meaning.
     margins = dict.fromkeys((stops, edges if wanted.com_over_feet else 0.0) for stops, edges in _MARGINS)
-    tries = [(collision, *each) for collision in (True, False) for each in margins]
-    for collision, stops, edges in tries:
+    attempts = [(collision, *margin) for collision in (True, False) for margin in margins]
+    for collision, stops, edges in attempts:
         demands = replace(wanted, collision=collision, limit_margin=stops, com_margin=edges)
         try:
             with naming_keys(setup.scenario):
                 problem = build_problem(setup.robot, objective, setup.q, demands)
                 solution = solve(problem, starts=starts, jobs=1, progress=_tell)
         except (Infeasible, SolverFailed) as error:
-            if (collision, stops, edges) == tries[-1]:
+            if (collision, stops, edges) == attempts[-1]:
                 raise
             if collision:
                 note = f"links may touch in the offline posture, because none without collisions was found: {error}"
             continue
         value, initial = objective.value(solution.q), objective.value(solution.initial)
-        way = distance(Chart(setup.robot.model), solution.q, solution.initial)
-        return OfflinePosture(solution, value, initial, way, "" if collision else note)
+        moved = distance(Chart(setup.robot.model), solution.q, solution.initial)
+        return OfflinePosture(solution, value, initial, moved, "" if collision else note)
     raise AssertionError("the last attempt returns or raises")
 
 
 def scenario_requirements(setup: Setup, objective: WorstCaseObjective, *, at_contact: bool = True) -> Requirements:
-    """Return what a scenario demands of a posture, without margins; arguments as of :func:`offline_posture`."""
+    """Return the requirements of a scenario without margins; for the arguments see :func:`offline_posture`."""
     control, contact, base, target = setup.scenario.control, objective.contact, "free", None
     if setup.robot.floating:
         base = "level" if control.tilt is not None else f"level:{np.rad2deg(FlowOptions().tilt)}"
     if at_contact and control.end_effector is not None and setup.scenario.contacts:
-        place = Numeric(setup.robot.model).at(setup.q).placement(point_on(setup.robot, contact.frame))
-        x, y, z = (place.translation - setup.gap * setup.scenario.normal).tolist()
+        placement = Numeric(setup.robot.model).at(setup.q).placement(point_on(setup.robot, contact.frame))
+        x, y, z = (placement.translation - setup.gap * setup.scenario.normal).tolist()
         target = (x, y, z)
     settings = ProblemSettings(
         robot=setup.scenario.robot,

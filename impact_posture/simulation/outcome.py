@@ -1,4 +1,4 @@
-"""Outcome of a run: whether its numbers say something about a controller, or the robot fell."""
+"""Outcome of a run: completed, or the bounds that it broke."""
 
 from __future__ import annotations
 
@@ -16,21 +16,21 @@ from impact_posture.simulation.series import Flags, Series
 from impact_posture.simulation.setup import Setup
 from impact_posture.system.arrays import Array
 
-# Each is graver than the one before.
+# In increasing order of gravity.
 Outcome = Literal["completed", "lost contact", "control lost", "fell"]
 OUTCOMES: tuple[Outcome, ...] = get_args(Outcome)
-# Ticks from one posture that is checked for links behind a surface to the next.
+# Stride of the ticks that are checked for links behind a surface.
 _EVERY = 25
-# Depth of a joint origin behind a surface that no contact explains, m.
+# A joint origin deeper behind a surface cannot come from a contact, m.
 _DEEP = 0.02
 
 
 @dataclass(frozen=True)
 class Event:
-    """A bound that was broken.
+    """Broken bound.
 
     Attributes:
-        status: Status of the run because of it.
+        status: Status of the run because of this event.
         time: Time, s.
         what: Description.
     """
@@ -40,15 +40,15 @@ class Event:
     what: str
 
 
-def gravest(found: Iterable[Outcome]) -> Outcome:
+def gravest(outcomes: Iterable[Outcome]) -> Outcome:
     """Return the gravest status, or ``completed`` if there is none."""
-    return max(found, key=OUTCOMES.index, default="completed")
+    return max(outcomes, key=OUTCOMES.index, default="completed")
 
 
 def links_behind(setup: Setup, runs: Iterable[Run]) -> tuple[str, ...]:
-    """Return a warning about each surface that links without a shape went through, because nothing stops these links.
+    """Return a warning about each surface that links without shapes passed through, because nothing stops such links.
 
-    A joint counts if its origin was more than 2 cm behind the plane, and was in front of it at the start.
+    A joint counts if its origin was more than 2 cm behind the plane, and in front of the plane at the start.
     """
     robot, built = setup.robot, setup.world.built
     shaped = {int(robot.model.frames[robot.frame_id(s.frame)].parentJoint) for s in setup.scenario.shapes}
@@ -70,18 +70,17 @@ def links_behind(setup: Setup, runs: Iterable[Run]) -> tuple[str, ...]:
 
 def _origins(model: pin.Model, joints: Sequence[int], postures: Array) -> Array:
     """Return the origins of joints in each posture, world, m, shape (postures, joints, 3)."""
-    data, found = model.createData(), np.empty((len(postures), len(joints), 3))
-    for one, q in zip(found, postures, strict=True):
+    data, origins = model.createData(), np.empty((len(postures), len(joints), 3))
+    for k, q in enumerate(postures):
         pin.forwardKinematics(model, data, q)
-        for k, joint in enumerate(joints):
-            one[k] = data.oMi[joint].translation
-    return found
+        origins[k] = [data.oMi[joint].translation for joint in joints]
+    return origins
 
 
 def judge(setup: Setup, run: Run) -> tuple[Event, ...]:
-    """Return the bounds of its scenario that a run broke, in the order of time."""
-    found = [*_falls(setup, run.series), *_losses(setup, run), *_contacts(setup, run)]
-    return tuple(sorted(found, key=lambda event: event.time))
+    """Return the bounds of the scenario that a run broke, in the order of time."""
+    events = [*_falls(setup, run.series), *_losses(setup, run), *_contacts(setup, run)]
+    return tuple(sorted(events, key=lambda event: event.time))
 
 
 def _falls(setup: Setup, series: Series) -> list[Event]:
@@ -100,7 +99,7 @@ def _falls(setup: Setup, series: Series) -> list[Event]:
     }
     for name, n in built.normals.items():
         if (setup.q[:3] - built.points[name]) @ n < bounds.clearance:
-            # The base began there, because the arm reaches around an endless plane.
+            # The base starts behind the plane, which in reality is bounded.
             continue
         words = f"the base came closer than {bounds.clearance:g} m to" if bounds.clearance else "the base went into"
         broken[f"{words} the surface '{name}'"] = (places - built.points[name]) @ n < bounds.clearance
@@ -108,41 +107,41 @@ def _falls(setup: Setup, series: Series) -> list[Event]:
 
 
 def _losses(setup: Setup, run: Run) -> list[Event]:
-    """Check for relaxed and held commands, and for a state that ran away."""
+    """Check for relaxed and held commands, and for a diverged state."""
     bounds, series, period = setup.scenario.bounds, run.series, setup.scenario.control.period
-    found, relaxed = [], series.relaxed
+    events, relaxed = [], series.relaxed
     if relaxed.mean() > bounds.relaxed:
         words = f"limits made tasks give way in {100 * relaxed.mean():.0f} % of all ticks, first"
-        found.append(Event("control lost", float(series.t[np.argmax(relaxed)]), words))
+        events.append(Event("control lost", float(series.t[np.argmax(relaxed)]), words))
     begin, length = _longest(series.held)
     if length * period > bounds.held + 1e-9:
         words = f"no command was found for {length * period:.3g} s, the last one was held,"
-        found.append(Event("control lost", float(series.t[begin]), words))
+        events.append(Event("control lost", float(series.t[begin]), words))
     if run.away is not None:
-        found.append(Event("control lost", run.away, "the state ran away"))
-    return found
+        events.append(Event("control lost", run.away, "the state ran away"))
+    return events
 
 
 def _contacts(setup: Setup, run: Run) -> list[Event]:
-    """Check for contacts that were never made, and for feet that did not stay."""
+    """Check for missed contacts, and for feet that left the ground."""
     bounds, series, period = setup.scenario.bounds, run.series, setup.scenario.control.period
-    found, impacts = [], run.of("impact")
+    events, impacts = [], run.of("impact")
     missed = [window for window in impacts if not window.touched]
     if missed:
         words = f"{len(missed)} of {len(impacts)} contacts were never made, the first expected"
-        found.append(Event("lost contact", missed[0].begin, words))
+        events.append(Event("lost contact", missed[0].begin, words))
     lifted = [(*_longest(~touches.astype(bool)), foot) for foot, touches in enumerate(series.feet.T)]
     lifted = [each for each in lifted if each[1] * period > bounds.lifted + 1e-9]
     if lifted:
-        # Other feet follow the first one.
+        # Report the first foot only, because others follow it.
         begin, length, foot = min(lifted)
         words = f"{feet_of(setup)[foot]} left the ground for {length * period:.3g} s"
-        found.append(Event("lost contact", float(series.t[begin]), words))
-    return found
+        events.append(Event("lost contact", float(series.t[begin]), words))
+    return events
 
 
 def _longest(flags: Flags) -> tuple[int, int]:
     """Return the begin and the length of the longest sequence of set flags."""
-    sequences = [place for (place,) in ndimage.find_objects(ndimage.label(flags)[0])]
-    longest = max(sequences, key=lambda place: place.stop - place.start, default=slice(0, 0))
+    sequences = [ticks for (ticks,) in ndimage.find_objects(ndimage.label(flags)[0])]
+    longest = max(sequences, key=lambda ticks: ticks.stop - ticks.start, default=slice(0, 0))
     return longest.start, longest.stop - longest.start

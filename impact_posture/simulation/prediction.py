@@ -1,4 +1,4 @@
-"""Impacts of a run, as the rigid model predicts them and as they were."""
+"""Impacts of a run: prediction of the rigid model, and measurement."""
 
 from __future__ import annotations
 
@@ -26,10 +26,10 @@ class Prediction:
         G: 1/kg.
         V: ``H/G²``.
         S: Squared jump per squared approach speed if the contact sticks, or ``None`` where it is undefined.
-        approach: Speed of robot and surface (or ball) towards each other just before the impact, m/s.  For pushes,
-            the impulse of the push, N·s.
-        frictionless: Jump without friction and rebound, ``v √V``.  For pushes, ``√H`` times the impulse, which is the
-            velocity at the end of the push of a robot without controller.
+        approach: Approach speed of robot and surface (or ball) just before the impact, m/s.  For pushes, the impulse
+            of the push, N·s.
+        frictionless: Jump without friction and rebound, ``v √V``.  For pushes, ``√H`` times the impulse: the velocity
+            of a robot without controller at the end of the push.
         sticking: Jump if the contact sticks, ``v √S`` (for an approach along the normal), or ``None`` for pushes.
         coulomb: Jump with the friction of the surface, ``v √C`` (likewise), or ``None`` for pushes.
         measured: Measured jump, as in :class:`~impact_posture.simulation.metrics.Metrics`.
@@ -51,7 +51,7 @@ class Prediction:
 
 def predict(setup: Setup, objective: WorstCaseObjective, run: Run) -> tuple[Prediction, ...]:
     """Predict the impacts of a run with the rigid model at the state before each."""
-    scenario, found = setup.scenario, []
+    scenario, predictions = setup.scenario, []
     numeric = Numeric(setup.robot.model)
     point = point_on(setup.robot, objective.contact.frame, objective.contact.offset)
     for window in run.of("impact"):
@@ -75,5 +75,5 @@ def predict(setup: Setup, objective: WorstCaseObjective, run: Run) -> tuple[Pred
         expected = smooth if coulomb is None else coulomb
         ratio = measured / expected if expected > 1e-9 else None
         jumps = smooth, sticking, coulomb, measured
-        found.append(Prediction(window.contact, here.H, here.G, here.V, here.S, approach, *jumps, ratio))
-    return tuple(found)
+        predictions.append(Prediction(window.contact, here.H, here.G, here.V, here.S, approach, *jumps, ratio))
+    return tuple(predictions)

@@ -14,15 +14,15 @@ from impact_posture.simulation.world.actuator_command import Trace
 from impact_posture.system.arrays import Array
 from impact_posture.tsid.controller import Command
 
-# Ticks from one evaluation of the metric to the next.  The metric is only drawn.
+# Stride of the ticks at which the metric is evaluated, because it is only drawn.
 _EVERY = 10
-# Ticks after which their true states are taken from the world, so that few contacts wait there.
+# Ticks after which their true states are taken from the world, to limit the contacts in its log.
 _BLOCK = 1000
 _NUMBERS = {status: k for k, status in enumerate(STATUSES)}
 
 
 def feet_of(setup: Setup) -> tuple[str, ...]:
-    """Return the frames of the shapes on bodies that must stay on the ground, if the robot stands."""
+    """Return the frames of the shapes that must stay on the ground, if the robot stands."""
     scenario, robot = setup.scenario, setup.robot
     if scenario.control.footing is None:
         return ()
@@ -32,10 +32,10 @@ def feet_of(setup: Setup) -> tuple[str, ...]:
 
 
 class Recorder:
-    """Record of a run, one row for each tick.
+    """Record of a run with one row for each tick.
 
     Args:
-        setup: The experiment.
+        setup: The scenario.
         metric: ``q → H``, for the time series of H.
     """
 
@@ -47,7 +47,7 @@ class Recorder:
         feet = feet_of(setup)
         self._feet = [k for k, frame in enumerate(shapes) if frame in feet]
         self._rows: list[tuple[Array, float, int, float]] = []
-        # Rotor commands, levels, numbers of status, distances; and true states.
+        # Rotor commands, levels, status numbers and distances; then true states.
         self._columns: list[tuple[Array, ...]] = []
         self._traces: list[Trace] = []
         self._push = (np.zeros(3), np.inf, -np.inf)
@@ -71,22 +71,22 @@ class Recorder:
             self._trace()
 
     def take_all(self, trace: Trace, *columns: Array) -> None:
-        """Record ticks: the states after them, rotor commands, levels, numbers of status, and distances."""
+        """Record ticks: the states after them, rotor commands, levels, status numbers, and distances."""
         self._traces.append(trace)
         self._columns.append(columns)
 
     def first_touch(self, begin: float, end: float) -> float | None:
-        """Return when the shape that hits first began to touch within ``[begin, end)``, s."""
+        """Return the time of the first touch within ``[begin, end)``, s; ``None`` without a touch."""
         trace, k = self._trace(), self._shape
-        assert k is not None  # noqa: S101 (a push has no shape that hits)
-        # A contact that lasts is pushed anew in every tick.
+        assert k is not None  # noqa: S101 (a push has no shape)
+        # A lasting contact has a new time in every tick.
         before = np.concatenate([[False], trace.touching[:-1, k]])
         touches = trace.began[~before, k]
         touches = touches[(begin <= touches) & (touches < end)]
         return float(touches[0]) if touches.size else None
 
     def series(self) -> Series:
-        """Return the time series, with what follows from the recorded states and commands."""
+        """Return the time series."""
         trace = self._trace()
         command, level, status, distance = (np.concatenate(parts) for parts in zip(*self._columns, strict=True))
         t, q, (pushed, begin, end) = trace.t, trace.q, self._push
@@ -96,9 +96,9 @@ class Recorder:
             force = pushed * ((begin < t) & (t <= end + 1e-9))[:, None]
             peak, slip = np.linalg.norm(force, axis=1), trace.slip.max(axis=1, initial=0.0)
         stopped, names = np.zeros(trace.v.shape, dtype=bool), self._setup.robot.tangent_names
-        for name, there in zip(self._world.stops.names, trace.stopped.T, strict=True):
+        for name, column in zip(self._world.stops.names, trace.stopped.T, strict=True):
             if name in names:
-                stopped[:, names.index(name)] = there
+                stopped[:, names.index(name)] = column
         objective = np.full(t.size, np.nan)
         objective[::_EVERY] = [self._value(posture) for posture in q[::_EVERY]]
         return Series(

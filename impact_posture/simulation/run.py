@@ -1,4 +1,4 @@
-"""One run of a controller through a scenario, with a record of everything that happened."""
+"""Runs of a controller through a scenario, recorded tick by tick."""
 
 from __future__ import annotations
 
@@ -23,15 +23,15 @@ from impact_posture.system.arrays import Array
 from impact_posture.system.processes import fork_call
 from impact_posture.system.progress import tell
 
-# Time when controllers begin to prepare, after the first reaction of sensors and motors, s.
+# Time when controllers begin to prepare, after the first transients of sensors and motors, s.
 BRACE = 0.1
-# Ticks from one message about the progress to the next, in Python and in C, where a call takes as long as ten ticks.
+# Ticks between two progress messages, in Python and in C, where a call costs as much as ten ticks.
 _TELL, _TELL_IN_C = 100, 1000
-# Times that differ by less are equal, because sums of periods are not exact, s.
+# Times that differ by less count as equal, because sums of periods are not exact, s.
 _SAME = 1e-9
-# Most ticks of a run, nearly three hours at 1 kHz.  A tick of an arm takes about a kilobyte of memory.
+# Most ticks of a run, nearly three hours at 1 kHz.  A tick of an arm needs about a kilobyte of memory.
 _MOST = 10**7
-# Most physics steps of a tick, which no signal interrupts.
+# Most physics steps of a tick, because a signal cannot interrupt a tick.
 _MOST_STEPS = 10**5
 
 
@@ -43,10 +43,10 @@ class Run:
         series: Time series.
         windows: An impact window for each contact or push, then the dwell and recovery windows.
         sign: Sign of the push, 1 for contacts.
-        waited: Time until the robot was pushed, s, NaN for contacts.
-        rested: Whether the robot had come to rest before the push.  After the patience of the scenario it is pushed
-            anyway, and the metrics contain its own motion.
-        away: Time when the state ran away, which ended the run, s.
+        waited: Time of the push, s, NaN for contacts.
+        rested: Whether the robot was at rest before the push.  If it never rests, the push comes after the patience
+            of the scenario, and the metrics contain the motion before it.
+        away: Time when the state diverged and the run ended, s.
     """
 
     series: Series
@@ -70,27 +70,27 @@ def run(factory: ControllerFactory, controller: str, *, seed: int = 0, mode: Mod
         controller: Name of the controller.
         seed: Seed of the sensor noise.
         mode: ``live`` keeps the term on, ``held`` holds the reached posture before the first impact.
-        gain: K instead of that of the scenario, 1/s².
-        only: The only sign of the push to run.
+        gain: K in place of the value in the scenario, 1/s².
+        only: Sign of the push to run; every sign of the scenario by default.
 
     Raises:
-        SimulationDiverged: The state ran away at once.  If it does so later, the run ends there.
-        ControllerNotFound: There is no such controller.
-        InputError: A tick is no multiple of the physics step, or the sign is neither 1 nor -1.
+        SimulationDiverged: The state diverged within two ticks.  If it diverges later, the run ends there.
+        ControllerNotFound: The controller is unknown.
+        InputError: A tick is not a multiple of the physics step, or the sign is neither 1 nor -1.
     """
     driver = factory.driver(controller, mode, gain)
     scenario = factory.setup.scenario
     if scenario.contacts:
         return (_contacts(_Loop(factory, driver, seed), scenario.contacts, mode),)
     if only not in (None, 1, -1):
-        raise InputError(f"{only} is no sign of a push", where=scenario.source, hint="give 1 or -1")
+        raise InputError(f"{only} is not a sign of a push", where=scenario.source, hint="give 1 or -1")
     task = scenario.task
-    assert not isinstance(task, RepeatedContacts)  # noqa: S101 (those have returned)
+    assert not isinstance(task, RepeatedContacts)  # noqa: S101 (contacts have returned)
     return _pushes(_Loop(factory, driver, seed), task, task.signs if only is None else (only,), mode)
 
 
 class _Loop:
-    """Controller and world, in C where both are there."""
+    """Loop of controller and world, in C if both exist in C."""
 
     def __init__(self, factory: ControllerFactory, driver: Driver, seed: int) -> None:
         setup = factory.setup
@@ -98,12 +98,9 @@ class _Loop:
         self.period, self.ramp = setup.scenario.control.period, setup.scenario.control.robust.ramp
         self.count = round(self.period / self.world.timestep)
         if not 1 <= self.count <= _MOST_STEPS or abs(self.count * self.world.timestep - self.period) > 1e-9:
-            fault = "no multiple of" if self.count <= _MOST_STEPS else f"more than {_MOST_STEPS:.0e} times"
-            raise InputError(
-                f"a tick of {self.period:g} s is {fault} the physics' {self.world.timestep:g} s",
-                where=setup.scenario.source,
-                hint="change control.period or physics.timestep",
-            )
+            fault = "not a multiple of" if self.count <= _MOST_STEPS else f"more than {_MOST_STEPS:.0e} times"
+            what = f"a tick of {self.period:g} s is {fault} the physics' {self.world.timestep:g} s"
+            raise InputError(what, where=setup.scenario.source, hint="change control.period or physics.timestep")
         command = driver.reset(setup.q)
         self.world.reset(setup.q, seed=seed, rotor_speed=command.rotor_speed)
         self.compiled = compiled_world(self.world, driver.compiled, self.count)
@@ -115,14 +112,14 @@ class _Loop:
         return self.world.time
 
     def ticks(self, n: int, reference: Reference | None = None) -> Array:
-        """Take ticks, fewer if the state runs away (:attr:`away`).  Return ``‖ν‖`` after each."""
+        """Run n ticks, fewer if the state diverges (:attr:`away`).  Return ``‖ν‖`` after each tick."""
         take, most = (self._in_python, _TELL) if self.compiled is None else (self._in_c, _TELL_IN_C)
         speeds = np.zeros(0)
         while speeds.size < n:
-            asked = min(most, n - speeds.size)
-            found = take(asked, reference)
-            speeds = np.concatenate([speeds, found])
-            if found.size < asked:
+            count = min(most, n - speeds.size)
+            new = take(count, reference)
+            speeds = np.concatenate([speeds, new])
+            if new.size < count:
                 # A figure needs two ticks.
                 if self.recorder.ticks < 2:
                     raise SimulationDiverged(self.t, where=self.setup.robot.name)
@@ -148,7 +145,7 @@ class _Loop:
             raise InputError(what, where=self.setup.scenario.source, hint=hint)
 
     def until(self, t: float) -> int:
-        """Return the number of ticks, at least one, until a time has come, s."""
+        """Return the number of ticks until a time (s), at least one."""
         return max(1, math.ceil((t - _SAME - self.t) / self.period))
 
     def _in_python(self, n: int, reference: Reference | None) -> Array:
@@ -168,33 +165,33 @@ class _Loop:
         assert self.compiled is not None  # noqa: S101 (the caller has asked)
         distances: list[float] = []
         levels: list[float] = []
-        # A driver with a level of its own knows it before the tick.
-        own = type(self.driver).level is not Driver.level
+        # A driver that overrides `level` knows it before the tick.
+        overrides = type(self.driver).level is not Driver.level
 
         def lead(t: float) -> None:
             point = None if reference is None else reference.at(t)
             self.driver.lead(t, point)
             distances.append(0.0 if point is None else point.distance)
-            if own:
+            if overrides:
                 levels.append(self.driver.level)
 
-        found = self.compiled.take(n, lead)
-        done = found.level.size
-        level = np.array(levels[:done]) if own else found.level
-        self.recorder.take_all(found.trace, found.rotor_speed, level, found.status, np.array(distances[:done]))
-        return np.asarray(np.linalg.norm(found.trace.v, axis=1))
+        ticks = self.compiled.take(n, lead)
+        done = ticks.level.size
+        level = np.array(levels[:done]) if overrides else ticks.level
+        self.recorder.take_all(ticks.trace, ticks.rotor_speed, level, ticks.status, np.array(distances[:done]))
+        return np.asarray(np.linalg.norm(ticks.trace.v, axis=1))
 
 
 def _contacts(loop: _Loop, task: RepeatedContacts, mode: Mode) -> Run:
     driver, reference = loop.driver, Reference(task, loop.setup.gap)
     loop.check_length(reference.total)
-    # The way in crosses the surface here, and brakes behind it.
+    # The reference crosses the surface at this time of the approach, and brakes behind it.
     crossing = reference.inward - 2 * task.beyond / task.speed
     starts = [reference.start(k) for k in range(task.count)]
     events = [(BRACE, driver.brace)]
     if mode == "held":
         events.append((max(BRACE, starts[0] - 2 * loop.ramp), driver.hold))
-    # From the begin of the way in, the next impact is the expected one.
+    # At the begin of each approach, the controller expects the next impact.
     events += [(start, partial(driver.expect, start + crossing)) for start in starts]
     events.sort(key=lambda event: event[0])
     left = round(reference.total / loop.period)
@@ -217,13 +214,13 @@ def _contacts(loop: _Loop, task: RepeatedContacts, mode: Mode) -> Run:
 
 
 def _pushes(loop: _Loop, task: SinglePush | Throw, signs: Sequence[int], mode: Mode) -> tuple[Run, ...]:
-    """Settle once and push with each sign from there, the other signs in forked processes."""
+    """Settle once, then push with each sign, the second sign in a forked process."""
     length = task.window if isinstance(task, Throw) else task.duration
     loop.check_length(task.settle + task.patience + length + task.after)
-    # All controllers begin to prepare before a push, whatever the patience of the scenario is.
+    # All controllers begin to prepare before the push, even for a short patience.
     rested = _settle(loop, task, max(task.settle, BRACE + loop.period), [loop.driver.brace])
     if mode == "held":
-        # The posture that was reached is held, and comes to rest again without the term.
+        # The reached posture is held, and the robot comes to rest again without the term.
         loop.driver.hold()
         rested = _settle(loop, task, loop.t + 2 * loop.ramp, []) and rested
     if loop.away is not None:
@@ -253,14 +250,14 @@ def _push(loop: _Loop, task: SinglePush | Throw, sign: int, rested: bool) -> Run
 
 
 def _settle(loop: _Loop, task: SinglePush | Throw, least: float, brace: list[Callable[[], None]]) -> bool:
-    """Go on until ``least`` and until the robot has been quiet for long enough.  Return whether it has."""
+    """Run until ``least`` (s), and until the robot has been quiet for long enough.  Return whether it has rested."""
     still, end = 0.0, max(least, loop.t) + task.patience
     while loop.t < least - _SAME or still < task.still - _SAME:
         if loop.t > end or loop.away is not None:
             return False
         if brace and loop.t >= BRACE - _SAME:
             brace.pop()()
-        # It is not at rest before so many ticks.
+        # The robot cannot be at rest before the first of these times.
         waits = [max(least, loop.t + task.still - still), end, *([BRACE] if brace else [])]
         for speed in loop.ticks(min(map(loop.until, waits))):
             still = still + loop.period if speed < task.quiet else 0.0

@@ -29,11 +29,10 @@ SHIPPED = Path(__file__).parent / "scenarios"
 @checked
 @dataclass(frozen=True)
 class RepeatedContacts(StrictTable):
-    """The end effector flies into a surface and away again, several times.
+    """The end effector moves into a surface and back, several times.
 
-    A reference starts where the shape is at the start.  It moves against the normal of the surface until it is
-    ``beyond`` behind the surface, stays there, and comes back
-    (:mod:`impact_posture.simulation.controllers.contact_reference`).
+    The reference starts at the shape.  It moves against the normal until it is ``beyond`` behind the surface, stays
+    there, and returns (:mod:`impact_posture.simulation.controllers.contact_reference`).
 
     Attributes:
         frame: Frame of the shape that touches.
@@ -45,7 +44,7 @@ class RepeatedContacts(StrictTable):
         dwell: Time that the reference stays behind the surface, s.
         beyond: Distance of the reference behind the surface, m.
         pause: Time between the way back and the next approach, s.
-        window: Time from the first touch that counts as the impact, s.  It is the same for every controller.
+        window: Length of the impact window from the first touch on, s.
     """
 
     frame: str
@@ -63,7 +62,7 @@ class RepeatedContacts(StrictTable):
 @checked
 @dataclass(frozen=True)
 class SinglePush(Settling):
-    """A standing robot is pushed after it has come to rest.
+    """Push of a robot that stands and has come to rest.
 
     Attributes:
         frame: Frame that is pushed.
@@ -89,12 +88,12 @@ class Bounds(StrictTable):
     The first three are for a floating base.
 
     Attributes:
-        tilt_deg: Largest angle between vertical and the base axis that was vertical at the start, degrees.
+        tilt_deg: Largest angle between the vertical and the base axis that was vertical at the start, degrees.
         clearance: Least height of the base origin above every surface, m.
-        sink: Largest distance of the base below its start, or below where a reference leads it, m.
-        lifted: Longest time that a foot loses its contact, s.
+        sink: Largest distance of the base below its start, or below its reference, m.
+        lifted: Longest loss of contact of a foot, s.
         relaxed: Largest share of relaxed ticks.
-        held: Longest time that a command is held, s.
+        held: Longest time for which a command is held, s.
     """
 
     tilt_deg: Positive = 60.0
@@ -114,10 +113,10 @@ class ScenarioTable(Scene, RobotSettings):
         name: Name of the experiment.
         description: One line.
         posture: Name or file of the start posture.  ``None`` takes the default posture of the robot.
-        joints: Values that replace those of the start posture, by joint, rad or m.
-        contacts: The contacts that the robot makes, or ``None``.
+        joints: Values by joint that replace values of the start posture, rad or m.
+        contacts: The contacts, or ``None``.
         push: The push, or ``None``.
-        throw: The body that is thrown at the robot, or ``None``.  There is one of the three.
+        throw: The ball that is thrown at the robot, or ``None``.  Exactly one of the three is set.
         control: The gains.
         bounds: Bounds that a run must keep to count.
     """
@@ -135,11 +134,11 @@ class ScenarioTable(Scene, RobotSettings):
 
     @property
     def laws(self) -> tuple[tuple[str, tuple[float, float]], ...]:
-        """Name and ``solref`` of all contact laws, with that of a ball."""
+        """Name and ``solref`` of all contact laws, including the ball."""
         return super().laws if self.throw is None else (*super().laws, ("throw", self.throw.solref))
 
     def __post_init__(self) -> None:
-        """Refuse no task, two tasks, and a task with an unknown shape or surface."""
+        """Refuse a scenario without exactly one task, and a task with an unknown shape or surface."""
         super().__post_init__()
         tasks = {key: getattr(self, key) for key in ("contacts", "push", "throw") if getattr(self, key) is not None}
         if len(tasks) != 1:
@@ -162,7 +161,7 @@ class ScenarioTable(Scene, RobotSettings):
 @checked
 @dataclass(frozen=True, eq=False, kw_only=True)
 class Scenario(ScenarioTable):
-    """An experiment before anything is loaded.
+    """Experiment as its file describes it, before the robot is loaded.
 
     Attributes:
         source: Path of the file, for errors.
@@ -179,14 +178,14 @@ class Scenario(ScenarioTable):
 
     @property
     def signs(self) -> tuple[int, ...]:
-        """Signs of the pushes or throws, one run each; none for contacts."""
+        """Sign of each run of a push or throw; empty for contacts."""
         return () if isinstance(self.task, RepeatedContacts) else self.task.signs
 
     @property
     def normal(self) -> Array:
-        """Unit normal of the impact, shape (3,): that of the surface, or the direction of the push or throw."""
-        given = self.push.force if self.push else self.throw.direction if self.throw else self.surface.normal
-        return np.asarray(np.array(given, dtype=float) / np.linalg.norm(given))
+        """Unit normal of the surface, or direction of the push or throw, shape (3,)."""
+        direction = self.push.force if self.push else self.throw.direction if self.throw else self.surface.normal
+        return np.asarray(np.array(direction, dtype=float) / np.linalg.norm(direction))
 
     @property
     def friction(self) -> float:
@@ -214,7 +213,7 @@ class Scenario(ScenarioTable):
 
     @property
     def offset(self) -> Vector3:
-        """Contact point of the shape that hits, center of the one that is hit, or pushed frame, in the frame, m."""
+        """Contact point in the frame of the task, m: of the shape, center of a shape that is hit, or frame origin."""
         if self.throw:
             return self.shape.center or (0.0, 0.0, 0.0)
         return self.shape.offset if self.contacts else (0.0, 0.0, 0.0)
@@ -231,15 +230,15 @@ def known_scenarios() -> tuple[str, ...]:
 
 
 def read_scenario(scenario: str | Path) -> Scenario:
-    """Read a shipped scenario by name, or another one from its file.  Paths in a file start from its folder.
+    """Read a shipped scenario by name, or another scenario from its file.  Paths in a file start from its folder.
 
     Raises:
-        ScenarioNotFound: There is no such scenario.  The error lists the nearest names.
+        ScenarioNotFound: The scenario is unknown.  The error lists the nearest names.
         SpecError: The file cannot be read, has an unknown key, or a value does not fit.
     """
     path = scenario_path(scenario)
     data = read_toml(path)
-    # The schema comes first, because the keys of another schema are not misspelt.
+    # Check the schema first, because another schema may have other keys.
     schema = data.get("schema", SCHEMA)
     if schema != SCHEMA:
         raise SpecError(f"schema '{shown(schema)}'", where=str(path), hint=f'write schema = "{SCHEMA}"')
@@ -258,7 +257,7 @@ def scenario_path(scenario: str | Path) -> Path:
     """Return the path of a scenario file.
 
     Raises:
-        ScenarioNotFound: There is no such scenario.  The error lists the nearest names.
+        ScenarioNotFound: The scenario is unknown.  The error lists the nearest names.
     """
     if isinstance(scenario, str):
         if scenario in known_scenarios():

@@ -29,12 +29,12 @@ Gradient = Callable[[Array], tuple[float, Array]]
 
 
 def scenario_objective(setup: Setup, kind: ObjectiveKind = "impulse", *, free: bool = False) -> WorstCaseObjective:
-    """Return the objective for the impact of a scenario, at the shape that hits or at the frame that is pushed.
+    """Return the objective for the impact of a scenario, at the shape of the contacts or at the pushed frame.
 
     Args:
-        setup: The experiment.
+        setup: The scenario.
         kind: Kind of objective.
-        free: Whether to ignore the feet of a robot that stands.
+        free: Whether to ignore the feet of a standing robot.
     """
     scenario, robot = setup.scenario, setup.robot
     x, y, z = (float(value) for value in scenario.normal)
@@ -46,7 +46,7 @@ def scenario_objective(setup: Setup, kind: ObjectiveKind = "impulse", *, free: b
 
 
 def interpreted(objective: WorstCaseObjective) -> Gradient:
-    """Return ``q → (objective, gradient)`` in the CasADi interpreter, which is ready at once, but slower than C."""
+    """Return ``q → (objective, gradient)`` in the CasADi interpreter, without compiler but slower than C."""
     function, normal = objective.gradient_fun(), np.array(objective.contact.normal, dtype=float)
 
     def call(q: Array) -> tuple[float, Array]:
@@ -59,10 +59,10 @@ def interpreted(objective: WorstCaseObjective) -> Gradient:
 
 
 def compiled(objective: WorstCaseObjective) -> Gradient:
-    """Return the same from the C export, which is built once and cached.
+    """Return ``q → (objective, gradient)`` from the C export, which is built once and cached.
 
     Raises:
-        CompilerError: There is no compiler, it failed, or its result computes other numbers.
+        CompilerError: There is no compiler, it failed, or the library computes other numbers.
         OutputError: The cache folder cannot be written, or other users can write it.
         SpecError: The library cannot be loaded, for example because another machine built it.
     """
@@ -77,12 +77,12 @@ def compiled(objective: WorstCaseObjective) -> Gradient:
 
 def objective_key(objective: WorstCaseObjective) -> str:
     """Return a hash of everything that the C code depends on."""
-    point = objective.robot.model.frames[objective.robot.frame_id(objective.contact.frame)]
-    held = [objective.robot.model.frames[objective.robot.frame_id(s.frame)] for s in objective.supports]
+    robot, names = objective.robot, [objective.contact.frame, *(s.frame for s in objective.supports)]
+    frames = [robot.model.frames[robot.frame_id(name)] for name in names]
     content = [
         ca.CasadiMeta.version(),
-        objective.robot.model_sha256,
-        *[f"{f.parentJoint} {f.placement.homogeneous.tolist()}" for f in (point, *held)],
+        robot.model_sha256,
+        *[f"{frame.parentJoint} {frame.placement.homogeneous.tolist()}" for frame in frames],
         repr(replace(objective.contact, impulse=1.0)),
         repr((objective.kind, objective.metric, objective.supports, objective.compliance)),
     ]
@@ -91,15 +91,12 @@ def objective_key(objective: WorstCaseObjective) -> str:
 
 @contextmanager
 def locked(path: Path) -> Iterator[None]:
-    """Let one process in at a time.  The others then find the work done."""
+    """Lock a file, so that only one process at a time is within the block."""
     try:
         file = path.open("w")
     except OSError as error:
-        raise OutputError(
-            f"cannot be written ({error.strerror})",
-            where=str(path.parent),
-            hint="set IMPACT_POSTURE_CACHE to a folder",
-        ) from None
+        what, hint = f"cannot be written ({error.strerror})", "set IMPACT_POSTURE_CACHE to a folder"
+        raise OutputError(what, where=str(path.parent), hint=hint) from None
     with file:
         fcntl.flock(file, fcntl.LOCK_EX)
         yield

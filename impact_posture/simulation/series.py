@@ -1,4 +1,4 @@
-"""Time series of a run, tick by tick, and the windows that count."""
+"""Time series of a run, and its windows."""
 
 from __future__ import annotations
 
@@ -17,15 +17,15 @@ Array = NDArray[Any]
 Flags = NDArray[np.bool_]
 
 STATUSES: tuple[Status, ...] = tuple(Status)
-# Times that differ by less are equal, because sums of time steps are not exact, s.
+# Times that differ by less count as equal, because sums of time steps are not exact, s.
 _SAME = 1e-9
-# Time from the begin of an impact in which a motion that was held back may come out again, s.
+# Length of the recovery from the begin of an impact, in which a delayed motion may appear, s.
 RECOVERY = 1.0
 
 
 @dataclass(frozen=True, eq=False)
 class Window:
-    """A window of time that counts.
+    """Time window of a run.
 
     Attributes:
         kind: ``impact``, ``dwell`` (from the first touch until the reference leaves), or ``recovery`` (until
@@ -33,7 +33,7 @@ class Window:
         contact: Number of the contact or push, from 0.
         begin: Begin, s.
         end: End, s.
-        touched: Whether the impact came.  If not, the window begins where it was expected.
+        touched: Whether the impact happened.  If not, the window begins at the expected time.
     """
 
     kind: str
@@ -45,7 +45,7 @@ class Window:
 
 @dataclass(frozen=True, eq=False)
 class Series:
-    """True states of a run of n ticks, each at the end of a tick, when its command has been executed.
+    """True states at the end of each of the n ticks of a run, after the command of the tick.
 
     Attributes:
         t: Time, s, shape (n,).
@@ -54,16 +54,16 @@ class Series:
         torque: Commanded joint torques, within the limits, shape (n, joints).
         rotor_command: Commanded rotor speeds, within the limits, shape (n, rotors).
         rotor_speed: True rotor speeds, shape (n, rotors).
-        force: Force on the shape that hits, or of the push, world, N, shape (n, 3).
-        peak: Largest normal force on that shape within the tick, N, shape (n,).
-        slip: Tangential speed of that shape, or of the fastest foot, in contact, m/s, shape (n,).
+        force: Force on the shape of the task, or of the push, world, N, shape (n, 3).
+        peak: Largest normal force on this shape within the tick, N, shape (n,).
+        slip: Tangential speed of this shape, or of the fastest foot, in contact, m/s, shape (n,).
         touching: Number of shapes in contact, shape (n,).
-        feet: Whether each foot that must stay is in contact, shape (n, feet).
+        feet: Whether each supporting foot is in contact, shape (n, feet).
         objective: H of the impact, shape (n,), NaN in ticks without an evaluation.
         level: Level of the term that prepares for the impact, shape (n,).
         status: Index into :data:`STATUSES`, shape (n,).
         at_stop: Whether a joint is at a position limit, shape (n, nv).
-        reference: Distance of the reference along its way in, m, shape (n,), zero for pushes.
+        reference: Distance of the reference along its approach, m, shape (n,), zero for pushes.
     """
 
     t: Array
@@ -90,7 +90,7 @@ class Series:
 
     @property
     def held(self) -> Flags:
-        """Ticks in which no command was found and the last one was held, shape (n,)."""
+        """Ticks without a new command, which held the last one, shape (n,)."""
         return np.asarray(~self.relaxed & (self.status != STATUSES.index(Status.SOLVED)))
 
     def slice(self, begin: float, end: float) -> slice:
@@ -104,14 +104,14 @@ class Series:
 
     @staticmethod
     def load(path: Path) -> Series:
-        """Read what :meth:`save` wrote.
+        """Read a file of :meth:`save`.
 
         Raises:
-            SpecError: It cannot be read, or is something else.
+            SpecError: The file cannot be read, or is not a time series.
         """
         try:
-            found = read_arrays(path)
-            columns = {f.name: found[f.name] for f in fields(Series)}
+            arrays = read_arrays(path)
+            columns = {f.name: arrays[f.name] for f in fields(Series)}
             if len({column.shape[0] for column in columns.values()}) != 1:
                 raise ValueError("columns of different lengths")
             return Series(**columns)

@@ -16,15 +16,16 @@ from impact_posture.simulation.world.world import World, build_world
 from impact_posture.system.arrays import Array
 from impact_posture.system.progress import tell
 
+# Keys of a scenario, which may be the place of an error.
 _KEYS = {field.name for field in fields(ScenarioTable)}
 
 
 @dataclass(frozen=True, eq=False)
 class Setup:
-    """An experiment that is ready to run.
+    """Scenario that is ready to run.
 
     Attributes:
-        scenario: The experiment.
+        scenario: The scenario.
         robot: The loaded robot.
         q: Start posture, shape (nq,).
         world: The simulated world, before its first reset.
@@ -46,10 +47,10 @@ class Setup:
 
 
 def set_up(scenario: Scenario) -> Setup:
-    """Load the robot, pose it, and build the world around it.
+    """Load the robot, set its start posture, and build the world around it.
 
     Raises:
-        ImpactPostureError: Something does not fit.
+        ImpactPostureError: A value of the scenario does not fit the robot.
     """
     tell(f"loading {scenario.robot}")
     with naming_keys(scenario):
@@ -66,7 +67,7 @@ def set_up(scenario: Scenario) -> Setup:
 
 @contextmanager
 def naming_keys(scenario: Scenario) -> Iterator[None]:
-    """Let errors name the keys of a scenario and its file, where they name settings."""
+    """Replace settings in errors by keys of the scenario, and name its file."""
     try:
         yield
     except ImpactPostureError as error:
@@ -74,7 +75,7 @@ def naming_keys(scenario: Scenario) -> Iterator[None]:
         if {where.partition(" ")[0], where.rpartition(" ")[2]} & _KEYS and scenario.source:
             where = f"{scenario.source}, {where}"
         elif where in ("", "problem") or (isinstance(error, NameNotFound) and "." not in where):
-            # What a robot lacks is named in the scenario, but a key of robot.toml is not.
+            # The scenario names a frame or joint that the robot lacks.  A key with a dot is from robot.toml.
             where = scenario.source
         what, hint = (
             text.replace("`contact_pose`", "control.end_effector.pose").replace("`", "")
@@ -85,7 +86,7 @@ def naming_keys(scenario: Scenario) -> Iterator[None]:
 
 
 def _check_base(robot: Robot, scenario: Scenario) -> None:
-    """Refuse a floating base that nothing holds, or that its rotors cannot push in every direction."""
+    """Refuse a floating base without feet and rotors, and rotors that cannot push it in every direction."""
     if not robot.floating or scenario.control.footing is not None:
         return
     propulsion = robot.spec.propulsion

@@ -1,8 +1,8 @@
 """Export of the world of a scenario for programs in other languages: the MuJoCo model and its parameters.
 
-``world.xml`` is the model to read, with six digits.  ``world.mjb`` is the model to run, in MuJoCo's binary form,
-which is exact and fits the version of MuJoCo that wrote it.  ``world.txt`` has one line for each parameter, a key and
-its numbers.  ``docs/examples/cpp/closed_loop`` reads both.  The exported sensors have a delay and the filter of the
+``world.xml`` is the model for readers, with six digits.  ``world.mjb`` is the exact binary model for the version of
+MuJoCo that wrote it.  ``world.txt`` has one line for each parameter, a key and its numbers.
+``docs/examples/cpp/closed_loop`` reads the last two files.  The exported sensors have the delay and the filter of the
 force, but no noise.
 """
 
@@ -26,7 +26,7 @@ from impact_posture.simulation.world.throw import Throw
 from impact_posture.system.output_folder import whole_folder
 
 MODEL, PARAMETERS = "world.mjb", "world.txt"
-# Families of joints in the file, whose places in q and qpos differ in nothing, or as a floating base.
+# Joint families that the file supports: joints with one number, and a floating base.
 _PLAIN = ("revolute", "prismatic")
 _BASE = "free-flyer"
 
@@ -41,7 +41,7 @@ def export_world(setup: Setup, out: Path, *, force: bool = False) -> None:
 
     Raises:
         InputError: The scenario throws a ball, or a joint is neither revolute, prismatic nor a floating base.
-        OutputError: The folder exists without ``force``, is not ours, or cannot be written.
+        OutputError: The folder exists without ``force``, has foreign files, or cannot be written.
     """
     mjcf = setup.world.built.mjcf
     model = mjcf.compile()
@@ -77,14 +77,14 @@ def _parameters(setup: Setup, model: Any) -> Iterable[tuple[str, Iterable[float]
 
 
 def _joints(setup: Setup) -> Iterable[tuple[str, Iterable[float]]]:
-    """Yield the places of the joints: ``joint q qpos v qvel``, and ``base`` before them for a floating base."""
+    """Yield the indices of each joint in q, qpos, v and qvel; the key of a floating base is ``base``."""
     for slot in setup.world.built.mjcf.layout.slots:
         family = slot.joint.kind.family
-        places = [slot.joint.q.start, slot.qpos.start, slot.joint.v.start, slot.qvel.start]
+        indices = [slot.joint.q.start, slot.qpos.start, slot.joint.v.start, slot.qvel.start]
         if family == _BASE and not slot.moved and slot.qpos.stop - slot.qpos.start == 7:
-            yield "base", places
+            yield "base", indices
         elif family in _PLAIN:
-            yield "joint", places
+            yield "joint", indices
         else:
             what = f"joint '{slot.joint.name}' is of the family {family}"
             raise InputError(what, where="world export", hint="lock it (lock = [...] in the scenario)")

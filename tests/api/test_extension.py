@@ -35,7 +35,7 @@ from impact_posture.robot.robot_spec import Support
 from impact_posture.simulation.controllers.controller_factory import GROUP
 from impact_posture.simulation.run import run
 from tests.experiment.conftest import shortened as cut
-from tests.simulation.factories import controller_factory, factory, needs_mujoco, shortened
+from tests.simulation.factories import controller_factory, needs_mujoco, shared_factory, shortened
 from tests.support.command import refused
 from tests.support.command import run as start
 from tests.support.helpers import Vector, robot
@@ -183,7 +183,7 @@ def test_what_another_package_makes_must_be_a_driver(setback: ModuleType, name: 
     needs_mujoco()
     setback.len = lambda *given: len(given)
     with pytest.raises(InputError, match=words) as caught:
-        factory("aerial-vertical").driver(name)
+        shared_factory("aerial-vertical").driver(name)
     assert "\n" not in caught.value.line and f"controller '{name}'" in caught.value.line
 
 

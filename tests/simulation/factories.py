@@ -1,4 +1,4 @@
-"""Shared by these tests: shortened scenarios, controller factories kept for a whole process, runs made by hand."""
+"""Short scenarios, controller factories and runs that tests share, and synthetic time series."""
 
 from __future__ import annotations
 
@@ -28,7 +28,7 @@ def needs_mujoco() -> None:
 
 
 def shortened(source: str | Path, **changes: Any) -> Setup:
-    """A scenario with one contact or a short wait, and whatever else is to change in its task."""
+    """Set up a scenario with one contact or a short wait, and with changes of its task."""
     scenario = read_scenario(source)
     if scenario.contacts:
         short: dict[str, Any] = {"count": 1, "settle": 0.3, "dwell": 0.2, "pause": 0.05}
@@ -39,12 +39,12 @@ def shortened(source: str | Path, **changes: Any) -> Setup:
 
 
 def controller_factory(setup: Setup, free: bool = False) -> ControllerFactory:
-    """Gradients at once, and an offline optimum from few starts."""
+    """Return a factory with interpreted gradients and an offline optimum from few starts."""
     return ControllerFactory(setup, free=free, gradient_of=interpreted, starts=2)
 
 
 def near(name: str, **changes: Any) -> Setup:
-    """A shipped scenario cut short; a surface that a hand goes to is 5 cm nearer."""
+    """Set up a short variant of a shipped scenario, with surfaces 5 cm nearer."""
     setup = shortened(name, **changes)
     if name in PUSHES:
         return setup
@@ -54,26 +54,25 @@ def near(name: str, **changes: Any) -> Setup:
 
 
 @functools.cache
-def factory(name: str, settle: float | None = None) -> ControllerFactory:
-    """A scenario of :func:`near`; one of each in a process."""
+def shared_factory(name: str, settle: float | None = None) -> ControllerFactory:
+    """Return the factory of a scenario of :func:`near`, which all tests of a process share."""
     return controller_factory(near(name) if settle is None else near(name, settle=settle))
 
 
-def driven(made: ControllerFactory, controller: str, *, mode: Mode = "live", seed: int = 0) -> Run:
-    """A run with the push forward alone."""
-    # What is tested is the driver.
-    made.starts = 1
-    return run(made, controller, mode=mode, seed=seed, only=1)[0]
+def driven(factory: ControllerFactory, controller: str, *, mode: Mode = "live", seed: int = 0) -> Run:
+    """Run contacts, or a push with sign 1, with one start for offline postures."""
+    factory.starts = 1
+    return run(factory, controller, mode=mode, seed=seed, only=1)[0]
 
 
 @functools.cache
 def lived(name: str, controller: str, mode: Mode, settle: float | None) -> Run:
-    """A run of a shipped scenario, cut short; one of each in a process.  No defaults: the cache tells them apart."""
-    return driven(factory(name, settle), controller, mode=mode)
+    """Return a run of :func:`shared_factory`, cached.  It has no defaults, which would confuse the cache."""
+    return driven(shared_factory(name, settle), controller, mode=mode)
 
 
 def by_hand(setup: Setup, n: int, period: float = 1e-3, begin: float = 0.0, **columns: Any) -> Series:
-    """A record of ``n`` ticks in which nothing happens but what ``columns`` say."""
+    """Return a series of n ticks at rest, with other values in ``columns``."""
     robot, propulsion = setup.robot, setup.robot.spec.propulsion
     joints = robot.nv - (6 if robot.floating else 0)
     rotors = 0 if propulsion is None else len(propulsion.rotors)
@@ -90,5 +89,5 @@ def by_hand(setup: Setup, n: int, period: float = 1e-3, begin: float = 0.0, **co
 
 
 def fields_of(series: Series) -> dict[str, np.ndarray[Any, Any]]:
-    """Its columns by name."""
+    """Return the columns by name."""
     return {name: getattr(series, name) for name in series.__dataclass_fields__}

@@ -1,4 +1,4 @@
-"""The controllers that the impact-robust term is held against do what their papers say."""
+"""Controllers for comparison with the impact-robust term follow the equations of their papers."""
 
 from __future__ import annotations
 
@@ -23,7 +23,7 @@ from impact_posture.simulation.setup import set_up
 from impact_posture.simulation.world.actuator_command import ActuatorCommand
 from impact_posture.simulation.world.sensor_noise import Reading
 from impact_posture.tsid.tasks.task import Task
-from tests.simulation.factories import SHIPPED, factory, needs_mujoco
+from tests.simulation.factories import SHIPPED, needs_mujoco, shared_factory
 from tests.support.helpers import Vector, central_gradient, frame_jacobian, mass_matrix, rng
 
 
@@ -32,10 +32,10 @@ def _mujoco() -> None:
     needs_mujoco()
 
 
-def moving(made: ControllerFactory, *key: object) -> Reading:
-    """A state near the start, in motion."""
-    generator, robot = rng(*key), made.setup.robot
-    q = np.array(pin.integrate(robot.model, made.setup.q, 0.02 * generator.normal(size=robot.nv)))
+def moving(factory: ControllerFactory, *key: object) -> Reading:
+    """Return a moving state near the start."""
+    generator, robot = rng(*key), factory.setup.robot
+    q = np.array(pin.integrate(robot.model, factory.setup.q, 0.02 * generator.normal(size=robot.nv)))
     return Reading(0.5, q, 0.3 * generator.normal(size=robot.nv), None)
 
 
@@ -43,87 +43,87 @@ def moving(made: ControllerFactory, *key: object) -> Reading:
 
 
 @pytest.mark.parametrize("name", SHIPPED)
-def test_the_spring_is_the_terms_by_another_route(name: str) -> None:
-    made = factory(name)
-    robot, objective, q = made.setup.robot, made.objective(), made.setup.q
-    # The oracle's gradients, differentiated with a larger step and to fourth order.
+def test_the_spring_of_the_term_is_its_hessian(name: str) -> None:
+    factory = shared_factory(name)
+    robot, objective, q = factory.setup.robot, factory.objective(), factory.setup.q
+    # Differences of the gradients of the oracle, with a larger step and to fourth order.
     hessian = central_gradient(objective.gradient, robot.model, q, 1e-3)
     joints = (hessian + hessian.T)[6:, 6:] / 2
     values, vectors = np.linalg.eigh(joints)
     expected = np.zeros((robot.nv, robot.nv))
     expected[6:, 6:] = (vectors * np.maximum(values, 0)) @ vectors.T
-    found = spring_of_term(robot, made.gradient(), q, 1.0)
-    np.testing.assert_allclose(found, expected, atol=1e-3 * np.abs(values).max())
-    np.testing.assert_array_equal(found, found.T)
-    assert np.linalg.eigvalsh(found)[0] > -1e-9 * np.abs(values).max()
+    spring = spring_of_term(robot, factory.gradient(), q, 1.0)
+    np.testing.assert_allclose(spring, expected, atol=1e-3 * np.abs(values).max())
+    np.testing.assert_array_equal(spring, spring.T)
+    assert np.linalg.eigvalsh(spring)[0] > -1e-9 * np.abs(values).max()
 
 
 @pytest.mark.parametrize("name", ["aerial-vertical", "solo8-push"])
-def test_stiff_has_the_spring_that_robust_is_where_it_rests(name: str) -> None:
-    made = factory(name)
-    robust, setup = made.driver("robust"), made.setup
+def test_stiff_has_the_spring_of_robust_at_rest(name: str) -> None:
+    factory = shared_factory(name)
+    robust, setup = factory.driver("robust"), factory.setup
     assert isinstance(robust, RobustDriver)
     reached = resting_posture(robust, setup.scenario.task.settle)
-    # Another posture than the start, and with less H.
-    assert made.objective().value(reached) < made.objective().value(setup.q)
-    posture, control = made.driver("stiff").posture, setup.scenario.control
+    # The posture differs from the start and has a smaller H.
+    assert factory.objective().value(reached) < factory.objective().value(setup.q)
+    posture, control = factory.driver("stiff").posture, setup.scenario.control
     assert posture.stiffness is not None
     assert posture.damping is not None
-    spring = spring_of_term(setup.robot, made.gradient(), reached, control.robust.gain / robust.posture.scale)
+    spring = spring_of_term(setup.robot, factory.gradient(), reached, control.robust.gain / robust.posture.scale)
     np.testing.assert_allclose(posture.stiffness, np.diag(posture.kp) + spring, rtol=1e-9, atol=1e-9)
-    # Critical in every direction at once: (s + K^½)² = s² + D s + K.
+    # The damping is critical in every direction: (s + K^½)² = s² + D s + K.
     np.testing.assert_allclose(posture.damping @ posture.damping / 4, posture.stiffness, rtol=1e-9, atol=1e-9)
 
 
 # ---- posture-sticking ------------------------------------------------------------------------------------------
 
 
-def test_the_offline_posture_of_S_is_met_at_the_surface() -> None:
+def test_the_offline_posture_of_S_is_reached_at_the_surface() -> None:
     setup = set_up(read_scenario("solo12-landing"))
-    made = ControllerFactory(setup, starts=1)
-    optimum, sticking = made.offline("posture-sticking"), made.objective("sticking").value
-    assert optimum is not None and made.offline("nominal") is None
-    there = resting_posture(made.driver("posture-sticking"), 3.0, ahead=setup.gap)
-    # Where the foot starts, the robot cannot be in that posture.
-    here = resting_posture(made.driver("posture-sticking"), 3.0)
+    factory = ControllerFactory(setup, starts=1)
+    optimum, sticking = factory.offline("posture-sticking"), factory.objective("sticking").value
+    assert optimum is not None and factory.offline("nominal") is None
+    there = resting_posture(factory.driver("posture-sticking"), 3.0, ahead=setup.gap)
+    # With the foot at its start, the robot cannot reach this posture.
+    here = resting_posture(factory.driver("posture-sticking"), 3.0)
     away = [np.linalg.norm(pin.difference(setup.robot.model, q, optimum.q)) for q in (there, here)]
     assert away[0] < 0.01 < away[1]
     assert sticking(there) == pytest.approx(optimum.objective, rel=0.01)
-    assert sticking(there) < 0.6 * sticking(resting_posture(made.driver("nominal"), 3.0, ahead=setup.gap))
+    assert sticking(there) < 0.6 * sticking(resting_posture(factory.driver("nominal"), 3.0, ahead=setup.gap))
 
 
 # ---- robust-release -----------------------------------------------------------------------------------------------
 
 
-def test_without_the_spring_the_posture_goes_further_and_is_held_there(monkeypatch: pytest.MonkeyPatch) -> None:
-    made = factory("aerial-vertical")
-    value, setup = made.objective().value, made.setup
-    monkeypatch.setattr(made, "starts", 1)
-    driver = made.driver("robust-release")
+def test_robust_release_moves_further_and_holds(monkeypatch: pytest.MonkeyPatch) -> None:
+    factory = shared_factory("aerial-vertical")
+    value, setup = factory.objective().value, factory.setup
+    monkeypatch.setattr(factory, "starts", 1)
+    driver = factory.driver("robust-release")
     assert isinstance(driver, ReleaseDriver)
     reached = resting_posture(driver, 6.0)
     assert driver.level == 0
     assert not driver.posture.activation.live
-    assert value(reached) < 0.5 * value(resting_posture(made.driver("robust"), 3.0))
-    assert value(reached) < 1.05 * value(made.offline().q)
-    # What is held is the posture, as the term left it.
+    assert value(reached) < 0.5 * value(resting_posture(factory.driver("robust"), 3.0))
+    assert value(reached) < 1.05 * value(factory.offline().q)
+    # The held posture is the posture that the term has reached.
     away = pin.difference(setup.robot.model, reached, driver.posture.target)[6:]
     assert np.abs(away).max() < 0.02
     driver.reset(setup.q)
     assert driver.level == 0
-    assert driver.posture.scale >= made.driver("robust").posture.scale
+    assert driver.posture.scale >= factory.driver("robust").posture.scale
 
 
 @pytest.mark.parametrize("name", ["aerial-lateral", "solo8-push"])
-def test_a_stiffened_posture_is_a_spring_and_a_damper(name: str) -> None:
-    made = factory(name)
-    driver = made.driver("nominal")
-    driver.reset(made.setup.q)
-    root = rng(name, "root").normal(size=(made.setup.robot.nv,) * 2)
+def test_a_stiffened_posture_task_is_a_spring_and_a_damper(name: str) -> None:
+    factory = shared_factory(name)
+    driver = factory.driver("nominal")
+    driver.reset(factory.setup.q)
+    root = rng(name, "root").normal(size=(factory.setup.robot.nv,) * 2)
     driver.posture.stiffen(root @ root.T)
-    reading, state = moving(made, name, "spring"), driver.controller.state
+    reading, state = moving(factory, name, "spring"), driver.controller.state
     state.update(reading.q, reading.v)
-    away = pin.difference(made.setup.robot.model, reading.q, made.setup.q)
+    away = pin.difference(factory.setup.robot.model, reading.q, factory.setup.q)
     K, D = driver.posture.stiffness, driver.posture.damping
     assert K is not None
     assert D is not None
@@ -132,9 +132,9 @@ def test_a_stiffened_posture_is_a_spring_and_a_damper(name: str) -> None:
 
 
 @pytest.mark.parametrize("name", ["aerial-vertical", "talos-push"])
-def test_the_resting_posture_is_where_the_simulated_robot_goes(name: str) -> None:
-    made = factory(name)
-    driver, world, q = made.driver("robust"), made.setup.world, made.setup.q
+def test_the_simulated_robot_reaches_the_resting_posture(name: str) -> None:
+    factory = shared_factory(name)
+    driver, world, q = factory.driver("robust"), factory.setup.world, factory.setup.q
     predicted = resting_posture(driver, 0.6)
     command = driver.reset(q)
     world.reset(q, rotor_speed=command.rotor_speed)
@@ -143,99 +143,94 @@ def test_the_resting_posture_is_where_the_simulated_robot_goes(name: str) -> Non
         command = driver.tick(world.read())
         world.step(command, round(1e-3 / world.timestep))
     joints = slice(6, None)
-    moved = pin.difference(made.setup.robot.model, q, predicted)[joints]
-    missed = pin.difference(made.setup.robot.model, world.truth().q, predicted)[joints]
+    moved = pin.difference(factory.setup.robot.model, q, predicted)[joints]
+    missed = pin.difference(factory.setup.robot.model, world.truth().q, predicted)[joints]
     assert np.linalg.norm(missed) < 0.15 * np.linalg.norm(moved)
 
 
 # ---- walker -------------------------------------------------------------------------------------------------------
 
 
-def walk(name: str, seconds: float) -> tuple[WalkerDriver, Any, list[Any], list[Vector]]:
-    """Let it flow; the driver, the world, states and steps of the reference at every tick."""
-    made = factory(name)
-    driver, world = made.driver("walker"), made.setup.world
+def walk(name: str, seconds: float) -> tuple[WalkerDriver, Any, Vector]:
+    """Run `walker`; return the driver, the world, and the last velocity of its reference."""
+    factory = shared_factory(name)
+    driver, world = factory.driver("walker"), factory.setup.world
     assert isinstance(driver, WalkerDriver)
-    command = driver.reset(made.setup.q)
-    world.reset(made.setup.q, rotor_speed=command.rotor_speed)
-    count, period = round(1e-3 / world.timestep), made.setup.scenario.control.period
-    readings, flows = [], []
+    command = driver.reset(factory.setup.q)
+    world.reset(factory.setup.q, rotor_speed=command.rotor_speed)
+    count, period = round(1e-3 / world.timestep), factory.setup.scenario.control.period
     driver.brace()
     for _ in range(round(seconds / period)):
         before = driver.posture.target.copy()
-        reading = world.read()
-        command = driver.tick(reading)
-        flows.append(pin.difference(made.setup.robot.model, before, driver.posture.target) / period)
-        readings.append(reading)
+        command = driver.tick(world.read())
         world.step(ActuatorCommand(command.torque, command.rotor_speed), count)
-    return driver, world, readings, flows
+    return driver, world, pin.difference(factory.setup.robot.model, before, driver.posture.target) / period
 
 
 @pytest.mark.parametrize("name", SHIPPED)
-def test_the_flow_lies_in_what_the_other_tasks_leave_and_lowers_the_metric(name: str) -> None:
-    driver, world, _, flows = walk(name, 0.5)
-    made, assembly, state = factory(name), driver.controller.assembly, driver.controller.state
-    flow = flows[-1]
+def test_the_flow_is_free_of_other_tasks_and_lowers_the_metric(name: str) -> None:
+    driver, world, flow = walk(name, 0.5)
+    factory, assembly, state = shared_factory(name), driver.controller.assembly, driver.controller.state
     assert np.linalg.norm(flow) > 1e-3
     rows = np.vstack([assembly.contacts.J, assembly.strict.J, assembly.weighted.J])
     rank = np.linalg.matrix_rank(rows, tol=1e-6 * np.linalg.norm(rows, 2))
     if rank == state.nv:
-        # Tasks by weight leave nothing: then it is what contacts and strict levels leave.
+        # If the weighted tasks leave no motion free, the flow is free of contacts and strict levels.
         rows = np.vstack([assembly.contacts.J, assembly.strict.J])
-    # The projector is renewed every fifth tick, within which the robot goes on.
+    # The projector is updated every fifth tick only.
     assert np.linalg.norm(rows @ flow) < 0.02 * np.linalg.norm(rows, 2) * np.linalg.norm(flow)
-    objective = made.objective()
+    objective = factory.objective()
     assert objective.gradient(state.q) @ flow < 0
-    assert objective.value(world.truth().q) < objective.value(made.setup.q) * (1 - 2e-3)
+    assert objective.value(world.truth().q) < objective.value(factory.setup.q) * (1 - 2e-3)
 
 
 def test_the_flow_is_the_projected_gradient() -> None:
-    made = factory("aerial-vertical")
-    driver = made.driver("walker")
+    factory = shared_factory("aerial-vertical")
+    driver = factory.driver("walker")
     assert isinstance(driver, WalkerDriver)
-    driver.reset(made.setup.q)
+    driver.reset(factory.setup.q)
     driver.brace()
-    control = made.setup.scenario.control
-    q, v = made.setup.q, np.zeros(9)
+    control = factory.setup.scenario.control
+    q, v = factory.setup.q, np.zeros(9)
     for k in range(400):
-        # The robot is held where it is: only the reference flows.
+        # The robot stays in place and only the reference flows.
         last = driver.posture.target.copy()
         driver.tick(Reading(1e-3 * k, q, v, None))
     assert driver.level == 1
-    J = np.vstack([np.eye(2, 9, 3), frame_jacobian(made.setup.robot.model, q, made.setup.robot.frame_id("ee"))])
+    J = np.vstack([np.eye(2, 9, 3), frame_jacobian(factory.setup.robot.model, q, factory.setup.robot.frame_id("ee"))])
     Z = np.linalg.svd(J)[2][8:].T
     assert Z.shape == (9, 1)
-    term = -control.robust.gain / driver.posture.scale * made.objective().gradient(q)
-    # Not further than K times its reach.
+    term = -control.robust.gain / driver.posture.scale * factory.objective().gradient(q)
+    # The term is bounded by K times its reach.
     bound = control.robust.gain * driver.posture.reach
     term *= min(1.0, bound / np.linalg.norm(term))
     expected = Z @ (Z.T @ term) / control.posture.kd
-    found = pin.difference(made.setup.robot.model, last, driver.posture.target) / 1e-3
-    np.testing.assert_allclose(found, expected, rtol=1e-5, atol=1e-6)
+    flow = pin.difference(factory.setup.robot.model, last, driver.posture.target) / 1e-3
+    np.testing.assert_allclose(flow, expected, rtol=1e-5, atol=1e-6)
 
 
-def test_without_being_asked_nothing_flows() -> None:
-    made = factory("aerial-vertical")
-    driver = made.driver("walker")
-    driver.reset(made.setup.q)
+def test_the_posture_does_not_flow_before_brace() -> None:
+    factory = shared_factory("aerial-vertical")
+    driver = factory.driver("walker")
+    driver.reset(factory.setup.q)
     for k in range(50):
-        driver.tick(Reading(1e-3 * k, made.setup.q, np.zeros(9), None))
-    np.testing.assert_array_equal(driver.posture.target, made.setup.q)
+        driver.tick(Reading(1e-3 * k, factory.setup.q, np.zeros(9), None))
+    np.testing.assert_array_equal(driver.posture.target, factory.setup.q)
 
 
 # ---- invariant ----------------------------------------------------------------------------------------------------
 
 
 def invariant(name: str) -> InvariantDriver:
-    driver = factory(name).driver("invariant")
+    driver = shared_factory(name).driver("invariant")
     assert isinstance(driver, InvariantDriver)
-    driver.reset(factory(name).setup.q)
+    driver.reset(shared_factory(name).setup.q)
     return driver
 
 
 def impulses(name: str, q: Vector) -> Vector:
-    """``M⁻¹Jᵀ`` of the impact, feet holding exactly, shape (nv, 3); from raw Pinocchio."""
-    setup = factory(name).setup
+    """Return ``M⁻¹Jᵀ`` of the impact with fixed feet, shape (nv, 3), from raw Pinocchio."""
+    setup = shared_factory(name).setup
     model, frame = setup.robot.model, setup.scenario.task.frame
     M = mass_matrix(model, q)
     J = frame_jacobian(model, q, setup.robot.frame_id(frame))[:3]
@@ -255,18 +250,18 @@ def leading(driver: InvariantDriver) -> list[Task]:
 
 
 @pytest.mark.parametrize("name", SHIPPED)
-def test_what_an_impulse_does_is_invisible_and_nothing_else(name: str) -> None:
-    made, driver = factory(name), invariant(name)
+def test_the_correction_removes_velocities_of_impulses_only(name: str) -> None:
+    factory, driver = shared_factory(name), invariant(name)
     generator = rng(name, "impulse")
-    quiet = moving(made, name, "invariant")
+    quiet = moving(factory, name, "invariant")
     quiet = Reading(quiet.t, quiet.q, np.zeros_like(quiet.v), None)
     change = impulses(name, quiet.q)
     for _ in range(5):
         impact = change @ generator.normal(size=3)
         correction = driver._correction(Reading(quiet.t, quiet.q, impact, None))
-        # What the feedback sees is rest.
+        # The corrected velocity is zero.
         np.testing.assert_allclose(impact + correction, 0, atol=1e-6 * np.abs(impact).max())
-    # A motion that no impulse makes better: the tasks' errors stand square on what an impulse can do to them.
+    # A motion that no impulse improves, because the task errors are orthogonal to the effect of impulses.
     state = driver._state.update(quiet.q, quiet.v)
     J = np.vstack([task.jacobian(state) for task in leading(driver)])
     v = generator.normal(size=quiet.v.size)
@@ -280,64 +275,58 @@ def test_what_an_impulse_does_is_invisible_and_nothing_else(name: str) -> None:
 
 @pytest.mark.parametrize("name", ["aerial-vertical", "talos-push"])
 def test_the_invariant_part_of_a_velocity_is_kept(name: str) -> None:
-    made, driver = factory(name), invariant(name)
-    reading = moving(made, name, "kept")
-    # The null space of J M⁻¹: what no impulse changes.
+    factory, driver = shared_factory(name), invariant(name)
+    reading = moving(factory, name, "kept")
+    # Impulses do not change the null space of J M⁻¹.
     kept = np.linalg.svd(impulses(name, reading.q).T)[2][3:]
     correction = driver._correction(reading)
     np.testing.assert_allclose(kept @ (reading.v + correction), kept @ reading.v, atol=1e-9)
     assert np.linalg.norm(correction) > 1e-3
 
 
-def test_the_approach_is_no_velocity_error() -> None:
-    # On its way in the end effector moves as it is asked to: nothing may be taken for the work of an impulse.
-    made = factory("aerial-vertical")
-    task = made.setup.scenario.task
+def test_the_approach_is_not_a_velocity_error() -> None:
+    # During the approach, the end effector follows its reference, so the correction is zero.
+    factory = shared_factory("aerial-vertical")
+    task = factory.setup.scenario.task
     assert isinstance(task, RepeatedContacts)
-    reference, driver = Reference(task, made.setup.gap), invariant("aerial-vertical")
+    reference, driver = Reference(task, factory.setup.gap), invariant("aerial-vertical")
     point = reference.at(task.settle + 0.4)
     assert point.speed == pytest.approx(0.5)
     v = np.zeros(9)
     v[2] = -point.speed
     driver._follow(point)
-    assert np.abs(driver._correction(Reading(0.5, made.setup.q, v, None))).max() < 1e-9
+    assert np.abs(driver._correction(Reading(0.5, factory.setup.q, v, None))).max() < 1e-9
 
 
-def test_when_it_is_on() -> None:
+def test_the_correction_is_active_around_the_impact() -> None:
     driver = invariant("aerial-vertical")
     assert driver.share(1.0) == 0
     driver.expect(1.0)
-    for t, level in (
-        (0.949, 0),
-        (0.98, 1),
-        (1.0, 1),
-        (1.049, 1 - np.exp(-0.4)),
-        (0.951, 1 - np.exp(-0.4)),
-        (1.051, 0),
-    ):
+    edge = 1 - np.exp(-0.4)
+    for t, level in ((0.949, 0), (0.98, 1), (1.0, 1), (1.049, edge), (0.951, edge), (1.051, 0)):
         assert driver.share(t) == pytest.approx(level, abs=1e-3), t
-    driver.reset(factory("aerial-vertical").setup.q)
+    driver.reset(shared_factory("aerial-vertical").setup.q)
     assert driver.share(1.0) == 0
 
 
 def test_only_the_feedback_is_corrected() -> None:
-    made, driver = factory("aerial-vertical"), invariant("aerial-vertical")
-    reading = moving(made, "feedback")
+    factory, driver = shared_factory("aerial-vertical"), invariant("aerial-vertical")
+    reading = moving(factory, "feedback")
     driver.expect(reading.t)
     driver.tick(reading)
-    # The dynamics are those of the measured velocity.
+    # The dynamics use the measured velocity.
     np.testing.assert_array_equal(driver.controller.state.v, reading.v)
     seen = reading.v + driver.share(reading.t) * driver._correction(reading)
     state, posture = driver.controller.state, driver.posture
-    away = pin.difference(made.setup.robot.model, reading.q, made.setup.q)
+    away = pin.difference(factory.setup.robot.model, reading.q, factory.setup.q)
     driver._lead(None)
     driver._command(reading, seen - reading.v)
     np.testing.assert_allclose(posture.desired(state), posture.kp * away - posture.kd * seen, atol=1e-9)
 
 
-def test_an_impact_that_is_felt_sets_the_time_once() -> None:
-    made, driver = factory("aerial-vertical"), invariant("aerial-vertical")
-    q, v = made.setup.q, np.zeros(9)
+def test_a_felt_impact_sets_the_time_once() -> None:
+    factory, driver = shared_factory("aerial-vertical"), invariant("aerial-vertical")
+    q, v = factory.setup.q, np.zeros(9)
     driver.expect(1.0)
     for t, force, expected in ((0.7, 50, 1.0), (0.9, 2, 1.0), (0.95, 50, 0.95), (0.97, 50, 0.95)):
         driver.tick(Reading(t, q, v, np.array([0.0, 0.0, force])))
@@ -348,13 +337,13 @@ def test_an_impact_that_is_felt_sets_the_time_once() -> None:
 
 
 @pytest.mark.parametrize("name", ["aerial-vertical", "solo8-push"])
-def test_outside_its_time_the_command_is_nominals_bit_for_bit(name: str) -> None:
-    made, driver, nominal = factory(name), invariant(name), factory(name).driver("nominal")
-    nominal.reset(made.setup.q)
+def test_away_from_the_impact_the_command_equals_nominal(name: str) -> None:
+    factory, driver, nominal = shared_factory(name), invariant(name), shared_factory(name).driver("nominal")
+    nominal.reset(factory.setup.q)
     driver.expect(0.3)
     other = 0
     for k in range(500):
-        t, still = 1e-3 * k, moving(made, name, "bits", k)
+        t, still = 1e-3 * k, moving(factory, name, "bits", k)
         reading = Reading(t, still.q, 0.1 * still.v, None)
         a, b = driver.tick(reading).u, nominal.tick(reading).u
         if abs(t - 0.3) < 0.0499:

@@ -1,4 +1,4 @@
-"""A program in C++ that runs an exported controller in an exported world, beside ``simulate``."""
+"""C++ program that runs an exported controller in an exported world, compared with ``simulate``."""
 
 from __future__ import annotations
 
@@ -29,7 +29,7 @@ EXAMPLE = Path(__file__).parents[2] / "docs" / "examples" / "cpp" / "closed_loop
 
 
 def quiet(name: str) -> Setup:
-    """Return a shipped scenario with sensors that have no noise, one contact and a short wait."""
+    """Set up a shipped scenario with sensors without noise, one contact and a short wait."""
     scenario = read_scenario(name)
     sensors = scenario.sensors
     sensors = Sensors(force_frame=sensors.force_frame, force_cutoff=sensors.force_cutoff, delay=0.001)
@@ -39,8 +39,8 @@ def quiet(name: str) -> Setup:
     return set_up(replace(scenario, sensors=sensors, push=push))
 
 
-@pytest.mark.parametrize(("name", "leads", "band"), [("aerial-vertical", "1", 1e-3), ("talos-push", "", 1e-6)])
-def test_the_program_measures_what_simulate_does(name: str, leads: str, band: float, tmp_path: Path) -> None:
+@pytest.mark.parametrize(("name", "leads", "band"), [("aerial-vertical", "1", 1e-3), ("solo8-push", "", 1e-6)])
+def test_the_program_agrees_with_simulate(name: str, leads: str, band: float, tmp_path: Path) -> None:
     need("g++")
     need("make")
     setup = quiet(name)
@@ -51,18 +51,18 @@ def test_the_program_measures_what_simulate_does(name: str, leads: str, band: fl
     mujoco = find_spec("mujoco")
     assert mujoco is not None
     assert mujoco.origin is not None
-    made = [f"CONTROLLER={tmp_path / 'controller'}", f"MUJOCO={Path(mujoco.origin).parent}", f"OUT={program}"]
+    variables = [f"CONTROLLER={tmp_path / 'controller'}", f"MUJOCO={Path(mujoco.origin).parent}", f"OUT={program}"]
     strict = "CXXFLAGS=-O1 -Wall -Wextra -Wpedantic -Werror"
-    subprocess.run(["make", "-s", "-C", EXAMPLE, *made, f"LEADS={leads}", strict], check=True)
-    found = subprocess.run([program, tmp_path / "world"], check=True, capture_output=True, text=True).stdout
-    printed = dict(line.split(" ", 1) for line in found.splitlines())
-    (one,) = run(ControllerFactory(setup), "nominal", only=1 if setup.scenario.push else None)
-    wanted = measure(setup, one)
+    subprocess.run(["make", "-s", "-C", EXAMPLE, *variables, f"LEADS={leads}", strict], check=True)
+    output = subprocess.run([program, tmp_path / "world"], check=True, capture_output=True, text=True).stdout
+    printed = dict(line.split(" ", 1) for line in output.splitlines())
+    (record,) = run(ControllerFactory(setup), "nominal", only=1 if setup.scenario.push else None)
+    wanted = measure(setup, record)
     for key in ("q_total_impact", "peak_jump", *(["peak_force"] if setup.scenario.contacts else [])):
         assert float(printed[key]) == pytest.approx(getattr(wanted, key), rel=band), key
     assert printed["contacts"] == "1 of 1"
     assert printed["ticks"].startswith(
-        f"{one.series.t.size} relaxed {wanted.relaxed_ticks} held {wanted.failed_ticks}"
+        f"{record.series.t.size} relaxed {wanted.relaxed_ticks} held {wanted.failed_ticks}"
     )
 
 

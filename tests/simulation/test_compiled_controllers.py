@@ -1,4 +1,4 @@
-"""Controllers that run as C in a simulation: the runs of Python, and when they are built."""
+"""Controllers in C in a simulation: comparison with Python, and when they are built."""
 
 from __future__ import annotations
 
@@ -20,44 +20,44 @@ from impact_posture.simulation.scenario_objective import interpreted
 from impact_posture.simulation.setup import set_up
 from impact_posture.simulation.world.sensor_noise import Reading
 from impact_posture.system.libraries import cache_path
-from tests.simulation.factories import driven, factory, needs_mujoco
+from tests.simulation.factories import driven, needs_mujoco, shared_factory
 from tests.support.daqp import sources_or_skip
 
-# Totals of Python's run and of C's: a wall amplifies the last digits, the ground does not.
+# Relative differences between Python and C.  A wall amplifies the last digits, the ground does not.
 BANDS = {"solo8-push": 1e-6, "aerial-vertical": 2e-2}
 
 
 @pytest.fixture(scope="module", autouse=True)
 def _built(tmp_path_factory: pytest.TempPathFactory) -> Any:
-    """A cache of these tests alone, in which compilers do not optimize."""
+    """Use a separate cache, in which compilers do not optimize."""
     needs_mujoco()
     sources_or_skip()
     with pytest.MonkeyPatch.context() as patch:
         patch.setenv("CFLAGS", "-O0")
-        own, used = tmp_path_factory.mktemp("cache"), cache_path()
+        cache, used = tmp_path_factory.mktemp("cache"), cache_path()
         for file in used.glob("daqp-*"):
-            shutil.copy(file, own)
-        patch.setenv("IMPACT_POSTURE_CACHE", str(own))
+            shutil.copy(file, cache)
+        patch.setenv("IMPACT_POSTURE_CACHE", str(cache))
         yield
 
 
 def in_c(name: str, **options: Any) -> ControllerFactory:
-    return replace(factory(name), **{"compile": "always", "warnings": [], "_fault": "", **options})
+    return replace(shared_factory(name), **{"compile": "always", "warnings": [], "_fault": "", **options})
 
 
 @pytest.mark.parametrize(
     ("name", "controller", "mode"), [("solo8-push", "robust", "held"), ("aerial-vertical", "nominal", "live")]
 )
-def test_a_run_in_c_is_that_of_python(name: str, controller: str, mode: Any) -> None:
-    made = in_c(name)
-    assert isinstance(made.driver(controller, mode).compiled, CompiledTick)
-    ours, theirs = driven(factory(name), controller, mode=mode), driven(made, controller, mode=mode)
-    wanted, found = (measure(made.setup, one) for one in (ours, theirs))
-    assert found.q_total_impact == pytest.approx(wanted.q_total_impact, rel=BANDS[name])
-    assert found.peak_jump == pytest.approx(wanted.peak_jump, rel=BANDS[name])
-    assert (found.contacts, found.failed_ticks) == (wanted.contacts, wanted.failed_ticks)
+def test_a_run_in_c_agrees_with_python(name: str, controller: str, mode: Any) -> None:
+    factory = in_c(name)
+    assert isinstance(factory.driver(controller, mode).compiled, CompiledTick)
+    ours, theirs = driven(shared_factory(name), controller, mode=mode), driven(factory, controller, mode=mode)
+    wanted, compiled = (measure(factory.setup, record) for record in (ours, theirs))
+    assert compiled.q_total_impact == pytest.approx(wanted.q_total_impact, rel=BANDS[name])
+    assert compiled.peak_jump == pytest.approx(wanted.peak_jump, rel=BANDS[name])
+    assert (compiled.contacts, compiled.failed_ticks) == (wanted.contacts, wanted.failed_ticks)
     np.testing.assert_array_equal(ours.series.level, theirs.series.level)
-    # Until the impact, both are the same to rounding.
+    # Until the impact, they differ by rounding only.
     calm = slice(0, 300)
     np.testing.assert_allclose(theirs.series.q[calm], ours.series.q[calm], rtol=0, atol=1e-9)
     np.testing.assert_allclose(theirs.series.torque[calm], ours.series.torque[calm], rtol=0, atol=1e-7)
@@ -71,43 +71,43 @@ def test_robots_that_differ_in_armature_and_mounting_share_the_library() -> None
         armature={"shoulder_pitch": 0.01, "elbow_pitch": 0.02},
         mounting={"shoulder_roll": (x + 0.01, y, z + 0.02)},
     )
-    made = [in_c("aerial-vertical"), ControllerFactory(set_up(other), compile="always", gradient_of=interpreted)]
-    there: list[set[Path]] = []
+    factories = [in_c("aerial-vertical"), ControllerFactory(set_up(other), compile="always", gradient_of=interpreted)]
+    folders: list[set[Path]] = []
     values: list[float] = []
-    for each in made:
+    for each in factories:
         driver = each.driver("robust")
         assert driver.compiled is not None
-        there.append(set((cache_path() / "controllers").iterdir()))
+        folders.append(set((cache_path() / "controllers").iterdir()))
         q, v = each.setup.q, np.full(each.setup.robot.nv, 0.01)
         driver.reset(q)
         driver.brace()
         driver.posture.brace()
         for t in 0.001 * np.arange(6):
-            wanted, found = driver.controller.tick(t, q, v), driver.compiled.tick(Reading(t, q, v, None))
-            np.testing.assert_allclose(found.u, wanted.u, rtol=1e-9, atol=1e-9)
-            np.testing.assert_allclose(found.acceleration, wanted.acceleration, rtol=1e-9, atol=1e-9)
+            wanted, command = driver.controller.tick(t, q, v), driver.compiled.tick(Reading(t, q, v, None))
+            np.testing.assert_allclose(command.u, wanted.u, rtol=1e-9, atol=1e-9)
+            np.testing.assert_allclose(command.acceleration, wanted.acceleration, rtol=1e-9, atol=1e-9)
         values.append(driver.compiled.library.report().objective)
         assert values[-1] == pytest.approx(driver.posture.value, rel=1e-12)
     assert values[0] != pytest.approx(values[1], rel=0.1)
-    assert there[0] == there[1]
+    assert folders[0] == folders[1]
 
 
-def test_auto_builds_where_it_can_and_a_job_says_so_where_its_runs_pay_for_it() -> None:
+def test_auto_compiles_from_two_runs_on() -> None:
     assert [worth_compiling("auto", runs) for runs in (1, 2, 3)] == ["never", "auto", "auto"]
     assert (worth_compiling("always", 1), worth_compiling("never", 9)) == ("always", "never")
     assert in_c("solo8-push", compile="never").driver("robust").compiled is None
-    made = in_c("solo8-push", compile="auto")
-    assert made.driver("robust").compiled is not None and made.in_c
-    # Looks into its controller.
-    assert made.driver("walker").compiled is None and not made.in_c
+    factory = in_c("solo8-push", compile="auto")
+    assert factory.driver("robust").compiled is not None and factory.in_c
+    # `walker` reads the state of its controller, so it runs in Python.
+    assert factory.driver("walker").compiled is None and not factory.in_c
 
 
-def test_a_document_says_that_c_computed_the_ticks() -> None:
+def test_the_document_names_the_language() -> None:
     _, document = execute(Job("solo8-push", "robust", sign=1, compile="always"), in_c("solo8-push"))
     assert document["language"] == "C"
 
 
-def test_what_cannot_run_in_c_is_named_or_runs_in_python(monkeypatch: pytest.MonkeyPatch) -> None:
+def test_controllers_that_cannot_run_in_c(monkeypatch: pytest.MonkeyPatch) -> None:
     with pytest.raises(InputError, match="'walker' has no C code"):
         in_c("solo8-push").driver("walker")
     with pytest.raises(InputError, match="no mode 'sometimes'"):
@@ -115,10 +115,10 @@ def test_what_cannot_run_in_c_is_named_or_runs_in_python(monkeypatch: pytest.Mon
     monkeypatch.setenv("CC", "false")
     with pytest.raises(CompilerError):
         in_c("solo8-push").driver("nominal")
-    made = in_c("solo8-push", compile="auto")
-    assert made.driver("nominal").compiled is None
-    (warning,) = made.warnings
+    factory = in_c("solo8-push", compile="auto")
+    assert factory.driver("nominal").compiled is None
+    (warning,) = factory.warnings
     assert warning.startswith("the controller runs in Python")
-    # Once is enough.
-    assert made.driver("nominal").compiled is None
-    assert made.warnings == []
+    # The failed build is not repeated.
+    assert factory.driver("nominal").compiled is None
+    assert factory.warnings == []

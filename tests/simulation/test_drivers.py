@@ -1,4 +1,4 @@
-"""Drivers: what each does before the impact, what it holds, and what it leaves behind."""
+"""Drivers before the impact, while they hold a posture, and after a reset."""
 
 from __future__ import annotations
 
@@ -19,7 +19,7 @@ from impact_posture.simulation.controllers.task_formulations import nominal_post
 from impact_posture.simulation.world.actuator_command import ActuatorCommand
 from impact_posture.tsid.tasks.body_tasks import BaseOrientation, CenterOfMass
 from impact_posture.tsid.tasks.frame_tasks import FramePose
-from tests.simulation.factories import AERIAL, PUSHES, SHIPPED, factory, needs_mujoco
+from tests.simulation.factories import AERIAL, PUSHES, SHIPPED, needs_mujoco, shared_factory
 
 
 @pytest.fixture(scope="module", autouse=True)
@@ -28,11 +28,11 @@ def _mujoco() -> None:
 
 
 class Stage:
-    """A driver in its world, without reference and recorder."""
+    """Driver in its world, without reference and recorder."""
 
-    def __init__(self, made: ControllerFactory, driver: Driver, seed: int = 0) -> None:
-        setup = made.setup
-        self.made, self.driver, self.world = made, driver, setup.world
+    def __init__(self, factory: ControllerFactory, driver: Driver, seed: int = 0) -> None:
+        setup = factory.setup
+        self.factory, self.driver, self.world = factory, driver, setup.world
         command = driver.reset(setup.q)
         self.world.reset(setup.q, seed=seed, rotor_speed=command.rotor_speed)
         self.count = round(setup.scenario.control.period / self.world.timestep)
@@ -44,23 +44,23 @@ class Stage:
         return self.world.truth()
 
     def moved(self, q: Any) -> float:
-        """Largest way of a joint from the start."""
-        return float(np.abs(pin.difference(self.made.setup.robot.model, self.made.setup.q, q)[6:]).max())
+        """Return the largest distance of a joint from the start."""
+        return float(np.abs(pin.difference(self.factory.setup.robot.model, self.factory.setup.q, q)[6:]).max())
 
     def H(self) -> float:
-        return self.made.objective().value(self.world.truth().q)
+        return self.factory.objective().value(self.world.truth().q)
 
 
 def stage(name: str, controller: str, mode: Mode = "live") -> Stage:
-    made = factory(name)
-    return Stage(made, made.driver(controller, mode))
+    factory = shared_factory(name)
+    return Stage(factory, factory.driver(controller, mode))
 
 
 # ---- before the impact --------------------------------------------------------------------------------------------
 
 
 @pytest.mark.parametrize("name", SHIPPED)
-def test_the_nominal_holds_its_posture_whatever_it_is_told(name: str) -> None:
+def test_nominal_holds_its_posture_after_brace(name: str) -> None:
     play = stage(name, "nominal")
     play.go(0.1)
     play.driver.brace()
@@ -70,8 +70,8 @@ def test_the_nominal_holds_its_posture_whatever_it_is_told(name: str) -> None:
 
 
 @pytest.mark.parametrize("name", SHIPPED)
-def test_the_term_lowers_the_metric_once_it_is_on_and_never_before(name: str) -> None:
-    off, on = stage(name, "robust"), None
+def test_robust_lowers_the_metric_after_brace_only(name: str) -> None:
+    off = stage(name, "robust")
     still = off.go(0.5).q
     assert off.driver.level == 0 and off.moved(still) < 0.02
     idle = off.H()
@@ -80,11 +80,11 @@ def test_the_term_lowers_the_metric_once_it_is_on_and_never_before(name: str) ->
     on.driver.brace()
     on.go(0.45)
     assert on.driver.level == 1
-    # The first half second of the way: how far it gets differs by robot.
+    # Robots differ in how far they move in the first half second.
     assert on.H() < idle * (1 - 2e-3)
 
 
-def test_before_the_term_is_on_robust_is_nominal_bit_for_bit() -> None:
+def test_robust_equals_nominal_before_brace() -> None:
     for name in ("aerial-vertical", "solo8-push"):
         a, b = stage(name, "nominal").go(0.1), stage(name, "robust").go(0.1)
         np.testing.assert_array_equal(a.q, b.q)
@@ -92,11 +92,11 @@ def test_before_the_term_is_on_robust_is_nominal_bit_for_bit() -> None:
 
 
 @pytest.mark.parametrize("controller", ["robust-speed", "robust-sticking"])
-def test_the_other_gradients_lower_their_own_metric(controller: str) -> None:
+def test_other_gradients_lower_their_metrics(controller: str) -> None:
     kind: Any = controller.removeprefix("robust-")
     play = stage("aerial-vertical", controller)
-    objective = play.made.objective(kind)
-    before = objective.value(play.made.setup.q)
+    objective = play.factory.objective(kind)
+    before = objective.value(play.factory.setup.q)
     play.go(0.1)
     play.driver.brace()
     assert objective.value(play.go(1.0).q) < 0.9 * before
@@ -104,18 +104,18 @@ def test_the_other_gradients_lower_their_own_metric(controller: str) -> None:
 
 def test_all_controllers_share_gains_tasks_and_weights(monkeypatch: pytest.MonkeyPatch) -> None:
     for name in ("aerial-lateral", "talos-push"):
-        made = factory(name)
-        # Formulations do not depend on where posture and path end.
-        monkeypatch.setitem(vars(made), "_optimum", lambda name, q=made.setup.q: SimpleNamespace(q=q))
-        monkeypatch.setitem(vars(made), "path", SimpleNamespace(duration=0.0))
-        nominal = made.driver("nominal").controller.formulation
+        factory = shared_factory(name)
+        # Formulations do not depend on the ends of posture and path.
+        monkeypatch.setitem(vars(factory), "_optimum", lambda name, q=factory.setup.q: SimpleNamespace(q=q))
+        monkeypatch.setitem(vars(factory), "path", SimpleNamespace(duration=0.0))
+        nominal = factory.driver("nominal").controller.formulation
         for controller in CONTROLLERS:
-            formulation = made.driver(controller).controller.formulation
+            formulation = factory.driver(controller).controller.formulation
             assert [t.name for t in formulation.tasks[:-1]] == [t.name for t in nominal.tasks[:-1]]
             for task, other in zip(formulation.tasks, nominal.tasks, strict=True):
                 np.testing.assert_array_equal(task.kp, other.kp)
                 np.testing.assert_array_equal(task.weight, other.weight)
-                # The stiff one is critically damped for a stiffness of its own.
+                # `stiff` is critically damped for another stiffness.
                 if "stiff" not in controller or task is not formulation.posture:
                     np.testing.assert_array_equal(task.kd, other.kd)
             assert [c.friction for c in formulation.contacts] == [c.friction for c in nominal.contacts]
@@ -126,7 +126,7 @@ def test_all_controllers_share_gains_tasks_and_weights(monkeypatch: pytest.Monke
 
 @pytest.mark.parametrize("controller", ["robust", "walker"])
 @pytest.mark.parametrize("name", ["aerial-vertical", *PUSHES])
-def test_held_freezes_posture_center_of_mass_and_base_where_they_are(name: str, controller: str) -> None:
+def test_held_freezes_posture_center_of_mass_and_base(name: str, controller: str) -> None:
     play = stage(name, controller, "held")
     play.go(0.1)
     play.driver.brace()
@@ -143,59 +143,59 @@ def test_held_freezes_posture_center_of_mass_and_base_where_they_are(name: str, 
     play.go(0.4)
     assert driver.level == 0
     target = driver.posture.target
-    way = pin.difference(play.made.setup.robot.model, reached, target)[6:]
-    # What is held is what was measured in the last tick before.
-    assert np.abs(way).max() < 0.01
+    moved = pin.difference(play.factory.setup.robot.model, reached, target)[6:]
+    # The held posture is the measured posture of the tick before.
+    assert np.abs(moved).max() < 0.01
     wanted = [np.array(t.target) for t in driver.controller.formulation.weighted]  # type: ignore[attr-defined]
     last = play.go(1.8 if name in AERIAL else 0.8).q
     np.testing.assert_array_equal(driver.posture.target, target)
     for task, kept in zip(driver.controller.formulation.weighted, wanted, strict=True):
         np.testing.assert_array_equal(task.target, kept)  # type: ignore[attr-defined]
-    assert np.abs(pin.difference(play.made.setup.robot.model, last, target)[6:]).max() < 0.04
+    assert np.abs(pin.difference(play.factory.setup.robot.model, last, target)[6:]).max() < 0.04
 
 
 @pytest.mark.parametrize("controller", ["robust", "walker", "posture"])
-def test_nothing_of_a_run_survives_a_reset(controller: str) -> None:
-    made = factory("solo8-push")
-    goal = np.array(pin.integrate(made.setup.robot.model, made.setup.q, 0.05 * np.ones(14)))
+def test_reset_clears_an_earlier_run(controller: str) -> None:
+    factory = shared_factory("solo8-push")
+    goal = np.array(pin.integrate(factory.setup.robot.model, factory.setup.q, 0.05 * np.ones(14)))
     driver: Driver
     if controller == "posture":
-        driver = PostureDriver(made.setup, nominal_posture(made.setup), goal)
+        driver = PostureDriver(factory.setup, nominal_posture(factory.setup), goal)
     else:
-        driver = made.driver(controller, "held")
-    first = Stage(made, driver).go(0.05)
-    used = Stage(made, driver)
+        driver = factory.driver(controller, "held")
+    first = Stage(factory, driver).go(0.05)
+    used = Stage(factory, driver)
     used.go(0.05)
     driver.brace()
     used.go(0.3)
     driver.hold()
     used.go(0.05)
-    again = Stage(made, driver).go(0.05)
+    again = Stage(factory, driver).go(0.05)
     np.testing.assert_array_equal(first.q, again.q)
     np.testing.assert_array_equal(first.torques, again.torques)
     assert driver.level == 0
 
 
-def test_a_reference_of_the_hand_does_not_survive_a_reset() -> None:
-    made = factory("aerial-vertical")
-    driver = made.driver("nominal")
-    fresh = driver.reset(made.setup.q)
-    made.setup.world.reset(made.setup.q)
-    driver.tick(made.setup.world.read(), ReferencePoint(0.05, 0.5, 1.0))
-    again = driver.reset(made.setup.q)
+def test_reset_clears_the_reference_of_the_end_effector() -> None:
+    factory = shared_factory("aerial-vertical")
+    driver = factory.driver("nominal")
+    fresh = driver.reset(factory.setup.q)
+    factory.setup.world.reset(factory.setup.q)
+    driver.tick(factory.setup.world.read(), ReferencePoint(0.05, 0.5, 1.0))
+    again = driver.reset(factory.setup.q)
     np.testing.assert_array_equal(fresh.u, again.u)
 
 
-def test_the_hand_follows_its_reference_into_the_surface() -> None:
-    made = factory("aerial-lateral")
-    driver = made.driver("nominal")
-    driver.reset(made.setup.q)
-    made.setup.world.reset(made.setup.q)
+def test_the_end_effector_follows_its_reference_into_the_surface() -> None:
+    factory = shared_factory("aerial-lateral")
+    driver = factory.driver("nominal")
+    driver.reset(factory.setup.q)
+    factory.setup.world.reset(factory.setup.q)
     (hand,) = [t for t in driver.controller.formulation.tasks if isinstance(t, FramePose)]
     assert hand.target is not None
     home = hand.target.translation.copy()
-    driver.tick(made.setup.world.read(), ReferencePoint(0.1, 0.3, 0.8))
-    # Against the wall's normal, which is −x.
+    driver.tick(factory.setup.world.read(), ReferencePoint(0.1, 0.3, 0.8))
+    # The motion is against the normal of the wall, which is −x.
     np.testing.assert_allclose(hand.target.translation - home, [0.1, 0, 0], atol=1e-15)
     np.testing.assert_allclose(hand.target_velocity, [0.3, 0, 0, 0, 0, 0])
     np.testing.assert_allclose(hand.target_acceleration, [0.8, 0, 0, 0, 0, 0])
@@ -206,21 +206,21 @@ def test_the_hand_follows_its_reference_into_the_surface() -> None:
 
 @pytest.mark.parametrize("name", ["aerial-lateral", "solo8-push"])
 def test_the_posture_driver_reaches_its_goal(name: str) -> None:
-    made = factory(name)
-    robot = made.setup.robot
-    goal = made.setup.q.copy()
+    factory = shared_factory(name)
+    robot = factory.setup.robot
+    goal = factory.setup.q.copy()
     if name in AERIAL:
         goal[-1] += 0.1
     else:
-        # All legs a tenth further bent: the base comes down, feet stay.
+        # All legs bend by 10 % more: the base moves down and the feet stay.
         goal[7:] *= 1.1
         data = robot.model.createData()
-        pin.framesForwardKinematics(robot.model, data, made.setup.q)
+        pin.framesForwardKinematics(robot.model, data, factory.setup.q)
         foot = robot.frame_id("FL_FOOT")
         before = data.oMf[foot].translation.copy()
         pin.framesForwardKinematics(robot.model, data, goal)
         goal[:3] += before - data.oMf[foot].translation
-    play = Stage(made, PostureDriver(made.setup, nominal_posture(made.setup), goal))
+    play = Stage(factory, PostureDriver(factory.setup, nominal_posture(factory.setup), goal))
     play.go(0.1)
     assert play.driver.level == 0
     play.driver.brace()
@@ -250,8 +250,8 @@ def test_the_posture_driver_reaches_its_goal(name: str) -> None:
         ("solo8-push", {"footing": None}, r"but no \[control.footing\]"),
     ],
 )
-def test_gains_that_no_task_takes_are_refused(name: str, change: dict[str, Any], words: str) -> None:
-    setup = factory(name).setup
+def test_gains_without_a_task_are_refused(name: str, change: dict[str, Any], words: str) -> None:
+    setup = shared_factory(name).setup
     control = replace(setup.scenario.control, **change)
     with pytest.raises(SpecError, match=words) as caught:
         ControllerFactory(replace(setup, scenario=replace(setup.scenario, control=control))).driver("nominal")

@@ -1,4 +1,4 @@
-"""The offline posture of a scenario: its constraints are those of optimize, and the motors hold it with room."""
+"""Offline posture of a scenario: constraints of optimize, and load of the motors."""
 
 from __future__ import annotations
 
@@ -25,22 +25,22 @@ needs_mujoco()
 
 
 @pytest.mark.parametrize("name", ["aerial-vertical", "aerial-lateral", "solo8-push"])
-def test_it_keeps_what_optimize_demands(name: str) -> None:
+def test_the_posture_satisfies_the_constraints_of_optimize(name: str) -> None:
     setup = set_up(read_scenario(name))
     objective = scenario_objective(setup)
-    found, demands = offline_posture(setup, objective, starts=3), scenario_requirements(setup, objective)
+    posture, demands = offline_posture(setup, objective, starts=3), scenario_requirements(setup, objective)
     assert demands.collision and demands.holdable and demands.limit_share == SHARE
     problem = build_problem(setup.robot, objective, setup.q, demands)
     assert problem.surroundings is not None
-    assert not problem.surroundings.collisions(found.q)
-    assert feasible(problem, found.q)
-    assert found.note == "" and found.objective < found.initial and found.distance > 0.1
-    assert found.objective == pytest.approx(objective.value(found.q))
+    assert not problem.surroundings.collisions(posture.q)
+    assert feasible(problem, posture.q)
+    assert posture.note == "" and posture.objective < posture.initial and posture.distance > 0.1
+    assert posture.objective == pytest.approx(objective.value(posture.q))
 
 
 @pytest.mark.parametrize("name", ["aerial-vertical", "aerial-lateral"])
-def test_a_flying_robot_holds_it_with_room(name: str) -> None:
-    """By inverse dynamics and the allocation alone."""
+def test_a_flying_robot_can_hold_the_posture(name: str) -> None:
+    """The loads follow from inverse dynamics and the allocation."""
     setup = set_up(read_scenario(name))
     q, robot = offline_posture(setup, scenario_objective(setup), starts=1).q, setup.robot
     torque = pin.computeGeneralizedGravity(robot.model, robot.model.createData(), q)
@@ -54,7 +54,7 @@ def test_a_flying_robot_holds_it_with_room(name: str) -> None:
 
 
 def test_the_share_of_the_limits_counts() -> None:
-    """A start is held up to the very share that it takes, about the middle of the range of the rotors."""
+    """A posture can be held exactly up to the share that it needs, about the middle of the range of the rotors."""
     setup = set_up(read_scenario("aerial-lateral"))
     objective = scenario_objective(setup)
     assert is_held(setup, objective)
@@ -69,26 +69,28 @@ def test_the_share_of_the_limits_counts() -> None:
         assert f"within {100 * share:g} % of their limits at rest" in cases.cases[0].words
 
 
-def test_a_note_says_where_collisions_cannot_be_demanded(monkeypatch: pytest.MonkeyPatch) -> None:
+def test_a_note_reports_possible_collisions(monkeypatch: pytest.MonkeyPatch) -> None:
     setup = set_up(read_scenario("aerial-vertical"))
     objective = scenario_objective(setup)
     # No posture keeps all links a meter apart.
     demands = replace(scenario_requirements(setup, objective), clearance=1.0)
     monkeypatch.setattr(offline, "scenario_requirements", lambda *_, **__: demands)
     monkeypatch.setattr(offline, "_MARGINS", offline._MARGINS[-1:])
-    found = offline_posture(setup, objective, starts=1)
-    assert found.note.startswith("links may touch in the offline posture, because none without collisions was found")
-    assert "\n" not in found.note and found.objective < found.initial
+    posture = offline_posture(setup, objective, starts=1)
+    assert posture.note.startswith(
+        "links may touch in the offline posture, because none without collisions was found"
+    )
+    assert "\n" not in posture.note and posture.objective < posture.initial
 
 
-def test_without_the_feet_nothing_is_demanded_of_them() -> None:
+def test_free_objectives_have_no_requirements_on_the_feet() -> None:
     setup = set_up(read_scenario("solo8-push"))
     objective = scenario_objective(setup, free=True)
     assert not scenario_requirements(setup, objective).com_over_feet
     assert offline_posture(setup, objective, starts=1).objective < objective.value(setup.q)
 
 
-def test_it_is_the_posture_in_which_the_surface_is_met() -> None:
+def test_the_end_effector_is_at_the_surface() -> None:
     setup = set_up(read_scenario("solo12-landing"))
     objective = scenario_objective(setup, "sticking")
     model, data = setup.robot.model, setup.robot.model.createData()
@@ -102,6 +104,6 @@ def test_it_is_the_posture_in_which_the_surface_is_met() -> None:
     start = place(setup.q)
     np.testing.assert_allclose(place(there), start - setup.gap * setup.scenario.normal, atol=1e-8)
     np.testing.assert_allclose(place(here), start, atol=1e-8)
-    # The robot stands, and its base tilts as far as the flow may tilt it.
+    # The base tilts no further than the flow may tilt it.
     for q in (there, here):
         assert pin.Quaternion(q[3:7]).matrix()[2, 2] >= np.cos(FlowOptions().tilt) - 1e-9

@@ -1,4 +1,4 @@
-"""What becomes of a run: bounds on records made by hand, robots that fall for real, robots that nothing holds."""
+"""Outcome of runs: bounds on synthetic series, robots that fall, and robots that nothing holds."""
 
 from __future__ import annotations
 
@@ -19,7 +19,15 @@ from impact_posture.simulation.scenario_file import Bounds, read_scenario
 from impact_posture.simulation.series import Window
 from impact_posture.simulation.setup import Setup, set_up
 from impact_posture.tsid.controller import Status
-from tests.simulation.factories import SHIPPED, by_hand, controller_factory, driven, factory, needs_mujoco, shortened
+from tests.simulation.factories import (
+    SHIPPED,
+    by_hand,
+    controller_factory,
+    driven,
+    needs_mujoco,
+    shared_factory,
+    shortened,
+)
 
 RELAXED, HELD = STATUSES.index(Status.RELAXED), STATUSES.index(Status.INFEASIBLE)
 HEXTILT = Path(__file__).parent / "hextilt.toml"
@@ -36,7 +44,7 @@ def judged(setup: Setup, columns: dict[str, Any], **run: Any) -> tuple[Event, ..
 
 
 def turned(setup: Setup, axis: tuple[float, float, float], degrees: float) -> np.ndarray[Any, Any]:
-    """The start posture, from tick 400 on with its base turned about an axis of the world."""
+    """Return the start posture, whose base is turned about an axis of the world from tick 400 on."""
     q = np.tile(setup.q, (1000, 1))
     turn = pin.AngleAxis(np.radians(degrees), np.array(axis)).matrix() @ pin.Quaternion(setup.q[3:7]).matrix()
     q[400:, 3:7] = pin.Quaternion(turn).coeffs()
@@ -44,21 +52,21 @@ def turned(setup: Setup, axis: tuple[float, float, float], degrees: float) -> np
 
 
 @pytest.mark.parametrize("name", SHIPPED)
-def test_a_robot_that_stays_where_it_is_completes(name: str) -> None:
-    assert judged(factory(name).setup, {}) == ()
+def test_a_robot_at_rest_completes(name: str) -> None:
+    assert judged(shared_factory(name).setup, {}) == ()
 
 
 @pytest.mark.parametrize("name", SHIPPED)
-def test_tilt_is_measured_from_the_start_and_yaw_is_none(name: str) -> None:
-    setup = factory(name).setup
+def test_tilt_is_measured_from_the_start_without_yaw(name: str) -> None:
+    setup = shared_factory(name).setup
     assert judged(setup, {"q": turned(setup, (0, 0, 1), 170)}) == ()
     assert judged(setup, {"q": turned(setup, (1, 0, 0), 59)}) == ()
     (event,) = judged(setup, {"q": turned(setup, (0, 1, 0), -61)})
     assert event.status == "fell" and "tilted beyond 60°" in event.what and event.time == pytest.approx(0.401)
 
 
-def test_links_without_shapes_behind_a_surface_are_told() -> None:
-    setup = factory("aerial-vertical").setup
+def test_links_without_shapes_behind_a_surface_are_a_warning() -> None:
+    setup = shared_factory("aerial-vertical").setup
     surface = setup.scenario.surfaces[0].name
     n, point = setup.world.built.normals[surface], setup.world.built.points[surface]
     data = setup.robot.model.createData()
@@ -67,18 +75,18 @@ def test_links_without_shapes_behind_a_surface_are_told() -> None:
     for depth, told in ((0.01, False), (0.05, True)):
         q = np.tile(setup.q, (1000, 1))
         q[600:700, :3] -= (elbow + depth) * n
-        # The elbow carries the shape, which the surface stops; the joints above it are still in front.
+        # The elbow has the shape, which the surface stops.  The joints above are still in front of the surface.
         assert links_behind(setup, [Run(by_hand(setup, 1000, q=q), ())]) == ()
         q[600:700, :3] = setup.q[:3] - ((setup.q[:3] - point) @ n + depth) * n
-        found = links_behind(setup, [Run(by_hand(setup, 1000, q=q), ())])
-        assert bool(found) and f"the surface '{surface}'" in found[0] and "shoulder" in found[0]
-        assert ("root_joint" in found[0]) is told
+        warnings = links_behind(setup, [Run(by_hand(setup, 1000, q=q), ())])
+        assert bool(warnings) and f"the surface '{surface}'" in warnings[0] and "shoulder" in warnings[0]
+        assert ("root_joint" in warnings[0]) is told
     assert links_behind(setup, [Run(by_hand(setup, 1000), ())]) == ()
 
 
 @pytest.mark.parametrize("name", SHIPPED)
-def test_below_the_surface_and_far_below_the_start(name: str) -> None:
-    setup = factory(name).setup
+def test_a_base_below_the_surface_or_its_start_fell(name: str) -> None:
+    setup = shared_factory(name).setup
     surface = setup.scenario.surfaces[0].name
     n, point = setup.world.built.normals[surface], setup.world.built.points[surface]
     q = np.tile(setup.q, (1000, 1))
@@ -90,7 +98,7 @@ def test_below_the_surface_and_far_below_the_start(name: str) -> None:
     q[700:, 2] -= 1.001
     events = judged(setup, {"q": q})
     assert "sank by more than 1 m" in "; ".join(e.what for e in events)
-    # Where a reference leads the arm down, the base follows.
+    # The base may follow a reference that leads the arm down.
     if n[2] == 1 and "aerial" in name:
         reference = np.where(np.arange(1000) < 700, 0.0, 0.5)
         assert "sank" not in "; ".join(e.what for e in judged(setup, {"q": q, "reference": reference}))
@@ -109,16 +117,16 @@ def test_relaxed_and_held_ticks(status: int, begin: int, length: int, words: str
     column = np.zeros(1000, int)
     column[begin : begin + length] = status
     for name in ("aerial-lateral", "solo8-push"):
-        found = judged(factory(name).setup, {"status": column})
+        events = judged(shared_factory(name).setup, {"status": column})
         if words is None:
-            assert found == ()
+            assert events == ()
         else:
-            assert [e.status for e in found] == ["control lost"] and words in found[0].what
-            assert found[0].time == pytest.approx(1e-3 * (begin + 1))
+            assert [e.status for e in events] == ["control lost"] and words in events[0].what
+            assert events[0].time == pytest.approx(1e-3 * (begin + 1))
 
 
-def test_feet_that_leave_the_ground_and_contacts_that_never_come() -> None:
-    setup = factory("solo8-push").setup
+def test_lifted_feet_and_missed_contacts() -> None:
+    setup = shared_factory("solo8-push").setup
     feet = np.ones((1000, 4), bool)
     feet[200:300, 1] = False
     assert judged(setup, {"feet": feet}) == ()
@@ -126,12 +134,12 @@ def test_feet_that_leave_the_ground_and_contacts_that_never_come() -> None:
     (event,) = judged(setup, {"feet": feet})
     assert event.status == "lost contact" and event.what == "FR_FOOT left the ground for 0.101 s"
     windows = [Window("impact", k, 0.1 + 0.2 * k, 0.2 + 0.2 * k, k != 2) for k in range(4)]
-    (event,) = judged(factory("aerial-vertical").setup, {}, windows=tuple(windows))
+    (event,) = judged(shared_factory("aerial-vertical").setup, {}, windows=tuple(windows))
     assert event.status == "lost contact" and event.what.startswith("1 of 4 contacts") and event.time == 0.5
 
 
 def test_the_scenario_sets_the_bounds() -> None:
-    setup = factory("solo8-push").setup
+    setup = shared_factory("solo8-push").setup
     feet, status = np.ones((1000, 4), bool), np.zeros(1000, int)
     feet[200:400, 1], status[500:600] = False, HELD
     columns = {"feet": feet, "status": status, "q": turned(setup, (0, 1, 0), 70)}
@@ -140,21 +148,21 @@ def test_the_scenario_sets_the_bounds() -> None:
     assert judged(replace(setup, scenario=wide), columns) == ()
 
 
-# ---- for real -----------------------------------------------------------------------------------------------------
+# ---- simulated runs -----------------------------------------------------------------------------------------------
 
 
-def test_a_robot_that_is_pushed_over_fell() -> None:
-    made = controller_factory(shortened("solo8-push", force=(60.0, 0.0, 0.0), after=0.5))
-    found = driven(made, "nominal")
-    events = judge(made.setup, found)
+def test_a_strongly_pushed_robot_fell() -> None:
+    factory = controller_factory(shortened("solo8-push", force=(60.0, 0.0, 0.0), after=0.5))
+    record = driven(factory, "nominal")
+    events = judge(factory.setup, record)
     assert "fell" in {e.status for e in events}
-    assert all(found.waited < e.time <= found.series.t[-1] for e in events)
+    assert all(record.waited < e.time <= record.series.t[-1] for e in events)
 
 
-def test_a_run_whose_state_runs_away_ends_there(monkeypatch: pytest.MonkeyPatch) -> None:
+def test_a_run_ends_when_the_state_diverges(monkeypatch: pytest.MonkeyPatch) -> None:
     for name in ("aerial-lateral", "solo8-push"):
-        made = controller_factory(shortened(name))
-        world, step = made.setup.world, made.setup.world.step
+        factory = controller_factory(shortened(name))
+        world, step = factory.setup.world, factory.setup.world.step
 
         def away(command: Any, count: int = 1, world: Any = world, step: Any = step) -> None:
             if world.time > 0.05:
@@ -162,20 +170,20 @@ def test_a_run_whose_state_runs_away_ends_there(monkeypatch: pytest.MonkeyPatch)
             step(command, count)
 
         monkeypatch.setattr(world, "step", away)
-        found = driven(made, "nominal")
-        assert found.away is not None and 0.05 < found.away < 0.06 and found.series.t[-1] < found.away
-        assert ("control lost", found.away) in [(e.status, e.time) for e in judge(made.setup, found)]
-        assert measure(made.setup, found).contacts == 0
+        record = driven(factory, "nominal")
+        assert record.away is not None and 0.05 < record.away < 0.06 and record.series.t[-1] < record.away
+        assert ("control lost", record.away) in [(e.status, e.time) for e in judge(factory.setup, record)]
+        assert measure(factory.setup, record).contacts == 0
 
 
 @pytest.mark.parametrize("controller", ["nominal", "robust"])
-def test_a_hextilt_flies_on_its_own_rotors_and_touches_the_floor(controller: str) -> None:
-    made = controller_factory(set_up(read_scenario(HEXTILT)))
-    found = driven(made, controller)
-    assert judge(made.setup, found) == ()
-    metrics = measure(made.setup, found)
+def test_a_hextilt_flies_and_touches_the_floor(controller: str) -> None:
+    factory = controller_factory(set_up(read_scenario(HEXTILT)))
+    record = driven(factory, controller)
+    assert judge(factory.setup, record) == ()
+    metrics = measure(factory.setup, record)
     assert metrics.contacts == 1 and metrics.failed_ticks == 0 and 0 < metrics.q_total_impact < 2
-    assert np.abs(found.series.q[:, :3] - made.setup.q[:3]).max() < 0.2
+    assert np.abs(record.series.q[:, :3] - factory.setup.q[:3]).max() < 0.2
 
 
 # ---- nothing holds it ---------------------------------------------------------------------------------------------

@@ -1,4 +1,4 @@
-"""A path to the offline optimum, played in a simulation."""
+"""Controller that follows a path to the offline optimum."""
 
 from __future__ import annotations
 
@@ -21,23 +21,23 @@ pytest.importorskip("toppra", reason="toppra is not installed (the extra 'path')
 
 @functools.cache
 def _made(name: str) -> ControllerFactory:
-    made = controller_factory(near(name))
-    # One start: what is tested is the path.
-    made.starts = 1
-    return made
+    factory = controller_factory(near(name))
+    # One start suffices for tests of the path.
+    factory.starts = 1
+    return factory
 
 
 @pytest.mark.parametrize("name", ["aerial-vertical", "solo8-push"])
 def test_the_robot_follows_the_path_to_its_end(name: str) -> None:
-    made = _made(name)
-    driver, model = made.driver("path"), made.setup.robot.model
+    factory = _made(name)
+    driver, model = factory.driver("path"), factory.setup.robot.model
     assert isinstance(driver, PathDriver)
     path = driver.path
     assert path.found
     assert path.duration > 0.1
-    q, v, period = made.setup.q.copy(), np.zeros(model.nv), driver.controller.period
+    q, v, period = factory.setup.q.copy(), np.zeros(model.nv), driver.controller.period
     first = driver.reset(q).u.copy()
-    # The path may begin where the start was put on the constraints.
+    # The path begins at the projection of the start onto the constraints.
     off = float(np.linalg.norm(pin.difference(model, q, path.q[0])))
     assert driver.level == 0
     driver.brace()
@@ -51,11 +51,11 @@ def test_the_robot_follows_the_path_to_its_end(name: str) -> None:
         if isinstance(task, CenterOfMass):
             center = pin.centerOfMass(model, model.createData(), path.q[-1])
             np.testing.assert_allclose(task.target, center, atol=1e-12)
-    np.testing.assert_array_equal(driver.reset(made.setup.q).u, first)
+    np.testing.assert_array_equal(driver.reset(factory.setup.q).u, first)
     assert driver.level == 0
 
 
-def test_a_run_goes_along_the_path() -> None:
+def test_a_run_follows_the_path() -> None:
     level = driven(_made("solo8-push"), "path").series.level
     assert level[0] == 0
     assert 0 < level[-1] <= 1

@@ -1,4 +1,4 @@
-"""What a recorder takes down, tick by tick, of truths made by hand."""
+"""Recorder with a synthetic world."""
 
 from __future__ import annotations
 
@@ -13,7 +13,7 @@ from impact_posture.simulation.recorder import STATUSES, Recorder
 from impact_posture.simulation.setup import Setup
 from impact_posture.simulation.world.actuator_command import Trace
 from impact_posture.tsid.controller import Command, Status
-from tests.simulation.factories import factory, needs_mujoco
+from tests.simulation.factories import needs_mujoco, shared_factory
 
 
 @pytest.fixture(scope="module", autouse=True)
@@ -25,8 +25,8 @@ def metric(q: Any) -> float:
     return 7.0
 
 
-class Told:
-    """In place of a world: rows made by hand, which it tells as traces."""
+class SyntheticWorld:
+    """Synthetic world that returns given rows as traces."""
 
     def __init__(self, setup: Setup) -> None:
         self.stops, self._setup, self.marks, self.next = setup.world.stops, setup, 0, 0
@@ -35,7 +35,7 @@ class Told:
     def add(
         self, t: float, *, began: float | None = None, touching: bool = False, stop: str = "", slip: float = 0.1
     ) -> None:
-        """A state with all shapes in the same contact but for their slip, which grows from shape to shape."""
+        """Add a state in which all shapes have the same contact, but a slip that grows from shape to shape."""
         robot, shapes = self._setup.robot, len(self._setup.scenario.shapes)
         rotors = 0 if robot.spec.propulsion is None else len(robot.spec.propulsion.rotors)
         ones = np.ones(shapes)
@@ -54,10 +54,10 @@ class Told:
         return Trace(*(np.array(column) for column in zip(*self.rows[first : self.marks], strict=True)))
 
 
-def told(name: str, metric: Callable[[Any], float]) -> tuple[Recorder, Told]:
-    """A recorder of a world made by hand."""
-    setup = factory(name).setup
-    recorder, world = Recorder(setup, metric), Told(setup)
+def recording(name: str, metric: Callable[[Any], float]) -> tuple[Recorder, SyntheticWorld]:
+    """Return a recorder with its synthetic world."""
+    setup = shared_factory(name).setup
+    recorder, world = Recorder(setup, metric), SyntheticWorld(setup)
     recorder._world = world  # type: ignore[assignment]
     return recorder, world
 
@@ -66,19 +66,19 @@ def command(speed: float = 50.0, status: Status = Status.SOLVED) -> Command:
     return Command(np.zeros(9), np.ones(3), np.full(6, speed), status, np.zeros(9), np.zeros(0))
 
 
-def test_a_touch_is_told_once_however_long_it_lasts() -> None:
-    recorder, world = told("aerial-vertical", metric)
-    # Touches in the third tick, stays for four, and bounces: the world tells of the last push at every look.
+def test_a_lasting_touch_is_reported_once() -> None:
+    recorder, world = recording("aerial-vertical", metric)
+    # The shape touches in the third tick, stays for four ticks, and bounces.
     course = [(None, False), (None, False), (0.0025, True), (0.003, True), (0.004, True), (0.005, False),
               (None, False), (0.0072, True), (0.008, True)]  # fmt: skip
     for k, (began, touching) in enumerate(course):
         world.add(1e-3 * (k + 1), began=began, touching=touching)
         recorder.take(command(), 0.0, 0.0)
         if k == 4:
-            # Where one block of ticks ends and the next begins makes no difference.
+            # The border between two blocks of ticks makes no difference.
             assert recorder.first_touch(0.0, 1.0) == 0.0025
     assert recorder.first_touch(0.0, 1.0) == 0.0025
-    # One that has lasted since before is none.
+    # A touch that began earlier does not count.
     assert recorder.first_touch(0.003, 0.007) is None
     assert recorder.first_touch(0.003, 1.0) == 0.0072
     assert recorder.first_touch(0.0, 0.002) is None and recorder.first_touch(0.0025, 0.0026) == 0.0025
@@ -88,11 +88,11 @@ def test_a_touch_is_told_once_however_long_it_lasts() -> None:
     np.testing.assert_array_equal(series.force[:, 2], 5.0 * series.touching)
 
 
-def test_columns_are_what_was_true_then() -> None:
-    setup = factory("aerial-vertical").setup
+def test_columns_have_the_values_of_their_ticks() -> None:
+    setup = shared_factory("aerial-vertical").setup
     propulsion = setup.robot.spec.propulsion
     assert propulsion is not None
-    recorder, world = told("aerial-vertical", metric)
+    recorder, world = recording("aerial-vertical", metric)
     for k, status in enumerate(STATUSES):
         world.add(1e-3 * k, stop="elbow_pitch" * (k % 2))
         recorder.take(command(500.0 * k, status), k / 9, k / 10)
@@ -100,12 +100,12 @@ def test_columns_are_what_was_true_then() -> None:
     np.testing.assert_array_equal(series.status, np.arange(len(STATUSES)))
     np.testing.assert_array_equal(series.at_stop[:, -1], np.arange(len(STATUSES)) % 2 == 1)
     assert not series.at_stop[:, :-1].any()
-    # Commands are recorded as the motors take them.
+    # Recorded commands are clipped to their limits.
     assert series.rotor_command[0, 0] == propulsion.speed_min and series.rotor_command[1, 0] == propulsion.speed_max
     np.testing.assert_allclose(series.level, np.arange(len(STATUSES)) / 9)
 
 
-def test_the_metric_is_taken_every_tenth_tick_and_may_be_undefined() -> None:
+def test_the_metric_is_evaluated_every_tenth_tick_and_may_be_undefined() -> None:
     calls = []
 
     def sometimes(q: Any) -> float:
@@ -114,17 +114,17 @@ def test_the_metric_is_taken_every_tenth_tick_and_may_be_undefined() -> None:
             raise MetricError("does not exist there", where="S", hint="move")
         return 2.0
 
-    recorder, world = told("aerial-vertical", sometimes)
+    recorder, world = recording("aerial-vertical", sometimes)
     for k in range(25):
         world.add(1e-3 * k)
         recorder.take(command(), 0.0, 0.0)
-    found = recorder.series().objective
+    values = recorder.series().objective
     assert len(calls) == 3
-    assert found[0] == found[20] == 2.0 and np.isnan(np.delete(found, [0, 20])).all()
+    assert values[0] == values[20] == 2.0 and np.isnan(np.delete(values, [0, 20])).all()
 
 
 def test_a_push_acts_from_its_begin_to_its_end() -> None:
-    recorder, world = told("solo8-push", lambda q: 1.0)
+    recorder, world = recording("solo8-push", lambda q: 1.0)
     recorder.pushed(np.array([6.5, 0, 0]), 0.1 + 0.2, 0.1 + 0.2 + 0.003)
     ticks = [0.299, 0.3, 0.301, 0.302, 0.303, 0.304]
     for t in ticks:

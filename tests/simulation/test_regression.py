@@ -1,8 +1,7 @@
-"""The shipped scenarios, one contact or push each: what the nominal and the robust controller come to, within bands.
+"""Nominal and robust controller in the shipped scenarios, with one contact or push, within bands.
 
-Bands are about the values that seeds 0 to 2 gave (talos: 0 and 1) with the scenarios as shipped when this was
-written: a few times their spread, and wide enough for another version of the physics, narrow enough to tell when a
-controller or a scenario changes.  A scenario that is tuned anew gets new bands.
+The bands contain the values of seeds 0 to 2 (talos: 0 and 1).  They are a few times wider than the spread of the
+seeds.  So they allow another version of the physics, and detect a change of a controller or a scenario.
 """
 
 from __future__ import annotations
@@ -39,16 +38,16 @@ def test_robust_against_nominal(
     name: str, settle: float, changes: dict[str, Any], nominal: Band, reduction: Band, lowered: Band
 ) -> None:
     metrics, before = [], []
-    # The nominal one has nothing to go to; the robust one has its posture by then (q and H as after 6 s, within 8 %).
+    # The robust controller reaches its posture in this time (q and H as after 6 s, within 8 %).
     for controller, seconds in (("nominal", 0.5), ("robust", settle)):
-        made = controller_factory(shortened(name, settle=seconds, **changes))
-        found = driven(made, controller)
-        metrics.append(measure(made.setup, found))
-        before.append(predict(made.setup, made.objective(), found)[0].H)
-        assert found.rested and metrics[-1].failed_ticks == 0 and metrics[-1].stops == ()
-        # H as recorded on the way is H before the impact, but for what happens within ten ticks.
-        (window,) = found.of("impact")
-        course = found.series.objective[: found.series.slice(window.begin, window.end).start]
+        factory = controller_factory(shortened(name, settle=seconds, **changes))
+        record = driven(factory, controller)
+        metrics.append(measure(factory.setup, record))
+        before.append(predict(factory.setup, factory.objective(), record)[0].H)
+        assert record.rested and metrics[-1].failed_ticks == 0 and metrics[-1].stops == ()
+        # The last recorded H is at most ten ticks before the impact.
+        (window,) = record.of("impact")
+        course = record.series.objective[: record.series.slice(window.begin, window.end).start]
         assert course[np.isfinite(course)][-1] == pytest.approx(before[-1], rel=0.05)
     q, robust = (m.q_total_impact for m in metrics)
     assert nominal[0] < q < nominal[1]

@@ -1,4 +1,4 @@
-"""A thrown ball obeys mechanics, the rigid model predicts what it does, and the scenarios with real impacts hold."""
+"""Thrown balls against mechanics and the rigid model, and the scenarios with real impacts."""
 
 from __future__ import annotations
 
@@ -26,8 +26,8 @@ from tests.simulation.factories import controller_factory, needs_mujoco
 from tests.simulation.test_scenario_files import REAL
 from tests.support.helpers import Vector, frame_jacobian, mass_matrix
 
-# Ways of flight, off the axes too.
-WAYS = ((-1, 0, 0), (0.5, 1.0, 0.0), (0.3, -0.4, -1.0))
+# Robot, direction of flight and sign.
+THROWS = [("solo8-throw", (-1, 0, 0), 1), ("solo8-throw", (0.3, -0.4, -1.0), -1), ("talos-throw", (0.5, 1.0, 0.0), 1)]
 
 
 @pytest.fixture(scope="module", autouse=True)
@@ -36,28 +36,26 @@ def _mujoco() -> None:
 
 
 @functools.cache
-def thrown(name: str, way: tuple[float, float, float] = (-1, 0, 0), friction: float = 0.5) -> Setup:
-    """A scenario with a throw, soon, along another way, with a contact that is fast beside the robot's motion."""
+def thrown(name: str, direction: tuple[float, float, float] = (-1, 0, 0)) -> Setup:
+    """Set up a scenario with an early throw in a direction, whose contact is short."""
     scenario = read_scenario(name)
     assert scenario.throw is not None
     quick = {"settle": 0.1, "patience": 0.2, "after": 0.1, "solref": (0.002, 1.0)}
-    throw = replace(scenario.throw, direction=way, friction=friction, **quick)
+    throw = replace(scenario.throw, direction=direction, friction=0.5, **quick)
     return set_up(replace(scenario, throw=throw, physics=replace(scenario.physics, timestep=0.0005)))
 
 
 def ball(world: World) -> tuple[Vector, Vector]:
-    """Position and velocity of the ball, whose joint is the last."""
+    """Return position and velocity of the ball, whose joint is the last."""
     return world._data.qpos[-7:-4].copy(), world._data.qvel[-6:-3].copy()
 
 
-@pytest.mark.parametrize("sign", [1, -1])
-@pytest.mark.parametrize("name", ["solo8-throw", "talos-throw"])
-@pytest.mark.parametrize("way", WAYS)
-def test_a_ball_obeys_mechanics(name: str, way: tuple[float, float, float], sign: int) -> None:
-    setup = thrown(name, way)
+@pytest.mark.parametrize(("name", "direction", "sign"), THROWS)
+def test_a_ball_obeys_mechanics(name: str, direction: tuple[float, float, float], sign: int) -> None:
+    setup = thrown(name, direction)
     world, throw, robot = setup.world, setup.scenario.throw, setup.robot
     assert throw is not None
-    # In weightlessness and without motors, nothing but the contact acts on both.
+    # Without gravity and motors, only the contact acts on ball and robot.
     scene = replace(setup.scenario, physics=replace(setup.scenario.physics, gravity=(0, 0, 0)), surfaces=())
     world = build_world(robot, scene, setup.q, throw)
     world.reset(setup.q)
@@ -66,46 +64,45 @@ def test_a_ball_obeys_mechanics(name: str, way: tuple[float, float, float], sign
     target = world._data.geom_xpos[world.ball._target].copy()
     begin, speed = ball(world)
     np.testing.assert_allclose(speed, sign * throw.speed * setup.scenario.normal, atol=1e-12)
-    # It flies at the center and touches when it should.
-    way_there = target - begin
-    np.testing.assert_allclose(np.cross(way_there, speed), 0, atol=1e-9)
+    # The ball flies at the center of the shape and touches at the expected time.
+    np.testing.assert_allclose(np.cross(target - begin, speed), 0, atol=1e-9)
     still = ActuatorCommand(np.zeros(robot.nv - 6), np.zeros(0))
     frame = [s.frame for s in setup.scenario.shapes].index(throw.frame)
     reach = throw.radius + setup.scenario.shape.size[0]
     touches, depth = [], 0.0
     for _ in range(80):
         world.step(still)
-        place, _v = ball(world)
-        depth = max(depth, reach - float(np.linalg.norm(place - world._data.geom_xpos[world.ball._target])))
+        position, _ = ball(world)
+        depth = max(depth, reach - float(np.linalg.norm(position - world._data.geom_xpos[world.ball._target])))
         shape = world.truth().shapes[frame]
         touches += [] if shape.began is None else [shape.began]
     assert touches[0] == pytest.approx(FLIGHT, abs=2 * world.timestep)
-    # The impulse on the shape is what the ball lost and what the robot gained, as linear and as angular momentum.
+    # The impulse on the shape is the momentum that the ball loses and the robot gains.
     impulse, after = shape.impulse, ball(world)[1]
     np.testing.assert_allclose(throw.mass * (speed - after), impulse, rtol=1e-6, atol=1e-9)
     data = robot.model.createData()
     truth = world.truth()
     momentum = pin.computeCentroidalMomentum(robot.model, data, truth.q, truth.v)
-    # Rotors of the motors have no momentum of their own; they act on the joints alone.
+    # The armature of the motors has no momentum here.
     np.testing.assert_allclose(momentum.linear, impulse, rtol=2e-3, atol=1e-3 * np.linalg.norm(impulse))
-    # It neither sticks in the shape nor goes through it.
+    # The ball neither sticks in the shape nor passes through it.
     assert 0 < depth < 0.5 * throw.speed * throw.solref[0] * 2
     assert sign * setup.scenario.normal @ impulse > throw.mass * throw.speed * 0.5
 
 
 @pytest.mark.parametrize("name", ["solo8-throw", "talos-throw"])
 def test_the_prediction_is_the_rigid_impact_of_two_bodies(name: str) -> None:
-    setup = thrown(name, WAYS[1])
+    setup = thrown(name, (0.5, 1.0, 0.0))
     objective = controller_factory(setup, free=True).objective()
     throw, q, model = setup.scenario.throw, setup.q, setup.robot.model
     assert throw is not None
-    # Robot and ball as one system, with the ball's motion as six more velocities.
+    # Robot and ball are one system with six more velocities.
     J = frame_jacobian(model, q, setup.robot.frame_id(throw.frame))[:3]
     M = np.zeros((setup.robot.nv + 6,) * 2)
     M[:-6, :-6] = mass_matrix(model, q)
     M[-6:-3, -6:-3], M[-3:, -3:] = throw.mass * np.eye(3), 0.4 * throw.mass * throw.radius**2 * np.eye(3)
     n = setup.scenario.normal
-    # The point of the ball is its front, r n from its center.
+    # The contact point of the ball is r n from its center.
     arm = throw.radius * np.array([[0, -n[2], n[1]], [n[2], 0, -n[0]], [-n[1], n[0], 0]])
     gap = np.hstack([J, -np.eye(3), arm])
     spread = np.linalg.solve(M, gap.T)
@@ -119,21 +116,21 @@ def test_the_prediction_is_the_rigid_impact_of_two_bodies(name: str) -> None:
     assert thrown_jumps(objective.oracle, q, replace(throw, friction=0.0), throw.speed)[2] == pytest.approx(free)
 
 
-def test_a_robot_that_stands_jumps_as_predicted() -> None:
+def test_a_standing_robot_jumps_as_predicted() -> None:
     setup = thrown("solo8-throw")
-    made = controller_factory(setup)
-    (found,) = run(made, "nominal", only=1)
-    metrics = measure(setup, found)
-    assert judge(setup, found) == ()
+    factory = controller_factory(setup)
+    (record,) = run(factory, "nominal", only=1)
+    metrics = measure(setup, record)
+    assert judge(setup, record) == ()
     assert metrics.contacts == metrics.contacts_asked == 1
-    (impact,) = predict(setup, made.objective(), found)
+    (impact,) = predict(setup, factory.objective(), record)
     assert impact.approach == pytest.approx(3.0, abs=0.02)
     # The contact rebounds with 0.13, and the controller acts for 15 ms.
     assert impact.coulomb is not None
     assert 0.95 < metrics.peak_jump / impact.coulomb < 1.25
     assert metrics.peak_force > 10
-    window = found.of("impact")[0]
-    assert window.begin == pytest.approx(found.waited) and window.end - window.begin == pytest.approx(0.3)
+    window = record.of("impact")[0]
+    assert window.begin == pytest.approx(record.waited) and window.end - window.begin == pytest.approx(0.3)
 
 
 @pytest.mark.parametrize("name", REAL)
@@ -147,9 +144,9 @@ def test_a_scenario_with_a_real_impact_stays_at_its_start(name: str) -> None:
         command = driver.tick(setup.world.read())
         setup.world.step(command, count)
     truth = setup.world.truth()
-    # Its feet give way by less than a millimeter, and its sensors shake it.
+    # The feet sink by less than a millimeter, and sensor noise moves the robot.
     assert np.linalg.norm(pin.difference(setup.robot.model, setup.q, truth.q)) < 0.05
-    # Whoever has to stand stands, and what is to hit has not yet.
+    # The feet touch the ground, and other shapes do not touch yet.
     feet = feet_of(setup)
     assert all(s.touching for s in truth.shapes if s.frame in feet)
     assert not any(s.touching for s in truth.shapes if s.frame not in feet)
@@ -169,7 +166,7 @@ def test_a_scenario_with_a_real_impact_stays_at_its_start(name: str) -> None:
         ("least = 0.1 ", 'lifted = ["FL_FOT"]\nleast = 0.1 ', r"no frame 'FL_FOT'.*FL_FOOT"),
     ],
 )  # fmt: skip
-def test_what_is_wrong_in_a_throw_is_one_line(tmp_path: Path, old: str, new: str, words: str) -> None:
+def test_a_wrong_throw_is_refused(tmp_path: Path, old: str, new: str, words: str) -> None:
     text = (SHIPPED / "solo8-throw.toml").read_text(encoding="utf-8")
     assert text.count(old) == 1
     path = tmp_path / "mine.toml"
@@ -179,7 +176,7 @@ def test_what_is_wrong_in_a_throw_is_one_line(tmp_path: Path, old: str, new: str
     assert "\n" not in caught.value.line and caught.value.hint
 
 
-def test_a_world_without_a_ball_says_so() -> None:
+def test_a_world_without_a_ball_cannot_throw() -> None:
     setup = set_up(read_scenario("solo8-push"))
     setup.world.reset(setup.q)
     with pytest.raises(InputError, match=r"has no ball.*\[throw\]"):

@@ -1,4 +1,4 @@
-"""What a world tells of many ticks at once, against what it tells tick by tick, and against MuJoCo itself."""
+"""Traces of many ticks against single ticks, and contact forces against MuJoCo."""
 
 from __future__ import annotations
 
@@ -9,31 +9,31 @@ from impact_posture.errors import InputError
 from impact_posture.simulation.world import contact_forces
 from impact_posture.simulation.world.actuator_command import ActuatorCommand
 from impact_posture.simulation.world.world import World
-from tests.simulation.factories import factory
+from tests.simulation.factories import shared_factory
 from tests.support.helpers import rng
 
 mujoco = pytest.importorskip("mujoco", reason="mujoco is not installed (the extra 'sim')")
 
-# A robot that flies, one that stands, and one with a fixed base, each let fall or swing into its surface.
+# A flying robot, a standing robot and a fixed base, which all move into their surfaces.
 SCENARIOS = ("aerial-vertical", "solo8-push", "panda-tap")
 
 
 def shaken(name: str, ticks: int = 40) -> tuple[World, list[ActuatorCommand]]:
-    """A world near its surface, and commands that move the robot."""
-    setup, random = factory(name).setup, rng(name)
+    """Return a world near its surface, and commands that move the robot."""
+    setup, random = shared_factory(name).setup, rng(name)
     robot, world = setup.robot, setup.world
     rotors = 0 if robot.spec.propulsion is None else len(robot.spec.propulsion.rotors)
     joints = robot.nv - (6 if robot.floating else 0)
     v = np.zeros(robot.nv)
     if robot.floating:
-        # The one that flies has to come down within the ticks.
+        # The flying robot must reach the surface within the ticks.
         v[2] = -10.0 if rotors else -1.0
     world.reset(setup.q, v, seed=1)
     return world, [ActuatorCommand(random.normal(size=joints), np.full(rotors, 16.0)) for _ in range(ticks)]
 
 
 @pytest.mark.parametrize("name", SCENARIOS)
-def test_a_trace_is_the_truth_of_every_tick(name: str, monkeypatch: pytest.MonkeyPatch) -> None:
+def test_a_trace_has_the_state_of_every_tick(name: str, monkeypatch: pytest.MonkeyPatch) -> None:
     world, commands = shaken(name)
     truths = []
     for command in commands:
@@ -43,14 +43,14 @@ def test_a_trace_is_the_truth_of_every_tick(name: str, monkeypatch: pytest.Monke
     monkeypatch.setattr(contact_forces, "_MOST", 5)
     for k, command in enumerate(commands):
         world.step(command, 3)
-        # The first ticks are not marked, so that their steps are evaluated before anybody looks.
+        # The first ticks are not marked, so their steps are evaluated before the first look.
         if k > 15:
             world.mark()
     trace = world.trace()
     for k, truth in enumerate(truths[16:]):
         for key in ("t", "q", "v", "rotor_speeds", "torques"):
             np.testing.assert_array_equal(getattr(trace, key)[k], getattr(truth, key), key)
-        stops = [name for name, there in zip(world.stops.names, trace.stopped[k], strict=True) if there]
+        stops = [name for name, stopped in zip(world.stops.names, trace.stopped[k], strict=True) if stopped]
         assert tuple(stops) == truth.at_stops
         for j, shape in enumerate(truth.shapes):
             assert trace.touching[k, j] == shape.touching and trace.slip[k, j] == shape.slip
@@ -59,7 +59,7 @@ def test_a_trace_is_the_truth_of_every_tick(name: str, monkeypatch: pytest.Monke
             if k:
                 assert trace.peak[k, j] == shape.peak
                 assert np.isnan(trace.began[k, j]) if shape.began is None else trace.began[k, j] == shape.began
-    # What happened before the first mark is told at it.
+    # The first mark has the peaks and touches of the earlier ticks.
     for j in range(len(truths[0].shapes)):
         assert trace.peak[0, j] == max(truth.shapes[j].peak for truth in truths[:17])
         began = [t.shapes[j].began for t in truths[:17] if t.shapes[j].began is not None]
@@ -67,7 +67,7 @@ def test_a_trace_is_the_truth_of_every_tick(name: str, monkeypatch: pytest.Monke
     assert name == "panda-tap" or trace.touching.any()
 
 
-def test_forces_are_those_of_mujoco() -> None:
+def test_forces_agree_with_mujoco() -> None:
     world, commands = shaken("solo8-push")
     model, data, copy = world._model, world._data, mujoco.MjData(world._model)
     shape_of = {model.geom(name).id: k for k, name in enumerate(world.built.shape_geoms)}
@@ -76,7 +76,7 @@ def test_forces_are_those_of_mujoco() -> None:
         mujoco.mj_copyData(copy, model, data)
         world.step(command)
         truth = world.truth()
-        # The contacts of a step are those at its begin, which the world has left behind.
+        # The contacts of a step are the contacts at its begin, which the world has overwritten.
         copy.ctrl[:] = truth.torques
         mujoco.mj_step2(model, copy)
         forces = np.zeros((len(shape_of), 3))

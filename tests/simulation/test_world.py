@@ -1,4 +1,4 @@
-"""The simulated world: its dynamics are Pinocchio's, its impacts the rigid model's, its actuators do as stated."""
+"""Simulated world: dynamics against Pinocchio, impacts against the rigid model, and actuators."""
 
 from __future__ import annotations
 
@@ -20,7 +20,8 @@ from impact_posture.simulation.world.scene import Physics, Scene, Sensors, Shape
 from impact_posture.simulation.world.world import World, build_world
 from impact_posture.simulation.world.world_builder import build_scene
 from tests.dynamics.test_mjcf import qacc
-from tests.support.helpers import NAMES, Vector, assert_close, mass_matrix, random_configurations, rng, robot
+from tests.support.helpers import NAMES, Vector, assert_close, mass_matrix, random_configurations, rng
+from tests.support.helpers import robot as known_robot
 from tests.support.restitution import ball
 
 mujoco = pytest.importorskip("mujoco", reason="mujoco is not installed (the extra 'sim')")
@@ -32,12 +33,12 @@ FLOOR = Surface("floor", (0, 0, 1))
 
 @functools.cache
 def without_rotors(name: str) -> Robot:
-    found = robot(name)
-    return replace(found, spec=replace(found.spec, propulsion=None))
+    robot = known_robot(name)
+    return replace(robot, spec=replace(robot.spec, propulsion=None))
 
 
-def idle(found: Robot) -> ActuatorCommand:
-    joints = found.nv - (6 if found.floating else 0)
+def idle(robot: Robot) -> ActuatorCommand:
+    joints = robot.nv - (6 if robot.floating else 0)
     return ActuatorCommand(np.zeros(joints), NONE)
 
 
@@ -45,57 +46,57 @@ def idle(found: Robot) -> ActuatorCommand:
 
 
 @pytest.mark.parametrize("name", NAMES)
-def test_shapes_surfaces_and_actuators_leave_the_dynamics_pinocchios(name: str) -> None:
-    found = robot(name)
-    frame = found.spec.contact.frame or found.frame_names[-1]
+def test_shapes_surfaces_and_actuators_do_not_change_the_dynamics(name: str) -> None:
+    robot = known_robot(name)
+    frame = robot.spec.contact.frame or robot.frame_names[-1]
     scene = Scene((FLOOR,), (Shape(frame, (0.05, 0.04, 0.03), "box"),))
-    built = build_scene(found, scene, found.posture())
+    built = build_scene(robot, scene, robot.posture())
     model, layout = built.mjcf.compile(), built.mjcf.layout
     model.opt.disableflags |= mujoco.mjtDisableBit.mjDSBL_CONSTRAINT
-    data, G = mujoco.MjData(model), actuation_matrix(found.model, found.spec.propulsion)
+    data, G = mujoco.MjData(model), actuation_matrix(robot.model, robot.spec.propulsion)
     assert model.nu == G.shape[1]
-    for k, q in enumerate([found.posture(), *random_configurations(found.model, 2, name, "world")]):
+    for k, q in enumerate([robot.posture(), *random_configurations(robot.model, 2, name, "world")]):
         generator = rng(name, "world", k)
-        v, u = generator.normal(size=found.nv), generator.normal(size=model.nu)
+        v, u = generator.normal(size=robot.nv), generator.normal(size=model.nu)
         data.qpos[:], data.qvel[:], data.ctrl[:] = layout.qpos(q), layout.qvel(q, v), u
         mujoco.mj_forward(model, data)
-        M, T = np.zeros((found.nv, found.nv)), layout.velocity_map(q)
+        M, T = np.zeros((robot.nv, robot.nv)), layout.velocity_map(q)
         mujoco.mj_fullM(model, data, M)
-        assert_close(T.T @ M @ T, mass_matrix(found.model, q), 1e-9, "M")
-        a = pin.aba(found.model, found.model.createData(), q, v, G @ u)
+        assert_close(T.T @ M @ T, mass_matrix(robot.model, q), 1e-9, "M")
+        a = pin.aba(robot.model, robot.model.createData(), q, v, G @ u)
         assert_close(data.qacc, qacc(layout, q, v, a), 1e-9, "acceleration")
 
 
 def flight(timestep: float, seconds: float = 0.2) -> tuple[Robot, Truth, Truth]:
-    found = robot("solo8")
-    world = build_world(found, Scene(physics=Physics(timestep)))
-    v = rng("flight").normal(size=found.nv)
+    robot = known_robot("solo8")
+    world = build_world(robot, Scene(physics=Physics(timestep)))
+    v = rng("flight").normal(size=robot.nv)
     v[3:6] *= 2
-    world.reset(found.posture(), v)
+    world.reset(robot.posture(), v)
     before = world.truth()
-    world.step(idle(found), round(seconds / timestep))
-    return found, before, world.truth()
+    world.step(idle(robot), round(seconds / timestep))
+    return robot, before, world.truth()
 
 
-def momentum_and_energy(found: Robot, truth: Truth) -> tuple[Vector, float]:
-    data = found.model.createData()
-    momentum = np.array(pin.computeCentroidalMomentum(found.model, data, truth.q, truth.v).vector)
-    kinetic = pin.computeKineticEnergy(found.model, data, truth.q, truth.v)
-    return momentum, float(kinetic + pin.computePotentialEnergy(found.model, data, truth.q))
+def momentum_and_energy(robot: Robot, truth: Truth) -> tuple[Vector, float]:
+    data = robot.model.createData()
+    momentum = np.array(pin.computeCentroidalMomentum(robot.model, data, truth.q, truth.v).vector)
+    kinetic = pin.computeKineticEnergy(robot.model, data, truth.q, truth.v)
+    return momentum, float(kinetic + pin.computePotentialEnergy(robot.model, data, truth.q))
 
 
 def test_free_flight_keeps_momentum_and_energy() -> None:
     errors = []
     for timestep in (5e-4, 2.5e-4):
-        found, before, after = flight(timestep)
+        robot, before, after = flight(timestep)
         assert not after.at_stops
-        (h0, e0), (h1, e1) = momentum_and_energy(found, before), momentum_and_energy(found, after)
-        fallen = found.mass * np.array(found.model.gravity.linear) * after.t
+        (h0, e0), (h1, e1) = momentum_and_energy(robot, before), momentum_and_energy(robot, after)
+        fallen = robot.mass * np.array(robot.model.gravity.linear) * after.t
         assert after.t == pytest.approx(0.2)
         errors.append([np.abs(h1[:3] - h0[:3] - fallen).max(), np.abs(h1[3:] - h0[3:]).max(), abs(e1 - e0)])
         scale = [np.abs(h0[:3]).max(), np.abs(h0[3:]).max(), e0]
         assert (np.array(errors[-1]) < 2e-3 * np.array(scale)).all(), errors
-    # First order in the time step: what is lost is the integrator's.
+    # The errors of the integrator are of first order in the time step.
     np.testing.assert_allclose(np.array(errors[0]) / errors[1], 2, rtol=0.3)
 
 
@@ -103,26 +104,26 @@ def test_free_flight_keeps_momentum_and_energy() -> None:
 
 
 def impact(law: ContactLaw, timestep: float, speed: float = 0.5) -> tuple[WorstCaseObjective, Vector, Vector, Truth]:
-    """The arm of a robot that flies as one body hits the floor: objective, q, Δν, truth after."""
-    found = without_rotors("tilthex_arm")
-    q = found.posture()
+    """Let a flying arm hit the floor; return the objective, q, Δν, and the state after the impact."""
+    robot = without_rotors("tilthex_arm")
+    q = robot.posture()
     scene = Scene(
         (Surface("floor", (0, 0, 1), gap=1e-6, **vars(law)),), (Shape("ee", size=(0.015,)),),
         replace(WEIGHTLESS, timestep=timestep),
     )  # fmt: skip
-    world = build_world(found, scene)
-    before = np.zeros(found.nv)
+    world = build_world(robot, scene)
+    before = np.zeros(robot.nv)
     before[2] = -speed
     world.reset(q, before)
     touched = False
     for _ in range(2000):
-        world.step(idle(found))
+        world.step(idle(robot))
         truth = world.truth()
         touched |= truth.shapes[0].touching
         if touched and not truth.shapes[0].touching:
             break
     assert touched and not truth.shapes[0].touching
-    return WorstCaseObjective(found, ImpactContact("ee", (0, 0, 1))), q, truth.v - before, truth
+    return WorstCaseObjective(robot, ImpactContact("ee", (0, 0, 1))), q, truth.v - before, truth
 
 
 def restitution(objective: WorstCaseObjective, truth: Truth, speed: float) -> float:
@@ -131,45 +132,45 @@ def restitution(objective: WorstCaseObjective, truth: Truth, speed: float) -> fl
 
 
 @pytest.mark.parametrize(("scale", "tolerance"), [(1.0, 0.03), (0.1, 0.003)])
-def test_an_impact_without_friction_is_the_rigid_models(scale: float, tolerance: float) -> None:
+def test_a_frictionless_impact_agrees_with_the_rigid_model(scale: float, tolerance: float) -> None:
     default = ContactLaw(friction=0.0)
     law = replace(default, solref=(default.solref[0] * scale, 1.0))
     objective, q, jump, truth = impact(law, 2.5e-4 * scale)
-    found = objective.oracle.quantities(q)
+    quantities = objective.oracle.quantities(q)
     impulse = float(truth.shapes[0].impulse[2])
     e = restitution(objective, truth, 0.5)
     assert 0.05 < e < 0.2
-    assert impulse == pytest.approx((1 + e) * 0.5 / found.G, rel=tolerance)
-    assert_close(jump, found.jump * impulse, tolerance, "jump")
+    assert impulse == pytest.approx((1 + e) * 0.5 / quantities.G, rel=tolerance)
+    assert_close(jump, quantities.jump * impulse, tolerance, "jump")
 
 
-def test_an_impact_that_sticks_is_the_rigid_models() -> None:
+def test_a_sticking_impact_agrees_with_the_rigid_model() -> None:
     law = ContactLaw(solref=(2e-4, 1.0), solimp=(0.9999, 0.9999, 0.001), friction=10.0)
     objective, q, jump, truth = impact(law, 2.5e-5)
-    found = objective.oracle.quantities(q)
-    assert found.sticking_jump is not None
+    quantities = objective.oracle.quantities(q)
+    assert quantities.sticking_jump is not None
     e = restitution(objective, truth, 0.5)
-    predicted = (1 + e) * 0.5 * np.asarray(found.sticking_jump)
+    predicted = (1 + e) * 0.5 * np.asarray(quantities.sticking_jump)
     assert_close(jump, predicted, 0.03, "jump")
-    # Friction matters here: the frictionless jump is another.
-    assert np.linalg.norm(jump - (1 + e) * 0.5 * found.jump / found.G) > 0.2 * np.linalg.norm(jump)
+    # The frictionless jump differs clearly.
+    assert np.linalg.norm(jump - (1 + e) * 0.5 * quantities.jump / quantities.G) > 0.2 * np.linalg.norm(jump)
 
 
-def test_the_surfaces_impulse_is_the_robots_momentum() -> None:
+def test_the_impulse_of_the_surface_changes_the_momentum() -> None:
     objective, q, _, truth = impact(ContactLaw(friction=0.3), 2.5e-4)
-    found = objective.robot
-    before, data = np.zeros(found.nv), found.model.createData()
+    robot = objective.robot
+    before, data = np.zeros(robot.nv), robot.model.createData()
     before[2] = -0.5
-    h0 = np.array(pin.computeCentroidalMomentum(found.model, data, q, before).linear)
-    h1 = np.array(pin.computeCentroidalMomentum(found.model, data, truth.q, truth.v).linear)
+    h0 = np.array(pin.computeCentroidalMomentum(robot.model, data, q, before).linear)
+    h1 = np.array(pin.computeCentroidalMomentum(robot.model, data, truth.q, truth.v).linear)
     assert_close(h1 - h0, truth.shapes[0].impulse, 1e-3, "momentum")
     f = truth.shapes[0].impulse
-    # It slides at times, and never pulls more sideways than Coulomb lets it.
+    # The contact slides at times, and the tangential impulse stays within the Coulomb limit.
     assert 0 < np.linalg.norm(f[:2]) <= 0.3 * f[2] * (1 + 1e-6)
 
 
 @pytest.mark.parametrize("normal", [(0, 0, 1), (-1, 0, 0), (1, 2, -2)])
-def test_a_ball_meets_surfaces_of_any_direction_where_they_should_be(normal: tuple[float, float, float]) -> None:
+def test_a_ball_hits_surfaces_of_any_direction(normal: tuple[float, float, float]) -> None:
     n = np.array(normal) / np.linalg.norm(normal)
     scene = Scene((Surface("s", normal, gap=0.1),), (Shape("ball", size=(0.02,)),), WEIGHTLESS)
     world = build_world(ball(), scene)
@@ -182,15 +183,15 @@ def test_a_ball_meets_surfaces_of_any_direction_where_they_should_be(normal: tup
     assert shape.peak > 0 and not shape.touching
     assert_close(shape.impulse, np.linalg.norm(shape.impulse) * n, 1e-6, "direction")
     assert truth.v[:3] @ n > 0
-    # Told once.
+    # The first touch is reported once.
     assert world.truth().shapes[0].began is None
 
 
-def test_a_box_stands_on_its_faces_and_its_center_is_found() -> None:
+def test_a_box_rests_on_a_face() -> None:
     turned = pin.SE3ToXYZQUAT(pin.SE3(pin.utils.rotate("y", np.pi / 2), np.zeros(3)))
     scene = Scene((FLOOR,), (Shape("ball", (0.1, 0.06, 0.02), "box", offset=(0.0, 0.0, 0.0)),))
     world = build_world(ball(2.0), scene, turned)
-    # The frame's −x looks up, so the box's x faces are its top and bottom: its bottom is where the frame is.
+    # The axis −x of the frame points up, so the origin of the frame is on the bottom face.
     assert world.built.points["floor"][2] == pytest.approx(0.0, abs=1e-12)
     world.reset(turned)
     world.step(ActuatorCommand(NONE, NONE), 4000)
@@ -202,21 +203,21 @@ def test_a_box_stands_on_its_faces_and_its_center_is_found() -> None:
 
 
 def test_a_quadruped_stands_on_its_feet() -> None:
-    found = robot("solo8")
-    scene = Scene((FLOOR,), tuple(Shape(s.frame, size=(0.016,), center=(0, 0, 0)) for s in found.spec.supports))
-    world = build_world(found, scene)
-    q = found.posture()
+    robot = known_robot("solo8")
+    scene = Scene((FLOOR,), tuple(Shape(s.frame, size=(0.016,), center=(0, 0, 0)) for s in robot.spec.supports))
+    world = build_world(robot, scene)
+    q = robot.posture()
     world.reset(q)
     for _ in range(500):
         truth = world.truth()
         world.step(ActuatorCommand(20 * (q[7:] - truth.q[7:]) - 0.5 * truth.v[6:], NONE), 4)
     shapes = world.truth().shapes
     assert all(s.touching for s in shapes)
-    assert sum(s.force for s in shapes)[2] == pytest.approx(9.81 * found.mass, rel=0.01)
+    assert sum(s.force for s in shapes)[2] == pytest.approx(9.81 * robot.mass, rel=0.01)
     assert max(s.slip for s in shapes) < 1e-3
 
 
-def test_one_shape_without_friction_on_one_surface_and_with_on_another() -> None:
+def test_a_shape_has_the_friction_of_each_surface() -> None:
     smooth = Surface("smooth", (0, 0, 1), friction=0.0)
     rough = Surface("rough", (-1, 0, 0), point=(0.02, 0, 0), friction=0.5)
     world = build_world(ball(), Scene((smooth, rough), (Shape("ball", size=(0.02,), center=(0, 0, 0)),)))
@@ -224,7 +225,7 @@ def test_one_shape_without_friction_on_one_surface_and_with_on_another() -> None
     world.step(ActuatorCommand(NONE, NONE), 100)
     (shape,) = world.truth().shapes
     assert shape.impulse[0] < -1 and shape.impulse[2] > 0
-    # Only the wall rubs, and less than it may.
+    # Only the wall has friction, and its force stays below the limit.
     assert -0.5 * abs(shape.impulse[0]) * (1 + 1e-9) <= shape.impulse[1] < -0.05
 
 
@@ -232,88 +233,88 @@ def test_one_shape_without_friction_on_one_surface_and_with_on_another() -> None
 
 
 def flying(**sensors: Any) -> tuple[Robot, World, ActuatorCommand]:
-    found = robot("tilthex_arm")
-    assert found.spec.propulsion is not None
-    wanted = hover(found.model, found.spec.propulsion, found.posture())
-    world = build_world(found, Scene(sensors=Sensors(**sensors)))
-    world.reset(found.posture())
-    return found, world, ActuatorCommand(wanted.joint_torques, wanted.speeds)
+    robot = known_robot("tilthex_arm")
+    assert robot.spec.propulsion is not None
+    wanted = hover(robot.model, robot.spec.propulsion, robot.posture())
+    world = build_world(robot, Scene(sensors=Sensors(**sensors)))
+    world.reset(robot.posture())
+    return robot, world, ActuatorCommand(wanted.joint_torques, wanted.speeds)
 
 
-def test_hovering_stays() -> None:
-    found, world, drive = flying()
+def test_a_hovering_robot_stays_in_place() -> None:
+    robot, world, drive = flying()
     world.step(drive, 400)
     truth = world.truth()
     assert np.abs(truth.v).max() < 1e-9
-    assert np.abs(pin.difference(found.model, found.posture(), truth.q)).max() < 1e-9
+    assert np.abs(pin.difference(robot.model, robot.posture(), truth.q)).max() < 1e-9
     assert_close(truth.rotor_speeds, drive.rotor_speed, 1e-12, "speeds")
 
 
-def test_rotors_lag_up_and_down_and_stay_within_their_limits() -> None:
-    found, world, drive = flying()
-    spec = found.spec.propulsion
+def test_rotors_lag_and_stay_within_their_limits() -> None:
+    robot, world, drive = flying()
+    spec = robot.spec.propulsion
     assert spec is not None
     start = drive.rotor_speed
     for wanted, constant in ((start + 10, spec.time_constant_up), (start - 10, spec.time_constant_down)):
-        world.reset(found.posture())
+        world.reset(robot.posture())
         world.step(ActuatorCommand(drive.torque, wanted), 50)
         truth = world.truth()
         expected = wanted + (start - wanted) * np.exp(-0.0125 / constant)
         assert_close(truth.rotor_speeds, expected, 1e-12, "speeds")
         assert_close(truth.thrusts, spec.thrust_coefficient * expected**2, 1e-12, "thrusts")
     for wanted, limit in ((500.0, spec.speed_max), (-3.0, spec.speed_min)):
-        world.reset(found.posture())
+        world.reset(robot.posture())
         world.step(ActuatorCommand(drive.torque, np.full(6, wanted)), 4000)
         assert_close(world.truth().rotor_speeds, np.full(6, limit), 1e-9, "limit")
 
 
 def test_motors_stay_within_their_limits() -> None:
-    found, world, drive = flying()
-    limits = np.asarray(found.model.effortLimit)[6:]
+    robot, world, drive = flying()
+    limits = np.asarray(robot.model.effortLimit)[6:]
     world.step(ActuatorCommand(np.array([99.0, -99.0, 1.0]), drive.rotor_speed))
     np.testing.assert_array_equal(world.truth().torques, [limits[0], -limits[1], 1.0])
 
 
-def test_a_joint_driven_against_its_stop_is_named_there() -> None:
-    found = without_rotors("tilthex_arm")
-    world = build_world(found, Scene(physics=WEIGHTLESS))
-    world.reset(found.posture())
+def test_a_joint_at_its_stop_is_named() -> None:
+    robot = without_rotors("tilthex_arm")
+    world = build_world(robot, Scene(physics=WEIGHTLESS))
+    world.reset(robot.posture())
     assert world.truth().at_stops == ()
     world.step(ActuatorCommand(np.array([0.0, 0.0, 3.0]), NONE), 4000)
     truth = world.truth()
     assert truth.at_stops == ("elbow_pitch",)
-    assert found.model.upperPositionLimit[9] <= truth.q[9] < found.model.upperPositionLimit[9] + 0.02
+    assert robot.model.upperPositionLimit[9] <= truth.q[9] < robot.model.upperPositionLimit[9] + 0.02
 
 
 def test_a_push_acts_at_its_point_and_ends() -> None:
-    found = robot("talos")
-    q, frame, offset, force = found.posture(), "torso_2_link", (0.1, -0.2, 0.3), np.array([32.0, -5.0, 9.0])
-    world = build_world(found, Scene(physics=WEIGHTLESS))
+    robot = known_robot("talos")
+    q, frame, offset, force = robot.posture(), "torso_2_link", (0.1, -0.2, 0.3), np.array([32.0, -5.0, 9.0])
+    world = build_world(robot, Scene(physics=WEIGHTLESS))
     world.reset(q)
     world.push(Push(frame, (32.0, -5.0, 9.0), 0.01, offset))
-    world.step(idle(found))
-    data, index = found.model.createData(), found.frame_id(frame)
-    J = pin.computeFrameJacobian(found.model, data, q, index, pin.LOCAL_WORLD_ALIGNED)
-    pin.framesForwardKinematics(found.model, data, q)
+    world.step(idle(robot))
+    data, index = robot.model.createData(), robot.frame_id(frame)
+    J = pin.computeFrameJacobian(robot.model, data, q, index, pin.LOCAL_WORLD_ALIGNED)
+    pin.framesForwardKinematics(robot.model, data, q)
     arm = data.oMf[index].rotation @ np.array(offset)
     wrench = np.concatenate([force, np.cross(arm, force)])
-    expected = np.linalg.solve(mass_matrix(found.model, q), J.T @ wrench) * world.timestep
+    expected = np.linalg.solve(mass_matrix(robot.model, q), J.T @ wrench) * world.timestep
     assert_close(world.truth().v, expected, 1e-6, "first step")
-    world.step(idle(found), 99)
+    world.step(idle(robot), 99)
     for _ in range(2):
         truth = world.truth()
-        momentum = pin.computeCentroidalMomentum(found.model, data, truth.q, truth.v).linear
+        momentum = pin.computeCentroidalMomentum(robot.model, data, truth.q, truth.v).linear
         assert_close(momentum, 0.01 * force, 1e-3, "momentum")
-        world.step(idle(found), 60)
+        world.step(idle(robot), 60)
 
 
 # ---- the same again ---------------------------------------------------------------------------------------------
 
 
 def run(world: World, seed: int) -> list[Vector]:
-    found = world.robot
+    robot = world.robot
     drive = ActuatorCommand(np.array([0.1, 0.4, 0.2]), np.full(6, 60.0))
-    world.reset(found.posture(), seed=seed)
+    world.reset(robot.posture(), seed=seed)
     world.push(Push("ee", (1.0, 2.0, 0.0), 0.02))
     rows = []
     for _ in range(60):
@@ -324,16 +325,16 @@ def run(world: World, seed: int) -> list[Vector]:
     return rows
 
 
-def test_a_seed_is_a_run() -> None:
-    found = robot("tilthex_arm")
+def test_the_seed_determines_noise_only() -> None:
+    robot = known_robot("tilthex_arm")
     sensors = Sensors(base_angle=1e-3, joint_rate=0.1, unbalance=1e-6, force_frame="ee", force=0.1, delay=2e-3)
     scene = Scene((Surface("floor", (0, 0, 1), gap=0.002),), (Shape("ee", size=(0.015,)),), sensors=sensors)
-    first, again = (build_world(found, scene) for _ in range(2))
+    first, again = (build_world(robot, scene) for _ in range(2))
     a, b, other = run(first, 5), run(again, 5), run(again, 6)
     np.testing.assert_array_equal(a, b)
     np.testing.assert_array_equal(a, run(first, 5))
-    # Another seed is other noise, not another truth.
-    truth = found.nq + found.nv + 3
+    # Another seed changes the noise and not the true state.
+    truth = robot.nq + robot.nv + 3
     assert not np.array_equal(np.array(a)[:, :truth], np.array(other)[:, :truth])
     np.testing.assert_array_equal(np.array(a)[:, truth:], np.array(other)[:, truth:])
     assert np.array(a)[-1, -1] > 0, "the arm touches the floor in this run"

@@ -1,4 +1,4 @@
-"""The simulated world's sensors, its contact laws' measured rebound, and what it refuses."""
+"""Simulated world: sensors, restitution of contact laws, and bad input."""
 
 from __future__ import annotations
 
@@ -29,7 +29,8 @@ from impact_posture.simulation.world.contact_law import ContactLaw
 from impact_posture.simulation.world.rotors import Vibration
 from impact_posture.simulation.world.scene import Physics, Scene, Sensors, Shape, Surface
 from impact_posture.simulation.world.world import World, build_world
-from tests.support.helpers import assert_close, mass_matrix, random_configurations, robot
+from tests.support.helpers import assert_close, mass_matrix, random_configurations
+from tests.support.helpers import robot as known_robot
 from tests.support.restitution import ball, ideal_restitution, measure_restitution
 
 pytest.importorskip("mujoco", reason="mujoco is not installed (the extra 'sim')")
@@ -40,18 +41,18 @@ IDLE = ActuatorCommand(NONE, NONE)
 
 
 def hovering(sensors: Sensors) -> tuple[Robot, World, ActuatorCommand]:
-    found = robot("tilthex_arm")
-    assert found.spec.propulsion is not None
-    wanted = hover(found.model, found.spec.propulsion, found.posture())
-    world = build_world(found, Scene(sensors=sensors))
-    world.reset(found.posture(), seed=3)
-    return found, world, ActuatorCommand(wanted.joint_torques, wanted.speeds)
+    robot = known_robot("tilthex_arm")
+    assert robot.spec.propulsion is not None
+    wanted = hover(robot.model, robot.spec.propulsion, robot.posture())
+    world = build_world(robot, Scene(sensors=sensors))
+    world.reset(robot.posture(), seed=3)
+    return robot, world, ActuatorCommand(wanted.joint_torques, wanted.speeds)
 
 
 # ---- sensors ----------------------------------------------------------------------------------------------------
 
 
-def test_a_perfect_sensor_tells_the_truth() -> None:
+def test_a_perfect_sensor_measures_the_true_state() -> None:
     _, world, drive = hovering(Sensors())
     world.push(Push("ee", (1, 0, 0), 0.1))
     world.step(drive, 100)
@@ -61,23 +62,23 @@ def test_a_perfect_sensor_tells_the_truth() -> None:
     np.testing.assert_array_equal(reading.v, truth.v)
 
 
-def test_noise_is_as_large_as_stated_and_touches_nothing_else() -> None:
+def test_noise_has_the_stated_deviation() -> None:
     base = {"base_position": 1e-3, "base_angle": 2e-3, "base_velocity": 3e-3, "base_rate": 4e-3}
-    found, world, _ = hovering(Sensors(**base, joint_angle=5e-3, joint_rate=6e-3))
+    robot, world, _ = hovering(Sensors(**base, joint_angle=5e-3, joint_rate=6e-3))
     truth = world.truth()
     readings = [world.read() for _ in range(2000)]
-    q = np.array([pin.difference(found.model, truth.q, r.q) for r in readings])
+    q = np.array([pin.difference(robot.model, truth.q, r.q) for r in readings])
     v = np.array([r.v - truth.v for r in readings])
     expected = np.repeat([1e-3, 2e-3, 5e-3], 3), np.repeat([3e-3, 4e-3, 6e-3], 3)
-    for found_noise, sigma in zip((q, v), expected, strict=True):
-        np.testing.assert_allclose(found_noise.std(axis=0), sigma, rtol=0.08)
-        assert (np.abs(found_noise.mean(axis=0)) < 4 * sigma / np.sqrt(2000)).all()
-        # White: one reading says nothing of the next.
-        assert np.abs(np.mean(found_noise[1:] * found_noise[:-1], axis=0) / sigma**2).max() < 0.1
+    for noise, sigma in zip((q, v), expected, strict=True):
+        np.testing.assert_allclose(noise.std(axis=0), sigma, rtol=0.08)
+        assert (np.abs(noise.mean(axis=0)) < 4 * sigma / np.sqrt(2000)).all()
+        # Successive readings are uncorrelated.
+        assert np.abs(np.mean(noise[1:] * noise[:-1], axis=0) / sigma**2).max() < 0.1
     np.testing.assert_array_equal(world.truth().q, truth.q)
 
 
-def test_encoders_count_and_the_base_does_not() -> None:
+def test_encoders_round_the_joints_only() -> None:
     _, world, drive = hovering(Sensors(joint_resolution=0.01))
     world.push(Push("ee", (1, 0, 0), 0.1))
     world.step(drive, 77)
@@ -87,7 +88,7 @@ def test_encoders_count_and_the_base_does_not() -> None:
     np.testing.assert_array_equal(reading.q[:7], truth.q[:7])
 
 
-def test_a_delay_shows_the_past() -> None:
+def test_a_delayed_reading_is_an_earlier_state() -> None:
     _, world, drive = hovering(Sensors(delay=0.0015))
     world.push(Push("ee", (1, 0, 0), 0.1))
     past = [world.truth().q]
@@ -98,7 +99,7 @@ def test_a_delay_shows_the_past() -> None:
     assert not np.array_equal(past[-1], past[-7])
 
 
-def test_the_measured_force_is_low_passed_at_its_cutoff() -> None:
+def test_the_measured_force_is_filtered() -> None:
     scene = Scene(
         (Surface("floor", (0, 0, 1), gap=1e-4),), (Shape("ball", size=(0.02,)),),
         sensors=Sensors(force_frame="ball", force_cutoff=100.0),
@@ -119,7 +120,7 @@ def test_the_measured_force_is_low_passed_at_its_cutoff() -> None:
     assert largest > 50
 
 
-def test_unbalanced_propellers_shake_the_gyroscope_at_their_own_frequencies() -> None:
+def test_unbalanced_propellers_disturb_the_gyroscope_at_their_frequencies() -> None:
     _, world, drive = hovering(Sensors(unbalance=1e-6))
     rates = []
     for _ in range(2000):
@@ -133,19 +134,19 @@ def test_unbalanced_propellers_shake_the_gyroscope_at_their_own_frequencies() ->
     assert 1e-3 < np.std(rates) < 0.1
 
 
-def test_the_vibration_is_the_unbalances_pull_on_the_robot() -> None:
-    found = robot("tilthex_arm")
-    spec, q = found.spec.propulsion, found.posture()
+def test_the_vibration_follows_from_the_forces_of_the_unbalance() -> None:
+    robot = known_robot("tilthex_arm")
+    spec, q = robot.spec.propulsion, robot.posture()
     assert spec is not None
-    vibration, U = Vibration(found.model, spec, 2e-6), 2e-6
+    vibration, U = Vibration(robot.model, spec, 2e-6), 2e-6
     phases, speeds = np.linspace(0, 5, 6), np.linspace(30, 90, 6)
     vibration.reset(q, phases)
-    inertia = mass_matrix(found.model, q)[:6, :6]
+    inertia = mass_matrix(robot.model, q)[:6, :6]
     step = 1e-7
     ahead = vibration.twist(speeds, phases + 2 * np.pi * speeds * step)
     back = vibration.twist(speeds, phases - 2 * np.pi * speeds * step)
     wrench = inertia @ (ahead - back) / (2 * step)
-    # Each pull stands across its propeller's axis and has the size U(2πω)²; together they are the wrench.
+    # Each force is perpendicular to the axis of its propeller and has the size U(2πω)².  The wrench is their sum.
     total = np.zeros(6)
     for k, rotor in enumerate(spec.rotors):
         turn = pin.Quaternion.FromTwoVectors(np.array([0.0, 0, 1]), np.array(rotor.direction)).matrix()
@@ -157,7 +158,7 @@ def test_the_vibration_is_the_unbalances_pull_on_the_robot() -> None:
 # ---- the contact law --------------------------------------------------------------------------------------------
 
 
-def test_the_default_law_rebounds_as_the_page_says() -> None:
+def test_restitution_agrees_with_the_page() -> None:
     rows = [line.split("|")[1:-1] for line in PAGE.read_text(encoding="utf-8").splitlines() if line.startswith("| ")]
     table = {tuple(float(re.sub(r"[^\d.]", "", cell)) for cell in row[:3]): row for row in rows[1:]}
     assert len(table) > 30
@@ -169,7 +170,7 @@ def test_the_default_law_rebounds_as_the_page_says() -> None:
 
 
 @pytest.mark.parametrize("damping", [0.2, 0.6, 1.0, 1.8])
-def test_restitution_comes_to_the_ideal_springs_as_steps_get_finer(damping: float) -> None:
+def test_restitution_converges_to_the_ideal_spring(damping: float) -> None:
     ideal, errors = ideal_restitution(damping), []
     for timestep in (4e-4, 1e-4):
         law = ContactLaw(solref=(0.01, damping), solimp=(0.9999, 0.9999, 0.001))
@@ -178,7 +179,7 @@ def test_restitution_comes_to_the_ideal_springs_as_steps_get_finer(damping: floa
     assert errors[1] < errors[0]
 
 
-def test_the_ideal_springs_restitution_is_that_of_its_equation() -> None:
+def test_the_restitution_of_the_ideal_spring_solves_its_equation() -> None:
     assert ideal_restitution(0.0) == 1.0
     assert ideal_restitution(1 - 1e-7) == pytest.approx(np.exp(-2), rel=1e-6)
     assert ideal_restitution(1 + 1e-7) == pytest.approx(np.exp(-2), rel=1e-6)
@@ -191,7 +192,7 @@ def test_the_ideal_springs_restitution_is_that_of_its_equation() -> None:
 
 
 @pytest.mark.parametrize("solref", [(0.002, 0.5), (0.00199, 1.0), (-1.1e6, -1e3)])
-def test_laws_faster_than_the_time_step_are_refused(solref: tuple[float, float]) -> None:
+def test_contact_laws_faster_than_the_time_step_are_refused(solref: tuple[float, float]) -> None:
     step = 1e-3 if solref[0] < 0.002 else 1.01e-3
     with pytest.raises(InputError, match="time step") as caught:
         Scene((Surface("wall", (0, 0, 1), solref=solref),), physics=Physics(step, stop_solref=(0.01, 1)))
@@ -224,14 +225,14 @@ def one_line(error: ImpactPostureError) -> str:
         (lambda: Scene(sensors=Sensors(force_frame="ee")), "carries no shape"),
     ],
 )
-def test_scenes_that_make_no_sense_are_refused(make: Any, words: str) -> None:
+def test_wrong_scenes_are_refused(make: Any, words: str) -> None:
     with pytest.raises(InputError, match=words) as caught:
         make()
     one_line(caught.value)
 
 
-def test_what_does_not_fit_the_robot_is_refused() -> None:
-    found = robot("panda")
+def test_scenes_that_do_not_fit_the_robot_are_refused() -> None:
+    robot = known_robot("panda")
     for scene, kind, words in (
         (Scene((Surface("s", (0, 0, 1)),), (Shape("hand", (0.1,)),)), FrameNotFound, "panda_hand"),
         (Scene((Surface("s", (0, 0, 1)),), (Shape("panda_link0", (0.1,)),)), ContactError, "welded"),
@@ -239,13 +240,13 @@ def test_what_does_not_fit_the_robot_is_refused() -> None:
         (Scene((Surface("s", (0, 0, 1)),)), InputError, "no shape"),
     ):
         with pytest.raises(kind, match=words) as caught:
-            build_world(found, scene)
+            build_world(robot, scene)
         one_line(caught.value)
 
 
 def test_wrong_use_is_refused() -> None:
-    found, world, drive = hovering(Sensors())
-    fresh = build_world(found, Scene())
+    robot, world, drive = hovering(Sensors())
+    fresh = build_world(robot, Scene())
     for use in (fresh.read, fresh.truth, lambda: fresh.step(drive)):
         with pytest.raises(InputError, match="reset"):
             use()
@@ -257,9 +258,9 @@ def test_wrong_use_is_refused() -> None:
         with pytest.raises(InputError, match=words):
             world.step(ActuatorCommand(torque, speeds))
     with pytest.raises(PostureError, match="give 9 finite numbers"):
-        world.reset(found.posture(), [0.0, 1.0])
+        world.reset(robot.posture(), [0.0, 1.0])
     with pytest.raises(InputError, match="give 6 finite numbers"):
-        world.reset(found.posture(), rotor_speed=[50.0, 50.0])
+        world.reset(robot.posture(), rotor_speed=[50.0, 50.0])
     for push in (Push("ee", (1, 0, 0), 0.0), Push("ee", (np.inf, 0, 0), 1.0)):
         with pytest.raises(InputError, match="no force or no duration"):
             world.push(push)
@@ -267,7 +268,7 @@ def test_wrong_use_is_refused() -> None:
         world.push(Push("e", (1, 0, 0), 1.0))
 
 
-def test_a_joint_that_no_motor_drives_is_refused() -> None:
+def test_a_joint_without_motor_is_refused() -> None:
     model = pin.Model()
     joint = model.addJoint(0, pin.JointModelPlanar(), pin.SE3.Identity(), "cart")
     model.appendBodyToJoint(joint, pin.Inertia.FromSphere(1.0, 0.1), pin.SE3.Identity())
@@ -276,15 +277,15 @@ def test_a_joint_that_no_motor_drives_is_refused() -> None:
         build_world(Robot("cart", "", model, "fixed", {"neutral": q}, "neutral", RobotSpec()), Scene())
 
 
-def test_ball_joints_and_translations_are_driven_in_pinocchios_axes() -> None:
+def test_ball_joints_and_translations_have_the_axes_of_pinocchio() -> None:
     model = pin.Model()
     parent = 0
     for kind in (pin.JointModelSpherical(), pin.JointModelTranslation(), pin.JointModelRUBX()):
         parent = model.addJoint(parent, kind, pin.SE3.Random(), kind.shortname())
         model.appendBodyToJoint(parent, pin.Inertia.FromSphere(1.0, 0.1), pin.SE3.Identity())
     (q,) = random_configurations(model, 1, "ball joints")
-    found = Robot("chain", "", model, "fixed", {"start": q}, "start", RobotSpec())
-    world = build_world(found, Scene())
+    robot = Robot("chain", "", model, "fixed", {"start": q}, "start", RobotSpec())
+    world = build_world(robot, Scene())
     world.reset(q)
     u = np.arange(1.0, 8.0)
     world.step(ActuatorCommand(u, NONE))
@@ -292,13 +293,13 @@ def test_ball_joints_and_translations_are_driven_in_pinocchios_axes() -> None:
     assert_close(world.truth().v, a * world.timestep, 1e-9, "first step")
 
 
-def test_a_state_that_runs_away_is_said_and_leaves_no_log(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+def test_a_diverged_state_is_an_error_without_a_log_file(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     monkeypatch.chdir(tmp_path)
-    found = robot("solo8")
-    world = build_world(found, Scene(physics=Physics(0.05, stop_solref=(0.2, 1.0))))
-    world.reset(found.posture())
+    robot = known_robot("solo8")
+    world = build_world(robot, Scene(physics=Physics(0.05, stop_solref=(0.2, 1.0))))
+    world.reset(robot.posture())
     with pytest.raises(SimulationDiverged, match="ran away at t = ") as caught:
-        # Damping that overshoots more every time.
+        # The damping overshoots more in every step.
         for _ in range(400):
             world.step(ActuatorCommand(-2.7 * np.sign(world.truth().v[6:] + 1e-3), NONE))
             world.push(Push("base_link", tuple(-2e3 * world.truth().v[:3] + 1.0), 0.05))  # type: ignore[arg-type]
@@ -306,7 +307,7 @@ def test_a_state_that_runs_away_is_said_and_leaves_no_log(tmp_path: Path, monkey
     assert not list(tmp_path.iterdir())
 
 
-def test_without_mujoco_it_imports_and_says_what_to_install() -> None:
+def test_without_mujoco_the_error_says_what_to_install() -> None:
     script = """
 import sys
 sys.modules["mujoco"] = None

@@ -1,4 +1,4 @@
-"""Controllers to compare the impact-robust term with: stiffer ones, and the gradient flow of Walker 1994."""
+"""Controllers for comparison with the impact-robust term: stiffer springs, and the gradient flow of Walker 1994."""
 
 from __future__ import annotations
 
@@ -20,11 +20,11 @@ from impact_posture.tsid.tasks.impact_robust import ImpactRobustPosture, curvatu
 
 
 def spring_of_term(robot: Robot, gradient: Gradient, q: Array, strength: float) -> Array:
-    """Return ``[K ∇²H(q)/λ]₊``, the spring that an impact-robust term is for a robot that is pushed away from ``q``.
+    """Return ``[K ∇²H(q)/λ]₊``, the stiffness of the impact-robust term at ``q``.
 
-    A posture task with this added stiffness has the spring of the term, but not its posture.  What the term gains
-    over such a task comes from the posture alone.  ``∇²H`` is symmetrized.  The base of a floating robot is left out,
-    because other tasks control it.  Negative curvature is left out, because the term is no spring there.
+    A posture task with this added stiffness has the spring of the term without its posture.  The difference between
+    the two controllers is the effect of the posture.  ``∇²H`` is symmetrized.  The base of a floating robot is left
+    out, because other tasks control it.  Negative curvature is left out, because it is not a stiffness.
 
     Args:
         robot: The robot.
@@ -43,43 +43,44 @@ def spring_of_term(robot: Robot, gradient: Gradient, q: Array, strength: float) 
     return np.asarray(spring + spring.T) / 2
 
 
-def resting_posture(driver: Driver, seconds: float, quiet: float = 1e-3, ahead: float = 0.0) -> Array:
-    """Return the posture that a driver braces to, shape (nq,).
+def resting_posture(driver: Driver, seconds: float, *, ahead: float = 0.0) -> Array:
+    """Return the posture in which a driver comes to rest after :meth:`Driver.brace`, shape (nq,).
 
-    The robot executes the planned acceleration exactly, without physics engine, sensors and motors.
+    The robot executes the planned acceleration exactly, without physics engine, sensors and motors.  It rests once
+    ``‖ν‖`` has been below 1e-3 at the full level of the driver for 0.2 s.
 
     Args:
         driver: The driver, which is reset.
         seconds: Longest time to come to rest, s.
-        quiet: ``‖ν‖`` below which the robot rests, once the driver is at its full level.
-        ahead: Way that the end effector then goes on towards the surface, m.
+        ahead: Distance that the end effector then moves towards the surface, m.
     """
     setup, period = driver.setup, driver.controller.period
     q, v, t = setup.q.copy(), np.zeros(setup.robot.nv), 0.0
     driver.reset(q)
     driver.brace()
-    for way in (0.0, ahead) if ahead else (0.0,):
-        began, rest = t, 0
-        if way:
+    for distance in (0.0, ahead) if ahead else (0.0,):
+        begin, rest = t, 0
+        if distance:
             driver.expect(t + MOVE)
-        while t < began + seconds and rest * period <= 0.2:
-            gone = ReferencePoint(way * smooth(min((t - began) / MOVE, 1.0)), 0.0, 0.0)
-            v = v + period * driver.tick(Reading(t, q, v, None), gone if way else None).acceleration
+        while t < begin + seconds and rest * period <= 0.2:
+            reference = ReferencePoint(distance * smooth(min((t - begin) / MOVE, 1.0)), 0.0, 0.0)
+            v = v + period * driver.tick(Reading(t, q, v, None), reference if distance else None).acceleration
             q = np.asarray(pin.integrate(setup.robot.model, q, period * v))
             t += period
-            rest = rest + 1 if driver.level == 1 and float(np.linalg.norm(v)) < quiet else 0
+            rest = rest + 1 if driver.level == 1 and float(np.linalg.norm(v)) < 1e-3 else 0
     return q
 
 
 class FlowPosture(ImpactRobustPosture):
     """Projected gradient flow of Walker 1994 as the reference of a posture task.
 
-    ``ν_ref = −α k Z Zᵀ ∇H/λ``, where the columns of ``Z`` span what the other tasks leave free.  ``q_des`` is the
-    integral of ``ν_ref``, and ``ν_ref`` is the velocity reference, in place of the impact-robust term.  ``k = K/K_d``
-    makes the flow as fast as that term would be.  It has the bound and the fade near joint limits of the term.
+    ``ν_ref = −α k Z Zᵀ ∇H/λ``.  The columns of ``Z`` span the motions that the other tasks leave free.  ``q_des`` is
+    the integral of ``ν_ref``, and ``ν_ref`` is the velocity reference.  They replace the impact-robust term.
+    ``k = K/K_d`` makes the flow as fast as this term.  The flow has the bound and the fade of the term near joint
+    limits.
 
     Attributes:
-        basis: ``Z``, shape (nv, r); without it, nothing flows.
+        basis: ``Z``, shape (nv, r).  Without it, the posture does not flow.
     """
 
     def reset(self, state: State) -> None:
@@ -89,7 +90,7 @@ class FlowPosture(ImpactRobustPosture):
         self._flow = np.zeros(state.nv)
 
     def contact(self) -> None:
-        """Let the flow fade; its reference is ahead of the robot, so :class:`WalkerDriver` moves it back at once."""
+        """Let the flow fade.  :class:`WalkerDriver` then moves the reference back to the robot."""
         self.activation.enter(Phase.CONTACT)
 
     def advance(self, state: State, dt: float) -> None:
@@ -120,7 +121,7 @@ class WalkerDriver(RobustDriver):
         return command
 
     def tick(self, reading: Reading, reference: ReferencePoint | None = None) -> Command:
-        """Return the command.  The redundancy is computed as often as the gradient."""
+        """Return the command, and compute the redundancy as often as the gradient."""
         if self.level > 0:
             if self._ticks % self.posture.every == 0:
                 self.posture.basis = self.controller.assembly.redundancy(self.controller.state)
@@ -130,23 +131,22 @@ class WalkerDriver(RobustDriver):
     def hold(self) -> None:
         """Stop the flow and hold the present posture, center of mass and base orientation."""
         super().hold()
-        # The reference is ahead of the robot wherever other tasks kept the robot back.
+        # The reference is ahead of the robot where other tasks have kept the robot back.
         self.posture.move_to(self.controller.state.q, self.posture.activation.ramp)
 
 
 class ReleaseDriver(RobustDriver):
-    """The impact-robust term without the nominal spring, until ``H`` falls no more.
+    """Impact-robust term without the nominal spring, until ``H`` stops falling.
 
-    Without ``K_p``, the posture flows to the optimum itself instead of resting short of it.  The term is scaled with
-    the larger curvature of the start and of the offline optimum, hence nowhere between is it a spring much stiffer
-    than ``K``.  As soon as ``H`` has fallen by less than :attr:`LEAST` of itself within :attr:`PATIENCE`, the reached
-    posture is held.
+    Without ``K_p``, the posture flows to the optimum instead of coming to rest before it.  The scale of the term is
+    the larger curvature of the start and the offline optimum, so its stiffness hardly exceeds ``K`` between them.
+    The reached posture is held when ``H`` falls by a share of less than :attr:`LEAST` within :attr:`PATIENCE` (s).
 
     Args:
         setup: The experiment.
         term: The term, with ``spring="release"`` and an activation that is not live.
         gradient: ``q → (H, ∇H)``.
-        optimum: Posture found offline, shape (nq,).
+        optimum: Offline posture, shape (nq,).
     """
 
     PATIENCE, LEAST = 0.5, 0.01
@@ -175,7 +175,7 @@ class ReleaseDriver(RobustDriver):
         self._braced = True
 
     def tick(self, reading: Reading, reference: ReferencePoint | None = None) -> Command:
-        """Return the command.  Now and then, look whether ``H`` still falls."""
+        """Return the command, and check periodically whether ``H`` still falls."""
         if self._braced and self.level == 1:
             self._ticks += 1
             if self._ticks * self.controller.period >= self.PATIENCE:

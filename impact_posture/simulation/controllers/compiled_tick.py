@@ -1,4 +1,4 @@
-"""The controller of a driver as machine code, built once for each formulation."""
+"""Controller of a driver as machine code, built once for each formulation."""
 
 from __future__ import annotations
 
@@ -26,47 +26,47 @@ from impact_posture.tsid.controller import Command, Controller
 from impact_posture.tsid.tasks.task import TargetTask
 
 _PREFIX = "controller"
-# Compilers take long to optimize what is generated from the model.  Robots that differ in armature and mounting share
-# it, so a little of that pays: ticks of a humanoid take 10 % less for 2 s.
+# Optimizing the generated code takes long.  For a humanoid, -O1 costs 2 s and makes ticks 10 % faster.  Robots that
+# differ only in armature and mounting share the library.
 _QUICK = ("-O1",)
 
 
 class CompiledTick:
-    """Ticks in C with the tasks of a controller in Python, which keep the targets.
+    """Controller in C that follows the targets of the tasks in Python.
 
     Attributes:
         library: The controller in C.
     """
 
     def __init__(self, controller: Controller, structure: Structure, library: CompiledController) -> None:
-        """Take a library of the formulation of the controller."""
+        """Connect a controller in Python and the library of its formulation."""
         self.library, self._controller, self._structure = library, controller, structure
         self._tasks = [t for t in controller.formulation.tasks if isinstance(t, TargetTask)]
         self._sent: dict[str, tuple[object, bytes, bytes]] = {}
         self._numbers = ModelParameters(structure.robot.model).values
 
     def reset(self, q: Array, v: Array) -> Command:
-        """Start at a state at which the controller in Python has just been reset, with its gains and targets."""
+        """Start at the state of the controller in Python after its reset, with its gains and targets."""
         for field in parameters(self._structure, self._controller.period):
             self.library.parameters[field.name][:] = field.value
         self.library.parameters["numbers"][:] = self._numbers
         if self._structure.robust is not None:
-            # Measured by the controller in Python, so that both have the same digits.
+            # Python has measured the scale, so that both controllers have the same digits.
             self.library.parameters["robust_scale"][:] = self._structure.robust.scale
         self._sent.clear()
         self._lead()
         return self.library.reset(q, v)
 
     def tick(self, reading: Reading) -> Command:
-        """Return the command at a reading, with the targets that have been moved."""
+        """Send the moved targets and return the command at a reading."""
         self._lead()
         return self.library.tick(reading.t, reading.q, reading.v, reading.force)
 
     def plan(self, times: Sequence[float], lead: Callable[[float], None]) -> tuple[Array, Array]:
-        """Return which targets a function moves before the ticks at n times, and where to.
+        """Return the targets that a function moves before the ticks at n times.
 
         Returns:
-            Whether a target is moved, shape (n, targets), and its numbers, shape (n, targets, 25).
+            Whether each target moves, shape (n, targets), and its numbers, shape (n, targets, 25).
         """
         targets = self.library.targets
         before = {name: row.copy() for name, row in targets.items()}
@@ -81,14 +81,14 @@ class CompiledTick:
         return led, leads
 
     def catch_up(self) -> None:
-        """Bring the state of the controller in Python to that of the last tick."""
+        """Set the state of the controller in Python to the state of the last tick."""
         self._controller.state.update(*self.library.measured)
 
     def _lead(self) -> list[str]:
-        """Send the targets that have been moved, and return the names of their tasks."""
+        """Send the moved targets.  Return the names of their tasks."""
         moved = []
         for task in self._tasks:
-            # A target is replaced as a whole.  What C moves by itself stays as it is.
+            # Python replaces a moved target as a whole.  Targets that C moves stay unchanged here.
             rates = task.target_velocity, task.target_acceleration
             now = (task.target, rates[0].tobytes(), rates[1].tobytes())
             sent = self._sent.get(task.name)
@@ -105,10 +105,10 @@ def compiled_tick(controller: Controller, structure: Structure, objective: Worst
     Args:
         controller: The controller in Python.
         structure: Structure of its formulation.
-        objective: The objective of its impact-robust posture task, if it has one.
+        objective: Objective of the impact-robust posture task, or ``None``.
 
     Raises:
-        InputError: There are no sources of DAQP.
+        InputError: The sources of DAQP are missing.
         CompilerError: There is no compiler, or it failed.
         OutputError: The cache cannot be written, or other users can write it.
     """
@@ -117,22 +117,22 @@ def compiled_tick(controller: Controller, structure: Structure, objective: Worst
         if not is_cached(library_path(folder, _PREFIX)):
             require_compiler("controller")
             tell("compiling the controller")
-            given: dict[str, Any] = {"objective": objective, "prefix": _PREFIX, "build": True, "force": True}
-            given |= {"generated": _QUICK, "shared": True}
-            if export_controller(controller.robot, controller.formulation, folder, **given).library is None:
+            options: dict[str, Any] = {"objective": objective, "prefix": _PREFIX, "build": True, "force": True}
+            options |= {"generated": _QUICK, "shared": True}
+            if export_controller(controller.robot, controller.formulation, folder, **options).library is None:
                 raise CompilerError("left no library", where=str(folder), hint="set CC to another compiler")
-    # The manifest may be that of another robot with the same code.
+    # The manifest may name another robot with the same code.
     return CompiledTick(controller, structure, CompiledController.load(folder))
 
 
 def _key(structure: Structure, objective: WorstCaseObjective | None) -> str:
-    """Return a hash of everything that is compiled in; gains, limits, targets and some numbers are parameters."""
+    """Return a hash of everything that is compiled.  Gains, limits, targets and some numbers are parameters."""
     robot = without_parameters(structure.robot)
     if objective is not None:
-        # Only one kind depends on the friction of the impact.
+        # Only the kind ``coulomb`` depends on the friction of the impact.
         friction = objective.contact.friction if objective.kind == "coulomb" else 0.0
         objective = replace(objective, robot=robot, contact=replace(objective.contact, friction=friction))
-    frames = [robot.model.frames[robot.frame_id(point.frame)] for point in structure.points]
+    points = [(robot.model.frames[robot.frame_id(point.frame)], point) for point in structure.points]
     content = [
         VERSION,
         repr(_QUICK),
@@ -141,10 +141,7 @@ def _key(structure: Structure, objective: WorstCaseObjective | None) -> str:
         repr({name: table.tolist() for name, table in structure.tables.items()}),
         repr((structure.actuators.G.tolist(), robot.model.gravity.vector.tolist())),
         repr([(task.name, type(task).__name__) for task in structure.formulation.tasks]),
-        *[
-            repr((f.parentJoint, f.placement.homogeneous.tolist(), p))
-            for f, p in zip(frames, structure.points, strict=True)
-        ],
+        *[repr((frame.parentJoint, frame.placement.homogeneous.tolist(), point)) for frame, point in points],
         "" if objective is None else objective_key(objective),
     ]
     return source_key(content, "dynamics", "impact", "codegen", "controller_export", "tsid")

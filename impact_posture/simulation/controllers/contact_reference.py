@@ -1,4 +1,4 @@
-"""Reference of the end effector for repeated contacts, over time."""
+"""Reference of the end effector over time, for repeated contacts."""
 
 from __future__ import annotations
 
@@ -13,7 +13,7 @@ from impact_posture.simulation.scenario_file import RepeatedContacts
 
 
 class ReferencePoint(NamedTuple):
-    """Reference along the way in, from the place of the shape at the start.
+    """Reference along the approach, relative to the start of the shape.
 
     Attributes:
         distance: m.
@@ -27,22 +27,22 @@ class ReferencePoint(NamedTuple):
 
 
 class Reference:
-    """Reference of :class:`RepeatedContacts` along ``−n``, the way into the surface.
+    """Reference of :class:`RepeatedContacts` along ``−n``, into the surface.
 
-    On the way in, it speeds up from rest with ``acceleration`` to ``speed``, goes to the surface with ``speed``, and
-    brakes evenly to rest ``beyond`` the surface.  It stays for ``dwell``.  It comes back from rest to rest with the
-    same acceleration and at most the same speed, and pauses.
+    The approach accelerates from rest with ``acceleration`` to ``speed``, keeps this speed until the surface, and
+    brakes evenly to rest ``beyond`` the surface.  After ``dwell``, the return goes from rest to rest with the same
+    acceleration and at most the same speed.  A pause follows.
 
     Attributes:
         task: The contacts.
-        inward: Time of the way in, s.
+        inward: Duration of the approach, s.
         cycle: Time from one approach to the next, s.
-        total: Time of the whole run, s.
-        legs: Duration, acceleration, distance and speed at the begin of each leg of constant acceleration.
+        total: Duration of the run, s.
+        legs: Duration, acceleration, and initial distance and speed of each leg of constant acceleration.
 
     Args:
         task: The contacts.
-        gap: Distance of shape and surface at the start, m.
+        gap: Distance between shape and surface at the start, m.
 
     Raises:
         InputError: The gap is too short to reach the speed.
@@ -50,17 +50,13 @@ class Reference:
 
     def __init__(self, task: RepeatedContacts, gap: float) -> None:
         v, a = task.speed, task.acceleration
-        # A product is infinite where a power of Python fails.
+        # A product overflows to infinity, but a power raises OverflowError.
         run_up = v * v / (2 * a)
         if not run_up <= gap:
-            raise InputError(
-                f"{v:g} m/s at {a:g} m/s² takes {run_up:.3g} m, the gap is {gap:.3g} m",
-                where="contacts",
-                hint="widen the gap, slow down, or accelerate more",
-            )
+            what = f"{v:g} m/s at {a:g} m/s² takes {run_up:.3g} m, the gap is {gap:.3g} m"
+            raise InputError(what, where="contacts", hint="widen the gap, slow down, or accelerate more")
         depth, braking = gap + task.beyond, 2 * task.beyond / v
         top = min(v, float(np.sqrt(a * depth)))
-        # Legs of constant acceleration: duration, acceleration, distance and speed at their begin.
         inward = [(v / a, a, 0.0, 0.0), ((gap - run_up) / v, 0.0, run_up, v)]
         if braking:
             inward.append((braking, -v / braking, gap, v))
@@ -77,7 +73,7 @@ class Reference:
         self.total = task.settle + task.count * self.cycle
 
     def start(self, contact: int) -> float:
-        """Return when the approach of a contact begins, s."""
+        """Return the begin of the approach of a contact, s."""
         return float(self.task.settle + contact * self.cycle)
 
     def at(self, t: float) -> ReferencePoint:

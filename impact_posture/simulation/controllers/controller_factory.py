@@ -1,4 +1,4 @@
-"""The controllers that are compared.  Each name makes one driver."""
+"""Controllers by name, and the factory that builds their drivers."""
 
 from __future__ import annotations
 
@@ -63,7 +63,7 @@ MEANING: dict[str, str] = {
     "walker": "the gradient's flow as reference of the posture task",
 }
 CONTROLLERS = tuple(MEANING)
-# A controller with this at the end of its name is also as stiff as the term is in its posture.
+# This suffix adds the stiffness that the impact-robust term has in the posture of the controller.
 _STIFF = "-stiff"
 _PLAIN = {
     "nominal": Driver,
@@ -71,7 +71,7 @@ _PLAIN = {
     "reference-spreading": ReferenceSpreadingDriver,
     "impact-aware": ImpactAwareDriver,
 }
-# Drivers that a controller in C can serve.
+# Drivers that can use a controller in C.
 _IN_C = (Driver, RobustDriver, FlowDriver, PostureDriver)
 _KINDS: dict[str, ObjectiveKind] = {
     "robust-speed": "speed",
@@ -79,39 +79,38 @@ _KINDS: dict[str, ObjectiveKind] = {
     "robust-flow-sticking": "sticking",
     "posture-sticking": "sticking",
 }
-# Controllers that go to a posture found offline.
+# Controllers that move to an offline posture.
 _OFFLINE = ("posture", "posture-sticking", "path")
 # Entry points by which other installed packages add controllers.
 GROUP = "impact_posture.controllers"
 
 
 def check_gain(name: str, gain: float | None) -> None:
-    """Refuse a gain for a controller of this package that has none.
+    """Refuse a gain for a controller of this package that does not have a gain.
 
     Raises:
         InputError: The controller has no gain.
     """
     has = name.startswith(("robust", "walker", "stiff")) and not name.startswith("robust-flow")
     if gain is not None and name in CONTROLLERS and not (has or name.endswith(_STIFF)):
-        raise InputError(
-            f"'{name}' has no gain", where="gain", hint="robust, its variants, walker and stiff have one"
-        )
+        hint = "robust, its variants, walker and stiff have one"
+        raise InputError(f"'{name}' has no gain", where="gain", hint=hint)
 
 
 @dataclass(eq=False)
 class ControllerFactory:
-    """A scenario and the parts of its controllers.  Each part is made at its first use.
+    """Builds the controllers of a scenario.  Shared parts are built at their first use.
 
     Attributes:
-        setup: The experiment.
+        setup: The scenario.
         free: Whether gradients and the offline optimum ignore the feet.
-        gradient_of: Makes the gradient of an objective, compiled or interpreted.
-        offline_of: Finds the offline posture, as :func:`~impact_posture.simulation.offline_posture.offline_posture`
-            does.
+        gradient_of: Function that builds the gradient of an objective, compiled or interpreted.
+        offline_of: Function with the arguments and result of
+            :func:`~impact_posture.simulation.offline_posture.offline_posture`.
         compile: Whether controllers run as machine code: ``auto`` where they can, always, or never.
         starts: Number of starts of the optimizer for offline postures.
-        in_c: Whether the last driver does.
-        warnings: What of the last driver is not compiled although it should have been, and why.
+        in_c: Whether the last driver runs as machine code.
+        warnings: Parts of the last driver that could not be compiled, with reasons.
     """
 
     setup: Setup
@@ -134,17 +133,17 @@ class ControllerFactory:
         return self._objectives[kind]
 
     def gradient(self, kind: ObjectiveKind = "impulse") -> Gradient:
-        """Return the gradient of an objective, interpreted if it cannot be compiled or loaded (:attr:`warnings`)."""
+        """Return the gradient of an objective.  It is interpreted, with a warning, if it cannot be compiled."""
         if kind not in self._gradients:
             try:
                 self._gradients[kind] = self.gradient_of(self.objective(kind)), ()
             except InputError as error:
-                # A fault of the objective itself is raised again.
+                # An error of the objective itself is raised again here.
                 warning = f"the gradient is interpreted, not compiled, which is slower: {error.line}"
                 self._gradients[kind] = interpreted(self.objective(kind)), (warning,)
-        found, warnings = self._gradients[kind]
+        gradient, warnings = self._gradients[kind]
         self.warnings += [warning for warning in warnings if warning not in self.warnings]
-        return found
+        return gradient
 
     @cached_property
     def metric(self) -> Callable[[Array], float]:
@@ -154,12 +153,12 @@ class ControllerFactory:
         return lambda q: float(function(q, normal))
 
     def offline(self, name: str = "posture") -> OfflinePosture | None:
-        """Return the offline posture of a controller, or ``None`` for one that goes to none."""
+        """Return the offline posture of a controller, or ``None`` for a controller without one."""
         name = name.removesuffix(_STIFF)
         return self._optimum(name) if name in _OFFLINE else None
 
     def _optimum(self, name: str) -> OfflinePosture:
-        # A path begins where the robot starts, so its end holds the end effector there.
+        # Along a path, the end effector stays at its start.
         kind, at_contact = _KINDS.get(name, "impulse"), name != "path"
         if (kind, at_contact) not in self._offline:
             self._offline[kind, at_contact] = self.offline_of(
@@ -169,26 +168,26 @@ class ControllerFactory:
 
     @cached_property
     def path(self) -> PosturePath:
-        """The path of the ``path`` controller."""
+        """Path of the ``path`` controller."""
         check_package()
         solution = self._optimum("path").solution
         tell("looking for a path to the offline posture")
         return posture_path(solution)
 
     def driver(self, name: str, mode: Mode = "live", gain: float | None = None) -> Driver:
-        """Make a controller.
+        """Build a controller.
 
-        A name that is not of this package is looked up among the entry points :data:`GROUP` of the installed
-        packages.  Such a controller is made by a function of this factory, the mode and the gain; the name runs it.
+        A name of another package is looked up among the entry points :data:`GROUP` of the installed packages.  The
+        entry point is a function of this factory, the mode and the gain that returns the driver.
 
         Args:
             name: Name of the controller.
             mode: ``live`` keeps the impact-robust term on through the impact, ``held`` holds the reached posture.
-            gain: K instead of that of the scenario, 1/s².
+            gain: K in place of the value in the scenario, 1/s².
 
         Raises:
-            ControllerNotFound: There is no such controller.
-            InputError: There is no such mode, the controller has no term to hold, or another package fails.
+            ControllerNotFound: The controller is unknown.
+            InputError: The mode is unknown, the controller has no term to hold, or another package fails.
         """
         self.warnings.clear()
         self.in_c = False
@@ -201,13 +200,13 @@ class ControllerFactory:
             return self._driver_from_outside(name, mode, gain)
         if mode == "held" and not (name.startswith("robust") or name == "walker"):
             raise InputError(f"'{name}' has no term to hold", where="mode", hint="only robust… and walker have one")
-        driver = self._made(name, mode, gain)
+        driver = self._build(name, mode, gain)
         driver.compiled = self._compiled(driver, name)
         self.in_c = driver.compiled is not None
         return driver
 
-    def _made(self, name: str, mode: Mode, gain: float | None) -> Driver:
-        """Make a controller of this package."""
+    def _build(self, name: str, mode: Mode, gain: float | None) -> Driver:
+        """Build a controller of this package."""
         setup, robot = self.setup, self.setup.robot
         if name == "stiff":
             return self._stiffened("nominal", "robust", gain)
@@ -224,11 +223,9 @@ class ControllerFactory:
         if name.startswith("robust-flow"):
             return FlowDriver(setup, ReferenceFlowPosture(robot, gradient, **options))
         if name == "robust-release":
-            once = Activation(ramp=term.ramp, live=False)
-            released = ImpactRobustPosture(
-                robot, gradient, K=K, fade=term.fade, activation=once, spring="release", **options
-            )
-            return ReleaseDriver(setup, released, gradient, self._optimum(name).q)
+            options |= {"activation": Activation(ramp=term.ramp, live=False), "spring": "release"}
+            posture = ImpactRobustPosture(robot, gradient, K=K, fade=term.fade, **options)
+            return ReleaseDriver(setup, posture, gradient, self._optimum(name).q)
         activation = Activation(ramp=term.ramp, live=mode == "live")
         driver, task = (WalkerDriver, FlowPosture) if name == "walker" else (RobustDriver, ImpactRobustPosture)
         return driver(setup, task(robot, gradient, K=K, fade=term.fade, activation=activation, **options))
@@ -236,7 +233,7 @@ class ControllerFactory:
     def _compiled(self, driver: Driver, name: str) -> CompiledTick | None:
         """Return the controller of a driver as machine code, or ``None`` where Python runs it.
 
-        Other drivers look into their controller, and only Python has one to look into.
+        Only the drivers of :data:`_IN_C` can run in C, because the others read the state of their controller.
         """
         always, controller = self.compile == "always", driver.controller
         if not always and (self.compile == "never" or self._fault or find_compiler() is None):
@@ -256,25 +253,25 @@ class ControllerFactory:
         except InputError as error:
             if always:
                 raise
-            # What fails once, such as a download, is not tried again for each run.
+            # A failed build or download is not tried again for each run.
             self._fault = f"the controller runs in Python, not in C, which is slower: {error.line}"
             self.warnings.append(self._fault)
             return None
 
     def _stiffened(self, name: str, at: str, gain: float | None) -> Driver:
-        """Make a controller with the spring that the term of ``robust`` is in the posture that ``at`` braces to."""
+        """Build controller ``name`` with the stiffness of the term of ``robust`` in the resting posture of ``at``."""
         robust = self.driver("robust", gain=gain)
         assert isinstance(robust, RobustDriver)  # noqa: S101 (the name says it)
         seconds = self.setup.scenario.task.settle
         reached = resting_posture(robust, seconds)
         if at != "robust":
             reached = resting_posture(self.driver(at), seconds)
-        driver, strength = self._made(name, "live", None), robust.posture.K / robust.posture.scale
+        driver, strength = self._build(name, "live", None), robust.posture.K / robust.posture.scale
         driver.posture.stiffen(spring_of_term(self.setup.robot, self.gradient(), reached, strength))
         return driver
 
     def _driver_from_outside(self, name: str, mode: Mode, gain: float | None) -> Driver:
-        """Make a controller of another installed package."""
+        """Build a controller of another installed package."""
         added = metadata.entry_points(group=GROUP)
         if name not in added.names:
             known = (*CONTROLLERS, *sorted(added.names))
@@ -286,8 +283,8 @@ class ControllerFactory:
             raise
         except Exception as error:
             # The code of another package may raise anything.
-            words = f"cannot be made: {type(error).__name__}: {error}"
-            raise InputError(words, where=where, hint="correct or remove the package that adds it") from error
+            what = f"cannot be made: {type(error).__name__}: {error}"
+            raise InputError(what, where=where, hint="correct or remove the package that adds it") from error
         if not isinstance(driver, Driver):
             raise InputError(f"makes a {type(driver).__name__}", where=where, hint="return a Driver")
         return driver

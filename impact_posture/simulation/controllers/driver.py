@@ -1,4 +1,4 @@
-"""A controller in a scenario: its references, its preparation for the impact, and the posture that it holds."""
+"""Controller of a scenario: references, preparation for the impact, and the posture that it holds."""
 
 from __future__ import annotations
 
@@ -26,13 +26,13 @@ MOVE = 1.0
 
 
 class Driver:
-    """Task-space inverse dynamics with a posture task.  This class is the nominal controller.
+    """Nominal controller: task-space inverse dynamics with a posture task.
 
     Attributes:
-        setup: The experiment.
+        setup: The scenario.
         posture: The posture task.
-        controller: The controller.
-        compiled: The same controller as machine code, which then gives the commands.
+        controller: The controller in Python.
+        compiled: The same controller as machine code.  If it is set, it gives the commands.
     """
 
     compiled: CompiledTick | None = None
@@ -50,24 +50,24 @@ class Driver:
         self._followed: ReferencePoint | None = None
 
     def reset(self, q: Array) -> Command:
-        """Begin at rest.  The tasks hold what is there, whatever an earlier run has moved."""
-        task, self._followed = self._end_effector, None
-        for one in (*([] if task is None else [task]), *self._body_tasks):
-            one.target, one.target_velocity, one.target_acceleration = None, 0.0, 0.0
+        """Begin at rest.  All tasks hold the present state, and targets of an earlier run are forgotten."""
+        end_effector, self._followed = self._end_effector, None
+        for task in (*([] if end_effector is None else [end_effector]), *self._body_tasks):
+            task.target, task.target_velocity, task.target_acceleration = None, 0.0, 0.0
         at_rest = np.zeros(self.setup.robot.nv)
         command = self.controller.reset(q, at_rest)
-        self._home = None if task is None else task.target
+        self._home = None if end_effector is None else end_effector.target
         return command if self.compiled is None else self.compiled.reset(q, at_rest)
 
     def tick(self, reading: Reading, reference: ReferencePoint | None = None) -> Command:
-        """Return the command, where ``reference`` is the target of the end effector along its way in."""
+        """Return the command.  ``reference`` is the target of the end effector along its approach."""
         self.lead(reading.t, reference)
         if self.compiled is not None:
             return self.compiled.tick(reading)
         return self.controller.tick(reading.t, reading.q, reading.v, reading.force)
 
     def lead(self, t: float, reference: ReferencePoint | None = None) -> None:
-        """Move the targets of the tasks for a tick at a time, s."""
+        """Move the targets of the tasks for a tick at time ``t``, s."""
         if reference != self._followed and reference is not None:
             self._follow(reference)
             self._followed = reference
@@ -76,42 +76,42 @@ class Driver:
         """Prepare for impacts from now on.  The nominal controller does nothing."""
 
     def hold(self) -> None:
-        """Hold the posture that was reached.  The nominal controller does nothing."""
+        """Hold the reached posture.  The nominal controller does nothing."""
 
     def expect(self, t: float) -> None:
-        """Expect an impact at a time, s.  The nominal controller does nothing."""
+        """Expect an impact at time ``t``, s.  The nominal controller does nothing."""
 
     @property
     def level(self) -> float:
         """Level of the term that prepares for the impact, 0 to 1."""
         return self.posture.level if self.compiled is None else self.compiled.library.level
 
-    def _tell(self, method: str, *given: Any, **named: Any) -> None:
-        """Call a method of the posture task, or that of its counterpart in C."""
-        getattr(self.posture if self.compiled is None else self.compiled.library, method)(*given, **named)
+    def _call_posture(self, method: str, *arguments: Any, **named: Any) -> None:
+        """Call a method of the posture task in Python or in C, whichever is in use."""
+        getattr(self.posture if self.compiled is None else self.compiled.library, method)(*arguments, **named)
 
     def _follow(self, reference: ReferencePoint) -> None:
         task, home = self._end_effector, self._home
         if task is None or home is None:
             return
-        way = reference.distance * self._inward[:3]
-        task.target = home + way if isinstance(home, np.ndarray) else pin.SE3(home.rotation, home.translation + way)
+        step = reference.distance * self._inward[:3]
+        task.target = home + step if isinstance(home, np.ndarray) else pin.SE3(home.rotation, home.translation + step)
         task.target_velocity = reference.speed * self._inward
         task.target_acceleration = reference.acceleration * self._inward
 
 
 class RobustDriver(Driver):
-    """Impact-robust controller, which uses the impact-robust term of its posture task from :meth:`brace` on."""
+    """Impact-robust controller.  Its posture task has the impact-robust term from :meth:`brace` on."""
 
     posture: ImpactRobustPosture
 
     def brace(self) -> None:
         """Switch the term on."""
-        self._tell("brace")
+        self._call_posture("brace")
 
     def hold(self) -> None:
         """Hold the present posture, center of mass and base orientation, and switch the term off."""
-        self._tell("contact")
+        self._call_posture("contact")
         if self.compiled is not None:
             self.compiled.catch_up()
         for task in self._body_tasks:
@@ -120,39 +120,39 @@ class RobustDriver(Driver):
 
 
 class FlowDriver(Driver):
-    """Controller whose posture flows to lower impacts, from :meth:`brace` on."""
+    """Controller whose posture flows to a smaller impact from :meth:`brace` on."""
 
     posture: ReferenceFlowPosture
     _now = 0.0
 
     def lead(self, t: float, reference: ReferencePoint | None = None) -> None:
-        """Keep the time."""
+        """Store the time."""
         self._now = t
         super().lead(t, reference)
 
     def brace(self) -> None:
-        """Let the posture flow."""
-        self._tell("brace")
+        """Start the flow of the posture."""
+        self._call_posture("brace")
 
     def hold(self) -> None:
         """Hold the posture that the flow has reached."""
-        self._tell("contact")
+        self._call_posture("contact")
 
     def expect(self, t: float) -> None:
-        """Rest early enough before an impact at a time, s."""
+        """Come to rest before an impact at time ``t``, s."""
         if self.level > 0:
-            self._tell("brace", t_impact=t - self._now)
+            self._call_posture("brace", t_impact=t - self._now)
 
 
 class PostureDriver(Driver):
-    """Nominal controller that goes to a posture found offline, from :meth:`brace` on."""
+    """Nominal controller that moves to an offline posture from :meth:`brace` on."""
 
     def __init__(self, setup: Setup, posture: JointPosture, target: Array) -> None:
-        """Set the posture to go to, shape (nq,)."""
+        """Set the target posture, shape (nq,)."""
         super().__init__(setup, posture)
         self._goal = target
         self._since: float | None = None
-        # Body tasks with their targets before and after.
+        # Body tasks with their first and last targets.
         self._moves: list[tuple[CenterOfMass | BaseOrientation, Any, Any]] = []
 
     def reset(self, q: Array) -> Command:
@@ -162,10 +162,10 @@ class PostureDriver(Driver):
 
     def brace(self) -> None:
         """Move posture, center of mass and base orientation to the goal within :data:`MOVE`."""
-        self._tell("move_to", self._goal, MOVE)
+        self._call_posture("move_to", self._goal, MOVE)
         model = self.setup.robot.model
         for task in self._body_tasks:
-            # The feet stay in place, because the goal was found with them there.
+            # The goal was computed with the feet in place, so they do not move.
             if isinstance(task, CenterOfMass):
                 end = np.array(pin.centerOfMass(model, model.createData(), self._goal))
             else:
@@ -186,18 +186,18 @@ class PostureDriver(Driver):
 
     @property
     def level(self) -> float:
-        """Share of the way to the goal, 0 to 1."""
+        """Progress of the motion to the goal, 0 to 1."""
         return 0.0 if self._since is None else smooth(self._since / MOVE)
 
 
 class PathDriver(Driver):
-    """Nominal controller whose posture follows a timed path, from :meth:`brace` on.
+    """Nominal controller whose posture follows a timed path from :meth:`brace` on.
 
-    Between two points of the path, the posture is interpolated on the manifold, velocity and acceleration linearly.
-    Center of mass and base orientation follow too.
+    Between two points of the path, the posture is interpolated on the manifold, and velocity and acceleration
+    linearly.  Center of mass and base orientation follow the posture.
 
     Attributes:
-        path: The path, which begins at the start of the scenario, as far as that satisfies the constraints.
+        path: Path that begins at the start posture, or at the nearest posture that satisfies the constraints.
     """
 
     def __init__(self, setup: Setup, posture: JointPosture, path: PosturePath) -> None:
@@ -236,7 +236,7 @@ class PathDriver(Driver):
 
     @property
     def level(self) -> float:
-        """Share of the duration of the path that has passed, 0 to 1."""
+        """Elapsed share of the duration of the path, 0 to 1."""
         if self._since is None:
             return 0.0
         return min(1.0, self._since / self.path.duration) if self.path.duration else 1.0

@@ -26,7 +26,7 @@ class ImpactFeedbackDriver(Driver):
     """
 
     FELT = 5.0
-    # An impact that is felt longer before the expected time belongs to the one before, s.
+    # A force earlier than this before the expected time belongs to the previous impact, s.
     EARLY = 0.2
 
     def __init__(self, setup: Setup, posture: JointPosture) -> None:
@@ -44,11 +44,11 @@ class ImpactFeedbackDriver(Driver):
         return super().reset(q)
 
     def expect(self, t: float) -> None:
-        """Expect an impact at a time, s.  One that is felt earlier or later moves the time."""
+        """Expect an impact at time ``t``, s.  An impact that the force sensor feels moves the time."""
         self._at, self._felt = t, False
 
     def _feel(self, reading: Reading) -> bool:
-        """Move the time to an impact that is felt.  Return whether the impact acts now."""
+        """Set the time of an impact that the force sensor feels.  Return whether the impact acts now."""
         acts = reading.force is not None and float(np.linalg.norm(reading.force)) > self.FELT
         if acts and not self._felt and reading.t > self._at - self.EARLY:
             self._at, self._felt = reading.t, True
@@ -62,7 +62,7 @@ class ImpactFeedbackDriver(Driver):
             self._follow(reference)
 
     def _command(self, reading: Reading, shift: Array | None) -> Command:
-        """Return the command for a velocity feedback that gets ``ν + shift``, with a shift of shape (nv,)."""
+        """Return the command with the velocity feedback of ``ν + shift``, where ``shift`` has the shape (nv,)."""
         if shift is not None:
             for task in self.controller.formulation.tasks:
                 task.target_velocity = task.target_velocity - task.jacobian(self._state) @ shift
@@ -73,27 +73,27 @@ class InvariantDriver(ImpactFeedbackDriver):
     """Feedback on the impact-invariant subspace around an impact (Yang and Posa 2021).
 
     An impulse at the contact does not change the component of ν in the null space of ``J M⁻¹``.  Around the impact,
-    the velocity feedback of every task gets ``ν + α M⁻¹Jᵀ λ*`` instead of ν, so it does not fight what an impulse may
-    have done.  ``λ*`` minimizes ``‖ẏ_des − J_y (ν + M⁻¹Jᵀ λ)‖``.  ``α = 1 − exp(−(T − |t − t*|)/τ)`` within ``T`` =
-    ``WINDOW`` (s) of the impact at ``t*``, with ``τ`` = ``FADE`` (s).
+    the velocity feedback of every task uses ``ν + α M⁻¹Jᵀ λ*`` instead of ν.  So it does not oppose a velocity that
+    an impulse may have caused.  ``λ*`` minimizes ``‖ẏ_des − J_y (ν + M⁻¹Jᵀ λ)‖``.  Within ``T`` = ``WINDOW`` (s) of
+    the impact at ``t*``, ``α = 1 − exp(−(T − |t − t*|)/τ)`` with ``τ`` = ``FADE`` (s).
 
-    Adapted: a force sensor moves ``t*``, where the paper has a schedule.  The posture task does not count for ``λ*``
-    if there are others, because its target is rest while they move.  The paper tracks no redundant posture.  Feet
-    that stand react to the impulse (``M⁻¹`` is contact-consistent).  The paper counts their impulses as free, too.
-    Here, free impulses could explain every velocity of center of mass and base, and would leave no feedback.
+    Differences from the paper: a force sensor moves ``t*``, instead of a schedule.  The posture task does not count
+    for ``λ*`` if there are other tasks, because its target is at rest while they move.  The paper has no redundant
+    posture.  Standing feet react to the impulse (``M⁻¹`` is contact-consistent).  In the paper, their impulses are
+    free.  Here, free impulses could explain every velocity of center of mass and base, and would leave no feedback.
     """
 
     WINDOW, FADE = 0.05, 0.0025
 
     def tick(self, reading: Reading, reference: ReferencePoint | None = None) -> Command:
-        """Return the command, with a velocity feedback that impulses do not change."""
+        """Return the command with a velocity feedback that impulses do not change."""
         self._feel(reading)
         self._lead(reference)
         share = self.share(reading.t)
         return self._command(reading, share * self._correction(reading) if share > 0 else None)
 
     def share(self, t: float) -> float:
-        """Return ``α`` at a time, s."""
+        """Return ``α`` at time ``t``, s."""
         left = self.WINDOW - abs(t - self._at)
         return float(-np.expm1(-left / self.FADE)) if left > 0 else 0.0
 
@@ -111,29 +111,29 @@ class InvariantDriver(ImpactFeedbackDriver):
 class ReferenceSpreadingDriver(ImpactFeedbackDriver):
     """Time-invariant reference spreading with an interim mode (van Steen et al. 2024).
 
-    The end effector has three references along its way ``s`` into the surface:
+    The end effector has three references along its distance ``s`` into the surface:
 
-    - Before the impact, the speed ``√(2 a s)``, at most that of the scenario, is a function of the place.  It goes on
-      behind the surface, so an impact that comes late meets no other reference.  There is no error of position along
-      the way.
-    - In the interim mode, from the first touch until the contact has lasted for ``SUSTAINED`` (s), at most
-      ``INTERIM`` (s), no task has velocity feedback.  The position follows the integral of the speed before the
+    - Before the impact, the speed is a function of the position, ``√(2 a s)`` up to the speed of the scenario.  It
+      continues behind the surface, so a late impact meets the same reference.  There is no position error along the
+      approach.
+    - The interim mode lasts from the first touch until the contact has lasted for ``SUSTAINED`` (s), at most
+      ``INTERIM`` (s).  No task has velocity feedback.  The position follows the integral of the speed before the
       impact, which completes the contact.
-    - After the impact, the position fades from there to where the scenario rests, with the time constant ``SETTLE``
-      (s).  The velocity targets of all tasks begin at ``J_y ν⁺`` and fade likewise.  ``ν⁺ = ν⁻ + Δν`` follows from a
-      rigid, inelastic impact at the velocity before the touch.
+    - After the impact, the position fades to the rest position of the scenario with the time constant ``SETTLE`` (s).
+      The velocity targets of all tasks begin at ``J_y ν⁺`` and fade likewise.  ``ν⁺ = ν⁻ + Δν`` follows from a rigid,
+      inelastic impact at the velocity before the touch.
 
-    Adapted: there is one contact, not several at nominally the same time.  A contact that rebounds counts as partial.
-    ``ν⁻`` is measured, because the tasks leave a redundancy without a reference.  On its way back, the end effector
-    follows the scenario in time.  Without contacts there is nothing to spread, and this is the nominal controller.
-    Longer modes let the robot move more, because this controller avoids feedback and not motion.
+    Differences from the paper: there is one contact instead of several simultaneous contacts.  A rebound counts as a
+    partial contact.  ``ν⁻`` is measured, because the tasks leave a redundancy without a reference.  The return
+    follows the scenario in time.  Without contacts, this is the nominal controller.  Longer modes let the robot move
+    more, because this controller avoids feedback and not motion.
     """
 
     SUSTAINED, INTERIM, SETTLE = 0.005, 0.05, 0.03
-    # Place from which the speed before the impact counts, m, because at zero the robot would never leave.
+    # Least distance for the speed before the impact, m.  At zero, the robot would never start.
     BEGIN = 2e-3
-    # Place of the touch, which the interim mode moves, how long the contact has lasted, and the end of the mode.
-    _place: float
+    # Distance of the touch, which the interim mode advances; duration of the contact; end of the interim mode.
+    _touch: float
     _lasted: float
     _done: float | None
 
@@ -155,7 +155,7 @@ class ReferenceSpreadingDriver(ImpactFeedbackDriver):
         return command
 
     def expect(self, t: float) -> None:
-        """Expect an impact at a time, s, before which the next approach begins."""
+        """Expect an impact at time ``t``, s, and begin the next approach."""
         super().expect(t)
         self._clear()
 
@@ -166,48 +166,47 @@ class ReferenceSpreadingDriver(ImpactFeedbackDriver):
         if reference is None or reference.speed < 0 or not math.isfinite(self._at):
             self._lead(reference)
             return self._command(reading, None)
-        way = float(-self.setup.scenario.normal @ (state.at(self._point).position - self._origin))
-        if reading.t < self._at or not (acts or self._place):
-            speed = min(math.sqrt(2 * self._acceleration * max(way, self.BEGIN)), self._speed)
+        distance = float(-self.setup.scenario.normal @ (state.at(self._point).position - self._origin))
+        if reading.t < self._at or not (acts or self._touch):
+            speed = min(math.sqrt(2 * self._acceleration * max(distance, self.BEGIN)), self._speed)
             self._before = reading.v.copy()
-            self._lead(ReferencePoint(way, speed, self._acceleration if speed < self._speed else 0.0))
+            self._lead(ReferencePoint(distance, speed, self._acceleration if speed < self._speed else 0.0))
             return self._command(reading, None)
-        if not self._place:
-            # The first tick of the touch.
-            self._place = way
+        if not self._touch:
+            # This is the first tick of the touch.
+            self._touch = distance
             self._after = self._before + self._impact.jump(state)[0] @ self._before
         self._lasted = self._lasted + self.controller.period if acts else 0.0
         since = reading.t - self._at
         if self._done is None and (self._lasted >= self.SUSTAINED or since > self.INTERIM):
             self._done = reading.t
         if self._done is None:
-            self._place += self.controller.period * self._speed
-            self._lead(ReferencePoint(self._place, self._speed, 0.0))
+            self._touch += self.controller.period * self._speed
+            self._lead(ReferencePoint(self._touch, self._speed, 0.0))
             for task in self.controller.formulation.tasks:
                 task.target_velocity = task.jacobian(state) @ reading.v
             return self._command(reading, None)
         fade = math.exp(-(reading.t - self._done) / self.SETTLE)
-        self._lead(ReferencePoint(reference.distance + fade * (self._place - reference.distance), 0.0, 0.0))
+        self._lead(ReferencePoint(reference.distance + fade * (self._touch - reference.distance), 0.0, 0.0))
         return self._command(reading, -fade * self._after)
 
     def _clear(self) -> None:
         """Forget the last impact."""
-        self._place, self._lasted, self._done = 0.0, 0.0, None
+        self._touch, self._lasted, self._done = 0.0, 0.0, None
         self._before = self._after = np.zeros(self.setup.robot.nv)
 
 
 class ImpactAwareDriver(Driver):
     """Nominal controller with limits of post-impact rates and impulsive torques (Wang et al. 2020).
 
-    From the begin of an approach until the way back, each tick obeys
-    :class:`~impact_posture.tsid.limits.impact_limits.ImpactLimits`, as if the impact came at the next tick.  It
-    approaches
-    only as fast as the limits of the robot allow.  Where they allow the speed of the scenario, this is the nominal
-    controller.
+    From the begin of an approach until the return, each tick obeys
+    :class:`~impact_posture.tsid.limits.impact_limits.ImpactLimits`, as if the impact came at the next tick.  So the
+    approach is only as fast as the limits of the robot allow.  If they allow the speed of the scenario, this is the
+    nominal controller.
 
-    Adapted: limits that the present state cannot obey give way like those of the joints.  The paper has no answer to
-    them.  The paper also keeps the zero-moment point and the friction of standing feet through the impact.  Here, the
-    feet react without limit.
+    Differences from the paper: limits that the present state violates give way, like limits of the joints.  The paper
+    does not treat this case.  It also keeps the zero-moment point and the friction of standing feet through the
+    impact.  Here, the feet react without limits.
     """
 
     def __init__(self, setup: Setup, posture: JointPosture) -> None:
@@ -225,11 +224,11 @@ class ImpactAwareDriver(Driver):
         return super().reset(q)
 
     def expect(self, t: float) -> None:
-        """Expect an impact at a time, s, and limit what it may do from now on."""
+        """Expect an impact, and apply its limits from now on."""
         self.limits.active = True
 
     def tick(self, reading: Reading, reference: ReferencePoint | None = None) -> Command:
-        """Return the command, limited until the end effector goes back."""
+        """Return the command, with limits until the end effector returns."""
         if reference is not None and reference.speed < 0:
             self.limits.active = False
         return super().tick(reading, reference)

@@ -1,4 +1,4 @@
-"""Tasks of a controller from the gains of a scenario.  All controllers have the same tasks except for the posture."""
+"""Tasks of a controller from the gains of a scenario.  Controllers differ in the posture task only."""
 
 from __future__ import annotations
 
@@ -34,36 +34,25 @@ def end_effector_task(setup: Setup) -> EndEffector | None:
     if scenario.contacts is None:
         return None
     if gains is None:
-        raise SpecError(
-            "has contacts, but nothing that leads the frame there",
-            where=scenario.source,
-            hint="add [control.end_effector]",
-        )
+        what = "has contacts, but nothing that leads the frame there"
+        raise SpecError(what, where=scenario.source, hint="add [control.end_effector]")
     mass, frame = scenario.control.apparent_mass, scenario.shape.frame
     impedance = None if mass is None else Impedance(mass)
-    point = Point(frame, scenario.shape.offset)
-    placed = Numeric(setup.robot.model).at(setup.q).placement(point_on(setup.robot, frame))
-    return pose_task(
-        point,
-        gains.pose,
-        placed.rotation.T @ scenario.normal,
-        kp=gains.kp,
-        kd=gains.kd,
-        weight=gains.weight,
-        impedance=impedance,
-        name="end effector",
-    )
+    placement = Numeric(setup.robot.model).at(setup.q).placement(point_on(setup.robot, frame))
+    axis, point = placement.rotation.T @ scenario.normal, Point(frame, scenario.shape.offset)
+    options: dict[str, Any] = {"kp": gains.kp, "kd": gains.kd, "weight": gains.weight}
+    return pose_task(point, gains.pose, axis, impedance=impedance, name="end effector", **options)
 
 
 def build_formulation(setup: Setup, posture: JointPosture, end_effector: EndEffector | None) -> TaskFormulation:
     """Build the tasks of a scenario around a posture task.
 
-    A robot with ``[control.footing]`` stands.  Contacts and friction are constraints, and center of mass, base
-    orientation, end effector and posture are weighted.  Any other robot has strict levels: level base, end effector,
+    For a robot with ``[control.footing]``, contacts and friction are constraints, and center of mass, base
+    orientation, end effector and posture are weighted.  Another robot has strict levels: level base, end effector,
     and the posture in the cost.
 
     Raises:
-        SpecError: There are gains for a task that the robot cannot have.
+        SpecError: A task with gains does not exist for this robot.
     """
     control, scenario = setup.scenario.control, setup.scenario
     _check_gains(setup)
@@ -82,9 +71,9 @@ def build_formulation(setup: Setup, posture: JointPosture, end_effector: EndEffe
 
 
 def posture_options(setup: Setup) -> dict[str, Any]:
-    """Return the options of the posture task, with the same damping for all controllers.
+    """Return the options of the posture task, which all controllers share.
 
-    The base of a floating robot has no weight in this task, because other tasks control it.
+    The base of a floating robot has no weight, because other tasks control it.
     """
     gains, base = setup.scenario.control.posture, 0.0 if setup.robot.floating else None
     kd = 2 * np.sqrt(gains.kp) if gains.kd is None else gains.kd
@@ -97,17 +86,17 @@ def nominal_posture(setup: Setup) -> JointPosture:
 
 
 def _check_gains(setup: Setup) -> None:
-    """Refuse gains that no task would use."""
+    """Refuse gains of tasks that do not exist."""
     control, source = setup.scenario.control, setup.scenario.source
     stands, flies = control.footing is not None, setup.robot.floating
-    for key, given, fits, why in (
+    for key, gains, fits, reason in (
         ("footing", control.footing, flies, "a base that is fixed"),
         ("tilt", control.tilt, flies and not stands, "feet" if stands else "a base that is fixed"),
         ("center_of_mass", control.center_of_mass, stands, "no [control.footing]"),
         ("base", control.base, stands, "no [control.footing]"),
     ):
-        if given is not None and not fits:
-            raise SpecError(f"has [control.{key}], but {why}", where=source, hint=f"remove [control.{key}]")
+        if gains is not None and not fits:
+            raise SpecError(f"has [control.{key}], but {reason}", where=source, hint=f"remove [control.{key}]")
 
 
 def _contacts(setup: Setup, footing: StanceGains) -> tuple[SupportContact, ...]:
@@ -117,9 +106,6 @@ def _contacts(setup: Setup, footing: StanceGains) -> tuple[SupportContact, ...]:
             raise FrameNotFound(name, [c.point.frame for c in contacts], where="control.footing.lifted")
     contacts = tuple(c for c in contacts if c.point.frame not in footing.lifted)
     if not contacts:
-        raise SpecError(
-            "has [control.footing], but the robot has no supports",
-            where=setup.scenario.source,
-            hint="name [[supports]] in robot.toml",
-        )
+        what = "has [control.footing], but the robot has no supports"
+        raise SpecError(what, where=setup.scenario.source, hint="name [[supports]] in robot.toml")
     return tuple(replace(contact, least=footing.least) for contact in contacts)

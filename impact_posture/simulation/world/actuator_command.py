@@ -1,4 +1,4 @@
-"""Input and output of a simulated world: commands within their limits, pushes, joint stops, and the true state."""
+"""Input and output of a simulated world: limited commands, pushes, joint stops, and the true state."""
 
 from __future__ import annotations
 
@@ -16,13 +16,13 @@ from impact_posture.simulation.world.rotors import Rotors
 from impact_posture.system.arrays import Array
 from impact_posture.tsid.controller import Command
 
-# No robot is so far away or so fast, m, m/s, rad/s, and no torque so large, N·m.
+# A larger position (m), speed (m/s, rad/s) or torque (N·m) means that the state has diverged.
 RUNAWAY = 1e6
 
 
 @dataclass(frozen=True, eq=False)
 class ActuatorCommand:
-    """Joint torques and rotor speeds, without what else the command of a controller holds.
+    """Joint torques and rotor speeds, the part of a controller's command that actuators execute.
 
     Attributes:
         torque: Joint torques, N·m (N for prismatic joints), shape (joints,), in the order of ν.
@@ -51,13 +51,13 @@ class CommandLimits:
         """Return rotor speeds, shape (rotors,), and joint torques, shape (joints,), within their limits.
 
         Raises:
-            InputError: The command has other sizes, is not finite, or has a torque without end.
+            InputError: The sizes do not fit, a number is not finite, or an unlimited torque is absurdly large.
         """
         speed, torque = np.asarray(command.rotor_speed, dtype=float), np.asarray(command.torque, dtype=float)
         if speed.shape != (self._count,) or torque.shape != self.effort.shape:
             sizes = f"give {self._count} and {self.effort.size}"
             raise InputError(f"{speed.size} rotor speeds and {torque.size} torques", where="command", hint=sizes)
-        # A sum of squares that is not absurd settles it.
+        # A moderate sum of squares excludes infinities and absurd torques.
         with np.errstate(over="ignore"):
             usual = speed.dot(speed) + torque.dot(torque) < RUNAWAY**2
         if not usual and not (np.isfinite(speed).all() and np.isfinite(torque).all()):
@@ -70,13 +70,13 @@ class CommandLimits:
 
 @dataclass(frozen=True)
 class Push:
-    """Force at a point of the robot, constant in the world.
+    """Force at a point of the robot, constant in the world frame.
 
     Attributes:
-        frame: The frame that carries the point.
+        frame: Frame of the point.
         force: Force, world, N.
         duration: Duration, s, rounded to physics steps.
-        offset: The point from the origin of the frame, in the frame, m.
+        offset: Point from the origin of the frame, in the frame, m.
     """
 
     frame: str
@@ -89,7 +89,7 @@ class ActivePushes:
     """Pushes that act on a world.
 
     Attributes:
-        active: For each push, its body, its point in the axes of the body, its force, and its last step.
+        active: Body, point in the axes of the body, force, and last step of each push.
 
     Args:
         model: The MuJoCo model.
@@ -100,13 +100,13 @@ class ActivePushes:
         self.active: list[tuple[int, Array, Array, int]] = []
 
     def in_c(self) -> dict[str, Any]:
-        """Return the members of ``c/world_ticks.c`` that are of these pushes."""
+        """Return the members of ``c/world_ticks.c`` for the pushes."""
         bodies, points, forces, ends = zip(*self.active, strict=True) if self.active else ((), (), (), ())
         return {"pushes": len(bodies), "push_body": bodies, "push_end": ends,
                 "push": [[*point, *force] for point, force in zip(points, forces, strict=True)]}  # fmt: skip
 
     def begin(self, push: Push, body: int, point: Array, step: int) -> None:
-        """Begin a push at a step, on a body, at a point in its axes.
+        """Begin a push of a body at a point in the axes of the body.
 
         Raises:
             InputError: The force is not finite, or the duration is shorter than a time step.
@@ -118,7 +118,7 @@ class ActivePushes:
         self.active.append((body, point, np.array(push.force, dtype=float), step + count))
 
     def apply(self, data: Any, step: int) -> None:
-        """Add the forces to a step, and forget the pushes that have ended."""
+        """Apply the forces in a step, and remove the pushes that have ended."""
         data.qfrc_applied[:] = 0.0
         self.active = [push for push in self.active if push[-1] > step]
         for body, point, force, _ in self.active:
@@ -130,7 +130,7 @@ class JointStops:
     """Position limits of joints.
 
     Attributes:
-        names: The joints with limits, in the order of :class:`Trace`.
+        names: Joints with limits, in the order of :class:`Trace`.
 
     Args:
         model: The MuJoCo model.
@@ -143,7 +143,7 @@ class JointStops:
         self.names = tuple(model.joint(int(k)).name for k in np.flatnonzero(limited))
 
     def reached(self, qpos: Array) -> Array:
-        """Return the joints that are at a limit, shape (n, joints), for ``qpos`` of shape (n, numbers)."""
+        """Return whether each joint is at a limit, shape (n, joints), for ``qpos`` of shape (n, numbers)."""
         values = qpos[:, self._places]
         return np.asarray((values <= self._low) | (values >= self._high))
 
@@ -173,10 +173,10 @@ class Truth(NamedTuple):
 
 
 class Trace(NamedTuple):
-    """True states of a world at n marks, in the words of :class:`Truth` and :class:`ShapeTruth`.
+    """True states of a world at n marks, with the quantities of :class:`Truth` and :class:`ShapeTruth`.
 
-    The first axis is that of the marks.  The second one is that of the joints with limits for ``stopped``, and of the
-    shapes for what follows.
+    The first axis counts marks.  The second axis of ``stopped`` counts the joints with limits.  The second axis of
+    the later columns counts the shapes.
     """
 
     t: Array

@@ -1,4 +1,4 @@
-"""Forces of the surfaces on each shape, written down in every step and evaluated for many steps at once."""
+"""Contact forces on each shape, which are recorded in every step and evaluated for many steps at once."""
 
 from __future__ import annotations
 
@@ -8,11 +8,11 @@ import numpy as np
 
 from impact_posture.system.arrays import Array
 
-# Rows of a contact with friction, and the row that a contact without it has.
+# Rows of a contact with friction, and the only row of a contact without friction.
 _ROWS, _FIRST = np.arange(3), np.arange(3) == 0
-# Places of the factors of a vector product.
+# Indices of the factors of a cross product.
 _NEXT, _LAST = [1, 2, 0], [2, 0, 1]
-# Steps with contact until they are evaluated, even if nobody looks.
+# Number of recorded steps from which they are evaluated without a look.
 _MOST = 4096
 
 
@@ -20,13 +20,13 @@ class ShapeTruth(NamedTuple):
     """Contact of a shape with all surfaces.
 
     Attributes:
-        frame: The frame that carries the shape.
-        touching: Whether a surface pushed it in the last step.
-        force: Force on it in the last step, world, N, shape (3,).
-        impulse: Impulse on it since the reset, world, N·s, shape (3,).
+        frame: Frame of the shape.
+        touching: Whether a surface pushed the shape in the last step.
+        force: Force on the shape in the last step, world, N, shape (3,).
+        impulse: Impulse on the shape since the reset, world, N·s, shape (3,).
         peak: Largest sum of normal forces since the last look, N.
-        began: Time since the last look when a surface first pushed it, s, or ``None``.
-        slip: Largest tangential speed of its contact points, m/s, 0 without contact.
+        began: Time of the first push since the last look, s, or ``None``.
+        slip: Largest tangential speed of the contact points, m/s, 0 without contact.
     """
 
     frame: str
@@ -39,7 +39,7 @@ class ShapeTruth(NamedTuple):
 
 
 class _Step(NamedTuple):
-    """Contacts of a step, as MuJoCo has them, with the number of the step and the time of its end."""
+    """Contacts of a step as MuJoCo stores them, with the number of the step and the time of its end."""
 
     number: int
     time: float
@@ -51,7 +51,7 @@ class _Step(NamedTuple):
 
 
 class _Mark(NamedTuple):
-    """Contacts after a step, with velocities and centers of mass of all bodies, as MuJoCo has them."""
+    """Contacts after a step, with velocities and centers of mass of all bodies, as MuJoCo stores them."""
 
     geoms: Array
     points: Array
@@ -61,7 +61,7 @@ class _Mark(NamedTuple):
 
 
 class ContactLog:
-    """Contacts of all steps since the last :meth:`look`, and what accumulates from them.
+    """Contacts of all steps since the last :meth:`look`, with accumulated impulses and peaks.
 
     Args:
         model: The MuJoCo model.
@@ -70,7 +70,8 @@ class ContactLog:
 
     def __init__(self, model: Any, geoms: tuple[str, ...]) -> None:
         self._count, self._step = len(geoms), float(model.opt.timestep)
-        # MuJoCo names the plane of a contact first, so the contact pushes the second geom.  A ball may be either.
+        # MuJoCo names the plane of a contact first, so the contact pushes the second geom.  A ball may be first or
+        # second.
         self._shape_of = np.full(model.ngeom, -1)
         for k, name in enumerate(geoms):
             self._shape_of[model.geom(name).id] = k
@@ -78,7 +79,7 @@ class ContactLog:
         self.reset()
 
     def reset(self) -> None:
-        """Forget everything."""
+        """Clear all records."""
         count = self._count
         self._steps: list[_Step] = []
         self._marks: list[tuple[int, _Mark | None]] = []
@@ -87,35 +88,35 @@ class ContactLog:
         self._peak, self._began = np.zeros(count), np.full(count, np.inf)
 
     def in_c(self) -> dict[str, Any]:
-        """Return the members of ``c/world_ticks.c`` that are of these contacts, which have just been reset."""
+        """Return the members of ``c/world_ticks.c`` for the contacts after a reset."""
         one, three = np.zeros(self._count), np.zeros((self._count, 3))
         return {"shapes": self._count, "shape_of": self._shape_of, "now": three, "normal": one, "impulse": three,
                 "peak": one, "began": one}  # fmt: skip
 
     def step(self, data: Any, number: int) -> None:
-        """Write down the contacts of a step, which ends at ``data.time`` and has some."""
+        """Record the contacts of a step that ends at ``data.time``."""
         contact = data.contact
         parts = contact.geom, contact.dim, contact.efc_address, contact.frame, data.efc_force
         self._steps.append(_Step(number, data.time, *(part.copy() for part in parts)))
 
     def fold(self, number: int) -> None:
-        """Evaluate the steps until now if they are many and no state waits for a look."""
+        """Evaluate the recorded steps if there are many and no mark is set."""
         if len(self._steps) >= _MOST and not self._marks:
             self._marks.append((number, None))
             *_, peak, began, _ = self.look()
             self._peak, self._began = peak[0], np.where(np.isnan(began[0]), np.inf, began[0])
 
     def mark(self, data: Any, number: int) -> None:
-        """Let the state after a step be one to look at."""
-        found = None
+        """Mark the state after a step for the next :meth:`look`."""
+        mark = None
         if data.ncon:
             parts = data.contact.geom, data.contact.pos, data.contact.frame, data.cvel, data.subtree_com
-            found = _Mark(*(part.copy() for part in parts))
-        self._marks.append((number, found))
+            mark = _Mark(*(part.copy() for part in parts))
+        self._marks.append((number, mark))
 
     def force(self, shape: int) -> list[float]:
         """Return the force on a shape in the last step with contact, world, N, shape (3,)."""
-        # For few contacts, as in the middle of a run, this is faster than what evaluates many steps.
+        # For a single step, this loop is faster than the vectorized evaluation.
         step, force = self._steps[-1], np.zeros(3)
         contacts = zip(step.rows, step.sizes, self._shape_of[step.geoms], step.frames, strict=True)
         for row, size, pair, frame in contacts:
@@ -125,18 +126,18 @@ class ContactLog:
         return list(force.tolist())
 
     def look(self) -> tuple[Array, ...]:
-        """Return the contacts at all n marks, and begin again.
+        """Return the contacts at all n marks, and clear the marks.
 
         Returns:
-            The numbers of :class:`ShapeTruth` in their order, but for the frame.  The first axis is that of the
-            marks, the second that of the shapes.  Where a shape was not touched anew, ``began`` is NaN.
+            The quantities of :class:`ShapeTruth` in their order, without the frame.  The first axis counts marks, the
+            second axis shapes.  ``began`` is NaN where a shape was not touched since the previous mark.
         """
         ends, count = np.array([number for number, _ in self._marks]), self._count
         numbers, n = np.array([step.number for step in self._steps]), ends.size
-        # A run that ends within a tick has steps behind its last mark.
+        # A run that ends within a tick has steps after its last mark.
         looked = int(np.searchsorted(numbers, ends[-1], side="right"))
         steps, numbers, self._steps = self._steps[:looked], numbers[:looked], self._steps[looked:]
-        # What was there at the last look is still there where no step has been taken since.
+        # Without a step since the last look, the contacts are unchanged.
         unmoved = ends == self._number
         force, normal = self._force * unmoved[:, None, None], self._normal * unmoved[:, None]
         impulse, peak, began = np.zeros((n, count, 3)), np.zeros((n, count)), np.full((n, count), np.inf)
@@ -165,10 +166,10 @@ class ContactLog:
         first, at = np.concatenate([s.rows for s in steps]), np.repeat(np.arange(len(steps)), counts)
         geoms, frames = np.concatenate([s.geoms for s in steps]), np.concatenate([s.frames for s in steps])
         # A contact just outside the surface does not push and has no address.
-        there = first >= 0
-        first = (first + np.repeat(starts, counts))[there]
-        at, geoms, sizes, frames = at[there], geoms[there], sizes[there], frames[there].reshape(-1, 3, 3)
-        # A contact has one number without friction, else three.
+        pushing = first >= 0
+        first = (first + np.repeat(starts, counts))[pushing]
+        at, geoms, sizes, frames = at[pushing], geoms[pushing], sizes[pushing], frames[pushing].reshape(-1, 3, 3)
+        # A contact has three numbers with friction, else one.
         rough = (sizes == 3)[:, None]
         local = np.concatenate([s.forces for s in steps])[first[:, None] + _ROWS * rough] * (rough | _FIRST)
         one, other = self._shape_of[geoms].T
@@ -180,21 +181,21 @@ class ContactLog:
         return forces, normals
 
     def _slips(self) -> Array:
-        """Return the largest tangential speed of the contact points of each shape at all marks, shape (n, shapes)."""
+        """Return the largest tangential speed of the contact points of each shape at each mark, shape (n, shapes)."""
         slips = np.zeros((len(self._marks), self._count))
-        there = [k for k, (_, found) in enumerate(self._marks) if found]
-        if not there:
+        touching = [k for k, (_, mark) in enumerate(self._marks) if mark]
+        if not touching:
             return slips
-        geoms, points, frames, twists, centers = zip(*(self._marks[k][1] for k in there), strict=True)
-        at = np.repeat(np.arange(len(there)), [len(own) for own in geoms])
+        geoms, points, frames, twists, centers = zip(*(self._marks[k][1] for k in touching), strict=True)
+        at = np.repeat(np.arange(len(touching)), [len(pairs) for pairs in geoms])
         geom, normals = np.concatenate(geoms), np.concatenate(frames)[:, :3]
         bodies, other = self._body_of[geom[:, 1]], self._shape_of[geom[:, 1]]
         twist, center = np.array(twists)[at, bodies], np.array(centers)[at, self._root_of[bodies]]
         arms, spins = np.concatenate(points) - center, twist[:, :3]
         velocities = twist[:, 3:] + spins[:, _NEXT] * arms[:, _LAST] - spins[:, _LAST] * arms[:, _NEXT]
         velocities -= (normals * velocities).sum(axis=1, keepdims=True) * normals
-        # A ball is no place to slide on.
+        # Sliding on a ball does not count.
         ground = (self._body_of[geom[:, 0]] == 0) & (other >= 0)
         speeds = np.sqrt((velocities * velocities).sum(axis=1))[ground]
-        np.maximum.at(slips, (np.array(there)[at[ground]], other[ground]), speeds)
+        np.maximum.at(slips, (np.array(touching)[at[ground]], other[ground]), speeds)
         return slips

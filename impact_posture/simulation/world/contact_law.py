@@ -1,4 +1,4 @@
-"""Contact law of MuJoCo: the keys ``solref``, ``solimp`` and ``friction`` of a surface or a thrown ball."""
+"""Contact law of MuJoCo: the keys ``solref``, ``solimp`` and ``friction`` of a surface or a ball."""
 
 from __future__ import annotations
 

@@ -1,4 +1,4 @@
-"""Propellers: their speeds, thrusts, and the vibration that they cause."""
+"""Propellers: speeds, thrusts, and the vibration that they cause."""
 
 from __future__ import annotations
 
@@ -36,14 +36,14 @@ class Rotors:
         self._up, self._down = -timestep / propulsion.time_constant_up, -timestep / propulsion.time_constant_down
         self._coefficient = propulsion.thrust_coefficient
         self.speeds: Array = np.full(len(propulsion.rotors), self._lowest)
-        # The part of the way to its command that a speed goes in 1, 2, ... steps, up and down, by their number.
-        self._gone: dict[int, tuple[Array, Array]] = {}
+        # Change of a speed in 1, 2, … steps over its difference from the command, up and down, by number of steps.
+        self._changes: dict[int, tuple[Array, Array]] = {}
 
     def reset(self, speeds: ArrayLike) -> None:
         """Set the speeds, cut to the limits.
 
         Raises:
-            InputError: There is not one finite number for each rotor.
+            InputError: ``speeds`` does not have one finite number for each rotor.
         """
         speeds = np.asarray(speeds, dtype=float)
         if speeds.shape != self.speeds.shape or not np.isfinite(speeds).all():
@@ -56,21 +56,21 @@ class Rotors:
 
     def steps(self, command: Array, count: int) -> Array:
         """Take time steps under one command within the limits.  Return the speeds, shape (count, rotors)."""
-        away = command - self.speeds
-        # A speed never passes its command, so its time constant does not change in between.
-        speeds = self.speeds - np.where(away > 0, *self._ways(count)) * away
+        difference = command - self.speeds
+        # A speed never passes its command, so the time constant does not change between the steps.
+        speeds = self.speeds - np.where(difference > 0, *self._changes_in(count)) * difference
         self.speeds = speeds[-1]
         return np.asarray(speeds)
 
-    def _ways(self, count: int) -> tuple[Array, Array]:
-        if count not in self._gone:
-            passed = np.arange(1.0, count + 1)[:, None]
-            self._gone[count] = np.expm1(self._up * passed), np.expm1(self._down * passed)
-        return self._gone[count]
+    def _changes_in(self, count: int) -> tuple[Array, Array]:
+        if count not in self._changes:
+            steps = np.arange(1.0, count + 1)[:, None]
+            self._changes[count] = np.expm1(self._up * steps), np.expm1(self._down * steps)
+        return self._changes[count]
 
     def in_c(self, count: int) -> dict[str, Any]:
-        """Return the members of ``c/world_ticks.c`` that are of these rotors, for a number of steps in a tick."""
-        up, down = self._ways(count)
+        """Return the members of ``c/world_ticks.c`` for the rotors and a number of steps in a tick."""
+        up, down = self._changes_in(count)
         return {"rotors": self.speeds.size, "speeds": self.speeds, "phases": 0 * self.speeds, "up": up, "down": down,
                 "lowest": self._lowest, "highest": self._highest, "thrust": self._coefficient}  # fmt: skip
 
@@ -108,19 +108,19 @@ class Vibration:
         self.phases: Array = np.zeros(len(propulsion.rotors))
 
     def reset(self, q: Array, phases: Array) -> None:
-        """Set the inertia of a configuration, shape (nq,), and the angles of the propellers, shape (rotors,), rad."""
+        """Set the inertia of a configuration, shape (nq,), and the angles of the propellers, rad, shape (rotors,)."""
         M = np.triu(pin.crba(self._model, self._data, q)[:6, :6])
         self._inverse = np.linalg.inv(M + np.triu(M, 1).T)
         self.phases = np.array(phases)
 
     def steps(self, speeds: Array, timestep: float) -> Array:
-        """Turn the propellers for time steps, with speeds and angles of shape (count, rotors)."""
+        """Turn the propellers for some time steps.  Speeds and returned angles have the shape (count, rotors)."""
         phases = self.phases + 2 * np.pi * timestep * speeds.cumsum(axis=0)
         self.phases = phases[-1]
         return np.asarray(phases)
 
     def in_c(self) -> dict[str, Any]:
-        """Return the members of ``c/world_ticks.c`` that are of this vibration."""
+        """Return the members of ``c/world_ticks.c`` for the vibration."""
         return {"vibrates": 1, "phases": self.phases, "along": self._x, "across": self._y, "inverse": self._inverse}
 
     def twist(self, speeds: Array, phases: Array) -> Array:

@@ -25,12 +25,12 @@ _Normal = Annotated[
 @checked
 @dataclass(frozen=True)
 class Surface(ContactLaw):
-    """Endless plane that pushes with its contact law.
+    """Infinite plane with its contact law.
 
     Attributes:
         name: Name of the surface.
         normal: Direction out of the surface, towards the robot, world, any length.
-        point: A point on the surface, world, m.  If there is none, ``gap`` places the surface.
+        point: Point on the surface, world, m.  ``None`` places the surface by ``gap``.
         gap: Distance from the nearest shape of the robot in the start posture, m.
     """
 
@@ -43,15 +43,15 @@ class Surface(ContactLaw):
 @checked
 @dataclass(frozen=True)
 class Shape(StrictTable):
-    """Massless shape on the robot, which surfaces push.
+    """Massless shape on the robot that can touch surfaces.
 
     Attributes:
         frame: Frame that carries the shape, and name of the shape.
         size: Radius, or three half extents, m.
         kind: ``sphere`` or ``box`` (along the axes of the frame).
-        offset: The point that touches, from the origin of the frame, in the frame, m.
-        center: Center of the shape, in the frame, m.  By default, ``offset`` is the lowest point of a sphere, or the
-            middle of the lowest face of a box, against the first surface in the start posture.
+        offset: Contact point from the origin of the frame, in the frame, m.
+        center: Center of the shape, in the frame, m.  By default, ``offset`` is the point of a sphere, or the middle
+            of the face of a box, that is nearest to the first surface in the start posture.
     """
 
     frame: str
@@ -61,14 +61,11 @@ class Shape(StrictTable):
     center: FiniteVector | None = None
 
     def __post_init__(self) -> None:
-        """Refuse a size of another kind."""
+        """Refuse a size that does not fit the kind of shape."""
         count, words = (1, "a radius") if self.kind == "sphere" else (3, "three half extents")
         if len(self.size) != count:
-            raise InputError(
-                f"size {list(self.size)} is not {words}",
-                where=f"{self.kind} at '{self.frame}'",
-                hint=f"give {words} above zero (m)",
-            )
+            what, hint = f"size {list(self.size)} is not {words}", f"give {words} above zero (m)"
+            raise InputError(what, where=f"{self.kind} at '{self.frame}'", hint=hint)
 
 
 @checked
@@ -77,8 +74,8 @@ class Physics(StrictTable):
     """Time step, gravity, and the stops of the joints.
 
     Attributes:
-        timestep: Time step, s, a picosecond or more.
-        gravity: Gravity, world, m/s².  ``None`` takes that of the robot model.
+        timestep: Time step, s, at least a picosecond.
+        gravity: Gravity, world, m/s².  ``None`` takes the gravity of the robot model.
         stop_solref: ``solref`` of the joint stops, as in :class:`ContactLaw`.
         stop_solimp: ``solimp`` of the joint stops.
     """
@@ -96,9 +93,9 @@ class Physics(StrictTable):
 @checked
 @dataclass(frozen=True)
 class Sensors(StrictTable):
-    """Errors of what a controller measures.  By default all sensors are perfect.
+    """Errors of the measured state.  By default, all sensors are perfect.
 
-    Noise is white and normal, and every reading draws it anew.  Numbers are standard deviations.
+    The noise is white and normal.  Its numbers are standard deviations.
 
     Attributes:
         base_position: m, each axis.
@@ -108,8 +105,8 @@ class Sensors(StrictTable):
         joint_angle: rad (m).
         joint_resolution: Step of the encoders, rad (m), 0 for none.
         joint_rate: rad/s (m/s).
-        unbalance: Mass times eccentricity of each propeller, kg·m.  It makes the measured twist of the base vibrate
-            at the frequency of each propeller.  Rotor speeds must be in Hz.
+        unbalance: Mass times eccentricity of each propeller, kg·m.  The measured twist of the base vibrates at the
+            frequency of each propeller.  Rotor speeds must be in Hz.
         force_frame: Shape whose contact force is measured, or ``None`` for no force sensor.
         force: N, each axis.
         force_cutoff: Cutoff frequency of the low-pass filter of the force, Hz.
@@ -135,7 +132,7 @@ class Sensors(StrictTable):
 class Scene(StrictTable):
     """Surroundings of a robot.
 
-    Every shape can touch every surface, and nothing else touches.
+    Every shape can touch every surface.  Other contacts do not exist.
 
     Attributes:
         surfaces: Surfaces around the robot.
@@ -155,7 +152,7 @@ class Scene(StrictTable):
         return (("stops", self.physics.stop_solref), *((s.name, s.solref) for s in self.surfaces))
 
     def __post_init__(self) -> None:
-        """Refuse a name that is used twice, a law that is too fast for the time step, and an unknown force sensor."""
+        """Refuse repeated names, contact laws too fast for the time step, and an unknown force sensor."""
         for words, names in (
             ("surfaces are called", [s.name for s in self.surfaces]),
             ("shapes are at", [s.frame for s in self.shapes]),
@@ -165,8 +162,8 @@ class Scene(StrictTable):
                 raise InputError(f"two {words} '{twice[0]}'", where="scene", hint="have one of each")
         step = self.physics.timestep
         for name, (a, b) in self.laws:
-            # MuJoCo silently applies the first two rules (refsafe).  A spring whose 1/√k is below the time step
-            # gives more energy than it took (measured, docs/generated/restitution.md).
+            # MuJoCo silently applies the first two rules (refsafe).  A spring with 1/√k below the time step returns
+            # more energy than it stores (measured, docs/generated/restitution.md).
             slow = (("the time constant", a, 2), ("its product with the damping ratio", a * b, 1))
             for words, value, least in slow if a > 0 else (("1/√k", (-a) ** -0.5, 1),):
                 if value < least * step * (1 - 1e-9):
@@ -177,8 +174,5 @@ class Scene(StrictTable):
                     )
         frame, frames = self.sensors.force_frame, [s.frame for s in self.shapes]
         if frame is not None and frame not in frames:
-            raise InputError(
-                f"force_frame '{frame}' carries no shape",
-                where="sensors",
-                hint=f"one of: {', '.join(frames)}" if frames else "add a shape",
-            )
+            hint = f"one of: {', '.join(frames)}" if frames else "add a shape"
+            raise InputError(f"force_frame '{frame}' carries no shape", where="sensors", hint=hint)

@@ -23,11 +23,11 @@ class Reading(NamedTuple):
     """Measured state.
 
     Attributes:
-        t: Time of the reading, s.  What is measured may be older (``Sensors.delay``).
+        t: Time of the reading, s.  The measured state may be older (``Sensors.delay``).
         q: Configuration, shape (nq,).
         v: ν, shape (nv,).
-        force: Force of the surfaces on the robot at the frame of the sensor, world axes, N, shape (3,), after the
-            low-pass filter.  ``None`` without a force sensor.
+        force: Filtered force of the surfaces on the shape of the sensor, world, N, shape (3,).  ``None`` without a
+            force sensor.
     """
 
     t: float
@@ -53,18 +53,18 @@ class ForceFilter:
         self._share, self.force = -math.expm1(-2 * math.pi * turns), NO_FORCE
 
     def in_c(self) -> dict[str, Any]:
-        """Return the members of ``c/world_ticks.c`` that are of this filter."""
+        """Return the members of ``c/world_ticks.c`` for the filter."""
         return {"share": self._share, "filtered": self.force}
 
     def feel(self, force: list[float]) -> None:
-        """Take the force of a step."""
+        """Filter the force of a step."""
         if force is not NO_FORCE or any(self.force):
             self.force = [old + self._share * (new - old) for old, new in zip(self.force, force, strict=True)]
 
 
 @dataclass(eq=False, slots=True)
 class Sample:
-    """True state after a step, which the sensors see, with speeds and angles of the propellers and the felt force."""
+    """True state after a step, with speeds and angles of the propellers and the filtered force."""
 
     layout: MjcfLayout
     qpos: Array
@@ -76,14 +76,14 @@ class Sample:
 
     @property
     def state(self) -> tuple[Array, Array]:
-        """The Pinocchio ``(q, ν)``, which callers must copy."""
+        """``(q, ν)`` of Pinocchio, which callers must copy before a change."""
         if self._state is None:
             self._state = self.layout.state(self.qpos, self.qvel)
         return self._state
 
 
 class SensorNoise:
-    """White noise in the tangent space, and the steps of the encoders.
+    """White noise in the tangent space, and rounding to the steps of the encoders.
 
     Args:
         robot: The robot.
@@ -96,7 +96,7 @@ class SensorNoise:
         if robot.floating:
             angles[:6] = [sensors.base_position] * 3 + [sensors.base_angle] * 3
             rates[:6] = [sensors.base_velocity] * 3 + [sensors.base_rate] * 3
-        # What has no noise draws none.
+        # A sensor without noise draws no numbers.
         force = np.full(0 if sensors.force_frame is None else 3, sensors.force)
         parts = [scale if scale.any() else scale[:0] for scale in (angles, rates, force)]
         self._scales = np.concatenate(parts)
@@ -107,21 +107,21 @@ class SensorNoise:
         self.reset(np.random.default_rng(0))
 
     def reset(self, generator: np.random.Generator) -> None:
-        """Draw all noise from a generator from now on, which nobody else may use."""
+        """Draw all noise from a generator from now on.  Nothing else may use the generator."""
         self._generator, self._drawn = generator, iter(np.zeros((0, 0)))
 
     def draw(self, n: int) -> Array:
-        """Return the noise of the next n readings, the numbers that single draws would give, shape (n, numbers)."""
+        """Return the noise of the next n readings, equal to n single draws, shape (n, numbers)."""
         return np.asarray(self._scales * self._generator.standard_normal((n, self._ends[-1])))
 
     def in_c(self) -> dict[str, Any]:
-        """Return the members of ``c/world_ticks.c`` that are of these sensors."""
+        """Return the members of ``c/world_ticks.c`` for the sensors."""
         first, second, third = self._ends
         return {"noises": third, "noisy_q": int(first > 0), "noisy_v": int(second > first),
                 "noisy_force": int(third > second), "resolution": self._sensors.joint_resolution}  # fmt: skip
 
     def read(self, t: float, q: Array, v: Array, force: Array | None) -> Reading:
-        """Add noise to the true state.  The given arrays are not changed."""
+        """Return the true state with noise.  The arguments stay unchanged."""
         sensors, (first, second, third) = self._sensors, self._ends
         drawn = next(self._drawn, None)
         if drawn is None:

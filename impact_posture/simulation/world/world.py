@@ -1,4 +1,4 @@
-"""A robot in MuJoCo under rotor and motor commands, with readings of its sensors and the true state."""
+"""Robot in MuJoCo under rotor and motor commands, with sensor readings and the true state."""
 
 from __future__ import annotations
 
@@ -38,17 +38,17 @@ _NOTHING = np.zeros(0)
 
 
 class World:
-    """A robot in its surroundings, which :func:`build_world` makes.
+    """Simulated robot in its surroundings, which :func:`build_world` builds.
 
-    Call :meth:`reset` first.  All coordinates are those of Pinocchio.
+    Call :meth:`reset` first.  All coordinates are in the convention of Pinocchio.
 
     Attributes:
         robot: The robot.
-        scene: Its surroundings.
-        built: The MuJoCo model, and where the surfaces are.
+        scene: Surroundings of the robot.
+        built: MuJoCo model and places of the surfaces.
         timestep: Time step of the physics, s.
         limits: Limits of the commands.
-        stops: The joints with position limits.
+        stops: Joints with position limits.
     """
 
     def __init__(self, robot: Robot, scene: Scene, built: BuiltScene) -> None:
@@ -89,9 +89,9 @@ class World:
 
         Args:
             q: Configuration, shape (nq,).
-            v: ν, shape (nv,).  At rest by default.
+            v: ν, shape (nv,).  Zero by default.
             seed: Seed of all noise.
-            rotor_speed: Speeds of the propellers, shape (rotors,).  Those of hovering at ``q`` by default.
+            rotor_speed: Speeds of the propellers, shape (rotors,).  The default hovers at ``q``.
 
         Raises:
             PostureError: The configuration or the velocity does not fit the robot.
@@ -134,7 +134,7 @@ class World:
         """Begin a push now.  Several pushes add up.
 
         Raises:
-            FrameNotFound: There is no such frame.
+            FrameNotFound: The robot has no such frame.
             InputError: The force is not finite, or the duration is shorter than a time step.
         """
         point = point_on(self.robot, push.frame, push.offset)
@@ -156,12 +156,12 @@ class World:
         """Take physics steps under one command.
 
         Args:
-            command: Rotor speeds and joint torques, which are cut to their limits.
+            command: Rotor speeds and joint torques, which are clipped to their limits.
             count: Number of steps.
 
         Raises:
-            InputError: There was no reset, or the command has other sizes or is not finite.
-            SimulationDiverged: The state ran away.
+            InputError: There was no reset, or the command does not fit or is not finite.
+            SimulationDiverged: The state diverged.
         """
         self._check_ready()
         speed, self._torques = self.limits.within(command)
@@ -171,7 +171,7 @@ class World:
         with unwarned():
             self._advance(speed, count)
         state = self._data.qpos, self._data.qvel
-        # The largest number is computed only where the sum of squares does not settle it.
+        # Compute the largest number only if the sum of squares is large.
         usual = state[0].dot(state[0]) + state[1].dot(state[1]) < RUNAWAY**2
         if not usual and not all(np.abs(part).max() < RUNAWAY for part in state):
             raise SimulationDiverged(self.time, where=self.robot.name)
@@ -181,7 +181,7 @@ class World:
         model, data, first, second = self._model, self._data, self._mujoco.mj_step1, self._mujoco.mj_step2
         rotors, vibration, speeds, phases = self._rotors, self._vibration, np.zeros((count, 0)), np.zeros((count, 0))
         if rotors is not None:
-            # Propellers feel nothing of the robot, so all their steps are taken at once.
+            # The robot has no influence on the propellers, so all their steps are computed at once.
             speeds = rotors.steps(command, count)
             thrusts = rotors.thrusts(speeds)
             phases = phases if vibration is None else vibration.steps(speeds, self.timestep)
@@ -198,7 +198,7 @@ class World:
                 log.step(data, self._steps)
             if self._felt is not None:
                 self._filter.feel(log.force(self._felt) if data.ncon else NO_FORCE)
-            # Now positions, contacts and velocities are those of the new state, and forces those of the step.
+            # Positions, contacts and velocities now belong to the new state, forces to the step before it.
             first(model, data)
             if delayed or k == count - 1:
                 self._past.append(self._sample(speeds[k], phases[k]))
@@ -209,7 +209,7 @@ class World:
         return Sample(layout, qpos, qvel, speeds, phases, self._filter.force)
 
     def read(self) -> Reading:
-        """Return what the sensors measure now.  Every call draws new noise."""
+        """Return the present sensor readings.  Every call draws new noise."""
         self._check_ready()
         sample = self._past[0]
         q, v = sample.state
@@ -219,14 +219,18 @@ class World:
         return self._noise.read(self.time, q, v, None if self._felt is None else np.array(sample.force))
 
     def mark(self) -> None:
-        """Let the present state be one of those that the next :meth:`trace` returns."""
+        """Mark the present state for the next :meth:`trace`."""
         self._check_ready()
         speeds = _NOTHING if self._rotors is None else self._rotors.speeds
         self._marks.append((self.time, self._past[-1], self._torques, speeds))
         self._log.mark(self._data, self._steps)
 
     def trace(self) -> Trace:
-        """Return the true states at all marks, of which there must be some, and begin again."""
+        """Return the true states at all marks, and clear the marks.
+
+        Raises:
+            InputError: There are no marks.
+        """
         if not self._marks:
             raise InputError("has no marks", where="world", hint="call mark() first")
         times, samples, torques, speeds = zip(*self._marks, strict=True)
@@ -237,7 +241,7 @@ class World:
         return Trace._make([*parts, stopped, *self._log.look()])
 
     def truth(self) -> Truth:
-        """Return the true state.  The peak force and the first touch of each shape begin again, as do all marks."""
+        """Return the true state, and clear all marks, peak forces and first touches."""
         self.mark()
         t, q, v, speeds, torques, stopped, *contacts = (column[-1] for column in self.trace())
         shapes = tuple(
@@ -249,33 +253,33 @@ class World:
         return Truth(float(t), q, v, speeds, thrusts, torques, shapes, stops)
 
     def in_c(self, count: int) -> dict[str, Any] | None:
-        """Return the members of ``c/world_ticks.c`` that are of this world, for a number of steps in a tick.
+        """Return the members of ``c/world_ticks.c`` for this world and a number of steps in a tick.
 
-        It is ``None`` where C has no such world: for delayed readings, and for joints other than a floating base,
-        hinges and slides.
+        ``None`` means that C cannot simulate this world: readings are delayed, or a joint is neither a floating base
+        nor a hinge nor a slide.
         """
         self._check_ready()
         places, sample, floating = self._layout.places, self._past[-1], self.robot.floating
         if places is None or self._past.maxlen != 1:
             return None
         q, v = sample.state
-        found = {"model": self._model._address, "data": self._data._address, "runaway": RUNAWAY**2,
-                 "nq": q.size, "nv": v.size, "nqpos": self._data.qpos.size, "floating": int(floating),
-                 "q_at": places[0], "v_at": places[1], "true_q": q, "true_v": v, "joints": self.limits.effort.size,
-                 "effort": self.limits.effort, "torque": self._torques, "steps": self._steps, "count": count,
-                 "timestep": self.timestep, "rotors": 0, "vibrates": 0, "refused": 0,
-                 "felt": -1 if self._felt is None else self._felt}  # fmt: skip
-        parts = [self._filter.in_c(), self._noise.in_c(), self._log.in_c()]
+        core = {"model": self._model._address, "data": self._data._address, "runaway": RUNAWAY**2,
+                "nq": q.size, "nv": v.size, "nqpos": self._data.qpos.size, "floating": int(floating),
+                "q_at": places[0], "v_at": places[1], "true_q": q, "true_v": v, "joints": self.limits.effort.size,
+                "effort": self.limits.effort, "torque": self._torques, "steps": self._steps, "count": count,
+                "timestep": self.timestep, "rotors": 0, "vibrates": 0, "refused": 0,
+                "felt": -1 if self._felt is None else self._felt}  # fmt: skip
+        parts = [core, self._filter.in_c(), self._noise.in_c(), self._log.in_c()]
         parts += [] if self._rotors is None else [self._rotors.in_c(count)]
         parts += [] if self._vibration is None else [self._vibration.in_c()]
-        return {key: value for part in (found, *parts) for key, value in part.items()}
+        return {key: value for part in parts for key, value in part.items()}
 
     def next_in_c(self, n: int) -> dict[str, Any]:
-        """Return the members that change from call to call: the noise of n readings, and the pushes."""
+        """Return the members that change between calls: the noise of n readings, and the pushes."""
         return {"noise": self._noise.draw(n), **self._pushes.in_c()}
 
     def go_to(self, steps: int) -> None:
-        """Take note that C has gone to a number of steps since the reset."""
+        """Set the number of steps since the reset, after C has taken them."""
         self._steps = steps
 
     def _check_ready(self) -> None:
@@ -288,9 +292,9 @@ def build_world(robot: Robot, scene: Scene, q: ArrayLike | None = None, throw: T
 
     Args:
         robot: The robot.
-        scene: Its surroundings.
-        q: Posture at which surfaces with a gap are placed, shape (nq,).  The default posture of the robot by default.
-        throw: The ball that is thrown.
+        scene: Surroundings of the robot.
+        q: Posture that surfaces with a gap refer to, shape (nq,).  By default, the default posture of the robot.
+        throw: Ball that is thrown.
 
     Raises:
         InputError: MuJoCo is not installed, or the scene does not fit the robot.

@@ -1,4 +1,4 @@
-"""One MuJoCo model of a robot and its surroundings."""
+"""MuJoCo model of a robot and its surroundings."""
 
 from __future__ import annotations
 
@@ -22,9 +22,9 @@ from impact_posture.simulation.world.throw import BALL, Throw, add_ball
 from impact_posture.system.arrays import Array
 from impact_posture.system.escape import xml_name
 
-# Families with the same velocities, in the same axes, in Pinocchio and MuJoCo.
+# Joint families whose velocities agree in Pinocchio and MuJoCo.
 _DRIVEN = ("revolute", "continuous", "prismatic", "translation", "spherical")
-# Where in the width of solimp the share d is halfway, and the power of its rise (MuJoCo defaults).
+# Midpoint and power of the rise of the share d within the width of ``solimp`` (MuJoCo defaults).
 _SOLIMP_SHAPE = (0.5, 2.0)
 
 
@@ -35,10 +35,10 @@ class BuiltScene:
     Attributes:
         mjcf: The model.  Its actuators are the rotors (thrust, N), then the joints (N·m or N), in the order of ``u``.
         normals: Unit normal of each surface, by name.
-        points: A point on each surface, world, m, by name.
+        points: Point on each surface, world, m, by name.
         gaps: Distance of each shape from each surface in the start posture, m, by surface and shape.
         shape_geoms: Name of the geom of each shape, in the order of the scene.
-        throw: The ball that is thrown, or ``None``.
+        throw: Ball that is thrown, or ``None``.
     """
 
     mjcf: Mjcf
@@ -54,9 +54,9 @@ def build_scene(robot: Robot, scene: Scene, q: Array, throw: Throw | None = None
 
     Args:
         robot: The robot.
-        scene: Its surroundings.
+        scene: Surroundings of the robot.
         q: Start posture, shape (nq,), which defines the gaps and the default centers of the shapes.
-        throw: The ball that is thrown.
+        throw: Ball that is thrown.
 
     Raises:
         FrameNotFound: The frame of a shape does not exist.
@@ -72,16 +72,16 @@ def build_scene(robot: Robot, scene: Scene, q: Array, throw: Throw | None = None
     first = next(iter(normals.values()), None)
     geoms, placed = [], []
     for shape in scene.shapes:
-        place = _placement(robot, numeric, shape, first)
+        placement = _placement(robot, numeric, shape, first)
         joint = point_on(robot, shape.frame).joint
         geoms.append(xml_name(f"shape {shape.frame}"))
-        mjcf.add_geom(joint, geoms[-1], shape.kind, shape.size, place)
-        placed.append((shape, numeric.data.oMi[joint] * place))
+        mjcf.add_geom(joint, geoms[-1], shape.kind, shape.size, placement)
+        placed.append((shape, numeric.data.oMi[joint] * placement))
     points = {s.name: _point(s, normals[s.name], placed) for s in scene.surfaces}
     gaps = {
-        (name, shape.frame): float(normals[name] @ (_lowest(shape, place, normals[name]) - point))
+        (name, shape.frame): float(normals[name] @ (_lowest(shape, placement, normals[name]) - point))
         for name, point in points.items()
-        for shape, place in placed
+        for shape, placement in placed
     }
     for surface in scene.surfaces:
         name = xml_name(f"surface {surface.name}")
@@ -97,7 +97,7 @@ def build_scene(robot: Robot, scene: Scene, q: Array, throw: Throw | None = None
 
 
 def _add_pair(mjcf: Mjcf, first: str, second: str, law: ContactLaw) -> None:
-    """Let two geoms touch."""
+    """Add a contact pair of two geoms."""
     mjcf.spec.add_pair(
         geomname1=first,
         geomname2=second,
@@ -109,12 +109,12 @@ def _add_pair(mjcf: Mjcf, first: str, second: str, law: ContactLaw) -> None:
 
 
 def _set_physics(spec: Any, physics: Physics) -> None:
-    """Set the time step, the solver, gravity, and how the joint stops push."""
+    """Set the time step, the solver, gravity, and the contact law of the joint stops."""
     mujoco = import_mujoco()
     spec.option.timestep = physics.timestep
     spec.option.integrator = mujoco.mjtIntegrator.mjINT_IMPLICITFAST
     spec.option.cone = mujoco.mjtCone.mjCONE_ELLIPTIC
-    # A simulation that diverges must not silently restart.
+    # By default, MuJoCo silently resets a simulation that diverges.
     spec.option.disableflags |= mujoco.mjtDisableBit.mjDSBL_AUTORESET
     if physics.gravity is not None:
         spec.option.gravity = physics.gravity
@@ -129,8 +129,8 @@ def _placement(robot: Robot, numeric: Numeric, shape: Shape, normal: Array | Non
     if shape.center is not None:
         return frame * pin.SE3(np.eye(3), np.array(shape.center, dtype=float))
     if normal is None:
-        raise InputError("has no center and no surface to be put against", where=f"shape at '{shape.frame}'",
-                         hint="give a center")  # fmt: skip
+        what = "has no center and no surface to be put against"
+        raise InputError(what, where=f"shape at '{shape.frame}'", hint="give a center")
     up = (numeric.data.oMi[point.joint] * frame).rotation.T @ normal
     if shape.kind == "sphere":
         rise = shape.size[0] * up
@@ -141,22 +141,22 @@ def _placement(robot: Robot, numeric: Numeric, shape: Shape, normal: Array | Non
 
 
 def _point(surface: Surface, normal: Array, placed: list[tuple[Shape, pin.SE3]]) -> Array:
-    """Return the given point on a surface, or the one below the nearest shape."""
+    """Return the point of a surface, by default at its gap below the nearest shape."""
     if surface.point is not None:
         return np.array(surface.point, dtype=float)
     if not placed:
-        raise InputError("there is no shape that it has a gap to", where=f"surface '{surface.name}'",
-                         hint="give a point, or a shape")  # fmt: skip
-    lowest = min((_lowest(shape, place, normal) for shape, place in placed), key=lambda p: float(normal @ p))
+        what = "there is no shape that it has a gap to"
+        raise InputError(what, where=f"surface '{surface.name}'", hint="give a point, or a shape")
+    lowest = min((_lowest(*each, normal) for each in placed), key=lambda point: float(normal @ point))
     return np.asarray(lowest - surface.gap * normal)
 
 
-def _lowest(shape: Shape, place: pin.SE3, normal: Array) -> Array:
-    """Return the point below the center of a shape on its lowest plane along a normal."""
+def _lowest(shape: Shape, placement: pin.SE3, normal: Array) -> Array:
+    """Return the point below the center of a shape, at the height of the lowest point of the shape along a normal."""
     reach = shape.size[0]
     if shape.kind == "box":
-        reach = float(np.abs(place.rotation.T @ normal) @ np.array(shape.size))
-    return np.asarray(place.translation - reach * normal)
+        reach = float(np.abs(placement.rotation.T @ normal) @ np.array(shape.size))
+    return np.asarray(placement.translation - reach * normal)
 
 
 def _add_rotors(mjcf: Mjcf, robot: Robot) -> None:
@@ -177,11 +177,11 @@ def _add_motors(mjcf: Mjcf, robot: Robot) -> None:
     transmission = import_mujoco().mjtTrn.mjTRN_JOINT
     for slot in Chart(robot.model).slots[1 if robot.floating else 0 :]:
         if slot.kind.family not in _DRIVEN:
-            raise UnsupportedJoint(
+            what, hint = (
                 f"no motor drives joint '{slot.name}' ({slot.kind.family})",
-                where="simulation",
-                hint="lock it (`lock`), or model it as slides and hinges",
+                "lock it (`lock`), or model it as",
             )
+            raise UnsupportedJoint(what, where="simulation", hint=f"{hint} slides and hinges")
         targets = mjcf.joints[slot.index]
         motors = [(f"motor {name}", name, np.eye(3)[0]) for name in targets]
         if slot.kind.family == "spherical":
