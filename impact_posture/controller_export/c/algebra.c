@@ -3,7 +3,7 @@
 /* Families of joints in ip_joint_family. */
 enum { IP_DIRECT, IP_CONTINUOUS, IP_FREE_FLYER, IP_SPHERICAL };
 
-/* As fmin and fmax where b is no NaN, and without a call. */
+/* As fmin and fmax if b is not NaN, but without a call. */
 static double ip_least(double a, double b)
 {
   return a < b ? a : b;
@@ -14,7 +14,7 @@ static double ip_most(double a, double b)
   return a > b ? a : b;
 }
 
-/* Part of a heading across the unit vector n; return its length. */
+/* Write the part of a heading across the unit vector n, and return its length. */
 static double ip_across(const double *n, const double *heading, double *across)
 {
   memcpy(across, heading, sizeof(double) * 3);
@@ -120,18 +120,18 @@ static void ip_matrix(const double *x, double *R)
 static void ip_product(const double *a, const double *b, int conjugate, double *out)
 {
   const double s = conjugate ? -1.0 : 1.0;
-  double found[4];
-  found[0] = a[3] * b[0] + s * (b[3] * a[0] + a[1] * b[2] - a[2] * b[1]);
-  found[1] = a[3] * b[1] + s * (b[3] * a[1] + a[2] * b[0] - a[0] * b[2]);
-  found[2] = a[3] * b[2] + s * (b[3] * a[2] + a[0] * b[1] - a[1] * b[0]);
-  found[3] = a[3] * b[3] - s * ip_dot(a, b, 3);
-  memcpy(out, found, sizeof found);
+  double product[4];
+  product[0] = a[3] * b[0] + s * (b[3] * a[0] + a[1] * b[2] - a[2] * b[1]);
+  product[1] = a[3] * b[1] + s * (b[3] * a[1] + a[2] * b[0] - a[0] * b[2]);
+  product[2] = a[3] * b[2] + s * (b[3] * a[2] + a[0] * b[1] - a[1] * b[0]);
+  product[3] = a[3] * b[3] - s * ip_dot(a, b, 3);
+  memcpy(out, product, sizeof product);
 }
 
 /* v = b - a on the manifold, in the tangent space at a (NV numbers). */
 static void ip_difference(const double *a, const double *b, double *v)
 {
-  double x[4], R[9], way[3], p[3];
+  double x[4], R[9], moved[3], p[3];
   int k;
   for (k = 0; k < IP_JOINTS; ++k) {
     const double *from = a + ip_joint_q[k], *to = b + ip_joint_q[k];
@@ -140,8 +140,8 @@ static void ip_difference(const double *a, const double *b, double *v)
       ip_product(from + 3, to + 3, 1, x);
       ip_log_quaternion(x, out + 3);
       ip_matrix(from + 3, R);
-      ip_subtract(to, from, way, 3);
-      ip_turn(R, way, 1, p);
+      ip_subtract(to, from, moved, 3);
+      ip_turn(R, moved, 1, p);
       ip_log6_linear(out + 3, p, out);
     } else if (ip_joint_family[k] == IP_SPHERICAL) {
       ip_product(from, to, 1, x);
@@ -168,16 +168,16 @@ static void ip_integrate(const double *q, const double *v, double step, double *
   double R[9], x[4], w[3], p[3], once[3], twice[3], far[3];
   int k, i;
   for (k = 0; k < IP_JOINTS; ++k) {
-    const double *from = q + ip_joint_q[k], *way = v + ip_joint_v[k];
+    const double *from = q + ip_joint_q[k], *rate = v + ip_joint_v[k];
     double *to = out + ip_joint_q[k];
     const int turns = ip_joint_family[k] == IP_FREE_FLYER ? 3 : 0;
     if (ip_joint_family[k] == IP_FREE_FLYER || ip_joint_family[k] == IP_SPHERICAL) {
-      ip_scaled(way + turns, step, w, 3);
+      ip_scaled(rate + turns, step, w, 3);
       if (turns) {
         const double t2 = ip_dot(w, w, 3), t = sqrt(t2);
         const double b = t < 1e-2 ? 0.5 - t2 * (1.0 / 24.0 - t2 / 720.0) : (1.0 - cos(t)) / t2;
         const double c = t < 1e-2 ? 1.0 / 6.0 - t2 * (1.0 / 120.0 - t2 / 5040.0) : (t - sin(t)) / (t2 * t);
-        ip_scaled(way, step, p, 3);
+        ip_scaled(rate, step, p, 3);
         ip_cross(w, p, once);
         ip_cross(w, once, twice);
         for (i = 0; i < 3; ++i) {
@@ -192,11 +192,11 @@ static void ip_integrate(const double *q, const double *v, double step, double *
       ip_exponential(w, x);
       ip_product(from + turns, x, 0, to + turns);
     } else if (ip_joint_family[k] == IP_CONTINUOUS) {
-      const double c = cos(step * way[0]), s = sin(step * way[0]), was = from[0];
+      const double c = cos(step * rate[0]), s = sin(step * rate[0]), was = from[0];
       to[0] = c * was - s * from[1];
       to[1] = s * was + c * from[1];
     } else {
-      to[0] = from[0] + step * way[0];
+      to[0] = from[0] + step * rate[0];
     }
   }
 }

@@ -1,4 +1,4 @@
-/* Contacts with the ground: what they ask for, where they are, and their friction cones. */
+/* Contacts with the ground: desired accelerations, places, and friction cones. */
 
 /* Least length of a heading across a normal. */
 #define IP_ACROSS 1e-6
@@ -10,7 +10,7 @@ static const double *ip_contact_motion(const ip_context *c, int entry)
   return c->m.jacobian[ip_contact_point[k]] + (entry - ip_contact_row[k]) * IP_NV;
 }
 
-/* Right-hand sides of the contacts; their rows are those of their points. */
+/* Right-hand sides of the contacts.  Their rows are the Jacobians of their points. */
 static void ip_contact_rows(ip_context *c)
 {
   int k, i;
@@ -45,8 +45,8 @@ static int ip_on_edge(const ip_context *c)
   return 0;
 }
 
-/* Hold the contacts where they are, and write the rows of their friction cones in world axes (contacts.py has the
- * formulas).  A row has entries at the forces of its contact only, so the others stay zero. */
+/* Hold the contacts at their places, and write the rows of their friction cones in world axes (support_contact.py has the
+ * formulas).  A row has entries at the forces of its contact only, so the other entries stay zero. */
 static void ip_hold_contacts(ip_context *c)
 {
   int k, i, j, b;
@@ -65,7 +65,7 @@ static void ip_hold_contacts(ip_context *c)
       if (!(length < IP_ACROSS)) {
         break;
       }
-      /* A point has any heading: take the world axis that is least so. */
+      /* A point may have any heading.  Use the world axis that is least along the normal. */
       j = fabs(n[1]) < fabs(n[0]) ? 1 : 0;
       j = fabs(n[2]) < fabs(n[j]) ? 2 : j;
       for (i = 0; i < 3; ++i) {

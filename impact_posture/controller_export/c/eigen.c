@@ -65,7 +65,7 @@ static void ip_qr_step(double *d, double *e, double *V, int n, int low, int high
   }
 }
 
-/* Bring a tridiagonal matrix nearer to its eigenvalues on the diagonal, by about so many rotations, or there. */
+/* Bring a tridiagonal matrix closer to its eigenvalues on the diagonal, by at most about so many rotations. */
 static void ip_diagonalize(double *A, double *V, int n, int rotations)
 {
   double e[IP_LARGEST], d[IP_LARGEST];
@@ -94,8 +94,8 @@ static void ip_diagonalize(double *A, double *V, int n, int rotations)
   }
 }
 
-/* Eigenvalues of the symmetric n x n matrix A on its diagonal, and eigenvectors in the rows of V.  Return the largest
- * eigenvalue, or 0 if all are negative. */
+/* Write the eigenvalues of the symmetric n x n matrix A on its diagonal, and the eigenvectors in the rows of V.  Return the
+ * largest eigenvalue, or 0 if all are negative. */
 static double ip_eigen(double *A, double *V, int n)
 {
   double most = 0.0;

@@ -1,15 +1,14 @@
-/* The answer to a tick whose strict levels cannot hold (relaxation.h). */
+/* Answer to a tick whose strict levels cannot hold (relaxation.h). */
 
-/* Rows of the program without those of the bounds on joints. */
+/* Number of rows of the program without bounds on joints. */
 #define IP_OTHERS (IP_GENERAL - (IP_DENSE ? IP_BOUNDED : 0))
-/* Miss that counts, relative to the terms of a row. */
+/* Least miss that counts, relative to the terms of a row. */
 #define IP_OFF 1e-6
-
-/* Force on one of several contacts that compares with an acceleration of 1, relative to the mass of the robot.  The
- * least iterations of pushed robots, 0.03 to 10 tried. */
+/* Force on one of the contacts that compares with an acceleration of 1, relative to the mass of the robot.  Of the values
+ * from 0.03 to 10, pushed robots took the fewest iterations with this one. */
 #define IP_FORCE_UNIT 0.1
 
-/* Write what gave way: the largest violation of a bound on a joint, then the norm of the miss of each level. */
+/* Write the largest violation of a bound on a joint, then the norm of the miss of each level. */
 static void ip_list_gave_way(ip_context *c, const double *lower, const double *upper)
 {
   double most = 0.0, size = 1.0;

@@ -1,8 +1,8 @@
-/* Parameters: what init refuses. */
+/* Check of the parameters. */
 
 const unsigned long ip_context_bytes = (unsigned long)sizeof(ip_context);
 
-/* Whether a number, which may never be NaN, fulfills a rule of ip_rules. */
+/* Whether a number satisfies a rule of ip_rules and is not NaN. */
 static int ip_holds(int rule, double x)
 {
   return !isnan(x) && (!(rule & IP_IS_FINITE) || isfinite(x)) && (!(rule & IP_NOT_NEGATIVE) || x >= 0.0)
@@ -36,7 +36,7 @@ int ip_init(ip_context *c, const ip_params *p)
     }
   }
   for (i = 0; IP_MOMENTUM && i < 3; ++i) {
-    /* These coordinates have no place for a weight of the base. */
+    /* The momentum coordinates cannot have a weight of the base. */
     if (p->posture_weight[i] != 0.0) {
       return IP_AT_POSTURE_WEIGHT;
     }

@@ -1,12 +1,12 @@
-/* The posture task: fades of q_des, and the impact-robust term with its phases. */
+/* Posture task: fades of q_des, and the impact-robust term with its phases. */
 
-/* Take q_des where a fade is, at rest. */
+/* Set q_des to the present posture of a fade, at rest. */
 static void ip_stop_fade(ip_context *c)
 {
-  double way[IP_NV];
+  double step[IP_NV];
   if (c->blend < 1.0) {
-    ip_difference(c->posture, c->next, way);
-    ip_integrate(c->posture, way, ip_smooth(c->blend), c->posture);
+    ip_difference(c->posture, c->next, step);
+    ip_integrate(c->posture, step, ip_smooth(c->blend), c->posture);
     c->blend = 1.0;
   }
   memset(c->posture_velocity, 0, sizeof c->posture_velocity);
@@ -81,18 +81,18 @@ static void ip_multiply(const double *A, const double *B, double *C, int n)
   }
 }
 
-/* Measure lambda, the largest curvature of H along the redundancy.  Return 0 where there is none. */
+/* Measure lambda, the largest curvature of H along the redundancy.  Return 0 where it does not exist. */
 static int ip_normalize(ip_context *c)
 {
   enum { N = IP_NV };
   double *A = c->scratch, *V = A + N * N, *P = V + N * N, q[IP_NQ], g[2][N], value, largest;
-  int all, i, j, k, found = 0;
+  int all, i, j, k, redundant = 0;
   c->scale = c->p.robust_scale[0];
   if (c->scale > 0.0) {
     return 1;
   }
-  /* What weighted tasks leave; if that is nothing, what contacts and strict levels leave; else everything. */
-  for (all = 1; all >= 0 && !found; --all) {
+  /* The redundancy beside all tasks, else beside contacts and strict levels, else all directions. */
+  for (all = 1; all >= 0 && !redundant; --all) {
     double most;
     memset(A, 0, sizeof(double) * N * N);
     memset(P, 0, sizeof(double) * N * N);
@@ -107,14 +107,14 @@ static int ip_normalize(ip_context *c)
       const double *z = V + k * N;
       for (i = 0; i < N * N && !(A[k * (N + 1)] > 1e-12 * fmax(most, 1e-24)); ++i) {
         P[i] += z[i / N] * z[i % N];
-        found = 1;
+        redundant = 1;
       }
     }
   }
-  for (i = 0; i < N && !found; ++i) {
+  for (i = 0; i < N && !redundant; ++i) {
     P[i * (N + 1)] = 1.0;
   }
-  /* Along the axes, because differences along a basis of the redundancy would depend on how it is computed. */
+  /* Along the axes, because the error of differences along a basis would depend on the choice of the basis. */
   for (k = 0; k < N; ++k) {
     double z[N] = {0};
     z[k] = 1.0;
@@ -192,9 +192,9 @@ static void ip_advance(ip_context *c, double dt)
     return;
   }
   if (c->p.robust_spring[0] == 2.0 && c->blend >= 1.0) {
-    double way[IP_NV];
-    ip_difference(c->posture, c->q, way);
-    ip_integrate(c->posture, way, c->level * (1.0 - exp(-dt / c->p.robust_follow[0])), c->posture);
+    double away[IP_NV];
+    ip_difference(c->posture, c->q, away);
+    ip_integrate(c->posture, away, c->level * (1.0 - exp(-dt / c->p.robust_follow[0])), c->posture);
   }
   if (--c->count <= 0) {
     c->count = (int)c->p.robust_every[0];
@@ -203,7 +203,7 @@ static void ip_advance(ip_context *c, double dt)
 #endif
 }
 
-/* The wanted accelerations of the posture task.  Without one they stay zero. */
+/* Write the desired accelerations of the posture task.  Without a posture task, they stay zero. */
 static void ip_posture_wanted(ip_context *c)
 {
 #if IP_POSTURE
@@ -235,13 +235,13 @@ static void ip_posture_wanted(ip_context *c)
 #endif
 }
 
-/* Let a phase begin with the first tick at a time or later. */
+/* Schedule a phase, which begins with the first tick at a time or later. */
 static int ip_announce(ip_context *c, int phase, double t)
 {
   const int before = c->waiting > 0 ? c->entering[c->waiting - 1] : c->phase;
   const int fits = phase == IP_BRACE ? before == IP_FREE || before == IP_RELEASE
                    : phase == IP_CONTACT ? before == IP_BRACE : before == IP_BRACE || before == IP_CONTACT;
-  /* A reference flow stops and goes in any order. */
+  /* A reference flow stops and starts in any order. */
   if (!c->ready || !(IP_FLOW || (IP_ROBUST && fits)) || isnan(t) || c->waiting == IP_WAITING
       || (c->waiting > 0 && t < c->since[c->waiting - 1])) {
     return 1;
@@ -251,7 +251,7 @@ static int ip_announce(ip_context *c, int phase, double t)
   return 0;
 }
 
-/* Begin the first phase that waits. */
+/* Begin the first waiting phase. */
 static void ip_enter(ip_context *c)
 {
 #if IP_FLOW

@@ -1,17 +1,17 @@
-/* The QP of a tick as DAQP solves it: the least |u|^2 with lower <= M u <= upper, rows of length one.
+/* The QP of a tick in the form of DAQP: the least |u|^2 with lower <= M u <= upper, with rows of length one.
  *
  * The variables z = [v; w; f] are z = T (center + u), where T makes the cost |T^-1 z|^2/2:
  * - IP_DENSE: T is the inverse of a Cholesky factor.  The bounds on joints are the last rows.
- * - IP_MOMENTUM: the cost is diagonal in the joints, the acceleration of the center of mass in the world, which stands
- *   for that of the base, and the angular acceleration of the base.
+ * - IP_MOMENTUM: the cost is diagonal in the accelerations of the joints, the center of mass in the world (in place of the
+ *   linear acceleration of the base), and the angular acceleration of the base.
  * - Otherwise T is diagonal.
- * In the last two, joints come first in u, and their bounds are bounds on u. */
+ * In the last two cases, joints come first in u, and their bounds are bounds on u. */
 
-/* A zero of DAQP. */
+/* Length of a row that is zero for DAQP. */
 #define IP_NOTHING 1e-11
 #define IP_JOINTS_V (IP_NV - IP_BASE)
 
-/* Entry of v at a place of u. */
+/* Entry of v for an entry of u. */
 static int ip_entry(int k)
 {
   return IP_DENSE ? k : k < IP_JOINTS_V ? k + IP_BASE : k - IP_JOINTS_V;
@@ -54,13 +54,13 @@ static void ip_whiten(const ip_context *c, const double *row, double *restrict o
 #endif
 }
 
-/* Set the bounds of one row of M in place, and make it a unit vector. */
+/* Normalize a row of M, and set its bounds. */
 static void ip_finish(ip_context *c, int r, double lower, double upper)
 {
   double *row = c->M[r], length = ip_dot(row, row, IP_VARIABLES), scale;
   const double shift = ip_dot(row, c->center, IP_NV);
   const int at = IP_SIMPLE + r;
-  /* Finite while all are. */
+  /* The sum stays finite while all numbers are finite. */
   c->sum += length + shift + (isnan(lower) || isnan(upper) ? NAN : 0.0);
   scale = length > IP_NOTHING * IP_NOTHING ? 1.0 / sqrt(length) : 1.0;
   ip_scaled(row, scale, row, IP_VARIABLES);
@@ -71,8 +71,8 @@ static void ip_finish(ip_context *c, int r, double lower, double upper)
   c->lower[at] = (lower - shift) * scale;
 }
 
-/* Add the cost of the accelerations to the upper triangle of H, whose rows are so long, and to its linear part -g, which
- * pulls towards g: weighted tasks, contacts that are not hard, and the posture. */
+/* Add the cost of weighted tasks, soft contacts and the posture to the upper triangle of H, with rows of `stride` numbers,
+ * and to g, where -g is its linear part. */
 static void ip_cost(const ip_context *c, double *H, int stride, double *g)
 {
   int i, r;
@@ -92,7 +92,7 @@ static void ip_cost(const ip_context *c, double *H, int stride, double *g)
   }
 }
 
-/* Make T, and the center of the cost. */
+/* Compute T, and the center of the cost. */
 static void ip_factorize(ip_context *c)
 {
   double g[IP_NV] = {0};
@@ -104,7 +104,7 @@ static void ip_factorize(ip_context *c)
   if (!ip_cholesky(R, IP_NV)) {
     c->sum = NAN;
   }
-  /* The inverse of the triangle, from its last row up. */
+  /* The inverse of the triangle, from the last row up. */
   for (i = IP_NV - 1; i >= 0; --i) {
     const double pivot = 1.0 / R[i * (IP_NV + 1)];
     double *out = inverse + i * IP_NV;
@@ -135,7 +135,7 @@ static void ip_factorize(ip_context *c)
 #endif
 }
 
-/* The row of s'(M v + h - J'f), of so many entries from the first on; return s'h. */
+/* Write the row of s'(M v + h - J'f), where s has `count` entries from `first` on, and return s'h. */
 static double ip_force_row(const ip_context *c, const double *s, int first, int count, double *restrict row)
 {
   double bias = s[0] * c->free_force[first];
@@ -161,7 +161,7 @@ static double ip_force_row(const ip_context *c, const double *s, int first, int 
   return bias;
 }
 
-/* Place the row [v; w; f] in M. */
+/* Transform the row [v; w; f] into M. */
 static void ip_put(ip_context *c, int r, double lower, double upper)
 {
   const double *row = c->rows[r];
@@ -229,7 +229,7 @@ static void ip_assemble(ip_context *c)
   }
 }
 
-/* The types of the bounds before any is active. */
+/* Reset the types of the bounds, so that only equations are active. */
 static void ip_cool(ip_context *c)
 {
   int i;
@@ -238,7 +238,7 @@ static void ip_cool(ip_context *c)
   }
 }
 
-/* Weights that a reset reads, and the rows of the cones. */
+/* Read the weights, and transform the rows of the cones. */
 static void ip_begin_qp(ip_context *c)
 {
   int i, k;
@@ -249,8 +249,8 @@ static void ip_begin_qp(ip_context *c)
   for (i = 0; i < IP_NV; ++i) {
     double weight = c->added[ip_entry(i)];
     for (k = 0; IP_MOMENTUM && k < IP_TASKS; ++k) {
-      const int first = ip_task_kind[k] == IP_BASE_TURN ? 3 : 0, own = ip_entry(i) - first;
-      weight = own >= 0 && own < 3 ? c->p.task_weight[ip_task_row[k] + own] + (first ? weight : 0.0) : weight;
+      const int first = ip_task_kind[k] == IP_BASE_TURN ? 3 : 0, row = ip_entry(i) - first;
+      weight = row >= 0 && row < 3 ? c->p.task_weight[ip_task_row[k] + row] + (first ? weight : 0.0) : weight;
     }
     c->ease[i] = 1.0 / sqrt(weight);
   }
@@ -258,9 +258,9 @@ static void ip_begin_qp(ip_context *c)
     c->ease[IP_NV + i] = 1.0 / sqrt(c->p.spare_weight[0]);
   }
   for (i = 0; i < IP_FORCES; ++i) {
-    const int own = i - ip_contact_row[ip_force_contact[i]];
-    /* A moment in N m counts like a force of 10 N. */
-    c->ease[IP_NV + IP_SPARE + i] = 1.0 / sqrt(c->p.force_weight[0] * (own < 3 ? 1.0 : 100.0));
+    const int row = i - ip_contact_row[ip_force_contact[i]];
+    /* A moment of 1 N m costs as much as a force of 10 N. */
+    c->ease[IP_NV + IP_SPARE + i] = 1.0 / sqrt(c->p.force_weight[0] * (row < 3 ? 1.0 : 100.0));
   }
   memset(c->center, 0, sizeof c->center);
   for (k = 0; k < IP_CONTACTS; ++k) {

@@ -1,7 +1,8 @@
-/* Strict levels of any rank, as LevelRank has them: dependent rows leave the program, nearly dependent rows are damped. */
+/* Strict levels of any rank, as LevelRank has them: dependent rows leave the program, and nearly dependent rows are
+ * damped. */
 
-/* Singular value, over the length of a level's longest row, below which a direction is damped; the share of it below
- * which a direction is dropped; the least 1 - alpha. */
+/* Least singular value, over the length of a level's longest row, without damping; the share of it below which a direction
+ * is dropped; the least 1 - alpha. */
 #define IP_SINGULAR 2e-2
 #define IP_DROPPED 1e-9
 #define IP_LEAST 1e-8
@@ -12,7 +13,7 @@ static double ip_size(const ip_context *c, int k)
   return k < IP_NV + IP_SPARE ? 1.0 : c->m.M[0];
 }
 
-/* out = a row of the equations, less another one, in these units and times s. */
+/* out = s times the difference of two rows of the equations in these units; `less` may be null. */
 static void ip_in_units(const ip_context *c, const double *row, const double *less, double s, double *out)
 {
   int k;
@@ -21,26 +22,26 @@ static void ip_in_units(const ip_context *c, const double *row, const double *le
   }
 }
 
-/* Whether the equations are independent, as LevelRank decides: no singular value of the scaled rows is below 0.02.  No
- * singular value moves further than the matrix does, so most ticks need no decomposition. */
+/* Decide whether the equations are independent, as LevelRank does: all singular values of the scaled rows are above 0.02.
+ * A singular value changes at most by the change of the matrix, so most ticks need no decomposition. */
 static void ip_measure_rank(ip_context *c)
 {
 #if IP_LEVELS
   enum { N = IP_EQUATIONS };
   const double least = IP_SINGULAR;
-  double *G = c->scratch, *S = G + N * N, *B = S + N * N, moved[IP_VARIABLES], way = 0.0, low, high, trace = 0.0;
+  double *G = c->scratch, *S = G + N * N, *B = S + N * N, moved[IP_VARIABLES], change = 0.0, low, high, trace = 0.0;
   int i, j, k;
   for (i = 0; i < N; ++i) {
     ip_in_units(c, c->rows[i], c->reference[i], 1.0 / c->length[i], moved);
-    way += ip_dot(moved, moved, IP_VARIABLES);
+    change += ip_dot(moved, moved, IP_VARIABLES);
   }
-  if (way < c->space) {
+  if (change < c->space) {
     return;
   }
   memcpy(c->reference, c->rows, sizeof c->reference);
   c->space = 0.0;
   c->independent = 1;
-  if (!isfinite(way)) {
+  if (!isfinite(change)) {
     return;
   }
   for (i = 0; i < N; ++i) {
@@ -74,7 +75,7 @@ static void ip_measure_rank(ip_context *c)
 #endif
 }
 
-/* Lengths of the equations, by which their rank is measured: the longest row of a level. */
+/* Set the lengths of the equations for the measure of their rank: each is the longest row of its level. */
 static void ip_begin_rank(ip_context *c)
 {
   double row[IP_VARIABLES];
@@ -101,8 +102,8 @@ static void ip_begin_rank(ip_context *c)
 }
 
 #if IP_LEVELS
-/* Rotate the k rows of B, of n numbers, until they are orthogonal, by U, of orthogonal rows: B becomes U B.  These are the
- * left singular vectors and, times the singular values, the right ones (Hestenes 1958). */
+/* Rotate the k rows of B, of n numbers, until they are orthogonal: B becomes U B with an orthogonal U.  The rows of U are the
+ * left singular vectors, and the rows of B the right singular vectors times the singular values (Hestenes 1958). */
 static void ip_orthogonalize(double *B, double *U, int k, int n)
 {
   int i, j, sweep, turned = 1;
@@ -140,8 +141,8 @@ static void ip_remove(double *Z, const double *v, double s, double share, int n)
   }
 }
 
-/* Replace the rows of the levels by independent ones, with open bounds where they are none, and add the damped ones to
- * the upper triangle of H and to g, which pulls. */
+/* Replace the rows of the levels by independent rows.  Rows that are not equations get open bounds, and damped rows are
+ * added to the upper triangle of H and to g, where -g is the linear part. */
 static void ip_reduce(ip_context *c, double *H, double *g)
 {
   enum { N = IP_VARIABLES };
@@ -200,7 +201,7 @@ static void ip_reduce(ip_context *c, double *H, double *g)
         }
       }
       if (x > IP_DROPPED) {
-        /* Z times the other rows stays the same, because they are orthogonal to this one. */
+        /* This leaves Z times the other rows, because they are orthogonal to this row. */
         ip_remove(Z, v, s, 1.0 - sqrt(1.0 - alpha), N);
       }
     }

@@ -1,4 +1,4 @@
-/* Set the point to zero, the bounds to those of the problem, and the coordinates to the scaled variables. */
+/* Start at zero, with the bounds of the problem and the scaled variables as coordinates. */
 static void begin(Relaxation *r, const relaxation_problem *p, char *work, int budget) {
     const int n = p->n;
     memset(r, 0, sizeof *r);

@@ -1,4 +1,4 @@
-/* Factorize the reduced cost plus `share` of its largest entry; false where it is not positive. */
+/* Factorize the reduced cost plus `share` of its largest entry; return 0 if it is not positive definite. */
 static int factorize(Relaxation *r, double share) {
     const int n = r->n, free = n - r->fixed;
     const double *Z = r->Z + r->fixed, *H = r->p->H;
@@ -25,7 +25,7 @@ static int factorize(Relaxation *r, double share) {
     return 1;
 }
 
-/* Turn whitened coordinates into those of Z. */
+/* Transform whitened coordinates to the coordinates of Z. */
 static void unwhiten(const Relaxation *r, double *y) {
     for (int i = r->n - r->fixed - 1; i >= 0; i--) {
         y[i] *= r->L[i * r->n + i];
@@ -33,7 +33,7 @@ static void unwhiten(const Relaxation *r, double *y) {
     }
 }
 
-/* Move to the minimum of the cost with the active rows of its program held, where a proximal term has kept it off. */
+/* Move to the exact minimum of the cost with the active rows of its program held, which a proximal term has missed. */
 static void finish_cost(Relaxation *r) {
     for (int k = 0; k < MOST_MOVES; k++) {
         hold_rows(r, 1);
@@ -49,8 +49,8 @@ static void finish_cost(Relaxation *r) {
     }
 }
 
-/* Minimize the cost in the coordinates that are left.  Its active rows are found with a proximal term, because the cost
- * may be too flat; then the point moves to its minimum. */
+/* Minimize the cost in the coordinates that are left.  A program with a proximal term decides the active rows, because the
+ * cost may be too flat.  Then the point moves to the minimum. */
 static int solve_cost(Relaxation *r) {
     const int free = r->n - r->fixed;
     int flag = 0;

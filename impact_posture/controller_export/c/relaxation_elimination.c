@@ -1,6 +1,6 @@
 /* ---- elimination --------------------------------------------------------------------------------------------- */
 
-/* Make the reflection I - tau v v' that leaves only the first number of x; x is not zero. */
+/* Compute the reflection I - tau v v' that maps x, which is not zero, to its first coordinate. */
 static double reflector(double *v, const double *x, int count) {
     const double s = norm(x, count), head = x[0];
     memmove(v, x, (size_t)count * sizeof *v);
@@ -10,7 +10,7 @@ static double reflector(double *v, const double *x, int count) {
 
 static void reflect(const double *v, double tau, double *x, int count) { ip_add(x, -tau * ip_dot(v, x, count), v, count); }
 
-/* Turn a move from the coordinates of turn() into those of Z. */
+/* Transform a step from the reflected coordinates to the coordinates of Z. */
 static void turn_back(const Relaxation *r, double *x, int rank) {
     for (int k = rank - 1; k >= 0; k--)
         reflect(r->v + k * r->n, r->tau[k], x + k, r->n - r->fixed - k);
@@ -35,14 +35,14 @@ static void least_squares(double *B, int stride, int rows, int columns, double *
     }
 }
 
-/* Turn a row into the coordinates of the first reflections. */
+/* Transform a row to the reflected coordinates. */
 static void turn_row(const Relaxation *r, double *row) {
     for (int k = 0; k < r->rank; k++) reflect(r->v + k * r->n, r->tau[k], row + k, r->n - r->fixed - k);
 }
 
 static void clear_rows(Relaxation *r) { r->exact = r->near = r->rank = 0; }
 
-/* List a row that reaches its goal exactly: in the turned coordinates, only the first ones move the exact rows. */
+/* List a row that reaches its goal exactly.  Only the first `rank` reflected coordinates move the exact rows. */
 static void add_exact(Relaxation *r, int entry) {
     const int n = r->n, rank = r->rank, free = n - r->fixed;
     double *b = r->B + r->exact * n, *v = r->v + rank * n;
@@ -57,7 +57,7 @@ static void add_exact(Relaxation *r, int entry) {
     r->rows[r->exact++] = entry;
 }
 
-/* List a row that comes near its goal (least squares).  The rows of the last program, in M, are not needed any more. */
+/* List a row that comes close to its goal (least squares).  It overwrites a row of the last program in M. */
 static void add_near(Relaxation *r, int entry) {
     double *b = r->M + r->near * r->n;
     memcpy(b, motion(r, entry), (size_t)(r->n - r->fixed) * sizeof *b);
@@ -73,12 +73,12 @@ static void swap(double *a, double *b, int count) {
     }
 }
 
-/* Make r->step the move by which the listed rows reach, or come near, their goals.  Return how many of the turned
- * coordinates it takes; those after r->rank are led by the first rows in r->own. */
+/* Set r->step to the step by which the listed rows reach, or come close to, their goals.  Return the number of reflected
+ * coordinates that it uses.  The coordinates after r->rank belong to the first rows in r->own. */
 static int find_step(Relaxation *r) {
     const int n = r->n, rank = r->rank, free = n - r->fixed, rest = free - rank;
     double *step = r->step, *C = r->L, *rhs = r->rhs, *square = r->column, longest = 0;
-    int found = 0;
+    int used = 0;
     memset(step, 0, (size_t)n * sizeof *step);
     for (int k = 0; k < rank; k++) {
         const int i = r->lead[k], entry = r->rows[i];
@@ -91,47 +91,47 @@ static int find_step(Relaxation *r) {
         square[i] = ip_dot(b + rank, b + rank, rest);
         longest = fmax(longest, r->length[r->own[i]]);
     }
-    for (; found < r->near && found < rest; found++) {
-        double *c = C + found * n, *v = r->v + (rank + found) * n, *tau = r->tau + rank + found;
-        int best = found;
-        for (int i = found; i < r->near; i++)
+    for (; used < r->near && used < rest; used++) {
+        double *c = C + used * n, *v = r->v + (rank + used) * n, *tau = r->tau + rank + used;
+        int best = used;
+        for (int i = used; i < r->near; i++)
             if (square[i] > square[best]) best = i;
-        if (best != found) {
-            const int row = r->own[found];
-            r->own[found] = r->own[best], r->own[best] = row;
+        if (best != used) {
+            const int row = r->own[used];
+            r->own[used] = r->own[best], r->own[best] = row;
             swap(c, C + best * n, rest);
-            swap(r->M + found * n, r->M + best * n, free);
-            swap(rhs + found, rhs + best, 1);
-            swap(square + found, square + best, 1);
+            swap(r->M + used * n, r->M + best * n, free);
+            swap(rhs + used, rhs + best, 1);
+            swap(square + used, square + best, 1);
         }
-        if (norm(c + found, rest - found) <= PIVOT * longest) break;
-        *tau = reflector(v, c + found, rest - found);
-        for (int i = found; i < r->near; i++) {
-            double *b = C + i * n + found;
-            reflect(v, *tau, b, rest - found);
-            /* The difference keeps few digits where a row nearly depends on those before. */
+        if (norm(c + used, rest - used) <= PIVOT * longest) break;
+        *tau = reflector(v, c + used, rest - used);
+        for (int i = used; i < r->near; i++) {
+            double *b = C + i * n + used;
+            reflect(v, *tau, b, rest - used);
+            /* The difference has few digits where a row nearly depends on earlier rows. */
             if (b[0] * b[0] < (1 - 1e-6) * square[i])
                 square[i] -= b[0] * b[0];
             else
-                square[i] = ip_dot(b + 1, b + 1, rest - found - 1);
+                square[i] = ip_dot(b + 1, b + 1, rest - used - 1);
         }
     }
-    if (found < r->near)
-        least_squares(C, n, r->near, found, rhs, step + rank, square);
+    if (used < r->near)
+        least_squares(C, n, r->near, used, rhs, step + rank, square);
     else
-        for (int k = 0; k < found; k++)
+        for (int k = 0; k < used; k++)
             step[rank + k] = (rhs[k] - ip_dot(C + k * n, step + rank, k)) / C[k * n + k];
-    turn_back(r, step, rank + found);
-    return rank + found;
+    turn_back(r, step, rank + used);
+    return rank + used;
 }
 
-/* Mark listed rows as held, or as free. */
+/* Mark the listed rows as held or free. */
 static void hold_rows(Relaxation *r, int held) {
     for (int i = 0; i < r->exact; i++) r->held[r->rows[i]] = held;
     for (int i = 0; i < r->near; i++) r->held[r->own[i]] = held;
 }
 
-/* Move by r->step until a row of the program stops it.  Return that row's entry, or -1 where none does. */
+/* Move by r->step until a row of the program stops it.  Return the entry of this row, or -1 after the whole step. */
 static int move(Relaxation *r) {
     double part = 1, end = 0;
     int stop = -1;
@@ -153,11 +153,11 @@ static int move(Relaxation *r) {
     return stop;
 }
 
-/* Leave out the first `rank` of the coordinates of turn(). */
+/* Eliminate the first `rank` reflected coordinates. */
 static void eliminate(Relaxation *r, int rank) {
     const int n = r->n, free = n - r->fixed, rest = free - rank;
     if (rest < rank) {
-        /* Few coordinates are left: Z times each of them. */
+        /* Few coordinates are left, so compute Z times each of them. */
         for (int c = 0; c < rest; c++) {
             double *e = r->B + c * n;
             memset(e, 0, (size_t)free * sizeof *e);

@@ -1,7 +1,7 @@
 /* ---- least-distance programs ---------------------------------------------------------------------------------- */
 
-/* List the inequalities of the levels above `level` and, as soft ones, all rows of `level`, in whitened coordinates
- * where the cost has a factor L. */
+/* List the inequalities of the levels above `level` and, as soft rows, all rows of `level`.  With a factor L of the cost,
+ * they are in whitened coordinates. */
 static void list_rows(Relaxation *r, int level, const double *L) {
     const int free = r->n - r->fixed;
     const int *warm = r->warm + level * r->entries;
@@ -10,8 +10,8 @@ static void list_rows(Relaxation *r, int level, const double *L) {
     for (int i = 0; i < r->entries; i++)
         if (r->p->level[i] == level && !r->held[i]) longest = fmax(longest, r->length[i]);
     for (int i = 0; i < r->entries; i++) {
-        const int own = r->p->level[i], soft = own == level && level > 0, equal = is_equation(r, i);
-        if (r->held[i] || own > level || (equal && !soft)) continue;
+        const int of = r->p->level[i], soft = of == level && level > 0, equal = is_equation(r, i);
+        if (r->held[i] || of > level || (equal && !soft)) continue;
         if (r->lower[i] <= -RELAXATION_NONE && r->upper[i] >= RELAXATION_NONE) continue;
         double *row = r->M + count * free;
         memcpy(row, motion(r, i), (size_t)free * sizeof *row);
@@ -23,8 +23,8 @@ static void list_rows(Relaxation *r, int level, const double *L) {
         }
         r->size[count] = size;
         ip_scaled(row, 1 / size, row, free);
-        /* The tolerance of a row is relative to its length in the units of the problem.  That of the cost is what
-         * rounding permits; its active rows are made exact afterwards. */
+        /* The tolerance of a row is relative to its length in the units of the problem.  The program of the cost has the
+         * tolerance of rounding, and its active rows become exact afterwards. */
         r->daqp.scaling[count] = L ? 1 : r->length[i] / size;
         const double ratio = longest / r->length[i];
         r->daqp.rho_ls[count] = r->daqp.rho_us[count] = STEP_WEIGHT * ratio * ratio;
@@ -91,9 +91,8 @@ static void list_active(Relaxation *r) {
     }
 }
 
-
-/* Drop the rows that the answer does not need from the lists, after a whole move: exact rows without a multiplier or
- * with one of the wrong sign, and inequalities that hold.  Return whether there are any. */
+/* After a whole move, drop the rows that the answer does not need: exact rows whose multiplier is zero or has the wrong
+ * sign, and inequalities that hold.  Return whether rows were dropped. */
 static int drop_rows(Relaxation *r) {
     double *force = r->column, most = 0, square = 0;
     const int exact = r->exact, near = r->near;
@@ -118,13 +117,13 @@ static int drop_rows(Relaxation *r) {
         r->rhs[i] *= r->goal[row] == r->upper[row] ? 1 : -1;
         if (r->rhs[i] < r->rhs[worst]) worst = i;
     }
-    /* Where many bounds meet, without progress, only the worst goes: else others would stop the move in its place. */
+    /* Without progress, where many bounds meet, drop only the worst row, because others would stop the move in its place. */
     const int all = square < (1 - PROGRESS) * r->square;
     for (int i = 0; i < exact; i++)
         if (most > 0 && (r->rhs[i] > COUNTS * most || (!all && i != worst))) r->rows[exacts++] = r->rows[i];
     for (int i = 0; i < near; i++)
         if (is_equation(r, r->own[i]) || violation(r, r->own[i]) > least(r, r->own[i])) r->own[nears++] = r->own[i];
-    /* Inequalities at their very bounds would be dropped and stop the move again without end. */
+    /* Inequalities exactly at their bounds would be dropped and stop the move again, endlessly. */
     if (exacts + nears == exact + near || (exacts == exact && !all)) return 0;
     r->square = square;
     clear_rows(r);
@@ -133,8 +132,8 @@ static int drop_rows(Relaxation *r) {
     return 1;
 }
 
-/* List what determines the level's answer: the active rows of the levels above, then the level's own equations and
- * violated rows, which stay where they are if there is nothing to find. */
+/* List the rows that determine the level's answer: the active rows of the levels above if the level is missed, then the
+ * level's equations and violated rows. */
 static void list_held(Relaxation *r, int level, int missed) {
     clear_rows(r);
     if (missed) list_active(r);
@@ -145,7 +144,7 @@ static void list_held(Relaxation *r, int level, int missed) {
     }
 }
 
-/* Find the exact answer of a level from nearly the right rows, and return how many coordinates they take. */
+/* Compute the exact answer of a level from approximate active rows, and return the number of coordinates that it uses. */
 static int finish_level(Relaxation *r, int level, int missed) {
     int last = -1;
     r->square = INFINITY;
@@ -164,14 +163,14 @@ static int finish_level(Relaxation *r, int level, int missed) {
         else
             add_near(r, stop);
     }
-    /* The point is good, if not the best: its rows stay as they are. */
+    /* The point is good but not the best, and its rows keep their values. */
     list_held(r, level, missed);
     for (int i = 0; i < r->exact; i++) r->goal[r->rows[i]] = r->value[r->rows[i]];
     for (int i = 0; i < r->near; i++) r->goal[r->own[i]] = r->value[r->own[i]];
     return find_step(r);
 }
 
-/* Bring the point as near to a level as the levels above permit, then keep it there. */
+/* Bring the point as close to a level as the levels above permit, then hold the level. */
 static int solve_level(Relaxation *r, int level) {
     int missed = 0, same = 0;
     list_rows(r, level, NULL);
@@ -181,7 +180,7 @@ static int solve_level(Relaxation *r, int level) {
         r->daqp.reuse_ind = 0;
         int flag = k ? run(r) : start(r);
         if (flag <= 0 && flag != DAQP_EXIT_ITERLIMIT && !k) {
-            /* A larger weight is easier. */
+            /* A program with a larger weight is easier. */
             for (int j = 0; j < r->count; j++) r->daqp.rho_us[j] = r->daqp.rho_ls[j] *= 100;
             flag = start(r);
         }
@@ -196,12 +195,12 @@ static int solve_level(Relaxation *r, int level) {
         same = !missed || (k && left - r->left == 1);
     }
     const int rank = finish_level(r, level, missed);
-    /* A dependent row may still move by rounding: an inequality goes on as one. */
+    /* A dependent row may still move by rounding, so an inequality stays an inequality. */
     for (int i = 0; i < r->exact; i++) r->held[r->rows[i]] = is_equation(r, r->rows[i]);
     for (int i = 0; i < r->near; i++) r->held[r->own[i]] = is_equation(r, r->own[i]);
     for (int k = 0; k < rank; k++) r->held[k < r->rank ? r->rows[r->lead[k]] : r->own[k - r->rank]] = 1;
     eliminate(r, rank);
-    /* The point is a solution, whatever rounding makes of its rows. */
+    /* The point counts as a solution, so the bounds open by the rounding of its rows. */
     for (int i = 0; i < r->entries; i++)
         if (r->p->level[i] <= level) {
             r->lower[i] = fmin(r->lower[i], r->value[i]);

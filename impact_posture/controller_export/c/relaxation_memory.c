@@ -5,26 +5,26 @@
 
 #include "daqp.h"
 
-/* DAQP finds the active rows of a level nearly, with this weight of the step (squared) against the violation, by steps
- * that each start at the last answer.  The exact answer then follows by moves with eliminated rows, which a bound may
- * stop, and which count against the budget like so many iterations for each row (as long as DAQP's, by measurement). */
+/* DAQP approximates the active rows of a level in steps from the last answer, with this weight of the squared step against
+ * the violation.  Moves with eliminated rows then lead to the exact answer.  A bound may stop a move.  For each row, a move
+ * counts as MOVE_COST iterations, which take as long by measurement. */
 #define STEP_WEIGHT 1e-5
 #define MOST_STEPS 4
 #define MOST_MOVES 60
 #define MOVE_COST 0.1
-/* Largest violation of a bound, and the violation that counts, relative to the numbers of the problem. */
+/* Largest violation of a bound, and least violation that counts, relative to the numbers of the problem. */
 #define EXACT 1e-9
 #define COUNTS 1e-7
 /* Least relative decrease of a sum of squares. */
 #define PROGRESS 1e-9
-/* Largest violation of level 0 in the end. */
+/* Largest violation of level 0 by the result. */
 #define WRONG 1e-7
 /* Largest violation of a bound in the program of the cost, relative to its unit. */
 #define ROUNDING 1e-10
-/* Length of a row that cannot move any more, and least pivot of an elimination, relative to the row's own length. */
+/* Length of a row that cannot move any more, and least pivot of an elimination, relative to the length of the whole row. */
 #define FLAT 1e-12
 #define PIVOT 1e-8
-/* Tried in order: added to the reduced cost, relative to its largest entry. */
+/* Proximal terms of the reduced cost, relative to its largest entry, in the order of the attempts. */
 static const double PROXIMAL[] = {1e-5, 1e-3};
 
 typedef struct {
@@ -32,12 +32,12 @@ typedef struct {
     int n, entries, fixed, left; /* variables, entries of [z; A z], eliminated coordinates, iterations left */
     double *Z, *T;               /* n x n: z moves by the columns from `fixed` on; A Z, row by row where it is known */
     double *z, *value, *lower, *upper, *length; /* the point, [z; A z], opened bounds, lengths in `unit` */
-    int *first, *last, *known;   /* range of a row's entries that are not zero; for which `fixed` its motion is known */
+    int *first, *last, *known;   /* range of a row's nonzero entries; `fixed` at the last computation of its motion */
     int *held;                   /* whether an entry is eliminated */
-    double *goal;                /* values that listed rows are to have */
+    double *goal;                /* desired values of listed rows */
     double *B, *v, *tau, *rhs, *step, *column; /* of an elimination */
     double *way;                 /* Z times a step */
-    int *rows, *lead, *own;      /* exact rows; those whose reflection is the k-th; rows to come near */
+    int *rows, *lead, *own;      /* exact rows; exact row of the k-th reflection; rows of least squares */
     int exact, near, rank;       /* their numbers, and the number of coordinates that the exact rows take */
     double *L, *wanted;          /* factor of the reduced cost (1/L on the diagonal), its minimum in whitened coordinates */
     DAQPWorkspace daqp;
@@ -49,11 +49,11 @@ typedef struct {
     double tolerance, scale;     /* violation that DAQP may leave; size of the point, in `unit` */
 } Relaxation;
 
-/* Place an array after the others; without a base, count only. */
+/* Place an array after the others; without a base, only count its bytes. */
 static void *take(char *base, size_t *used, size_t count, size_t size) {
-    char *found = base ? base + *used : NULL;
+    char *array = base ? base + *used : NULL;
     *used += (count * size + sizeof(double) - 1) / sizeof(double) * sizeof(double);
-    return found;
+    return array;
 }
 
 static size_t place(Relaxation *r, char *base, size_t n, size_t m, size_t levels) {
@@ -73,7 +73,7 @@ static size_t place(Relaxation *r, char *base, size_t n, size_t m, size_t levels
         {&r->lead, n}, {&r->own, e}, {&r->entry, e},
         {&r->daqp.sense, e}, {&r->daqp.WS, active}, {&r->daqp.prox_mask, n},
     };
-    /* The active rows, which outlive a solution, come first. */
+    /* The active rows come first, because they stay for the next solution. */
     for (size_t k = 0; k < sizeof ints / sizeof *ints; k++)
         *ints[k].array = take(base, &used, ints[k].count, sizeof(int));
     for (size_t k = 0; k < sizeof doubles / sizeof *doubles; k++)

@@ -2,7 +2,7 @@
 
 static double norm(const double *a, int n) { return sqrt(ip_dot(a, a, n)); }
 
-/* How an entry moves in the coordinates that are left. */
+/* Derivative of an entry by the coordinates that are left. */
 static const double *motion(const Relaxation *r, int entry) {
     const int n = r->n, row = entry - n;
     if (row < 0) return r->Z + entry * n + r->fixed;
@@ -37,7 +37,7 @@ static void find_way(Relaxation *r, const double *step) {
     for (int i = 0; i < r->n; i++) r->way[i] = ip_dot(r->Z + i * r->n + r->fixed, step, r->n - r->fixed);
 }
 
-/* Go a part of r->way. */
+/* Move by a part of r->way. */
 static void go(Relaxation *r, double part) {
     ip_add(r->z, part, r->way, r->n);
     for (int i = 0; i < r->entries; i++) r->value[i] = entry_of(r, r->z, i);

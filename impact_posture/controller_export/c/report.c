@@ -1,4 +1,4 @@
-/* What a program reads about a tick. */
+/* Diagnosis of a tick. */
 
 void ip_last_report(const ip_context *c, ip_report *report)
 {

@@ -1,4 +1,4 @@
-/* The solution of the QP by DAQP, warm from the last active set. */
+/* Solution of the QP by DAQP from the last active set. */
 
 /* out = T x, added to out. */
 static void ip_add_turned(const ip_context *c, const double *x, double *out)
@@ -32,8 +32,8 @@ static void ip_add_turned(const ip_context *c, const double *x, double *out)
   }
 }
 
-/* Read z = [v; w; f] from u, and correct it once so that the active rows hold to the last digits: in the variables of
- * DAQP, the large weights of the cost cost digits. */
+/* Compute z = [v; w; f] from u, and correct it once so that the active rows hold to the last digits.  The large weights of
+ * the cost lose digits in the variables of DAQP. */
 static void ip_decode(ip_context *c, DAQPWorkspace *w)
 {
   double x[IP_VARIABLES];
@@ -45,7 +45,7 @@ static void ip_decode(ip_context *c, DAQPWorkspace *w)
   ip_add_turned(c, x, c->z);
   memset(x, 0, sizeof x);
 #if IP_MOMENTUM
-  /* The least weight of the acceleration of the base is no part of the diagonal cost. */
+  /* The diagonal cost does not contain the least weight of the base's acceleration. */
   double rest[IP_NV] = {0};
   for (i = 0; i < 3; ++i) {
     rest[i] = -c->added[i] * c->z[i];
@@ -74,7 +74,7 @@ static void ip_decode(ip_context *c, DAQPWorkspace *w)
   ip_add_turned(c, x, c->z);
 }
 
-/* Memory of DAQP on the stack, for both programs of a tick. */
+/* Memory of DAQP on the stack, large enough for both programs of a tick. */
 typedef struct {
   double lam[IP_VARIABLES + 1], lam_star[IP_VARIABLES + 1], xldl[IP_VARIABLES + 1], zldl[IP_VARIABLES + 1];
   double D[IP_VARIABLES + 1], L[(IP_VARIABLES + 1) * (IP_VARIABLES + 2) / 2], xold[IP_VARIABLES];
@@ -83,7 +83,7 @@ typedef struct {
   DAQPSettings settings;
 } ip_memory;
 
-/* Prepare a program of n variables, `simple` bounds and m bounds and rows.  The caller sets rows and bounds. */
+/* Prepare a program of n variables with m bounds and rows, of which `simple` are bounds.  The caller sets them. */
 static void ip_prepare(ip_memory *s, int n, int simple, int m, double *u, DAQPWorkspace *w)
 {
   memset(s->prox, 0, sizeof s->prox);
@@ -123,7 +123,7 @@ static int ip_solve_warm(ip_context *c)
   flag = flag < 0 ? flag : daqp_ldp(&w);
   c->iterations += w.iterations;
   if (w.state & DAQP_STATE_NOISE_FLOOR) {
-    /* It went in circles and then took violated bounds for rounding. */
+    /* It cycled and then took violated bounds for rounding. */
     flag = DAQP_EXIT_CYCLE;
   }
   memset(c->multipliers, 0, sizeof c->multipliers);

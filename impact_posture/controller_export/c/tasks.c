@@ -1,4 +1,4 @@
-/* Tasks, contacts, and joint limits at the state in the context. */
+/* Tasks and joint limits at the state in the context. */
 
 /* Kinds of tasks in ip_task_kind. */
 enum { IP_TILT, IP_BASE_TURN, IP_MASS_CENTER, IP_POSITION, IP_POSE, IP_ALIGNED };
@@ -57,7 +57,7 @@ static void ip_center_of_mass(const ip_model *m, const double *q, double *positi
 #endif
 }
 
-/* Angle times axis, components x and y, of the shortest rotation that takes the z axis to a unit vector. */
+/* Components x and y of angle times axis of the shortest rotation from the z axis to a unit vector. */
 static void ip_shortest(const double *to, double *e)
 {
   const double sine = hypot(to[0], to[1]);
@@ -72,7 +72,7 @@ static void ip_shortest(const double *to, double *e)
   }
 }
 
-/* Rows of a task that never change. */
+/* Rows of tasks whose Jacobian is constant. */
 static void ip_constant_rows(int k, double *J)
 {
   int i;
@@ -81,7 +81,7 @@ static void ip_constant_rows(int k, double *J)
   }
 }
 
-/* Target that is the present output. */
+/* Set a target to the present output. */
 static void ip_present(const ip_context *c, int k, ip_target *target)
 {
   const int point = ip_task_point[k];
@@ -104,19 +104,19 @@ static void ip_present(const ip_context *c, int k, ip_target *target)
   target->set = 1.0;
 }
 
-/* Make log6 of the way to a pose, in world axes, of e, the way of its origin, and both rotations. */
+/* Complete e, which begins with the difference of the origins, to log6 of the motion to a pose, in world axes. */
 static void ip_pose_error(const double *R, const double *wanted, double *e)
 {
-  double way[9], w[3], p[3], linear[3];
-  ip_relative(R, wanted, way);
-  ip_log3(way, w);
+  double relative[9], w[3], p[3], linear[3];
+  ip_relative(R, wanted, relative);
+  ip_log3(relative, w);
   ip_turn(R, e, 1, p);
   ip_log6_linear(w, p, linear);
   ip_turn(R, linear, 0, e);
   ip_turn(R, w, 0, e + 3);
 }
 
-/* Error e, rows J that are not constant, and drift of one task with the quantities m of the robot at q. */
+/* Write error e, Jacobian J unless it is constant, and drift of a task, with the quantities m of the robot at q. */
 static void ip_task_output(const ip_target *target, int k, const ip_model *m, const double *q, double *J, double *e,
                            double *drift)
 {
@@ -172,7 +172,7 @@ static void ip_task_output(const ip_target *target, int k, const ip_model *m, co
   }
 }
 
-/* Rows J and right-hand sides a of one task, with a = y''* - J'v. */
+/* Write rows J and right-hand sides a = y''* - J'v of a task. */
 static void ip_task_rows(ip_context *c, int k)
 {
   const int row = ip_task_row[k], size = ip_task_row[k + 1] - row, point = ip_task_point[k];
@@ -196,17 +196,17 @@ static void ip_task_rows(ip_context *c, int k)
   }
 }
 
-/* Bounds on one joint's acceleration: to[0] to the upper, to[1] to the lower limit (LimitLaw has the formulas). */
+/* Bounds on a joint's acceleration, to[0] towards the upper and to[1] towards the lower limit (LimitLaw has the formulas). */
 static void ip_bounds(const ip_context *c, int i, double *to)
 {
   const ip_params *p = &c->p;
   const double margin = ip_least(p->law_margin[0], (p->joint_upper[i] - p->joint_lower[i]) / 4.0);
   int s;
   for (s = 0; s < 2; ++s) {
-    const double way = c->room[s][i] - margin, room = fabs(way);
+    const double distance = c->room[s][i] - margin, room = fabs(distance);
     double speed = sqrt(2.0 * p->law_deceleration[0] * room);
     speed = ip_least(ip_least(p->law_approach[0] * room, speed), p->joint_velocity[i]);
-    speed = copysign(speed, way) * p->law_rate[0] + (s ? 1.0 : -1.0) * p->law_rate[0] * c->v[i];
+    speed = copysign(speed, distance) * p->law_rate[0] + (s ? 1.0 : -1.0) * p->law_rate[0] * c->v[i];
     to[s] = i < IP_BASE ? speed : ip_least(ip_most(speed, -p->law_acceleration[0]), p->law_acceleration[0]);
   }
 }

@@ -1,9 +1,10 @@
-/* The functions of the controller. */
+/* Functions of the controller. */
 
+/* Longest time step of ramps, in periods. */
 #define IP_LONGEST 10.0
-/* Largest sum of squares of a measurement (1e8 m, rad/s or N). */
+/* Largest sum of squares of a valid measurement (1e8 m, rad/s or N). */
 #define IP_ABSURD 1e16
-/* Times that differ by less are equal, s, because sums of periods are not exact. */
+/* Largest difference of equal times, s, because sums of periods are not exact. */
 #define IP_SAME 1e-9
 
 /* Whether a quaternion, or a cosine with its sine, is far from unit length. */
@@ -37,14 +38,13 @@ static void ip_write(ip_context *c, const double *u, int status, ip_command *out
   out->iterations = c->iterations;
 }
 
-/* Give the previous command, with damping of the joints whose rates are finite. */
+/* Write the previous command, with damping of the joints whose measured rates are valid. */
 static void ip_hold(ip_context *c, int status, const double *v, ip_command *out)
 {
   double u[IP_CONTROLS];
   int i;
   for (i = 0; i < IP_CONTROLS; ++i) {
     const int k = IP_BASE + i - IP_ROTORS;
-    /* What no joint reaches is no measurement. */
     u[i] = c->held[i] - (i >= IP_ROTORS && fabs(v[k]) < sqrt(IP_ABSURD) ? c->damping[k] * v[k] : 0.0);
     u[i] = fmin(fmax(u[i], c->p.control_lower[i]), c->p.control_upper[i]);
   }
@@ -85,7 +85,7 @@ static void ip_answer(ip_context *c, ip_command *out)
   }
   flag = c->independent ? ip_solve_warm(c) : 0;
   if (c->independent && flag <= 0 && flag != DAQP_EXIT_INFEASIBLE) {
-    /* The solver gave up from its warm start.  Try once without. */
+    /* The solver gave up from its warm start, so try a cold start. */
     flag = ip_solve_warm(c);
   }
   if (flag <= 0 && !ip_relax(c)) {
@@ -116,7 +116,7 @@ static int ip_measured(const double *q, const double *v, const double *force)
 {
   double total = ip_dot(q, q, IP_NQ) + ip_dot(v, v, IP_NV);
   total += force ? ip_dot(force, force, 6) : 0.0;
-  /* A sum of squares is finite and below a bound only if all numbers are. */
+  /* A sum of squares is finite and below a bound only if each number is. */
   return total < IP_ABSURD && !ip_turned_wrong(q);
 }
 
@@ -134,7 +134,7 @@ int ip_reset(ip_context *c, const double q[IP_NQ], const double v[IP_NV], ip_com
   for (k = 0; k < IP_TASKS; ++k) {
     ip_constant_rows(k, c->J[ip_task_row[k]]);
     if (c->target[k].set < 0.0) {
-      /* A flow has led it. */
+      /* A flow has moved it. */
       memset(&c->target[k], 0, sizeof c->target[k]);
     }
     if (c->target[k].set <= 0.0) {
@@ -161,7 +161,7 @@ int ip_reset(ip_context *c, const double q[IP_NQ], const double v[IP_NV], ip_com
   for (i = 0; i < IP_NV; ++i) {
     c->damping[i] = 10.0 * c->m.M[i * (IP_NV + 1)];
   }
-  /* The command that is held first carries the robot against gravity. */
+  /* The first held command balances gravity. */
   for (i = 0; i < IP_CONTROLS; ++i) {
     const double *h = c->m.h;
     const double force = i < IP_ROTORS ? ip_dot(ip_inverse + i * IP_BASE, h, IP_BASE) : h[IP_BASE + i - IP_ROTORS];

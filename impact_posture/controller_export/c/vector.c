@@ -1,6 +1,6 @@
 /* Loops over vectors. */
 
-/* Two doubles that are added and multiplied at once, where a compiler has them: it may not reorder a sum by itself. */
+/* Two doubles that one instruction adds or multiplies, if the compiler supports them.  It may not reorder a sum itself. */
 #if defined(__GNUC__)
 typedef double ip_pair __attribute__((vector_size(16), aligned(8), may_alias));
 #define IP_PAIR(p) (*(const ip_pair *)(p))
@@ -12,7 +12,7 @@ static inline double ip_dot(const double *a, const double *b, int n)
   double sum = 0.0;
   int i = 0;
 #if defined(__GNUC__)
-  /* Sums that do not wait for each other. */
+  /* Independent sums do not wait for each other. */
   ip_pair s = {0.0, 0.0}, t = {0.0, 0.0};
   for (; i + 3 < n; i += 4) {
     s += IP_PAIR(a + i) * IP_PAIR(b + i);
