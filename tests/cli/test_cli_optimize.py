@@ -89,18 +89,8 @@ def test_solved_again_from_its_own_problem(result: Path, tmp_path: Path) -> None
 
 
 def test_plot_draws_again(result: Path, tmp_path: Path) -> None:
-    done = run(
-        "plot",
-        result,
-        "--out",
-        tmp_path / "pictures",
-        "--format",
-        "svg",
-        "--figure",
-        "ellipsoid",
-        cwd=tmp_path,
-        pictures=("ellipsoid",),
-    )
+    draw = ("plot", result, "--out", tmp_path / "pictures", "--format", "svg", "--figure", "ellipsoid")
+    done = run(*draw, cwd=tmp_path, pictures=("ellipsoid",))
     assert done.returncode == 0, done.stderr
     assert (tmp_path / "pictures" / "ellipsoid.svg").is_file()
     refused = run("plot", tmp_path, cwd=tmp_path)
@@ -121,7 +111,7 @@ def test_broken_result_is_refused(result: Path, tmp_path: Path) -> None:
     broken = tmp_path / "broken"
     shutil.copytree(result, broken)
     (broken / "result.npz").write_bytes(b"")
-    refused(run("plot", broken, cwd=tmp_path), 1, "broken", "no whole result")
+    refused(run("plot", broken, cwd=tmp_path), 1, "broken", "not a whole result")
 
 
 def test_energy_has_one_unit_in_pictures_and_tables(result: Path, tmp_path: Path) -> None:
@@ -132,19 +122,8 @@ def test_energy_has_one_unit_in_pictures_and_tables(result: Path, tmp_path: Path
 
 
 def test_posture_file_starts_the_next_optimization(result: Path, tmp_path: Path) -> None:
-    done = run(
-        "optimize",
-        "tilthex_arm",
-        "--normal",
-        0,
-        0,
-        1,
-        "--posture",
-        result / "posture.json",
-        "--json",
-        *FAST,
-        cwd=tmp_path,
-    )
+    start_again = ("--posture", result / "posture.json", "--json", *FAST)
+    done = run("optimize", "tilthex_arm", "--normal", 0, 0, 1, *start_again, cwd=tmp_path)
     assert done.returncode == 0, done.stderr
     document = json.loads(done.stdout)
     assert document["reduction"] == pytest.approx(0.0, abs=1e-6)

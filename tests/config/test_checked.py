@@ -1,4 +1,4 @@
-"""Arguments of a wrong type from Python: one line that names the parameter, from every public function and class."""
+"""Every public function and class refuses wrong arguments in one line that names the parameter."""
 
 from __future__ import annotations
 
@@ -67,7 +67,7 @@ GOOD: list[tuple[Callable[..., Any], dict[str, Any]]] = [
     ],
     (tsid.support_contacts, {"robot": ROBOT}),
 ]
-# ReferenceFlow is made by its posture task, and Task, a base, by its subclasses.  The others are results.
+# A posture task makes a ReferenceFlow, and Task is a base class.  The others are results.
 OTHERS = {
     "Export", "ImpactPostureError", "PostureResult", "Robot", "__version__", "known_robots", "sweep", "tsid",
     "ImpactGradient", "CompiledController",
@@ -80,12 +80,12 @@ class Odd:
 
 
 def _parameters() -> list[Any]:
-    found = []
-    for function, good in GOOD:
-        for name, parameter in inspect.signature(function).parameters.items():
-            if parameter.kind is not parameter.VAR_KEYWORD:
-                found.append(pytest.param(function, good, name, id=f"{function.__qualname__}-{name}"))
-    return found
+    return [
+        pytest.param(function, good, name, id=f"{function.__qualname__}-{name}")
+        for function, good in GOOD
+        for name, parameter in inspect.signature(function).parameters.items()
+        if parameter.kind is not parameter.VAR_KEYWORD
+    ]
 
 
 def test_every_public_name_is_tried() -> None:
@@ -106,11 +106,22 @@ def test_no_parameter_takes_an_odd_value(function: Callable[..., Any], good: dic
 @pytest.mark.parametrize(
     ("call", "line"),
     [
+        (lambda: ip.ImpactContact(3, (0, 0, 1)), "frame: is 3; give text"),  # type: ignore[arg-type]
+        (lambda: ip.ImpactContact("ee", (0, 0, 0)), "normal: is (0, 0, 0); give three finite numbers, not all zero"),
+        (lambda: ip.ImpactContact("ee", (0, 0, 1), normal_frame="body"), "'body' is not one of world, contact"),  # type: ignore[arg-type]
+        (lambda: ip.ImpactContact("ee", (0, 0, 1), friction=float("nan")), "friction: is nan; give 0 to 1e+100"),
+        (lambda: ip.Metric("mass"), "kind: 'mass' is not one of euclidean, kinetic, weighted"),  # type: ignore[arg-type]
+        (lambda: ip.Metric("weighted"), "needs weights"),
+        (lambda: ip.Metric("kinetic", (1.0,)), "takes no weights"),
+        (lambda: ip.Metric("weighted", (1.0, float("nan"))), "weights: is (1.0, nan); give"),
+        (lambda: ip.ImpactObjective(ROBOT, CONTACT, metric="Kinetic"), "did you mean kinetic?"),  # type: ignore[arg-type]
+        (lambda: ip.ImpactObjective(ROBOT, CONTACT, metric=ip.Metric("weighted", (1.0,))), "has 1 entries; give 9"),
+        (lambda: ip.ImpactObjective(ROBOT, CONTACT, compliance=-1.0), "compliance: is -1.0"),
+        (lambda: ip.ImpactObjective(ROBOT, CONTACT, others=[None]), "others: is [None]"),  # type: ignore[list-item]
         (lambda: ip.load_robot(5), "robot: is 5; give text"),  # type: ignore[arg-type]
         (lambda: ip.optimize(PROBLEM, starts="a"), "starts: is 'a'; give a whole number"),  # type: ignore[arg-type]
         (lambda: ip.optimize(PROBLEM, starts=True), "starts: is True; give a whole number"),
         (lambda: ip.optimize(PROBLEM, compile="alwys"), "did you mean always?"),  # type: ignore[arg-type]
-        (lambda: ip.ImpactContact("ee", "x"), "normal: is 'x'; give three finite numbers, not all zero"),  # type: ignore[arg-type]
         (lambda: ip.ImpactContact("ee", (0, 0, 1), (0, 0)), "offset: is (0, 0); give three finite numbers"),  # type: ignore[arg-type]
         (lambda: RESULT.save(3), "out: is 3; give text or Path"),  # type: ignore[arg-type]
         (lambda: RESULT.save("out", force="no"), "force: is 'no'; give True or False"),  # type: ignore[arg-type]

@@ -88,19 +88,8 @@ POSTURE = """{
 BY_JOINT = "shoulder = 0.1\nelbow = 0.2\n"
 YAML = "name: [shoulder, elbow]\nposition: [0.1, 0.2]\n"
 JSON_VALUES = (
-    "NaN",
-    "Infinity",
-    "-1e999",
-    "[]",
-    "{}",
-    "null",
-    "true",
-    '"a"',
-    '[["a"]]',
-    "[1, 2, 3]",
-    "1e308",
-    '"\\u0000"',
-)
+    "NaN", "Infinity", "-1e999", "[]", "{}", "null", "true", '"a"', '[["a"]]', "[1, 2, 3]", "1e308", '"\\u0000"'
+)  # fmt: skip
 
 # A file, what it says when it is sound, and the command that reads it.
 FILES: dict[str, tuple[str, Callable[[], str], tuple[str, ...]]] = {
