@@ -1,1 +1,1 @@
-"""The C export of a metric and its gradient, and the loader of a built export."""
+"""The C export of ``H``, its gradient and the objective, and the loader of a built export."""

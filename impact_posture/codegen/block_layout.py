@@ -1,4 +1,4 @@
-"""Divide a graph among C functions: blocks that compute a part each, and exported functions that call them."""
+"""Divide a graph among C functions: each block computes a part, and the exported functions call blocks."""
 
 from __future__ import annotations
 
@@ -9,9 +9,9 @@ from dataclasses import dataclass
 
 from impact_posture.codegen.expression_graph import ARITHMETIC, COSINE, SINE, Graph
 
-# Most statements of a block.  The time of a compiler grows faster than the length of a function.
+# Largest number of statements in a block.  The time of a compiler grows faster than the length of a function.
 _BLOCK = 300
-# Most operations in one statement.
+# Largest number of operations in a statement.
 _STATEMENT = 12
 
 
@@ -20,8 +20,8 @@ class Block:
     """A C function that computes a part of the graph.
 
     Attributes:
-        functions: Numbers of the exported functions that need it.
-        nodes: The nodes that it computes, in order, each by a statement of its own.
+        functions: Numbers of the exported functions that call the block.
+        nodes: The nodes that it computes, in order, by one statement each.
     """
 
     functions: frozenset[int]
@@ -30,17 +30,17 @@ class Block:
 
 @dataclass(frozen=True)
 class Layout:
-    """Blocks in the order of their calls, and the values that they hand on.
+    """Blocks in the order of their calls, and the values that later blocks use.
 
     Attributes:
         graph: The operations.
         blocks: The blocks.
-        inlined: Nodes that the statement of their only user computes.
-        slots: Node → its place in the work array of its width.
+        inlined: Nodes that are computed within the statement of their only user.
+        slots: Node → its index in the work array of its width.
         sizes: Width → length of the work array.
-        angles: Inputs whose sine and cosine are taken, in the order of the array of sines.
-        trig: Sine or cosine node → its first place in that array.
-        leaves: Nodes that every block has at hand, so that they need no statement.
+        angles: Inputs whose sine and cosine are computed, in the order of the array of sines.
+        trig: Sine or cosine node → its first index in this array.
+        leaves: Nodes without a statement: constants, inputs, lanes, sines and cosines.
     """
 
     graph: Graph
@@ -58,8 +58,8 @@ def lay_out(graph: Graph, functions: Sequence[Sequence[str]], block: int = _BLOC
 
     Args:
         graph: The operations.
-        functions: For each exported function the outputs that it returns.
-        block: Most statements of a block.
+        functions: The outputs of each exported function.
+        block: Largest number of statements in a block.
     """
     order = _depth_first(graph, [k for names in functions for name in names for k in graph.outputs[name]])
     angles, trig = _trig(graph, order)
@@ -85,7 +85,7 @@ def lay_out(graph: Graph, functions: Sequence[Sequence[str]], block: int = _BLOC
     at = {k: number for number, part in enumerate(blocks) for k in part.nodes}
 
     def home(k: int) -> int:
-        """The block of the statement that computes node k."""
+        """Return the block of the statement that computes node k."""
         while k in inlined:
             (k,) = users[k]
         return at[k]
@@ -96,9 +96,9 @@ def lay_out(graph: Graph, functions: Sequence[Sequence[str]], block: int = _BLOC
 
 
 def _slots(graph: Graph, blocks: Sequence[Block], last: Mapping[int, int]) -> tuple[dict[int, int], dict[int, int]]:
-    """Places in the work arrays for values that later blocks use, and the lengths of the arrays.
+    """Return indices in the work arrays for values that later blocks use, and the lengths of the arrays.
 
-    Every function calls its blocks in one order.  So a place is free after the ``last`` block that uses its value.
+    Every function calls its blocks in one order.  So an index is free after the ``last`` block that uses its value.
     """
     slots: dict[int, int] = {}
     sizes: dict[int, int] = {}
@@ -130,14 +130,13 @@ def _sources(graph: Graph, leaves: Set[int], k: int) -> list[int]:
 
 
 def _depth_first(graph: Graph, roots: Sequence[int]) -> list[int]:
-    """The nodes that the roots need, operands first, close to where they are used.
+    """Return the nodes that the roots need, operands first, close to where they are used.
 
     The operand with the longest chain comes first, so that the other operands wait for less time.
     """
     depth: list[int] = []
     for node in graph.nodes:
-        steps = 1 if node.op in ARITHMETIC else 0
-        depth.append(steps + max((depth[a] for a in node.operands), default=0))
+        depth.append((node.op in ARITHMETIC) + max((depth[a] for a in node.operands), default=0))
     seen: set[int] = set()
     order: list[int] = []
     for root in roots:
@@ -155,7 +154,7 @@ def _depth_first(graph: Graph, roots: Sequence[int]) -> list[int]:
 
 
 def _trig(graph: Graph, order: Sequence[int]) -> tuple[tuple[int, ...], dict[int, int]]:
-    """Sines and cosines of inputs, vectors first, so that each vector starts at a multiple of its width."""
+    """Return ``angles`` and ``trig`` of :class:`Layout`, vectors first, each at a multiple of its width."""
     trigonometric = [k for k in order if graph.nodes[k].op in (SINE, COSINE)]
     starts: dict[int, int] = {}
     angles: list[int] = []
@@ -172,7 +171,7 @@ def _trig(graph: Graph, order: Sequence[int]) -> tuple[tuple[int, ...], dict[int
 
 
 def _needed(graph: Graph, functions: Sequence[Sequence[str]], leaves: Set[int]) -> dict[int, frozenset[int]]:
-    """Node → numbers of the exported functions that need it."""
+    """Return node → numbers of the exported functions that need it."""
     numbers: dict[int, set[int]] = {}
     for number, names in enumerate(functions):
         waiting = [_source(graph, k) for name in names for k in graph.outputs[name]]
@@ -191,7 +190,7 @@ def _inlined(
     outputs: set[int],
     needed: Mapping[int, frozenset[int]],
 ) -> set[int]:
-    """Arithmetic that one other operation of the same functions uses, once."""
+    """Return arithmetic that is used once, by another arithmetic operation of the same functions."""
     size: dict[int, int] = {}
     inlined: set[int] = set()
     for k in order:

@@ -1,7 +1,7 @@
-"""C99 from a laid-out graph: straight-line blocks of local variables, and work arrays for values that blocks hand on.
+"""C99 from a layout: blocks of straight-line code with local variables, and work arrays for values of later blocks.
 
-Blocks are terse because a humanoid has ten thousand operations.  Vectors are the extension of GCC and Clang, so their
-arithmetic is written as that of numbers.
+Names are short because a humanoid has ten thousand operations.  Vectors are the extension of GCC and Clang, whose
+arithmetic has the same operators as numbers.
 """
 
 from __future__ import annotations
@@ -14,15 +14,15 @@ from impact_posture.codegen.block_layout import Block, Layout
 from impact_posture.codegen.c_literals import Real
 from impact_posture.codegen.expression_graph import COSINE, Node
 
-# Approximate number of characters in the place of a constant.
+# Length of a reference to a constant in a table, such as K[1234].  A shorter literal is written out.
 _PLACE = 7
 SHORT_NAMES = ("APART", "K", "K2", "K4", "V2", "V2u", "V4", "V4u", "VN")
-"""Macros of the emitted text; its end undefines them."""
+"""Macros of the emitted text, which the end of the text undefines."""
 
-# Arrays that a block may receive beside the inputs.
+# Arrays that a block may receive in addition to the inputs.
 _SHARED = ("s", "c", "w", "w2", "w4")
-# The compiler splits a vector that is wider than the processor's.  Without optimization the parts and the whole have
-# a place each.
+# The compiler splits vectors that are wider than the processor's.  Without optimization it stores the parts and the
+# whole.
 _HALVES = 2
 
 
@@ -33,8 +33,8 @@ class BlockText:
     Attributes:
         text: The function.
         call: Its call with the caller's names: inputs, ``m.s``, ``m.w`` and so on.
-        local_bytes: Most bytes of its variables.
-        wide_bytes: Most bytes of the parts of vectors that are wider than the processor's.
+        local_bytes: Upper bound on the bytes of its variables.
+        wide_bytes: Upper bound on the bytes of the parts of vectors that are wider than the processor's.
     """
 
     text: str
@@ -44,7 +44,7 @@ class BlockText:
 
 
 class Constants:
-    """Tables of the numbers in the blocks of a library.  The place of a number is shorter than its seventeen digits.
+    """Tables of the constants in the blocks of a library.  A reference is shorter than the digits of a number.
 
     Args:
         prefix: Beginning of the names of the tables.
@@ -56,7 +56,7 @@ class Constants:
         self._tables: dict[int, dict[tuple[float, ...], int]] = {}
 
     def place(self, node: Node) -> str:
-        """Return the C of a constant: a short number as it is, another by its place."""
+        """Return the C of a constant: a short literal, or a reference to a table."""
         if node.width == 1:
             text = self._real.literal(node.value[0])
             if len(text) < _PLACE:
@@ -65,7 +65,7 @@ class Constants:
         return f"{_short(node.width)}[{known.setdefault(node.value, len(known))}]"
 
     def text(self, types: Mapping[int, str]) -> str:
-        """Return the C of the tables, with the type of each width, and of their short names."""
+        """Return the C of the tables and of their short names.  ``types`` has the C type of each width."""
         lines = []
         for width, known in sorted(self._tables.items()):
             rows = [", ".join(self._real.plain(v) for v in value) for value in known]
@@ -83,16 +83,16 @@ def _short(width: int) -> str:
 
 
 class Emitter:
-    """The C of one laid-out graph.
+    """The C of one layout.
 
     Args:
-        layout: Blocks and the values that they hand on.
+        layout: The layout.
         prefix: Beginning of the names of the blocks.
         real: The type of literals.
-        types: Width → C type of a number or vector of that width.
-        constants: Tables that receive the numbers.
+        types: Width → C type of a number or vector of this width.
+        constants: Tables for the constants.
         size: Bytes of the type of width one, if it is not ``real``.
-        work: Name of the structure with inputs and work arrays; empty where inputs are arguments of their own.
+        work: Name of the structure with inputs and work arrays; empty if inputs are separate arguments.
     """
 
     def __init__(
@@ -109,7 +109,7 @@ class Emitter:
         self._constants, self._size, self._work = constants, size or real.size, work
         self._graph = layout.graph
         at = {k: number for number, block in enumerate(layout.blocks) for k in block.nodes}
-        # Nodes that their own block uses again, so that they need a name there.
+        # Nodes that need a name, because another statement of the same block uses them.
         self._reused: set[int] = set()
         for k, number in at.items():
             waiting = list(self._graph.nodes[k].operands)
@@ -123,7 +123,7 @@ class Emitter:
         self.blocks = [self._block(number, block) for number, block in enumerate(layout.blocks)]
 
     def output(self, k: int, work: str = "m.") -> str:
-        """Return the C of an output after the calls of the blocks."""
+        """Return the C of an output, valid after the calls of the blocks."""
         node = self._graph.nodes[k]
         if node.op == "const":
             return self._real.literal(node.value[0])
@@ -177,7 +177,7 @@ class Emitter:
         )
 
     def _vector_bytes(self, block: Block) -> int:
-        """Bytes of all vectors that a block computes, also within statements."""
+        """Return the bytes of all vectors that a block computes, also within statements."""
         total, waiting = 0, list(block.nodes)
         while waiting:
             node = self._graph.nodes[waiting.pop()]
@@ -186,7 +186,7 @@ class Emitter:
         return total
 
     def _expression(self, k: int, number: int, names: dict[int, str], lines: list[str], *, top: bool = False) -> str:
-        """Return a name, a place in an array, or the operation itself, in parentheses unless on ``top``."""
+        """Return a variable, an array element, or the operation, in parentheses unless it is the whole statement."""
         node = self._graph.nodes[k]
         if not top and k in names:
             return names[k]

@@ -1,4 +1,4 @@
-"""Numbers as C text: the number type of an export, literals and initializers."""
+"""Numbers as C text: the number type of an export, its literals and initializers."""
 
 from __future__ import annotations
 
@@ -16,12 +16,12 @@ _MATH = re.compile(r"\b(exp|log|pow|sqrt|a?sin|a?cos|a?tan|atan2|tanh|hypot|fabs
 
 @dataclass(frozen=True)
 class Real:
-    """The C type that an export computes in.
+    """The number type of an export.
 
     Attributes:
         name: ``double`` or ``float``.
         size: Bytes of a number.
-        unit_tolerance: Largest distance of the norm of a quaternion from one.
+        unit_tolerance: Largest deviation of the norm of a quaternion from one.
     """
 
     name: str
@@ -30,15 +30,15 @@ class Real:
 
     @property
     def dtype(self) -> np.dtype[np.floating[Any]]:
-        """The same type in numpy."""
+        """The same type in NumPy."""
         return np.dtype(np.float64 if self.name == "double" else np.float32)
 
     def rounded(self, values: ArrayLike) -> NDArray[np.float64]:
-        """Return the nearest numbers of this type, as doubles."""
+        """Return numbers rounded to this type, as doubles."""
         return np.array(values, dtype=self.dtype).astype(np.float64)
 
     def literal(self, value: float) -> str:
-        """Return a literal that reads back as the nearest number; a negative one is in parentheses."""
+        """Return the literal of the nearest number of this type; a negative literal is in parentheses."""
         if self.name == "double" or not math.isfinite(value):
             return c_double(value)
         with np.errstate(over="ignore", under="ignore"):
@@ -57,7 +57,7 @@ class Real:
         return brace_initializer([self.plain(v) for v in values], 4, indent)
 
     def spelled(self, operation: str) -> str:
-        """Return the C of an operation on doubles in this type: ``sinf`` for ``sin``, ``1.0f`` for ``1.0``."""
+        """Translate the C of an operation on doubles to this type: ``sinf`` for ``sin``, ``1.0f`` for ``1.0``."""
         if self.name == "double":
             return operation
         text = _MATH.sub(r"\1f(", operation).replace("(double)", "(float)")
@@ -74,7 +74,7 @@ REALS = {real.name: real for real in (DOUBLE, FLOAT)}
 
 
 def c_double(value: float) -> str:
-    """Return a double literal that reads back exactly; a negative one is in parentheses."""
+    """Return a double literal that reads back exactly; a negative literal is in parentheses."""
     if math.isnan(value):
         return "NAN"
     text = "INFINITY" if math.isinf(value) else repr(abs(value))

@@ -1,4 +1,4 @@
-"""Names and signatures of the C functions of an export."""
+"""C identifiers, and the files that builds of an export add."""
 
 from __future__ import annotations
 
@@ -8,7 +8,7 @@ from impact_posture.errors import InputError
 from impact_posture.system.escape import identifier
 
 _IDENTIFIER = re.compile(r"[A-Za-z][A-Za-z0-9_]*")
-# A file <prefix>.h would hide the header of the C library.
+# A file <prefix>.h with one of these names would hide the header of the C library.
 _C_HEADERS = frozenset(
     "assert complex ctype errno fenv float inttypes iso646 limits locale math setjmp signal stdarg stdbool stddef"
     " stdint stdio stdlib string tgmath time wchar wctype".split()
@@ -16,7 +16,7 @@ _C_HEADERS = frozenset(
 
 
 def products(prefix: str) -> tuple[str, ...]:
-    """Return the files that the Makefile of an export, or a program that loads it, makes beside the export."""
+    """Return the files that the Makefile of an export, or a program that loads it, adds to the export."""
     library = f"lib{prefix}.so"
     return ("example", "example_cpp", f"{prefix}.o", library, f"{library}.sha256")
 
@@ -28,21 +28,19 @@ def c_identifier(robot: str, frame: str) -> str:
 
 
 def check_prefix(prefix: str) -> str:
-    """Return a prefix that C accepts.
+    """Return the prefix if it is usable.
 
     Raises:
-        InputError: The prefix is no C identifier, or the name of the example or of a C header.
+        InputError: The prefix is not a C identifier, or is the name of the example or of a C header.
     """
+    what, hint = "", "choose another"
     if not _IDENTIFIER.fullmatch(prefix):
-        raise InputError(
-            f"the prefix '{prefix}' is no C identifier",
-            where="prefix",
-            hint=f"letters, digits and underscores, a letter first, such as {c_identifier(prefix, '')}",
-        )
-    if prefix.lower() == "example":
-        raise InputError("the prefix 'example' is taken by example.c", where="prefix", hint="choose another")
-    if prefix.lower() in _C_HEADERS:
-        raise InputError(
-            f"the prefix '{prefix}' is the name of the C header {prefix}.h", where="prefix", hint="choose another"
-        )
+        what = f"the prefix '{prefix}' is not a C identifier"
+        hint = f"letters, digits and underscores, a letter first, such as {c_identifier(prefix, '')}"
+    elif prefix.lower() == "example":
+        what = "the prefix 'example' is taken by example.c"
+    elif prefix.lower() in _C_HEADERS:
+        what = f"the prefix '{prefix}' is the name of the C header {prefix}.h"
+    if what:
+        raise InputError(what, where="prefix", hint=hint)
     return prefix

@@ -1,4 +1,4 @@
-"""Data for ``templates/source.c.jinja``: the functions of an export, the blocks that they share, and the batch."""
+"""Content of ``templates/source.c.jinja``: the functions of an export, their blocks, and the batch."""
 
 from __future__ import annotations
 
@@ -19,16 +19,15 @@ from impact_posture.config.cached_values import read_stored, write_stored
 from impact_posture.system.libraries import source_key
 
 LARGEST_VECTOR = 64
-"""Bytes of the widest vectors that the source uses, and of the widest group of narrower vectors in a batch."""
+"""Bytes of the widest vectors, and of the widest group of narrower vectors in a batch."""
 
-# Blocks have frames of their own (APART), so one of them is on the stack at a time, and a compiler stores no more in
-# it than the variables of the block.  Where a compiler joins functions, the variables of all of them may get places.
-# This covers return addresses, saved registers, alignment and the variables of the small functions.
+# Bytes for return addresses, saved registers, alignment and the variables of the small functions.  APART keeps
+# blocks from being joined, so the variables of one block at a time are on the stack.
 _FRAMES = 2048
 # With -march=native a compiler makes vectors of neighboring numbers, and may store a number in several vectors.
 _SPILL = 2
 
-# So few statements of a block of the batch stay in the first cache of the processor from group to group.
+# Statements in a block of the batch.  A block of this length stays in the first cache from group to group.
 _BATCH_BLOCK = 60
 
 
@@ -43,13 +42,13 @@ class CSource:
         angles: Index in ``q`` of each angle whose sine and cosine are computed.
         room: Length of the arrays of sines and cosines.
         work: C type, name and length of each work array.
-        functions: Each function of one configuration: its ``stem``, ``name``, constant ``normal`` if it has no
-            parameter for one, ``calls`` of blocks, ``outputs`` (target, value, whether it is constant), and
-            ``finite``, the name and length of each result.
-        batches: Each objective: its ``stem``, ``normal``, the literal ``scale`` of its objective over ``H`` (empty if
-            it is no multiple), and the ``blocks``, ``angles``, ``room``, ``work`` and ``outputs`` of its batch on
+        functions: For each function of one configuration its ``stem``, ``name``, constant ``normal`` (``None`` if it
+            is a parameter), ``calls`` of blocks, ``outputs`` (target, value, whether it is constant), and ``finite``,
+            the name and length of each result.
+        batches: For each objective its ``stem``, ``normal``, the literal ``scale`` of its ratio to ``H`` (empty if
+            it is not a multiple), and the ``blocks``, ``angles``, ``room``, ``work`` and ``outputs`` of its batch on
             vectors.  Without blocks the batch is a loop.
-        stack_bytes: Upper bound on the stack of a call, without that of the C library.
+        stack_bytes: Upper bound on the stack of a call, without the functions of the C library.
     """
 
     portable: bool
@@ -64,13 +63,13 @@ class CSource:
 
 
 def build_c_source(exported: Sequence[NamedObjective], prefix: str, real: Real, *, portable: bool = False) -> CSource:
-    """Generate the functions of each objective, or take them from the cache of the user by what they compute.
+    """Generate the functions of each objective, or read them from the user's cache.
 
     Args:
         exported: The objectives, all of one robot.
-        prefix: Beginning of the names of everything that functions share.
-        real: The C type to compute in.
-        portable: Use no vectors, for compilers that have none.
+        prefix: Beginning of the names that functions share.
+        real: The number type.
+        portable: Use no vectors, for compilers without them.
     """
     library = export_library(exported)
     models = [
@@ -102,11 +101,11 @@ def _generate(
     contacts = {v.stem: v.objective.contact for v in single}
     robot = single[0].objective.robot
     scalars = library.graph()
-    # A single call waits for results more than for arithmetic units.  A batch has other lanes to go on with.
+    # A single call waits for results of operations.  A batch computes other lanes meanwhile, so its order stays.
     graph = reorder_sums(scalars if portable else library.vector_graph())
     layout = lay_out(graph, [f.outputs for f in library.functions])
     constants = Constants(prefix, real)
-    # The names of types stand in thousands of places, so they are short.  The source undefines them at its end.
+    # The names of types occur thousands of times, so they are short.  The source undefines them at its end.
     types = {1: real.name, 2: "V2", 4: "V4"}
     emitter = Emitter(layout, prefix, real, types, constants)
     angles = _angles(layout)
@@ -134,7 +133,7 @@ def _generate(
         scale = real.literal(v.objective.scale) if v.objective.is_multiple_of_H else ""
         batch = {"stem": v.stem, "normal": v.objective.contact.normal, "scale": scale, "blocks": ()}
         function = next(f for f in library.functions if (f.stem, f.name) == (v.stem, "eval"))
-        # A batch of the free robot beside one that stands would be another third of the source, so it is a loop.
+        # A batch of the robot without supports would add a third to the source, so it is a loop.
         if not portable and not v.free and (lanes := _lanes(function, scalars, real, constants)):
             held = 2 * lanes["room"] + lanes["work"] + robot.nq + 3 + 2 * (1 + robot.nv)
             frame = max((block.local_bytes for block in lanes["blocks"]), default=0)
@@ -150,7 +149,7 @@ def _generate(
 
 
 def _lanes(function: Exported, scalars: Graph, real: Real, constants: Constants) -> dict[str, Any]:
-    """The batch on vectors of configurations; empty where C has no vector form of an operation."""
+    """Return the batch on vectors of configurations; empty if an operation has no vector form in C."""
     layout = lay_out(scalars, [function.outputs], _BATCH_BLOCK)
     computed = {k for block in layout.blocks for k in block.nodes} | layout.inlined
     if not all(k in layout.trig or scalars.nodes[k].op in ARITHMETIC for k in computed):
@@ -167,12 +166,12 @@ def _lanes(function: Exported, scalars: Graph, real: Real, constants: Constants)
 
 
 def _angles(layout: Layout) -> tuple[int, ...]:
-    """Index in ``q`` of each angle."""
+    """Return the index in ``q`` of each angle."""
     return tuple(layout.graph.nodes[k].args[1] for k in layout.angles)
 
 
 def _outputs(function: Exported, emitter: Emitter, work: str) -> Iterator[dict[str, Any]]:
-    """The assignments of a function's results, from the work arrays of the structure ``work``."""
+    """Yield the assignments of a function's results from the structure ``work``."""
     graph, arrays = emitter.layout.graph, lengths(0, 0)
     for name, output in zip(SIGNATURES[function.name][1], function.outputs, strict=True):
         for k, node in enumerate(graph.outputs[output]):

@@ -1,4 +1,4 @@
-"""Proof that what a compiler makes of an export computes the right numbers."""
+"""Compile an export, and compare its numbers with CasADi and Pinocchio."""
 
 from __future__ import annotations
 
@@ -37,13 +37,14 @@ from impact_posture.system.libraries import (
 from impact_posture.system.scratch_folder import scratch_folder
 from impact_posture.system.toolchain import find_compiler, words_of
 
-# The oracle factorizes another matrix.  Feet at compliance ε cost digits there (condition about 1/ε).
+# Tolerance against the oracle, which factorizes another matrix.  Its condition with feet at compliance ε is about
+# 1/ε.
 _ORACLE_TOLERANCE = 1e-5
-# Random postures and normals of a comparison.
+# Number of random postures and normals in a comparison.
 _SAMPLES = 20
-# Number of libraries in the cache. The oldest go first.
+# Number of libraries in the cache, which drops the oldest.
 _CACHED = 16
-# An error of a gradient is relative to a thousandth of its value at least.
+# The error of a gradient is relative to its largest entry, or to a thousandth of the value if that is larger.
 _LEAST = {"grad": "H", "objective_grad": "objective"}
 _SHARE = 1e-3
 
@@ -60,7 +61,7 @@ def compile_and_check(
         keep: Leave the library in the folder of the export, even if it fails.
 
     Raises:
-        CompilerError: There is no compiler, it failed, or its code computes other numbers.
+        CompilerError: There is no compiler, it failed, or the numbers of its code are wrong.
     """
     manifest, _ = read_manifest(export_dir / f"{prefix}.json")
     real, worst = REALS[manifest["real"]], 0.0
@@ -71,7 +72,7 @@ def compile_and_check(
         library = load_library(built)
         for v in named_objectives(objectives, prefix):
             objective = v.objective
-            # Beside an objective of several contacts, each frame has one of its own.
+            # Without ``several``, ImpactGradient binds the objective of the frame alone.
             block = manifest if v.joint else manifest | {"several": None}
             gradient = ImpactGradient(library, block, objective.contact.frame, free=v.free)
             tolerance = self_test_tolerance(objective, real)
@@ -81,19 +82,17 @@ def compile_and_check(
             ):
                 difference = largest_difference(gradient, objective, reference, _SAMPLES)
                 if difference > allowed:
-                    raise CompilerError(
-                        f"the numbers of the compiled code differ from those of {name} by {difference:.3g}, relative",
-                        where=f"{prefix}.c",
-                        hint="try another compiler (set CC) without -ffast-math, or double instead of float",
-                    )
+                    what = f"the compiled code differs from {name} by {difference:.3g}, relative"
+                    hint = "try another compiler (set CC) without -ffast-math, or double instead of float"
+                    raise CompilerError(what, where=f"{prefix}.c", hint=hint)
                 worst = max(worst, difference)
     return worst
 
 
 def _cached_library(export_dir: Path, prefix: str) -> Path | None:
-    """Return the library of a source that was built before, or build it now; ``None`` if the cache cannot be written.
+    """Return the library of an export from the cache, built if it is missing; ``None`` if the cache is not writable.
 
-    A humanoid takes seconds to compile, and the optimal posture is the only difference between many exports.
+    A humanoid takes seconds to compile, and many exports differ in the constant posture alone.
     """
     source = (export_dir / f"{prefix}.c").read_text(encoding="utf-8")
     content = [re.sub(rf"^const \w+ {prefix}_(posture|manifest)\[.*?;$", "", source, flags=re.DOTALL | re.MULTILINE)]
@@ -117,7 +116,7 @@ def largest_difference(
     build_reference: Callable[[WorstCaseObjective], Reference],
     samples: int,
 ) -> float:
-    """Return the largest relative difference of a compiled export from a reference; infinite where a call fails.
+    """Return the largest relative difference of a compiled export from a reference; infinite if a call fails.
 
     Args:
         gradient: The export.
@@ -130,7 +129,7 @@ def largest_difference(
     normals /= np.linalg.norm(normals, axis=1, keepdims=True)
     worst = 0.0
     for k, q in enumerate(sample_postures(objective.robot, samples, 1)):
-        # Rounded to the C type, so that the call changes nothing.
+        # Rounded to the C type, so that reference and export have the same inputs.
         q, n = (np.array(v, dtype=gradient.dtype).astype(float) for v in (q, normals[k]))
         expected = reference(q, n)
         for name, quantities in RESULTS.items():
@@ -155,7 +154,7 @@ class Deviation:
     """The largest relative error of one quantity at one sample.
 
     Attributes:
-        error: Largest ``|found − expected|`` over the scale; infinite where a number is not finite.
+        error: Largest ``|value − expected|`` over the scale; infinite where a number is not finite.
         index: Index of the entry with that error.
     """
 
@@ -164,7 +163,7 @@ class Deviation:
 
 
 def deviation(values: Array, expected: Array, scale: float = 0.0) -> Deviation:
-    """Return the largest deviation over the largest expected entry, or over ``scale`` if that is larger."""
+    """Return the largest error, relative to the largest expected entry or to ``scale`` if that is larger."""
     with np.errstate(invalid="ignore"):
         difference = np.abs(values - expected)
     difference[~np.isfinite(difference)] = np.inf

@@ -1,4 +1,4 @@
-"""The export of an objective that a folder holds already."""
+"""An export of an objective that exists already in a folder."""
 
 from __future__ import annotations
 
@@ -20,18 +20,18 @@ _OTHERS = ("posture", "compression", "stack_bytes")
 
 
 def existing_export(objective: WorstCaseObjective, out: Path, *, build: bool) -> Export | None:
-    """Return the export of an objective that a folder holds already, such as ``c/`` of a result; else ``None``.
+    """Return the export of an objective in a folder such as ``c/`` of a result; ``None`` if there is none.
 
-    The manifest may also state a posture and the compression of the impact.  All else must be what
-    :func:`~impact_posture.codegen.export.export` would write.
+    The manifest may also state a posture and the compression of the impact.  Everything else must equal the output of
+    :func:`~impact_posture.codegen.export.export`.
 
     Args:
         objective: The objective.
         out: The folder.
-        build: As :func:`~impact_posture.codegen.export.write_export`.
+        build: As in :func:`~impact_posture.codegen.export.write_export`.
 
     Raises:
-        CompilerError: The compiler failed, or its code computes other numbers.
+        CompilerError: The compiler failed, or the numbers of its code are wrong.
     """
     prefix = default_prefix([objective])
     files = own_files(out, "export")
@@ -42,7 +42,7 @@ def existing_export(objective: WorstCaseObjective, out: Path, *, build: bool) ->
         content = _comparable(manifest)
     except (OSError, LookupError, ValueError, TypeError, AttributeError, RecursionError):
         return None
-    # What has been written and read has lists in place of tuples.
+    # A manifest read from a file has lists in place of tuples.
     if content != _comparable(json.loads(json.dumps(build_manifest([objective], prefix, None, None)))):
         return None
     existing = Export(out, objective.robot, tuple(out / name for name in files), manifest, requested=build)
@@ -53,6 +53,6 @@ def existing_export(objective: WorstCaseObjective, out: Path, *, build: bool) ->
 
 
 def _comparable(manifest: dict[str, Any]) -> dict[str, Any]:
-    """Return what the objective alone determines."""
+    """Return the keys that the objective alone determines."""
     rest = {key: value for key, value in manifest.items() if key not in _OTHERS}
     return rest | {"symbols": {name: symbol for name, symbol in rest["symbols"].items() if name != "posture"}}

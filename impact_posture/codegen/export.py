@@ -1,4 +1,4 @@
-"""Export ``H``, ``∇H`` and the objective of a problem as C code that a controller can link."""
+"""Export ``H``, ``∇H`` and the objective of a problem as C code for a controller."""
 
 from __future__ import annotations
 
@@ -61,8 +61,7 @@ class Export(WrittenCode):
     """A written export of an objective.
 
     Attributes:
-        agreement: Largest relative difference of the built code from the numbers of CasADi and Pinocchio; ``None``
-            where it was not built.
+        agreement: Largest relative difference of the built code from CasADi and Pinocchio; ``None`` without a build.
         requested: Whether a library was requested.
     """
 
@@ -75,7 +74,7 @@ class Export(WrittenCode):
         return self.agreement is not None
 
     def load(self, **options: Any) -> ImpactGradient:
-        """Load the library, which runs its code; the options are those of :meth:`ImpactGradient.load`."""
+        """Load the library, which runs its code, with the options of :meth:`ImpactGradient.load`."""
         return ImpactGradient.load(self.out, robot=self.robot, **options)
 
     @property
@@ -87,7 +86,7 @@ class Export(WrittenCode):
 
     @property
     def verdict(self) -> str:
-        """The outcome of the build, on one line."""
+        """The outcome of the build as one line."""
         if self.library is not None:
             return f"{self.library.name}: built, agrees to {self.agreement:.0e}"
         if self.requested:
@@ -122,27 +121,27 @@ def export(
     force: bool = False,
     check: bool = True,
 ) -> Export:
-    """Write the C export of an objective into an existing folder and, where a compiler is there, prove it.
+    """Write the C export of an objective into an existing folder, and check it if there is a compiler.
 
-    The function writes nothing before it has made all texts, and each file appears whole or not at all.
+    All texts are complete before the first file is written, and each file is written whole or not at all.
 
     Args:
-        objective: The objective.  Several objectives of one robot, each at a frame of its own, make one library with
-            functions ``<prefix>_<frame>_eval`` and so on.
+        objective: The objective.  Several objectives of one robot at different frames make one library with functions
+            ``<prefix>_<frame>_eval`` and so on.
         out: The folder.
         prefix: Beginning of the C names, a C identifier; robot and frame by default.
-        posture: A configuration that the code holds as a constant, shape (nq,).
-        compression: Compression time, peak force and x of the impact, which the manifest and the header state.
-        real: The C type to compute in.
+        posture: A configuration for a constant in the code, shape (nq,).
+        compression: Compression time, peak force and x of the impact, for the manifest and the header.
+        real: The number type.
         portable: Write plain C99, for compilers without the vectors of GCC and Clang.
         force: Replace existing files.
         check: Build and compare.
 
     Raises:
-        InputError: The prefix is no C identifier, or the objectives differ in more than the contact.
-        PostureError: The posture has another length or is not finite.
-        OutputError: ``out`` is no folder, holds the files already, or cannot be written.
-        CompilerError: The compiler failed, or its code computes other numbers.  The files stay.
+        InputError: The prefix is not a C identifier, or the objectives differ in more than the contact.
+        PostureError: The posture has the wrong length or is not finite.
+        OutputError: ``out`` is not a folder, already contains the files, or is not writable.
+        CompilerError: The compiler failed, or the numbers of its code are wrong.  The files remain.
     """
     objectives = _same_robot(objective)
     robot = objectives[0].robot
@@ -158,7 +157,7 @@ def export(
     if posture is not None:
         stated = np.array(posture, dtype=float)
         posture = robot.check_posture(stated, limits=False)
-        # Normalizing a configuration of unit norm changes its last digits.  Keep those that result.json has.
+        # Normalization changes the last digits of a normalized configuration.  Keep the digits of result.json.
         posture = stated if np.allclose(stated, posture, rtol=0, atol=1e-9) else posture
     exported, code = cached_code(tuple(objectives), prefix, real, portable)
     manifest = build_manifest(objectives, prefix, posture, compression, real, code.stack_bytes, portable=portable)
@@ -179,7 +178,7 @@ def export(
 def cached_code(
     objectives: tuple[WorstCaseObjective, ...], prefix: str, real: Real, portable: bool
 ) -> tuple[tuple[NamedObjective, ...], CSource]:
-    """Return the functions of an export, which take most of the time of :func:`export` and need no posture."""
+    """Return the functions of an export, which take most of the time of :func:`export` and depend on no posture."""
     exported = named_objectives(objectives, prefix)
     return exported, build_c_source(exported, prefix, real, portable=portable)
 
@@ -197,23 +196,23 @@ def write_export(
     build: bool = False,
     force: bool = False,
 ) -> Export:
-    """Write an export into a folder of its own, whole or not at all, and build its library there on request.
+    """Write an export into a new folder, whole or not at all, and build its library there on request.
 
     Args:
         objectives: One objective for each frame.
         out: The folder; ``./<prefix>-c`` by default.
-        prefix: Beginning of the C names; robot and frame by default.
-        posture: A configuration that the code holds as a constant, shape (nq,).
-        compression: As :func:`export`.
+        prefix: As in :func:`export`.
+        posture: As in :func:`export`.
+        compression: As in :func:`export`.
         single: Compute in ``float``.
-        portable: Write plain C99, for compilers without the vectors of GCC and Clang.
-        build: Leave ``lib<prefix>.so`` in the folder.  A machine without a compiler gets no library and no error.
+        portable: As in :func:`export`.
+        build: Build ``lib<prefix>.so`` in the folder.  Without a compiler there is neither a library nor an error.
         force: Replace an earlier export.
 
     Raises:
-        OutputError: The folder exists without ``force``, is no export, or cannot be written.
-        CompilerError: The compiler failed, or its code computes other numbers.  Nothing is written.
-        ImpactPostureError: As :func:`export`.
+        OutputError: The folder exists without ``force``, is not an export, or is not writable.
+        CompilerError: The compiler failed, or the numbers of its code are wrong.  Nothing is written.
+        ImpactPostureError: As in :func:`export`.
     """
     prefix = default_prefix(objectives) if prefix is None else check_prefix(prefix)
     out = Path(f"{prefix}-c") if out is None else out
@@ -243,18 +242,15 @@ def default_prefix(objectives: Sequence[WorstCaseObjective]) -> str:
 
 
 def _same_robot(objective: WorstCaseObjective | Sequence[WorstCaseObjective]) -> tuple[WorstCaseObjective, ...]:
-    """Return the objectives as a tuple; refuse objectives that differ in more than the contact."""
+    """Return the objectives as a tuple, and refuse objectives that differ in more than the contact."""
     objectives = (objective,) if isinstance(objective, WorstCaseObjective) else tuple(objective)
     if not objectives:
         raise InputError("no objective is given", where="codegen", hint="give one for each frame")
     first = objectives[0]
     for other in objectives[1:]:
         if _without_contact(other) != _without_contact(first):
-            raise InputError(
-                f"'{other.contact.frame}' and '{first.contact.frame}' differ in more than the contact",
-                where="codegen",
-                hint="export them one by one",
-            )
+            what = f"'{other.contact.frame}' and '{first.contact.frame}' differ in more than the contact"
+            raise InputError(what, where="codegen", hint="export them one by one")
     return objectives
 
 

@@ -1,8 +1,7 @@
 """Files of an export, written from the templates in ``templates/``.
 
-Each file has its language.  Every text that a template inserts is escaped for it, because the names of robots, joints
-and frames are data.  Text that is in the language already has the type :class:`Verbatim`.  A name that no one gave
-fails (``StrictUndefined``).
+A template escapes every inserted text for the language of its file, because the names of robots, joints and frames
+are data.  Text of type :class:`Verbatim` is inserted unchanged.  An undefined name is an error (``StrictUndefined``).
 """
 
 from __future__ import annotations
@@ -29,7 +28,7 @@ _WIDTH = 112
 
 
 class Verbatim(str):
-    """Text that a template inserts as it is."""
+    """Text that a template inserts without escapes."""
 
     __slots__ = ()
 
@@ -37,13 +36,13 @@ class Verbatim(str):
 def render_files(
     exported: Sequence[NamedObjective], prefix: str, manifest: dict[str, Any], code: CSource, real: Real
 ) -> dict[str, str]:
-    """Return file name → text of every file but the manifest."""
+    """Return file name → text of every file except the manifest."""
     context = _context(exported, prefix, manifest, code, real)
     return {name: template.render(context) for name, template in load_templates(prefix).items()}
 
 
 def load_templates(prefix: str = "") -> dict[str, Template]:
-    """Return file name → template, which takes long for the first time."""
+    """Return file name → template.  The first call takes long."""
     names = {
         f"{prefix}.h": "header.h", f"{prefix}.c": "source.c",
         **{name: name for name in ("example.c", "example.cpp", "Makefile", "CMakeLists.txt", "README.md")},
@@ -55,7 +54,7 @@ def load_templates(prefix: str = "") -> dict[str, Template]:
 
 @cache
 def environment(package: str, escape: Callable[[str], str]) -> Environment:
-    """Return the templates of a package, for one language."""
+    """Return the templates of a package with the escapes of one language."""
 
     def insert(value: object) -> str:
         return value if isinstance(value, Verbatim) else escape(str(value))
@@ -87,7 +86,7 @@ def _verbatim(function: Callable[..., str]) -> Callable[..., Verbatim]:
 
 
 def wrapped(words: Iterable[str], indent: str) -> str:
-    """Return comma-separated words over several lines of a comment."""
+    """Return comma-separated words on several lines of a comment."""
     lines, line = [], ""
     *first, last = words
     for piece in (*[f"{word}," for word in first], last):
@@ -99,7 +98,7 @@ def wrapped(words: Iterable[str], indent: str) -> str:
 
 
 def _parameters(real: Real, sizes: Mapping[str, int], function: str) -> str:
-    """C parameters of an exported function."""
+    """Return the C parameters of an exported function."""
     inputs, results = SIGNATURES[function]
     parameters = [f"const {real.name} {name}[{sizes[name]}]" for name in inputs]
     parameters += [
@@ -108,7 +107,7 @@ def _parameters(real: Real, sizes: Mapping[str, int], function: str) -> str:
     return ", ".join(parameters)
 
 
-# ---- what the templates know --------------------------------------------------------------------------------------
+# ---- variables of the templates -----------------------------------------------------------------------------------
 
 
 def _context(
@@ -181,19 +180,19 @@ def _frame(v: NamedObjective, test: dict[str, Any], alone: bool) -> dict[str, An
 
 
 def _worst_note(objective: WorstCaseObjective) -> str:
-    """Say what the objective is the worst of, and which gradient it has where several are as bad."""
+    """Return the note of a header on model variants, on the gradient at a tie, and on friction."""
     note = ""
     if objective.model_variants:
         note = "; the worst of " + "; ".join(model.name for model in objective.model_variants)
     if objective.normal_cone_deg or objective.model_variants:
-        note += ".  Where several are as bad, grad is the subgradient at one of them"
+        note += ".  Where several tie, grad is the subgradient at one of them"
     if objective.kind == "coulomb":
         note += f", friction {objective.contact.friction:.9g}; {objective.impact_kind.kink}"
     return note
 
 
 def _several(joint: NamedObjective, test: dict[str, Any]) -> dict[str, Any]:
-    """The objective of several contacts at once."""
+    """Return the variables of the objective of several contacts at once."""
     objective = joint.objective
     names = [f"({model.name})" for model in objective.model_variants]
     return {

@@ -1,4 +1,4 @@
-"""The C functions of an export: what they are called, what they take and what they return."""
+"""The C functions of an export: names, parameters and results."""
 
 from __future__ import annotations
 
@@ -14,7 +14,7 @@ SIGNATURES: Mapping[str, tuple[tuple[str, ...], tuple[str, ...]]] = {
     "jump": (("q", "n"), ("a", "G", "V")),
     "ellipsoid": (("q",), ("L",)),
 }
-"""Name of each C function → its inputs and its results, in the order of its parameters."""
+"""Name of each C function → its inputs and its results, in the order of its parameters; the batch is not included."""
 
 
 FUNCTIONS = (*SIGNATURES, "eval_batch")
@@ -27,7 +27,7 @@ def lengths(nq: int, nv: int) -> dict[str, int]:
 
 
 def stems(prefix: str, frames: Sequence[str]) -> tuple[str, ...]:
-    """Return what the function names of each frame begin with: the prefix for one frame, else prefix and frame.
+    """Return the beginning of the function names of each frame: the prefix for one frame, else prefix and frame.
 
     Raises:
         InputError: A frame is given twice, or two frames have the same C identifier.

@@ -1,4 +1,4 @@
-"""CasADi functions of an export, and the references that its compiled code must reproduce."""
+"""The CasADi expressions of all functions of an export."""
 
 from __future__ import annotations
 
@@ -24,8 +24,8 @@ class NamedObjective:
     Attributes:
         objective: The objective.
         stem: Beginning of its C names.
-        free: Whether it is the free robot beside one that stands.
-        joint: Whether it is of several contacts at once; it has no ``H`` of its own.
+        free: Whether it is the objective without the supports of a standing robot.
+        joint: Whether it is the objective of several contacts at once, which has no ``H``.
     """
 
     objective: WorstCaseObjective
@@ -35,19 +35,18 @@ class NamedObjective:
 
 
 def named_objectives(objectives: Sequence[WorstCaseObjective], prefix: str) -> tuple[NamedObjective, ...]:
-    """Return the objective of each contact, followed by ``<stem>_free`` without its supports where it has some.
+    """Return the objective of each contact, followed by ``<stem>_free`` without supports if it has supports.
 
-    A problem of several contacts has these for each contact, and the objective of all contacts last.
+    A problem of several contacts has these for each contact, and last the objective of all contacts.
 
     Raises:
         InputError: A problem of several contacts is not the only objective.
     """
     several = [objective for objective in objectives if objective.others]
     if several and len(objectives) > 1:
-        raise InputError(
-            "is one problem of several contacts beside others", where="codegen", hint="export them one by one"
-        )
-    # A frame with two contacts has one H, of any normal.
+        what = "a several-contact objective cannot be exported with others"
+        raise InputError(what, where="codegen", hint="export them one by one")
+    # H takes the normal at run time, so a frame with two contacts has one H.
     singles: dict[str, WorstCaseObjective] = {}
     for single in (single for objective in several for single in objective.singles):
         singles.setdefault(single.contact.frame, single)
@@ -69,7 +68,7 @@ class Exported:
     Attributes:
         stem: Beginning of its C name.
         name: A name of :data:`~impact_posture.codegen.export_functions.SIGNATURES`.
-        outputs: The outputs of :attr:`ExportLibrary.function` that it returns.
+        outputs: Names of its results in :attr:`ExportLibrary.function`.
     """
 
     stem: str
@@ -79,12 +78,12 @@ class Exported:
 
 @dataclass(frozen=True)
 class ExportLibrary:
-    """Everything that a library computes, as one function, so that common expressions exist once.
+    """All results of a library as one function, so that common expressions exist once.
 
     Attributes:
         function: ``(q, n, constants)`` → all outputs.
         constants: Values of the input ``constants``, in which repeated limbs differ.
-        seeds: Input name and index → its place among repeated limbs.
+        seeds: Input name and index → its limb.
         functions: The exported functions.
     """
 
@@ -94,14 +93,14 @@ class ExportLibrary:
     functions: tuple[Exported, ...]
 
     def graph(self) -> Graph:
-        """Return the operations on single numbers, with the constants as numbers."""
+        """Return the operations on single numbers, with values for the constants."""
         *inputs, _ = self.function.sx_in()
         values = self.function.call([*inputs, ca.DM(self.constants)])
         names = self.function.name_in()[:-1], self.function.name_out()
         return graph_of(ca.Function("numbers", inputs, values, *names, {"cse": True}))
 
     def vector_graph(self) -> Graph:
-        """Return the same operations, with one vector operation for those that repeated limbs share."""
+        """Return the operations, with one vector operation for equal operations of repeated limbs."""
         if not self.seeds:
             return self.graph()
         return pack_lanes(graph_of(self.function), self.seeds, {"constants": self.constants})
@@ -110,7 +109,7 @@ class ExportLibrary:
 def export_library(exported: Sequence[NamedObjective]) -> ExportLibrary:
     """Return the functions of objectives of one robot.
 
-    The C code has ``objective`` from ``H`` where it is a multiple of ``H``, and ``V`` from ``H`` and ``G``.
+    They omit ``V``, which the C code computes from ``H`` and ``G``, and an ``objective`` that is a multiple of ``H``.
     """
     model = exported[0].objective.robot.model
     q, n, limbs = ca.SX.sym("q", model.nq), ca.SX.sym("n", 3), RepeatedLimbs(model)

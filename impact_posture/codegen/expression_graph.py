@@ -1,4 +1,4 @@
-"""The instructions of a CasADi function as a graph of operations, which C may compute in any order."""
+"""The instructions of a CasADi function as a graph of operations."""
 
 from __future__ import annotations
 
@@ -11,13 +11,13 @@ import casadi as ca
 
 from impact_posture.errors import CompilerError
 
-# Operations that C has on vectors.  A division is a product with a reciprocal, which several divisions share.
+# Operations with a vector form in C.  A division is a product with a reciprocal, which several divisions can share.
 ARITHMETIC = frozenset({"+", "-", "*", "neg", "inv"})
 _COMMUTE = frozenset({"+", "*"})
-# Functions of C that CasADi calls by the same names, of one number and of two.
+# Functions with the same names in C and in CasADi, of one and of two arguments.
 _OF_ONE = ("exp", "log", "sqrt", "sin", "cos", "tan", "asin", "acos", "atan", "tanh", "fabs")
 _OF_TWO = ("pow", "atan2", "hypot", "fmin", "fmax")
-# The C of the other operations.  Operands are names or stand in parentheses.
+# The C of the other operations.  Operands are names or are in parentheses.
 CALLS = {
     **{getattr(ca, f"OP_{name.upper()}"): f"{name}({{0}})" for name in _OF_ONE},
     **{getattr(ca, f"OP_{name.upper()}"): f"{name}({{0}}, {{1}})" for name in _OF_TWO},
@@ -32,7 +32,7 @@ CALLS = {
     ca.OP_OR: "(double)({0} != 0.0 || {1} != 0.0)",
     ca.OP_IF_ELSE_ZERO: "({0} != 0.0 ? {1} : 0.0)",
 }
-# Sums and products; those of one operand take it twice.
+# Sums and products.  A square and a double have their operand twice.
 _PAIRS = {ca.OP_ADD: "+", ca.OP_SUB: "-", ca.OP_MUL: "*", ca.OP_SQ: "*", ca.OP_TWICE: "+"}
 _SINGLE = {ca.OP_NEG: "neg", ca.OP_INV: "inv"}
 SINE, COSINE = CALLS[ca.OP_SIN], CALLS[ca.OP_COS]
@@ -43,9 +43,9 @@ class Node(NamedTuple):
 
     Attributes:
         op: ``const``, ``in``, ``lane``, ``gather``, one of :data:`ARITHMETIC`, or a C expression of :data:`CALLS`.
-        args: Numbers of the operands.  ``in`` has the number of its name and an index, ``lane`` a node and an index.
-        width: Count of its numbers: 1, or the lanes of a vector.
-        value: The numbers of ``const``.
+        args: Numbers of the operands.  ``in`` has the number of an input and an index, ``lane`` a node and an index.
+        width: 1, or the number of lanes of a vector.
+        value: The value of ``const``, one number for each lane.
     """
 
     op: str
@@ -55,13 +55,13 @@ class Node(NamedTuple):
 
     @property
     def operands(self) -> tuple[int, ...]:
-        """Numbers of the nodes that it needs."""
+        """Numbers of the nodes among :attr:`args`."""
         return () if self.op in ("const", "in") else self.args[:1] if self.op == "lane" else self.args
 
 
 @dataclass
 class Graph:
-    """Operations in an order in which every operand comes first.  Equal operations exist once.
+    """Operations, each after its operands.  Equal operations exist once.
 
     Attributes:
         inputs: Names of the inputs.
@@ -75,7 +75,7 @@ class Graph:
     _known: dict[Node, int] = field(default_factory=dict)
 
     def add(self, node: Node) -> int:
-        """Return the number of the node; arithmetic on constants becomes a constant."""
+        """Return the number of a node, which is added if it is new; arithmetic on constants becomes a constant."""
         if node.op in ARITHMETIC and all(self.nodes[a].op == "const" for a in node.args):
             operands = [self.nodes[a] for a in node.args]
             width = max(o.width for o in operands)
@@ -114,7 +114,7 @@ def graph_of(function: ca.Function) -> Graph:
     """Return the operations of an SX function.  Sparse outputs become dense.
 
     Raises:
-        CompilerError: An operation has no C form.
+        CompilerError: An operation has no form in C.
     """
     inputs = function.sx_in()
     outputs = [ca.densify(value) for value in function.call(inputs)]
@@ -149,6 +149,5 @@ def _operation(graph: Graph, operation: int, operands: list[int]) -> int:
     if operation in CALLS:
         text = CALLS[operation]
         return graph.add(Node(text, (a, b) if "{1}" in text else (a,)))
-    raise CompilerError(
-        f"CasADi operation {operation} has no C form", where="codegen", hint="add it to codegen/expression_graph.py"
-    )
+    hint = "add it to codegen/expression_graph.py"
+    raise CompilerError(f"CasADi operation {operation} has no C form", where="codegen", hint=hint)

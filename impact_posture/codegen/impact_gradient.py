@@ -1,4 +1,4 @@
-"""A built export as Python functions for a control loop.  This module needs numpy and the library, no CasADi."""
+"""A built export as Python functions for a control loop, without CasADi and Pinocchio."""
 
 from __future__ import annotations
 
@@ -23,8 +23,8 @@ if TYPE_CHECKING:
 Array = NDArray[Any]
 
 _TYPES: dict[str, Any] = {"double": ctypes.c_double, "float": ctypes.c_float}
-# A library reproduces the reference of its manifest up to the rounding of the compiler.  In float, feet at compliance
-# ε leave few of the seven digits (condition about 1/ε).
+# Tolerance for the reference values of the manifest: rounding of the compiler.  In float, feet at compliance ε leave
+# few of the seven digits (condition about 1/ε).
 _SELF_TEST = {"double": 1e-7, "float": 0.1}
 
 
@@ -32,13 +32,20 @@ class ImpactGradient:
     """``H``, its tangent gradient and related quantities from a compiled export.
 
     Every method copies its inputs into buffers that were allocated once.  **Array results are views of buffers, which
-    the next call of the same method overwrites**, so copy a result that must last.  One object serves one thread.
-    :meth:`copy` makes another object on the same library for another thread (calls release the lock of Python).
+    the next call of the same method overwrites**, so copy a result that must last.  An object serves one thread.
+    :meth:`copy` returns an object for another thread.  Calls release the global interpreter lock.
+
+    Methods for one configuration raise these errors:
+
+    - ``InputError``: A number is not finite.
+    - ``PostureError``: A quaternion or cosine-sine pair is not of unit norm.
+    - ``MetricError``: The result is not finite, because the quantity does not exist there.
+    - ``ValueError``: An input has the wrong shape.
 
     Attributes:
         manifest: The content of ``<prefix>.json``.
         frame: The contact frame of this object.
-        free: Whether this object leaves out the supports.
+        free: Whether this object ignores the supports.
         nq: Length of a configuration.
         nv: Length of a gradient.
         dtype: The number type of the library.
@@ -55,7 +62,7 @@ class ImpactGradient:
         block = (block.get("free") if free else None) or block
         symbols = dict(block["symbols"])
         if manifest.get("several") and not free:
-            # At every frame the objective of the problem is that of all contacts together.
+            # The problem has one objective, of all contacts together, at every frame.
             symbols |= manifest["several"]["symbols"]
         self._library, self._reference = library, block["self_test"]
         real = _TYPES[manifest["real"]]
@@ -66,7 +73,7 @@ class ImpactGradient:
         self._functions: dict[str, tuple[Callable[[], int], tuple[Array, ...]]] = {}
         for name, (input_names, results) in SIGNATURES.items():
             buffers = [(real * sizes.get(result, 1))() for result in results]
-            arguments = [ctypes.byref(buffer) for buffer in (*[inputs[one] for one in input_names], *buffers)]
+            arguments = [ctypes.byref(buffer) for buffer in (*[inputs[key] for key in input_names], *buffers)]
             views = tuple(np.frombuffer(buffer, dtype=self.dtype) for buffer in buffers)
             self._functions[name] = partial(getattr(library, symbols[name]), *arguments), views
         self._batch = getattr(library, symbols["eval_batch"])
@@ -76,24 +83,24 @@ class ImpactGradient:
     def load(
         cls, path: str | Path, *, robot: Robot | None = None, frame: str | None = None, free: bool = False
     ) -> ImpactGradient:
-        """Load an export.  **This runs its code**, so load a foreign export only if you would run a foreign program.
+        """Load an export.  **This runs its code**, so load an export only if you trust its origin.
 
-        The method uses ``lib<prefix>.so`` beside the manifest.  Where there is none, it **builds the library there**
-        with the user's compiler (``$CC``, cc, gcc or clang).  A library that this package built must have the SHA-256
-        that lies beside it.  Any library must be whole, name this manifest, and reproduce its numbers.
+        The library is ``lib<prefix>.so`` beside the manifest.  If it is missing, this method **builds it there** with
+        the user's compiler (``$CC``, cc, gcc or clang).  If there is a file with its SHA-256, the library must have
+        this hash.  It must also name this manifest and reproduce its reference values.
 
         Args:
             path: The folder of the export, or its ``<prefix>.json``.
-            robot: The robot in hand; the export must be of this model.
-            frame: The contact frame of an export with several; the first by default.
-            free: Leave out the supports, where the export has some.
+            robot: The robot, whose model the export must have.
+            frame: The contact frame; by default the first of the export.
+            free: Ignore the supports, if the export has some.
 
         Raises:
-            SpecError: There is no export, or it is broken.
-            ManifestMismatch: The export is of another robot, joint order or convention, or the library belongs to
-                another manifest; names the difference.
-            FrameNotFound: The export has no such frame; lists its frames.
-            CompilerError: There is no library, and none can be built.
+            SpecError: The export does not exist or is damaged.
+            ManifestMismatch: Robot, joint order or convention differ, or the library belongs to another manifest.
+                The error names the difference.
+            FrameNotFound: The export has no such frame.  The error lists its frames.
+            CompilerError: The library is missing and cannot be built.
         """
         manifest, folder = read_manifest(Path(path))
         if robot is not None:
@@ -113,17 +120,17 @@ class ImpactGradient:
         return gradient
 
     def copy(self) -> ImpactGradient:
-        """Return the same functions with buffers of their own, for another thread."""
+        """Return the same functions with new buffers, for another thread."""
         return ImpactGradient(self._library, self.manifest, self.frame, free=self.free)
 
     @checked
     def check_robot(self, robot: Robot) -> None:
-        """Refuse another robot than that of the export; its joint model may be another one.
+        """Refuse a robot that differs from the export in more than the joint model.
 
         Raises:
-            ManifestMismatch: Names the first difference.
+            ManifestMismatch: The robot differs.  The error names the first difference.
         """
-        # This needs Pinocchio, and the rest of the module does not.
+        # Only this method needs Pinocchio.
         from impact_posture.robot.joint_model import with_joint_model
 
         joints = self.manifest["joint_model"]
@@ -132,24 +139,27 @@ class ImpactGradient:
     # ---- one configuration ------------------------------------------------------------------------------------
 
     def call(self, name: str, q: ArrayLike, n: ArrayLike | None = None) -> tuple[int, tuple[Array, ...]]:
-        """Call a C function and return its code and views of its results, also when the code is not zero.
+        """Call a C function of :data:`~impact_posture.codegen.export_functions.SIGNATURES`.
 
         Args:
-            name: A function of :data:`~impact_posture.codegen.export_functions.SIGNATURES`.
+            name: Name of the function.
             q: Configuration, shape (nq,).
             n: Unit normal out of the surface, in the manifest's ``normal_frame``, shape (3,).
 
+        Returns:
+            The code of the function, and views of its results, also if the code is not zero.
+
         Raises:
-            ValueError: An input has another shape.
+            ValueError: An input has the wrong shape.
         """
         function, results = self._functions[name]
-        # Assignment alone would spread one number over all joints.
+        # Assignment alone would broadcast one number to all joints.
         if len(q) != self.nq:  # type: ignore[arg-type]
             raise ValueError(f"q has length {len(q)}, not {self.nq}")  # type: ignore[arg-type]
         self._q[:] = q
         if n is None:
             if "n" in SIGNATURES[name][0]:
-                raise ValueError(f"{name} needs a normal")  # else that of the last call
+                raise ValueError(f"{name} needs a normal")
         else:
             if len(n) != 3:  # type: ignore[arg-type]
                 raise ValueError(f"n has length {len(n)}, not 3")  # type: ignore[arg-type]
@@ -169,51 +179,29 @@ class ImpactGradient:
         Args:
             q: Configuration, shape (nq,).
             n: Unit normal out of the surface, in the manifest's ``normal_frame``, shape (3,).
-
-        Raises:
-            InputError: A number is not finite.
-            PostureError: A quaternion or cosine-sine pair is not of unit norm.
-            MetricError: The result is not finite, because the quantity does not exist there.
-            ValueError: An input has another shape.
         """
-        # Written out, because control loops call this method in every tick.
+        # Without self._results, because control loops call this method in every tick.
         code, (H, gradient) = self.call("eval", q, n)
         if code:
             raise _failure(code)
         return H.item(), gradient
 
     def objective(self, q: ArrayLike) -> tuple[float, Array]:
-        """Return the exported objective at its own normal, and its tangent gradient, a view of shape (nv,).
-
-        Raises:
-            InputError, PostureError, MetricError, ValueError: As :meth:`value_and_gradient`.
-        """
+        """Return the exported objective at its normal, and its tangent gradient, a view of shape (nv,)."""
         value, gradient = self._results("objective", q)
         return value.item(), gradient
 
     def value(self, q: ArrayLike, n: ArrayLike) -> float:
-        """Return ``H`` alone.
-
-        Raises:
-            InputError, PostureError, MetricError, ValueError: As :meth:`value_and_gradient`.
-        """
+        """Return ``H`` alone."""
         return float(self._results("value", q, n)[0].item())
 
     def jump(self, q: ArrayLike, n: ArrayLike) -> tuple[Array, float, float]:
-        """Return ``a = M⁻¹Jᵀn``, a view of shape (nv,), ``G = nᵀJa`` (1/kg) and ``V = H/G²``.
-
-        Raises:
-            InputError, PostureError, MetricError, ValueError: As :meth:`value_and_gradient`.
-        """
+        """Return ``a = M⁻¹Jᵀn``, a view of shape (nv,), ``G = nᵀJa`` (1/kg) and ``V = H/G²``."""
         a, G, V = self._results("jump", q, n)
         return a, G.item(), V.item()
 
     def ellipsoid(self, q: ArrayLike) -> Array:
-        """Return ``Λ_c`` in world axes, a view of shape (3, 3).
-
-        Raises:
-            InputError, PostureError, MetricError, ValueError: As :meth:`value_and_gradient`.
-        """
+        """Return ``Λ_c`` in world axes, a view of shape (3, 3)."""
         return self._results("ellipsoid", q)[0].reshape(3, 3)
 
     # ---- many configurations ----------------------------------------------------------------------------------
@@ -221,17 +209,17 @@ class ImpactGradient:
     def value_and_gradient_batch(
         self, q: ArrayLike, n: ArrayLike, out: tuple[Array, Array] | None = None
     ) -> tuple[Array, Array]:
-        """Return ``H``, shape (N,), and tangent gradients, shape (N, nv), of many configurations in fresh arrays.
+        """Return ``H``, shape (N,), and tangent gradients, shape (N, nv), of many configurations in new arrays.
 
-        Rows that cannot be computed (see :meth:`value_and_gradient`) are NaN.  They change no other row.
+        A row whose configuration would raise an error is NaN, and the other rows are valid.
 
         Args:
             q: Configurations, shape (N, nq).
             n: Unit normals, shape (N, 3), or one normal for all, shape (3,).
-            out: Contiguous arrays of the library's type to write into, instead of fresh ones.
+            out: Contiguous arrays of the library's type for the results.
 
         Raises:
-            InputError: A shape or a type does not fit.
+            InputError: A shape or a type is wrong.
         """
         q = np.ascontiguousarray(q, dtype=self.dtype)
         if q.ndim != 2 or q.shape[1] != self.nq:
@@ -244,11 +232,8 @@ class ImpactGradient:
         H, grad = (np.empty(count, self.dtype), np.empty((count, self.nv), self.dtype)) if out is None else out
         for array, shape in ((H, (count,)), (grad, (count, self.nv))):
             if array.shape != shape or array.dtype != self.dtype or not array.flags.carray:
-                raise InputError(
-                    f"has shape {array.shape} of {array.dtype}",
-                    where="out",
-                    hint=f"give contiguous arrays of {self.dtype}, shapes ({count},) and ({count}, {self.nv})",
-                )
+                hint = f"give contiguous arrays of {self.dtype}, shapes ({count},) and ({count}, {self.nv})"
+                raise InputError(f"has shape {array.shape} of {array.dtype}", where="out", hint=hint)
         pointers = [ctypes.c_void_p(array.ctypes.data) for array in (q, n, H, grad)]
         self._batch(pointers[0], pointers[1], ctypes.c_int(count), pointers[2], pointers[3])
         return H, grad
@@ -262,9 +247,8 @@ class ImpactGradient:
         difference = float(np.abs(values - expected).max() / np.abs(expected).max())
         # A comparison by ">" would accept a NaN.
         if not difference <= _SELF_TEST[self.manifest["real"]]:
-            raise ManifestMismatch(
-                "reference value of H", test["H"], H, where=where, hint="delete the library: it is built again"
-            )
+            hint = "delete the library, which is then built again"
+            raise ManifestMismatch("reference value of H", test["H"], H, where=where, hint=hint)
 
 
 def _failure(code: int) -> Exception:

@@ -1,4 +1,4 @@
-"""The manifest of an export: robot, frames, metric and objective, and the reference values that prove the code."""
+"""The manifest of an export: robot, frames, metric, objective and self-test."""
 
 from __future__ import annotations
 
@@ -48,11 +48,11 @@ def build_manifest(
     *,
     portable: bool = False,
 ) -> dict[str, Any]:
-    """Return all that a reader needs to know whether the export fits the robot in hand.
+    """Return the manifest of an export.
 
-    ``frames`` has an entry for each frame, and the top level repeats that of the first.  ``free`` of an entry has the
-    symbols and the reference of the robot without its supports; it is null where the robot has none.  ``several`` has
-    those of the objective of several contacts at once.
+    ``frames`` has an entry for each frame, and the top level repeats the first entry.  ``free`` of an entry has
+    symbols and self-test for the robot without its supports, or is null without supports.  ``several`` has symbols
+    and self-test of the objective of several contacts at once.
     """
     first = objectives[0]
     robot, metric = first.robot, first.metric

@@ -1,4 +1,4 @@
-"""Read the manifest of an export and compare it with the robot in hand.  This module needs no CasADi."""
+"""Read the manifest of an export, and compare it with a robot and a library.  This module needs no CasADi."""
 
 from __future__ import annotations
 
@@ -25,7 +25,7 @@ Numbers = tuple[Annotated[float, Field(allow_inf_nan=False)], ...]
 
 
 class Loose(BaseModel):
-    """A block whose other keys may be there or not."""
+    """A block with required keys, which may have other keys."""
 
     model_config = ConfigDict(strict=True)
 
@@ -52,7 +52,7 @@ class _Several(Loose):
 
 
 class _Manifest(Loose):
-    """The keys that a loader needs; the library vouches for all of them (:func:`check_library`)."""
+    """The keys that a loader needs.  :func:`check_library` compares the whole manifest with the library."""
 
     prefix: Annotated[str, Field(pattern=r"^[A-Za-z][A-Za-z0-9_]*$")]
     real: Literal["double", "float"]
@@ -73,7 +73,7 @@ def read_manifest(path: Path) -> tuple[dict[str, Any], Path]:
         path: The folder, or the manifest itself.
 
     Raises:
-        SpecError: There is no manifest, there are several, or it is broken.
+        SpecError: There is no manifest or more than one, or it is damaged.
     """
     manifest, checked, file = read_checked(path, SCHEMA, _Manifest, "export", "codegen")
     sizes = [("armature", len(checked.armature), checked.nv)]
@@ -83,87 +83,81 @@ def read_manifest(path: Path) -> tuple[dict[str, Any], Path]:
             sizes.append((f"self_test.grad at {block.frame}", len(part.self_test.grad), checked.nv))
     for name, size, expected in sizes:
         if size != expected:
-            raise _not_whole(file, f"{name} has {size} numbers instead of {expected}")
+            raise _incomplete(file, f"{name} has {size} numbers instead of {expected}")
     return manifest, file.parent
 
 
 def read_checked(
     path: Path, schema: str, model: type[_Checked], what: str, command: str
 ) -> tuple[dict[str, Any], _Checked, Path]:
-    """Read a manifest of a schema; return it, checked too, and its file.
+    """Read and validate a manifest; return its content, the validated model, and its file.
 
     Args:
         path: The folder, or the manifest itself.
         schema: The schema.
-        model: What the manifest has to hold.
-        what: What is in the folder, in messages.
+        model: The model that validates the content.
+        what: Name of the kind of folder in messages.
         command: The command that writes it.
 
     Raises:
-        SpecError: There is no manifest, there are several, or it is broken.
+        SpecError: There is no manifest or more than one, or it is damaged.
     """
     files = [path] if not os.path.isdir(path) else sorted(p for p in path.glob("*.json") if _is_manifest(p, schema))
     if len(files) != 1:
-        words = f"holds no {what}" if not files else f"holds {len(files)} {what}s"
+        count = f"holds no {what}" if not files else f"holds {len(files)} {what}s"
         hint = f"name the folder that {command} wrote" if not files else f"name one, such as {files[0].name}"
-        raise SpecError(words, where=str(path), hint=hint)
+        raise SpecError(count, where=str(path), hint=hint)
     (file,) = files
     try:
         manifest = json.loads(read_text(file))
     except (OSError, ValueError, RecursionError) as error:
-        words = getattr(error, "strerror", None) or str(error)
-        raise SpecError(f"cannot be read ({words})", where=str(file), hint="run codegen again") from None
+        reason = getattr(error, "strerror", None) or str(error)
+        raise SpecError(f"cannot be read ({reason})", where=str(file), hint="run codegen again") from None
     if not isinstance(manifest, dict) or manifest.get("schema") != schema:
         hint = f"name the folder that {command} wrote, or run codegen again"
-        raise SpecError(f"is no manifest of an {what}", where=str(file), hint=hint)
+        raise SpecError(f"is not a manifest of an {what}", where=str(file), hint=hint)
     try:
-        # From JSON, because strict validation takes a list for a tuple there and converts nothing else.
+        # Strict validation accepts a list for a tuple only from JSON text.
         return manifest, model.model_validate_json(json.dumps(manifest, allow_nan=False)), file
     except ValidationError as error:
         first = error.errors()[0]
-        raise _not_whole(file, f"{'.'.join(map(str, first['loc']))}: {first['msg']}") from None
+        raise _incomplete(file, f"{'.'.join(map(str, first['loc']))}: {first['msg']}") from None
     except (ValueError, RecursionError) as error:
-        raise _not_whole(file, str(error)) from None
+        raise _incomplete(file, str(error)) from None
 
 
-def _not_whole(file: Path, why: str) -> SpecError:
+def _incomplete(file: Path, why: str) -> SpecError:
     hint = "name the folder that codegen wrote, or run codegen again"
-    return SpecError(f"is no whole manifest: {why}", where=str(file), hint=hint)
+    return SpecError(f"is not a complete manifest: {why}", where=str(file), hint=hint)
 
 
 def identity(manifest: Mapping[str, Any]) -> str:
-    """Return the words of a library about its manifest: sizes, number type and hash, ``key=value`` each."""
+    """Return the text by which a library names its manifest: sizes, number type and hash, as ``key=value``."""
     content = json.dumps(manifest, sort_keys=True, separators=(",", ":"), allow_nan=False)
     digest = hashlib.sha256(content.encode()).hexdigest()
     return f"nq={manifest['nq']} nv={manifest['nv']} real={manifest['real']} sha256={digest}"
 
 
 def check_library(library: ctypes.CDLL, manifest: Mapping[str, Any], *, where: str) -> None:
-    """Refuse a library that belongs to another manifest, before any call of its functions.
+    """Refuse a library that belongs to another manifest, before any of its functions is called.
 
     Raises:
-        SpecError: The library names no manifest.
+        SpecError: The library does not name a manifest.
         ManifestMismatch: Sizes, number type or another part of the manifest differ.
     """
     symbol = f"{manifest['prefix']}_manifest"
     try:
         address = ctypes.addressof(ctypes.c_char.in_dll(library, symbol))
     except ValueError:
-        raise SpecError(
-            f"has no symbol {symbol}", where=where, hint="delete it: it is built again; or run codegen again"
-        ) from None
+        hint = "delete the library, which is then built again, or run codegen again"
+        raise SpecError(f"has no symbol {symbol}", where=where, hint=hint) from None
     inside = ctypes.string_at(address).decode("ascii", "replace")
     pairs = [dict(part.partition("=")[::2] for part in text.split()) for text in (identity(manifest), inside)]
     for key, value in pairs[0].items():
         if pairs[1].get(key) != value:
             name = "the manifest's hash" if key == "sha256" else key
-            raise ManifestMismatch(
-                name,
-                value,
-                pairs[1].get(key),
-                where=where,
-                hint="delete the library: it is built again; or run codegen",
-            )
+            hint = "delete the library, which is then built again, or run codegen"
+            raise ManifestMismatch(name, value, pairs[1].get(key), where=where, hint=hint)
 
 
 def _is_manifest(path: Path, schema: str) -> bool:
@@ -176,7 +170,7 @@ def _is_manifest(path: Path, schema: str) -> bool:
 
 
 def check_robot(manifest: Mapping[str, Any], robot: Robot, *, where: str = "manifest") -> None:
-    """Refuse an export of another robot and name the first difference.
+    """Refuse an export of another robot, and name the first difference.
 
     Raises:
         ManifestMismatch: Joint order, convention, armature, or another part of the model differs.
@@ -199,10 +193,10 @@ def check_robot(manifest: Mapping[str, Any], robot: Robot, *, where: str = "mani
 
 
 def frame_block(manifest: Mapping[str, Any], frame: str | None) -> Mapping[str, Any]:
-    """Return the block of one frame; without a name, that of the first.
+    """Return the block of a frame, by default of the first.
 
     Raises:
-        FrameNotFound: The manifest has no such frame; lists its frames.
+        FrameNotFound: The manifest has no such frame.  The error lists its frames.
     """
     blocks: dict[str, Mapping[str, Any]] = {str(block["frame"]): block for block in manifest["frames"]}
     if frame is None:

@@ -1,4 +1,4 @@
-"""Reference values that the code of an export must reproduce, and how closely: the self-test of a manifest."""
+"""The self-test of a manifest: reference values for the code of an export, and its tolerance."""
 
 from __future__ import annotations
 
@@ -21,16 +21,16 @@ from impact_posture.robot.robot import Robot
 from impact_posture.system.arrays import Array
 
 Reference = Callable[[Array, Array], dict[str, Array]]
-"""Quantities at a configuration ``q`` (nq,) and a normal ``n`` (3,), by name, each a flat array."""
+"""Function of a configuration ``q`` (nq,) and a normal ``n`` (3,) that returns quantities by name, as flat arrays."""
 
 
 # The manifest and the check of the same export need the same references.
 @lru_cache(maxsize=8)
 def casadi_reference(objective: WorstCaseObjective) -> Reference:
-    """Return the quantities of an export as CasADi interprets them.
+    """Return the quantities of an export, computed with CasADi.
 
     The names are ``H``, ``grad`` (nv,), ``jump`` (nv,), ``G``, ``V = H/G²``, ``ellipsoid`` (9,).  ``objective`` and
-    ``objective_grad`` (nv,) are at the objective's own normal; several contacts at once have these two only.
+    ``objective_grad`` (nv,) are at the normal of the contact.  Several contacts at once have only these two.
     """
     k = objective.kernel
     value, gradient = objective.gradient_fun().call([k.q, ca.DM(objective.contact.normal)])
@@ -46,7 +46,7 @@ def casadi_reference(objective: WorstCaseObjective) -> Reference:
 
 
 def oracle_reference(objective: WorstCaseObjective) -> Reference:
-    """Return the same quantities from the numbers of Pinocchio."""
+    """Return the same quantities, computed with Pinocchio."""
 
     def evaluate(q: Array, n: Array) -> dict[str, Array]:
         values: dict[str, ArrayLike] = {"objective": objective.value(q), "objective_grad": objective.gradient(q)}
@@ -61,12 +61,12 @@ def oracle_reference(objective: WorstCaseObjective) -> Reference:
 
 
 def oracle_along(objective: WorstCaseObjective, normal: Array) -> ImpactOracle:
-    """Return the oracle of the leading contact along another normal, shape (3,), in the axes of its own."""
+    """Return the oracle of the leading contact along another normal, shape (3,), in the same axes."""
     x, y, z = (float(v) for v in normal)
     return ImpactOracle(replace(objective.case, contact=replace(objective.contact, normal=(x, y, z))))
 
 
-# A unit vector along no axis, so that no entry of a gradient vanishes.  It is exact enough in binary.
+# A unit vector that is not along an axis, so that no entry of a gradient vanishes.
 _NORMAL = (0.48, -0.6, 0.64)
 
 
@@ -81,9 +81,9 @@ def sample_postures(robot: Robot, count: int, seed: int) -> list[Array]:
 
 
 def self_test(objective: WorstCaseObjective, real: Real = DOUBLE) -> dict[str, Any]:
-    """Return reference values at one posture and normal, from CasADi: ``q, n, H, grad, objective, …``.
+    """Return reference values at one posture and normal, computed with CasADi: ``q, n, H, grad, objective, …``.
 
-    Posture and normal are numbers of the type of the export, so that the call changes nothing.
+    Posture and normal are exact in the number type of the export.
 
     Raises:
         MetricError: The objective does not exist there.
@@ -91,18 +91,15 @@ def self_test(objective: WorstCaseObjective, real: Real = DOUBLE) -> dict[str, A
     q, n = real.rounded(sample_postures(objective.robot, 1, 0)[0]), real.rounded(_NORMAL)
     values = casadi_reference(objective)(q, n)
     if not all(np.isfinite(value).all() for value in values.values()):
-        raise MetricError(
-            f"objective '{objective.name}' is not finite at a random posture of {objective.robot.name}",
-            where="codegen",
-            hint="choose another objective or frame",
-        )
+        what = f"objective '{objective.name}' is not finite at a random posture of {objective.robot.name}"
+        raise MetricError(what, where="codegen", hint="choose another objective or frame")
     inputs = {"q": q} if objective.others else {"q": q, "n": n}
     return {
         name: float(value[0]) if name in _SCALARS else value.tolist() for name, value in (inputs | values).items()
     }
 
 
-# C function → the reference's names of its results.
+# C function → names of its results in a reference.
 RESULTS = {
     "eval": ("H", "grad"),
     "objective": ("objective", "objective_grad"),
@@ -113,10 +110,10 @@ RESULTS = {
 
 
 def self_test_tolerance(objective: WorstCaseObjective, real: Real) -> float:
-    """Return the largest relative difference from the numbers of CasADi that rounding explains.
+    """Return the largest relative difference from CasADi that rounding errors can explain.
 
-    The C code divides by reciprocals, and a compiler may fuse sums with products.  In float the condition of the
-    model shows.
+    The C code multiplies by reciprocals, and a compiler may fuse sums with products.  In float the condition of the
+    model amplifies these errors.
     """
     if real.name == "double":
         return 1e-9 * (heavy_feet_rounding(objective.robot, objective.compliance) if objective.supports else 1.0)

@@ -1,7 +1,7 @@
-"""Find the operations that repeated limbs have in common, and let vectors do them with one SIMD lane for each limb.
+"""Compute equal operations of repeated limbs as one vector operation, with one SIMD lane for each limb.
 
-The key of an operation is its kind and the keys of its operands.  An angle or constant of a limb has the key of its
-place in the limb.  Operations of all lanes of a group with one key become one operation on vectors.
+The key of an operation consists of its kind and the keys of its operands.  The key of an angle or constant of a limb
+is its place in the limb.  Operations of all limbs of a group with the same key become one vector operation.
 """
 
 from __future__ import annotations
@@ -11,18 +11,18 @@ from dataclasses import dataclass
 
 from impact_posture.codegen.expression_graph import ARITHMETIC, COSINE, SINE, Graph, Node
 
-# Identity of an operand in the key of an operation: the number of a node, or a place in a limb.
+# Key of an operation.
 Key = tuple[object, ...]
 
 
 @dataclass(frozen=True)
 class LimbInput:
-    """An input that each of several repeated limbs has.
+    """An input of one of several repeated limbs.
 
     Attributes:
         group: Number of the group of limbs.
         lane: Number of the limb in the group.
-        name: A name that the limbs share.
+        name: Name of the input in all limbs.
     """
 
     group: int
@@ -33,11 +33,11 @@ class LimbInput:
 def pack_lanes(
     graph: Graph, seeds: Mapping[tuple[str, int], LimbInput], values: Mapping[str, Sequence[float]]
 ) -> Graph:
-    """Return the same computation with vectors for what repeated limbs share.
+    """Return the same computation with vector operations for equal operations of repeated limbs.
 
     Args:
         graph: Operations on single numbers.
-        seeds: Input name and index → its place among repeated limbs.
+        seeds: Input name and index → its limb.
         values: Values of the inputs that are constants, by name.
     """
     widths: dict[int, int] = {}
@@ -53,7 +53,7 @@ def pack_lanes(
 
 
 def _levels(graph: Graph) -> list[list[int]]:
-    """Nodes by the length of the longest path to them from an input or a constant."""
+    """Return the nodes by the length of the longest path to them from an input or a constant."""
     depth: list[int] = []
     levels: list[list[int]] = []
     for k, node in enumerate(graph.nodes):
@@ -67,10 +67,10 @@ def _levels(graph: Graph) -> list[list[int]]:
 def _bundles(
     graph: Graph, levels: list[list[int]], places: Mapping[int, LimbInput], widths: Mapping[int, int]
 ) -> dict[int, tuple[int, ...]]:
-    """Return node → the nodes in one vector with it, itself among them.
+    """Return node → all nodes in its vector.
 
-    Operations with one key lie equally deep.  So level by level it is known whether every lane has an operation
-    before anything is built on it.  Where a lane has none, or two, the operations stay single.
+    Operations with the same key are in the same level, so each level is complete before the next uses it.  Where a
+    lane has no operation with a key, or two, these operations remain single.
     """
     bundles: dict[int, tuple[int, ...]] = {}
     lanes: dict[int, tuple[int, int]] = {}
@@ -97,7 +97,7 @@ def _bundles(
 def _place(
     graph: Graph, k: int, places: Mapping[int, LimbInput], lanes: Mapping[int, tuple[int, int]], short: list[int]
 ) -> tuple[Key, tuple[int, int]] | None:
-    """Return the key of a node with its group and lane; ``None`` where it is in no lane or in several."""
+    """Return the key of a node with its group and lane; ``None`` if its operands are in no lane or in several."""
     node = graph.nodes[k]
     if k in places:
         place = places[k]
@@ -123,7 +123,7 @@ def _merge(
     vectors: dict[tuple[int, ...], int] = {}
 
     def number(k: int) -> int:
-        """The single number of node k."""
+        """Return the new node for the single number k."""
         if k not in singles:
             bundle = bundles[k]
             singles[k] = merged.element(vectors[bundle], bundle.index(k))
@@ -147,7 +147,7 @@ def _merge(
             if all(merged.nodes[p].op == "const" for p in parts):
                 return merged.constant(*[merged.nodes[p].value[0] for p in parts])
             return merged.add(Node("gather", tuple(parts), len(parts)))
-        # Lanes share an operand that is a single number.  Their own operands are a vector in the same order.
+        # An operand is a single number that all lanes share, or a vector in the same order.
         slots = [list(operands) for operands in zip(*[node.operands for node in members], strict=True)]
         if members[0].op in "+*":
             _align(slots, bundles)
@@ -157,7 +157,7 @@ def _merge(
         ]
         return merged.add(Node(members[0].op, tuple(operands), max(merged.nodes[o].width for o in operands)))
 
-    # The nodes of a bundle lie in one level, and their operands in earlier ones.
+    # The nodes of a bundle are in one level, and their operands in earlier levels.
     for k in (k for level in levels for k in level):
         if k not in bundles:
             singles[k] = single(graph.nodes[k])
@@ -168,7 +168,7 @@ def _merge(
 
 
 def _align(slots: list[list[int]], bundles: Mapping[int, tuple[int, ...]]) -> None:
-    """Put the two operands of each lane's sum or product in the order of the first lane's."""
+    """Put the two operands of each lane's sum or product in the order of the first lane."""
     first, second = slots
     for lane in range(1, len(first)):
         pairs = ((first[0], first[lane]), (second[0], second[lane]))

@@ -1,4 +1,4 @@
-"""Rebuild sums so that they add first the terms that are ready first, and wait for their last term only."""
+"""Reorder sums: a sum adds the terms that are ready first, so that only its last term causes a delay."""
 
 from __future__ import annotations
 
@@ -7,15 +7,15 @@ from collections.abc import Callable
 
 from impact_posture.codegen.expression_graph import Graph, Node
 
-# Approximate cycles until a result can be used, on current processors; and those of a sine or cosine.
+# Approximate latency of operations on current processors, in cycles, and of a sine or cosine.
 _LATENCY = {"+": 4, "-": 4, "*": 4, "inv": 15, "neg": 1, "lane": 2, "const": 0, "in": 0, "gather": 1}
 _TRIG = 40
-# A pair that is added apart costs an addition that no product can absorb.  It must save so many cycles.
+# Least number of cycles that a separate sum of two terms must save.  No fused multiply-add can absorb its addition.
 _WORTH = 8
 
 
 def reorder_sums(graph: Graph) -> Graph:
-    """Return the same computation with every sum in the order in which its terms become ready."""
+    """Return the same computation with the terms of every sum in the order in which they are ready."""
     reordered = Graph(graph.inputs)
     ready: list[int] = []
     new_of: dict[int, int] = {}
@@ -43,7 +43,7 @@ def reorder_sums(graph: Graph) -> Graph:
 
 
 def _inner(graph: Graph) -> set[int]:
-    """Return the sums whose only use is as a term of one other sum of their width."""
+    """Return the sums that are used once, as a term of another sum of the same width."""
     users: dict[int, set[int]] = {}
     times: Counter[int] = Counter()
     for k, node in enumerate(graph.nodes):
@@ -78,23 +78,22 @@ def _terms(graph: Graph, root: int, inner: set[int]) -> list[tuple[int, int]]:
 
 
 def _sum(graph: Graph, add: Callable[[Node], int], ready: list[int], terms: list[tuple[int, int]]) -> int:
-    """Return the sum of signed nodes, the latest last."""
+    """Return the node of the sum of signed nodes, which adds the latest term last."""
     queue = sorted(terms, key=lambda term: (ready[term[1]], term[1]))
 
-    def plus(one: tuple[int, int], other: tuple[int, int]) -> tuple[int, int]:
-        # A single number that all lanes add stays single until a vector joins it.
-        width = max(graph.nodes[one[1]].width, graph.nodes[other[1]].width)
-        if one[0] == other[0]:
-            return one[0], add(Node("+", (one[1], other[1]), width))
-        positive, negative = (one, other) if one[0] > 0 else (other, one)
+    def plus(first: tuple[int, int], second: tuple[int, int]) -> tuple[int, int]:
+        # Sums of single numbers remain single until a vector is added.
+        width = max(graph.nodes[first[1]].width, graph.nodes[second[1]].width)
+        if first[0] == second[0]:
+            return first[0], add(Node("+", (first[1], second[1]), width))
+        positive, negative = (first, second) if first[0] > 0 else (second, first)
         return 1, add(Node("-", (positive[1], negative[1]), width))
 
     total = queue.pop(0)
     while queue:
         term = queue.pop(0)
         if queue and ready[total[1]] >= ready[queue[0][1]] + _WORTH:
-            # Two terms wait while the sum is on its way.
-            other = queue.pop(0)
-            term = plus(term, other)
+            # Two terms are ready before the sum.
+            term = plus(term, queue.pop(0))
         total = plus(total, term)
     return total[1] if total[0] > 0 else add(Node("neg", (total[1],), graph.nodes[total[1]].width))

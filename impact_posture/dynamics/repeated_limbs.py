@@ -1,7 +1,7 @@
 """Repeated limbs of a robot, which have the same joints: the two legs of a humanoid, the four legs of a quadruped.
 
-Their expressions differ in constants only.  With parameters for those constants, named alike in every limb, all limbs
-have the same instructions, and a processor does them at once in its SIMD lanes.
+Their expressions differ in constants only.  With parameters for these constants, all limbs have the same
+instructions, which a processor executes at once in its SIMD lanes.
 """
 
 from __future__ import annotations
@@ -18,14 +18,15 @@ from impact_posture.dynamics.joints import joint_kind
 from impact_posture.dynamics.spatial import constant, rounded
 from impact_posture.robot.model_joints import finite_armature
 
-# A limb computes with zeros where another limb has other constants.  So much more work is worth it.
+# A limb also computes with zeros where its counterpart has nonzero constants.  This is the largest ratio of such
+# work.
 _FILL = 1.25
 _WIDTHS = (4, 2)
 
 
 @dataclass(frozen=True)
 class Place:
-    """Place of a joint in repeated limbs.
+    """Position of a joint in repeated limbs.
 
     Attributes:
         group: Number of the group of limbs.
@@ -42,9 +43,9 @@ class RepeatedLimbs:
     """The repeated limbs of a model, and parameters for the constants in which they differ.
 
     Attributes:
-        groups: For each group its limbs, and for each limb its joints in one order.
-        places: Joint index → its place; joints outside repeated limbs are missing.
-        parameters: Symbol and value of each parameter, by its group, its lane, and a name that all lanes share.
+        groups: For each group its limbs, and for each limb its joints, in the same order.
+        places: Joint index → its place; without joints outside repeated limbs.
+        parameters: Symbol and value of each parameter, by group, lane, and a name common to all lanes.
     """
 
     def __init__(self, model: pin.Model) -> None:
@@ -58,7 +59,7 @@ class RepeatedLimbs:
         self.parameters: dict[tuple[int, int, str], tuple[ca.SX, float]] = {}
 
     def counterparts(self, joint: int) -> list[int]:
-        """Return the joints at the same position of all limbs, by lane; the joint alone outside repeated limbs."""
+        """Return the joints at the same position of all limbs, by lane; outside repeated limbs the joint alone."""
         place = self.places.get(joint)
         return [joint] if place is None else [limb[place.position] for limb in self.groups[place.group]]
 
@@ -67,8 +68,8 @@ class RepeatedLimbs:
 
         Args:
             joint: The joint.
-            tag: A name for the kind of constant.
-            of: The numbers of a joint: a vector, or a matrix (a symmetric one stays symmetric).
+            tag: Name of the kind of constant.
+            of: The numbers of a joint: a vector, or a matrix (symmetry is kept).
         """
         place = self.places.get(joint)
         if place is None:
@@ -81,7 +82,7 @@ class RepeatedLimbs:
             entries = [d[i, j] for d in dense]
             if len(set(entries)) > 1:
                 row, column = (min(i, j), max(i, j)) if symmetric else (i, j)
-                # The name has all values, because a constant of the same kind may differ in another kernel.
+                # The values are a part of the name, because another kernel may have other values of this kind.
                 name = f"{place.position}.{tag}.{row}.{column}.{entries}"
                 expression[i, j] = self._parameter(place, name, float(numbers[i, j]))
             elif entries[0] != 0.0:
@@ -89,7 +90,7 @@ class RepeatedLimbs:
         return expression
 
     def indicator(self, joint: int, of: int) -> ca.SX:
-        """Return one for the joint ``of`` and zero for its counterparts, which makes their expressions alike."""
+        """Return a parameter that is one for the joint ``of`` and zero for its counterparts."""
         place = self.places[of]
         return self._parameter(self.places[joint], f"{place.position}.on.{place.lane}", float(joint == of))
 
@@ -101,7 +102,7 @@ class RepeatedLimbs:
 
 
 def _groups(model: pin.Model) -> tuple[tuple[tuple[int, ...], ...], ...]:
-    """Return the outermost repeated limbs; what hangs from a limb is a part of it."""
+    """Return the outermost repeated limbs.  A limb is a whole subtree."""
     groups: list[tuple[tuple[int, ...], ...]] = []
     waiting = [0]
     while waiting:
@@ -127,11 +128,11 @@ def _limb(model: pin.Model, root: int) -> tuple[int, ...]:
     return (root, *[joint for child in model.children[root] for joint in _limb(model, int(child))])
 
 
-def _alike(model: pin.Model, one: tuple[int, ...], other: tuple[int, ...]) -> bool:
+def _alike(model: pin.Model, first: tuple[int, ...], second: tuple[int, ...]) -> bool:
     """Return whether two limbs have the same joints in the same order, and nearly the same zeros."""
-    if _joints(model, one) != _joints(model, other):
+    if _joints(model, first) != _joints(model, second):
         return False
-    pairs = [[_numbers(model, k) != 0.0 for k in pair] for pair in zip(one, other, strict=True)]
+    pairs = [[_numbers(model, k) != 0.0 for k in pair] for pair in zip(first, second, strict=True)]
     return all(np.count_nonzero(a | b) <= _FILL * max(map(np.count_nonzero, (a, b))) for a, b in pairs)
 
 

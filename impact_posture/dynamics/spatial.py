@@ -1,7 +1,7 @@
 """Spatial algebra on CasADi expressions, with the linear part first as in Pinocchio.
 
 A motion ``[v; w]`` and a force ``[f; m]`` are 6-vectors of ``SX``.  ``R`` and ``p`` place a child frame in its
-parent by ``x_parent = R x_child + p``.  Structural zeros stay, so that CasADi never multiplies by a constant zero.
+parent by ``x_parent = R x_child + p``.  Structural zeros are kept, so that CasADi never multiplies by zero.
 """
 
 from __future__ import annotations
@@ -20,10 +20,10 @@ Result = TypeVar("Result", ca.SX, tuple[ca.SX, ...])
 
 
 def template(operation: Callable[P, Result]) -> Callable[P, Result]:
-    """Make the expressions of an operation once for each size of its arguments, which are inserted from then on.
+    """Decorate an operation: its expressions are built once for each size of arguments, and then reused.
 
-    A tree applies the same few operations to joint after joint, and most of the time goes to calls from Python.
-    CasADi inserts arguments as if the operation were written out with them, so that their zeros and ones vanish.
+    A tree applies a few operations to every joint, and calls from Python would take most of the time.  CasADi inserts
+    the arguments into the expressions, and simplifies products with their zeros and ones.
 
     Args:
         operation: Function of ``SX`` matrices that returns one matrix or a tuple.  Keyword arguments are options.
@@ -44,7 +44,7 @@ def template(operation: Callable[P, Result]) -> Callable[P, Result]:
 
 
 def rounded(value: ArrayLike) -> NDArray[np.float64]:
-    """Return numbers without rounding dust: what is nearly −1, 0 or 1 becomes exactly that."""
+    """Return numbers in which values within 1e-15 of −1, 0 or 1 become exact."""
     array = np.array(value, dtype=float)
     nice = np.rint(array)
     near = (np.abs(array - nice) < 1e-15) & (np.abs(nice) <= 1)
@@ -99,7 +99,7 @@ def motion_cross_force(motion: ca.SX, force: ca.SX) -> ca.SX:
 class Spin:
     """Rotation about the coordinate ``axis`` 0, 1 or 2, with the cosine and sine of its angle.
 
-    ``sense`` is −1 where the axis of the joint points the other way; the sine contains it already.
+    ``sense`` is −1 if the axis of the joint has the opposite direction.  The sine includes this sign.
     """
 
     axis: int
@@ -128,7 +128,7 @@ def _turned(M: ca.SX, k: int, cosine: ca.SX, sine: ca.SX) -> ca.SX:
 def spin_power(inertia: ca.SX, x: ca.SX, y: ca.SX, *, axis: int, sense: float) -> ca.SX:
     """Return ``yᵀ K x`` with the symmetric ``K = (S×)ᵀ I + I (S×)`` of a 6×6 inertia ``I`` and a motion ``S``.
 
-    ``S`` turns about the coordinate ``axis``, or the other way if ``sense`` is −1.
+    ``S`` rotates about the coordinate ``axis``, in the opposite direction if ``sense`` is −1.
     """
     turn = skew(constant(sense * np.eye(3)[axis]))
     S = ca.diagcat(turn, turn)
@@ -141,9 +141,9 @@ def inertia_to_parent(inertia: ca.SX, R: ca.SX, p: ca.SX, *spin: ca.SX, axis: in
 
     Args:
         inertia: Inertia in child coordinates.
-        R: Rotation of the child, or of its rest position where it spins.
+        R: Rotation of the child; with a spin, rotation of its rest position.
         p: Origin of the child, shape (3, 1).
-        spin: Cosine and sine of the rotation about ``axis`` that comes before ``R``; none without an axis.
+        spin: Cosine and sine of the rotation about ``axis``, which is applied before ``R``.
         axis: Coordinate axis of the spin, 0, 1 or 2.
     """
     blocks = [symmetric(inertia[:3, :3]), inertia[:3, 3:], symmetric(inertia[3:, 3:])]
@@ -157,7 +157,7 @@ def inertia_to_parent(inertia: ca.SX, R: ca.SX, p: ca.SX, *spin: ca.SX, axis: in
 
 
 def symmetric(matrix: ca.SX) -> ca.SX:
-    """Copy the upper triangle onto the lower, so that half of the expressions are never computed."""
+    """Copy the upper triangle to the lower one, so that equal expressions are computed once."""
     return ca.triu2symm(ca.triu(matrix))
 
 
@@ -169,7 +169,7 @@ def quaternion_product(a: ca.SX, b: ca.SX) -> ca.SX:
 
 
 def quaternion_matrix(q: ca.SX) -> ca.SX:
-    """Return the rotation matrix of a unit quaternion in ``x y z w`` order; it is quadratic in its entries."""
+    """Return the rotation matrix of a unit quaternion in ``x y z w`` order, quadratic in its entries."""
     x, y, z, w = q[0], q[1], q[2], q[3]
     return ca.blockcat(
         [

@@ -1,8 +1,8 @@
 """Dynamics of the kinematic tree at one symbolic configuration: sweeps and an O(n) articulated-body factorization.
 
-Everything is in link coordinates.  ``M`` does not depend on the pose of the base, which only rotates world directions
-into links.  Notation and signs follow Featherstone, *Rigid Body Dynamics Algorithms* (2008), with the linear part
-first as in Pinocchio.
+All quantities are in link coordinates.  ``M`` does not depend on the pose of the base, which only rotates world
+directions to link coordinates.  Notation and signs follow Featherstone, *Rigid Body Dynamics Algorithms* (2008), with
+the linear part first as in Pinocchio.
 """
 
 from __future__ import annotations
@@ -55,9 +55,9 @@ class Response:
     Attributes:
         a: ``M⁻¹(τ + Σ Jᵀ w)``, shape (nv,).
         velocities: Spatial velocity of every link under ``a``, in link coordinates.
-        before: The same without the motion of the link's own joint.
+        before: Spatial velocity of every link without the motion of its joint, ``v⁻``.
         forces: Spatial force through every joint, on its link.
-        passed: The part of that force that does not depend on the motion of the parent.
+        passed: The part of this force that does not depend on the motion of the parent.
         wrenches: The wrenches.
     """
 
@@ -70,10 +70,7 @@ class Response:
 
 
 class Tree(Kinematics):
-    """A ``pin.Model`` at the configuration ``q`` (``SX``), with optional extra inertias on its links.
-
-    Arguments as :class:`~impact_posture.dynamics.kinematics.Kinematics`.
-    """
+    """Dynamics of a model, with the arguments of :class:`~impact_posture.dynamics.kinematics.Kinematics`."""
 
     # ---- sweeps -----------------------------------------------------------------------------------------------
 
@@ -100,9 +97,9 @@ class Tree(Kinematics):
 
         Args:
             v: Generalized velocity, shape (nv,).
-            velocities: Spatial velocity of every link under ``v``, if it is known already.
+            velocities: Spatial velocity of every link under ``v``, if it is known.
             extra: Include the extra inertias.
-            less: The wrenches.
+            less: The wrenches ``w``.
         """
         velocities = self.velocities(v) if velocities is None else velocities
         inertia = self._inertia if extra else self._own_inertia
@@ -125,7 +122,7 @@ class Tree(Kinematics):
         return ca.vertcat(force, moment + cross(position, force))
 
     def generalized_force(self, wrenches: Sequence[Wrench], gravity: ca.SX | None = None) -> ca.SX:
-        """Return ``Σ Jᵀ [force; moment]`` of the wrenches, and of the weights of the links, shape (nv,).
+        """Return ``Σ Jᵀ [force; moment]`` of the wrenches and, with ``gravity``, of the weights, shape (nv,).
 
         Args:
             wrenches: The wrenches.
@@ -149,7 +146,7 @@ class Tree(Kinematics):
         return ca.vertcat(R @ local[:3], R @ local[3:])
 
     def own_velocity(self, point: PointOnLink, velocities: ByJoint) -> ca.SX:
-        """Return the linear and angular velocity of a point in its own axes, shape (6,)."""
+        """Return the linear and angular velocity of a point in the axes of the point, shape (6,)."""
         motion, axes = velocities[point.joint], constant(point.rotation).T
         return ca.vertcat(axes @ (motion[:3] + cross(motion[3:], ca.SX(point.position))), axes @ motion[3:])
 
@@ -172,7 +169,7 @@ class Tree(Kinematics):
         factors: dict[int, tuple[ca.SX, ...]] = {}
         for slot, i, parent in reversed(self._joints):
             D = step.pivot(articulated[i], self._S[i], self.armature[slot.v])
-            # Not in a template, so that a constant becomes a factor and not a divisor.
+            # Outside a template, so that a constant 1/D is a factor and not a divisor.
             pivot = ca.SX(0) if slot.v.start in self.locked else 1 / D if slot.kind.nv == 1 else D
             factors[i] = pivot, *step.reduce(articulated[i], self._S[i], pivot)
             if parent:
@@ -182,8 +179,7 @@ class Tree(Kinematics):
     def respond(self, tau: ca.SX | None = None, wrenches: Sequence[Wrench] = ()) -> Response:
         """Solve ``M a = τ + Σ Jᵀ w`` by the articulated-body factorization, in O(n) and without forming ``M``.
 
-        The force through joint i is ``f_i = I^a_i v_i⁻ + p^a_i``.  The factorization knows the momentum of the whole
-        subtree, so no sweep has to gather it.
+        The force through joint i is ``f_i = I^a_i v_i⁻ + p^a_i``, without a sweep over the momenta of the subtree.
         """
         bias: ByJoint = dict.fromkeys(self._R, _ZERO)
         for wrench in wrenches:
@@ -207,16 +203,16 @@ class Tree(Kinematics):
         return Response(ca.densify(ca.vertcat(*rates.values())), velocities, before, forces, passed, tuple(wrenches))
 
     def pair_gradient(self, x: Response, y: Response) -> ca.SX:
-        """Return the tangent gradient of ``w_xᵀJ y + w_yᵀJ x − yᵀM x`` with all four letters held fixed, shape (nv,).
+        """Return the tangent gradient of ``w_xᵀJ y + w_yᵀJ x − yᵀM x`` for fixed x, y, w_x and w_y, shape (nv,).
 
-        It is ``Sᵀ(v_y⁻ ×* f_x + v_x⁻ ×* f_y)`` and the turning of wrenches that stay in the world.  The two responses
-        know all of this.  With ``f = I^a v⁻ + p^a`` and a joint that turns about a coordinate axis, the part of
-        ``I^a`` is the one product ``v_y⁻ᵀ K v_x⁻`` in place of two, where ``K`` is the rate of ``I^a`` as it turns.
+        It is ``Sᵀ(v_y⁻ ×* f_x + v_x⁻ ×* f_y)`` plus the rotation of wrenches that are constant in the world.  With
+        ``f = I^a v⁻ + p^a`` and a joint about a coordinate axis, the two terms of ``I^a`` are the one product
+        ``v_y⁻ᵀ K v_x⁻``, where ``K`` is the rate of ``I^a`` as the joint rotates.
         """
         turning: ByJoint = {}
-        for one, other in ((x, y), (y, x)):
-            for wrench in one.wrenches:
-                self._turn(turning, wrench, other.velocities)
+        for pushed, moved in ((x, y), (y, x)):
+            for wrench in pushed.wrenches:
+                self._turn(turning, wrench, moved.velocities)
         rows: ByJoint = {}
         forces = [dict(x.forces), dict(y.forces)]
         for i in x.forces:
@@ -230,11 +226,11 @@ class Tree(Kinematics):
     # ---- tangent gradients by adjoints ------------------------------------------------------------------------
 
     def energy_gradient(self, velocities: ByJoint) -> ca.SX:
-        """Return the tangent gradient of ``vᵀM(q)v`` with ``v`` held fixed, without extra inertias, shape (nv,).
+        """Return the tangent gradient of ``vᵀM(q)v`` for fixed ``v``, without extra inertias, shape (nv,).
 
-        Moving joint j by ``S_j δ`` turns every velocity beyond it by ``−S_j δ ×``.  With ``F_j`` the momentum of the
-        subtree of j, that changes the value by ``−2 S_jᵀ (v_j⁻ ×* F_j)``, where ``v_j⁻`` is the velocity of the link
-        without the motion of joint j.
+        A motion ``S_j δ`` of joint j turns every velocity beyond it by ``−S_j δ ×``.  With ``F_j`` the momentum of
+        the subtree of j, this changes the value by ``−2 S_jᵀ (v_j⁻ ×* F_j)``, where ``v_j⁻`` is the velocity of the
+        link without the motion of joint j.
         """
         forces = {i: -2 * (self._own_inertia[i] @ velocity) for i, velocity in velocities.items()}
         # A joint with one axis keeps its motion, because Sᵀ(S ×* F) is zero.
@@ -246,9 +242,10 @@ class Tree(Kinematics):
         return self._gather([(before, self._accumulate(forces))], {})
 
     def _turn(self, turning: ByJoint, wrench: Wrench, velocities: ByJoint) -> None:
-        """Add ``f × u + m × ω`` of a wrench that stays in the world while its link moves with ``(u, ω)``.
+        """Add ``f × u + m × ω`` of a wrench that is constant in the world while its link moves with ``(u, ω)``.
 
-        The wrench turns back relative to the link, which adds ``−ω_jᵀ (f × u + m × ω)`` on every joint below.
+        The wrench turns back relative to the link, which adds ``−ω_jᵀ (f × u + m × ω)`` for every joint j on the path
+        to the link.
         """
         joint = wrench.point.joint
         if wrench.in_frame:

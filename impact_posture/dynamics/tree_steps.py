@@ -1,4 +1,4 @@
-"""What a sweep over the tree does at one joint, as templates.
+"""The steps of sweeps over the tree at one joint, as templates.
 
 Letters are those of Featherstone (2008).  ``S`` is the motion subspace, shape (6, nv), ``I`` the articulated inertia
 of the link, and ``pivot`` is ``D = SᵀIS + armature``, or ``1/D`` for a joint with one axis.
@@ -19,7 +19,7 @@ def pivot(inertia: ca.SX, S: ca.SX, armature: ca.SX) -> ca.SX:
 
 @template
 def reduce(inertia: ca.SX, S: ca.SX, pivot: ca.SX) -> tuple[ca.SX, ...]:
-    """Return the gain ``D⁻¹SᵀI``, shape (nv, 6), and the inertia that the parent feels, ``I − I S D⁻¹SᵀI``."""
+    """Return the gain ``D⁻¹SᵀI``, shape (nv, 6), and the inertia that acts on the parent, ``I − I S D⁻¹SᵀI``."""
     U = inertia @ S
     gain = _solve(pivot, U.T)
     return gain, symmetric(inertia - U @ gain)
@@ -27,7 +27,7 @@ def reduce(inertia: ca.SX, S: ca.SX, pivot: ca.SX) -> tuple[ca.SX, ...]:
 
 @template
 def drive(S: ca.SX, tau: ca.SX, bias: ca.SX, gain: ca.SX) -> tuple[ca.SX, ...]:
-    """Return what drives a joint, ``τ − Sᵀp``, shape (nv,), and the bias force that the parent feels, shape (6,)."""
+    """Return the drive of a joint, ``τ − Sᵀp``, shape (nv,), and the bias force on its parent, shape (6,)."""
     driving = tau - S.T @ bias
     return driving, bias + gain.T @ driving
 
@@ -38,8 +38,8 @@ def respond(
 ) -> tuple[ca.SX, ...]:
     """Return the rates of a joint, the velocity of its link and the force through it.
 
-    ``before`` is the velocity of the link without the motion of the joint.  The rest is as :func:`drive` and
-    :func:`reduce` return it.
+    ``before`` is the velocity of the link without the motion of the joint.  The other arguments are results of
+    :func:`drive` and :func:`reduce`.
     """
     rates = _solve(pivot, drive) - gain @ before
     return rates, before + S @ rates, reduced @ before + passed

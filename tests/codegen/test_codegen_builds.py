@@ -384,7 +384,7 @@ def test_command_for_a_result(tmp_path: Path) -> None:
         (("tilthex_arm",), 2, "--normal"),
         (("tilthexarm", "--normal", "0", "0", "1"), 1, "tilthex_arm"),
         (("tilthex_arm", "--normal", "0", "0", "1", "--frame", "eee"), 1, "no frame 'eee'"),
-        (("tilthex_arm", "--normal", "0", "0", "1", "--prefix", "1x"), 2, "no C identifier"),
+        (("tilthex_arm", "--normal", "0", "0", "1", "--prefix", "1x"), 2, "not a C identifier"),
         (("tilthex_arm", "--normal", "0", "0", "1", "--prefix", "math"), 2, "C header math.h"),
     ],
 )

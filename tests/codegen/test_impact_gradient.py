@@ -248,7 +248,7 @@ def test_what_is_no_export(loaded: Loaded, tmp_path: Path, monkeypatch: pytest.M
     with pytest.raises(SpecError, match="cannot be read"):
         ImpactGradient.load(tmp_path / "absent.json")
     (tmp_path / "other.json").write_text("{}")
-    with pytest.raises(SpecError, match="is no manifest"):
+    with pytest.raises(SpecError, match="is not a manifest"):
         ImpactGradient.load(tmp_path / "other.json")
     with pytest.raises(FrameNotFound, match="did you mean"):
         ImpactGradient.load(loaded.folder, frame="eee")
