@@ -7,7 +7,6 @@ import json
 import re
 import subprocess
 from collections.abc import Iterator
-from concurrent.futures import ThreadPoolExecutor
 from dataclasses import dataclass, replace
 from pathlib import Path
 
@@ -204,16 +203,6 @@ def test_library_holds_no_writable_data(built: Built) -> None:
     assert names == expected
 
 
-def test_works_from_several_threads(built: Built) -> None:
-    postures = sample_postures(built.objective.robot, 200, 9)
-    alone = [built.library.eval(q, UNIT) for q in postures]
-    with ThreadPoolExecutor(4) as pool:
-        together = list(pool.map(lambda q: built.library.eval(q, UNIT), postures))
-    for one, other in zip(alone, together, strict=True):
-        assert one[:2] == other[:2]
-        np.testing.assert_array_equal(one[2], other[2])
-
-
 def test_gradient_may_overwrite_the_configuration(built: Built) -> None:
     q = sample_postures(built.objective.robot, 1, 4)[0]
     _, H, gradient = built.library.eval(q, UNIT)
@@ -277,9 +266,6 @@ def test_texts_name_what_they_are_of(built: Built) -> None:
     assert f"#define {prefix.upper()}_NQ {robot.nq}\n" in header
     assert f"#define {prefix.upper()}_NV {robot.nv}\n" in header
     assert all(line == line.rstrip() and line.isascii() for line in header.splitlines())
-
-
-# ---- building -----------------------------------------------------------------------------------------------------
 
 
 # ---- names, folders, inputs ---------------------------------------------------------------------------------------

@@ -44,18 +44,6 @@ def test_objective_that_exists_nowhere(pendulum: str, tmp_path: Path) -> None:
     assert [p.name for p in tmp_path.iterdir()] == ["pendulum.urdf"]
 
 
-def test_example_agrees(small: WorstCaseObjective, tmp_path: Path) -> None:
-    make = need("make")
-    need_compiler()
-    written = export(small, tmp_path, posture=small.robot.posture())
-    assert written.compiled
-    assert written.agreement is not None and written.agreement <= 1e-11
-    assert {p.name for p in tmp_path.iterdir()} == {p.name for p in written.files}
-    subprocess.run([make, "-s", "CFLAGS=-O1 -Wall -Wextra -Werror"], cwd=tmp_path, check=True)
-    done = subprocess.run([tmp_path / "example"], capture_output=True, text=True, check=True)
-    assert "agrees: largest relative difference" in done.stdout
-
-
 def test_example_notices_a_wrong_number(pendulum: str, tmp_path: Path) -> None:
     make = need("make")
     need_compiler()
@@ -69,27 +57,6 @@ def test_example_notices_a_wrong_number(pendulum: str, tmp_path: Path) -> None:
     done = subprocess.run([tmp_path / "example"], capture_output=True, text=True, check=False)
     assert done.returncode == 1
     assert "DISAGREES" in done.stdout
-
-
-def test_cmake_target_from_outside(pendulum: str, tmp_path: Path) -> None:
-    cmake = need("cmake")
-    need_compiler()
-    inside = tmp_path / "c"
-    inside.mkdir()
-    robot = load_robot(pendulum)
-    objective = WorstCaseObjective(robot, ImpactContact("tip", (1.0, 1.0, 0.0)))
-    export(objective, inside, prefix="pend", posture=robot.posture(), check=False)
-    (tmp_path / "CMakeLists.txt").write_text(
-        "cmake_minimum_required(VERSION 3.16)\nproject(controller C)\nadd_subdirectory(c)\n"
-        "add_executable(controller main.c)\ntarget_link_libraries(controller PRIVATE pend::pend)\n"
-    )
-    (tmp_path / "main.c").write_text(
-        '#include "pend.h"\nint main(void) { double v, g[PEND_NV]; return pend_objective(pend_posture, &v, g); }\n'
-    )
-    for command in (["-S", ".", "-B", "build"], ["--build", "build"]):
-        done = subprocess.run([cmake, *command], cwd=tmp_path, capture_output=True, text=True, check=False)
-        assert done.returncode == 0, done.stdout + done.stderr
-    assert subprocess.run([tmp_path / "build" / "controller"], check=False).returncode == 0
 
 
 def test_two_exports_in_one_program(pendulum: str, tmp_path: Path) -> None:

@@ -101,7 +101,7 @@ def test_results_are_views_that_the_next_call_overwrites(loaded: Loaded) -> None
     assert not np.shares_memory(elsewhere, first)
 
 
-@pytest.mark.parametrize("count", [0, 1, 7, 8, 1000])
+@pytest.mark.parametrize("count", [0, 7, 200])
 def test_batches(loaded: Loaded, count: int) -> None:
     gradient, robot = loaded.gradient, loaded.objectives[0].robot
     q = np.array(sample_postures(robot, count, 23)).reshape(count, robot.nq)

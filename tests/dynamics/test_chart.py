@@ -134,11 +134,3 @@ def test_bounds_are_the_models(name: str) -> None:
         else:
             assert np.isinf(low).all()
             assert np.isinf(high).all()
-
-
-def test_bounds_in_name_order() -> None:
-    # ur5 has no free-flyer: x is q, and the bounds are the URDF's.
-    found = robot("ur5")
-    lower, upper = Chart(found.model).bounds()
-    pairs: dict[str, tuple[float, float]] = dict(zip(found.joint_names, zip(lower, upper, strict=True), strict=True))
-    assert pairs["elbow_joint"] == pytest.approx((-np.pi, np.pi), abs=1e-6)

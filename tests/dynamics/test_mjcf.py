@@ -15,7 +15,7 @@ from hypothesis import strategies as st
 from impact_posture.dynamics import mjcf
 from impact_posture.dynamics.mjcf import build_mjcf
 from impact_posture.dynamics.mjcf_layout import MjcfLayout
-from impact_posture.errors import InputError, UnsupportedJoint
+from impact_posture.errors import InputError
 from impact_posture.robot.robot_loader import load_robot
 from impact_posture.robot.urdf import build_model
 from tests.dynamics.test_dynamics import JOINTS, random_tree, write_urdf
@@ -237,13 +237,6 @@ def test_base_armature_of_one_linear_and_one_angular_value_has_its_place() -> No
     M, T = np.zeros((7, 7)), found.written.layout.velocity_map(q)
     mujoco.mj_fullM(found.model, found.data, M)
     assert_close(T.T @ M @ T, mass_matrix(model, q), TOLERANCE, "M")
-
-
-def test_joints_that_no_urdf_makes_are_refused_by_name() -> None:
-    model = pin.Model()
-    model.addJoint(0, pin.JointModelHX(0.1), pin.SE3.Identity(), "odd")
-    with pytest.raises(UnsupportedJoint, match="joint 'odd'"):
-        build_mjcf(model)
 
 
 def test_the_model_is_plain_and_the_same_again() -> None:

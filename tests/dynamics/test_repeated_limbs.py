@@ -205,12 +205,9 @@ def test_sums_in_another_order_have_the_same_value_sooner(name: str) -> None:
             assert_close(after[output], before[output], 1e-12, output, 1e-12)
 
 
-@pytest.mark.parametrize("name", ["panda", "tilthex_arm", "anymal_c"])
-def test_robots_without(name: str) -> None:
-    assert RepeatedLimbs(robot(name).model).groups == ()
-
-
 def test_limbs_are_outermost_and_disjoint() -> None:
+    for name in ("panda", "tilthex_arm", "anymal_c"):
+        assert RepeatedLimbs(robot(name).model).groups == ()
     for name in ("talos", "solo12", "hyq", "g1"):
         model = robot(name).model
         limbs = RepeatedLimbs(model)
@@ -304,7 +301,7 @@ def test_two_exports_in_one_unit(tmp_path: Path) -> None:
         export(objective, tmp_path / name, prefix=name, check=False)
     (tmp_path / "both.c").write_text('#include "solo8/solo8.c"\n#include "panda/panda.c"\n')
     strict = ("-std=c99", "-Wall", "-Wextra", "-pedantic", "-Werror")
-    run_compiler([*compiler, *strict, "-O1", "-c", "both.c", "-o", "both.o"], tmp_path)
+    run_compiler([*compiler, *strict, "-fsyntax-only", "both.c"], tmp_path)
 
 
 def test_the_prefix_costs_no_room(tmp_path: Path) -> None:

@@ -63,18 +63,6 @@ def test_an_impact_from_below_lifts(name: str) -> None:
     assert "lifts" in result.line and result.to_dict()["stays"] is False
 
 
-def test_impacts_are_mirrored_in_the_feet() -> None:
-    """What one direction presses the opposite one lifts: the set of impulses is the other's, negated."""
-    found, supports = standing("solo12")
-    q = found.posture()
-    down = contact_stability(oracle_of("solo12", (0.0, 0.0, -1.0)), supports, q)
-    up = contact_stability(oracle_of("solo12", (0.0, 0.0, 1.0)), supports, q)
-    assert down.freedom == up.freedom
-    if down.freedom == 0:
-        for one, other in zip(down.feet, up.feet, strict=True):
-            np.testing.assert_allclose(one.impulse, -other.impulse, atol=1e-6)
-
-
 @pytest.mark.parametrize(("name", "normal"), [("solo12", (0.3, 0.2, -1.0)), ("talos", (1.0, 0.2, -0.4))])
 def test_impulses_are_those_of_impulse_dynamics(name: str, normal: tuple[float, float, float]) -> None:
     """Where the feet's impulses are unique they are Pinocchio's, from its rigid impulse dynamics."""

@@ -21,7 +21,6 @@ from impact_posture.robot.robot import Robot
 from impact_posture.robot.robot_spec import Support
 from tests.support.helpers import (
     assert_close,
-    central_gradient,
     frame_jacobian,
     frame_placement,
     mass_matrix,
@@ -158,18 +157,6 @@ def test_the_predicted_jumps_obey_the_impact() -> None:
     assert names[:3] == [impact.robot.tangent_names[k] for k in order[:3]]
 
 
-@pytest.mark.parametrize("kind", ["impulse", "speed", "sticking", "energy"])
-def test_gradients_against_central_differences(kind: str) -> None:
-    impact = resolve(ImpactSettings(robot="tilthex_arm", normal=(0.0, 0.3, 1.0), posture="tucked", objective=kind))  # type: ignore[arg-type]
-    found = evaluate(impact.objective, impact.q)
-    model, oracle = impact.robot.model, impact.objective.oracle
-    H = central_gradient(lambda q: oracle.quantities(q).H, model, impact.q, 1e-4)
-    assert_close(found.gradient, H, 1e-6, "gradient of H")
-    assert found.objective_gradient is not None
-    value = central_gradient(impact.objective.value, model, impact.q, 1e-4)
-    assert_close(found.objective_gradient, value, 1e-6, "gradient of the objective")
-
-
 def strict(found: Evaluation) -> dict[str, object]:
     block = json.loads(json.dumps(found.to_dict(), allow_nan=False))
     assert set(block) >= DESIGN_KEYS
@@ -196,19 +183,6 @@ def test_where_S_does_not_exist(planar: str) -> None:
     assert block["S"] is None and block["objective"] is None and block["objective_gradient"] is None
     assert found.sticking is None and found.scalars.V is not None
     assert any("S is undefined" in line for line in found.warnings)
-
-
-def test_S_by_the_pseudo_inverse_inside_the_range(planar: str) -> None:
-    impact = resolve(ImpactSettings(robot=planar, frame="tip", normal=(1.0, 0.4, 0.0), objective="sticking"))
-    q = np.array([0.3, 0.9])
-    found = evaluate(impact.objective, q)
-    n = found.worst_normal
-    J = frame_jacobian(impact.robot.model, q, impact.robot.frame_id("tip"))[:3]
-    A = np.linalg.solve(mass_matrix(impact.robot.model, q), J.T)
-    expected = A @ np.linalg.pinv(J @ A, rcond=1e-9) @ n
-    assert found.scalars.S == pytest.approx(expected @ expected, rel=1e-9)
-    assert found.sticking is not None
-    assert_close(J @ found.sticking.velocity, n, 1e-9, "no slip")
 
 
 def test_where_the_contact_cannot_move_along_the_normal(planar: str) -> None:

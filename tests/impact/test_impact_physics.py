@@ -171,16 +171,6 @@ def test_root_h_is_the_ellipsoids_half_width(name: str, metric: str) -> None:
     assert radius < np.sqrt(o.H)
 
 
-@pytest.mark.parametrize("name", NAMES)
-def test_ellipsoid_is_symmetric_and_positive(name: str) -> None:
-    found = robot(name)
-    for supports in {(), feet(found)}:
-        for q in random_configurations(found.model, 2, name, "ellipsoid"):
-            o = quantities(found, q, np.array([0.0, 0.0, 1.0]), supports=supports)
-            np.testing.assert_array_equal(o.ellipsoid, o.ellipsoid.T)
-            assert np.linalg.eigvalsh(o.ellipsoid)[0] > 0
-
-
 # ---- invariances ------------------------------------------------------------------------------------------------
 
 

@@ -323,9 +323,6 @@ def test_struck_feet_that_are_balls_are_held_in_place_only() -> None:
     assert "position of FL_FOOT" in names and "pose of FL_FOOT" not in names
 
 
-HANDS = ("gripper_right_base_link", "gripper_left_base_link")
-
-
 @pytest.mark.parametrize("normal_frame", ["world", "contact"])
 @pytest.mark.parametrize(
     ("normals", "stops"),
@@ -374,8 +371,6 @@ def test_a_resolved_problem_gives_the_same_again(tmp_path: Path) -> None:
     again = prepare(read_settings(tmp_path / "problem.toml"))
     assert again.problem.objective.contacts == prepared.problem.objective.contacts
     assert again.problem.impact.bilateral and again.problem.impact.contact.impulse == 0.7
-    one, two = (solve(p.problem, starts=2, seed=3, jobs=1, compile="never") for p in (prepared, again))
-    np.testing.assert_array_equal(one.q, two.q)
 
 
 @pytest.mark.parametrize(

@@ -41,8 +41,8 @@ SOLO8 = {"straight": 9, "equal knees": 10, "one knee moved by 1e-6": 11, "one kn
 CASES = [*[("solo8", posture) for posture in SOLO8], ("solo12", "random"), ("bolt", "random"), ("talos", "random")]
 STIFFENED = [(*case, e) for case in CASES for e in (ENDS if case[0] == "talos" else STIFFNESS)]
 
-# As this processor rounds, and as others may.
-SEEDS = (None, 1, 2)
+# The rounding of this processor, and another one.
+SEEDS = (None, 1)
 
 
 @pytest.fixture(autouse=True)
