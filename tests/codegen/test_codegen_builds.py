@@ -320,7 +320,7 @@ def test_a_build_that_fails_leaves_what_was_there(
         monkeypatch.setenv("CC", need("false"))
     elif how == "other numbers":
         monkeypatch.setattr("impact_posture.codegen.compile_and_check._ORACLE_TOLERANCE", -1.0)
-        monkeypatch.setattr("impact_posture.codegen.self_test.self_test_tolerance", lambda *_: -1.0)
+        monkeypatch.setattr("impact_posture.codegen.compile_and_check.self_test_tolerance", lambda *_: -1.0)
     else:
         error = KeyboardInterrupt
 
