@@ -2,8 +2,6 @@
 
 from __future__ import annotations
 
-import hashlib
-
 import casadi as ca
 import numpy as np
 
@@ -12,10 +10,10 @@ from impact_posture.dynamics.tree import Tree
 from impact_posture.errors import InputError
 from impact_posture.impact.quantities.lifted_form import Guess
 from impact_posture.posture.approach.attainable_speed import FASTEST, AttainableSpeed
-from impact_posture.posture.constraints.constraint import Constraint, LiftedRows, Linearization
+from impact_posture.posture.constraints.constraint import Constraint, LiftedRows, Linearization, digest
 from impact_posture.system.arrays import Array
 
-# A speed that the joints lack is not a meter: where a pose cannot be held, the pose is the reason.
+# A missing speed counts less than meters: where a pose cannot be held, the pose is the reason.
 _PRICE = 1e-3
 
 
@@ -33,7 +31,7 @@ class ApproachSpeed(Constraint):
     """
 
     price = _PRICE
-    # As for holding: starts that are pulled onto it are less diverse.
+    # Starts that are pulled onto this constraint are less diverse.
     projected = False
 
     def __init__(self, attainable: AttainableSpeed, speed: float) -> None:
@@ -48,22 +46,21 @@ class ApproachSpeed(Constraint):
 
     @property
     def structure(self) -> str:
-        own = self._attainable
-        parts = [np.array([*self.parameters.shape, *self._kept]), own.free, own.scale]
-        for moved in own.points:
-            parts += [moved.point.position, moved.point.rotation, np.array([moved.point.joint, *moved.rows])]
-            parts.append(np.array([moved.comes, moved.in_frame]))
-        digest = hashlib.sha256(b"".join(np.ascontiguousarray(part).tobytes() for part in parts)).hexdigest()[:16]
-        return f"{type(self).__name__}:{digest}"
+        attainable = self._attainable
+        parts: list[object] = [self.parameters.shape, self._kept, attainable.free, attainable.scale]
+        for moved in attainable.points:
+            parts += [moved.point.position, moved.point.rotation, moved.point.joint, moved.rows]
+            parts += [moved.comes, moved.in_frame]
+        return f"{type(self).__name__}:{digest(*parts)}"
 
     def describe(self) -> str:
         return f"{self.name} within the velocity limits of the joints"
 
     def evaluate(self, model: Numeric) -> tuple[Array, Array]:
-        found = self._attainable.at(model)
-        # Where nothing bounds it, twice the speed will do.
-        speed = found.speed if np.isfinite(found.speed) else 2 * self._speed
-        return np.array([self._speed - speed]), -found.gradient[None, :]
+        attained = self._attainable.at(model)
+        # An unbounded speed counts as twice the wanted speed.
+        speed = attained.speed if np.isfinite(attained.speed) else 2 * self._speed
+        return np.array([self._speed - speed]), -attained.gradient[None, :]
 
     # ---- lifted form ------------------------------------------------------------------------------------------
 
@@ -73,12 +70,12 @@ class ApproachSpeed(Constraint):
         return zero, zero
 
     def lift(self, tree: Tree, parameters: ca.SX) -> LiftedRows:
-        own = self._attainable
-        z = ca.SX.sym("w", len(own.free))
+        attainable = self._attainable
+        z = ca.SX.sym("w", len(attainable.free))
         v = ca.SX(tree.model.nv, 1)
-        v[own.free.tolist()] = own.scale * z
+        v[attainable.free.tolist()] = attainable.scale * z
         velocities, rows, start = tree.velocities(v), [], 1
-        for moved in own.points:
+        for moved in attainable.points:
             axes = ca.SX(moved.axes)
             if moved.comes:
                 axes = ca.reshape(parameters[start : start + 9], 3, 3).T
@@ -91,22 +88,21 @@ class ApproachSpeed(Constraint):
         return len(self._attainable.free)
 
     def guess(self, model: Numeric) -> Guess:
-        """See :class:`Constraint`; the fastest approach, slowed down to the speed."""
-        own = self._attainable
-        found = own.at(model)
-        slower = min(1.0, self._speed / min(found.speed, FASTEST)) if found.speed > 0 else 1.0
-        return Guess(slower * found.velocities, -own.upper, own.upper)
+        """Return the fastest approach, slowed down to the wanted speed."""
+        attained, upper = self._attainable.at(model), self._attainable.upper
+        slower = min(1.0, self._speed / min(attained.speed, FASTEST)) if attained.speed > 0 else 1.0
+        return Guess(slower * attained.velocities, -upper, upper)
 
     def linearize(self, model: Numeric, auxiliaries: Array) -> Linearization:
-        """See :class:`Constraint`; the limits of the joints are rows as well."""
-        own = self._attainable
-        names = [f"motion of {moved.name} in the {self.name}" for moved in own.points for _ in moved.rows]
-        by_posture = [own.by_posture(model, auxiliaries, row) for row in np.eye(len(names))]
-        A, limited = own.jacobian(model), np.flatnonzero(np.isfinite(own.upper))
-        bounds, zero = own.upper[limited], np.zeros(len(A))
+        """Return the rows of :meth:`lift` and the velocity limits."""
+        attainable = self._attainable
+        names = [f"motion of {moved.name} in the {self.name}" for moved in attainable.points for _ in moved.rows]
+        by_posture = [attainable.by_posture(model, auxiliaries, row) for row in np.eye(len(names))]
+        A, limited = attainable.jacobian(model), np.flatnonzero(np.isfinite(attainable.upper))
+        bounds, zero = attainable.upper[limited], np.zeros(len(A))
         return Linearization(
-            [*names, *(f"velocity limit of {own.names[k]}" for k in limited)],
-            np.concatenate([A @ auxiliaries + own.arrives * self._speed, auxiliaries[limited]]),
+            [*names, *(f"velocity limit of {attainable.names[k]}" for k in limited)],
+            np.concatenate([A @ auxiliaries + attainable.arrives * self._speed, auxiliaries[limited]]),
             np.concatenate([zero, -bounds]),
             np.concatenate([zero, bounds]),
             np.vstack([np.array(by_posture), np.zeros((len(limited), model.model.nv))]),

@@ -1,7 +1,7 @@
-"""The fastest motion with which the joints bring the contact to the surface.
+"""The highest speed at which the joints can bring the contact to the surface.
 
-An impact-robust arm is often stretched along the normal, and a stretched arm cannot move along itself: the posture
-takes the impact well, but no joint motion arrives in it at speed.
+An impact-robust arm is often stretched along the normal, and a stretched arm cannot move in this direction.  Such a
+posture takes the impact well, but no joint motion can arrive in it at speed.
 """
 
 from __future__ import annotations
@@ -24,20 +24,20 @@ from impact_posture.posture.program.linear_program import solve_linear
 from impact_posture.robot.robot import Robot
 from impact_posture.system.arrays import Array, independent_rows
 
-# A speed that no contact has, m/s, and a limit that no joint has, rad/s or m/s: what reaches them is not bounded.
+# A contact speed (m/s) or velocity limit (rad/s or m/s) from here on counts as unbounded.
 FASTEST = 1e3
 
 
 @dataclass(frozen=True, eq=False)
 class MovingPoint:
-    """What a point must do while the contact approaches: rows of ``D v`` and ``D ω`` that are ``−σ d`` or zero.
+    """Demands on the motion of a point during the approach: rows of ``D v`` and ``D ω`` equal ``−σ d``.
 
     Attributes:
         name: Name of the frame.
         point: The point.
         axes: ``D``, shape (3, 3): the normal and two tangents, or the axes of the world.
-        rows: Rows of ``(D v, D ω)`` that are held.
-        comes: Whether the first row is the approach, ``nᵀv = −σ``; else it is zero as the others.
+        rows: Constrained rows of ``(D v, D ω)``.
+        comes: Whether the first row is the approach, ``nᵀv = −σ``; otherwise it is zero like the other rows.
         in_frame: Whether the axes turn with the frame.
     """
 
@@ -54,10 +54,10 @@ class MovingPoint:
         return np.array([float(self.comes and row == 0) for row in self.rows])
 
     def wrench(self, weights: Array) -> Array:
-        """Return the force and moment whose power is the sum of the rows with these weights, shape (6,)."""
-        whole = np.zeros(6)
-        whole[list(self.rows)] = weights
-        return np.concatenate([self.axes.T @ whole[:3], self.axes.T @ whole[3:]])
+        """Return the force and moment whose power is the weighted sum of the rows, shape (6,)."""
+        wrench = np.zeros(6)
+        wrench[list(self.rows)] = weights
+        return np.concatenate([self.axes.T @ wrench[:3], self.axes.T @ wrench[3:]])
 
     def jacobian(self, model: Numeric) -> Array:
         """Return the rows over the generalized velocity, shape (k, nv)."""
@@ -79,8 +79,8 @@ class Attained:
     """The fastest approach at a posture.
 
     Attributes:
-        speed: ``σ``, m/s; infinite where nothing bounds it.
-        velocities: Each free entry of the velocity at ``min(σ, FASTEST)``, in units of its scale, shape (k,).
+        speed: ``σ``, m/s; infinite where no limit bounds it.
+        velocities: Free entries of the velocity at ``min(σ, FASTEST)``, in units of their scales, shape (k,).
         gradient: Tangent gradient of the speed, shape (nv,).
     """
 
@@ -92,20 +92,20 @@ class Attained:
 class AttainableSpeed:
     """``σ(q) = max σ`` such that a generalized velocity ``|ν_i| ≤ ν̄_i`` brings the contact in at ``nᵀJν = −σ``.
 
-    The contact point moves along the normal alone, frames that are kept do not move, and the contact frame turns only
-    where its pose leaves it free, or where the joints are too few to hold it.  Several contacts all arrive at ``σ``,
-    and may slide.  The base of a robot that stands keeps still, and its feet with it; that of a robot without feet
-    moves at any speed.  A contact whose pose is free is one where something hits the robot, at any speed.
+    The contact point moves along the normal only, and kept frames do not move.  The contact frame turns only where
+    its pose is free, or where the joints are too few to hold it.  Several contacts all arrive at ``σ`` and may slide.
+    The base and feet of a standing robot do not move; the base of a robot without feet moves at any speed.  At a
+    contact with a free pose something hits the robot, at any speed.
 
     Args:
         robot: The robot, with the velocity limits of its URDF.
-        objective: Its contacts and supports.
-        requirements: What of the base, of the contact's pose and of other frames is held.
+        objective: The contacts and supports.
+        requirements: Held parts of the base, of contact poses and of other frames.
 
     Attributes:
-        unknown: Why there is no such speed; empty if there is one, which may still be infinite at some postures.
+        unknown: Why the speed is undefined; empty if it is defined, although infinite at some postures.
         scale: Unit of each free entry of the velocity, rad/s or m/s, shape (k,).
-        upper: Its limit in this unit, infinite where it has none, shape (k,).
+        upper: Limit of each free entry in its unit, or infinity, shape (k,).
     """
 
     def __init__(self, robot: Robot, objective: Objective, requirements: Requirements) -> None:
@@ -131,16 +131,16 @@ class AttainableSpeed:
             self.points = [replace(moved, rows=moved.rows[:3]) if moved.comes else moved for moved in self.points]
 
     def _chain(self, points: Sequence[PointOnLink]) -> NDArray[np.bool_]:
-        """Return which entries of the velocity move some of the points, shape (nv,)."""
-        found, model = np.zeros(self._model.nv, dtype=bool), self._model
+        """Return which entries of the velocity move any of the points, shape (nv,)."""
+        moves, model = np.zeros(self._model.nv, dtype=bool), self._model
         for point in points:
             for joint in model.supports[point.joint].tolist()[1:]:
-                found[model.idx_vs[joint] : model.idx_vs[joint] + model.nvs[joint]] = True
-        return found
+                moves[model.idx_vs[joint] : model.idx_vs[joint] + model.nvs[joint]] = True
+        return moves
 
     @property
     def independent(self) -> list[int]:
-        """Rows that are no sums of other rows at all postures: a planar robot does not leave its plane anyway."""
+        """Independent rows: for example, a planar robot cannot leave its plane, so its rows out of it are zero."""
         if not self.points:
             return []
         rng, model, blocks = np.random.default_rng(0), Numeric(self._model), []
@@ -151,22 +151,22 @@ class AttainableSpeed:
 
     @property
     def arrives(self) -> Array:
-        """Rows that are the approach, shape (m,)."""
+        """1 for rows of the approach and 0 for other rows, shape (m,)."""
         return np.concatenate([point.arrives for point in self.points])
 
     def jacobian(self, model: Numeric) -> Array:
-        """Return the rows over the free velocities in their scales, shape (m, k)."""
-        whole = np.vstack([point.jacobian(model) for point in self.points])
-        return np.asarray(whole[:, self.free] * self.scale)
+        """Return the rows over the free velocities in their units, shape (m, k)."""
+        rows = np.vstack([point.jacobian(model) for point in self.points])
+        return np.asarray(rows[:, self.free] * self.scale)
 
     def by_posture(self, model: Numeric, velocities: Array, weights: Array) -> Array:
-        """Return the tangent gradient of the rows summed with ``weights``, shape (m,), as shape (nv,)."""
+        """Return the tangent gradient, shape (nv,), of the rows summed with ``weights``, shape (m,)."""
         v = np.zeros(model.model.nv)
         v[self.free] = self.scale * velocities
         gradient = np.zeros(len(v))
         ends = np.cumsum([len(moved.rows) for moved in self.points])[:-1]
-        for moved, own in zip(self.points, np.split(weights, ends), strict=True):
-            gradient += model.coupling_gradient(moved.point, moved.wrench(own), v, in_frame=moved.in_frame)
+        for moved, weight in zip(self.points, np.split(weights, ends), strict=True):
+            gradient += model.coupling_gradient(moved.point, moved.wrench(weight), v, in_frame=moved.in_frame)
         return gradient
 
     def at(self, model: Numeric) -> Attained:
@@ -175,26 +175,26 @@ class AttainableSpeed:
         rows, cost = np.zeros(len(A)), np.zeros(A.shape[1])
         cost[-1] = -1.0
         high = np.append(self.upper, FASTEST)
-        found = solve_linear(cost, A, rows, rows, np.append(-self.upper, 0.0), high)
-        if found is None:
+        optimum = solve_linear(cost, A, rows, rows, np.append(-self.upper, 0.0), high)
+        if optimum is None:
             return Attained(0.0, np.zeros(len(self.free)), np.zeros(model.model.nv))
-        if -found.value > (1 - 1e-9) * FASTEST:
-            return Attained(float("inf"), found.x[:-1], np.zeros(model.model.nv))
-        gradient = -self.by_posture(model, found.x[:-1], found.multipliers)
-        return Attained(max(0.0, -found.value), found.x[:-1], gradient)
+        if -optimum.value > (1 - 1e-9) * FASTEST:
+            return Attained(float("inf"), optimum.x[:-1], np.zeros(model.model.nv))
+        gradient = -self.by_posture(model, optimum.x[:-1], optimum.multipliers)
+        return Attained(max(0.0, -optimum.value), optimum.x[:-1], gradient)
 
     def reached(self, q: Array) -> float | None:
-        """Return the speed at ``q``, shape (nq,), in m/s; ``None`` where it is not known or bounded."""
+        """Return the speed at ``q``, shape (nq,), in m/s; ``None`` where it is unknown or unbounded."""
         speed = float("inf") if self.unknown else self.at(Numeric(self._model).at(q)).speed
         return speed if np.isfinite(speed) else None
 
 
 def _moving_points(robot: Robot, objective: Objective, requirements: Requirements) -> list[MovingPoint]:
-    found: list[MovingPoint] = []
+    points: list[MovingPoint] = []
     poses = (requirements.contact_pose, *requirements.other_poses)
     alone = len(objective.contacts) == 1
     for contact, pose in zip(objective.contacts, poses, strict=False):
-        # What hits a robot that is free there comes at a speed of its own.
+        # At a contact with a free pose something else hits the robot, at its own speed.
         if pose == "free":
             continue
         turning = {"full": (3, 4, 5), "aligned": (4, 5)}.get(pose, ())
@@ -202,9 +202,9 @@ def _moving_points(robot: Robot, objective: Objective, requirements: Requirement
         axes = np.vstack([n, np.linalg.svd(n[None, :])[2][1:]])
         point = point_on(robot, contact.frame, contact.offset)
         rows = (0, 1, 2, *turning) if alone else (0,)
-        found.append(MovingPoint(contact.frame, point, axes, rows, True, contact.normal_frame == "contact"))
+        points.append(MovingPoint(contact.frame, point, axes, rows, True, contact.normal_frame == "contact"))
     struck = {contact.frame for contact in objective.contacts}
     for frame in dict.fromkeys(requirements.keep):
-        if found and frame not in struck:
-            found.append(MovingPoint(frame, point_on(robot, frame), np.eye(3), tuple(range(6))))
-    return found
+        if points and frame not in struck:
+            points.append(MovingPoint(frame, point_on(robot, frame), np.eye(3), tuple(range(6))))
+    return points

@@ -1,9 +1,10 @@
-"""Turn the requirements of a task into the constraints of a posture problem, before any solver sees it."""
+"""Turn the requirements of a task into the constraints of a posture problem."""
 
 from __future__ import annotations
 
 from collections.abc import Sequence
 from dataclasses import replace
+from itertools import product
 
 import numpy as np
 import pinocchio as pin
@@ -30,7 +31,7 @@ from impact_posture.posture.constraints.pose_constraints import (
 )
 from impact_posture.posture.constraints.requirements import Requirements
 from impact_posture.posture.constraints.surroundings import Surroundings
-from impact_posture.posture.formulation.impact_constraints import in_every_variant, kept_feet, limits
+from impact_posture.posture.formulation.impact_constraints import impact_constraints
 from impact_posture.posture.formulation.well_posed import fix_undetermined_motions, make_well_posed
 from impact_posture.posture.loads.load_cases import LoadCases, load_cases
 from impact_posture.posture.program.constrained_problem import ConstrainedProblem
@@ -41,20 +42,17 @@ from impact_posture.system.arrays import Array
 
 
 def build_problem(robot: Robot, objective: Objective, given: Array, requirements: Requirements) -> ConstrainedProblem:
-    """Turn requirements into constraints; nothing is solved yet.
+    """Turn requirements into constraints without solving anything.
 
     Raises:
         InputError: The requirements contradict each other or the robot.
     """
     _check(robot, requirements)
     numeric = Numeric(robot.model).at(given)
-    chart = Chart(robot.model)
-    constraints: list[Constraint] = []
-    for support in objective.supports:
-        constraints.append(_held_support(robot, numeric, support))
+    constraints: list[Constraint] = [_held_support(robot, numeric, support) for support in objective.supports]
     held = {s.frame for s in objective.supports}
     poses = (requirements.contact_pose, *requirements.other_poses)
-    # Two impacts at one frame along two normals hold the frame once.
+    # A frame that is struck along several normals is held once.
     struck: dict[str, tuple[ImpactContact, str]] = {}
     # An objective without contacts leaves the contact pose unused.
     for contact, mode in zip(objective.contacts, poses, strict=bool(objective.contacts)):
@@ -75,30 +73,27 @@ def build_problem(robot: Robot, objective: Objective, given: Array, requirements
                 raise
             decided.append("center of mass left free: the feet span no area to keep it above")
     if isinstance(objective, WorstCaseObjective):
-        bounds = requirements.least_mobility, requirements.largest_jump
-        if requirements.keep_contacts:
-            constraints += kept_feet(objective, numeric, requirements.friction)
-        constraints += limits(objective, bounds)
-        constraints += in_every_variant(objective, numeric, requirements.friction, bounds, constraints)
+        constraints += impact_constraints(objective, numeric, requirements, constraints)
     if requirements.approach_speed > 0:
         attainable = AttainableSpeed(robot, objective, requirements)
         if attainable.unknown:
             decided.append(f"the speed of the approach is not demanded: {attainable.unknown}")
         else:
             constraints.append(ApproachSpeed(attainable, requirements.approach_speed))
-    lower, upper = _bounds(robot, chart, given, requirements)
-    held_up = load_cases(objective, given, requirements) if requirements.holdable else LoadCases()
-    decided += held_up.notes
-    loads = [constraint for case in held_up.cases for constraint in case.constraints()]
-    more, notes = fix_undetermined_motions(robot, objective, numeric, requirements, constraints)
-    clear, around = [], None
+    lower, upper = _bounds(Chart(robot.model), given, requirements)
+    loads = load_cases(objective, given, requirements) if requirements.holdable else LoadCases()
+    fixed, notes = fix_undetermined_motions(robot, objective, numeric, requirements, constraints)
+    notes = [*decided, *loads.notes, *notes]
+    constraints += fixed
+    around = None
     if requirements.collision:
         around = _surroundings(objective, numeric, requirements, list(struck.values()))
-        clear, notes = [*around.nested, *around.constraints], [*notes, *around.notes]
+        constraints += [*around.nested, *around.constraints]
+        notes += around.notes
+    constraints += [constraint for case in loads.cases for constraint in case.constraints()]
     problem = ConstrainedProblem(
-        robot, objective, requirements, given, (*constraints, *more, *clear, *loads), lower, upper,
-        notes=(*decided, *notes), surroundings=around,
-    )  # fmt: skip
+        robot, objective, requirements, given, tuple(constraints), lower, upper, (), tuple(notes), around
+    )
     return make_well_posed(problem)
 
 
@@ -108,26 +103,26 @@ def retarget(
     quaternion: tuple[float, float, float, float] | None,
     numeric: Numeric | None = None,
 ) -> ConstrainedProblem:
-    """Return the problem with another target of its only contact; all else stays, so its program fits as it is.
+    """Return the problem with another target of its only contact, which can use the same program.
 
     Args:
         problem: A problem with one contact.
         position: Position of the contact frame, world, meters; ``None`` for its initial position.
-        quaternion: Its orientation, x y z w; ``None`` for its initial orientation.
+        quaternion: Orientation of the contact frame, x y z w; ``None`` for its initial orientation.
         numeric: The model, if the caller has it; it is moved to the given posture.
 
     Raises:
-        InputError: The contact pose takes no target, or the quaternion has no unit length.
+        InputError: The contact pose takes no target, or the quaternion does not have unit length.
     """
     requirements = replace(problem.requirements, target_position=position, target_quaternion=quaternion)
     _check_target(requirements)
     (contact,) = problem.objective.contacts
     numeric = (numeric or Numeric(problem.robot.model)).at(problem.given)
-    made = _contact_constraints(problem.robot, contact, numeric, requirements, requirements.contact_pose)
-    # The constraints of the contact follow those of the feet.
-    first = len(problem.objective.supports)
-    kept = problem.constraints[:first], problem.constraints[first + len(made) :]
-    return replace(problem, requirements=requirements, constraints=(*kept[0], *made, *kept[1]))
+    contact_pose = _contact_constraints(problem.robot, contact, numeric, requirements, requirements.contact_pose)
+    constraints, first = list(problem.constraints), len(problem.objective.supports)
+    # The first constraints are of the feet, and the next of the contact.
+    constraints[first : first + len(contact_pose)] = contact_pose
+    return replace(problem, requirements=requirements, constraints=tuple(constraints))
 
 
 def _surroundings(
@@ -136,17 +131,16 @@ def _surroundings(
     requirements: Requirements,
     struck: Sequence[tuple[ImpactContact, str]],
 ) -> Surroundings:
-    """What the links stay clear of; a push (a free contact pose) has no surface."""
-    found = Surroundings(objective.robot, numeric, requirements.hold, requirements.clearance)
-    touching = [(contact, mode) for contact, mode in struck if mode != "free"]
-    found.add_ground(objective.supports, [contact for contact, _ in touching])
-    for contact, _ in touching:
-        if requirements.surface != "none":
-            width = float("inf") if requirements.surface == "plane" else requirements.surface
-            feet = [point_on(objective.robot, foot.frame, foot.offset) for foot in objective.supports]
-            found.add_surface(contact, width if width is None else float(width), feet, objective.contacts)
-    found.add_obstacles(requirements.obstacles)
-    return found
+    """Return the bodies to stay clear of; a contact with a free pose is a push and has no surface."""
+    around = Surroundings(objective.robot, numeric, requirements.hold, requirements.clearance)
+    touching = [contact for contact, mode in struck if mode != "free"]
+    around.add_ground(objective.supports, touching)
+    feet = [point_on(objective.robot, foot.frame, foot.offset) for foot in objective.supports]
+    for contact in touching if requirements.surface != "none" else ():
+        width = float("inf") if requirements.surface == "plane" else requirements.surface
+        around.add_surface(contact, width if width is None else float(width), feet, objective.contacts)
+    around.add_obstacles(requirements.obstacles)
+    return around
 
 
 def _check(robot: Robot, requirements: Requirements) -> None:
@@ -184,7 +178,7 @@ def _held_support(robot: Robot, numeric: Numeric, support: Support) -> Constrain
 
 
 def contact_target(robot: Robot, contact: ImpactContact, numeric: Numeric, requirements: Requirements) -> pin.SE3:
-    """Return the target pose of a contact frame, by default its pose at ``numeric.q``."""
+    """Return the target pose of a contact frame; parts without a target keep their value at ``numeric.q``."""
     placement = numeric.placement(point_on(robot, contact.frame)).copy()
     if requirements.target_position is not None:
         placement.translation = np.array(requirements.target_position)
@@ -245,10 +239,8 @@ def _com_constraint(
     corners = []
     for support in supports:
         placement = numeric.placement(point_on(robot, support.frame, support.offset))
-        for sx in (-1, 1):
-            for sy in (-1, 1):
-                corner = placement.act(np.array([sx * support.size[0], sy * support.size[1], 0.0]))
-                corners.append(corner[:2])
+        for x, y in product((-support.size[0], support.size[0]), (-support.size[1], support.size[1])):
+            corners.append(placement.act(np.array([x, y, 0.0]))[:2])
     edges = polygon_edges(corners)
     if edges is None:
         raise InputError(
@@ -259,7 +251,8 @@ def _com_constraint(
     return CenterOfMassOverFeet(*edges, margin)
 
 
-def _bounds(robot: Robot, chart: Chart, given: Array, requirements: Requirements) -> tuple[Array, Array]:
+def _bounds(chart: Chart, given: Array, requirements: Requirements) -> tuple[Array, Array]:
+    """Return the joint limits less the margin, chart coordinates, shape (nx,); held joints get equal limits."""
     lower, upper = chart.bounds()
     x = chart.to_x(given)
     margin = requirements.limit_margin

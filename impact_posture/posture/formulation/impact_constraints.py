@@ -1,4 +1,4 @@
-"""Constraints that bound an impact, or what it does to the feet, in every model variant."""
+"""The constraints on an impact and on the feet under it, for every contact and model variant."""
 
 from __future__ import annotations
 
@@ -11,46 +11,39 @@ from impact_posture.posture.constraints.center_of_mass_over_feet import CenterOf
 from impact_posture.posture.constraints.constraint import Constraint
 from impact_posture.posture.constraints.impact_bounds import ImpactBounds
 from impact_posture.posture.constraints.kept_contacts import KeptContacts
+from impact_posture.posture.constraints.requirements import Requirements
 
 
-def limits(objective: WorstCaseObjective, bounds: tuple[float, float], variant: str = "") -> list[Constraint]:
-    """Return the bounds on an impact, by contact; none where nothing is bounded or all joints are locked."""
-    made = [ImpactBounds(single, *bounds, variant) for single in objective.singles]
-    return [constraint for constraint in made if constraint.rows]
+def impact_constraints(
+    objective: WorstCaseObjective, numeric: Numeric, requirements: Requirements, constraints: Sequence[Constraint]
+) -> list[Constraint]:
+    """Return the bounds on the impact and the constraints of the feet, which depend on the model.
 
+    Cones are convex, so feet that stay under the impact at each contact stay under all impacts at once.  A payload
+    moves the center of mass, so its constraint (among ``constraints``) gets a copy for each model with a payload.
 
-def kept_feet(objective: WorstCaseObjective, numeric: Numeric, friction: float) -> list[Constraint]:
-    """Return what keeps the feet, by contact.  Cones are convex, so feet that stay under each impact do under all."""
-    if objective.bilateral:
+    Raises:
+        InputError: Feet should stay under contacts that also pull.
+    """
+    if requirements.keep_contacts and objective.bilateral:
         raise InputError(
             "contacts that pull as well as push would have to leave the feet without any impulse",
             where="keep_contacts",
             hint="leave out `bilateral` or `keep_contacts`",
         )
-    return [KeptContacts(single, numeric, friction) for single in objective.singles]
-
-
-def in_every_variant(
-    objective: WorstCaseObjective,
-    numeric: Numeric,
-    friction: float,
-    bounds: tuple[float, float],
-    constraints: Sequence[Constraint],
-) -> list[Constraint]:
-    """Return the constraints of the other model variants that those of the robot as modeled do not imply.
-
-    A pose does not depend on the weight of the robot, but its center of mass and the support impulses do.  Without
-    these constraints a posture could tip over with the very payload that it was found for.
-    """
-    found: list[Constraint] = []
-    kept = any(isinstance(constraint, KeptContacts) for constraint in constraints)
+    added: list[Constraint] = []
     centers = [constraint for constraint in constraints if isinstance(constraint, CenterOfMassOverFeet)]
-    for variant, member in zip(objective.model_variants[1:], objective.by_variant[1:], strict=True):
+    for k, member in enumerate((objective, *objective.by_variant[1:])):
+        variant = objective.model_variants[k] if k else None
+        name = variant.name if variant else ""
         # The armature does not move the center of mass.
-        if variant.payload is not None and variant.armature_factor == 1:
-            loaded = variant.robot.model, variant.name
-            found += [CenterOfMassOverFeet(c.normals, c.offsets, c.margin, loaded) for c in centers]
-        if kept:
-            found += [KeptContacts(single, numeric, friction, variant.name) for single in member.singles]
-        found += limits(member, bounds, variant.name)
-    return found
+        if variant and variant.payload is not None and variant.armature_factor == 1:
+            loaded = variant.robot.model, name
+            added += [CenterOfMassOverFeet(c.normals, c.offsets, c.margin, loaded) for c in centers]
+        if requirements.keep_contacts:
+            added += [KeptContacts(single, numeric, requirements.friction, name) for single in member.singles]
+        limits = requirements.least_mobility, requirements.largest_jump
+        bounds = [ImpactBounds(single, *limits, name) for single in member.singles]
+        # Without limits, or if all joints are locked, there is nothing to bound.
+        added += [bound for bound in bounds if bound.rows]
+    return added

@@ -1,4 +1,4 @@
-"""``problem.toml``: an optimization as a file.  Each key is the option of the same name with ``_`` for ``-``."""
+"""Read, prepare and write ``problem.toml``, whose keys are the command-line options with ``_`` for ``-``."""
 
 from __future__ import annotations
 
@@ -26,7 +26,16 @@ from impact_posture.robot.urdf import EXAMPLE_PREFIX
 from impact_posture.system.escape import toml
 
 _FILES = ("srdf", "config")
-# Settings with the name of a requirement that is worked out from them and from the robot.
+# Keys of the file that an option replaces in addition to its own key.
+_REPLACED_BY = {
+    "frame": ("contact",),
+    "normal": ("contact",),
+    "contact": ("frame", "normal"),
+    "contact_duration": ("contact_stiffness",),
+    "contact_stiffness": ("contact_duration",),
+    "posture": ("q",),
+}
+# Requirements that depend on the robot as well as on the setting of the same name.
 _WORKED_OUT = {"contact_pose", "base", "hold", "com_margin", "limit_margin"}
 
 
@@ -35,7 +44,7 @@ class Prepared:
     """A problem ready to be solved.
 
     Attributes:
-        settings: Settings of file and command line together.
+        settings: Merged settings of file and command line.
         impact: Robot, contact, metric, supports and given posture.
         problem: The posture problem.
     """
@@ -46,35 +55,26 @@ class Prepared:
 
 
 def read_settings(path: Path, over: dict[str, object] | None = None) -> ProblemSettings:
-    """Read a ``problem.toml``, whose paths are relative to its folder; options in ``over`` replace its keys."""
+    """Read a ``problem.toml`` with paths relative to its folder; options in ``over`` replace its keys."""
     data = from_folder(read_toml(path), path.resolve().parent, (*_FILES, "weights", "armature", "posture"))
     over = over or {}
     # An option also replaces keys that state the same thing in another form.
+    replaced = [key for option in over for key in _REPLACED_BY.get(option, ())]
     if over.get("metric", "weighted") != "weighted" and "weights" not in over:
-        data.pop("weights", None)
-    if "frame" in over or "normal" in over:
-        data.pop("contact", None)
-    if "contact" in over:
-        data.pop("frame", None)
-        data.pop("normal", None)
-    if "contact_duration" in over:
-        data.pop("contact_stiffness", None)
-    if "contact_stiffness" in over:
-        data.pop("contact_duration", None)
-    if "posture" in over:
-        data.pop("q", None)
+        replaced.append("weights")
+    data = {key: value for key, value in data.items() if key not in replaced}
     return validate(ProblemSettings, data | over, str(path))
 
 
 def prepare(settings: ProblemSettings, impact: ResolvedImpact | None = None) -> Prepared:
-    """Resolve all defaults and build the problem; nothing is solved yet.
+    """Resolve all defaults and build the problem without solving it.
 
     Args:
-        settings: The problem.
-        impact: The impact, if it is built already; by default that of the settings.
+        settings: The settings of the problem.
+        impact: The impact, if it is resolved already.
 
     Raises:
-        ImpactPostureError: A setting is wrong; the first fault, in one line.
+        ImpactPostureError: A setting is wrong; the error names the first fault in one line.
     """
     impact = resolve(settings) if impact is None else impact
     if impact.robot.joint_model == "elastic":
@@ -103,9 +103,7 @@ def _held_by_default(robot: Robot) -> tuple[str, ...]:
 
 
 def requirements(settings: ProblemSettings, objective: Objective) -> Requirements:
-    """Return the demands of the task on the posture; a setting that is ``None`` comes from the robot.
-
-    A setting with the name of a requirement becomes that requirement, unless it is worked out here.
+    """Return the requirements of the settings; settings that are ``None`` get the values of the robot.
 
     Raises:
         InputError: A setting is about feet, but there are no supports.
@@ -143,7 +141,7 @@ def requirements(settings: ProblemSettings, objective: Objective) -> Requirement
 
 
 def _least_mobility(settings: ProblemSettings) -> float:
-    """Return the least G, 1/kg, with which the peak force stays within ``max_force``; 0 for no bound."""
+    """Return the least G, 1/kg, with which the peak force stays within ``max_force``; 0 without a bound."""
     for name, asked in (
         ("max_force", settings.max_force is not None),
         ("tradeoff_against", settings.tradeoff > 0 and settings.tradeoff_against == "force"),
@@ -178,7 +176,7 @@ def _largest_jump(settings: ProblemSettings) -> float:
 
 
 def resolved_settings(prepared: Prepared) -> ProblemSettings:
-    """Return the settings with all defaults written out, which give the same result again."""
+    """Return the settings with all defaults written out, which reproduce the result."""
     settings, impact, wanted = prepared.settings, prepared.impact, prepared.problem.requirements
     robot = settings.robot
     if names_a_path(robot, Path()):
@@ -226,8 +224,8 @@ def _resolved_contacts(impact: ResolvedImpact) -> dict[str, object]:
 
 
 def _resolved_variants(variants: Sequence[ModelVariant]) -> dict[str, object]:
-    """The settings that give these model variants."""
-    # The model as stated is always among them.
+    """Return the settings that give these model variants."""
+    # The robot as modeled is always a variant.
     factors = {variant.armature_factor for variant in variants} - {1.0}
     if len(factors) == 1:
         factors.add(1.0)
@@ -246,13 +244,13 @@ def _armature_by_joint(impact: ResolvedImpact) -> str | dict[str, float]:
 
 
 def dump_settings(settings: ProblemSettings) -> str:
-    """Write settings as TOML, in the order of the fields and without those that are ``None``.
+    """Write settings as TOML in the order of the fields, without values that are ``None``.
 
     Raises:
         SpecError: The path of a file is not UTF-8.
     """
     lines = [f"schema = {toml(settings.schema)}"]
-    # The robot comes first, because a reader looks for it.
+    # Readers look for the robot first.
     for key in sorted((field.name for field in fields(ProblemSettings)), key=lambda name: name != "robot"):
         value = getattr(settings, key)
         if key != "schema" and value is not None and value != {}:

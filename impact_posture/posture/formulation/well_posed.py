@@ -1,4 +1,4 @@
-"""Make a problem well-posed: fix undetermined motions, leave out repeated equalities, hold apparent freedoms."""
+"""Make a problem well-posed: fix undetermined motions, omit repeated equalities, hold turns of first order only."""
 
 from __future__ import annotations
 
@@ -24,9 +24,9 @@ from impact_posture.posture.program.constrained_problem import (
 from impact_posture.robot.robot import Robot
 from impact_posture.system.arrays import Array, independent_rows, null_space
 
-# Size of the trial turn (rad), and the share of it that must survive for the turn to be possible.
+# Size of a trial turn (rad), and the share of it that must remain if the turn is possible.
 _TRIAL, _SURVIVES = 0.05, 0.1
-# Random feasible postures at which ranks are compared.
+# Number of random feasible postures at which ranks are compared.
 _SAMPLES = 4
 
 
@@ -37,11 +37,11 @@ def fix_undetermined_motions(
     requirements: Requirements,
     constraints: Sequence[Constraint],
 ) -> tuple[list[Constraint], list[str]]:
-    """Return constraints that fix the base where nothing else does, and notes for the user.
+    """Return constraints that fix the base where nothing else determines it, and notes for the user.
 
-    The value does not change if the whole robot moves, or turns about an axis that the objective does not see.  Such
-    motions are fixed at their initial value if the constraints allow them.  A free contact pose also fixes yaw,
-    because a turn of the whole robot towards the impact is no change of posture.
+    Some motions of the whole robot do not change the objective, such as translations.  If the constraints allow such
+    a motion, it is fixed at its initial value.  With a free contact pose and without feet, yaw is fixed as well,
+    because a turn of the whole robot relative to the impact does not change the posture.
     """
     if not robot.floating:
         return [], []
@@ -58,7 +58,7 @@ def fix_undetermined_motions(
     notes: list[str] = []
 
     def free() -> Array:
-        """Base twists that are still allowed, world axes, shape (6, k)."""
+        """Return base twists that are still allowed, world axes, shape (6, k)."""
         rows = [c.evaluate(numeric)[1] @ motions for c in (*constraints, *added)]
         if not rows:
             return np.asarray(numeric.jacobian(base) @ motions)
@@ -85,8 +85,8 @@ def make_well_posed(problem: ConstrainedProblem) -> ConstrainedProblem:
     """Choose independent equality rows for the program, and hold turns that exist to first order only.
 
     Four point feet on planar legs (solo8) give 12 equations of rank 10.  Two equations repeat others, and the base
-    may roll to first order although any finite roll would spread the feet.  A program can handle neither.  It leaves
-    out the repeated rows, which the certificate still checks, and holds the turn explicitly.
+    may roll to first order although any finite roll would spread the feet.  The solver can handle neither.  So the
+    program omits the repeated rows, which the certificate still checks, and a constraint holds the turn.
     """
     numeric = Numeric(problem.robot.model)
     jacobian = equality_jacobian(problem, numeric.at(problem.given))
@@ -104,7 +104,7 @@ def make_well_posed(problem: ConstrainedProblem) -> ConstrainedProblem:
                 added.append(turn)
                 notes.append(f"{turn.name} held: the feet block it, although their linearization allows it")
     problem = replace(problem, constraints=(*problem.constraints, *added), notes=(*problem.notes, *notes))
-    # A posture may be singular by chance (a straight arm), so the most regular posture decides what repeats.
+    # A posture may be singular by chance (a straight arm), so the posture with the highest rank decides.
     generic = max(postures, key=lambda q: rank(equality_jacobian(problem, numeric.at(q))))
     jacobian = equality_jacobian(problem, numeric.at(generic))
     if rank(jacobian) == len(jacobian):
@@ -113,7 +113,7 @@ def make_well_posed(problem: ConstrainedProblem) -> ConstrainedProblem:
 
 
 def _only_to_first_order(problem: ConstrainedProblem, numeric: Numeric, turn: HeldTurn, q: Array) -> bool:
-    """Whether the linearized equalities at ``q`` allow a turn that the equalities themselves undo."""
+    """Return whether the linearized equalities at ``q`` allow a turn that the nonlinear equalities undo."""
     model = problem.robot.model
     jacobian = equality_jacobian(problem, numeric.at(q))
     free = null_space(jacobian, RANK_TOLERANCE)
@@ -137,11 +137,11 @@ def _only_to_first_order(problem: ConstrainedProblem, numeric: Numeric, turn: He
 
 
 def _independent_rows(problem: ConstrainedProblem, numeric: Numeric) -> tuple[tuple[int, ...], ...]:
-    """The rows of each constraint that the program carries: all inequalities, and independent equalities."""
+    """Return the rows of each constraint for the program: all inequalities, and independent equalities."""
     held = held_rows(problem.robot, problem.requirements.hold).sum(axis=0) > 0
     equalities = [(index, c) for index, c in enumerate(problem.constraints) if c.equality]
     labels = [(index, row) for index, c in equalities for row in range(c.rows)]
-    # Of rows that repeat each other, those of the cheaper constraint are left out.
+    # Among rows that repeat each other, rows of cheap constraints are omitted.
     stacked = np.vstack([c.price * c.evaluate(numeric)[1] for _, c in equalities])
     stacked[:, held] = 0.0
     chosen = {labels[k] for k in independent_rows(stacked, RANK_TOLERANCE)}

@@ -1,4 +1,4 @@
-"""Distribution of the forces that hold a robot at rest, with the least share of its limits."""
+"""Forces that hold a robot at rest with the least largest share of the limits of its actuators."""
 
 from __future__ import annotations
 
@@ -12,9 +12,9 @@ from impact_posture.posture.loads.static_load import ForceSource, StaticLoad
 from impact_posture.posture.program.linear_program import solve_linear
 from impact_posture.system.arrays import Array
 
-# Shares closer to the largest than this are as large.
+# Shares closer to the largest share than this are equal to it.
 _TIED = 1e-9
-# Times that forces near even ones leave out feet that would have to pull.
+# Most times that forces near even ones leave out feet that would have to pull.
 _TURNS = 4
 # Rate above which a load meets no limit.
 _MOST = 1e6
@@ -27,10 +27,10 @@ class Distribution:
     Attributes:
         forces: ``z`` of rotors and feet, shape (k,).
         shares: Signed share of its limit that each actuator uses, 0 in the middle of its range, shape (actuators,).
-        unbalanced: Sum of the absolute entries of the wrench on the base that nothing bears, in weights (moments
-            over one meter); zero if the posture can be balanced.
-        jacobian: Tangent Jacobian of ``unbalanced`` and the absolute shares, shape (1 + actuators, nv).  Where the
-            forces are not unique, it is that of the largest share or of ``unbalanced``, and other rows are zero.
+        unbalanced: Sum of the absolute entries of the unbalanced wrench on the base, in weights (moments over 1 m);
+            zero if the posture can be balanced.
+        jacobian: Tangent Jacobian of ``unbalanced`` and the absolute shares, shape (1 + actuators, nv).  If there are
+            forces to choose, only the rows of the largest share or of ``unbalanced`` are computed.
     """
 
     forces: Array
@@ -46,7 +46,7 @@ class Distribution:
 
 @dataclass(frozen=True, eq=False)
 class Thrusts:
-    """Thrusts that the wrench on the base determines alone, ``u = P τ_base``.
+    """Thrusts that the wrench on the base determines, ``u = P τ_base``.
 
     Attributes:
         names: Name of each rotor.
@@ -68,11 +68,11 @@ class Equilibrium:
 
     Args:
         model: The robot, with gravity.
-        sources: Wrenches of rotors and feet in weights, and of what pushes on it, N.
+        sources: Wrenches of rotors and feet in weights, and of pushes on the robot, N.
         weight: The weight of the robot, N.
         limits: Largest torques, infinite where unknown, shape (nv,).
-        balance: Combinations of the base wrench that the sources balance, shape (b, 6); none on a fixed base.
-        thrusts: Thrusts that are not among the sources.
+        balance: Combinations of the base wrench that the sources balance, shape (b, 6); none for a fixed base.
+        thrusts: Thrusts of rotors that are not among the sources.
         names: Names of the entries of ``ν``.
     """
 
@@ -88,7 +88,7 @@ class Equilibrium:
     ) -> None:
         self.load, self.weight, self.balanced = StaticLoad(model, sources), weight, len(balance)
         bounded = [k for k, limit in enumerate(limits) if np.isfinite(limit)]
-        # An entry of z with two limits is a thrust; feet can push as hard as it takes.
+        # Entries of z with two limits are thrusts, because the forces of feet have no upper limit.
         self._free = np.flatnonzero(np.isfinite(self.load.upper))
         half, middle = (thrusts.upper - thrusts.lower) / 2, (thrusts.upper + thrusts.lower) / 2
         base = np.vstack([balance / weight, thrusts.matrix / half[:, None]])
@@ -105,27 +105,24 @@ class Equilibrium:
             (weight * self.load.lower[self._free], weight * self.load.upper[self._free]),
         ]
         self.lower, self.upper = (np.concatenate(parts) for parts in zip(*ends, strict=True))
-        # What was found last, because one posture is looked at several times.
+        # The last results, because a search evaluates a posture several times.
         self._even: tuple[bytes, float] | None = None
-        self._found: tuple[bytes, Distribution] | None = None
+        self._latest: tuple[bytes, Distribution] | None = None
 
     def _affine(self, load: Array, by_force: Array) -> tuple[Array, Array, Array, Array]:
-        """``A, b, S, c`` of the balance ``A z + b`` and the shares ``S z + c``, from the load at ``z = 0``."""
-        every, start = self.rows @ by_force, self.rows @ load + self.offset
-        half = (self.load.upper - self.load.lower)[self._free, None] / 2
+        """Return ``A, b, S, c`` of the balance ``A z + b`` and the shares ``S z + c`` from the load at ``z = 0``."""
+        slopes, values = self.rows @ by_force, self.rows @ load + self.offset
+        half = (self.load.upper - self.load.lower)[self._free] / 2
         middle = (self.load.upper + self.load.lower)[self._free] / 2
-        S = np.vstack([every[self.balanced :], np.eye(self.load.count)[self._free] / half])
-        return (
-            every[: self.balanced],
-            start[: self.balanced],
-            S,
-            np.append(start[self.balanced :], -middle / half[:, 0]),
-        )
+        A, torques = np.split(slopes, [self.balanced])
+        b, c = np.split(values, [self.balanced])
+        thrusts = np.eye(self.load.count)[self._free] / half[:, None]
+        return A, b, np.vstack([torques, thrusts]), np.append(c, -middle / half)
 
     def spares(self, q: Array, room: float) -> bool:
-        """Return whether forces near even ones balance the base and keep ``room`` from every limit.
+        """Return whether nearly even forces balance the base and keep every share ``room`` below its limit.
 
-        This proves without a linear program that the posture can be held.  It says nothing if they do not.
+        If they do, the posture can be held, and no linear program is needed.  If not, other forces may hold it.
         """
         key = q.tobytes()
         if self._even is None or self._even[0] != key:
@@ -133,7 +130,7 @@ class Equilibrium:
         return self._even[1] <= 1 - room
 
     def _even_share(self, q: Array) -> float:
-        """Return the largest share of a limit at forces near even ones; infinite if they do not balance the base."""
+        """Return the largest share of a limit at nearly even forces; infinite if they do not balance the base."""
         still = self.load.torque(q, np.zeros(self.load.count), by_posture=False)
         A, b, S, c = self._affine(still.value, still.by_force)
         lower, upper = self.load.lower, self.load.upper
@@ -147,17 +144,17 @@ class Equilibrium:
             pulling = pushing & (z < 0)
             if not pulling.any():
                 break
-            # What would have to pull does nothing, and the rest carries the load.
+            # Feet that would have to pull do nothing, and the others carry the load.
             used &= ~pulling
         balanced = np.abs(A @ z + b).max(initial=0.0) < _TIED and (z[pushing] >= 0).all()
         return float(np.abs(S @ z + c).max(initial=0.0)) if balanced else np.inf
 
     def distribute(self, q: Array) -> Distribution:
-        """Return the forces that balance the base with the least largest share, or with the least imbalance."""
+        """Return the forces with the least largest share if the base can be balanced, or else the least imbalance."""
         key = q.tobytes()
-        if self._found is None or self._found[0] != key:
-            self._found = key, self._distribute(q)
-        return self._found[1]
+        if self._latest is None or self._latest[0] != key:
+            self._latest = key, self._distribute(q)
+        return self._latest[1]
 
     def _distribute(self, q: Array) -> Distribution:
         count = self.load.count
@@ -169,53 +166,53 @@ class Equilibrium:
             return Distribution(np.zeros(0), c, 0.0, jacobian)
         z, unbalanced, duals = self._least_share(A, b, S, c) or self._least_imbalance(A, b)
         shares = S @ z + c
-        # The value moves with R τ at fixed z, by the multipliers of its rows.
+        # The derivative of the optimum is the derivative of R τ at fixed z, weighted by the multipliers of its rows.
         gradient = duals @ self.rows @ self.load.torque(q, z).by_posture
         worst = np.abs(shares) > np.abs(shares).max(initial=0.0) - _TIED
         jacobian[np.append(unbalanced > 0, worst & (unbalanced == 0))] = gradient
         return Distribution(z, shares, unbalanced, jacobian)
 
     def shares(self, q: Array, load: Array) -> Array | None:
-        """Return the signed shares for another load than that of rest, such as ``M ν̇ + h``, shape (actuators,).
+        """Return the signed shares, shape (actuators,), for a load other than gravity, such as ``M ν̇ + h``.
 
-        The largest is as small as possible.  ``None`` if the feet cannot balance the load.
+        The largest share is as small as possible.  ``None`` if the feet cannot balance the load.
         """
         A, b, S, c = self._affine(load, self._by_force(q))
         if not self.load.count:
             return c
-        found = self._least_share(A, b, S, c)
-        return None if found is None else S @ found[0] + c
+        optimum = self._least_share(A, b, S, c)
+        return None if optimum is None else S @ optimum[0] + c
 
     def largest_rate(self, q: Array, rest: Array, dynamic: Array) -> float | None:
-        """Return the largest ``λ ≥ 0`` for which the limits allow the load ``rest + λ dynamic``; infinite if all do.
+        """Return the largest ``λ ≥ 0`` for which the limits allow the load ``rest + λ dynamic``.
 
-        ``None`` if they do not even allow ``rest``.
+        The result is infinite if the limits allow every λ, and ``None`` if they do not even allow ``rest``.
         """
         A, b, S, c = self._affine(rest, self._by_force(q))
         rate = self.rows @ dynamic
-        into = np.append(rate[self.balanced :], np.zeros(len(self._free)))
-        found = solve_linear(
+        of_shares = np.append(rate[self.balanced :], np.zeros(len(self._free)))
+        optimum = solve_linear(
             np.append(np.zeros(self.load.count), -1.0),
-            np.vstack([np.column_stack([A, rate[: self.balanced]]), np.column_stack([S, into])]),
+            np.vstack([np.column_stack([A, rate[: self.balanced]]), np.column_stack([S, of_shares])]),
             np.concatenate([-b, -1 - c]),
             np.concatenate([-b, 1 - c]),
             np.append(self.load.lower, 0.0),
             np.append(self.load.upper, _MOST),
         )
-        if found is None:
+        if optimum is None:
             return None
-        return float("inf") if found.x[-1] > _MOST * (1 - 1e-9) else float(found.x[-1])
+        return float("inf") if optimum.x[-1] > _MOST * (1 - 1e-9) else float(optimum.x[-1])
 
     def _by_force(self, q: Array) -> Array:
         return self.load.torque(q, np.zeros(self.load.count)).by_force
 
     def _least_share(self, A: Array, b: Array, S: Array, c: Array) -> tuple[Array, float, Array] | None:
-        """``min s`` with ``A z + b = 0`` and ``|S z + c| ≤ s``; ``None`` if the feet cannot balance the robot."""
+        """Return z, 0, multipliers of ``min s`` with ``A z + b = 0``, ``|S z + c| ≤ s``; ``None`` if infeasible."""
         count, one, infinite = self.load.count, np.ones((len(S), 1)), np.full(2 * len(S), np.inf)
         low, high = np.append(self.load.lower, 0.0), np.append(self.load.upper, np.inf)
         # A thrust beyond its limits shows as a share above one.
         low[self._free], high[self._free] = -np.inf, np.inf
-        found = solve_linear(
+        optimum = solve_linear(
             np.append(np.zeros(count), 1.0),
             np.vstack([np.block([[S, -one], [-S, -one]]), np.column_stack([A, np.zeros(len(A))])]),
             np.concatenate([-infinite, -b]),
@@ -223,24 +220,23 @@ class Equilibrium:
             low,
             high,
         )
-        if found is None:
+        if optimum is None:
             return None
-        above, below, balance = np.split(found.multipliers, [len(S), 2 * len(S)])
+        above, below, balance = np.split(optimum.multipliers, [len(S), 2 * len(S)])
         duals = np.concatenate([balance, above - below])
-        return found.x[:count], 0.0, duals[: len(self.rows)]
+        return optimum.x[:count], 0.0, duals[: len(self.rows)]
 
     def _least_imbalance(self, A: Array, b: Array) -> tuple[Array, float, Array]:
-        """``min Σ|A z + b|`` within the limits of thrusts and feet."""
-        one, apart = np.eye(len(A)), np.zeros(2 * len(A))
-        found = solve_linear(
-            np.concatenate([np.zeros(self.load.count), apart + 1]),
-            np.hstack([A, -one, one]),
+        """Return z, the value and multipliers of ``min Σ|A z + b|`` within the limits of thrusts and feet."""
+        unit, slacks = np.eye(len(A)), np.zeros(2 * len(A))
+        optimum = solve_linear(
+            np.concatenate([np.zeros(self.load.count), slacks + 1]),
+            np.hstack([A, -unit, unit]),
             -b,
             -b,
-            np.append(self.load.lower, apart),
-            np.append(self.load.upper, apart + np.inf),
+            np.append(self.load.lower, slacks),
+            np.append(self.load.upper, slacks + np.inf),
         )
-        assert found is not None  # noqa: S101 (narrows a type: any imbalance is allowed)
-        duals = np.zeros(len(self.rows))
-        duals[: len(A)] = found.multipliers
-        return found.x[: self.load.count], found.value, duals
+        assert optimum is not None  # noqa: S101 (narrows a type: any imbalance is allowed)
+        duals = np.append(optimum.multipliers, np.zeros(len(self.rows) - len(A)))
+        return optimum.x[: self.load.count], optimum.value, duals

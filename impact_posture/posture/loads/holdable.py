@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import hashlib
 from typing import Self
 
 import casadi as ca
@@ -11,77 +10,78 @@ import numpy as np
 from impact_posture.dynamics.numeric import Numeric
 from impact_posture.dynamics.tree import Tree
 from impact_posture.impact.quantities.lifted_form import Guess
-from impact_posture.posture.constraints.constraint import Constraint, ExpressionConstraint, LiftedRows, Linearization
+from impact_posture.posture.constraints.constraint import (
+    Constraint,
+    ExpressionConstraint,
+    LiftedRows,
+    Linearization,
+    digest,
+)
 from impact_posture.posture.loads.equilibrium import Equilibrium
 from impact_posture.posture.loads.static_load import StaticLoad
 from impact_posture.system.arrays import Array
 
-# The program lacks the rows if a posture exceeds them by more than this, half of what the certificate allows.
+# The program lacks the rows if a posture violates them by more than this, half of what the certificate allows.
 _KEPT = 5e-9
-# Shares of a limit closer to 1 than this may have a multiplier.
+# A share of a limit closer to 1 than this may have a multiplier.
 _NEAR = 1e-3
-# A share of a limit is not a meter: where a pose cannot be held, the actuators are the reason, not the pose.
+# A share of a limit counts less than meters: where a pose cannot be held, the actuators are the reason.
 _PRICE = 1e-3
 
 
 class Holdable(Constraint):
     """Forces z exist with ``R τ(q, z)`` within bounds: the base is balanced, and no actuator exceeds its limits.
 
-    The reduced form has a row for the unbalanced wrench of the base, and ``share − 1`` for each actuator at the
-    forces with the least largest share.
+    ``c(q)`` has a row for the unbalanced wrench of the base, and ``share − 1`` for each actuator at the forces with
+    the least largest share.
 
     Args:
         name: The load in words, such as ``at rest``.
         equilibrium: The robot at rest.
-        words: Description in one line.
-        active: Whether the program has it.  Most optima keep the limits anyway, and a program that lacks the rows is
-            faster; :meth:`grown` adds them where an optimum does not.
+        description: Description in one line.
+        active: Whether the program has the rows.  Most optima keep the limits anyway, and a program without the rows
+            is faster, so :meth:`grown` adds them only where an optimum violates a limit.
     """
 
     price = _PRICE
-    # Most starts end within the limits anyway, and pulled onto them they are less diverse.
+    # Most starts end within the limits anyway, and starts that are pulled onto this constraint are less diverse.
     projected = False
-    # It grows at most once and seldom, so the program is worth compiling before.
-    grows = False
+    by_row = True
 
-    def __init__(self, name: str, equilibrium: Equilibrium, words: str, active: bool = False) -> None:
-        self.name, self._load, self._words, self._rest = f"holding {name}", name, words, equilibrium
+    def __init__(self, name: str, equilibrium: Equilibrium, description: str, active: bool = False) -> None:
+        self.name, self._load, self._description, self._rest = f"holding {name}", name, description, equilibrium
         rest, self.active = equilibrium, active
         self._balance = f"balance of the base {name}"
-        self._names = [f"{kind} of {own} {name}" for kind, own in zip(rest.kinds, rest.actuators, strict=True)]
+        self._names = [f"{kind} of {part} {name}" for kind, part in zip(rest.kinds, rest.actuators, strict=True)]
         self.parameters = np.zeros(0)
         self.lower = np.full(1 + len(self._names), -np.inf)
         self.upper = np.zeros(1 + len(self._names))
 
     def describe(self) -> str:
-        return self._words
+        return self._description
 
     @property
     def structure(self) -> str:
-        return (
-            f"{super().structure}:{_digest(np.column_stack([self._rest.rows, self._rest.offset]), self._rest.load)}"
-        )
+        return f"{super().structure}:{digest(self._rest.rows, self._rest.offset, *self._rest.load.content)}"
 
     def row_name(self, row: int) -> str:
         return self._names[row - 1] if row else self._balance
 
-    def conflicts(self, excess: Array) -> dict[str, float]:
-        return {self.row_name(int(row)): float(excess[row]) for row in np.flatnonzero(excess)}
-
     def evaluate(self, model: Numeric) -> tuple[Array, Array]:
-        found = self._rest.distribute(model.q)
-        # No torque is known without a balance.
-        shares = np.full(len(self._names), -1.0) if found.unbalanced else np.abs(found.shares) - 1
-        return np.append(found.unbalanced, shares), found.jacobian
+        forces = self._rest.distribute(model.q)
+        # Without a balance no torque is known.
+        shares = np.full(len(self._names), -1.0) if forces.unbalanced else np.abs(forces.shares) - 1
+        return np.append(forces.unbalanced, shares), forces.jacobian
 
     def value(self, model: Numeric) -> Array:
-        """See :class:`Constraint`; at the limits of all actuators where even forces show that it holds."""
+        """Return ``c(q)``, or zeros if even forces show that the posture can be held."""
         return np.zeros(self.rows) if self._rest.spares(model.q, 0.0) else self.evaluate(model)[0]
 
     def grown(self, model: Numeric, auxiliaries: Array | None = None) -> Self:
+        """Add the rows where a posture violates them; this is rare, so a program without them is worth compiling."""
         if self.active or self.value(model).max() <= _KEPT:
             return self
-        return type(self)(self._load, self._rest, self._words, active=True)
+        return type(self)(self._load, self._rest, self._description, active=True)
 
     # ---- lifted form ------------------------------------------------------------------------------------------
 
@@ -98,10 +98,8 @@ class Holdable(Constraint):
     def lift(self, tree: Tree, parameters: ca.SX) -> LiftedRows:
         if not self.active:
             return LiftedRows(ca.SX(0, 1))
-        rest, load = self._rest, self._rest.load
-        z = ca.SX.sym("z", load.count)
-        own = tree if tree.model is load.model else Tree(load.model, tree.q)
-        return LiftedRows(_rows(rest.rows) @ load.symbolic(own, z) + rest.offset, z)
+        z = ca.SX.sym("z", self._rest.load.count)
+        return LiftedRows(_sparse(self._rest.rows) @ self._rest.load.symbolic(tree, z) + self._rest.offset, z)
 
     @property
     def unknowns(self) -> int:
@@ -114,15 +112,15 @@ class Holdable(Constraint):
         return Guess(self._rest.distribute(model.q).forces, load.lower, load.upper)
 
     def linearize(self, model: Numeric, auxiliaries: Array) -> Linearization:
-        """See :class:`Constraint`; the bounds of the forces are rows as well.
+        """Return the rows of :meth:`lift` and the bounds of the forces.
 
-        If the program lacks the rows, the forces are those with the least largest share, and limits that are far are
-        left out.
+        If the program lacks the rows, the forces have the least largest share.  No row is returned where even forces
+        stay away from all limits.
         """
         rest, load, z = self._rest, self._rest.load, auxiliaries
-        if not self.active and rest.spares(model.q, _NEAR):
-            return Linearization.joined([], model.model.nv)
         if not self.active:
+            if rest.spares(model.q, _NEAR):
+                return Linearization.joined([], model.model.nv)
             z = rest.distribute(model.q).forces
         torque = load.torque(model.q, z)
         lower, upper = self._bounds
@@ -138,9 +136,9 @@ class Holdable(Constraint):
 
 
 class ReachableWrench(ExpressionConstraint):
-    """The wrench on the base is one that the rotors can make: ``R h(q) = 0`` for what they cannot.
+    """The rotors can make the wrench on the base: ``R h(q) = 0`` for the combinations that they cannot make.
 
-    Rotors in one plane make no side force, so the robot has to be level to hold its weight.
+    For example, rotors in one plane make no side force, so the robot has to be level to hold its weight.
 
     Args:
         name: The load in words, such as ``at rest``.
@@ -158,30 +156,18 @@ class ReachableWrench(ExpressionConstraint):
 
     @property
     def structure(self) -> str:
-        return f"{super().structure}:{_digest(self._rows, self._load)}"
+        return f"{super().structure}:{digest(self._rows, *self._load.content)}"
 
     def describe(self) -> str:
         return f"no {self.name}"
 
     def symbolic(self, tree: Tree, parameters: ca.SX) -> ca.SX:
-        own = tree if tree.model is self._load.model else Tree(self._load.model, tree.q)
-        return _rows(self._rows) @ self._load.symbolic(own, ca.SX(0, 1))
+        return _sparse(self._rows) @ self._load.symbolic(tree, ca.SX(0, 1))
 
     def evaluate(self, model: Numeric) -> tuple[Array, Array]:
         torque = self._load.torque(model.q, np.zeros(0))
         return self._rows @ torque.value, self._rows @ torque.by_posture
 
 
-def _rows(matrix: Array) -> ca.SX:
+def _sparse(matrix: Array) -> ca.SX:
     return ca.SX(ca.sparsify(ca.DM(matrix)))
-
-
-def _digest(rows: Array, load: StaticLoad) -> str:
-    """Hash of the numbers that enter the expressions."""
-    parts = [rows, np.array(load.model.gravity.linear)]
-    parts += [np.array(inertia.toDynamicParameters()) for inertia in load.model.inertias]
-    for source in load.sources:
-        point = source.point
-        parts += [source.columns, source.constant, point.position, point.rotation]
-        parts.append(np.array([point.joint, source.in_frame], dtype=float))
-    return hashlib.sha256(b"".join(np.ascontiguousarray(part).tobytes() for part in parts)).hexdigest()[:16]

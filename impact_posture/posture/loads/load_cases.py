@@ -1,4 +1,4 @@
-"""Load cases in which a robot has to hold its posture: at rest before the impact, and while it pushes after it."""
+"""The loads under which a robot has to hold its posture: at rest before the impact, and pushing after it."""
 
 from __future__ import annotations
 
@@ -22,11 +22,11 @@ from impact_posture.robot.actuation import allocation_matrix, thrust_limits, tor
 from impact_posture.robot.robot import Robot
 from impact_posture.system.arrays import Array
 
-# Edges of the pyramid that stands for a friction cone.  It lies inside the cone.
+# Number of edges of the pyramid inside a friction cone.
 _EDGES = 4
-# Beyond this friction a pyramid is so flat that its edges no longer carry weight.
+# With more friction the pyramid would be so flat that its edges carry no weight.
 _MOST_FRICTION = 10.0
-# A singular value of the map from forces to the base wrench below this share of the largest one is rounding.
+# Singular values of the map from forces to the base wrench below this share of the largest are rounding.
 _RANK = 1e-9
 
 
@@ -36,24 +36,23 @@ class LoadCase:
 
     Attributes:
         name: The load in words, such as ``at rest``.
-        words: Description of the constraint in one line.
+        description: Description of the constraint in one line.
         equilibrium: The robot at rest under this load.
         unreachable: Combinations of the base wrench that the rotors cannot make, shape (6 − r, 6).
     """
 
     name: str
-    words: str
+    description: str
     equilibrium: Equilibrium
     unreachable: Array
 
     def constraints(self) -> list[Constraint]:
         """Return the constraints of this case."""
-        rest, made = self.equilibrium, list[Constraint]()
-        if len(self.unreachable):
-            pushes = [source for source in rest.load.sources if not source.lower.size]
-            load = StaticLoad(rest.load.model, pushes)
-            made.append(ReachableWrench(self.name, load, self.unreachable / rest.weight))
-        return [*made, Holdable(self.name, rest, self.words)]
+        rest, holdable = self.equilibrium, Holdable(self.name, self.equilibrium, self.description)
+        if not len(self.unreachable):
+            return [holdable]
+        load = StaticLoad(rest.load.model, [source for source in rest.load.sources if not source.lower.size])
+        return [ReachableWrench(self.name, load, self.unreachable / rest.weight), holdable]
 
 
 @dataclass(frozen=True, eq=False)
@@ -61,9 +60,9 @@ class LoadCases:
     """The load cases of a problem.
 
     Attributes:
-        cases: The load cases; none where the data of the robot do not allow a statement.
-        notes: Notes for the user about what is not known.
-        unknown: Why there are no load cases; empty if there are.
+        cases: The load cases; empty if the data of the robot are not sufficient.
+        notes: Notes for the user about missing data.
+        unknown: Why there are no load cases; empty if there are any.
     """
 
     cases: tuple[LoadCase, ...] = ()
@@ -71,26 +70,26 @@ class LoadCases:
     unknown: str = ""
 
     def holding(self, q: Array) -> HoldingForces | None:
-        """Return what holds ``q``, at rest and in the other cases; ``None`` if the data do not say."""
+        """Return the forces that hold ``q`` at rest and in the other cases; ``None`` without cases."""
         if not self.cases:
             return None
-        found = [HoldingForces.of(case.name, case.equilibrium, case.unreachable, q) for case in self.cases]
-        return replace(found[0], other_loads=tuple(found[1:]))
+        first, *others = [HoldingForces.of(case.name, case.equilibrium, case.unreachable, q) for case in self.cases]
+        return replace(first, other_loads=tuple(others))
 
 
 def load_cases(objective: Objective, q: Array, requirements: Requirements) -> LoadCases:
-    """Return the load cases for which the data of the robot allow a statement.
+    """Return the load cases for which the data of the robot are sufficient.
 
-    Before the impact the contact bears nothing.  With a ``hold_force`` the robot must also hold that force along the
-    normal of every contact after it.  A payload that the robot may carry makes further cases.
+    Before the impact the contact bears no force.  With a ``hold_force`` the robot must also hold this force along the
+    normal of every contact.  Each payload that the robot may carry adds these cases once more.
 
     Args:
-        objective: What is minimized, with its contacts, supports and model variants.
+        objective: The objective, with its contacts, supports and model variants.
         q: A posture with the feet in place, shape (nq,).
-        requirements: The friction of the feet, the force to hold, and the share of the limits that it may take.
+        requirements: The friction of the feet, the force to hold, and the share of the limits that holding may take.
 
     Raises:
-        InputError: A force is to be held, but nothing is known about what holds the robot.
+        InputError: A force has to be held, but the data of the robot are not sufficient.
     """
     robot, force, share = objective.robot, requirements.hold_force, requirements.limit_share
     weight = robot.mass * float(np.linalg.norm(robot.model.gravity.linear))
@@ -115,7 +114,7 @@ def load_cases(objective: Objective, q: Array, requirements: Requirements) -> Lo
     what = " and ".join([", ".join(kinds[:-1]), kinds[-1]] if kinds[1:] else kinds)
     sources, balance, thrusts = [*rotors, *feet], reach[:rank], Thrusts()
     if rotors and not feet and rank == rotors[0].lower.size:
-        # The base determines independent rotors, which then need no unknowns.
+        # The base wrench determines the thrusts of independent rotors, so these need no unknowns.
         limit = weight * rotors[0].lower, weight * rotors[0].upper
         thrusts = Thrusts(rotors[0].names, np.asarray(np.linalg.pinv(rotors[0].columns / weight)), *limit)
         sources, balance = [], balance[:0]
@@ -132,20 +131,20 @@ def load_cases(objective: Objective, q: Array, requirements: Requirements) -> Lo
 
 
 def _reach(load: StaticLoad, q: Array) -> tuple[Array, int]:
-    """Orthonormal combinations of the base wrench, first those that the forces determine, and their number."""
+    """Return orthonormal combinations of the base wrench, first the reachable ones, and the number of these."""
     vectors, values, _ = np.linalg.svd(load.torque(q, np.zeros(load.count)).by_force[:6])
     return vectors.T, int((values > _RANK * values.max(initial=0.0)).sum())
 
 
 def _models(objective: Objective) -> list[tuple[pin.Model, str]]:
-    """The model of the robot, and those of its payloads, with their names."""
-    found = [(objective.robot.model, "")]
+    """Return the model of the robot, and its models with payloads, each with a suffix for names."""
+    models = [(objective.robot.model, "")]
     if isinstance(objective, WorstCaseObjective):
         for variant in objective.model_variants[1:]:
             # The armature does not change the weight.
             if variant.payload is not None and variant.armature_factor == 1:
-                found.append((variant.robot.model, f" ({variant.name})"))
-    return found
+                models.append((variant.robot.model, f" ({variant.name})"))
+    return models
 
 
 def _rotors(robot: Robot, weight: float, share: float) -> list[ForceSource]:
@@ -161,26 +160,26 @@ def _rotors(robot: Robot, weight: float, share: float) -> list[ForceSource]:
 
 
 def _feet(objective: Objective, weight: float, friction: float) -> list[ForceSource]:
-    """Forces at the contact points, or the corners of soles: edges of pyramids about world z, in weights."""
+    """Return the forces at contact points or corners of soles: edges of pyramids about world z, in weights."""
     angles = 2 * np.pi * np.arange(_EDGES) / _EDGES
     slope = min(friction, _MOST_FRICTION)
     edges = np.array([slope * np.cos(angles), slope * np.sin(angles), np.ones(_EDGES)])
-    found = []
+    sources = []
     for support in objective.supports:
         signs = [(x, y) for x in (-1, 1) for y in (-1, 1)] if support.has_sole else [(0, 0)]
         columns, lower = np.vstack([edges, np.zeros_like(edges)]), np.zeros(_EDGES)
         if support.kind == "surface" and not support.has_sole:
             columns, lower = np.hstack([columns, np.eye(6)[:, 3:]]), np.append(lower, np.full(3, -np.inf))
         for x, y in signs:
-            offset = np.array(support.offset) + np.array([x * support.size[0], y * support.size[1], 0.0])
-            point = point_on(objective.robot, support.frame, (float(offset[0]), float(offset[1]), float(offset[2])))
+            (ox, oy, oz), (half_x, half_y) = support.offset, support.size
+            point = point_on(objective.robot, support.frame, (ox + x * half_x, oy + y * half_y, oz))
             names = (support.frame,) * lower.size
-            found.append(ForceSource(point, weight * columns, lower, np.full(lower.size, np.inf), names))
-    return found
+            sources.append(ForceSource(point, weight * columns, lower, np.full(lower.size, np.inf), names))
+    return sources
 
 
 def _push(robot: Robot, contact: ImpactContact, force: float) -> ForceSource:
-    """The force of the surface on the robot, along the normal."""
+    """Return the force of the surface on the robot along the normal."""
     point = point_on(robot, contact.frame, contact.offset)
     wrench = np.append(force * np.array(contact.normal), np.zeros(3))
     return ForceSource(point, in_frame=contact.normal_frame == "contact", constant=wrench)

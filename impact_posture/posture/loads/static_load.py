@@ -1,8 +1,8 @@
-"""Joint torques of a robot at rest, as an expression and in Pinocchio's numbers.
+"""Joint torques of a robot at rest, as an expression of CasADi and as numbers of Pinocchio.
 
 A robot at rest under gravity satisfies ``τ = h(q) − Σ J_kᵀ w_k``, with the generalized gravity ``h`` and the wrenches
-``w_k = W_k z_k + p_k`` of rotors, feet and what pushes on the robot.  ``τ`` is dual to ``ν``.  Its first six entries
-are the unbalanced wrench of a floating base, which nothing bears.
+``w_k = W_k z_k + p_k`` of rotors, feet and pushes on the robot.  ``τ`` is dual to ``ν``.  For a floating base its
+first six entries are the unbalanced wrench, which no actuator bears.
 """
 
 from __future__ import annotations
@@ -21,15 +21,15 @@ from impact_posture.system.arrays import Array
 
 @dataclass(frozen=True, eq=False)
 class ForceSource:
-    """A wrench ``W z + p`` on a link, in the axes of the world, or in those of the frame.
+    """A wrench ``W z + p`` on a link, in world axes or in the axes of a frame.
 
     Attributes:
-        point: Point of the link.
+        point: Point of the link, with the axes of the frame.
         columns: ``W``, force (N) above moment (N·m) about the point per unit z, shape (6, k).
         lower: Lower bounds of z, shape (k,).
         upper: Upper bounds of z, shape (k,).
         names: Name of each entry of z.
-        in_frame: Whether the wrench turns with the link.
+        in_frame: Whether the wrench has the axes of the frame and turns with the link.
         constant: ``p``, shape (6,).
     """
 
@@ -48,7 +48,7 @@ class StaticTorque:
 
     Attributes:
         value: ``τ``, shape (nv,).
-        by_posture: Tangent Jacobian ``∂τ/∂q``, shape (nv, nv); zero if it was left out.
+        by_posture: Tangent Jacobian ``∂τ/∂q``, shape (nv, nv); zero if it was not asked for.
         by_force: ``∂τ/∂z``, shape (nv, k).
     """
 
@@ -80,12 +80,22 @@ class StaticLoad:
         """Number of entries of z."""
         return len(self.lower)
 
+    @property
+    def content(self) -> list[object]:
+        """All numbers that enter the expressions."""
+        parts = [self.model.gravity.linear, *(inertia.toDynamicParameters() for inertia in self.model.inertias)]
+        for source in self.sources:
+            point = source.point
+            parts += [source.columns, source.constant, point.position, point.rotation, point.joint, source.in_frame]
+        return parts
+
     def split(self, z: Array) -> list[Array]:
-        """Return the part of z of each source."""
+        """Split z by source."""
         return np.split(z, self._parts[1:-1]) if self.sources else []
 
     def symbolic(self, tree: Tree, z: ca.SX) -> ca.SX:
-        """Return ``τ(q, z)`` as an expression, shape (nv, 1)."""
+        """Return ``τ(q, z)`` as an expression, shape (nv, 1); ``tree`` gives q and may be of another model."""
+        tree = tree if tree.model is self.model else Tree(self.model, tree.q)
         wrenches = []
         for source, start, stop in zip(self.sources, self._parts, self._parts[1:], strict=False):
             w = ca.SX(source.columns) @ z[int(start) : int(stop)] + ca.SX(source.constant)
@@ -93,25 +103,25 @@ class StaticLoad:
         return -tree.generalized_force(wrenches, constant(self.model.gravity.linear))
 
     def torque(self, q: Array, z: Array, *, by_posture: bool = True) -> StaticTorque:
-        """Return ``τ`` and its derivatives at a posture, or ``τ`` and ``∂τ/∂z`` alone, which takes less time.
+        """Return ``τ`` and its derivatives at a posture; without ``∂τ/∂q`` it takes less time.
 
-        Pinocchio holds forces constant in the link.  A force in world axes turns back as its link turns by δ, and
-        becomes ``f + f × δ`` there.
+        Pinocchio keeps forces constant in the axes of the link.  In these axes a force with world axes becomes
+        ``f + f × δ`` if the link turns by δ.
         """
         model, data = self.model, self._data
         pin.computeJointJacobians(model, data, q)
         forces = [pin.Force.Zero() for _ in range(model.njoints)]
         by_force = np.zeros((model.nv, self.count))
         turning = np.zeros((model.nv, model.nv))
-        for source, own, start in zip(self.sources, self.split(z), self._parts, strict=False):
+        for source, part, start in zip(self.sources, self.split(z), self._parts, strict=False):
             point, joint = source.point, source.point.joint
             axes = point.rotation if source.in_frame else np.array(data.oMi[joint].rotation).T
             arm = pin.skew(point.position)
             local = np.zeros((6, 6))
             local[:3, :3], local[3:, :3], local[3:, 3:] = axes, arm @ axes, axes
             jacobian = np.array(pin.getJointJacobian(model, data, joint, pin.LOCAL)).reshape(6, -1)
-            by_force[:, start : start + own.size] = -jacobian.T @ local @ source.columns
-            wrench = source.columns @ own + source.constant
+            by_force[:, start : start + part.size] = -jacobian.T @ local @ source.columns
+            wrench = source.columns @ part + source.constant
             forces[joint] = forces[joint] + pin.Force(local @ wrench)
             if by_posture and not source.in_frame:
                 force, moment = pin.skew(axes @ wrench[:3]), pin.skew(axes @ wrench[3:])

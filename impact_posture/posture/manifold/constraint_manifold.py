@@ -1,7 +1,7 @@
 """The constraint manifold of a posture problem, evaluated at many postures at once.
 
-The functions of the program are made for one posture at a time.  Here CasADi maps them over a batch, NumPy solves the
-small linear systems of the batch together, and a posture of talos costs about 0.1 ms.
+The functions of the program take one posture at a time.  Here CasADi evaluates a batch of postures, and NumPy solves
+the small linear systems of the batch together.  A posture of talos costs about 0.1 ms.
 """
 
 from __future__ import annotations
@@ -22,7 +22,7 @@ from impact_posture.posture.program.constrained_problem import ConstrainedProble
 from impact_posture.system.arrays import Array
 
 _CONVERGED = 1e-10
-# This share of the size of a singular matrix makes it regular.
+# Share of the trace that is added to the diagonal of a matrix that may be singular.
 _ROUNDING = 1e-13
 _LONGEST_STEP = 0.5
 
@@ -41,16 +41,16 @@ class Projected:
 
 
 class ConstraintManifold:
-    """``{q : c(q) = 0}`` of the equalities of a problem, in chart coordinates ``x`` and tangent vectors ``v``.
+    """``{q : c(q) = 0}`` for the equalities of a problem, in chart coordinates ``x`` and tangent vectors ``v``.
 
-    Postures that differ by full turns of joints count as one, so a joint whose range is a turn or more has no limit.
+    Postures that differ by full turns of joints are the same, so a joint with a range of a turn or more has no limit.
 
     Args:
-        problem: The posture problem; its objective is that of an impact.
+        problem: The posture problem, with an impact objective.
 
     Attributes:
-        lower: Lower limits without those of joints that can turn fully, shape (nx,).
-        upper: Upper limits, shape (nx,).
+        lower: Lower limits, −∞ for joints that can turn fully, shape (nx,).
+        upper: Upper limits, ∞ for these joints, shape (nx,).
     """
 
     def __init__(self, problem: ConstrainedProblem) -> None:
@@ -60,12 +60,12 @@ class ConstraintManifold:
         tree = Tree(model, self.chart.configuration(x), x)
         motion = _tangent_map(self.chart.slots, tree.q, self.chart.nx)
         held = held_rows(problem.robot, problem.requirements.hold)
-        # A constraint that only the program satisfies may have no expression in q alone.
-        followed = [
+        # A constraint with auxiliaries has no expression in q alone, and counts as an inequality.
+        equalities = [
             c for c in problem.constraints if isinstance(c, ExpressionConstraint) and c.equality and c.projected
         ]
-        equal = ca.vertcat(ca.SX(0, 1), *[c.symbolic(tree, ca.SX(ca.DM(c.parameters))) for c in followed])
-        self._inequalities = [c for c in problem.constraints if c not in followed]
+        equal = ca.vertcat(ca.SX(0, 1), *[c.symbolic(tree, ca.SX(ca.DM(c.parameters))) for c in equalities])
+        self._inequalities = [c for c in problem.constraints if c not in equalities]
         jacobian = ca.vertcat(ca.jacobian(equal, x) @ motion, held)
         self._equalities = _function([x], [ca.vertcat(equal, ca.SX(len(held), 1)), jacobian])
         objective, normal = problem.impact.gradient_fun(), ca.DM(problem.impact.contact.normal)
@@ -81,7 +81,7 @@ class ConstraintManifold:
         self._middle = np.where(limited, self.lower, 0.0) / 2 + np.where(limited, self.upper, 0.0) / 2
         self.lower[self._turning], self.upper[self._turning] = -np.inf, np.inf
 
-    # ---- functions of many postures ---------------------------------------------------------------------------
+    # ---- values at many postures ------------------------------------------------------------------------------
 
     def equalities(self, x: Array) -> tuple[Array, Array]:
         """Return ``c``, shape (N, m), and its tangent Jacobian, shape (N, m, nv)."""
@@ -94,11 +94,11 @@ class ConstraintManifold:
         return value[:, 0, 0], gradient[:, :, 0]
 
     def distance_to_feasible(self, x: Array) -> Array:
-        """Return the distance from the limits and inequalities to first order, shape (N,); zero where they hold."""
+        """Return the first-order distance from limits and inequalities, shape (N,); zero where all hold."""
         outside = np.maximum(np.maximum(self.lower - x, x - self.upper), 0.0).max(axis=1, initial=0.0)
         numeric = Numeric(self.problem.robot.model)
-        for k, one in enumerate(x if self._inequalities else ()):
-            numeric.at(self.to_q(one))
+        for k in range(len(x) if self._inequalities else 0):
+            numeric.at(self.to_q(x[k]))
             for constraint in self._inequalities:
                 value, jacobian = constraint.evaluate(numeric)
                 slopes = np.maximum(np.linalg.norm(jacobian, axis=1), 1e-9)
@@ -112,7 +112,7 @@ class ConstraintManifold:
     # ---- moves ------------------------------------------------------------------------------------------------
 
     def move(self, x: Array, v: Array) -> Array:
-        """Return postures moved by tangent vectors, shape (N, nv), to first order for a base; turns wrapped."""
+        """Return postures moved by tangent vectors, shape (N, nv), without full turns; to first order for a base."""
         moved = _call(self._moved, x, v)[0][:, :, 0]
         turns = np.where(self._turning, np.floor((moved - self._middle + np.pi) / (2 * np.pi)), 0.0)
         return np.asarray(moved - 2 * np.pi * turns)
@@ -131,21 +131,21 @@ class ConstraintManifold:
             if within:
                 x[left] = np.clip(x[left], self.lower, self.upper)
             value, jacobian = self.equalities(x[left])
-            there = np.abs(value).max(axis=1, initial=0.0) < _CONVERGED
-            converged[left[there]] = True
-            left, value, jacobian = left[~there], value[~there], jacobian[~there]
+            done = np.abs(value).max(axis=1, initial=0.0) < _CONVERGED
+            converged[left[done]] = True
+            left, value, jacobian = left[~done], value[~done], jacobian[~done]
             if not left.size or step == steps:
                 break
             x[left] = self.move(x[left], -_least_norm(jacobian, value))
         return Projected(x, converged)
 
     def embed(self, x: Array) -> Array:
-        """Return points whose Euclidean distance is that of the postures, for small distances, shape (N, k)."""
+        """Return points, shape (N, k), whose Euclidean distances equal small distances of the postures."""
         parts = [np.zeros((len(x), 0))]
         for slot in self.chart.slots:
             piece = x[:, slot.x]
             if slot.kind.family in ("free-flyer", "spherical"):
-                # Entries of the rotation: of two rotations they differ by √8 sin(angle/2).
+                # Two rotation matrices differ by √8 sin(angle/2).
                 parts += [piece[:, :-4], _rotations(piece[:, -4:]) / np.sqrt(2)]
             elif slot.kind.family in ("revolute", "continuous", "planar"):
                 parts += [piece[:, :-1], np.cos(piece[:, -1:]), np.sin(piece[:, -1:])]
@@ -163,20 +163,20 @@ def _function(inputs: list[ca.SX], outputs: list[ca.SX]) -> ca.Function:
 
 
 def _call(function: ca.Function, *inputs: Array) -> list[Array]:
-    """Call a function on the rows of the inputs; return its outputs with the posture as the first axis."""
+    """Call a function on each row of the inputs; the first axis of each output is the posture."""
     count = len(inputs[0])
     shapes = [function.size_out(i) for i in range(function.n_out())]
     if not count:
         return [np.zeros((0, *shape)) for shape in shapes]
-    found = function.call([ca.DM(np.ascontiguousarray(value.T)) for value in inputs])
+    outputs = function.call([ca.DM(np.ascontiguousarray(value.T)) for value in inputs])
     return [
         np.asarray(value, dtype=float).reshape(shape[0], count, shape[1]).transpose(1, 0, 2)
-        for value, shape in zip(found, shapes, strict=True)
+        for value, shape in zip(outputs, shapes, strict=True)
     ]
 
 
 def _least_norm(jacobian: Array, value: Array) -> Array:
-    """Return the steps of least norm with ``J v = c``, no longer than a limit, shape (N, nv)."""
+    """Return the steps of least norm with ``J v = c``, shortened to the longest step, shape (N, nv)."""
     gram = jacobian @ jacobian.transpose(0, 2, 1)
     rows = np.arange(gram.shape[1])
     # Rows may repeat others, and a planar arm has rows of zeros.
@@ -187,22 +187,22 @@ def _least_norm(jacobian: Array, value: Array) -> Array:
 
 
 def _tangent_map(slots: Sequence[JointSlot], q: ca.SX, nx: int) -> ca.SX:
-    """Return ``∂x/∂v``, shape (nx, nv): the motion of the chart coordinates under a tangent vector."""
-    found = ca.SX(nx, slots[-1].v.stop)
+    """Return the derivative ``∂x/∂v`` of the chart coordinates, shape (nx, nv)."""
+    dx_dv = ca.SX(nx, slots[-1].v.stop)
     for slot in slots:
         piece, family = q[slot.q], slot.kind.family
         if family in ("free-flyer", "spherical"):
             x, y, z, w = (piece[piece.numel() - 4 + i] for i in range(4))
             half = ca.blockcat([[w, -z, y], [z, w, -x], [-y, x, w], [-x, -y, -z]]) / 2
-            found[slot.x.stop - 4 : slot.x.stop, slot.v.stop - 3 : slot.v.stop] = half
+            dx_dv[slot.x.stop - 4 : slot.x.stop, slot.v.stop - 3 : slot.v.stop] = half
             if family == "free-flyer":
-                found[slot.x.start : slot.x.start + 3, slot.v.start : slot.v.start + 3] = quaternion_matrix(piece[3:])
+                dx_dv[slot.x.start : slot.x.start + 3, slot.v.start : slot.v.start + 3] = quaternion_matrix(piece[3:])
         elif family == "planar":
             c, s = piece[2], piece[3]
-            found[slot.x, slot.v] = ca.blockcat([[c, -s, 0], [s, c, 0], [0, 0, 1]])
+            dx_dv[slot.x, slot.v] = ca.blockcat([[c, -s, 0], [s, c, 0], [0, 0, 1]])
         else:
-            found[slot.x, slot.v] = ca.SX.eye(slot.v.stop - slot.v.start)
-    return found
+            dx_dv[slot.x, slot.v] = ca.SX.eye(slot.v.stop - slot.v.start)
+    return dx_dv
 
 
 def _normalized(chart: Chart, x: ca.SX) -> ca.SX:
@@ -217,5 +217,5 @@ def _rotations(quaternions: Array) -> Array:
     cross = np.zeros((len(w), 3, 3))
     for i, j, k in ((0, 1, 2), (1, 2, 0), (2, 0, 1)):
         cross[:, i, j], cross[:, j, i] = -v[:, k], v[:, k]
-    found = np.eye(3) + 2 * w[:, None, None] * cross + 2 * cross @ cross
-    return np.asarray(found.reshape(-1, 9))
+    rotations = np.eye(3) + 2 * w[:, None, None] * cross + 2 * cross @ cross
+    return np.asarray(rotations.reshape(-1, 9))

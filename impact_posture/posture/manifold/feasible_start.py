@@ -1,4 +1,4 @@
-"""Feasible starts, which are random postures pulled onto the constraint manifold."""
+"""Feasible starts: random postures that are pulled onto the constraint manifold."""
 
 from __future__ import annotations
 
@@ -15,14 +15,14 @@ from impact_posture.system.arrays import Array
 
 # A constraint with a violation up to this (m, rad) is satisfied.
 FEASIBLE = 1e-8
-# Postures that one start tries to pull onto the constraints.
+# Most random postures that one start pulls onto the constraints.
 ATTEMPTS = 20
 _STEPS = 80
-# A posture whose violation has not fallen by a fifth in so many steps hardly ever reaches the constraints.
+# The projection stops if the violation falls by less than a fifth in this many steps: it would hardly ever converge.
 _PATIENCE = 16
 # Most postures on the projected constraints that one start chooses from.
 CANDIDATES = 3
-# This share of the size of a singular matrix makes it regular.
+# Share of the trace that is added to the diagonal of a matrix that may be singular.
 _ROUNDING = 1e-13
 
 
@@ -40,11 +40,7 @@ class Projection:
 
 
 class Projector:
-    """Levenberg–Marquardt onto the projected constraints within the limits; held joints do not move.
-
-    Args:
-        problem: The posture problem.
-    """
+    """Levenberg–Marquardt projection onto the projected constraints within the limits, without moving held joints."""
 
     def __init__(self, problem: ConstrainedProblem) -> None:
         self.problem = problem
@@ -57,11 +53,11 @@ class Projector:
         self._free = [c for c in problem.constraints if not c.projected]
 
     def clip(self, q: Array) -> Array:
-        """Clamp ``q`` to the bounds."""
+        """Clamp ``q`` to the joint limits."""
         return self.chart.to_q(self._clipped(q))
 
     def _clipped(self, q: Array) -> Array:
-        """Return the chart coordinates of ``q`` within the bounds, shape (nx,)."""
+        """Return the chart coordinates of ``q`` clamped to the joint limits, shape (nx,)."""
         return np.minimum(np.maximum(self.chart.to_x(q), self.problem.lower), self.problem.upper)
 
     def residual(self, q: Array) -> tuple[Array, Array]:
@@ -78,7 +74,7 @@ class Projector:
         return np.concatenate(values), np.concatenate(jacobians)
 
     def outside(self, q: Array, most: float = np.inf) -> float:
-        """Return the violation of the constraints that are not projected, summed until it reaches ``most``."""
+        """Return the summed violation of all constraints that are not projected; above ``most`` it may be too low."""
         self.numeric.at(q)
         total = 0.0
         for constraint in self._free:
@@ -88,7 +84,7 @@ class Projector:
         return total
 
     def project(self, q: Array, tolerance: float = 1e-9) -> Projection:
-        """Pull ``q`` onto the constraints.  The result may still violate them."""
+        """Pull ``q`` onto the constraints; the result may still violate them."""
         x = self._clipped(q)
         q = self.chart.to_q(x)
         value, jacobian = self.residual(q)
@@ -106,7 +102,7 @@ class Projector:
                 gram = free @ free.T
                 diagonal = gram.reshape(-1)[:: len(gram) + 1]
                 plain = diagonal.copy()
-                # Rows may repeat others (two frames on one link), so the damping must not fall below rounding.
+                # Rows may repeat others (two frames on one link), so the damping must stay above rounding.
                 least = _ROUNDING * max(1.0, float(plain.sum()))
             diagonal[:] = plain + (damping * min(1.0, size) + least)
             step = -free.T @ np.linalg.solve(gram, value)
@@ -124,7 +120,7 @@ class Projector:
         return Projection(q, float(np.abs(value).max(initial=0.0)))
 
     def _blocked(self, x: Array, direction: Array) -> NDArray[np.bool_]:
-        """Joints on a limit that the descent direction would violate, at the chart coordinates of a posture."""
+        """Return which tangent entries are at a limit that the descent direction would violate, shape (nv,)."""
         at, along = x[self._in_x], direction[self._in_v]
         at_low = (at <= self._low + 1e-12) & (along < 0)
         at_high = (at >= self._high - 1e-12) & (along > 0)
@@ -141,29 +137,28 @@ def feasible_start(
     around: Array | None = None,
     projector: Projector | None = None,
 ) -> Array | None:
-    """Return the ``index``-th feasible start of a seed; ``None`` if no attempt reached the constraints.
+    """Return the ``index``-th feasible start of a seed, or ``None`` if no attempt reached the constraints.
 
-    Start 0 is the given posture, pulled onto the constraints.  Odd starts lie near ``around``, by default the given
-    posture, and even starts anywhere within the limits.  Near starts reach the constraints more often, far starts
-    find other optima.  Of ``candidates`` postures that reach them, the first counts that satisfies the constraints
-    without projection too, else the one that violates them least.
+    Start 0 is the given posture, pulled onto the constraints.  Odd starts lie near ``around``, and even starts
+    anywhere within the limits: near starts reach the constraints more often, far starts find other optima.  Among
+    ``candidates`` postures on the projected constraints, the start violates the other constraints least.
 
     Args:
         problem: The posture problem.
         index: Index of the start.
         seed: Seed of all starts.
         candidates: Most postures on the projected constraints to choose from.
-        around: Posture that odd starts are near, shape (nq,).
-        projector: That of the problem, or of one that grew into it, if the caller has it.
+        around: Posture near odd starts, shape (nq,); by default the given posture.
+        projector: Projector of the problem, or of a problem that grew into it, if the caller has it.
     """
     if index == 0:
-        found = (projector or Projector(problem)).project(problem.given)
-        return found.q if found.violation <= FEASIBLE else None
+        projection = (projector or Projector(problem)).project(problem.given)
+        return projection.q if projection.violation <= FEASIBLE else None
     return StartDraw(problem, index, seed, around, projector).choose(candidates)
 
 
 class StartDraw:
-    """The random postures of one start, which are drawn as far as they are needed; see :func:`feasible_start`."""
+    """The random postures of one start, drawn only as needed; see :func:`feasible_start`."""
 
     def __init__(
         self,
@@ -182,24 +177,24 @@ class StartDraw:
         self._least = np.inf
 
     def choose(self, candidates: int) -> Array | None:
-        """Return the best of so many postures on the projected constraints, those of the last call among them."""
+        """Return the best of ``candidates`` postures on the projected constraints, with those of earlier calls."""
         while self._attempts < ATTEMPTS and self._tried < candidates and self._least > FEASIBLE:
             near = self._around if (self._index + self._attempts) % 2 else None
             self._attempts += 1
             posture = random_posture(self._problem, self._projector.chart, self._rng, near)
-            found = self._projector.project(posture)
-            if found.violation <= FEASIBLE:
-                outside = self._projector.outside(found.q, self._least)
+            projection = self._projector.project(posture)
+            if projection.violation <= FEASIBLE:
+                outside = self._projector.outside(projection.q, self._least)
                 self._tried += 1
                 if outside < self._least:
-                    self._best, self._least = found.q, outside
+                    self._best, self._least = projection.q, outside
         return self._best
 
 
 def random_posture(
     problem: ConstrainedProblem, chart: Chart, rng: np.random.Generator, near: Array | None = None
 ) -> Array:
-    """Return a random posture near a given one, or anywhere within the bounds, not yet on the constraints."""
+    """Return a random posture near ``near``, or anywhere within the limits; it may violate the constraints."""
     model = problem.robot.model
     base = 6 if problem.robot.floating else 0
     if near is not None:

@@ -23,7 +23,7 @@ class NullSpacePath:
         H: Squared jump per squared impulse, shape (N,).
         G: Inverse effective mass, shape (N,).
         V: Squared jump per squared approach speed, shape (N,).
-        S: The same if the contact sticks, NaN where undefined, shape (N,).
+        S: V of a contact that sticks, NaN where undefined, shape (N,).
         objective: The objective, shape (N,).
     """
 
@@ -44,13 +44,7 @@ def null_space_path(problem: ConstrainedProblem, start: Array, end: Array, point
         postures.append(projector.project(pin.interpolate(model, start, end, float(t))).q)
     postures.append(end)
     steps = [np.linalg.norm(pin.difference(model, a, b)) for a, b in pairwise(postures)]
-    found = [problem.impact.oracle.quantities(q) for q in postures]
-    return NullSpacePath(
-        q=np.array(postures),
-        s=np.concatenate([[0.0], np.cumsum(steps)]),
-        H=np.array([f.H for f in found]),
-        G=np.array([f.G for f in found]),
-        V=np.array([f.V for f in found]),
-        S=np.array([np.nan if f.S is None else f.S for f in found]),
-        objective=np.array([problem.objective.value(q) for q in postures]),
-    )
+    quantities = [problem.impact.oracle.quantities(q) for q in postures]
+    H, G, V, S = np.array([(v.H, v.G, v.V, np.nan if v.S is None else v.S) for v in quantities]).T
+    objective = np.array([problem.objective.value(q) for q in postures])
+    return NullSpacePath(np.array(postures), np.concatenate([[0.0], np.cumsum(steps)]), H, G, V, S, objective)

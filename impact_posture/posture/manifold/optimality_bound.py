@@ -2,8 +2,8 @@
 
 A patch is the part of the manifold within a radius r of its center.  With ``φ = ln f``, its gradient g along the
 manifold and a bound M on the curvature of φ, the patch has ``φ ≥ φ(center) − ‖g‖ r − M r²/2``.  M is estimated from
-the gradients of neighbors, so the result is an estimate, too: it is called *bounded* and not proved.  The logarithm
-makes the bound relative, and keeps it useful beside the poles of V and S.
+the gradients at neighbors, so the result is an estimate as well.  It is therefore called *bounded* and not proved.
+The logarithm makes the bound relative, and keeps it useful near the poles of V and S.
 """
 
 from __future__ import annotations
@@ -17,14 +17,14 @@ from impact_posture.posture.manifold.constraint_manifold import ConstraintManifo
 from impact_posture.posture.manifold.self_motion import SelfMotion
 from impact_posture.system.arrays import Array
 
-# Factor on the largest curvature that was seen nearby.
+# Factor on the largest curvature between neighbors.
 _SAFETY = 2.0
-# A feasible posture satisfies limits and inequalities to this distance.
+# A posture is feasible if limits and inequalities hold up to this distance.
 _FEASIBLE = 1e-7
-# A patch is left out if the feasible set is farther, to first order, than this share of its radius.
+# A patch is left out if the feasible set is farther from its center than this many radii, to first order.
 _BEYOND = 1.5
 _MOST = 200_000
-# A disc of radius 1 is covered by seven of half the radius, one in the middle; a segment by two.
+# Seven discs of half the radius, one of them in the middle, cover a disc; two segments of half the length a segment.
 _RING = [[np.sqrt(0.75) * np.cos(a), np.sqrt(0.75) * np.sin(a)] for a in np.pi / 3 * np.arange(6)]
 _PARTS = {1: np.array([[-0.5], [0.5]]), 2: np.array([[0.0, 0.0], *_RING])}
 # Parts overlap a little, because the manifold is curved.
@@ -38,8 +38,8 @@ class OptimalityBound:
     Attributes:
         best: Least objective of a feasible posture.
         lower: Estimated lower bound on the objective.
-        x: Posture of ``best`` if a patch has it, chart coordinates, shape (nx,); ``None`` for the known posture.
-        patches: Patches that were evaluated.
+        x: Center of a patch with the objective ``best``, shape (nx,); ``None`` if the known posture is best.
+        patches: Number of evaluated patches.
         finished: Whether every patch reached the wanted gap.
     """
 
@@ -69,56 +69,51 @@ class _Patches:
     def lower(self) -> Array:
         """Bound on φ in each patch; −∞ where the center has no objective."""
         slope = np.linalg.norm(self.gradient, axis=1)
-        found = self.value - slope * self.radius - self.curvature * self.radius**2 / 2
-        return np.where(np.isfinite(found), found, -np.inf)
+        bound = self.value - slope * self.radius - self.curvature * self.radius**2 / 2
+        return np.where(np.isfinite(bound), bound, -np.inf)
 
     def where(self, mask: NDArray[np.bool_]) -> _Patches:
-        return _Patches(*(getattr(self, name)[mask] for name in ("x", "radius", "value", "gradient", "curvature")))
+        return _Patches(*(values[mask] for values in vars(self).values()))
 
 
 def bound_objective(motion: SelfMotion, best: float, gap: float = 0.01) -> OptimalityBound:
-    """Split patches until none can hold a feasible posture that is better than ``(1 − gap) best``.
+    """Split patches until none can contain a feasible posture with an objective below ``(1 − gap) best``.
 
     Args:
         motion: The mapped manifold.
-        best: Objective of a known feasible posture; infinite for none.
+        best: Objective of a known feasible posture, or infinity.
         gap: The wanted gap.
     """
     manifold, dimension = motion.manifold, motion.dimension
-    active = _initial(motion)
-    count, retired, found = len(active.x), np.inf, None
+    x = np.concatenate([component.x for component in motion.components])
+    value, gradient = _along(manifold, x, dimension)
+    radius = np.concatenate([component.radius for component in motion.components])
+    active = _Patches(x, radius, value, gradient, _curvature(manifold, x, gradient))
+    count, retired, best_x = len(x), np.inf, None
     while len(active.x):
         retired, active = _retire(active, retired, best * (1 - gap))
-        # Feasibility takes longest, so only patches that may hold a better posture are asked.
+        # The feasibility test takes longest, so it comes after the first bound.
         distance = manifold.distance_to_feasible(active.x)
         values = np.where((distance <= _FEASIBLE) & np.isfinite(active.value), active.value, np.inf)
         if values.size and np.exp(values.min()) < best * (1 - 1e-9):
-            best, found = float(np.exp(values.min())), active.x[int(values.argmin())]
+            best, best_x = float(np.exp(values.min())), active.x[int(values.argmin())]
         retired, active = _retire(active.where(distance <= _BEYOND * active.radius), retired, best * (1 - gap))
         if not len(active.x) or count + len(active.x) * len(_PARTS[dimension]) > _MOST:
             break
         active = _split(manifold, dimension, active)
         count += len(active.x)
     lower = min(retired, float(active.lower.min(initial=np.inf)))
-    return OptimalityBound(best, min(float(np.exp(lower)), best), found, count, not len(active.x))
+    return OptimalityBound(best, min(float(np.exp(lower)), best), best_x, count, not len(active.x))
 
 
 def _retire(active: _Patches, retired: float, threshold: float) -> tuple[float, _Patches]:
     """Return the least bound on φ of all retired patches, and the patches that may lie below a threshold."""
-    open_ = active.lower < np.log(threshold)
-    return min(retired, float(active.lower[~open_].min(initial=np.inf))), active.where(open_)
-
-
-def _initial(motion: SelfMotion) -> _Patches:
-    """Patches around the nodes of all components, which cover them."""
-    x = np.concatenate([component.x for component in motion.components])
-    value, gradient = _along(motion.manifold, x, motion.dimension)
-    radius = np.concatenate([component.radius for component in motion.components])
-    return _Patches(x, radius, value, gradient, _curvature(motion.manifold, x, gradient))
+    below = active.lower < np.log(threshold)
+    return min(retired, float(active.lower[~below].min(initial=np.inf))), active.where(below)
 
 
 def _curvature(manifold: ConstraintManifold, x: Array, gradient: Array) -> Array:
-    """Return the largest change of the gradient per distance to near centers, with the safety factor, shape (N,)."""
+    """Return a safe estimate of the curvature: twice the change of the gradient per distance to neighbors, (N,)."""
     from scipy.spatial import cKDTree
 
     points = manifold.embed(x)
@@ -130,6 +125,7 @@ def _curvature(manifold: ConstraintManifold, x: Array, gradient: Array) -> Array
 
 
 def _split(manifold: ConstraintManifold, dimension: int, parents: _Patches) -> _Patches:
+    """Return the parts of patches; the curvature of a part is at least half of its parent's."""
     parts = _PARTS[dimension]
     basis = manifold.tangents(parents.x, dimension)
     steps = np.einsum("n,pd,ndv->npv", parents.radius, parts, basis)

@@ -1,13 +1,13 @@
 """The self-motion manifold of a problem with one or two degrees of freedom left, mapped by continuation.
 
 A self-motion moves the robot while all equalities hold (J. W. Burdick, "On the inverse kinematics of redundant
-manipulators: characterization of the self-motion manifolds", ICRA 1989).  Its components are the pieces between which
-no motion within the joint limits exists.  One degree of freedom gives curves, two give surfaces.
+manipulators: characterization of the self-motion manifolds", ICRA 1989).  No motion within the joint limits leads
+from one component of the manifold to another.  One degree of freedom gives curves, two give surfaces.
 """
 
 from __future__ import annotations
 
-from collections.abc import Callable
+from collections.abc import Sequence
 from dataclasses import dataclass
 
 import numpy as np
@@ -19,17 +19,17 @@ from impact_posture.system.arrays import Array
 
 # Steps along a curve, rad or m: the first, the longest, and one so short that the curve is singular.
 _FIRST, LONGEST_STEP, _SINGULAR = 0.02, 0.08, 1e-7
-# Cosine of the largest turn of the tangent in a step, and of a turn that lets the steps grow.
+# Least cosine of the turn of the tangent in a step, and the cosine above which steps grow.
 _TURN, _STRAIGHT = 0.98, 0.995
-# A posture belongs to a node if it leaves the node's tangent space by at most this share of its distance.
+# A posture belongs to a node if it is off the tangent space of the node by at most this share of its distance.
 _FLAT = 0.2
-# The points of a curve are at most about half a step from a node: a little more, because the curve bends.
+# Points of a curve are within this share of a step of a node: half of it, and a little more because the curve bends.
 _HALF = 0.52
-# Longest curve, in nodes, and largest surface.
+# Most nodes of a curve or surface.
 _NODES = 20_000
-# Step of a surface; new nodes keep this share of it from all others; number of directions of a step.
+# Step of a surface, least distance between nodes as a share of the step, and number of directions of a step.
 _STEP, _APART, _DIRECTIONS = 0.16, 0.7, 8
-# A point of a circle of one step around a node is half a direction from a tried point, which is near a node.
+# Each point at one step from a node is within half a direction of a tried point, which is near a node.
 COVERED = _APART + 2 * np.sin(np.pi / _DIRECTIONS / 2)
 _BATCH = 100
 
@@ -41,9 +41,9 @@ class Component:
     Attributes:
         x: Nodes in chart coordinates, along the curve for one degree of freedom, shape (N, nx).
         s: Path length to each node, rad mixed with m, shape (N,); zeros for a surface.
-        radius: Each point of the component is within this distance of a node.
-        ends: What ends the curve: ``closed`` alone, or ``limit``, ``singular`` or ``unfinished`` (too long) for each
-            of both ends; empty for a surface.
+        radius: Radius of the part that each node covers, shape (N,).
+        ends: ``closed`` alone, or for each of both ends of a curve ``limit``, ``singular`` or ``unfinished`` (too
+            long); empty for a surface.
     """
 
     x: Array
@@ -64,9 +64,9 @@ class SelfMotion:
     Attributes:
         manifold: The manifold of the problem.
         dimension: Degrees of freedom, 1 or 2.
-        components: The components found.
-        starts: Random postures that reached the manifold within the limits.
-        unsuccessful: The last of them, none of which was on a new component.
+        components: The components that starts reached.
+        starts: Number of random postures that reached the manifold within the limits.
+        unsuccessful: Number of the last starts in a row that were on no new component.
     """
 
     manifold: ConstraintManifold
@@ -76,14 +76,14 @@ class SelfMotion:
     unsuccessful: int
 
     def component_of(self, x: Array) -> Array:
-        """Return the index of the component of each posture, shape (N,); −1 for none."""
+        """Return the index of the component of each posture, shape (N,), or −1."""
         return _component_of(self.manifold, self.dimension, self.components, x)
 
 
 def map_self_motion(
     manifold: ConstraintManifold, dimension: int, known: Array, *, patience: int = 1000, seed: int = 0
 ) -> SelfMotion:
-    """Follow every component that random starts reach, until ``patience`` starts in a row reach no new one.
+    """Map every component that random starts reach, until ``patience`` starts in a row reach no new component.
 
     Args:
         manifold: The manifold of the problem.
@@ -99,22 +99,21 @@ def map_self_motion(
         raise InputError(
             f"{dimension} degrees of freedom are left", where="search", hint="a map needs 1 or 2: add constraints"
         )
-    trace: Callable[[ConstraintManifold, Array], Component] = _curve if dimension == 1 else _surface
-    rng, found = np.random.default_rng(seed), [*_missing(manifold, dimension, (), known, trace)]
+    rng, components = np.random.default_rng(seed), _missing(manifold, dimension, (), known)
     starts = unsuccessful = idle = 0
-    # A tenth of the postures reaches the manifold at least, or the limits leave next to nothing of it.
+    # If less than a tenth of the postures reach the manifold, the limits leave almost nothing of it.
     while unsuccessful < patience and idle < 10 * patience:
         x = _random(manifold, rng)
-        new = _missing(manifold, dimension, found, x, trace)
-        found += new
+        new = _missing(manifold, dimension, components, x)
+        components += new
         starts += len(x)
         idle = 0 if len(x) else idle + _BATCH
         unsuccessful = 0 if new else unsuccessful + len(x)
-    return SelfMotion(manifold, dimension, tuple(found), starts, unsuccessful)
+    return SelfMotion(manifold, dimension, tuple(components), starts, unsuccessful)
 
 
 def component_through(manifold: ConstraintManifold, x: Array) -> SelfMotion:
-    """Follow the curve through one posture, shape (nx,), of a manifold with one degree of freedom."""
+    """Map the curve through one posture, shape (nx,), of a manifold with one degree of freedom."""
     return SelfMotion(manifold, 1, (_curve(manifold, x),), 0, 0)
 
 
@@ -122,40 +121,33 @@ def _random(manifold: ConstraintManifold, rng: np.random.Generator) -> Array:
     """Return random postures on the manifold within the limits; inequalities need not hold."""
     problem = manifold.problem
     drawn = [random_posture(problem, manifold.chart, rng, None if k % 4 else problem.given) for k in range(_BATCH)]
-    found = manifold.project(np.array([manifold.chart.to_x(q) for q in drawn]), within=True)
-    return found.x[found.converged]
+    projected = manifold.project(np.array([manifold.chart.to_x(q) for q in drawn]), within=True)
+    return projected.x[projected.converged]
 
 
-def _missing(
-    manifold: ConstraintManifold,
-    dimension: int,
-    known: tuple[Component, ...] | list[Component],
-    x: Array,
-    trace: Callable[[ConstraintManifold, Array], Component],
-) -> list[Component]:
-    """Return the components of postures that are on none of the known ones."""
+def _missing(manifold: ConstraintManifold, dimension: int, known: Sequence[Component], x: Array) -> list[Component]:
+    """Return the new components that postures are on, in addition to the known components."""
     new: list[Component] = []
     left = x[_component_of(manifold, dimension, known, x) < 0]
     while len(left):
-        new.append(trace(manifold, left[0]))
+        new.append(_curve(manifold, left[0]) if dimension == 1 else _surface(manifold, left[0]))
         rest = left[1:]
         left = rest[_component_of(manifold, dimension, new[-1:], rest) < 0]
     return new
 
 
-def _component_of(
-    manifold: ConstraintManifold, dimension: int, components: tuple[Component, ...] | list[Component], x: Array
-) -> Array:
+def _component_of(manifold: ConstraintManifold, dimension: int, components: Sequence[Component], x: Array) -> Array:
+    """Return the index of the component that each posture is on, or −1, shape (N,)."""
     from scipy.spatial import cKDTree
 
-    found = np.full(len(x), -1)
+    owner = np.full(len(x), -1)
     points = manifold.embed(x)
     for index, component in enumerate(components):
         nodes = manifold.embed(component.x)
         near = min(8, len(nodes))
         distances, places = cKDTree(nodes).query(points, near)
         for distance, place in zip(distances.reshape(-1, near).T, places.reshape(-1, near).T, strict=True):
-            chosen = np.flatnonzero((found < 0) & (distance <= 1.1 * component.radius[place] + 1e-6))
+            chosen = np.flatnonzero((owner < 0) & (distance <= 1.1 * component.radius[place] + 1e-6))
             if not chosen.size:
                 continue
             basis = manifold.tangents(component.x[place[chosen]], dimension)
@@ -163,17 +155,17 @@ def _component_of(
             along = _embedded(manifold, component.x[place[chosen]], basis)
             share = np.einsum("nk,ndk->nd", step, along)
             off = np.linalg.norm(step - np.einsum("nd,ndk->nk", share, along), axis=1)
-            found[chosen[off <= _FLAT * distance[chosen] + 1e-6]] = index
-    return found
+            owner[chosen[off <= _FLAT * distance[chosen] + 1e-6]] = index
+    return owner
 
 
 def _embedded(manifold: ConstraintManifold, x: Array, basis: Array) -> Array:
-    """Return the tangent vectors of a basis as motions of the embedded point, of unit length, shape (N, d, k)."""
+    """Return the unit directions in which the embedded points move along the vectors of a basis, shape (N, d, k)."""
     size = 1e-6
     here = manifold.embed(x)
     moved = [(manifold.embed(manifold.move(x, size * v)) - here) / size for v in basis.transpose(1, 0, 2)]
-    found = np.stack(moved, axis=1)
-    return np.asarray(found / np.linalg.norm(found, axis=2, keepdims=True))
+    directions = np.stack(moved, axis=1)
+    return np.asarray(directions / np.linalg.norm(directions, axis=2, keepdims=True))
 
 
 # ---- one degree of freedom -----------------------------------------------------------------------------------
@@ -193,9 +185,10 @@ def _curve(manifold: ConstraintManifold, x: Array) -> Component:
 
 
 def _branch(manifold: ConstraintManifold, start: Array, tangent: Array) -> tuple[list[Array], list[float], str]:
-    """Follow a curve in one direction, by predictor and corrector.
+    """Follow a curve in one direction by predictor and corrector.
 
-    Return the nodes from the start on, the lengths of the steps, and what ended it.
+    Returns:
+        The nodes from the start on, the lengths of the steps, and how the curve ends.
     """
     nodes, x, direction, step = [start], start, tangent, _FIRST
     lengths: list[float] = []
@@ -213,12 +206,12 @@ def _branch(manifold: ConstraintManifold, start: Array, tangent: Array) -> tuple
             continue
         beyond = np.maximum(manifold.lower - moved.x[0], moved.x[0] - manifold.upper).max(initial=-np.inf)
         if beyond > 1e-9:
-            # The limit lies within the step.
+            # A limit lies within the step, and shorter steps find it.
             if step < 10 * _SINGULAR:
                 return nodes, lengths, "limit"
             step /= 2
             continue
-        # The start lies between the two nodes if it is ahead of the first and behind the second.
+        # The start lies between both nodes if it is ahead of the first and behind the second.
         gap = home - point[0]
         if len(nodes) > 2 and np.linalg.norm(gap) <= 1.05 * length and ahead @ first > _TURN**2:
             behind = (point[1] - point[0]) @ (home - point[1]) <= 0
@@ -235,10 +228,10 @@ def _branch(manifold: ConstraintManifold, start: Array, tangent: Array) -> tuple
 
 
 def _surface(manifold: ConstraintManifold, x: Array) -> Component:
-    """Cover the surface through a posture with nodes, from an advancing front.
+    """Cover the surface through a posture with nodes, by an advancing front.
 
-    Each node tries points one step away in all directions of its tangent plane.  A point that is near no node becomes
-    one.  Nodes beyond the limits by less than a step cover the rim, and the front stops there.
+    Each node tries points one step away in all directions of its tangent plane.  A point that is far from all nodes
+    becomes a node.  Nodes beyond the limits by less than a step cover the rim, and the front stops there.
     """
     from scipy.spatial import cKDTree
 

@@ -1,9 +1,9 @@
-"""The search beyond multi-start: a complete map for one or two degrees of freedom, basin hopping for all others.
+"""Global search: a complete map for one or two degrees of freedom, and basin hopping for more.
 
-The map (:mod:`impact_posture.posture.manifold.self_motion`) states how far the best posture can be from optimal.
-Basin hopping starts again from the best posture with some joints drawn anew (D. J. Wales and J. P. K. Doye, "Global
-optimization by basin-hopping", J. Phys. Chem. A 1997), because many optima differ in a few joints only.  The value at
-a start says little about the optimum that it leads to, so starts are not chosen by value (``make study-global``).
+The map (:mod:`impact_posture.posture.manifold.self_motion`) shows how far the best posture can be from optimal.
+Basin hopping starts from the best posture with some joints drawn anew (D. J. Wales and J. P. K. Doye, "Global
+optimization by basin-hopping", J. Phys. Chem. A 1997), because many optima differ in a few joints only.  Starts are
+not chosen by their objective, which hardly predicts the objective at their ends (``make study-global``).
 """
 
 from __future__ import annotations
@@ -18,7 +18,7 @@ from numpy.typing import NDArray
 from impact_posture.dynamics.numeric import Numeric
 from impact_posture.errors import InputError, SolverFailed
 from impact_posture.posture.manifold.constraint_manifold import ConstraintManifold
-from impact_posture.posture.manifold.feasible_start import Projector, random_posture
+from impact_posture.posture.manifold.feasible_start import FEASIBLE, Projector, random_posture
 from impact_posture.posture.manifold.optimality_bound import OptimalityBound, bound_objective
 from impact_posture.posture.manifold.self_motion import SelfMotion, map_self_motion
 from impact_posture.posture.program.compiled_solver import CompileMode
@@ -28,26 +28,24 @@ from impact_posture.posture.search.growing_search import Progress
 from impact_posture.posture.search.multistart import PostureSolution, solve
 from impact_posture.system.arrays import Array
 
-# Hops for each start of the multi-start search, and so rounds of as many hops as starts.
+# Number of rounds, each with as many hops as the multi-start search had starts.
 HOPS_PER_START = 3
 # Shares of the joints that a hop draws anew.
 _REDRAWN = (0.1, 0.25, 0.5)
 # A value is better if it is lower by more than this share.
 _BETTER = 1e-6
-# A start missed the best posture if it ended more than this share above.
+# A start missed the best posture if its end is more than this share above it.
 _MISSED = 1e-3
 _KEYS = ("redundancy", "improvement", "missed_rate", "unseen_share", "estimated_optima", "hops", "word", "line")
-# Attributes of a solution that tell of the multi-start search.
+# Attributes of a solution that describe the multi-start search.
 _OF_THE_STARTS = (
     "optima", "starts", "feasible_starts", "certified_starts", "dominated_starts", "solve_time_s", "build_time_s",
 )  # fmt: skip
-# Largest violation of a start on the constraints.
-_ON = 1e-8
 
 
 @dataclass(frozen=True, eq=False)
 class SelfMotionMap:
-    """The nodes of a mapped self-motion manifold, to be drawn.
+    """The nodes of a mapped self-motion manifold for figures.
 
     Attributes:
         q: Nodes, component after component, along the curve for one degree of freedom, shape (N, nq).
@@ -72,18 +70,18 @@ class SelfMotionMap:
 
 @dataclass(frozen=True, eq=False)
 class GlobalSearch:
-    """Finding of the search beyond multi-start.
+    """Result of the global search.
 
     Attributes:
         redundancy: Degrees of freedom that the equalities leave.
-        improvement: Share by which the best posture is below the best one of the multi-start search.
+        improvement: Share by which the objective is below the best objective of the multi-start search.
         missed_rate: Share of the certified starts that ended more than 0.1 % above the best posture.
         unseen_share: Estimated share of further starts that would end in an optimum not seen yet.
         estimated_optima: Estimated number of optima.
-        hops: Hops of basin hopping; 0 with a map.
+        hops: Number of hops; 0 with a map.
         motion: The map, or ``None``.
         bound: The bound on the map, or ``None``.
-        map: The map as drawn, or ``None``.
+        map: The map for figures, or ``None``.
     """
 
     redundancy: int
@@ -98,7 +96,7 @@ class GlobalSearch:
 
     @property
     def line(self) -> str:
-        """The finding in words."""
+        """The result in a sentence."""
         missed = f"{100 * self.missed_rate:.0f} % of the starts"
         if self.motion is None or self.bound is None:
             return (
@@ -116,7 +114,7 @@ class GlobalSearch:
 
     @property
     def word(self) -> str | None:
-        """How far the bound can be trusted: ``bounded``, because it rests on estimates; ``None`` without a map."""
+        """``bounded`` with a map, because the bound rests on estimates and is not proved; ``None`` without a map."""
         return None if self.bound is None else "bounded"
 
     def to_dict(self) -> dict[str, object]:
@@ -143,7 +141,7 @@ class GlobalSearch:
 
 @dataclass(frozen=True, eq=False)
 class GlobalSolution:
-    """The better one of a given solution and the postures found beyond it, with the finding."""
+    """The best solution after the global search, with the result of the search."""
 
     solution: PostureSolution
     search: GlobalSearch
@@ -153,7 +151,7 @@ def check_searchable(problem: ConstrainedProblem) -> None:
     """Refuse a problem that :func:`search_globally` cannot search.
 
     Raises:
-        InputError: The objective is not that of an impact, or the distance from the start counts, too.
+        InputError: The objective is not an impact objective, or the problem has a regularization.
     """
     _ = problem.impact
     if problem.requirements.regularization:
@@ -173,17 +171,17 @@ def search_globally(
     compile: CompileMode = "auto",
     progress: Progress | None = None,
 ) -> GlobalSolution:
-    """Search on from the solution of the multi-start search.
+    """Continue from the solution of the multi-start search.
 
     Args:
         solution: The solution of a problem that passes :func:`check_searchable`.
         seed: Seed of the random postures.
         jobs: Processes that search side by side.
-        compile: Whether the program is compiled.
-        progress: Called with the solves done and planned.
+        compile: Whether to compile the program.
+        progress: Called with the numbers of finished and planned solves.
     """
     problem = solution.problem
-    # A singular posture has more freedom than the manifold.
+    # A singular posture has more freedom than the manifold, so the larger rank counts.
     numeric = Numeric(problem.robot.model)
     ranks = [rank(equality_jacobian(problem, numeric.at(q))) for q in (solution.initial, solution.q)]
     redundancy = problem.robot.nv - max(ranks)
@@ -201,7 +199,7 @@ def search_globally(
 
 
 def _compared(before: PostureSolution, after: PostureSolution) -> tuple[float, float, float, float]:
-    """Return improvement, missed rate, unseen share and estimated number of optima."""
+    """Return improvement, missed rate, unseen share and estimated number of optima of :class:`GlobalSearch`."""
     value, hits = before.problem.objective.value, [optimum.hits for optimum in before.optima]
     best = value(after.q)
     near = sum(optimum.hits for optimum in before.optima if optimum.objective <= best * (1 + _MISSED))
@@ -211,46 +209,46 @@ def _compared(before: PostureSolution, after: PostureSolution) -> tuple[float, f
 def _improved(
     before: PostureSolution, guesses: Sequence[Array | None], *, seed: int, jobs: int, compile: CompileMode
 ) -> PostureSolution:
-    """Solve from guesses, and return the better one of both solutions with the starts of the given one."""
+    """Solve from guesses, and return the better solution, with the multi-start statistics of ``before``."""
     known = [q for q in guesses if q is not None]
     try:
         count = 1 + len(known)
-        found = solve(before.problem, starts=count, seed=seed, jobs=jobs, compile=compile, guesses=known)
+        after = solve(before.problem, starts=count, seed=seed, jobs=jobs, compile=compile, guesses=known)
     except SolverFailed:
         return before
     value = before.problem.objective.value
-    if not value(found.q) < value(before.q) * (1 - _BETTER):
+    if not value(after.q) < value(before.q) * (1 - _BETTER):
         return before
-    return replace(found, **{key: getattr(before, key) for key in _OF_THE_STARTS})
+    return replace(after, **{key: getattr(before, key) for key in _OF_THE_STARTS})
 
 
 def _redrawn(projector: Projector, q: Array, rng: np.random.Generator) -> Array | None:
-    """Return the posture with some joints drawn anew, pulled onto the constraints; ``None`` if it does not reach."""
+    """Draw some joints anew and pull the posture onto the constraints; ``None`` if it does not reach them."""
     chart = projector.chart
     x, other = chart.to_x(q), chart.to_x(random_posture(projector.problem, chart, rng))
     share = rng.choice(_REDRAWN)
     for slot in chart.slots:
         if slot.kind.family != "free-flyer" and rng.random() < share:
             x[slot.x] = other[slot.x]
-    found = projector.project(chart.to_q(x))
-    return found.q if found.violation <= _ON else None
+    projection = projector.project(chart.to_q(x))
+    return projection.q if projection.violation <= FEASIBLE else None
 
 
 def _mapped(
     solution: PostureSolution, redundancy: int, seed: int, solve_from: Callable[..., PostureSolution]
 ) -> tuple[PostureSolution, SelfMotion, OptimalityBound, SelfMotionMap]:
-    """Map the manifold, polish the best node of each component, and bound what is left."""
+    """Map the manifold, solve from the best node of each component, and bound the objective on the map."""
     manifold = ConstraintManifold(solution.problem)
     chart, ends = manifold.chart, [optimum.q for optimum in solution.optima]
     known = np.array([chart.to_x(q) for q in (solution.initial, *ends)])
     motion = map_self_motion(manifold, redundancy, known, seed=seed)
-    x = np.concatenate([component.x for component in motion.components])
+    x = np.concatenate([part.x for part in motion.components])
     component = np.repeat(np.arange(len(motion.components)), [len(part.x) for part in motion.components])
-    objective, feasible = manifold.objective(x)[0], manifold.distance_to_feasible(x) <= _ON
+    objective, feasible = manifold.objective(x)[0], manifold.distance_to_feasible(x) <= FEASIBLE
     usable = feasible & np.isfinite(objective)
-    leading = [np.flatnonzero(usable & (component == k)) for k in range(len(motion.components))]
-    nodes = [places[objective[places].argmin()] for places in leading if places.size]
-    better = solve_from(solution, [manifold.to_q(x[node]) for node in nodes])
+    nodes_of = [np.flatnonzero(usable & (component == k)) for k in range(len(motion.components))]
+    best_nodes = [nodes[objective[nodes].argmin()] for nodes in nodes_of if nodes.size]
+    better = solve_from(solution, [manifold.to_q(x[node]) for node in best_nodes])
     bound = bound_objective(motion, solution.problem.objective.value(better.q))
     if bound.x is not None:
         better = solve_from(better, [manifold.to_q(bound.x)])
@@ -261,7 +259,7 @@ def _mapped(
         return np.array([np.linalg.norm(points - target, axis=1).argmin() for target in targets])
 
     drawn = SelfMotionMap(
-        q=np.array([manifold.to_q(one) for one in x]),
+        q=np.array([manifold.to_q(node) for node in x]),
         component=component,
         s=np.concatenate([part.s for part in motion.components]),
         objective=objective,
@@ -277,11 +275,11 @@ def _mapped(
 def unseen_share(hits: Sequence[int]) -> float:
     """Return the share of further starts that would end in an optimum not seen yet.
 
-    This is Good–Turing's estimate, the share of starts that ended in an optimum found once (I. J. Good, "The
+    This is the Good–Turing estimate, the share of starts that ended in an optimum with one hit (I. J. Good, "The
     population frequencies of species and the estimation of population parameters", Biometrika 1953).
 
     Args:
-        hits: Starts that ended in each optimum, at least one.
+        hits: Number of starts that ended in each optimum, at least one.
     """
     return sum(count == 1 for count in hits) / sum(hits)
 
@@ -289,11 +287,11 @@ def unseen_share(hits: Sequence[int]) -> float:
 def estimated_optima(hits: Sequence[int]) -> float:
     """Return an estimate of the number of optima, seen and unseen, that tends to be low.
 
-    This is Chao1 without bias, ``n + f₁(f₁ − 1)/(2(f₂ + 1))`` with the numbers ``f_k`` of optima found k times
-    (A. Chao, "Nonparametric estimation of the number of classes in a population", Scand. J. Statist. 1984).
+    This is the bias-corrected Chao1 estimate ``n + f₁(f₁ − 1)/(2(f₂ + 1))`` with the numbers ``f_k`` of optima with k
+    hits (A. Chao, "Nonparametric estimation of the number of classes in a population", Scand. J. Statist. 1984).
 
     Args:
-        hits: Starts that ended in each optimum.
+        hits: Number of starts that ended in each optimum.
     """
     once, twice = (sum(count == k for count in hits) for k in (1, 2))
     return len(hits) + once * (once - 1) / (2 * (twice + 1))

@@ -1,4 +1,4 @@
-"""The runs of the solver from all starts, with a program that grows by what their ends lack."""
+"""Runs of the solver from all starts, with a program that grows by the parts that it lacks at their ends."""
 
 from __future__ import annotations
 
@@ -25,22 +25,22 @@ from impact_posture.system.processes import fork_map
 
 Progress = Callable[[int, int], None]
 
-# Starts that run before the others in a program that grows.
+# Number of starts that run before all others if the program grows.
 FIRST = 2
 # Most runs from one start, each with a program that has grown.
 _ROUNDS = 10
-# Unknowns of all starts together up to which every start is finished, because that takes no longer.
+# With at most this many unknowns of all starts together, every start is finished, because that takes no longer.
 _SMALL = 1000
-# Where only the best counts: unknowns of the starts that go on together, their least number, and the share above the
-# best from which a bound dominates.  With more starts, the program gets what none of the best needs; with fewer, it
-# is built more often.  A run that ended in a trap may end below its bound.
+# If only the best counts: unknowns of the starts that continue together, their least number, and the share above the
+# best objective from which a start is dominated.  With more starts, the program gets parts that the best do not need.
+# With fewer, it is built more often.  The share is large because a run that ended in a trap may end below its bound.
 _BATCH, _LEAST, _FAR = 600, 2, 0.05
-# A fork takes as long as the runs of programs with so many unknowns in all.
+# A fork takes as long as runs with this many unknowns in all.
 _FORK = 200
-# Starts that go on from postures this close (rad, m) share one run, which would end at the same posture.
+# Starts that continue from postures this close (rad, m) share one run, because their runs would end equally.
 _SAME = 1e-6
-# Price of a meter of slack for runs that ended in a trap, and how often they begin anew, each time ten times as dear:
-# where the objective falls steeply, as that of a stretched ur10 does, any fixed price leaves some slack.
+# Price of a meter of slack after a trap, number of repetitions, and factor on the price in each.  Any fixed price
+# leaves slack where the objective falls steeply, as for a stretched ur10.
 HIGH_PRICE, _ANEW, _DEARER = 20 * SLACK_PRICE, 4, 10
 
 
@@ -49,16 +49,16 @@ class SolverRun:
     """A run of the solver from one start.
 
     Attributes:
-        start: The start; ``None`` if none reached the constraints.
+        start: The start, shape (nq,); ``None`` if no attempt reached the constraints.
         record: Result of the solver; ``None`` if the objective does not exist at its end.
         objective: Objective at the end.
-        minimized: Objective in units of the initial one, with the regularization.
+        minimized: Objective divided by the initial objective, plus the regularization.
         certificate: Certificate of the end; ``None`` while the program lacks parts.
         lacks: Whether the program lacks parts at the end.
-        dominated: Whether it was left there, because it could not become the best.
-        trapped: Whether the end violates something although the program lacks nothing, or because that pays.  The run
-            begins anew, at a higher price.
-        time_s: Wall time of this run and of those before it from the same start; an even share of shared runs.
+        dominated: Whether the start was stopped here because it could not become the best.
+        trapped: Whether the end violates a constraint although the program lacks nothing, or because slack pays.  The
+            run is repeated at a higher price.
+        time_s: Wall time of all runs from the start, s; runs for several starts count in equal shares.
     """
 
     start: Array | None = None
@@ -81,14 +81,14 @@ class SolverRun:
 def run_start(
     nlp: PostureNLP, start: Array, scale: float, price: float = SLACK_PRICE, first: SolveRecord | None = None
 ) -> tuple[SolveRecord, Certificate]:
-    """Solve from a feasible start and certify the end; try the other guesses of the objective if it fails.
+    """Solve from a feasible start and certify the end; if this fails, try the other guesses of the objective.
 
     Args:
         nlp: The program.
         start: The start, shape (nq,).
         scale: The initial objective.
         price: Price of a meter of slack.
-        first: Result of the first guess, if it is known.
+        first: Result of the first guess, if the caller has it.
     """
     record = first or nlp.solve(start, scale=scale, price=price)
     certificate = certify(nlp.problem, record.q, scale, record.auxiliaries, nlp.program.numeric)
@@ -103,15 +103,15 @@ def run_start(
 
 
 class GrowingSearch:
-    """The runs from all starts, whose program gets what it lacks until no end of a run lacks anything.
+    """Runs from all starts, repeated with a grown program until it lacks no part at any end.
 
     Args:
         problem: The posture problem.
         draws: The starts.
         scale: The initial objective.
         compile: Whether to compile the program.
-        finish_all: Whether starts go on that cannot become the best; in small programs they always do.
-        rows: The rows of the constraints, if another program of the problem has them.
+        finish_all: Whether to finish starts that cannot become the best; small programs always finish them.
+        rows: Rows of the constraints, if another program of the problem has them.
     """
 
     def __init__(
@@ -129,44 +129,44 @@ class GrowingSearch:
         self._small = draws.count * self._unknowns <= _SMALL
         self._finish_all = finish_all or self._small
         self.build_time_s = self.nlp.build_time_s
-        # A run goes on from where it ended without what the program lacked.
+        # Ends of runs, from which the next runs continue with the grown program.
         self._ends: dict[int, Array] = {}
         # Price of a meter of slack for starts that did not end in a trap.
         self._price = SLACK_PRICE
-        # Times that each start ended in a trap.
+        # Number of traps of each start.
         self._trapped: Counter[int] = Counter()
 
     def run(self, jobs: int, progress: Progress | None) -> list[SolverRun]:
-        """Run all starts; those whose ends the program did not keep feasible run again with what it lacked.
+        """Run all starts, and again from each end where the program lacked rows.
 
-        A program without all rows bounds what the start can still reach, because with more rows the objective rises.
-        The starts with the lowest bounds go on first, and those whose bound is well above a certified end not at all.
+        The objective at such an end is a lower bound for the start, because more rows raise the objective.  Starts
+        with the lowest bounds continue first, and starts with bounds well above a certified end do not continue.
         """
         runs: dict[int, SolverRun] = {}
         starts, best = self._draws.count, np.inf
         waiting, counts = list(range(starts)), [0] * starts
-        # Ends that lack something, with the problem of their run: what starts lack that go on later waits with them.
+        # Ends where the program lacks rows, with the problem of their run; it gets the rows when the start continues.
         owed: dict[int, tuple[SolveRecord, ConstrainedProblem]] = {}
         while waiting:
             batch = self._next(waiting, runs)
             self._grow([owed.pop(k) for k in batch if k in owed])
-            shared = self._shared(batch)
-            last = {k for own in shared.values() if max(counts[j] for j in own) >= _ROUNDS - 1 for k in own}
-            for leader, run in self._round(list(shared), jobs, last):
-                own = run.time_s / len(shared[leader])
-                for k in shared[leader]:
-                    runs[k] = replace(run, time_s=own + (runs[k].time_s if k in runs else 0.0))
+            groups = self._groups(batch)
+            last = {k for group in groups.values() if max(counts[j] for j in group) >= _ROUNDS - 1 for k in group}
+            for leader, run in self._round(list(groups), jobs, last):
+                share = run.time_s / len(groups[leader])
+                for k in groups[leader]:
+                    runs[k] = replace(run, time_s=share + (runs[k].time_s if k in runs else 0.0))
                     counts[k] += 1
                 if progress:
                     progress(min(len(runs), starts), starts)
                 if run.good and run.minimized < best and self._clear(run):
                     best = run.minimized
             lacking = {k: r for k in batch if (r := runs[k].record) is not None and runs[k].lacks and k not in last}
-            # A run without all rows goes through bodies and may end between them.  With the rows and a higher price
-            # it keeps what its start satisfies.
+            # A run without all rows passes through bodies and may end between them.  With all rows and a higher
+            # price, it keeps the constraints that its start satisfies.
             trapped = {k for k in batch if runs[k].trapped and k not in last}
             if len(runs) < starts and trapped == {*range(FIRST)}:
-                # Passing through something is worth more than the price to each of the first starts.
+                # For each of the first starts, passing through a body lowers the objective by more than the price.
                 self._price = HIGH_PRICE
             self._trapped.update(trapped)
             owed |= {k: (r, self.problem) for k, r in lacking.items()}
@@ -180,8 +180,8 @@ class GrowingSearch:
         return [runs[index] for index in range(starts)]
 
     def _grow(self, owed: list[tuple[SolveRecord, ConstrainedProblem]]) -> None:
-        """Give the program what it lacks at ends of runs, each with the problem of its run."""
-        # The auxiliaries of another program say nothing.
+        """Add the rows that the program lacks at ends of runs, each given with the problem of its run."""
+        # Auxiliaries are of use with the program of their run only.
         now = [record for record, problem in owed if problem is self.problem]
         before = [record.q for record, problem in owed if problem is not self.problem]
         numeric = self.nlp.program.numeric
@@ -197,36 +197,38 @@ class GrowingSearch:
     def _next(self, waiting: list[int], runs: dict[int, SolverRun]) -> list[int]:
         """Return the starts to run next."""
         if not runs and self.problem.grows:
-            # What the first starts lack is what most others will.
+            # Most starts lack the same rows as the first starts.
             return waiting[:FIRST]
         if self._small and len(runs) == FIRST and waiting[0] < FIRST:
-            # A little more in a small program costs the others less than another run.
+            # In a small program more rows cost the other starts less than another run.
             return [k for k in waiting if k < FIRST]
         if self._finish_all or not all(k in runs for k in waiting):
             return waiting
-        groups = self._shared(sorted(waiting, key=lambda k: runs[k].minimized))
+        groups = self._groups(sorted(waiting, key=lambda k: runs[k].minimized))
         count = max(_BATCH // self._unknowns, _LEAST)
         return sorted(k for group in list(groups.values())[:count] for k in group)
 
     def _clear(self, run: SolverRun) -> bool:
-        """Whether no original shapes touch at the end of a run."""
+        """Return whether no original shapes touch at the end of a run."""
         around = self.problem.surroundings
         return around is None or run.record is None or not around.collisions(run.record.q)
 
-    def _shared(self, waiting: list[int]) -> dict[int, list[int]]:
-        """Group starts that go on from the same posture: the first of each group runs for all."""
+    def _groups(self, waiting: list[int]) -> dict[int, list[int]]:
+        """Group starts that continue from the same posture; the first of each group runs for all."""
         groups: dict[int, list[int]] = {}
         for index in waiting:
-            end = self._ends.get(index)
-            same = (k for k in groups if end is not None and k in self._ends and _near(end, self._ends[k]))
-            groups.setdefault(next(same, index), []).append(index)
+            leader = index
+            if index in self._ends:
+                away = ((np.abs(self._ends[index] - self._ends[k]).max(), k) for k in groups if k in self._ends)
+                leader = next((k for distance, k in away if distance < _SAME), index)
+            groups.setdefault(leader, []).append(index)
         return groups
 
     def _round(self, waiting: list[int], jobs: int, last: set[int]) -> Iterator[tuple[int, SolverRun]]:
         jobs = jobs if len(waiting) * self._unknowns > _FORK else 1
         with fork_map(lambda k: self._timed(waiting[k], last=waiting[k] in last), len(waiting), jobs) as results:
             if around := self.problem.surroundings:
-                # The last word needs the shapes themselves, and this process would only wait.
+                # Load the original shapes, which the final check needs, while this process would only wait.
                 _ = around.shapes.geometry
             for k, run in results:
                 yield waiting[k], run
@@ -237,7 +239,7 @@ class GrowingSearch:
 
     @one_blas_thread()
     def _run(self, index: int, *, last: bool) -> SolverRun:
-        """Run one start; an end that the program lacks parts for is certified in its last round only."""
+        """Run one start; if the program lacks parts at its end, certify the end in the last round only."""
         nlp, scale, problem = self.nlp, self._scale, self.problem
         numeric = nlp.program.numeric
         trapped, start = self._trapped[index], self._ends.get(index)
@@ -253,25 +255,21 @@ class GrowingSearch:
                 record, certificate = run_start(nlp, start, scale, price, record)
             objective = problem.objective.value(record.q)
         except MetricError:
-            # This start led to a posture where the objective does not exist.  The other starts go on.
+            # The objective does not exist at the end of this start.  The other starts continue.
             return SolverRun(start)
         minimized = objective / scale
         if problem.requirements.regularization:
             minimized += problem.requirements.regularization * distance(nlp.chart, record.q, problem.given) ** 2
         certified = certificate is not None and certificate.holds()
-        # More rows do not help where a violation pays.
+        # More rows do not help where slack pays.
         pays = record.converged and problem.slack(record.auxiliaries) > FEASIBLE
         anew = record.converged and (pays or not lacks) and not certified and trapped < _ANEW
         anew = anew and not feasible(problem, record.q, numeric)
         return SolverRun(start, record, objective, minimized, certificate, lacks, trapped=anew)
 
 
-def _near(one: Array, other: Array) -> bool:
-    return bool(np.abs(one - other).max() < _SAME)
-
-
 def feasible(problem: ConstrainedProblem, q: Array, numeric: Numeric | None = None) -> bool:
-    """Return whether ``q`` satisfies all constraints, those of the program and others.
+    """Return whether ``q`` satisfies all constraints, also constraints that the program lacks.
 
     Args:
         problem: The posture problem.

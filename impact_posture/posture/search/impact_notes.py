@@ -11,7 +11,7 @@ _LOCKED = 0.05
 
 
 def percent(share: float) -> str:
-    """Return a share in percent; the digits suffice to show less than 100 as less, and zero has no minus sign."""
+    """Return a share in percent, with as many digits as a share below 100 % needs, and zero without a minus sign."""
     for digits in range(1, 15):
         text = f"{100 * share:.{digits}f}"
         if abs(share) >= 1 or abs(float(text)) != 100:

@@ -1,4 +1,4 @@
-"""The posture that a search begins from: the given one on the constraints, or which constraints conflict."""
+"""Find the posture from which a search begins, or name the constraints that conflict."""
 
 from __future__ import annotations
 
@@ -8,72 +8,73 @@ import numpy as np
 
 from impact_posture.errors import ContactError, ImpactPostureError, Infeasible, SolverFailed
 from impact_posture.posture.formulation.build_problem import build_problem
-from impact_posture.posture.manifold.feasible_start import Projector, feasible_start
+from impact_posture.posture.manifold.feasible_start import FEASIBLE, Projector, feasible_start
 from impact_posture.posture.program.constrained_problem import ConstrainedProblem
 from impact_posture.posture.program.program_rows import ProgramRows
 from impact_posture.posture.search.conflicts import ElasticProgram, find_conflicts
 from impact_posture.posture.search.growing_search import feasible
 from impact_posture.system.arrays import Array
 
-# A violation so small that the relaxed constraints stop after the first few postures.
+# Violation of a known conflict that lets :func:`find_conflicts` stop after a few starts.
 _QUICK = 1e-9
 
 
 def initial_posture(problem: ConstrainedProblem, seed: int, rows: ProgramRows) -> tuple[ConstrainedProblem, Array]:
     """Return the given posture moved onto the constraints, or the first other start that reaches them.
 
-    Constraints without projection need the elastic program, and the returned problem has the parts that it needed.
+    If a start violates constraints without projection, the elastic program moves it.  The returned problem then has
+    all parts that this program needed.
 
     Raises:
         Infeasible: No posture satisfies the constraints; the error names the conflicting constraints.
-        SolverFailed: A posture near the constraints was found, and none on them.
+        SolverFailed: A posture was found near the constraints, but none on them.
     """
     starts = (feasible_start(problem, index, seed) for index in range(5))
     start = next((q for q in starts if q is not None), None)
     if start is not None and feasible(problem, start):
         return problem, start
     given, problem = problem.given, problem if start is None else replace(problem, given=start)
-    answer = find_conflicts(problem, seed, ElasticProgram(problem, rows))
-    if answer.conflicts:
-        limits = f"; there {', '.join(answer.at_limits[:4])}" if answer.at_limits else ""
+    least = find_conflicts(problem, seed, ElasticProgram(problem, rows))
+    if least.conflicts:
+        limits = f"; there {', '.join(least.at_limits[:4])}" if least.at_limits else ""
         sign = "; check the sign of the normal, which points towards the robot, and how far the `surface` reaches"
-        struck = sign if any(" / surface at " in name for name in answer.conflicts) else ""
+        struck = sign if any(" / surface at " in name for name in least.conflicts) else ""
         raise Infeasible(
-            answer.conflicts,
-            hint=f"{_way_out(problem, seed)}relax one of them, move the target, or start from another `posture`"
+            least.conflicts,
+            hint=f"{_turn_hint(problem, seed)}relax one of them, move the target, or start from another `posture`"
             f"{struck}{limits}",
         )
-    found = Projector(problem).project(answer.q)
-    if found.violation > 1e-8:
+    projection = Projector(problem).project(least.q)
+    if projection.violation > FEASIBLE:
         raise SolverFailed(
-            f"a posture within {found.violation:.1e} of the constraints was found, but none on them",
+            f"a posture within {projection.violation:.1e} of the constraints was found, but none on them",
             where="problem",
             hint="start from a `posture` nearer to the target",
         )
-    return replace(answer.problem, given=given), found.q
+    return replace(least.problem, given=given), projection.q
 
 
-def _way_out(problem: ConstrainedProblem, seed: int) -> str:
-    """Say whether there is a posture if the contact frame may turn."""
+def _turn_hint(problem: ConstrainedProblem, seed: int) -> str:
+    """Return a hint if the constraints do not conflict when the contact frame may turn, else an empty text."""
     if not problem.objective.contacts or problem.requirements.contact_pose in ("position", "box", "free"):
         return ""
     freed = replace(problem.requirements, contact_pose="position", target_quaternion=None)
     try:
         turned = build_problem(problem.robot, problem.objective, problem.given, freed)
-        found = find_conflicts(turned, seed, beside=_QUICK)
+        least = find_conflicts(turned, seed, beside=_QUICK)
     except ImpactPostureError:
         return ""
-    return "" if found.conflicts else "let the contact frame turn (`contact_pose` position), which is possible; or "
+    return "" if least.conflicts else "let the contact frame turn (`contact_pose` position), which is possible; or "
 
 
 def initial_objective(problem: ConstrainedProblem, initial: Array) -> float:
     """Return the objective at the start, which scales the program and so must exist.
 
     Raises:
-        ContactError: The contact point cannot move along the normal there.
+        ContactError: The contact point cannot move along the normal at the start.
     """
     objective = problem.objective
-    # The value is rounding if nothing can move along the normal.
+    # If nothing can move along the normal, the value would be rounding.
     value = objective.value(initial) if objective.movable(initial) else 0.0
     if not (np.isfinite(value) and value > 0):
         frames = ", ".join(f"'{contact.frame}'" for contact in objective.contacts)

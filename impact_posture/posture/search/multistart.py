@@ -1,10 +1,10 @@
-"""Multi-start search: many feasible starts, one program, distinct optima, and the best certified posture."""
+"""Multi-start search: solve one program from many feasible starts, and return the best certified posture."""
 
 from __future__ import annotations
 
 import time
 from collections.abc import Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 
 import numpy as np
 import pinocchio as pin
@@ -23,11 +23,11 @@ from impact_posture.posture.search.initial_posture import initial_objective, ini
 from impact_posture.posture.search.start_draws import StartDraws
 from impact_posture.system.arrays import Array
 
-# Optima closer than this in posture (tangent norm) and in objective (relative) are the same optimum.
+# Two ends are the same optimum if their postures (tangent norm) and objectives (relative) differ by less than this.
 SAME_POSTURE, _SAME_OBJECTIVE = 1e-2, 1e-4
-# A reduction below this share is no gain: the jump, a square root, changes by less than 0.05 %.
+# A smaller reduction does not count: the jump, a square root, changes by less than 0.05 %.
 _NO_GAIN = 1e-3
-# From this number of starts on, a single hit of the best optimum gets a note.
+# With at least this many starts, a single hit of the best optimum gets a note.
 _MANY = 8
 
 
@@ -52,25 +52,25 @@ class PostureSolution:
 
     Attributes:
         problem: The posture problem.
-        initial: The given posture, moved to the constraints if it did not satisfy them.
-        moved: Length of that move, tangent norm.
-        q: The best certified posture.
+        initial: The given posture, moved onto the constraints if it does not satisfy them, shape (nq,).
+        moved: Length of this move, tangent norm.
+        q: The best certified posture, shape (nq,).
         certificate: Certificate of ``q``.
         redundancy: Degrees of freedom that the equalities leave at ``q``.
         optima: Distinct optima, best first.
         starts: Number of starts.
         feasible_starts: Starts that reached the constraints.
-        certified_starts: Starts that ended at a certified posture at which no original shapes touch.
-        colliding_starts: Starts that ended at another certified posture.
-        dominated_starts: Starts that were left on the way, because they could not become the best.
+        certified_starts: Starts that ended at a certified posture where no original shapes touch.
+        colliding_starts: Starts that ended at a certified posture where original shapes touch.
+        dominated_starts: Starts that were stopped because they could not become the best.
         status: Return status of IPOPT for the best run.
         iterations: Iterations of the best run.
         solve_time_s: Wall time of all runs together.
         start_time_s: Median wall time of the runs from one start.
         build_time_s: Time to build the program.
-        compiled: Whether it ran as machine code.
+        compiled: Whether the program ran as machine code.
         notes: Notes for the user about the solution.
-        compiler_fault: Reason why a compilation failed; empty else.
+        compiler_fault: Why a compilation failed; empty if none failed.
     """
 
     problem: ConstrainedProblem
@@ -113,9 +113,17 @@ def solve(
     guesses: Sequence[Array] = (),
     finish_all: bool = False,
 ) -> PostureSolution:
-    """Solve from the given posture, from feasible ``guesses`` and from random feasible ones: ``starts`` in all.
+    """Solve from the given posture, from feasible ``guesses`` and from random feasible postures.
 
-    Unless ``finish_all``, a start is left where it can no longer become the best.
+    Args:
+        problem: The posture problem.
+        starts: Number of all starts.
+        seed: Seed of the random postures.
+        jobs: Number of processes.
+        compile: Whether to compile the program.
+        progress: Called with the numbers of finished starts and of all starts.
+        guesses: Feasible postures, shape (nq,) each.
+        finish_all: Also finish starts that can no longer become the best.
 
     Raises:
         Infeasible: No posture satisfies the constraints; the error names the conflicting constraints.
@@ -132,14 +140,14 @@ def solve(
     certified = [r for r in runs if r.good]
     if not certified:
         raise _failure(runs)
-    good, touching = _last_word(problem, certified)
+    good, touching = _without_collisions(problem, certified)
     if not good:
         raise SolverFailed(
             f"original shapes touch at all {len(certified)} certified postures: {touching}",
             where="solver",
             hint="try more `starts`, another `posture`, or a larger `clearance`",
         )
-    # Of equally good runs the first counts, so that the solution does not depend on the speed of processes.
+    # The first of equally good runs counts, so that the solution does not depend on the speed of processes.
     best = min(good, key=lambda r: round(r.minimized, 9))
     assert best.record is not None and best.certificate is not None  # noqa: S101 (narrows types)
     q, certificate, notes = best.record.q, best.certificate, []
@@ -185,45 +193,44 @@ def solve(
     )
 
 
-def _last_word(problem: ConstrainedProblem, runs: list[SolverRun]) -> tuple[list[SolverRun], str]:
-    """The runs at whose ends no original shapes touch, and two shapes that do at another end."""
+def _without_collisions(problem: ConstrainedProblem, runs: list[SolverRun]) -> tuple[list[SolverRun], str]:
+    """Return the runs whose original shapes do not touch at the end, and the names of two shapes that touch."""
     if problem.surroundings is None:
         return runs, ""
     good: list[SolverRun] = []
-    touching, known = "", list[tuple[Array, list[tuple[str, str]]]]()
+    touching, checked = "", list[tuple[Array, list[tuple[str, str]]]]()
     for run in runs:
         assert run.record is not None  # noqa: S101 (narrows a type)
         q = run.record.q
-        # The verdict on one end of a group of equal ones is that on all.
-        found = next(
-            (hits for other, hits in known if np.linalg.norm(wrapped_difference(problem, other, q)) < 1e-6), None
-        )
-        if found is None:
-            found = problem.surroundings.collisions(q)
-            known.append((q, found))
-        if found:
-            touching = " / ".join(found[0])
+        # Equal ends are checked once.
+        same = (pairs for other, pairs in checked if np.linalg.norm(wrapped_difference(problem, other, q)) < 1e-6)
+        pairs = next(same, None)
+        if pairs is None:
+            pairs = problem.surroundings.collisions(q)
+            checked.append((q, pairs))
+        if pairs:
+            touching = " / ".join(pairs[0])
         else:
             good.append(run)
     return good, touching
 
 
 def distinct(problem: ConstrainedProblem, ends: list[tuple[Array, float]]) -> tuple[Optimum, ...]:
-    """Group ends at the same posture, best objective first."""
-    found: list[Optimum] = []
+    """Group ends (posture, objective) by optimum, best objective first."""
+    optima: list[Optimum] = []
     for q, objective in sorted(ends, key=lambda end: end[1]):
-        for k, known in enumerate(found):
+        for k, known in enumerate(optima):
             near = abs(objective - known.objective) <= _SAME_OBJECTIVE * max(abs(known.objective), 1e-300)
             if near and np.linalg.norm(wrapped_difference(problem, known.q, q)) < SAME_POSTURE:
-                found[k] = Optimum(known.q, known.objective, known.hits + 1)
+                optima[k] = replace(known, hits=known.hits + 1)
                 break
         else:
-            found.append(Optimum(q, objective, 1))
-    return tuple(found)
+            optima.append(Optimum(q, objective, 1))
+    return tuple(optima)
 
 
 def hits_of_best(optima: Sequence[Optimum]) -> int:
-    """Return how many starts reached the best objective, at any posture: ends on a flat optimum are distinct."""
+    """Return how many starts reached the best objective at any posture, because ends on a flat optimum differ."""
     best = optima[0].objective
     return sum(o.hits for o in optima if o.objective - best <= _SAME_OBJECTIVE * abs(best))
 
@@ -238,15 +245,15 @@ def wrapped_difference(problem: ConstrainedProblem, one: Array, other: Array) ->
 
 
 def _failure(runs: list[SolverRun]) -> SolverFailed:
-    solved = [r for r in runs if r.record is not None and r.certificate is not None]
-    words = sorted({r.record.status for r in solved if r.record is not None})
+    solved = [(r.record, r.certificate) for r in runs if r.record is not None and r.certificate is not None]
     if not solved:
         return SolverFailed(
             "the objective does not exist where the starts ended", where="solver", hint="choose another `objective`"
         )
-    nearest = min((r.certificate for r in solved if r.certificate), key=lambda c: c.stationarity)
+    statuses = sorted({record.status for record, _ in solved})
+    nearest = min((certificate for _, certificate in solved), key=lambda c: c.stationarity)
     return SolverFailed(
-        f"none of {len(solved)} feasible starts ended at a certified posture (solver: {', '.join(words)}; best "
+        f"none of {len(solved)} feasible starts ended at a certified posture (solver: {', '.join(statuses)}; best "
         f"stationarity {nearest.stationarity:.1e}, violation {nearest.primal:.1e})",
         where="solver",
         hint="try more `starts`, another `seed` or `posture`, or a small `regularization`",
