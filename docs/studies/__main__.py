@@ -19,7 +19,7 @@ from impact_posture.posture.program.ipopt import one_blas_thread
 
 @one_blas_thread()
 def main() -> int:
-    """Print what each study finds; with ``--write`` also renew its page of the documentation."""
+    """Print the results of each study; with ``--write`` also renew its page of the documentation."""
     listed = "\n".join(f"  {study.name:13}{study.about}" for study in STUDIES.values())
     parser = argparse.ArgumentParser(
         prog="python -m docs.studies", description=f"benchmarks and studies:\n{listed}",
@@ -27,7 +27,7 @@ def main() -> int:
     )  # fmt: skip
     parser.add_argument("names", nargs="+", choices=list(STUDIES), metavar="NAME")
     parser.add_argument("--only", default="", metavar="TEXT", help="cases whose name has this in it")
-    parser.add_argument("--count", type=int, help="how many of what the study counts")
+    parser.add_argument("--count", type=int, help="number of starts, ticks, passes, postures, draws or seeds")
     parser.add_argument("--seed", type=int, default=0, help="of impacts and points; the first of four of flow")
     parser.add_argument("--number", type=int, help="points: print this one alone, run anew")
     parser.add_argument("--jobs", type=int, default=2, help="processes of points and reproduction")
@@ -36,7 +36,7 @@ def main() -> int:
     asked = parser.parse_args()
     wanted = [STUDIES[name] for name in asked.names]
     if asked.write and (asked.only or asked.number is not None or not all(study.page for study in wanted)):
-        parser.error("--write is for studies that have a page, and for all of their cases: leave --only away")
+        parser.error("--write is for studies that have a page, and for all of their cases: leave out --only")
     if asked.count is not None and asked.count < 1:
         parser.error("--count: one or more")
     return max([_run(study, asked) for study in wanted])

@@ -1,4 +1,4 @@
-"""How long ``optimize`` takes until it prints its answer, and until figures and C code are written."""
+"""Time of ``optimize`` until it prints its answer, and until figures and C code are written."""
 
 from __future__ import annotations
 
@@ -15,7 +15,7 @@ from typing import NamedTuple
 
 from docs.studies.core import Request, machine, table
 
-# What the project asks for: answer and end on two idle cores with warm caches, s.
+# Goals: answer and end on two idle cores with warm caches, s.
 CASES = {
     "tilthex_arm": ("tilthex_arm --normal 0 0 1", 1.2, 2.5),
     "talos, hand": ("talos --frame gripper_right_base_link --normal -1 0 0", 2.5, 5.0),
@@ -33,9 +33,9 @@ class Run(NamedTuple):
 
 
 def lines(request: Request) -> Iterator[str]:
-    """A row a case and program; the programs take turns, because other work changes the times of a machine."""
-    own = str(Path(sys.executable).with_name("impact-posture"))
-    programs = {"this one": own} | ({"the other": request.against} if request.against else {})
+    """Yield a row for each case and program; programs take turns, because other work changes the times."""
+    this = str(Path(sys.executable).with_name("impact-posture"))
+    programs = {"this": this} | ({"other": request.against} if request.against else {})
     yield f"{machine()}; medians of {request.count} runs in a terminal, after one that warms the caches."
     yield ""
     head = ("case", "program", "answer s", "target", "end s", "target", "processor s")
@@ -53,12 +53,12 @@ def _rows(request: Request, programs: dict[str, str]) -> Iterator[list[str]]:
         for name, runs in runs_of.items():
             middle = Run(*(statistics.median(times) for times in zip(*runs[1:], strict=True)))
             yield [case, name, *f"{middle.answer:.2f}|{answer}|{middle.end:.2f}|{end}|{middle.busy:.2f}".split("|")]
-            if name == "this one" and (middle.answer > answer or middle.end > end):
+            if name == "this" and (middle.answer > answer or middle.end > end):
                 request.missed.append(f"{case}: {middle.answer:.2f} s and {middle.end:.2f} s")
 
 
 def timed(command: list[str]) -> Run:
-    """Run a command in a terminal of its own, in a folder that is removed.
+    """Run a command in a new terminal, in a folder that is removed.
 
     Bytecode is a cache like the others, so the command may write it.
     """

@@ -1,4 +1,4 @@
-"""Compile sources into a shared library once: what was built stays in the cache, by a hash of command and sources."""
+"""Compile sources into a shared library, which a cache keeps by a hash of command and sources."""
 
 from __future__ import annotations
 
@@ -23,7 +23,7 @@ _V3 = frozenset({"avx2", "bmi1", "bmi2", "f16c", "fma", "abm", "movbe"})
 
 @dataclass(frozen=True)
 class Built:
-    """A loaded library, what made it without the folders of headers, and processor seconds of the compiler."""
+    """A loaded library, its compiler command without header folders, and processor seconds of the compiler."""
 
     library: ctypes.CDLL
     flags: str
@@ -66,13 +66,13 @@ def _compilers_time() -> float:
 
 
 def flag_sets() -> dict[str, list[str]]:
-    """Ways of compiling by their names; the one for AVX2 where the processor has it."""
+    """Return sets of compiler flags by name; the set for AVX2 only if the processor has it."""
     avx2 = {"-O3 AVX2": ["-O3", "-march=x86-64-v3"]} if set(processor()["flags"].split()) >= _V3 else {}
     return {"-O2": ["-O2"], **avx2, "-O3 native": ["-O3", "-march=native"]}
 
 
 def processor() -> dict[str, str]:
-    """Name, and the instructions that it has, of the first processor; empty where the system does not say."""
+    """Return name and instructions of the first processor; empty if the system does not state them."""
     file = Path("/proc/cpuinfo")
     lines = file.read_text(encoding="utf-8").splitlines() if file.is_file() else []
     entries = {key.strip(): value.strip() for key, _, value in (line.partition(":") for line in reversed(lines))}
@@ -80,6 +80,6 @@ def processor() -> dict[str, str]:
 
 
 def compiler_version(compiler: Sequence[str]) -> str:
-    """The first line of what a compiler says of itself."""
+    """Return the first line of the version text of a compiler."""
     done = subprocess.run([*compiler, "--version"], capture_output=True, text=True, errors="replace", check=True)
     return done.stdout.splitlines()[0]

@@ -1,4 +1,4 @@
-"""The problems that are measured, each once; a study adds what it alone needs by their names."""
+"""Problems that the studies measure, by name."""
 
 from __future__ import annotations
 
@@ -31,7 +31,7 @@ class Case:
     more: Mapping[str, object] = field(default_factory=dict)
 
     def problem(self, **more: object) -> ConstrainedProblem:
-        """The problem; contact frame and supports are the robot's own unless ``more`` has others."""
+        """Build the problem; contact frame and supports come from the robot unless ``more`` has others."""
         values = {"robot": self.robot, "normal": self.normal, **self.more, **more}
         return prepare(make_settings(values)).problem
 
@@ -67,5 +67,5 @@ CASES = {case.name: case for case in _ALL}
 
 
 def cases(only: str, names: Iterator[str] | None = None) -> list[Case]:
-    """Those of some names, or of all, whose name has ``only`` in it."""
+    """Return the cases with these names, or all, whose name contains ``only``."""
     return [CASES[name] for name in (names or CASES) if only in name]

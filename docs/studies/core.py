@@ -1,4 +1,4 @@
-"""What all benchmarks share: the list of studies, the machine, clocks, starts, tables."""
+"""Shared parts of the studies: list of studies, machine, clocks, starts, tables."""
 
 from __future__ import annotations
 
@@ -44,7 +44,7 @@ class Study:
     target: str = ""  # of make, which writes its page
 
     def lines(self, request: Request) -> Iterator[str]:
-        """Lines of its page, or of what it prints."""
+        """Yield the lines of its page or output."""
         module, _, function = self.source.partition(":")
         return getattr(import_module(f"docs.studies.{module}"), function or "lines")(request)
 
@@ -59,7 +59,7 @@ STUDIES = {
     study.name: study
     for study in (
         Study("solve", "solve", "solve and build times, and the exported gradient with feet; random starts", 20),
-        Study("optima", "solve:optima", "whether 16 starts find what many starts find", 500, page=False),
+        Study("optima", "solve:optima", "whether 16 starts reach the optimum of many starts", 500, page=False),
         Study(
             "answer", "answer", "optimize until its answer and until its end, beside another program", 5, page=False
         ),
@@ -71,7 +71,7 @@ STUDIES = {
         Study("digits", "digits", "the digits that double precision keeps with feet; random postures", 3),
         Study("shapes", "shapes", "the collision shapes of the catalogue, fitted anew"),
         Study("feasible", "feasible", "what feasibility costs; seeds", 3, target="study-feasible"),
-        Study("approach", "approach", "how fast robots arrive in their optima", target="study-feasible"),
+        Study("approach", "approach", "speed at which robots arrive in their optima", target="study-feasible"),
         Study("restitution", "restitution", "rebound of each contact law", target="calibration"),
         Study("impacts", "impact.page", "objectives against impacts in MuJoCo; postures", 30, target="study-impacts"),
         Study("elastic", "elastic.study", "arms with elastic joints in MuJoCo; postures", 20, target="study-elastic"),
@@ -82,7 +82,7 @@ STUDIES = {
         Study("points", "robustness.study:points", "runs the points of the next two; random draws", 40, page=False),
         Study("robustness", "robustness.study", "where each controller helps", target="study-robustness"),
         Study("envelope", "robustness.study:kept_targets", "targets that are kept", target="study-robustness"),
-        Study("scan", "scan", "what decides along the redundancy; postures of each robot", 11, target="study-scan"),
+        Study("scan", "scan", "a scan along the redundancy; postures of each robot", 11, target="study-scan"),
         Study("reproduction", "reproduction", "the experiments of the paper; seeds", 10, target="reproduction"),
     )
 }
@@ -90,7 +90,7 @@ STUDIES = {
 
 @dataclass(frozen=True)
 class Request:
-    """What the command line asks of a study; ``missed`` takes the goals that it misses."""
+    """Options of the command line for a study; ``missed`` collects the goals that it misses."""
 
     only: str = ""
     count: int = 1
@@ -108,12 +108,12 @@ def page_of(name: str) -> Path:
 
 
 def say(words: str, end: str = "\n") -> None:
-    """Tell the progress, beside the page."""
+    """Print progress on standard error."""
     print(words, end=end, file=sys.stderr, flush=True)
 
 
 def collected(work: Callable[[int], _T], count: int, jobs: int, what: str) -> list[_T]:
-    """Return ``work(0)`` to ``work(count - 1)`` from several processes, and tell the progress."""
+    """Return ``work(0)`` to ``work(count - 1)`` from several processes, and print progress."""
     results_by_index: dict[int, _T] = {}
     with fork_map(work, count, jobs) as results:
         for index, result in results:
@@ -124,7 +124,7 @@ def collected(work: Callable[[int], _T], count: int, jobs: int, what: str) -> li
 
 
 def table(head: Sequence[str], rows: Iterator[Sequence[str]] | Sequence[Sequence[str]]) -> Iterator[str]:
-    """Lines of a Markdown table, each as soon as its row is there."""
+    """Yield the lines of a Markdown table, each as soon as its row is known."""
     yield f"| {' | '.join(head)} |"
     yield "|" + "---|" * len(head)
     yield from (f"| {' | '.join(row)} |" for row in rows)
@@ -136,7 +136,7 @@ def cell(value: float | None, digits: int) -> str:
 
 
 def machine(*packages: str) -> str:
-    """What this runs on and with: the processor, the compiler, and versions of packages."""
+    """Describe processor, compiler and versions of packages."""
     compiler = find_compiler()
     versions = ", ".join(f"{name} {version(name)}" for name in ("casadi", "pin", "numpy", *packages))
     return (
@@ -159,7 +159,7 @@ def one_core() -> Iterator[None]:
 
 
 def median_time(call: Callable[[], object], repeats: int) -> float:
-    """Median processor time of a call, seconds: what other programs take of a busy machine does not count."""
+    """Return the median processor time of a call, s, which leaves out other programs."""
     times = []
     for _ in range(repeats):
         began = time.thread_time()
@@ -169,12 +169,12 @@ def median_time(call: Callable[[], object], repeats: int) -> float:
 
 
 def crba_time(model: pin.Model) -> float:
-    """Median processor time of one Pinocchio ``crba`` from Python, seconds: the yardstick of a machine."""
+    """Return the median processor time of one Pinocchio ``crba`` from Python, s, as a unit for this machine."""
     data, q = model.createData(), pin.randomConfiguration(model, -np.ones(model.nq), np.ones(model.nq))
     return median_time(lambda: pin.crba(model, data, q), CRBA_CALLS)
 
 
 def feasible_starts(problem: ConstrainedProblem, count: int, seed: int) -> list[Vector]:
-    """The first feasible of random postures, ``count`` of them."""
+    """Return the first ``count`` feasible postures of random draws."""
     starts = (feasible_start(problem, index, seed) for index in range(1, 4 * count))
     return [start for start in starts if start is not None][:count]

@@ -1,6 +1,6 @@
-"""Lifted against reduced: the impact's linear solve as equations of the program, or inside the objective.
+"""Lifted and reduced form: the linear solve of the impact as equations of the program, or inside the objective.
 
-Both by IPOPT with exact Hessians on the same starts, interpreted.
+IPOPT solves both with exact Hessians from the same starts, interpreted.
 """
 
 from __future__ import annotations
@@ -26,7 +26,7 @@ _Runs = list[tuple[float, int, bool]]
 
 
 def lines(request: Request) -> Iterator[str]:
-    """One row a case and formulation."""
+    """Yield a row for each case and formulation."""
     yield from (machine(), "")
     yield from table(_HEAD, (row for name in _CASES if request.only in name for row in _rows(name, request.count)))
 
@@ -48,7 +48,7 @@ def _rows(name: str, count: int) -> Iterator[list[str]]:
 
 
 def _reduced(nlp: PostureNLP) -> ca.Function:
-    """IPOPT on ``x`` alone: the value of the objective is that of the adjoint kernel."""
+    """Build the program in ``x`` alone, whose objective comes from the adjoint kernel."""
     problem, objective, chart = nlp.problem, nlp.problem.objective, nlp.chart
     x, scale = ca.SX.sym("x", chart.nx), ca.SX.sym("scale")
     q = chart.configuration(x)

@@ -1,6 +1,6 @@
-"""The paper's experiments for the documentation: its controllers over many seeds, every controller over a few.
+"""Experiments of the paper for the documentation: its controllers over many seeds, every controller over a few.
 
-Runs that are done are kept in build/reproduction; run it again after an interruption.
+Finished runs are kept in build/reproduction, so that an interrupted study can continue.
 """
 
 from __future__ import annotations
@@ -24,13 +24,13 @@ OTHERS = 2
 
 
 def lines(request: Request) -> Iterator[str]:
-    """The page; its pictures are drawn where it is written."""
+    """Yield the page, and draw its pictures if it is written."""
     scenarios, store = tuple(s for s in PAPER if request.only in s), JobStore(ROOT / "build" / "reproduction")
     shared = {"processes": request.jobs, "store": store, "progress": lambda a, b: say(f"\r{a} of {b} runs", end="")}
     began = time.perf_counter()
     plan = {s: controllers_of(s, False) for s in scenarios}
     main = reproduce(plan, seeds=request.count, **shared)
-    say(f"\nthe first part took {time.perf_counter() - began:.0f} s, less what was kept")
+    say(f"\nthe first part took {time.perf_counter() - began:.0f} s without the kept runs")
     every = reproduce({s: controllers_of(s, True) for s in scenarios}, seeds=OTHERS, **shared)
     yield "\n\n".join(_parts(main, every))
     if request.write:
@@ -40,7 +40,7 @@ def lines(request: Request) -> Iterator[str]:
 
 
 def _take_shown(folder: Path) -> None:
-    """The pictures that the documentation shows; the others stay away from the repository."""
+    """Copy only the pictures that the documentation shows."""
     text = (ROOT / "docs" / "reproduction.md").read_text(encoding="utf-8")
     shutil.rmtree(IMAGES, ignore_errors=True)
     for name in re.findall(r"images/reproduction/(\S+\.png)", text):

@@ -1,6 +1,6 @@
-"""What decides: one scan along the redundancy of the arm over a floor, and one of the humanoid towards its optimum.
+"""Scan along the redundancy of the arm over a floor, and from the start of the humanoid to its optimum.
 
-The nominal controller holds each posture and is hit there.  Nothing else changes from posture to posture.
+The nominal controller holds each posture and takes the impact there.  Only the posture changes.
 """
 
 from __future__ import annotations
@@ -32,9 +32,9 @@ ARM, HUMANOID = "aerial-vertical", "talos-push"
 PICTURE = ROOT / "docs" / "images" / "where-bracing-helps.png"
 # The elbow's bend at the start of the shipped scenario, and the largest one, rad.
 _SHIPPED, _LARGEST = 0.9, 1.5
-# Time that the humanoid settles.  It holds its posture from the start, s.
+# Time in which the humanoid settles, s.  It holds its posture from the start.
 _SETTLE = 1.0
-# The jump lies on the motion of a push, whose line shows in the gaps.
+# For a push, the lines of jump and motion coincide, so the jump is dashed.
 _JUMP = {"color": GREEN, "linestyle": (0, (2, 2)), "linewidth": 1.6, "zorder": 3.2}
 
 
@@ -75,14 +75,14 @@ def lines(request: Request) -> Iterator[str]:
 
 
 def _caption(scans: Mapping[str, Sequence[Place]]) -> Iterator[str]:
-    """What the picture shows, in words."""
+    """Describe the picture in words."""
     if ARM in scans:
         fine = [p for p in scans[ARM] if p.status == "completed"]
         start = min(fine, key=lambda p: abs(p.at - _SHIPPED))
         best, last = min(fine, key=lambda p: p.H), fine[-1]
         most = max((p for p in fine if p.at < start.at), key=lambda p: p.motion)
         yield (
-            "Left, the arm over the floor, whose one redundancy is the bend of the elbow. H is lowest at "
+            "Left, the arm over the floor, whose only redundancy is the bend of the elbow. H is lowest at "
             f"{best.at:g} rad, where {_against(best, start)}. On the way there from the shipped "
             f"{start.at:g} rad, the motion at first changes by {percent(most.motion / start.motion - 1)} (at "
             f"{most.at:g} rad). The other way, at {last.at:g} rad, H rises from {start.H:.0f} to {last.H:.0f}, and "
@@ -92,15 +92,15 @@ def _caption(scans: Mapping[str, Sequence[Place]]) -> Iterator[str]:
         fine = [p for p in scans[HUMANOID] if p.status == "completed"]
         start, end, most = fine[0], fine[-1], max(fine, key=lambda p: p.V)
         yield (
-            f"Right, the straight way of the humanoid from its start to the offline optimum, on its feet. √H falls "
+            f"Right, the straight line of the humanoid from its start to the offline optimum, on its feet. √H falls "
             f"to {math.sqrt(end.H / start.H):.2f} and the motion to {end.motion / start.motion:.2f}, while √V first "
             f"rises to {math.sqrt(most.V / start.V):.2f}: a push has an impulse, not a speed."
         )
 
 
-def _against(one: Place, other: Place) -> str:
-    motion, jump = (percent(getattr(one, name) / getattr(other, name) - 1) for name in ("motion", "jump"))
-    force = one.force / other.force
+def _against(place: Place, start: Place) -> str:
+    motion, jump = (percent(getattr(place, name) / getattr(start, name) - 1) for name in ("motion", "jump"))
+    force = place.force / start.force
     return f"the motion changes by {motion}, the jump by {jump} and the force by a factor of {force:.2g}"
 
 
@@ -115,7 +115,7 @@ def _scan(name: str, request: Request) -> list[Place]:
 
 
 def _places(name: str, count: int) -> Vector:
-    """The shipped start is among them: elbows from stretched to the largest, and shares of the way."""
+    """Return elbow angles from stretched to the largest, with the shipped start, or shares of the line."""
     if name == HUMANOID:
         return np.linspace(0.0, 1.0, count)
     return np.unique(np.append(np.linspace(0.0, _LARGEST, count), _SHIPPED).round(6))
@@ -137,7 +137,7 @@ def _setups(name: str, count: int) -> Iterator[Setup]:
     scenario = replace(shipped.scenario, push=replace(task, settle=_SETTLE))
     way = pin.difference(robot.model, shipped.q, optimum)
     for share in places:
-        # Straight from the start to the optimum, and back onto the feet.
+        # A point on the straight line from the start to the optimum, pulled back onto the feet.
         q = Projector(problem).project(np.asarray(pin.integrate(robot.model, shipped.q, share * way))).q
         yield Setup(scenario, robot, q, build_world(robot, scenario, q))
 
@@ -155,7 +155,7 @@ def _place(at: float, setup: Setup) -> Place:
 
 
 def _told(name: str, places: Sequence[Place]) -> Iterator[str]:
-    what = "elbow, rad" if name == ARM else "share of the way to the optimum"
+    what = "elbow, rad" if name == ARM else "share of the line to the optimum"
     yield from (f"`{name}`, the nominal controller in each posture:", "")
     head = (what, "H", "V", "S", "motion", "jump", "force, N", "status")
     body = [
@@ -168,7 +168,7 @@ def _told(name: str, places: Sequence[Place]) -> Iterator[str]:
 
 
 def draw(arm: Sequence[Place], humanoid: Sequence[Place]) -> None:
-    """Draw what the model says above what was measured, one column a scan."""
+    """Draw the predictions above the measurements, one column for each scan."""
     from matplotlib.figure import Figure
 
     with style():

@@ -1,8 +1,8 @@
-"""What a sweep survives, and what it costs: ``make study-sweep``.
+"""Robustness and cost of sweeps: ``make study-sweep``.
 
 A Dask cluster that loses a worker, MPI ranks, Slurm jobs on this machine, and a parent that is killed at random
-times give the bytes of the pool.  Then the speed, the memory of a long run, and the overhead of a task.
-``python -m docs.studies.sweep FOLDER ROBOT POINTS`` solves a large sweep, or goes on with it.
+times must give the bytes of the pool.  Then follow the speed, the memory of a long run, and the overhead of a task.
+``python -m docs.studies.sweep FOLDER ROBOT POINTS`` solves a large sweep, or continues it.
 """
 
 from __future__ import annotations
@@ -57,7 +57,7 @@ z = { from = -0.15, to = 0.15, count = COUNT }
 
 
 def tilted(count: int) -> str:
-    """A sweep over tilts of the surface and of the tool of the aerial manipulator, ``count`` of each."""
+    """Write a sweep over ``count`` tilts of the surface and ``count`` tilts of the tool of the aerial manipulator."""
     tilts = [(k / (count - 1) - 0.5, 3.1 * k / (count - 1) - 1.35) for k in range(count)]
     normals = [[0.0, math.sin(tilt), math.cos(tilt)] for tilt, _ in tilts]
     turns = [[math.cos(tilt / 2), 0.0, -math.sin(tilt / 2), 0.0] for _, tilt in tilts]
@@ -65,17 +65,17 @@ def tilted(count: int) -> str:
 
 
 def shards(folder: Path) -> dict[str, bytes]:
-    """The files of a sweep folder."""
+    """Return the files of a sweep folder."""
     return {str(path.relative_to(folder)): path.read_bytes() for path in sorted(folder.glob("data/*/*.parquet"))}
 
 
 def command(*words: object) -> list[str]:
-    """The command line of this installation."""
+    """Return a command line of this installation."""
     return [sys.executable, str(Path(sys.executable).with_name("impact-posture")), *map(str, words)]
 
 
 def killed_dask_worker(sweep: Sweep, folder: Path) -> None:
-    """A loopback cluster of four worker processes, one of which is killed in mid-run."""
+    """Run on a local cluster of four worker processes, and kill one of them halfway."""
     from distributed import LocalCluster
 
     with LocalCluster(n_workers=4, threads_per_worker=1, dashboard_address=None) as cluster:
@@ -93,7 +93,7 @@ def killed_dask_worker(sweep: Sweep, folder: Path) -> None:
 
 
 def mpi_ranks(file: Path, folder: Path) -> None:
-    """Three ranks of MPI, the first of which is the parent."""
+    """Run on three ranks of MPI, the first of which is the parent."""
     mpiexec = shutil.which("mpiexec", path=f"{Path(sys.executable).parent}{os.pathsep}{os.environ['PATH']}")
     if mpiexec is None:
         raise FileNotFoundError("no mpiexec")
@@ -105,13 +105,13 @@ def mpi_ranks(file: Path, folder: Path) -> None:
 
 
 def slurm_jobs(sweep: Sweep, folder: Path) -> None:
-    """Jobs of submitit on this machine."""
+    """Run as jobs of submitit on this machine."""
     with SlurmJobs(folder.with_name("slurm-logs"), {"timeout_min": 30}, "local") as executor:
         run_sweep(sweep, folder, executor, in_hand=4)
 
 
 def slurm_cluster(file: Path, folder: Path) -> None:
-    """Job arrays of a Slurm cluster that this machine belongs to."""
+    """Run as job arrays of a Slurm cluster that this machine belongs to."""
     if shutil.which("sbatch") is None:
         raise FileNotFoundError("no sbatch")
     words = command("sweep", file, "--slurm", "timeout_min=30", "--out", folder)
@@ -134,7 +134,7 @@ def killed_parent(file: Path, folder: Path, seed: int) -> int:
         if child.wait() == 0:
             if kills >= KILLS:
                 return kills
-            # It was done before its time: take some shards away, and go on.
+            # The run ended too early: remove some shards, and continue.
             for path in sorted(folder.glob("data/*/*.parquet"))[::2]:
                 path.unlink()
 
@@ -147,19 +147,19 @@ def robustness(folder: Path, only: str = "") -> None:
     with process_pool(2) as pool:
         run_sweep(sweep, folder / "pool", pool)
     wanted = shards(folder / "pool")
-    ways: dict[str, Callable[[Path], object]] = {
+    executors: dict[str, Callable[[Path], object]] = {
         "Dask, 4 workers, one killed": lambda out: killed_dask_worker(sweep, out),
         "MPI, 3 ranks": lambda out: mpi_ranks(file, out),
         "submitit, local jobs": lambda out: slurm_jobs(sweep, out),
         "submitit, job arrays of Slurm": lambda out: slurm_cluster(file, out),
         f"parent killed {KILLS} times": lambda out: killed_parent(file, out, 1),
     }
-    for k, (name, way) in enumerate(ways.items()):
+    for k, (name, execute) in enumerate(executors.items()):
         if only and only not in name:
             continue
-        out = folder / f"way-{k}"
+        out = folder / f"executor-{k}"
         try:
-            way(out)
+            execute(out)
         except (ImportError, FileNotFoundError, subprocess.CalledProcessError) as error:
             print(f"{name}: not run ({error} {getattr(error, 'stderr', b'')[-300:]!r})")
             continue
@@ -168,7 +168,7 @@ def robustness(folder: Path, only: str = "") -> None:
 
 
 def speed(folder: Path, points: int) -> None:
-    """Measure the share of the solver, the memory of this process while it works, and what a second process adds."""
+    """Measure the share of the solver, the memory of this process, and the gain of a second process."""
     file = folder / "long.toml"
     file.write_text(SMALL.replace("count = 10", f"count = {max(2, round((points / 6) ** 0.5))}").replace("20", "256"))
     sweep, seen = read_sweep(file), list[tuple[int, float]]()
@@ -190,7 +190,7 @@ def speed(folder: Path, points: int) -> None:
     began = time.perf_counter()
     with process_pool(2) as pool:
         run_sweep(sweep, folder / "two", pool)
-    # The solver alone is one process that stores nothing: the shards of the first run, without the rest of it.
+    # "Alone" counts the time of the shards in the first run without storing them.
     alone, together = solved / result.total_s, solved / (time.perf_counter() - began)
     share = together / (2 * alone)
     print(f"the search alone {alone:.0f} a second, the sweep with two workers {together:.0f}: {100 * share:.0f} %")
@@ -202,7 +202,7 @@ def _resident(process: int | str = "self") -> float:
 
 
 class Watched(Executor):
-    """A pool that adds up what its shards took.
+    """A pool that records the times of its shards.
 
     Args:
         pool: The pool.
@@ -217,12 +217,12 @@ class Watched(Executor):
     def submit(self, *task: Any, **options: Any) -> Future[Any]:
         """See ``Executor``."""
         future = self._pool.submit(*task, **options)
-        future.add_done_callback(lambda one: self.finished.append((one.result().solver_s, one.result().total_s)))
+        future.add_done_callback(lambda f: self.finished.append((f.result().solver_s, f.result().total_s)))
         return future
 
 
 def atlas(folder: Path, name: str, points: int) -> None:
-    """Solve a large sweep by two processes, or go on with it, and print what it took and what it result."""
+    """Solve a large sweep with two processes, or continue it, and print times and results."""
     folder.mkdir(parents=True, exist_ok=True)
     file, count = folder / f"{name}.toml", math.isqrt(points - 1) + 1
     file.write_text(tilted(count) if name == "tilthex_arm" else TALOS.replace("COUNT", str(count)))
@@ -253,7 +253,7 @@ def atlas(folder: Path, name: str, points: int) -> None:
 
 
 def task_overhead() -> None:
-    """Measure what an executor takes for a task that does nothing."""
+    """Measure the time of an executor for an empty task."""
 
     def each(executor: Executor, count: int) -> float:
         list(executor.map(len, [""] * 20))
@@ -283,5 +283,5 @@ if __name__ == "__main__":
             elif part == "overhead":
                 task_overhead()
             else:
-                # One of the ways by a word of its name, such as MPI.
+                # An executor by a word of its name, such as MPI.
                 robustness(Path(place), "" if part == "robustness" else part)

@@ -1,7 +1,7 @@
-"""Whether a sweep misses what ``optimize`` finds: ``python -m docs.studies.sweep_verdicts``.
+"""Compare the verdicts of a sweep with ``optimize``: ``python -m docs.studies.sweep_verdicts``.
 
-A grid of targets is solved by a sweep with 4 starts, and each point alone by ``optimize`` with 16.  An infeasible
-point at which the other certifies a posture is a false verdict.
+A sweep with 4 starts solves a grid of targets, and ``optimize`` with 16 starts solves each point alone.  A point that
+only one of them certifies is a false verdict of the other.
 """
 
 from __future__ import annotations
@@ -27,12 +27,12 @@ from impact_posture.sweep.sweep_run import run_sweep
 # Robot, points along each axis, and half the length of an axis, m.
 GRIDS = (("xarm7", 5, 0.2), ("panda", 5, 0.3), ("ur5", 4, 0.3), ("kinova", 4, 0.3))
 NORMAL = (-1.0, 0.0, 0.0)
-# An optimum that is higher by more than this share is another one.
+# Optima that differ by more than this share count as different.
 _WORSE = 0.02
 
 
 def alone(robot: str, x: float, y: float) -> float | None:
-    """The objective of the best of 16 starts, or nothing where none certifies."""
+    """Return the objective of the best of 16 starts, or ``None`` without a certified start."""
     loaded = load_robot(robot)
     place = Numeric(loaded.model).at(loaded.posture()).placement(point_on(loaded, loaded.spec.contact.frame or ""))
     at = place.translation
@@ -46,7 +46,7 @@ def alone(robot: str, x: float, y: float) -> float | None:
 
 
 def compared(robot: str, count: int, half: float, folder: Path) -> Iterator[str]:
-    """One line for a robot, and one for each false verdict."""
+    """Yield a line for a robot, and a line for each false verdict."""
     axis = [-half + 2 * half * k / (count - 1) for k in range(count)]
     file = folder / f"{robot}.toml"
     file.write_text(
@@ -60,15 +60,15 @@ def compared(robot: str, count: int, half: float, folder: Path) -> Iterator[str]
     ratio = (time.process_time() - began) / spent
     pairs = list(zip(rows, known, strict=True))
     certified = [row["status"] == "certified" for row in rows]
-    false = [(row, one) for row, one in pairs if row["status"] != "certified" and one is not None]
-    new = sum(one is None for own, one in zip(certified, known, strict=True) if own)
-    worse = sum(row["value"] > (1 + _WORSE) * one for row, one in pairs if row["value"] and one)
+    false = [(row, best) for row, best in pairs if row["status"] != "certified" and best is not None]
+    new = sum(best is None for fine, best in zip(certified, known, strict=True) if fine)
+    worse = sum(row["value"] > (1 + _WORSE) * best for row, best in pairs if row["value"] and best)
     yield (
         f"{robot}: {sum(certified)} of {len(rows)} points certified by the sweep, {len(false)} missed, {new} that "
         f"optimize misses; {worse} at a worse optimum; optimize took {ratio:.1f} times as long"
     )
-    for row, one in false:
-        yield f"  x = {row['x']:+.3f}, y = {row['y']:+.3f}: {row['status']} ({row['reason']}), but {one:.4g}"
+    for row, best in false:
+        yield f"  x = {row['x']:+.3f}, y = {row['y']:+.3f}: {row['status']} ({row['reason']}), but {best:.4g}"
 
 
 if __name__ == "__main__":

@@ -1,4 +1,4 @@
-"""Arithmetic of H with ∇H, counted on CasADi's instructions and on the graph that our C is written from."""
+"""Operations of H with ∇H, counted on CasADi's instructions and on the graph behind our C."""
 
 from __future__ import annotations
 
@@ -21,23 +21,22 @@ _NODES = {"+": "add", "-": "add", "*": "mul", "inv": "div", "neg": "neg", SINE: 
 
 
 def total(operations: Operations) -> int:
-    """All but sign changes, which compilers fold."""
+    """Count all operations except sign changes, which compilers fold."""
     return operations.total() - operations["neg"]
 
 
 def of_function(function: ca.Function) -> Operations:
-    """What the C that CasADi writes of a function does."""
+    """Count the operations in CasADi's C of a function."""
     kinds = (_INSTRUCTIONS.get(function.instruction_id(k)) for k in range(function.n_instructions()))
     return Counter(kind for kind in kinds if kind)
 
 
 def of_export(objective: WorstCaseObjective) -> tuple[Operations, int | None]:
-    """What one call of ``eval`` of the export does, on single numbers; and how many operations vectors make of it.
+    """Count the operations of one call of ``eval`` of the export, on single numbers and with vectors.
 
-    A call runs the blocks that its outputs need and no others, so the reach of the graph is the count.  The second
-    number counts operations as the C has them, where those on the numbers of repeated limbs are one; its sines and
-    cosines are still one each; ``None``: no repeated limbs.  The order in which the C adds up sums is not looked at:
-    it moves the count by a hundredth at most.
+    A call runs only the blocks that its outputs need, so the reachable part of the graph gives the count.  The second
+    number counts an operation on all repeated limbs once, and sines and cosines singly.  It is ``None`` without
+    repeated limbs.  The order of sums in the C is ignored, which changes the count by at most 1 %.
     """
     exported = export_library([NamedObjective(objective, "kernel")])
     outputs = next(f.outputs for f in exported.functions if f.name == "eval")

@@ -1,17 +1,17 @@
-"""What an articulated-body factorization, two solves and the gradient must at least do, counted joint by joint.
+"""Operations of an ideal articulated-body factorization, two solves and the gradient, counted joint by joint.
 
-The count follows patterns of zeros, not values.  Every link has axes of its own in which its joint is a turn in a
-coordinate plane: a pair of numbers turns in 4 multiplications and 2 additions (4m 2a), a symmetric 2×2 in 4m 5a and a
-general one in 4m 10a by the double angle (3m 2a a joint).  A constant rotation that only permutes axes is free, any
-other one costs one more plane.  Translations are cross products with the numbers that are not zero.  Then, per joint:
+The count follows patterns of zeros, not values.  In the axes of its link, each joint is a rotation in a coordinate
+plane.  To rotate a pair of numbers takes 4 multiplications and 2 additions (4m 2a), a symmetric 2×2 matrix 4m 5a, and
+a general 2×2 matrix 4m 10a with the double angle (3m 2a for each joint).  A constant rotation that only permutes axes
+is free, and any other costs one more plane.  Translations are cross products with the nonzero numbers.  Per joint:
 
 - factorization: ``U = I^A S`` is a column, one reciprocal, ``U/D``, one triangle of ``I^a = I^A − U Uᵀ/D`` (its axis
-  row is zero without armature), ``I^a`` turned, moved (``p̂A``, then ``p̂B`` and its partner on a triangle), added up;
+  row is zero without armature), ``I^a`` rotated, moved (``p̂A``, then ``p̂B`` and its partner on a triangle), added;
 - solve for a: biases inward on the contact's chain only, velocities outward; solve for b: biases from every joint;
 - gradient: the rows of ``f = I^a v⁻ + p^a`` that the axis row of ``v⁻ ×* f`` meets, for a and for b, and that row.
 
-The base adds ``Rᵀn``, an LDLᵀ of a symmetric 6×6 and two solves with it.  Symmetric values, equal entries and
-constants that fold are not seen, so that a program can go below this on particular robots: a yardstick, no proof.
+The base adds ``Rᵀn``, an LDLᵀ of a symmetric 6×6 and two solves with it.  The count ignores symmetric values, equal
+entries and constants that fold, so a program can need fewer operations on particular robots.
 """
 
 from __future__ import annotations
@@ -70,7 +70,7 @@ class _Count:
 
 
 class _Joint:
-    """How one joint moves things between its link and the parent's."""
+    """Transforms between the link of a joint and the parent link."""
 
     def __init__(self, model: pin.Model, i: int) -> None:
         name = model.joints[i].shortname().replace("JointModel", "")
@@ -87,7 +87,7 @@ class _Joint:
 
     @property
     def row(self) -> int:
-        """Of a spatial vector, the number along the axis."""
+        """Index of the entry of a spatial vector along the axis."""
         return self.axis + (3 if self.revolute else 0)
 
     def vector(self, count: _Count, v: Pattern, inward: bool) -> Pattern:

@@ -1,4 +1,4 @@
-"""Kernels at random configurations: their numbers are held against Pinocchio's, then C loops time them in turns."""
+"""Compare kernels with Pinocchio at random configurations, then time them in turns with C loops."""
 
 from __future__ import annotations
 
@@ -25,24 +25,24 @@ from impact_posture.robot.robot import Robot
 from impact_posture.system.toolchain import find_compiler
 
 COUNT = 256
-# Differences call H so many times that a few configurations do.
+# Differences call H many times, so a few configurations are enough.
 FEW = 16
 STEP = 1e-5
-# First rounds do not count.  A pass before each brings back into the caches what other kernels have taken.
+# First rounds do not count.  A pass before each pass restores the caches after other kernels.
 _UNCOUNTED = 2
 Kind = Literal["eval", "value", "batch", "differences"]
 
 
 class Absent(Exception):
-    """A peer that cannot run here, and why."""
+    """A peer cannot run here; the message has the reason."""
 
 
 class Disagreement(Exception):
-    """A kernel that computes other numbers, or refuses to; its time means nothing."""
+    """A kernel computes other numbers or fails, so that its time means nothing."""
 
 
 def c_compiler() -> list[str]:
-    """The user's C compiler.
+    """Return the C compiler of the user.
 
     Raises:
         CompilerError: There is none.
@@ -81,7 +81,7 @@ class Samples:
 
     @cached_property
     def objective(self) -> WorstCaseObjective:
-        """What is exported: W = I."""
+        """Objective that is exported, with W = I."""
         return WorstCaseObjective(self.robot, ImpactContact(self.frame, (0.0, 0.0, 1.0)))
 
     @cached_property
@@ -107,7 +107,7 @@ class Samples:
 
 @dataclass(frozen=True)
 class Kernel:
-    """One way of computing H and ∇H.
+    """An implementation of H and ∇H.
 
     Addresses by kind: ``eval`` is ``int f(q, n, H, grad)``, ``value`` and ``differences`` are ``int f(q, n, H)``,
     ``batch`` is ``int f(q, n, count, H, grad)``.
@@ -118,12 +118,12 @@ class Kernel:
     built: Built
     functions: dict[Kind, ctypes.c_void_p]
     operations: Operations | None = None  # of H with ∇H; None: a library of templates
-    packed: int | None = None  # how many they are once vectors do several numbers at a time; None: no vectors
+    packed: int | None = None  # operations if a vector instruction counts once; None: no vectors
     source_kb: float | None = None
 
 
 class Harness:
-    """The loops of ``harness.c`` over one robot's samples."""
+    """Loops of ``harness.c`` over the samples of a robot."""
 
     def __init__(self, samples: Samples) -> None:
         self.samples = samples
@@ -134,7 +134,7 @@ class Harness:
         self._results = np.zeros(COUNT), np.zeros((COUNT, samples.robot.nv))
 
     def pass_s(self, kind: Kind, function: ctypes.c_void_p) -> float:
-        """Processor seconds a configuration of one pass, after one that does not count.
+        """Return processor seconds for each configuration of a pass, after a pass that does not count.
 
         Raises:
             Disagreement: A call returned an error code.
@@ -151,7 +151,7 @@ class Harness:
         return float(took)
 
     def difference(self, kernel: Kernel) -> float:
-        """Largest relative difference of H and ∇H (against its largest entry) from the oracle, over all calls.
+        """Return the largest relative difference of H and ∇H (over its largest entry) from the oracle.
 
         Raises:
             Disagreement: Above 1e-6, or 1e-5 for finite differences; or a call that returned an error code.
@@ -177,7 +177,7 @@ class Harness:
         return worst
 
     def times(self, kernels: Sequence[Kernel], rounds: int) -> list[dict[Kind, float]]:
-        """Medians over rounds in which the kernels take turns, microseconds a configuration."""
+        """Return medians over rounds in which the kernels take turns, µs for each configuration."""
         passes: list[dict[Kind, list[float]]] = [{kind: [] for kind in kernel.functions} for kernel in kernels]
         with one_core():
             for _ in range(rounds + _UNCOUNTED):

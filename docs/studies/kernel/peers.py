@@ -1,4 +1,4 @@
-"""Ours, and what a user would take instead of it: each group is a function of the samples that gives its kernels."""
+"""Our export and other implementations: each group is a function that returns kernels for the samples."""
 
 from __future__ import annotations
 
@@ -47,7 +47,7 @@ int kernel_eval(const double *q, const double *n, double *H, double *grad)
 
 
 def exported(objective: WorstCaseObjective, prefix: str) -> tuple[Iterator[tuple[str, Built]], float]:
-    """The C export under each set of flags by its name, and the size of its source, kB."""
+    """Build the C export with each set of flags; return builds by name, and the size of the source, kB."""
     with tempfile.TemporaryDirectory() as folder:
         export(objective, Path(folder), prefix=prefix, check=False)
         sources = {name: (Path(folder) / name).read_text(encoding="utf-8") for name in (f"{prefix}.c", f"{prefix}.h")}
@@ -58,7 +58,7 @@ def exported(objective: WorstCaseObjective, prefix: str) -> tuple[Iterator[tuple
 
 
 def ours(samples: Samples) -> list[Kernel]:
-    """The export, and ∇H by central differences of its H."""
+    """Return the export, and ∇H by central differences of its H."""
     builds, size = exported(samples.objective, "kernel")
     count, packed = of_export(samples.objective)
     kernels = []
@@ -74,7 +74,7 @@ def ours(samples: Samples) -> list[Kernel]:
 
 
 def same_graph(samples: Samples) -> list[Kernel]:
-    """The expressions that our export is written from, printed by CasADi, compiled as ours."""
+    """Return the expressions behind our export, printed by CasADi and compiled with the same flags."""
     exported = export_library([NamedObjective(samples.objective, "kernel")])
     q, n, _ = exported.function.sx_in()
     values = exported.function.call([q, n, ca.DM(exported.constants)])
@@ -86,13 +86,13 @@ def same_graph(samples: Samples) -> list[Kernel]:
 
 
 def dense(samples: Samples) -> list[Kernel]:
-    """The textbook way within CasADi: composite rigid bodies, LDLᵀ, reverse mode."""
+    """Return the textbook method in CasADi: composite rigid bodies, LDLᵀ, reverse mode."""
     robot = samples.robot
     q, n, step = ca.SX.sym("q", robot.nq), ca.SX.sym("n", 3), ca.SX.sym("step", robot.nv)
     # To first order in the step this is q ⊕ step.
     at, direction = q + tangent_map(Chart(robot.model), q) @ step, n
     if robot.floating:
-        # M does not depend on the base's pose: leave it at rest and give the normal in the base's axes.
+        # M does not depend on the pose of the base, so keep the base fixed and turn the normal into its axes.
         at = ca.vertcat(ca.DM([0, 0, 0, 0, 0, 0, 1]), at[7:])
         rest = quaternion_matrix(q[3:7]).T @ n
         direction = rest - ca.cross(step[3:6], rest)
@@ -103,13 +103,14 @@ def dense(samples: Samples) -> list[Kernel]:
 
 
 def adam(samples: Samples) -> list[Kernel]:
-    """ADAM's mass matrix and Jacobian, LDLᵀ, reverse mode.
+    """Return ADAM's mass matrix and Jacobian with LDLᵀ and reverse mode.
 
-    ADAM is parametrized by the homogeneous transform of the base and the joint positions.  The transform here is that
-    of ``q`` times the rotation ``1 + ε̂``: reverse mode with respect to (ε, joints) at ε = 0 is the tangent gradient
-    in the base's axes.  The position of the base does not enter H.  BODY_FIXED is the representation whose M is
-    Pinocchio's; its Jacobian is in the frame's axes, so that the normal goes there.  Armature, which ADAM does not
-    know, is added to the diagonal; of a fixed base the rows and columns of its floating base are left out.
+    ADAM takes the homogeneous transform of the base and the joint positions.  Here the transform of ``q`` is
+    multiplied by the rotation ``1 + ε̂``, so reverse mode with respect to (ε, joints) at ε = 0 gives the
+    tangent gradient in the axes of the base.  The position of the base does not enter H.  In the representation
+    BODY_FIXED, M agrees with Pinocchio, and the Jacobian is in the axes of the frame, so the normal is turned into
+    these axes.  Armature, which ADAM does not have, is added to the diagonal.  For a fixed base, the rows and columns
+    of the base are left out.
 
     Raises:
         Absent: ADAM is not installed, or cannot do this robot.
@@ -123,7 +124,7 @@ def adam(samples: Samples) -> list[Kernel]:
         raise Absent("has no joints of several coordinates")
     robot, quiet = samples.robot, io.StringIO()
     try:
-        # Its URDF reader prints what it does not know.
+        # The URDF reader of ADAM prints unknown elements.
         with contextlib.redirect_stderr(quiet), contextlib.redirect_stdout(quiet), _prismatic_joints_repaired():
             kinematics = KinDynComputations(_urdf(samples), list(robot.joint_names))
             kinematics.set_frame_velocity_representation(Representations.BODY_FIXED_REPRESENTATION)
@@ -143,22 +144,22 @@ def adam(samples: Samples) -> list[Kernel]:
 
 
 def solved(M: ca.SX, force: ca.SX) -> ca.SX:
-    """``H = aᵀa`` with ``M a = force`` by CasADi's sparse ``LDLᵀ``."""
+    """Return ``H = aᵀa`` with ``M a = force`` by CasADi's sparse ``LDLᵀ``."""
     D, LT, order = ca.ldl(M)
     return ca.sumsqr(ca.ldl_solve(force, D, LT, order))
 
 
 def _by_reverse_mode(label: str, group: str, q: ca.SX, n: ca.SX, step: ca.SX, H: ca.SX) -> list[Kernel]:
-    """H and its gradient with respect to ``step`` at zero step; common subexpressions found."""
+    """Return H and its gradient with respect to ``step`` at zero, with common subexpressions shared."""
     general = ca.Function("general", [q, n, step], [H, ca.densify(ca.gradient(H, step))])
     values = general.call([q, n, ca.DM.zeros(step.shape)])
     function = ca.Function("eval", [q, n], values, ["q", "n"], ["H", "grad"], {"cse": True})
-    # GNU C: what CasADi writes is compiled as people compile it.
+    # GNU C, the usual dialect for CasADi's code.
     return _printed(label, group, function, {"-O2": ["-O2"], "-O3 native": ["-O3", "-march=native"]})
 
 
 def _printed(label: str, group: str, function: ca.Function, ways: dict[str, Sequence[str]]) -> list[Kernel]:
-    """CasADi's C of ``(q, n) → H, ∇H``."""
+    """Compile CasADi's C of ``(q, n) → H, ∇H``."""
     with tempfile.TemporaryDirectory() as folder:
         generator = ca.CodeGenerator("peer.c", {"with_header": False})
         generator.add(function)
@@ -176,9 +177,9 @@ def _printed(label: str, group: str, function: ca.Function, ways: dict[str, Sequ
 
 
 def _urdf(samples: Samples) -> str:
-    """The robot's URDF with an ``<origin>`` in every ``<inertial>``: ADAM's reader fails without."""
-    own, source = "impact-posture:", samples.robot.source
-    path = robots_data() / source.removeprefix(own) if source.startswith(own) else resolve_path(source, Path())
+    """Return the URDF with an ``<origin>`` in every ``<inertial>``, which the reader of ADAM needs."""
+    scheme, source = "impact-posture:", samples.robot.source
+    path = robots_data() / source.removeprefix(scheme) if source.startswith(scheme) else resolve_path(source, Path())
     root = ET.parse(path).getroot()
     for inertial in root.iter("inertial"):
         if inertial.find("origin") is None:
@@ -188,7 +189,7 @@ def _urdf(samples: Samples) -> str:
 
 @contextlib.contextmanager
 def _prismatic_joints_repaired() -> Iterator[None]:
-    """ADAM 0.5 gives a prismatic joint a motion subspace of twelve rows, which fails in its mass matrix: keep six."""
+    """Keep six rows of the motion subspace of prismatic joints.  ADAM 0.5 has twelve, and its mass matrix fails."""
     from adam.model.std_factories.std_joint import StdJoint
 
     original = StdJoint.motion_subspace

@@ -19,7 +19,7 @@ _DEFINITIONS = (
     "BOOST_MPL_LIMIT_LIST_SIZE=30", "BOOST_MPL_LIMIT_VECTOR_SIZE=30", "BOOST_MPL_CFG_NO_PREPROCESSED_HEADERS",
     "BOOST_FUSION_INVOKE_MAX_ARITY=12", "FUSION_MAX_VECTOR_SIZE=12", "NDEBUG",
 )  # fmt: skip
-# With GCC's default budget, what is inlined of one row depends on the other rows: up to a fifth of its time.
+# With GCC's default budget, inlining in one row depends on the other rows, which changes its time by up to a fifth.
 _INLINE = ("inline-unit-growth=400", "large-function-growth=2000", "large-stack-frame-growth=10000")
 _PARAMETERS = [*[f"--param={p}" for p in _INLINE], *[f"-D{d}" for d in _DEFINITIONS]]
 _FLAGS = ("-std=c++17", "-O3", "-march=native", CONTRACT, *_PARAMETERS)
@@ -35,10 +35,10 @@ _FREE_FLYER = 8
 
 
 def kernels(samples: Samples) -> list[Kernel]:
-    """Every formulation; they share one library and one loaded model, so time one robot at a time.
+    """Build every formulation.  They share one library and one loaded model, so time one robot at a time.
 
     Raises:
-        Absent: No C++ compiler or headers, or a model that the peer does not do.
+        Absent: No C++ compiler or headers, or a model that the peer does not support.
     """
     arrays = model_arrays(samples.robot.model)
     compiler, eigen = cxx_compiler(), eigen_headers()
@@ -60,7 +60,7 @@ def kernels(samples: Samples) -> list[Kernel]:
 
 
 def model_arrays(model: pin.Model) -> list[np.ndarray]:
-    """Parents, joints, axes, placements, inertias, armature, as ``peer_load`` takes them.
+    """Return parents, joints, axes, placements, inertias and armature for ``peer_load``.
 
     Raises:
         Absent: A joint that the peer does not have, or armature on the free-flyer.

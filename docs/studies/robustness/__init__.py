@@ -1,1 +1,1 @@
-"""Random variations of the shipped experiments: where does each controller help?"""
+"""Random variations of the shipped experiments, which show where each controller helps."""

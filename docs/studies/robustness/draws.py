@@ -1,4 +1,4 @@
-"""Points of the envelope of a shipped scenario, and how each becomes a setup."""
+"""Points of the envelope of a shipped scenario, and their setups."""
 
 from __future__ import annotations
 
@@ -23,15 +23,15 @@ from impact_posture.simulation.scenario_objective import scenario_objective
 from impact_posture.simulation.setup import Setup, set_up
 from impact_posture.simulation.world.world import build_world
 
-# To bound the time, the same for every point and less than in the scenarios' files: contacts, seconds behind the
-# surface and between contacts; seconds for which a push waits for a robot that does not come to rest.
+# To save time, every point has fewer contacts and shorter pauses (s) than the files of the scenarios, and a push
+# waits for at most PATIENCE seconds until the robot rests.
 COUNT, DWELL, PAUSE = 2, 0.4, 0.6
 PATIENCE = 5.0
-# A pyramid inside the cone, with a tenth to spare: as in the scenarios' files.
+# A pyramid inside the cone with a margin of a tenth, as in the files of the scenarios.
 _TRUST = 0.9 / math.sqrt(2)
 # Least distance of the center of mass of a robot that stands from the edges of its support polygon, m.
 _COM_MARGIN = 0.02
-# Of a base's own tilt and way, the share of what joints are stirred by.
+# Random changes of the base, as a share of the random changes of the joints.
 _BASE = 0.2
 
 
@@ -45,7 +45,7 @@ class Draw:
         attempt: Number of random draws before that were not admissible.
         seed: Seed of the study.
         name: Name of the variation, empty for a random draw.
-        values: Values by the names of :data:`RANGES`.  What is not there is as shipped.
+        values: Values by the names of :data:`RANGES`; the rest is as shipped.
     """
 
     scenario: str
@@ -61,7 +61,7 @@ def _generator(scenario: str, number: int, attempt: int, seed: int, what: int = 
 
 
 def draw(scenario: str, number: int, attempt: int = 0, seed: int = 0) -> Draw:
-    """Return a point of the envelope, the same every time: a variation, or after those a random draw."""
+    """Return a point of the envelope, the same every time: first the variations, then random draws."""
     named = list(VARIATIONS[scenario].items())
     if number < len(named):
         name, values = named[number]
@@ -71,10 +71,10 @@ def draw(scenario: str, number: int, attempt: int = 0, seed: int = 0) -> Draw:
 
 
 def prepare(chosen: Draw) -> Setup:
-    """Build what was chosen.
+    """Build the setup of a point.
 
     Raises:
-        ImpactPostureError: A start that is none: outside the limits, or not on the feet.
+        ImpactPostureError: The start is outside the limits, or not on the feet.
     """
     scenario, v = read_scenario(chosen.scenario), chosen.values
     control = scenario.control
@@ -102,7 +102,7 @@ def prepare(chosen: Draw) -> Setup:
 
 
 def _armature(scenario: Scenario, factor: float) -> dict[str, float]:
-    """By joint; those that have none stay without."""
+    """Return the scaled armature by joint; joints without armature stay without."""
     model = load_robot(scenario.robot, scenario).model
     own = {str(name): float(model.armature[k]) for name, k in zip(model.names, model.idx_vs, strict=True) if k >= 0}
     return {name: factor * value for name, value in own.items() if value > 0}
@@ -147,14 +147,14 @@ def _push(scenario: Scenario, task: SinglePush, v: Mapping[str, float]) -> Scena
 
 
 def _stiffer(gains: Gains, factor: float) -> Gains:
-    """The shipped pushes have one stiffness a task, critically damped."""
+    """Scale gains; the tasks of the shipped pushes have one stiffness each and critical damping."""
     if isinstance(gains.kp, tuple) or gains.kd is not None:
         raise InputError("a task with a damping of its own", where="robustness study", hint="scale it too")
     return replace(gains, kp=factor * gains.kp)
 
 
 def _start(setup: Setup, chosen: Draw) -> Vector:
-    """The scenario's posture, stirred and put back on its feet."""
+    """Return the posture of the scenario with random changes, pulled back onto its feet."""
     robot = setup.robot
     rng = _generator(chosen.scenario, chosen.number, chosen.attempt, chosen.seed, what=1)
     hold = tuple(j for j in robot.spec.constraints.hold if j not in robot.locked)

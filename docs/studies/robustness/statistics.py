@@ -1,4 +1,4 @@
-"""How often a controller helps, which targets it keeps, and what goes with it."""
+"""Statistics of a study: how often a controller helps, which targets it keeps, and correlations."""
 
 from __future__ import annotations
 
@@ -13,8 +13,8 @@ from scipy.stats import spearmanr
 from docs.studies.robustness.outcomes import NOMINAL, Record
 from impact_posture.experiment.seed_statistics import value_of
 
-# What may predict a jump, and the number of a document's prediction that says it: the impulse of a contact is
-# not known before, so H counts as √H alone.
+# Predictors of a jump, and their values in the prediction of a document.  The impulse of a contact is not known
+# before, so H counts as √H alone.
 PREDICTORS: dict[str, Callable[[Mapping[str, float | None]], float | None]] = {
     "H": lambda p: None if p["H"] is None else math.sqrt(p["H"]),
     "V": lambda p: p["frictionless"],
@@ -27,8 +27,7 @@ PREDICTORS: dict[str, Callable[[Mapping[str, float | None]], float | None]] = {
 class Summary:
     """Results of one controller at all points of a scenario.
 
-    A controller that failed (raised, lost a contact, fell …) helped in nothing.  In medians and quartiles it counts
-    as worse than any that did not.
+    A controller that failed (raised, lost a contact, fell …) does not help.  In medians and quartiles it ranks last.
 
     Attributes:
         controller: The controller.
@@ -38,9 +37,9 @@ class Summary:
         kept: Points at which it keeps every target.
         missed: Number of points at which it misses a target, by target.
         motion: Quartiles of the relative change of the motion in the windows, infinite for failed.
-        recovery: Quartiles of that over the recovery.
+        recovery: The same over the recovery.
         jump: Median relative change of the peak jump.
-        force: Median and largest ratio of the peak force to that of nominal.
+        force: Median and largest peak force, divided by the nominal controller's.
         saturation: Seconds at a limit of all runs that did not fail, inside and outside the windows.
         failures: Number of points at which it failed, by status.
     """
@@ -65,7 +64,7 @@ def tried(records: Sequence[Record]) -> list[Record]:
 
 
 def change(record: Record, controller: str, metric: str = "q_total_impact") -> float:
-    """Return a metric against nominal: −0.3 is 30 % less, and ``inf`` is that of a controller that failed."""
+    """Return a relative change against nominal: −0.3 is 30 % less, and ``inf`` stands for a failure."""
     if record.failure(controller):
         return math.inf
     own, before = (value_of(record.documents[c], metric) for c in (controller, NOMINAL))
@@ -73,7 +72,7 @@ def change(record: Record, controller: str, metric: str = "q_total_impact") -> f
 
 
 def summarize(records: Sequence[Record], controller: str) -> Summary:
-    """Count and rank."""
+    """Summarize a controller over all points."""
     records = tried(records)
     fine = [record for record in records if not record.failure(controller)]
     motion, recovery, jumps = (
@@ -108,7 +107,7 @@ def quartiles(values: Sequence[float]) -> tuple[float, ...]:
 
 
 def quantile(values: Sequence[float], p: float) -> float:
-    """Linear between neighbors, of which the upper may be infinite."""
+    """Interpolate linearly between neighbors, of which the upper may be infinite."""
     ordered = sorted(values)
     place = p * (len(ordered) - 1)
     low = math.floor(place)
@@ -120,7 +119,7 @@ def quantile(values: Sequence[float], p: float) -> float:
 
 @dataclass(frozen=True)
 class Split:
-    """How often a controller helped among some points, and how much: median change of the motion."""
+    """How often a controller helped at some points, and the median change of the motion."""
 
     count: int
     helps: int
@@ -128,14 +127,14 @@ class Split:
 
 
 def split(records: Sequence[Record], controller: str, choose: Callable[[Record], bool]) -> tuple[Split, Split]:
-    """Those that are chosen, and the others."""
+    """Split records into chosen and other records."""
     parts = [[change(r, controller) for r in records if choose(r) is wanted] for wanted in (True, False)]
     chosen, others = (Split(len(m), sum(x < 0 for x in m), quantile(m, 0.5) if m else math.nan) for m in parts)
     return chosen, others
 
 
 def predicted(record: Record, controller: str, name: str) -> float | None:
-    """Return what H, V, S or C says about the jump, ``None`` where nothing is known."""
+    """Return the prediction of the jump by H, V, S or C, or ``None`` if it is unknown."""
     prediction = record.documents[controller]["prediction"]
     return None if prediction is None or not prediction["impacts"] else PREDICTORS[name](prediction)
 
@@ -157,7 +156,7 @@ def ranks_of_jumps(records: Sequence[Record], names: Sequence[str]) -> dict[str,
 
 
 def fall(record: Record, controller: str, name: str) -> float | None:
-    """How much lower a predictor (as ln of the ratio) or the offset (m) is before the impact than nominal's."""
+    """Return the fall of a predictor (ln of the ratio) or of the offset (m) against nominal before the impact."""
     if name == "offset":
         before, after = (record.documents[c]["offset"] for c in (NOMINAL, controller))
         return None if before is None or after is None else float(before - after)
@@ -166,7 +165,7 @@ def fall(record: Record, controller: str, name: str) -> float | None:
 
 
 def agreement(records: Sequence[Record], names: Sequence[str], of: str, metric: str) -> tuple[int, int]:
-    """In how many runs that did not fail a metric fell where a predictor did, and rose where it rose; of how many."""
+    """Count the runs in which a metric changed in the same direction as a predictor, and all runs without failure."""
     same = [
         (fallen > 0) == (change(r, c, metric) < 0)
         for r in records
@@ -177,7 +176,7 @@ def agreement(records: Sequence[Record], names: Sequence[str], of: str, metric: 
 
 
 def rank(records: Sequence[Record], controller: str, of: Callable[[Record], float | None]) -> float:
-    """Spearman's correlation of a number with the *reduction* of the motion, among those that did not fail."""
+    """Return Spearman's correlation of a number with the *reduction* of the motion, without failed runs."""
     pairs = [(of(r), -change(r, controller)) for r in records if not r.failure(controller)]
     known = np.array([pair for pair in pairs if pair[0] is not None], dtype=float).reshape(-1, 2)
     if len(known) < 3 or np.ptp(known, axis=0).min() == 0:
@@ -186,13 +185,13 @@ def rank(records: Sequence[Record], controller: str, of: Callable[[Record], floa
 
 
 def worst(records: Sequence[Record], controller: str) -> Record | None:
-    """With the largest change of the motion among those that did not fail."""
+    """Return the record with the largest change of the motion, without failed runs."""
     fine = [r for r in records if not r.failure(controller)]
     return max(fine, key=lambda r: change(r, controller), default=None)
 
 
 def misled(records: Sequence[Record], controller: str) -> Record | None:
-    """Where H fell most though the jump rose."""
+    """Return the record in which H fell most although the jump rose."""
     fine = [r for r in records if not r.failure(controller) and change(r, controller, "peak_jump") > 0]
     fallen = {k: fall(r, controller, "H") or 0.0 for k, r in enumerate(fine)}
     most = max(fallen, key=lambda k: fallen[k], default=None)

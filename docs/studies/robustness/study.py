@@ -1,6 +1,6 @@
-"""Where does each controller help?  Variations of the shipped experiments, every controller in each.
+"""Run every controller in variations of the shipped experiments, to see where each helps.
 
-Each point that is done stays in build/robustness; a run that was interrupted goes on from there.
+Finished points stay in build/robustness, so that an interrupted study can continue.
 """
 
 from __future__ import annotations
@@ -20,9 +20,9 @@ from impact_posture.system.processes import fork_map
 
 
 def points(request: Request) -> Iterator[str]:
-    """Run the points that are not kept yet; or one point anew."""
+    """Run the points that are not kept yet, or run one point again."""
     import_mujoco()
-    # Every armature and mounting has libraries of its own, which are not for the user's cache.
+    # Every armature and mounting has other libraries, which must not fill the cache of the user.
     os.environ["IMPACT_POSTURE_CACHE"] = str(ROOT / "build" / "robustness" / "cache")
     scenarios = [name for name in RANGES if request.only in name]
     began = time.perf_counter()
@@ -40,12 +40,12 @@ def points(request: Request) -> Iterator[str]:
 
 
 def lines(request: Request) -> Iterator[str]:
-    """The page of where controllers help, from the points that are kept."""
+    """Yield the page that says where controllers help, from the kept points."""
     yield from page.page(_store(request).complete([n for n in RANGES if request.only in n]), request.seed)
 
 
 def kept_targets(request: Request) -> Iterator[str]:
-    """The page of the targets that controllers keep, from the points that are kept."""
+    """Yield the page of the targets that controllers keep, from the kept points."""
     yield from envelope.page(_store(request).complete([n for n in RANGES if request.only in n]))
 
 
@@ -63,8 +63,8 @@ def study(
 ) -> None:
     """Run the points that the store lacks.
 
-    The scenarios take turns and every controller runs through a point before the next one, so that a study that is
-    cut short has the same points of all controllers.
+    The scenarios take turns, and every controller runs at a point before the next point.  So an interrupted study has
+    the same points of all controllers.
     """
     wanted = [(name, number) for number in range(max(points.values())) for name in points if number < points[name]]
     missing = [each for each in wanted if not is_complete(store.get(*each))]
@@ -72,7 +72,7 @@ def study(
     def one(index: int) -> str:
         name, number = missing[index]
         began = time.process_time()
-        # Kept by the process that ran it: nothing that is done is lost when the others are stopped.
+        # Each process stores its own records, so that an interruption loses only unfinished points.
         with one_blas_thread():
             store.keep(run(name, number, seed, store.get(name, number)))
         return f"{name} {number}: {time.process_time() - began:.0f} s"
@@ -83,7 +83,7 @@ def study(
 
 
 class Store:
-    """Finished points of a study, a file each: an interrupted study goes on where it was."""
+    """Finished points of a study, one file each."""
 
     def __init__(self, folder: Path, seed: int) -> None:
         self._folder, self._seed = folder, seed
@@ -92,12 +92,12 @@ class Store:
         return self._folder / f"seed-{self._seed}" / scenario / f"{number:03d}.json"
 
     def get(self, scenario: str, number: int) -> Record | None:
-        """What was kept of a point, if it still holds."""
+        """Return the record of a point, or ``None`` if it is missing or outdated."""
         file = self._file(scenario, number)
         return Record.from_json(file.read_text(encoding="utf-8")) if file.is_file() else None
 
     def keep(self, record: Record) -> None:
-        """Write it down, whole or not at all."""
+        """Write a record, whole or not at all."""
         file = self._file(record.draw.scenario, record.draw.number)
         file.parent.mkdir(parents=True, exist_ok=True)
         beside = file.with_suffix(f".{os.getpid()}")

@@ -1,4 +1,4 @@
-"""What varies in the shipped scenarios: the ranges of random draws, and the variations one at a time."""
+"""Ranges of the random draws, and variations of one value at a time."""
 
 from __future__ import annotations
 
@@ -9,7 +9,7 @@ import numpy as np
 
 @dataclass(frozen=True)
 class Range:
-    """What a draw chooses, from low to high: ``linear``, ``log``, or ``sign`` (one of the two ends)."""
+    """Range of a drawn value from low to high: ``linear``, ``log``, or ``sign`` (one of the two ends)."""
 
     name: str
     low: float
@@ -26,7 +26,7 @@ class Range:
         return float(rng.uniform(self.low, self.high))
 
     def text(self) -> str:
-        """The range, as the page shows it."""
+        """Write the range for the page."""
         how = {"linear": "{} … {}", "log": "{} … {}, log-uniform", "sign": "{} or {}"}[self.scale]
         return how.format(f"{self.low:g}", f"{self.high:g}")
 
@@ -103,7 +103,7 @@ _PUSHED = {
     "gains × 0.5": {"stiffness": 0.5},
     "gains × 2": {"stiffness": 2.0},
 }
-# One value changed at a time, everything else as shipped; those of most interest first.
+# One value changes at a time, and the rest is as shipped.  The most interesting variations come first.
 VARIATIONS: dict[str, dict[str, dict[str, float]]] = {
     "aerial-vertical": {
         SHIPPED: {},
