@@ -1,4 +1,4 @@
-# Everything from a bare clone: `make demo`, `make test`.  Needs Python >= 3.11, make and a C compiler.
+# From a bare clone: `make demo`, `make test`.  Needs Python >= 3.11, make and a C compiler.
 PYTHON ?= python3
 VENV := .venv
 BIN := $(VENV)/bin
@@ -13,26 +13,26 @@ help:
 	@echo "make lint types  ruff, import-linter; mypy"
 	@echo "make docs        the documentation site in docs/_build/html"
 	@echo "make wheel       build sdist and wheel, compare them with git, install, run every command, types"
-	@echo "make test-wheel  the same, then the whole suite against what was installed"
+	@echo "make test-wheel  the same, then the whole suite against the installed wheel"
 	@echo "make lowest      the same with the lowest versions that pyproject.toml allows; PYTHON= tries another Python"
-	@echo "make bench       how fast it is on this machine: solve times, ticks, the exported kernel beside its peers"
+	@echo "make bench       speed on this machine: solve times, ticks, the exported kernel and its peers"
 	@echo "make coverage    branch coverage of both packages by the suite, for the documentation"
-	@echo "make study-impacts  what the objectives predict against impacts simulated in MuJoCo"
-	@echo "make study-elastic  which inertia arms with elastic joints meet a contact with, against MuJoCo"
-	@echo "make study-global   how complete the search global is, and basin hopping beside multi-start"
+	@echo "make study-impacts  predictions of the objectives against impacts simulated in MuJoCo"
+	@echo "make study-elastic  inertia of arms with elastic joints in an impact, against MuJoCo"
+	@echo "make study-global   completeness of the global search, and basin hopping against multi-start"
 	@echo "make reproduction   the paper's experiments, many seeds, for the documentation (about ten minutes)"
-	@echo "make study-feasible  what it costs to be clear of collisions, held by the motors and reached at speed"
-	@echo "make study-flow     where the reference flow of robust-flow rests, from 1,000 random starts of each of four seeds (three minutes)"
-	@echo "make study-real-impacts  balls, strikes, taps: what the rigid model predicts, and what MuJoCo finds (some minutes)"
-	@echo "make study-robustness  where each controller helps, and which targets it keeps: variations of each experiment (about ten minutes; goes on where it was)"
-	@echo "make study-scan     what decides along the redundancy of an arm and of a humanoid, as a picture"
-	@echo "make study-controller  the controller in C against the one in Python: equal answers, growth, times of a tick (an hour; PART=equality, growth or times: times alone need a quiet machine, 4 minutes)"
-	@echo "make study-sweep    what sweeps survive (killed workers and parents, MPI, Slurm jobs), and what they cost"
-	@echo "make calibration    the simulated world's restitution, law by law"
+	@echo "make study-feasible  cost of collision constraints, limits at rest and approach speed"
+	@echo "make study-flow     rest of the reference flow, from 1,000 random starts of each of four seeds (three minutes)"
+	@echo "make study-real-impacts  balls, strikes, taps: rigid model against MuJoCo (some minutes)"
+	@echo "make study-robustness  where each controller helps and which targets it keeps (ten minutes; continues after an interruption)"
+	@echo "make study-scan     a scan along the redundancy of an arm and of a humanoid, as a picture"
+	@echo "make study-controller  the controller in C against Python: equal answers, growth, times (an hour; PART=equality, growth or times; times: 4 minutes on a quiet machine)"
+	@echo "make study-sweep    robustness (killed workers and parents, MPI, Slurm jobs) and cost of sweeps"
+	@echo "make calibration    restitution of the contact laws in the simulated world"
 	@echo "make regression  recompute the committed reference results"
-	@echo "make pictures    draw the pictures that the documentation shows"
+	@echo "make pictures    draw the pictures of the documentation"
 	@echo "make viewer      rebuild the script of report.html from its sources; needs npm"
-	@echo "make clean       remove what make made"
+	@echo "make clean       remove all files that make wrote"
 
 $(BIN)/python:
 	$(PYTHON) -c 'import sys; sys.exit("impact-posture needs Python 3.11 or newer, this is " + sys.version.split()[0] + ": make PYTHON=python3.12" if sys.version_info < (3, 11) else 0)'

@@ -1,4 +1,4 @@
-"""Draw the pictures that README and pages show, into ``docs/images``.  Run: ``make pictures``."""
+"""Draw the pictures of README and pages into ``docs/images``.  Run: ``make pictures``."""
 
 from __future__ import annotations
 
@@ -11,7 +11,7 @@ from pathlib import Path
 from PIL import Image
 
 IMAGES = Path(__file__).parent / "images"
-# A command, and which of its figures go where.
+# Commands, and the places of their figures.
 PICTURES = [
     (
         "tilthex_arm --frame ee --normal 0 0 1",
@@ -24,13 +24,13 @@ PICTURES = [
 ]
 
 
-# The report of the first command, as a browser shows it.
+# A browser takes a picture of the report of the first command.
 BROWSER = ("chromium", "--headless=new", "--no-sandbox", "--use-angle=swiftshader", "--enable-unsafe-swiftshader",
            "--hide-scrollbars", "--window-size=1280,1120", "--virtual-time-budget=8000")  # fmt: skip
 
 
 def picture_report(page: Path) -> None:
-    """Take a picture of a report at 60 % of the way, if the browser is there."""
+    """Take a picture of a report at 60 % of the motion, if the browser is installed."""
     if shutil.which(BROWSER[0]) is None:
         print(f"{BROWSER[0]} is not installed: the picture of the report stays")
         return

@@ -1,4 +1,4 @@
-"""An aerial manipulator braces for an impact from below: nominal posture, impact-robust posture, and what changes.
+"""An aerial manipulator braces for an impact from below: nominal posture, impact-robust posture, and the difference.
 
 Run: python brace.py EXPORT
 EXPORT: what `impact-posture codegen tilthex_arm --frame ee --normal 0 0 1 --out EXPORT` wrote.
@@ -30,7 +30,7 @@ for k in range(4500):
     if k in events:
         events[k]()
     command = controller.tick(k * 1e-3, q, v)
-    # On a robot: send command.rotor_speed and command.torque.  Here: what was planned happens.
+    # On a robot: send command.rotor_speed and command.torque.  Here the robot moves exactly as planned.
     v = v + 1e-3 * command.acceleration
     q = pin.integrate(robot.model, q, 1e-3 * v)
 

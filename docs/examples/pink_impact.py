@@ -54,7 +54,7 @@ class ImpactTask(Task):
 
 
 class PointTask(Task):
-    """A frame's origin stays where it is, its orientation is free; pink's FrameTask has all six rows."""
+    """Hold the origin of a frame and leave its orientation free; pink's FrameTask has all six rows."""
 
     def __init__(self, frame: str, configuration: pink.Configuration) -> None:
         super().__init__(cost=1.0)
@@ -72,7 +72,7 @@ class PointTask(Task):
 
 
 class LevelTask(Task):
-    """The base keeps its z axis vertical, its yaw is free: ``e = (Rᵀ e_z)_xy``, with the rate ``−ω × Rᵀ e_z``."""
+    """Keep the z axis of the base vertical and its yaw free: ``e = (Rᵀ e_z)_xy``, with the rate ``−ω × Rᵀ e_z``."""
 
     def __init__(self, frame: str) -> None:
         super().__init__(cost=1.0)
@@ -90,20 +90,20 @@ class LevelTask(Task):
 
 
 def pose_and_level(frame: str, configuration: pink.Configuration) -> list[Task]:
-    """What the aerial manipulator holds."""
+    """Return the tasks that the aerial manipulator holds."""
     pose = FrameTask(frame, position_cost=1.0, orientation_cost=1.0)
     pose.set_target_from_configuration(configuration)
     return [pose, LevelTask("base_link")]
 
 
 def point(frame: str, configuration: pink.Configuration) -> list[Task]:
-    """What an arm with a ball tip holds."""
+    """Return the task that an arm with a ball tip holds."""
     return [PointTask(frame, configuration)]
 
 
 @dataclass(frozen=True)
 class Contact:
-    """What is touched, in ``optimize``'s words, and what pink holds meanwhile."""
+    """A contact as options of ``optimize``, and the tasks that pink holds."""
 
     name: str
     settings: dict[str, object]
@@ -127,7 +127,7 @@ CONTACTS = (
 
 @dataclass(frozen=True)
 class Outcome:
-    """Where pink came to rest, and what the offline optimization says of the same problem."""
+    """Posture in which pink rests, and the offline optimization of the same problem."""
 
     contact: Contact
     prepared: Prepared
@@ -138,14 +138,14 @@ class Outcome:
     speed: float  # norm of v at the last tick
 
     def distances(self) -> list[float]:
-        """Tangent norm from the resting posture to each of ``optimize``'s optima."""
+        """Return the tangent norm from the resting posture to each optimum of ``optimize``."""
         model = self.prepared.impact.robot.model
         return [float(np.linalg.norm(pin.difference(model, self.q, o.q))) for o in self.offline.optima]
 
 
 def follow(contact: Contact, speed: float = 5.0) -> Outcome:
     """Run pink from the start posture until it rests."""
-    # pink holds what the contact says and knows neither collisions nor loads, so the offline problem has none either.
+    # pink knows neither collisions nor loads, so the offline problem leaves them out, too.
     settings = {"collision": False, "holdable": False, **contact.settings}
     prepared = prepare(validate(ProblemSettings, settings, "options"))
     impact, offline = prepared.impact, solve(prepared.problem)
@@ -170,7 +170,7 @@ def follow(contact: Contact, speed: float = 5.0) -> Outcome:
 
 
 def limited(prepared: Prepared) -> pin.Model:
-    """The robot with ``optimize``'s margin from the joint limits; pink reads limits from the model."""
+    """Return the model with the limit margin of ``optimize``, because pink reads limits from the model."""
     model = prepared.impact.robot.model.copy()
     joints = slice(7 if prepared.impact.robot.floating else 0, None)
     lower, upper = model.lowerPositionLimit.copy(), model.upperPositionLimit.copy()
@@ -181,7 +181,7 @@ def limited(prepared: Prepared) -> pin.Model:
 
 
 def report(outcome: Outcome) -> None:
-    """Print what came of it."""
+    """Print an outcome."""
     objective, H = outcome.prepared.impact.objective, outcome.H
     print(outcome.contact.name)
     print(f"  H {H[0]:.6g} → {H[-1]:.6g} ({100 * (H[-1] / H[0] - 1):+.1f} %) in {(len(H) - 1) * DT:.1f} s")
@@ -198,7 +198,7 @@ def report(outcome: Outcome) -> None:
 
 
 def main() -> list[Outcome]:
-    """All contacts."""
+    """Follow the term at all contacts."""
     outcomes = []
     for contact in CONTACTS:
         outcomes.append(follow(contact))

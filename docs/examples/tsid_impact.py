@@ -28,12 +28,12 @@ from impact_posture.robot.robot_loader import load_robot
 DT, DURATION = 0.002, 20.0
 FRAME, NORMAL = "tool0", (0.0, 0.0, 1.0)
 KD = 20.0  # 1/s
-SPEED = 1.0  # norm of the velocity K/K_d ∇H at the first tick: K by itself means another thing on every robot
+SPEED = 1.0  # norm of the velocity K/K_d ∇H at the first tick, because K alone depends on the robot
 
 
 @dataclass(frozen=True)
 class Outcome:
-    """What the run did."""
+    """Record of a run."""
 
     q: np.ndarray
     H: np.ndarray  # at each tick
@@ -51,7 +51,7 @@ def run() -> Outcome:
         gradient = ImpactGradient.load(folder, robot=robot)
     K = KD * SPEED / np.linalg.norm(gradient.value_and_gradient(q, NORMAL)[1])
 
-    # The very model that the export is of, armature included; a URDF has none.
+    # The model of the export, with armature, which a URDF does not have.
     wrapper = tsid.RobotWrapper(model, tsid.RootJointType.FIXED_BASE_SYSTEM, False)
     formulation = tsid.InverseDynamicsFormulationAccForce("impact", wrapper, False)
     formulation.computeProblemData(0.0, q, v)

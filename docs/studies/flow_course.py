@@ -1,4 +1,4 @@
-"""Courses of the reference flow in C: the exported controller with a small driver beside it, without any ticks."""
+"""Courses of the reference flow in C: an exported controller with a small driver, without ticks."""
 
 from __future__ import annotations
 
@@ -34,7 +34,7 @@ _BUILDERS = {"aerial": aerial_formulation, "arm": arm_formulation}
 
 
 def formulation_for(robot: Robot, posture: JointPosture) -> TaskFormulation:
-    """The formulation that suits the robot."""
+    """Return the formulation for the kind of robot."""
     return _BUILDERS.get(robot.spec.kind, legged_formulation)(robot, posture)
 
 
@@ -43,13 +43,13 @@ class Course:
     """A flow from its start to its rest.
 
     Attributes:
-        q: Where it ended, shape (nq,).
+        q: Posture at the end, shape (nq,).
         values: ``H`` at each update, shape (k,).
-        rested: When it rested, s; infinite if it did not.
+        rested: Time at which it rested, s; infinite if it did not rest.
         missed: Largest distance from contacts and tasks, m or rad.
-        share: Largest share of what the actuators may give at rest on the way, if the start was within it.
-        room: Least distance of a joint from its limit less its margin there, rad (m); zero or more holds the margin.
-        failures: Steps that the solver did not find.
+        share: Largest static actuator share on the way, over the allowed share, if the start was within it.
+        room: Least distance of a joint from its limit minus its margin, rad (m); the margin holds if this is ≥ 0.
+        failures: Steps in which the solver failed.
     """
 
     q: Vector
@@ -62,11 +62,11 @@ class Course:
 
 
 class CompiledFlow:
-    """The reference flow of a problem as its controller in C has it.
+    """The reference flow of a problem, run by its controller in C.
 
     Args:
         problem: The problem, whose objective the flow follows.
-        folder: A folder for the code, which does not exist yet.
+        folder: New folder for the code.
     """
 
     def __init__(self, problem: ConstrainedProblem, folder: Path) -> None:
@@ -90,19 +90,19 @@ class CompiledFlow:
         self._moving = np.flatnonzero(moving & np.isfinite(self._ranges.upper - self._ranges.lower))
 
     def share(self, q: Vector) -> float:
-        """Return the largest share of what rest may take that holding a posture takes; infinite where none begins."""
+        """Return the static actuator share of a posture over the allowed share; infinite if the flow cannot begin."""
         rows = self._begun(q, FlowOptions(), None)
         return np.inf if rows is None else float(rows[1])
 
     def course(self, q: Vector, longest: float, options: FlowOptions, first: Vector | None = None) -> Course:
-        """Let the flow go from ``q`` for at most ``longest`` seconds; ``first`` is a posture to visit before."""
+        """Run the flow from ``q`` for at most ``longest`` seconds; ``first`` is a posture to visit first."""
         begun = self._begun(q, options, first)
         if begun is None:
-            raise MetricError("the flow does not begin there", where="course", hint="start elsewhere")
+            raise MetricError("the flow cannot begin at this posture", where="course", hint="start elsewhere")
         rows = np.zeros((round(longest / UPDATE), begun.size))
         done = self._run(self._controller._context, ctypes.c_double(DT), len(rows), _pointer(rows))
         rows = np.vstack([begun, rows[:done]])
-        # The look at a posture is the first part of its update.
+        # An update evaluates its posture first.
         rested = done * UPDATE if done < round(longest / UPDATE) else np.inf
         share, missed = rows[:, 1].max(), rows[:, 2].max()
         room, failures = self._room(rows[:, 4:], options), int(rows[-1, 3])
@@ -114,13 +114,12 @@ class CompiledFlow:
             controller.parameters[f"flow_{option.name}"][:] = getattr(options, option.name)
         if first is not None:
             controller.parameters["flow_path"][:] = first
-        given = ctypes.byref(controller._given)
-        visit = int(first is not None)
-        refused = self._begin(controller._context, given, _pointer(np.ascontiguousarray(q)), visit, _pointer(row))
+        parameters, start = ctypes.byref(controller._given), _pointer(np.ascontiguousarray(q))
+        refused = self._begin(controller._context, parameters, start, int(first is not None), _pointer(row))
         return None if refused else row
 
     def _room(self, q: Vector, options: FlowOptions) -> float:
-        """Return the least distance of a joint from its limit less its margin, of joints that move."""
+        """Return the least distance of a moving joint from its limit minus its margin."""
         at, ranges = q[:, self._ranges.index[self._moving]], self._ranges
         upper, lower = ranges.upper[self._moving], ranges.lower[self._moving]
         margin = np.minimum(options.joint_margin, (upper - lower) / 8)

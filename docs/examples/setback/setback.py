@@ -19,7 +19,7 @@ Vector = NDArray[np.float64]
 
 
 class JointAngle(ip.tsid.Task):
-    """The angle of a joint with one number in ``q``: ``e = target − q_j``."""
+    """Move a joint with one number in ``q`` to an angle: ``e = target − q_j``."""
 
     def __init__(self, robot: Robot, joint: str, target: float, kp: float, weight: float = 1.0) -> None:
         super().__init__(f"angle of {joint}", 1, kp=kp, weight=weight)
@@ -35,7 +35,7 @@ class JointAngle(ip.tsid.Task):
 
 
 class SetbackDriver(Driver):
-    """Bend a joint before the impact, by a task in the cost that other controllers do not have."""
+    """Bend a joint before the impact, with an additional task in the cost."""
 
     def __init__(self, setup: Setup, joint: str, by: float, kp: float) -> None:
         super().__init__(setup, nominal_posture(setup))
@@ -62,6 +62,6 @@ class SetbackDriver(Driver):
 
 
 def setback(factory: ControllerFactory, mode: Mode, gain: float | None) -> Driver:
-    """Make the controller; pyproject.toml names this function."""
+    """Build the controller; pyproject.toml names this function."""
     setup = factory.setup
     return SetbackDriver(setup, setup.robot.joint_names[-1], by=-0.15, kp=60.0 if gain is None else gain)
