@@ -1,4 +1,4 @@
-"""The installed ``impact-posture``: commands, JSON, exit codes, one-line errors, and how soon it answers."""
+"""The installed ``impact-posture``: commands, JSON, exit codes, one-line errors and the time of the help."""
 
 from __future__ import annotations
 
@@ -30,10 +30,10 @@ PUSH = ("evaluate", "tilthex_arm", "--normal", "0", "0", "1")
 
 @functools.cache
 def document(*arguments: str) -> dict[str, Any]:
-    """The one JSON document of a run that went well, strictly parsed."""
+    """Return the JSON document of a successful run, strictly parsed."""
 
     def refuse(constant: str) -> None:
-        raise AssertionError(f"{constant} is no JSON")
+        raise AssertionError(f"{constant} is not JSON")
 
     done = start(*arguments, "--json")
     assert (done.returncode, done.stderr) == (0, "")
@@ -51,14 +51,14 @@ def test_help_comes_at_once_and_names_the_commands() -> None:
         before = resource.getrusage(resource.RUSAGE_CHILDREN)
         done = subprocess.run([str(COMMAND), "--help"], capture_output=True, text=True, timeout=60)
         after = resource.getrusage(resource.RUSAGE_CHILDREN)
-        # The processor's time: a loaded machine makes a program wait.
+        # Processor time, because a loaded machine makes a program wait.
         times.append(after.ru_utime - before.ru_utime + after.ru_stime - before.ru_stime)
         assert done.returncode == 0
         if times[-1] < 1.0:
             break
     for name in ("robots", "inspect", "evaluate", "optimize", "plot"):
         assert f" {name} " in done.stdout
-    # The design asks for 0.3 s; processors differ.
+    # The limit is 0.3 s, with a margin for slow processors.
     assert min(times) < 1.0
 
 
@@ -74,7 +74,7 @@ def test_help_imports_nothing_heavy() -> None:
     assert done.stderr == ""
 
 
-def test_what_others_have_to_do_at_the_end_is_done() -> None:
+def test_exit_handlers_run() -> None:
     code = (
         "import atexit, sys\nfrom impact_posture_cli import main, process\n"
         "begin = process.prepare\n"
@@ -129,19 +129,19 @@ def test_robots() -> None:
     assert max(len(line) for line in page.stdout.splitlines()) <= 80
 
 
-def test_inspect_has_it_all() -> None:
-    found, loaded = document("inspect", "tilthex_arm"), robot("tilthex_arm")
-    assert [j["name"] for j in found["joints"]] == list(loaded.joint_names)
-    elbow = found["joints"][2]
+def test_inspect_shows_joints_frames_postures_and_rotors() -> None:
+    summary, loaded = document("inspect", "tilthex_arm"), robot("tilthex_arm")
+    assert [j["name"] for j in summary["joints"]] == list(loaded.joint_names)
+    elbow = summary["joints"][2]
     assert (elbow["lower"], elbow["upper"]) == (-2.4, 2.4)
     assert (elbow["effort"], elbow["armature"]) == (3.0, 0.01)
-    assert found["mass"] == pytest.approx(loaded.mass)
-    assert "ee" in [f["name"] for f in found["frames"] if f["link"]]
-    assert {p["name"] for p in found["postures"]} >= {"home", "tucked"}
-    assert found["contact"]["frame"] == "ee"
-    assert found["actuation"]["rank"] == 6
-    assert all(at["feasible"] for at in found["actuation"]["postures"])
-    assert 0 < found["actuation"]["postures"][0]["lateral_force"]["left"] < 10
+    assert summary["mass"] == pytest.approx(loaded.mass)
+    assert "ee" in [f["name"] for f in summary["frames"] if f["link"]]
+    assert {p["name"] for p in summary["postures"]} >= {"home", "tucked"}
+    assert summary["contact"]["frame"] == "ee"
+    assert summary["actuation"]["rank"] == 6
+    assert all(at["feasible"] for at in summary["actuation"]["postures"])
+    assert 0 < summary["actuation"]["postures"][0]["lateral_force"]["left"] < 10
 
 
 def test_inspect_pages_fit_the_terminal() -> None:
@@ -155,7 +155,7 @@ def test_inspect_pages_fit_the_terminal() -> None:
 
 
 def test_evaluate_numbers_against_pinocchio() -> None:
-    found = document(*PUSH, "--speed", "0.5", "--restitution", "0.2", "--offset", "0", "0", "0.02")
+    output = document(*PUSH, "--speed", "0.5", "--restitution", "0.2", "--offset", "0", "0", "0.02")
     loaded = robot("tilthex_arm")
     q, n = loaded.posture(), np.array([0.0, 0.0, 1.0])
     M = mass_matrix(loaded.model, q)
@@ -163,7 +163,7 @@ def test_evaluate_numbers_against_pinocchio() -> None:
     A = np.linalg.inv(M) @ J.T
     a, G = A @ n, n @ J @ A @ n
     stuck = A @ np.linalg.inv(J @ A) @ n
-    block = found["evaluation"]
+    block = output["evaluation"]
     H, S = a @ a, stuck @ stuck
     expected = {"H": H, "G": G, "V": H / G**2, "S": S, "E": 0.5 / G, "effective_mass": 1 / G, "objective": H}
     for key, value in expected.items():
@@ -172,11 +172,11 @@ def test_evaluate_numbers_against_pinocchio() -> None:
     assert relative(block["jump"]["sticking"]["velocity"], stuck * 0.6) < 1e-9
     axes, radii = np.array(block["ellipsoid"]["axes"]), np.array(block["ellipsoid"]["radii"])
     assert relative(axes @ np.diag(radii**2) @ axes.T, A.T @ A) < 1e-9
-    assert found["posture"] == "home" and found["robot"]["armature"][6:] == [0.01] * 3
-    assert set(found["classical"]) == {"velocity", "force"}
+    assert output["posture"] == "home" and output["robot"]["armature"][6:] == [0.01] * 3
+    assert set(output["classical"]) == {"velocity", "force"}
 
 
-def test_evaluate_prints_all_of_it() -> None:
+def test_evaluate_prints_all_quantities() -> None:
     page = start("evaluate", "talos", "--frame", "torso_2_link", "--normal", "-1", "0", "0", "--speed", "0.5")
     assert page.returncode == 0 and page.stderr == ""
     assert max(len(line) for line in page.stdout.splitlines()) <= 80
@@ -195,11 +195,11 @@ def test_quiet_leaves_the_result_alone() -> None:
     assert (quiet.stderr, quiet.stdout) == ("", loud.stdout)
 
 
-def test_undefined_is_said_and_null() -> None:
+def test_an_undefined_value_is_null_and_a_warning() -> None:
     arguments = ("evaluate", "ur5", "--frame", "upper_arm_link", "--normal", "1", "1", "1", "--objective", "sticking")
-    found = document(*arguments)
-    assert found["evaluation"]["S"] is None and found["evaluation"]["objective"] is None
-    assert any("S is undefined" in line for line in found["warnings"])
+    output = document(*arguments)
+    assert output["evaluation"]["S"] is None and output["evaluation"]["objective"] is None
+    assert any("S is undefined" in line for line in output["warnings"])
     page = start(*arguments)
     assert page.returncode == 0 and "undefined" in page.stdout and "S is undefined" in page.stderr
 
@@ -209,20 +209,20 @@ def test_options_reach_the_library(tmp_path: Path) -> None:
     state.write_text("name: [elbow_pitch]\nposition: [0.5]\n")
     weights = tmp_path / "weights.toml"
     weights.write_text("elbow_pitch = 0.25\n")
-    found = document(
+    output = document(
         "evaluate", "tilthex_arm", "--contact", "ee:0,0,-1:2", "--normal-frame", "contact", "--posture", str(state),
         "--metric", "weighted", "--weights", str(weights), "--armature", "elbow_pitch=0.02",
         "--lock", "shoulder_roll",
     )  # fmt: skip
-    assert found["robot"]["locked"] == ["shoulder_roll"]
-    assert found["robot"]["armature"][6:] == [0.01, 0.02]
-    assert found["evaluation"]["q"][8] == 0.5
-    assert found["metric"]["weights"] == [1.0] * 7 + [0.25]
-    assert found["contacts"][0]["normal_frame"] == "contact"
-    assert found["evaluation"]["objective"] == pytest.approx(4 * found["evaluation"]["H"])
+    assert output["robot"]["locked"] == ["shoulder_roll"]
+    assert output["robot"]["armature"][6:] == [0.01, 0.02]
+    assert output["evaluation"]["q"][8] == 0.5
+    assert output["metric"]["weights"] == [1.0] * 7 + [0.25]
+    assert output["contacts"][0]["normal_frame"] == "contact"
+    assert output["evaluation"]["objective"] == pytest.approx(4 * output["evaluation"]["H"])
 
 
-def test_supports_given_taken_away_and_by_default() -> None:
+def test_supports_by_option_without_and_by_default() -> None:
     push = ("evaluate", "solo8", "--normal", "1", "0", "0")
     assert len(document(*push)["supports"]) == 4
     bare = document(*push, "--no-support")
@@ -326,7 +326,7 @@ def test_a_reader_that_leaves_makes_no_noise() -> None:
 
 
 class Raises:
-    """A command that ends in one way."""
+    """A command that raises an error."""
 
     def __init__(self, error: BaseException) -> None:
         self.error = error
@@ -358,7 +358,7 @@ def test_exceptions_become_one_line(
     assert capsys.readouterr().out == ""
 
 
-def test_a_traceback_comes_only_when_asked_for(
+def test_the_debug_variable_prints_a_traceback(
     capsys: pytest.CaptureFixture[str], monkeypatch: pytest.MonkeyPatch
 ) -> None:
     monkeypatch.setenv(boundary.DEBUG_VARIABLE, "1")
@@ -370,5 +370,5 @@ def test_a_long_wait_is_estimated_from_the_pace_so_far() -> None:
     from impact_posture_cli.progress_line import _time_left
 
     assert _time_left(30.0, 10, 20) == ", 0:01:00 left"
-    # No pace yet, and nothing left.
+    # There is no pace yet, or nothing is left.
     assert [_time_left(1.0, 10, 20), _time_left(30.0, 0, 20), _time_left(30.0, 30, 0)] == ["", "", ""]

@@ -1,4 +1,4 @@
-"""Robots that no file describes, through the command line: what it asks for, lists, warns of and accepts."""
+"""Robots without a robot.toml on the command line: hints, warnings, locked joints and drafts."""
 
 from __future__ import annotations
 
@@ -45,7 +45,7 @@ def call(capsys: pytest.CaptureFixture[str], *arguments: str) -> tuple[int, str,
         ("panda_description/urdf/panda.urdf", "panda_hand", "--support FRAME for each foot"),
     ],
 )
-def test_a_floating_robot_without_feet_or_rotors_is_asked(
+def test_a_floating_robot_without_feet_or_rotors_needs_a_support(
     path: str, frame: str, words: str, capsys: pytest.CaptureFixture[str]
 ) -> None:
     asked = ("--root", "free-flyer", "--frame", frame, *UP)
@@ -53,22 +53,22 @@ def test_a_floating_robot_without_feet_or_rotors_is_asked(
     assert code == 1 and errors.count("\n") == 1
     for word in (words, "--no-support", "--base", "robot.toml", "--write-robot-toml"):
         assert word in errors
-    # A measurement goes ahead, with a word.
+    # An evaluation only warns.
     code, _, errors = call(capsys, "evaluate", DATA + path, *asked)
     assert code == 0
     assert any("floating freely" in line and words in line for line in errors.splitlines())
 
 
 @pytest.mark.parametrize("more", [{"support": ()}, {"support": ("FL_foot",)}, {"base": "level"}])
-def test_who_says_what_holds_it_is_not_asked(more: dict[str, Any]) -> None:
+def test_a_stated_support_needs_no_hint(more: dict[str, Any]) -> None:
     settings = {"robot": B1_Z1, "root": "free-flyer", "frame": "link06", "normal": (0, 0, 1), **more}
     prepared = prepare(make_settings(settings))
     assert not any("floating freely" in line for line in prepared.impact.warnings)
-    # The resolved problem says it, too.
+    # The resolved problem also states the support.
     prepare(resolved_settings(prepared))
 
 
-def test_known_robots_are_not_asked() -> None:
+def test_known_robots_need_no_hint() -> None:
     for name in ("borinot", "tilthex_arm", "solo8", "panda"):
         impact = resolve(ImpactSettings(robot=name, normal=(0, 0, 1)))
         assert not any("floating freely" in line for line in impact.warnings), name
@@ -81,11 +81,11 @@ def test_massless_joints_are_listed_and_locked_together(capsys: pytest.CaptureFi
     with pytest.raises(InertiaError, match="24 joints move no mass") as caught:
         load_robot(ROMEO)
     assert "`lock_massless`" in caught.value.line
-    found = load_robot(ROMEO, LoadOptions(lock_massless=True))
-    assert len(found.locked) == 24
-    assert all(f"'{joint}'" in caught.value.line for joint in found.locked)
+    loaded = load_robot(ROMEO, LoadOptions(lock_massless=True))
+    assert len(loaded.locked) == 24
+    assert all(f"'{joint}'" in caught.value.line for joint in loaded.locked)
     code, out, _ = call(capsys, "inspect", ROMEO, "--lock-massless", "--json")
-    assert code == 0 and json.loads(out)["locked"] == list(found.locked)
+    assert code == 0 and json.loads(out)["locked"] == list(loaded.locked)
     settings = {"robot": ROMEO, "lock_massless": True, "frame": "r_gripper", "normal": (1, 0, 0)}
     again = resolved_settings(prepare(make_settings(settings)))
     assert again.lock_massless
@@ -94,8 +94,8 @@ def test_massless_joints_are_listed_and_locked_together(capsys: pytest.CaptureFi
 def test_a_robot_toml_can_lock_them(tmp_path: Path) -> None:
     config = tmp_path / "romeo.toml"
     config.write_text('[model]\nlock_massless = true\nlock = ["Neck*", "HeadRoll"]\n', encoding="utf-8")
-    found = load_robot(ROMEO, LoadOptions(config=str(config)))
-    assert {"NeckYaw", "NeckPitch", "HeadRoll", "LHand"} <= set(found.locked)
+    loaded = load_robot(ROMEO, LoadOptions(config=str(config)))
+    assert {"NeckYaw", "NeckPitch", "HeadRoll", "LHand"} <= set(loaded.locked)
 
 
 @pytest.mark.parametrize(
@@ -119,7 +119,7 @@ def test_an_srdf_in_the_data_package() -> None:
     load = {"robot": B1_Z1, "srdf": SRDF, "root": "free-flyer", "frame": "link06", "normal": (0, 0, 1), "support": ()}
     prepared = prepare(make_settings(load))
     assert prepared.impact.robot.default_posture == "standing_with_arm_home"
-    # Not turned into a path of this machine.
+    # The name does not become a path of this machine.
     assert resolved_settings(prepared).srdf == SRDF
 
 
@@ -131,7 +131,7 @@ def test_an_srdf_in_the_data_package() -> None:
         ("talos", LoadOptions(root="fixed"), "half_sitting"),
     ],
 )
-def test_a_base_that_a_fixed_root_leaves_out_is_said(name: str, options: LoadOptions, posture: str) -> None:
+def test_a_fixed_root_warns_that_it_leaves_out_the_base(name: str, options: LoadOptions, posture: str) -> None:
     warned = [line for line in load_robot(name, options).warnings if "the root is fixed" in line]
     assert len(warned) == 1 and posture in warned[0] and "`root` free-flyer" in warned[0]
 
@@ -150,7 +150,7 @@ def test_a_robot_without_a_base_pose_is_not_warned_about_one() -> None:
         (1 - 1e-9, "99.9999999%"), (-0.25, "-25.0%"), (1 - 2**-53, "99.99999999999999%"), (1.5, "150.0%"),
     ],
 )  # fmt: skip
-def test_percent_never_rounds_to_what_is_not(share: float, text: str) -> None:
+def test_percent_never_rounds_to_100(share: float, text: str) -> None:
     assert percent(share) == text
 
 

@@ -1,4 +1,4 @@
-"""Runs a command line in a forked copy of this process, where everything is imported, and judges how it ended."""
+"""Run a command line in a fork of this process, which has imported everything, and judge how it ends."""
 
 from __future__ import annotations
 
@@ -20,9 +20,9 @@ from impact_posture_cli.error_boundary import run
 from tests.support.command import PARSER
 
 CODES = {0, 1, 2, 3, 4, 130, 143}
-# Of a usage error: how to call it, and what was wrong.
+# Beginnings of the lines of a usage error.
 USAGE = ("Usage: ", "Try ", "Error: ")
-# Raw words of libraries and interpreters.
+# Words that only libraries and interpreters write.
 NOISE = ("Traceback", "internal error", "Warning:", "Exception ignored", "terminate called", "Segmentation", "DEBUG")
 # Processor seconds that one attack may take, and seconds until it counts as hanging.
 BUSY, PATIENCE = 60, 120
@@ -45,7 +45,7 @@ SMALL = """<robot name="small">
 
 @dataclass(frozen=True)
 class Outcome:
-    """How a command line ended: its code, below zero for a signal, and what it wrote."""
+    """Exit code of a command line (below zero for a signal), its output and the changed files."""
 
     argv: tuple[str, ...]
     code: int
@@ -55,21 +55,21 @@ class Outcome:
 
     @property
     def complaints(self) -> list[str]:
-        """What is wrong with that; nothing where all is well."""
+        """Faults of this outcome."""
         lines = [line for line in self.err.splitlines() if line.strip() and not line.startswith("warning: ")]
         errors = [line for line in lines if line.startswith(("error: ", "Error: "))]
-        found = [f"says {word!r}" for word in NOISE if word in self.err or word in self.out]
+        complaints = [f"says {word!r}" for word in NOISE if word in self.err or word in self.out]
         if self.code not in CODES:
-            found.append(f"exit code {self.code}")
+            complaints.append(f"exit code {self.code}")
         elif self.code == 0 and lines:
-            found.append("words on standard error after success")
+            complaints.append("writes to standard error after success")
         elif self.code and len(errors) != 1:
-            found.append(f"{len(errors)} error lines")
+            complaints.append(f"{len(errors)} error lines")
         elif any(line not in errors and not (self.code == 2 and line.startswith(USAGE)) for line in lines):
-            found.append("more than one line")
+            complaints.append("more than one line")
         if self.code and self.changed:
-            found.append(f"fails and leaves {', '.join(self.changed)}")
-        return found
+            complaints.append(f"fails and leaves {', '.join(self.changed)}")
+        return complaints
 
 
 def strike(folder: Path, *argv: str) -> Outcome:
@@ -93,11 +93,7 @@ def strike(folder: Path, *argv: str) -> Outcome:
 def attack(
     cases: Iterable[tuple[str, ...]], folder: Path, arrange: Callable[[int], object] = lambda k: None
 ) -> list[Outcome]:
-    """Run them all, each after ``arrange(k)``; fail with every complaint, each with its command line.
-
-    Returns:
-        What came of them, so that a test can see that its attack was one.
-    """
+    """Run all command lines, each after ``arrange(k)``, and fail with all complaints."""
     outcomes, failures = [], []
     for k, argv in enumerate(cases):
         arrange(k)
@@ -141,8 +137,5 @@ def _wait(child: int) -> int:
 
 
 def _content(folder: Path) -> dict[str, bytes]:
-    found = {}
-    for path in folder.rglob("*"):
-        name = path.relative_to(folder).as_posix()
-        found[name] = path.read_bytes() if path.is_file() else b""
-    return found
+    paths = folder.rglob("*")
+    return {p.relative_to(folder).as_posix(): p.read_bytes() if p.is_file() else b"" for p in paths}

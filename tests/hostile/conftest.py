@@ -1,4 +1,4 @@
-"""A folder to attack in, with a small robot, and with what may not be lost."""
+"""A folder to attack in, with a small robot and a file that must survive."""
 
 from __future__ import annotations
 
@@ -11,13 +11,13 @@ from tests.hostile.arena import SMALL, strike
 
 @pytest.fixture(scope="session")
 def sound(tmp_path_factory: pytest.TempPathFactory) -> None:
-    """The small robot can be evaluated, with everything imported once: each attack then is a fork."""
+    """Check that the small robot can be evaluated, and import everything once for all forks."""
     import tests.support.command  # noqa: F401
 
     folder = tmp_path_factory.mktemp("sound")
     (folder / "small.urdf").write_text(SMALL)
-    found = strike(folder, "evaluate", "small.urdf", "--frame", "tip", "--normal", "0", "0", "1")
-    assert (found.code, found.complaints) == (0, []), found.err
+    outcome = strike(folder, "evaluate", "small.urdf", "--frame", "tip", "--normal", "0", "0", "1")
+    assert (outcome.code, outcome.complaints) == (0, []), outcome.err
 
 
 @pytest.fixture

@@ -1,4 +1,4 @@
-"""Inputs beyond what can be computed: one line, whatever gave up within."""
+"""Inputs that are too large or too deep end in one line."""
 
 from __future__ import annotations
 

@@ -1,4 +1,4 @@
-"""Small files that would fill the memory, the time or the screen: one short line that says what to correct."""
+"""Small files that would fill memory, time or screen end in one short line."""
 
 from __future__ import annotations
 
@@ -23,8 +23,8 @@ FILES = {
     "aliases as a schema": ("p.yaml", NINES + "schema: *i\n", POSTURE, "is not a posture"),
     "aliases of themselves": ("p.yaml", "joints: &j\n  shoulder: *j\n", POSTURE, "recursive"),
     "empty float": ("p.yaml", 'joints:\n  shoulder: !!float ""\n', POSTURE, "not a number"),
-    "bool that is none": ("p.yaml", 'joints:\n  shoulder: !!bool "maybe"\n', POSTURE, "not a number"),
-    "time that is none": ("p.yaml", 'joints:\n  shoulder: !!timestamp "x"\n', POSTURE, "not a number"),
+    "not a bool": ("p.yaml", 'joints:\n  shoulder: !!bool "maybe"\n', POSTURE, "not a number"),
+    "not a time": ("p.yaml", 'joints:\n  shoulder: !!timestamp "x"\n', POSTURE, "not a number"),
     "minutes and seconds": ("p.yaml", "joints:\n  shoulder: 0:1\n", POSTURE, "not a number"),
     "code in a tag": ("p.yaml", '!!python/object/apply:os.system ["touch gone"]\n', POSTURE, "holds no posture"),
     "names by the thousand": (
@@ -50,7 +50,7 @@ FILES = {
 def test_files_that_grow(name: str, arena: Path) -> None:
     file, text, argv, words = FILES[name]
     (arena / file).write_text(text)
-    # It holds for the children too: an attack that succeeds must not take the machine with it.
+    # The limit also holds for the fork, so that an attack cannot fill the memory of the machine.
     limits = resource.getrlimit(resource.RLIMIT_AS)
     resource.setrlimit(resource.RLIMIT_AS, (8 << 30, limits[1]))
     try:

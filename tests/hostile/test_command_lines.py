@@ -1,4 +1,4 @@
-"""Every option of every command with values that make no sense: one line, the right code, nothing lost.
+"""Every option of every command refuses senseless values in one line, and loses nothing.
 
 ``--hostile-full`` tries twenty times as many.
 """
@@ -16,7 +16,7 @@ from tests.hostile.arena import attack
 from tests.hostile.values import value
 
 PUSH = ("small.urdf", "--frame", "tip", "--normal", "0", "0", "1")
-# Where a command would begin to work for long, a folder that must not be replaced stops it.
+# A folder that must not be replaced stops commands that would work for long.
 STOP = ("--out", "precious", "--force")
 SOUND: dict[str, tuple[str, ...]] = {
     "inspect": ("small.urdf",),
@@ -37,7 +37,7 @@ def parameters(command: str) -> list[Any]:
 
 
 def spoil(command: str, rng: random.Random) -> tuple[str, ...]:
-    """A sound command line with one or two options more, or with another argument."""
+    """Return a sound command line with one or two more options, or with another argument."""
     words = [command, *SOUND[command]]
     for _ in range(rng.choice((1, 1, 2))):
         parameter = rng.choice(parameters(command))
@@ -59,7 +59,7 @@ def test_values_that_make_no_sense(command: str, arena: Path, hostile_full: bool
     rng = random.Random(command)
     stops = SOUND[command][-3:] == STOP
     cases = [spoil(command, rng) for _ in range(COUNT * (20 if hostile_full else 1))]
-    # With two folders to write to, the last one counts: that of ours.
+    # The last --out counts.
     outcomes = attack([(*case, *STOP) if stops else case for case in cases], arena)
     assert len({outcome.code for outcome in outcomes}) > 1
     assert (arena / "precious" / "thesis.txt").read_text() == "ten years"

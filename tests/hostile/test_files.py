@@ -1,4 +1,4 @@
-"""Spoiled input files and result folders: one line that names the file, the right code, nothing lost.
+"""Spoiled input files and result folders end in one line that names the file, and lose nothing.
 
 ``--hostile-full`` tries twenty times as many.
 """
@@ -91,14 +91,13 @@ JSON_VALUES = (
     "NaN", "Infinity", "-1e999", "[]", "{}", "null", "true", '"a"', '[["a"]]', "[1, 2, 3]", "1e308", '"\\u0000"'
 )  # fmt: skip
 
-# A file, what it says when it is sound, and the command that reads it.
+# Name of a file, its sound content, and the command that reads it.
 FILES: dict[str, tuple[str, Callable[[], str], tuple[str, ...]]] = {
     "problem": ("problem.toml", lambda: PROBLEM, ("optimize", "problem.toml", *STOP)),
     "robot": ("robot.toml", lambda: ROBOT, ("inspect", "small.urdf", "--config", "robot.toml")),
     "robot beside": ("robot.toml", lambda: ROBOT, ("evaluate", *PUSH)),
     "scenario": (
-        "scenario.toml",
-        lambda: scenario_path("solo8-push").read_text(encoding="utf-8"),
+        "scenario.toml", lambda: scenario_path("solo8-push").read_text(encoding="utf-8"),
         ("simulate", "scenario.toml", *STOP),
     ),
     "posture": ("p.json", lambda: POSTURE, ("evaluate", *PUSH, "--posture", "p.json")),
@@ -139,8 +138,8 @@ def result(tmp_path_factory: pytest.TempPathFactory) -> Path:
     solution = solve(prepared.problem, starts=1, compile="never")
     with pytest.MonkeyPatch.context() as patch:
         patch.setattr(plot, "draw_all", lambda *_: [])
-        found = PostureResult(PostureProblem.of(prepared), solution)
-        found.save(place / "out", codegen=False, report=False, jobs=1)
+        result = PostureResult(PostureProblem.of(prepared), solution)
+        result.save(place / "out", codegen=False, report=False, jobs=1)
     return place / "out"
 
 
@@ -180,10 +179,10 @@ def spoil_bytes(folder: Path, rng: random.Random) -> None:
 def spoil_entries(folder: Path, rng: random.Random) -> None:
     path = folder / rng.choice(("result.json", "result.npz", "problem.toml"))
     path.unlink()
-    way = rng.randrange(3)
-    if way == 0:
+    kind = rng.randrange(3)
+    if kind == 0:
         path.mkdir()
-    elif way == 1:
+    elif kind == 1:
         path.symlink_to("/dev/null")
 
 
@@ -207,7 +206,7 @@ def test_results_of_another_version(key: str, value: object, words: str, result:
         assert words in outcome.err and len(outcome.err) < 500
 
 
-WAYS = (spoil_document, spoil_arrays, spoil_bytes, spoil_entries)
+FAULTS = (spoil_document, spoil_arrays, spoil_bytes, spoil_entries)
 
 
 @pytest.mark.parametrize("command", ["plot", "codegen", "report"])
@@ -219,7 +218,7 @@ def test_spoiled_results(command: str, result: Path, arena: Path, hostile_full: 
         shutil.rmtree(arena / "out", ignore_errors=True)
         shutil.copytree(result, arena / "out")
         if k:
-            rng.choice(WAYS)(arena / "out", rng)
+            rng.choice(FAULTS)(arena / "out", rng)
 
     outcomes = attack([(command, "out", *more)] * (COUNT * (20 if hostile_full else 1)), arena, arrange)
     assert outcomes[0].code == 0 or "holds thesis.txt" in outcomes[0].err, outcomes[0].err

@@ -1,4 +1,4 @@
-"""Signals at random times: the process ends as it should, says so in one line, and leaves nothing behind.
+"""Signals at random times end the process in one line, and leave nothing behind.
 
 ``--hostile-full`` sends more of them.
 """
@@ -18,7 +18,7 @@ import pytest
 
 COMMAND = Path(sys.executable).parent / "impact-posture"
 PUSH = ("tilthex_arm", "--normal", "0", "0", "1")
-# Each with the processor time, s, that its first process takes at least.
+# Commands, and the least processor time of their first process, s.
 COMMANDS = {
     "evaluate": (("evaluate", *PUSH), 0.7),
     "codegen": (("codegen", *PUSH, "--compile", "--out", "deep/er/out"), 1.0),
@@ -47,24 +47,24 @@ def busy(pid: int) -> float:
 
 def session(leader: int) -> list[str]:
     """The command lines of the living processes of a session."""
-    found = []
+    commands = []
     for entry in Path("/proc").iterdir():
         with contextlib.suppress(OSError, ValueError):
             fields = (entry / "stat").read_text().rpartition(")")[2].split()
             if int(entry.name) and int(fields[3]) == leader and fields[0] not in "ZX":
-                found.append((entry / "cmdline").read_text().replace("\0", " "))
-    # One that has given its memory back is about to end.
-    return [words for words in found if words]
+                commands.append((entry / "cmdline").read_text().replace("\0", " "))
+    # A process without a command line is about to end.
+    return [command for command in commands if command]
 
 
 def times(count: int) -> list[tuple[str, int, signal.Signals]]:
-    """Command, number of the case, and the signal: each command as often."""
+    """Return the command, the number and the signal of each case."""
     return [(name, k, SIGNALS[(k + n) % len(SIGNALS)]) for k in range(count) for n, name in enumerate(COMMANDS)]
 
 
 def send(name: str, k: int, number: signal.Signals, folder: Path) -> None:
     arguments, whole = COMMANDS[name]
-    # The same case at the same point of the work, however fast the machine is now.
+    # The moment is processor time, because the speed of the machine varies.
     moment = random.Random(f"{name} {k}").uniform(0.0, whole)
     work, temporary = folder / "work", folder / "temporary"
     for place in (work, temporary):
@@ -78,7 +78,7 @@ def send(name: str, k: int, number: signal.Signals, folder: Path) -> None:
     )  # fmt: skip
     try:
         with contextlib.suppress(OSError):
-            # Before that, the interpreter itself starts.
+            # Wait until the program handles the signal.
             while process.poll() is None and not caught(process.pid) >> (signal.SIGTERM - 1) & 1:
                 time.sleep(0.002)
             begin = busy(process.pid)
@@ -97,12 +97,12 @@ def send(name: str, k: int, number: signal.Signals, folder: Path) -> None:
         assert process.returncode == 128 + number, about
         assert len(lines) == 1 and lines[0].startswith("error: "), about
     assert "Traceback" not in errors and "ignored" not in errors, about
-    # Ended before the signal, or between its last step and its end: then the folder is there, whole.
+    # A process that ends before the signal has written its folder as a whole.
     names = {path.name for path in work.iterdir()}
     assert names <= {"out", "deep"}, about
     if "deep" in names:
         assert [path.name for path in (work / "deep" / "er").iterdir()] == ["out"], about
-    # matplotlib's own, where its cache cannot be written, is not ours to remove.
+    # Matplotlib makes its own folder if it cannot write its cache.
     assert not [path for path in temporary.iterdir() if not path.name.startswith("matplotlib-")], about
     assert not list((folder / "cache").rglob(".impact-posture-*")), about
     assert not left, about

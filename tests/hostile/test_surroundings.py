@@ -1,4 +1,4 @@
-"""Surroundings that are not as usual: closed streams, folders that cannot be written, settings of other programs."""
+"""Commands in unusual surroundings: closed streams, read-only folders, settings of other programs."""
 
 from __future__ import annotations
 
@@ -46,7 +46,7 @@ def test_files_never_take_the_number_of_a_closed_stream(tmp_path: Path) -> None:
     assert (tmp_path / "file").read_bytes() == b""
 
 
-# Where the system has no folder for temporary files: no other way works as root.
+# Simulates a system without a folder for temporary files, which works for root as well.
 NO_TEMPORARY_FOLDER = """
 import sys, tempfile
 def refuse():

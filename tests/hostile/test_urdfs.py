@@ -1,4 +1,4 @@
-"""Spoiled URDFs: a robot or one line that names the file, in bounded time and memory.
+"""Spoiled URDFs load or end in one line that names the file, in bounded time and memory.
 
 ``--hostile-full`` tries twenty times as many.
 """
@@ -21,7 +21,7 @@ COUNT = 16
 
 
 def spoiled(rng: random.Random) -> bytes:
-    """The small robot with one to three things wrong."""
+    """Return the small robot with one to three random faults."""
     root = ET.fromstring(SMALL)
     for _ in range(rng.choice((1, 1, 2, 3))):
         rng.choice((remove, duplicate, set_attribute, set_number, rename, reconnect, move, add))(root, rng)
@@ -55,7 +55,7 @@ def with_attributes(root: ET.Element, rng: random.Random) -> ET.Element:
 
 
 def printable(texts: tuple[str, ...]) -> list[str]:
-    """What XML can hold."""
+    """Return the short texts that XML can hold."""
     return [
         text for text in texts if len(text) < 1000 and all(c >= " " and not "\ud800" <= c <= "\udfff" for c in text)
     ]
@@ -127,7 +127,7 @@ def test_spoiled_urdfs(argv: tuple[str, ...], arena: Path, hostile_full: bool) -
     assert outcomes[0].code == 0
     refused = [outcome for outcome in outcomes if outcome.code]
     assert len(refused) > COUNT / 4
-    # Or the frame, or the joint, that is no longer there.
+    # Other lines name a missing frame or joint.
     assert sum("bad.urdf" in outcome.err for outcome in refused) > len(refused) / 2
 
 
@@ -194,7 +194,7 @@ def test_files_made_to_break_parsers(make: Callable[[], str], arena: Path) -> No
 
 
 def test_shapes_of_which_no_two_can_meet(arena: Path) -> None:
-    """Two neighbors have shapes: there is no pair whose distance a result could hold."""
+    """Only two neighbors have shapes, so that a result has no distance to state."""
     box = '<collision><geometry><box size="0.1 0.1 0.5"/></geometry></collision>'
     (arena / "boxes.urdf").write_text(SMALL.replace("</inertial>", f"</inertial>{box}"))
     push = ("--frame", "tip", "--normal", "1", "0", "0", "--contact-pose", "free")
