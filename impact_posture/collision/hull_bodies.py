@@ -36,11 +36,7 @@ def merged_bodies(shapes: Sequence[pin.GeometryObject], apart: NDArray[np.bool_]
     """Merge shapes of a robot where this gives fewer pairs and hardly more volume.
 
     Two bodies become one if they move with the same joint, must not touch the same shapes, and no point of their
-    common hull is more than 1 cm from them.
-
-    Args:
-        shapes: The shapes.
-        apart: Whether two shapes must not touch, shape (n, n).
+    common hull is more than 1 cm from them.  ``apart`` tells whether two shapes must not touch, shape (n, n).
     """
     corners = [
         hull_corners(shape_points(shape.geometry) @ shape.placement.rotation.T + shape.placement.translation)

@@ -42,24 +42,18 @@ class JointPlanes:
 
 
 def joint_planes(
-    robot: Robot, names: tuple[str, str], ends: tuple[int, int], touch: Callable[[pin.Data], bool]
+    robot: Robot, names: tuple[str, str], joints: tuple[int, int], touch: Callable[[pin.Data], bool]
 ) -> JointPlanes | None:
-    """Return planes that separate the shapes of two bodies; ``None`` if none are found.
+    """Return planes that separate the shapes of two bodies with these names and joints; ``None`` if none are found.
 
     The shapes are checked on a grid over the ranges of the joints.  Planes remove the positions where the shapes
     touch, with the grid cells around them.  Each step adds the plane that removes the most of these positions per
-    lost free position.
-
-    Args:
-        robot: The robot.
-        names: Names of the bodies.
-        ends: Joints of the bodies.
-        touch: Tells whether the shapes touch at the placements in the data.
+    lost free position.  ``touch`` tells whether the shapes touch at the placements in the data.
     """
     model, start = robot.model, robot.posture()
     lowest, highest = model.lowerPositionLimit, model.upperPositionLimit
     # The joints that move one body against the other, without joints of no range, which keep their position.
-    moving = sorted(set(model.supports[ends[0]]) ^ set(model.supports[ends[1]]))
+    moving = sorted(set(model.supports[joints[0]]) ^ set(model.supports[joints[1]]))
     between = [k for k in moving if model.nqs[k] != 1 or lowest[model.idx_qs[k]] < highest[model.idx_qs[k]]]
     at = [model.idx_qs[k] for k in between]
     low, high = lowest[at], highest[at]
@@ -82,22 +76,19 @@ def joint_planes(
     return JointPlanes(names, tuple(str(model.names[k]) for k in between), rows, planes[1] + rows @ start[at])
 
 
-def _cut_off(hit: NDArray[np.bool_], shares: Array, step: float) -> tuple[Array, Array] | None:
+def _cut_off(hit: NDArray[np.bool_], positions: Array, step: float) -> tuple[Array, Array] | None:
     """Return normals, shape (k, m), and bounds of planes that remove the positions hit, but not the origin.
 
-    Args:
-        hit: Whether the shapes touch at each position.
-        shares: Positions relative to the default posture, in units of half the ranges, shape (n, m).
-        step: Step of the grid.
+    Positions are relative to the default posture, in units of half the ranges, shape (n, m), as is the grid step.
     """
-    free, left = shares[~hit], shares[hit]
+    free, left = positions[~hit], positions[hit]
     count = max(1, len(free))
     # Along each axis, and between axes.
-    signs = np.array([signs for signs in product((-1, 0, 1), repeat=shares.shape[1]) if any(signs)], dtype=float)
+    signs = np.array([signs for signs in product((-1, 0, 1), repeat=positions.shape[1]) if any(signs)], dtype=float)
     directions = signs / np.linalg.norm(signs, axis=1, keepdims=True)
     # Extent of the cells around a position along each direction.
     cells = step * np.abs(directions).sum(axis=1)
-    normals, bounds = [np.zeros((0, shares.shape[1]))], [np.zeros(0)]
+    normals, bounds = [np.zeros((0, positions.shape[1]))], [np.zeros(0)]
     while len(left):
         heights = (left @ directions.T - cells).round(9)
         planes = [(k, bound) for k, along in enumerate(heights.T) for bound in np.unique(along) if bound > 0]

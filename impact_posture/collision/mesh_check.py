@@ -43,10 +43,6 @@ class MeshCheck:
     """Collision check of the shapes of a robot, prepared for many postures.
 
     A collision counts from a depth of 1 µm.  Meshes are surfaces: a mesh wholly inside another does not collide.
-
-    Args:
-        robot: The robot.
-        shapes: The shapes of the robot.
     """
 
     def __init__(self, robot: Robot, shapes: RobotShapes) -> None:
@@ -63,12 +59,9 @@ class MeshCheck:
     def collisions(
         self, q: Array, obstacles: Sequence[Standing] = (), planes: Sequence[HalfSpace] = ()
     ) -> list[tuple[str, str]]:
-        """Return the names in each collision at a posture: two shapes, or a shape and an obstacle or plane.
+        """Return the names in each collision at a posture, shape (nq,).
 
-        Args:
-            q: The posture, shape (nq,).
-            obstacles: Obstacles that the shapes must not touch.
-            planes: Planes that the shapes must stay in front of.
+        The shapes must not touch each other or the obstacles, and must stay in front of the planes.
         """
         collisions, shapes = [], self._shapes
         if pin.computeCollisions(self._model, self._data, self._geometry, self._placed, q, False):

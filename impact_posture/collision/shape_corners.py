@@ -70,11 +70,9 @@ def correct(shape: Any) -> Corrected:
 
 
 def renumbered(count: int, faces: Triangles) -> Triangles | None:
-    """Return triangles that use every corner; ``None`` if the parts of the file cannot be separated.
+    """Return triangles that use all ``count`` corners; ``None`` if the parts of the file cannot be separated.
 
-    Args:
-        count: Number of corners.
-        faces: Triangles with the numbers of coal, shape (n, 3).
+    ``faces`` are the triangles with the numbers of coal, shape (n, 3).
     """
     candidates = (shifted(faces) for shifted in (lambda same: same, _shifted, partial(_shifted, across=True)))
     complete = (triangles for triangles in candidates if np.bincount(triangles.ravel(), minlength=count).all())

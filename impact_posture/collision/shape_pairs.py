@@ -27,15 +27,9 @@ Pair = tuple[int, int]
 def pairs_apart(
     model: pin.Model, joints: Sequence[int], links: Sequence[str], disabled: set[frozenset[str]]
 ) -> NDArray[np.bool_]:
-    """Return whether two shapes must not touch, shape (n, n).
+    """Return whether two shapes must not touch, shape (n, n), from the joint and the link of each shape.
 
-    Shapes of the same joint or of consecutive joints may touch, and so may links that the SRDF allows to touch.
-
-    Args:
-        model: The model.
-        joints: The joint of each shape, n indices.
-        links: The link of each shape, n names.
-        disabled: Pairs of links that the SRDF allows to touch.
+    Shapes of the same joint or of consecutive joints may touch, and so may the pairs of links that the SRDF disables.
     """
     joint = np.array(joints, dtype=int)
     parent = np.array(model.parents, dtype=int)[joint]
@@ -70,12 +64,7 @@ def nested_pairs(
     """Return the pairs of bodies whose hulls touch at most of the postures at which their shapes do not.
 
     Such bodies are nested, such as a shaft in a fork.  Separate hulls would forbid most postures of the robot.
-
-    Args:
-        robot: The robot.
-        bodies: The swept hulls.
-        pairs: The pairs to check.
-        touch: Tells whether shapes of two bodies touch at the placements in the data.
+    ``touch`` tells whether shapes of two bodies touch at the placements in the data.
     """
     data = robot.model.createData()
     apart, forbidden = np.zeros((2, len(pairs)), dtype=int)

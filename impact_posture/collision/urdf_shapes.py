@@ -73,10 +73,7 @@ class UrdfShape:
             return b"<up_axis>Y_UP" in file.read(_HEAD)
 
     def load(self, largest: float) -> Corrected:
-        """Return the coal shape, and whether it is exact or a convex hull.
-
-        Args:
-            largest: Largest extent (m) that a shape in meters can have.
+        """Return the coal shape, and whether it is exact or a convex hull; a shape larger than ``largest`` (m) fails.
 
         Raises:
             UnusableShape: The mesh cannot be read, is empty, has numbers that are not finite, or is in millimeters.
@@ -118,9 +115,7 @@ def largest_extent(robot: Robot) -> float:
 def read_urdf_shapes(robot: Robot, first: str = "collision") -> tuple[list[UrdfShape], list[str]]:
     """Return the shapes of a URDF, with paths of meshes, and a line for each shape that is left out.
 
-    Args:
-        robot: The robot.
-        first: Kind of shape to use where a link has both, ``collision`` or ``visual``.
+    Where a link has both ``collision`` and ``visual`` shapes, ``first`` is the kind to use.
 
     Raises:
         UrdfError: The URDF has become unreadable, or its links differ from the links of the robot.

@@ -25,11 +25,7 @@ _AT_CORNERS, _BETWEEN = 8, 2
 
 
 class PathCurve:
-    """The cubic spline ``q(s) = q₀ ⊕ z(s)``, ``0 ≤ s ≤ 1``, through postures.
-
-    Args:
-        space: The postures that the constraints allow.
-        postures: At least two, in order.
+    """The cubic spline ``q(s) = q₀ ⊕ z(s)``, ``0 ≤ s ≤ 1``, through two or more postures.
 
     Attributes:
         s: Values of ``s`` at the postures, evenly by path length, shape (n,).

@@ -73,15 +73,10 @@ def connect(space: PathSpace, start: Array, target: Array, seed: int = 0, effort
 
     The method is CBiRRT (Berenson et al. 2009).  The planners of OMPL 2.0 on projected state spaces stop at
     inequalities, while these walks slide along them.  On a planar arm beside discs, OMPL found 5 of 18 paths in the
-    time in which these trees found 18.  The effort is a count and not a time, so that the result depends only on the
-    seed.
+    time in which these trees found 18.
 
-    Args:
-        space: The postures that the constraints allow.
-        start: First posture, shape (nq,), valid.
-        target: Last posture, shape (nq,), valid.
-        seed: Seed of the random postures.
-        effort: Number of postures pulled onto the constraints after which the search ends.
+    Both ends, shape (nq,), must be valid.  The search ends after ``effort`` postures pulled onto the constraints.
+    This is a count and not a time, so that the result depends only on the seed.
     """
     rng, chart = np.random.default_rng(seed), space.projector.chart
     first, second = _Tree(space, start), _Tree(space, target)

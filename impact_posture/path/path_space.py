@@ -28,10 +28,7 @@ _SLIDING = {"free-flyer": 3, "planar": 2, "prismatic": 1, "translation": 3}
 
 
 class PathSpace:
-    """Postures on the constraints of a problem, and checked motions between them.
-
-    Args:
-        problem: The posture problem, whose constraints and joint limits hold along a path.
+    """Postures on the constraints and within the joint limits of a problem, and checked motions between them.
 
     Attributes:
         pulls: Number of postures pulled onto the constraints so far, which measures the effort.

@@ -20,13 +20,7 @@ from impact_posture.system.arrays import Array
 
 
 class ReachableCurve:
-    """The component of the self-motion through the start.
-
-    Args:
-        space: The postures that the constraints allow.
-        start: A valid posture, shape (nq,).
-        motion: The self-motion through the start.
-    """
+    """The component of the self-motion through a valid start, shape (nq,)."""
 
     def __init__(self, space: PathSpace, start: Array, motion: SelfMotion) -> None:
         self._space, self._start, self._motion, self._manifold = space, start, motion, motion.manifold

@@ -77,11 +77,8 @@ class LateralForce:
 def thrust_limits(propulsion: PropulsionSpec) -> tuple[float, float]:
     """Return the smallest and the largest thrust of a rotor, ``c_f ω²`` at the speed limits, N."""
     if propulsion.speed_min >= propulsion.speed_max:
-        raise SpecError(
-            f"speed_min {propulsion.speed_min:g} is not below speed_max {propulsion.speed_max:g}",
-            where="propulsion",
-            hint="correct the rotor speed limits",
-        )
+        fault = f"speed_min {propulsion.speed_min:g} is not below speed_max {propulsion.speed_max:g}"
+        raise SpecError(fault, where="propulsion", hint="correct the rotor speed limits")
     c = propulsion.thrust_coefficient
     return c * propulsion.speed_min**2, c * propulsion.speed_max**2
 
@@ -110,11 +107,8 @@ def allocation_matrix(model: pin.Model, propulsion: PropulsionSpec) -> Array:
         raise FrameNotFound(propulsion.frame, (f.name for f in model.frames), where="propulsion.frame")
     frame = model.frames[model.getFrameId(propulsion.frame)]
     if frame.parentJoint != 1:
-        raise SpecError(
-            f"frame '{propulsion.frame}' is not on the base body",
-            where="propulsion.frame",
-            hint="name a frame that is fixed to the floating base",
-        )
+        fault = f"frame '{propulsion.frame}' is not on the base body"
+        raise SpecError(fault, where="propulsion.frame", hint="name a frame that is fixed to the floating base")
     if not propulsion.rotors:
         raise SpecError("there are no rotors", where="propulsion.rotors", hint="list them, or leave propulsion out")
     columns = []
@@ -122,11 +116,8 @@ def allocation_matrix(model: pin.Model, propulsion: PropulsionSpec) -> Array:
         direction = np.asarray(rotor.direction, dtype=float)
         length = float(np.linalg.norm(direction))
         if not np.isfinite(length) or abs(length - 1.0) > 1e-3:
-            raise SpecError(
-                f"direction of length {length:.4g}",
-                where=f"propulsion.rotors '{rotor.name}'",
-                hint="give a unit vector",
-            )
+            fault = f"direction of length {length:.4g}"
+            raise SpecError(fault, where=f"propulsion.rotors '{rotor.name}'", hint="give a unit vector")
         force = direction / length
         moment = np.cross(rotor.position, force) - rotor.spin * propulsion.drag_ratio * force
         columns.append(frame.placement.act(pin.Force(force, moment)).vector)

@@ -97,11 +97,9 @@ def check_mass_matrix(robot: Robot, where: str) -> None:
     M = (upper + np.triu(upper, 1).T)[np.ix_(moving, moving)]
     diagonal = np.diag(M)
     if not np.abs(M).max() <= _LARGEST:
-        raise InertiaError(
-            f"the mass matrix has entries beyond all numbers at posture '{robot.default_posture}'",
-            where=where,
-            hint="correct the masses, inertias, lengths and `armature`; they are in kg, kg m² and m",
-        )
+        fault = f"the mass matrix has entries beyond all numbers at posture '{robot.default_posture}'"
+        hint = "correct the masses, inertias, lengths and `armature`; they are in kg, kg m² and m"
+        raise InertiaError(fault, where=where, hint=hint)
     free = diagonal <= _TINY
     if not free.any():
         scale = 1 / np.sqrt(diagonal)
@@ -114,11 +112,9 @@ def check_mass_matrix(robot: Robot, where: str) -> None:
     names = [name for name, moves in zip(robot.tangent_names, moving, strict=True) if moves]
     named = [name for name, moves in zip(names, free, strict=True) if moves]
     verb = "moves no inertia" if len(named) == 1 else "move no inertia together"
-    raise InertiaError(
-        f"the mass matrix is singular at posture '{robot.default_posture}': {', '.join(named)} {verb}",
-        where=where,
-        hint="give the links mass and rotational inertia, or the joints `armature`, or `lock` one",
-    )
+    fault = f"the mass matrix is singular at posture '{robot.default_posture}': {', '.join(named)} {verb}"
+    hint = "give the links mass and rotational inertia, or the joints `armature`, or `lock` one"
+    raise InertiaError(fault, where=where, hint=hint)
 
 
 def _link_fault(link: ET.Element, where: str) -> tuple[float, str] | None:

@@ -94,19 +94,14 @@ def with_joint_model(robot: Robot, joint_model: JointModel) -> Robot:
         # A rotor without inertia holds nothing against its spring.
         springs = table.elastic & (stated > 0)
         if not springs.any():
-            raise InputError(
-                f"no joint of {robot.name} has a rotor on a spring of known stiffness",
-                where="joint_model",
-                hint="state stiffness in robot.toml [transmission] and the inertia of the rotors in [armature]",
-            )
+            fault = f"no joint of {robot.name} has a rotor on a spring of known stiffness"
+            hint = "state stiffness in robot.toml [transmission] and the inertia of the rotors in [armature]"
+            raise InputError(fault, where="joint_model", hint=hint)
         armature = np.where(springs, 0.0, armature)
     armature[table.locked] = np.inf
     if (np.isinf(armature) | ~joints).all() and not robot.floating:
-        raise InputError(
-            f"all joints of {robot.name} are locked, so nothing moves in an impact",
-            where="joint_model",
-            hint="choose reflected or link",
-        )
+        fault = f"all joints of {robot.name} are locked, so nothing moves in an impact"
+        raise InputError(fault, where="joint_model", hint="choose reflected or link")
     if np.array_equal(armature, robot.model.armature):
         return replace(robot, joint_model=joint_model, stated_armature=stated)
     model = pin.Model(robot.model)

@@ -65,12 +65,8 @@ def build_model_variants(
 ) -> tuple[ModelVariant, ...]:
     """Return all pairs of an armature (as stated, lowest, highest) and a payload (none, or one of ``payloads``).
 
-    Args:
-        robot: The robot as modeled, which is the first variant.
-        armature_range: Factors on the stated armature, lowest and highest.
-        payloads: Payloads; each variant has at most one of them.
-
-    The result is empty if nothing is uncertain.
+    ``armature_range`` has the lowest and the highest factor on the stated armature.  The first variant is the robot
+    as modeled.  The result is empty if nothing is uncertain.
 
     Raises:
         InputError: A range or mass is invalid, the armature is zero, or there are too many variants.
@@ -80,11 +76,8 @@ def build_model_variants(
     for payload in payloads:
         robot.frame_id(payload.frame)
         if robot.model.frames[robot.frame_id(payload.frame)].parentJoint == 0:
-            raise InputError(
-                f"frame '{payload.frame}' is welded to the world, where a mass changes nothing",
-                where="payload",
-                hint="choose a frame on a moving link",
-            )
+            fault = f"frame '{payload.frame}' is welded to the world, where a mass changes nothing"
+            raise InputError(fault, where="payload", hint="choose a frame on a moving link")
         if payloads.count(payload) > 1:
             what = f"{payload.mass:g} kg at '{payload.frame}' is given twice"
             raise InputError(what, where="payload", hint="remove one of them")
@@ -102,11 +95,9 @@ def _factors(robot: Robot, armature_range: tuple[float, float] | None) -> list[f
     armature = np.asarray(robot.model.armature)
     if not armature[np.isfinite(armature)].any():
         none = robot.armature.any() and f"no armature with the joint model '{robot.joint_model}'"
-        raise InputError(
-            f"{robot.name} has {none or 'no armature'}, so a factor changes nothing",
-            where="armature_range",
-            hint="leave it out" if none else "state one with `armature` or in robot.toml",
-        )
+        fault = f"{robot.name} has {none or 'no armature'}, so a factor changes nothing"
+        hint = "leave it out" if none else "state one with `armature` or in robot.toml"
+        raise InputError(fault, where="armature_range", hint=hint)
     return [1.0, *sorted({low, high} - {1.0})]
 
 

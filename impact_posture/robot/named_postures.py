@@ -20,12 +20,8 @@ def named_postures(
 ) -> tuple[dict[str, Array], str]:
     """Return all named postures, shape (nq,) each, and the name of the default posture.
 
-    Args:
-        model: The model, with its final limits.
-        srdf: SRDF with ``group_state`` tags, or ``None``.
-        spec: The ``robot.toml``; its postures replace postures of the SRDF with the same name.
-        root: Root joint of the model.
-        name: Name of the robot.
+    Postures of ``robot.toml`` (``spec``) replace ``group_state`` tags of the SRDF with the same name.  The model must
+    have its final limits.
 
     Raises:
         UrdfError: The SRDF cannot be read.
@@ -81,11 +77,8 @@ def _toml_postures(model: pin.Model, spec: RobotSpec, root: Root, name: str) -> 
         where = f"{name} posture '{key}'"
         q = np.array(pin.neutral(model), dtype=float)
         if posture.base is not None and spec.model.root != "free-flyer" and root != "free-flyer":
-            raise SpecError(
-                f"posture '{key}' gives a base pose, but the root is fixed",
-                where=name,
-                hint='remove it, or write root = "free-flyer" in [model]',
-            )
+            fault = f"posture '{key}' gives a base pose, but the root is fixed"
+            raise SpecError(fault, where=name, hint='remove it, or write root = "free-flyer" in [model]')
         # A floating robot that the user fixes to the world keeps its postures (ignored_bases warns about their base).
         if posture.base is not None and root == "free-flyer":
             norm = float(np.linalg.norm(posture.base[3:]))
@@ -97,11 +90,8 @@ def _toml_postures(model: pin.Model, spec: RobotSpec, root: Root, name: str) -> 
         for joint, value in posture.joints.items():
             index = joint_index(model, joint, where)
             if model.nvs[index] != 1:
-                raise SpecError(
-                    f"posture '{key}': joint '{joint}' has {model.nvs[index]} degrees of freedom, not one number",
-                    where=name,
-                    hint="give it in an SRDF",
-                )
+                fault = f"posture '{key}': joint '{joint}' has {model.nvs[index]} degrees of freedom, not one number"
+                raise SpecError(fault, where=name, hint="give it in an SRDF")
             if not np.isfinite(value):
                 raise SpecError(f"posture '{key}': joint '{joint}' is {value}", where=name, hint="give a number")
             q[q_slice(model, index)] = scalar_entries(model, index, value)

@@ -215,11 +215,8 @@ class Robot:
         """
         q = np.array(q, dtype=float).reshape(-1)
         if q.size != self.nq:
-            raise PostureError(
-                f"a posture of {self.name} has {self.nq} numbers, this one {q.size}",
-                where=where,
-                hint=f"give {self.convention.split(';')[0]}",
-            )
+            fault = f"a posture of {self.name} has {self.nq} numbers, this one {q.size}"
+            raise PostureError(fault, where=where, hint=f"give {self.convention.split(';')[0]}")
         if not np.isfinite(q).all():
             raise PostureError(
                 f"entry {int(np.argmin(np.isfinite(q)))} is not finite", where=where, hint="correct it"

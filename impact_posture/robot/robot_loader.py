@@ -84,17 +84,9 @@ def build_robot(located: Located, options: LoadOptions) -> Robot:
         warnings = (*warnings, *ignored_bases(spec, srdf, default))
     warnings = (*warnings, *armature_warning(model, armature_source, spec.constraints.hold))
     loaded = Robot(
-        name=name,
-        source=source,
-        model=model,
-        root=root,
-        postures=postures,
-        default_posture=default,
-        spec=spec,
-        locked=locked,
-        armature_source=armature_source,
-        warnings=warnings,
-    )
+        name=name, source=source, model=model, root=root, postures=postures, default_posture=default, spec=spec,
+        locked=locked, armature_source=armature_source, warnings=warnings,
+    )  # fmt: skip
     check_mass_matrix(loaded, source)
     return loaded
 
@@ -115,12 +107,9 @@ def names_a_path(robot: str, folder: Path) -> bool:
 
 
 def from_folder(data: dict[str, object], folder: Path, files: Sequence[str]) -> dict[str, object]:
-    """Return the content of a file with its relative paths resolved from the folder of the file.
+    """Return a copy of the content of a file in ``folder`` with its relative paths resolved.
 
-    Args:
-        data: Content of a file that names a ``robot`` as the command line does; not changed.
-        folder: Folder of the file.
-        files: Keys whose values may be paths.
+    The content names a ``robot`` as the command line does.  The values of the keys ``files`` may be paths.
     """
     data = dict(data)
     for key in files:
@@ -214,11 +203,8 @@ def _override_limits(model: pin.Model, spec: RobotSpec, name: str) -> None:
             raise SpecError(f"position limits of '{joint}' are [{low}, {high}]", where=where, hint="lower < upper")
         index = joint_index(model, joint, where)
         if model.nqs[index] != 1:
-            raise SpecError(
-                f"joint '{joint}' has no position limits",
-                where=where,
-                hint="remove it, because the joint turns freely",
-            )
+            fault = f"joint '{joint}' has no position limits"
+            raise SpecError(fault, where=where, hint="remove it, because the joint turns freely")
         lower[model.idx_qs[index]], upper[model.idx_qs[index]] = low, high
     model.lowerPositionLimit, model.upperPositionLimit = lower, upper
     for values, kind in ((spec.limits.velocity, "Velocity"), (spec.limits.effort, "Effort")):
@@ -235,11 +221,8 @@ def _check_limits(model: pin.Model, source: str) -> None:
     for index in range(1, model.njoints):
         for k in np.flatnonzero(swapped[q_slice(model, index)]) + model.idx_qs[index]:
             limits = f"{model.lowerPositionLimit[k]:g}, {model.upperPositionLimit[k]:g}"
-            raise UrdfError(
-                f"the lower position limit of '{model.names[index]}' is above its upper limit ({limits})",
-                where=source,
-                hint="swap them there, or give robot.toml [limits.position]",
-            )
+            fault = f"the lower position limit of '{model.names[index]}' is above its upper limit ({limits})"
+            raise UrdfError(fault, where=source, hint="swap them there, or give robot.toml [limits.position]")
 
 
 def _named(model: pin.Model, patterns: Sequence[str], where: str) -> tuple[str, ...]:

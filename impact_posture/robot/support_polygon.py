@@ -13,14 +13,11 @@ _ROUNDING, _DIGITS = 1e-9, 12
 
 
 def convex_ring(points: Array) -> list[int]:
-    """Return the corners of the convex hull of points of the plane as indices, counter-clockwise.
+    """Return the corners of the convex hull of points, shape (k, 2), as indices, counter-clockwise.
 
     Each chain of the hull follows the sorted points and leaves out points without a left turn (A. M. Andrew, "Another
     efficient algorithm for convex hulls in two dimensions", Inf. Process. Lett. 1979).  The import of SciPy, which
     has convex hulls, takes longer than many problems take to solve.
-
-    Args:
-        points: Points, shape (k, 2).
     """
     order = np.lexsort((points[:, 1], points[:, 0])).tolist()
     x, y = points[:, 0].tolist(), points[:, 1].tolist()
@@ -39,15 +36,10 @@ def convex_ring(points: Array) -> list[int]:
 
 
 def polygon_edges(points: Iterable[Array]) -> tuple[Array, Array] | None:
-    """Return the edges ``n·p ≤ b`` of the convex hull of points of the plane; ``None`` if their hull has no area.
+    """Return the edges ``n·p ≤ b`` of the convex hull of points, shape (2,) each, m; ``None`` without an area.
 
-    Corners on the line between their neighbors are left out.
-
-    Args:
-        points: Points, shape (2,) each, m.
-
-    Returns:
-        Outward unit normals ``n``, shape (k, 2), and offsets ``b``, m, shape (k,).
+    The edges are outward unit normals ``n``, shape (k, 2), and offsets ``b``, m, shape (k,).  Corners on the line
+    between their neighbors are left out.
     """
     places = np.array(list(points), dtype=float).reshape(-1, 2)
     corners = [places[k] for k in convex_ring(places)]

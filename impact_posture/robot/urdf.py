@@ -82,10 +82,7 @@ def build_model(
 ) -> tuple[pin.Model, tuple[str, ...], dict[str, str]]:
     """Parse the URDF at ``path`` without opening meshes; return the model, warnings, and mimicked joint by joint.
 
-    Args:
-        path: The URDF.
-        free_flyer: Put a free-flyer joint between the world and the root link.
-        accept_inertias: Turn refusals of impossible inertias into warnings.
+    ``free_flyer`` adds a free-flyer joint before the root link.  ``accept_inertias`` turns errors into warnings.
 
     Raises:
         UrdfError: The file is missing or is not a URDF, Pinocchio rejects its tree, or it has too many joints.
@@ -103,17 +100,12 @@ def build_model(
         raise UrdfError("has no movable joint", where=str(path), hint="use `root` free-flyer or another URDF")
     first = 2 if free_flyer else 1
     if model.njoints > first and model.joints[first].shortname() == "JointModelFreeFlyer":
-        raise UrdfError(
-            f"its first joint, '{model.names[first]}', is floating",
-            where=str(path),
-            hint="remove that joint with its parent link, and use `root` free-flyer",
-        )
+        fault = f"its first joint, '{model.names[first]}', is floating"
+        hint = "remove that joint with its parent link, and use `root` free-flyer"
+        raise UrdfError(fault, where=str(path), hint=hint)
     if model.nv > MOST_DEGREES_OF_FREEDOM:
-        raise UrdfError(
-            f"has {model.nv} degrees of freedom, more than the supported {MOST_DEGREES_OF_FREEDOM}",
-            where=str(path),
-            hint="fix joints in the URDF that hardly matter",
-        )
+        fault = f"has {model.nv} degrees of freedom, more than the supported {MOST_DEGREES_OF_FREEDOM}"
+        raise UrdfError(fault, where=str(path), hint="fix joints in the URDF that hardly matter")
     mimics, lost = _mimics(root)
     return model, (*check_inertias(root, model, path, accept_inertias), *lost), mimics
 
@@ -167,11 +159,8 @@ def parse_urdf(path: Path) -> ET.Element:
     except (ET.ParseError, ValueError) as error:  # Path raises ValueError for a name with a null character.
         raise UrdfError(f"is not XML ({error})", where=str(path), hint="give a URDF file") from None
     if root.tag != "robot":
-        raise UrdfError(
-            f"is XML but not a URDF: its root is <{root.tag}>, not <robot>",
-            where=str(path),
-            hint="expand xacro first, or give the .urdf",
-        )
+        fault = f"is XML but not a URDF: its root is <{root.tag}>, not <robot>"
+        raise UrdfError(fault, where=str(path), hint="expand xacro first, or give the .urdf")
     if root.find("link") is None:
         raise UrdfError("has no <link>", where=str(path), hint="expand xacro first, or give the .urdf")
     return root

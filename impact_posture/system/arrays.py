@@ -7,24 +7,19 @@ Array = NDArray[np.float64]
 
 
 def null_space(rows: Array, tolerance: float) -> Array:
-    """Return an orthonormal basis of the null space of a matrix, as columns, shape (n, r).
+    """Return an orthonormal basis of the null space of a matrix of shape (k, n), as columns, shape (n, r).
 
-    The import of SciPy, which has the same function, takes longer than many problems take to solve.
-
-    Args:
-        rows: Shape (k, n).
-        tolerance: Singular values up to this share of the largest count as zero.
+    Singular values up to ``tolerance`` times the largest count as zero.  The import of SciPy, which has the same
+    function, takes longer than many problems take to solve.
     """
     _, values, axes = np.linalg.svd(rows)
     return np.asarray(axes[int((values > tolerance * values.max(initial=0.0)).sum()) :].T)
 
 
 def independent_rows(rows: Array, tolerance: float) -> list[int]:
-    """Return the indices of linearly independent rows that span all rows, by pivoted Gram-Schmidt.
+    """Return the indices of independent rows of shape (k, n) that span all rows, by pivoted Gram-Schmidt.
 
-    Args:
-        rows: Shape (k, n).
-        tolerance: Largest remainder, after projection, of a row that counts as dependent.
+    A row is dependent if its remainder after projection is at most ``tolerance``.
     """
     left, chosen = np.array(rows, dtype=float), list[int]()
     for _ in range(len(left)):

@@ -35,11 +35,8 @@ def library_path(folder: Path, prefix: str) -> Path:
 def build_library(folder: Path, prefix: str, library: Path | None = None, flags: Sequence[str] = ()) -> Path:
     """Compile ``<prefix>.c`` in ``folder`` into a shared library, and return the path of the library.
 
-    Args:
-        folder: The folder of the source.
-        prefix: The name of the source without its ending.
-        library: The library to write; ``lib<prefix>.so`` beside the source by default.
-        flags: Compiler flags after the flags of strict C and of ``$CFLAGS``.
+    The library is ``lib<prefix>.so`` beside the source by default.  ``flags`` of the compiler follow the flags of
+    strict C and of ``$CFLAGS``.
 
     Raises:
         CompilerError: There is no compiler, or it failed; with its first error line and the command.
@@ -58,12 +55,8 @@ def build_library(folder: Path, prefix: str, library: Path | None = None, flags:
 def build_parts(folder: Path, library: Path, parts: Mapping[str, Sequence[str]]) -> Path:
     """Compile sources in parallel into a shared library, and return the path of the library.
 
+    ``parts`` has the sources in ``folder``, each with compiler flags after the flags of strict C and of ``$CFLAGS``.
     The cache keeps the object file of each preprocessed source and its flags, so that libraries share them.
-
-    Args:
-        folder: The folder of the sources.
-        library: The library to write.
-        parts: Source → compiler flags after the flags of strict C and of ``$CFLAGS``.
 
     Raises:
         CompilerError: There is no compiler, or it failed; with its first error line and the command.
@@ -107,11 +100,9 @@ def building(library: Path) -> Iterator[Path]:
             if (built := folder / library.name).is_file():
                 _replace(library, built)
     except OSError as error:
-        raise OutputError(
-            f"cannot be written ({error.strerror or error})",
-            where=str(library.parent),
-            hint="free some space or check the permissions; IMPACT_POSTURE_CACHE names another cache",
-        ) from None
+        fault = f"cannot be written ({error.strerror or error})"
+        hint = "free some space or check the permissions; IMPACT_POSTURE_CACHE names another cache"
+        raise OutputError(fault, where=str(library.parent), hint=hint) from None
 
 
 def _replace(library: Path, built: Path) -> None:
@@ -216,9 +207,7 @@ def cache_folder(*parts: str) -> Path:
 def source_key(content: Iterable[str], *packages: str) -> str:
     """Return a short hash of everything that compiled code depends on.
 
-    Args:
-        content: Texts that the code depends on.
-        packages: Packages below ``impact_posture`` that write the code; changed source code gives another key.
+    This is texts (``content``), and the source code of the packages below ``impact_posture`` that write the code.
     """
     text = "\n".join([__version__, *content, *map(_source_hash, packages)])
     return hashlib.sha256(text.encode()).hexdigest()[:32]

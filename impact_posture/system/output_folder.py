@@ -26,12 +26,7 @@ Kind = Literal["result", "export", "run", "comparison", "reproduction", "sweep",
 
 
 def check_output(out: Path, *, force: bool, kind: Kind) -> None:
-    """Refuse an unusable output folder before the work begins.
-
-    Args:
-        out: The folder to be written.
-        force: Whether an existing folder of the same kind may be replaced.
-        kind: The kind of content.
+    """Refuse an unusable output folder before the work begins; ``force`` allows an earlier result of the same kind.
 
     Raises:
         OutputError: The path exists and is not a folder, the folder exists without ``force`` or has foreign files, or
@@ -195,11 +190,9 @@ def _check_ours(out: Path, kind: Kind) -> None:
     foreign = _foreign(out, set())
     if foreign:
         more = f" and {len(foreign) - _SHOWN} more" if len(foreign) > _SHOWN else ""
-        raise OutputError(
-            f"holds {', '.join(foreign[:_SHOWN])}{more}, which this command did not write",
-            where=str(out),
-            hint="choose another `out`, or move that away: `force` replaces earlier results only",
-        )
+        fault = f"holds {', '.join(foreign[:_SHOWN])}{more}, which this command did not write"
+        hint = "choose another `out`, or move that away: `force` replaces earlier results only"
+        raise OutputError(fault, where=str(out), hint=hint)
 
 
 def _foreign(folder: Path, ours: set[str], below: str = "") -> list[str]:

@@ -22,10 +22,10 @@ ENDING = (signal.SIGINT, signal.SIGTERM, signal.SIGHUP)
 # Forked workers find the function here, because the objects that it holds (a CasADi solver) cannot be sent to them.
 _WORK: dict[str, Callable[[int], Any]] = {}
 
-# What a process must undo when it ends early, with the process that began it, because a fork inherits the list.
+# Functions to call when a process ends early, each with the process that added it, because a fork inherits the list.
 _UNFINISHED: list[tuple[int, Callable[[], None]]] = []
 
-# Number of blocks that hold signals, and the ends that signals requested meanwhile.
+# Number of blocks that hold signals, and the ends that signals have requested in these blocks.
 _HELD = [0]
 _LATER: list[Callable[[], None]] = []
 
@@ -52,9 +52,9 @@ def undone(undo: Callable[[], None]) -> Iterator[None]:
 
 @contextmanager
 def signals_held() -> Iterator[None]:
-    """Let no signal end the process within the block; a signal that comes takes effect after it."""
-    # The mask protects processes that are forked here.  The count protects this one, because any thread may get a
-    # signal.
+    """Delay signals that would end the process until the end of the block."""
+    # The mask protects processes that are forked here.  The count protects this process, because any thread may get
+    # a signal.
     before = signal.pthread_sigmask(signal.SIG_BLOCK, ENDING)
     _HELD[0] += 1
     try:
@@ -67,10 +67,10 @@ def signals_held() -> Iterator[None]:
 
 
 def end_early(leave: Callable[[], None]) -> None:
-    """Kill the workers, undo what this process has not finished, newest first, and ``leave``.
+    """Kill the workers, call the functions of :func:`undone`, newest first, and ``leave``.
 
     A signal handler calls this function, and ``leave`` calls ``os._exit``.  An exception is not enough, because the
-    wrappers of C++ libraries take a ``KeyboardInterrupt`` for a failed conversion and go on.
+    wrappers of C++ libraries take a ``KeyboardInterrupt`` for a failed conversion and continue.
     """
     if _HELD[0]:
         _LATER.append(leave)
@@ -111,8 +111,8 @@ def fork_map(function: Callable[[int], _Result], count: int, jobs: int) -> Itera
     others = set(multiprocessing.active_children())
     pool = ProcessPoolExecutor(min(jobs, count), multiprocessing.get_context("fork"), depend, (os.getpid(),))
     try:
-        # The workers are forked here.  A signal reaches every process of the terminal.  No worker may act on it, not
-        # even at its start.
+        # The workers are forked here.  A signal reaches every process of the terminal, but workers must ignore it,
+        # even at their start.
         with signals_held():
             futures = [pool.submit(_worker, index) for index in range(count)]
         yield _finished(futures)
@@ -134,8 +134,8 @@ def _finished(futures: list[Future[tuple[int, _Result]]]) -> Iterator[tuple[int,
 def fork_call(function: Callable[[], _Result]) -> Iterator[Callable[[], _Result]]:
     """Start ``function()`` in a copy of this process and yield a function that waits for its result.
 
-    This copies state that cannot be copied otherwise (physics, solvers).  Exceptions of the copy are raised here.
-    The copy does not outlive the block.
+    The copy has state that cannot be copied otherwise (physics, solvers).  Exceptions of the copy are raised here.
+    The copy ends with the block.
 
     Raises:
         OSError: The system cannot fork.
@@ -152,7 +152,7 @@ def fork_call(function: Callable[[], _Result]) -> Iterator[Callable[[], _Result]
     sender.close()
 
     def kill() -> None:
-        # After the first call, another process may have this number.
+        # After the first call, another process may have this process id.
         with suppress(ChildProcessError):
             if os.waitpid(child, os.WNOHANG) == (0, 0):
                 os.kill(child, signal.SIGKILL)
@@ -172,7 +172,7 @@ def fork_call(function: Callable[[], _Result]) -> Iterator[Callable[[], _Result]
 
 
 def _send_result(function: Callable[[], Any], sender: Any) -> NoReturn:
-    """Run in the copy: send the error and the result, and end without the clean-up of the original."""
+    """Send the error and the result from the copy, and end without the clean-up of the original process."""
     try:
         try:
             sender.send((None, function()))
@@ -183,7 +183,7 @@ def _send_result(function: Callable[[], Any], sender: Any) -> NoReturn:
 
 
 def depend(parent: int) -> None:
-    """Ignore signals except SIGTERM, by which a pool ends its workers; end when the parent ends."""
+    """Ignore signals except SIGTERM, with which a pool ends its workers; end when the parent ends."""
     for number in ENDING:
         signal.signal(number, signal.SIG_DFL if number == signal.SIGTERM else signal.SIG_IGN)
     signal.pthread_sigmask(signal.SIG_UNBLOCK, ENDING)

@@ -123,8 +123,5 @@ def _check(command: list[str], folder: Path, code: int, output: str) -> None:
         return
     lines = [line for line in output.splitlines() if line.strip()]
     first = next((line for line in lines if "error" in line.lower()), lines[0] if lines else None)
-    raise CompilerError(
-        f"{first or f'no output, exit code {code}'} (command: {shlex.join(command)}, in {folder})",
-        where="the C compiler failed",
-        hint="check the compiler or set CC to another",
-    )
+    fault = f"{first or f'no output, exit code {code}'} (command: {shlex.join(command)}, in {folder})"
+    raise CompilerError(fault, where="the C compiler failed", hint="check the compiler or set CC to another")

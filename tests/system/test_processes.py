@@ -1,4 +1,4 @@
-"""Work shared out among processes: the same results in whatever order, faults come home, nobody is left behind."""
+"""Work in several processes: complete results in any order, errors reach the caller, and no process remains."""
 
 from __future__ import annotations
 
@@ -27,7 +27,7 @@ pytestmark = pytest.mark.skipif(not Path("/proc/self/status").is_file(), reason=
 
 
 def alive(pid: int) -> bool:
-    """Whether a process runs; one that has ended and that nobody asked about yet does not."""
+    """Return whether a process runs and is not a zombie."""
     try:
         return "\nState:\tZ" not in Path(f"/proc/{pid}/status").read_text(encoding="utf-8")
     except OSError:
@@ -44,39 +44,39 @@ def gone(pids: list[int], within: float = 10.0) -> bool:
 
 
 @pytest.mark.parametrize("jobs", [1, 2, 5])
-def test_every_index_comes_once_with_its_result_in_whatever_order(jobs: int) -> None:
+def test_every_index_has_its_result_in_any_order(jobs: int) -> None:
     def work(index: int) -> tuple[int, int]:
-        # The first are the slowest: they come last where others work beside them.
+        # The first indices are the slowest, and finish last in parallel.
         time.sleep(0.02 * (3 - index) if index < 3 else 0)
         return index**2, os.getpid()
 
     with fork_map(work, 7, jobs) as results:
-        found = dict(results)
-    assert {index: square for index, (square, _) in found.items()} == {k: k**2 for k in range(7)}
-    pids = {pid for _, pid in found.values()}
+        by_index = dict(results)
+    assert {index: square for index, (square, _) in by_index.items()} == {k: k**2 for k in range(7)}
+    pids = {pid for _, pid in by_index.values()}
     assert (os.getpid() in pids) == (jobs == 1) and len(pids) <= jobs
     assert jobs == 1 or gone(list(pids))
 
 
-def test_a_worker_that_is_killed_is_noticed() -> None:
+def test_a_killed_worker_is_an_error() -> None:
     def work(index: int) -> int:
         if index == 2:
             os.kill(os.getpid(), signal.SIGKILL)
         return index
 
-    with pytest.raises(WorkerDied, match="jobs=1"), fork_map(work, 6, 2) as results:
+    with pytest.raises(WorkerDied, match="`jobs` 1"), fork_map(work, 6, 2) as results:
         list(results)
     with fork_map(lambda index: index, 3, 2) as results:
         assert sorted(results) == [(k, k) for k in range(3)]
 
 
-def test_what_cannot_be_sent_to_a_process_is_found_there() -> None:
+def test_workers_have_objects_that_cannot_be_sent() -> None:
     held = open(__file__, encoding="utf-8")
     with held, fork_map(lambda index: (index, held.name), 3, 2) as results:
         assert sorted(results) == [(k, (k, __file__)) for k in range(3)]
 
 
-def test_nothing_to_do() -> None:
+def test_no_work_gives_no_results() -> None:
     with fork_map(lambda index: index, 0, 4) as results:
         assert list(results) == []
 
@@ -91,7 +91,7 @@ def test_nothing_to_do() -> None:
     ],
     ids=lambda e: type(e).__name__,
 )
-def test_a_workers_fault_reaches_the_caller_whole(error: Exception, jobs: int) -> None:
+def test_the_caller_gets_the_error_of_a_worker(error: Exception, jobs: int) -> None:
     def work(index: int) -> int:
         if index == 2:
             raise error
@@ -105,7 +105,7 @@ def test_a_workers_fault_reaches_the_caller_whole(error: Exception, jobs: int) -
         assert vars(caught.value) == vars(error)
 
 
-def test_after_a_fault_no_process_is_left_and_the_next_sharing_works(tmp_path: Path) -> None:
+def test_after_an_error_no_process_remains_and_the_next_call_works(tmp_path: Path) -> None:
     def work(index: int) -> int:
         (tmp_path / str(os.getpid())).touch()
         if index == 0:
@@ -139,7 +139,7 @@ import os, signal, sys, time
 from pathlib import Path
 from impact_posture.system.processes import fork_call, fork_map
 
-# A shell ignores Ctrl-C for what it runs in the background, and its children inherit that.
+# A shell ignores Ctrl-C for background processes, and their children inherit this.
 signal.signal(signal.SIGINT, signal.default_int_handler)
 
 def work(index):
@@ -172,7 +172,7 @@ def test_ctrl_c_leaves_no_process_and_no_noise(tmp_path: Path, send: Callable[[i
         assert (process.returncode, out, err) == (130, "stopped\n", "")
         assert gone(workers)
     finally:
-        # Its own session: nothing else is in that group.
+        # The group has only processes of this session.
         with contextlib.suppress(ProcessLookupError):
             os.killpg(process.pid, signal.SIGKILL)
 
@@ -196,14 +196,14 @@ elif sys.argv[1] == "a copy":
     with fork_call(linger) as collect:
         collect()
 else:
-    # Like a compiler, it starts others.
+    # Like a compiler, the script starts other processes.
     script = 'touch $1/$$; sh -c "touch $1/\\$\\$; sleep 60; :"; :'
     run_compilers([["sh", "-c", script, "cc", str(folder), "-o", f"{folder}/none"]] * 2, folder)
 """
 
 
 @pytest.mark.parametrize(("what", "count"), [("workers", 2), ("a copy", 1), ("compilers", 4)])
-def test_nobody_outlives_a_killed_parent(what: str, count: int, tmp_path: Path) -> None:
+def test_no_process_outlives_a_killed_parent(what: str, count: int, tmp_path: Path) -> None:
     if what == "compilers" and (os.cpu_count() or 1) < 2:
         count = 2
     process = subprocess.Popen([sys.executable, "-c", KILLED, what, str(tmp_path)], start_new_session=True)
@@ -232,7 +232,7 @@ def ended(monkeypatch: pytest.MonkeyPatch) -> list[str]:
     return []
 
 
-def test_what_is_unfinished_is_undone_newest_first_whatever_fails(ended: list[str]) -> None:
+def test_unfinished_blocks_are_undone_newest_first_despite_errors(ended: list[str]) -> None:
     with undone(lambda: ended.append("old")), contextlib.suppress(ZeroDivisionError), undone(lambda: [][1 // 0]):
         with undone(lambda: ended.append("done")):
             pass
@@ -241,7 +241,7 @@ def test_what_is_unfinished_is_undone_newest_first_whatever_fails(ended: list[st
     assert ended == ["done", "new", "old", "left", "new", "old"]
 
 
-def test_a_copy_does_not_undo_what_its_original_has_begun(tmp_path: Path) -> None:
+def test_a_copy_does_not_undo_blocks_of_the_original(tmp_path: Path) -> None:
     (tmp_path / "folder").mkdir()
     with undone((tmp_path / "folder").rmdir), fork_call(lambda: end_early(lambda: None)) as collect:
         collect()
@@ -259,7 +259,7 @@ def test_nothing_ends_the_process_while_signals_are_held(ended: list[str]) -> No
 # ---- a copy of this process ----------------------------------------------------------------------------------------
 
 
-def test_a_copy_goes_on_from_the_very_state() -> None:
+def test_a_copy_continues_from_the_same_state() -> None:
     numbers = np.random.default_rng(5)
     numbers.random(3)
 
@@ -267,12 +267,12 @@ def test_a_copy_goes_on_from_the_very_state() -> None:
         return numbers.random(100_000)
 
     with fork_call(draw) as collect:
-        # More than a pipe holds: the copy waits, this process does not.
+        # The result is larger than the buffer of a pipe, so the copy waits while this process goes on.
         here = draw()
         np.testing.assert_array_equal(collect(), here)
 
 
-def test_what_a_copy_raises_is_raised_here() -> None:
+def test_an_exception_of_a_copy_is_raised_here() -> None:
     def fail() -> None:
         raise InputError("is wrong", where="the copy", hint="correct it")
 
@@ -286,15 +286,15 @@ def test_a_copy_that_dies_is_an_error() -> None:
 
 
 def test_no_copy_outlives_its_block(tmp_path: Path) -> None:
-    told = tmp_path / "pid"
+    file = tmp_path / "pid"
 
     def linger() -> None:
-        told.with_suffix(".part").write_text(str(os.getpid()))
-        told.with_suffix(".part").replace(told)
+        file.with_suffix(".part").write_text(str(os.getpid()))
+        file.with_suffix(".part").replace(file)
         time.sleep(60)
 
     with pytest.raises(KeyboardInterrupt), fork_call(linger):
-        while not told.exists():
+        while not file.exists():
             time.sleep(0.01)
         raise KeyboardInterrupt
-    assert gone([int(told.read_text())], within=1.0)
+    assert gone([int(file.read_text())], within=1.0)
