@@ -95,6 +95,11 @@ def test_a_held_command_is_within_its_limits_and_damps_the_joints() -> None:
         held = controller.tick(0.0, np.full(robot.nq, wrong), v)
         assert held.status is Status.NON_FINITE
         assert np.array_equal(held.u, first.u)
+    # A rate beyond all measurements damps nothing.
+    for rate in (2e8, -np.inf, np.nan):
+        glitch = v.copy()
+        glitch[0] = rate
+        assert np.array_equal(controller.tick(0.0, q, glitch).u, first.u)
     fast = controller.tick(np.nan, q, v + 1.0)
     assert fast.status is Status.NON_FINITE
     assert (fast.u <= first.u).all() and (fast.u < first.u).any()

@@ -50,23 +50,24 @@ def test_no_pip_is_one_line(cache: Path, monkeypatch: pytest.MonkeyPatch) -> Non
         daqp_sources()
 
 
-def test_other_contents_are_refused(cache: Path) -> None:
-    in_cache(cache)
-    with pytest.raises(InputError, match="is not DAQP"):
-        daqp_sources()
+LINK = tarfile.TarInfo()
+LINK.type, LINK.linkname = tarfile.SYMTYPE, "/etc/passwd"
 
 
-def test_a_link_for_a_file_is_refused(cache: Path) -> None:
-    link = tarfile.TarInfo()
-    link.type, link.linkname = tarfile.SYMTYPE, "/etc/passwd"
-    in_cache(cache, daqp_c=link)
-    with pytest.raises(InputError, match=r"has no file csrc/src/daqp\.c"):
-        daqp_sources()
-
-
-def test_a_huge_member_is_refused(cache: Path) -> None:
-    in_cache(cache, types_h=bytes(2 << 20))
-    with pytest.raises(InputError, match=r"has no file csrc/include/types\.h"):
+@pytest.mark.parametrize(
+    ("members", "message"),
+    [
+        ({}, "is not DAQP"),
+        ({"daqp_c": LINK}, r"has no file csrc/src/daqp\.c"),
+        ({"types_h": bytes(2 << 20)}, r"has no file csrc/include/types\.h"),
+    ],
+    ids=["contents", "link", "size"],
+)
+def test_an_archive_with_other_files_is_refused(
+    cache: Path, members: dict[str, tarfile.TarInfo | bytes], message: str
+) -> None:
+    in_cache(cache, **members)
+    with pytest.raises(InputError, match=message):
         daqp_sources()
 
 

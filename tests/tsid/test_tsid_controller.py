@@ -115,34 +115,6 @@ def test_limits_relax_the_lower_level_first_and_say_how_far() -> None:
     assert_dynamics(controller, command)
 
 
-def test_a_relaxed_level_comes_as_close_as_it_can() -> None:
-    """quadprog solves the same lexicographic problem, assembled here over (ν̇, u)."""
-    quadprog = pytest.importorskip("quadprog")
-    r = robot(ARM)
-    controller = pushed(r, 1.5)
-    q, v = r.posture(), np.zeros(r.nv)
-    controller.tick(0.0, q, v)
-    (relaxed,) = controller.report().relaxed
-    state, nv = controller.state, r.nv
-    M = pin.crba(r.model, r.model.createData(), q)
-    h = pin.rnea(r.model, r.model.createData(), q, v, np.zeros(nv))
-    G, low, high = controller.actuators.G, controller.actuators.lower, controller.actuators.upper
-    ee = controller.formulation.levels[1][0]
-    J, wanted = np.array(ee.jacobian(state)), ee.desired(state) - ee.drift(state)
-    A = np.hstack([J, np.zeros((6, G.shape[1]))])
-    tilt = np.hstack([np.eye(2, nv, 3), np.zeros((2, G.shape[1]))])
-    equal = np.vstack([np.hstack([M, -G]), tilt])
-    bounds = AccelerationBounds(r, LimitLaw())
-    bounds.update(state)
-    lower, upper = np.concatenate([bounds.lower, low]), np.concatenate([bounds.upper, high])
-    eye = np.eye(A.shape[1])
-    fl, fu = np.isfinite(lower), np.isfinite(upper)
-    C = np.vstack([equal, eye[fl], -eye[fu]])
-    b = np.concatenate([-h, np.zeros(2), lower[fl], -upper[fu]])
-    x = quadprog.solve_qp(A.T @ A + 1e-9 * eye, A.T @ wanted, C.T, b, len(equal))[0]
-    assert relaxed.amount == pytest.approx(np.linalg.norm(A @ x - wanted), rel=1e-5)
-
-
 def test_a_saturated_flight_never_fails() -> None:
     r = robot(ARM)
     controller = pushed(r, 3.0)
