@@ -94,8 +94,9 @@ static void ip_flow_look(ip_context *c)
 }
 
 /* Compute the redundancy, and the gradient on it. */
-static void ip_flow_split(ip_flow *f)
+static void ip_flow_split(ip_context *c)
 {
+  ip_flow *f = &c->flow;
   int i;
   ip_flow_space(f);
   memset(f->multiplier, 0, sizeof f->multiplier);

@@ -109,14 +109,21 @@ static void ip_flow_limits(ip_context *c)
   }
 }
 
+/* Displacement within a time of the flow after a change. */
+static void ip_flow_after(const ip_flow *f, const double *step, double time, double *moved)
+{
+  int i;
+  for (i = 0; i < IP_NV; ++i) {
+    moved[i] = time * (f->flow[i] + step[i]);
+  }
+}
+
 /* Take out of a change of the flow the parts that cross limits within a time, row by row. */
 static void ip_flow_along_limits(const ip_flow *f, double time, double *step)
 {
   double moved[IP_NV], across[IP_NV], over, square;
-  int i, r;
-  for (i = 0; i < IP_NV; ++i) {
-    moved[i] = time * (f->flow[i] + step[i]);
-  }
+  int r;
+  ip_flow_after(f, step, time, moved);
   for (r = 0; r < IP_FLOW_ROWS; ++r) {
     const int k = r - IP_JOINTS_V;
     over = ip_flow_ahead(f, r, moved);

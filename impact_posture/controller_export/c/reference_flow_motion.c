@@ -75,10 +75,7 @@ static void ip_flow_back(ip_context *c, double period, double *back)
 static double ip_flow_braking(const ip_flow *f, const ip_params *p, const double *step, double period)
 {
   double after[IP_NV];
-  int i;
-  for (i = 0; i < IP_NV; ++i) {
-    after[i] = f->flow[i] + step[i];
-  }
+  ip_flow_after(f, step, 1.0, after);
   return IP_CAUTION * ip_largest(after, 0) / (2.0 * f->able * p->flow_acceleration[0]) + period;
 }
 
@@ -87,10 +84,8 @@ static int ip_flow_stops(const ip_flow *f, const ip_params *p, const double *ste
 {
   const double time = ip_flow_braking(f, p, step, period);
   double moved[IP_NV];
-  int i, r;
-  for (i = 0; i < IP_NV; ++i) {
-    moved[i] = time * (f->flow[i] + step[i]);
-  }
+  int r;
+  ip_flow_after(f, step, time, moved);
   for (r = 0; r < IP_FLOW_ROWS; ++r) {
     const double ahead = ip_flow_ahead(f, r, moved);
     if (ahead > f->room[0][r] + IP_NEAR || ahead < f->room[1][r] - IP_NEAR) {
@@ -105,15 +100,10 @@ static int ip_flow_stops(const ip_flow *f, const ip_params *p, const double *ste
 static void ip_flow_bound_speed(const ip_flow *f, const ip_params *p, double *step)
 {
   double after[IP_NV];
-  int i;
-  for (i = 0; i < IP_NV; ++i) {
-    after[i] = f->flow[i] + step[i];
-  }
+  ip_flow_after(f, step, 1.0, after);
   if (ip_largest(after, 0) > p->flow_speed[0]) {
     ip_shorten(after, p->flow_speed[0]);
-    for (i = 0; i < IP_NV; ++i) {
-      step[i] = after[i] - f->flow[i];
-    }
+    ip_subtract(after, f->flow, step, IP_NV);
   }
 }
 
@@ -267,8 +257,8 @@ static int ip_flow_begin(ip_context *c)
     return 0;
   }
   ip_flow_look(c);
-  ip_flow_decompose(f);
-  ip_flow_split(f);
+  ip_flow_decompose(c);
+  ip_flow_split(c);
   ip_flow_limit(c);
   for (k = 0; k < f->left; ++k) {
     ip_flow_probe(c);
@@ -279,58 +269,37 @@ static int ip_flow_begin(ip_context *c)
   return 1;
 }
 
-/* Do the work of one tick of an update.  Python does it at the ticks of the look, the changes, the probe and the step. */
-static void ip_flow_update(ip_context *c)
+/* A part of the eigenvalues of the curvature and, at the last tick, the variables of the Newton step. */
+static void ip_flow_curve(ip_context *c)
 {
+  enum { BEND = 7, TRIDIAGONAL = 8, LAST = 12 };
   ip_flow *f = &c->flow;
-  double *C = f->work, *V = C + IP_NV * IP_NV;
-  const int n = f->left, descends = ip_flow_descends(f);
-  switch (f->phase) {
-  case 0:
-    ip_flow_look(c);
-    break;
-  case 1:
-    ip_flow_decompose(f);
-    break;
-  case 2:
-    ip_flow_split(f);
-    break;
-  case 3:
-    ip_flow_limit(c);
-    break;
-  case IP_FLOW_UNTIL:
-  case IP_FLOW_PHASES - IP_FLOW_SINCE:
-    ip_flow_govern(c);
-    break;
-  case 5:
-    ip_flow_probe(c);
-    break;
-  case 6:
-    ip_flow_compare(c);
-    break;
-  case 13:
-    ip_flow_direct(c);
-    break;
-  default:
-    if (descends && f->phase == 7) {
-      ip_flow_bend(c);
-    } else if (descends && f->phase == 8) {
-      ip_tridiagonal(C, V, n);
-    } else if (descends) {
-      /* The last part goes on to the end. */
-      ip_diagonalize(C, V, n, f->phase == 12 ? 30 * n * n : n * n / 2);
-    }
-    if (descends && f->phase == 12) {
-      ip_flow_turn(c);
-      ip_flow_rows(f);
-    }
+  double *A = f->work, *V = A + IP_NV * IP_NV;
+  const int n = f->left;
+  if (!ip_flow_descends(f)) {
+    return;
   }
-  f->phase = (f->phase + 1) % IP_FLOW_PHASES;
+  if (f->phase == BEND) {
+    ip_flow_bend(c);
+  } else if (f->phase == TRIDIAGONAL) {
+    ip_tridiagonal(A, V, n);
+  } else {
+    ip_diagonalize(A, V, n, f->phase == LAST ? 30 * n * n : n * n / 2);
+  }
+  if (f->phase == LAST) {
+    ip_flow_turn(c);
+    ip_flow_rows(f);
+  }
 }
 
 /* Advance the flow by dt seconds, and move the targets of the posture task and of the tasks that it leads. */
 static void ip_flow_lead(ip_context *c, double dt)
 {
+  /* Python has the look, the changes, the probe and the step at the same ticks. */
+  static void (*const parts[IP_FLOW_PHASES])(ip_context *) = {
+    ip_flow_look,    ip_flow_decompose, ip_flow_split, ip_flow_limit, ip_flow_govern, ip_flow_probe, ip_flow_compare,
+    ip_flow_curve,   ip_flow_curve,     ip_flow_curve, ip_flow_curve, ip_flow_govern, ip_flow_curve, ip_flow_direct,
+  };
   ip_flow *f = &c->flow;
   double position[3], J[3 * IP_NV], drift[3];
   int i, k;
@@ -339,7 +308,8 @@ static void ip_flow_lead(ip_context *c, double dt)
   }
   f->clock += dt;
   f->elapsed += dt;
-  ip_flow_update(c);
+  parts[f->phase](c);
+  f->phase = (f->phase + 1) % IP_FLOW_PHASES;
   ip_add(f->velocity, dt, f->acceleration, IP_NV);
   ip_integrate(f->q, f->velocity, dt, f->q);
   if (!f->on && ip_largest(f->velocity, 0) <= IP_STILL) {

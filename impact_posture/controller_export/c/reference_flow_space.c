@@ -37,9 +37,10 @@ static void ip_solve_factor(const double *R, int n, double *b)
 #endif
 
 /* Write eigenvectors and eigenvalues of JJ' into f->work.  A Gram matrix is exact enough for singular values above 2 %. */
-static void ip_flow_decompose(ip_flow *f)
+static void ip_flow_decompose(ip_context *c)
 {
   enum { N = IP_NV, M = IP_HELD };
+  ip_flow *f = &c->flow;
   double *G = f->work;
   int i, j;
   for (i = 0; i < M; ++i) {

@@ -1,7 +1,7 @@
 /* Bounds of the acceleration that keep the zero moment point of a standing robot within the polygon of its feet.  The
  * formulas are in impact_posture/tsid/flow/zero_moment_point.py. */
 
-/* Share of the way from the center of mass to an edge that accelerations may take, and the least distance that counts, m. */
+/* Share of the distance from the center of mass to an edge that accelerations may use, and the least distance, m. */
 #define IP_ZMP_SHARE 0.8
 #define IP_ZMP_LEAST 0.01
 

@@ -65,7 +65,7 @@ static int solve_cost(Relaxation *r) {
         if (flag <= 0) continue;
         ip_add(r->wanted, unit, r->daqp.u, free);
         unwhiten(r, r->wanted);
-        find_way(r, r->wanted);
+        find_motion(r, r->wanted);
         go(r, 1);
         list_active(r);
         find_step(r);

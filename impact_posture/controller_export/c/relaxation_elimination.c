@@ -62,7 +62,7 @@ static void add_near(Relaxation *r, int entry) {
     double *b = r->M + r->near * r->n;
     memcpy(b, motion(r, entry), (size_t)(r->n - r->fixed) * sizeof *b);
     turn_row(r, b);
-    r->own[r->near++] = entry;
+    r->close[r->near++] = entry;
 }
 
 static void swap(double *a, double *b, int count) {
@@ -74,7 +74,7 @@ static void swap(double *a, double *b, int count) {
 }
 
 /* Set r->step to the step by which the listed rows reach, or come close to, their goals.  Return the number of reflected
- * coordinates that it uses.  The coordinates after r->rank belong to the first rows in r->own. */
+ * coordinates that it uses.  The coordinates after r->rank belong to the first rows in r->close. */
 static int find_step(Relaxation *r) {
     const int n = r->n, rank = r->rank, free = n - r->fixed, rest = free - rank;
     double *step = r->step, *C = r->L, *rhs = r->rhs, *square = r->column, longest = 0;
@@ -87,9 +87,9 @@ static int find_step(Relaxation *r) {
     for (int i = 0; i < r->near; i++) {
         const double *b = r->M + i * n;
         memcpy(C + i * n, b + rank, (size_t)rest * sizeof *C);
-        rhs[i] = r->goal[r->own[i]] - r->value[r->own[i]] - ip_dot(b, step, rank);
+        rhs[i] = r->goal[r->close[i]] - r->value[r->close[i]] - ip_dot(b, step, rank);
         square[i] = ip_dot(b + rank, b + rank, rest);
-        longest = fmax(longest, r->length[r->own[i]]);
+        longest = fmax(longest, r->length[r->close[i]]);
     }
     for (; used < r->near && used < rest; used++) {
         double *c = C + used * n, *v = r->v + (rank + used) * n, *tau = r->tau + rank + used;
@@ -97,8 +97,8 @@ static int find_step(Relaxation *r) {
         for (int i = used; i < r->near; i++)
             if (square[i] > square[best]) best = i;
         if (best != used) {
-            const int row = r->own[used];
-            r->own[used] = r->own[best], r->own[best] = row;
+            const int row = r->close[used];
+            r->close[used] = r->close[best], r->close[best] = row;
             swap(c, C + best * n, rest);
             swap(r->M + used * n, r->M + best * n, free);
             swap(rhs + used, rhs + best, 1);
@@ -128,19 +128,19 @@ static int find_step(Relaxation *r) {
 /* Mark the listed rows as held or free. */
 static void hold_rows(Relaxation *r, int held) {
     for (int i = 0; i < r->exact; i++) r->held[r->rows[i]] = held;
-    for (int i = 0; i < r->near; i++) r->held[r->own[i]] = held;
+    for (int i = 0; i < r->near; i++) r->held[r->close[i]] = held;
 }
 
 /* Move by r->step until a row of the program stops it.  Return the entry of this row, or -1 after the whole step. */
 static int move(Relaxation *r) {
     double part = 1, end = 0;
     int stop = -1;
-    find_way(r, r->step);
+    find_motion(r, r->step);
     hold_rows(r, 1);
     for (int j = 0; j < r->count; j++) {
         const int i = r->entry[j];
         if (r->held[i]) continue;
-        const double by = entry_of(r, r->way, i), room = r->tolerance * r->length[i];
+        const double by = entry_of(r, r->motion_z, i), room = r->tolerance * r->length[i];
         const double upper = fmax(r->upper[i], r->value[i]), lower = fmin(r->lower[i], r->value[i]);
         if (r->value[i] + part * by > upper + room)
             part = (upper - r->value[i]) / by, stop = i, end = r->upper[i];

@@ -100,10 +100,10 @@ static int drop_rows(Relaxation *r) {
     memset(force, 0, (size_t)r->rank * sizeof *force);
     memset(r->rhs, 0, (size_t)exact * sizeof *r->rhs);
     for (int i = 0; i < near; i++) {
-        const double miss = r->goal[r->own[i]] - r->value[r->own[i]];
-        if (fabs(miss) <= least(r, r->own[i])) continue;
+        const double miss = r->goal[r->close[i]] - r->value[r->close[i]];
+        if (fabs(miss) <= least(r, r->close[i])) continue;
         ip_add(force, miss, r->M + i * r->n, r->rank);
-        most = fmax(most, fabs(miss) * r->length[r->own[i]]);
+        most = fmax(most, fabs(miss) * r->length[r->close[i]]);
         square += miss * miss;
     }
     for (int k = r->rank - 1; k >= 0; k--) {
@@ -122,13 +122,13 @@ static int drop_rows(Relaxation *r) {
     for (int i = 0; i < exact; i++)
         if (most > 0 && (r->rhs[i] > COUNTS * most || (!all && i != worst))) r->rows[exacts++] = r->rows[i];
     for (int i = 0; i < near; i++)
-        if (is_equation(r, r->own[i]) || violation(r, r->own[i]) > least(r, r->own[i])) r->own[nears++] = r->own[i];
+        if (is_equation(r, r->close[i]) || violation(r, r->close[i]) > least(r, r->close[i])) r->close[nears++] = r->close[i];
     /* Inequalities exactly at their bounds would be dropped and stop the move again, endlessly. */
     if (exacts + nears == exact + near || (exacts == exact && !all)) return 0;
     r->square = square;
     clear_rows(r);
     for (int i = 0; i < exacts; i++) add_exact(r, r->rows[i]);
-    for (int i = 0; i < nears; i++) add_near(r, r->own[i]);
+    for (int i = 0; i < nears; i++) add_near(r, r->close[i]);
     return 1;
 }
 
@@ -166,7 +166,7 @@ static int finish_level(Relaxation *r, int level, int missed) {
     /* The point is good but not the best, and its rows keep their values. */
     list_held(r, level, missed);
     for (int i = 0; i < r->exact; i++) r->goal[r->rows[i]] = r->value[r->rows[i]];
-    for (int i = 0; i < r->near; i++) r->goal[r->own[i]] = r->value[r->own[i]];
+    for (int i = 0; i < r->near; i++) r->goal[r->close[i]] = r->value[r->close[i]];
     return find_step(r);
 }
 
@@ -187,7 +187,7 @@ static int solve_level(Relaxation *r, int level) {
         keep_active(r, level);
         if (flag == DAQP_EXIT_ITERLIMIT || (flag <= 0 && level <= 1 && !k)) return flag;
         if (flag <= 0) break;
-        find_way(r, r->daqp.u);
+        find_motion(r, r->daqp.u);
         go(r, unit);
         missed = 0;
         for (int j = 0; j < r->count && !missed; j++)
@@ -197,8 +197,8 @@ static int solve_level(Relaxation *r, int level) {
     const int rank = finish_level(r, level, missed);
     /* A dependent row may still move by rounding, so an inequality stays an inequality. */
     for (int i = 0; i < r->exact; i++) r->held[r->rows[i]] = is_equation(r, r->rows[i]);
-    for (int i = 0; i < r->near; i++) r->held[r->own[i]] = is_equation(r, r->own[i]);
-    for (int k = 0; k < rank; k++) r->held[k < r->rank ? r->rows[r->lead[k]] : r->own[k - r->rank]] = 1;
+    for (int i = 0; i < r->near; i++) r->held[r->close[i]] = is_equation(r, r->close[i]);
+    for (int k = 0; k < rank; k++) r->held[k < r->rank ? r->rows[r->lead[k]] : r->close[k - r->rank]] = 1;
     eliminate(r, rank);
     /* The point counts as a solution, so the bounds open by the rounding of its rows. */
     for (int i = 0; i < r->entries; i++)

@@ -36,8 +36,8 @@ typedef struct {
     int *held;                   /* whether an entry is eliminated */
     double *goal;                /* desired values of listed rows */
     double *B, *v, *tau, *rhs, *step, *column; /* of an elimination */
-    double *way;                 /* Z times a step */
-    int *rows, *lead, *own;      /* exact rows; exact row of the k-th reflection; rows of least squares */
+    double *motion_z;                 /* Z times a step */
+    int *rows, *lead, *close;    /* exact rows; exact row of the k-th reflection; rows of least squares */
     int exact, near, rank;       /* their numbers, and the number of coordinates that the exact rows take */
     double *L, *wanted;          /* factor of the reduced cost (1/L on the diagonal), its minimum in whitened coordinates */
     DAQPWorkspace daqp;
@@ -61,7 +61,7 @@ static size_t place(Relaxation *r, char *base, size_t n, size_t m, size_t levels
     size_t used = 0;
     const struct { double **array; size_t count; } doubles[] = {
         {&r->Z, n * n}, {&r->T, m * n}, {&r->z, n}, {&r->value, e}, {&r->lower, e}, {&r->upper, e},
-        {&r->length, e}, {&r->B, e * n}, {&r->v, n * n}, {&r->tau, n}, {&r->rhs, e}, {&r->goal, e}, {&r->step, n}, {&r->way, n},
+        {&r->length, e}, {&r->B, e * n}, {&r->v, n * n}, {&r->tau, n}, {&r->rhs, e}, {&r->goal, e}, {&r->step, n}, {&r->motion_z, n},
         {&r->column, e},
         {&r->L, e * n}, {&r->wanted, n}, {&r->M, e * n}, {&r->size, e}, {&r->daqp.dupper, e}, {&r->daqp.dlower, e},
         {&r->daqp.scaling, e}, {&r->daqp.Mu, e}, {&r->daqp.rho_ls, e}, {&r->daqp.rho_us, e}, {&r->daqp.w_ls, e},
@@ -70,7 +70,7 @@ static size_t place(Relaxation *r, char *base, size_t n, size_t m, size_t levels
     };
     const struct { int **array; size_t count; } ints[] = {
         {&r->warm, (levels + 2) * e}, {&r->first, m}, {&r->last, m}, {&r->known, m}, {&r->held, e}, {&r->rows, e},
-        {&r->lead, n}, {&r->own, e}, {&r->entry, e},
+        {&r->lead, n}, {&r->close, e}, {&r->entry, e},
         {&r->daqp.sense, e}, {&r->daqp.WS, active}, {&r->daqp.prox_mask, n},
     };
     /* The active rows come first, because they stay for the next solution. */

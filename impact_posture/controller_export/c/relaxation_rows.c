@@ -32,13 +32,13 @@ static double violation(const Relaxation *r, int entry) {
 /* Smallest violation of an entry that counts. */
 static double least(const Relaxation *r, int entry) { return COUNTS * r->scale * r->length[entry]; }
 
-/* Make r->way the motion of z by a step in the coordinates that are left. */
-static void find_way(Relaxation *r, const double *step) {
-    for (int i = 0; i < r->n; i++) r->way[i] = ip_dot(r->Z + i * r->n + r->fixed, step, r->n - r->fixed);
+/* Make r->motion_z the motion of z by a step in the coordinates that are left. */
+static void find_motion(Relaxation *r, const double *step) {
+    for (int i = 0; i < r->n; i++) r->motion_z[i] = ip_dot(r->Z + i * r->n + r->fixed, step, r->n - r->fixed);
 }
 
-/* Move by a part of r->way. */
+/* Move by a part of r->motion_z. */
 static void go(Relaxation *r, double part) {
-    ip_add(r->z, part, r->way, r->n);
+    ip_add(r->z, part, r->motion_z, r->n);
     for (int i = 0; i < r->entries; i++) r->value[i] = entry_of(r, r->z, i);
 }

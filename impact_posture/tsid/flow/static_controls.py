@@ -37,7 +37,7 @@ class StaticControls:
     """
 
     def __init__(self, actuators: Actuators, contacts: Sequence[SupportContact], share: float) -> None:
-        """Set the share of the limits that rest may take, 0 to 1."""
+        """Set the share of the limits that rest may use, 0 to 1."""
         base = actuators.base
         self.limited = np.flatnonzero(np.isfinite(actuators.upper) & np.isfinite(actuators.lower))
         lower, upper = actuators.lower[self.limited], actuators.upper[self.limited]

@@ -11,7 +11,7 @@ from impact_posture.tsid.flow.redundancy import Redundancy
 from impact_posture.tsid.state import State
 from impact_posture.tsid.support_contact import SupportContact
 
-# Share of the way from the center of mass to an edge that accelerations may take.
+# Share of the distance from the center of mass to an edge that accelerations may use.
 _SHARE = 0.8
 # Least distance of the center of mass from an edge that counts, m.
 _LEAST = 0.01

@@ -68,7 +68,7 @@ class ImpactRobustPosture(JointPosture):
       ``λ`` is the curvature at the start, where ``H`` may even be concave.
     - ``K_d = 2√(K_p + K)`` by default, critical for both springs together where ``λ* = λ``.
     - The length of the term is at most ``K·reach``, like a spring ``K`` stretched by ``reach``.  A bound below
-      ``K_p|q_des ⊖ q|`` would stall the flow on its way.
+      ``K_p|q_des ⊖ q|`` would stop the robot short of the optimum.
     - ``s(q)`` fades out the part of each joint that pushes into a position limit, from ``fade[1]`` rad before the
       limit to ``fade[0]`` (at most a quarter and a sixteenth of the joint's range).  Without it, the robot would
       brace on its stops.

@@ -195,7 +195,7 @@ class TaskStack:
         self.refresh()
 
     def refresh(self, state: State | None = None) -> None:
-        """Read gains and weights of the tasks, and evaluate the Jacobians at ``state`` if it is given."""
+        """Read gains and weights of the tasks, and evaluate the Jacobians at ``state`` unless it is ``None``."""
         if state is not None:
             for task, J, *_ in self._parts:
                 J[:] = task.jacobian(state)
