@@ -2,18 +2,16 @@
 
 ::
 
-    f(d) = min over q  objective(q)    subject to the problem's constraints and price(q) ≤ d
+    f(d) = min over q  objective(q)    subject to the constraints of the problem and price(q) ≤ d
 
-for a series of prices d from the least to that of the optimum.  The price is the distance ‖q ⊖ q₀‖ of
-:func:`~impact_posture.posture.constraints.posture_distance.distance_squared`, or the peak force of the impact.  It
-is a bound and
-not a penalty, because the minimizers of ``objective + w·price`` reach the convex hull of the curve only.
+for a series of bounds d from the least price to the price of the optimum.  The price is the distance ‖q ⊖ q₀‖ of
+:func:`~impact_posture.posture.constraints.posture_distance.distance_squared`, or the peak force of the impact.  It is
+a bound and not a penalty, because the minimizers of ``objective + w·price`` reach the convex hull of the curve only.
 
-One program, with the price as the bound of a row, is solved along two paths: outward from the posture at the least
-price and inward from the optimum.  Each solve starts at the end of the previous solve, with its multipliers if this
-end is within the bound.  The best certified end at
-each price counts.  If the end at the next price was found on another path, that path is tried here as well.  So the
-curve is the lower envelope of the paths.  It falls only because better postures were found.
+One program, with d as the bound of a row, is solved along two paths: outward from the posture with the least price
+and inward from the optimum.  Each solve starts at the end of the previous solve, with its multipliers if this end is
+within the bound.  The best certified end within each bound counts.  If the best end at a neighboring bound is on
+another path, this path is tried here as well.  So the curve is the lower envelope of the paths.
 """
 
 from __future__ import annotations
@@ -38,13 +36,13 @@ from impact_posture.posture.search.growing_search import Progress, run_start
 from impact_posture.posture.search.multistart import PostureSolution, solve
 from impact_posture.system.arrays import Array
 
-# A move below this (rad, m) is zero.
+# Prices that differ by less than this (relative, and rad or m) are equal.
 _STILL = 1e-6
-# A posture is better only by more than this share of the initial objective.
+# A posture is better if it gains more than this share of the initial objective.
 _EQUAL = 1e-9
-# A rise of the curve above this share of the initial objective is reported.
+# A rise of the curve by more than this share of the initial objective is reported.
 _RISE = 1e-6
-# Number of other optima with a path of their own, and rounds of trying the paths of neighbors.
+# Number of other optima from which a path starts, and rounds of trying the paths of neighbors.
 _PATHS, _ROUNDS = 3, 3
 # Most times that the program of one point grows.
 _GROWTH = 8
@@ -61,16 +59,16 @@ def pareto_front(
     compile: CompileMode = "auto",
     progress: Progress | None = None,
 ) -> TradeOff:
-    """Follow the curve in ``points`` equal steps from the least price to that of the optimum.
+    """Follow the curve in ``points`` equal steps from the least price to the price of the optimum.
 
-    The regularization is left out, because it is a price on the distance that is bounded here.
+    The regularization is left out, because the bound on the distance replaces it.
 
     Args:
         solution: The solved problem.
         points: Number of steps.
         force: Contact and approach speed (m/s) whose peak force is the price; ``None`` for the distance.
         compile: Whether to compile the program.
-        progress: Called with the solves done and planned.
+        progress: Called with the numbers of finished and planned solves.
 
     Raises:
         InputError: The number of points is below 1, or there are several contacts whose forces would compete.
@@ -101,26 +99,25 @@ def _price(
         raise InputError(
             "is of one contact, and there are several", where="tradeoff_against", hint="give one `contact`"
         )
-    # E = 1/(2G), and the force falls as G rises.
-    lightest = replace(objective, kind="energy", normal_cone_deg=0.0, model_variants=())
-    found = solve(replace(problem, objective=lightest), starts=_FORCE_STARTS, compile=compile, guesses=[solution.q])
-    return ForcePrice(objective, contact, speed, found.q)
+    # The least E = 1/(2G) has the least force, which falls as G rises.
+    energy = replace(objective, kind="energy", normal_cone_deg=0.0, model_variants=())
+    least = solve(replace(problem, objective=energy), starts=_FORCE_STARTS, compile=compile, guesses=[solution.q])
+    return ForcePrice(objective, contact, speed, least.q)
 
 
 def _bounded(problem: ConstrainedProblem, price: TradeOffPrice) -> ConstrainedProblem:
-    """The problem with the bound as its last constraint, and without its regularization."""
-    row = price.bound(1.0)
+    """Return the problem with the bound as its last constraint and without regularization."""
     return replace(
         problem,
         requirements=replace(problem.requirements, regularization=0.0),
-        constraints=(*problem.constraints, row),
+        constraints=(*problem.constraints, price.bound(1.0)),
         rows=(*problem.rows, (0,)) if problem.rows else (),
     )
 
 
 @dataclass(frozen=True, eq=False)
-class _Found:
-    """The end of a solve: the path on which it was found, and the point."""
+class _End:
+    """The end of a solve: the name of its path, and the point."""
 
     path: str
     point: TradePoint
@@ -144,7 +141,7 @@ class _Curve:
     ) -> None:
         self._problem, self._nlp, self._price, self._levels, self._compile = problem, nlp, price, levels, compile
         self._scale = problem.objective.value(price.nearest)
-        self._best: list[_Found | None] = [None] * len(levels)
+        self._best: list[_End | None] = [None] * len(levels)
         self._tried: set[tuple[int, bytes]] = set()
         # Ends of solves by their postures.
         self._ends: dict[bytes, WarmStart] = {}
@@ -185,17 +182,17 @@ class _Curve:
         """Try the path of each neighbor if it differs or does better; return whether a point improved."""
         better = False
         for k in order:
-            own, other = self._best[k], self._best[k + neighbor]
+            best, other = self._best[k], self._best[k + neighbor]
             if other is None:
                 continue
-            rises = own is not None and neighbor < 0 and other.point.objective < own.point.objective
-            if own is None or own.path != other.path or rises:
+            rises = best is not None and neighbor < 0 and other.point.objective < best.point.objective
+            if best is None or best.path != other.path or rises:
                 self._solve(k, other.path, other.point.q)
-                better |= self._best[k] is not own
+                better |= self._best[k] is not best
         return better
 
     def _solve(self, k: int, path: str, start: Array) -> Array:
-        """Solve within level ``k``, from ``start`` or from a posture nearby that is within it."""
+        """Solve within bound ``k`` from ``start``, or from a posture near it that is within the bound."""
         level = self._levels[k]
         key = (k, start.tobytes())
         if self._nlp is None or key in self._tried:
@@ -215,7 +212,7 @@ class _Curve:
                 start = record.q
             self._take(k, path, record.q, certificate)
         except MetricError:
-            # This path led to a posture where the objective does not exist.
+            # The objective does not exist at the end of this path.
             return start
         finally:
             self.solves += 1
@@ -226,43 +223,42 @@ class _Curve:
         return replace(self._problem, constraints=(*self._problem.constraints[:-1], bound))
 
     def _take(self, k: int, path: str, q: Array, certificate: Certificate | None = None) -> None:
-        """Keep a posture if it satisfies the constraints and is the best within level ``k``."""
-        found = _Found(path, self._point(k, q, certificate))
-        feasible = replace(found.point.certificate, stationarity=0.0, complementarity=0.0).holds()
-        own = self._best[k]
-        margin = _EQUAL * self._scale
-        if feasible and (own is None or (found.rank[0], found.rank[1] + margin) < own.rank):
-            self._best[k] = found
+        """Keep a posture if it satisfies the constraints and is the best within bound ``k``."""
+        end, best = _End(path, self._point(k, q, certificate)), self._best[k]
+        uncertified, objective = end.rank
+        if end.point.certificate.feasible and (
+            best is None or (uncertified, objective + _EQUAL * self._scale) < best.rank
+        ):
+            self._best[k] = end
 
     def _point(self, k: int, q: Array, certificate: Certificate | None = None) -> TradePoint:
         problem = self._at(self._levels[k])
-        found = problem.impact.oracle.quantities(q)
+        quantities = problem.impact.oracle.quantities(q)
         return TradePoint(
             within=self._levels[k],
             distance=self._price.measure(q),
             q=q,
             objective=problem.objective.value(q),
-            H=found.H,
-            G=found.G,
-            V=found.V,
-            S=found.S,
+            H=quantities.H,
+            G=quantities.G,
+            V=quantities.V,
+            S=quantities.S,
             certificate=certificate or certify(problem, q, self._scale),
             first=k == 0,
         )
 
     def finish(self, solution: PostureSolution, solve: float, build: float, notes: list[str]) -> TradeOff:
-        """Return the curve as it is now."""
+        """Return the curve with notes."""
         points: list[TradePoint] = []
-        for k, found in enumerate(self._best):
-            # If no solve ended on the constraints, the posture of the previous level satisfies them.
+        for k, end in enumerate(self._best):
+            # If no solve ended on the constraints, the posture of the previous bound satisfies them.
             before = points[-1].q if points else self._price.nearest
-            points.append(self._point(k, before) if found is None else found.point)
+            points.append(self._point(k, before) if end is None else end.point)
         best = solution.problem.objective.value(solution.q)
-        open_ = [f"{p.within:.3g}" for p in points if not p.certified]
-        if open_:
-            notes.append(
-                f"trade-off: {len(open_)} of {len(points)} points are not certified, within {', '.join(open_)}"
-            )
+        open_bounds = [f"{p.within:.3g}" for p in points if not p.certified]
+        if open_bounds:
+            count = f"{len(open_bounds)} of {len(points)} points"
+            notes.append(f"trade-off: {count} are not certified, within {', '.join(open_bounds)}")
         risen = [b for a, b in pairwise(points) if b.objective > a.objective + _RISE * self._scale]
         if risen:
             notes.append(

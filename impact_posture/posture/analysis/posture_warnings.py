@@ -1,4 +1,4 @@
-"""Notes and warnings about an optimal posture that its numbers alone do not show."""
+"""Warnings about an optimal posture: it cannot be held or reached at speed, or joints are behind a surface."""
 
 from __future__ import annotations
 
@@ -8,9 +8,9 @@ from impact_posture.posture.formulation.problem_file import Prepared
 from impact_posture.posture.loads.holding_forces import HoldingForces
 from impact_posture.system.arrays import Array
 
-# Share of the approach speed that three digits do not show.
+# An attainable speed below the approach speed by less than this share gets no warning, as three digits hide it.
 _REACHED = 5e-3
-# A joint further than this behind a surface gets a warning, meters.
+# A joint farther than this (m) behind a surface or below the ground gets a warning.
 _BEHIND = 0.01
 
 
@@ -23,8 +23,8 @@ def posture_warnings(
         prepared: The problem.
         initial: Initial posture, shape (nq,).
         q: Optimal posture, shape (nq,).
-        holding: What holds the optimal posture, if it is known.
-        attainable: Speed at which the joints can arrive in it, m/s, if it is bounded.
+        holding: Forces that hold the optimal posture, if they are known.
+        attainable: Speed at which the joints can arrive in the optimal posture, m/s, if it is bounded.
     """
     verb = "hold" if prepared.impact.robot.spec.propulsion is None else "hover in"
     loads = holding.violations() if holding else []
@@ -42,10 +42,8 @@ def posture_warnings(
 
 
 def _surface_warnings(prepared: Prepared, initial: Array, q: Array) -> list[str]:
-    """Links whose origin lies behind the plane of the contact; no constraint keeps them on the side of the normal.
-
-    A push (a free contact pose) has no surface.
-    """
+    """Return warnings about joints behind the plane of the contact, where no constraint keeps them in front of it."""
+    # A push (a free contact pose) has no surface.
     if prepared.problem.requirements.contact_pose == "free":
         return []
     before, after = (_joints_behind(prepared, posture) for posture in (initial, q))
@@ -65,7 +63,7 @@ def _surface_warnings(prepared: Prepared, initial: Array, q: Array) -> list[str]
 
 
 def _joints_behind(prepared: Prepared, q: Array) -> list[str]:
-    """Joints whose origin lies behind the plane of the contact, except the joint of the link that touches."""
+    """Return the joints whose origin lies behind the plane of the contact, except the joint of the contact link."""
     oracle = prepared.impact.objective.oracle.at(q)
     contact = oracle.numeric.placement(oracle.point).translation
     n, touching = oracle.n.copy(), oracle.point.joint
@@ -77,23 +75,22 @@ def _joints_behind(prepared: Prepared, q: Array) -> list[str]:
 
 
 def _ground_warnings(prepared: Prepared, q: Array) -> list[str]:
-    """Joints below the lowest foot, where level ground would be; no constraint keeps them above it."""
+    """Return a warning about joints below the lowest foot, where no constraint keeps them above level ground."""
     robot, supports = prepared.impact.robot, prepared.impact.supports
     if not supports:
         return []
     numeric = Numeric(robot.model).at(q)
     ground = min(numeric.placement(point_on(robot, s.frame, s.offset)).translation[2] for s in supports)
     below = [name for _, name, origin in _origins(prepared, numeric) if origin[2] < ground - _BEHIND]
-    if not below:
-        return []
-    return [
+    text = (
         f"the optimal posture has {_named(below)} below the lowest foot: nothing keeps them above the ground; narrow "
         "their limits (robot.toml [limits.position]) or stay nearer with `regularization`"
-    ]
+    )
+    return [text] if below else []
 
 
 def _origins(prepared: Prepared, numeric: Numeric) -> list[tuple[int, str, Array]]:
-    """Index, name and world origin of every joint at the posture of ``numeric``."""
+    """Return the index, name and world origin of every joint at the posture of ``numeric``."""
     model = prepared.impact.robot.model
     return [
         (i, "the base" if model.names[i] == "root_joint" else str(model.names[i]), numeric.data.oMi[i].translation)

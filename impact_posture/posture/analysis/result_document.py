@@ -1,4 +1,4 @@
-"""The result of an optimization as the document ``result.json`` and as arrays."""
+"""The result of an optimization as the content of ``result.json`` and ``result.npz``."""
 
 from __future__ import annotations
 
@@ -49,7 +49,7 @@ def result_document(
     path: dict[str, object] | None = None,
     global_search: GlobalSearch | None = None,
 ) -> dict[str, object]:
-    """Return the content of ``result.json``; the last four arguments are keys only if they are given."""
+    """Return the content of ``result.json``, with blocks for those of the last four arguments that are given."""
     initial, optimal = evaluations(prepared, solution)
     impact, around = prepared.impact, prepared.problem.surroundings
     loads = load_cases(impact.objective, solution.initial, prepared.problem.requirements)
@@ -57,8 +57,8 @@ def result_document(
     approach = AttainableSpeed(impact.robot, impact.objective, prepared.problem.requirements)
     attainable = [approach.reached(q) for q in (solution.initial, solution.q)]
     fault = [solution.compiler_fault] if solution.compiler_fault else []
-    found = posture_warnings(prepared, solution.initial, solution.q, after, attainable[1])
-    warnings = (*impact.warnings, *initial.warnings, *optimal.warnings, *fault, *found)
+    at_posture = posture_warnings(prepared, solution.initial, solution.q, after, attainable[1])
+    warnings = (*impact.warnings, *initial.warnings, *optimal.warnings, *fault, *at_posture)
     curve = {} if tradeoff is None else {"tradeoff": tradeoff.to_list(), "tradeoff_against": tradeoff.against}
     return {
         "schema": SCHEMA,
@@ -99,10 +99,10 @@ def result_document(
 
 def versions() -> dict[str, str]:
     """Return the versions of all software that a result depends on."""
-    found = {"impact-posture": __version__, "python": platform.python_version()}
-    found |= {"casadi": ca.CasadiMeta.version(), "pinocchio": pin.__version__, "numpy": np.__version__}
+    software = {"impact-posture": __version__, "python": platform.python_version()}
+    software |= {"casadi": ca.CasadiMeta.version(), "pinocchio": pin.__version__, "numpy": np.__version__}
     data = _version_of("example-robot-data")
-    return found | ({} if data is None else {"example-robot-data": data})
+    return software | ({} if data is None else {"example-robot-data": data})
 
 
 @cache
@@ -124,12 +124,12 @@ def result_arrays(
     oracle = solution.problem.impact.oracle
     arrays: dict[str, NDArray[Any]] = {}
     for name, q in (("initial", solution.initial), ("optimal", solution.q)):
-        found = oracle.quantities(q)
+        quantities = oracle.quantities(q)
         arrays |= {
             f"{name}_q": q,
-            f"{name}_jump": found.jump,
-            f"{name}_ellipsoid": found.ellipsoid,
-            f"{name}_mobility": found.mobility,
+            f"{name}_jump": quantities.jump,
+            f"{name}_ellipsoid": quantities.ellipsoid,
+            f"{name}_mobility": quantities.mobility,
             f"{name}_gradient": oracle.gradient_H(q),
         }
     arrays |= {f"path_{key}": getattr(path, key) for key in ("q", "s", "H", "G", "V", "S", "objective")}

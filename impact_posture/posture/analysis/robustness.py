@@ -21,22 +21,22 @@ from impact_posture.posture.search.multistart import SAME_POSTURE, PostureSoluti
 from impact_posture.robot.model_variant import between
 from impact_posture.system.arrays import Array
 
-# Number of models drawn between the variants, to check whether one is worse than all variants.
+# Number of models drawn between the variants to check whether any is worse than all variants.
 _BETWEEN = 60
-# A share below this is an error of the solver, and a constraint within this (m, rad) is satisfied.
+# A smaller share is an error of the solver, and a smaller violation (m, rad) counts as satisfied.
 _NOISE = 1e-6
 
 
 @dataclass(frozen=True, eq=False)
 class VariantOptimum:
-    """One model variant, and the best posture for it alone.
+    """A model variant and its own optimum, the best posture for this variant alone.
 
     Attributes:
         name: Name of the model variant.
-        at_robust: Its objective at the robust optimum.
-        own: Its objective at its own optimum; ``None`` if no start certified.
-        q: Its own optimum, shape (nq,), or ``None``.
-        moved: Tangent distance of its own optimum from the robust optimum, or ``None``.
+        at_robust: Objective of the variant at the robust optimum.
+        own: Objective of the variant at its own optimum; ``None`` if no start certified.
+        q: The own optimum, shape (nq,), or ``None``.
+        moved: Tangent distance of the own optimum from the robust optimum, or ``None``.
     """
 
     name: str
@@ -58,9 +58,9 @@ class Robustness:
     Attributes:
         model_variants: All model variants, the model as it stands first.
         worst_robust: Worst objective over the model variants at the robust optimum.
-        worst_nominal: The same at the optimum of the model as it stands; ``None`` if that does not exist, or violates
-            a constraint for another model variant.
-        broken: The violated constraints.
+        worst_nominal: Worst objective at the optimum of the model as it stands; ``None`` if this optimum does not
+            exist, or violates a constraint for another model variant.
+        broken: Names of the violated constraints.
         between: Largest objective at the robust optimum among models drawn between the model variants.
         drawn: Number of drawn models.
     """
@@ -74,23 +74,23 @@ class Robustness:
 
     @property
     def moved(self) -> float | None:
-        """Distance of the robust optimum from that of the model as it stands, tangent norm."""
+        """Tangent distance of the robust optimum from the optimum of the model as it stands."""
         return self.model_variants[0].moved
 
     @property
     def price(self) -> float | None:
-        """Share by which the objective of the model as it stands is above its own optimum."""
+        """Share by which the objective of the model as it stands is above the objective at its own optimum."""
         own = self.model_variants[0].own
         return None if own is None else self.model_variants[0].at_robust / own - 1
 
     @property
     def gain(self) -> float | None:
-        """Share by which the worst case is below that at the optimum of the model as it stands."""
+        """Share by which the worst case is below the worst case at the optimum of the model as it stands."""
         return None if self.worst_nominal is None else 1 - self.worst_robust / self.worst_nominal
 
     @property
     def line(self) -> str:
-        """The finding in words."""
+        """The comparison in a sentence."""
         if self.moved is None or self.price is None:
             return "the model as it stands has no certified optimum of its own to compare with"
         parts = [f"the optimum moves by {self.moved:.3g} rad (m)"]
@@ -139,63 +139,62 @@ def solve_robustly(
     progress: Progress | None = None,
     finish_all: bool = False,
 ) -> RobustSolution:
-    """Solve a problem; with model variants solve each variant alone first.
+    """Solve a problem with model variants, after each variant alone; without variants solve it once.
 
-    The optima of the variants are starts of the robust problem, besides ``starts`` other starts.
+    The optima of the variants are starts of the robust problem in addition to ``starts`` other starts.
 
     Raises:
         Infeasible, SolverFailed: See :func:`~impact_posture.posture.search.multistart.solve`.
     """
     given, wanted = problem.given, problem.requirements
     if not (isinstance(problem.objective, WorstCaseObjective) and problem.objective.model_variants):
-        found = solve(
+        solution = solve(
             problem, starts=starts, seed=seed, jobs=jobs, compile=compile, progress=progress, finish_all=finish_all
         )
-        return RobustSolution(found, None)
-    # Build each problem anew, because support impulses and the center of mass depend on the model.
+        return RobustSolution(solution, None)
+    # Each problem is built anew, because support impulses and the center of mass depend on the model.
     alone = [
         build_problem(variant.robot, member, given, wanted)
         for variant, member in zip(problem.impact.model_variants, problem.impact.by_variant, strict=True)
     ]
     total = starts * (len(alone) + 1)
 
-    def run(one: ConstrainedProblem, guesses: Sequence[Array], number: int) -> PostureSolution:
+    def run(posed: ConstrainedProblem, guesses: Sequence[Array], number: int) -> PostureSolution:
         def advance(done: int, _: int) -> None:
             if progress is not None:
                 progress(min(number * starts + done, total), total)
 
         count = starts + len(guesses)
         return solve(
-            one, starts=count, seed=seed, jobs=jobs, compile=compile, progress=advance, guesses=guesses,
+            posed, starts=count, seed=seed, jobs=jobs, compile=compile, progress=advance, guesses=guesses,
             finish_all=finish_all,
         )  # fmt: skip
 
-    optima = [_optimum(partial(run, one, (), k)) for k, one in enumerate(alone)]
-    solution = run(
-        problem, _apart(problem, [q for q in optima if q is not None and not _broken(problem, q)]), len(alone)
-    )
-    for k, (one, q) in enumerate(zip(alone, optima, strict=True)):
-        # If the robust optimum is better for a variant than its own optimum, that one was not its best.
-        if q is None or one.objective.value(solution.q) < one.objective.value(q) * (1 - _NOISE):
-            optima[k] = _optimum(partial(run, one, (solution.q,), len(alone)))
+    optima = [_optimum(partial(run, member, (), k)) for k, member in enumerate(alone)]
+    feasible = [q for q in optima if q is not None and not _broken(problem, q)]
+    solution = run(problem, _apart(problem, feasible), len(alone))
+    for k, (member, q) in enumerate(zip(alone, optima, strict=True)):
+        # If the robust optimum is better for a variant than its own optimum, the starts missed a better one.
+        if q is None or member.objective.value(solution.q) < member.objective.value(q) * (1 - _NOISE):
+            optima[k] = _optimum(partial(run, member, (solution.q,), len(alone)))
     return RobustSolution(solution, compare_variants(solution, optima, seed))
 
 
 def compare_variants(solution: PostureSolution, optima: Sequence[Array | None], seed: int = 0) -> Robustness:
     """Compare the robust optimum with the optima of the variants, and with models drawn between the variants."""
     problem, objective = solution.problem, solution.problem.impact
-    found: list[VariantOptimum] = []
+    variants: list[VariantOptimum] = []
     for variant, q in zip(objective.model_variants, optima, strict=True):
         member = replace(objective, robot=variant.robot, model_variants=())
         own = None if q is None else member.value(q)
         step = None if q is None else float(np.linalg.norm(wrapped_difference(problem, solution.q, q)))
-        found.append(VariantOptimum(variant.name, member.value(solution.q), own, q, step))
+        variants.append(VariantOptimum(variant.name, member.value(solution.q), own, q, step))
     nominal = optima[0]
     broken = () if nominal is None else tuple(_broken(problem, nominal))
     drawn = between(objective.model_variants, _BETWEEN, seed)
     values = [replace(objective, robot=robot, model_variants=()).value(solution.q) for robot in drawn]
     return Robustness(
-        model_variants=tuple(found),
+        model_variants=tuple(variants),
         worst_robust=objective.value(solution.q),
         worst_nominal=None if nominal is None or broken else objective.value(nominal),
         broken=broken,
@@ -205,16 +204,16 @@ def compare_variants(solution: PostureSolution, optima: Sequence[Array | None], 
 
 
 def _apart(problem: ConstrainedProblem, postures: Sequence[Array]) -> list[Array]:
-    """The postures without those that are nearly equal to an earlier posture."""
-    found: list[Array] = []
+    """Return the postures that are not nearly equal to an earlier posture."""
+    kept: list[Array] = []
     for q in postures:
-        if all(np.linalg.norm(wrapped_difference(problem, one, q)) > SAME_POSTURE for one in found):
-            found.append(q)
-    return found
+        if all(np.linalg.norm(wrapped_difference(problem, other, q)) > SAME_POSTURE for other in kept):
+            kept.append(q)
+    return kept
 
 
 def _broken(problem: ConstrainedProblem, q: Array) -> list[str]:
-    """Names of the constraints that a posture does not satisfy."""
+    """Return the names of the constraints that a posture violates."""
     violations = problem.violations(Numeric(problem.robot.model).at(q))
     pairs = zip(problem.constraints, violations, strict=True)
     return [constraint.name for constraint, excess in pairs if np.abs(excess).max(initial=0.0) > _NOISE]

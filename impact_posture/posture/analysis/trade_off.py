@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from dataclasses import dataclass, replace
+from dataclasses import dataclass
 
 import numpy as np
 
@@ -18,19 +18,19 @@ KNEE = 1 / 3
 
 @dataclass(frozen=True, eq=False)
 class TradePoint:
-    """The best posture found within one bound.
+    """The best posture within one bound.
 
     Attributes:
         within: The bound on the distance from the initial posture (rad mixed with m), or on the peak force (N).
-        distance: Distance or force of the posture, less than ``within`` if more gains nothing.
+        distance: Distance or force of the posture, below ``within`` if the objective gains nothing there.
         q: Posture, shape (nq,).
         objective: Objective at the posture.
         H: Squared jump per squared impulse.
         G: Inverse effective mass, 1/kg.
         V: Squared jump per squared approach speed.
-        S: The same if the contact sticks, ``None`` where undefined.
+        S: V of a contact that sticks, ``None`` where undefined.
         certificate: Certificate of the problem with the bound; its stationarity has no meaning at the first point.
-        first: Whether this is the one posture at the least distance or force.
+        first: Whether this is the only posture at the least distance or force.
     """
 
     within: float
@@ -46,9 +46,8 @@ class TradePoint:
 
     @property
     def certified(self) -> bool:
-        """Whether the certificate holds; of the first point, whether the posture satisfies the constraints."""
-        found = self.certificate
-        return replace(found, stationarity=0.0, complementarity=0.0).holds() if self.first else found.holds()
+        """Whether the certificate holds; at the first point, whether the posture satisfies the constraints."""
+        return self.certificate.feasible if self.first else self.certificate.holds()
 
     def to_dict(self) -> dict[str, object]:
         """Return JSON content."""
@@ -62,7 +61,7 @@ class TradeOff:
     """The best objective within each distance from the initial posture, or within each peak force.
 
     Attributes:
-        points: Points by distance or force, the posture with the least first.
+        points: Points in the order of distance or force.
         knee: Index of the point at the knee (:func:`find_knee`), or ``None``.
         solves: Runs of the solver.
         solve_time_s: Wall time of these runs.
@@ -86,14 +85,14 @@ class TradeOff:
     def arrays(self) -> dict[str, Array]:
         """Return entries of ``result.npz``: ``tradeoff_q`` (k, nq) and arrays (k,), with NaN for a missing S."""
         names = ("within", "distance", "objective", "H", "G", "V", "q", "certified")
-        found = {f"tradeoff_{name}": np.array([getattr(p, name) for p in self.points]) for name in names}
-        return found | {"tradeoff_S": np.array([np.nan if p.S is None else p.S for p in self.points])}
+        arrays = {f"tradeoff_{name}": np.array([getattr(p, name) for p in self.points]) for name in names}
+        return arrays | {"tradeoff_S": np.array([np.nan if p.S is None else p.S for p in self.points])}
 
 
 def find_knee(distances: Array, objectives: Array) -> int | None:
-    """Return the point whose share of the gain exceeds its share of the distance most.
+    """Return the index of the point whose share of the gain exceeds its share of the distance most.
 
-    It is ``None`` if the excess is below :data:`KNEE`, or if there is no gain.
+    Return ``None`` if the excess is below :data:`KNEE`, or if there is no gain.
     """
     far, gain = distances[-1] - distances[0], objectives[0] - objectives[-1]
     if not (far > 0 and gain > 0):

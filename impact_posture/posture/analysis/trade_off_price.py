@@ -1,4 +1,4 @@
-"""What a trade-off bounds: the distance from the initial posture, or the peak force of the impact."""
+"""The price that a trade-off bounds: the distance from the initial posture, or the peak force of the impact."""
 
 from __future__ import annotations
 
@@ -25,7 +25,7 @@ class DistancePrice:
         model: The robot.
         nearest: The posture at the least price, shape (nq,).
         against: Name of the price in options and files.
-        nothing: What to say if the optimum has the least price.
+        nothing: Message if the optimum has the least price.
     """
 
     model: pin.Model

@@ -1,4 +1,4 @@
-"""The verdict on an optimal posture: what happens to jump, impulse and force at the stated speed, in words."""
+"""The verdict on an optimal posture: how jump, impulse and force change at the stated approach speed."""
 
 from __future__ import annotations
 
@@ -18,19 +18,19 @@ Outcome = Literal[
     "better", "better at the price of force", "better at the price of impulse", "no better", "worse", "unknown"
 ]
 
-# A change below this share is none.
+# A change below this share does not count.
 _SAME = 0.01
 
 
 @dataclass(frozen=True)
 class PredictedImpact:
-    """What the impact at the stated approach speed does in a posture.
+    """The impact at the stated approach speed in one posture.
 
     Attributes:
         jump: ``‖Δν‖_W``.
-        impulse: Size of the impulse, N·s; that of the first contact where several come at once.
-        peak_force: Peak force without friction, N; ``None`` where no contact is stated or several come at once.
-        sticks: Whether the contact point sticks, the first one of several; ``None`` for a jump without friction.
+        impulse: Size of the impulse of the first contact, N·s.
+        peak_force: Peak force without friction, N; ``None`` without a stated contact or with several contacts.
+        sticks: Whether the first contact point sticks; ``None`` for a jump without friction.
     """
 
     jump: float
@@ -45,18 +45,18 @@ class PredictedImpact:
 
 @dataclass(frozen=True)
 class Verdict:
-    """What the optimal posture changes at the stated approach speed, with the stated friction.
+    """Changes by the optimal posture at the stated approach speed, with the stated friction.
 
     Attributes:
         outcome: The verdict in a few words.
         line: The verdict in a sentence.
-        jump: Relative change of ``‖Δν‖_W``; ``None`` where it is not known.
+        jump: Relative change of ``‖Δν‖_W``; ``None`` if it is unknown.
         impulse: Relative change of the size of the impulse.
         peak_force: Relative change of the peak force without friction.
-        advice: The jump without friction, what would do better, or which joint model fits; one line each.
-        before: The impact in the initial posture; ``None`` where it is not known.
+        advice: The jump without friction, a better objective, or a joint model that fits, one line each.
+        before: The impact in the initial posture; ``None`` if it is unknown.
         after: The impact in the optimal posture.
-        assumptions: What the numbers assume, one line each.
+        assumptions: Assumptions behind the numbers, one line each.
     """
 
     outcome: Outcome
@@ -77,9 +77,9 @@ class Verdict:
 def verdict(impact: ResolvedImpact, before: Evaluation, after: Evaluation) -> Verdict:
     """Compare the predicted jumps of the initial and the optimal posture.
 
-    The jump is that with the friction of the contact.  The peak force is that of the stated contact, or that of a
-    linear contact of any stiffness, ``F ∝ √m``.  Of several contacts, the jump is that of all at once, or that of the
-    first contact alone where the former is not known at both postures.
+    Jumps include the friction of the contact.  Peak forces are for the stated contact, or for a linear contact of any
+    stiffness, ``F ∝ √m``.  Several contacts act at once; if this jump is unknown at one of the postures, the first
+    contact alone is compared.
     """
     together = bool(before.together and after.together)
     pair = _jump(before, together), _jump(after, together)
@@ -95,13 +95,13 @@ def verdict(impact: ResolvedImpact, before: Evaluation, after: Evaluation) -> Ve
         outcome = "worse"
     elif jump > -_SAME:
         outcome = "no better"
-    parts = [f"the jump {_words(jump)} ({pair[0].norm:.3g} to {pair[1].norm:.3g}{_slip(pair[1])})"]
     where = f" at {impact.contact.frame}" if together else ""
-    parts.append(
-        f"the impulse{where} {_words(impulse)} ({pair[0].impulse_size:.3g} to {pair[1].impulse_size:.3g} N·s)"
-    )
+    parts = [
+        f"the jump {_in_words(jump)} ({pair[0].norm:.3g} to {pair[1].norm:.3g}{_slip(pair[1])})",
+        f"the impulse{where} {_in_words(impulse)} ({pair[0].impulse_size:.3g} to {pair[1].impulse_size:.3g} N·s)",
+    ]
     if force is not None:
-        parts.append(f"the peak force {_words(force)}{_newtons(before, after)}")
+        parts.append(f"the peak force {_in_words(force)}{_newtons(before, after)}")
     contact = f"with friction {impact.contact.friction:g}" if isinstance(pair[1], CoulombJump) else "without friction"
     if impact.objective.others:
         contact += ", all contacts at once," if together else f", at {impact.contact.frame} alone,"
@@ -116,15 +116,16 @@ def verdict(impact: ResolvedImpact, before: Evaluation, after: Evaluation) -> Ve
     return Verdict(outcome, line, jump, impulse, force, advice, *sides, assumptions)
 
 
-def _predicted(found: Evaluation, jump: Jump) -> PredictedImpact:
-    # The force of several contacts at once is not known.
-    peak = None if found.contacts or found.compression is None else found.compression.peak_force
+def _predicted(evaluation: Evaluation, jump: Jump) -> PredictedImpact:
+    # The forces of several contacts at once are unknown.
+    compression = None if evaluation.contacts else evaluation.compression
+    peak = None if compression is None else compression.peak_force
     return PredictedImpact(jump.norm, jump.impulse_size, peak, jump.sticks if isinstance(jump, CoulombJump) else None)
 
 
 def _assumptions(impact: ResolvedImpact, jump: Jump, together: bool, force: float | None) -> tuple[str, ...]:
     friction = f"friction {impact.contact.friction:g}" if isinstance(jump, CoulombJump) else "no friction"
-    # Of several contacts at once, the impact is plastic.
+    # Impacts at several contacts at once are plastic.
     restitution = 0.0 if together else impact.restitution
     stated = "the stated contact" if impact.contact_stiffness else "a linear contact, the same before and after"
     return (
@@ -135,15 +136,17 @@ def _assumptions(impact: ResolvedImpact, jump: Jump, together: bool, force: floa
     )
 
 
-def _jump(found: Evaluation, together: bool) -> Jump | None:
-    return found.together[0] if found.together and together else found.coulomb or found.frictionless
+def _jump(evaluation: Evaluation, together: bool) -> Jump | None:
+    if evaluation.together and together:
+        return evaluation.together[0]
+    return evaluation.coulomb or evaluation.frictionless
 
 
 def _change(before: float, after: float) -> float:
     return after / before - 1 if before > 0 else 0.0
 
 
-def _words(change: float) -> str:
+def _in_words(change: float) -> str:
     if abs(change) <= _SAME:
         return "stays"
     size = f"{100 * abs(change):.0f} %" if change < 1 else f"a factor of {1 + change:.3g}"
@@ -171,19 +174,19 @@ def _newtons(before: Evaluation, after: Evaluation) -> str:
 
 
 def _without_friction(before: Evaluation, after: Evaluation, jump: float) -> Iterator[str]:
-    """Say the jump without friction where it changes the other way."""
+    """Yield the change of the jump without friction if it has the opposite sign."""
     if before.frictionless is None or after.frictionless is None or before.contacts:
         return
     change = _change(before.frictionless.norm, after.frictionless.norm)
     if abs(change) > _SAME and (change > 0) != (jump > 0):
-        yield f"without friction the jump {_words(change)}"
+        yield f"without friction the jump {_in_words(change)}"
 
 
 def _better_objective(impact: ResolvedImpact, outcome: Outcome, jumps: tuple[Jump, Jump]) -> Iterator[str]:
     objective = impact.objective
     if outcome in ("worse", "no better") and objective.kind != "coulomb" and not objective.others:
         kind = "sticking" if objective.normal_cone_deg else "coulomb"
-        # The jump with friction is that of S where the contact sticks at both postures, and that of V at friction 0.
+        # The jump with friction is the jump of S if the contact sticks at both postures, and of V at friction 0.
         slides = impact.contact.friction == 0
         sticks = all(isinstance(jump, CoulombJump) and jump.sticks for jump in jumps)
         same = (kind, "speed" if slides else "", "sticking" if sticks else "")
@@ -194,15 +197,15 @@ def _better_objective(impact: ResolvedImpact, outcome: Outcome, jumps: tuple[Jum
 
 
 def _other_joint_model(impact: ResolvedImpact, before: Evaluation, after: Evaluation) -> Iterator[str]:
-    """Say what the joint models make of it that fit x better than the one chosen."""
-    found = after.compression
-    if found is None or found.x is None or impact.robot.joint_model in (found.fitting, "locked", "elastic"):
+    """Yield the change of the jump with each joint model that fits x better than the chosen model."""
+    chosen, compression = impact.robot.joint_model, after.compression
+    if compression is None or compression.x is None or chosen in (compression.fitting, "locked", "elastic"):
         return
     rebound = (1 + impact.restitution) * impact.speed
     for name, objective in both_models(impact.objective).items():
-        if name == impact.robot.joint_model or found.fitting not in (None, name):
+        if name == chosen or compression.fitting not in (None, name):
             continue
-        jumps = [coulomb_jump(objective, one.q, rebound) for one in (before, after)]
+        jumps = [coulomb_jump(objective, evaluation.q, rebound) for evaluation in (before, after)]
         if jumps[0] is not None and jumps[1] is not None:
-            change = _words(_change(jumps[0].norm, jumps[1].norm))
-            yield f"with joint model '{name}' (x = {found.x:.2g}) the jump {change}"
+            change = _in_words(_change(jumps[0].norm, jumps[1].norm))
+            yield f"with joint model '{name}' (x = {compression.x:.2g}) the jump {change}"

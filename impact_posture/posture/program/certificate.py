@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 
 import numpy as np
 import pinocchio as pin
@@ -85,6 +85,11 @@ class Certificate:
             and self.complementarity <= complementarity
             and max(self.pose_error_m, self.pose_error_rad) <= pose
         )
+
+    @property
+    def feasible(self) -> bool:
+        """Whether the posture satisfies the constraints, optimal or not."""
+        return replace(self, stationarity=0.0, complementarity=0.0).holds()
 
     def to_dict(self) -> dict[str, object]:
         """Return the ``certificate`` block of ``result.json``."""
