@@ -41,17 +41,17 @@ class ImpactObjective(WorstCaseObjective):
             contact frame of robot.toml takes the offset from there.
         metric: ``euclidean``, ``kinetic`` or ``weighted``, or a :class:`~impact_posture.impact.metric.Metric`.
         kind: ``impulse`` (λ̄²H), ``speed`` (V), ``sticking`` (S), ``coulomb`` (C) or ``energy`` (E).
-        supports: Feet that stay, as ``FRAME[:point|surface]``; ``None`` for those of robot.toml, ``()`` for none.
-        compliance: ε of the supports, 1/kg; 0 for 1e-4 over the robot's mass.
-        normal_cone_deg: Half angle of the cone of normals whose worst counts, degrees.
+        supports: Feet that stay, as ``FRAME[:point|surface]``; ``None`` for the feet of robot.toml, ``()`` for none.
+        compliance: ε of the supports, 1/kg; 0 for 1e-4 divided by the mass of the robot.
+        normal_cone_deg: Half angle of the cone of normals, degrees; the worst normal counts.
         others: More contacts that act at the same time.
         bilateral: Whether several contacts can pull as well as push.
-        model_variants: Robot models whose worst counts, the robot as modeled first.
+        model_variants: Robot models, the robot as modeled first; the worst model counts.
         weights: Weights of the weighted metric: nv numbers, a TOML file, or ``velocity-limits``.
         armature_range: Lowest and highest factor on the armature; the worst counts.
         payloads: Frame and mass in kg of payloads that the robot may carry, one at a time; the worst counts.
         joint_model: Inertia at the joints: ``reflected``, ``link`` or ``locked``
-            (:func:`~impact_posture.robot.joint_model.with_joint_model`); ``None`` for that of the robot.
+            (:func:`~impact_posture.robot.joint_model.with_joint_model`); ``None`` for the value of the robot.
 
     Raises:
         ImpactPostureError: An argument does not fit the robot.
@@ -76,13 +76,13 @@ class ImpactObjective(WorstCaseObjective):
         joint_model: JointModel | None = None,
     ) -> None:
         robot = with_joint_model(robot, joint_model or robot.joint_model)
-        given = [contact] if isinstance(contact, ImpactContact) else list(contact)
-        if not given:
+        contacts = [contact] if isinstance(contact, ImpactContact) else list(contact)
+        if not contacts:
             raise InputError("names no contact", where="contact", hint="give an ImpactContact")
-        leading, *more = (_at_own_frame(robot, one) for one in (*given, *others))
+        leading, *more = (_with_offset(robot, each) for each in (*contacts, *others))
         feet = _supports(robot, supports)
-        for one in (leading, *more):
-            refuse_held(robot, one, feet)
+        for each in (leading, *more):
+            refuse_held(robot, each, feet)
         refuse_rigid(robot, feet)
         if not isinstance(metric, Metric):
             values = weights if weights is None or isinstance(weights, str) else tuple(weights)
@@ -95,7 +95,7 @@ class ImpactObjective(WorstCaseObjective):
         super().__init__(
             robot, leading, metric, kind, feet, compliance, normal_cone_deg, tuple(more), bilateral, variants
         )
-        # This is a hint and no error, because evaluating an impact needs no support.
+        # This is a hint, not an error, because the evaluation of an impact needs no support.
         object.__setattr__(self, "_missing", missing_support(robot) if supports is None and not feet else "")
 
     @checked
@@ -121,11 +121,11 @@ class ImpactObjective(WorstCaseObjective):
         return kept or write_export([self], Path(out), build=build, **options)
 
 
-def _at_own_frame(robot: Robot, contact: ImpactContact) -> ImpactContact:
-    own = robot.spec.contact
-    if contact.frame != own.frame or any(contact.offset) or not any(own.offset):
-        return contact
-    return replace(contact, offset=own.offset)
+def _with_offset(robot: Robot, contact: ImpactContact) -> ImpactContact:
+    """Return the contact with the offset of robot.toml if it has the frame of robot.toml and no offset."""
+    default = robot.spec.contact
+    missing = contact.frame == default.frame and not any(contact.offset) and any(default.offset)
+    return replace(contact, offset=default.offset) if missing else contact
 
 
 def _supports(robot: Robot, supports: Sequence[str | Support] | None) -> tuple[Support, ...]:

@@ -1,4 +1,4 @@
-"""The result behind ``import impact_posture as ip``, and :func:`optimize`, which finds it."""
+"""The result behind ``ip.PostureResult``, and ``ip.optimize``, which computes it."""
 
 from __future__ import annotations
 
@@ -48,7 +48,7 @@ class PostureResult:
         robustness: Cost and gain of the model variants; ``None`` without model variants.
         tradeoff: The best objective within each distance from the start; ``None`` before :meth:`trade_off`.
         motion: The path from the start to the optimum; ``None`` before :meth:`path`.
-        global_search: Finding of the search ``global``; ``None`` without it.
+        global_search: Result of the search ``global``; ``None`` after another search.
     """
 
     problem: PostureProblem
@@ -65,7 +65,7 @@ class PostureResult:
 
     @property
     def initial(self) -> Array:
-        """The start, moved to the constraints if it did not satisfy them, shape (nq,)."""
+        """The initial posture, moved onto the constraints if it violates them, shape (nq,)."""
         return self.solution.initial
 
     @property
@@ -75,7 +75,7 @@ class PostureResult:
 
     @property
     def certificate(self) -> Certificate:
-        """Stationarity, violation and multipliers, recomputed from Pinocchio's numbers."""
+        """Stationarity, violation and multipliers, recomputed with Pinocchio."""
         return self.solution.certificate
 
     @cached_property
@@ -90,7 +90,7 @@ class PostureResult:
         return result_document(self._prepared, self.solution, *extras)
 
     @cached_property
-    def _found(self) -> SolvedPostures:
+    def _postures(self) -> SolvedPostures:
         solution, mapped = self.solution, None if self.global_search is None else self.global_search.map
         path = null_space_path(solution.problem, solution.initial, solution.q)
         return SolvedPostures(solution.initial, solution.q, path, self.document, mapped)
@@ -142,8 +142,8 @@ class PostureResult:
     def path(self, *, seed: ZeroOrMore = 0) -> PostureResult:
         """Return the same result with a path from the start to the optimum, timed within the robot's limits.
 
-        See :func:`~impact_posture.path.posture_path.posture_path`.  Where it does not reach the optimum, it tries the
-        others, of which a large program has all only if the search was to ``finish_all``.
+        See :func:`~impact_posture.path.posture_path.posture_path`.  If it finds no path to the optimum, it tries other
+        optima.  A large program has all of them only after a search with ``finish_all``.
 
         Args:
             seed: Seed of the sampling planner.
@@ -175,10 +175,10 @@ class PostureResult:
             force: Replace an earlier result.
             codegen: Whether to export, build and check the C code as well.
             formats: Formats of the pictures: ``png``, ``svg``, ``pdf``.
-            report: Whether to write ``report.html``, a page with all of it and the robot in 3-D.
-            meshes: Whether the page may hold the meshes of the user's own URDF, which it then passes on.
-            jobs: Processes that draw and compile side by side.
-            progress: Called after each figure, the C code and the report with the numbers done and in all.
+            report: Whether to write ``report.html``, a page with the result and the robot in 3-D.
+            meshes: Whether the page may hold, and so pass on, the meshes of the user's own URDF.
+            jobs: Number of parallel processes that draw and compile.
+            progress: Called after each figure, the C code and the report with the numbers of finished and all files.
 
         Returns:
             The folder, the export in it, and the reason if its C code could not be built.
@@ -186,19 +186,19 @@ class PostureResult:
         Raises:
             OutputError: The folder exists without ``force``, or cannot be written.
         """
-        prepared, found = self._prepared, self._found
+        prepared, postures = self._prepared, self._postures
         with whole_folder(Path(out), force=force, kind="result") as folder:
             write_json(folder / "result.json", self.document)
-            arrays = result_arrays(self.solution, found.path, self.tradeoff, found.mapped)
+            arrays = result_arrays(self.solution, postures.path, self.tradeoff, postures.mapped)
             np.savez_compressed(folder / "result.npz", **arrays)  # type: ignore[arg-type]
-            write_json(folder / "posture.json", write_posture(prepared.impact.robot, found.optimal))
+            write_json(folder / "posture.json", write_posture(prepared.impact.robot, postures.optimal))
             (folder / "problem.toml").write_text(dump_settings(resolved_settings(prepared)), encoding="utf-8")
             if self.motion is not None:
                 from impact_posture.path.path_files import write_path
 
                 write_path(folder, prepared.impact.robot, self.motion)
             written = finish_result(
-                folder, prepared, found, codegen=codegen, formats=formats, report=report, meshes=meshes, jobs=jobs,
+                folder, prepared, postures, codegen=codegen, formats=formats, report=report, meshes=meshes, jobs=jobs,
                 progress=progress,
             )  # fmt: skip
         return replace(written, out=Path(out))
@@ -210,7 +210,7 @@ class PostureResult:
         """Draw the figures into a folder; return their paths."""
         from impact_posture.output.plot import draw_all
 
-        return draw_all(result_view(self._prepared, self._found, self.motion), Path(out), formats, only)
+        return draw_all(result_view(self._prepared, self._postures, self.motion), Path(out), formats, only)
 
     @checked
     def export(self, out: str | Path, *, build: bool = True, **options: Any) -> Export:
@@ -239,27 +239,27 @@ def optimize(
         problem: The problem.
         starts: Number of starts: the given posture, then random feasible postures.
         seed: Seed of the random starts.
-        jobs: Processes that search side by side.
-        compile: Whether the program is compiled: ``auto`` (if it pays), ``always`` or ``never``.
+        jobs: Number of parallel processes.
+        compile: When to compile the program: ``auto`` (if it saves time), ``always`` or ``never``.
         search: ``multistart``, or ``global`` (:func:`~impact_posture.posture.search.global_search.search_globally`).
-        progress: Called after each start with the numbers done and in all.
-        finish_all: Finish starts that can no longer become the best, too.  The search ``global`` always does.
+        progress: Called after each start with the numbers of finished and all starts.
+        finish_all: Also finish starts that can no longer become the best.  The search ``global`` always does.
 
     Raises:
-        InputError: There is no start, or the problem is none for the search ``global``.
+        InputError: An argument is wrong, or the search ``global`` cannot solve the problem.
         Infeasible: No posture satisfies the constraints; the error names the conflicting constraints.
         SolverFailed: No run ended at a certified posture.
     """
     if search == "global":
         check_searchable(problem.problem)
-    found = solve_robustly(
+    solved = solve_robustly(
         problem.problem, starts=starts, seed=seed, jobs=jobs, compile=compile, progress=progress,
         finish_all=finish_all or search == "global",
     )  # fmt: skip
     if search == "multistart":
-        return PostureResult(problem, found.solution, found.robustness)
-    best = search_globally(found.solution, seed=seed, jobs=jobs, compile=compile, progress=progress)
-    robustness = found.robustness and compare_variants(
-        best.solution, [variant.q for variant in found.robustness.model_variants], seed
+        return PostureResult(problem, solved.solution, solved.robustness)
+    best = search_globally(solved.solution, seed=seed, jobs=jobs, compile=compile, progress=progress)
+    robustness = solved.robustness and compare_variants(
+        best.solution, [variant.q for variant in solved.robustness.model_variants], seed
     )
     return PostureResult(problem, best.solution, robustness, global_search=best.search)

@@ -15,7 +15,6 @@ import pytest
 
 import impact_posture as ip
 from impact_posture.errors import InputError, OutputError, PostureError, SpecError
-from impact_posture.impact.evaluation.evaluation import Evaluation
 from impact_posture.output import plot
 from impact_posture.posture.formulation.problem_file import prepare
 from impact_posture.system.toolchain import find_compiler
@@ -37,12 +36,9 @@ def result() -> ip.PostureResult:
 
 
 def test_every_name_is_there() -> None:
-    assert {"load_robot", "ImpactContact", "ImpactObjective", "PostureProblem", "optimize", "tsid"} <= set(dir(ip))
-    for name in ip.__all__:
-        assert getattr(ip, name) is not None
-    for name in ip.tsid.__all__:
-        assert getattr(ip.tsid, name) is not None
+    assert dir(ip) == sorted(ip.__all__) and {"load_robot", "optimize", "PostureProblem", "tsid"} < set(dir(ip))
     for package in (ip, ip.tsid):
+        assert all(getattr(package, name) is not None for name in package.__all__)
         with pytest.raises(AttributeError, match="nothing"):
             package.nothing  # noqa: B018
 
@@ -55,7 +51,7 @@ def test_the_online_part_loads_no_casadi() -> None:
     assert subprocess.run([sys.executable, "-c", code], check=False).returncode == 0
 
 
-def test_objects_check_themselves() -> None:
+def test_contacts_problems_and_robots_check_their_arguments() -> None:
     assert ip.ImpactContact("ee", (0, 0, 2)).normal == UP
     contact = ip.ImpactContact("ee", (0.3, -0.2, 0.7))
     assert replace(contact, impulse=2.0).normal == contact.normal
@@ -67,6 +63,12 @@ def test_objects_check_themselves() -> None:
         ip.PostureProblem(arm(), posture=[0.0, 1.0])
     with pytest.raises(InputError, match="no contact"):
         ip.ImpactObjective(ip.load_robot("ur5"), [])
+    for frame in ("body", "World", "local", None, True):
+        with pytest.raises(InputError, match="normal_frame"):
+            ip.ImpactContact("ee", UP, normal_frame=frame)  # type: ignore[arg-type]
+    for friction in ("0.3", None, -1.0, float("nan")):
+        with pytest.raises(ip.ImpactPostureError, match="friction"):
+            ip.ImpactContact("ee", UP, friction=friction)  # type: ignore[arg-type]
 
 
 @pytest.mark.parametrize(
@@ -88,23 +90,13 @@ def test_objects_check_themselves() -> None:
         ),
     ],
 )  # fmt: skip
-def test_defaults_are_those_of_the_command_line(
+def test_defaults_agree_with_the_command_line(
     robot: str, frame: str, settings: dict[str, object], objective: dict[str, Any]
 ) -> None:
-    theirs = prepare(
-        make_settings(
-            {
-                "robot": robot,
-                "frame": frame,
-                "normal": (0.1, 0.2, 1.0),
-                "collision": True,
-                "holdable": True,
-                **settings,
-            }
-        )
-    )
-    made = ip.ImpactObjective(ip.load_robot(robot), ip.ImpactContact(frame, (0.1, 0.2, 1.0)), **objective)
-    ours = ip.PostureProblem(made)
+    keys = {"robot": robot, "frame": frame, "normal": (0.1, 0.2, 1.0), "collision": True, "holdable": True}
+    theirs = prepare(make_settings(keys | settings))
+    contact = ip.ImpactContact(frame, (0.1, 0.2, 1.0))
+    ours = ip.PostureProblem(ip.ImpactObjective(ip.load_robot(robot), contact, **objective))
     assert ours.prepared is not None
     assert ours.prepared.impact.to_dict() == theirs.impact.to_dict()
     assert ours.problem.requirements == theirs.problem.requirements
@@ -122,16 +114,16 @@ def test_a_robot_that_floats_without_anything_to_hold_it_is_refused() -> None:
 
 def test_evaluation_has_its_numbers() -> None:
     objective = arm()
-    found: Evaluation = objective.evaluate(objective.robot.posture(), speed=2.0)
-    assert pytest.approx(objective.value(objective.robot.posture())) == found.H
-    assert found.E is not None and pytest.approx(0.5 / found.G) == found.E
-    assert found.V is not None and found.S is not None and found.speed == 2.0
+    evaluation = objective.evaluate(objective.robot.posture(), speed=2.0)
+    assert pytest.approx(objective.value(objective.robot.posture())) == evaluation.H
+    assert evaluation.E is not None and pytest.approx(0.5 / evaluation.G) == evaluation.E
+    assert evaluation.V is not None and evaluation.S is not None and evaluation.speed == 2.0
 
 
 def test_a_result_saves_what_the_command_line_writes(
     result: ip.PostureResult, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
-    # The same files, and on them nothing, as the command has them here.
+    # Blank pictures, as the command draws here.
     for name in ALL_PICTURES:
         monkeypatch.setitem(plot.FIGURES, name, blank)
     written = result.save(tmp_path / "python", codegen=False, report=False, jobs=1)
@@ -146,7 +138,7 @@ def test_a_result_saves_what_the_command_line_writes(
             document["solver"].pop(key)
     assert python == cli
     toml = [(folder / "problem.toml").read_text().splitlines() for folder in (written.out, theirs)]
-    # How many starts is no part of a problem in Python.
+    # In Python, the number of starts is not part of the problem.
     assert [a for a, b in zip(*toml, strict=True) if a != b] == ["starts = 16"]
     assert run("optimize", written.out / "problem.toml", "--out", "again", "--starts", 2, "--no-codegen",
                cwd=tmp_path).returncode == 0  # fmt: skip
@@ -163,7 +155,7 @@ def test_a_result_draws_and_exports_itself(result: ip.PostureResult, tmp_path: P
     value, slope = gradient.objective(result.q)
     assert value == pytest.approx(result.problem.problem.objective.value(result.q), rel=1e-9)
     for q, n in ((0.1, UP), ([0.1], UP), (result.q, 1.0), (result.q, [1.0]), (result.q[None], UP), (result.q, None)):
-        # Spread over all joints, one number would give an answer.
+        # A number that is broadcast over all joints must not give an answer.
         with pytest.raises((TypeError, ValueError)):
             gradient.value_and_gradient(q, n)
     robot = result.problem.problem.robot
@@ -174,7 +166,7 @@ def test_a_result_draws_and_exports_itself(result: ip.PostureResult, tmp_path: P
     assert controller.tick(0.0, q, v).status is ip.tsid.Status.SOLVED and slope.shape == (robot.nv,)
 
 
-def test_the_code_of_a_result_is_that_of_its_objective(result: ip.PostureResult, tmp_path: Path) -> None:
+def test_the_code_of_a_result_is_the_code_of_its_objective(result: ip.PostureResult, tmp_path: Path) -> None:
     result.save(tmp_path / "out", formats=("png",), report=False, jobs=1)
     folder = tmp_path / "out" / "c"
     before = {path.name: path.read_bytes() for path in folder.iterdir()}
@@ -200,7 +192,7 @@ def test_the_code_of_a_result_is_that_of_its_objective(result: ip.PostureResult,
     portable = objective.export(tmp_path / "portable", portable=True, build=False).out
     with pytest.raises(OutputError, match="`force` to replace it"):
         objective.export(portable)
-    # What asks for more than the defaults is never taken as it is.
+    # An export with other options than the defaults is never reused.
     with pytest.raises(OutputError, match="choose another `out`"):
         objective.export(folder, prefix="arm")
     manifest = folder / "tilthex_arm_ee.json"
@@ -214,10 +206,6 @@ def test_the_code_of_a_result_is_that_of_its_objective(result: ip.PostureResult,
         objective.export(folder)
 
 
-def test_the_entrance_lists_its_names_only() -> None:
-    assert dir(ip) == sorted(ip.__all__) and {"load_robot", "optimize", "PostureProblem", "tsid"} < set(dir(ip))
-
-
 def test_a_trade_off_is_added_to_a_result(result: ip.PostureResult) -> None:
     curve = result.trade_off(2).tradeoff
     assert curve is not None and result.tradeoff is None
@@ -225,12 +213,11 @@ def test_a_trade_off_is_added_to_a_result(result: ip.PostureResult) -> None:
 
 
 def test_an_objective_from_outside_is_optimized_and_cannot_be_saved(tmp_path: Path) -> None:
-    found = ip.optimize(
-        ip.PostureProblem(JointDistance(ip.load_robot("ur5"), (0.3, -1.0, 1.0, 0.2, 0.1, 0.0))), starts=2, jobs=1
-    )
-    assert found.reduction > 0
+    objective = JointDistance(ip.load_robot("ur5"), (0.3, -1.0, 1.0, 0.2, 0.1, 0.0))
+    result = ip.optimize(ip.PostureProblem(objective), starts=2, jobs=1)
+    assert result.reduction > 0
     with pytest.raises(InputError, match="not an impact objective"):
-        found.save(tmp_path / "out")
+        result.save(tmp_path / "out")
     assert not (tmp_path / "out").exists()
 
 
@@ -245,7 +232,7 @@ def test_the_shown_lines_run(page: str, tmp_path: Path) -> None:
     assert (tmp_path / "out" / "result.json").is_file() and "Certificate" in done.stdout
 
 
-def test_friction_is_that_of_the_contact_and_is_saved(tmp_path: Path) -> None:
+def test_the_friction_of_the_contact_is_saved(tmp_path: Path) -> None:
     robot = ip.load_robot("tilthex_arm")
     objective = ip.ImpactObjective(robot, ip.ImpactContact("ee", (0, 0, 1), friction=0.3), kind="coulomb")
     problem = ip.PostureProblem(objective, base="level")
