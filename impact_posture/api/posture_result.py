@@ -142,7 +142,7 @@ class PostureResult:
     def path(self, *, seed: ZeroOrMore = 0) -> PostureResult:
         """Return the same result with a path from the start to the optimum, timed within the robot's limits.
 
-        See :func:`~impact_posture.path.posture_path.posture_path`.  If it finds no path to the optimum, it tries other
+        See :func:`~impact_posture.path.posture_path.posture_path`.  Without a path to the optimum, it tries the other
         optima.  A large program has all of them only after a search with ``finish_all``.
 
         Args:

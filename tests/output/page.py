@@ -87,6 +87,24 @@ def defects(figure: Figure) -> list[str]:
     return found + [f"no unit on an axis '{label}'" for label in labels(figure) if "[" not in label]
 
 
+def check_page(figure: Figure) -> None:
+    """Check that a page has no defects, and that its parts keep to their places and off each other."""
+    assert defects(figure) == []
+    head, body, foot = figure.subfigs
+    for part in (head, foot):
+        for words in part.texts:
+            box = words.get_window_extent()
+            assert box.y0 >= part.bbox.y0 and box.y1 <= part.bbox.y1
+    # A pixel less on each side, because boxes that only touch do not overlap.
+    boxes = [axes.get_tightbbox().padded(-1) for axes in body.axes if axes.get_visible()]
+    for legend in body.legends:
+        box = legend.get_window_extent()
+        assert box.x0 >= 0 and box.x1 <= body.bbox.x1 and not any(box.overlaps(other) for other in boxes)
+    for box in boxes:
+        assert box.x0 >= 0 and box.x1 <= body.bbox.x1
+        assert box.y0 >= body.bbox.y0 and box.y1 <= body.bbox.y1
+
+
 def _shown(text: Text, figure: Figure) -> bool:
     """Whether a text is drawn: ticks beyond an axis' end are not."""
     for axes in figure.axes:

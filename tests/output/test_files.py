@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from collections.abc import Callable
 from pathlib import Path
 from xml.etree import ElementTree
 
@@ -9,6 +10,7 @@ import matplotlib
 import matplotlib.image
 import numpy as np
 import pytest
+from matplotlib.figure import Figure
 
 from impact_posture.errors import InputError, OutputError
 from impact_posture.output.plot import FIGURES, FORMATS, FigureNotFound, ResultView, draw_all, postures_figure
@@ -18,18 +20,17 @@ from impact_posture.output.plot.jump_figure import jump_figure
 from impact_posture.output.plot.path_figures import path_figure, tradeoff_figure
 from impact_posture.output.plot.self_motion_figure import self_motion_figure
 from impact_posture.output.plot.style import WIDTH
-from tests.output.page import defects
+from tests.output.page import check_page, defects
 from tests.output.views import PENDULUM, make_view, text_of
 
 
 def test_figures_are_written_in_all_formats(tilthex: ResultView, tmp_path: Path) -> None:
-    # Surfaces and hatches in every format, the rest in one each: the writers are matplotlib's.
+    # Surfaces and hatches are written in every format, and the other figures in one format each.
     first = draw_all(tilthex, tmp_path / "figures", FORMATS, only=["ellipsoid", "jump"])
     assert [p.name for p in first] == [f"{n}.{f}" for n in ("ellipsoid", "jump") for f in ("png", "svg", "pdf")]
     paths = first + draw_all(tilthex, tmp_path / "figures", (".PNG",), only=["postures"])
-    paths += draw_all(
-        tilthex, tmp_path / "figures", ("svg", "svg"), only=["nullspace", "classical", "tradeoff", "path"]
-    )
+    others = ["nullspace", "classical", "tradeoff", "path"]
+    paths += draw_all(tilthex, tmp_path / "figures", ("svg", "svg"), only=others)
     paths += draw_all(tilthex, tmp_path / "figures", only=["self_motion"])
     assert len(paths) == len(set(paths)) == 12
     assert {p.stem for p in paths} == set(FIGURES)
@@ -59,46 +60,24 @@ def test_the_same_view_gives_the_same_files(pendulum: ResultView, tmp_path: Path
     matplotlib.__version_info__ < (3, 11), reason="before 3.11 matplotlib puts a label here and there on a line"
 )
 @pytest.mark.parametrize(
-    ("name", "figure"),
+    ("figure", "name"),
     [
-        ("talos", postures_figure),
-        ("tilthex", postures_figure),
-        ("solo8", postures_figure),
-        ("pendulum", postures_figure),
-        ("turned", postures_figure),
-        ("two_hands", postures_figure),
-        ("panda", postures_figure),
-        ("talos", jump_figure),
-        ("panda", jump_figure),
-        ("solo8", ellipsoid_figure),
-        ("solo8_cone", ellipsoid_figure),
-        ("torso", ellipsoid_figure),
-        ("turned", ellipsoid_figure),
-        ("pendulum", ellipsoid_figure),
-        ("talos", classical_figure),
-        ("turned", classical_figure),
-        ("pendulum", classical_figure),
-        ("tilthex", tradeoff_figure),
-        ("pendulum", path_figure),
-        ("tilthex", self_motion_figure),
-        ("surface", self_motion_figure),
+        *(
+            (postures_figure, name)
+            for name in ("talos", "tilthex", "solo8", "pendulum", "turned", "two_hands", "panda")
+        ),
+        *((jump_figure, name) for name in ("talos", "panda")),
+        *((ellipsoid_figure, name) for name in ("solo8", "solo8_cone", "torso", "turned", "pendulum")),
+        *((classical_figure, name) for name in ("talos", "turned", "pendulum")),
+        *((self_motion_figure, name) for name in ("tilthex", "surface")),
+        (tradeoff_figure, "tilthex"),
+        (path_figure, "pendulum"),
     ],
 )
-def test_pages_have_no_defects(name: str, figure: object, request: pytest.FixtureRequest) -> None:
-    page = figure(request.getfixturevalue(name))  # type: ignore[operator]
-    assert defects(page) == []
-    head, body, foot = page.subfigs
-    for part in (head, foot):
-        for words in part.texts:
-            box = words.get_window_extent()
-            assert box.y0 >= part.bbox.y0 and box.y1 <= part.bbox.y1
-    # A pixel less all round: what they touch is blank.
-    boxes = [axes.get_tightbbox().padded(-1) for axes in body.axes]
-    for box in boxes:
-        assert box.x0 >= 0 and box.x1 <= body.bbox.x1
-        assert box.y0 >= body.bbox.y0 and box.y1 <= body.bbox.y1
-    for legend in body.legends:
-        assert not any(legend.get_window_extent().overlaps(box) for box in boxes)
+def test_pages_have_no_defects(
+    figure: Callable[[ResultView], Figure], name: str, request: pytest.FixtureRequest
+) -> None:
+    check_page(figure(request.getfixturevalue(name)))
 
 
 def test_defects_are_found(monkeypatch: pytest.MonkeyPatch, turned: ResultView) -> None:
@@ -163,10 +142,9 @@ def test_bad_input(pendulum: ResultView, panda: ResultView, tmp_path: Path) -> N
         draw_all(pendulum, tmp_path, only=["elipsoid"])
     with pytest.raises(InputError, match="no format 'gif'"):
         draw_all(pendulum, tmp_path, ("gif",))
-    with pytest.raises(InputError, match="no path to draw"):
-        draw_all(panda, tmp_path, only=["nullspace"])
-    with pytest.raises(InputError, match=r"no trade-off to draw.*`tradeoff`"):
-        draw_all(panda, tmp_path, only=["tradeoff"])
+    for name, words in {"nullspace": "no path to draw", "tradeoff": "no trade-off to draw.*`tradeoff`"}.items():
+        with pytest.raises(InputError, match=words):
+            draw_all(panda, tmp_path, only=[name])
     with pytest.raises(InputError, match=r"no map to draw.*`search` global"):
         draw_all(panda, tmp_path, only=["self_motion"])
     (tmp_path / "file").write_text("in the way")

@@ -39,25 +39,20 @@ from impact_posture.output.plot.snapshots_figure import instants, snapshots_figu
 from impact_posture.output.plot.style import framed
 from impact_posture.robot.robot_loader import load_robot
 from impact_posture.simulation.series import Window
-from tests.output.page import defects
+from tests.output.page import check_page
 from tests.output.views import PENDULUM, text_of
 
 TICKS = 400
 
 
-def make_run(
-    name: str, controller: str = "nominal", *, frame: str | None = None, push: bool = False, **keys: Any
-) -> RunView:
+def make_run(name: str, *, push: bool = False) -> RunView:
     """A robot that swings about its posture for 4 s, hit at 1 s and 2.5 s, or pushed at 1 s."""
     robot = load_robot(name)
     t = np.arange(1, TICKS + 1) * 0.01
     base = 6 if robot.floating else 0
-    rng = np.random.default_rng(5)
-    ways = np.outer(np.sin(2 * t), 0.05 * rng.uniform(0.2, 1.0, robot.nv))
-    q = np.array([pin.integrate(robot.model, robot.posture(), way) for way in ways])
+    swings = np.outer(np.sin(2 * t), 0.05 * np.random.default_rng(5).uniform(0.2, 1.0, robot.nv))
+    q = np.array([pin.integrate(robot.model, robot.posture(), swing) for swing in swings])
     rotors = 0 if robot.spec.propulsion is None else len(robot.spec.propulsion.rotors)
-    objective = np.where(np.arange(TICKS) % 10 == 0, 3.0 + np.cos(t), np.nan)
-    supports = robot.spec.supports
     hits = (1.0,) if push else (1.0, 2.5)
     windows = [Window("impact", k, at, at + 0.3, True) for k, at in enumerate(hits)]
     windows += [] if push else [Window("dwell", k, at, at + 0.8, True) for k, at in enumerate(hits)]
@@ -65,22 +60,20 @@ def make_run(
     inside = np.any([(t > at) & (t <= at + 0.3) for at in hits], axis=0)
     force[inside] = (6.0, 0.0, 0.0)
     contact = ImpactContact(robot.spec.contact.frame or robot.frame_names[-1], (1, 0, 0))
-    values: dict[str, Any] = {
-        "torque": 0.5 * np.outer(np.sin(3 * t), np.ones(robot.nv - base)),
-        "rotor_command": np.full((TICKS, rotors), 60.0),
-        "rotor_speed": np.full((TICKS, rotors), 59.0),
-        "force": force,
-        "peak": np.linalg.norm(force, axis=1),
-        "objective": objective,
-        "level": np.zeros(TICKS),
-        "at_stop": np.zeros((TICKS, robot.nv), dtype=bool),
-        "windows": tuple(windows),
-        "surface": None if push else np.array([-0.5, 0.0, 0.0]),
-        "supports": supports,
-    }
-    values |= keys
-    v = np.gradient(ways, t, axis=0)
-    return RunView("made-up", "nominal", robot, contact, t, q, v, **values)
+    return RunView(
+        "made-up", "nominal", robot, contact, t, q, np.gradient(swings, t, axis=0),
+        torque=0.5 * np.outer(np.sin(3 * t), np.ones(robot.nv - base)),
+        rotor_command=np.full((TICKS, rotors), 60.0),
+        rotor_speed=np.full((TICKS, rotors), 59.0),
+        force=force,
+        peak=np.linalg.norm(force, axis=1),
+        objective=np.where(np.arange(TICKS) % 10 == 0, 3.0 + np.cos(t), np.nan),
+        level=np.zeros(TICKS),
+        at_stop=np.zeros((TICKS, robot.nv), dtype=bool),
+        windows=tuple(windows),
+        surface=None if push else np.array([-0.5, 0.0, 0.0]),
+        supports=robot.spec.supports,
+    )  # fmt: skip
 
 
 @pytest.fixture(scope="module")
@@ -144,11 +137,8 @@ def test_metric_shows_H_speed_and_force(flying: RunView) -> None:
     np.testing.assert_allclose(curves(force)["force: normal, peak"][1], flying.peak)
     np.testing.assert_allclose(curves(force)["force: friction"][1], 0.0, atol=1e-12)
     assert H.get_yscale() == "linear" and H.get_ylim()[0] == 0.0
-    assert [axes.get_ylabel() for axes in (H, speed, force)] == [
-        "H  [‖Δν‖²/(N·s)²]",
-        "‖ν‖  [m/s, rad/s]",
-        "force  [N]",
-    ]
+    names = ["H  [‖Δν‖²/(N·s)²]", "‖ν‖  [m/s, rad/s]", "force  [N]"]
+    assert [axes.get_ylabel() for axes in (H, speed, force)] == names
     ramped = dataclasses.replace(flying, level=np.linspace(0, 1, TICKS))
     assert "activation of the term" in text_of(metric_figure(ramped))
 
@@ -171,10 +161,9 @@ def test_controls_show_rotors_torques_limits_and_saturation(flying: RunView) -> 
     assert limits(rotors) == [propulsion.speed_min / propulsion.speed_max, 1.0]
     share = flying.rotor_speed[:, 0] / propulsion.speed_max
     np.testing.assert_allclose(curves(rotors)["rotor 1"][1], share)
-    # Thin and without dashes: they carry noise.
-    assert {
-        (line.get_linestyle(), line.get_linewidth()) for line in rotors.lines if line.get_label()[:5] == "rotor"
-    } == {("-", 0.7)}
+    # Noisy curves are thin and without dashes.
+    lines = [line for line in rotors.lines if line.get_label()[:5] == "rotor"]
+    assert {(line.get_linestyle(), line.get_linewidth()) for line in lines} == {("-", 0.7)}
     assert limits(joints) == [-1.0, 1.0] and joints.get_ylabel() == "torque / limit  [1]"
     assert set(curves(rotors)) == {f"rotor {k}" for k in range(1, 7)}
     assert rotors.get_ylabel() == "rotor speed / highest  [1]"
@@ -258,10 +247,8 @@ def test_comparison_puts_nominal_first_and_counts_from_each_ones_touch(flying: R
     known = np.isfinite(flying.objective)
     np.testing.assert_allclose(curves(upper)["robust"][1], 0.5 * flying.objective[known])
     for line, view in zip(lower.lines, (flying, robust), strict=True):
-        begin = view.impacts[0].begin
-        np.testing.assert_allclose(
-            np.interp(100.0, line.get_xdata(), line.get_ydata()), np.interp(begin + 0.1, view.t, view.speed)
-        )
+        drawn = np.interp(100.0, line.get_xdata(), line.get_ydata())
+        np.testing.assert_allclose(drawn, np.interp(view.impacts[0].begin + 0.1, view.t, view.speed))
     titles = [axes.get_title() for axes in panels(controls_comparison_figure([robust, flying]))]
     assert titles[:2] == ["nominal", "robust"]
     rows = panels(joints_figure([robust, flying]))[::2]
@@ -281,8 +268,8 @@ def test_pushes_share_the_push_as_zero(pushed: RunView) -> None:
 def test_more_than_three_controllers_go_on_below(flying: RunView) -> None:
     names = ("nominal", "robust", "posture", "stiff")
     views = [dataclasses.replace(flying, controller=name) for name in names]
-    found = [axes.get_title() for axes in panels(controls_comparison_figure(views)) if axes.get_title()]
-    assert found == list(names)
+    titles = [axes.get_title() for axes in panels(controls_comparison_figure(views)) if axes.get_title()]
+    assert titles == list(names)
 
 
 def test_snapshots_show_the_robot_where_it_was(flying: RunView, pushed: RunView) -> None:
@@ -343,18 +330,9 @@ def test_bars_carry_means_intervals_and_the_papers_numbers() -> None:
 )
 def test_nothing_overlaps(name: str, figure: Any, request: pytest.FixtureRequest) -> None:
     page = figure(request.getfixturevalue(name))
-    assert defects(page) == []
-    _, body, foot = page.subfigs
+    check_page(page)
     boxes = [axes.get_tightbbox().padded(-1) for axes in panels(page)]
-    for k, box in enumerate(boxes):
-        assert box.x0 >= 0 and box.x1 <= body.bbox.x1 + 1
-        assert box.y0 >= body.bbox.y0 - 1 and box.y1 <= body.bbox.y1 + 1
-        assert not any(box.overlaps(other) for other in boxes[:k])
-    (legend,) = body.legends
-    assert legend.get_window_extent().x0 >= 0 and legend.get_window_extent().x1 <= body.bbox.x1
-    assert not any(legend.get_window_extent().overlaps(box) for box in boxes)
-    for words in foot.texts:
-        assert words.get_window_extent().y0 >= foot.bbox.y0
+    assert not any(box.overlaps(other) for k, box in enumerate(boxes) for other in boxes[:k])
 
 
 def test_files_in_all_formats_and_the_same_each_time(flying: RunView, fixed: RunView, tmp_path: Path) -> None:
