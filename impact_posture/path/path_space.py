@@ -43,18 +43,14 @@ class PathSpace:
 
     def violations(self, q: Array) -> list[tuple[str, float, float]]:
         """Return name, violation and tolerance of each constraint and of the joint limits at ``q``, shape (nq,)."""
-        by_constraint = zip(
-            self.problem.constraints, self.problem.violations(self.projector.numeric.at(q)), strict=True
-        )
+        rows = self.problem.violations(self.projector.numeric.at(q))
         x = self.projector.chart.to_x(q)
         outside = np.abs(x - np.clip(x, self.problem.lower, self.problem.upper)).max(initial=0.0)
-        return [
-            *(
-                (c.name, float(np.abs(rows).max(initial=0.0)), EQUALITY if c.equality else INEQUALITY)
-                for c, rows in by_constraint
-            ),
-            ("joint limits", float(outside), INEQUALITY),
+        by_constraint = [
+            (c.name, float(np.abs(violation).max(initial=0.0)), EQUALITY if c.equality else INEQUALITY)
+            for c, violation in zip(self.problem.constraints, rows, strict=True)
         ]
+        return [*by_constraint, ("joint limits", float(outside), INEQUALITY)]
 
     def valid(self, q: Array) -> bool:
         """Return whether ``q``, shape (nq,), satisfies all constraints."""

@@ -176,15 +176,9 @@ def hover(model: pin.Model, propulsion: PropulsionSpec, q: ArrayLike) -> Hover:
     for name, torque, share in zip(joints, torques, used, strict=True):
         if share > 1.0:
             violations.append(f"{name} would need {torque:.3g} N·m, above its limit")
-    return Hover(
-        thrusts=thrusts,
-        speeds=np.sqrt(np.maximum(thrusts, 0.0) / propulsion.thrust_coefficient),
-        joint_torques=torques,
-        thrust_margin=thrust_margin,
-        torque_margin=float(1.0 - np.max(used, initial=0.0)),
-        residual=residual,
-        violations=tuple(violations),
-    )
+    speeds = np.sqrt(np.maximum(thrusts, 0.0) / propulsion.thrust_coefficient)
+    torque_margin = float(1.0 - np.max(used, initial=0.0))
+    return Hover(thrusts, speeds, torques, thrust_margin, torque_margin, residual, tuple(violations))
 
 
 def lateral_force_range(model: pin.Model, propulsion: PropulsionSpec, q: ArrayLike) -> LateralForce:

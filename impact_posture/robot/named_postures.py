@@ -32,9 +32,8 @@ def named_postures(
     # A joint whose limits exclude zero starts at the nearest of them.
     postures.setdefault("neutral", np.clip(pin.neutral(model), model.lowerPositionLimit, model.upperPositionLimit))
     if default not in postures:
-        raise SpecError(
-            f"default_posture '{default}' does not exist", where=name, hint=f"one of: {', '.join(postures)}"
-        )
+        fault = f"default_posture '{default}' does not exist"
+        raise SpecError(fault, where=name, hint=f"choose one of {', '.join(postures)}")
     return postures, default
 
 
@@ -83,9 +82,8 @@ def _toml_postures(model: pin.Model, spec: RobotSpec, root: Root, name: str) -> 
         if posture.base is not None and root == "free-flyer":
             norm = float(np.linalg.norm(posture.base[3:]))
             if not (np.isfinite(posture.base).all() and abs(norm - 1) < 1e-3):
-                raise SpecError(
-                    f"base quaternion of norm {norm:.4g}", where=where, hint="give a unit quaternion x y z w"
-                )
+                fault = f"base quaternion of norm {norm:.4g}"
+                raise SpecError(fault, where=where, hint="give a unit quaternion x y z w")
             q[:7] = posture.base
         for joint, value in posture.joints.items():
             index = joint_index(model, joint, where)

@@ -190,9 +190,8 @@ def set_joints(robot: Robot, q: Array, joints: Mapping[str, object], where: str)
         else:
             numbers, nq = _numbers(value, f"joint '{name}'", where), int(robot.model.nqs[index])
             if len(numbers) != nq:
-                raise PostureError(
-                    f"joint '{name}' takes {nq} numbers, not {len(numbers)}", where=where, hint="correct it"
-                )
+                fault = f"joint '{name}' takes {nq} numbers, not {len(numbers)}"
+                raise PostureError(fault, where=where, hint="correct it")
             q[entries] = numbers
     return q
 

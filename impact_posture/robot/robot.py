@@ -218,9 +218,8 @@ class Robot:
             fault = f"a posture of {self.name} has {self.nq} numbers, this one {q.size}"
             raise PostureError(fault, where=where, hint=f"give {self.convention.split(';')[0]}")
         if not np.isfinite(q).all():
-            raise PostureError(
-                f"entry {int(np.argmin(np.isfinite(q)))} is not finite", where=where, hint="correct it"
-            )
+            fault = f"entry {int(np.argmin(np.isfinite(q)))} is not finite"
+            raise PostureError(fault, where=where, hint="correct it")
         self._check_norms(q, where)
         if self.floating:
             self._check_swapped(q[3:7], where)

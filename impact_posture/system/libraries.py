@@ -69,17 +69,14 @@ def build_parts(folder: Path, library: Path, parts: Mapping[str, Sequence[str]])
         commands = [[*compiler, *_FLAGS, *words_of("CFLAGS"), *flags, name] for name, flags in parts.items()]
         texts = [scratch / f"{name}.i" for name in parts]
         run_compilers([[*c, "-E", "-P", "-o", str(text)] for c, text in zip(commands, texts, strict=True)], folder)
-        objects = [
-            cached / f"{source_key([repr(command), text.read_text(encoding='utf-8')])}.o"
+        objects = {
+            cached / f"{source_key([repr(command), text.read_text(encoding='utf-8')])}.o": command
             for command, text in zip(commands, texts, strict=True)
-        ]
+        }
         with ExitStack() as finished:
-            missing = []
-            for command, part in zip(commands, objects, strict=True):
-                if not is_cached(part):
-                    output = finished.enter_context(building(part)) / part.name
-                    missing.append([*command, "-c", "-o", str(output)])
-            run_compilers(missing, folder)
+            missing = {part: command for part, command in objects.items() if not is_cached(part)}
+            outputs = [str(finished.enter_context(building(part)) / part.name) for part in missing]
+            run_compilers([[*c, "-c", "-o", out] for c, out in zip(missing.values(), outputs, strict=True)], folder)
         run_compiler([*compiler, "-shared", *map(str, objects), "-o", str(scratch / library.name), "-lm"], folder)
     return library
 
@@ -198,9 +195,8 @@ def cache_folder(*parts: str) -> Path:
             folder.mkdir(mode=0o700, parents=True, exist_ok=True)
             check_private(folder)
     except OSError as error:
-        raise OutputError(
-            f"cannot be written ({error.strerror})", where=str(folder), hint="set IMPACT_POSTURE_CACHE to a folder"
-        ) from None
+        fault = f"cannot be written ({error.strerror})"
+        raise OutputError(fault, where=str(folder), hint="set IMPACT_POSTURE_CACHE to a folder") from None
     return folder
 
 

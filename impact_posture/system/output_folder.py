@@ -20,7 +20,9 @@ from impact_posture.system.processes import signals_held, undone
 from impact_posture.system.scratch_folder import RECORD, SCHEMA, SCRATCH, made_by, remove_scratch, scratch_folder
 from impact_posture.system.text_files import read_text
 
+# Number of foreign files that a message names.
 _SHOWN = 3
+_EXISTS = "choose another `out`, or `force` to replace it"
 
 Kind = Literal["result", "export", "run", "comparison", "reproduction", "sweep", "world"]
 
@@ -38,14 +40,13 @@ def check_output(out: Path, *, force: bool, kind: Kind) -> None:
     if os.path.lexists(out) and not out.is_dir():
         raise OutputError("exists and is not a folder", where=str(out), hint="choose another `out`")
     if Path(os.path.realpath(out)) in (Path.cwd(), *Path.cwd().parents):
-        raise OutputError(
-            "is the current folder or one around it", where=str(out), hint="choose a new folder, such as ./result"
-        )
+        fault = "is the current folder or a folder around it"
+        raise OutputError(fault, where=str(out), hint="choose a new folder, such as ./result")
     if os.path.ismount(out):
         raise OutputError("is a mount point", where=str(out), hint="choose a folder in it")
     if out.is_dir() and any(out.iterdir()):
         if not force:
-            raise OutputError("exists", where=str(out), hint="choose another `out`, or `force` to replace it")
+            raise OutputError("exists", where=str(out), hint=_EXISTS)
         _check_ours(out, kind)
     parent = next(folder for folder in out.absolute().parents if folder.exists())
     if not parent.is_dir() or not os.access(parent, os.W_OK | os.X_OK):
@@ -88,9 +89,8 @@ def whole_folder(out: Path, *, force: bool, kind: Kind, products: Sequence[str] 
                 yield beside
             except OutputError as error:
                 # The user knows only the final folder.
-                raise OutputError(
-                    error.what, where=error.where.replace(str(beside), str(out)), hint=error.hint
-                ) from None
+                where = error.where.replace(str(beside), str(out))
+                raise OutputError(error.what, where=where, hint=error.hint) from None
             write_record(beside, kind, products)
             with signals_held():
                 _replace(beside, out, force, kind)
@@ -99,9 +99,8 @@ def whole_folder(out: Path, *, force: bool, kind: Kind, products: Sequence[str] 
         if isinstance(error, FileNotFoundError) and error.filename:
             # The missing file may be outside the folder.
             reason = f"{reason}: {error.filename}"
-        raise OutputError(
-            f"cannot be written ({reason})", where=str(out), hint="free space or choose another `out`"
-        ) from error
+        fault = f"cannot be written ({reason})"
+        raise OutputError(fault, where=str(out), hint="free space or choose another `out`") from error
 
 
 def write_record(folder: Path, kind: Kind, products: Sequence[str] = ()) -> None:
@@ -184,9 +183,8 @@ def write_whole(path: Path, content: str | bytes) -> None:
 def _check_ours(out: Path, kind: Kind) -> None:
     content = _read_record(out)
     if content is not None and content["kind"] != kind:
-        raise OutputError(
-            f"holds another command's results ({content['kind']})", where=str(out), hint="choose another `out`"
-        )
+        fault = f"holds another command's results ({content['kind']})"
+        raise OutputError(fault, where=str(out), hint="choose another `out`")
     foreign = _foreign(out, set())
     if foreign:
         more = f" and {len(foreign) - _SHOWN} more" if len(foreign) > _SHOWN else ""
@@ -234,9 +232,7 @@ def _replace(beside: Path, out: Path, force: bool, kind: Kind) -> None:
             os.rename(beside, out)
         except OSError as error:
             if error.errno in (errno.ENOTEMPTY, errno.EEXIST):
-                raise OutputError(
-                    "exists", where=str(out), hint="choose another `out`, or `force` to replace it"
-                ) from None
+                raise OutputError("exists", where=str(out), hint=_EXISTS) from None
             raise
         return
     # This name is never swept.  After a kill between the two renames, the user finds the old result there.
@@ -270,7 +266,6 @@ def parents_of(out: Path) -> Iterator[None]:
             for folder in reversed(missing):
                 folder.mkdir(exist_ok=True)
         except OSError as error:
-            raise OutputError(
-                f"cannot be made ({error.strerror})", where=str(error.filename), hint="choose another `out`"
-            ) from None
+            fault = f"cannot be made ({error.strerror})"
+            raise OutputError(fault, where=str(error.filename), hint="choose another `out`") from None
         yield

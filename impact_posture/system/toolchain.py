@@ -58,9 +58,8 @@ def words_of(variable: str) -> list[str]:
     try:
         return shlex.split(text)
     except ValueError as error:
-        raise CompilerError(
-            f"{text!r} cannot be split into words ({str(error).lower()})", where=variable, hint="close the quote"
-        ) from None
+        fault = f"{text!r} cannot be split into words ({str(error).lower()})"
+        raise CompilerError(fault, where=variable, hint="close the quote") from None
 
 
 def run_compiler(command: list[str], folder: Path) -> None:
