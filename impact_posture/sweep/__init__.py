@@ -1,4 +1,4 @@
-"""Many posture problems at once, on whatever runs them; their results as one table in Parquet files."""
+"""Sweeps of many posture problems on any executor, with one table of results in Parquet files."""
 
 from impact_posture.sweep.atlas import open_atlas as open
 

@@ -1,4 +1,4 @@
-"""The folder of a sweep: a manifest, and one Parquet file for each shard, written whole."""
+"""Folder of a sweep: a manifest, and a Parquet file for each shard, written as a whole."""
 
 from __future__ import annotations
 
@@ -28,19 +28,19 @@ if TYPE_CHECKING:
 
 SCHEMA = "impact-posture/sweep-folder/1"
 MANIFEST, _DATA = "manifest.json", "data"
-# Shards after their first pass, which the second one replaces in the table while their neighbors still need them.
+# Folder of shards after their first pass, which neighbors still need after the second pass has replaced them.
 _FIRST_PASS = "first-pass"
-# Shards whose postures are kept in memory; those along an axis are needed one after the other.
+# Number of shards whose postures are kept in memory, because successive shards have common neighbors.
 _KEPT = 16
-# Packages whose formulas decide the numbers.
+# Packages whose code determines the numbers.
 _PACKAGES = ("robot", "dynamics", "collision", "impact", "posture", "sweep")
 
 
 def sweep_key(sweep: Sweep) -> str:
-    """Return a hash of everything that the results of a sweep depend on; it loads the robot of every case.
+    """Return a hash of everything that the results of a sweep depend on.  This loads the robot of every case.
 
     Raises:
-        ImpactPostureError: A setting does not fit its robot; the first fault, in one line.
+        ImpactPostureError: A setting does not fit its robot.
     """
     content = [repr((sweep.outer, sweep.grid, sweep.shard))]
     for case in sweep.cases:
@@ -51,12 +51,12 @@ def sweep_key(sweep: Sweep) -> str:
 
 
 class Atlas:
-    """The folder that a sweep writes.
+    """Folder that a sweep writes.
 
     Args:
         folder: The folder.
         sweep: The sweep.
-        key: Its :func:`sweep_key`.
+        key: :func:`sweep_key` of the sweep.
     """
 
     def __init__(self, folder: Path, sweep: Sweep, key: str) -> None:
@@ -65,14 +65,14 @@ class Atlas:
 
     @contextmanager
     def opened(self) -> Iterator[None]:
-        """Make the folder, or go on with it; no other process writes it within the block.
+        """Make or continue the folder, and lock it against other processes within the block.
 
         Raises:
-            OutputError: It holds something else, another sweep or version, or another process works in it.
+            OutputError: The folder has other content, another sweep or version, or another process uses it.
         """
         manifest = self.folder / MANIFEST
         if not os.path.isfile(manifest):
-            # A run that was killed before it wrote the manifest left a record, and no results that could be lost.
+            # A run that was killed before it wrote the manifest left a record without results.
             if not is_ours(self.folder, "sweep") or (self.folder / _DATA).exists():
                 check_output(self.folder, force=False, kind="sweep")
             try:
@@ -90,13 +90,10 @@ class Atlas:
             try:
                 fcntl.flock(held, fcntl.LOCK_EX | fcntl.LOCK_NB)
             except BlockingIOError:
-                raise OutputError(
-                    "is in use by another process",
-                    where=str(self.folder),
-                    hint="wait for it, or choose another `out`",
-                ) from None
+                hint = "wait for it, or choose another `out`"
+                raise OutputError("is in use by another process", where=str(self.folder), hint=hint) from None
             except OSError:
-                # This file system knows no locks.
+                # The file system has no locks.
                 pass
             for part in self.folder.glob("*/case=*/.shard-*.parquet.*.part"):
                 with suppress(OSError):
@@ -104,12 +101,13 @@ class Atlas:
             yield
 
     def waiting(self) -> tuple[list[int], list[int]]:
-        """Return the shards whose first pass is lacking and needed, and those that lack the second one."""
-        lacking = [shard for shard in range(self._sweep.shards) if not self._is_done(shard)]
-        if self._sweep.passes == 1:
-            return lacking, []
-        needed = {*lacking, *(other for shard in lacking for other in self._sweep.beside(shard))}
-        return [shard for shard in sorted(needed) if self._first(shard) is None], lacking
+        """Return the shards that need the first pass, and the shards that need the second pass."""
+        passes, shards = self._sweep.passes, range(self._sweep.shards)
+        missing = [shard for shard in shards if self._passes(self._path(shard), shard) != passes]
+        if passes == 1:
+            return missing, []
+        needed = {*missing, *(other for shard in missing for other in self._sweep.beside(shard))}
+        return [shard for shard in sorted(needed) if self._first(shard) is None], missing
 
     def solved(self, shard: int) -> tuple[bytes, dict[int, list[float]]]:
         """Return the file of a shard after its first pass, and the postures next to it in other shards."""
@@ -120,14 +118,14 @@ class Atlas:
         return self._content(shard), beside
 
     def write(self, shard: int, content: bytes, passes: int) -> None:
-        """Write the file of a shard, whole or not at all.
+        """Write the file of a shard as a whole.
 
         Raises:
-            OutputError: It cannot be written.
+            OutputError: The file cannot be written.
         """
         before = self._passes(self._path(shard), shard)
         if before == 1 < passes:
-            # Its neighbors still need it.
+            # The neighbors still need the first pass.
             self._write(self._path(shard, _FIRST_PASS), self._content(shard))
         self._write(self._path(shard, _FIRST_PASS if before > passes else _DATA), content)
 
@@ -155,11 +153,8 @@ class Atlas:
     def _passes(self, path: Path, shard: int) -> int:
         return passes_of(path, self._key, len(self._sweep.span(shard)[1]))
 
-    def _is_done(self, shard: int) -> bool:
-        return self._passes(self._path(shard), shard) == self._sweep.passes
-
     def _first(self, shard: int) -> Path | None:
-        """The file of a shard after its first pass."""
+        """Return the file of a shard after its first pass, or ``None``."""
         paths = self._path(shard), self._path(shard, _FIRST_PASS)
         return next((path for path in paths if self._passes(path, shard) == 1), None)
 
@@ -170,7 +165,7 @@ class Atlas:
         return path.read_bytes()
 
     def _read_postures(self, shard: int) -> dict[int, list[float] | None]:
-        """The postures of a shard after its first pass, by their points."""
+        """Return the postures of a shard after its first pass by point."""
         return dict(zip(self._sweep.span(shard)[1], read_postures(self._content(shard)), strict=True))
 
     def _manifest(self) -> dict[str, Any]:
@@ -191,38 +186,38 @@ def read_manifest(folder: Path) -> dict[str, Any]:
     """Return the manifest of a sweep folder.
 
     Raises:
-        SpecError: There is none, or it cannot be read.
+        SpecError: The manifest is missing, or cannot be read.
     """
     path = folder / MANIFEST
     try:
-        found = json.loads(read_text(path))
-        if found["schema"] != SCHEMA:
-            raise ValueError(f"schema {found['schema']}")
-        return {**found, "key": str(found["key"]), "version": str(found["version"])}
+        content = json.loads(read_text(path))
+        if content["schema"] != SCHEMA:
+            raise ValueError(f"schema {content['schema']}")
+        return {**content, "key": str(content["key"]), "version": str(content["version"])}
     except FileNotFoundError:
         raise SpecError("holds no manifest.json", where=str(folder), hint="name a folder that sweep wrote") from None
     except (OSError, ValueError, LookupError, TypeError, RecursionError) as error:
-        what = f"is no manifest of a sweep ({type(error).__name__}: {error})"
+        what = f"is not a manifest of a sweep ({type(error).__name__}: {error})"
         raise SpecError(what, where=str(path), hint="name a folder that sweep wrote") from None
 
 
 @checked
 def open_atlas(folder: str | Path) -> Dataset:
-    """Open the table of a sweep, finished or not, as a ``pyarrow.dataset.Dataset``.
+    """Open the table of a finished or unfinished sweep as a ``pyarrow.dataset.Dataset``.
 
     Raises:
         InputError: pyarrow is not installed.
-        SpecError: The folder is none of a sweep, or has no finished shard.
+        SpecError: The folder is not a sweep folder, or has no finished shard.
     """
     check_package("pyarrow", "sweep")
     from pyarrow import ArrowException, dataset
 
     read_manifest(Path(folder))
-    place = Path(folder) / _DATA
-    if next(place.glob("case=*/*.parquet"), None) is None:
+    data = Path(folder) / _DATA
+    if next(data.glob("case=*/*.parquet"), None) is None:
         raise SpecError("has no finished shard", where=str(folder), hint="run sweep again, which goes on")
     try:
-        return dataset.dataset(place, format="parquet", partitioning="hive")
+        return dataset.dataset(data, format="parquet", partitioning="hive")
     except (OSError, ArrowException) as error:
         raise SpecError(f"cannot be read ({error})", where=str(folder), hint="run sweep again") from None
 
@@ -231,7 +226,7 @@ def check_package(name: str, extra: str) -> None:
     """Check that the package of an extra is installed.
 
     Raises:
-        InputError: It is not.
+        InputError: The package is missing.
     """
     from importlib.util import find_spec
 

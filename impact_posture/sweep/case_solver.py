@@ -1,4 +1,4 @@
-"""Robot, problems and programs of one case, which a process builds once."""
+"""Robot, problems and programs of a case, which a process builds once."""
 
 from __future__ import annotations
 
@@ -23,19 +23,19 @@ from impact_posture.sweep.point_search import Place, Timer, Walk
 from impact_posture.sweep.sweep_file import OFFSETS, Case, Grid
 from impact_posture.system.arrays import Array
 
-# Problems and programs that a process keeps, and most problems if the speed varies.  Each takes about a MB, and all
-# but the speeds of one normal are done for good.
+# Problems and programs that a process keeps, and most problems if the speed varies.  Each takes about a MB.  Points
+# with another normal come later, and their problems are not needed before.
 _KEPT, _MOST_SPEEDS = 4, 64
 
 _Value = TypeVar("_Value")
 
 
 class CaseSolver:
-    """The robot, problems and programs of a case, which a process keeps from shard to shard.
+    """Robot, problems and programs of a case, which a process keeps from shard to shard.
 
     Args:
         case: The case.
-        speeds: Number of speeds, which vary fastest.
+        speeds: Number of speeds, the fastest axis.
 
     Attributes:
         timer: Time of the solver.
@@ -57,11 +57,11 @@ class CaseSolver:
 
     @property
     def content(self) -> str:
-        """All that files say of the robot and the problem, as text."""
-        found = self.template(*self.normal_and_speed({}))
-        around, weights = found.problem.surroundings, found.impact.objective.metric.weights
+        """Text with all content of the files of the robot and the problem."""
+        prepared = self.template(*self.normal_and_speed({}))
+        around, weights = prepared.problem.surroundings, prepared.impact.objective.metric.weights
         bodies = [] if around is None else [(b.name, b.radius, b.vertices.tolist()) for b in around.shapes.bodies]
-        return repr((self.robot.data_sha256, found.impact.q.tolist(), weights, bodies))
+        return repr((self.robot.data_sha256, prepared.impact.q.tolist(), weights, bodies))
 
     def normal_and_speed(self, values: Mapping[str, Any]) -> tuple[Any, float]:
         """Return the normal and the speed at values of the grid, which choose the template."""
@@ -71,16 +71,16 @@ class CaseSolver:
     def _template(self, normal: Any, speed: float) -> Prepared:
         """Return the problem with a normal and a speed, at the target of the case."""
         settings = replace(self._case.settings, normal=normal, speed=speed)
-        made = prepare(settings, resolve(settings, self._loaded))
-        # Most problems do not depend on the speed, and then all speeds share their solutions.
-        objective = made.impact.objective
-        key = objective.structure, tuple(objective.parameters), made.problem.requirements
-        return replace(kept(self._known, key, lambda: made, self._templates), impact=made.impact)
+        prepared = prepare(settings, resolve(settings, self._loaded))
+        # Most problems do not depend on the speed, so all speeds share a problem and its solutions.
+        objective = prepared.impact.objective
+        key = objective.structure, tuple(objective.parameters), prepared.problem.requirements
+        return replace(kept(self._known, key, lambda: prepared, self._templates), impact=prepared.impact)
 
     def _attainable(self, normal: Any, speed: float) -> AttainableSpeed:
         """Return the fastest approach of the problem with a normal and a speed."""
-        made = self.template(normal, speed)
-        return AttainableSpeed(self.robot, made.impact.objective, made.problem.requirements)
+        prepared = self.template(normal, speed)
+        return AttainableSpeed(self.robot, prepared.impact.objective, prepared.problem.requirements)
 
     def target(self, values: Mapping[str, Any]) -> Place:
         """Return the position and orientation of the contact frame at values of the grid."""
@@ -101,7 +101,7 @@ class CaseSolver:
         """Check that the targets and speeds of the grid fit the problem.
 
         Raises:
-            InputError: The contact takes no target, a quaternion has no unit length, or a demand needs another speed.
+            InputError: The contact takes no target, a quaternion is not a unit quaternion, or a speed does not fit.
         """
         for axis in grid.axes:
             for value in axis.values if axis.name.startswith(("target", "speed")) else axis.values[:1]:
@@ -109,19 +109,19 @@ class CaseSolver:
                 retarget(prepared.problem, *self.target({axis.name: value}))
 
     def walk(self, template: ConstrainedProblem) -> Walk:
-        """Return the way of a template through a shard.
+        """Return the walk of a template through a shard.
 
-        Its program is built anew only if its expressions are new.  It grows on its own from here, so its rounding
-        depends on the template and the points of the shard alone.
+        A program is built only for new expressions.  Each walk has its own branch of the program, so rounding depends
+        on the template and the points of the shard only.
         """
         key = f"{template.objective.structure}\n{template.structure}"
-        made = kept(self._programs, key, lambda: build_nlp(template, compile="never"), _KEPT)
-        nlp = replace(made, problem=template, program=made.program.branch())
+        built = kept(self._programs, key, lambda: build_nlp(template, compile="never"), _KEPT)
+        nlp = replace(built, problem=template, program=built.program.branch())
         return Walk(template, self._case.settings, nlp, self.timer)
 
 
 def kept(cache: OrderedDict[Any, _Value], key: Any, make: Callable[[], _Value], most: int) -> _Value:
-    """Return a value of a cache that drops what was not used for longest."""
+    """Return a value of a cache that drops the least recently used value."""
     if key not in cache:
         cache[key] = make()
         if len(cache) > most:

@@ -1,4 +1,4 @@
-"""Where shards run: processes of this machine, a Dask cluster, MPI ranks, or Slurm jobs."""
+"""Executors of shards: processes of this machine, a Dask cluster, MPI ranks, and Slurm jobs."""
 
 from __future__ import annotations
 
@@ -19,13 +19,13 @@ from impact_posture.system.processes import depend, signals_held
 
 @contextmanager
 def process_pool(workers: int) -> Iterator[Executor]:
-    """Yield a pool of processes on this machine; none outlives the block."""
-    # Forked as everywhere in this package: nothing is imported again, and a signal leaves no semaphores behind.
+    """Yield a pool of processes on this machine, which end with the block."""
+    # A fork imports nothing again, and leaves no semaphores behind after a signal.
     pool = ProcessPoolExecutor(workers, multiprocessing.get_context("fork"), depend, (os.getpid(),))
     others = set(multiprocessing.active_children())
     try:
-        # All workers are forked here, before anything starts a thread.  A signal reaches every process of the
-        # terminal, and no worker may act on it.
+        # All workers are forked here, before a thread starts.  A signal reaches every process of the terminal, but
+        # workers must ignore it.
         with signals_held():
             pool.submit(os.getpid)
         yield pool
@@ -40,10 +40,10 @@ def dask_cluster(address: str) -> Iterator[Executor]:
     """Yield the executor of a Dask cluster.
 
     Args:
-        address: Address of its scheduler, such as ``tcp://host:8786``.
+        address: Address of the scheduler, such as ``tcp://host:8786``.
 
     Raises:
-        InputError: The package is missing, or no scheduler answers there.
+        InputError: The package is missing, or no scheduler answers at the address.
     """
     check_package("distributed", "dask")
     from distributed import Client
@@ -51,11 +51,8 @@ def dask_cluster(address: str) -> Iterator[Executor]:
     try:
         client = Client(address, timeout="10s")
     except (OSError, ValueError) as error:
-        raise InputError(
-            f"no Dask scheduler answers ({error})",
-            where=f"scheduler {address}",
-            hint="start one, or correct the address",
-        ) from None
+        what, hint = f"no Dask scheduler answers ({error})", "start one, or correct the address"
+        raise InputError(what, where=f"scheduler {address}", hint=hint) from None
     with client:
         yield client.get_executor()
 
@@ -77,21 +74,21 @@ def mpi_ranks() -> Iterator[Executor]:
 
 
 class SlurmJobs(Executor):
-    """Shards as elements of Slurm job arrays, by submitit.
+    """Executor of shards as elements of Slurm job arrays, by submitit.
 
     Args:
-        folder: Folder of its logs, which every node sees.
+        folder: Folder of the logs, which every node sees.
         options: Parameters of ``submitit.AutoExecutor``, such as ``timeout_min`` or ``slurm_partition``.
-        cluster: Cluster of submitit: ``slurm``, or ``local`` for processes of this machine; ``None`` to decide.
+        cluster: Cluster of submitit: ``slurm``, ``local`` for processes of this machine, or ``None`` for detection.
     """
 
     def __init__(self, folder: Path, options: dict[str, Any], cluster: str | None = None) -> None:
         check_package("submitit", "slurm")
         self._folder, self._options, self._cluster = folder, options, cluster
-        # submitit makes its folder at once, and what is refused leaves nothing behind.
-        with TemporaryDirectory() as place:
+        # submitit creates its folder at once, so try the options in a temporary folder.
+        with TemporaryDirectory() as trial:
             try:
-                self._executor(Path(place))
+                self._executor(Path(trial))
             except (NameError, TypeError, ValueError, AssertionError) as error:
                 raise InputError(str(error), where="slurm", hint="name parameters of submitit.AutoExecutor") from None
         self._waiting = ThreadPoolExecutor(1 << 10)
@@ -99,9 +96,9 @@ class SlurmJobs(Executor):
     def _executor(self, folder: Path) -> Any:
         import submitit
 
-        made = submitit.AutoExecutor(folder, cluster=self._cluster)
-        made.update_parameters(**self._options)
-        return made
+        executor = submitit.AutoExecutor(folder, cluster=self._cluster)
+        executor.update_parameters(**self._options)
+        return executor
 
     @cached_property
     def _jobs(self) -> Any:
@@ -123,15 +120,15 @@ class SlurmJobs(Executor):
 
 
 def parse_options(texts: Sequence[str]) -> dict[str, Any]:
-    """Return ``KEY=VALUE`` texts as options; a value that is an integer becomes one.
+    """Return ``KEY=VALUE`` texts as options.  Decimal values become integers.
 
     Raises:
         InputError: A text has no key or no value.
     """
-    found: dict[str, Any] = {}
+    options: dict[str, Any] = {}
     for text in texts:
         key, _, value = text.partition("=")
         if not (key.isidentifier() and value):
-            raise InputError(f"'{text}' is no KEY=VALUE", where="slurm", hint="give for example timeout_min=60")
-        found[key] = int(value) if value.isdecimal() else value
-    return found
+            raise InputError(f"'{text}' is not KEY=VALUE", where="slurm", hint="give for example timeout_min=60")
+        options[key] = int(value) if value.isdecimal() else value
+    return options

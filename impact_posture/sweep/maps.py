@@ -1,4 +1,4 @@
-"""Maps of a sweep: the objective over two axes, where no posture exists, and where the best one switches."""
+"""Maps of a sweep: objective over two axes, points without posture, and switches of the best posture."""
 
 from __future__ import annotations
 
@@ -29,11 +29,11 @@ from impact_posture.sweep.sweep_file import Axis, Grid
 from impact_posture.system.arrays import Array
 from impact_posture.system.escape import plot_label
 
-# The best posture switches between neighbors that differ (tangent norm, without the place of the base) by more than
-# SWITCH, and by more than this many times what the closest quarter of all neighbors differ by at most: half of them
-# may be on both sides of a switch.
+# The best posture switches between neighbors whose difference (tangent norm, without the position of the base)
+# exceeds SWITCH, and this multiple of the lower quartile of all differences.  The quartile is the usual difference
+# as long as at most half of the pairs of neighbors are on two sides of a switch.
 _UNUSUAL = 4.0
-# From this ratio of the largest to the least objective on, colors follow its logarithm.
+# Use a logarithmic color scale above this ratio of the largest to the least objective.
 _WIDE = 20.0
 _HATCH = {"infeasible": "////", "uncertified": "....", "undefined": "xxxx"}
 # Most labels of values along an axis.
@@ -42,13 +42,13 @@ _TICKS = 9
 
 @dataclass(frozen=True)
 class Shown:
-    """What the maps of a sweep show.
+    """Content of the maps of a sweep.
 
     Attributes:
         points: Number of problems of the sweep.
         counts: Number of solved points of each status.
-        switches: Number of steps between neighbors of the maps at which the best posture switches.
-        best: The point with the least objective of each case: its values and its objective.
+        switches: Number of pairs of neighbors in the maps between which the best posture switches.
+        best: Values and objective of the best point of each case.
         files: The pictures.
     """
 
@@ -65,19 +65,17 @@ class Shown:
 
 
 def draw_maps(folder: Path, out: Path, axes: Sequence[str] | None = None, formats: Sequence[str] = ("png",)) -> Shown:
-    """Draw a map of each case of a sweep folder.
-
-    All other axes are at their middle value.
+    """Draw a map of each case of a sweep folder, with other axes at their middle values.
 
     Args:
-        folder: The sweep folder, finished or not.
+        folder: The sweep folder, finished or unfinished.
         out: Folder of the pictures.
-        axes: Names of the axes across and upwards; by default the two with the most values.
+        axes: Names of the horizontal and the vertical axis; by default the two axes with the most values.
         formats: Formats of the pictures.
 
     Raises:
-        InputError: There is no such axis.
-        SpecError: The folder is none of a sweep.
+        InputError: An axis is unknown.
+        SpecError: The folder is not a sweep folder.
     """
     from pyarrow import compute
 
@@ -89,12 +87,11 @@ def draw_maps(folder: Path, out: Path, axes: Sequence[str] | None = None, format
             prepare(validate(ProblemSettings, tomllib.loads(c["problem"]), str(folder))).problem for c in cases
         ]
     except (LookupError, TypeError, ValueError) as error:
-        raise SpecError(
-            f"is damaged ({error})", where=str(folder / "manifest.json"), hint="run sweep again"
-        ) from None
+        where = str(folder / "manifest.json")
+        raise SpecError(f"is damaged ({error})", where=where, hint="run sweep again") from None
     across, upwards = _chosen(grid, axes)
     plane = _plane(grid, across, upwards)
-    counts = {one: data.count_rows(filter=compute.field("status") == one) for one in STATUS}
+    counts = {status: data.count_rows(filter=compute.field("status") == status) for status in STATUS}
     switches, best, files = 0, list[dict[str, Any]](), list[Path]()
     for number, (case, problem) in enumerate(zip(cases, problems, strict=True)):
         table = _Slice(data, plane + number * grid.size, problem)
@@ -108,27 +105,26 @@ def _hashable(value: Any) -> Any:
     return tuple(value) if isinstance(value, list) else value
 
 
-def _chosen(grid: Grid, asked: Sequence[str] | None) -> tuple[int, int | None]:
-    """Return the indices of the axes across and upwards; ``None`` if there is only one."""
+def _chosen(grid: Grid, axes: Sequence[str] | None) -> tuple[int, int | None]:
+    """Return the indices of the horizontal and the vertical axis; ``None`` for a single axis."""
     names = [axis.name for axis in grid.axes]
-    if asked is None:
+    if axes is None:
         longest = sorted(range(len(names)), key=lambda k: (-grid.shape[k], k))[:2]
         if not longest:
-            raise InputError(
-                "has no axis that varies", where="grid", hint="read the table with impact_posture.sweep.open"
-            )
+            hint = "read the table with impact_posture.sweep.open"
+            raise InputError("has no axis that varies", where="grid", hint=hint)
         return longest[0], longest[1] if len(longest) > 1 and grid.shape[longest[1]] > 1 else None
-    for name in asked:
+    for name in axes:
         if name not in names:
             hint = f"did you mean {', '.join(nearest(name, names))}?"
             raise InputError(f"no axis '{name}'", where="axes", hint=hint)
-    if not 1 <= len(set(asked)) == len(asked) <= 2:
-        raise InputError(f"names {len(asked)} axes", where="axes", hint="give one or two different ones")
-    return names.index(asked[0]), names.index(asked[1]) if len(asked) > 1 else None
+    if not 1 <= len(set(axes)) == len(axes) <= 2:
+        raise InputError(f"names {len(axes)} axes", where="axes", hint="give one or two different ones")
+    return names.index(axes[0]), names.index(axes[1]) if len(axes) > 1 else None
 
 
 def _plane(grid: Grid, across: int, upwards: int | None) -> NDArray[np.int64]:
-    """Return the points of a map, shape (rows, columns); other axes are at their middle value."""
+    """Return the points of a map, shape (rows, columns), with other axes at their middle values."""
     place: list[Any] = [count // 2 for count in grid.shape]
     place[across] = np.arange(grid.shape[across])
     if upwards is not None:
@@ -137,16 +133,11 @@ def _plane(grid: Grid, across: int, upwards: int | None) -> NDArray[np.int64]:
 
 
 class _Slice:
-    """The points of one map.
-
-    Args:
-        data: The table of the sweep.
-        points: The points of the map, shape (rows, columns).
-        problem: The problem of the case.
+    """Points of one map, in arrays of shape (rows, columns).
 
     Attributes:
-        status: Status of each point; empty where none is solved yet, shape (rows, columns).
-        value: Objectives, NaN where there is none, shape (rows, columns).
+        status: Status of each point; empty for an unsolved point.
+        value: Objectives, NaN for a point without posture.
         switches: Pairs of neighbors ``(row, column), (row, column)`` between which the best posture switches.
     """
 
@@ -166,18 +157,18 @@ class _Slice:
 
 def _switches(postures: Sequence[Sequence[Array | None]], problem: ConstrainedProblem) -> list[tuple[Any, Any]]:
     steps = []
-    # The base of a robot that floats follows the target, which is no switch.
-    own = slice(3, None) if problem.robot.floating else slice(None)
+    # The base of a floating robot follows the target, so its position does not count.
+    first = 3 if problem.robot.floating else 0
     for row, line in enumerate(postures):
         for column, q in enumerate(line):
             for other in ((row, column + 1), (row + 1, column)):
                 if other[0] < len(postures) and other[1] < len(line) and q is not None:
                     next_to = postures[other[0]][other[1]]
                     if next_to is not None:
-                        size = float(np.linalg.norm(wrapped_difference(problem, q, next_to)[own]))
+                        size = float(np.linalg.norm(wrapped_difference(problem, q, next_to)[first:]))
                         steps.append((size, (row, column), other))
     usual = float(np.quantile([size for size, _, _ in steps], 0.25)) if steps else 0.0
-    return [(one, other) for size, one, other in steps if size > max(SWITCH, _UNUSUAL * usual)]
+    return [(cell, other) for size, cell, other in steps if size > max(SWITCH, _UNUSUAL * usual)]
 
 
 def _best(data: Any, grid: Grid, number: int, values: dict[str, Any]) -> list[dict[str, Any]]:
@@ -219,11 +210,11 @@ def _draw(
         notes.append(f"{missing} points are not solved yet.")
     with framed("Objective of the best posture", [facts], 1.4 + min(3.4, 0.45 * rows), notes) as (figure, body):
         panel = body.subplots()
-        found = table.value[np.isfinite(table.value)]
-        wide = found.size > 0 and found.min() > 0 and found.max() > _WIDE * found.min()
+        known = table.value[np.isfinite(table.value)]
+        wide = known.size > 0 and known.min() > 0 and known.max() > _WIDE * known.min()
         edges = np.arange(columns + 1) - 0.5, np.arange(rows + 1) - 0.5
         drawn = panel.pcolormesh(*edges, np.ma.masked_invalid(table.value), norm=LogNorm() if wide else None)
-        if found.size:
+        if known.size:
             body.colorbar(drawn, ax=panel, label="objective")
         handles: list[Any] = []
         for status, hatch in _HATCH.items():
@@ -237,7 +228,7 @@ def _draw(
             lines = [_edge(*pair) for pair in table.switches]
             panel.add_collection(LineCollection(lines, colors=VERMILLION, linewidths=1.8))
             handles.append(Line2D([], [], color=VERMILLION, linewidth=1.8, label="switch to another optimum"))
-        if found.size:
+        if known.size:
             row, column = np.unravel_index(np.nanargmin(table.value), table.value.shape)
             handles += panel.plot(
                 column, row, marker="*", markersize=9, color="white", markeredgecolor=INK, linestyle="none",
@@ -253,22 +244,22 @@ def _draw(
         return save(figure, path.parent, path.name, formats)
 
 
-def _edge(one: tuple[int, int], other: tuple[int, int]) -> list[tuple[float, float]]:
+def _edge(cell: tuple[int, int], other: tuple[int, int]) -> list[tuple[float, float]]:
     """Return the border between two cells."""
-    row, column = (np.array(one) + np.array(other)) / 2
-    if one[0] == other[0]:
+    row, column = (np.array(cell) + np.array(other)) / 2
+    if cell[0] == other[0]:
         return [(column, row - 0.5), (column, row + 0.5)]
     return [(column - 0.5, row), (column + 0.5, row)]
 
 
-def _label(axis: Any, own: Axis) -> None:
-    """Label an axis of a panel with a few of its values."""
-    count = len(own.values)
+def _label(axis: Any, grid_axis: Axis) -> None:
+    """Label an axis of a panel with a few values of a grid axis."""
+    count = len(grid_axis.values)
     shown = np.unique(np.linspace(0, count - 1, min(count, _TICKS)).round().astype(int))
-    # Entries of a vector stand below each other on the axis across, where long labels would meet.
-    space = "\n" if axis.axis_name == "x" and isinstance(own.values[0], tuple) else " "
-    axis.set_ticks(shown, [plot_label(_short(own.values[k])).replace(" ", space) for k in shown])
-    axis.set_label_text(plot_label(own.name + (" offset, m" if own.name in "xyz" else "")))
+    # On the horizontal axis, long labels would overlap, so the entries of a vector are one below the other.
+    space = "\n" if axis.axis_name == "x" and isinstance(grid_axis.values[0], tuple) else " "
+    axis.set_ticks(shown, [plot_label(_short(grid_axis.values[k])).replace(" ", space) for k in shown])
+    axis.set_label_text(plot_label(grid_axis.name + (" offset, m" if grid_axis.name in "xyz" else "")))
 
 
 def _short(value: Any) -> str:

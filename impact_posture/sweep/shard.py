@@ -1,4 +1,4 @@
-"""Solve a shard in two passes: what a worker gets, and the Parquet file that it returns."""
+"""Solution of a shard in two passes.  Workers return the shard as a Parquet file."""
 
 from __future__ import annotations
 
@@ -19,11 +19,11 @@ from impact_posture.sweep.shard_table import STATUS, read_shard, write_shard
 from impact_posture.sweep.sweep_file import Sweep
 from impact_posture.system.arrays import Array
 
-# MUMPS, within IPOPT, is not made for threads; a worker with several takes its shards one after the other.
+# MUMPS, within IPOPT, is not thread-safe, so a worker with several threads solves one shard at a time.
 _ALONE = threading.Lock()
 # Cases whose robots and programs a worker keeps.
 _KEPT = 4
-# Problems of a shard that may have grown.
+# Walks that a shard keeps.
 _KEPT_WALKS = 64
 _SOLVERS: OrderedDict[tuple[str, int], CaseSolver] = OrderedDict()
 
@@ -34,7 +34,7 @@ class ShardResult:
 
     Attributes:
         index: Index of the shard.
-        content: Its Parquet file.
+        content: Parquet file of the shard.
         counts: Number of points of each status.
         solver_s: Wall time within IPOPT and the functions that it calls, s.
         total_s: Wall time of the pass, s.
@@ -48,7 +48,7 @@ class ShardResult:
 
 
 def solve_shard(sweep: Sweep, key: str, index: int) -> ShardResult:
-    """Solve all points of a shard, each from its fixed predecessors.
+    """Solve all points of a shard, each from its neighbors before it.
 
     Args:
         sweep: The sweep.
@@ -64,14 +64,14 @@ def solve_shard(sweep: Sweep, key: str, index: int) -> ShardResult:
 def revise_shard(
     sweep: Sweep, key: str, index: int, content: bytes, beside: Mapping[int, list[float]]
 ) -> ShardResult:
-    """Improve the points of a solved shard by the postures that neighboring shards have next to it.
+    """Improve the points of a solved shard from the postures of neighboring shards.
 
     Args:
         sweep: The sweep.
         key: Hash of the sweep, its robots and this version.
         index: Index of the shard.
-        content: Its file after the first pass.
-        beside: Postures after the first pass at the points of other shards that are neighbors of this one.
+        content: File of the shard after the first pass.
+        beside: Postures after the first pass at the neighboring points in other shards.
 
     Raises:
         ImpactPostureError: A setting is wrong.
@@ -82,7 +82,7 @@ def revise_shard(
 def _passed(
     sweep: Sweep, key: str, index: int, passes: int, known: list[PointResult], work: Callable[[_Shard], None]
 ) -> ShardResult:
-    """Work on the known answers of a shard."""
+    """Run a pass over a shard with known results."""
     with _ALONE, one_blas_thread():
         began = time.perf_counter()
         case, points = sweep.span(index)
@@ -92,39 +92,30 @@ def _passed(
         shard = _Shard(sweep, solver, points, known)
         work(shard)
         content = write_shard(sweep, key, index, passes, shard.results, shard.predicted)
-        counts = {status: sum(one.row["status"] == status for one in shard.results) for status in STATUS}
+        counts = {status: sum(point.row["status"] == status for point in shard.results) for status in STATUS}
         return ShardResult(index, content, counts, solver.timer.solver_s, time.perf_counter() - began)
 
 
 class _Shard:
-    """The points of a shard and their answers.
-
-    Args:
-        sweep: The sweep.
-        solver: Robot and programs of the case.
-        points: Indices of its points.
-        results: What is known of the first of them.
-
-    Attributes:
-        results: The answers so far.
-    """
+    """Points of a shard, with the results of the first ones so far."""
 
     def __init__(self, sweep: Sweep, solver: CaseSolver, points: range, results: list[PointResult]) -> None:
         self._grid, self._solver, self._points, self.results = sweep.grid, solver, points, results
         self._walks: OrderedDict[int, Walk] = OrderedDict()
 
     def solve(self) -> None:
-        """Solve each point from the neighbors before it, then look back from the neighbors after it."""
+        """Solve each point from the neighbors before it, then improve it from the neighbors after it."""
         grid, first = self._grid, self._points.start
-        for point, own in self._own_problems():
-            if not own:
+        for point, is_new in self._problems():
+            if not is_new:
                 self.results.append(self.results[-1])
                 continue
             before = [self.results[k - first] for k in grid.neighbors(point, first)]
-            guesses = [one.start for one in before if one.start is not None]
-            beside = 0.0 if guesses else min((one.violation for one in before if one.violation), default=0.0)
+            guesses = [result.start for result in before if result.start is not None]
+            violations = [result.violation for result in before if result.violation]
+            beside = 0.0 if guesses else min(violations, default=0.0)
             self.results.append(search(*self._at(point), guesses, beside))
-        # An optimum that appears on the way may have been the better one already before.
+        # A later optimum may be better at earlier points too.
         for point in reversed(self._points):
             start = self.results[point - first].start
             if start is not None:
@@ -133,10 +124,10 @@ class _Shard:
         self._share()
 
     def revise(self, beside: Mapping[int, list[float]]) -> None:
-        """Improve the points at the border by postures of other shards, and the others by points that improved."""
+        """Improve border points from postures of other shards, and other points from improved points."""
         improved = set[int]()
 
-        def look(points: Iterable[int], starts: Callable[[int], Start | None]) -> None:
+        def improve_from_neighbors(points: Iterable[int], starts: Callable[[int], Start | None]) -> None:
             for point in points:
                 for other in self._grid.around(point):
                     start = starts(other)
@@ -151,20 +142,20 @@ class _Shard:
                 return here(other)
             return Start(np.array(beside[other])) if other in beside else None
 
-        own = [point for point, own in self._own_problems() if own]
-        look(own, anywhere)
-        look(reversed(own), here)
+        points = [point for point, is_new in self._problems() if is_new]
+        improve_from_neighbors(points, anywhere)
+        improve_from_neighbors(reversed(points), here)
         self._share()
 
     def predicted(self, values: Mapping[str, Any], q: Array, row: Mapping[str, Any]) -> dict[str, float | None]:
-        """Return the columns that depend on the posture and on the normal or the speed at a point."""
-        chosen = self._solver.normal_and_speed(values)
-        impact = self._solver.template(*chosen).impact
+        """Return the predicted impulse, jump and attainable speed at a point."""
+        choice = self._solver.normal_and_speed(values)
+        impact = self._solver.template(*choice).impact
         approach = (1 + impact.restitution) * impact.speed
         return {
             "predicted_impulse": approach / row["G"],
             "predicted_jump": approach * row["V"] ** 0.5,
-            "attainable_speed": self._solver.attainable(*chosen).reached(q),
+            "attainable_speed": self._solver.attainable(*choice).reached(q),
         }
 
     def _at(self, point: int) -> tuple[Walk, Place]:
@@ -173,10 +164,10 @@ class _Shard:
         walk = kept(self._walks, id(prepared.problem), partial(self._solver.walk, prepared.problem), _KEPT_WALKS)
         return walk, self._solver.target(values)
 
-    def _own_problems(self) -> Iterator[tuple[int, bool]]:
-        """Yield each point, and whether it is another problem than the one before it.
+    def _problems(self) -> Iterator[tuple[int, bool]]:
+        """Yield each point, and whether its problem differs from the problem of the point before it.
 
-        Where only the speed differs, and the problem does not see it, it is the same.
+        Points that differ only in the speed have the same problem, unless a requirement depends on the speed.
         """
         last: tuple[Walk, Place] | None = None
         for point in self._points:
@@ -185,16 +176,16 @@ class _Shard:
             last = walk, place
 
     def _improve(self, point: int, start: Start) -> bool:
-        """Improve a point from the posture of a neighbor; say whether that did."""
+        """Improve a point from the posture of a neighbor.  Return whether it improved."""
         index = point - self._points.start
         known = self.results[index]
         self.results[index] = improve(*self._at(point), known, start)
         return self.results[index] is not known
 
     def _share(self) -> None:
-        """Give the points that are the same problem as the one before them its answer."""
-        # The first speed has the most neighbors of its own.
-        for point, own in self._own_problems():
-            if not own:
+        """Copy the result of a point to the points after it with the same problem."""
+        # The first speed has the most neighbors.
+        for point, is_new in self._problems():
+            if not is_new:
                 index = point - self._points.start
                 self.results[index] = self.results[index - 1]

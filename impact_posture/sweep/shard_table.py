@@ -1,4 +1,4 @@
-"""The table of a shard: a Parquet file with a row for each point."""
+"""Table of a shard: a Parquet file with a row for each point."""
 
 from __future__ import annotations
 
@@ -30,11 +30,11 @@ def write_shard(
 
     Args:
         sweep: The sweep.
-        key: Its hash.
+        key: Hash of the sweep.
         index: Index of the shard.
-        passes: Number of passes that the shard has had.
-        results: The answers to its points.
-        predicted: Returns the columns that follow from the values of a point, its posture and its other columns.
+        passes: Number of passes over the shard.
+        results: Results of its points.
+        predicted: Returns the predicted columns from the values of a point, its posture and its other columns.
     """
     import pyarrow as pa
     from pyarrow import parquet
@@ -43,12 +43,12 @@ def write_shard(
     axes = (*sweep.outer, *sweep.grid.axes)
     kinds = {axis.name: _kind(axis) for axis in axes}
     number, text, count = pa.float64(), pa.string(), pa.int32()
-    own = [("status", text), ("reason", text), ("q", pa.list_(number)), *[(name, number) for name in NUMBERS]]
-    columns = [("point", pa.int64()), *kinds.items(), *own, ("optima", count), ("runs", count)]
+    outputs = [("status", text), ("reason", text), ("q", pa.list_(number)), *[(name, number) for name in NUMBERS]]
+    columns = [("point", pa.int64()), *kinds.items(), *outputs, ("optima", count), ("runs", count)]
     rows = []
     for point, result in zip(points, results, strict=True):
         values = {**sweep.grid.values(point), **sweep.cases[case].values}
-        # A value that Arrow has no plain type for is JSON.
+        # Values without a plain Arrow type are stored as JSON.
         odd = {name: json.dumps(v) for name, v in values.items() if kinds[name] == text and not isinstance(v, str)}
         rows.append({"point": case * sweep.grid.size + point, **values, **odd, **result.row})
         if result.q is not None:
@@ -60,16 +60,16 @@ def write_shard(
 
 
 def read_shard(content: bytes) -> list[PointResult]:
-    """Return the answers in the file of a shard."""
+    """Return the results in the file of a shard."""
     import pyarrow as pa
     from pyarrow import parquet
 
     columns = ["status", "reason", "q", *(name for name in NUMBERS if name not in PREDICTED), "optima", "runs"]
-    found = []
+    results = []
     for row in parquet.read_table(pa.BufferReader(content), columns=columns).to_pylist():
         known = {name: value for name, value in row.items() if value is not None}
-        found.append(PointResult(known, Start(np.array(known["q"])) if "q" in known else None))
-    return found
+        results.append(PointResult(known, Start(np.array(known["q"])) if "q" in known else None))
+    return results
 
 
 def read_postures(content: bytes) -> list[list[float] | None]:
@@ -77,19 +77,19 @@ def read_postures(content: bytes) -> list[list[float] | None]:
     import pyarrow as pa
     from pyarrow import parquet
 
-    found: list[list[float] | None] = parquet.read_table(pa.BufferReader(content), columns=["q"])["q"].to_pylist()
-    return found
+    q: list[list[float] | None] = parquet.read_table(pa.BufferReader(content), columns=["q"])["q"].to_pylist()
+    return q
 
 
 def passes_of(path: Path, key: str, points: int) -> int:
-    """Return how many passes the shard in a file has had; 0 if it is no whole file of the sweep."""
+    """Return the number of passes over the shard in a file; 0 if it is not a complete file of the sweep."""
     from pyarrow import ArrowException, parquet
 
     try:
-        found = parquet.read_metadata(path)
-        about = found.metadata or {}
-        own = found.num_rows == points and about.get(b"sweep") == key.encode()
-        return int(about[b"passes"]) if own else 0
+        table = parquet.read_metadata(path)
+        metadata = table.metadata or {}
+        fits = table.num_rows == points and metadata.get(b"sweep") == key.encode()
+        return int(metadata[b"passes"]) if fits else 0
     except (OSError, ArrowException, LookupError, ValueError):
         return 0
 

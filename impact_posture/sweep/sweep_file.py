@@ -1,4 +1,4 @@
-"""``SWEEP.toml``: one posture problem, and the values that vary over a grid, in the order of its points."""
+"""Content of ``SWEEP.toml``: one posture problem, and the values that vary over a grid."""
 
 from __future__ import annotations
 
@@ -19,28 +19,28 @@ from impact_posture.errors import SpecError, nearest, printable
 from impact_posture.impact.impact_contact import LARGEST
 from impact_posture.robot.robot_loader import from_folder
 
-# Axes that one program serves, from the slowest to the fastest.  ``x``, ``y`` and ``z`` are offsets of the target.
+# Axes that share one program, from the slowest to the fastest.  ``x``, ``y`` and ``z`` are offsets of the target.
 OFFSETS = ("x", "y", "z")
 _INNER = ("normal", "target_quaternion", "target_position", *OFFSETS, "speed")
-# Settings that belong to one optimization, to its search or to its output.
+# Settings of the search or the output, which cannot vary.
 _NO_AXIS = ("schema", "q", "starts", "seed", "tradeoff", "tradeoff_against", "path", "search", "finish_all",
             "contact")  # fmt: skip
 _FILES = ("srdf", "config", "weights", "armature", "posture")
-# Most points of a grid, which keeps every index a 64-bit integer.
+# Most points of a grid, so that every index is a 64-bit integer.
 _MOST = 10**15
-# Most combinations of values that need a program of their own.  The settings of each stay in memory.
+# Most combinations of values that need separate programs, because the settings of all of them are in memory.
 _MOST_CASES = 10**5
-# Neighbors from which a point is warm started: those along the fastest axes.
+# Number of neighbors, along the fastest axes, from which a point is warm started.
 _NEIGHBORS = 2
 
 
 @dataclass(frozen=True)
 class Axis:
-    """One varied value.
+    """Axis of a grid.
 
     Attributes:
-        name: ``x``, ``y`` or ``z`` (an offset, world, meters), or the name of a setting.
-        values: Its values, in the order of the file.
+        name: ``x``, ``y`` or ``z`` (offset of the target, world, m), or the name of a setting.
+        values: Values in the order of the file.
     """
 
     name: str
@@ -49,7 +49,7 @@ class Axis:
 
 @dataclass(frozen=True)
 class Grid:
-    """All combinations of the values of several axes; the last axis varies fastest.
+    """All combinations of the values of several axes.  The last axis varies fastest.
 
     Attributes:
         axes: The axes, from the slowest to the fastest.
@@ -76,20 +76,20 @@ class Grid:
         return {axis.name: axis.values[k] for axis, k in zip(self.axes, self.place(point), strict=True)}
 
     def neighbors(self, point: int, first: int) -> list[int]:
-        """Return the neighbors before ``point`` along the fastest axes, not before ``first``, the nearest first.
+        """Return the nearest neighbors before ``point`` along the fastest axes, not before ``first``.
 
-        They depend on nothing but the grid and the shard, and so do the bytes of the shard.
+        They depend on the grid and the shard only, so the bytes of the shard are reproducible.
         """
         return [other for other in self.around(point) if first <= other < point][:_NEIGHBORS]
 
     def around(self, point: int) -> list[int]:
-        """Return the neighbors along all axes, the fastest first: the one before ``point``, then the one after it."""
-        found: list[int] = []
+        """Return the neighbors along all axes, before and after ``point``, the fastest axis first."""
+        neighbors: list[int] = []
         stride = 1
         for count, k in zip(reversed(self.shape), reversed(self.place(point)), strict=True):
-            found += [point - stride] * (k > 0) + [point + stride] * (k + 1 < count)
+            neighbors += [point - stride] * (k > 0) + [point + stride] * (k + 1 < count)
             stride *= count
-        return found
+        return neighbors
 
 
 @dataclass(frozen=True)
@@ -97,9 +97,9 @@ class SweepSettings(StrictTable):
     """Content of a ``SWEEP.toml``.
 
     Attributes:
-        problem: A table with the keys of a ``problem.toml``, or the path of one.
+        problem: Table with the keys of a ``problem.toml``, or the path of a ``problem.toml``.
         grid: Values of each axis.
-        shard: Points of a shard, which is solved and written as one.
+        shard: Points of a shard, which is solved and written as a unit.
         schema: Name of this format.
     """
 
@@ -111,11 +111,11 @@ class SweepSettings(StrictTable):
 
 @dataclass(frozen=True)
 class Case:
-    """One combination of the values that need a program of their own.
+    """Combination of values that needs a separate program.
 
     Attributes:
         settings: The problem at the first point of the grid.
-        values: Value of each such axis.
+        values: Value of each outer axis.
     """
 
     settings: ProblemSettings
@@ -128,8 +128,8 @@ class Sweep:
 
     Attributes:
         cases: Combinations of robot parameters, objectives and other settings.
-        outer: The axes of these settings.
-        grid: Targets, normals and speeds, the same for every case.
+        outer: Axes of these settings.
+        grid: Targets, normals and speeds, equal for every case.
         shard: Points of a shard.
     """
 
@@ -145,7 +145,7 @@ class Sweep:
 
     @property
     def shards(self) -> int:
-        """Number of shards; no shard has points of two cases."""
+        """Number of shards.  A shard has points of one case only."""
         return len(self.cases) * self.shards_of_case
 
     @property
@@ -155,7 +155,7 @@ class Sweep:
 
     @property
     def passes(self) -> int:
-        """Number of passes over each shard: the second is for what neighboring shards have found."""
+        """Number of passes over each shard.  The second pass uses the optima of neighboring shards."""
         return 1 if self.shards_of_case == 1 else 2
 
     def span(self, shard: int) -> tuple[int, range]:
@@ -165,27 +165,27 @@ class Sweep:
         return case, range(first, min(first + self.shard, self.grid.size))
 
     def beside(self, shard: int) -> dict[int, list[int]]:
-        """Return the neighbors of the points of a shard that are in other shards, by their shard."""
+        """Return the neighbors of the points of a shard in other shards, by shard."""
         case, points = self.span(shard)
-        found: dict[int, list[int]] = {}
+        neighbors: dict[int, list[int]] = {}
         for other in sorted({other for point in points for other in self.grid.around(point)}.difference(points)):
-            found.setdefault(case * self.shards_of_case + other // self.shard, []).append(other)
-        return found
+            neighbors.setdefault(case * self.shards_of_case + other // self.shard, []).append(other)
+        return neighbors
 
 
 def read_sweep(path: Path) -> Sweep:
-    """Read a ``SWEEP.toml``, whose paths are relative to its folder.
+    """Read a ``SWEEP.toml``.  Its paths are relative to its folder.
 
     Raises:
-        SpecError: A key is unknown or missing, or a value does not fit; the first fault, in one line.
+        SpecError: A key is unknown or missing, or a value does not fit.
     """
     settings, folder = validate(SweepSettings, read_toml(path), str(path)), path.resolve().parent
     if isinstance(settings.problem, str):
-        at = folder / settings.problem
-        where, problem = str(at), from_folder(read_toml(at), at.parent, _FILES)
+        file = folder / settings.problem
+        where, problem = str(file), from_folder(read_toml(file), file.parent, _FILES)
     else:
         where, problem = f"{path}: problem", from_folder(settings.problem, folder, _FILES)
-    sizes = {name: _size(given, f"{path}: grid.{name}") for name, given in settings.grid.items()}
+    sizes = {name: _size(table, f"{path}: grid.{name}") for name, table in settings.grid.items()}
     outer = [name for name in sizes if name not in _INNER]
     inner = [name for name in _INNER if name in sizes]
     _check_names([*outer, *inner], f"{path}: grid")
@@ -195,46 +195,46 @@ def read_sweep(path: Path) -> Sweep:
     ):
         if count > most:
             raise SpecError(f"has {count} {words}", where=f"{path}: grid", hint=f"give at most {most:.0e}")
-    values = {name: _values(name, given) for name, given in settings.grid.items()}
+    values = {name: _values(name, table) for name, table in settings.grid.items()}
     if "contact" in problem:
         raise SpecError("a sweep is of one contact", where=f"{where}.contact", hint="give `frame` and `normal`")
     first = {name: values[name][0] for name in inner if name not in OFFSETS}
-    made = validate(ProblemSettings, problem | first | {name: values[name][0] for name in outer}, where)
+    first_settings = validate(ProblemSettings, problem | first | {name: values[name][0] for name in outer}, where)
     axes = tuple(Axis(name, _checked(name, values[name], problem | first, f"{path}: grid")) for name in inner)
     for name in outer:
         _checked(name, values[name], problem | first, f"{path}: grid")
-    if made.tradeoff or made.path or made.search != "multistart":
+    if first_settings.tradeoff or first_settings.path or first_settings.search != "multistart":
         raise SpecError("`tradeoff`, `path` and `search` are for one optimum", where=where, hint="leave them out")
     cases = []
-    for chosen in product(*(values[name] for name in outer)):
-        of_case = dict(zip(outer, chosen, strict=True))
-        own = from_folder(problem | first | of_case, folder, [name for name in _FILES if name in outer])
-        cases.append(Case(validate(ProblemSettings, own, str(path)), of_case))
+    for combination in product(*(values[name] for name in outer)):
+        case = dict(zip(outer, combination, strict=True))
+        table = from_folder(problem | first | case, folder, [name for name in _FILES if name in outer])
+        cases.append(Case(validate(ProblemSettings, table, str(path)), case))
     return Sweep(tuple(cases), tuple(Axis(name, values[name]) for name in outer), Grid(axes), settings.shard)
 
 
-def _size(given: Any, where: str) -> int:
-    """Return the number of values of an axis, a list or ``{from, to, count}``."""
-    if isinstance(given, dict):
-        low, high, count = (given.get(key, "") for key in ("from", "to", "count"))
+def _size(axis: Any, where: str) -> int:
+    """Return the number of values of an axis, which is a list or ``{from, to, count}``."""
+    if isinstance(axis, dict):
+        low, high, count = (axis.get(key, "") for key in ("from", "to", "count"))
         ends = all(type(v) in (int, float) and abs(v) <= LARGEST for v in (low, high))
-        if not ends or set(given) != {"from", "to", "count"} or type(count) is not int or not 2 <= count <= 10**6:
-            raise SpecError("is no range", where=where, hint="give from, to and count (2 to 1e6), or a list")
+        if not ends or set(axis) != {"from", "to", "count"} or type(count) is not int or not 2 <= count <= 10**6:
+            raise SpecError("is not a range", where=where, hint="give from, to and count (2 to 1e6), or a list")
         return count
-    if not isinstance(given, list) or not given:
-        raise SpecError("is no axis", where=where, hint="give a list of values, or { from, to, count }")
-    return len(given)
+    if not isinstance(axis, list) or not axis:
+        raise SpecError("is not an axis", where=where, hint="give a list of values, or { from, to, count }")
+    return len(axis)
 
 
-def _values(name: str, given: Any) -> tuple[Any, ...]:
-    """Return the values of an axis that has a :func:`_size`."""
-    if isinstance(given, dict):
-        low, high, count = given["from"], given["to"], given["count"]
-        # Rounded, so that a tenth is a tenth and zero is zero.
+def _values(name: str, axis: Any) -> tuple[Any, ...]:
+    """Return the values of an axis after the check of :func:`_size`."""
+    if isinstance(axis, dict):
+        low, high, count = axis["from"], axis["to"], axis["count"]
+        # Round, so that a tenth is a tenth and zero is zero.
         even = [low + (high - low) * k / (count - 1) for k in range(count)]
         return tuple(0.0 if abs(v) < 1e-12 * abs(high - low) else float(f"{v:.12g}") for v in even)
-    # A larger integer may be no float.  The demand of the setting refuses it.
-    return tuple(float(v) if name in _INNER and type(v) is int and abs(v) <= LARGEST else v for v in given)
+    # A larger integer may overflow as a float.  The demand of the setting refuses it later.
+    return tuple(float(v) if name in _INNER and type(v) is int and abs(v) <= LARGEST else v for v in axis)
 
 
 def _check_names(names: Sequence[str], where: str) -> None:
@@ -243,25 +243,22 @@ def _check_names(names: Sequence[str], where: str) -> None:
         if name in _NO_AXIS:
             raise SpecError(f"'{name}' cannot vary", where=where, hint="set it in the problem")
         if name not in known:
-            close = ", ".join(nearest(name, known))
-            raise SpecError(
-                f"unknown axis '{printable(name, longest=60)}'", where=where, hint=f"did you mean {close}?"
-            )
+            what, hint = f"unknown axis '{printable(name, longest=60)}'", ", ".join(nearest(name, known))
+            raise SpecError(what, where=where, hint=f"did you mean {hint}?")
 
 
 def _checked(name: str, values: Sequence[Any], problem: dict[str, Any], where: str) -> tuple[Any, ...]:
-    """Return the values as the settings hold them; those of offsets are finite numbers."""
-    # An offset has the demand of one entry of a position.
+    """Return the values as validated settings."""
+    # An offset must be valid as an entry of a position.
     key, wrap = ("target_position", lambda v: [v, 0.0, 0.0]) if name in OFFSETS else (name, lambda v: v)
-    found = []
+    checked = []
     for k, value in enumerate(values):
         try:
-            made = getattr(validate(ProblemSettings, problem | {key: wrap(value)}, where), key)
+            setting = getattr(validate(ProblemSettings, problem | {key: wrap(value)}, where), key)
         except SpecError as error:
-            raise SpecError(
-                error.what.replace(f"'{key}", f"'{name}"), where=f"{where}.{name}[{k}]", hint=error.hint
-            ) from None
-        found.append(made[0] if name in OFFSETS else made)
-    if len(set(map(repr, found))) < len(found):
+            what = error.what.replace(f"'{key}", f"'{name}")
+            raise SpecError(what, where=f"{where}.{name}[{k}]", hint=error.hint) from None
+        checked.append(setting[0] if name in OFFSETS else setting)
+    if len(set(map(repr, checked))) < len(checked):
         raise SpecError("has a value twice", where=f"{where}.{name}", hint="leave one of them out")
-    return tuple(found)
+    return tuple(checked)

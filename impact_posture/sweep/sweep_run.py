@@ -1,4 +1,4 @@
-"""Run a sweep on an executor, and write each shard when it is done."""
+"""Run of a sweep on an executor, which writes each shard when it is solved."""
 
 from __future__ import annotations
 
@@ -15,21 +15,21 @@ from impact_posture.sweep.shard_table import STATUS
 from impact_posture.sweep.sweep_file import Sweep
 
 Progress = Callable[[int, int], None]
-# Shards that are submitted and not yet written.  More cost memory, fewer leave workers idle.
+# Shards that are submitted and not yet written.  More shards need memory, fewer leave workers idle.
 IN_HAND = 64
 
 
 @dataclass(frozen=True)
 class SweepRun:
-    """What a run has done.
+    """Result of a run of a sweep.
 
     Attributes:
         folder: The sweep folder.
         points: Number of problems of the sweep.
         counts: Number of points of each status in the shards that this run finished.
-        shards: Shards that this run finished.
-        solver_s: Wall time of the workers within IPOPT, s, added up.
-        total_s: Wall time of all shards, s, added up.
+        shards: Number of shards that this run finished.
+        solver_s: Sum of the wall times of the workers within IPOPT, s.
+        total_s: Sum of the wall times of all shards, s.
     """
 
     folder: Path
@@ -48,23 +48,22 @@ def run_sweep(
     progress: Progress | None = None,
     in_hand: int = IN_HAND,
 ) -> SweepRun:
-    """Solve all shards that the folder lacks, and write them.
+    """Solve all shards that are missing in the folder, and write them.
 
-    The bytes of a shard depend on the sweep alone, and not on what runs it.
+    The bytes of a shard depend on the sweep only, not on the executor.
 
     Args:
         sweep: The sweep.
-        folder: The folder; an unfinished one of the same sweep is gone on with.
-        executor: What runs the shards: anything that implements ``concurrent.futures.Executor``; ``None`` for this
-            process.
-        progress: Called with the points that are done and all of them, of what was left to do; with several shards a
-            case, every point is counted twice.
+        folder: The folder.  An unfinished folder of the same sweep is continued.
+        executor: A ``concurrent.futures.Executor``; ``None`` for this process.
+        progress: Callback with the number of solved points and of points to solve.  With several shards in a case,
+            every point counts twice.
         in_hand: Most shards that are submitted at once.
 
     Raises:
         InputError: pyarrow is not installed, or a setting does not fit the robot.
-        OutputError: The folder holds something else, or cannot be written.
-        WorkerDied: A worker of a pool was killed; another run goes on where this one ended.
+        OutputError: The folder has other content, or cannot be written.
+        WorkerDied: A worker of a pool was killed.  Another run continues the sweep.
     """
     check_package("pyarrow", "sweep")
     key = sweep_key(sweep)
@@ -96,18 +95,18 @@ def run_sweep(
 
 
 def _results(tasks: Iterable[tuple[Any, ...]], executor: Executor | None, in_hand: int) -> Iterator[ShardResult]:
-    """Yield the shards in the order in which they finish; a task is a function and its arguments."""
+    """Yield the shards in the order in which they finish.  A task is a function with its arguments."""
     if executor is None:
         yield from (function(*values) for function, *values in tasks)
         return
     left, pending = iter(tasks), set[Future[ShardResult]]()
     submit_all = getattr(executor, "submit_all", None)
     while True:
-        next_ones = [task for _, task in zip(range(in_hand - len(pending)), left, strict=False)]
-        if submit_all and next_ones:
-            pending |= set(submit_all(next_ones))
+        batch = [task for _, task in zip(range(in_hand - len(pending)), left, strict=False)]
+        if submit_all and batch:
+            pending |= set(submit_all(batch))
         else:
-            pending |= {executor.submit(*task) for task in next_ones}
+            pending |= {executor.submit(*task) for task in batch}
         if not pending:
             return
         finished, pending = wait(pending, return_when=FIRST_COMPLETED)

@@ -1,1 +1,1 @@
-"""Every way of computing an impact's quantities, side by side."""
+"""Comparison of several computations of the quantities of an impact."""

@@ -1,4 +1,4 @@
-"""Sources that compute the same quantities of an impact by different means, and the postures at which they do."""
+"""Sources that compute the quantities of an impact by different means, and random samples for them."""
 
 from __future__ import annotations
 
@@ -24,8 +24,8 @@ from impact_posture.system.scratch_folder import scratch_folder
 
 # First step of the finite differences, and their number, each half of the one before.
 _FIRST_STEP, _LEVELS = 0.02, 7
-# H, G and ∇H vanish where the contact cannot move along n.  Their errors are relative to this share of their largest
-# value over all normals.
+# H, G and ∇H vanish where the contact cannot move along n.  So the scale of their errors is at least this share of
+# their largest value over all normals.
 _FLOOR = 1e-3
 
 
@@ -43,12 +43,17 @@ class PostureSample:
 
 
 def random_samples(robot: Robot, count: int, seed: int, normal: Array | None = None) -> tuple[PostureSample, ...]:
-    """Return random postures, each with a random normal; one seed gives one result.
-
-    The first sample has ``normal``, shape (3,), if it is given.
+    """Return random postures with random normals, which depend on the seed only.
 
     Joints are uniform within their limits.  Without limits, angles are within ±π and lengths within 1 m of the
-    default posture, and orientations are uniform.  A limit missing on one side lies as far from the default posture.
+    default posture, and orientations are uniform.  A limit that is missing on
+    one side is at this distance from the default posture.
+
+    Args:
+        robot: The robot.
+        count: Number of samples.
+        seed: The seed.
+        normal: Normal of the first sample, shape (3,).
     """
     generator, chart = np.random.default_rng(seed), Chart(robot.model)
     start = chart.to_x(robot.posture())
@@ -59,18 +64,18 @@ def random_samples(robot: Robot, count: int, seed: int, normal: Array | None = N
             reach[slot.x.stop - 1] = np.pi
     lower = np.where(np.isfinite(lower), lower, np.minimum(start, upper) - reach)
     upper = np.where(np.isfinite(upper), upper, np.maximum(start, lower) + reach)
-    found = []
+    samples = []
     for k in range(count):
         x = generator.uniform(lower, upper)
         for quaternion in chart.quaternion_slices():
             x[quaternion] = _direction(generator, 4)
         drawn = _direction(generator, 3)
-        found.append(PostureSample(chart.to_q(x), drawn if k or normal is None else normal))
-    return tuple(found)
+        samples.append(PostureSample(chart.to_q(x), drawn if k or normal is None else normal))
+    return tuple(samples)
 
 
 def _direction(generator: np.random.Generator, size: int) -> Array:
-    """Return a unit vector, uniform on the sphere."""
+    """Return a uniformly distributed unit vector."""
     vector = generator.normal(size=size)
     return np.asarray(vector / np.linalg.norm(vector))
 
@@ -80,8 +85,8 @@ class Numbers:
     """Quantities of one source at one sample: ``H``, ``G``, ``Λ_c``, ``∇H``, ``M``, ``J``.
 
     Attributes:
-        values: Array of each quantity; a source need not have all.
-        scales: Least scale of the relative error of each quantity; its largest entry replaces a smaller scale.
+        values: Array of each quantity that the source computes.
+        scales: Least scale of the relative error of each quantity.  The largest entry replaces a smaller scale.
     """
 
     values: dict[str, Array]
@@ -92,23 +97,23 @@ Source = Callable[[PostureSample], Numbers]
 
 
 def pinocchio_numbers(objective: WorstCaseObjective, sample: PostureSample) -> Numbers:
-    """Return the reference, from ``M``, ``J`` and derivatives of Pinocchio by dense linear algebra."""
+    """Return the reference from ``M``, ``J`` and derivatives of Pinocchio by dense linear algebra."""
     oracle = oracle_along(objective, sample.normal)
-    found = oracle.quantities(sample.q)
+    quantities = oracle.quantities(sample.q)
     values = {
-        "H": np.array([found.H]),
-        "G": np.array([found.G]),
-        "Λ_c": found.ellipsoid,
+        "H": np.array([quantities.H]),
+        "G": np.array([quantities.G]),
+        "Λ_c": quantities.ellipsoid,
         "∇H": oracle.gradient_H(sample.q),
         "M": oracle.M,
         "J": oracle.J,
     }
-    of_H, of_G = (_FLOOR * float(np.abs(matrix).max()) for matrix in (found.ellipsoid, found.mobility))
+    of_H, of_G = (_FLOOR * float(np.abs(matrix).max()) for matrix in (quantities.ellipsoid, quantities.mobility))
     return Numbers(values, {"H": of_H, "∇H": of_H, "G": of_G})
 
 
 def pinocchio_differences(objective: WorstCaseObjective, sample: PostureSample) -> Numbers:
-    """Return ``∇H`` as finite differences of ``H`` from Pinocchio."""
+    """Return ``∇H`` from finite differences of ``H`` from Pinocchio."""
     oracle = oracle_along(objective, sample.normal)
 
     def value(q: Array) -> float:
@@ -120,14 +125,14 @@ def pinocchio_differences(objective: WorstCaseObjective, sample: PostureSample) 
 
 
 def casadi_source(objective: WorstCaseObjective) -> Source:
-    """Return the source of the symbolic kernel, interpreted by CasADi."""
+    """Return the source of the symbolic expressions, interpreted by CasADi."""
     reference = casadi_reference(_impulse(objective))
     return lambda sample: _named(reference(sample.q, sample.normal))
 
 
 @contextmanager
 def compiled_source(objective: WorstCaseObjective) -> Iterator[Source]:
-    """Yield the source of the C export, built by the user's compiler in a temporary folder.
+    """Yield the source of the C export, built in a temporary folder.
 
     Raises:
         CompilerError: There is no compiler, or it failed.
@@ -140,7 +145,7 @@ def compiled_source(objective: WorstCaseObjective) -> Iterator[Source]:
             values: dict[str, Array] = {}
             for function in ("eval", "jump", "ellipsoid"):
                 code, results = compiled.call(function, sample.q, sample.normal)
-                # Code 3 of jump says that V does not exist, because G is zero.  G does exist.
+                # Code 3 of `jump` means that V is undefined because G is zero.  The other results are valid.
                 good = code == 0 or (function, code) == ("jump", 3)
                 for name, result in zip(RESULTS[function], results, strict=True):
                     values[name] = result.copy() if good else np.full(result.shape, np.nan)
@@ -150,7 +155,7 @@ def compiled_source(objective: WorstCaseObjective) -> Iterator[Source]:
 
 
 def _impulse(objective: WorstCaseObjective) -> WorstCaseObjective:
-    """Return the objective that exists everywhere; it has the same ``H`` and ``∇H``."""
+    """Return the objective ``impulse``, which is defined everywhere and has the same ``H`` and ``∇H``."""
     return replace(objective, kind="impulse")
 
 
@@ -161,7 +166,7 @@ def _named(values: dict[str, Array]) -> Numbers:
 
 
 class MujocoSource:
-    """``M`` and ``J`` from MuJoCo, and what follows from them by one dense solve."""
+    """Source of ``M`` and ``J`` from MuJoCo.  The other quantities follow from one dense solve."""
 
     def __init__(self, objective: WorstCaseObjective) -> None:
         self._objective = objective
@@ -170,7 +175,7 @@ class MujocoSource:
         self._numeric = MujocoNumeric(model)
 
     def __call__(self, sample: PostureSample) -> Numbers:
-        """Return the numbers at one sample; ``∇H`` by finite differences of this ``H``."""
+        """Return the numbers at one sample, with ``∇H`` from finite differences of ``H``."""
 
         def value(q: Array) -> float:
             return float(self._values(q, sample.normal)["H"][0])
@@ -197,8 +202,8 @@ class MujocoSource:
 def difference_gradient(value: Callable[[Array], float], model: pin.Model, q: Array) -> Array:
     """Return ``d/dε value(q ⊕ ε e_i)``, shape (nv,), by Ridders' extrapolation of central differences.
 
-    Each entry is the one of its tableau that differs least from its neighbors.  So the steps need no tuning, neither
-    to stiff supports nor to a flat direction (Ridders 1982, "Accurate computation of F'(x) and F'(x)F''(x)").
+    Each entry is the extrapolation of its tableau that differs least from its neighbors.  So stiff supports and flat
+    directions need no tuned steps (Ridders 1982, "Accurate computation of F'(x) and F'(x)F''(x)").
 
     Args:
         value: The function.

@@ -37,25 +37,25 @@ CASADI, COMPILED, DIFFERENCES, MUJOCO = "CasADi", "compiled C", "finite differen
 NO_COMPILER = f"no C compiler: {GET_ONE}"
 
 
-# Largest relative errors that pass.  _MODEL is for M and J from MuJoCo, which has the same rigid bodies and solves no
-# system, _VALUES for H, G, Λ_c and gradients by adjoints, and _DIFFERENCES for gradients by finite differences.
+# Largest relative errors that pass: M and J from MuJoCo; H, G, Λ_c and gradients by adjoints; and gradients by finite
+# differences.
 _MODEL, _VALUES, _DIFFERENCES = 1e-9, 1e-9, 1e-8
-# The last two on feet.  Feet at compliance ε make a system of condition 1/ε, which costs digits.
+# The last two for robots on feet, because the compliance ε gives a system with the condition number 1/ε.
 _ON_FEET = 1e-7, 1e-6
 
 
 @dataclass(frozen=True)
 class VerificationRow:
-    """One quantity of one source, compared with the numbers of Pinocchio.
+    """Comparison of a quantity of a source with Pinocchio.
 
     Attributes:
         source: Name of the source.
         quantity: ``H``, ``G``, ``Λ_c``, ``∇H``, ``M`` or ``J``.
-        verdict: ``skipped`` where this machine lacks the source.
-        error: Largest relative error over all samples; ``None`` where there is none or it is not finite.
+        verdict: ``skipped`` if this machine lacks the source.
+        error: Largest relative error over all samples; ``None`` if it is unknown or not finite.
         tolerance: Largest relative error that passes.
         sample: Number of the sample with that error, from 0.
-        entry: Entry of the quantity with that error; empty for a number.
+        entry: Entry of the quantity with that error; empty for a scalar.
         note: Reason of a skip or failure.
     """
 
@@ -71,12 +71,12 @@ class VerificationRow:
 
 @dataclass(frozen=True, eq=False)
 class VerificationReport:
-    """All sources side by side.
+    """Comparison of all sources.
 
     Attributes:
-        rows: The rows, in the order of the sources.
+        rows: Rows in the order of the sources.
         samples: The samples.
-        seed: The seed of the samples.
+        seed: Seed of the samples.
     """
 
     rows: tuple[VerificationRow, ...]
@@ -85,11 +85,11 @@ class VerificationReport:
 
     @property
     def passed(self) -> bool:
-        """Whether no row failed; skipped rows do not count."""
+        """Whether all rows passed; skipped rows do not count."""
         return all(row.verdict != "fail" for row in self.rows)
 
     def to_dict(self) -> dict[str, object]:
-        """Return the JSON content: verdict, rows, and the samples that rows name."""
+        """Return the JSON content: verdict, rows, and the samples that the rows name."""
         named = sorted({row.sample for row in self.rows if row.sample is not None})
         return {
             "passed": self.passed,
@@ -113,23 +113,23 @@ def verify(
 ) -> VerificationReport:
     """Compare ``H``, ``G``, ``Λ_c`` and ``∇H`` from every source with the numbers of Pinocchio.
 
-    The sources are the interpreter of CasADi, the compiled C export if a compiler is there, ``∇H`` by finite
-    differences of ``H`` from Pinocchio, and MuJoCo if it is installed.  MuJoCo gives ``M`` and ``J`` of a model from
-    the same ``pin.Model``, and ``∇H`` is by finite differences of the ``H`` that follows.
+    The sources are the interpreter of CasADi, the C export if there is a compiler, finite differences of ``H`` from
+    Pinocchio for ``∇H``, and MuJoCo if it is installed.  MuJoCo gives ``M`` and ``J`` of a model of the same
+    ``pin.Model``.  ``H`` follows from them, and ``∇H`` from finite differences of this ``H``.
 
     The error of a quantity is relative to its largest entry.  ``H``, ``G`` and ``∇H`` vanish where the contact cannot
-    move along the normal.  So their scale is at least a thousandth of the largest entry of ``Λ_c`` (for ``G`` of
-    ``JM⁻¹Jᵀ``).
+    move along the normal.  So their scale is at least a thousandth of the largest entry of ``Λ_c`` (``JM⁻¹Jᵀ`` for
+    ``G``).
 
     Args:
         objective: Robot, contact, metric and supports.
-        samples: Number of random postures and normals; the first normal is that of the contact.
+        samples: Number of random postures and normals.  The first normal is the normal of the contact.
         seed: Seed of the samples.
-        progress: Receives the number of comparisons done and in all.
+        progress: Callback with (done, all) comparisons.
 
     Raises:
-        InputError: There is no sample, or the seed is negative.
-        CompilerError: The compiler failed; with its words and the command.
+        InputError: ``samples`` is below one, or the seed is negative.
+        CompilerError: The compiler failed.  The error has its output and the command.
     """
     drawn = random_samples(objective.robot, samples, seed, np.array(objective.contact.normal))
     expected = [pinocchio_numbers(objective, sample) for sample in drawn]
@@ -153,21 +153,19 @@ def verify(
             if isinstance(source, VerificationRow):
                 rows.append(source)
                 continue
-            found: list[Numbers] = []
+            numbers: list[Numbers] = []
             for sample in drawn:
-                found.append(source(sample))
+                numbers.append(source(sample))
                 compared += 1
                 if progress is not None:
                     progress(compared, total)
-            rows += [
-                _row(objective.robot, name, quantity, tolerance, found, expected)
-                for quantity, tolerance in tolerances[name].items()
-            ]
+            for quantity, tolerance in tolerances[name].items():
+                rows.append(_row(objective.robot, name, quantity, tolerance, numbers, expected))
     return VerificationReport(tuple(rows), drawn, seed)
 
 
 def _mujoco(objective: WorstCaseObjective) -> Source | VerificationRow:
-    """Return the source of MuJoCo, or the row that says why there is none."""
+    """Return the source of MuJoCo, or a row with the reason why it is missing."""
     try:
         import_mujoco()
     except InputError as error:
@@ -180,12 +178,12 @@ def _mujoco(objective: WorstCaseObjective) -> Source | VerificationRow:
 
 
 def _row(
-    robot: Robot, name: str, quantity: str, tolerance: float, found: Sequence[Numbers], expected: Sequence[Numbers]
+    robot: Robot, name: str, quantity: str, tolerance: float, numbers: Sequence[Numbers], expected: Sequence[Numbers]
 ) -> VerificationRow:
     """Return the row of the worst sample of one quantity."""
     deviations = [
-        deviation(mine.values[quantity], reference.values[quantity], reference.scales.get(quantity, 0.0))
-        for mine, reference in zip(found, expected, strict=True)
+        deviation(actual.values[quantity], reference.values[quantity], reference.scales.get(quantity, 0.0))
+        for actual, reference in zip(numbers, expected, strict=True)
     ]
     worst = max(range(len(deviations)), key=lambda k: deviations[k].error)
     largest = deviations[worst]
@@ -202,14 +200,14 @@ def _row(
     )
 
 
-def _entry(robot: Robot, quantity: str, found: Deviation) -> str:
-    names, axes = robot.tangent_names, "xyz"
+def _entry(robot: Robot, quantity: str, largest: Deviation) -> str:
+    names, axes, index = robot.tangent_names, "xyz", largest.index
     if quantity == "∇H":
-        return names[found.index[0]]
+        return names[index[0]]
     if quantity == "Λ_c":
-        return "".join(axes[k] for k in found.index)
+        return "".join(axes[k] for k in index)
     if quantity == "M":
-        return ", ".join(dict.fromkeys(names[k] for k in found.index))
+        return ", ".join(dict.fromkeys(names[k] for k in index))
     if quantity == "J":
-        return f"{axes[found.index[0]]}, {names[found.index[1]]}"
+        return f"{axes[index[0]]}, {names[index[1]]}"
     return ""
