@@ -1,4 +1,4 @@
-"""Values in the cache of the user.  One that is damaged, or that another user may write, is not used."""
+"""Dataclasses in the cache of the user.  Damaged files, and files that another user may write, are ignored."""
 
 from __future__ import annotations
 
@@ -20,7 +20,7 @@ from impact_posture.system.output_folder import write_whole
 
 _Value = TypeVar("_Value", bound=Hashable)
 
-# The longest text that is read, bytes.  The longest one of the catalogue needs a third of it.
+# Largest file that is read, bytes.  The largest file of a catalogue robot has a third of it.
 _LONGEST = 10_000_000
 
 
@@ -34,11 +34,11 @@ def _unpacked(stored: tuple[str, tuple[int, ...], str]) -> NDArray[Any]:
 
 
 StoredArray = Annotated[NDArray[Any], PlainValidator(_unpacked), PlainSerializer(_packed)]
-"""Annotation of an array in a dataclass that is stored."""
+"""Annotation of an array in a stored dataclass."""
 
 
 def read_stored(kind: str, key: str, cls: type[_Value]) -> _Value | None:
-    """Return the dataclass of a kind and key; ``None`` where no file can be used."""
+    """Return the dataclass of a kind and key, or ``None`` without a valid file."""
     with suppress(OSError, OutputError, TypeError, ValueError):
         path = _path(kind, key)
         check_private(path)

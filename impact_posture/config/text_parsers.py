@@ -22,7 +22,7 @@ def parse_contact(text: str) -> tuple[str, tuple[float, float, float], float | N
             impulse = float(parts.pop())
         x, y, z = (float(v) for v in parts[-1].split(","))
     except ValueError:
-        raise ContactError(f"'{text}' is no contact", where="contact", hint=hint) from None
+        raise ContactError(f"'{text}' is not a contact", where="contact", hint=hint) from None
     frame = ":".join(parts[:-1])
     if not frame:
         raise ContactError(f"'{text}' names no frame", where="contact", hint=hint)
@@ -33,7 +33,7 @@ def parse_armature(texts: Sequence[str]) -> Mapping[str, float] | str | None:
     """Read ``--armature``: ``none``, one file, or any number of ``JOINT=VALUE``.
 
     Raises:
-        InputError: The forms are mixed, or a value is no number.
+        InputError: The forms are mixed, or a value is not a number.
     """
     if not texts:
         return None
@@ -48,7 +48,7 @@ def parse_armature(texts: Sequence[str]) -> Mapping[str, float] | str | None:
             values[joint] = float(value)
         except ValueError:
             raise InputError(
-                f"'{text}' is no JOINT=VALUE", where="armature", hint="give none, one file, or only JOINT=VALUE"
+                f"'{text}' is not JOINT=VALUE", where="armature", hint="give none, one file, or only JOINT=VALUE"
             ) from None
     return values
 
@@ -59,19 +59,16 @@ def parse_payloads(texts: Sequence[str]) -> tuple[tuple[str, float], ...]:
     Raises:
         InputError: A text does not have this form.
     """
-    found = []
+    payloads = []
     for text in texts:
         frame, _, mass = text.rpartition(":")
         try:
-            value = float(mass)
+            payloads.append((frame, float(mass)))
         except ValueError:
-            value = float("nan")
-        if not frame or not value > 0:
-            raise InputError(
-                f"'{text}' is no payload", where="payload", hint="give a frame and kg above zero: FRAME MASS"
-            )
-        found.append((frame, value))
-    return tuple(found)
+            frame = ""
+        if not frame:
+            raise InputError(f"'{text}' is not a payload", where="payload", hint="give a frame and kg: FRAME MASS")
+    return tuple(payloads)
 
 
 def parse_number_or_name(text: str) -> float | str:

@@ -112,7 +112,7 @@ def test_evaluate_tells_contacts_of_one_frame_apart(tmp_path: Path) -> None:
 @pytest.mark.parametrize(
     ("arguments", "code", "said"),
     [
-        (("--contact", "panda_hand:0,0"), 2, "is no contact"),
+        (("--contact", "panda_hand:0,0"), 2, "is not a contact"),
         (("--contact", "panda_hand:0,0,0"), 2, "with a direction"),
         (("--contact", "panda_hand:0,0,1:-1"), 2, "impulse above zero"),
         ((*BOTH, "--normal", 0, 0, 1), 2, "instead of --frame and --normal"),

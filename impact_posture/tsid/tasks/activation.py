@@ -4,6 +4,8 @@ from __future__ import annotations
 
 from enum import Enum
 
+from impact_posture.config.checked import checked
+from impact_posture.config.demand import Positive
 from impact_posture.errors import InputError
 from impact_posture.tsid.smooth_step import smooth
 
@@ -26,6 +28,7 @@ _FOLLOWS = {
 }
 
 
+@checked
 class Activation:
     """Level between 0 and 1 that moves along ``3x² − 2x³`` to the goal of the phase.
 
@@ -40,14 +43,8 @@ class Activation:
         goal: The level to which the phase leads.
     """
 
-    def __init__(self, *, ramp: float = 0.3, live: bool = False) -> None:
-        """Start in FREE.
-
-        Raises:
-            InputError: The ramp is not positive.
-        """
-        if not ramp > 0:
-            raise InputError("the ramp is not positive", where="activation", hint="give seconds above zero")
+    def __init__(self, *, ramp: Positive = 0.3, live: bool = False) -> None:
+        """Start in FREE."""
         self.ramp, self.live = ramp, live
         self.reset()
 

@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import math
 from collections.abc import Callable
-from typing import Any, Literal
+from typing import Annotated, Any, Literal
 
 import numpy as np
 import pinocchio as pin
@@ -12,6 +12,7 @@ from numpy.typing import ArrayLike
 
 from impact_posture.codegen.impact_gradient import ImpactGradient
 from impact_posture.config.checked import checked
+from impact_posture.config.demand import Demand, NonNegative, OneOrMore, Positive
 from impact_posture.errors import InputError, MetricError
 from impact_posture.robot.robot import Robot
 from impact_posture.system.arrays import Array
@@ -58,6 +59,11 @@ def fitting_gradient(robot: Robot, gradient: Gradient | ImpactGradient) -> Gradi
     return gradient_of(gradient)
 
 
+_Fade = Annotated[
+    tuple[float, float], Demand(lambda fade: 0 <= fade[0] < fade[1], "two distances, zero or more, the lower first")
+]
+
+
 @checked
 class ImpactRobustPosture(JointPosture):
     """``ν̇* = K_p (q_des ⊖ q) − K_d ν − α K s(q) ∇H(q)/λ`` (Afifi et al. 2026, impact-robust posture).
@@ -97,14 +103,14 @@ class ImpactRobustPosture(JointPosture):
         gradient: Gradient | ImpactGradient,
         target: ArrayLike | None = None,
         *,
-        K: float = 10.0,
+        K: NonNegative = 10.0,
         name: str = "impact-robust posture",
         spring: Spring = "keep",
-        follow: float = 0.5,
-        reach: float = 2.0,
-        fade: tuple[float, float] = (0.05, 0.20),
-        every: int = 5,
-        scale: float | None = None,
+        follow: Positive = 0.5,
+        reach: Positive = 2.0,
+        fade: _Fade = (0.05, 0.20),
+        every: OneOrMore = 5,
+        scale: Positive | None = None,
         activation: Activation | None = None,
         **gains: Any,
     ) -> None:
@@ -130,9 +136,6 @@ class ImpactRobustPosture(JointPosture):
             ManifestMismatch: The export is of another robot.
         """
         super().__init__(robot, target, name=name, **gains)
-        sound = 0 <= K < math.inf and reach > 0 and follow > 0 and 0 <= fade[0] < fade[1]
-        if not (sound and every >= 1 and (scale or 1) > 0):
-            raise InputError("a gain of the impact-robust term is out of range", where=name, hint="see its docstring")
         self.K, self.scale = float(K), 1.0 if scale is None else float(scale)
         self.activation = activation or Activation()
         self.spring, self.reach, self.every = spring, float(reach), int(every)
