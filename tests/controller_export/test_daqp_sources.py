@@ -1,4 +1,4 @@
-"""The sources of DAQP: found, checked, and refused in one line."""
+"""Sources of DAQP: the download, the checks, and refusals in one line."""
 
 from __future__ import annotations
 

@@ -372,8 +372,8 @@ def test_a_relaxed_answer_is_damped_alike(name: str, torque: float) -> None:
     quadprog, damped = pytest.importorskip("quadprog"), []
 
     def look(controller: Controller, command: Command) -> None:
-        qp, given, solved = controller.assembly.rank.qp, controller.assembly.qp, controller._outcome.solved
-        if command.status is not Status.RELAXED or qp is given or np.array_equal(qp.H, given.H):
+        qp, full, solved = controller.assembly.rank.qp, controller.assembly.qp, controller._outcome.solved
+        if command.status is not Status.RELAXED or qp is full or np.array_equal(qp.H, full.H):
             return
         assert solved is not None
         damped.append(command)
