@@ -135,8 +135,6 @@ class Emitter:
             return f"{work}{'c' if node.op == COSINE else 's'}[{self.layout.trig[k]}]"
         return f"{work}{self._slot(k)}"
 
-    # ---- one block --------------------------------------------------------------------------------------------
-
     def _block(self, number: int, block: Block) -> BlockText:
         names: dict[int, str] = {}
         lines: list[str] = []

@@ -146,11 +146,8 @@ def export(
     objectives = _same_robot(objective)
     robot = objectives[0].robot
     if robot.joint_model == "elastic":
-        raise InputError(
-            "elastic predicts the impact at one posture, and C code holds for all",
-            where="joint_model",
-            hint="export link or reflected",
-        )
+        what = "elastic predicts the impact at one posture, and C code is for all postures"
+        raise InputError(what, where="joint_model", hint="export link or reflected")
     prefix = default_prefix(objectives) if prefix is None else check_prefix(prefix)
     if not out.is_dir():
         raise OutputError("no such folder", where=str(out), hint="create it first")

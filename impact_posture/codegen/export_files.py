@@ -107,9 +107,6 @@ def _parameters(real: Real, sizes: Mapping[str, int], function: str) -> str:
     return ", ".join(parameters)
 
 
-# ---- variables of the templates -----------------------------------------------------------------------------------
-
-
 def _context(
     exported: Sequence[NamedObjective], prefix: str, manifest: dict[str, Any], code: CSource, real: Real
 ) -> dict[str, Any]:

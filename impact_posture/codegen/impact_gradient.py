@@ -136,8 +136,6 @@ class ImpactGradient:
         joints = self.manifest["joint_model"]
         check_robot(self.manifest, robot if joints == robot.joint_model else with_joint_model(robot, joints))
 
-    # ---- one configuration ------------------------------------------------------------------------------------
-
     def call(self, name: str, q: ArrayLike, n: ArrayLike | None = None) -> tuple[int, tuple[Array, ...]]:
         """Call a C function of :data:`~impact_posture.codegen.export_functions.SIGNATURES`.
 
@@ -204,8 +202,6 @@ class ImpactGradient:
         """Return ``Λ_c`` in world axes, a view of shape (3, 3)."""
         return self._results("ellipsoid", q)[0].reshape(3, 3)
 
-    # ---- many configurations ----------------------------------------------------------------------------------
-
     def value_and_gradient_batch(
         self, q: ArrayLike, n: ArrayLike, out: tuple[Array, Array] | None = None
     ) -> tuple[Array, Array]:
@@ -237,8 +233,6 @@ class ImpactGradient:
         pointers = [ctypes.c_void_p(array.ctypes.data) for array in (q, n, H, grad)]
         self._batch(pointers[0], pointers[1], ctypes.c_int(count), pointers[2], pointers[3])
         return H, grad
-
-    # ---- parts ------------------------------------------------------------------------------------------------
 
     def _self_test(self, where: str) -> None:
         test = self._reference

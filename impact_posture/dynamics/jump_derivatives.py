@@ -104,8 +104,6 @@ class JumpDerivatives:
             ca.blockcat([[curvature, mixed.T], [mixed, ca.SX(others, others)]]),
         )
 
-    # ---- blocks -----------------------------------------------------------------------------------------------
-
     def _lies_on(self, ends: Sequence[int], joints: Sequence[int], *, itself: bool = True) -> Array:
         """Return whether each of the ``joints`` (columns) is on the path from a root to each of the ends (rows)."""
         paths = {end: {int(i) for i in self._tree.model.supports[end]} - (set() if itself else {end}) for end in ends}
@@ -130,8 +128,6 @@ class JumpDerivatives:
         for foot, X in zip(self._feet, self._foot_motions, strict=True):
             rows.append(_kept(X @ motions, np.tile(self._lies_on([foot.point.joint], joints), (foot.rows, 1))))
         return ca.vertcat(*rows)
-
-    # ---- the tree in the axes of its roots --------------------------------------------------------------------
 
     @cached_property
     def _places(self) -> dict[int, tuple[ca.SX, ca.SX]]:

@@ -197,9 +197,6 @@ def _unique(name: str, taken: set[str]) -> str:
     return unique
 
 
-# ---- joints -----------------------------------------------------------------------------------------------------
-
-
 def _add_joints(body: Any, model: pin.Model, slot: JointSlot, free: bool, taken: set[str]) -> tuple[str, ...]:
     """Add the MuJoCo joints of a Pinocchio joint to its body and return their names.
 
@@ -243,9 +240,6 @@ def _alike(armature: Array, slot: JointSlot) -> None:
     if armature.size and np.ptp(armature) > 0:
         what = f"the armature of joint '{slot.name}' differs between its axes"
         raise InputError(what, where="MJCF", hint="give it one value")
-
-
-# ---- inertias and sites -----------------------------------------------------------------------------------------
 
 
 def _inertia(inertia: pin.Inertia) -> tuple[dict[str, Any], Array | None]:

@@ -72,8 +72,6 @@ class Response:
 class Tree(Kinematics):
     """Dynamics of a model, with the arguments of :class:`~impact_posture.dynamics.kinematics.Kinematics`."""
 
-    # ---- sweeps -----------------------------------------------------------------------------------------------
-
     def velocities(self, v: ca.SX) -> ByJoint:
         """Return the spatial velocity of every link, in link coordinates, for the generalized velocity ``v``."""
         velocities: ByJoint = {}
@@ -150,8 +148,6 @@ class Tree(Kinematics):
         motion, axes = velocities[point.joint], constant(point.rotation).T
         return ca.vertcat(axes @ (motion[:3] + cross(motion[3:], ca.SX(point.position))), axes @ motion[3:])
 
-    # ---- articulated body -------------------------------------------------------------------------------------
-
     def _inertia_to_parent(self, i: int, inertia: ca.SX) -> ca.SX:
         """Return the symmetric 6×6 (articulated) inertia of link i in the coordinates of its parent."""
         spin = self._spin[i]
@@ -222,8 +218,6 @@ class Tree(Kinematics):
                 rows[i] = spin_power(inertia, x.before[i], y.before[i], axis=spin.axis, sense=spin.sense)
                 forces[0][i], forces[1][i] = x.passed[i], y.passed[i]
         return self._gather([(y.before, forces[0]), (x.before, forces[1])], turning, rows)
-
-    # ---- tangent gradients by adjoints ------------------------------------------------------------------------
 
     def energy_gradient(self, velocities: ByJoint) -> ca.SX:
         """Return the tangent gradient of ``vᵀM(q)v`` for fixed ``v``, without extra inertias, shape (nv,).

@@ -69,10 +69,7 @@ def point_on(robot: Robot, frame: str, offset: Vector3 = (0.0, 0.0, 0.0)) -> Poi
     """
     carrier = robot.model.frames[robot.frame_id(frame)]
     if carrier.parentJoint == 0:
-        raise ContactError(
-            f"frame '{frame}' is welded to the world and cannot move",
-            where=robot.name,
-            hint="choose a frame on a moving link, or `root` free-flyer",
-        )
+        hint = "choose a frame on a moving link, or `root` free-flyer"
+        raise ContactError(f"frame '{frame}' is welded to the world and cannot move", where=robot.name, hint=hint)
     position = carrier.placement.act(np.array(offset, dtype=float))
     return PointOnLink(int(carrier.parentJoint), np.array(position), np.array(carrier.placement.rotation))

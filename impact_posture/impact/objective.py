@@ -42,11 +42,9 @@ class Minimized(Protocol):
     @property
     def attempts(self) -> int:
         """Number of different guesses of :meth:`guess`."""
-        ...
 
     def guess(self, q: Array, scale: float, attempt: int = 0) -> Guess:
         """Return the initial auxiliaries of the lifted form at ``q``, and their bounds."""
-        ...
 
     def value(self, q: Array) -> float:
         """Return the value at ``q``, > 0, computed with Pinocchio.
@@ -54,7 +52,6 @@ class Minimized(Protocol):
         Raises:
             MetricError: The value does not exist at ``q``.
         """
-        ...
 
     def subgradients(self, q: Array, within: float = 0.0) -> Subgradients:
         """Return gradients that span the subdifferential at ``q``, computed with Pinocchio.
@@ -62,11 +59,9 @@ class Minimized(Protocol):
         There is one gradient where the value is smooth.  A member of a maximum contributes its gradient if its value
         is at most ``within`` below the maximum.  The leading member comes first.
         """
-        ...
 
     def lift(self, tree: Tree, parameters: ca.SX, scale: ca.SX) -> Lifted:
         """Return the value in terms of auxiliaries and equations at ``tree.q``; ``scale`` is a typical value."""
-        ...
 
 
 class WorstCase(Minimized, Protocol):
@@ -78,11 +73,9 @@ class WorstCase(Minimized, Protocol):
     @property
     def oracle(self) -> ImpactOracle:
         """The oracle of the leading contact, on the robot as modeled."""
-        ...
 
     def expressions(self, k: ImpactKernel) -> tuple[ca.SX, ca.SX]:
         """Return value and tangent gradient (nv) in the symbols of a kernel of the objective's robot and contact."""
-        ...
 
 
 class Objective(Minimized, Protocol):
@@ -91,37 +84,29 @@ class Objective(Minimized, Protocol):
     @property
     def robot(self) -> Robot:
         """The robot."""
-        ...
 
     @property
     def name(self) -> str:
         """Name in outputs."""
-        ...
 
     @property
     def contacts(self) -> tuple[ImpactContact, ...]:
         """Contacts whose frames the problem constrains; may be empty."""
-        ...
 
     @property
     def supports(self) -> tuple[Support, ...]:
         """Feet that the problem keeps in place; may be empty."""
-        ...
 
     @property
     def structure(self) -> str:
         """Text that identifies the expressions of a robot, as part of the key of the compile cache."""
-        ...
 
     @property
     def parameters(self) -> Array:
         """Parameters of the lifted form, which may change without rebuilding the program, shape (k,)."""
-        ...
 
     def movable(self, q: Array) -> bool:
         """Return whether the contact can move at ``q``; otherwise the value is a rounding error."""
-        ...
 
     def blind_motions(self) -> Array:
         """Return base twists that do not change the value, world axes, linear first, shape (k, 6)."""
-        ...

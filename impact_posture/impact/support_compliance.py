@@ -43,11 +43,8 @@ def check_compliance(robot: Robot, compliance: float) -> None:
     """
     least = least_compliance(robot)
     if not (np.isfinite(compliance) and compliance >= least):
-        raise InputError(
-            f"the compliance is {compliance:g} 1/kg",
-            where="support_compliance",
-            hint=f"give at least {least:.3g}, which is 1e-6 over the mass; stiffer feet are lost in rounding errors",
-        )
+        hint = f"give at least {least:.3g}, which is 1e-6 over the mass; stiffer feet are lost in rounding errors"
+        raise InputError(f"the compliance is {compliance:g} 1/kg", where="support_compliance", hint=hint)
 
 
 def heavy_feet_rounding(robot: Robot, compliance: float) -> float:

@@ -58,11 +58,9 @@ def refuse_held(robot: Robot, contact: ImpactContact, supports: Sequence[Support
             continue
         same_point = float(np.linalg.norm(foot.position - point.position)) < 1e-6
         if support.kind == "surface" or support.frame == contact.frame or same_point:
-            raise ContactError(
-                f"the contact point is held by the support at '{support.frame}'",
-                where=f"frame {contact.frame}",
-                hint="choose another frame, name the other `support` frames, or choose no `support`",
-            )
+            what = f"the contact point is held by the support at '{support.frame}'"
+            hint = "choose another frame, name the other `support` frames, or choose no `support`"
+            raise ContactError(what, where=f"frame {contact.frame}", hint=hint)
 
 
 def refuse_rigid(robot: Robot, supports: Sequence[Support]) -> None:
@@ -72,8 +70,6 @@ def refuse_rigid(robot: Robot, supports: Sequence[Support]) -> None:
         InputError: No joint of the standing robot moves.
     """
     if supports and np.isinf(robot.model.armature[6:]).all():
-        raise InputError(
-            f"all joints of {robot.name} are locked and its feet stay, so nothing moves in an impact",
-            where="joint_model",
-            hint="choose reflected or link, or no `support` for a robot off the ground",
-        )
+        what = f"all joints of {robot.name} are locked and its feet stay, so nothing moves in an impact"
+        hint = "choose reflected or link, or no `support` for a robot off the ground"
+        raise InputError(what, where="joint_model", hint=hint)

@@ -171,8 +171,6 @@ class WorstCaseObjective:
         """Whether the objective is ``λ̄²H`` of the leading contact."""
         return self.impact_kind.symbol == "H" and isinstance(self.worst_case, ImpactKind)
 
-    # ---- symbolic ---------------------------------------------------------------------------------------------
-
     @cached_property
     def kernel(self) -> ImpactKernel:
         """The expressions of H, G, V, S and E with symbols for q and n."""
@@ -206,8 +204,6 @@ class WorstCaseObjective:
     def guess(self, q: Array, scale: float, attempt: int = 0) -> Guess:
         """Return the auxiliaries of :meth:`lift` that solve its equations at ``q``."""
         return self.worst_case.guess(q, scale, attempt)
-
-    # ---- numeric ----------------------------------------------------------------------------------------------
 
     @cached_property
     def oracle(self) -> ImpactOracle:

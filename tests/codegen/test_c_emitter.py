@@ -63,11 +63,11 @@ def test_every_operation_of_the_emitter(tmp_path: Path) -> None:
     run_compiler(command, tmp_path)
     call = ctypes.CDLL(str(library)).f
     for point in ([0.3, 0.7, 0.5], [-0.4, 0.2, -0.9], [2.0, 2.0, 0.0], [1.5, 1.2, 1.0]):
-        found, extra = np.full(len(values), np.nan), np.full(1, np.nan)
-        arrays = [np.array(point), np.zeros(2), found, extra]
+        result, extra = np.full(len(values), np.nan), np.full(1, np.nan)
+        arrays = [np.array(point), np.zeros(2), result, extra]
         call(*[v.ctypes.data_as(ctypes.POINTER(ctypes.c_double)) for v in arrays])
         expected = [np.array(v.full(), dtype=float).ravel() for v in function(point, [0, 0])]
-        np.testing.assert_allclose(found, expected[0], rtol=1e-14)
+        np.testing.assert_allclose(result, expected[0], rtol=1e-14)
         np.testing.assert_allclose(extra, expected[1], rtol=1e-14)
 
 

@@ -116,8 +116,8 @@ def test_gradients_are_those_of_the_values(built: Built) -> None:
         ahead, behind = pin.integrate(robot.model, q, step), pin.integrate(robot.model, q, -step)
         differences[0, i] = (built.library.value(ahead, UNIT)[1] - built.library.value(behind, UNIT)[1]) / (2 * h)
         differences[1, i] = (built.library.objective(ahead)[1] - built.library.objective(behind)[1]) / (2 * h)
-    for found, expected, scale in ((gradient, differences[0], H), (own, differences[1], value)):
-        np.testing.assert_allclose(found, expected, atol=1e-6 * max(np.abs(expected).max(), scale), rtol=0)
+    for result, expected, scale in ((gradient, differences[0], H), (own, differences[1], value)):
+        np.testing.assert_allclose(result, expected, atol=1e-6 * max(np.abs(expected).max(), scale), rtol=0)
 
 
 def test_free_beside_standing(built: Built) -> None:

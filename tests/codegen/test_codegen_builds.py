@@ -119,8 +119,8 @@ def test_several_frames_in_one_library(two: tuple[WorstCaseObjective, ...], tmp_
     assert written.compiled
     assert [b["symbols"]["eval"] for b in written.manifest["frames"]] == ["two_ee_eval", "two_base_link_eval"]
     run([make, "-s", "CFLAGS=-O1 -Wall -Wextra -Werror"], tmp_path)
-    said = run(["./example"], tmp_path)
-    assert "two_ee: H" in said and "two_base_link: H" in said and "agrees" in said
+    output = run(["./example"], tmp_path)
+    assert "two_ee: H" in output and "two_base_link: H" in output and "agrees" in output
     source = (tmp_path / "two.c").read_text()
     assert ("double" in source) == (real is DOUBLE)
     assert ("sinf(" in source) == (real is FLOAT)
@@ -256,8 +256,8 @@ def test_example_under_valgrind(plain_export: Path, tmp_path: Path) -> None:
     valgrind, compiler = need("valgrind"), need_compiler()
     target = tmp_path / "example"
     run_compiler([*compiler, "-std=c99", "-O0", "-g", "example.c", "two.c", "-o", str(target), "-lm"], plain_export)
-    said = run([valgrind, "--error-exitcode=9", "--leak-check=full", str(target)], tmp_path)
-    assert "ERROR SUMMARY: 0 errors" in said and "total heap usage: 1 allocs" in said  # printf's buffer
+    output = run([valgrind, "--error-exitcode=9", "--leak-check=full", str(target)], tmp_path)
+    assert "ERROR SUMMARY: 0 errors" in output and "total heap usage: 1 allocs" in output  # printf's buffer
 
 
 def test_example_under_sanitizers(plain_export: Path, tmp_path: Path) -> None:
@@ -373,7 +373,7 @@ def test_command_for_a_result(tmp_path: Path) -> None:
 
 
 @pytest.mark.parametrize(
-    ("arguments", "code", "said"),
+    ("arguments", "code", "message"),
     [
         (("tilthex_arm",), 2, "--normal"),
         (("tilthexarm", "--normal", "0", "0", "1"), 1, "tilthex_arm"),
@@ -382,9 +382,9 @@ def test_command_for_a_result(tmp_path: Path) -> None:
         (("tilthex_arm", "--normal", "0", "0", "1", "--prefix", "math"), 2, "C header math.h"),
     ],
 )
-def test_command_refuses(tmp_path: Path, arguments: tuple[str, ...], code: int, said: str) -> None:
+def test_command_refuses(tmp_path: Path, arguments: tuple[str, ...], code: int, message: str) -> None:
     done = call(tmp_path, *arguments)
-    assert done.returncode == code and said in done.stderr
+    assert done.returncode == code and message in done.stderr
     assert not list(tmp_path.iterdir())
 
 
@@ -393,16 +393,16 @@ def test_one_library_checks_a_source_with_any_posture(tmp_path: Path, monkeypatc
     monkeypatch.setenv("IMPACT_POSTURE_CACHE", str(tmp_path / "cache"))
     monkeypatch.setenv("CFLAGS", "-O0")
     objective = WorstCaseObjective(load_robot("panda"), ImpactContact("panda_link8", (0, 0, 1)))
-    made = []
+    written = []
     for number, posture in enumerate(sample_postures(objective.robot, 2, 0)):
         (folder := tmp_path / str(number)).mkdir()
-        made.append(export(objective, folder, posture=posture))
-    assert made[0].agreement == made[1].agreement and made[0].manifest != made[1].manifest
+        written.append(export(objective, folder, posture=posture))
+    assert written[0].agreement == written[1].agreement and written[0].manifest != written[1].manifest
     (library,) = (tmp_path / "cache" / "exports").glob("*.so")
     # A damaged library is built again, and where nothing can be kept one is built beside.
     library.unlink()
     library.write_bytes(b"")
-    assert export(objective, folder, posture=posture, force=True).agreement == made[0].agreement
+    assert export(objective, folder, posture=posture, force=True).agreement == written[0].agreement
     assert library.stat().st_size > 1000
     monkeypatch.setenv("IMPACT_POSTURE_CACHE", "/proc/nothing")
-    assert export(objective, folder, posture=posture, force=True).agreement == made[0].agreement
+    assert export(objective, folder, posture=posture, force=True).agreement == written[0].agreement

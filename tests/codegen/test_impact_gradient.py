@@ -60,9 +60,9 @@ def loaded(request: pytest.FixtureRequest, tmp_path_factory: pytest.TempPathFact
     yield Loaded(objectives, gradient, folder, 1e-11 if real is DOUBLE else 1e-3)
 
 
-def close(found: object, expected: object, tolerance: float) -> None:
+def close(values: object, expected: object, tolerance: float) -> None:
     expected = np.asarray(expected, dtype=float)
-    np.testing.assert_allclose(np.asarray(found), expected, rtol=0, atol=tolerance * np.abs(expected).max())
+    np.testing.assert_allclose(np.asarray(values), expected, rtol=0, atol=tolerance * np.abs(expected).max())
 
 
 @pytest.mark.parametrize("k", range(len(FRAMES)))
@@ -203,18 +203,18 @@ def test_another_robot_is_refused_by_name(loaded: Loaded) -> None:
 
 
 @pytest.mark.parametrize(
-    ("key", "value", "said"),
+    ("key", "value", "message"),
     [
         ("convention", "q = w first", "convention is 'q = w first' in the export"),
         ("model_sha256", "0" * 64, "model_sha256 (inertias, placements or axes)"),
     ],
 )
-def test_convention_and_hash(loaded: Loaded, tmp_path: Path, key: str, value: str, said: str) -> None:
+def test_convention_and_hash(loaded: Loaded, tmp_path: Path, key: str, value: str, message: str) -> None:
     folder = shutil.copytree(loaded.folder, tmp_path / "c")
     edit(folder, key, value)
     with pytest.raises(ManifestMismatch) as caught:
         ImpactGradient.load(folder, robot=loaded.objectives[0].robot)
-    assert said in caught.value.line and "\n" not in caught.value.line
+    assert message in caught.value.line and "\n" not in caught.value.line
 
 
 def test_swapped_joints(loaded: Loaded, tmp_path: Path) -> None:

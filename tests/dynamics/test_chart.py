@@ -81,8 +81,8 @@ def test_adjoint_gradients_are_casadis_derivatives_on_the_tangent_space(name: st
     for what, (value, gradient) in cases.items():
         pair = ca.Function("pair", [q], [ca.gradient(value, q).T @ tangent, gradient])
         for at in random_configurations(model, 2, name, what):
-            expected, found = pair(at)
-            assert_close(np.array(found).reshape(1, -1), expected, 1e-11, what)
+            expected, result = pair(at)
+            assert_close(np.array(result).reshape(1, -1), expected, 1e-11, what)
 
 
 @pytest.mark.parametrize("name", [*NAMES, "mixed"])
@@ -95,8 +95,8 @@ def test_chart_round_trip(name: str) -> None:
         coordinates = chart.to_x(q)
         assert coordinates.shape == (chart.nx,)
         assert_close(chart.to_q(coordinates), q, 1e-14, "to_q(to_x(q))")
-        found, norms = configuration_fun(coordinates)
-        assert_close(found, q, 1e-14, "q(x)")
+        result, norms = configuration_fun(coordinates)
+        assert_close(result, q, 1e-14, "q(x)")
         assert np.abs(np.array(norms)).max(initial=0.0) < 1e-14
         assert np.array(norms).size == sum(slot.kind.family in ("free-flyer", "spherical") for slot in chart.slots)
 

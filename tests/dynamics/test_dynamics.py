@@ -40,9 +40,9 @@ OFFSET = np.array([0.03, -0.05, 0.08])
 
 
 def point_at(model: pin.Model, frame: int, offset: Vector = OFFSET) -> PointOnLink:
-    found = model.frames[frame]
-    position = np.array(found.placement.act(offset))
-    return PointOnLink(int(found.parentJoint), position, np.array(found.placement.rotation))
+    carrier = model.frames[frame]
+    position = np.array(carrier.placement.act(offset))
+    return PointOnLink(int(carrier.parentJoint), position, np.array(carrier.placement.rotation))
 
 
 @dataclass(frozen=True)
@@ -108,7 +108,7 @@ def compare(symbolic: Symbolic, q: Vector, generator: np.random.Generator) -> No
     model, frame = symbolic.model, symbolic.frame
     v, u, tau = (generator.normal(size=model.nv) for _ in range(3))
     w = generator.normal(size=6)
-    found = dict(zip(OUTPUTS, (np.array(o) for o in symbolic.all_fun(q, v, u, tau, w)), strict=True))
+    result = dict(zip(OUTPUTS, (np.array(o) for o in symbolic.all_fun(q, v, u, tau, w)), strict=True))
     M, J, placement = mass_matrix(model, q), frame_jacobian(model, q, frame, OFFSET), frame_placement(model, q, frame)
     turned = np.concatenate([placement.rotation @ w[:3], placement.rotation @ w[3:]])
     data = model.createData()
@@ -136,7 +136,7 @@ def compare(symbolic: Symbolic, q: Vector, generator: np.random.Generator) -> No
         "J v": J @ v,
     }
     for name, value in expected.items():
-        assert_close(found[name], value, TOLERANCE, name)
+        assert_close(result[name], value, TOLERANCE, name)
     # Pinocchio's derivative algorithms, which share nothing with the backward sweeps under test.
     numeric, point = Numeric(model).at(q), point_at(model, frame)
     terms = (
@@ -149,7 +149,7 @@ def compare(symbolic: Symbolic, q: Vector, generator: np.random.Generator) -> No
         "gradient of a pair": (sum(gradient for gradient, _ in terms), max(scale for _, scale in terms)),
     }
     for name, (value, scale) in gradients.items():
-        assert_close(found[name], value, TOLERANCE, name, scale)
+        assert_close(result[name], value, TOLERANCE, name, scale)
     quaternion, position = (np.array(o).reshape(-1) for o in symbolic.chart_fun(symbolic.chart.to_x(q)))
     assert abs(np.linalg.norm(quaternion) - 1) < TOLERANCE
     assert_close(pin.Quaternion(quaternion).matrix(), placement.rotation, TOLERANCE, "quaternion")
@@ -161,9 +161,9 @@ def compare(symbolic: Symbolic, q: Vector, generator: np.random.Generator) -> No
 
 @functools.cache
 def symbolic_of(name: str) -> Symbolic:
-    found = robot(name)
-    assert found.spec.contact.frame is not None
-    return build(found.model, found.frame_id(found.spec.contact.frame))
+    loaded = robot(name)
+    assert loaded.spec.contact.frame is not None
+    return build(loaded.model, loaded.frame_id(loaded.spec.contact.frame))
 
 
 @pytest.mark.parametrize("name", NAMES)
@@ -178,9 +178,9 @@ def test_robot_agrees_with_pinocchio(name: str) -> None:
 
 @pytest.mark.parametrize("name", ["solo8", "panda", "kinova", "tilthex_arm"])
 def test_numeric_gradients_are_central_differences(name: str) -> None:
-    found = robot(name)
-    assert found.spec.contact.frame is not None
-    model, frame = found.model, found.frame_id(found.spec.contact.frame)
+    loaded = robot(name)
+    assert loaded.spec.contact.frame is not None
+    model, frame = loaded.model, loaded.frame_id(loaded.spec.contact.frame)
     generator = rng(name, "numeric")
     (q,) = random_configurations(model, 1, name, "numeric")
     left, right, w = generator.normal(size=model.nv), generator.normal(size=model.nv), generator.normal(size=6)
@@ -214,9 +214,9 @@ def test_numeric_gradients_are_central_differences(name: str) -> None:
 
 @pytest.mark.parametrize("name", NAMES)
 def test_numeric_is_pinocchio(name: str) -> None:
-    found = robot(name)
-    assert found.spec.contact.frame is not None
-    model, frame = found.model, found.frame_id(found.spec.contact.frame)
+    loaded = robot(name)
+    assert loaded.spec.contact.frame is not None
+    model, frame = loaded.model, loaded.frame_id(loaded.spec.contact.frame)
     for q in random_configurations(model, 2, name, "is pinocchio"):
         numeric, point = Numeric(model).at(q), point_at(model, frame)
         assert_close(numeric.mass_matrix(), mass_matrix(model, q), TOLERANCE, "M")
@@ -347,8 +347,8 @@ def write_urdf(path: Path, joints: list[tuple[str, str]]) -> Path:
 )
 def test_urdf_joints(tmp_path: Path, joints: list[tuple[str, str]], types: list[str], floating: bool) -> None:
     model, _, _ = build_model(write_urdf(tmp_path / "chain.urdf", joints), free_flyer=floating)
-    made = [joint.shortname().removeprefix("JointModel") for joint in list(model.joints)[1 + floating :]]
-    assert made == types
+    built = [joint.shortname().removeprefix("JointModel") for joint in list(model.joints)[1 + floating :]]
+    assert built == types
     symbolic = build(model, model.getFrameId(f"l{len(joints)}"))
     for k, q in enumerate(random_configurations(model, 2, types, floating)):
         compare(symbolic, q, rng(types, k))
@@ -364,8 +364,8 @@ def test_a_template_inserts_its_arguments_as_if_written_out() -> None:
 
     v, angle = ca.SX.sym("v", 3), ca.SX.sym("angle")
     R = ca.blockcat([[1, 0, 0], [0, ca.cos(angle), -ca.sin(angle)], [0, ca.sin(angle), ca.cos(angle)]])
-    written, found = 2 * (R @ v), turned(R, v, factor=2.0)
-    assert str(found) == str(written)
+    written, result = 2 * (R @ v), turned(R, v, factor=2.0)
+    assert str(result) == str(written)
     assert str(turned(ca.SX.eye(3), v, factor=2.0)) == str(2 * v)
     assert turned(ca.SX(3, 3), v, factor=2.0).is_zero()
     assert times == [2.0], "made again for the same sizes and options"

@@ -54,9 +54,9 @@ def functions_of(program: Program) -> tuple[ca.Function, ca.Function]:
     unknowns = ca.vertcat(program.rows.x, lifted.variables)
     rows = ca.vertcat(program.value, program.rows.norms, lifted.residual, lifted.inequalities)
     results = []
-    for name, found in ("ours", program.fixed), ("theirs", Derivatives.of(rows, unknowns)):
-        arguments = [unknowns, found.multipliers, program.parameters]
-        results.append(ca.Function(name, arguments, [found.jacobian, ca.triu(found.hessian)]))
+    for name, result in ("ours", program.fixed), ("theirs", Derivatives.of(rows, unknowns)):
+        arguments = [unknowns, result.multipliers, program.parameters]
+        results.append(ca.Function(name, arguments, [result.jacobian, ca.triu(result.hessian)]))
     return results[0], results[1]
 
 

@@ -64,20 +64,20 @@ def qacc(layout: MjcfLayout, q: Vector, v: Vector, a: Vector) -> Vector:
     return layout.qvel(q, a + turning)
 
 
-def compare(model: pin.Model, found: InMujoco, q: Vector, generator: np.random.Generator) -> None:
+def compare(model: pin.Model, simulated: InMujoco, q: Vector, generator: np.random.Generator) -> None:
     """Mass matrix, every frame's pose and Jacobian, and accelerations under gravity, velocity and torque."""
-    layout, data = found.written.layout, found.data
+    layout, data = simulated.written.layout, simulated.data
     v, tau = generator.normal(size=model.nv), generator.normal(size=model.nv)
     T = layout.velocity_map(q)
     data.qpos[:], data.qvel[:], data.qfrc_applied[:] = layout.qpos(q), layout.qvel(q, v), T @ tau
-    mujoco.mj_forward(found.model, data)
+    mujoco.mj_forward(simulated.model, data)
     M = np.zeros((model.nv, model.nv))
-    mujoco.mj_fullM(found.model, data, M)
+    mujoco.mj_fullM(simulated.model, data, M)
     assert_close(T.T @ M @ T, mass_matrix(model, q), TOLERANCE, "M")
-    for frame, site in found.written.sites.items():
-        index = mujoco.mj_name2id(found.model, mujoco.mjtObj.mjOBJ_SITE, site)
+    for frame, site in simulated.written.sites.items():
+        index = mujoco.mj_name2id(simulated.model, mujoco.mjtObj.mjOBJ_SITE, site)
         linear, angular = np.zeros((3, model.nv)), np.zeros((3, model.nv))
-        mujoco.mj_jacSite(found.model, data, linear, angular, index)
+        mujoco.mj_jacSite(simulated.model, data, linear, angular, index)
         placement = frame_placement(model, q, frame)
         assert_close(np.vstack([linear, angular]) @ T, frame_jacobian(model, q, frame), TOLERANCE, f"J {site}", 1e-6)
         assert_close(data.site_xpos[index], placement.translation, TOLERANCE, f"position {site}", 1e-6)
@@ -100,18 +100,18 @@ def test_robot_agrees_with_pinocchio(name: str) -> None:
 
 @pytest.mark.parametrize("name", NAMES)
 def test_indices_are_those_of_the_compiled_model(name: str) -> None:
-    model, found = robot(name).model, in_mujoco(name)
-    assert (found.model.nq, found.model.nv) == (found.written.layout.nqpos, model.nv)
-    assert found.model.nbody == model.njoints
-    for slot in found.written.layout.slots:
-        body = found.model.body(found.written.bodies[slot.joint.index])
+    model, simulated = robot(name).model, in_mujoco(name)
+    assert (simulated.model.nq, simulated.model.nv) == (simulated.written.layout.nqpos, model.nv)
+    assert simulated.model.nbody == model.njoints
+    for slot in simulated.written.layout.slots:
+        body = simulated.model.body(simulated.written.bodies[slot.joint.index])
         first = int(body.jntadr[0])
-        assert found.model.jnt_qposadr[first] == slot.qpos.start
-        assert found.model.jnt_dofadr[first] == slot.qvel.start
+        assert simulated.model.jnt_qposadr[first] == slot.qpos.start
+        assert simulated.model.jnt_dofadr[first] == slot.qvel.start
     # A point mass gets 1e-15 kg m² of rotational inertia; nothing else is changed.
-    assert found.model.body_mass.sum() == pytest.approx(pin.computeTotalMass(model), rel=1e-12)
+    assert simulated.model.body_mass.sum() == pytest.approx(pin.computeTotalMass(model), rel=1e-12)
     named = {f.name for f in model.frames} - {"universe"}
-    assert {found.model.site(k).name for k in range(found.model.nsite)} == named
+    assert {simulated.model.site(k).name for k in range(simulated.model.nsite)} == named
 
 
 # ---- every joint ------------------------------------------------------------------------------------------------
@@ -161,15 +161,15 @@ def test_joints_numbered_across_branches() -> None:
         added = model.addJoint(parent, joint, pin.SE3.Random(), f"j{k}")
         model.appendBodyToJoint(added, pin.Inertia.Random(), pin.SE3.Identity())
     model.addFrame(pin.Frame("tip", 4, 0, pin.SE3.Random(), pin.FrameType.OP_FRAME))
-    found = InMujoco(model)
-    assert [slot.joint.index for slot in found.written.layout.slots] == [1, 2, 4, 3, 5]
+    simulated = InMujoco(model)
+    assert [slot.joint.index for slot in simulated.written.layout.slots] == [1, 2, 4, 3, 5]
     (q,) = random_configurations(model, 1, "across")
     # Pinocchio's own CRBA wants depth-first numbers; its ABA does not.
-    layout, data = found.written.layout, found.data
+    layout, data = simulated.written.layout, simulated.data
     v, tau = rng("v").normal(size=model.nv), rng("tau").normal(size=model.nv)
     data.qpos[:], data.qvel[:] = layout.qpos(q), layout.qvel(q, v)
     data.qfrc_applied[:] = layout.velocity_map(q) @ tau
-    mujoco.mj_forward(found.model, data)
+    mujoco.mj_forward(simulated.model, data)
     expected = qacc(layout, q, v, pin.aba(model, model.createData(), q, v, tau))
     assert_close(data.qacc, expected, TOLERANCE, "acceleration")
 
@@ -177,11 +177,14 @@ def test_joints_numbered_across_branches() -> None:
 def test_urdf_joints_with_limits(tmp_path: Any) -> None:
     joints = [("revolute", "0 0 1"), ("continuous", "1 2 3"), ("prismatic", "1 1 0"), ("planar", "0 0 1")]
     model, _, _ = build_model(write_urdf(tmp_path / "chain.urdf", joints), free_flyer=True)
-    found = InMujoco(model)
+    simulated = InMujoco(model)
     (q,) = random_configurations(model, 1, "urdf")
-    compare(model, found, q, rng("urdf"))
-    limits = {found.model.joint(k).name: (bool(found.model.jnt_limited[k]), list(found.model.jnt_range[k]))
-              for k in range(found.model.njnt)}  # fmt: skip
+    compare(model, simulated, q, rng("urdf"))
+    compiled = simulated.model
+    limits = {
+        compiled.joint(k).name: (bool(compiled.jnt_limited[k]), list(compiled.jnt_range[k]))
+        for k in range(compiled.njnt)
+    }
     assert limits["to_l1"] == (True, [-1.0, 1.0])
     assert limits["to_l3"] == (True, [-1.0, 1.0])
     assert not limits["to_l2"][0] and not limits["to_l4.x"][0] and not limits["to_l4.turn"][0]
@@ -192,10 +195,10 @@ def test_urdf_joints_with_limits(tmp_path: Any) -> None:
 
 def test_moments_beyond_the_triangle_inequality_are_kept() -> None:
     model = robot("romeo").model
-    found = build_mjcf(model)
-    assert set(found.moments) == {"RShoulderYawLink", "RElbowYawLink"}
-    compiled = found.compile()
-    for joint, name in found.bodies.items():
+    simulated = build_mjcf(model)
+    assert set(simulated.moments) == {"RShoulderYawLink", "RElbowYawLink"}
+    compiled = simulated.compile()
+    for joint, name in simulated.bodies.items():
         exact = np.linalg.eigvalsh(model.inertias[joint].inertia)
         assert_close(np.sort(compiled.body(name).inertia), exact, 1e-12, name)
 
@@ -203,18 +206,18 @@ def test_moments_beyond_the_triangle_inequality_are_kept() -> None:
 def test_a_massless_body_between_others() -> None:
     model = random_tree(["RX", "RY", "RZ"], [0, 0, 0], 1, True)
     model.inertias[2] = pin.Inertia.Zero()
-    found = InMujoco(model)
-    assert found.model.body(found.written.bodies[2]).mass[0] == 1e-15
+    simulated = InMujoco(model)
+    assert simulated.model.body(simulated.written.bodies[2]).mass[0] == 1e-15
     (q,) = random_configurations(model, 1, "massless")
-    compare(model, found, q, rng("massless"))
+    compare(model, simulated, q, rng("massless"))
 
 
 def test_names_that_meet_or_need_escaping() -> None:
     model = random_tree(["RX", "RY"], [0, 0], 1, False)
     model.names[1], model.names[2] = "world", 'a<"b&'
-    found = build_mjcf(model, 'r<"&')
-    compiled = found.compile()
-    assert found.bodies == {1: "world_2", 2: 'a<"b&'}
+    simulated = build_mjcf(model, 'r<"&')
+    compiled = simulated.compile()
+    assert simulated.bodies == {1: "world_2", 2: 'a<"b&'}
     assert compiled.joint('a<"b&').name == 'a<"b&'
 
 
@@ -229,13 +232,13 @@ def test_armature_that_has_no_place_is_refused() -> None:
 def test_base_armature_of_one_linear_and_one_angular_value_has_its_place() -> None:
     model = random_tree(["FreeFlyer", "RX"], [0, 0], 1, False)
     model.armature = np.array([2.0, 2, 2, 0.5, 0.5, 0.5, 0.1])
-    found = InMujoco(model)
-    assert found.model.jnt_type[0] == mujoco.mjtJoint.mjJNT_SLIDE
+    simulated = InMujoco(model)
+    assert simulated.model.jnt_type[0] == mujoco.mjtJoint.mjJNT_SLIDE
     (q,) = random_configurations(model, 1, "base")
-    found.data.qpos[:] = found.written.layout.qpos(q)
-    mujoco.mj_forward(found.model, found.data)
-    M, T = np.zeros((7, 7)), found.written.layout.velocity_map(q)
-    mujoco.mj_fullM(found.model, found.data, M)
+    simulated.data.qpos[:] = simulated.written.layout.qpos(q)
+    mujoco.mj_forward(simulated.model, simulated.data)
+    M, T = np.zeros((7, 7)), simulated.written.layout.velocity_map(q)
+    mujoco.mj_fullM(simulated.model, simulated.data, M)
     assert_close(T.T @ M @ T, mass_matrix(model, q), TOLERANCE, "M")
 
 

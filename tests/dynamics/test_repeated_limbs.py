@@ -77,9 +77,9 @@ def limbs_urdf(limb: list[int], limbs: int, seed: int, *, odd: bool) -> str:
 
 def values_of(graph: Graph, inputs: dict[str, np.ndarray]) -> dict[str, np.ndarray]:
     """Outputs of a graph, its vectors as arrays."""
-    found: list[np.ndarray | float] = []
+    result: list[np.ndarray | float] = []
     for node in graph.nodes:
-        x = [found[a] for a in node.operands]
+        x = [result[a] for a in node.operands]
         if node.op == "const":
             value: np.ndarray | float = np.array(node.value) if node.width > 1 else node.value[0]
         elif node.op == "in":
@@ -93,8 +93,8 @@ def values_of(graph: Graph, inputs: dict[str, np.ndarray]) -> dict[str, np.ndarr
         else:
             value = np.cos(x[0]) if node.op == COSINE else np.sin(x[0])
         assert np.size(value) == node.width
-        found.append(value)
-    return {name: np.array([float(found[k]) for k in nodes]) for name, nodes in graph.outputs.items()}
+        result.append(value)
+    return {name: np.array([float(result[k]) for k in nodes]) for name, nodes in graph.outputs.items()}
 
 
 def shares(graph: Graph) -> dict[int, int]:
@@ -140,8 +140,8 @@ def test_random_limbs_against_pinocchio(
     supports = (Support(f"b1_{len(limb) - 1}"),) if seed % 3 == 0 else ()
     contact = ImpactContact(f"b0_{len(limb) - 1}", (0.3, -0.4, 0.9), (0.05, 0.1, -0.02))
     objective = WorstCaseObjective(loaded, contact, Metric(metric, weights), "speed", supports)  # type: ignore[arg-type]
-    found = export_library([NamedObjective(objective, "limbs")])
-    graph = found.vector_graph()
+    library = export_library([NamedObjective(objective, "limbs")])
+    graph = library.vector_graph()
     assert max(shares(graph)) == (4 if count > 3 else 2)
     for q in random_configurations(loaded.model, 2, "limbs", seed):
         n = unit(generator)
@@ -166,12 +166,12 @@ def test_random_limbs_against_pinocchio(
 )
 def test_robots_with_repeated_limbs(name: str, frame: str, width: int, most: float) -> None:
     objective = WorstCaseObjective(robot(name), ImpactContact(frame, (0.0, 0.6, 0.8)))
-    found = export_library([NamedObjective(objective, name)])
-    graph = found.vector_graph()
+    library = export_library([NamedObjective(objective, name)])
+    graph = library.vector_graph()
     counts = shares(graph)
     assert set(counts) == {1, width}
     # The same with numbers alone: vectors change the order of no sum.
-    plain = found.graph()
+    plain = library.graph()
     assert sum(counts.values()) < most * shares(plain)[1]
     for q in random_configurations(robot(name).model, 2, name):
         inputs = {"q": q, "n": unit(rng(name))}
@@ -191,10 +191,10 @@ def longest(graph: Graph) -> int:
 @pytest.mark.parametrize("name", ["solo8", "panda", "talos"])
 def test_sums_in_another_order_have_the_same_value_sooner(name: str) -> None:
     frame = robot(name).spec.contact.frame if robot(name).spec.contact else robot(name).model.frames[-1].name
-    found = export_library(
+    library = export_library(
         [NamedObjective(WorstCaseObjective(robot(name), ImpactContact(frame, (0.0, 0.6, 0.8))), name)]
     )
-    graph = found.vector_graph()
+    graph = library.vector_graph()
     other = reorder_sums(graph)
     assert longest(other) < 0.95 * longest(graph)
     assert sum(shares(other).values()) <= 1.01 * sum(shares(graph).values())
@@ -270,9 +270,9 @@ def test_angles_near_and_far(tmp_path: Path, flags: tuple[str, ...]) -> None:
 def test_blocks_are_shared() -> None:
     """What value needs is a part of what eval needs, computed by blocks that both call."""
     objective = WorstCaseObjective(robot("talos"), ImpactContact("gripper_right_base_link", (0.0, 0.6, 0.8)))
-    found = export_library([NamedObjective(objective, "t")])
-    layout = lay_out(found.vector_graph(), [f.outputs for f in found.functions])
-    names = [f.name for f in found.functions]
+    library = export_library([NamedObjective(objective, "t")])
+    layout = lay_out(library.vector_graph(), [f.outputs for f in library.functions])
+    names = [f.name for f in library.functions]
     calls = {
         name: {b for b, block in enumerate(layout.blocks) if k in block.functions} for k, name in enumerate(names)
     }

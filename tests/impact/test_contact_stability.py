@@ -30,20 +30,20 @@ FEET = {"solo8": 4, "solo12": 4, "talos": 2}
 
 
 def standing(name: str) -> tuple[Robot, tuple[Support, ...]]:
-    found = robot(name)
-    return found, found.spec.supports
+    loaded = robot(name)
+    return loaded, loaded.spec.supports
 
 
 def oracle_of(name: str, normal: tuple[float, float, float], frame: str = "base_link") -> ImpactOracle:
-    found, supports = standing(name)
-    return ImpactOracle(ImpactCase(found, ImpactContact(frame, normal), Metric(), supports, 1e-6))
+    loaded, supports = standing(name)
+    return ImpactOracle(ImpactCase(loaded, ImpactContact(frame, normal), Metric(), supports, 1e-6))
 
 
 @pytest.mark.parametrize("name", ["solo8", "solo12"])
 def test_an_impact_from_above_presses_all_feet(name: str) -> None:
     """Every foot pushes up; together less than the impact, because knees without stiff motors give way."""
-    found, supports = standing(name)
-    q = found.posture()
+    loaded, supports = standing(name)
+    q = loaded.posture()
     result = contact_stability(oracle_of(name, (0.0, 0.0, -1.0)), supports, q)
     assert result.friction is not None and 0 <= result.friction < 3
     assert len(result.feet) == FEET[name]
@@ -56,8 +56,8 @@ def test_an_impact_from_above_presses_all_feet(name: str) -> None:
 
 @pytest.mark.parametrize("name", ["solo8", "solo12"])
 def test_an_impact_from_below_lifts(name: str) -> None:
-    found, supports = standing(name)
-    result = contact_stability(oracle_of(name, (0.0, 0.0, 1.0)), supports, found.posture())
+    loaded, supports = standing(name)
+    result = contact_stability(oracle_of(name, (0.0, 0.0, 1.0)), supports, loaded.posture())
     assert result.friction is None
     assert any(foot.lifts for foot in result.feet)
     assert "lifts" in result.line and result.to_dict()["stays"] is False
@@ -66,20 +66,22 @@ def test_an_impact_from_below_lifts(name: str) -> None:
 @pytest.mark.parametrize(("name", "normal"), [("solo12", (0.3, 0.2, -1.0)), ("talos", (1.0, 0.2, -0.4))])
 def test_impulses_are_those_of_impulse_dynamics(name: str, normal: tuple[float, float, float]) -> None:
     """Where the feet's impulses are unique they are Pinocchio's, from its rigid impulse dynamics."""
-    found, supports = standing(name)
+    loaded, supports = standing(name)
     frame = "base_link"
-    q = np.asarray(pin.integrate(found.model, found.posture(), 0.05 * np.random.default_rng(0).normal(size=found.nv)))
-    oracle = ImpactOracle(ImpactCase(found, ImpactContact(frame, normal), Metric(), supports, 1e-9))
+    q = np.asarray(
+        pin.integrate(loaded.model, loaded.posture(), 0.05 * np.random.default_rng(0).normal(size=loaded.nv))
+    )
+    oracle = ImpactOracle(ImpactCase(loaded, ImpactContact(frame, normal), Metric(), supports, 1e-9))
     result = contact_stability(oracle, supports, q)
     assert result.freedom == 0
-    Js = np.vstack([frame_jacobian(found.model, q, found.frame_id(s.frame), s.offset)[: s.rows] for s in supports])
+    Js = np.vstack([frame_jacobian(loaded.model, q, loaded.frame_id(s.frame), s.offset)[: s.rows] for s in supports])
     n = np.array(normal) / np.linalg.norm(normal)
-    J = frame_jacobian(found.model, q, found.frame_id(frame))[:3]
-    free = np.linalg.solve(mass_matrix(found.model, q), J.T @ n)
-    data = found.model.createData()
-    after = np.array(pin.impulseDynamics(found.model, data, q, free, Js, 0.0, 1e-12))
+    J = frame_jacobian(loaded.model, q, loaded.frame_id(frame))[:3]
+    free = np.linalg.solve(mass_matrix(loaded.model, q), J.T @ n)
+    data = loaded.model.createData()
+    after = np.array(pin.impulseDynamics(loaded.model, data, q, free, Js, 0.0, 1e-12))
     np.testing.assert_allclose(after, oracle.quantities(q).jump, atol=1e-5 * np.abs(after).max())
-    expected = np.linalg.lstsq(Js.T, mass_matrix(found.model, q) @ (after - free), rcond=None)[0]
+    expected = np.linalg.lstsq(Js.T, mass_matrix(loaded.model, q) @ (after - free), rcond=None)[0]
     own = np.concatenate(
         [np.concatenate([f.impulse, f.moment])[: s.rows] for f, s in zip(result.feet, supports, strict=True)]
     )
@@ -88,8 +90,8 @@ def test_impulses_are_those_of_impulse_dynamics(name: str, normal: tuple[float, 
 
 def test_the_set_matters_where_the_rank_drops() -> None:
     """solo8's planar legs: feet can press against each other, and the impulses that pull least pull less."""
-    found, supports = standing("solo8")
-    q = found.posture()
+    loaded, supports = standing("solo8")
+    q = loaded.posture()
     oracle = oracle_of("solo8", (0.0, 1.0, -0.6))
     result = contact_stability(oracle, supports, q)
     assert result.freedom > 0
@@ -103,10 +105,10 @@ def test_the_set_matters_where_the_rank_drops() -> None:
 
 def test_soles_tip_over_their_edges() -> None:
     """An impact high up on talos' torso turns the soles: with smaller soles more friction never helps."""
-    found, supports = standing("talos")
-    q = found.posture()
+    loaded, supports = standing("talos")
+    q = loaded.posture()
     frame = "torso_2_link"
-    oracle = ImpactOracle(ImpactCase(found, ImpactContact(frame, (1.0, 0.0, -0.2)), Metric(), supports, 1e-6))
+    oracle = ImpactOracle(ImpactCase(loaded, ImpactContact(frame, (1.0, 0.0, -0.2)), Metric(), supports, 1e-6))
     wide = tuple(Support(s.frame, "surface", s.offset, (5.0, 5.0)) for s in supports)
     narrow = tuple(Support(s.frame, "surface", s.offset, (1e-4, 1e-4)) for s in supports)
     assert contact_stability(oracle, narrow, q).friction is None
@@ -122,19 +124,19 @@ def test_soles_tip_over_their_edges() -> None:
 )
 def test_kept_feet_say_the_same_twice(name: str, frame: str) -> None:
     """Expression, Pinocchio's numbers and finite differences."""
-    found, supports = standing(name)
+    loaded, supports = standing(name)
     contact = ImpactContact(frame, (0.3, -0.2, -1.0))
-    objective = WorstCaseObjective(found, contact, supports=supports, compliance=1e-2 / found.mass)
-    numeric = Numeric(found.model)
-    kept = KeptContacts(objective, numeric.at(found.posture()), 0.7)
-    q_symbol, n_symbol = ca.SX.sym("q", found.nq), ca.SX.sym("n", 3)
-    symbolic = ca.Function("rows", [q_symbol, n_symbol], [kept.symbolic(Tree(found.model, q_symbol), n_symbol)])
-    step = 0.2 * np.random.default_rng(3).normal(size=found.nv)
-    q = np.asarray(pin.integrate(found.model, found.posture(), step))
+    objective = WorstCaseObjective(loaded, contact, supports=supports, compliance=1e-2 / loaded.mass)
+    numeric = Numeric(loaded.model)
+    kept = KeptContacts(objective, numeric.at(loaded.posture()), 0.7)
+    q_symbol, n_symbol = ca.SX.sym("q", loaded.nq), ca.SX.sym("n", 3)
+    symbolic = ca.Function("rows", [q_symbol, n_symbol], [kept.symbolic(Tree(loaded.model, q_symbol), n_symbol)])
+    step = 0.2 * np.random.default_rng(3).normal(size=loaded.nv)
+    q = np.asarray(pin.integrate(loaded.model, loaded.posture(), step))
     values, jacobian = kept.evaluate(numeric.at(q))
     assert values.shape == kept.upper.shape and len({kept.row_name(k) for k in range(kept.rows)}) >= 2
     assert_close(np.array(symbolic(q, contact.normal)).ravel(), values, 1e-7, "expression")
-    expected = central_gradient(lambda x: kept.evaluate(numeric.at(x))[0], found.model, q, 1e-4)
+    expected = central_gradient(lambda x: kept.evaluate(numeric.at(x))[0], loaded.model, q, 1e-4)
     assert_close(jacobian, expected, 1e-5, "Jacobian")
 
 
@@ -146,25 +148,25 @@ def test_kept_feet_change_the_optimum() -> None:
     assert any(isinstance(c, KeptContacts) for c in kept.problem.constraints)
     supports = free.problem.objective.supports
     without = solve(free.problem, starts=2, jobs=1)
-    found = solve(kept.problem, starts=2, jobs=1)
-    assert found.certificate.holds()
+    solution = solve(kept.problem, starts=2, jobs=1)
+    assert solution.certificate.holds()
     oracle = kept.problem.impact.oracle
-    before, after = contact_stability(oracle, supports, without.q), contact_stability(oracle, supports, found.q)
+    before, after = contact_stability(oracle, supports, without.q), contact_stability(oracle, supports, solution.q)
     assert before.friction is None or before.friction > 1.0
     assert after.friction is not None and after.friction <= 1.02
 
 
 @pytest.mark.parametrize(
-    ("arguments", "said"),
+    ("arguments", "message"),
     [
         (("tilthex_arm", "--normal", "0", "0", "1", "--keep-contacts"), "no feet to keep"),
         (("solo12", "--normal", "0", "0", "1", "--keep-contacts", "--friction", "0"), "above zero"),
     ],
 )
-def test_refusals(tmp_path: Path, arguments: tuple[str, ...], said: str) -> None:
+def test_refusals(tmp_path: Path, arguments: tuple[str, ...], message: str) -> None:
     done = run("optimize", *arguments, cwd=tmp_path)
     assert done.returncode in (1, 2)
-    assert said in done.stderr and "Traceback" not in done.stderr
+    assert message in done.stderr and "Traceback" not in done.stderr
     assert not list(tmp_path.iterdir())
 
 

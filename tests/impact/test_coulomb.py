@@ -92,11 +92,11 @@ def test_kinetic_energy_rises_with_friction_from_frictionless_to_sticking(seed: 
 @pytest.mark.parametrize("name", SOME)
 def test_value_and_gradient_agree_three_ways(name: str) -> None:
     """Pinocchio's numbers, the symbolic kernel and differences, at any friction, for every metric and support."""
-    for index, (found, contact, metric, supports) in enumerate(combinations(name)):
+    for index, (loaded, contact, metric, supports) in enumerate(combinations(name)):
         friction = FRICTIONS[index % len(FRICTIONS)]
-        objective = WorstCaseObjective(found, replace(contact, friction=friction), metric, "coulomb", supports)
+        objective = WorstCaseObjective(loaded, replace(contact, friction=friction), metric, "coulomb", supports)
         where = f"μ = {friction}, {describe(contact, metric, supports)}"
-        (q,) = random_configurations(found.model, 1, name, where)
+        (q,) = random_configurations(loaded.model, 1, name, where)
         oracle, value, gradient = objective.oracle, objective.value(q), objective.gradient(q)
         o, impact = oracle.quantities(q), coulomb_impact(oracle, q)
         assert o.S is not None
@@ -106,7 +106,7 @@ def test_value_and_gradient_agree_three_ways(name: str) -> None:
         # Both solve with M, each in its own order.
         rounding = 4 * np.finfo(float).eps * np.linalg.cond(oracle.M)
         assert limit is None or abs(value / limit - 1) < rounding, where
-        differences = central_gradient(objective.value, found.model, q, STEP)
+        differences = central_gradient(objective.value, loaded.model, q, STEP)
         assert_close(gradient, differences, 1e-6, f"differences ({where})", value)
         if name in WHOLE or index == 0:
             numbers = [np.array(x).ravel() for x in objective.gradient_fun()(q, contact.normal)]
@@ -115,22 +115,22 @@ def test_value_and_gradient_agree_three_ways(name: str) -> None:
             assert_close(numbers[1], gradient, 1e-6 if supports else 1e-9, where, value)
 
 
-def hung(found: Robot, normal: tuple[float, float, float], friction: float) -> WorstCaseObjective:
-    return WorstCaseObjective(found, ImpactContact(TIP, normal, friction=friction), Metric(), "coulomb", ())
+def hung(loaded: Robot, normal: tuple[float, float, float], friction: float) -> WorstCaseObjective:
+    return WorstCaseObjective(loaded, ImpactContact(TIP, normal, friction=friction), Metric(), "coulomb", ())
 
 
 @pytest.mark.parametrize("friction", (0.0, 0.05, 0.5, 5.0))
 def test_planar_robots(friction: float) -> None:
     """Nothing moves the tip across the plane, so that JM⁻¹Jᵀ is singular in every posture."""
-    found = arm([Y, Y, Y], [0.3, 0.7, -0.5], floating=False)
+    loaded = arm([Y, Y, Y], [0.3, 0.7, -0.5], floating=False)
     for normal in ((0.0, 0.0, 1.0), (0.6, 0.0, 0.8), (-1.0, 0.0, 0.0)):
-        objective, contact = hung(found, normal, friction), np.array(normal)
-        for q in random_configurations(found.model, 3, friction, normal):
+        objective, contact = hung(loaded, normal, friction), np.array(normal)
+        for q in random_configurations(loaded.model, 3, friction, normal):
             impact, o = coulomb_impact(objective.oracle, q), objective.oracle.quantities(q)
             assert_coulomb(o.mobility, o.normal, friction, impact.impulse, 1e-9)
             assert abs(impact.impulse[1]) < 1e-9
             value, gradient = objective.value(q), objective.gradient(q)
-            assert_close(gradient, central_gradient(objective.value, found.model, q, STEP), 1e-6, "gradient", value)
+            assert_close(gradient, central_gradient(objective.value, loaded.model, q, STEP), 1e-6, "gradient", value)
             numbers = [np.array(x).ravel() for x in objective.gradient_fun()(q, contact)]
             assert_close(numbers[0], value, 1e-10, "value")
             assert_close(numbers[1], gradient, 1e-8, "symbolic gradient", value)
@@ -140,24 +140,24 @@ def test_planar_robots(friction: float) -> None:
 
 def test_a_point_on_a_line_slides_or_jams() -> None:
     """One hinge: the tip moves along one direction, at an angle to the normal; enough friction holds it there."""
-    found = arm([Y], [0.0], floating=False)
+    loaded = arm([Y], [0.0], floating=False)
     q, normal = np.array([0.4]), (0.0, 0.0, 1.0)
-    slides, jams = hung(found, normal, 0.1), hung(found, normal, 5.0)
+    slides, jams = hung(loaded, normal, 0.1), hung(loaded, normal, 5.0)
     impact, o = coulomb_impact(slides.oracle, q), slides.oracle.quantities(q)
     assert not impact.sticks and o.S is None
     assert_coulomb(o.mobility, o.normal, 0.1, impact.impulse, 1e-12)
     value, gradient = (np.array(x).ravel() for x in slides.gradient_fun()(q, normal))
     assert_close(value, slides.value(q), 1e-12, "value")
-    assert_close(gradient, central_gradient(slides.value, found.model, q, STEP), 1e-7, "gradient")
+    assert_close(gradient, central_gradient(slides.value, loaded.model, q, STEP), 1e-7, "gradient")
     with pytest.raises(MetricError, match="S does not exist"):
         jams.value(q)
     assert evaluate(jams, q).coulomb is None
 
 
 def test_a_blocked_contact_has_no_value() -> None:
-    found = arm([Y, Y], [0.3, 0.4], floating=False)
+    loaded = arm([Y, Y], [0.3, 0.4], floating=False)
     with pytest.raises(MetricError, match="S does not exist"):
-        hung(found, (0.0, 1.0, 0.0), 0.5).value(found.posture())
+        hung(loaded, (0.0, 1.0, 0.0), 0.5).value(loaded.posture())
 
 
 def test_a_point_that_moves_along_the_normal_alone_meets_no_friction() -> None:
@@ -165,8 +165,8 @@ def test_a_point_that_moves_along_the_normal_alone_meets_no_friction() -> None:
     joint = model.addJoint(0, pin.JointModelPZ(), pin.SE3.Identity(), "lift")
     model.appendBodyToJoint(joint, pin.Inertia.Random(), pin.SE3.Identity())
     model.addFrame(pin.Frame(TIP, joint, 0, pin.SE3.Identity(), pin.FrameType.BODY))
-    found = replace(arm([Y], [0.0], floating=False), model=model, postures={"home": np.zeros(1)})
-    objective = hung(found, (0.0, 0.0, 1.0), 0.5)
+    loaded = replace(arm([Y], [0.0], floating=False), model=model, postures={"home": np.zeros(1)})
+    objective = hung(loaded, (0.0, 0.0, 1.0), 0.5)
     o = objective.oracle.quantities(np.zeros(1))
     assert objective.value(np.zeros(1)) == pytest.approx(o.V, rel=1e-14)
     value, gradient = objective.gradient_fun()(np.zeros(1), (0, 0, 1))
@@ -175,12 +175,12 @@ def test_a_point_that_moves_along_the_normal_alone_meets_no_friction() -> None:
 
 @pytest.mark.parametrize("metric", ("euclidean", "kinetic"))
 def test_the_value_is_continuous_at_the_switch_and_has_one_gradient_on_each_side(metric: str) -> None:
-    found = arm([Z, Y, Y, X, Y], [0.3, -0.8, 1.2, -0.5, 0.4], floating=False)
+    loaded = arm([Z, Y, Y, X, Y], [0.3, -0.8, 1.2, -0.5, 0.4], floating=False)
     for seed in range(4):
         generator = rng("switch", seed)
-        objective = hung(found, tuple(unit(generator)), 0.0)
+        objective = hung(loaded, tuple(unit(generator)), 0.0)
         objective = replace(objective, metric=Metric(metric))  # type: ignore[arg-type]
-        q = np.array(pin.integrate(found.model, found.posture(), generator.normal(size=found.nv)))
+        q = np.array(pin.integrate(loaded.model, loaded.posture(), generator.normal(size=loaded.nv)))
         o = objective.oracle.quantities(q)
         friction = required(o.mobility, o.normal)
         objective = replace(objective, contact=replace(objective.contact, friction=friction * (1 + 1e-12)))
@@ -190,11 +190,11 @@ def test_the_value_is_continuous_at_the_switch_and_has_one_gradient_on_each_side
         assert_close(slid.jump, stuck.jump, 1e-9, "jump")
         sides = [coulomb_gradient(objective.oracle, q, impact) for impact in (stuck, slid)]
         outward = central_gradient(
-            lambda at, o=objective.oracle: required(o.quantities(at).mobility, o.n), found.model, q, 1e-5
+            lambda at, o=objective.oracle: required(o.quantities(at).mobility, o.n), loaded.model, q, 1e-5
         )
         step = 1e-6 * outward / (outward @ outward)
         for sign, side in zip((-1, 1), sides, strict=True):
-            there = np.array(pin.integrate(found.model, q, sign * step))
+            there = np.array(pin.integrate(loaded.model, q, sign * step))
             assert coulomb_impact(objective.oracle, there).sticks == (sign < 0)
             assert_close(objective.gradient(there), side, 1e-4, f"side {sign}")
         # With W = M the slope always falls where the contact begins to slip.
@@ -205,14 +205,14 @@ def test_the_value_is_continuous_at_the_switch_and_has_one_gradient_on_each_side
 
 @pytest.mark.parametrize("name", WHOLE)
 def test_lifted_form_holds_at_its_guess(name: str) -> None:
-    for index, (found, contact, metric, supports) in enumerate(combinations(name)):
+    for index, (loaded, contact, metric, supports) in enumerate(combinations(name)):
         friction = FRICTIONS[index % len(FRICTIONS)]
-        objective = WorstCaseObjective(found, replace(contact, friction=friction), metric, "coulomb", supports)
-        q, n = ca.SX.sym("q", found.nq), ca.SX.sym("n", 3)
-        lifted = objective.lift(Tree(found.model, q), n, ca.SX(1))
+        objective = WorstCaseObjective(loaded, replace(contact, friction=friction), metric, "coulomb", supports)
+        q, n = ca.SX.sym("q", loaded.nq), ca.SX.sym("n", 3)
+        lifted = objective.lift(Tree(loaded.model, q), n, ca.SX(1))
         outputs = [lifted.residual, lifted.value, lifted.inequalities]
         lifted_fun = ca.Function("lifted", [q, n, lifted.variables], outputs)
-        (at,) = random_configurations(found.model, 1, name, index)
+        (at,) = random_configurations(loaded.model, 1, name, index)
         guess = objective.guess(at, 1.0)
         residual, value, rows = (np.array(x) for x in lifted_fun(at, contact.normal, guess.values))
         assert np.abs(residual).max() < 1e-8 * max(1.0, np.abs(guess.values).max())

@@ -68,11 +68,11 @@ def test_contacts_that_do_not_feel_each_other_are_single_contacts() -> None:
 @pytest.mark.parametrize("friction", (0.0, 0.2, 0.6, 3.0))
 def test_one_contact_is_the_single_solution(friction: float) -> None:
     for name in ("panda", "tilthex_arm", "talos"):
-        found = robot(name)
-        assert found.spec.contact.frame is not None
-        contact = ImpactContact(found.spec.contact.frame, (0.2, -0.4, 0.8), friction=friction)
-        objective = WorstCaseObjective(found, contact, kind="coulomb")
-        for q in random_configurations(found.model, 3, name, friction):
+        loaded = robot(name)
+        assert loaded.spec.contact.frame is not None
+        contact = ImpactContact(loaded.spec.contact.frame, (0.2, -0.4, 0.8), friction=friction)
+        objective = WorstCaseObjective(loaded, contact, kind="coulomb")
+        for q in random_configurations(loaded.model, 3, name, friction):
             impact, o = coulomb_impact(objective.oracle, q), objective.oracle.quantities(q)
             p = contact_impulses(o.mobility, o.normal[None, :], np.array([friction]))
             assert p is not None
@@ -84,11 +84,13 @@ def test_one_contact_is_the_single_solution(friction: float) -> None:
 
 def feet_of(friction: float) -> tuple[WorstCaseObjective, Vector]:
     """solo12 in the air, whose four feet meet tilted ground."""
-    found = robot("solo12")
+    loaded = robot("solo12")
     n = np.array([0.35, 0.1, 1.0])
     contacts = [ImpactContact(foot, tuple(n / np.linalg.norm(n)), friction=friction) for foot in FEET]
-    objective = WorstCaseObjective(found, contacts[0], Metric(), "impulse", (), others=tuple(contacts[1:]))
-    return objective, np.array(pin.integrate(found.model, found.posture(), 0.2 * rng("feet").normal(size=found.nv)))
+    objective = WorstCaseObjective(loaded, contacts[0], Metric(), "impulse", (), others=tuple(contacts[1:]))
+    return objective, np.array(
+        pin.integrate(loaded.model, loaded.posture(), 0.2 * rng("feet").normal(size=loaded.nv))
+    )
 
 
 @pytest.mark.parametrize("friction", (0.0, 0.15, 0.4, 2.0))
@@ -114,8 +116,8 @@ def test_four_feet_land_in_mujoco(friction: float) -> None:
 
 def drop(objective: WorstCaseObjective, q: Vector) -> Vector:
     """``Δν`` in MuJoCo of the robot that moves as one body along ``−n``: no gravity, no motors, almost no rebound."""
-    mujoco, found = import_mujoco(), objective.robot
-    written = build_mjcf(found.model)
+    mujoco, result = import_mujoco(), objective.robot
+    written = build_mjcf(result.model)
     n, radius, time = objective.oracle.at(q).n.copy(), 0.005, 2e-4
     option = written.spec.option
     option.gravity, option.timestep, option.integrator = np.zeros(3), time / 50, mujoco.mjtIntegrator.mjINT_EULER
@@ -123,7 +125,7 @@ def drop(objective: WorstCaseObjective, q: Vector) -> Vector:
     option.disableflags |= mujoco.mjtDisableBit.mjDSBL_LIMIT
     numeric = objective.oracle.numeric.at(q)
     for k, contact in enumerate(objective.contacts):
-        point = point_on(found, contact.frame, contact.offset)
+        point = point_on(result, contact.frame, contact.offset)
         position = numeric.placement(point).translation
         center = numeric.data.oMi[point.joint].actInv(position + radius * n)
         written.add_geom(point.joint, f"ball_{k}", "sphere", (radius,), pin.SE3(np.eye(3), center))
@@ -135,7 +137,7 @@ def drop(objective: WorstCaseObjective, q: Vector) -> Vector:
         )  # fmt: skip
     model = written.spec.compile()
     data = mujoco.MjData(model)
-    before = np.zeros(found.nv)
+    before = np.zeros(result.nv)
     before[:3] = -pin.Quaternion(q[3:7]).matrix().T @ n
     data.qpos[:], data.qvel[:] = written.layout.qpos(q), written.layout.qvel(q, before)
     quiet = 0

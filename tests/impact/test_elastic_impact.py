@@ -36,9 +36,9 @@ from tests.support.helpers import (
 STEP = 2e-4
 
 
-def on_springs(found: Robot, table: TransmissionSpec) -> Robot:
+def on_springs(loaded: Robot, table: TransmissionSpec) -> Robot:
     """The robot with another ``[transmission]``."""
-    return replace(found, spec=replace(found.spec, transmission=table))
+    return replace(loaded, spec=replace(loaded.spec, transmission=table))
 
 
 def springs(stiffness: float, damping: float = 0.0, **joints: JointTransmissionSpec) -> TransmissionSpec:
@@ -60,28 +60,28 @@ def case_of(name: str) -> Setup:
     rigid, locked = JointTransmissionSpec("rigid"), JointTransmissionSpec("locked")
     if name == "panda":
         soft = {f"panda_joint{k}": JointTransmissionSpec("elastic", 14e3 if k < 5 else 9e3) for k in range(1, 8)}
-        made, stiffness = on_springs(robot(name), TransmissionSpec(joints=soft)), 1e5
+        loaded, stiffness = on_springs(robot(name), TransmissionSpec(joints=soft)), 1e5
     elif name == "arm":
-        made, stiffness = on_springs(seven_joints(), springs(150.0)), 3e3
+        loaded, stiffness = on_springs(seven_joints(), springs(150.0)), 3e3
     elif name == "mixed arm":
         table = springs(150.0, 0.4, joint_1=rigid, joint_3=locked, joint_5=JointTransmissionSpec(None, 700.0, 0.0))
-        made, stiffness = on_springs(seven_joints(), table), 5e3
+        loaded, stiffness = on_springs(seven_joints(), table), 5e3
     elif name == "talos":
         soft = {f"arm_right_{k}_joint": JointTransmissionSpec("elastic", 9e3, 3.0) for k in range(1, 8)}
-        made, stiffness = on_springs(robot(name), TransmissionSpec("rigid", joints=soft)), 1e5
+        loaded, stiffness = on_springs(robot(name), TransmissionSpec("rigid", joints=soft)), 1e5
     elif name == "tilthex_arm":
-        made, stiffness = on_springs(robot(name), springs(300.0)), 1e4
+        loaded, stiffness = on_springs(robot(name), springs(300.0)), 1e4
     else:
-        made, stiffness = on_springs(robot(name), springs(30.0, 0.01)), 1e4
-    feet = made.spec.supports if name == "solo12" else ()
+        loaded, stiffness = on_springs(robot(name), springs(30.0, 0.01)), 1e4
+    feet = loaded.spec.supports if name == "solo12" else ()
     place = list(CASES).index(name)
     kind: MetricKind = ("euclidean", "kinetic", "weighted")[place % 3]
-    weights = tuple(generator.uniform(0.5, 2.0, made.nv)) if kind == "weighted" else None
+    weights = tuple(generator.uniform(0.5, 2.0, loaded.nv)) if kind == "weighted" else None
     axes: NormalFrame = ("world", "contact")[place % 2]
-    assert made.spec.contact.frame is not None
-    contact = ImpactContact(made.spec.contact.frame, tuple(unit(generator)), (0.01, -0.02, 0.03), axes)
-    q = np.array(pin.integrate(made.model, made.posture(), 0.2 * generator.normal(size=made.nv)))
-    return Setup(ImpactCase(made, contact, Metric(kind, weights), feet), q, stiffness)
+    assert loaded.spec.contact.frame is not None
+    contact = ImpactContact(loaded.spec.contact.frame, tuple(unit(generator)), (0.01, -0.02, 0.03), axes)
+    q = np.array(pin.integrate(loaded.model, loaded.posture(), 0.2 * generator.normal(size=loaded.nv)))
+    return Setup(ImpactCase(loaded, contact, Metric(kind, weights), feet), q, stiffness)
 
 
 CASES = ("panda", "arm", "mixed arm", "talos", "tilthex_arm", "solo12")
@@ -104,23 +104,23 @@ class Stepped(NamedTuple):
 
 def stepped(case: ImpactCase, q: Vector, stiffness: float, speed: float) -> Stepped:
     """The equations of motion as they stand, by Pinocchio's matrices and an adaptive Runge–Kutta method."""
-    found, spec = case.robot, case.robot.spec.transmission
-    nv, base = found.nv, 6 if found.floating else 0
-    own = [spec.joints.get(joint, JointTransmissionSpec()) for joint in found.joint_names]
+    result, spec = case.robot, case.robot.spec.transmission
+    nv, base = result.nv, 6 if result.floating else 0
+    own = [spec.joints.get(joint, JointTransmissionSpec()) for joint in result.joint_names]
     kinds = np.array(["base"] * base + [joint.kind or spec.kind or "none" for joint in own])
     K = np.array([0.0] * base + [joint.stiffness or spec.stiffness or 0.0 for joint in own])
     D = np.array([0.0] * base + [spec.damping if joint.damping is None else joint.damping for joint in own])
-    soft = (kinds == "elastic") & (found.armature > 0) & (K > 0)
-    moves, B = kinds != "locked", np.where(soft, found.armature, 1.0)
+    soft = (kinds == "elastic") & (result.armature > 0) & (K > 0)
+    moves, B = kinds != "locked", np.where(soft, result.armature, 1.0)
     K, D = K * soft, D * soft
-    bare = pin.Model(found.model)
-    bare.armature = np.where(soft, 0.0, found.armature)
+    bare = pin.Model(result.model)
+    bare.armature = np.where(soft, 0.0, result.armature)
     links = mass_matrix(bare, q)
     M = links.copy()
     for foot in case.supports:
-        Js = frame_jacobian(bare, q, found.frame_id(foot.frame), foot.offset)[: foot.rows]
+        Js = frame_jacobian(bare, q, result.frame_id(foot.frame), foot.offset)[: foot.rows]
         M += Js.T @ Js / case.compliance
-    frame = found.frame_id(case.contact.frame)
+    frame = result.frame_id(case.contact.frame)
     n = np.array(case.contact.normal)
     if case.in_contact_frame:
         n = frame_placement(bare, q, frame).rotation @ n
@@ -168,20 +168,20 @@ def stepped(case: ImpactCase, q: Vector, stiffness: float, speed: float) -> Step
 def test_time_stepping_finds_the_same(name: str) -> None:
     case, q, stiffness = case_of(name)
     speed = 0.7
-    found, other = ElasticImpact(case).response(q, stiffness, speed), stepped(case, q, stiffness, speed)
-    assert found.duration == pytest.approx(other.duration, rel=1e-8)
-    assert found.force == pytest.approx(stiffness * other.delta, rel=1e-8)
-    assert found.impulse == pytest.approx(other.impulse, rel=1e-8)
-    assert_close(found.jump, other.x, 1e-8, "links")
-    assert_close(found.rotor_jump, other.y, 1e-8, "rotors")
-    assert_close(found.torque, other.torque, 1e-7, "torque")
-    assert_close(found.peak_torque, other.largest_torque, 1e-6, "largest torque")
-    assert found.peak_jump_norm == pytest.approx(np.sqrt(other.largest_square), rel=1e-6)
-    assert (found.peak_torque >= np.abs(found.torque) * (1 - 1e-12)).all()
-    assert found.peak_jump_norm >= found.jump_norm * (1 - 1e-12)
-    assert found.value == pytest.approx((found.jump_norm / speed) ** 2, rel=1e-12)
+    response, other = ElasticImpact(case).response(q, stiffness, speed), stepped(case, q, stiffness, speed)
+    assert response.duration == pytest.approx(other.duration, rel=1e-8)
+    assert response.force == pytest.approx(stiffness * other.delta, rel=1e-8)
+    assert response.impulse == pytest.approx(other.impulse, rel=1e-8)
+    assert_close(response.jump, other.x, 1e-8, "links")
+    assert_close(response.rotor_jump, other.y, 1e-8, "rotors")
+    assert_close(response.torque, other.torque, 1e-7, "torque")
+    assert_close(response.peak_torque, other.largest_torque, 1e-6, "largest torque")
+    assert response.peak_jump_norm == pytest.approx(np.sqrt(other.largest_square), rel=1e-6)
+    assert (response.peak_torque >= np.abs(response.torque) * (1 - 1e-12)).all()
+    assert response.peak_jump_norm >= response.jump_norm * (1 - 1e-12)
+    assert response.value == pytest.approx((response.jump_norm / speed) ** 2, rel=1e-12)
     # Free flight goes on at the approach speed, so the force times this speed is the power of the contact.
-    assert found.impulse * found.speed == pytest.approx(other.energy + other.loss, rel=1e-8)
+    assert response.impulse * response.speed == pytest.approx(other.energy + other.loss, rel=1e-8)
     assert (other.loss > 0) == (name in ("mixed arm", "talos", "solo12"))
 
 
@@ -234,10 +234,10 @@ def test_first_greatest_compression_of_many() -> None:
         }
         drawn = replace(case, robot=on_springs(case.robot, TransmissionSpec(joints=soft)))
         q, stiffness = generator.uniform(-1, 1, 7), 10 ** generator.uniform(2, 5)
-        found, other = ElasticImpact(drawn).response(q, stiffness), stepped(drawn, q, stiffness, 1.0)
-        assert found.duration == pytest.approx(other.duration, rel=1e-7)
-        assert found.value == pytest.approx(float(other.x @ other.x), rel=1e-6)
-        close += 0.2 < found.compliance_ratio < 0.75
+        response, other = ElasticImpact(drawn).response(q, stiffness), stepped(drawn, q, stiffness, 1.0)
+        assert response.duration == pytest.approx(other.duration, rel=1e-7)
+        assert response.value == pytest.approx(float(other.x @ other.x), rel=1e-6)
+        close += 0.2 < response.compliance_ratio < 0.75
     assert close >= 3
 
 
@@ -249,9 +249,9 @@ def test_ratio_of_a_robot_on_its_feet() -> None:
     K = np.diag([0.0] * 6 + [30.0] * 12)
     kkt = np.block([[K, Js.T], [Js, np.zeros((len(Js),) * 2)]])
     compliance = j @ np.linalg.lstsq(kkt, np.append(j, np.zeros(len(Js))), rcond=1e-12)[0][:18]
-    found = ElasticImpact(case).response(q, stiffness)
-    expected = found.duration * np.sqrt(j @ oracle.solve(j) / compliance)
-    assert found.compliance_ratio == pytest.approx(expected, rel=1e-5)
+    response = ElasticImpact(case).response(q, stiffness)
+    expected = response.duration * np.sqrt(j @ oracle.solve(j) / compliance)
+    assert response.compliance_ratio == pytest.approx(expected, rel=1e-5)
 
 
 def test_contact_that_no_spring_takes() -> None:
@@ -262,8 +262,8 @@ def test_contact_that_no_spring_takes() -> None:
         robot=on_springs(case.robot, springs(150.0, **rigid)),
         contact=ImpactContact("link_6", (1, 0, 0), normal_frame="contact"),
     )
-    found = ElasticImpact(held).response(q, stiffness)
-    assert found.compliance_ratio > 1e12
+    response = ElasticImpact(held).response(q, stiffness)
+    assert response.compliance_ratio > 1e12
 
 
 def test_numbers_are_proportional_to_the_speed() -> None:
@@ -277,11 +277,17 @@ def test_numbers_are_proportional_to_the_speed() -> None:
 
 def test_joints_without_a_spring() -> None:
     case, q, stiffness = case_of("mixed arm")
-    found = ElasticImpact(case).response(q, stiffness)
+    response = ElasticImpact(case).response(q, stiffness)
     rigid, locked, soft = 1, 3, [0, 2, 4, 5, 6]
-    assert found.jump[locked] == found.rotor_jump[locked] == 0.0 != found.jump[rigid] == found.rotor_jump[rigid]
-    assert found.torque[rigid] == found.peak_torque[locked] == 0.0
-    assert (found.peak_torque[soft] > 0).all() and (found.rotor_jump[soft] != found.jump[soft]).all()
+    assert (
+        response.jump[locked]
+        == response.rotor_jump[locked]
+        == 0.0
+        != response.jump[rigid]
+        == response.rotor_jump[rigid]
+    )
+    assert response.torque[rigid] == response.peak_torque[locked] == 0.0
+    assert (response.peak_torque[soft] > 0).all() and (response.rotor_jump[soft] != response.jump[soft]).all()
 
 
 def test_armature_is_that_stated_whatever_the_joint_model() -> None:
@@ -315,11 +321,11 @@ def test_no_rotor_on_a_spring(table: TransmissionSpec) -> None:
     model = pin.Model(case.robot.model)
     if table.kind == "elastic" and table.stiffness:
         model.armature = np.zeros(model.nv)
-    made = on_springs(replace(case.robot, model=model), table)
+    loaded = on_springs(replace(case.robot, model=model), table)
     with pytest.raises(
         InputError, match=r"no joint of made up has a rotor on a spring.*\[transmission\].*\[armature\]"
     ):
-        ElasticImpact(replace(case, robot=made))
+        ElasticImpact(replace(case, robot=loaded))
 
 
 def test_springs_too_stiff_for_a_soft_contact() -> None:
@@ -330,10 +336,10 @@ def test_springs_too_stiff_for_a_soft_contact() -> None:
 
 
 def test_contact_that_cannot_move() -> None:
-    made = on_springs(arm([Y, Y], [0.4, 0.9], floating=False), springs(100.0))
-    case = ImpactCase(made, ImpactContact(TIP, (0, 1, 0)))
+    loaded = on_springs(arm([Y, Y], [0.4, 0.9], floating=False), springs(100.0))
+    case = ImpactCase(loaded, ImpactContact(TIP, (0, 1, 0)))
     with pytest.raises(ContactError, match="cannot move along its normal"):
-        ElasticImpact(case).response(made.posture(), 1e4)
+        ElasticImpact(case).response(loaded.posture(), 1e4)
 
 
 def test_extreme_but_allowed_numbers_answer() -> None:
@@ -349,10 +355,12 @@ def test_extreme_but_allowed_numbers_answer() -> None:
             assert "\n" not in str(error)
     for K, D in ((1e-300, 0.0), (1e-3, 1e6), (1e9, 1e-9), (1e20, 0.0), (150.0, 1e300)):
         for stiffness in (1.0, 1e12):
-            made = replace(case, robot=on_springs(case.robot, springs(K, D)))
+            loaded = replace(case, robot=on_springs(case.robot, springs(K, D)))
             try:
-                found = ElasticImpact(made).response(q, stiffness)
+                response = ElasticImpact(loaded).response(q, stiffness)
             except ImpactPostureError as error:
                 assert "\n" not in str(error)
             else:
-                assert np.isfinite([found.value, found.duration, found.peak_jump_norm, *found.peak_torque]).all()
+                assert np.isfinite(
+                    [response.value, response.duration, response.peak_jump_norm, *response.peak_torque]
+                ).all()

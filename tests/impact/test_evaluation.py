@@ -90,75 +90,79 @@ def test_numbers_against_dense_algebra(name: str, frame: str, metric: str) -> No
     loaded = robot(name)
     n = unit(rng("normal", name))
     impact = resolve(ImpactSettings(robot=name, frame=frame, normal=tuple(n), metric=metric, impulse=3.0))  # type: ignore[arg-type]
-    found = evaluate(impact.objective, impact.q, 0.7, 0.3)
+    evaluation = evaluate(impact.objective, impact.q, 0.7, 0.3)
     W = mass_matrix(loaded.model, impact.q) if metric == "kinetic" else None
     expected = dense(loaded, frame, impact.q, n, W, impact.supports)
     # The feet's 1/ε beside the links' masses costs the plain inverse digits.
     tolerance = 1e-6 if impact.supports else 1e-10
     for key in ("H", "G", "V", "S", "E"):
-        assert_close(found.to_dict()[key], expected[key], tolerance, key)  # type: ignore[arg-type]
-    assert found.objective == pytest.approx(9.0 * found.scalars.H, rel=1e-14)
-    assert found.scalars.effective_mass == pytest.approx(1 / expected["G"], rel=tolerance)
-    axes, radii = found.ellipsoid.axes, found.ellipsoid.radii
+        assert_close(evaluation.to_dict()[key], expected[key], tolerance, key)  # type: ignore[arg-type]
+    assert evaluation.objective == pytest.approx(9.0 * evaluation.scalars.H, rel=1e-14)
+    assert evaluation.scalars.effective_mass == pytest.approx(1 / expected["G"], rel=tolerance)
+    axes, radii = evaluation.ellipsoid.axes, evaluation.ellipsoid.radii
     assert_close(axes @ np.diag(radii**2) @ axes.T, expected["ellipsoid"], tolerance, "ellipsoid")
     assert_close(axes @ axes.T, np.eye(3), 1e-12, "axes")
     assert np.linalg.det(axes) > 0 and (np.diff(radii) <= 0).all()
-    assert found.frictionless is not None and found.sticking is not None
-    assert_close(found.frictionless.velocity, expected["a"] * 1.3 * 0.7 / expected["G"], tolerance, "frictionless")
-    assert_close(found.sticking.velocity, expected["stuck"] * 1.3 * 0.7, tolerance, "sticking")
-    assert found.frictionless.norm == pytest.approx(1.3 * 0.7 * np.sqrt(expected["V"]), rel=tolerance)
-    assert found.sticking.norm == pytest.approx(1.3 * 0.7 * np.sqrt(expected["S"]), rel=tolerance)
+    assert evaluation.frictionless is not None and evaluation.sticking is not None
+    assert_close(
+        evaluation.frictionless.velocity, expected["a"] * 1.3 * 0.7 / expected["G"], tolerance, "frictionless"
+    )
+    assert_close(evaluation.sticking.velocity, expected["stuck"] * 1.3 * 0.7, tolerance, "sticking")
+    assert evaluation.frictionless.norm == pytest.approx(1.3 * 0.7 * np.sqrt(expected["V"]), rel=tolerance)
+    assert evaluation.sticking.norm == pytest.approx(1.3 * 0.7 * np.sqrt(expected["S"]), rel=tolerance)
     pose = frame_placement(loaded.model, impact.q, loaded.frame_id(frame))
-    assert_close(found.pose.homogeneous, pose.homogeneous, 1e-12, "pose")
+    assert_close(evaluation.pose.homogeneous, pose.homogeneous, 1e-12, "pose")
 
 
 def test_free_values_stand_beside_the_supported_ones() -> None:
     loaded, n = robot("talos"), np.array([-1.0, 0.0, 0.0])
     impact = resolve(ImpactSettings(robot="talos", frame="torso_2_link", normal=(-2.0, 0.0, 0.0)))
-    found = evaluate(impact.objective, impact.q)
+    evaluation = evaluate(impact.objective, impact.q)
     assert [s.frame for s in impact.supports] == ["left_sole_link", "right_sole_link"]
     expected = dense(loaded, "torso_2_link", impact.q, n, None, ())
-    assert found.without_supports is not None
+    assert evaluation.without_supports is not None
     for key in ("H", "G", "V", "S", "E"):
-        assert_close(found.without_supports.to_dict()[key], expected[key], 1e-10, key)  # type: ignore[arg-type]
-    assert found.to_dict()["free"] == found.without_supports.to_dict()
-    assert found.contact_stability is not None
-    assert found.to_dict()["footing"] == found.contact_stability.to_dict()
+        assert_close(evaluation.without_supports.to_dict()[key], expected[key], 1e-10, key)  # type: ignore[arg-type]
+    assert evaluation.to_dict()["free"] == evaluation.without_supports.to_dict()
+    assert evaluation.contact_stability is not None
+    assert evaluation.to_dict()["footing"] == evaluation.contact_stability.to_dict()
     # Two flat feet have full rank: their compliance hardly matters.
-    assert found.compliance_effect is not None and 0 < found.compliance_effect < 1e-2
+    assert evaluation.compliance_effect is not None and 0 < evaluation.compliance_effect < 1e-2
     without = resolve(ImpactSettings(robot="talos", frame="torso_2_link", normal=(-1.0, 0.0, 0.0), support=()))
     alone = evaluate(without.objective, without.q)
     assert alone.without_supports is None and "free" not in alone.to_dict()
     assert alone.contact_stability is None and "footing" not in alone.to_dict()
-    assert alone.scalars.H == pytest.approx(found.without_supports.H, rel=1e-14)
+    assert alone.scalars.H == pytest.approx(evaluation.without_supports.H, rel=1e-14)
 
 
 def test_the_predicted_jumps_obey_the_impact() -> None:
     impact = resolve(ImpactSettings(robot="tilthex_arm", normal=(0.3, -0.2, 1.0)))
     speed, e = 0.8, 0.4
-    found = evaluate(impact.objective, impact.q, speed, e)
-    assert found.frictionless is not None and found.sticking is not None and found.energy_loss is not None
-    n = found.worst_normal
+    evaluation = evaluate(impact.objective, impact.q, speed, e)
+    assert (
+        evaluation.frictionless is not None and evaluation.sticking is not None and evaluation.energy_loss is not None
+    )
+    n = evaluation.worst_normal
     parts = dense(robot("tilthex_arm"), "ee", impact.q, n, None, ())
     J, M = parts["J"], parts["M"]
     before = rng("approach").normal(size=9)
     along = n @ J
     before -= along * (along @ before + speed) / (along @ along)
     assert n @ J @ before == pytest.approx(-speed)
-    after = before + found.frictionless.velocity
+    after = before + evaluation.frictionless.velocity
     assert n @ J @ after == pytest.approx(e * speed)
-    assert_close(M @ found.frictionless.velocity, J.T @ found.frictionless.impulse, 1e-10, "momentum")
-    assert_close(M @ found.sticking.velocity, J.T @ found.sticking.impulse, 1e-10, "momentum")
-    assert_close(J @ found.sticking.velocity, (1 + e) * speed * n, 1e-10, "no slip")
-    assert found.energy_loss == pytest.approx((before @ M @ before - after @ M @ after) / 2)
-    assert found.frictionless.impulse_size == pytest.approx((1 + e) * speed / parts["G"])
-    names = [name for name, _, _ in found.frictionless.largest]
-    order = np.argsort(-np.abs(found.frictionless.velocity))
+    assert_close(M @ evaluation.frictionless.velocity, J.T @ evaluation.frictionless.impulse, 1e-10, "momentum")
+    assert_close(M @ evaluation.sticking.velocity, J.T @ evaluation.sticking.impulse, 1e-10, "momentum")
+    assert_close(J @ evaluation.sticking.velocity, (1 + e) * speed * n, 1e-10, "no slip")
+    assert evaluation.energy_loss == pytest.approx((before @ M @ before - after @ M @ after) / 2)
+    assert evaluation.frictionless.impulse_size == pytest.approx((1 + e) * speed / parts["G"])
+    names = [name for name, _, _ in evaluation.frictionless.largest]
+    order = np.argsort(-np.abs(evaluation.frictionless.velocity))
     assert names[:3] == [impact.robot.tangent_names[k] for k in order[:3]]
 
 
-def strict(found: Evaluation) -> dict[str, object]:
-    block = json.loads(json.dumps(found.to_dict(), allow_nan=False))
+def strict(result: Evaluation) -> dict[str, object]:
+    block = json.loads(json.dumps(result.to_dict(), allow_nan=False))
     assert set(block) >= DESIGN_KEYS
     return block
 
@@ -169,35 +173,35 @@ def test_the_block_has_the_keys_of_result_json() -> None:
     assert set(block["ellipsoid"]) == {"axes", "radii"}  # type: ignore[call-overload]
     assert set(block["pose"]) == {"position", "quaternion_xyzw"}  # type: ignore[call-overload]
     assert len(block["gradient"]) == 9 and len(block["q"]) == 9  # type: ignore[arg-type]
-    asked = impact.to_dict()
-    assert set(asked) == {"robot", "contacts", "scenarios", "supports", "support_compliance", "metric"}
+    options = impact.to_dict()
+    assert set(options) == {"robot", "contacts", "scenarios", "supports", "support_compliance", "metric"}
     robot_keys = "name source model_sha256 nq nv joint_names root convention armature locked"
-    assert set(asked["robot"]) >= set(robot_keys.split())  # type: ignore[call-overload]
+    assert set(options["robot"]) >= set(robot_keys.split())  # type: ignore[call-overload]
 
 
 def test_where_S_does_not_exist(planar: str) -> None:
     impact = resolve(ImpactSettings(robot=planar, frame="tip", normal=(1.0, 0.0, 0.5), objective="sticking"))
     q = np.array([0.3, 0.9])
-    found = evaluate(impact.objective, q)
-    block = strict(found)
+    evaluation = evaluate(impact.objective, q)
+    block = strict(evaluation)
     assert block["S"] is None and block["objective"] is None and block["objective_gradient"] is None
-    assert found.sticking is None and found.scalars.V is not None
-    assert any("S is undefined" in line for line in found.warnings)
+    assert evaluation.sticking is None and evaluation.scalars.V is not None
+    assert any("S is undefined" in line for line in evaluation.warnings)
 
 
 def test_where_the_contact_cannot_move_along_the_normal(planar: str) -> None:
     impact = resolve(ImpactSettings(robot=planar, frame="tip", normal=(0.0, 0.0, 1.0), objective="speed"))
-    found = evaluate(impact.objective, np.array([0.3, 0.9]))
-    block = strict(found)
+    evaluation = evaluate(impact.objective, np.array([0.3, 0.9]))
+    block = strict(evaluation)
     assert [block[key] for key in ("V", "S", "E", "effective_mass", "objective")] == [None] * 5
-    assert found.frictionless is None and found.energy_loss is None
-    assert found.scalars.H == pytest.approx(0.0, abs=1e-20)
-    assert any("unbounded" in line for line in found.warnings)
+    assert evaluation.frictionless is None and evaluation.energy_loss is None
+    assert evaluation.scalars.H == pytest.approx(0.0, abs=1e-20)
+    assert any("unbounded" in line for line in evaluation.warnings)
 
 
 def test_one_joint_dominates_or_none_does(planar: str) -> None:
-    found = evaluate(*_impact(planar, (0.0, 1.0, 0.0), [0.0, 0.0]))
-    joint = found.dominance
+    evaluation = evaluate(*_impact(planar, (0.0, 1.0, 0.0), [0.0, 0.0]))
+    joint = evaluation.dominance
     a = np.linalg.solve(
         mass_matrix(_impact(planar, (0.0, 1.0, 0.0), [0.0, 0.0])[0].robot.model, np.zeros(2)), [1.0, 0.5]
     )
@@ -230,9 +234,9 @@ def test_an_impossible_approach_is_refused(speed: float, restitution: float) -> 
 def test_classical_ellipsoids() -> None:
     impact = resolve(ImpactSettings(robot="panda", normal=(0.0, 0.0, 1.0)))
     J = frame_jacobian(impact.robot.model, impact.q, impact.robot.frame_id("panda_hand_tcp"))[:3]
-    found = classical_ellipsoids(impact.objective, impact.q)
+    ellipsoids = classical_ellipsoids(impact.objective, impact.q)
     for name, matrix in (("velocity", J @ J.T), ("force", np.linalg.inv(J @ J.T))):
-        axes, radii = found[name].axes, found[name].radii
+        axes, radii = ellipsoids[name].axes, ellipsoids[name].radii
         assert_close(axes @ np.diag(radii**2) @ axes.T, matrix, 1e-9, name)
         assert (np.diff(radii) <= 0).all()
 

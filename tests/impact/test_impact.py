@@ -43,14 +43,16 @@ VALUE, GRADIENT = 1e-9, 1e-6
 STEP = 2e-4
 
 
-def supports_of(found: Robot) -> tuple[Support, ...]:
+def supports_of(loaded: Robot) -> tuple[Support, ...]:
     """The robot's feet; where it has none, a point brace a third of the way to the contact."""
-    if found.spec.supports:
-        return found.spec.supports
-    assert found.spec.contact.frame is not None
-    path = list(found.model.supports[found.model.frames[found.frame_id(found.spec.contact.frame)].parentJoint])[1:]
+    if loaded.spec.supports:
+        return loaded.spec.supports
+    assert loaded.spec.contact.frame is not None
+    path = list(loaded.model.supports[loaded.model.frames[loaded.frame_id(loaded.spec.contact.frame)].parentJoint])[
+        1:
+    ]
     braced = path[len(path) // 3]
-    frame = next(f for f in found.model.frames if f.parentJoint == braced and f.type == pin.FrameType.BODY)
+    frame = next(f for f in loaded.model.frames if f.parentJoint == braced and f.type == pin.FrameType.BODY)
     return (Support(str(frame.name), "point", (0.02, 0.03, -0.01)),)
 
 
@@ -62,15 +64,15 @@ SOME = (*WHOLE, "kinova", "tiago", "talos", "anymal_kinova", "borinot", "bolt", 
 
 def combinations(name: str) -> Iterator[tuple[Robot, ImpactContact, Metric, tuple[Support, ...]]]:
     """Yield metric × supports × frame of the normal: all twelve, or three with each metric once, by the robot."""
-    found, generator = robot(name), rng(name, "combinations")
-    assert found.spec.contact.frame is not None
-    weights = tuple(float(w) for w in generator.uniform(0.5, 2.0, found.nv))
+    loaded, generator = robot(name), rng(name, "combinations")
+    assert loaded.spec.contact.frame is not None
+    weights = tuple(float(w) for w in generator.uniform(0.5, 2.0, loaded.nv))
     metrics = (Metric(), Metric("kinetic"), Metric("weighted", weights))
-    pairs = list(itertools.product(((), supports_of(found)), ("world", "contact")))
+    pairs = list(itertools.product(((), supports_of(loaded)), ("world", "contact")))
     for (i, metric), (k, (supports, axes)) in itertools.product(enumerate(metrics), enumerate(pairs)):
         if name in WHOLE or k == (NAMES.index(name) + i) % 4:
             normal = unit(generator)
-            yield found, ImpactContact(found.spec.contact.frame, tuple(normal), OFFSET, axes, 3.0), metric, supports
+            yield loaded, ImpactContact(loaded.spec.contact.frame, tuple(normal), OFFSET, axes, 3.0), metric, supports
 
 
 def describe(contact: ImpactContact, metric: Metric, supports: tuple[Support, ...]) -> str:
@@ -79,16 +81,16 @@ def describe(contact: ImpactContact, metric: Metric, supports: tuple[Support, ..
 
 @pytest.mark.parametrize("name", SOME)
 def test_symbolic_oracle_and_differences_agree(name: str) -> None:
-    for found, contact, metric, supports in combinations(name):
-        compliance = default_compliance(found)
-        q, n = ca.SX.sym("q", found.nq), ca.SX.sym("n", 3)
-        k = ImpactKernel(ImpactCase(found, contact, metric, supports, compliance), q, n)
+    for loaded, contact, metric, supports in combinations(name):
+        compliance = default_compliance(loaded)
+        q, n = ca.SX.sym("q", loaded.nq), ca.SX.sym("n", 3)
+        k = ImpactKernel(ImpactCase(loaded, contact, metric, supports, compliance), q, n)
         kernel_fun = ca.Function(
             "kernel", [q, n],
             [k.H, k.G, k.V, k.S, k.E, k.ellipsoid, k.mobility, k.jump.a, k.world_normal,
              k.grad_H, k.grad_G, k.grad_V, k.grad_S, k.grad_E],
         )  # fmt: skip
-        oracle = ImpactOracle(ImpactCase(found, contact, metric, supports, compliance))
+        oracle = ImpactOracle(ImpactCase(loaded, contact, metric, supports, compliance))
 
         def values(at: Vector, oracle: ImpactOracle = oracle) -> Vector:
             o = oracle.quantities(at)
@@ -96,7 +98,7 @@ def test_symbolic_oracle_and_differences_agree(name: str) -> None:
             return np.array([o.H, o.G, o.V, o.S, o.E])
 
         where = describe(contact, metric, supports)
-        (at,) = random_configurations(found.model, 1, name, where)
+        (at,) = random_configurations(loaded.model, 1, name, where)
         out = [np.array(value) for value in kernel_fun(at, contact.normal)]
         o = oracle.quantities(at)
         expected = [o.H, o.G, o.V, o.S, o.E, o.ellipsoid, o.mobility, o.jump, o.normal]
@@ -104,7 +106,7 @@ def test_symbolic_oracle_and_differences_agree(name: str) -> None:
         for what, value, numbers in zip(words, out, expected, strict=False):
             assert_close(value, np.asarray(numbers), VALUE, f"{what} ({where})")
         gradients = dict(zip("HGVSE", (g.reshape(-1) for g in out[9:]), strict=True))
-        differences = dict(zip("HGVSE", central_gradient(values, found.model, at, STEP), strict=True))
+        differences = dict(zip("HGVSE", central_gradient(values, loaded.model, at, STEP), strict=True))
         for what, gradient in gradients.items():
             assert_close(gradient, differences[what], GRADIENT, f"grad {what} ({where})")
         for what, gradient in {
@@ -116,26 +118,26 @@ def test_symbolic_oracle_and_differences_agree(name: str) -> None:
 @pytest.mark.parametrize("name", NAMES)
 def test_oracle_by_its_definition(name: str) -> None:
     """Inverses written out, from Pinocchio's matrices and nothing else."""
-    for found, contact, metric, supports in combinations(name):
+    for loaded, contact, metric, supports in combinations(name):
         if metric.kind == "weighted":
             continue
-        model, where = found.model, describe(contact, metric, supports)
+        model, where = loaded.model, describe(contact, metric, supports)
         (q,) = random_configurations(model, 1, name, where, "definition")
-        frame, epsilon = found.frame_id(contact.frame), default_compliance(found)
+        frame, epsilon = loaded.frame_id(contact.frame), default_compliance(loaded)
         M, J = mass_matrix(model, q), frame_jacobian(model, q, frame, contact.offset)[:3]
         held = M.copy()
         for support in supports:
-            J_s = frame_jacobian(model, q, found.frame_id(support.frame), support.offset)[: support.rows]
+            J_s = frame_jacobian(model, q, loaded.frame_id(support.frame), support.offset)[: support.rows]
             held += J_s.T @ J_s / epsilon
         n = np.array(contact.normal)
         if contact.normal_frame == "contact":
             n = frame_placement(model, q, frame).rotation @ n
-        W = M if metric.kind == "kinetic" else np.eye(found.nv)
+        W = M if metric.kind == "kinetic" else np.eye(loaded.nv)
         A = np.linalg.solve(held, J.T)
         ellipsoid, mobility = A.T @ W @ A, J @ A
         s = np.linalg.solve(mobility, n)
         G = n @ mobility @ n
-        o = ImpactOracle(ImpactCase(found, contact, metric, supports, epsilon)).quantities(q)
+        o = ImpactOracle(ImpactCase(loaded, contact, metric, supports, epsilon)).quantities(q)
         # Forming M + JᵀJ/ε loses what the oracle's own system keeps.
         tolerance = 1e-8 if supports else 1e-10
         assert o.S is not None
@@ -150,16 +152,16 @@ def test_oracle_by_its_definition(name: str) -> None:
 @pytest.mark.parametrize("name", SOME)
 def test_lifted_form(name: str) -> None:
     """At the guess the equations hold and the value is the oracle's; the equations fix the unknowns."""
-    for k, (found, contact, metric, supports) in enumerate(combinations(name)):
+    for k, (loaded, contact, metric, supports) in enumerate(combinations(name)):
         # A robot that goes through all combinations goes through them with each kind, every other with three kinds.
         for kind in KINDS if name in WHOLE else [KINDS[(NAMES.index(name) + k) % len(KINDS)]]:
-            objective = WorstCaseObjective(found, contact, metric, kind, supports)
-            q, n = ca.SX.sym("q", found.nq), ca.SX.sym("n", 3)
-            lifted = objective.lift(Tree(found.model, q), n, ca.SX(1))
+            objective = WorstCaseObjective(loaded, contact, metric, kind, supports)
+            q, n = ca.SX.sym("q", loaded.nq), ca.SX.sym("n", 3)
+            lifted = objective.lift(Tree(loaded.model, q), n, ca.SX(1))
             assert lifted.variables.shape == lifted.residual.shape
             lifted_fun = ca.Function("lifted", [q, n, lifted.variables], [lifted.residual, lifted.value])
             where = f"{kind}, {describe(contact, metric, supports)}"
-            (at,) = random_configurations(found.model, 1, name, where)
+            (at,) = random_configurations(loaded.model, 1, name, where)
             guess = objective.guess(at, 1.0).values
             residual, value = (np.array(o) for o in lifted_fun(at, contact.normal, guess))
             assert np.abs(residual).max() < 1e-9 * max(1.0, np.abs(guess).max()), where
@@ -174,10 +176,10 @@ def test_lifted_form(name: str) -> None:
 def test_objective_functions_agree_with_its_own_numbers(name: str, kind: ObjectiveKind) -> None:
     all_of_them = list(combinations(name))
     # All metrics, both frames, with and without supports; CasADi's subexpression search is slow.
-    for found, contact, metric, supports in (all_of_them[k] for k in (0, 5, 7, 10)):
-        objective = WorstCaseObjective(found, contact, metric, kind, supports)
+    for result, contact, metric, supports in (all_of_them[k] for k in (0, 5, 7, 10)):
+        objective = WorstCaseObjective(result, contact, metric, kind, supports)
         where = describe(contact, metric, supports)
-        (q,) = random_configurations(found.model, 1, name, kind, where)
+        (q,) = random_configurations(result.model, 1, name, kind, where)
         value, gradient = (np.array(o) for o in objective.gradient_fun()(q, contact.normal))
         assert_close(value, objective.value(q), VALUE, f"value ({where})")
         if metric.kind == "euclidean":
@@ -185,7 +187,7 @@ def test_objective_functions_agree_with_its_own_numbers(name: str, kind: Objecti
         # Stiff feet cost digits where the contact can hardly move, and the inverse of its mobility is large.
         agreed = GRADIENT if supports else 1e-8
         assert_close(gradient, objective.gradient(q), agreed, f"gradient ({where})")
-        differences = central_gradient(lambda at, o=objective: o.value(at), found.model, q, STEP)
+        differences = central_gradient(lambda at, o=objective: o.value(at), result.model, q, STEP)
         assert_close(objective.gradient(q), differences, GRADIENT, f"differences ({where})")
         if kind == "impulse":
             assert objective.scale == 9.0
@@ -223,9 +225,9 @@ def test_degenerate_combinations_have_warnings(name: str, frame: str) -> None:
 
 
 def test_velocity_limit_weights_are_inverse_squares() -> None:
-    found = robot("panda")
-    metric = build_metric(found, "weighted", "velocity-limits")
-    np.testing.assert_allclose(metric.diagonal(found.nv), 1 / np.array(found.model.upperVelocityLimit) ** 2)
+    loaded = robot("panda")
+    metric = build_metric(loaded, "weighted", "velocity-limits")
+    np.testing.assert_allclose(metric.diagonal(loaded.nv), 1 / np.array(loaded.model.upperVelocityLimit) ** 2)
     floating = build_metric(robot("solo8"), "weighted", "velocity-limits").diagonal(14)
     np.testing.assert_array_equal(floating[:6], np.ones(6))
     np.testing.assert_allclose(floating[6:], 80.0**-2)

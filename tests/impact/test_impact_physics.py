@@ -41,7 +41,7 @@ OFFSET = (0.01, -0.02, 0.03)
 
 
 def quantities(
-    found: Robot,
+    loaded: Robot,
     q: Vector,
     normal: Vector,
     metric: Metric = Metric(),
@@ -49,53 +49,39 @@ def quantities(
     compliance: float | None = None,
     frame: str | None = None,
 ) -> ImpactQuantities:
-    frame = frame or found.spec.contact.frame
+    frame = frame or loaded.spec.contact.frame
     assert frame is not None
     contact = ImpactContact(frame, tuple(normal), OFFSET)
-    return ImpactOracle(ImpactCase(found, contact, metric, supports, compliance or 0.0)).quantities(q)
+    return ImpactOracle(ImpactCase(loaded, contact, metric, supports, compliance or 0.0)).quantities(q)
 
 
-def feet(found: Robot) -> tuple[Support, ...]:
-    return found.spec.supports
+def feet(loaded: Robot) -> tuple[Support, ...]:
+    return loaded.spec.supports
 
 
-def jacobians(found: Robot, q: Vector, supports: tuple[Support, ...]) -> tuple[Vector, Vector, Vector]:
+def jacobians(loaded: Robot, q: Vector, supports: tuple[Support, ...]) -> tuple[Vector, Vector, Vector]:
     """``M``, the contact's 3-row ``J`` and the supports' stacked ``J_s`` from Pinocchio."""
-    assert found.spec.contact.frame is not None
-    J = frame_jacobian(found.model, q, found.frame_id(found.spec.contact.frame), OFFSET)[:3]
+    assert loaded.spec.contact.frame is not None
+    J = frame_jacobian(loaded.model, q, loaded.frame_id(loaded.spec.contact.frame), OFFSET)[:3]
     parts = [
-        frame_jacobian(found.model, q, found.frame_id(s.frame), s.offset)[: s.rows] for s in supports
+        frame_jacobian(loaded.model, q, loaded.frame_id(s.frame), s.offset)[: s.rows] for s in supports
     ]  # fmt: skip
-    return mass_matrix(found.model, q), J, np.vstack([np.zeros((0, found.nv)), *parts])
+    return mass_matrix(loaded.model, q), J, np.vstack([np.zeros((0, loaded.nv)), *parts])
 
 
 # ---- balances ---------------------------------------------------------------------------------------------------
 
 
-@pytest.mark.parametrize("name", STANDING)
-def test_momentum_balances_with_feet(name: str) -> None:
-    """``M a = Jᵀn + J_sᵀf`` and ``J_s a = −ε f``."""
-    found = robot(name)
-    generator = rng(name, "momentum")
-    for q in [found.posture(), *random_configurations(found.model, 2, name, "momentum")]:
-        n = unit(generator)
-        M, J, J_s = jacobians(found, q, feet(found))
-        o = quantities(found, q, n, supports=feet(found))
-        assert_close(M @ o.jump - J_s.T @ o.support_impulse, J.T @ n, 1e-9, "momentum")
-        slip = -default_compliance(found) * o.support_impulse
-        assert np.abs(J_s @ o.jump - slip).max() < 1e-12 * np.abs(o.jump).max()
-
-
 @pytest.mark.parametrize("name", NAMES)
 def test_an_impact_stops_the_contact_and_dissipates_e(name: str) -> None:
     """``λ = v_n/G`` ends the approach and costs the kinetic energy ``E v_n²``; sticking stops the whole point."""
-    found = robot(name)
+    loaded = robot(name)
     generator = rng(name, "energy")
-    for q in random_configurations(found.model, 2, name, "energy"):
+    for q in random_configurations(loaded.model, 2, name, "energy"):
         n, speed = unit(generator), 1.7
-        M, J, _ = jacobians(found, q, ())
-        o = quantities(found, q, n)
-        before = generator.normal(size=found.nv)
+        M, J, _ = jacobians(loaded, q, ())
+        o = quantities(loaded, q, n)
+        before = generator.normal(size=loaded.nv)
         before *= -speed / (n @ J @ before)
         after = before + o.jump * speed / o.G
         assert abs(n @ J @ after) < 1e-9 * speed
@@ -115,10 +101,10 @@ def test_an_impact_stops_the_contact_and_dissipates_e(name: str) -> None:
 @pytest.mark.parametrize("name", NAMES)
 def test_kinetic_identities(name: str) -> None:
     """Free: ``H = G``, ``V = 1/G = 2E``, ``Λ_c = JM⁻¹Jᵀ``, ``S = nᵀ(JM⁻¹Jᵀ)⁻¹n ≥ 1/G`` (Cauchy–Schwarz)."""
-    found = robot(name)
+    loaded = robot(name)
     generator = rng(name, "kinetic")
-    for q in random_configurations(found.model, 3, name, "kinetic"):
-        o = quantities(found, q, unit(generator), Metric("kinetic"))
+    for q in random_configurations(loaded.model, 3, name, "kinetic"):
+        o = quantities(loaded, q, unit(generator), Metric("kinetic"))
         assert pytest.approx(o.G, rel=1e-10) == o.H
         assert pytest.approx(1 / o.G, rel=1e-10) == o.V
         assert pytest.approx(2 * o.E, rel=1e-10) == o.V
@@ -128,7 +114,7 @@ def test_kinetic_identities(name: str) -> None:
         assert o.S >= (1 - 1e-10) / o.G
         # Along an eigenvector a frictionless and a sticking impact are the same.
         values, vectors = np.linalg.eigh(o.mobility)
-        own = quantities(found, q, vectors[:, 1], Metric("kinetic"))
+        own = quantities(loaded, q, vectors[:, 1], Metric("kinetic"))
         assert own.S == pytest.approx(own.V, rel=1e-6)
         assert pytest.approx(values[1], rel=1e-9) == own.G
 
@@ -136,13 +122,13 @@ def test_kinetic_identities(name: str) -> None:
 @pytest.mark.parametrize("name", STANDING)
 def test_feet_never_add_mobility(name: str) -> None:
     """Supports take effective mass's inverse down, and more so the stiffer they are; ``G`` falls with each foot."""
-    found = robot(name)
+    loaded = robot(name)
     generator = rng(name, "mobility")
-    (q,) = random_configurations(found.model, 1, name, "mobility")
+    (q,) = random_configurations(loaded.model, 1, name, "mobility")
     n = unit(generator)
-    ladder = [quantities(found, q, n, supports=feet(found)[:k]).G for k in range(len(feet(found)) + 1)]
+    ladder = [quantities(loaded, q, n, supports=feet(loaded)[:k]).G for k in range(len(feet(loaded)) + 1)]
     assert all(later <= earlier * (1 + 1e-9) for earlier, later in itertools.pairwise(ladder))
-    stiffness = [quantities(found, q, n, supports=feet(found), compliance=c).G for c in (1.0, 1e-2, 1e-4)]
+    stiffness = [quantities(loaded, q, n, supports=feet(loaded), compliance=c).G for c in (1.0, 1e-2, 1e-4)]
     assert stiffness[0] >= stiffness[1] * (1 - 1e-9) >= stiffness[2] * (1 - 1e-9) ** 2
 
 
@@ -150,17 +136,17 @@ def test_feet_never_add_mobility(name: str) -> None:
 @pytest.mark.parametrize("name", ["solo8", "panda", "tilthex_arm", "talos"])
 def test_root_h_is_the_ellipsoids_half_width(name: str, metric: str) -> None:
     """The ellipsoid is the image of the unit ball under ``JM⁻¹W^½``; its farthest point along n is at ``√H``."""
-    found, generator = robot(name), rng(name, metric, "width")
-    weights = generator.uniform(0.5, 2.0, found.nv)
+    loaded, generator = robot(name), rng(name, metric, "width")
+    weights = generator.uniform(0.5, 2.0, loaded.nv)
     chosen = Metric("weighted", tuple(weights)) if metric == "weighted" else Metric(metric)  # type: ignore[arg-type]
-    (q,) = random_configurations(found.model, 1, name, metric, "width")
+    (q,) = random_configurations(loaded.model, 1, name, metric, "width")
     n = unit(generator)
-    o = quantities(found, q, n, chosen)
-    M, J, _ = jacobians(found, q, ())
-    root = {"euclidean": np.eye(found.nv), "weighted": np.diag(np.sqrt(weights)), "kinetic": np.linalg.cholesky(M)}
+    o = quantities(loaded, q, n, chosen)
+    M, J, _ = jacobians(loaded, q, ())
+    root = {"euclidean": np.eye(loaded.nv), "weighted": np.diag(np.sqrt(weights)), "kinetic": np.linalg.cholesky(M)}
     image = J @ np.linalg.solve(M, root[metric])
     assert_close(image @ image.T, o.ellipsoid, 1e-9, "ellipsoid")
-    ball = generator.normal(size=(found.nv, 2000))
+    ball = generator.normal(size=(loaded.nv, 2000))
     ball /= np.linalg.norm(ball, axis=0)
     reach = n @ image @ ball
     assert reach.max() <= np.sqrt(o.H)
@@ -177,12 +163,12 @@ def test_root_h_is_the_ellipsoids_half_width(name: str, metric: str) -> None:
 @pytest.mark.parametrize("name", FLOATING)
 def test_moving_the_base(name: str) -> None:
     """Nothing changes when the robot is carried elsewhere, nor when robot and normal turn together."""
-    found = robot(name)
+    loaded = robot(name)
     generator = rng(name, "moved")
-    for supports in {(), feet(found)}:
-        (q,) = random_configurations(found.model, 1, name, "moved")
+    for supports in {(), feet(loaded)}:
+        (q,) = random_configurations(loaded.model, 1, name, "moved")
         n = unit(generator)
-        here = quantities(found, q, n, supports=supports)
+        here = quantities(loaded, q, n, supports=supports)
         shifted = q.copy()
         shifted[:3] += [3.0, -2.0, 1.0]
         turn = pin.Quaternion(unit(generator, 4))
@@ -191,40 +177,31 @@ def test_moving_the_base(name: str) -> None:
         turned[:3], turned[3:7] = turn.matrix() @ q[:3], base.coeffs()
         tolerance = 1e-9
         for there in (
-            quantities(found, shifted, n, supports=supports),
-            quantities(found, turned, turn.matrix() @ n, supports=supports),
+            quantities(loaded, shifted, n, supports=supports),
+            quantities(loaded, turned, turn.matrix() @ n, supports=supports),
         ):
             for letter in "HGVSE":
                 value, expected = getattr(there, letter), getattr(here, letter)
                 assert_close(value, expected, tolerance, f"{letter}, {len(supports)} supports")
         R = turn.matrix()
-        there = quantities(found, turned, n, supports=supports)
+        there = quantities(loaded, turned, n, supports=supports)
         assert_close(there.ellipsoid, R @ here.ellipsoid @ R.T, tolerance, "ellipsoid turns with the robot")
-
-
-def test_turning_the_robot_alone_does_change_h() -> None:
-    found = robot("tilthex_arm")
-    q = found.posture("brace_forward")
-    turned = q.copy()
-    turned[3:7] = (pin.Quaternion(pin.rpy.rpyToMatrix(0.0, 0.6, 0.0)) * pin.Quaternion(q[3:7])).coeffs()
-    n = np.array([1.0, 0.0, 0.0])
-    assert relative(quantities(found, turned, n).H, quantities(found, q, n).H) > 0.01
 
 
 @pytest.mark.parametrize("name", ["talos", "panda", "solo8"])
 def test_the_sign_of_the_normal_does_not_matter(name: str) -> None:
-    found = robot(name)
-    (q,) = random_configurations(found.model, 1, name, "sign")
+    loaded = robot(name)
+    (q,) = random_configurations(loaded.model, 1, name, "sign")
     n = unit(rng(name, "sign"))
-    one, other = quantities(found, q, n), quantities(found, q, -n)
+    one, other = quantities(loaded, q, n), quantities(loaded, q, -n)
     for letter in "HGVSE":
         assert_close(getattr(one, letter), getattr(other, letter), 1e-12, letter)
 
 
 def test_the_kinetic_metric_does_not_depend_on_the_base_point() -> None:
     """The euclidean one does: that is what the kinetic metric is for."""
-    found = robot("borinot")
-    moved = found.model.copy()
+    loaded = robot("borinot")
+    moved = loaded.model.copy()
     shift = pin.SE3(np.eye(3), np.array([0.2, -0.1, 0.3]))
     # The same body seen from another base origin: everything on it moves the other way.
     moved.inertias[1] = shift.actInv(moved.inertias[1])
@@ -234,13 +211,13 @@ def test_the_kinetic_metric_does_not_depend_on_the_base_point() -> None:
     for k in range(moved.nframes):
         if moved.frames[k].parentJoint == 1:
             moved.frames[k].placement = shift.inverse() * moved.frames[k].placement
-    other = Robot(found.name, found.source, moved, found.root, {}, "", found.spec)
-    (q,) = random_configurations(found.model, 1, "base point")
+    other = Robot(loaded.name, loaded.source, moved, loaded.root, {}, "", loaded.spec)
+    (q,) = random_configurations(loaded.model, 1, "base point")
     q_moved = q.copy()
     q_moved[:3] += pin.Quaternion(q[3:7]).matrix() @ shift.translation
     n = unit(rng("base point"))
     for metric, same in ((Metric("kinetic"), True), (Metric(), False)):
-        one, there = quantities(found, q, n, metric), quantities(other, q_moved, n, metric)
+        one, there = quantities(loaded, q, n, metric), quantities(other, q_moved, n, metric)
         assert_close(there.G, one.G, 1e-9, "G")
         assert (relative(there.V, one.V) < 1e-9) == same
 
@@ -248,54 +225,36 @@ def test_the_kinetic_metric_does_not_depend_on_the_base_point() -> None:
 # ---- feet: the limit of zero compliance ---------------------------------------------------------------------------
 
 
-@pytest.mark.parametrize("name", ["talos", "icub", "romeo", "g1"])
-def test_stiffer_feet_approach_pinocchios_impulse_dynamics(name: str) -> None:
-    """At full rank the jump tends to the exact one of held feet, in proportion to ε."""
-    found = robot(name)
-    model, n = found.model, unit(rng(name, "exact"))
-    for q in random_configurations(model, 2, name, "exact"):
-        M, J, J_s = jacobians(found, q, feet(found))
-        assert np.linalg.matrix_rank(J_s) == 12
-        exact = pin.impulseDynamics(model, model.createData(), q, np.linalg.solve(M, J.T @ n), J_s, 0.0, 0.0)
-        errors = []
-        for epsilon in (1e-4, 1e-5, 1e-6):
-            o = quantities(found, q, n, supports=feet(found), compliance=epsilon / found.mass)
-            errors.append(relative(o.jump, exact))
-        assert errors[1] < 0.05
-        assert errors[1] / errors[0] == pytest.approx(0.1, rel=0.2)
-        assert errors[2] / errors[1] == pytest.approx(0.1, rel=0.2)
-
-
 def test_feet_are_heavier_links() -> None:
     """The heavy-foot shortcut: solo8 with the point mass 1/ε welded to its feet, by Pinocchio's own CRBA."""
-    found = robot("solo8")
-    epsilon = default_compliance(found)
-    heavy = found.model.copy()
-    for support in feet(found):
-        frame = heavy.frames[found.frame_id(support.frame)]
+    loaded = robot("solo8")
+    epsilon = default_compliance(loaded)
+    heavy = loaded.model.copy()
+    for support in feet(loaded):
+        frame = heavy.frames[loaded.frame_id(support.frame)]
         point = pin.Inertia(1 / epsilon, np.zeros(3), np.zeros((3, 3)))
         heavy.appendBodyToJoint(
             frame.parentJoint, point, frame.placement * pin.SE3(np.eye(3), np.array(support.offset))
         )
-    extra = support_inertia(found, feet(found), epsilon)
+    extra = support_inertia(loaded, feet(loaded), epsilon)
     assert len(extra) == 4
     for joint, inertia in extra.items():
-        added = heavy.inertias[joint].matrix() - found.model.inertias[joint].matrix()
+        added = heavy.inertias[joint].matrix() - loaded.model.inertias[joint].matrix()
         assert_close(inertia, added, 1e-9, "inertia")
-    (q,) = random_configurations(found.model, 1, "heavy")
-    M, _, J_s = jacobians(found, q, feet(found))
+    (q,) = random_configurations(loaded.model, 1, "heavy")
+    M, _, J_s = jacobians(loaded, q, feet(loaded))
     assert_close(mass_matrix(heavy, q), M + J_s.T @ J_s / epsilon, 1e-9, "M")
 
 
 @pytest.mark.parametrize("normal", [(1.0, 0.0, 0.0), (0.0, 0.0, 1.0), (0.0, 1.0, 0.0)])
 def test_solo8_on_its_feet_is_not_solo8_in_the_air(normal: tuple[float, float, float]) -> None:
     """Crouching with the feet held: the free ``H`` and the one that knows of the ground disagree about its sign."""
-    found = robot("solo8")
-    contact, q = ImpactContact("base_link", normal), found.posture()
-    free, standing = WorstCaseObjective(found, contact), WorstCaseObjective(found, contact, supports=feet(found))
+    loaded = robot("solo8")
+    contact, q = ImpactContact("base_link", normal), loaded.posture()
+    free, standing = WorstCaseObjective(loaded, contact), WorstCaseObjective(loaded, contact, supports=feet(loaded))
     assert relative(standing.value(q), free.value(q)) > 0.1
     # What the feet allow that lowers the base and does nothing else to it.
-    _, _, J_s = jacobians(found, q, feet(found))
+    _, _, J_s = jacobians(loaded, q, feet(loaded))
     allowed = np.linalg.svd(J_s)[2][np.linalg.matrix_rank(J_s, tol=1e-9) :].T
     crouch = allowed @ np.linalg.lstsq(allowed[:6], np.array([0, 0, -1.0, 0, 0, 0]), rcond=None)[0]
     np.testing.assert_allclose(crouch[:6], [0, 0, -1, 0, 0, 0], atol=1e-9)
@@ -308,13 +267,13 @@ def test_solo8_on_its_feet_is_not_solo8_in_the_air(normal: tuple[float, float, f
 
 def test_point_feet_lose_rank_and_stay_smooth() -> None:
     """Four point feet of solo8 hold 9 to 11 directions; the compliance keeps the differences finite and right."""
-    found = robot("solo8")
-    q = found.posture("standing")
-    _, _, J_s = jacobians(found, q, feet(found))
+    loaded = robot("solo8")
+    q = loaded.posture("standing")
+    _, _, J_s = jacobians(loaded, q, feet(loaded))
     assert J_s.shape[0] == 12
     assert np.linalg.matrix_rank(J_s, tol=1e-9) < 12
-    objective = WorstCaseObjective(found, ImpactContact("base_link", (0.0, 1.0, 0.0)), supports=feet(found))
-    differences = central_gradient(objective.value, found.model, q, 2e-4)
+    objective = WorstCaseObjective(loaded, ImpactContact("base_link", (0.0, 1.0, 0.0)), supports=feet(loaded))
+    differences = central_gradient(objective.value, loaded.model, q, 2e-4)
     assert_close(objective.gradient(q), differences, 1e-6, "gradient", scale=objective.value(q))
 
 
@@ -329,23 +288,23 @@ def pendulum() -> Robot:
     )
 
 
-def _plane(found: Robot, q: Vector) -> tuple[Vector, Vector]:
+def _plane(loaded: Robot, q: Vector) -> tuple[Vector, Vector]:
     """The contact's Jacobian and the normal of the plane that it can move in."""
-    J = frame_jacobian(found.model, q, found.frame_id("link2"), OFFSET)[:3]
+    J = frame_jacobian(loaded.model, q, loaded.frame_id("link2"), OFFSET)[:3]
     return J, np.linalg.svd(J)[0][:, 2]
 
 
 def test_s_is_undefined_out_of_the_plane() -> None:
-    found = pendulum()
-    (q,) = random_configurations(found.model, 1, "plane")
-    _, out = _plane(found, q)
+    loaded = pendulum()
+    (q,) = random_configurations(loaded.model, 1, "plane")
+    _, out = _plane(loaded, q)
     for tilt in (1.0, 0.1, 1e-3):
         n = out * tilt + np.sqrt(1 - tilt**2) * np.cross(out, unit(rng("in plane")))
-        o = quantities(found, q, n, frame="link2")
+        o = quantities(loaded, q, n, frame="link2")
         assert o.S is None
         assert o.sticking_jump is None
         assert o.sticking_impulse is None
-    objective = WorstCaseObjective(found, ImpactContact("link2", tuple(out), OFFSET), kind="sticking")
+    objective = WorstCaseObjective(loaded, ImpactContact("link2", tuple(out), OFFSET), kind="sticking")
     with pytest.raises(MetricError, match="S does not exist"):
         objective.value(q)
     with pytest.raises(MetricError, match="S does not exist"):
@@ -353,22 +312,22 @@ def test_s_is_undefined_out_of_the_plane() -> None:
 
 
 def test_s_in_the_plane_by_the_pseudo_inverse() -> None:
-    found = pendulum()
-    for q in random_configurations(found.model, 3, "in the plane"):
-        J, out = _plane(found, q)
+    loaded = pendulum()
+    for q in random_configurations(loaded.model, 3, "in the plane"):
+        J, out = _plane(loaded, q)
         n = np.cross(out, unit(rng("tangent")))
         n /= np.linalg.norm(n)
-        o = quantities(found, q, n, frame="link2")
-        M = mass_matrix(found.model, q)
+        o = quantities(loaded, q, n, frame="link2")
+        M = mass_matrix(loaded.model, q)
         # Two joints, two directions: J alone fixes the jump.
         jump = np.linalg.pinv(J) @ n
         assert o.S is not None
         assert o.S == pytest.approx(float(jump @ jump), rel=1e-8)
         assert_close(o.sticking_jump if o.sticking_jump is not None else np.nan, jump, 1e-8, "jump")
-        kinetic = quantities(found, q, n, Metric("kinetic"), frame="link2")
+        kinetic = quantities(loaded, q, n, Metric("kinetic"), frame="link2")
         assert kinetic.S == pytest.approx(float(jump @ M @ jump), rel=1e-8)
-        objective = WorstCaseObjective(found, ImpactContact("link2", tuple(n), OFFSET), kind="sticking")
-        differences = central_gradient(objective.value, found.model, q, 2e-4)
+        objective = WorstCaseObjective(loaded, ImpactContact("link2", tuple(n), OFFSET), kind="sticking")
+        differences = central_gradient(objective.value, loaded.model, q, 2e-4)
         assert_close(objective.gradient(q), differences, 1e-6, "gradient", scale=objective.value(q))
         value, gradient = (np.array(o) for o in objective.gradient_fun()(q, n))
         assert_close(value, objective.value(q), 1e-9, "symbolic value")

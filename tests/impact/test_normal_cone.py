@@ -114,8 +114,12 @@ def test_no_cone_is_the_plain_problem() -> None:
     assert none.value(q) == 4 * none.oracle.quantities(q).H
     assert np.array_equal(none.gradient(q), 4 * none.oracle.gradient_H(q))
     assert none.gradient_fun().n_instructions() == plain.gradient_fun().n_instructions()
-    found = evaluate(none, q)
-    assert found.cone is None and "cone" not in found.to_dict() and np.array_equal(found.worst_normal, found.normal)
+    evaluation = evaluate(none, q)
+    assert (
+        evaluation.cone is None
+        and "cone" not in evaluation.to_dict()
+        and np.array_equal(evaluation.worst_normal, evaluation.normal)
+    )
     # And the cone goes there as it closes.
     narrow = WorstCaseObjective(robot("tilthex_arm"), contact, normal_cone_deg=1e-3)
     assert 1 < narrow.value(q) / none.value(q) < 1 + 1e-3
@@ -158,18 +162,18 @@ def test_every_matrix(values: tuple, one: tuple, other: tuple, place: str, degre
     elif place == "plane":
         axis = np.cos(other[0]) * vectors[:, 0] + np.sin(other[0]) * vectors[:, 1]
     size = max(np.abs(A).max(), 1e-30)
-    found = worst_normal(A, axis, degrees)
+    worst = worst_normal(A, axis, degrees)
     cosine = np.cos(np.deg2rad(degrees))
-    assert along(A, cone_samples(axis, degrees, 3000)).max() <= found.value + 1e-12 * size
-    assert found.bound - found.value <= 1e-8 * size, "the dual proves the value"
-    for n in found.normals:
+    assert along(A, cone_samples(axis, degrees, 3000)).max() <= worst.value + 1e-12 * size
+    assert worst.bound - worst.value <= 1e-8 * size, "the dual proves the value"
+    for n in worst.normals:
         assert abs(np.linalg.norm(n) - 1) < 1e-12 and n @ axis >= cosine - 1e-12
-        assert found.value - n @ A @ n <= 1e-6 * size
+        assert worst.value - n @ A @ n <= 1e-6 * size
     n = np.array(symbolic(degrees)(A, axis)).ravel()
     assert abs(np.linalg.norm(n) - 1) < 1e-12 and n @ axis >= cosine - 1e-12
-    assert abs(n @ A @ n - found.value) <= 1e-12 * size, "the closed form finds it as well"
-    if not found.tied and values == (3, 2, 1):
-        assert np.linalg.norm(n - found.normal) < 1e-9
+    assert abs(n @ A @ n - worst.value) <= 1e-12 * size, "the closed form finds it as well"
+    if not worst.tied and values == (3, 2, 1):
+        assert np.linalg.norm(n - worst.normal) < 1e-9
 
 
 def test_ties_are_flagged() -> None:
@@ -192,16 +196,16 @@ def test_ties_are_flagged() -> None:
 @pytest.mark.parametrize("kind", CONE_KINDS)
 @pytest.mark.parametrize("name", ["tilthex_arm", "panda", "solo8"])
 def test_gradient_where_the_worst_normal_is_unique(name: str, kind: ObjectiveKind) -> None:
-    found = robot(name)
-    feet = found.spec.supports if kind == "impulse" else ()
+    loaded = robot(name)
+    feet = loaded.spec.supports if kind == "impulse" else ()
     for degrees, metric, axes in ((5.0, "kinetic", "contact"), (45.0, "euclidean", "world")):
         contact = ImpactContact(ROBOTS[name], tuple(unit(rng(name, axes, kind))), (0.02, 0, 0.01), axes)  # type: ignore[arg-type]
-        objective = WorstCaseObjective(found, contact, Metric(metric), kind, feet, normal_cone_deg=degrees)  # type: ignore[arg-type]
-        (q,) = random_configurations(found.model, 1, name, axes, kind, degrees, spread=0.4)
+        objective = WorstCaseObjective(loaded, contact, Metric(metric), kind, feet, normal_cone_deg=degrees)  # type: ignore[arg-type]
+        (q,) = random_configurations(loaded.model, 1, name, axes, kind, degrees, spread=0.4)
         assert not cone_of(objective).worst(q).tied
         gradient = objective.gradient(q)
         where = f"{kind} {axes} {degrees} {metric}"
-        assert_close(gradient, central_gradient(objective.value, found.model, q, 1e-4), 2e-6, where)
+        assert_close(gradient, central_gradient(objective.value, loaded.model, q, 1e-4), 2e-6, where)
         value, symbolic_gradient = (np.array(v).ravel() for v in objective.gradient_fun()(q, contact.normal))
         assert_close(value, objective.value(q), 1e-9, where)
         assert_close(objective.value_fun()(q, contact.normal), objective.value(q), 1e-9, where)
@@ -212,18 +216,18 @@ def test_gradient_where_the_worst_normal_is_unique(name: str, kind: ObjectiveKin
 
 def test_subgradients_at_a_mirror_symmetric_posture() -> None:
     """Towards every side the objective rises like the largest of its gradients: they span the subdifferential."""
-    found = robot("solo8")
-    objective = WorstCaseObjective(found, ImpactContact("base_link", (1.0, 0.0, 0.0)), normal_cone_deg=20.0)
-    q = found.posture()
+    loaded = robot("solo8")
+    objective = WorstCaseObjective(loaded, ImpactContact("base_link", (1.0, 0.0, 0.0)), normal_cone_deg=20.0)
+    q = loaded.posture()
     worst = cone_of(objective).worst(q)
     assert worst.tied and np.allclose(worst.normals[0], worst.normals[1] * [1, 1, -1], atol=1e-9)
     points = objective.subgradients(q)
     assert relative(points.gradients[0], points.gradients[1]) > 0.1
     for index in range(20):
-        direction = unit(rng("kink", index), found.nv)
+        direction = unit(rng("kink", index), loaded.nv)
         step = 1e-6
         rise = (
-            objective.value(np.array(pin.integrate(found.model, q, step * direction))) - objective.value(q)
+            objective.value(np.array(pin.integrate(loaded.model, q, step * direction))) - objective.value(q)
         ) / step
         assert rise == pytest.approx((points.gradients @ direction).max(), rel=1e-4, abs=1e-4 * objective.value(q))
     # The C export's gradient is one of them.
@@ -324,9 +328,9 @@ def test_export_has_the_worst_case(tmp_path: Path) -> None:
         (tmp_path / kind).mkdir()
         contact = ImpactContact("ee", (0.1, -0.2, 1.0), impulse=2.0)
         objective = WorstCaseObjective(robot("tilthex_arm"), contact, kind=kind, normal_cone_deg=15.0)
-        made = export(objective, tmp_path / kind)
-        assert made.compiled and made.agreement is not None and made.agreement < 1e-9
-        assert made.manifest["normal_cone_deg"] == 15.0
+        written = export(objective, tmp_path / kind)
+        assert written.compiled and written.agreement is not None and written.agreement < 1e-9
+        assert written.manifest["normal_cone_deg"] == 15.0
         header = next((tmp_path / kind).glob("*.h")).read_text()
         assert "worst normal within 15 degrees" in header and "subgradient" in header
 

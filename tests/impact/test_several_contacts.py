@@ -12,12 +12,11 @@ import pytest
 from hypothesis import given, settings
 from hypothesis import strategies as st
 
-from impact_posture.codegen.self_test import sample_postures
 from impact_posture.errors import ContactError, ImpactPostureError, InputError, MetricError, SpecError
 from impact_posture.impact.evaluation.evaluation import evaluate
 from impact_posture.impact.impact_contact import ImpactContact
 from impact_posture.impact.metric import Metric
-from impact_posture.impact.worst_case.impulse_box import ImpulseBox, WorstImpulses, corners
+from impact_posture.impact.worst_case.impulse_box import ImpulseBox, corners
 from impact_posture.impact.worst_case_objective import WorstCaseObjective
 from impact_posture.posture.constraints.clearance import Clearance
 from impact_posture.posture.constraints.kept_contacts import KeptContacts
@@ -87,8 +86,8 @@ def enumerated(objective: WorstCaseObjective, q: np.ndarray) -> tuple[np.ndarray
     """All corners of the box, the origin among them, and ``‖Σ λ_i a_i‖²_W`` there."""
     jumps, W = jumps_of(objective, q)
     ends = [(-c.impulse if objective.bilateral else 0.0, c.impulse) for c in objective.contacts]
-    found = np.array(list(itertools.product(*ends)))
-    return found, np.einsum("ki,ij,kj->k", found, jumps.T @ W @ jumps, found)
+    rows = np.array(list(itertools.product(*ends)))
+    return rows, np.einsum("ki,ij,kj->k", rows, jumps.T @ W @ jumps, rows)
 
 
 # ---- against enumeration, samples and finite differences ----------------------------------------------------------
@@ -106,14 +105,14 @@ def enumerated(objective: WorstCaseObjective, q: np.ndarray) -> tuple[np.ndarray
 )
 def test_every_box(floating: bool, count: int, feet: int, metric: str, axes: str, bilateral: bool, seed: int) -> None:
     generator = rng(seed, "box")
-    found = random_robot(generator, floating=floating)
+    loaded = random_robot(generator, floating=floating)
     contacts = [
         ImpactContact(f"f{k}", tuple(unit(generator)), tuple(0.1 * generator.normal(size=3)), axes, impulse)  # type: ignore[arg-type]
         for k, impulse in enumerate(generator.uniform(0.3, 3.0, count))
     ]
-    weights = tuple(generator.uniform(0.2, 5.0, found.nv)) if metric == "weighted" else None
+    weights = tuple(generator.uniform(0.2, 5.0, loaded.nv)) if metric == "weighted" else None
     objective = WorstCaseObjective(
-        found,
+        loaded,
         contacts[0],
         Metric(metric, weights),  # type: ignore[arg-type]
         supports=tuple(Support(f"f{5 - k}", "point") for k in range(feet)),
@@ -121,7 +120,7 @@ def test_every_box(floating: bool, count: int, feet: int, metric: str, axes: str
         others=tuple(contacts[1:]),
         bilateral=bilateral,
     )
-    (q,) = random_configurations(found.model, 1, seed, "box", spread=0.6)
+    (q,) = random_configurations(loaded.model, 1, seed, "box", spread=0.6)
     jumps, W = jumps_of(objective, q)
     box, values = enumerated(objective, q)
     value = objective.value(q)
@@ -141,7 +140,7 @@ def test_every_box(floating: bool, count: int, feet: int, metric: str, axes: str
     best = np.sort(values)[::-1]
     if best[2 if bilateral else 1] < value * (1 - 1e-3):
         gradient = objective.gradient(q)
-        differences = central_gradient(objective.value, found.model, q, 1e-4)
+        differences = central_gradient(objective.value, loaded.model, q, 1e-4)
         assert_close(gradient, differences, 3e-6, "gradient", scale=value)
         symbolic = [np.array(v).ravel() for v in objective.gradient_fun()(q, objective.contact.normal)]
         assert_close(symbolic[0], value, 1e-9, "CasADi's value")
@@ -153,18 +152,18 @@ def test_every_box(floating: bool, count: int, feet: int, metric: str, axes: str
                                               ("solo8", ("FL_UPPER_LEG", "FR_UPPER_LEG"))])  # fmt: skip
 def test_subgradients_at_a_mirror_symmetric_posture(name: str, frames: tuple[str, str]) -> None:
     """Squeezed from both sides: either impact alone is as bad, and the objective rises like the larger of the two."""
-    found = robot(name)
+    loaded = robot(name)
     one, other = (ImpactContact(f, (0.0, side, 0.0)) for f, side in zip(frames, (1.0, -1.0), strict=True))
-    objective = WorstCaseObjective(found, one, others=(other,))
-    q = found.posture()
+    objective = WorstCaseObjective(loaded, one, others=(other,))
+    q = loaded.posture()
     worst, points = box_of(objective).worst(q), objective.subgradients(q)
     assert np.array_equal(worst.tied, [[1, 0], [0, 1]]) and worst.to_dict()["tied"] is True
     assert len(points.gradients) == 2 and relative(*points.gradients) > 0.5
     assert np.all(points.gaps <= 1e-6 * objective.value(q))
     step = 1e-6
     for index in range(20):
-        direction = unit(rng("kink", name, index), found.nv)
-        there = np.array(pin.integrate(found.model, q, step * direction))
+        direction = unit(rng("kink", name, index), loaded.nv)
+        there = np.array(pin.integrate(loaded.model, q, step * direction))
         rise = (objective.value(there) - objective.value(q)) / step
         slopes = points.gradients @ direction
         # Within the hull, and at its far end: the maximum of smooth functions.
@@ -176,31 +175,6 @@ def test_subgradients_at_a_mirror_symmetric_posture(name: str, frames: tuple[str
     assert min(relative(gradient, g) for g in points.gradients) < 1e-6
 
 
-def test_both_hands_of_talos_by_hand() -> None:
-    found = robot("talos")
-    feet = found.spec.supports
-    right, left = (
-        ImpactContact(frame, (-1.0, 0.0, 0.2), impulse=i) for frame, i in zip(HANDS, (1.0, 2.0), strict=True)
-    )
-    objective = WorstCaseObjective(found, right, supports=feet, others=(left,))
-    assert [single.contact for single in objective.singles] == [right, left]
-    for q in (found.posture(), *sample_postures(found, 2, 3)):
-        _, values = enumerated(objective, q)
-        assert_close(objective.value(q), values.max(), 1e-7, "talos")
-        assert_close(replace(objective, bilateral=True).value(q), max(values.max(), _opposed(objective, q)), 1e-7, "")
-        assert objective.value(q) >= max(single.value(q) for single in objective.singles) * (1 - 1e-12)
-    seen = evaluate(objective, found.posture())
-    assert [one.objective for one in seen.contacts] == [s.value(found.posture()) for s in objective.singles]
-    assert seen.impulses is not None and seen.objective == pytest.approx(seen.impulses.value, rel=1e-12)
-
-
-def _opposed(objective: WorstCaseObjective, q: np.ndarray) -> float:
-    """``‖λ̄₁a₁ − λ̄₂a₂‖²``."""
-    jumps, W = jumps_of(objective, q)
-    a = jumps @ np.array([objective.contacts[0].impulse, -objective.contacts[1].impulse])
-    return float(a @ W @ a)
-
-
 def test_corners() -> None:
     for count in range(2, 7):
         one_sided, both = corners(count, False), corners(count, True)
@@ -208,14 +182,19 @@ def test_corners() -> None:
         assert len({tuple(c) for c in one_sided}) == len(one_sided) and one_sided.any(axis=1).all()
         assert len({tuple(c) for c in (*both, *-both)}) == 2**count
         assert one_sided[0].all(), "all at once comes first: what a user expects of equally bad ones"
-    assert isinstance(
-        box_of(WorstCaseObjective(robot("panda"), *_pair())).worst(robot("panda").posture()), WorstImpulses
+
+
+def test_an_evaluation_has_each_contact_alone_and_the_worst_impulses() -> None:
+    talos = robot("talos")
+    right, left = (
+        ImpactContact(hand, (-1.0, 0.0, 0.2), impulse=k) for hand, k in zip(HANDS, (1.0, 2.0), strict=True)
     )
-
-
-def _pair() -> tuple[ImpactContact, Metric, str, tuple[Support, ...], float, float, tuple[ImpactContact, ...]]:
-    hand, elbow = ImpactContact("panda_hand_tcp", (0, 0, 1)), ImpactContact("panda_link4", (1, 0, 0))
-    return hand, Metric(), "impulse", (), 0.0, 0.0, (elbow,)  # type: ignore[return-value]
+    objective, q = WorstCaseObjective(talos, right, supports=talos.spec.supports, others=(left,)), talos.posture()
+    evaluation = evaluate(objective, q)
+    assert [single.contact for single in objective.singles] == [right, left]
+    assert [contact.objective for contact in evaluation.contacts] == [s.value(q) for s in objective.singles]
+    assert evaluation.impulses is not None
+    assert evaluation.objective == pytest.approx(evaluation.impulses.value, rel=1e-12)
 
 
 # ---- solving ------------------------------------------------------------------------------------------------------
@@ -259,8 +238,8 @@ def test_no_feasible_posture_is_better() -> None:
     problem = problem_of(ELBOW)
     solution = solve(problem, starts=8, jobs=1, compile="never")
     assert solution.redundancy == 2
-    found = [feasible_start(problem, k, seed=5) for k in range(1, 60)]
-    values = [problem.objective.value(q) for q in found if q is not None]
+    result = [feasible_start(problem, k, seed=5) for k in range(1, 60)]
+    values = [problem.objective.value(q) for q in result if q is not None]
     assert len(values) > 40
     best = problem.objective.value(solution.q)
     assert min(values) >= best * (1 - 1e-7)
@@ -358,8 +337,8 @@ def test_kept_feet_of_each_impact() -> None:
     assert [tuple(c.parameters) for c in kept] == [c.normal for c in problem.objective.contacts]
     solution = solve(problem, starts=1, jobs=1, compile="never")
     for one in evaluate(problem.objective, solution.q).contacts:
-        found = one.contact_stability
-        assert found is not None and found.friction is not None and found.friction <= 2.02
+        result = one.contact_stability
+        assert result is not None and result.friction is not None and result.friction <= 2.02
     with pytest.raises(InputError, match="pull as well as push"):
         problem_of(task, bilateral=True)
 

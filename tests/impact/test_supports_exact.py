@@ -51,18 +51,18 @@ def sixty_digits() -> Iterator[None]:
         yield
 
 
-def feet(found: Robot) -> tuple[Support, ...]:
+def feet(loaded: Robot) -> tuple[Support, ...]:
     """The robot's feet; solo8's by their centers, where straight legs are singular."""
-    own = found.spec.supports
-    return tuple(replace(s, offset=(0.0, 0.0, 0.0)) for s in own) if found.name == "solo8" else own
+    own = loaded.spec.supports
+    return tuple(replace(s, offset=(0.0, 0.0, 0.0)) for s in own) if loaded.name == "solo8" else own
 
 
 def objective(name: str, relative_compliance: float, normal: Vector | None = None) -> WorstCaseObjective:
-    found = robot(name)
-    assert found.spec.contact.frame is not None
+    loaded = robot(name)
+    assert loaded.spec.contact.frame is not None
     n = unit(rng(name, "exact normal")) if normal is None else normal
-    contact = ImpactContact(found.spec.contact.frame, tuple(n))
-    return WorstCaseObjective(found, contact, supports=feet(found), compliance=relative_compliance / found.mass)
+    contact = ImpactContact(loaded.spec.contact.frame, tuple(n))
+    return WorstCaseObjective(loaded, contact, supports=feet(loaded), compliance=relative_compliance / loaded.mass)
 
 
 def posture(name: str, label: str) -> Vector:
@@ -84,9 +84,9 @@ def bounded(name: str, label: str, relative_compliance: float) -> Bounded:
         return Bounded(oracle, oracle.compliance)
 
 
-def within(found: object, expected: Exact | Decimal, bound: Vector | float, what: str) -> None:
+def within(values: object, expected: Exact | Decimal, bound: Vector | float, what: str) -> None:
     """Every entry within its bound."""
-    error = distance(found, np.asarray(expected, dtype=object))
+    error = distance(values, np.asarray(expected, dtype=object))
     assert (error <= bound).all(), f"{what}: error {error.max():.1e}, allowed {np.max(bound):.1e}"
 
 
@@ -117,17 +117,17 @@ def test_the_oracle_solves_what_it_is_given(
     x = bounded(name, label, relative_compliance)
     with elsewhere(seed):
         oracle = objective(name, relative_compliance).oracle
-        found, gradient = oracle.quantities(x.oracle.numeric.q), oracle.gradient_H(x.oracle.numeric.q)
+        result, gradient = oracle.quantities(x.oracle.numeric.q), oracle.gradient_H(x.oracle.numeric.q)
     lost, nv = x.lost_by_elimination, x.nv
-    within(found.jump, x.jump, lost[:nv], "jump")
-    within(found.support_impulse, x.impulse, lost[nv:], "support impulses")
-    within(found.H, x.H, x.H_by_elimination, "H")
-    within(found.G, x.G, x.G_by_elimination, "G")
+    within(result.jump, x.jump, lost[:nv], "jump")
+    within(result.support_impulse, x.impulse, lost[nv:], "support impulses")
+    within(result.H, x.H, x.H_by_elimination, "H")
+    within(result.G, x.G, x.G_by_elimination, "G")
     lost_V = float(x.V) * (x.H_by_elimination / float(x.H) + 2 * x.G_by_elimination / float(x.G))
-    within(found.V, x.V, 1.01 * lost_V, "V")
+    within(result.V, x.V, 1.01 * lost_V, "V")
     within(gradient, x.grad_H, x.gradient_by_elimination, "∇H")
     # The condition of the jump is that of the motion, not 1/ε; between ranks it is its square root at most.
-    assert size(distance(found.jump, x.jump)) <= 1e-9 * size(x.jump)
+    assert size(distance(result.jump, x.jump)) <= 1e-9 * size(x.jump)
 
 
 @pytest.mark.parametrize("seed", SEEDS)
@@ -137,10 +137,10 @@ def test_the_oracles_sticking_impact(name: str, label: str, seed: int | None) ->
     x = bounded(name, label, 1e-4)
     with elsewhere(seed):
         oracle = objective(name, 1e-4).oracle
-        found, gradient = oracle.quantities(x.oracle.numeric.q), oracle.gradient_S(x.oracle.numeric.q)
+        result, gradient = oracle.quantities(x.oracle.numeric.q), oracle.gradient_S(x.oracle.numeric.q)
     lost_S, lost_gradient = x.sticking_by_elimination
-    assert found.S is not None
-    within(found.S, x.S, lost_S, "S")
+    assert result.S is not None
+    within(result.S, x.S, lost_S, "S")
     within(gradient, x.grad_S, lost_gradient, "∇S")
 
 
@@ -171,8 +171,8 @@ def test_the_kernel_loses_what_heavy_feet_must(name: str, label: str, relative_c
 
 @pytest.mark.parametrize("relative_compliance", ENDS)
 def test_the_compiled_code_loses_no_more(tmp_path: Path, relative_compliance: float) -> None:
-    made = objective("solo8", relative_compliance)
-    export(made, tmp_path, prefix="feet", check=False)
+    written = objective("solo8", relative_compliance)
+    export(written, tmp_path, prefix="feet", check=False)
     with built(tmp_path, "feet") as library:
         for label in SOLO8:
             _compiled(library, bounded("solo8", label, relative_compliance))
@@ -236,12 +236,12 @@ def test_the_limit_of_no_compliance_is_not_smooth() -> None:
 )
 def test_full_rank_feet_tend_to_impulse_dynamics(name: str, count: int) -> None:
     """Rigid contacts by Pinocchio: within ``ε/(σ+ε)`` of ours, and what ours extrapolate to at no compliance."""
-    found = robot(name)
-    supports = found.spec.supports[:count]
+    loaded = robot(name)
+    supports = loaded.spec.supports[:count]
     base = replace(objective(name, 1e-4), supports=supports)
-    (q,) = random_configurations(found.model, 1, name, count, "full rank", spread=0.5)
+    (q,) = random_configurations(loaded.model, 1, name, count, "full rank", spread=0.5)
     rigid = Rigid(base, q)
-    case = replace(base.case, robot=found, supports=supports)
+    case = replace(base.case, robot=loaded, supports=supports)
     oracles = [ImpactOracle(replace(case, compliance=base.compliance / k)) for k in (1, 2, 4)]
     M, n = oracles[0].at(q).M, oracles[0].n
     held = np.linalg.svd(np.linalg.solve(np.linalg.cholesky(M), rigid.Js.T), compute_uv=False)[-1] ** 2
@@ -256,7 +256,7 @@ def test_full_rank_feet_tend_to_impulse_dynamics(name: str, count: int) -> None:
     for what in ("H", "G", "V", "S", "jump", "support_impulse", "ellipsoid"):
         _near(_extrapolated([getattr(o, what) for o in all_of_them]), expected[what], tolerance, what)
     gradients = _extrapolated([oracle.gradient_H(q) for oracle in oracles])
-    differences = central_gradient(lambda at: rigid.quantities(at)["H"], found.model, q, 1e-3)
+    differences = central_gradient(lambda at: rigid.quantities(at)["H"], loaded.model, q, 1e-3)
     _near(gradients, differences, tolerance + 1e-8, "∇H")
 
 
@@ -266,8 +266,8 @@ def _extrapolated(values: list[object]) -> Vector:
     return np.asarray(one / 3 - 2 * half + 8 * quarter / 3)
 
 
-def _near(found: Vector, expected: object, tolerance: float, what: str) -> None:
-    error = size(found - np.asarray(expected)) / size(expected)
+def _near(values: Vector, expected: object, tolerance: float, what: str) -> None:
+    error = size(values - np.asarray(expected)) / size(expected)
     assert error <= tolerance, f"{what}: relative error {error:.1e} above {tolerance:.1e}"
 
 
@@ -284,8 +284,8 @@ def test_decimal_elimination_by_its_residual() -> None:
 def test_the_stiffest_feet_pass_every_check(tmp_path: Path) -> None:
     """What ``problem.toml`` accepts, ``codegen``, the loader and ``verify`` accept too."""
     stiffest = objective("bolt", least_compliance(robot("bolt")) * robot("bolt").mass)
-    made = export(stiffest, tmp_path)
-    assert made.compiled and made.agreement is not None
+    written = export(stiffest, tmp_path)
+    assert written.compiled and written.agreement is not None
     ImpactGradient.load(tmp_path)
     assert verify(stiffest, samples=3).passed
 

@@ -74,8 +74,6 @@ class ImpactKernel:
             for link in limbs.counterparts(joint)
         ]
 
-    # ---- H, G and what follows from them ----------------------------------------------------------------------
-
     @cached_property
     def H(self) -> ca.SX:
         """``aᵀWa``: squared jump per squared impulse."""
@@ -142,8 +140,6 @@ class ImpactKernel:
         """Tangent gradient of E, shape (nv,)."""
         return -self.grad_G / (2 * self.G**2)
 
-    # ---- three directions: the ellipsoid and sticking ---------------------------------------------------------
-
     @cached_property
     def _axes(self) -> list[Response]:
         """``M⁻¹Jᵀe_k`` for the three world directions."""
@@ -191,8 +187,6 @@ class ImpactKernel:
         if self.case.in_contact_frame:
             gradient = gradient - 2 * self.tree.turning_gradient(self.point, self.world_normal, r)
         return gradient
-
-    # ---- parts ------------------------------------------------------------------------------------------------
 
     def _weigh(self, a: ca.SX, velocities: ByJoint) -> ca.SX:
         if self.metric.kind == "kinetic":

@@ -135,8 +135,6 @@ class ImpactOracle:
             start += foot.rows
         return np.concatenate(parts)
 
-    # ---- gradients --------------------------------------------------------------------------------------------
-
     def gradient_H(self, q: Array, normal: Array | None = None) -> Array:
         """Return the tangent gradient of H, shape (nv,).
 
