@@ -32,7 +32,7 @@ class MjcfSlot:
         qvel: Its entries of ``qvel``.
         placement: Rest frame of the joint in its parent.
         moved: Whether it is a MuJoCo free joint with a rest frame other than the world.  MuJoCo has the pose and the
-            linear velocity of a free joint in world axes, and those of three slides and a ball in the rest frame.
+            linear velocity of a free joint in world axes, but of three slides and a ball in the rest frame.
     """
 
     joint: JointSlot

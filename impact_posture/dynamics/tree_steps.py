@@ -1,6 +1,6 @@
 """The steps of sweeps over the tree at one joint, as templates.
 
-Letters are those of Featherstone (2008).  ``S`` is the motion subspace, shape (6, nv), ``I`` the articulated inertia
+Notation follows Featherstone (2008).  ``S`` is the motion subspace, shape (6, nv), ``I`` the articulated inertia
 of the link, and ``pivot`` is ``D = SᵀIS + armature``, or ``1/D`` for a joint with one axis.
 """
 

@@ -1,4 +1,4 @@
-"""The emitter: every CasADi operation as C, and literals that read back exactly."""
+"""Every CasADi operation as C, and literals that read back exactly."""
 
 from __future__ import annotations
 
@@ -21,7 +21,7 @@ OPTIMIZED = True
 
 
 def c_function(function: ca.Function) -> str:
-    """``void f(inputs..., outputs...)`` of an SX function."""
+    """Return the C of ``void f(inputs..., outputs...)`` for an SX function."""
     graph = graph_of(function)
     layout = lay_out(graph, [function.name_out()], block=10)
     constants = Constants("f", DOUBLE)

@@ -1,4 +1,4 @@
-"""The C export: generated, compiled, loaded, and compared with CasADi, finite differences and Pinocchio."""
+"""The C export is generated, compiled, loaded, and compared with CasADi, finite differences and Pinocchio."""
 
 from __future__ import annotations
 
@@ -93,18 +93,18 @@ def built(request: pytest.FixtureRequest, tmp_path_factory: pytest.TempPathFacto
 
 
 def test_agrees_with_casadi(built: Built) -> None:
-    # The C divides by multiplying with reciprocals; stiff feet (1/ε of 1e4 robots) turn its last digits into this.
+    # The C code multiplies by reciprocals.  Stiff feet (1/ε of 1e4 robots) amplify the difference in the last digits.
     tolerance = 1e-10 if built.objective.supports else 1e-12
     assert largest_difference(built.library.gradient, built.objective, casadi_reference, 10) <= tolerance
 
 
 def test_agrees_with_pinocchio(built: Built) -> None:
-    # The oracle solves the KKT system of feet at compliance 1e-4/m: its condition costs four digits and more.
+    # The oracle solves the KKT system of feet at compliance 1e-4/m, whose condition costs at least four digits.
     tolerance = 1e-8 if built.objective.supports else 1e-11
     assert largest_difference(built.library.gradient, built.objective, oracle_reference, 10) <= tolerance
 
 
-def test_gradients_are_those_of_the_values(built: Built) -> None:
+def test_gradients_equal_differences_of_the_values(built: Built) -> None:
     robot, h = built.objective.robot, 1e-5
     q = sample_postures(robot, 1, 11)[0]
     _, H, gradient = built.library.eval(q, UNIT)
@@ -121,7 +121,7 @@ def test_gradients_are_those_of_the_values(built: Built) -> None:
 
 
 def test_free_beside_standing(built: Built) -> None:
-    """What stands has the free robot's functions too, equal to Pinocchio's without supports."""
+    """The export of a standing robot also has the functions without supports, equal to Pinocchio without supports."""
     objective, frame = built.objective, built.export.manifest["frames"][0]
     assert (frame["free"] is None) == (not objective.supports)
     if objective.supports:
@@ -157,7 +157,7 @@ def test_codes(built: Built) -> None:
         assert library.eval(q, np.array([bad, 0, 0]))[0] == library.value(q, np.array([0, bad, 0]))[0] == 1
 
 
-def test_unit_norm_is_asked_for(built: Built) -> None:
+def test_a_norm_other_than_one_is_refused(built: Built) -> None:
     library, robot = built.library, built.objective.robot
     q = sample_postures(robot, 1, 3)[0]
     units = [slice(3, 7)] if robot.floating else []
@@ -194,7 +194,7 @@ def test_library_holds_no_writable_data(built: Built) -> None:
         [need("nm"), built.library.gradient._library._name], capture_output=True, text=True, check=True
     ).stdout.splitlines()
     symbols = [line.split()[-2:] for line in lines]
-    # What every library holds begins with an underscore, but for the mark that its end has come.
+    # The symbols of every library begin with an underscore, except ``completed``.
     own = [(kind, name) for kind, name in symbols if not name.startswith(("_", "completed."))]
     assert not [name for kind, name in own if kind in "bBdDcCsSgG"]
     names = {name for kind, name in own if kind in "TR"}
@@ -220,7 +220,7 @@ def test_posture_is_a_constant(built: Built) -> None:
     np.testing.assert_array_equal(built.export.manifest["posture"], np.array(array))
 
 
-# Vectors, comparisons, and a robot with neither.
+# A robot with vectors and comparisons, and a robot without both.
 @pytest.mark.parametrize("built", ["solo12-standing", "hextilt"], indirect=True)
 def test_compiles_as_cpp(built: Built, tmp_path: Path) -> None:
     compiler = need("g++")

@@ -1,4 +1,4 @@
-"""The C export in the hands of compilers and build tools, and what it refuses."""
+"""The C export with compilers and build tools, and its refusals."""
 
 from __future__ import annotations
 
@@ -73,7 +73,7 @@ def test_two_exports_in_one_program(pendulum: str, tmp_path: Path) -> None:
         "  int code = first_objective(first_posture, &a, g) + second_objective(second_posture, &b, g);\n"
         '  printf("%.17g %.17g\\n", a, b); return code; }\n'
     )
-    # Linked, and as one translation unit.
+    # As linked files, and as one translation unit.
     (tmp_path / "unity.c").write_text('#include "first.c"\n#include "second.c"\n#include "both.c"\n')
     for sources in (["first.c", "second.c", "both.c"], ["unity.c"]):
         program = tmp_path / "program"
@@ -106,7 +106,7 @@ def test_compiler_that_fails(pendulum: str, tmp_path: Path, monkeypatch: pytest.
     assert (tmp_path / "pend.c").is_file()
 
 
-def test_compiler_says_why(pendulum: str, tmp_path: Path) -> None:
+def test_the_message_of_the_compiler_is_shown(pendulum: str, tmp_path: Path) -> None:
     need_compiler()
     objective = WorstCaseObjective(load_robot(pendulum), ImpactContact("tip", (1.0, 1.0, 0.0)))
     export(objective, tmp_path, prefix="pend", check=False)

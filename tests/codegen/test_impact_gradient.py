@@ -1,4 +1,4 @@
-"""The compiled export from Python: numbers, views, batches, refusals, threads, and how little a call costs."""
+"""The compiled export from Python: numbers, views, batches, refusals and threads."""
 
 from __future__ import annotations
 
@@ -109,7 +109,7 @@ def test_batches(loaded: Loaded, count: int) -> None:
     n /= np.linalg.norm(n, axis=1, keepdims=True)
     H, grad = gradient.value_and_gradient_batch(q, n)
     assert H.shape == (count,) and grad.shape == (count, robot.nv)
-    # A batch adds in another order than a single call.
+    # The order of sums in a batch differs from a single call.
     tolerance = 1e-12 if gradient.dtype == np.float64 else 1e-5
     for k in range(count):
         value, row = gradient.value_and_gradient(q[k], n[k])
@@ -242,7 +242,9 @@ def test_library_that_computes_other_numbers(loaded: Loaded, tmp_path: Path) -> 
         ImpactGradient.load(folder)
 
 
-def test_what_is_no_export(loaded: Loaded, tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+def test_folders_without_a_valid_export_are_refused(
+    loaded: Loaded, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
     with pytest.raises(SpecError, match="holds no export"):
         ImpactGradient.load(tmp_path)
     with pytest.raises(SpecError, match="cannot be read"):

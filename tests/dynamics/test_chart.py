@@ -1,4 +1,4 @@
-"""The chart that the optimizer moves in, and gradients on the tangent space."""
+"""The chart of the optimizer, and gradients on the tangent space."""
 
 from __future__ import annotations
 
@@ -17,7 +17,7 @@ from tests.support.tangent import tangent_map
 
 @functools.cache
 def mixed_model() -> pin.Model:
-    """Every joint with a rotation of its own kind, in one chain."""
+    """Return a chain of joints with every kind of rotation."""
     pin.seed(5)
     model, parent = pin.Model(), 0
     joints = [
@@ -70,7 +70,7 @@ def test_adjoint_gradients_are_casadis_derivatives_on_the_tangent_space(name: st
     cases: dict[str, tuple[ca.SX, ca.SX]] = {"vMv": (energy, tree.energy_gradient(tree.velocities(v)))}
     direction = tree.rotation(point) @ force
     cases["turning"] = (ca.dot(direction, moment), tree.turning_gradient(point, direction, moment))
-    # The pair's bracket holds both answers fixed although they depend on q: d(τᵀM⁻¹τ') = −a'ᵀ dM a.
+    # The gradient of a pair holds both responses fixed although they depend on q: d(τᵀM⁻¹τ') = −a'ᵀ dM a.
     x, y = tree.respond(tau=tau), tree.respond(tau=other_tau)
     cases["τᵀM⁻¹τ'"] = (ca.dot(other_tau, x.a), tree.pair_gradient(x, y))
     for in_frame in (False, True):

@@ -1,4 +1,4 @@
-"""Symbolic dynamics against Pinocchio's numbers: every known robot, random trees of every joint, odd URDFs."""
+"""Symbolic dynamics against Pinocchio: every known robot, random trees of every joint, unusual URDFs."""
 
 from __future__ import annotations
 
@@ -137,7 +137,7 @@ def compare(symbolic: Symbolic, q: Vector, generator: np.random.Generator) -> No
     }
     for name, value in expected.items():
         assert_close(result[name], value, TOLERANCE, name)
-    # Pinocchio's derivative algorithms, which share nothing with the backward sweeps under test.
+    # The derivative algorithms of Pinocchio are independent of the backward sweeps.
     numeric, point = Numeric(model).at(q), point_at(model, frame)
     terms = (
         (numeric.coupling_gradient(point, w, other), np.abs(w) @ np.abs(J @ other)),
@@ -168,7 +168,7 @@ def symbolic_of(name: str) -> Symbolic:
 
 @pytest.mark.parametrize("name", NAMES)
 def test_robot_agrees_with_pinocchio(name: str) -> None:
-    # Zeros and right angles of the named postures take other branches of Pinocchio than random numbers do.
+    # Zeros and right angles of the named postures take other branches of Pinocchio than random numbers.
     symbolic = symbolic_of(name)
     for k, q in enumerate(
         [*random_configurations(symbolic.model, 3, name, "dynamics"), *robot(name).postures.values()]
@@ -252,7 +252,7 @@ _AXIS = np.array([1.0, -2.0, 3.0]) / np.sqrt(14.0)
 
 @functools.cache
 def _continuous_about_an_odd_axis() -> pin.JointModel:
-    # Python cannot make this joint, only the URDF parser.
+    # Only the URDF parser can make this joint, Python cannot.
     joint = '<parent link="a"/><child link="b"/><axis xyz="1 -2 3"/>'
     xml = f'<link name="a"/>{_LINK.format("b", 1.0)}<joint name="j" type="continuous">{joint}</joint>'
     return pin.buildModelFromXML(f'<robot name="r">{xml}</robot>').joints[1]
@@ -271,12 +271,12 @@ JOINTS: dict[str, Callable[[], pin.JointModel]] = {
 
 
 def random_tree(kinds: list[str], climbs: list[int], seed: int, armature: bool) -> pin.Model:
-    """Build a tree; ``climbs[k]`` says how many ancestors joint k's parent lies above the joint before it."""
+    """Build a tree; the parent of joint k is the joint before it, or ``climbs[k]`` ancestors above."""
     pin.seed(seed)
     generator = np.random.default_rng(seed)
     model, path = pin.Model(), [0]
     for k, kind in enumerate(kinds):
-        # A parent on the path from the root keeps the numbering depth-first, as Pinocchio's own CRBA needs.
+        # With parents on the path from the root, the numbering is depth-first, as CRBA of Pinocchio requires.
         del path[max(1, len(path) - climbs[k]) :]
         joint = model.addJoint(path[-1], JOINTS[kind](), pin.SE3.Random(), f"{k} {kind}")
         body = pin.Inertia.Random()

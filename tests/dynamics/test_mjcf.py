@@ -1,4 +1,4 @@
-"""MuJoCo and Pinocchio compute the same numbers of a ``pin.Model``, on every robot and joint."""
+"""MuJoCo and Pinocchio compute the same numbers for a ``pin.Model``, on every robot and joint."""
 
 from __future__ import annotations
 
@@ -38,7 +38,7 @@ SUPPORTED = sorted(JOINTS)
 
 
 class InMujoco:
-    """A model in MuJoCo without limits, because random postures leave them."""
+    """A model in MuJoCo without limits, because random postures violate them."""
 
     def __init__(self, model: pin.Model) -> None:
         self.written = build_mjcf(model)
@@ -65,7 +65,7 @@ def qacc(layout: MjcfLayout, q: Vector, v: Vector, a: Vector) -> Vector:
 
 
 def compare(model: pin.Model, simulated: InMujoco, q: Vector, generator: np.random.Generator) -> None:
-    """Mass matrix, every frame's pose and Jacobian, and accelerations under gravity, velocity and torque."""
+    """Compare mass matrix, pose and Jacobian of every frame, and accelerations under gravity, velocity and torque."""
     layout, data = simulated.written.layout, simulated.data
     v, tau = generator.normal(size=model.nv), generator.normal(size=model.nv)
     T = layout.velocity_map(q)
@@ -84,7 +84,7 @@ def compare(model: pin.Model, simulated: InMujoco, q: Vector, generator: np.rand
         assert_close(data.site_xmat[index], placement.rotation, TOLERANCE, f"rotation {site}")
     a = pin.aba(model, model.createData(), q, v, tau)
     assert_close(data.qacc, qacc(layout, q, v, a), TOLERANCE, "acceleration")
-    # And back.
+    # The way back.
     returned = layout.q(layout.qpos(q))
     assert np.abs(pin.difference(model, q, returned)).max() < 1e-12
     assert_close(layout.state(data.qpos, data.qvel)[1], v, 1e-12, "velocity")
@@ -99,7 +99,7 @@ def test_robot_agrees_with_pinocchio(name: str) -> None:
 
 
 @pytest.mark.parametrize("name", NAMES)
-def test_indices_are_those_of_the_compiled_model(name: str) -> None:
+def test_indices_equal_the_compiled_model(name: str) -> None:
     model, simulated = robot(name).model, in_mujoco(name)
     assert (simulated.model.nq, simulated.model.nv) == (simulated.written.layout.nqpos, model.nv)
     assert simulated.model.nbody == model.njoints
@@ -108,7 +108,7 @@ def test_indices_are_those_of_the_compiled_model(name: str) -> None:
         first = int(body.jntadr[0])
         assert simulated.model.jnt_qposadr[first] == slot.qpos.start
         assert simulated.model.jnt_dofadr[first] == slot.qvel.start
-    # A point mass gets 1e-15 kg m² of rotational inertia; nothing else is changed.
+    # A point mass gets 1e-15 kg m² of rotational inertia.  Nothing else is changed.
     assert simulated.model.body_mass.sum() == pytest.approx(pin.computeTotalMass(model), rel=1e-12)
     named = {f.name for f in model.frames} - {"universe"}
     assert {simulated.model.site(k).name for k in range(simulated.model.nsite)} == named
@@ -151,7 +151,7 @@ def test_random_tree_agrees_with_pinocchio(kinds: list[str], seed: int, armature
 
 
 def test_joints_numbered_across_branches() -> None:
-    """Pinocchio may number a sister before a daughter; MuJoCo goes depth first."""
+    """Pinocchio may number a sister before a daughter, while MuJoCo numbers depth first."""
     pin.seed(3)
     model = pin.Model()
     for k, (parent, joint) in enumerate(
@@ -164,7 +164,7 @@ def test_joints_numbered_across_branches() -> None:
     simulated = InMujoco(model)
     assert [slot.joint.index for slot in simulated.written.layout.slots] == [1, 2, 4, 3, 5]
     (q,) = random_configurations(model, 1, "across")
-    # Pinocchio's own CRBA wants depth-first numbers; its ABA does not.
+    # CRBA of Pinocchio requires depth-first numbers, and ABA does not.
     layout, data = simulated.written.layout, simulated.data
     v, tau = rng("v").normal(size=model.nv), rng("tau").normal(size=model.nv)
     data.qpos[:], data.qvel[:] = layout.qpos(q), layout.qvel(q, v)

@@ -1,4 +1,4 @@
-"""Repeated limbs in SIMD lanes: the numbers of Pinocchio, on random robots and on known ones."""
+"""Repeated limbs in SIMD lanes, against Pinocchio, on random robots and on known robots."""
 
 from __future__ import annotations
 
@@ -44,7 +44,7 @@ COMPUTE: dict[str, Callable[..., np.ndarray]] = {
 
 
 def limbs_urdf(limb: list[int], limbs: int, seed: int, *, odd: bool) -> str:
-    """Limbs with the same joints and other numbers on a body; with ``odd``, one more limb with other joints."""
+    """Return a body with limbs of equal joints and random numbers; with ``odd``, one more limb with other joints."""
     generator = np.random.default_rng(seed)
 
     def numbers(low: float, high: float, count: int = 3) -> str:
@@ -52,7 +52,7 @@ def limbs_urdf(limb: list[int], limbs: int, seed: int, *, odd: bool) -> str:
 
     def link(name: str) -> str:
         a, b, c = generator.uniform(0.01, 0.05, 3)
-        # The triangle inequality of inertias holds for sums of two of three.
+        # Sums of two of three positive numbers satisfy the triangle inequality of inertias.
         return (
             f'<link name="{name}"><inertial><origin xyz="{numbers(-0.1, 0.1)}" rpy="{numbers(-1, 1)}"/>'
             f'<mass value="{generator.uniform(0.5, 3):.6f}"/><inertia ixx="{a + b:.6f}" ixy="0" ixz="0"'
@@ -76,7 +76,7 @@ def limbs_urdf(limb: list[int], limbs: int, seed: int, *, odd: bool) -> str:
 
 
 def values_of(graph: Graph, inputs: dict[str, np.ndarray]) -> dict[str, np.ndarray]:
-    """Outputs of a graph, its vectors as arrays."""
+    """Return the outputs of a graph, with its vectors as arrays."""
     result: list[np.ndarray | float] = []
     for node in graph.nodes:
         x = [result[a] for a in node.operands]
@@ -98,7 +98,7 @@ def values_of(graph: Graph, inputs: dict[str, np.ndarray]) -> dict[str, np.ndarr
 
 
 def shares(graph: Graph) -> dict[int, int]:
-    """Width → operations of that width that some output needs."""
+    """Return width → number of operations of this width that an output needs."""
     needed: set[int] = set()
     waiting = [k for nodes in graph.outputs.values() for k in nodes]
     while waiting:
@@ -170,7 +170,7 @@ def test_robots_with_repeated_limbs(name: str, frame: str, width: int, most: flo
     graph = library.vector_graph()
     counts = shares(graph)
     assert set(counts) == {1, width}
-    # The same with numbers alone: vectors change the order of no sum.
+    # Compare with single numbers.  Vectors do not change the order of sums.
     plain = library.graph()
     assert sum(counts.values()) < most * shares(plain)[1]
     for q in random_configurations(robot(name).model, 2, name):
@@ -181,7 +181,7 @@ def test_robots_with_repeated_limbs(name: str, frame: str, width: int, most: flo
 
 
 def longest(graph: Graph) -> int:
-    """Operations that wait for each other, at most."""
+    """Return the length of the longest chain of operations."""
     depth: list[int] = []
     for node in graph.nodes:
         depth.append((node.op in ARITHMETIC) + max((depth[a] for a in node.operands), default=0))
@@ -220,7 +220,7 @@ def test_limbs_are_outermost_and_disjoint() -> None:
                 assert model.joints[i].shortname() == model.joints[j].shortname()
 
 
-# Five limbs are a vector of four and one alone.
+# Five limbs are a vector of four and a single limb.
 @pytest.mark.parametrize("count", [2, 5])
 def test_compiled_limbs(tmp_path: Path, count: int) -> None:
     need_compiler()
@@ -229,7 +229,7 @@ def test_compiled_limbs(tmp_path: Path, count: int) -> None:
     objective = WorstCaseObjective(loaded, ImpactContact("b1_2", (0.3, -0.4, 0.9)), kind="sticking")
     export(objective, tmp_path, prefix="t", check=False)
     strict = ("-Wall", "-Wextra", "-pedantic", "-Werror")
-    # Vectors of two, as the processor has them, are those of test_angles_near_and_far.
+    # test_angles_near_and_far covers vectors of two with the instructions of this processor.
     for flags in ((), ("-O3", "-march=native"))[: 1 if count == 2 else 2]:
         with built(tmp_path, "t", (*strict, *flags)) as compiled:
             assert largest_difference(compiled.gradient, objective, oracle_reference, 5) <= 1e-10, flags
@@ -249,7 +249,7 @@ def test_portable_has_no_vectors_and_the_same_numbers(tmp_path: Path) -> None:
 
 @pytest.mark.parametrize("flags", [(), ("-O3", "-march=native")], ids=["plain", "native"])
 def test_angles_near_and_far(tmp_path: Path, flags: tuple[str, ...]) -> None:
-    """H of two links depends on the angle between them alone: turned by whole turns it stays, near pi/2 and far."""
+    """H of two links depends on the difference of their angles alone, also for angles near pi/2 and large angles."""
     need_compiler()
     (tmp_path / "t.urdf").write_text(limbs_urdf([0, 0], 2, 3, odd=False))
     loaded = load_robot(str(tmp_path / "t.urdf"), LoadOptions(root="fixed"))
@@ -263,12 +263,12 @@ def test_angles_near_and_far(tmp_path: Path, flags: tuple[str, ...]) -> None:
             expected = ImpactOracle(ImpactCase(loaded, objective.contact, objective.metric)).quantities(reduced)
             code, H, _ = compiled.eval(q, n)
             assert code == 0
-            # An angle's own last digit is what is left of it.
+            # The rounding of a large angle limits the accuracy.
             assert pytest.approx(expected.H, rel=1e-11) == H, angle
 
 
 def test_blocks_are_shared() -> None:
-    """What value needs is a part of what eval needs, computed by blocks that both call."""
+    """``eval`` calls all blocks of ``value``."""
     objective = WorstCaseObjective(robot("talos"), ImpactContact("gripper_right_base_link", (0.0, 0.6, 0.8)))
     library = export_library([NamedObjective(objective, "t")])
     layout = lay_out(library.vector_graph(), [f.outputs for f in library.functions])
@@ -278,7 +278,7 @@ def test_blocks_are_shared() -> None:
     }
     assert calls["value"] < calls["eval"] and calls["value"] <= calls["jump"]
     assert calls["value"] & calls["ellipsoid"]
-    # Every node is computed in one place only.
+    # Every node is computed once.
     nodes = [k for block in layout.blocks for k in block.nodes]
     assert len(nodes) == len(set(nodes))
 
@@ -293,7 +293,7 @@ def test_a_limb_with_another_axis_is_not_repeated() -> None:
 
 
 def test_two_exports_in_one_unit(tmp_path: Path) -> None:
-    """A unity build puts both files into one: nothing of the first may stand in the second's way."""
+    """In a unity build both files are one unit, and the macros of the first do not disturb the second."""
     compiler = need_compiler()
     for name, frame in (("solo8", "base_link"), ("panda", "panda_hand_tcp")):
         (tmp_path / name).mkdir()
@@ -305,7 +305,7 @@ def test_two_exports_in_one_unit(tmp_path: Path) -> None:
 
 
 def test_the_prefix_costs_no_room(tmp_path: Path) -> None:
-    """The source of a humanoid, by whatever name: what the names of thousands of operations are made of is short."""
+    """The names in thousands of operations are short, whatever the prefix."""
     objective = WorstCaseObjective(robot("talos"), ImpactContact("gripper_right_base_link", (0.0, 0.6, 0.8)))
     export(objective, tmp_path, check=False)
     (source,) = tmp_path.glob("talos*.c")

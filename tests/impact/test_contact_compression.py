@@ -44,8 +44,8 @@ masses, speeds = st.floats(0.05, 500.0), st.floats(0.01, 20.0)
 
 
 def touch(power: float, stiffness: float, mass: float, speed: float) -> tuple[float, float]:
-    """Integrate ``m δ̈ = −k δ^p`` from touch to rest: T and the force there."""
-    # In units of the greatest compression and of the time to cross it.
+    """Integrate ``m δ̈ = −k δ^p`` from touch to rest, and return T and the force at T."""
+    # In units of the greatest compression, and of this compression divided by the speed.
     depth = ((power + 1) * mass * speed**2 / (2 * stiffness)) ** (1 / (power + 1))
     ratio = stiffness * depth**power * depth / (mass * speed**2)
 
@@ -66,12 +66,12 @@ def touch(power: float, stiffness: float, mass: float, speed: float) -> tuple[fl
 
 @settings(max_examples=20, deadline=None)
 @given(mass=masses, speed=speeds, stiffness=st.floats(1e2, 1e8))
-def test_time_and_force_are_those_of_an_integrated_contact(mass: float, speed: float, stiffness: float) -> None:
+def test_time_and_force_equal_an_integrated_contact(mass: float, speed: float, stiffness: float) -> None:
     for contact, power in ((ContactStiffness(linear=stiffness), 1.0), (ContactStiffness(hertz=stiffness), 1.5)):
         time, force = touch(power, stiffness, mass, speed)
         assert contact.compression_time(1 / mass, speed) == pytest.approx(time, rel=1e-6)
         assert contact.peak_force(1 / mass, speed) == pytest.approx(force, rel=1e-6)
-        # A contact of that T and G has the impulse mv, whatever its law.
+        # A contact with this T and G has the impulse mv, whatever its law.
         alike = ContactStiffness(duration=time)
         assert alike.peak_force(1 / mass, speed) == pytest.approx(np.pi / 2 * mass * speed / time)
         for one in (contact, alike):
@@ -81,7 +81,7 @@ def test_time_and_force_are_those_of_an_integrated_contact(mass: float, speed: f
 
 def test_the_constant_of_hertz_and_the_materials() -> None:
     assert pytest.approx(scipy.integrate.quad(lambda z: 1 / np.sqrt(1 - z**2.5), 0, 1)[0], rel=1e-9) == HERTZ_TIME
-    # Two steel bodies: E* is half the plane-strain modulus of one.
+    # For two steel bodies, E* is half the plane-strain modulus of steel.
     E, nu = MATERIALS["steel"]
     assert hertz_stiffness("steel") == pytest.approx(4 / 3 * E / (2 * (1 - nu**2)) * 0.1)
     order = sorted(MATERIALS, key=hertz_stiffness)
@@ -117,7 +117,7 @@ def test_x_from_plain_matrices(name: str, frame: str) -> None:
         assert table is not None and table.x is None and list(table.by_material) == list(MATERIALS)
 
 
-def test_x_of_a_robot_on_its_feet_is_that_of_the_elastic_response() -> None:
+def test_x_of_a_standing_robot_equals_the_elastic_response() -> None:
     loaded = elastic("talos", 2000.0)
     supports = loaded.spec.supports
     for frame in ("torso_2_link", "gripper_right_base_link"):
@@ -127,7 +127,7 @@ def test_x_of_a_robot_on_its_feet_is_that_of_the_elastic_response() -> None:
         squeezed = compression(objective, q, 1.0, ContactStiffness(linear=1e9))
         response = ElasticImpact(objective.case).response(q, 1e9)
         assert squeezed is not None and squeezed.x is not None and G > 0
-        # A very short contact: T is that of the links alone.
+        # The contact is so short that T belongs to the links alone.
         assert squeezed.x == pytest.approx(response.compliance_ratio, rel=0.02)
 
 
@@ -151,7 +151,7 @@ def test_a_joint_model_that_does_not_fit_is_named_with_both_answers(stiffness: f
             assert all(f"{value:.4g} with '{other}'" in lines[0] for other, value in values.items())
 
 
-def test_nothing_is_told_where_nothing_is_known() -> None:
+def test_unknown_values_are_none() -> None:
     loaded = robot("tilthex_arm")
     objective = WorstCaseObjective(loaded, ImpactContact("ee", (0, 0, 1)))
     assert evaluate(objective, loaded.posture()).compression is None
@@ -298,7 +298,7 @@ def test_bounds_that_cannot_be_met_name_their_rows_and_units() -> None:
 
 
 def test_edges_of_speed_and_of_locked_joints(tmp_path: Path) -> None:
-    """A material at rest has no T, and a robot without moving joints no jump of a joint to bound."""
+    """Without speed a material has no T, and without moving joints there is no joint jump to bound."""
     still = ("evaluate", "panda", "--normal", 0, 0, 1, "--speed", 0, "--contact-stiffness", "steel", "--json")
     done = json.loads(run(*still).stdout)["evaluation"]["compression"]
     assert done["compression_time"] is None and done["peak_force"] == 0 and done["x"] is None

@@ -29,17 +29,17 @@ STEP = 2e-4
 
 
 def required(B: Vector, n: Vector) -> float:
-    """Least friction with which a point of mobility B sticks: tangential over normal part of ``B⁻¹n``."""
+    """Return the least friction with which a point of mobility B sticks: tangential over normal part of ``B⁻¹n``."""
     s = np.linalg.solve(B, n)
     return float(np.linalg.norm(s - (n @ s) * n) / (n @ s))
 
 
 def assert_coulomb(B: Vector, n: Vector, friction: float, impulse: Vector, tolerance: float) -> None:
-    """The plastic impact of a point that approaches at ``−n`` obeys Coulomb's law."""
+    """Check Coulomb's law for the plastic impact of a point that approaches at ``−n``."""
     after = B @ impulse - n
     normal, tangential = float(n @ impulse), impulse - (n @ impulse) * n
     size, slip = float(np.linalg.norm(tangential)), float(np.linalg.norm(after))
-    # Rounding of the velocity after the impact.
+    # The scale of rounding errors of the velocity after the impact.
     scale = float(np.linalg.norm(B) * np.linalg.norm(impulse)) + 1
     assert abs(n @ after) <= tolerance * scale
     assert normal > 0 and size <= friction * normal + tolerance * (1 + normal + size)
@@ -47,7 +47,7 @@ def assert_coulomb(B: Vector, n: Vector, friction: float, impulse: Vector, toler
         assert abs(size - friction * normal) <= tolerance * (1 + normal + size)
         opposed = np.linalg.norm(tangential * slip + after * friction * normal)
         assert opposed <= tolerance * scale * (1 + normal + size)
-    # The change of energy: impulse times mean velocity of the point.
+    # The energy does not grow.  Its change is the impulse times the mean velocity of the point.
     assert impulse @ (after - n) / 2 <= tolerance * scale
 
 
@@ -61,7 +61,7 @@ def _direction() -> ca.Function:
 def test_a_fixed_number_of_steps_solves_the_secular_equation_to_rounding(
     seed: int, powers: list[float], share: float
 ) -> None:
-    """Random B of any condition up to 1e5, friction from 1e-10 of what sticking requires to twice as much."""
+    """Random B of any condition up to 1e5, with 1e-10 to 2 times the friction that sticking requires."""
     generator = np.random.default_rng(seed)
     n, Q = unit(generator), np.linalg.qr(generator.normal(size=(3, 3)))[0]
     B = Q @ np.diag(10.0 ** np.array(powers)) @ Q.T
@@ -78,7 +78,7 @@ def test_a_fixed_number_of_steps_solves_the_secular_equation_to_rounding(
 
 @given(st.integers(0, 2**32 - 1))
 def test_kinetic_energy_rises_with_friction_from_frictionless_to_sticking(seed: int) -> None:
-    """With W = M the value is ``p B p`` at unit approach speed: 1/G without friction, ``nB⁻¹n`` sticking."""
+    """With W = M the value is ``p B p`` at unit approach speed: 1/G without friction, ``nB⁻¹n`` for sticking."""
     generator = np.random.default_rng(seed)
     n, A = unit(generator), generator.normal(size=(3, 3))
     B = A @ A.T + 1e-3 * np.eye(3)
@@ -91,7 +91,7 @@ def test_kinetic_energy_rises_with_friction_from_frictionless_to_sticking(seed: 
 
 @pytest.mark.parametrize("name", SOME)
 def test_value_and_gradient_agree_three_ways(name: str) -> None:
-    """Pinocchio's numbers, the symbolic kernel and differences, at any friction, for every metric and support."""
+    """Pinocchio, the symbolic kernel and differences agree at any friction, for every metric and support."""
     for index, (loaded, contact, metric, supports) in enumerate(combinations(name)):
         friction = FRICTIONS[index % len(FRICTIONS)]
         objective = WorstCaseObjective(loaded, replace(contact, friction=friction), metric, "coulomb", supports)
@@ -103,7 +103,7 @@ def test_value_and_gradient_agree_three_ways(name: str) -> None:
         assert_coulomb(o.mobility, o.normal, friction, impact.impulse, 1e-8)
         assert_close(oracle.at(q).solve(oracle.J.T @ impact.impulse), impact.jump, 1e-8, where)
         limit = o.S if impact.sticks else o.V if friction == 0 else None
-        # Both solve with M, each in its own order.
+        # Both solve with M, in different orders.
         rounding = 4 * np.finfo(float).eps * np.linalg.cond(oracle.M)
         assert limit is None or abs(value / limit - 1) < rounding, where
         differences = central_gradient(objective.value, loaded.model, q, STEP)
@@ -121,7 +121,7 @@ def hung(loaded: Robot, normal: tuple[float, float, float], friction: float) -> 
 
 @pytest.mark.parametrize("friction", (0.0, 0.05, 0.5, 5.0))
 def test_planar_robots(friction: float) -> None:
-    """Nothing moves the tip across the plane, so that JM⁻¹Jᵀ is singular in every posture."""
+    """The tip cannot move across the plane, so JM⁻¹Jᵀ is singular in every posture."""
     loaded = arm([Y, Y, Y], [0.3, 0.7, -0.5], floating=False)
     for normal in ((0.0, 0.0, 1.0), (0.6, 0.0, 0.8), (-1.0, 0.0, 0.0)):
         objective, contact = hung(loaded, normal, friction), np.array(normal)
@@ -139,7 +139,7 @@ def test_planar_robots(friction: float) -> None:
 
 
 def test_a_point_on_a_line_slides_or_jams() -> None:
-    """One hinge: the tip moves along one direction, at an angle to the normal; enough friction holds it there."""
+    """With one hinge the tip moves along one direction, at an angle to the normal.  Enough friction blocks it."""
     loaded = arm([Y], [0.0], floating=False)
     q, normal = np.array([0.4]), (0.0, 0.0, 1.0)
     slides, jams = hung(loaded, normal, 0.1), hung(loaded, normal, 5.0)
@@ -197,10 +197,10 @@ def test_the_value_is_continuous_at_the_switch_and_has_one_gradient_on_each_side
             there = np.array(pin.integrate(loaded.model, q, sign * step))
             assert coulomb_impact(objective.oracle, there).sticks == (sign < 0)
             assert_close(objective.gradient(there), side, 1e-4, f"side {sign}")
-        # With W = M the slope always falls where the contact begins to slip.
+        # With W = M, the slope always falls where the contact begins to slip.
         assert metric == "euclidean" or (sides[1] - sides[0]) @ outward < 0
         exported = np.array(objective.gradient_fun()(q, objective.contact.normal)[1]).ravel()
-        assert_close(exported, sides[0], 1e-6, "the gradient at the switch is that of sticking")
+        assert_close(exported, sides[0], 1e-6, "at the switch the gradient of sticking")
 
 
 @pytest.mark.parametrize("name", WHOLE)

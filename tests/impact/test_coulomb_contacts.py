@@ -1,4 +1,4 @@
-"""Several contacts at once with friction: Coulomb's law at each, contacts that do not feel each other, and MuJoCo."""
+"""Several contacts at once with friction: Coulomb's law at each, uncoupled contacts, and MuJoCo."""
 
 from __future__ import annotations
 
@@ -22,7 +22,7 @@ FEET = ("FL_FOOT", "FR_FOOT", "HL_FOOT", "HR_FOOT")
 
 
 def assert_laws(B: Vector, normals: Vector, friction: Vector, p: Vector, tolerance: float) -> None:
-    """Signorini's and Coulomb's laws at every contact, and a loss of energy."""
+    """Check Signorini's and Coulomb's laws at every contact, and that energy is lost."""
     before = -normals
     after = before + (B @ p.ravel()).reshape(p.shape)
     scale = float(np.abs(p).max())
@@ -32,7 +32,7 @@ def assert_laws(B: Vector, normals: Vector, friction: Vector, p: Vector, toleran
         assert normal >= -tolerance * scale and n @ u >= -tolerance
         assert abs(normal * (n @ u)) <= tolerance * scale
         assert np.linalg.norm(tangential) <= mu * normal + tolerance * scale
-        # The friction on a point that slides has its full size, against the slip.
+        # The friction on a sliding point has the largest size and opposes the slip.
         assert np.linalg.norm(tangential * np.linalg.norm(slip) + mu * normal * slip) <= tolerance * scale
     assert (p * (before + after)).sum() <= tolerance * scale
 
@@ -83,7 +83,7 @@ def test_one_contact_is_the_single_solution(friction: float) -> None:
 
 
 def feet_of(friction: float) -> tuple[WorstCaseObjective, Vector]:
-    """solo12 in the air, whose four feet meet tilted ground."""
+    """Return solo12 in the air, whose four feet meet tilted ground."""
     loaded = robot("solo12")
     n = np.array([0.35, 0.1, 1.0])
     contacts = [ImpactContact(foot, tuple(n / np.linalg.norm(n)), friction=friction) for foot in FEET]
@@ -95,7 +95,7 @@ def feet_of(friction: float) -> tuple[WorstCaseObjective, Vector]:
 
 @pytest.mark.parametrize("friction", (0.0, 0.15, 0.4, 2.0))
 def test_four_feet_land_in_mujoco(friction: float) -> None:
-    """MuJoCo lifts a foot that slides (its friction is convex), so only feet that stick are compared closely."""
+    """MuJoCo lifts a foot that slides, because its friction is convex.  So sticking feet are compared closely."""
     objective, q = feet_of(friction)
     jumps = coulomb_jumps(objective, q, 1.0)
     assert jumps is not None
@@ -105,7 +105,7 @@ def test_four_feet_land_in_mujoco(friction: float) -> None:
     assert_close(oracles[0].solve(impulse), velocity, 1e-9, "jump")
     measured = drop(objective, q)
     if friction in (0.0, 2.0):
-        # Nothing slides, or nothing rubs: both friction laws are the same.
+        # Without slip, or without friction, both friction laws are equal.
         assert all(jump.sticks for jump in jumps) is (friction == 2.0)
         assert_close(measured, velocity, 0.02, "Δν")
     else:
@@ -115,7 +115,7 @@ def test_four_feet_land_in_mujoco(friction: float) -> None:
 
 
 def drop(objective: WorstCaseObjective, q: Vector) -> Vector:
-    """``Δν`` in MuJoCo of the robot that moves as one body along ``−n``: no gravity, no motors, almost no rebound."""
+    """Return ``Δν`` in MuJoCo for a robot that translates along ``−n`` without gravity and motors."""
     mujoco, result = import_mujoco(), objective.robot
     written = build_mjcf(result.model)
     n, radius, time = objective.oracle.at(q).n.copy(), 0.005, 2e-4

@@ -1,4 +1,4 @@
-"""Links, rotors and springs in a contact: own time stepping, energy, limits, differences, and bad input."""
+"""Links, rotors and springs in a contact: time stepping, energy, limits, differences, and bad input."""
 
 from __future__ import annotations
 
@@ -37,12 +37,12 @@ STEP = 2e-4
 
 
 def on_springs(loaded: Robot, table: TransmissionSpec) -> Robot:
-    """The robot with another ``[transmission]``."""
+    """Return the robot with another ``[transmission]``."""
     return replace(loaded, spec=replace(loaded.spec, transmission=table))
 
 
 def springs(stiffness: float, damping: float = 0.0, **joints: JointTransmissionSpec) -> TransmissionSpec:
-    """Springs at all joints but those given."""
+    """Return springs at all joints except ``joints``."""
     return TransmissionSpec("elastic", stiffness, damping, joints)
 
 
@@ -55,7 +55,7 @@ class Setup(NamedTuple):
 
 
 def case_of(name: str) -> Setup:
-    """Robots with and without a free base, feet, dampers; stiff, locked and unstated joints; all metrics."""
+    """Return robots with and without base, feet and dampers, stiff, locked and unstated joints, and all metrics."""
     generator = rng(name, "elastic")
     rigid, locked = JointTransmissionSpec("rigid"), JointTransmissionSpec("locked")
     if name == "panda":
@@ -88,7 +88,7 @@ CASES = ("panda", "arm", "mixed arm", "talos", "tilthex_arm", "solo12")
 
 
 class Stepped(NamedTuple):
-    """What time stepping finds at the end of the compression, and the largest numbers on the way."""
+    """Results of time stepping at the end of the compression, and the largest values before."""
 
     duration: float
     x: Vector
@@ -103,7 +103,7 @@ class Stepped(NamedTuple):
 
 
 def stepped(case: ImpactCase, q: Vector, stiffness: float, speed: float) -> Stepped:
-    """The equations of motion as they stand, by Pinocchio's matrices and an adaptive Runge–Kutta method."""
+    """Integrate the equations of motion with matrices of Pinocchio, by an adaptive Runge–Kutta method."""
     result, spec = case.robot, case.robot.spec.transmission
     nv, base = result.nv, 6 if result.floating else 0
     own = [spec.joints.get(joint, JointTransmissionSpec()) for joint in result.joint_names]
@@ -180,13 +180,13 @@ def test_time_stepping_finds_the_same(name: str) -> None:
     assert (response.peak_torque >= np.abs(response.torque) * (1 - 1e-12)).all()
     assert response.peak_jump_norm >= response.jump_norm * (1 - 1e-12)
     assert response.value == pytest.approx((response.jump_norm / speed) ** 2, rel=1e-12)
-    # Free flight goes on at the approach speed, so the force times this speed is the power of the contact.
+    # Free flight continues at the approach speed, so the force times this speed is the power of the contact.
     assert response.impulse * response.speed == pytest.approx(other.energy + other.loss, rel=1e-8)
     assert (other.loss > 0) == (name in ("mixed arm", "talos", "solo12"))
 
 
 @pytest.mark.parametrize("name", CASES)
-def test_gradient_is_that_of_differences(name: str) -> None:
+def test_gradient_equals_differences(name: str) -> None:
     case, q, stiffness = case_of(name)
     elastic = ElasticImpact(case)
     value = elastic.value(q, stiffness)
@@ -197,7 +197,7 @@ def test_gradient_is_that_of_differences(name: str) -> None:
 
 @pytest.mark.parametrize("name", ["panda", "arm", "tilthex_arm"])
 def test_limits_are_the_joint_models(name: str) -> None:
-    """Stiff contacts meet links, soft contacts and stiff springs links and rotors, each in proportion to a number."""
+    """Stiff contacts meet the links; soft contacts and stiff springs meet links and rotors."""
     case, q, _ = case_of(name)
     case = replace(case, metric=Metric(), robot=on_springs(case.robot, springs(5e3 if name == "panda" else 150.0)))
     elastic, stiff = ElasticImpact(case), {}
@@ -223,7 +223,7 @@ def test_dampers_hold_rotors_to_links() -> None:
 
 
 def test_first_greatest_compression_of_many() -> None:
-    """Soft wrists let the compression rise, stall and rise again; the first standstill counts, not a later one."""
+    """With soft wrists the compression rises, stops and rises again.  The impact ends at the first stop."""
     generator, close = rng("first root"), 0
     case, _, _ = case_of("arm")
     case = replace(case, metric=Metric())
@@ -242,7 +242,7 @@ def test_first_greatest_compression_of_many() -> None:
 
 
 def test_ratio_of_a_robot_on_its_feet() -> None:
-    """The base gives way through the springs of the legs, while feet and rotors hold."""
+    """The base yields through the springs of the legs, while feet and rotors are fixed."""
     case, q, stiffness = case_of("solo12")
     oracle = ElasticImpact(case).oracle.at(q)
     Js, j = oracle.Js, oracle.n @ oracle.J
@@ -343,7 +343,7 @@ def test_contact_that_cannot_move() -> None:
 
 
 def test_extreme_but_allowed_numbers_answer() -> None:
-    """Soft and stiff at both ends: a finite answer, or one line."""
+    """Extreme stiffness, damping and inertia give a finite result or a one-line error."""
     case, q, _ = case_of("arm")
     for inertia in (1e-14, 1e-9, 1e6, 1e18, 1e40):
         model = pin.Model(case.robot.model)

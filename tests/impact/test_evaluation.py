@@ -1,4 +1,4 @@
-"""``evaluate``: its numbers against dense Pinocchio algebra, its predictions against the physics of an impact."""
+"""``evaluate``: numbers against dense algebra on Pinocchio, and predictions against the physics of an impact."""
 
 from __future__ import annotations
 
@@ -49,7 +49,7 @@ LINK = """<link name="{0}"><inertial><origin xyz="0.25 0 0"/><mass value="{1}"/>
 
 @pytest.fixture
 def planar(tmp_path: Path) -> str:
-    """A two-link arm that moves in the xy plane alone."""
+    """Return a two-link arm that moves in the xy plane."""
     links = LINK.format("l1", 2.0, 0.02) + LINK.format("l2", 1.0, 0.015) + '<link name="tip"/>'
     path = tmp_path / "planar.urdf"
     path.write_text(PLANAR.format(links=links))
@@ -57,7 +57,7 @@ def planar(tmp_path: Path) -> str:
 
 
 def dense(loaded: Robot, frame: str, q: np.ndarray, n: np.ndarray, W: np.ndarray | None, feet: tuple[Support, ...]):
-    """H, G, V, S, Λ_c, a and the sticking jump by inverting ``M + J_sᵀJ_s/ε`` outright."""
+    """Return H, G, V, S, Λ_c, a and the sticking jump by inverting ``M + J_sᵀJ_s/ε``."""
     M = mass_matrix(loaded.model, q)
     J = frame_jacobian(loaded.model, q, loaded.frame_id(frame))[:3]
     inertia = M.copy()
@@ -93,7 +93,7 @@ def test_numbers_against_dense_algebra(name: str, frame: str, metric: str) -> No
     evaluation = evaluate(impact.objective, impact.q, 0.7, 0.3)
     W = mass_matrix(loaded.model, impact.q) if metric == "kinetic" else None
     expected = dense(loaded, frame, impact.q, n, W, impact.supports)
-    # The feet's 1/ε beside the links' masses costs the plain inverse digits.
+    # In the inverse, 1/ε of the feet in addition to the masses of the links costs digits.
     tolerance = 1e-6 if impact.supports else 1e-10
     for key in ("H", "G", "V", "S", "E"):
         assert_close(evaluation.to_dict()[key], expected[key], tolerance, key)  # type: ignore[arg-type]
@@ -126,7 +126,7 @@ def test_free_values_stand_beside_the_supported_ones() -> None:
     assert evaluation.to_dict()["free"] == evaluation.without_supports.to_dict()
     assert evaluation.contact_stability is not None
     assert evaluation.to_dict()["footing"] == evaluation.contact_stability.to_dict()
-    # Two flat feet have full rank: their compliance hardly matters.
+    # Two flat feet have full rank, so their compliance has little effect.
     assert evaluation.compliance_effect is not None and 0 < evaluation.compliance_effect < 1e-2
     without = resolve(ImpactSettings(robot="talos", frame="torso_2_link", normal=(-1.0, 0.0, 0.0), support=()))
     alone = evaluate(without.objective, without.q)
@@ -261,7 +261,7 @@ def test_contacts_as_text(text: str, expected: object) -> None:
 
 
 @pytest.mark.parametrize("text", ["ee", "ee:0,0", ":0,0,1", "ee:a,b,c", "0,0,1"])
-def test_contacts_that_are_none(text: str) -> None:
+def test_invalid_contacts_are_refused(text: str) -> None:
     with pytest.raises(ContactError, match=r"^contact: "):
         parse_contact(text)
 

@@ -1,4 +1,4 @@
-"""``H, G, V, S, E, Λ_c``, their gradients and lifted form: symbolic, from Pinocchio's numbers, by differences."""
+"""``H, G, V, S, E, Λ_c``, their gradients and lifted form: symbolic, with Pinocchio, and by differences."""
 
 from __future__ import annotations
 
@@ -39,12 +39,12 @@ from tests.support.helpers import (
 KINDS: tuple[ObjectiveKind, ...] = ("impulse", "speed", "sticking", "energy")
 OFFSET = (0.01, -0.02, 0.03)
 VALUE, GRADIENT = 1e-9, 1e-6
-# Differences of a value that is good to 1e-11 (stiff feet) are best at about this step, 1e-9 relative.
+# The best step for differences of a value that is exact to 1e-11 (stiff feet): 1e-9 relative error.
 STEP = 2e-4
 
 
 def supports_of(loaded: Robot) -> tuple[Support, ...]:
-    """The robot's feet; where it has none, a point brace a third of the way to the contact."""
+    """Return the robot's feet, or for a robot without feet a point brace at a third of the path to the contact."""
     if loaded.spec.supports:
         return loaded.spec.supports
     assert loaded.spec.contact.frame is not None
@@ -117,7 +117,7 @@ def test_symbolic_oracle_and_differences_agree(name: str) -> None:
 
 @pytest.mark.parametrize("name", NAMES)
 def test_oracle_by_its_definition(name: str) -> None:
-    """Inverses written out, from Pinocchio's matrices and nothing else."""
+    """Write out the inverses, with matrices from Pinocchio alone."""
     for loaded, contact, metric, supports in combinations(name):
         if metric.kind == "weighted":
             continue
@@ -138,7 +138,7 @@ def test_oracle_by_its_definition(name: str) -> None:
         s = np.linalg.solve(mobility, n)
         G = n @ mobility @ n
         o = ImpactOracle(ImpactCase(loaded, contact, metric, supports, epsilon)).quantities(q)
-        # Forming M + JᵀJ/ε loses what the oracle's own system keeps.
+        # Forming M + JᵀJ/ε loses digits that the KKT system of the oracle keeps.
         tolerance = 1e-8 if supports else 1e-10
         assert o.S is not None
         for what, value, expected in (
@@ -151,9 +151,9 @@ def test_oracle_by_its_definition(name: str) -> None:
 
 @pytest.mark.parametrize("name", SOME)
 def test_lifted_form(name: str) -> None:
-    """At the guess the equations hold and the value is the oracle's; the equations fix the unknowns."""
+    """At the guess the equations hold, the value equals the oracle, and the equations determine the unknowns."""
     for k, (loaded, contact, metric, supports) in enumerate(combinations(name)):
-        # A robot that goes through all combinations goes through them with each kind, every other with three kinds.
+        # WHOLE robots combine with every kind, other robots with three kinds.
         for kind in KINDS if name in WHOLE else [KINDS[(NAMES.index(name) + k) % len(KINDS)]]:
             objective = WorstCaseObjective(loaded, contact, metric, kind, supports)
             q, n = ca.SX.sym("q", loaded.nq), ca.SX.sym("n", 3)
@@ -175,7 +175,7 @@ def test_lifted_form(name: str) -> None:
 @pytest.mark.parametrize("name", WHOLE)
 def test_objective_functions_agree_with_its_own_numbers(name: str, kind: ObjectiveKind) -> None:
     all_of_them = list(combinations(name))
-    # All metrics, both frames, with and without supports; CasADi's subexpression search is slow.
+    # All metrics, both frames, with and without supports.  The search of CasADi for common subexpressions is slow.
     for result, contact, metric, supports in (all_of_them[k] for k in (0, 5, 7, 10)):
         objective = WorstCaseObjective(result, contact, metric, kind, supports)
         where = describe(contact, metric, supports)
@@ -184,7 +184,7 @@ def test_objective_functions_agree_with_its_own_numbers(name: str, kind: Objecti
         assert_close(value, objective.value(q), VALUE, f"value ({where})")
         if metric.kind == "euclidean":
             assert_close(objective.value_fun()(q, contact.normal), objective.value(q), VALUE, f"value_fun ({where})")
-        # Stiff feet cost digits where the contact can hardly move, and the inverse of its mobility is large.
+        # Stiff feet cost digits if the contact can hardly move, because the inverse of its mobility is large.
         agreed = GRADIENT if supports else 1e-8
         assert_close(gradient, objective.gradient(q), agreed, f"gradient ({where})")
         differences = central_gradient(lambda at, o=objective: o.value(at), result.model, q, STEP)
@@ -197,7 +197,7 @@ def test_objective_functions_agree_with_its_own_numbers(name: str, kind: Objecti
 
 
 def test_an_oracle_that_returns_to_a_posture_has_the_same_numbers() -> None:
-    """Also after more postures than it keeps, and with its model moved to each."""
+    """This includes more postures than the oracle keeps."""
     talos = robot("talos")
     contact = ImpactContact("gripper_right_base_link", normal=(0, 0.6, 0.8))
     postures = random_configurations(talos.model, 36, "returns", spread=0.2)

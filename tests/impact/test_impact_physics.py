@@ -1,4 +1,4 @@
-"""What the impact quantities must obey as physics: balances, identities, invariances, limits."""
+"""Physical laws of the impact quantities: balances, identities, invariances and limits."""
 
 from __future__ import annotations
 
@@ -60,7 +60,7 @@ def feet(loaded: Robot) -> tuple[Support, ...]:
 
 
 def jacobians(loaded: Robot, q: Vector, supports: tuple[Support, ...]) -> tuple[Vector, Vector, Vector]:
-    """``M``, the contact's 3-row ``J`` and the supports' stacked ``J_s`` from Pinocchio."""
+    """Return ``M``, the contact's 3-row ``J`` and the stacked ``J_s`` of the supports from Pinocchio."""
     assert loaded.spec.contact.frame is not None
     J = frame_jacobian(loaded.model, q, loaded.frame_id(loaded.spec.contact.frame), OFFSET)[:3]
     parts = [
@@ -74,7 +74,7 @@ def jacobians(loaded: Robot, q: Vector, supports: tuple[Support, ...]) -> tuple[
 
 @pytest.mark.parametrize("name", NAMES)
 def test_an_impact_stops_the_contact_and_dissipates_e(name: str) -> None:
-    """``λ = v_n/G`` ends the approach and costs the kinetic energy ``E v_n²``; sticking stops the whole point."""
+    """``λ = v_n/G`` stops the approach and dissipates ``E v_n²``.  Sticking stops the whole point."""
     loaded = robot(name)
     generator = rng(name, "energy")
     for q in random_configurations(loaded.model, 2, name, "energy"):
@@ -100,7 +100,7 @@ def test_an_impact_stops_the_contact_and_dissipates_e(name: str) -> None:
 
 @pytest.mark.parametrize("name", NAMES)
 def test_kinetic_identities(name: str) -> None:
-    """Free: ``H = G``, ``V = 1/G = 2E``, ``Λ_c = JM⁻¹Jᵀ``, ``S = nᵀ(JM⁻¹Jᵀ)⁻¹n ≥ 1/G`` (Cauchy–Schwarz)."""
+    """Without feet ``H = G``, ``V = 1/G = 2E``, ``Λ_c = JM⁻¹Jᵀ``, ``S = nᵀ(JM⁻¹Jᵀ)⁻¹n ≥ 1/G`` (Cauchy–Schwarz)."""
     loaded = robot(name)
     generator = rng(name, "kinetic")
     for q in random_configurations(loaded.model, 3, name, "kinetic"):
@@ -112,7 +112,7 @@ def test_kinetic_identities(name: str) -> None:
         assert o.S is not None
         assert pytest.approx(float(o.normal @ np.linalg.solve(o.mobility, o.normal)), rel=1e-7) == o.S
         assert o.S >= (1 - 1e-10) / o.G
-        # Along an eigenvector a frictionless and a sticking impact are the same.
+        # Along an eigenvector a frictionless and a sticking impact are equal.
         values, vectors = np.linalg.eigh(o.mobility)
         own = quantities(loaded, q, vectors[:, 1], Metric("kinetic"))
         assert own.S == pytest.approx(own.V, rel=1e-6)
@@ -121,7 +121,7 @@ def test_kinetic_identities(name: str) -> None:
 
 @pytest.mark.parametrize("name", STANDING)
 def test_feet_never_add_mobility(name: str) -> None:
-    """Supports take effective mass's inverse down, and more so the stiffer they are; ``G`` falls with each foot."""
+    """``G`` falls with each foot, and with the stiffness of the feet."""
     loaded = robot(name)
     generator = rng(name, "mobility")
     (q,) = random_configurations(loaded.model, 1, name, "mobility")
@@ -135,7 +135,7 @@ def test_feet_never_add_mobility(name: str) -> None:
 @pytest.mark.parametrize("metric", ["euclidean", "kinetic", "weighted"])
 @pytest.mark.parametrize("name", ["solo8", "panda", "tilthex_arm", "talos"])
 def test_root_h_is_the_ellipsoids_half_width(name: str, metric: str) -> None:
-    """The ellipsoid is the image of the unit ball under ``JM⁻¹W^½``; its farthest point along n is at ``√H``."""
+    """The ellipsoid is the image of the unit ball under ``JM⁻¹W^½``.  Its farthest point along n is at ``√H``."""
     loaded, generator = robot(name), rng(name, metric, "width")
     weights = generator.uniform(0.5, 2.0, loaded.nv)
     chosen = Metric("weighted", tuple(weights)) if metric == "weighted" else Metric(metric)  # type: ignore[arg-type]
@@ -152,7 +152,7 @@ def test_root_h_is_the_ellipsoids_half_width(name: str, metric: str) -> None:
     assert reach.max() <= np.sqrt(o.H)
     farthest = image.T @ n / np.linalg.norm(image.T @ n)
     assert n @ image @ farthest == pytest.approx(np.sqrt(o.H), rel=1e-10)
-    # The radius along n, where the surface meets the line, is another and smaller number.
+    # The radius along n, where the surface meets the line, is smaller.
     radius = 1 / np.sqrt(n @ np.linalg.solve(o.ellipsoid, n))
     assert radius < np.sqrt(o.H)
 
@@ -162,7 +162,7 @@ def test_root_h_is_the_ellipsoids_half_width(name: str, metric: str) -> None:
 
 @pytest.mark.parametrize("name", FLOATING)
 def test_moving_the_base(name: str) -> None:
-    """Nothing changes when the robot is carried elsewhere, nor when robot and normal turn together."""
+    """The quantities are equal after a translation of the robot, and after a rotation of robot and normal."""
     loaded = robot(name)
     generator = rng(name, "moved")
     for supports in {(), feet(loaded)}:
@@ -199,11 +199,11 @@ def test_the_sign_of_the_normal_does_not_matter(name: str) -> None:
 
 
 def test_the_kinetic_metric_does_not_depend_on_the_base_point() -> None:
-    """The euclidean one does: that is what the kinetic metric is for."""
+    """The euclidean metric depends on the base point."""
     loaded = robot("borinot")
     moved = loaded.model.copy()
     shift = pin.SE3(np.eye(3), np.array([0.2, -0.1, 0.3]))
-    # The same body seen from another base origin: everything on it moves the other way.
+    # With another base origin, everything on the body moves in the opposite direction.
     moved.inertias[1] = shift.actInv(moved.inertias[1])
     for k in range(2, moved.njoints):
         if moved.parents[k] == 1:
@@ -226,7 +226,7 @@ def test_the_kinetic_metric_does_not_depend_on_the_base_point() -> None:
 
 
 def test_feet_are_heavier_links() -> None:
-    """The heavy-foot shortcut: solo8 with the point mass 1/ε welded to its feet, by Pinocchio's own CRBA."""
+    """The inertia of held feet equals point masses 1/ε welded to the feet of solo8, by CRBA of Pinocchio."""
     loaded = robot("solo8")
     epsilon = default_compliance(loaded)
     heavy = loaded.model.copy()
@@ -248,12 +248,12 @@ def test_feet_are_heavier_links() -> None:
 
 @pytest.mark.parametrize("normal", [(1.0, 0.0, 0.0), (0.0, 0.0, 1.0), (0.0, 1.0, 0.0)])
 def test_solo8_on_its_feet_is_not_solo8_in_the_air(normal: tuple[float, float, float]) -> None:
-    """Crouching with the feet held: the free ``H`` and the one that knows of the ground disagree about its sign."""
+    """When solo8 crouches, ``H`` with feet and ``H`` without feet change in opposite directions."""
     loaded = robot("solo8")
     contact, q = ImpactContact("base_link", normal), loaded.posture()
     free, standing = WorstCaseObjective(loaded, contact), WorstCaseObjective(loaded, contact, supports=feet(loaded))
     assert relative(standing.value(q), free.value(q)) > 0.1
-    # What the feet allow that lowers the base and does nothing else to it.
+    # The motion that the feet allow and that lowers the base without other base motion.
     _, _, J_s = jacobians(loaded, q, feet(loaded))
     allowed = np.linalg.svd(J_s)[2][np.linalg.matrix_rank(J_s, tol=1e-9) :].T
     crouch = allowed @ np.linalg.lstsq(allowed[:6], np.array([0, 0, -1.0, 0, 0, 0]), rcond=None)[0]
@@ -261,12 +261,12 @@ def test_solo8_on_its_feet_is_not_solo8_in_the_air(normal: tuple[float, float, f
     assert (free.gradient(q) @ crouch) * (standing.gradient(q) @ crouch) < 0
     if normal == (1.0, 0.0, 0.0):
         assert free.gradient(q) @ crouch < 0 < standing.gradient(q) @ crouch
-    # Held feet can only take mobility away.
+    # Held feet cannot increase mobility.
     assert standing.oracle.quantities(q).G < free.oracle.quantities(q).G
 
 
 def test_point_feet_lose_rank_and_stay_smooth() -> None:
-    """Four point feet of solo8 hold 9 to 11 directions; the compliance keeps the differences finite and right."""
+    """Four point feet of solo8 hold 9 to 11 directions.  With compliance the gradient exists and is correct."""
     loaded = robot("solo8")
     q = loaded.posture("standing")
     _, _, J_s = jacobians(loaded, q, feet(loaded))
@@ -282,14 +282,14 @@ def test_point_feet_lose_rank_and_stay_smooth() -> None:
 
 @functools.cache
 def pendulum() -> Robot:
-    """Two parallel axes: the tip moves in a vertical plane."""
+    """Return a robot with two parallel axes, whose tip moves in a vertical plane."""
     return load_robot(
         "example-robot-data:double_pendulum_description/urdf/double_pendulum.urdf", LoadOptions(root="fixed")
     )
 
 
 def _plane(loaded: Robot, q: Vector) -> tuple[Vector, Vector]:
-    """The contact's Jacobian and the normal of the plane that it can move in."""
+    """Return the contact's Jacobian and the normal of the plane in which the contact moves."""
     J = frame_jacobian(loaded.model, q, loaded.frame_id("link2"), OFFSET)[:3]
     return J, np.linalg.svd(J)[0][:, 2]
 
@@ -319,7 +319,7 @@ def test_s_in_the_plane_by_the_pseudo_inverse() -> None:
         n /= np.linalg.norm(n)
         o = quantities(loaded, q, n, frame="link2")
         M = mass_matrix(loaded.model, q)
-        # Two joints, two directions: J alone fixes the jump.
+        # Two joints move in two directions, so J alone determines the jump.
         jump = np.linalg.pinv(J) @ n
         assert o.S is not None
         assert o.S == pytest.approx(float(jump @ jump), rel=1e-8)

@@ -1,4 +1,4 @@
-"""The worst case over a cone of normals: against sampling, by two independent ways, at ties, and solved."""
+"""The worst case over a cone of normals: against samples, by two independent methods, at ties, and in searches."""
 
 from __future__ import annotations
 
@@ -56,7 +56,7 @@ def cone_of(objective: WorstCaseObjective) -> NormalCone:
 
 
 def cone_samples(axis: np.ndarray, degrees: float, count: int = 100_000) -> np.ndarray:
-    """Unit vectors of a cone, a third of them on its edge, the others spread evenly inside, shape (count, 3)."""
+    """Return unit vectors of a cone, a third on its edge, the others spread evenly inside, shape (count, 3)."""
     edge = count // 3
     k = np.arange(count - edge) + 0.5
     height = np.concatenate([np.full(edge, np.cos(np.deg2rad(degrees))), np.ones(count - edge)])
@@ -64,7 +64,7 @@ def cone_samples(axis: np.ndarray, degrees: float, count: int = 100_000) -> np.n
     turn = np.concatenate([2 * np.pi * np.arange(edge) / edge, np.pi * (3 - np.sqrt(5)) * k])
     radius = np.sqrt(1 - height**2)
     local = np.stack([height, radius * np.cos(turn), radius * np.sin(turn)])
-    # Axes of its own: those of the code under test are not to be trusted here.
+    # Axes that are independent of the code under test.
     side = np.cross(axis, np.eye(3)[np.abs(axis).argmin()])
     side /= np.linalg.norm(side)
     return np.asarray((np.stack([axis, side, np.cross(axis, side)], axis=1) @ local).T)
@@ -75,7 +75,7 @@ def along(form: np.ndarray, normals: np.ndarray) -> np.ndarray:
 
 
 def pinocchio_form(name: str, frame: str, q: np.ndarray, kind: ObjectiveKind) -> np.ndarray:
-    """The matrix of the objective's quadratic form, by dense algebra: Λ_c, B⁻¹Λ_cB⁻¹ or B = JM⁻¹Jᵀ."""
+    """Return the matrix of the objective's quadratic form by dense algebra: Λ_c, B⁻¹Λ_cB⁻¹ or B = JM⁻¹Jᵀ."""
     model = robot(name).model
     J = frame_jacobian(model, q, robot(name).frame_id(frame))[:3]
     A = np.linalg.solve(mass_matrix(model, q), J.T)
@@ -90,7 +90,7 @@ def pinocchio_form(name: str, frame: str, q: np.ndarray, kind: ObjectiveKind) ->
 
 @pytest.mark.parametrize("degrees", ANGLES)
 @pytest.mark.parametrize("name", ROBOTS)
-def test_never_below_and_at_most_a_little_above_a_hundred_thousand_normals(name: str, degrees: float) -> None:
+def test_the_value_bounds_a_hundred_thousand_normals_closely(name: str, degrees: float) -> None:
     for index, q in enumerate(random_configurations(robot(name).model, 3, name, degrees, spread=0.5)):
         axis = unit(rng(name, degrees, index))
         normals = cone_samples(axis, degrees)
@@ -120,7 +120,7 @@ def test_no_cone_is_the_plain_problem() -> None:
         and "cone" not in evaluation.to_dict()
         and np.array_equal(evaluation.worst_normal, evaluation.normal)
     )
-    # And the cone goes there as it closes.
+    # The value converges to this limit as the cone closes.
     narrow = WorstCaseObjective(robot("tilthex_arm"), contact, normal_cone_deg=1e-3)
     assert 1 < narrow.value(q) / none.value(q) < 1 + 1e-3
 
@@ -215,7 +215,7 @@ def test_gradient_where_the_worst_normal_is_unique(name: str, kind: ObjectiveKin
 
 
 def test_subgradients_at_a_mirror_symmetric_posture() -> None:
-    """Towards every side the objective rises like the largest of its gradients: they span the subdifferential."""
+    """In every direction the objective rises at the rate of its largest gradient: the gradients span the hull."""
     loaded = robot("solo8")
     objective = WorstCaseObjective(loaded, ImpactContact("base_link", (1.0, 0.0, 0.0)), normal_cone_deg=20.0)
     q = loaded.posture()
@@ -230,7 +230,7 @@ def test_subgradients_at_a_mirror_symmetric_posture() -> None:
             objective.value(np.array(pin.integrate(loaded.model, q, step * direction))) - objective.value(q)
         ) / step
         assert rise == pytest.approx((points.gradients @ direction).max(), rel=1e-4, abs=1e-4 * objective.value(q))
-    # The C export's gradient is one of them.
+    # The gradient of the C export is one of them.
     value, gradient = (np.array(v).ravel() for v in objective.gradient_fun()(q, objective.contact.normal))
     assert value[0] == pytest.approx(objective.value(q), rel=1e-12)
     assert min(relative(gradient, g) for g in points.gradients) < 1e-6
@@ -250,8 +250,8 @@ LINK = """<link name="{0}"><inertial><origin xyz="0.03 0.02 0.2"/><mass value="{
 
 
 @pytest.mark.parametrize("degrees", [5.0, 45.0])
-def test_solution_is_that_of_brute_force(degrees: float, tmp_path: Path) -> None:
-    """A search that knows nothing of duals or gradients: 3,000 sampled normals, Nelder–Mead from many starts."""
+def test_solution_equals_brute_force(degrees: float, tmp_path: Path) -> None:
+    """Search without duals and gradients: 3,000 sampled normals, Nelder–Mead from many starts."""
     links = "".join(LINK.format(name, mass) for name, mass in (("a", 2.0), ("b", 1.0), ("c", 0.5)))
     (tmp_path / "arm.urdf").write_text(ARM.format(links=links))
     arm = load_robot(str(tmp_path / "arm.urdf"))
@@ -282,7 +282,7 @@ def test_solution_is_that_of_brute_force(degrees: float, tmp_path: Path) -> None
     mine = objective.value(solution.q)
     assert mine <= min(ends) * (1 + 2e-4), "nothing that brute force finds is better"
     assert mine >= sampled(solution.q) * (1 - 1e-12)
-    assert min(ends) >= mine * (1 - 2e-4), "brute force's best is no better, its samples apart"
+    assert min(ends) >= mine * (1 - 2e-4), "brute force is not better, apart from its samples"
 
 
 @pytest.mark.parametrize("kind", CONE_KINDS)
@@ -298,7 +298,7 @@ def test_starts_certify(name: str, kind: ObjectiveKind) -> None:
 
 
 def test_solved_from_and_at_mirror_symmetric_postures() -> None:
-    """solo8 starts at a tie and ends at one: no gradient there is zero, but a mixture of them balances."""
+    """solo8 starts and ends at a tie.  No gradient is zero there, but a convex combination balances."""
     settings = {"robot": "solo8", "frame": "base_link", "normal": (1, 0, 0), "normal_cone": 20.0}
     problem = prepare(make_settings(settings)).problem
     assert cone_of(problem.impact).worst(problem.given).tied

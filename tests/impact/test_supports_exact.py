@@ -1,4 +1,4 @@
-"""Feet that stay, against sixty digits and against Pinocchio's impulse dynamics: at every rank of their Jacobian."""
+"""Feet that stay, against sixty digits and the impulse dynamics of Pinocchio, at every rank of their Jacobian."""
 
 from __future__ import annotations
 
@@ -33,10 +33,10 @@ from tests.support.helpers import Vector, central_gradient, random_configuration
 from tests.support.rigid import Rigid
 from tests.support.rounding import other_rounding
 
-# Compliance times the robot's mass: the default, and stiffer.
+# Compliance times the mass of the robot: the default, and stiffer feet.
 STIFFNESS = (1e-4, 1e-6, 1e-9)
 ENDS = STIFFNESS[::2]
-# Ranks of solo8's four feet, taken at their centers: straight legs, equal knees, unequal ones.
+# Ranks of the four feet of solo8, at their centers: straight legs, equal knees, unequal knees.
 SOLO8 = {"straight": 9, "equal knees": 10, "one knee moved by 1e-6": 11, "one knee moved by 1e-3": 11, "random": 11}
 CASES = [*[("solo8", posture) for posture in SOLO8], ("solo12", "random"), ("bolt", "random"), ("talos", "random")]
 STIFFENED = [(*case, e) for case in CASES for e in (ENDS if case[0] == "talos" else STIFFNESS)]
@@ -52,7 +52,7 @@ def sixty_digits() -> Iterator[None]:
 
 
 def feet(loaded: Robot) -> tuple[Support, ...]:
-    """The robot's feet; solo8's by their centers, where straight legs are singular."""
+    """Return the robot's feet; for solo8 by their centers, where straight legs are singular."""
     own = loaded.spec.supports
     return tuple(replace(s, offset=(0.0, 0.0, 0.0)) for s in own) if loaded.name == "solo8" else own
 
@@ -85,7 +85,7 @@ def bounded(name: str, label: str, relative_compliance: float) -> Bounded:
 
 
 def within(values: object, expected: Exact | Decimal, bound: Vector | float, what: str) -> None:
-    """Every entry within its bound."""
+    """Check that every entry is within its bound."""
     error = distance(values, np.asarray(expected, dtype=object))
     assert (error <= bound).all(), f"{what}: error {error.max():.1e}, allowed {np.max(bound):.1e}"
 
@@ -113,7 +113,7 @@ def test_solo8_has_every_rank(label: str, rank: int) -> None:
 def test_the_oracle_solves_what_it_is_given(
     name: str, label: str, relative_compliance: float, seed: int | None
 ) -> None:
-    """Each quantity within what elimination on the KKT system may lose by its condition; the jump to nine digits."""
+    """The errors are within the bounds of elimination on the KKT system, and the jump has nine correct digits."""
     x = bounded(name, label, relative_compliance)
     with elsewhere(seed):
         oracle = objective(name, relative_compliance).oracle
@@ -126,14 +126,14 @@ def test_the_oracle_solves_what_it_is_given(
     lost_V = float(x.V) * (x.H_by_elimination / float(x.H) + 2 * x.G_by_elimination / float(x.G))
     within(result.V, x.V, 1.01 * lost_V, "V")
     within(gradient, x.grad_H, x.gradient_by_elimination, "∇H")
-    # The condition of the jump is that of the motion, not 1/ε; between ranks it is its square root at most.
+    # The condition of the jump is the condition of the motion, not 1/ε.  Between ranks it is at most its root.
     assert size(distance(result.jump, x.jump)) <= 1e-9 * size(x.jump)
 
 
 @pytest.mark.parametrize("seed", SEEDS)
 @pytest.mark.parametrize(("name", "label"), CASES)
 def test_the_oracles_sticking_impact(name: str, label: str, seed: int | None) -> None:
-    """S and ∇S lose what rounding their matrices loses, whatever the processor; not the square of a condition."""
+    """S and ∇S lose as much as rounded matrices, on any processor, not the square of a condition."""
     x = bounded(name, label, 1e-4)
     with elsewhere(seed):
         oracle = objective(name, 1e-4).oracle
@@ -145,7 +145,7 @@ def test_the_oracles_sticking_impact(name: str, label: str, seed: int | None) ->
 
 
 def heavy_feet(x: Bounded, H: object, gradient: object, jump: object, G: object) -> None:
-    """Within what a factorization with heavy feet may lose; at the default compliance nine digits are left."""
+    """Check the bounds of a factorization with heavy feet; at the default compliance nine digits are left."""
     within(jump, x.jump, x.jump_by_heavy_feet, "jump")
     within(H, x.H, x.H_by_heavy_feet, "H")
     within(G, x.G, x.G_by_heavy_feet, "G")
@@ -194,9 +194,9 @@ def _compiled(library: Exported, x: Bounded) -> None:
     ("name", "label"), [("solo8", "straight"), ("solo8", "equal knees"), ("solo12", "random"), ("talos", "random")]
 )
 def test_the_effect_of_compliance_is_bounded(name: str, label: str, relative_compliance: float) -> None:
-    """At most ``ε/(σ+ε)`` of what the feet do, σ the least eigenvalue that they hold; nothing where they allow."""
+    """The effect is at most ``ε/(σ+ε)`` of the effect of the feet, with σ the least eigenvalue that they hold."""
     x = bounded(name, label, relative_compliance)
-    # So stiff that what is left of the bias is beyond doubles, so soft that the rounding of J_s holds nothing.
+    # Stiff enough that the bias is below doubles, and soft enough that the rounding of J_s holds nothing.
     rigid = ExactImpact(x.oracle, 1e-14 / x.oracle.robot.mass)
     M, Js = x.oracle.M, x.oracle.Js
     share = x.share
@@ -208,18 +208,18 @@ def test_the_effect_of_compliance_is_bounded(name: str, label: str, relative_com
     assert 0 <= float(x.G - rigid.G) <= share * (G_free - float(rigid.G)) * (1 + 1e-6)
     least = np.sqrt(np.linalg.eigvalsh(M)[0])
     assert abs(np.sqrt(float(x.H)) - np.sqrt(float(rigid.H))) <= kinetic / least * (1 + 1e-6)
-    # Along motions that the feet allow the momentum is the impact's, whatever the compliance.
+    # Along motions that the feet allow, the momentum is the impact's, whatever the compliance.
     allowed = np.linalg.svd(Js)[2][np.linalg.matrix_rank(Js, tol=1e-9) :]
     assert np.abs(allowed @ M @ off).max() <= 1e-9 * np.abs(M @ off).max()
 
 
 def test_the_limit_of_no_compliance_is_not_smooth() -> None:
-    """A sideways impact at solo8, one knee moved by 1e-6 rad: another limit, and the same value at the default."""
+    """With one knee of solo8 moved by 1e-6 rad, the limit differs and the value at the default is equal."""
     sideways = np.array([0.0, 1.0, 0.0])
     values = {}
     for label in ("equal knees", "one knee moved by 1e-6"):
         oracle = objective("solo8", 1e-4, sideways).oracle.at(posture("solo8", label))
-        # Between the square of 1e-6 (what the moved knee holds) and that of 1e-16 (what rounding does).
+        # Between 1e-12, which the moved knee holds, and 1e-32, which rounding holds.
         values[label] = [float(ExactImpact(oracle, e).H) for e in (1e-22, oracle.compliance)]
     (rigid, soft), (rigid_moved, soft_moved) = values.values()
     assert rigid_moved < 1e-6 * rigid
@@ -235,7 +235,7 @@ def test_the_limit_of_no_compliance_is_not_smooth() -> None:
     [("talos", 1), ("talos", 2), ("g1", 2), ("solo12", 4), ("go2", 4), ("anymal_c", 4), ("bolt", 2)],
 )
 def test_full_rank_feet_tend_to_impulse_dynamics(name: str, count: int) -> None:
-    """Rigid contacts by Pinocchio: within ``ε/(σ+ε)`` of ours, and what ours extrapolate to at no compliance."""
+    """Compare with rigid contacts of Pinocchio: within ``ε/(σ+ε)``, and extrapolated to zero compliance."""
     loaded = robot(name)
     supports = loaded.spec.supports[:count]
     base = replace(objective(name, 1e-4), supports=supports)
@@ -250,7 +250,7 @@ def test_full_rank_feet_tend_to_impulse_dynamics(name: str, count: int) -> None:
     share = base.compliance / (held + base.compliance)
     assert share < 0.02
     assert 0 < np.sqrt(off @ M @ off) <= share * np.sqrt(done @ M @ done) * (1 + 1e-9)
-    # Three terms of the series in ε/σ are gone; the third power is left, and grows with each inverse.
+    # The extrapolation removes two powers of ε/σ.  The third is left, and grows with each inverse.
     tolerance = 20 * share**3 + 1e-10
     expected = rigid.quantities(q)
     for what in ("H", "G", "V", "S", "jump", "support_impulse", "ellipsoid"):
@@ -261,7 +261,7 @@ def test_full_rank_feet_tend_to_impulse_dynamics(name: str, count: int) -> None:
 
 
 def _extrapolated(values: list[object]) -> Vector:
-    """From ε, ε/2 and ε/4 to zero (Richardson)."""
+    """Extrapolate from ε, ε/2 and ε/4 to zero (Richardson)."""
     one, half, quarter = (np.asarray(v, dtype=float) for v in values)
     return np.asarray(one / 3 - 2 * half + 8 * quarter / 3)
 
@@ -272,7 +272,7 @@ def _near(values: Vector, expected: object, tolerance: float, what: str) -> None
 
 
 def test_decimal_elimination_by_its_residual() -> None:
-    """The reference itself: ``K K⁻¹ = 1`` to fifty digits at the worst conditioned posture."""
+    """The reference itself is exact: ``K K⁻¹ = 1`` to forty digits at the worst conditioned posture."""
     x = bounded("solo8", "straight", 1e-9)
     residual = x.K @ x.inverse - exact(np.eye(len(x.K)))
     assert abs(residual).max() < Decimal("1e-40")
@@ -282,7 +282,7 @@ def test_decimal_elimination_by_its_residual() -> None:
 
 
 def test_the_stiffest_feet_pass_every_check(tmp_path: Path) -> None:
-    """What ``problem.toml`` accepts, ``codegen``, the loader and ``verify`` accept too."""
+    """``codegen``, the loader and ``verify`` accept the stiffest feet that ``problem.toml`` accepts."""
     stiffest = objective("bolt", least_compliance(robot("bolt")) * robot("bolt").mass)
     written = export(stiffest, tmp_path)
     assert written.compiled and written.agreement is not None

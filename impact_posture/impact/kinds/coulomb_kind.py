@@ -58,7 +58,7 @@ class CoulombKind(ImpactKind):
         return Subgradients(np.array([coulomb_gradient(oracle, q, sides[k]) for k in near]), gaps[near])
 
     def expressions(self, k: ImpactKernel) -> tuple[ca.SX, ca.SX]:
-        """Return value and tangent gradient (nv) in the symbols of a kernel; at the kink, those of sticking."""
+        """Return value and tangent gradient (nv) in the symbols of a kernel; at the kink for sticking."""
         case, n = self.case, k.n
         if case.contact.friction <= NO_FRICTION:
             return k.V, k.grad_V
