@@ -31,8 +31,8 @@ _SELF_TEST = {"double": 1e-7, "float": 0.1}
 class ImpactGradient:
     """``H``, its tangent gradient and related quantities from a compiled export.
 
-    Every method copies its inputs into buffers that were allocated once.  **Array results are views of buffers, which
-    the next call of the same method overwrites**, so copy a result that must last.  An object serves one thread.
+    Every method copies its inputs into buffers that were allocated once.  **Array results are views of buffers, and
+    the next call of the same method overwrites them.**  Copy a result that must last.  An object serves one thread.
     :meth:`copy` returns an object for another thread.  Calls release the global interpreter lock.
 
     Methods for one configuration raise these errors:

@@ -213,7 +213,7 @@ def frozen_directions(robot: Robot, point: PointOnLink) -> Array:
 
 
 def _inverse3(A: ca.SX) -> ca.SX:
-    """Inverse of a symmetric 3×3 by cofactors."""
+    """Return the inverse of a symmetric 3×3 matrix by cofactors."""
     rows = [A[k, :].T for k in range(3)]
     cofactors = ca.horzcat(ca.cross(rows[1], rows[2]), ca.cross(rows[2], rows[0]), ca.cross(rows[0], rows[1]))
     return cofactors / ca.dot(rows[0], cofactors[:, 0])

@@ -1,8 +1,8 @@
 """The exact worst normal of a cone, ``max nᵀAn`` over ``∠(n, n₀) ≤ α``, with the multiplier that proves it.
 
-A quadratic on a cap of the sphere has its maximum at an eigenvector inside the cap or on the cap's edge, where it is
-a trigonometric polynomial of degree two.  ``bound = λ_max(A + μ(n₀n₀ᵀ − cos²α I)) ≥ nᵀAn`` for every normal of the
-cone and any ``μ ≥ 0``.  It is attained at the optimal ``μ`` (S-lemma).
+The maximum of a quadratic on a cap of the sphere is at an eigenvector inside the cap, or on the edge of the cap.  On
+the edge it is a trigonometric polynomial of degree two.  For every normal of the cone and any ``μ ≥ 0``,
+``bound = λ_max(A + μ(n₀n₀ᵀ − cos²α I)) ≥ nᵀAn``, with equality at the optimal ``μ`` (S-lemma).
 """
 
 from __future__ import annotations
