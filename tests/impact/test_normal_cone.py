@@ -324,7 +324,8 @@ def test_speed_has_no_dual_and_no_cone_is_half_open() -> None:
 
 def test_export_has_the_worst_case(tmp_path: Path) -> None:
     need_compiler()
-    for kind in CONE_KINDS:
+    kinds: tuple[ObjectiveKind, ...] = ("sticking", "energy")
+    for kind in kinds:
         (tmp_path / kind).mkdir()
         contact = ImpactContact("ee", (0.1, -0.2, 1.0), impulse=2.0)
         objective = WorstCaseObjective(robot("tilthex_arm"), contact, kind=kind, normal_cone_deg=15.0)
