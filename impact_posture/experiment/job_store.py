@@ -37,9 +37,6 @@ class JobStore:
 
     The name of a file is a hash of everything that its job depends on (:func:`key_of`).  A document begins with its
     checksum and has the checksums of its time series, so a damaged file is noticed and its job runs again.
-
-    Args:
-        folder: The folder.  It is made when the first job is stored.
     """
 
     def __init__(self, folder: Path) -> None:

@@ -99,11 +99,7 @@ def controller_factory(scenario: str, free: bool = False) -> ControllerFactory:
 
 
 def execute(job: Job, factory: ControllerFactory | None = None) -> tuple[tuple[Run, ...], Document]:
-    """Run a job.  Return the runs and the document.
-
-    Args:
-        job: The job.
-        factory: Controllers of a variation of the scenario, which replaces it.
+    """Run a job, by default with the controllers of its scenario.  Return the runs and the document.
 
     Raises:
         ImpactPostureError: As :func:`impact_posture.simulation.run.run`, or the scenario cannot be set up.

@@ -163,12 +163,7 @@ def thin(series: Series, windows: Iterable[Window]) -> Series:
 
 
 def run_scene(runs: Sequence[tuple[RunView, WorstCaseObjective]], *, meshes: bool = False) -> ReportScene:
-    """Return the scene of runs of one scenario.
-
-    Args:
-        runs: Views of the runs, with the ticks of :func:`thin`, and the objective of each.
-        meshes: Include the meshes of the user's URDF.
-    """
+    """Return the scene of runs of one scenario, each a view with the ticks of :func:`thin` and its objective."""
     first, objective = runs[0]
     planes = []
     if first.surface is not None:

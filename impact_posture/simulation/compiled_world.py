@@ -84,10 +84,6 @@ class CompiledWorld:
     def take(self, n: int, lead: Callable[[float], None]) -> Ticks:
         """Run n ticks, or fewer if the state diverges.
 
-        Args:
-            n: Number of ticks.
-            lead: Moves the targets of the controller before a tick at a time, s.
-
         Raises:
             InputError: A command is not finite, or an unlimited torque is absurdly large.
         """
@@ -116,11 +112,6 @@ def compiled_world(world: World, tick: CompiledTick | None, count: int) -> Compi
 
     Python runs them without a controller in C, without the headers of MuJoCo, and for some worlds
     (:meth:`World.in_c`).
-
-    Args:
-        world: The world.
-        tick: The controller.
-        count: Physics steps in a tick.
     """
     contents = None if tick is None else world.in_c(count)
     if tick is None or contents is None or contents["rotors"] > _ROTORS:

@@ -32,12 +32,7 @@ def feet_of(setup: Setup) -> tuple[str, ...]:
 
 
 class Recorder:
-    """Record of a run with one row for each tick.
-
-    Args:
-        setup: The scenario.
-        metric: ``q → H``, for the time series of H.
-    """
+    """Record of a run with one row for each tick.  ``metric`` is ``q → H``."""
 
     def __init__(self, setup: Setup, metric: Callable[[Array], float]) -> None:
         self._setup, self._metric, self._world = setup, metric, setup.world

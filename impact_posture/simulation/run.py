@@ -129,10 +129,7 @@ class _Loop:
         return speeds
 
     def check_length(self, t: float) -> None:
-        """Refuse a run of fewer than two ticks, or of more than :data:`_MOST`.
-
-        Args:
-            t: Duration of the run, s.
+        """Refuse a run of duration ``t`` (s) with fewer than two ticks, or with more than :data:`_MOST`.
 
         Raises:
             InputError: The run is too short or too long.

@@ -31,10 +31,7 @@ Gradient = Callable[[Array], tuple[float, Array]]
 def scenario_objective(setup: Setup, kind: ObjectiveKind = "impulse", *, free: bool = False) -> WorstCaseObjective:
     """Return the objective for the impact of a scenario, at the shape of the contacts or at the pushed frame.
 
-    Args:
-        setup: The scenario.
-        kind: Kind of objective.
-        free: Whether to ignore the feet of a standing robot.
+    With ``free``, the feet of a standing robot do not count.
     """
     scenario, robot = setup.scenario, setup.robot
     x, y, z = (float(value) for value in scenario.normal)

@@ -34,11 +34,6 @@ _BASE = "free-flyer"
 def export_world(setup: Setup, out: Path, *, force: bool = False) -> None:
     """Write ``world.xml``, ``world.mjb`` and ``world.txt`` of a scenario.
 
-    Args:
-        setup: The experiment.
-        out: The folder.
-        force: Whether an earlier export there may be replaced.
-
     Raises:
         InputError: The scenario throws a ball, or a joint is neither revolute, prismatic nor a floating base.
         OutputError: The folder exists without ``force``, has foreign files, or cannot be written.

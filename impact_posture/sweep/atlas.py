@@ -51,13 +51,7 @@ def sweep_key(sweep: Sweep) -> str:
 
 
 class Atlas:
-    """Folder that a sweep writes.
-
-    Args:
-        folder: The folder.
-        sweep: The sweep.
-        key: :func:`sweep_key` of the sweep.
-    """
+    """Folder that a sweep writes."""
 
     def __init__(self, folder: Path, sweep: Sweep, key: str) -> None:
         self.folder, self._sweep, self._key = folder, sweep, key

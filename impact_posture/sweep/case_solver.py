@@ -33,10 +33,6 @@ _Value = TypeVar("_Value")
 class CaseSolver:
     """Robot, problems and programs of a case, which a process keeps from shard to shard.
 
-    Args:
-        case: The case.
-        speeds: Number of speeds, the fastest axis.
-
     Attributes:
         timer: Time of the solver.
         robot: The robot.

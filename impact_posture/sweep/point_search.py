@@ -65,14 +65,7 @@ class Timer:
 
 
 class Walk:
-    """Problem and program of a template, which grow from point to point of a shard.
-
-    Args:
-        template: The problem with the normal and the speed of some points.
-        settings: Settings with the number and the seed of the starts.
-        nlp: Program of the template.  Only this walk lets it grow.
-        timer: Timer of the solver.
-    """
+    """Problem and program of a template, which grow from point to point of a shard."""
 
     def __init__(
         self, template: ConstrainedProblem, settings: ProblemSettings, nlp: PostureNLP, timer: Timer

@@ -48,12 +48,7 @@ class ShardResult:
 
 
 def solve_shard(sweep: Sweep, key: str, index: int) -> ShardResult:
-    """Solve all points of a shard, each from its neighbors before it.
-
-    Args:
-        sweep: The sweep.
-        key: Hash of the sweep, its robots and this version.
-        index: Index of the shard.
+    """Solve all points of shard ``index``, each from its neighbors before it.  ``key`` identifies the sweep.
 
     Raises:
         ImpactPostureError: A setting is wrong.
@@ -64,14 +59,9 @@ def solve_shard(sweep: Sweep, key: str, index: int) -> ShardResult:
 def revise_shard(
     sweep: Sweep, key: str, index: int, content: bytes, beside: Mapping[int, list[float]]
 ) -> ShardResult:
-    """Improve the points of a solved shard from the postures of neighboring shards.
+    """Improve the points of a shard after its first pass (``content``) from postures of neighboring points.
 
-    Args:
-        sweep: The sweep.
-        key: Hash of the sweep, its robots and this version.
-        index: Index of the shard.
-        content: File of the shard after the first pass.
-        beside: Postures after the first pass at the neighboring points in other shards.
+    ``beside`` has the postures of the neighboring points in other shards after the first pass.
 
     Raises:
         ImpactPostureError: A setting is wrong.

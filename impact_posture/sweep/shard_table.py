@@ -26,15 +26,9 @@ def write_shard(
     results: Sequence[PointResult],
     predicted: Callable[[Mapping[str, Any], Array, Mapping[str, Any]], dict[str, float | None]],
 ) -> bytes:
-    """Return the file of a shard.
+    """Return the file of a shard after a number of passes.
 
-    Args:
-        sweep: The sweep.
-        key: Hash of the sweep.
-        index: Index of the shard.
-        passes: Number of passes over the shard.
-        results: Results of its points.
-        predicted: Returns the predicted columns from the values of a point, its posture and its other columns.
+    ``predicted`` returns the predicted columns of a point from its values, its posture and its other columns.
     """
     import pyarrow as pa
     from pyarrow import parquet

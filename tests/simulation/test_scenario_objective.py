@@ -17,7 +17,7 @@ import pinocchio as pin
 import pytest
 
 from impact_posture.config.settings import ObjectiveKind
-from impact_posture.errors import CompilerError, MetricError, OutputError
+from impact_posture.errors import MetricError
 from impact_posture.impact.impact_contact import ImpactContact
 from impact_posture.impact.metric import Metric
 from impact_posture.impact.supports import resolve_supports
@@ -249,27 +249,6 @@ def test_a_gradient_that_cannot_be_compiled_is_interpreted(
     assert len(factory.warnings) == 1
     factory.driver("nominal")
     assert not factory.warnings
-
-
-def test_a_cache_that_cannot_be_written_is_an_error(monkeypatch: pytest.MonkeyPatch, tmp_path: Path) -> None:
-    need_compiler()
-    (tmp_path / "file").touch()
-    monkeypatch.setenv("IMPACT_POSTURE_CACHE", str(tmp_path / "file"))
-    with pytest.raises(OutputError, match="cannot be written") as caught:
-        compiled(objective_of("ur5", "tool0", "impulse", False))
-    assert "\n" not in caught.value.line and "IMPACT_POSTURE_CACHE" in caught.value.line
-
-
-def test_a_compiler_that_fails_is_an_error_and_leaves_nothing(
-    builds: list[Path], monkeypatch: pytest.MonkeyPatch
-) -> None:
-    objective = objective_of("ur5", "tool0", "impulse", False)
-    monkeypatch.setenv("CC", "false")
-    with pytest.raises(CompilerError):
-        compiled(objective)
-    monkeypatch.delenv("CC")
-    q = near(objective, "after")
-    assert compiled(objective)(q)[0] == pytest.approx(objective.value(q), rel=1e-9)
 
 
 def test_two_processes_build_once(tmp_path: Path) -> None:

@@ -15,7 +15,6 @@ from impact_posture.simulation.controllers.controller_factory import ControllerF
 from impact_posture.simulation.metrics import measure
 from impact_posture.simulation.outcome import judge
 from impact_posture.simulation.prediction import predict
-from impact_posture.simulation.recorder import feet_of
 from impact_posture.simulation.run import run
 from impact_posture.simulation.scenario_file import SHIPPED, read_scenario
 from impact_posture.simulation.setup import Setup, set_up
@@ -23,7 +22,6 @@ from impact_posture.simulation.world.actuator_command import ActuatorCommand
 from impact_posture.simulation.world.throw import FLIGHT, Throw, thrown_jumps
 from impact_posture.simulation.world.world import World, build_world
 from tests.simulation.factories import controller_factory, needs_mujoco
-from tests.simulation.test_scenario_files import REAL
 from tests.support.helpers import Vector, frame_jacobian, mass_matrix
 
 # Robot, direction of flight and sign.
@@ -131,27 +129,6 @@ def test_a_standing_robot_jumps_as_predicted() -> None:
     assert metrics.peak_force > 10
     window = record.of("impact")[0]
     assert window.begin == pytest.approx(record.waited) and window.end - window.begin == pytest.approx(0.3)
-
-
-@pytest.mark.parametrize("name", REAL)
-def test_a_scenario_with_a_real_impact_stays_at_its_start(name: str) -> None:
-    setup = set_up(read_scenario(name))
-    driver = ControllerFactory(setup).driver("nominal")
-    command = driver.reset(setup.q)
-    setup.world.reset(setup.q, rotor_speed=command.rotor_speed)
-    count = round(setup.scenario.control.period / setup.world.timestep)
-    for _ in range(100):
-        command = driver.tick(setup.world.read())
-        setup.world.step(command, count)
-    truth = setup.world.truth()
-    # The feet sink by less than a millimeter, and sensor noise moves the robot.
-    assert np.linalg.norm(pin.difference(setup.robot.model, setup.q, truth.q)) < 0.05
-    # The feet touch the ground, and other shapes do not touch yet.
-    feet = feet_of(setup)
-    assert all(s.touching for s in truth.shapes if s.frame in feet)
-    assert not any(s.touching for s in truth.shapes if s.frame not in feet)
-    lifted = () if setup.scenario.control.footing is None else setup.scenario.control.footing.lifted
-    assert len(driver.controller.formulation.contacts) == len(feet) and not set(lifted) & set(feet)
 
 
 @pytest.mark.parametrize(

@@ -202,21 +202,6 @@ def test_a_box_rests_on_a_face() -> None:
     assert np.abs(truth.q[3:] - turned[3:]).max() < 1e-3
 
 
-def test_a_quadruped_stands_on_its_feet() -> None:
-    robot = known_robot("solo8")
-    scene = Scene((FLOOR,), tuple(Shape(s.frame, size=(0.016,), center=(0, 0, 0)) for s in robot.spec.supports))
-    world = build_world(robot, scene)
-    q = robot.posture()
-    world.reset(q)
-    for _ in range(500):
-        truth = world.truth()
-        world.step(ActuatorCommand(20 * (q[7:] - truth.q[7:]) - 0.5 * truth.v[6:], NONE), 4)
-    shapes = world.truth().shapes
-    assert all(s.touching for s in shapes)
-    assert sum(s.force for s in shapes)[2] == pytest.approx(9.81 * robot.mass, rel=0.01)
-    assert max(s.slip for s in shapes) < 1e-3
-
-
 def test_a_shape_has_the_friction_of_each_surface() -> None:
     smooth = Surface("smooth", (0, 0, 1), friction=0.0)
     rough = Surface("rough", (-1, 0, 0), point=(0.02, 0, 0), friction=0.5)

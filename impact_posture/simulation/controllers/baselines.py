@@ -141,12 +141,7 @@ class ReleaseDriver(RobustDriver):
     Without ``K_p``, the posture flows to the optimum instead of coming to rest before it.  The scale of the term is
     the larger curvature of the start and the offline optimum, so its stiffness hardly exceeds ``K`` between them.
     The reached posture is held when ``H`` falls by a share of less than :attr:`LEAST` within :attr:`PATIENCE` (s).
-
-    Args:
-        setup: The experiment.
-        term: The term, with ``spring="release"`` and an activation that is not live.
-        gradient: ``q → (H, ∇H)``.
-        optimum: Offline posture, shape (nq,).
+    The term has ``spring="release"`` and an activation that is not live.
     """
 
     PATIENCE, LEAST = 0.5, 0.01

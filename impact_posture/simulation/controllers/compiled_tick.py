@@ -102,11 +102,6 @@ class CompiledTick:
 def compiled_tick(controller: Controller, structure: Structure, objective: WorstCaseObjective | None) -> CompiledTick:
     """Return the controller as machine code, which is built once and cached.
 
-    Args:
-        controller: The controller in Python.
-        structure: Structure of its formulation.
-        objective: Objective of the impact-robust posture task, or ``None``.
-
     Raises:
         InputError: The sources of DAQP are missing.
         CompilerError: There is no compiler, or it failed.

@@ -40,10 +40,6 @@ class Reference:
         total: Duration of the run, s.
         legs: Duration, acceleration, and initial distance and speed of each leg of constant acceleration.
 
-    Args:
-        task: The contacts.
-        gap: Distance between shape and surface at the start, m.
-
     Raises:
         InputError: The gap is too short to reach the speed.
     """

@@ -90,9 +90,6 @@ class ActivePushes:
 
     Attributes:
         active: Body, point in the axes of the body, force, and last step of each push.
-
-    Args:
-        model: The MuJoCo model.
     """
 
     def __init__(self, model: Any) -> None:
@@ -131,9 +128,6 @@ class JointStops:
 
     Attributes:
         names: Joints with limits, in the order of :class:`Trace`.
-
-    Args:
-        model: The MuJoCo model.
     """
 
     def __init__(self, model: Any) -> None:

@@ -61,12 +61,7 @@ class _Mark(NamedTuple):
 
 
 class ContactLog:
-    """Contacts of all steps since the last :meth:`look`, with accumulated impulses and peaks.
-
-    Args:
-        model: The MuJoCo model.
-        geoms: Names of the geoms of the shapes.
-    """
+    """Contacts of all steps since the last :meth:`look`, with accumulated impulses and peaks."""
 
     def __init__(self, model: Any, geoms: tuple[str, ...]) -> None:
         self._count, self._step = len(geoms), float(model.opt.timestep)

@@ -22,10 +22,6 @@ class Rotors:
     rotor, and the drag moment is ``κ`` times the thrust against its spin.  There is no gyroscopic moment, because the
     inertia of the propellers is not in the model.
 
-    Args:
-        propulsion: Data of the rotors.
-        timestep: Time step, s.
-
     Raises:
         SpecError: The limits are wrong.
     """
@@ -86,11 +82,6 @@ class Vibration:
     its disc, ``e_i = cos φ_i x_i + s_i sin φ_i y_i`` turns with its spin ``s_i`` and ``φ̇_i = 2πω_i``.  The integral
     over time, with the joints held, is the twist ``Σ I⁻¹ [f_i; p_i × f_i]``.  The momentum is
     ``f_i = 2πω_i U (sin φ_i x_i − s_i cos φ_i y_i)``, and I (6 × 6) is the inertia of the robot at the base.
-
-    Args:
-        model: The model of the robot.
-        propulsion: Data of the rotors, with speeds in Hz.
-        unbalance: U, kg·m.
     """
 
     def __init__(self, model: pin.Model, propulsion: PropulsionSpec, unbalance: float) -> None:

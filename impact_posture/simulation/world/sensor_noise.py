@@ -40,13 +40,10 @@ NO_FORCE = [0.0, 0.0, 0.0]
 
 
 class ForceFilter:
-    """Low-pass filter of a force sensor.
+    """Low-pass filter of a force sensor.  ``turns`` is the cutoff frequency times the time step.
 
     Attributes:
         force: The filtered force, N, three numbers.
-
-    Args:
-        turns: Cutoff frequency times the time step.
     """
 
     def __init__(self, turns: float) -> None:
@@ -83,12 +80,7 @@ class Sample:
 
 
 class SensorNoise:
-    """White noise in the tangent space, and rounding to the steps of the encoders.
-
-    Args:
-        robot: The robot.
-        sensors: Errors of its sensors.
-    """
+    """White noise in the tangent space, and rounding to the steps of the encoders."""
 
     def __init__(self, robot: Robot, sensors: Sensors) -> None:
         self._model, self._sensors = robot.model, sensors

@@ -113,12 +113,7 @@ def add_ball(mjcf: Mjcf, throw: Throw) -> None:
 
 
 class Ball:
-    """Ball of a compiled model.
-
-    Args:
-        model: The MuJoCo model.
-        throw: The throw.
-    """
+    """Ball of a compiled model."""
 
     def __init__(self, model: Any, throw: Throw) -> None:
         joint = int(model.body(BALL).jntadr[0])

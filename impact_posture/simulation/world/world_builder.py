@@ -50,13 +50,7 @@ class BuiltScene:
 
 
 def build_scene(robot: Robot, scene: Scene, q: Array, throw: Throw | None = None) -> BuiltScene:
-    """Build the model of a robot in its surroundings.
-
-    Args:
-        robot: The robot.
-        scene: Surroundings of the robot.
-        q: Start posture, shape (nq,), which defines the gaps and the default centers of the shapes.
-        throw: Ball that is thrown.
+    """Build the model of a robot in its surroundings, whose gaps and default centers refer to the posture ``q``.
 
     Raises:
         FrameNotFound: The frame of a shape does not exist.
