@@ -6,6 +6,8 @@ import pkgutil
 from importlib import import_module
 from typing import TYPE_CHECKING, Any
 
+from generated_markdown import add_directive
+
 if TYPE_CHECKING:
     from sphinx.application import Sphinx
 
@@ -42,17 +44,4 @@ def markdown(names: list[str]) -> str:
 
 def setup(app: Sphinx) -> dict[str, Any]:
     """Register the directive."""
-    from docutils import nodes
-    from sphinx.util.docutils import SphinxDirective
-
-    class ApiReference(SphinxDirective):
-        """Insert :func:`markdown` where it stands."""
-
-        required_arguments = 1
-        optional_arguments = 30
-
-        def run(self) -> list[nodes.Node]:
-            return self.parse_text_to_nodes(markdown(self.arguments), allow_section_headings=True)
-
-    app.add_directive("api-reference", ApiReference)
-    return {"version": "1", "parallel_read_safe": True}
+    return add_directive(app, "api-reference", markdown)

@@ -12,6 +12,7 @@ from dataclasses import dataclass
 from typing import TYPE_CHECKING, Any, Literal, Union, get_args, get_origin, get_type_hints
 
 import typer
+from generated_markdown import add_directive
 from typer.models import ArgumentInfo, OptionInfo
 
 if TYPE_CHECKING:
@@ -135,14 +136,4 @@ def markdown() -> str:
 
 def setup(app: Sphinx) -> dict[str, Any]:
     """Register the directive."""
-    from docutils import nodes
-    from sphinx.util.docutils import SphinxDirective
-
-    class CliReference(SphinxDirective):
-        """Insert :func:`markdown` where it stands."""
-
-        def run(self) -> list[nodes.Node]:
-            return self.parse_text_to_nodes(markdown(), allow_section_headings=True)
-
-    app.add_directive("cli-reference", CliReference)
-    return {"version": "1", "parallel_read_safe": True}
+    return add_directive(app, "cli-reference", lambda _: markdown())

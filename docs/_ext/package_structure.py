@@ -6,6 +6,8 @@ import ast
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
+from generated_markdown import add_directive
+
 if TYPE_CHECKING:
     from sphinx.application import Sphinx
 
@@ -67,14 +69,4 @@ def markdown() -> str:
 
 def setup(app: Sphinx) -> dict[str, Any]:
     """Register the directive."""
-    from docutils import nodes
-    from sphinx.util.docutils import SphinxDirective
-
-    class PackageStructure(SphinxDirective):
-        """Insert :func:`markdown` where it stands."""
-
-        def run(self) -> list[nodes.Node]:
-            return self.parse_text_to_nodes(markdown())
-
-    app.add_directive("package-structure", PackageStructure)
-    return {"version": "1", "parallel_read_safe": True}
+    return add_directive(app, "package-structure", lambda _: markdown())

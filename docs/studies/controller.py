@@ -131,15 +131,7 @@ def times_of_ticks(_: int) -> Iterator[str]:
         except controller_peer.Missing as missing:
             peer, why = None, str(missing)
         theirs = f"Pinocchio and DAQP, C++ {why}".strip()
-        head = [
-            "robot",
-            "Python",
-            "C -O2",
-            "C native",
-            "C -O2, caches flushed",
-            "with a moving flow, C -O2",
-            theirs,
-        ]
+        head = ["robot", "Python", "C -O2", "C native", "C -O2, caches flushed", "with a moving flow, C -O2", theirs]
         yield from table(head, _speeds(peer, ratios))
     yield from ("", "With the impact-robust term, means over quiet states.", "")
     ratio = ["robot", "nominal, µs", "gradient", "every fifth tick, over nominal", "every tick: more, over gradient"]

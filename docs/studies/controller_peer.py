@@ -14,6 +14,7 @@ import numpy as np
 import pinocchio as pin
 
 from docs.studies.core import Vector
+from docs.studies.kernel.pinocchio import DEFINITIONS
 from impact_posture.controller_export.daqp_sources import VERSION, daqp_sources
 from impact_posture.system.libraries import cache_folder
 from impact_posture.tsid.controller import Controller, Status
@@ -22,9 +23,6 @@ from tests.support.exported_controller import formulation_of
 SOURCE = Path(__file__).with_suffix(".cpp")
 _REPETITIONS, _MOST = 7, 500
 _PREFIX = Path(pin.__file__).parents[4]
-# From the CMake package of Pinocchio.
-_DEFINITIONS = ["BOOST_MPL_LIMIT_LIST_SIZE=30", "BOOST_MPL_LIMIT_VECTOR_SIZE=30", "BOOST_FUSION_INVOKE_MAX_ARITY=12",
-                "BOOST_MPL_CFG_NO_PREPROCESSED_HEADERS", "NDEBUG"]  # fmt: skip
 
 
 class Missing(Exception):
@@ -56,7 +54,7 @@ def _build(folder: Path, daqp: Path) -> Path:
     headers = ["-I", str(daqp / "include"), "-isystem", str(_PREFIX / "include")]
     # The wheel of CasADi has the headers of Eigen, the wheel of Pinocchio does not.
     eigen = ["-isystem", str(Path(casadi.__file__).parent / "include" / "eigen3")]
-    definitions = [f"-D{word}" for word in _DEFINITIONS]
+    definitions = [f"-D{word}" for word in DEFINITIONS]
     objects = [f"{Path(source).stem}.o" for source in sources]
     commands = [
         ["cc", "-O2", *headers, "-c", *sources],

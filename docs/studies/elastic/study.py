@@ -9,7 +9,6 @@ from functools import cache
 from itertools import pairwise
 
 import numpy as np
-from numpy.typing import NDArray
 
 from docs.studies.core import Request, machine, say, table
 from docs.studies.elastic.figure import draw
@@ -25,8 +24,6 @@ from impact_posture.robot.robot_loader import load_robot
 from impact_posture.robot.robot_spec import JointTransmissionSpec, TransmissionSpec
 from tests.support.arms import TIP, seven_joints
 from tests.support.helpers import rng, unit
-
-Vector = NDArray[np.float64]
 
 SPEED = 0.5  # m/s
 # Contact stiffnesses of each posture: from x = 0.05 to 2 with the compression time of the links alone.

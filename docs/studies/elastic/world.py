@@ -5,12 +5,10 @@ from __future__ import annotations
 from dataclasses import dataclass
 
 import numpy as np
-from numpy.typing import NDArray
 
+from docs.studies.core import Vector
 from impact_posture.dynamics.mjcf import build_mjcf, import_mujoco, pose
 from impact_posture.impact.elasticity.elastic_impact import ElasticImpact
-
-Vector = NDArray[np.float64]
 
 # Mass (kg) and moments (kg m²) of a rotor's body; the rotor's own inertia is the armature of its joint.
 _TINY = 1e-9

@@ -15,13 +15,13 @@ from docs.studies.kernel.harness import Absent, Kernel, Samples
 from tests.support.tools import cxx_compiler, eigen_headers
 
 # Boost.MPL's preprocessed headers stop below the number of Pinocchio's joint types.
-_DEFINITIONS = (
+DEFINITIONS = (
     "BOOST_MPL_LIMIT_LIST_SIZE=30", "BOOST_MPL_LIMIT_VECTOR_SIZE=30", "BOOST_MPL_CFG_NO_PREPROCESSED_HEADERS",
     "BOOST_FUSION_INVOKE_MAX_ARITY=12", "FUSION_MAX_VECTOR_SIZE=12", "NDEBUG",
 )  # fmt: skip
 # With GCC's default budget, inlining in one row depends on the other rows, which changes its time by up to a fifth.
 _INLINE = ("inline-unit-growth=400", "large-function-growth=2000", "large-stack-frame-growth=10000")
-_PARAMETERS = [*[f"--param={p}" for p in _INLINE], *[f"-D{d}" for d in _DEFINITIONS]]
+_PARAMETERS = [*[f"--param={p}" for p in _INLINE], *[f"-D{d}" for d in DEFINITIONS]]
 _FLAGS = ("-std=c++17", "-O3", "-march=native", CONTRACT, *_PARAMETERS)
 # The first is Pinocchio's own derivative algorithms; the others are by hand in part or whole.  Row → H with ∇H, H.
 DERIVATIVES = "Pinocchio derivatives"
