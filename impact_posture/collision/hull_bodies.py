@@ -35,7 +35,7 @@ class Body(NamedTuple):
 def merged_bodies(shapes: Sequence[pin.GeometryObject], apart: NDArray[np.bool_]) -> list[Body]:
     """Merge shapes of a robot where this gives fewer pairs and hardly more volume.
 
-    Two bodies become one if they move with the same joint, must not touch the same shapes, and no point of their
+    Two bodies are merged if they have the same joint and must not touch the same shapes, and if no point of their
     common hull is more than 1 cm from them.  ``apart`` tells whether two shapes must not touch, shape (n, n).
     """
     corners = [

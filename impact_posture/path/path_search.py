@@ -14,8 +14,8 @@ from impact_posture.system.arrays import Array
 
 # Largest number of postures that the search pulls onto the constraints for a target.
 EFFORT = 5000
-# Relative excess over the straight distance of the ends above which a path gets an elastic band, and above which it
-# first gets shortcuts, whose walks cost more.
+# A path gets an elastic band if it is longer than the straight distance by more than the first share.  If it exceeds
+# the second share, it first gets shortcuts, whose walks cost more.
 _BENT, _DETOUR = 0.02, 0.2
 _SHORTCUTS = 24
 # Postures of the elastic bands, and sweeps over each.

@@ -60,13 +60,13 @@ class PathSpace:
         """Return the largest violation at ``q``, shape (nq,)."""
         return max(size for _, size, _ in self.violations(q))
 
-    def difference(self, one: Array, other: Array) -> Array:
-        """Return ``other ⊖ one``, shape (nv,)."""
-        return np.array(pin.difference(self.model, one, other))
+    def difference(self, start: Array, end: Array) -> Array:
+        """Return ``end ⊖ start``, shape (nv,)."""
+        return np.array(pin.difference(self.model, start, end))
 
-    def distance(self, one: Array, other: Array) -> float:
-        """Return the tangent norm ``‖other ⊖ one‖``, rad mixed with m."""
-        return float(np.linalg.norm(self.difference(one, other)))
+    def distance(self, start: Array, end: Array) -> float:
+        """Return the tangent norm ``‖end ⊖ start‖``, rad mixed with m."""
+        return float(np.linalg.norm(self.difference(start, end)))
 
     def pulled(self, q: Array, step: Array | None = None) -> Array | None:
         """Return ``q ⊕ step`` pulled onto the constraints, or ``None`` if it does not reach them."""
@@ -87,22 +87,22 @@ class PathSpace:
         """Return the number of parts for the check of a tangent step; a part may double on the constraints."""
         return max(1, int(np.ceil(_JUMP * self.size(step) - 1e-9)))
 
-    def clear(self, one: Array, other: Array) -> bool:
-        """Return whether the motion from ``one`` to ``other`` along the constraints is valid between its ends.
+    def clear(self, start: Array, end: Array) -> bool:
+        """Return whether the motion from ``start`` to ``end`` along the constraints is valid between its ends.
 
         The check pulls postures of the straight motion onto the constraints.  A part of a size above 1 is blocked.
         """
-        whole, q = self.difference(one, other), one
+        whole, q = self.difference(start, end), start
         parts = self.checks(whole)
         for k in range(1, parts + 1):
-            moved = self.pulled(one, whole * (k / parts)) if k < parts else other
+            moved = self.pulled(start, whole * (k / parts)) if k < parts else end
             if moved is None or self.size(self.difference(q, moved)) > 1:
                 return False
             q = moved
         return True
 
     def clear_path(self, postures: Iterable[Array]) -> bool:
-        """Return whether all postures and all motions between consecutive ones are valid."""
+        """Return whether all postures of a path and all motions between them are valid."""
         path = list(postures)
         return all(map(self.valid, path)) and all(self.clear(a, b) for a, b in pairwise(path))
 
@@ -151,8 +151,8 @@ class PathSpace:
 def lever_arms(chart: Chart, model: pin.Model) -> Array:
     """Return a bound on the motion of a frame per unit of each velocity entry, m/rad or 1, shape (nv,).
 
-    For a rotation, this is the length of the longest chain of placements from the joint to a frame behind it, which
-    bounds the distance of the frame from the axis.  Sliding joints on the chain add their largest travel.
+    For a rotation, the bound is the length of the longest chain of placements from the joint to a frame behind it.
+    No frame is farther from the axis.  Sliding joints on the chain add their largest travel.
     """
     depth = np.zeros(model.njoints)
     for frame in model.frames:

@@ -1,7 +1,7 @@
 """Paths of a robot with one degree of freedom left, along the curve of its self-motion in both directions.
 
-No sampling is needed.  Either the curve leads to a posture, or it proves that no path exists, because the posture is
-on another component of the self-motion, or because the constraints cut the curve in both directions.
+No sampling is needed.  Either the curve leads to a posture, or it proves that no path exists.  Then the posture is on
+another component of the self-motion, or the constraints cut the curve in both directions.
 """
 
 from __future__ import annotations

@@ -97,9 +97,9 @@ def torque_limits(model: pin.Model) -> Array:
 def allocation_matrix(model: pin.Model, propulsion: PropulsionSpec) -> Array:
     """Map rotor thrusts (N) to the base wrench ``[force; moment]``, in the base frame at its origin.
 
-    A rotor at ``p`` with unit thrust direction ``d``, spin ``s`` and drag ratio ``κ`` makes the wrench
-    ``[d; p × d - s κ d]`` per unit thrust in the propulsion frame.  It is transformed to the base (root joint) frame,
-    which gives a matrix of 6 × n_rotors.  The model must be free-flying, with the propulsion frame on its base body.
+    In the propulsion frame, the wrench per unit thrust of a rotor is ``[d; p × d - s κ d]``, with its position ``p``,
+    unit thrust direction ``d``, spin ``s`` and drag ratio ``κ``.  The result, shape (6, n_rotors), is in the base
+    (root joint) frame.  The model must be free-flying, with the propulsion frame on its base body.
     """
     if not is_free_flyer(model):
         raise SpecError("rotors on a robot that cannot fly", where="propulsion", hint='set root = "free-flyer"')
@@ -184,10 +184,9 @@ def hover(model: pin.Model, propulsion: PropulsionSpec, q: ArrayLike) -> Hover:
 def lateral_force_range(model: pin.Model, propulsion: PropulsionSpec, q: ArrayLike) -> LateralForce:
     """Return the largest net horizontal force that keeps attitude and height, in each of four directions.
 
-    A linear program per direction maximizes ``F = m a`` over thrusts ``f`` and acceleration ``a >= 0``.  Its
-    constraints are ``A f = h_b + M_b e a`` (six rows, which carry the weight and permit no rotation), the thrust
-    limits, and ``|h_j + M_j e a| <= τ_max`` for the joints, which do not move; ``e`` moves the whole robot in the
-    direction.
+    A linear program for each direction maximizes ``F = m a`` over thrusts ``f`` and acceleration ``a >= 0``.  The
+    vector ``e`` moves the whole robot in the direction.  The six rows ``A f = h_b + M_b e a`` carry the weight and
+    permit no rotation.  Other constraints are the thrust limits and ``|h_j + M_j e a| <= τ_max`` for the joints.
     """
     matrix = allocation_matrix(model, propulsion)
     low, high = thrust_limits(propulsion)

@@ -117,7 +117,7 @@ def tips(robot: Robot, feet: Sequence[str] = ()) -> tuple[str, ...]:
             return 1, depth
         return (2 if _HAND.search(name) else 3), depth
 
-    # Of the frames on a link, the outer ones come later in the URDF.
+    # Outer frames of a link come later in the URDF.
     moving = [(i, f) for i, f in enumerate(model.frames) if f.parentJoint > 0 and f.name != "root_joint"]
     ordered = sorted(moving, key=lambda entry: (*rank(entry[1]), -entry[0]))
     return tuple(dict.fromkeys(str(frame.name) for _, frame in ordered))

@@ -91,7 +91,7 @@ def with_joint_model(robot: Robot, joint_model: JointModel) -> Robot:
     elif joint_model == "locked":
         armature[joints] = np.inf
     elif joint_model == "elastic":
-        # A rotor without inertia holds nothing against its spring.
+        # A rotor without inertia offers no resistance to its spring.
         springs = table.elastic & (stated > 0)
         if not springs.any():
             fault = f"no joint of {robot.name} has a rotor on a spring of known stiffness"

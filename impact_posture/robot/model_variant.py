@@ -79,8 +79,8 @@ def build_model_variants(
             fault = f"frame '{payload.frame}' is welded to the world, where a mass changes nothing"
             raise InputError(fault, where="payload", hint="choose a frame on a moving link")
         if payloads.count(payload) > 1:
-            what = f"{payload.mass:g} kg at '{payload.frame}' is given twice"
-            raise InputError(what, where="payload", hint="remove one of them")
+            fault = f"{payload.mass:g} kg at '{payload.frame}' is given twice"
+            raise InputError(fault, where="payload", hint="remove one of them")
     variants = tuple(_variant(robot, factor, payload) for payload in (None, *payloads) for factor in factors)
     if len(variants) > MOST_VARIANTS:
         hint = f"give at most {MOST_VARIANTS} combinations"

@@ -29,7 +29,7 @@ def named_postures(
     """
     postures = _srdf_postures(model, srdf, spec) | _toml_postures(model, spec, root, name)
     default = spec.default_posture or next(iter(postures), "neutral")
-    # A joint whose limits exclude zero starts at the nearest of them.
+    # A joint whose limits exclude zero is at the nearest limit.
     postures.setdefault("neutral", np.clip(pin.neutral(model), model.lowerPositionLimit, model.upperPositionLimit))
     if default not in postures:
         fault = f"default_posture '{default}' does not exist"

@@ -46,7 +46,7 @@ class Robot:
         postures: Named configurations, shape (nq,).
         default_posture: Name of the posture to start from.
         spec: The resolved ``robot.toml``.
-        locked: Joints made rigid.
+        locked: Names of the locked joints.
         armature_source: Source of the armature in words.
         warnings: Warnings about this model, one line each.
         joint_model: Inertia that the impact meets at the joints

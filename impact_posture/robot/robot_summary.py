@@ -18,7 +18,7 @@ from impact_posture.robot.urdf import EXAMPLE_PREFIX, robots_data
 
 WAYS_TO_NAME = (
     "a known name, as listed",
-    "a path to a .urdf; a robot.toml beside it, or --config, says what URDF cannot",
+    "a path to a .urdf; a robot.toml beside it, or --config, adds data that a URDF cannot hold",
     f"{EXAMPLE_PREFIX}<path below its robots/ folder>",
 )
 

@@ -48,7 +48,7 @@ def scratch_folder(parent: Path | None = None, mode: int = 0o700) -> Iterator[Pa
     try:
         parent = Path(tempfile.gettempdir()) if parent is None else parent
     except FileNotFoundError:
-        raise OutputError("no temporary folder can be written", where="TMPDIR", hint="set it to one") from None
+        raise OutputError("no temporary folder can be written", where="TMPDIR", hint="set it to a folder") from None
     _sweep(parent)
     folder = parent / f"{SCRATCH}{secrets.token_hex(4)}"
     # The folder is made inside the block, so that no signal can leave it behind.
