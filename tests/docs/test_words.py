@@ -24,7 +24,7 @@ LEFT = {
     r"Footing": "ContactStability, StanceGains",
 }
 # Phrases that are hard to read, where they are counted, and the largest number of lines with them.
-RARE = {r"found": (CODE, 1000), r"that of|those of|is no \w+": (READ, 300)}
+RARE = {r"found": (CODE, 100), r"that of|those of|is no \w+": (READ, 60)}
 pytestmark = pytest.mark.skipif(not (ROOT / "docs").is_dir(), reason="not in a checkout")
 
 

@@ -43,7 +43,7 @@ def test_mujoco_finds_the_same(name: str, stiffness: float) -> None:
 
 
 def test_an_error_of_the_model_shows() -> None:
-    """Another spring than that of the world is off by more than the goals of the study allow."""
+    """A wrong spring causes errors above the goals of the study."""
     studied = STUDIED["own arm"]
     arm = studied.robot()
     case = ImpactCase(arm, ImpactContact(studied.frame, (0.0, 0.0, 1.0)))

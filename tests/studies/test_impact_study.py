@@ -70,7 +70,7 @@ def test_the_sticking_impulse_says_which_postures_slide() -> None:
     assert any(held)
     assert not all(held)
     assert [bool(slip < 0.01) for slip in row.measured("slip")] == held
-    # Sliding is no rebound.
+    # Sliding does not look like a rebound.
     assert (np.abs(row.measured("restitution") - 0.05) < 0.02).all()
     ours, mujocos = dropped(FLYING).on(Surface(10.0)), dropped(FLYING).on(Surface(STICKS))
     np.testing.assert_allclose(ours.measured("size"), mujocos.measured("size"), rtol=0.01)

@@ -118,7 +118,7 @@ void generalized(const Peer & p, const Force & w, Vector & tau)
   }
 }
 
-// Velocity of a link in world axes from that of its parent.
+// Velocity of a link in world axes from the velocity of its parent.
 void velocity(const Peer & p, Index i, const Vector & rates, Links<Motion> & v)
 {
   const Index parent = p.model.parents[i];
