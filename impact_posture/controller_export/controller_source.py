@@ -34,9 +34,9 @@ from impact_posture.version import __version__
 
 # Files of c/ in the order of the source.
 _CORE = (
-    "vector.c", "eigen.c", "algebra.c", "tasks.c", "contacts.c", "posture.c", "qp.c", "rank.c", "solve.c",
-    "give_way.c", "reference_flow_space.c", "reference_flow_limits.c", "reference_flow_zmp.c",
-    "reference_flow_direction.c", "reference_flow.c", "reference_flow_motion.c", "init.c", "tick.c", "report.c",
+    "vector.c", "eigen.c", "algebra.c", "tasks.c", "contacts.c", "qp.c", "rank.c", "solve.c", "give_way.c",
+    "reference_flow_space.c", "reference_flow_limits.c", "reference_flow_zmp.c", "reference_flow_direction.c",
+    "reference_flow.c", "reference_flow_motion.c", "posture.c", "init.c", "tick.c", "report.c",
 )  # fmt: skip
 _RELAXATION = (
     "relaxation_memory.c", "vector.c", "relaxation_rows.c", "relaxation_elimination.c", "relaxation_level.c",

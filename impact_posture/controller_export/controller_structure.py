@@ -12,7 +12,6 @@ from numpy.typing import NDArray
 from impact_posture.dynamics.chart import Chart
 from impact_posture.errors import InputError
 from impact_posture.robot.robot import Robot, unit_parts
-from impact_posture.system.arrays import Array
 from impact_posture.tsid.actuators import Actuators
 from impact_posture.tsid.assembly import Assembly
 from impact_posture.tsid.flow.reference_flow_posture import ReferenceFlowPosture
@@ -160,7 +159,8 @@ def structure_of(robot: Robot, formulation: TaskFormulation) -> Structure:
         "inverse": actuators.inverse,
         "blind": actuators.blind if rotors else np.eye(actuators.base),
         "spare": actuators.spare,
-        "task_axis": [_axes(t) for t in tasks],
+        # The axis of an alignment, and two directions across it.
+        "task_axis": [[t._axis, *t._across] if isinstance(t, FrameAligned) else np.zeros((3, 3)) for t in tasks],
     }
     if sizes["FLOW"] and robot.floating:
         doubles["upright"] = robot.upright
@@ -240,10 +240,3 @@ def _check(robot: Robot, formulation: TaskFormulation) -> None:
     for slot in Chart(robot.model).slots:
         if slot.kind.family not in _FAMILIES:
             raise refuse(f"joint '{slot.name}' ({slot.kind.family}) has no C code")
-
-
-def _axes(task: Task) -> Array:
-    """Return the axis of an alignment and two directions across it, shape (9,); zeros for another task."""
-    if not isinstance(task, FrameAligned):
-        return np.zeros(9)
-    return np.concatenate([task._axis, *task._across])

@@ -21,13 +21,6 @@ static void ip_fade_to(ip_context *c, const double *q, double over)
   c->over = over;
 }
 
-#if IP_FLOW
-static double ip_flow_settle(const ip_params *p);
-static void ip_flow_lead(ip_context *c, double dt);
-static int ip_flow_moves(const ip_flow *f);
-static void ip_flow_start_at(ip_flow *f, const double *q);
-#endif
-
 #if IP_ROBUST
 /* Evaluate the term at q; keep the previous one where the gradient does not exist. */
 static void ip_evaluate(ip_context *c)

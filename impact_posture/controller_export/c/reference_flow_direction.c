@@ -70,12 +70,6 @@ APART static void ip_flow_solve(ip_flow *f)
   }
 }
 
-/* Whether the flow takes Newton steps at this update. */
-static int ip_flow_descends(const ip_flow *f)
-{
-  return !f->failed && f->visited == IP_PATH;
-}
-
 /* The root of H/H0, or its least value that counts. */
 static double ip_flow_root(const ip_flow *f)
 {

@@ -39,22 +39,6 @@ static double ip_flow_ahead(const ip_flow *f, int r, const double *moved)
   return along;
 }
 
-#if IP_BASE
-/* Angle between the vertical and the direction that is upright in the base, rad, and its slope. */
-static double ip_flow_tilt(const ip_flow *f, double *row)
-{
-  const double *vertical = f->m.base + 6;
-  double axis[3], sine;
-  int i;
-  ip_cross(vertical, ip_upright, axis);
-  sine = sqrt(ip_dot(axis, axis, 3));
-  for (i = 0; i < 3; ++i) {
-    row[3 + i] = sine > IP_LEVEL ? axis[i] / sine : 0.0;
-  }
-  return atan2(sine, ip_dot(vertical, ip_upright, 3));
-}
-#endif
-
 /* Bounds of the rows on the step, at the model of the flow, less the braking distance of the flow. */
 static void ip_flow_limits(ip_context *c)
 {
@@ -86,8 +70,14 @@ static void ip_flow_limits(ip_context *c)
       }
 #if IP_BASE
     } else if (r < IP_JOINTS_V + IP_PLACED) {
+      double axis[3], sine;
       memcpy(f->vertical, f->m.base + 6, sizeof f->vertical);
-      f->tilt = ip_flow_tilt(f, f->row[IP_EDGES]);
+      ip_cross(f->vertical, ip_upright, axis);
+      sine = sqrt(ip_dot(axis, axis, 3));
+      for (j = 0; j < 3; ++j) {
+        f->row[IP_EDGES][3 + j] = sine > IP_LEVEL ? axis[j] / sine : 0.0;
+      }
+      f->tilt = atan2(sine, ip_dot(f->vertical, ip_upright, 3));
       high = p->flow_tilt[0] - f->tilt;
       ahead = ip_dot(f->row[IP_EDGES], coasting, IP_NV);
 #endif

@@ -276,7 +276,7 @@ static void ip_flow_curve(ip_context *c)
   ip_flow *f = &c->flow;
   double *A = f->work, *V = A + IP_NV * IP_NV;
   const int n = f->left;
-  if (!ip_flow_descends(f)) {
+  if (f->failed || f->visited < IP_PATH) {
     return;
   }
   if (f->phase == BEND) {

@@ -48,9 +48,7 @@ class FlowGovernor:
         options, size = self._options, max(float(np.abs(remaining).max(initial=0.0)), _TINY)
         # Two fifths of the acceleration stop a speed of sqrt(4/5 a d) within the distance d.
         pace = min(1.0 / _RETURN, math.sqrt(0.8 * options.acceleration / size), options.speed / size)
-        change = pace * remaining - self.returning
-        largest = max(float(np.abs(change).max(initial=0.0)), _TINY)
-        self.returning += min(options.acceleration * period / largest, 1.0) * change
+        self.returning += limited(pace * remaining - self.returning, options.acceleration * period)
         return self.returning
 
     def stopping(self, flow: Array) -> float:
