@@ -44,11 +44,5 @@ class Draft:
 def comment_lines(text: str) -> list[str]:
     """Return the lines of a comment."""
     # Names may contain line breaks, which would end the comment.
-    return textwrap.wrap(
-        printable(text),
-        _WIDTH,
-        initial_indent="# ",
-        subsequent_indent="# ",
-        break_long_words=False,
-        break_on_hyphens=False,
-    )
+    wrapper = textwrap.TextWrapper(_WIDTH - 2, break_long_words=False, break_on_hyphens=False)
+    return [f"# {line}" for line in wrapper.wrap(printable(text))]
