@@ -32,8 +32,8 @@ class Written:
     Attributes:
         out: The folder.
         export: The C export, or ``None``.
-        compiler_error: Why the C code could not be built; empty if it was built, or if there is no compiler.
-        report_error: Why there is no report; empty if there is one, or if none was wanted.
+        compiler_error: Reason if the C code could not be built; empty otherwise, and without a compiler.
+        report_error: Reason if the report could not be written; empty otherwise.
     """
 
     out: Path
@@ -121,6 +121,6 @@ def _export(folder: Path, prepared: Prepared, postures: SolvedPostures) -> Writt
     except CompilerError as error:
         # The posture is kept although the compiler failed. The command line reports the error.
         compiler_error, exported = error.line, write(force=True, check=False)
-    # A record of its own lets the export be replaced alone, with the products of its Makefile.
+    # With a separate record, the export can be replaced alone, with the products of its Makefile.
     write_record(code, "export", products(exported.prefix))
     return Written(folder, exported, compiler_error)

@@ -210,7 +210,7 @@ def test_tradeoff_marks_knee_and_what_did_not_certify(tilthex: ResultView) -> No
     figure = tradeoff_figure(kneed)
     ring = next(line for line in figure.axes[0].lines if line.get_label() == "knee")
     assert ring.get_xdata() == data.within[4] and ring.get_ydata() == data.objective[4]
-    assert "marked only if that is by 1/3 or more" in text_of(figure)
+    assert "the excess is 1/3 or more" in text_of(figure)
     assert "1/3" not in text_of(tradeoff_figure(tilthex))
 
 

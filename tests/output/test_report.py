@@ -1,4 +1,4 @@
-"""``report.html``: what it says, what it may hold, and what a browser makes of it."""
+"""``report.html``: text, permitted content, and the page in a browser."""
 
 from __future__ import annotations
 
@@ -54,7 +54,7 @@ def scene(folder: Path) -> ReportScene:
 
 
 class Reader(HTMLParser):
-    """What a page is made of: its tags with attributes, and the text of each."""
+    """The tags of a page with attributes, and the text of each tag."""
 
     def __init__(self, page: str) -> None:
         super().__init__()
@@ -93,28 +93,29 @@ def levels(packed: dict[str, Any], buffer: bytes) -> np.ndarray:
 
 def test_the_page_holds_the_result_and_reaches_nothing(folder: Path) -> None:
     page = (folder / "report.html").read_text()
-    found, document = Reader(page), json.loads((folder / "result.json").read_text())
+    reader, document = Reader(page), json.loads((folder / "result.json").read_text())
     assert len(page) < 1.3e6
-    assert document["verdict"]["line"] in "".join(found.texts["p"])
-    assert "jump" in found.texts["figcaption"] and sum(tag == "img" for tag, _ in found.tags) == len(
-        list(folder.glob("*.png"))
-    )
-    # The words that the user typed.
-    command = found.texts["code"][0]
+    assert document["verdict"]["line"] in "".join(reader.texts["p"])
+    images = sum(tag == "img" for tag, _ in reader.tags)
+    assert "jump" in reader.texts["figcaption"] and images == len(list(folder.glob("*.png")))
+    # The command as the user typed it.
+    command = reader.texts["code"][0]
     assert command.startswith("impact-posture optimize tilthex_arm --frame ee --normal 0 0 1 --starts 1")
-    assert (folder / "problem.toml").read_text().split("\n")[0] in "".join(found.texts["pre"])
-    # Nothing is loaded: no address but those within the page.
-    for _, attributes in found.tags:
+    assert (folder / "problem.toml").read_text().split("\n")[0] in "".join(reader.texts["pre"])
+    # All addresses lie within the page.
+    for _, attributes in reader.tags:
         for name in ("src", "href", "srcset", "data", "action"):
             assert (attributes.get(name) or "data:").startswith("data:")
-    (policy,) = [a["content"] or "" for t, a in found.tags if t == "meta" and "http-equiv" in a]
+    (policy,) = [a["content"] or "" for t, a in reader.tags if t == "meta" and "http-equiv" in a]
     assert policy.startswith("default-src 'none';") and "unsafe" not in policy and "http" not in policy
     loader, style = (page.rpartition(f"<{tag}>")[2].partition(f"</{tag}>")[0] for tag in ("script", "style"))
     # Only the loader and the viewer that it unpacks may run.
-    viewer = gzip.decompress(base64.b64decode(found.packed["viewer"])).decode()
-    hashes = [f"'sha256-{base64.b64encode(hashlib.sha256(t.encode()).digest()).decode()}'" for t in (loader, viewer)]
-    assert f"script-src {' '.join(hashes)};" in policy
-    assert f"style-src 'sha256-{base64.b64encode(hashlib.sha256(style.encode()).digest()).decode()}'" in policy
+    viewer = gzip.decompress(base64.b64decode(reader.packed["viewer"])).decode()
+    hashes = [
+        f"'sha256-{base64.b64encode(hashlib.sha256(text.encode()).digest()).decode()}'"
+        for text in (loader, viewer, style)
+    ]
+    assert f"script-src {hashes[0]} {hashes[1]};" in policy and f"style-src {hashes[2]}" in policy
     assert "three.js authors" in viewer and "MIT License" in page
 
 
@@ -213,8 +214,7 @@ def written(text: str, scene: ReportScene) -> str:
 
 
 class Packed(ReportScene):
-    def pack(self) -> tuple[str, str]:
-        return "{}", ""
+    packed = ("{}", "")  # type: ignore[assignment]
 
 
 @settings(max_examples=12, deadline=None)
@@ -311,11 +311,10 @@ INERTIAL = '<inertial><mass value="1"/><inertia ixx="1" iyy="1" izz="1" ixy="0" 
 
 
 def own(folder: Path, a: str, b: str) -> ip.Robot:
-    # The last corner is in a dent: the hull has three corners and the faces of another solid.
-    lines = [f"v {x} {y} {z}" for x, y, z in [*TETRAHEDRON, [0, 0, 0]]]
-    (folder / "dent.obj").write_text(
-        "\n".join([*lines, "f 1 2 4", "f 2 3 4", "f 3 1 4", "f 1 5 2", "f 2 5 3", "f 3 5 1"])
-    )
+    # The last corner but one is in a dent, so the hull lacks it.
+    corners = [f"v {x} {y} {z}" for x, y, z in [*TETRAHEDRON, [0, 0, 0]]]
+    faces = ["f 1 2 4", "f 2 3 4", "f 3 1 4", "f 1 5 2", "f 2 5 3", "f 3 5 1"]
+    (folder / "dent.obj").write_text("\n".join([*corners, *faces]))
     (folder / "own.urdf").write_text(URDF.format(inertial=INERTIAL, a=a, b=b))
     return ip.load_robot(str(folder / "own.urdf"))
 

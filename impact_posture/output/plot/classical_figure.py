@@ -20,7 +20,7 @@ NOTES = (
     "Each kind of ellipsoid is divided by its longest finite semi-axis before, which the legend states. "
     "Velocity J Jᵀ: contact velocities of joint velocities of norm 1. Force (J Jᵀ)⁻¹: contact forces of joint "
     "torques of norm 1 (unbounded where J is singular). Neither depends on inertia or supports; impact "
-    "Λ$_c$ = J M⁻¹ W M⁻¹ Jᵀ does. A direction of large velocity is one of small force. The jump of an impact "
+    "Λ$_c$ = J M⁻¹ W M⁻¹ Jᵀ does. A direction of large velocity has small force. The jump of an impact "
     "need not follow either.",
 )
 _LOOKS: dict[str, dict[str, Any]] = {

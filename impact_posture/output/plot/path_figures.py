@@ -27,14 +27,14 @@ if TYPE_CHECKING:
     from impact_posture.posture.manifold.null_space_path import NullSpacePath
 
 NOTES = {
-    "distance": "Each point is the best posture found that moves at most so far from the initial one (joint angles, "
+    "distance": "Each point is the best posture found within this distance from the initial posture (joint angles, "
     "sliding joints and base taken together)",
-    "force": "Each point is the best posture found whose impact has at most this peak force",
+    "force": "Each point is the best posture found with at most this peak force of the impact",
 }
 _LINES = "; lines between points only join them. Hollow: not certified as an optimum."
 _KNEE = (
-    "The knee is the point whose share of the gain exceeds its share of the {} most, marked only if that is by "
-    "1/3 or more (a parabola reaches 1/4)."
+    "At the knee, the share of the gain exceeds the share of the {} most. It is marked only if the excess is 1/3 or "
+    "more (a parabola reaches 1/4)."
 )
 
 
@@ -222,10 +222,10 @@ _SHARES: dict[str, dict[str, Any]] = {
 }
 # Names of the integrated velocities of the base.
 _MOVED = {"v": "base along ", "w": "base about "}
-_LEAST = "Torques, thrusts and forces on the feet that are not determined are those whose largest share is least."
+_LEAST = "Torques, thrusts and forces on the feet that are not determined are chosen for the least largest share."
 _NOTES = {
     "scaled": f"One time scale for the whole motion: its fastest instant just meets a limit. {_LEAST}",
-    "slowed": f"At each place the speed is one that the limits allow there, which is low at corners. {_LEAST}",
+    "slowed": f"The limits allow the speed at each place. It is low at corners. {_LEAST}",
     "time-optimal": "Time-optimal: a limit is met all the time, up to 1 %; the curves join the points of the motion.",
 }
 

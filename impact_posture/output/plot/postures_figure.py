@@ -137,7 +137,7 @@ def side_plane(first: Skeleton, second: Skeleton) -> Plane:
         return upright_plane(n)
     motion = second.points - first.points
     size = second.points - second.points.mean(axis=0)
-    # In the planes across its own plane, a planar robot is seen edge-on.
+    # A planar robot would be seen edge-on from within its plane.
     if second.across is not None:
         candidates = [plane for plane in candidates if not plane.contains(second.across)] or candidates
 
@@ -179,7 +179,7 @@ def _window(states: list[Skeleton], plane: Plane, surfaces: list[DrawnSurface]) 
 
 
 def padded(low: Array, high: Array) -> tuple[Array, Array]:
-    """Return the corners of a picture with a margin, whose shorter side is at least 0.6 of the longer."""
+    """Return the corners of a picture with a margin and a shorter side of at least 0.6 of the longer side."""
     longest = float((high - low).max()) or 1.0
     middle, half = (low + high) / 2, np.maximum(high - low, 0.6 * longest) / 2 + 0.05 * longest
     return middle - half, middle + half

@@ -54,7 +54,7 @@ class TradeOffData:
         V: ``H/G²``, shape (k,).
         S: The sticking counterpart of V, shape (k,); NaN where it does not exist.
         certified: Whether the certificate of each posture holds, shape (k,).
-        knee: Index of the knee, if there is one.
+        knee: Index of the knee, if the curve has a knee.
         against: The bounded quantity.
     """
 
@@ -178,7 +178,7 @@ def header_lines(view: ResultView) -> tuple[str, list[str]]:
     """Return the title and the small lines below it: robot, contact, settings, and H, G, V, S and E."""
     contact, metric, robot = view.objective.contact, view.objective.metric, view.robot
     named = zip(view.objective.contacts, contact_letters(view), strict=True)
-    frames = ", ".join(f"{one.frame}{letter and f' ({letter.strip()})'}" for one, letter in named)
+    frames = ", ".join(f"{each.frame}{letter and f' ({letter.strip()})'}" for each, letter in named)
     normal = ", ".join(number(v) for v in contact.normal)
     axes = "world" if contact.normal_frame == "world" else "contact frame"
     facts = [f"offset ({', '.join(number(v) for v in contact.offset)}) m"] if any(contact.offset) else []

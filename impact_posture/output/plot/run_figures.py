@@ -116,7 +116,7 @@ def comparison_figure(views: Sequence[RunView]) -> Figure:
         longest = max(clips.items(), key=lambda item: item[1].end - item[1].begin)
         cells.append([Cell(speed_panel(views), clips, longest)])
         if not views[0].pushed:
-            notes.append(f"Windows above: those of {names[0]}. Below, time counts from the own touch of each run.")
+            notes.append(f"Above, windows of {names[0]} are shaded. Below, time counts from the touch of each run.")
     return time_figure(views, cells, 2.3 if len(cells) > 1 else 2.6, notes, air=0.0)
 
 

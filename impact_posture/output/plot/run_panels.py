@@ -129,7 +129,7 @@ def metric_panels(view: RunView) -> list[Panel]:
     else:
         friction = np.linalg.norm(view.force - normal[:, None] * n, axis=1)
         names = ("force: normal, peak", "force: friction")
-        note = "The normal force is the largest one within each tick of the controller."
+        note = "The normal force is the largest value within each tick of the controller."
         force = Panel("force  [N]", names, [np.stack([view.peak, friction], axis=1)], note=note)
     panels = [metric_panel([view]), replace(speed_panel([view]), scale="auto", overlay=False), force]
     if np.ptp(view.level) > 1e-9:

@@ -40,7 +40,7 @@ def write_result_report(
         prepared: The problem.
         view: Its solution.
         document: The content of ``result.json``.
-        meshes: Pass on the meshes of the user's own URDF, too.
+        meshes: Whether the report may hold the meshes of the user's own URDF.
         scene: The result of :func:`result_scene`, if the caller has it.
 
     Raises:
@@ -152,7 +152,7 @@ def _content(folder: Path, prepared: Prepared, view: ResultView, document: dict[
         moves=_moves(view, document),
         notes=(
             f"{solver['certified_starts']} of {solver['starts']} starts ended at a certified posture."
-            + (f" {dominated} were left on the way, because they could not become the best." if dominated else ""),
+            + (f" {dominated} were stopped early, because they could not become the best." if dominated else ""),
             f"{document['redundancy']} degrees of freedom are left by the constraints at the optimum.",
             *document["constraints"], *active, *document["notes"], *document["warnings"],
         ),
@@ -189,6 +189,6 @@ def _moves(view: ResultView, document: dict[str, Any]) -> str:
         return f"The slider follows the motion of --path from the initial posture to {end}, over time. {arrows}."
     return (
         "The slider follows the straight line between the two postures, each point pulled onto the constraints. "
-        "It is no motion plan: limits of speed and collisions on the way are not checked (--path does that). "
+        "It is not a motion plan: speed limits and collisions between the points are not checked (--path does that). "
         f"{arrows}."
     )

@@ -1,4 +1,4 @@
-"""The starts of a search."""
+"""The feasible starts of a search."""
 
 from __future__ import annotations
 
@@ -8,7 +8,7 @@ from impact_posture.system.arrays import Array
 
 
 class StartDraws:
-    """Known starts, then random ones (:func:`impact_posture.posture.manifold.feasible_start.feasible_start`).
+    """Known starts, then random starts (:func:`impact_posture.posture.manifold.feasible_start.feasible_start`).
 
     The process that runs a start draws it.  The constraints of the starts do not grow with the problem.
 
