@@ -167,7 +167,7 @@ def _tradeoff_data(points: Sequence[dict[str, Any]], against: Against) -> TradeO
 
     if len(points) < 2:
         return None
-    keys = ("within", "distance", "objective", "H", "G", "V", "S")
+    keys = ("within", "objective", "H", "G", "V", "S")
     # A missing S becomes NaN.
     columns = {key: np.array([p[key] for p in points], dtype=float) for key in keys}
     knee = next((k for k, p in enumerate(points) if p["knee"]), None)

@@ -86,7 +86,7 @@ def trade_of(objective: WorstCaseObjective, way: list[np.ndarray], knee: int | N
     """A curve to draw, better or worse as it may be; its last but one point is not certified."""
     path = sample_path(objective, way)
     certified = np.arange(len(way)) != len(way) - 2
-    return TradeOffData(path.s, path.s, path.objective, path.H, path.G, path.V, path.S, certified, knee)
+    return TradeOffData(path.s, path.objective, path.H, path.G, path.V, path.S, certified, knee)
 
 
 def motion_of(objective: WorstCaseObjective, way: list[np.ndarray], v: np.ndarray) -> PosturePath:

@@ -30,6 +30,10 @@ def jump_figure(view: ResultView) -> Figure:
     gain = (1 + view.restitution) * view.speed
     states = (view.before, view.after)
     rubbed = [coulomb_jump(view.objective, q, gain) for q in (view.q_initial, view.q_optimal)]
+    before, after = rubbed
+    with_friction = ""
+    if before is not None and after is not None:
+        with_friction = f"\nwith friction {before.friction:g}: ‖Δν‖ = {number(before.norm)} → {number(after.norm)}"
     columns: list[tuple[str, str, list[Array], list[Array | None], str]] = [
         ("per impulse of 1 N·s", "/(N·s)", [state.jump for state in states], [None, None], _norms(view, "H", 1.0)),
         (
@@ -37,7 +41,7 @@ def jump_figure(view: ResultView) -> Figure:
             "",
             [gain / state.G * state.jump if state.G > 0 else 0 * state.jump for state in states],
             [None if jump is None else jump.velocity for jump in rubbed],
-            _norms(view, "V", gain) + _with_friction(rubbed),
+            _norms(view, "V", gain) + with_friction,
         ),
     ]
     heights = [0.42 + _ROW * len(indices) for _, indices, _ in groups]
@@ -91,14 +95,6 @@ def _norms(view: ResultView, name: str, gain: float) -> str:
     # The narrower title names the unit of both columns.
     factor, unit = ("", f" {jump_unit(view)}") if gain == 1 else (f"{gain:g} m/s · ", "")
     return f"‖Δν‖ = {factor}√{name} = {first} → {last}{unit}"
-
-
-def _with_friction(jumps: Sequence[CoulombJump | None]) -> str:
-    """Return the norms of the jumps with friction."""
-    first, second = jumps
-    if first is None or second is None:
-        return ""
-    return f"\nwith friction {first.friction:g}: ‖Δν‖ = {number(first.norm)} → {number(second.norm)}"
 
 
 def _notes(view: ResultView, rubbed: Sequence[CoulombJump | None]) -> list[str]:

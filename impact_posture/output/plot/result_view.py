@@ -47,7 +47,6 @@ class TradeOffData:
 
     Attributes:
         within: Bounds on the distance (rad mixed with m) or force (N), increasing, shape (k,).
-        distance: Distance or force of each posture, at most ``within``, shape (k,).
         objective: Objective of each posture, shape (k,).
         H: ``nᵀΛ_c n``, shape (k,).
         G: ``1/m_eff`` along the normal, 1/kg, shape (k,).
@@ -59,7 +58,6 @@ class TradeOffData:
     """
 
     within: Array
-    distance: Array
     objective: Array
     H: Array
     G: Array

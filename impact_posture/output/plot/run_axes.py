@@ -115,7 +115,11 @@ def time_figure(
 def _draw(axes: Any, cell: Cell, views: Sequence[RunView]) -> None:
     """Draw the shaded windows, limits and curves of a cell."""
     panel, (shown, frame) = cell.panel, cell.frame
-    _shade(axes, views[shown], frame)
+    # Impacts are shaded over dwells.
+    for kind, shade in SHADES.items():
+        for window in views[shown].windows:
+            if window.kind == kind and window.end > frame.begin and window.begin < frame.end:
+                axes.axvspan(frame.x(window.begin), frame.x(window.end), **shade)
     axes.set_xlim(frame.x(frame.begin), frame.x(frame.end))
     axes.grid(True, axis="y")
     for limit in panel.limits:
@@ -130,27 +134,16 @@ def _draw(axes: Any, cell: Cell, views: Sequence[RunView]) -> None:
             # Dashes of a noisy curve would run together.
             look = looks[entry % len(looks)] | ({"linestyle": "-", "linewidth": 0.7} if panel.noisy else {})
             name = panel.names[entry] if panel.names else ""
-            _curve(axes, view, values, clip, label=plot_label(name) if name else None, **look)
+            # A curve is straight across gaps (NaN).
+            inside = (view.t >= clip.begin) & (view.t <= clip.end) & np.isfinite(values)
+            label = plot_label(name) if name else None
+            axes.plot(clip.x(view.t[inside]), values[inside], label=label, **look)
             if panel.stopped is not None and panel.stopped[which][:, k].any():
                 axes.plot(clip.x(view.t), np.where(panel.stopped[which][:, k], values, np.nan), **STOP)
     if panel.scale == "metric":
         _scale_metric(axes, panel.values)
     elif panel.scale == "from zero":
         axes.set_ylim(bottom=0.0)
-
-
-def _shade(axes: Any, view: RunView, clip: Clip) -> None:
-    """Shade the windows that overlap a clip, impacts over dwells."""
-    for kind, look in SHADES.items():
-        for span in view.windows:
-            if span.kind == kind and span.end > clip.begin and span.begin < clip.end:
-                axes.axvspan(clip.x(span.begin), clip.x(span.end), **look)
-
-
-def _curve(axes: Any, view: RunView, values: Array, clip: Clip, **look: Any) -> None:
-    """Draw a curve within a clip, straight across gaps (NaN)."""
-    inside = (view.t >= clip.begin) & (view.t <= clip.end) & np.isfinite(values)
-    axes.plot(clip.x(view.t[inside]), values[inside], **look)
 
 
 def _saturation(axes: Any, panel: Panel, which: int, view: RunView, clip: Clip) -> None:

@@ -39,26 +39,27 @@ def self_motion_figure(view: ResultView) -> Figure:
         InputError: The view has no map.
     """
     data = required(view.self_motion, "map", "self_motion", "run optimize again with `search` global")
-    curves = bool(data.s.any())
+    curves, known = bool(data.s.any()), np.isfinite(data.objective) & (data.objective > 0)
+    y = np.where(known, data.objective, np.nan)
     with framed(*header_lines(view), 3.4, [_CURVES if curves else _SURFACES, _GRAY]) as (figure, body):
         label = f"objective ({view.objective.kind})  [{objective_unit(view)}]"
-        axes = _draw_curves(body, data, label) if curves else _draw_surfaces(body, data, label, view)
+        axes = _draw_curves(body, data, y, label) if curves else _draw_surfaces(body, data, y, label, view)
         shared_legend(body, axes.get_legend_handles_labels()[0], "lower")
     return figure
 
 
-def _draw_curves(body: Any, data: SelfMotionMap, label: str) -> Any:
+def _draw_curves(body: Any, data: SelfMotionMap, y: Array, label: str) -> Any:
     axes = body.subplots()
     count = int(data.component.max()) + 1
     lengths = np.array([data.s[data.component == k].max() for k in range(count)])
     gap = _GAP * lengths.sum()
     offsets = np.concatenate([[0.0], np.cumsum(lengths + gap)])
-    x, y = data.s + offsets[data.component], _drawable(data.objective)
+    x = data.s + offsets[data.component]
     for k in range(count):
         mine = data.component == k
         names = ("infeasible", "feasible") if k == 0 else (None, None)
         axes.plot(x[mine], y[mine], color=GRAY, linewidth=0.8, linestyle=(0, (1, 1.5)), label=names[0])
-        axes.plot(x[mine], np.where(data.feasible[mine], y[mine], np.nan), color=BLUE, linewidth=1.6, label=names[1])
+        axes.plot(x[mine], np.where(data.feasible, y, np.nan)[mine], color=BLUE, linewidth=1.6, label=names[1])
         if k:
             axes.axvline(offsets[k] - gap / 2, color=PALE, linewidth=0.8)
     _mark(axes, data, x, y, np.ones(len(x), dtype=bool))
@@ -70,19 +71,21 @@ def _draw_curves(body: Any, data: SelfMotionMap, label: str) -> Any:
     return axes
 
 
-def _draw_surfaces(body: Any, data: SelfMotionMap, label: str, view: ResultView) -> Any:
+def _draw_surfaces(body: Any, data: SelfMotionMap, y: Array, label: str, view: ResultView) -> Any:
     sizes = np.bincount(data.component)
     # The component of the optimum comes first.
     order = sorted(range(len(sizes)), key=lambda k: (k != data.component[data.optimum[0]], -sizes[k]))[:_PANELS]
     panels = body.subplots(1, len(order), squeeze=False)[0]
-    chart, y = Chart(view.robot.model), _drawable(data.objective)
+    chart = Chart(view.robot.model)
+    joints = [s.x.start for s in chart.slots if s.kind.family in ("revolute", "continuous", "prismatic")]
     x = np.array([chart.to_x(q) for q in data.q])
     shown = y[data.feasible & np.isfinite(y)]
     norm = LogNorm(shown.min(), np.quantile(shown, 0.95)) if shown.size and shown.max() > shown.min() else None
     image = None
     for axes, k in zip(panels, order, strict=True):
         mine = data.component == k
-        pair = _widest(chart, x[mine])
+        # The two joint coordinates with the largest spread.
+        pair = [joints[i] for i in np.argsort(-np.ptp(x[mine][:, joints], axis=0), kind="stable")[:2]]
         for index, name in zip(pair, ("x", "y"), strict=True):
             slot = next(s for s in chart.slots if s.x.start <= index < s.x.stop)
             unit = "m" if slot.kind.family == "prismatic" else "rad"
@@ -96,22 +99,9 @@ def _draw_surfaces(body: Any, data: SelfMotionMap, label: str, view: ResultView)
     return panels[0]
 
 
-def _widest(chart: Chart, x: Array) -> tuple[int, int]:
-    """Return the two joint coordinates with the largest spread."""
-    joints = [s.x.start for s in chart.slots if s.kind.family in ("revolute", "continuous", "prismatic")]
-    spread = np.ptp(x[:, joints], axis=0)
-    first, second = np.argsort(-spread, kind="stable")[:2]
-    return joints[first], joints[second]
-
-
 def _mark(axes: Any, data: SelfMotionMap, x: Array, y: Array, mine: NDArray[np.bool_]) -> None:
     """Mark the start, the optimum and the optima of the multi-start search that lie on a component."""
     for name, look in _MARKS.items():
         places = getattr(data, name)
         here = places[mine[places]]
         axes.plot(x[here], y[here], linestyle="", label=_LABELS[name], **look)
-
-
-def _drawable(values: Array) -> Array:
-    """Return the values, NaN where they do not exist."""
-    return np.where(np.isfinite(values) & (values > 0), values, np.nan)

@@ -68,7 +68,7 @@ def snapshots_figure(views: Sequence[RunView]) -> Figure:
     every = np.hstack([plane.axes @ state.points.T for row in rows for state in row])
     low, high = every.min(axis=1), every.max(axis=1)
     reach = 0.22 * float((high - low).max())
-    arrows = [_arrow(view, row[0], plane, reach) for view, row in zip(views, rows, strict=True)]
+    arrows = [_arrow(view, plane, reach) for view in views]
     for arrow, row in zip(arrows, rows, strict=True):
         if arrow is not None:
             tips = np.array([plane.axes @ state.contact for state in row[1:]])
@@ -130,7 +130,7 @@ def _surface(axes: Any, view: RunView, plane: Plane, low: Array, high: Array) ->
     axes.plot(*corners[:2].T, color=INK, linewidth=1.0, zorder=1)
 
 
-def _arrow(view: RunView, state: Skeleton, plane: Plane, reach: float) -> Array | None:
+def _arrow(view: RunView, plane: Plane, reach: float) -> Array | None:
     """Return the push from tail to tip in the figure; ``None`` without a push."""
     largest = view.force[int(np.argmax(np.linalg.norm(view.force, axis=1)))]
     size = float(np.linalg.norm(largest))
