@@ -122,14 +122,14 @@ def dense_torques(controller: Controller, q: np.ndarray, v: np.ndarray) -> np.nd
     n = nv + nf + nj
     A, w, b = np.vstack(rows), np.concatenate(weight), np.concatenate(wanted)
     H, g = np.zeros((n, n)), np.zeros(n)
-    # quadprog wants a positive definite H: traces, where nothing has a weight.
+    # The solver needs a positive definite H, hence small weights where none is set.
     H[:nv, :nv], g[:nv] = A.T * w @ A + 1e-8 * np.eye(nv), -A.T * w @ b
     H[-nj:, -nj:] = 1e-13 * np.eye(nj)
     start = nv
     for W in wrenches:
         scale = 1e-6 * np.array([1.0, 1, 1, 100, 100, 100][: W.shape[0]])
         at = slice(start, start + W.shape[1])
-        # Corner forces that make the same wrench are the same to the robot: a trace of weight chooses.
+        # A small weight chooses among corner forces with the same wrench.
         H[at, at] = W.T * scale @ W + 1e-12 * np.eye(W.shape[1])
         start += W.shape[1]
     S = np.vstack([np.zeros((6, nj)), np.eye(nj)])

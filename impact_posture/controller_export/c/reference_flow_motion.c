@@ -177,7 +177,7 @@ static void ip_flow_govern(ip_context *c)
   fastest = fmin(fastest, 0.4 * p->flow_acceleration[0] * fmax(f->remains, 0.0));
   fastest = f->on ? fastest : 0.0;
   ip_flow_back(c, period, back);
-  /* The constraints have turned since the last change.  Back on them, a joint can be faster than before. */
+  /* The constraints change with the posture, and the projection on them can speed up a joint. */
   ip_flow_project(f, f->flow);
   ip_shorten(f->flow, p->flow_speed[0]);
   for (i = 0; i < N; ++i) {

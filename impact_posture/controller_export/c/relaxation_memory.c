@@ -35,7 +35,7 @@ typedef struct {
     int *first, *last, *known;   /* range of a row's nonzero entries; `fixed` at the last computation of its motion */
     int *held;                   /* whether an entry is eliminated */
     double *goal;                /* desired values of listed rows */
-    double *B, *v, *tau, *rhs, *step, *column; /* of an elimination */
+    double *B, *v, *tau, *rhs, *step, *column; /* work arrays of an elimination */
     double *motion_z;                 /* Z times a step */
     int *rows, *lead, *close;    /* exact rows; exact row of the k-th reflection; rows of least squares */
     int exact, near, rank;       /* their numbers, and the number of coordinates that the exact rows take */

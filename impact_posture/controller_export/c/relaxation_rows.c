@@ -32,7 +32,7 @@ static double violation(const Relaxation *r, int entry) {
 /* Smallest violation of an entry that counts. */
 static double least(const Relaxation *r, int entry) { return COUNTS * r->scale * r->length[entry]; }
 
-/* Make r->motion_z the motion of z by a step in the coordinates that are left. */
+/* Set r->motion_z to the motion of z by a step in the coordinates that are left. */
 static void find_motion(Relaxation *r, const double *step) {
     for (int i = 0; i < r->n; i++) r->motion_z[i] = ip_dot(r->Z + i * r->n + r->fixed, step, r->n - r->fixed);
 }

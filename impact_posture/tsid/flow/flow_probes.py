@@ -1,4 +1,4 @@
-"""Directions beside its posture in which the reference flow measures curvature."""
+"""Directions in which the reference flow measures the curvature beside its posture."""
 
 from __future__ import annotations
 
@@ -33,7 +33,7 @@ class ProbeDirections:
         self.count = 0
 
     def next(self, space: Redundancy) -> Array:
-        """Return the part of the next fixed direction that is orthogonal to this round's, shape (nv,)."""
+        """Return the part of the next fixed direction that is orthogonal to the round's earlier ones, shape (nv,)."""
         k = self.count % space.basis.shape[1]
         z, seen = self._seen[k], self._seen[:k]
         z[:] = self._fixed[k]

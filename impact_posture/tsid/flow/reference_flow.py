@@ -274,7 +274,7 @@ class ReferenceFlow:
         if not self.on:
             fastest = 0.0
         governor = self._governor
-        # The constraints have turned since the last change.  Back on them, a joint can be faster than before.
+        # The constraints change with the posture, and the projection on them can speed up a joint.
         governor.flow = limited(self._space.project(governor.flow), options.speed)
         descends = fastest > 0 and self._visited == len(self._path)
         slope = self._slope if descends else None

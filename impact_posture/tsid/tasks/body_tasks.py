@@ -134,7 +134,7 @@ class BodyTaskLead:
                 task.target_velocity, task.target_acceleration = v[3:6], a[3:6]
 
     def reset(self, state: State) -> None:
-        """Give the tasks that moved along their present output as target, at rest."""
+        """Set the targets of the moved tasks to their present outputs, at rest."""
         for task in self._led:
             task.target, task.target_velocity, task.target_acceleration = None, 0.0, 0.0
             task.reset(state)
