@@ -23,15 +23,11 @@ ScenarioName = Annotated[
         "g1-strike, solo12-landing, panda-tap, hextilt-poke, or a path to a scenario.toml.",
     ),
 ]
-Seeds = Annotated[int, option("--seeds", panel=RUN, min=1, help="Seeds of each controller, from 0.")]
+Seeds = Annotated[int, option("--seeds", RUN, "Seeds of each controller, from 0.", min=1)]
 Compile = Annotated[
-    CompileMode,
-    option(
-        "--compile", panel=RUN,
-        help="Whether controllers are compiled to machine code. auto: from 2 seeds on, which pay for it.",
-    ),
-]  # fmt: skip
-Processes = Annotated[int, option("--jobs", panel=RUN, min=1, help="Number of processes that run at the same time.")]
+    CompileMode, option("--compile", RUN, "Compile controllers to machine code; auto from 2 seeds on.")
+]
+Processes = Annotated[int, option("--jobs", RUN, "Number of processes that run at the same time.", min=1)]
 
 
 def rows_table(page: Page, rows: tuple[ControllerRow, ...] | list[ControllerRow]) -> None:

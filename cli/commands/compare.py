@@ -16,8 +16,8 @@ from impact_posture_cli.progress_line import progress
 Controllers = Annotated[
     str,
     options.option(
-        "--controllers", metavar="A,B,…", panel=RUN,
-        help="Names as in simulate. robust:held is robust with --mode held, and robust:free is robust with --free.",
+        "--controllers", RUN, "Names as in simulate; robust:held has --mode held, and robust:free has --free.",
+        metavar="A,B,…",
     ),
 ]  # fmt: skip
 Out = Annotated[str | None, options.out_option("Folder for comparison.json and figures.", "none")]

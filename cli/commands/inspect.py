@@ -19,12 +19,11 @@ if TYPE_CHECKING:
 WriteRobotToml = Annotated[
     str | None,
     options.option(
-        "--write-robot-toml", metavar="[FILE.toml]", panel=OUTPUT,
-        help="Draft a robot.toml for a URDF, with every guess marked. Without FILE it is written beside the URDF, or "
-        "here as NAME.toml if the URDF belongs to a package.",
+        "--write-robot-toml", OUTPUT, "Draft a robot.toml; without FILE, beside the URDF, or here for a package.",
+        metavar="[FILE.toml]",
     ),
 ]  # fmt: skip
-ForceFile = Annotated[bool, options.option("--force", panel=OUTPUT, help="Replace an existing robot.toml.")]
+ForceFile = Annotated[bool, options.option("--force", OUTPUT, "Replace an existing robot.toml.")]
 
 
 @with_settings(RobotSettings)

@@ -10,16 +10,10 @@ from impact_posture_cli.experiments import RUN, Compile, Processes, Seeds, rows_
 from impact_posture_cli.output import Page, print_json
 from impact_posture_cli.progress_line import progress
 
-All = Annotated[
-    bool,
-    options.option(
-        "--all", panel=RUN,
-        help="Run every controller, not only nominal, robust, robust-flow and the recommended ones.",
-    ),
-]  # fmt: skip
+All = Annotated[bool, options.option("--all", RUN, "Run every controller, not only the recommended ones.")]
 Scenarios = Annotated[
     list[str] | None,
-    options.option("--scenario", panel=RUN, show_default="all four", help="Run this one only; repeatable."),
+    options.option("--scenario", RUN, "One scenario; repeatable.", show_default="all four"),
 ]
 Out = Annotated[str, options.out_option("Folder of the results.")]
 

@@ -24,41 +24,30 @@ _FAILED = 4
 Controller = Annotated[
     str,
     options.option(
-        "--controller", panel=RUN,
-        help="nominal, robust, robust-speed, robust-sticking, robust-release, robust-flow, robust-flow-sticking, "
+        "--controller", RUN,
+        "nominal, robust, robust-speed, robust-sticking, robust-release, robust-flow, robust-flow-sticking, "
         "posture, posture-sticking, path, stiff, posture-stiff, invariant, walker, reference-spreading, "
         "impact-aware, or the name that an installed package has registered.",
     ),
 ]  # fmt: skip
-RunSeed = Annotated[int, options.option("--seed", panel=RUN, min=0, help="Seed of the sensors' noise.")]
+RunSeed = Annotated[int, options.option("--seed", RUN, "Seed of the sensor noise.", min=0)]
 RunMode = Annotated[
-    Mode,
-    options.option(
-        "--mode", panel=RUN,
-        help="live keeps the impact-robust term on in the impact; held keeps the posture that was reached before.",
-    ),
-]  # fmt: skip
-Free = Annotated[
-    bool, options.option("--free", panel=RUN, help="Gradient and optimum as if the feet were in the air.")
+    Mode, options.option("--mode", RUN, "In the impact: keep the robust term on (live), or hold the posture (held).")
 ]
+Free = Annotated[bool, options.option("--free", RUN, "Gradient and optimum as if the feet were in the air.")]
 Gain = Annotated[
     float | None,
     options.option(
-        "--gain", panel=RUN, callback=demanding(Positive), show_default="the scenario's",
-        help="Gain K of the impact-robust term, 1/s².",
+        "--gain", RUN, "Gain K of the impact-robust term, 1/s².", callback=demanding(Positive),
+        show_default="the scenario's",
     ),
 ]  # fmt: skip
 Sign = Annotated[
-    Literal["+1", "1", "-1"] | None,
-    options.option("--sign", panel=RUN, show_default="both", help="Which way a robot is pushed."),
+    Literal["+1", "1", "-1"] | None, options.option("--sign", RUN, "Sign of the push.", show_default="both")
 ]
 ExportWorld = Annotated[
-    str | None,
-    options.option(
-        "--export-world", metavar="DIR", panel=RUN,
-        help="Write MuJoCo's model and the parameters of the scenario for a program in C++, and run nothing.",
-    ),
-]  # fmt: skip
+    str | None, options.option("--export-world", RUN, "Write the world for C++ and run nothing.", metavar="DIR")
+]
 Out = Annotated[
     str | None,
     options.out_option("Folder for run.json, the time series and the figures.", "./SCENARIO-CONTROLLER"),

@@ -20,26 +20,24 @@ if TYPE_CHECKING:
 RUN = "Where it runs"
 
 Target = Annotated[
-    str,
-    typer.Argument(metavar="SWEEP.toml|show", help="File of the problems to solve, or the word show."),
+    str, typer.Argument(metavar="SWEEP.toml|show", help="File of the problems to solve, or the word show.")
 ]
 Shown = Annotated[str | None, typer.Argument(metavar="DIR", help="With show: the folder that sweep wrote.")]
-Workers = Annotated[int, options.option("--workers", panel=RUN, min=1, help="Number of processes on this machine.")]
+Workers = Annotated[int, options.option("--workers", RUN, "Number of processes on this machine.", min=1)]
 Scheduler = Annotated[
-    str | None,
-    options.option("--scheduler", metavar="ADDRESS", panel=RUN, help="On a Dask cluster, such as tcp://host:8786."),
+    str | None, options.option("--scheduler", RUN, "Dask cluster, such as tcp://host:8786.", metavar="ADDRESS")
 ]
-Mpi = Annotated[bool, options.option("--mpi", panel=RUN, help="On the ranks of mpiexec … -m mpi4py.futures.")]
+Mpi = Annotated[bool, options.option("--mpi", RUN, "Use the ranks of mpiexec … -m mpi4py.futures.")]
 Slurm = Annotated[
     list[str] | None,
-    options.option("--slurm", metavar="KEY=VALUE", panel=RUN, help="As Slurm job arrays by submitit; repeatable."),
+    options.option("--slurm", RUN, "Use Slurm job arrays; option of submitit; repeatable.", metavar="KEY=VALUE"),
 ]
 Out = Annotated[
     str | None, options.out_option("Folder of the sweep; with show, of the maps.", "./SWEEP, or DIR/maps")
 ]
 MapAxes = Annotated[
     str | None,
-    options.option("--axes", metavar="A,B", panel="Maps", show_default="the two longest", help="Axes of the maps."),
+    options.option("--axes", "Maps", "Axes of the maps.", metavar="A,B", show_default="the two longest"),
 ]
 
 

@@ -23,14 +23,12 @@ if TYPE_CHECKING:
 NormalOfFirst = Annotated[
     Vector3 | None,
     options.option(
-        "--normal", metavar="X Y Z", callback=demanding(Direction), panel=CONTACT,
-        show_default="0 0 1", help="Normal of the first sample; the others' are random.",
+        "--normal", CONTACT, "Normal of the first sample; the other normals are random.", metavar="X Y Z",
+        callback=demanding(Direction), show_default="0 0 1",
     ),
 ]  # fmt: skip
-Samples = Annotated[
-    int, options.option("--samples", panel=OUTPUT, min=1, help="Number of random postures and normals.")
-]
-SampleSeed = Annotated[int, options.option("--seed", panel=OUTPUT, min=0, help="Seed of the random samples.")]
+Samples = Annotated[int, options.option("--samples", OUTPUT, "Number of random postures and normals.", min=1)]
+SampleSeed = Annotated[int, options.option("--seed", OUTPUT, "Seed of the random samples.", min=0)]
 
 
 _WITHOUT = {
