@@ -7,7 +7,6 @@ import json
 from collections.abc import Sequence
 from pathlib import Path
 
-import casadi as ca
 import numpy as np
 import pinocchio as pin
 import pytest
@@ -15,9 +14,7 @@ from hypothesis import given, settings
 from hypothesis import strategies as st
 from scipy.optimize import linprog
 
-from impact_posture.dynamics.chart import Chart
 from impact_posture.dynamics.numeric import Numeric
-from impact_posture.dynamics.tree import Tree
 from impact_posture.errors import Infeasible, InputError
 from impact_posture.posture.analysis.result_document import result_document
 from impact_posture.posture.approach.approach_speed import ApproachSpeed
@@ -25,7 +22,8 @@ from impact_posture.posture.approach.attainable_speed import AttainableSpeed
 from impact_posture.posture.formulation.problem_file import Prepared, prepare
 from impact_posture.posture.search.multistart import solve
 from tests.support.command import refused, run
-from tests.support.helpers import Vector, assert_close, central_gradient, rng
+from tests.support.constraints import check_lifted_rows
+from tests.support.helpers import Vector, rng
 from tests.support.settings import make_settings
 
 # Fixed base and standing, one contact and two, a normal that turns with the frame, a held joint and a kept frame.
@@ -48,24 +46,24 @@ def prepared(name: str, speed: float = 0.5, **more: object) -> Prepared:
     return prepare(make_settings(over))
 
 
-def constraint_of(made: Prepared) -> ApproachSpeed:
-    (found,) = (c for c in made.problem.constraints if isinstance(c, ApproachSpeed))
+def constraint_of(posed: Prepared) -> ApproachSpeed:
+    (found,) = (c for c in posed.problem.constraints if isinstance(c, ApproachSpeed))
     return found
 
 
-def posture(made: Prepared, seed: int) -> Vector:
-    robot = made.problem.robot
-    return np.array(pin.integrate(robot.model, made.problem.given, 0.3 * rng(seed).normal(size=robot.nv)))
+def posture(posed: Prepared, seed: int) -> Vector:
+    robot = posed.problem.robot
+    return np.array(pin.integrate(robot.model, posed.problem.given, 0.3 * rng(seed).normal(size=robot.nv)))
 
 
-def fastest(made: Prepared, q: Vector) -> float:
+def fastest(posed: Prepared, q: Vector) -> float:
     """Another program from raw Jacobians: all entries of the velocity, with those that may not move as bounds."""
-    robot, wanted = made.problem.robot, made.problem.requirements
+    robot, wanted = posed.problem.robot, posed.problem.requirements
     model, data = robot.model, robot.model.createData()
     pin.computeJointJacobians(model, data, q)
     pin.updateFramePlacements(model, data)
     nv, rows, arrives = model.nv, [], []
-    contacts = made.problem.objective.contacts
+    contacts = posed.problem.objective.contacts
     for contact in contacts:
         frame = model.getFrameId(contact.frame)
         J = pin.getFrameJacobian(model, data, frame, pin.ReferenceFrame.LOCAL_WORLD_ALIGNED)
@@ -99,12 +97,12 @@ def fastest(made: Prepared, q: Vector) -> float:
 @pytest.mark.parametrize("name", PROBLEMS)
 @given(seed=st.integers(0, 2**20))
 @settings(max_examples=6)
-def test_the_fastest_approach_is_that_of_another_program(name: str, seed: int) -> None:
-    made = prepared(name)
-    attainable = AttainableSpeed(made.problem.robot, made.problem.objective, made.problem.requirements)
-    q = posture(made, seed)
-    found = attainable.at(Numeric(made.problem.robot.model).at(q))
-    assert found.speed == pytest.approx(fastest(made, q), rel=1e-6, abs=1e-9)
+def test_the_fastest_approach_agrees_with_another_program(name: str, seed: int) -> None:
+    posed = prepared(name)
+    attainable = AttainableSpeed(posed.problem.robot, posed.problem.objective, posed.problem.requirements)
+    q = posture(posed, seed)
+    found = attainable.at(Numeric(posed.problem.robot.model).at(q))
+    assert found.speed == pytest.approx(fastest(posed, q), rel=1e-6, abs=1e-9)
     assert (np.abs(found.velocities) <= attainable.upper + 1e-9).all()
 
 
@@ -112,9 +110,9 @@ def test_the_fastest_approach_is_that_of_another_program(name: str, seed: int) -
 @given(seed=st.integers(0, 2**20))
 @settings(max_examples=4)
 def test_reduced_form_has_the_gradient_of_the_manifold(name: str, seed: int) -> None:
-    made = prepared(name)
-    constraint, model = constraint_of(made), made.problem.robot.model
-    numeric, q = Numeric(model), posture(made, seed)
+    posed = prepared(name)
+    constraint, model = constraint_of(posed), posed.problem.robot.model
+    numeric, q = Numeric(model), posture(posed, seed)
 
     def value(q: Vector) -> float:
         return float(constraint.evaluate(numeric.at(q))[0][0])
@@ -127,47 +125,33 @@ def test_reduced_form_has_the_gradient_of_the_manifold(name: str, seed: int) -> 
 
 
 @pytest.mark.parametrize("name", PROBLEMS)
-def test_lifted_rows_say_the_same_twice_with_the_jacobian_of_the_manifold(name: str) -> None:
-    made = prepared(name)
-    constraint, model = constraint_of(made), made.problem.robot.model
-    numeric, chart = Numeric(model), Chart(model)
-    q, x, p = posture(made, 5), ca.SX.sym("x", chart.nx), ca.SX.sym("p", len(constraint.parameters))
-    lifted = constraint.lift(Tree(model, chart.configuration(x), x), p)
+def test_lifted_rows_agree_with_pinocchio_and_with_differences(name: str) -> None:
+    posed = prepared(name)
+    constraint = constraint_of(posed)
     z = rng(name).uniform(-1, 1, constraint.unknowns)
-    program = ca.Function("rows", [x, lifted.variables, p], [lifted.rows])
-    rows = np.array(program(chart.to_x(q), z, constraint.parameters)).ravel()
-    found = constraint.linearize(numeric.at(q), z)
-    assert_close(rows, found.value[: rows.size], 1e-10, "rows", 1.0)
-    assert len(found.names) == len(found.value)
-    for bounds, own in zip((found.lower, found.upper), constraint.lifted_bounds, strict=True):
-        assert (bounds[: rows.size] == own).all()
-    slopes = central_gradient(lambda q: constraint.linearize(numeric.at(q), z).value, model, q, 1e-3)
-    assert_close(found.posture, slopes, 1e-8, "by posture", 1e-3)
-    step = rng(name, 1).normal(size=z.size)
-    moved = constraint.linearize(numeric.at(q), z + step).value
-    assert_close(found.value + found.auxiliary @ step, moved, 1e-9, "by velocities", 1.0)
+    check_lifted_rows(constraint, posed.problem.robot.model, posture(posed, 5), z)
 
 
 @pytest.mark.parametrize(("name", "speed"), [("tiago", 0.8), ("talos", 1.0)])
-def test_an_optimum_that_is_too_slow_moves_to_one_that_is_not(name: str, speed: float) -> None:
+def test_an_optimum_that_is_too_slow_moves_to_a_fast_one(name: str, speed: float) -> None:
     """Both certify; the optimum without the demand arrives too slowly, and is the better one for that."""
     free, asked = (prepared(name, speed, approach=approach) for approach in (False, True))
     attainable = AttainableSpeed(asked.problem.robot, asked.problem.objective, asked.problem.requirements)
-    found = [solve(made.problem, starts=4, jobs=1) for made in (free, asked)]
+    found = [solve(posed.problem, starts=4, jobs=1) for posed in (free, asked)]
     slow, fast = (attainable.reached(one.q) for one in found)
     assert slow is not None and fast is not None
     assert slow < 0.9 * speed <= speed * (1 - 1e-6) <= fast
     assert found[1].optima[0].objective > found[0].optima[0].objective
-    documents = [result_document(made, one) for made, one in zip((free, asked), found, strict=True)]
+    documents = [result_document(posed, one) for posed, one in zip((free, asked), found, strict=True)]
     warned = [any("add `approach`" in line for line in document["warnings"]) for document in documents]
     assert warned == [True, False]
     assert fastest(asked, found[1].q) == pytest.approx(documents[1]["optimal"]["attainable_speed"], rel=1e-6)
 
 
-def test_what_the_joints_cannot_do_is_infeasible_and_named() -> None:
-    made = prepared("ur5", 20.0)
+def test_a_speed_beyond_the_joints_is_infeasible_and_named() -> None:
+    posed = prepared("ur5", 20.0)
     with pytest.raises(Infeasible, match="approach at 20 m/s"):
-        solve(made.problem, starts=2, jobs=1)
+        solve(posed.problem, starts=2, jobs=1)
 
 
 @pytest.mark.parametrize(
@@ -182,16 +166,16 @@ def test_what_the_joints_cannot_do_is_infeasible_and_named() -> None:
 def test_where_joints_with_limits_do_not_bring_the_contact_nothing_is_demanded(
     more: dict[str, object], words: str
 ) -> None:
-    made = prepare(make_settings({"normal": (0, 0, 1), "approach": True, **more}))
-    assert not any(isinstance(c, ApproachSpeed) for c in made.problem.constraints)
-    assert any("speed of the approach is not demanded" in note and words in note for note in made.problem.notes)
-    assert AttainableSpeed(made.problem.robot, made.problem.objective, made.problem.requirements).unknown
+    posed = prepare(make_settings({"normal": (0, 0, 1), "approach": True, **more}))
+    assert not any(isinstance(c, ApproachSpeed) for c in posed.problem.constraints)
+    assert any("speed of the approach is not demanded" in note and words in note for note in posed.problem.notes)
+    assert AttainableSpeed(posed.problem.robot, posed.problem.objective, posed.problem.requirements).unknown
 
 
-def test_a_kept_foot_is_no_leg_that_moves_the_hand() -> None:
-    made = prepared("talos", keep=("right_sole_link",))
-    constraint = constraint_of(made)
-    at = Numeric(made.problem.robot.model).at(made.problem.given)
+def test_a_kept_foot_does_not_count_as_a_leg_that_moves_the_hand() -> None:
+    posed = prepared("talos", keep=("right_sole_link",))
+    constraint = constraint_of(posed)
+    at = Numeric(posed.problem.robot.model).at(posed.problem.given)
     assert constraint.evaluate(at)[0][0] == pytest.approx(
         constraint_of(prepared("talos", keep=())).evaluate(at)[0][0]
     )
@@ -236,10 +220,10 @@ def test_unusual_arms_certify(tmp_path: Path, axes: str, limits: list[float], po
     path = chain(tmp_path / "chain.urdf", axes, limits)
     q = tuple([0.3, 0.6, 0.5, 0.4, 0.3, 0.4, 0.2][: len(axes)])
     values = {"robot": path, "frame": "tip", "normal": (-1, 0, 0), "q": q, "contact_pose": pose}
-    made = prepare(make_settings({**values, "speed": 0.2, "approach": True}))
-    found = solve(made.problem, starts=3, jobs=1)
+    posed = prepare(make_settings({**values, "speed": 0.2, "approach": True}))
+    found = solve(posed.problem, starts=3, jobs=1)
     assert found.certificate.holds() and found.certified_starts == 3
-    attainable = AttainableSpeed(made.problem.robot, made.problem.objective, made.problem.requirements)
+    attainable = AttainableSpeed(posed.problem.robot, posed.problem.objective, posed.problem.requirements)
     assert 0.2 - 1e-8 <= (attainable.reached(found.q) or np.inf)
 
 
@@ -247,9 +231,9 @@ def test_joints_that_are_too_few_are_refused(tmp_path: Path) -> None:
     held = {"hold": tuple(f"joint{k}" for k in range(1, 8)), "robot": "xarm7", "normal": (0, 0, 1)}
     with pytest.raises(InputError, match="cannot move"):
         prepare(make_settings({**held, "approach": True}))
-    made = prepare(make_settings(held))
-    attainable = AttainableSpeed(made.problem.robot, made.problem.objective, made.problem.requirements)
-    assert attainable.reached(made.problem.given) == 0.0
+    posed = prepare(make_settings(held))
+    attainable = AttainableSpeed(posed.problem.robot, posed.problem.objective, posed.problem.requirements)
+    assert attainable.reached(posed.problem.given) == 0.0
 
 
 def test_the_command(tmp_path: Path) -> None:

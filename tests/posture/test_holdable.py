@@ -19,7 +19,6 @@ from impact_posture.dynamics.mjcf import build_mjcf
 from impact_posture.dynamics.numeric import Numeric
 from impact_posture.dynamics.tree import Tree
 from impact_posture.errors import InputError
-from impact_posture.posture.constraints.constraint import Constraint
 from impact_posture.posture.formulation.problem_file import prepare
 from impact_posture.posture.loads.equilibrium import Equilibrium, Thrusts
 from impact_posture.posture.loads.holdable import Holdable, ReachableWrench
@@ -31,6 +30,7 @@ from impact_posture.posture.search.conflicts import find_conflicts
 from impact_posture.posture.search.growing_search import run_start
 from impact_posture.posture.search.multistart import solve
 from impact_posture.robot.actuation import allocation_matrix, hover, torque_limits
+from tests.support.constraints import check_lifted_rows
 from tests.support.helpers import Vector, assert_close, central_gradient, frame_jacobian, rng
 from tests.support.settings import make_settings
 
@@ -80,8 +80,8 @@ def statics(posed: ConstrainedProblem, case: LoadCase, q: Vector, z: Vector) -> 
 @pytest.mark.parametrize("name", ROBOTS)
 @given(seed=SIZE)
 @settings(max_examples=3)
-def test_torques_are_those_of_statics_and_their_derivatives_of_the_manifold(name: str, seed: int) -> None:
-    """Gravity and forces in Pinocchio's other algorithms, the expression, and differences on the manifold."""
+def test_torques_agree_with_statics_the_expression_and_differences(name: str, seed: int) -> None:
+    """Statics uses other algorithms of Pinocchio for gravity and forces."""
     posed, generator = problem(name, **PUSHED.get(name, {})), np.random.default_rng(seed)
     case = cases(name, **PUSHED.get(name, {}))[-1]
     load, model, q = case.equilibrium.load, posed.robot.model, posture(posed, seed)
@@ -172,23 +172,22 @@ def least_share(posed: ConstrainedProblem, q: Vector) -> float:
 @pytest.mark.parametrize("name", ROBOTS)
 @given(seed=SIZE)
 @settings(max_examples=4)
-def test_least_largest_share_is_that_of_another_program(name: str, seed: int) -> None:
-    """Feet may lose the balance at a random posture; then both programs say so, except for side forces of rotors."""
+def test_least_largest_share_agrees_with_another_program(name: str, seed: int) -> None:
+    """Both programs report lost balance at random postures of feet; side forces of rotors are left out."""
     posed, (case,) = problem(name), cases(name)
     q = posture(posed, seed) if name != "borinot" else posed.given
-    found = case.equilibrium.distribute(q)
+    distribution = case.equilibrium.distribute(q)
     expected = least_share(posed, q)
-    assert (found.unbalanced == 0) == np.isfinite(expected)
-    if found.unbalanced == 0:
-        assert found.largest == pytest.approx(expected, rel=1e-6)
-        load = case.equilibrium.load
-        assert (found.forces[~np.isfinite(load.upper)] >= -1e-9).all()
-        assert np.abs(statics(posed, case, q, found.forces)[:6]).max(initial=0.0) < (
-            1e-7 * case.equilibrium.weight if posed.objective.supports else np.inf
-        )
+    assert (distribution.unbalanced == 0) == np.isfinite(expected)
+    if distribution.unbalanced == 0:
+        assert distribution.largest == pytest.approx(expected, rel=1e-6)
+        assert (distribution.forces[~np.isfinite(case.equilibrium.load.upper)] >= -1e-9).all()
+        if posed.objective.supports:
+            base = statics(posed, case, q, distribution.forces)[:6]
+            assert np.abs(base).max(initial=0.0) < 1e-7 * case.equilibrium.weight
 
 
-def test_thrusts_are_those_of_hover() -> None:
+def test_thrusts_agree_with_hover() -> None:
     for name in ("tilthex_arm", "hextilt", "borinot"):
         posed, (case,) = problem(name), cases(name)
         expected = hover(posed.robot.model, posed.robot.spec.propulsion, posed.given)
@@ -196,12 +195,10 @@ def test_thrusts_are_those_of_hover() -> None:
         shares = dict(zip(rest.actuators, rest.distribute(posed.given).shares, strict=True))
         spans = dict(zip(rest.actuators, zip(rest.lower, rest.upper, strict=True), strict=True))
         # Six rotors in one plane share the load in many ways, whose tightest rotor is the same.
-        found = [
-            low + (high - low) * (1 + shares[k]) / 2 for k, (low, high) in spans.items() if k.startswith("rotor")
-        ]
-        assert min(found) == pytest.approx(min(expected.thrusts), abs=1e-6)
+        thrusts = [a + (b - a) * (1 + shares[k]) / 2 for k, (a, b) in spans.items() if k.startswith("rotor")]
+        assert min(thrusts) == pytest.approx(min(expected.thrusts), abs=1e-6)
         if name != "borinot":
-            assert found == pytest.approx(expected.thrusts)
+            assert thrusts == pytest.approx(expected.thrusts)
 
 
 @pytest.mark.parametrize("name", ["tilthex_arm", "borinot", "talos", "solo12", "panda"])
@@ -232,33 +229,13 @@ def test_reduced_form_has_the_gradient_of_its_largest_row(name: str, seed: int) 
 
 
 @pytest.mark.parametrize("name", ["tilthex_arm", "borinot", "talos", "solo12", "ur5"])
-def test_lifted_rows_say_the_same_twice_with_the_jacobian_of_the_manifold(name: str) -> None:
-    posed, model = problem(name), problem(name).robot.model
-    numeric, chart = Numeric(model), Chart(model)
-    q = posture(posed, 5)
-    x = ca.SX.sym("x", chart.nx)
-    tree = Tree(model, chart.configuration(x), x)
-    posed_cases = cases(name, **PUSHED.get(name, {}))
-    made: list[Constraint] = [Holdable(case.name, case.equilibrium, "", active=True) for case in posed_cases]
-    made += [c for case in posed_cases for c in case.constraints() if isinstance(c, ReachableWrench)]
-    for constraint in made:
-
-        def rows_at(q: Vector, z: Vector, one: Constraint = constraint) -> Vector:
-            return one.linearize(numeric.at(q), z).value
-
-        z = rng(name).uniform(0, 1, constraint.guess(numeric.at(q)).values.size)
-        lifted = constraint.lift(tree, ca.SX(0, 1))
-        rows = np.array(ca.Function("rows", [x, lifted.variables], [lifted.rows])(chart.to_x(q), z)).ravel()
-        found = constraint.linearize(numeric.at(q), z)
-        assert_close(rows, found.value[: rows.size], 1e-10, "rows", 1.0)
-        assert len(found.names) == len(found.value) == rows.size + z.size
-        for bounds, program in zip((found.lower, found.upper), constraint.lifted_bounds, strict=True):
-            assert (bounds[: rows.size] == program).all()
-        slopes = central_gradient(functools.partial(rows_at, z=z), model, q, 1e-3)
-        assert_close(found.posture, slopes, 1e-8, "by posture", 1e-3)
-        step = rng(name, 1).normal(size=z.size)
-        moved = rows_at(q, z + step)
-        assert_close(found.value + found.auxiliary @ step, moved, 1e-9, "by force", 1.0)
+def test_lifted_rows_agree_with_pinocchio_and_with_differences(name: str) -> None:
+    posed, q = problem(name), posture(problem(name), 5)
+    for case in cases(name, **PUSHED.get(name, {})):
+        holdable = Holdable(case.name, case.equilibrium, "", active=True)
+        for constraint in (holdable, *(c for c in case.constraints() if isinstance(c, ReachableWrench))):
+            z = rng(name).uniform(0, 1, constraint.unknowns)
+            check_lifted_rows(constraint, posed.robot.model, q, z)
 
 
 # ---- solutions --------------------------------------------------------------------------------------------------
@@ -283,8 +260,8 @@ def test_an_optimum_beyond_the_limits_moves_to_them_and_certifies() -> None:
     assert posed.objective.value(last.q) > posed.objective.value(first.q)
 
 
-def test_a_program_that_lacks_the_rows_says_what_they_would() -> None:
-    """Far from the limits there is nothing to certify; beyond them the rows show by how much, at the best forces."""
+def test_a_program_without_the_rows_is_certified_by_the_best_forces() -> None:
+    """Far from the limits there are no rows; beyond them the rows show the violation."""
     (case,) = cases("solo12")
     posed, q = problem("solo12"), problem("solo12").given
     constraint, numeric = Holdable("at rest", case.equilibrium, ""), Numeric(problem("solo12").robot.model)
