@@ -152,7 +152,7 @@ def test_an_end_that_lacks_parts_is_certified_in_the_last_round_only(monkeypatch
     assert [run.good for run in search.run(1, None)][lacking[0]] is False
 
 
-def test_what_even_forces_hold_needs_no_linear_program(monkeypatch: pytest.MonkeyPatch) -> None:
+def test_postures_held_by_even_forces_need_no_linear_program(monkeypatch: pytest.MonkeyPatch) -> None:
     problem = prepare(
         ProblemSettings(robot="talos", frame="gripper_right_base_link", normal=(-1.0, 0.0, 0.0))
     ).problem

@@ -70,9 +70,9 @@ def test_the_same_answer_from_machine_code_of_a_program_that_grows(
     assert problem.grows
     interpreted = solve(problem, starts=2, jobs=1, compile="never")
     assert interpreted.problem is not problem
-    found = solve(problem, starts=2, jobs=1, compile="always")
-    assert found.compiled and found.iterations == interpreted.iterations
-    np.testing.assert_allclose(found.q, interpreted.q, atol=1e-9)
+    compiled_run = solve(problem, starts=2, jobs=1, compile="always")
+    assert compiled_run.compiled and compiled_run.iterations == interpreted.iterations
+    np.testing.assert_allclose(compiled_run.q, interpreted.q, atol=1e-9)
 
 
 def test_a_broken_library_is_not_used(

@@ -74,9 +74,7 @@ def test_its_ends_are_the_solutions_of_speed_and_of_sticking() -> None:
     for friction, other in ((0.0, "speed"), (50.0, "sticking")):
         problem = problem_of("tilthex_arm", (-1.0, 0.0, 0.0), friction)
         same = problem_of("tilthex_arm", (-1.0, 0.0, 0.0), friction, objective=other)
-        values = [
-            p.objective.value(solve(p, starts=2, jobs=1, compile="never").q) for p in (problem, same)
-        ]  # fmt: skip
+        values = [p.objective.value(solve(p, starts=2, jobs=1, compile="never").q) for p in (problem, same)]
         assert values[0] == pytest.approx(values[1], rel=1e-8)
 
 
@@ -104,11 +102,11 @@ def test_an_optimum_on_the_verge_of_slipping_is_certified_by_both_sides() -> Non
 
 def test_planar_robots_are_optimized() -> None:
     """Nothing holds the friction across the plane, in the program as little as in the robot."""
-    found = arm([Y, Y, Y, Y], [0.3, 0.7, -0.5, 0.4], floating=False)
+    robot = arm([Y, Y, Y, Y], [0.3, 0.7, -0.5, 0.4], floating=False)
     for friction in (0.0, 0.05, 0.3, 3.0):
         contact = ImpactContact(TIP, (0.6, 0.0, 0.8), friction=friction)
-        objective = WorstCaseObjective(found, contact, kind="coulomb")
-        problem = build_problem(found, objective, found.posture(), Requirements(contact_pose="position"))
+        objective = WorstCaseObjective(robot, contact, kind="coulomb")
+        problem = build_problem(robot, objective, robot.posture(), Requirements(contact_pose="position"))
         assert solve(problem, starts=2, jobs=1, compile="never").certificate.holds()
 
 
@@ -166,21 +164,8 @@ def test_several_contacts_at_once_are_predicted_with_friction() -> None:
 
 
 def test_optimize_writes_friction_and_reads_it_again(tmp_path: Path) -> None:
-    argv = (
-        "--friction",
-        "0.2",
-        "--objective",
-        "coulomb",
-        "--starts",
-        "2",
-        "--no-codegen",
-        "--format",
-        "svg",
-        "--json",
-    )
-    first = json.loads(
-        run("optimize", "panda", "--normal", "0", "0", "1", *argv, "--out", str(tmp_path / "a")).stdout
-    )
+    argv = "panda --normal 0 0 1 --friction 0.2 --objective coulomb --starts 2 --no-codegen --format svg --json"
+    first = json.loads(run("optimize", *argv.split(), "--out", tmp_path / "a").stdout)
     again = prepare(read_settings(tmp_path / "a" / "problem.toml")).impact
     second = again.evaluate(np.array(first["optimal"]["q"])).to_dict()
     assert "friction = 0.2" in (tmp_path / "a" / "problem.toml").read_text()

