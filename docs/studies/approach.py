@@ -18,7 +18,7 @@ _SHARE = 0.9
 
 
 def lines(request: Request) -> Iterator[str]:
-    """A row for each robot whose joints bring its contact to the surface, and each normal."""
+    """Yield a row for each normal and each robot whose joints move the contact to the surface."""
     yield f"The fastest approach at the start and at the best of {STARTS} starts, clear of collisions and held by"
     yield f"the motors; then the optimum with {_SHARE:.0%} of the speed at the start demanded. *loss*: rise of the"
     yield "objective. *a start*: median time of a start over the median without the demand. Robots that fly and"

@@ -28,7 +28,7 @@ _HEAD = "robot|n|rank of $J_s$|ε m|bound|$H$ moved|oracle: H|∇H|f|kernel: H|�
 
 
 def lines(request: Request) -> Iterator[str]:
-    """A row a case and compliance."""
+    """Yield a row for each case and compliance."""
     yield (
         f"The least digits over the default and {request.count} random postures; in brackets the "
         "guarantee of backward "

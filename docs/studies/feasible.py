@@ -44,7 +44,7 @@ class Cost(NamedTuple):
 
 
 def lines(request: Request) -> Iterator[str]:
-    """A row for each robot and normal."""
+    """Yield a row for each robot and normal."""
     yield "Each robot of the catalogue at its own contact frame, striking a floor (*down*) and a wall (*ahead*),"
     yield f"from {STARTS} starts: *free* of demands, *clear* of collisions, and with *all*, also held by the motors."
     yield "*collide*: number of distinct optima of the free problem at which shapes touch each other, the surface"

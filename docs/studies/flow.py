@@ -93,7 +93,7 @@ class Outcome:
 
 
 def lines(request: Request) -> Iterator[str]:
-    """A row for each robot and seed; with four seeds, no parameter is chosen for one set of starts."""
+    """Yield a row for each robot and seed.  Four seeds avoid tuning for one set of starts."""
     each = -(-request.count // len(CASES))
     yield machine("daqp")
     yield ""

@@ -101,7 +101,7 @@ def result(scenario: str, name: str) -> dict[str, Any]:
 
 
 def lines(request: Request) -> Iterator[str]:
-    """A table for each scenario."""
+    """Yield a table for each scenario."""
     controllers = [c for c in COMPARED if c in CONTROLLERS]
     # At other speeds, only controllers whose posture depends on the speed or impulse, beside the nominal one.
     others = [c for c in controllers if c.endswith(("nominal", "robust", "sticking"))]

@@ -21,7 +21,7 @@ _HEAD = (
 
 
 def lines(request: Request) -> Iterator[str]:
-    """A row for each robot."""
+    """Yield a row for each robot."""
     yield from (machine("daqp"), "")
     yield (
         "Processor time of a call, the shortest of ten in five passes, `-O2`; "

@@ -18,7 +18,7 @@ _HEAD = "time step|T|ζ|*e*|range|ideal|duration|depth|peak force".split("|")
 
 
 def lines(request: Request) -> Iterator[str]:
-    """A row for each law that its time step can follow."""
+    """Yield a row for each law that its time step can follow."""
     import_mujoco()
     low, high, width = ContactLaw().solimp
     yield (

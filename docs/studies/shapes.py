@@ -21,7 +21,7 @@ _HEAD = ("robot", "shapes", "hulls", "corners", "sweep, mm", "pairs of shapes", 
 
 
 def lines(request: Request) -> Iterator[str]:
-    """A row a robot."""
+    """Yield a row for each robot."""
     yield "Corners: median of the hulls. Sweep: median and largest of the hulls, without balls and capsules. Fit:"
     yield "processor time with the loading of meshes. At the default: shapes and hulls that collide in this posture."
     yield (

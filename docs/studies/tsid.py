@@ -111,7 +111,7 @@ class Flight:
 
 
 def lines(request: Request) -> Iterator[str]:
-    """A row of ticks and a row of solvers for each robot."""
+    """Yield a row of ticks and a row of solvers for each robot."""
     yield from (machine("daqp"), "")
     yield (
         f"{request.count} ticks, one core; impact-robust controller, bracing. Processor time of a tick, "

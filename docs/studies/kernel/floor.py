@@ -135,7 +135,7 @@ class _Joint:
 def floor(robot: Robot, contact: int) -> int:
     """Operations of H and ∇H of one robot with the contact on joint ``contact``'s link.
 
-    Every joint has one degree of freedom, but for a free-flyer at the root.
+    Every joint has one degree of freedom, except a free-flyer at the root.
     """
     model, count = robot.model, _Count()
     joints = {i: _Joint(model, i) for i in range(1, model.njoints) if model.nvs[i] == 1}

@@ -100,7 +100,7 @@ class Samples:
 
     @property
     def plain(self) -> bool:
-        """Whether every joint has one number in ``q`` and in ``v``, but for a free-flyer at the root."""
+        """Whether every joint has one number in ``q`` and in ``v``, except a free-flyer at the root."""
         model, first = self.robot.model, 2 if self.robot.floating else 1
         return all(pair == (1, 1) for pair in zip([*model.nqs][first:], [*model.nvs][first:], strict=True))
 
