@@ -36,14 +36,8 @@ def fill_optional(arguments: Sequence[str]) -> list[str]:
     for word, following in zip_longest(arguments, arguments[1:], fillvalue=""):
         filled.append(word)
         if word in _OPTIONAL and not _OPTIONAL[word].match(following):
-            filled.append(_default(word))
+            # Imported here, because --help does without.
+            from impact_posture.config.settings import TRADEOFF_POINTS
+
+            filled.append(str(TRADEOFF_POINTS) if word == "--tradeoff" else "")
     return filled
-
-
-def _default(option: str) -> str:
-    """Return the value of an option that stands without a value."""
-    if option != "--tradeoff":
-        return ""
-    from impact_posture.config.settings import TRADEOFF_POINTS
-
-    return str(TRADEOFF_POINTS)

@@ -304,24 +304,6 @@ def test_a_package_folder_is_looked_for_where_the_user_is(tmp_path: Path) -> Non
     assert start(*INSPECT, "--package-dir", "meshes", cwd=tmp_path).returncode == 0
 
 
-@pytest.mark.skipif(not Path("/dev/full").exists(), reason="there is no /dev/full here")
-def test_a_full_disk_is_one_line() -> None:
-    with open("/dev/full", "w") as full:
-        done = subprocess.run([str(COMMAND), "robots"], stdout=full, stderr=subprocess.PIPE, text=True, timeout=60)
-    assert (done.returncode, done.stderr) == (1, "error: No space left on device; free some space\n")
-
-
-def test_a_reader_that_leaves_makes_no_noise() -> None:
-    process = subprocess.Popen(
-        [str(COMMAND), "inspect", "talos", "--json"], stdout=subprocess.PIPE, stderr=subprocess.PIPE, text=True
-    )
-    assert process.stdout is not None and process.stderr is not None
-    process.stdout.close()
-    assert process.stderr.read() == ""
-    process.stderr.close()
-    assert process.wait(timeout=60) == 1
-
-
 # ---- the boundary alone -----------------------------------------------------------------------------------------
 
 
@@ -341,6 +323,9 @@ BOUNDARY = [
     (KeyboardInterrupt(), 130, "error: interrupted\n"),
     (OSError(errno.ENOSPC, "No space left on device", "out"), 1, "error: out: No space left on device; free some"),
     (PermissionError(errno.EACCES, "Permission denied", "out"), 1, "error: out: Permission denied; check the path"),
+    (RecursionError("maximum recursion depth exceeded"), 1, "error: an input is nested too deeply; correct the file"),
+    (MemoryError(), 1, "error: out of memory; free some"),
+    (RuntimeError("std::bad_alloc"), 1, "error: out of memory; free some"),
     (ValueError("two\nlines"), 1, "error: internal error: ValueError: two lines; please report it"),
 ]
 
