@@ -72,7 +72,7 @@ def test_optimize(tmp_path: Path) -> None:
 
 def test_bad_input(tmp_path: Path) -> None:
     for arguments, code, text in (
-        (("--payload", "ee", "heavy"), 2, "no payload"),
+        (("--payload", "ee", "heavy"), 2, "is not a payload"),
         (("--payload", "ee", -1), 2, "above zero"),
         (("--armature-range", 2, 0.5), 2, "the lower first"),
         (("--armature-range", 0.5, "nan"), 2, "two factors"),

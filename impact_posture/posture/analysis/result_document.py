@@ -49,7 +49,7 @@ def result_document(
     path: dict[str, object] | None = None,
     global_search: GlobalSearch | None = None,
 ) -> dict[str, object]:
-    """Return the content of ``result.json``, with blocks for those of the last four arguments that are given."""
+    """Return the content of ``result.json``, with a block for each of the last four arguments that is given."""
     initial, optimal = evaluations(prepared, solution)
     impact, around = prepared.impact, prepared.problem.surroundings
     loads = load_cases(impact.objective, solution.initial, prepared.problem.requirements)

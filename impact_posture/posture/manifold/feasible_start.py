@@ -177,7 +177,7 @@ class StartDraw:
         self._least = np.inf
 
     def choose(self, candidates: int) -> Array | None:
-        """Return the best of ``candidates`` postures on the projected constraints, with those of earlier calls."""
+        """Return the best of ``candidates`` postures on the projected constraints, counting earlier calls."""
         while self._attempts < ATTEMPTS and self._tried < candidates and self._least > FEASIBLE:
             near = self._around if (self._index + self._attempts) % 2 else None
             self._attempts += 1
