@@ -15,7 +15,7 @@ ROOT = "impact_posture"
 
 
 def modules(name: str) -> list[str]:
-    """A module of the library, or a package's public modules (itself first, where it exports something)."""
+    """Return a module, or the public modules of a package, with the package first if it exports names."""
     full = f"{ROOT}.{name}"
     package = import_module(full)
     if not hasattr(package, "__path__"):
@@ -26,7 +26,7 @@ def modules(name: str) -> list[str]:
 
 
 def markdown(names: list[str]) -> str:
-    """A heading and an ``automodule`` for each module."""
+    """Write a heading and an ``automodule`` for each module."""
     parts = []
     for module in (m for name in names for m in modules(name)):
         parts += [

@@ -39,14 +39,14 @@ class Parameter:
 
 
 def commands() -> dict[str, Callable[..., None]]:
-    """The subcommands by name, in the order of ``--help``."""
+    """Return the subcommands by name, in the order of ``--help``."""
     from impact_posture_cli.app import COMMANDS, load
 
     return {name: load(name) for name in COMMANDS}
 
 
 def parameters(command: Callable[..., None]) -> list[Parameter]:
-    """What a command takes, in the order of its signature."""
+    """Return the parameters of a command in the order of its signature."""
     hints = get_type_hints(command, include_extras=True)
     options = []
     for name, parameter in inspect.signature(command).parameters.items():
@@ -112,7 +112,7 @@ def _cell(text: str) -> str:
 
 
 def markdown() -> str:
-    """One section a command: what it does, how to call it, a table of its options."""
+    """Write a section for each command: its purpose, its usage, and a table of its options."""
     from impact_posture_cli.app import COMMANDS
 
     parts = []

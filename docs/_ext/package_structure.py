@@ -56,7 +56,7 @@ def parts() -> dict[str, tuple[int, int, set[str]]]:
 
 
 def markdown() -> str:
-    """A row for each part, and the sum."""
+    """Write a row for each part, and the sum."""
     every = parts()
     rows = ["| part | files | lines | imports |", "|---|---|---|---|"]
     for name, (files, lines, imports) in every.items():

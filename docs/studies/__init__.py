@@ -1,1 +1,1 @@
-"""What this project costs and what it is worth, measured: see docs/reference/bench.md."""
+"""Benchmarks and studies; docs/reference/bench.md lists them."""

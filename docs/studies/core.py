@@ -103,7 +103,7 @@ class Request:
 
 
 def page_of(name: str) -> Path:
-    """The page of a study in the documentation."""
+    """Return the page of a study in the documentation."""
     return ROOT / "docs" / "generated" / f"{name}.md"
 
 
@@ -131,7 +131,7 @@ def table(head: Sequence[str], rows: Iterator[Sequence[str]] | Sequence[Sequence
 
 
 def cell(value: float | None, digits: int) -> str:
-    """A number of a table."""
+    """Write a number for a table cell."""
     return "–" if value is None else f"{value:.{digits}f}"
 
 
