@@ -149,15 +149,15 @@ def test_another_task_in_the_controller(setback: ModuleType) -> None:
 
 def test_another_controller_lives_through_a_scenario(setback: ModuleType) -> None:
     needs_mujoco()
-    made = controller_factory(shortened("aerial-vertical"))
-    (bent,), (nominal,) = run(made, "setback"), run(made, "nominal")
+    built = controller_factory(shortened("aerial-vertical"))
+    (bent,), (nominal,) = run(built, "setback"), run(built, "nominal")
     begin = nominal.of("impact")[0].begin
-    before = [found.series.q[np.searchsorted(found.series.t, begin) - 2] for found in (bent, nominal)]
+    before = [outcome.series.q[np.searchsorted(outcome.series.t, begin) - 2] for outcome in (bent, nominal)]
     moved = float(before[0][-1] - before[1][-1])
     assert -0.2 < moved < -0.1
-    for found, level in ((bent, 1.0), (nominal, 0.0)):
-        assert found.away is None and found.of("impact")[0].touched
-        assert found.series.level[-1] == level
+    for outcome, level in ((bent, 1.0), (nominal, 0.0)):
+        assert outcome.away is None and outcome.of("impact")[0].touched
+        assert outcome.series.level[-1] == level
 
 
 def test_the_installed_command_runs_a_registered_controller(setback: ModuleType, tmp_path: Path) -> None:
@@ -169,8 +169,8 @@ def test_the_installed_command_runs_a_registered_controller(setback: ModuleType,
     words = ("simulate", scenario, "--json", "--controller")
     done = start(*words, "setback", "--no-report", cwd=tmp_path)
     assert (done.returncode, done.stderr) == (0, "")
-    found = json.loads(done.stdout)
-    assert (found["controller"], found["status"], found["warnings"]) == ("setback", "completed", [])
+    document = json.loads(done.stdout)
+    assert (document["controller"], document["status"], document["warnings"]) == ("setback", "completed", [])
     for name, said in (
         ("setbakc", ("no controller 'setbakc'", "did you mean setback?")),
         ("gone", ("controller 'gone' (setback_gone:make)", "No module named 'setback_gone'")),
@@ -197,5 +197,5 @@ def test_a_registered_controller_is_compared_and_runs_again(setback: ModuleType,
     assert [row.status for row in first.rows] == ["completed", "completed"]
     setback.SetbackDriver.brace = setback.Driver.brace
     again = reproduce(plan, seeds=1, store=store)
-    totals = [[row.metrics["q_total_impact"].mean for row in found.rows] for found in (first, again)]
+    totals = [[row.metrics["q_total_impact"].mean for row in result.rows] for result in (first, again)]
     assert totals[0][0] == totals[1][0] != totals[0][1] != totals[1][1]

@@ -1,4 +1,4 @@
-"""What can be wrong with a page, found without looking at it."""
+"""Check a page of figures for defects."""
 
 from __future__ import annotations
 
@@ -14,7 +14,7 @@ from mpl_toolkits.mplot3d import Axes3D
 
 from impact_posture.output.plot.style import lay_out
 
-# Darker than this in some color is a line; grids, walls and faint fills are lighter.
+# Lines are darker than this in some color; grids, walls and faint fills are lighter.
 _INK = 0.6
 _NUMBER = re.compile("[−0-9.e]+")
 
@@ -52,14 +52,14 @@ class Words:
 
 
 def defects(figure: Figure) -> list[str]:
-    """What is wrong with a figure: texts on each other, on lines or off the page, axes without units, legends."""
+    """List defects: texts on each other, on lines or off the page, axes without units, several legends."""
     figure.set_dpi(100)
     canvas = FigureCanvasAgg(figure)
     # It draws everything as well, so that texts know where they stand.
     lay_out(figure)
     texts = [t for t in figure.findobj(Text) if t.get_visible() and t.get_text().strip() and _shown(t, figure)]
     words = [Words.of(text) for text in texts]
-    found = [
+    problems = [
         f"'{one.text}' stands on '{other.text}'"
         for one, other in combinations(words, 2)
         if np.linalg.norm(one.center - other.center) < np.linalg.norm(one.half) + np.linalg.norm(other.half)
@@ -76,15 +76,15 @@ def defects(figure: Figure) -> list[str]:
     height, width = image.shape
     for one in words:
         if one.holds(dark).any():
-            found.append(f"'{one.text}' stands on a line")
+            problems.append(f"'{one.text}' stands on a line")
         corners = one.center + (np.array([[1, 1], [1, -1], [-1, 1], [-1, -1]]) * one.half) @ one.turn
         if (corners < -1).any() or (corners > np.array([width, height]) + 1).any():
-            found.append(f"'{one.text}' is off the page")
+            problems.append(f"'{one.text}' is off the page")
     legends = [legend for part in figure.subfigs for legend in part.legends]
     legends += [axes.get_legend() for axes in figure.axes if axes.get_legend() is not None]
     if len(legends) > 1:
-        found.append(f"{len(legends)} legends")
-    return found + [f"no unit on an axis '{label}'" for label in labels(figure) if "[" not in label]
+        problems.append(f"{len(legends)} legends")
+    return problems + [f"no unit on an axis '{label}'" for label in labels(figure) if "[" not in label]
 
 
 def check_page(figure: Figure) -> None:
@@ -128,10 +128,10 @@ def _axes(axes: object) -> list[object]:
 
 def labels(figure: Figure) -> list[str]:
     """Names of all axes that show numbers."""
-    found = []
+    names = []
     for axes in figure.axes:
         for axis in _axes(axes) if axes.axison and axes.get_visible() else ():
             numbers = [t.label1 for t in axis.get_major_ticks()] + [t.label2 for t in axis.get_major_ticks()]
             if axis.get_visible() and any(t.get_visible() and _NUMBER.fullmatch(t.get_text()) for t in numbers):
-                found.append(axis.label.get_text())
-    return found
+                names.append(axis.label.get_text())
+    return names

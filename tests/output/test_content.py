@@ -1,4 +1,4 @@
-"""What the figures say against the numbers that they were drawn from."""
+"""Compare figures with the numbers that they show."""
 
 from __future__ import annotations
 
@@ -114,8 +114,8 @@ def test_free_ellipsoid_stands_beside_the_consistent_one(solo8: ResultView, tilt
     np.testing.assert_allclose(solo8.free[1].ellipsoid, expected, rtol=1e-9, atol=1e-12 * expected.max())
     figure = ellipsoid_figure(solo8)
     text = text_of(figure)
-    for word, found in (("before", solo8.free[0]), ("after", solo8.free[1])):
-        assert f"{word}, free: √H = {number(np.sqrt(found.H))}" in text
+    for word, free in (("before", solo8.free[0]), ("after", solo8.free[1])):
+        assert f"{word}, free: √H = {number(np.sqrt(free.H))}" in text
     matrices = [f.ellipsoid for f in (solo8.before, solo8.after, solo8.free[0], solo8.free[1])]
     for axes, plane in zip(panels_of(figure), COORDINATE_PLANES, strict=True):
         reach = [line.get_xdata().max() for line in axes.lines if len(line.get_xdata()) == 181]
@@ -166,9 +166,9 @@ def test_three_ellipsoids_share_panels_and_state_their_units(tilthex: ResultView
     for kind in kinds_of(tilthex):
         assert kind.scale == pytest.approx(roots[kind.name][0].max(), rel=1e-9)
         assert f": 1 = {number(kind.scale)} {units[kind.name]}" in text
-        for matrix, found in zip(kind.matrices, roots[kind.name], strict=True):
+        for matrix, expected in zip(kind.matrices, roots[kind.name], strict=True):
             sizes = np.sqrt(np.linalg.eigvalsh(matrix))
-            np.testing.assert_allclose(sizes, np.sort(found) / kind.scale, rtol=1e-9)
+            np.testing.assert_allclose(sizes, np.sort(expected) / kind.scale, rtol=1e-9)
     panels = np.array(figure.axes).reshape(2, 3)
     limits = {axes.get_xlim() for axes in panels.flat} | {axes.get_ylim() for axes in panels.flat}
     assert len(limits) == 1

@@ -89,8 +89,8 @@ def test_defects_are_found(monkeypatch: pytest.MonkeyPatch, turned: ResultView) 
     flat.text(0.5, 0.51, "other", transform=flat.transAxes)
     flat.plot([], [], label="line")
     flat.legend()
-    found = defects(page)
-    assert "'one' stands on 'other'" in found and "2 legends" in found and "no unit on an axis 'x'" in found
+    problems = defects(page)
+    assert "'one' stands on 'other'" in problems and "2 legends" in problems and "no unit on an axis 'x'" in problems
     flat.plot(np.mean(flat.get_xlim()), np.mean(flat.get_ylim()), "ks", markersize=30)
     assert "'one' stands on a line" in defects(page)
 
@@ -132,9 +132,9 @@ def test_a_turning_normal_is_drawn_twice() -> None:
 def test_user_settings_are_put_back_and_ignored(pendulum: ResultView, tmp_path: Path) -> None:
     (clean,) = draw_all(pendulum, tmp_path / "clean", ("svg",), only=["jump"])
     with matplotlib.rc_context({"font.size": 21.0, "axes.facecolor": "red", "savefig.dpi": 37}):
-        (own,) = draw_all(pendulum, tmp_path / "own", ("svg",), only=["jump"])
+        (changed,) = draw_all(pendulum, tmp_path / "changed", ("svg",), only=["jump"])
         assert matplotlib.rcParams["font.size"] == 21.0
-    assert clean.read_bytes() == own.read_bytes()
+    assert clean.read_bytes() == changed.read_bytes()
 
 
 def test_bad_input(pendulum: ResultView, panda: ResultView, tmp_path: Path) -> None:

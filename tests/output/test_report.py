@@ -152,7 +152,7 @@ def test_a_result_is_kept_without_its_report(tmp_path: Path, monkeypatch: pytest
     assert written.report_error == "RuntimeError: no room"
     assert (tmp_path / "out" / "posture.json").is_file() and not (tmp_path / "out" / "report.html").exists()
     assert not result.save(tmp_path / "bare", codegen=False, report=False, jobs=1).report_error
-    # Where no command line made it, the page has the one that makes it again, and names options all the same.
+    # A result from Python gets a page with the command that makes it again.
     assert not rewrite_report(tmp_path / "bare").name.startswith(".")
     page = (tmp_path / "bare" / "report.html").read_text()
     assert Reader(page).texts["code"][0] == "impact-posture optimize problem.toml"
@@ -187,11 +187,11 @@ def test_every_contact_is_shown(tmp_path: Path, monkeypatch: pytest.MonkeyPatch)
     at = levels(track["points"], arrays)[-1].reshape(2, 3)
     assert np.allclose(at, [data.oMf[robot.frame_id(one.frame)].translation for one in contacts], atol=1e-4)
     # Each ellipsoid squared is Λ_c of its contact, and the arrow is the jump of both together.
-    for own, single in zip(
+    for packed_root, single in zip(
         levels(track["ellipsoids"], arrays)[-1].reshape(2, 6), view.objective.singles, strict=True
     ):
         root = np.zeros((3, 3))
-        root[np.triu_indices(3)] = root.T[np.triu_indices(3)] = own
+        root[np.triu_indices(3)] = root.T[np.triu_indices(3)] = packed_root
         expected = single.oracle.quantities(q).ellipsoid
         assert np.allclose(root @ root, expected, atol=1e-2 * np.abs(expected).max())
     both = coulomb_jumps(view.objective, q, view.speed)
@@ -222,9 +222,9 @@ class Packed(ReportScene):
 def test_texts_stay_texts(scene: ReportScene, text: str) -> None:
     light = Packed(**vars(scene))
     page = written(text, light)
-    found, plain = Reader(page), Reader(written("x", light))
-    # The tags and their attributes are those of a harmless text, and nothing turns the direction of writing.
-    assert [(tag, list(attributes)) for tag, attributes in found.tags] == [(t, list(a)) for t, a in plain.tags]
+    hostile, plain = Reader(page), Reader(written("x", light))
+    # The page has the same tags and attributes as with a harmless text, and keeps the direction of writing.
+    assert [(tag, list(attributes)) for tag, attributes in hostile.tags] == [(t, list(a)) for t, a in plain.tags]
     assert "\u202e" not in page
 
 
@@ -272,14 +272,14 @@ def test_a_run_is_thinned_where_nothing_happens() -> None:
     columns = {name: np.zeros((n, 1)) for name in Series.__dataclass_fields__}
     columns |= {"t": 0.001 * np.arange(1, n + 1), "force": generator.normal(size=(n, 3)), "peak": generator.random(n)}
     columns["q"] = np.where(np.arange(n)[:, None] < 3500, 0.0, np.nan)
-    found = thin(Series(**columns), [Window("impact", 0, 1.0, 1.3, True), Window("recovery", 0, 1.0, 2.0, True)])
-    inside = (found.t >= 1.0) & (found.t <= 1.3)
-    assert np.allclose(np.diff(found.t[inside]), 0.001) and inside.sum() >= 300
-    assert np.diff(found.t).max() <= 0.0251 and len(found.t) < 450 and found.t[-1] == columns["t"][3499]
+    thinned = thin(Series(**columns), [Window("impact", 0, 1.0, 1.3, True), Window("recovery", 0, 1.0, 2.0, True)])
+    inside = (thinned.t >= 1.0) & (thinned.t <= 1.3)
+    assert np.allclose(np.diff(thinned.t[inside]), 0.001) and inside.sum() >= 300
+    assert np.diff(thinned.t).max() <= 0.0251 and len(thinned.t) < 450 and thinned.t[-1] == columns["t"][3499]
     # No peak is lost between two frames.
-    assert found.peak.max() == columns["peak"][:3500].max()
+    assert thinned.peak.max() == columns["peak"][:3500].max()
     sizes = np.linalg.norm(columns["force"][:3500], axis=1)
-    assert np.linalg.norm(found.force, axis=1).max() == sizes.max()
+    assert np.linalg.norm(thinned.force, axis=1).max() == sizes.max()
 
 
 # ---- shapes --------------------------------------------------------------------------------------------------------
@@ -310,7 +310,7 @@ URDF = """<robot name="own"><link name="a">{inertial}{a}</link><link name="b">{i
 INERTIAL = '<inertial><mass value="1"/><inertia ixx="1" iyy="1" izz="1" ixy="0" ixz="0" iyz="0"/></inertial>'
 
 
-def own(folder: Path, a: str, b: str) -> ip.Robot:
+def user_robot(folder: Path, a: str, b: str) -> ip.Robot:
     # The last corner but one is in a dent, so the hull lacks it.
     corners = [f"v {x} {y} {z}" for x, y, z in [*TETRAHEDRON, [0, 0, 0]]]
     faces = ["f 1 2 4", "f 2 3 4", "f 3 1 4", "f 1 5 2", "f 2 5 3", "f 3 5 1"]
@@ -324,7 +324,9 @@ def visual(shape: str) -> str:
 
 
 def test_own_meshes_go_in_only_if_asked(tmp_path: Path) -> None:
-    robot = own(tmp_path, visual('<mesh filename="dent.obj"/>'), visual('<mesh filename="dent.obj" scale="2 2 2"/>'))
+    robot = user_robot(
+        tmp_path, visual('<mesh filename="dent.obj"/>'), visual('<mesh filename="dent.obj" scale="2 2 2"/>')
+    )
     hulls, meshes = draw_robot(robot), draw_robot(robot, True)
     assert [len(one.solids[0].corners) for one in (hulls, meshes)] == [4, 5] and hulls.licenses == ()
     assert "hulls" in hulls.notes[0] and not meshes.notes
@@ -346,10 +348,10 @@ def test_small_shapes_beside_large_meshes_are_drawn() -> None:
 
 
 def test_primitives_and_robots_without_shapes(tmp_path: Path) -> None:
-    drawn = draw_robot(own(tmp_path, visual('<box size="0.1 0.2 0.3"/>'), visual('<sphere radius="0.1"/>')))
+    drawn = draw_robot(user_robot(tmp_path, visual('<box size="0.1 0.2 0.3"/>'), visual('<sphere radius="0.1"/>')))
     assert np.allclose(np.ptp(drawn.solids[0].points, axis=0), [0.1, 0.2, 0.3], atol=1e-5) and not drawn.notes
     (tmp_path / "bare").mkdir()
-    sticks = draw_robot(own(tmp_path / "bare", "", visual('<mesh filename="missing.obj"/>')))
+    sticks = draw_robot(user_robot(tmp_path / "bare", "", visual('<mesh filename="missing.obj"/>')))
     assert len(sticks.parts) == 1 and "sticks" in sticks.notes[-1] and "missing.obj" in sticks.notes[0]
     assert np.ptp(sticks.solids[0].points[:, 2]) >= 0.5
     # The last stick goes on to the farthest frame of the last link, where contacts are.

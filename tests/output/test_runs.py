@@ -108,14 +108,16 @@ def curves(axes: Axes) -> dict[str, tuple[np.ndarray, np.ndarray]]:
 
 def shaded(axes: Axes, kind: str) -> np.ndarray:
     """Begin and end of each shaded span, in order."""
-    own: list[Any] = [p for p in axes.patches if to_hex(p.get_facecolor()) == SHADES[kind]["facecolor"]]
-    return np.array(sorted((p.get_x(), p.get_x() + p.get_width()) for p in own))
+    spans: list[Any] = [p for p in axes.patches if to_hex(p.get_facecolor()) == SHADES[kind]["facecolor"]]
+    return np.array(sorted((p.get_x(), p.get_x() + p.get_width()) for p in spans))
 
 
 def limits(axes: Axes) -> list[float]:
     """Heights of the dashed lines."""
-    own = [line for line in axes.lines if line.get_linestyle() == "--" and line.get_linewidth() == LIMIT["linewidth"]]
-    return sorted(float(np.asarray(line.get_ydata())[0]) for line in own)
+    lines = [
+        line for line in axes.lines if line.get_linestyle() == "--" and line.get_linewidth() == LIMIT["linewidth"]
+    ]
+    return sorted(float(np.asarray(line.get_ydata())[0]) for line in lines)
 
 
 def test_windows_are_shaded_when_they_are(flying: RunView) -> None:
@@ -284,7 +286,7 @@ def test_snapshots_show_the_robot_where_it_was(flying: RunView, pushed: RunView)
         x, y = axes.get_xlim(), axes.get_ylim()
         assert (state.points[:, 0] > x[0]).all() and (state.points[:, 2] < y[1]).all() and x[0] < -0.5
     arrows = [[t for t in axes.texts if t.arrow_patch is not None] for axes in panels(snapshots_figure([pushed]))]  # type: ignore[attr-defined]
-    assert [len(own) for own in arrows] == [0, 1, 1]
+    assert [len(panel) for panel in arrows] == [0, 1, 1]
     tip, tail = np.array(arrows[2][0].xy), np.array(arrows[2][0].xyann)
     state = build_skeleton(pushed.robot, pushed.q[pushed.index(1.3)], [pushed.contact])
     np.testing.assert_allclose(tip, state.contact[[0, 2]])

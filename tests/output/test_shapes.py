@@ -70,10 +70,10 @@ def test_half_width_is_the_support_function(rank: int) -> None:
 
 
 def test_half_width_is_the_root_of_H_and_not_the_radius(tilthex: ResultView) -> None:
-    found = tilthex.after
-    assert half_width(found.ellipsoid, found.normal) == pytest.approx(np.sqrt(found.H), rel=1e-12)
-    radius = 1 / np.sqrt(found.normal @ np.linalg.solve(found.ellipsoid, found.normal))
-    assert radius < 0.9 * np.sqrt(found.H)
+    after = tilthex.after
+    assert half_width(after.ellipsoid, after.normal) == pytest.approx(np.sqrt(after.H), rel=1e-12)
+    radius = 1 / np.sqrt(after.normal @ np.linalg.solve(after.ellipsoid, after.normal))
+    assert radius < 0.9 * np.sqrt(after.H)
 
 
 @pytest.mark.parametrize("rank", RANKS)
@@ -123,7 +123,7 @@ def test_cone_shadow_is_the_projection_of_the_cone(degrees: float, plane: Plane)
     np.testing.assert_allclose(axis @ rim, 2.0 * np.cos(np.radians(degrees)), rtol=1e-12)
     outline = cone_shadow(axis, degrees, 2.0, plane.axes)
     np.testing.assert_array_equal(outline[:, 0], outline[:, -1])
-    # Both have the same support function: that of the apex and the rim.
+    # The outline has the same support function as the apex and the rim.
     angle = np.linspace(0, 2 * np.pi, 73)
     directions = np.array([np.cos(angle), np.sin(angle)]).T
     seen = np.maximum((directions @ plane.axes @ rim).max(axis=1), 0.0)
@@ -133,12 +133,12 @@ def test_cone_shadow_is_the_projection_of_the_cone(degrees: float, plane: Plane)
 @pytest.mark.parametrize("count", [3, 4, 10, 100, 1000])
 def test_an_outline_is_the_convex_hull(count: int) -> None:
     points = np.random.default_rng(count).normal(size=(2, count)) * [[1e-2], [3.0]]
-    found = outline(points)
-    np.testing.assert_array_equal(found[:, 0], found[:, -1])
+    ring = outline(points)
+    np.testing.assert_array_equal(ring[:, 0], ring[:, -1])
     hull = points[:, ConvexHull(points.T).vertices]
-    assert sorted(map(tuple, found[:, 1:].T)) == sorted(map(tuple, hull.T))
+    assert sorted(map(tuple, ring[:, 1:].T)) == sorted(map(tuple, hull.T))
     # Counter-clockwise, as the corners of SciPy.
-    x, y = found
+    x, y = ring
     assert float(x[:-1] @ y[1:] - x[1:] @ y[:-1]) / 2 == pytest.approx(ConvexHull(points.T).volume, rel=1e-12)
 
 

@@ -23,14 +23,14 @@ from impact_posture.robot.robot_loader import load_robot
 PENDULUM = "example-robot-data:double_pendulum_description/urdf/double_pendulum.urdf"
 
 
-def sample_path(objective: WorstCaseObjective, way: list[np.ndarray]) -> NullSpacePath:
+def sample_path(objective: WorstCaseObjective, postures: list[np.ndarray]) -> NullSpacePath:
     model = objective.robot.model
-    steps = [np.linalg.norm(pin.difference(model, q, p)) for q, p in pairwise(way)]
-    found = [objective.oracle.quantities(q) for q in way]
+    steps = [np.linalg.norm(pin.difference(model, q, p)) for q, p in pairwise(postures)]
+    impacts = [objective.oracle.quantities(q) for q in postures]
     # A missing S becomes NaN.
-    curves = {name: np.array([getattr(f, name) for f in found], dtype=float) for name in "HGVS"}
-    values = np.array([objective.value(q) for q in way])
-    return NullSpacePath(np.array(way), np.concatenate([[0.0], np.cumsum(steps)]), **curves, objective=values)
+    curves = {name: np.array([getattr(f, name) for f in impacts], dtype=float) for name in "HGVS"}
+    values = np.array([objective.value(q) for q in postures])
+    return NullSpacePath(np.array(postures), np.concatenate([[0.0], np.cumsum(steps)]), **curves, objective=values)
 
 
 def make_view(
@@ -53,23 +53,23 @@ def make_view(
     v = scale * np.random.default_rng(3).normal(size=robot.nv)
     if robot.floating:
         v[:6] *= 0.2
-    way = [pin.integrate(robot.model, q0, v * t) for t in np.linspace(0, 1, 12)]
+    postures = [pin.integrate(robot.model, q0, v * t) for t in np.linspace(0, 1, 12)]
     return ResultView(
         objective,
         q0,
-        way[-1],
-        path=sample_path(objective, way) if path else None,
-        tradeoff=trade_of(objective, way) if path else None,
-        motion=motion_of(objective, way, v) if path else None,
-        self_motion=map_of(objective, way) if path else None,
+        postures[-1],
+        path=sample_path(objective, postures) if path else None,
+        tradeoff=trade_of(objective, postures) if path else None,
+        motion=motion_of(objective, postures, v) if path else None,
+        self_motion=map_of(objective, postures) if path else None,
         **keys,  # type: ignore[arg-type]
     )
 
 
-def map_of(objective: WorstCaseObjective, way: list[np.ndarray]) -> SelfMotionMap:
-    """Two components to draw, there and back; the end of the way back is infeasible."""
-    path = sample_path(objective, way)
-    count = len(way)
+def map_of(objective: WorstCaseObjective, postures: list[np.ndarray]) -> SelfMotionMap:
+    """Two components to draw, there and back; the end of the second is infeasible."""
+    path = sample_path(objective, postures)
+    count = len(postures)
     return SelfMotionMap(
         q=np.concatenate([path.q, path.q[::-1]]),
         component=np.repeat([0, 1], count),
@@ -82,20 +82,20 @@ def map_of(objective: WorstCaseObjective, way: list[np.ndarray]) -> SelfMotionMa
     )
 
 
-def trade_of(objective: WorstCaseObjective, way: list[np.ndarray], knee: int | None = None) -> TradeOffData:
+def trade_of(objective: WorstCaseObjective, postures: list[np.ndarray], knee: int | None = None) -> TradeOffData:
     """A curve to draw, better or worse as it may be; its last but one point is not certified."""
-    path = sample_path(objective, way)
-    certified = np.arange(len(way)) != len(way) - 2
+    path = sample_path(objective, postures)
+    certified = np.arange(len(postures)) != len(postures) - 2
     return TradeOffData(path.s, path.objective, path.H, path.G, path.V, path.S, certified, knee)
 
 
-def motion_of(objective: WorstCaseObjective, way: list[np.ndarray], v: np.ndarray) -> PosturePath:
+def motion_of(objective: WorstCaseObjective, postures: list[np.ndarray], v: np.ndarray) -> PosturePath:
     """A motion at a constant velocity in 1 s, whose thrusts are not known."""
-    t = np.linspace(0, 1, len(way))
+    t = np.linspace(0, 1, len(postures))
     use = LimitUse(t, np.full(t.size, 0.4), 0.5 + 0.3 * t, np.full(t.size, np.nan), {"active": None})
-    values = np.array([objective.value(q) for q in way])
+    values = np.array([objective.value(q) for q in postures])
     return PosturePath(
-        False, "a reason", "continuation", "scaled", values[-1], t, np.array(way), np.tile(v, (t.size, 1)),
+        False, "a reason", "continuation", "scaled", values[-1], t, np.array(postures), np.tile(v, (t.size, 1)),
         np.zeros((t.size, v.size)), float(np.linalg.norm(v)), 0.0, use, values,
     )  # fmt: skip
 

@@ -1,4 +1,4 @@
-"""What makes answers fast and must not change them: caches by content, polygons of feet, rounds of a search."""
+"""Caches, polygons of feet and rounds of a search make answers fast and must not change them."""
 
 from __future__ import annotations
 
@@ -49,14 +49,14 @@ points = st.lists(
 @given(points)
 @settings(max_examples=60, deadline=None)
 def test_the_polygon_of_the_feet_is_the_convex_hull(corners: list[tuple[float, float]]) -> None:
-    found = polygon_edges([np.array(corner) for corner in corners])
+    edges = polygon_edges([np.array(corner) for corner in corners])
     try:
         hull = ConvexHull(np.array(corners).reshape(-1, 2))
     except (QhullError, ValueError):
-        assert found is None
+        assert edges is None
         return
-    assert found is not None
-    normals, offsets = found
+    assert edges is not None
+    normals, offsets = edges
     np.testing.assert_allclose(np.linalg.norm(normals, axis=1), 1, atol=1e-9)
     # As many edges as corners of the hull, and the same half-planes.
     expected = np.unique(np.round(hull.equations, 7), axis=0)
@@ -74,9 +74,9 @@ def test_feet_in_a_row_whose_places_are_inexact_keep_their_corners(
     corners: list[tuple[float, float]], seed: int
 ) -> None:
     points = np.array(corners) + 1e-10 * np.random.default_rng(seed).normal(size=(len(corners), 2))
-    found = polygon_edges(points)
-    if found is not None:
-        assert (points @ found[0].T <= found[1] + 1e-8).all()
+    edges = polygon_edges(points)
+    if edges is not None:
+        assert (points @ edges[0].T <= edges[1] + 1e-8).all()
 
 
 def _objective(robot: str, frame: str) -> WorstCaseObjective:
@@ -102,7 +102,7 @@ def test_code_from_the_cache_is_the_code(
 
     first = texts()
     assert texts() == first and len(count) == 1
-    # Whatever shapes the code gives another key.
+    # Each change of the code gives another key.
     other = replace(objective, contact=replace(objective.contact, normal=(0.0, 0.6, 0.8)))
     for changed in ({"objective": other}, {"real": FLOAT}, {"portable": True}):
         assert texts(**changed) != first
