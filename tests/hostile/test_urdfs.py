@@ -8,7 +8,6 @@ from __future__ import annotations
 import json
 import random
 import xml.etree.ElementTree as ET
-from collections.abc import Callable
 from pathlib import Path
 
 import pytest
@@ -79,9 +78,8 @@ def set_number(root: ET.Element, rng: random.Random) -> None:
 
 
 def rename(root: ET.Element, rng: random.Random) -> None:
-    rng.choice(list(root.iter())).tag = rng.choice(
-        ("link", "joint", "inertial", "mass", "stranger", "mimic", "robot")
-    )
+    tags = ("link", "joint", "inertial", "mass", "stranger", "mimic", "robot")
+    rng.choice(list(root.iter())).tag = rng.choice(tags)
 
 
 def reconnect(root: ET.Element, rng: random.Random) -> None:
@@ -92,10 +90,8 @@ def reconnect(root: ET.Element, rng: random.Random) -> None:
 
 
 def move(root: ET.Element, rng: random.Random) -> None:
-    (parent, child), (other, _) = (
-        rng.choice(parents(root) or [(root, root)]),
-        rng.choice(parents(root) or [(root, root)]),
-    )
+    pairs = parents(root) or [(root, root)]
+    (parent, child), (other, _) = rng.choice(pairs), rng.choice(pairs)
     if child is not root and other not in child.iter():
         parent.remove(child)
         other.append(child)
@@ -131,63 +127,34 @@ def test_spoiled_urdfs(argv: tuple[str, ...], arena: Path, hostile_full: bool) -
     assert sum("bad.urdf" in outcome.err for outcome in refused) > len(refused) / 2
 
 
-def bomb() -> str:
-    """Entities that grow to 10⁹ of them."""
-    entities = "".join(f'<!ENTITY e{k} "{f"&e{k - 1};" * 10}">' for k in range(1, 10))
-    return f'<!DOCTYPE robot [<!ENTITY e0 "a">{entities}]>{SMALL.replace("small", "&e9;", 1)}'
-
-
-def outside() -> str:
-    """A file from elsewhere."""
-    return f'<!DOCTYPE robot [<!ENTITY x SYSTEM "file:///etc/passwd">]>{SMALL.replace("small", "&x;", 1)}'
-
-
-def nested() -> str:
-    """Elements within elements."""
-    return SMALL.replace('<link name="tip"/>', "<a>" * 20_000 + "</a>" * 20_000 + '<link name="tip"/>')
-
-
-def wide() -> str:
-    """Ten thousand links that nothing joins."""
-    return SMALL.replace("</robot>", "".join(f'<link name="l{k}"/>' for k in range(10_000)) + "</robot>")
-
-
-def long() -> str:
-    """A name of a million letters."""
-    return SMALL.replace("small", "a" * 1_000_000, 1)
-
-
-def wide_text() -> str:
-    """Another encoding than it says."""
-    return '<?xml version="1.0" encoding="utf-16"?>' + SMALL
-
-
-def comment() -> str:
-    """Nothing but a comment."""
-    return "<!-- " + "a" * 100_000 + " -->"
-
-
-def deep() -> str:
-    """A chain that overflows the stack of the URDF parser."""
-    links = "".join(
-        f'<link name="d{k}"/><joint name="e{k}" type="fixed"><parent link="{f"d{k - 1}" if k else "tip"}"/>'
-        f'<child link="d{k}"/></joint>'
-        for k in range(10_000)
-    )
-    return SMALL.replace("</robot>", f"{links}</robot>")
-
-
-def below_itself() -> str:
-    """A link that is its own parent, beside a root."""
-    joint = '<joint name="c" type="fixed"><parent link="lower"/><child link="lower"/></joint>'
-    return SMALL.replace("</robot>", f"{joint}</robot>")
-
-
-@pytest.mark.parametrize(
-    "make", [deep, below_itself, bomb, outside, nested, wide, long, wide_text, comment], ids=lambda f: f.__name__
+ENTITIES = "".join(f'<!ENTITY e{k} "{f"&e{k - 1};" * 10}">' for k in range(1, 10))
+CHAIN = "".join(
+    f'<link name="d{k}"/><joint name="e{k}" type="fixed"><parent link="{f"d{k - 1}" if k else "tip"}"/>'
+    f'<child link="d{k}"/></joint>'
+    for k in range(10_000)
 )
-def test_files_made_to_break_parsers(make: Callable[[], str], arena: Path) -> None:
-    (arena / "bad.urdf").write_text(make())
+ISLANDS = "".join(f'<link name="l{k}"/>' for k in range(10_000))
+LOOP = '<joint name="c" type="fixed"><parent link="lower"/><child link="lower"/></joint>'
+BREAKERS = {
+    "entities that grow to a billion": (
+        f'<!DOCTYPE robot [<!ENTITY e0 "a">{ENTITIES}]>{SMALL.replace("small", "&e9;", 1)}'
+    ),
+    "file from elsewhere": (
+        f'<!DOCTYPE robot [<!ENTITY x SYSTEM "file:///etc/passwd">]>{SMALL.replace("small", "&x;", 1)}'
+    ),
+    "nested elements": SMALL.replace('<link name="tip"/>', "<a>" * 20_000 + "</a>" * 20_000 + '<link name="tip"/>'),
+    "links without joints": SMALL.replace("</robot>", f"{ISLANDS}</robot>"),
+    "long name": SMALL.replace("small", "a" * 1_000_000, 1),
+    "wrong encoding": '<?xml version="1.0" encoding="utf-16"?>' + SMALL,
+    "only a comment": "<!-- " + "a" * 100_000 + " -->",
+    "chain that overflows the stack of the URDF parser": SMALL.replace("</robot>", f"{CHAIN}</robot>"),
+    "link below itself": SMALL.replace("</robot>", f"{LOOP}</robot>"),
+}  # fmt: skip
+
+
+@pytest.mark.parametrize("name", BREAKERS)
+def test_files_made_to_break_parsers(name: str, arena: Path) -> None:
+    (arena / "bad.urdf").write_text(BREAKERS[name])
     outcome = strike(arena, "inspect", "bad.urdf", "--json")
     assert not outcome.complaints, (outcome.complaints, outcome.err[-300:])
     assert len(outcome.err) < 5_000 and "root:" not in outcome.out
