@@ -21,10 +21,7 @@ class ActuatorLimits:
 
     Motors, rotors and feet carry the load as in :class:`~impact_posture.posture.loads.equilibrium.Equilibrium`.
 
-    Args:
-        objective: The objective, with the robot and its supports.
-        q: A posture with the feet in place, shape (nq,).
-        requirements: The friction of the feet.
+    They are built from a posture with the feet in place, shape (nq,), and from the friction in the requirements.
 
     Attributes:
         names: Names of the actuators with a limit.

@@ -72,11 +72,7 @@ def check_name(out: Path) -> None:
 def whole_folder(out: Path, *, force: bool, kind: Kind, products: Sequence[str] = ()) -> Iterator[Path]:
     """Yield a temporary folder beside ``out``.  After the block it replaces ``out``; after an error it is removed.
 
-    Args:
-        out: The folder to be written.
-        force: Whether an existing folder of the same kind may be replaced.
-        kind: The kind of content.
-        products: Files that may be built there later, such as libraries; they are not foreign.
+    ``products`` are files that may be built there later, such as libraries; they are not foreign.
 
     Raises:
         OutputError: See :func:`check_output`; or the disk is full or not writable.

@@ -37,9 +37,7 @@ def made_by() -> dict[str, str]:
 def scratch_folder(parent: Path | None = None, mode: int = 0o700) -> Iterator[Path]:
     """Yield a temporary folder, which is removed after the block and after a signal.
 
-    Args:
-        parent: The parent folder; the system's temporary folder by default.
-        mode: Permissions; by default, only the user can read the folder.
+    It lies in ``parent``, by default the temporary folder of the system.  By default, only the user can read it.
 
     Raises:
         OutputError: The system has no temporary folder.

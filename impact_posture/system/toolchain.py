@@ -63,11 +63,7 @@ def words_of(variable: str) -> list[str]:
 
 
 def run_compiler(command: list[str], folder: Path) -> None:
-    """Run one compiler command in ``folder``.
-
-    Raises:
-        CompilerError: The command failed; with the first error line of the compiler.
-    """
+    """Run a compiler command in ``folder``; see :func:`run_compilers`."""
     run_compilers([command], folder)
 
 
