@@ -23,13 +23,8 @@ from impact_posture.simulation.setup import set_up
 from impact_posture.simulation.world.actuator_command import ActuatorCommand
 from impact_posture.simulation.world.sensor_noise import Reading
 from impact_posture.tsid.tasks.task import Task
-from tests.simulation.factories import SHIPPED, needs_mujoco, shared_factory
+from tests.simulation.factories import SHIPPED, shared_factory
 from tests.support.helpers import Vector, central_gradient, frame_jacobian, mass_matrix, rng
-
-
-@pytest.fixture(scope="module", autouse=True)
-def _mujoco() -> None:
-    needs_mujoco()
 
 
 def moving(factory: ControllerFactory, *key: object) -> Reading:

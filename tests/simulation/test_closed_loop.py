@@ -20,10 +20,7 @@ from impact_posture.simulation.scenario_file import read_scenario
 from impact_posture.simulation.setup import Setup, set_up
 from impact_posture.simulation.world.scene import Sensors
 from impact_posture.simulation.world_export import export_world
-from tests.simulation.factories import needs_mujoco
 from tests.support.tools import need
-
-needs_mujoco()
 
 EXAMPLE = Path(__file__).parents[2] / "docs" / "examples" / "cpp" / "closed_loop"
 

@@ -20,7 +20,7 @@ from impact_posture.simulation.scenario_objective import interpreted
 from impact_posture.simulation.setup import set_up
 from impact_posture.simulation.world.sensor_noise import Reading
 from impact_posture.system.libraries import cache_path
-from tests.simulation.factories import driven, needs_mujoco, shared_factory
+from tests.simulation.factories import driven, shared_factory
 from tests.support.daqp import sources_or_skip
 
 # Relative differences between Python and C.  A wall amplifies the last digits, the ground does not.
@@ -30,7 +30,6 @@ BANDS = {"solo8-push": 1e-6, "aerial-vertical": 2e-2}
 @pytest.fixture(scope="module", autouse=True)
 def _built(tmp_path_factory: pytest.TempPathFactory) -> Any:
     """Use a separate cache, in which compilers do not optimize."""
-    needs_mujoco()
     sources_or_skip()
     with pytest.MonkeyPatch.context() as patch:
         patch.setenv("CFLAGS", "-O0")

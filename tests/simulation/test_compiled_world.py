@@ -24,7 +24,6 @@ from tests.simulation.factories import (
     driven,
     fields_of,
     near,
-    needs_mujoco,
     shared_factory,
     shortened,
 )
@@ -37,7 +36,6 @@ BAND = 1e-7
 
 @pytest.fixture(autouse=True)
 def _quick(monkeypatch: pytest.MonkeyPatch) -> None:
-    needs_mujoco()
     sources_or_skip()
     monkeypatch.setenv("CFLAGS", "-O0")
 

@@ -19,12 +19,7 @@ from impact_posture.simulation.controllers.task_formulations import nominal_post
 from impact_posture.simulation.world.actuator_command import ActuatorCommand
 from impact_posture.tsid.tasks.body_tasks import BaseOrientation, CenterOfMass
 from impact_posture.tsid.tasks.frame_tasks import FramePose
-from tests.simulation.factories import AERIAL, PUSHES, SHIPPED, needs_mujoco, shared_factory
-
-
-@pytest.fixture(scope="module", autouse=True)
-def _mujoco() -> None:
-    needs_mujoco()
+from tests.simulation.factories import AERIAL, PUSHES, SHIPPED, shared_factory
 
 
 class Stage:

@@ -10,15 +10,10 @@ from impact_posture.simulation.controllers.impact_baselines import ImpactAwareDr
 from impact_posture.simulation.metrics import before
 from impact_posture.simulation.scenario_file import RepeatedContacts
 from impact_posture.simulation.world.sensor_noise import Reading
-from tests.simulation.factories import lived, needs_mujoco, shared_factory
+from tests.simulation.factories import lived, shared_factory
 from tests.support.helpers import Vector, frame_jacobian, mass_matrix, rng
 
 NAME = "aerial-vertical"
-
-
-@pytest.fixture(scope="module", autouse=True)
-def _mujoco() -> None:
-    needs_mujoco()
 
 
 def spreading() -> tuple[ReferenceSpreadingDriver, Reference]:

@@ -15,12 +15,7 @@ from impact_posture.simulation.recorder import STATUSES
 from impact_posture.simulation.run import Run
 from impact_posture.simulation.series import Series, Window
 from impact_posture.tsid.controller import Status
-from tests.simulation.factories import by_hand, fields_of, needs_mujoco, shared_factory
-
-
-@pytest.fixture(scope="module", autouse=True)
-def _mujoco() -> None:
-    needs_mujoco()
+from tests.simulation.factories import by_hand, fields_of, shared_factory
 
 
 def touch(begin: float, length: float = 0.3, contact: int = 0, kind: str = "impact", touched: bool = True) -> Window:

@@ -19,9 +19,6 @@ from impact_posture.simulation.scenario_file import read_scenario
 from impact_posture.simulation.scenario_objective import scenario_objective
 from impact_posture.simulation.setup import set_up
 from impact_posture.tsid.flow.flow_direction import FlowOptions
-from tests.simulation.factories import needs_mujoco
-
-needs_mujoco()
 
 
 @pytest.mark.parametrize("name", ["aerial-vertical", "aerial-lateral", "solo8-push"])
@@ -66,7 +63,7 @@ def test_the_share_of_the_limits_counts() -> None:
         part = cases.holding(setup.q)
         assert part is not None and part.feasible is fits
         assert part.largest_share == pytest.approx(whole.largest_share / share)
-        assert f"within {100 * share:g} % of their limits at rest" in cases.cases[0].words
+        assert f"within {100 * share:g} % of their limits at rest" in cases.cases[0].description
 
 
 def test_a_note_reports_possible_collisions(monkeypatch: pytest.MonkeyPatch) -> None:

@@ -24,18 +24,12 @@ from tests.simulation.factories import (
     by_hand,
     controller_factory,
     driven,
-    needs_mujoco,
     shared_factory,
     shortened,
 )
 
 RELAXED, HELD = STATUSES.index(Status.RELAXED), STATUSES.index(Status.INFEASIBLE)
 HEXTILT = Path(__file__).parent / "hextilt.toml"
-
-
-@pytest.fixture(scope="module", autouse=True)
-def _mujoco() -> None:
-    needs_mujoco()
 
 
 def judged(setup: Setup, columns: dict[str, Any], **run: Any) -> tuple[Event, ...]:

@@ -19,7 +19,7 @@ from impact_posture.simulation.prediction import predict
 from impact_posture.simulation.run import run
 from impact_posture.simulation.scenario_file import read_scenario
 from impact_posture.simulation.setup import set_up
-from tests.simulation.factories import controller_factory, driven, fields_of, needs_mujoco
+from tests.simulation.factories import controller_factory, driven, fields_of
 from tests.support.helpers import robot as known_robot
 
 RAIL = Path(__file__).parents[2] / "docs" / "examples" / "rail_arm"
@@ -98,11 +98,6 @@ least = 0.1
 [control.robust]
 gain = 130
 """
-
-
-@pytest.fixture(scope="module", autouse=True)
-def _mujoco() -> None:
-    needs_mujoco()
 
 
 @pytest.fixture(scope="module")

@@ -22,16 +22,11 @@ from impact_posture.simulation.world.contact_law import ContactLaw
 from impact_posture.simulation.world.scene import Physics, Sensors
 from impact_posture.simulation.world.world import build_world
 from impact_posture.tsid.controller import Command, Status
-from tests.simulation.factories import driven, needs_mujoco, shared_factory
+from tests.simulation.factories import driven, shared_factory
 from tests.support.helpers import Vector, frame_jacobian, mass_matrix
 
 NONE = np.zeros(0)
 WEIGHTLESS = Physics(gravity=(0.0, 0.0, 0.0))
-
-
-@pytest.fixture(scope="module", autouse=True)
-def _mujoco() -> None:
-    needs_mujoco()
 
 
 @functools.cache

@@ -6,19 +6,13 @@ from collections.abc import Callable
 from typing import Any
 
 import numpy as np
-import pytest
 
 from impact_posture.errors import MetricError
 from impact_posture.simulation.recorder import STATUSES, Recorder
 from impact_posture.simulation.setup import Setup
 from impact_posture.simulation.world.actuator_command import Trace
 from impact_posture.tsid.controller import Command, Status
-from tests.simulation.factories import needs_mujoco, shared_factory
-
-
-@pytest.fixture(scope="module", autouse=True)
-def _mujoco() -> None:
-    needs_mujoco()
+from tests.simulation.factories import shared_factory
 
 
 def metric(q: Any) -> float:

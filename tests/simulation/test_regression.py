@@ -13,14 +13,9 @@ import pytest
 
 from impact_posture.simulation.metrics import measure
 from impact_posture.simulation.prediction import predict
-from tests.simulation.factories import controller_factory, driven, needs_mujoco, shortened
+from tests.simulation.factories import controller_factory, driven, shortened
 
 Band = tuple[float, float]
-
-
-@pytest.fixture(scope="module", autouse=True)
-def _mujoco() -> None:
-    needs_mujoco()
 
 
 # Measured: q of nominal 0.280-0.309, 0.112-0.127, 0.409, 0.284; reductions of q 74-75, 80-81, 12.2, 52 %; of H 97.8,

@@ -27,7 +27,6 @@ from tests.simulation.factories import (
     fields_of,
     lived,
     near,
-    needs_mujoco,
     shared_factory,
     shortened,
 )
@@ -42,11 +41,6 @@ ALL += [(name, few, "live") for name in ("aerial-lateral", "talos-push") for few
 ALL += [("aerial-lateral", "reference-spreading", "live"), ("talos-push", "posture", "live")]
 ALL += [(name, "robust", "held") for name in SHIPPED]
 ALL += [(name, "walker", "held") for name in ("aerial-vertical", "solo8-push")]
-
-
-@pytest.fixture(scope="module", autouse=True)
-def _mujoco() -> None:
-    needs_mujoco()
 
 
 # ---- completion ---------------------------------------------------------------------------------------------------

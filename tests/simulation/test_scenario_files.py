@@ -42,10 +42,6 @@ SHIPPED = ("aerial-lateral", "aerial-vertical", "solo8-push", "talos-push")
 REAL = ("g1-strike", "hextilt-poke", "panda-tap", "solo12-landing", "solo8-throw", "talos-strike", "talos-throw")
 
 
-def needs_mujoco() -> None:
-    pytest.importorskip("mujoco", reason="mujoco is not installed (the extra 'sim')")
-
-
 # ---- shipped ----------------------------------------------------------------------------------------------------
 
 
@@ -58,7 +54,6 @@ def test_the_shipped_scenarios_are_known() -> None:
 
 @pytest.mark.parametrize("name", known_scenarios())
 def test_every_shipped_scenario_stays_at_its_start(name: str) -> None:
-    needs_mujoco()
     setup = set_up(read_scenario(name))
     driver = ControllerFactory(setup).driver("nominal")
     command = driver.reset(setup.q)
@@ -87,7 +82,6 @@ def test_pushes_have_the_values_of_the_paper() -> None:
 
 
 def test_pushed_robots_have_armature_and_limits() -> None:
-    needs_mujoco()
     solo = set_up(read_scenario("solo8-push")).robot
     np.testing.assert_allclose(solo.armature[6:], 3.6e-4, rtol=0.02)
     np.testing.assert_allclose(np.asarray(solo.model.effortLimit)[6:], 2.7)
@@ -142,7 +136,6 @@ def folder(tmp_path: Path) -> Path:
 
 
 def test_a_scenario_of_a_user_runs_from_any_folder(folder: Path, monkeypatch: pytest.MonkeyPatch) -> None:
-    needs_mujoco()
     path = write(folder, OWN)
     monkeypatch.chdir(folder.parent)
     setup = set_up(read_scenario("own/my_scenario.toml"))
@@ -199,7 +192,6 @@ def test_a_wrong_file_is_refused_in_one_line(folder: Path, old: str, new: str, w
     ],
 )
 def test_a_run_of_impossible_length_is_refused(folder: Path, old: str, new: str, words: str) -> None:
-    needs_mujoco()
     assert old in OWN
     factory = ControllerFactory(set_up(read_scenario(write(folder, LED.replace(old, new)))))
     with pytest.raises(InputError, match=words) as caught:
@@ -208,7 +200,6 @@ def test_a_run_of_impossible_length_is_refused(folder: Path, old: str, new: str,
 
 
 def test_a_robot_with_one_joint_runs(folder: Path) -> None:
-    needs_mujoco()
     setup = set_up(read_scenario(write(folder, OWN)))
     others = [name for name in setup.robot.joint_names if name != "elbow"]
     text = LED.replace('robot = "rail_arm.urdf"', f'robot = "rail_arm.urdf"\nlock = {others}'.replace("'", '"'))
@@ -232,7 +223,6 @@ def test_a_misspelt_scenario_and_a_missing_file() -> None:
 
 
 def test_a_frame_that_the_robot_lacks_is_refused(folder: Path) -> None:
-    needs_mujoco()
     path = write(folder, OWN.replace('frame = "', 'frame = "tool_tip" # '))
     with pytest.raises(ImpactPostureError, match="no frame 'tool_tip'") as caught:
         set_up(read_scenario(path))
@@ -303,7 +293,6 @@ def test_a_gap_that_is_too_short_for_the_speed_is_refused() -> None:
 
 
 def test_the_program_of_the_page_runs() -> None:
-    needs_mujoco()
     (program,) = re.findall(
         r"^```python\n(.*?)^```", (DOCS / "simulation.md").read_text(encoding="utf-8"), re.M | re.S
     )
@@ -355,7 +344,6 @@ def test_an_error_keeps_a_key_of_robot_toml() -> None:
 
 
 def test_an_infeasible_offline_posture_names_keys(tmp_path: Path) -> None:
-    needs_mujoco()
     text = (SHIPPED_FOLDER / "panda-tap.toml").read_text(encoding="utf-8")
     path = tmp_path / "mine.toml"
     path.write_text(text.replace("gap = 0.1 ", "gap = 3.0 "), encoding="utf-8")

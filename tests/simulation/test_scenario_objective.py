@@ -29,7 +29,7 @@ from impact_posture.simulation.scenario_file import read_scenario
 from impact_posture.simulation.scenario_objective import compiled, interpreted, scenario_objective
 from impact_posture.simulation.setup import set_up
 from impact_posture.system.libraries import hash_path
-from tests.simulation.factories import needs_mujoco, shared_factory
+from tests.simulation.factories import shared_factory
 from tests.support.helpers import Vector, assert_close, central_gradient, frame_jacobian, mass_matrix, rng
 from tests.support.helpers import robot as known_robot
 from tests.support.tools import need_compiler
@@ -120,7 +120,6 @@ def test_an_undefined_objective_is_an_error() -> None:
 
 
 def test_the_contact_is_the_shape_or_the_pushed_frame() -> None:
-    needs_mujoco()
     for name, frame, normal, feet in (
         ("aerial-vertical", "ee", (0, 0, 1), 0),
         ("aerial-lateral", "ee", (-1, 0, 0), 0),
@@ -133,7 +132,6 @@ def test_the_contact_is_the_shape_or_the_pushed_frame() -> None:
 
 
 def test_the_feet_change_the_objective() -> None:
-    needs_mujoco()
     setup = shared_factory("solo8-push").setup
     held, free = scenario_objective(setup), scenario_objective(setup, free=True)
     assert held.supports and not free.supports
@@ -141,7 +139,6 @@ def test_the_feet_change_the_objective() -> None:
 
 
 def test_the_contact_has_the_offset_of_the_shape() -> None:
-    needs_mujoco()
     setup = shared_factory("aerial-vertical").setup
     scenario = setup.scenario
     moved = replace(scenario.shapes[0], offset=(0.0, 0.01, 0.02))
@@ -185,7 +182,6 @@ def test_compiled_equals_interpreted_and_is_built_once(which: Any, builds: list[
 
 
 def test_another_robot_or_normal_is_built_separately(builds: list[Path]) -> None:
-    needs_mujoco()
     scenario = read_scenario("aerial-vertical")
     heavier = replace(scenario, armature={"elbow_pitch": 0.05})
     first, other = scenario_objective(shared_factory("aerial-vertical").setup), scenario_objective(set_up(heavier))
@@ -213,7 +209,6 @@ def test_a_gradient_that_cannot_be_compiled_is_interpreted(
     fault: str, builds: list[Path], monkeypatch: pytest.MonkeyPatch, tmp_path: Path
 ) -> None:
     """There is one warning, and the numbers are the same."""
-    needs_mujoco()
     setup = shared_factory("aerial-vertical").setup
     if fault == "no compiler":
         monkeypatch.setenv("PATH", str(tmp_path))

@@ -21,16 +21,11 @@ from impact_posture.simulation.setup import Setup, set_up
 from impact_posture.simulation.world.actuator_command import ActuatorCommand
 from impact_posture.simulation.world.throw import FLIGHT, Throw, thrown_jumps
 from impact_posture.simulation.world.world import World, build_world
-from tests.simulation.factories import controller_factory, needs_mujoco
+from tests.simulation.factories import controller_factory
 from tests.support.helpers import Vector, frame_jacobian, mass_matrix
 
 # Robot, direction of flight and sign.
 THROWS = [("solo8-throw", (-1, 0, 0), 1), ("solo8-throw", (0.3, -0.4, -1.0), -1), ("talos-throw", (0.5, 1.0, 0.0), 1)]
-
-
-@pytest.fixture(scope="module", autouse=True)
-def _mujoco() -> None:
-    needs_mujoco()
 
 
 @functools.cache

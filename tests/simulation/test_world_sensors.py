@@ -33,8 +33,6 @@ from tests.support.helpers import assert_close, mass_matrix, random_configuratio
 from tests.support.helpers import robot as known_robot
 from tests.support.restitution import ball, ideal_restitution, measure_restitution
 
-pytest.importorskip("mujoco", reason="mujoco is not installed (the extra 'sim')")
-
 PAGE = Path(__file__).parents[2] / "docs" / "generated" / "restitution.md"
 NONE = np.zeros(0)
 IDLE = ActuatorCommand(NONE, NONE)
