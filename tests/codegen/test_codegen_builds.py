@@ -203,14 +203,23 @@ def test_example_for_eigen(arm: WorstCaseObjective, tmp_path: Path) -> None:
     assert "H = " in run(["./example_cpp"], tmp_path)
 
 
-def test_cmake_install_and_find_package(arm: WorstCaseObjective, tmp_path: Path) -> None:
-    cmake = need("cmake")
+def test_cmake_make_and_the_target_names_that_they_reserve(arm: WorstCaseObjective, tmp_path: Path) -> None:
+    cmake, make = need("cmake"), need("make")
     need_compiler()
-    source, user = tmp_path / "c", tmp_path / "user"
-    source.mkdir(), user.mkdir()
-    export(arm, source, prefix="Arm_C", posture=arm.robot.posture(), check=False)
-    run([cmake, "-S", ".", "-B", "build", f"-DCMAKE_INSTALL_PREFIX={tmp_path / 'there'}"], source)
-    run([cmake, "--build", "build", "--target", "install"], source)
+    prefixes, user = ("test", "all", "install", "clean", "Arm_C"), tmp_path / "user"
+    for folder in (*prefixes, "user"):
+        (tmp_path / folder).mkdir()
+    for prefix in prefixes:
+        export(arm, tmp_path / prefix, prefix=prefix, posture=arm.robot.posture(), check=False)
+    folders = "\n".join(f"add_subdirectory({prefix})" for prefix in prefixes)
+    (tmp_path / "CMakeLists.txt").write_text(f"cmake_minimum_required(VERSION 3.16)\nproject(user C)\n{folders}\n")
+    run([cmake, "-S", ".", "-B", "build", f"-DCMAKE_INSTALL_PREFIX={tmp_path / 'there'}"], tmp_path)
+    run([cmake, "--build", "build", "--target", "Arm_C_library"], tmp_path)
+    run([cmake, "--install", "build/Arm_C"], tmp_path)
+    run([cmake, "-S", "test", "-B", "alone"], tmp_path)
+    run([cmake, "--build", "alone"], tmp_path)
+    assert "agrees" in run(["alone/example"], tmp_path)
+    run([make, "-s", "CFLAGS=-O0", "check"], tmp_path / "all")
     (user / "CMakeLists.txt").write_text(
         "cmake_minimum_required(VERSION 3.16)\nproject(controller C)\nfind_package(Arm_C REQUIRED)\n"
         "add_executable(controller main.c)\ntarget_link_libraries(controller PRIVATE Arm_C::Arm_C)\n"
@@ -222,22 +231,6 @@ def test_cmake_install_and_find_package(arm: WorstCaseObjective, tmp_path: Path)
     run([cmake, "-S", ".", "-B", "build", f"-DCMAKE_PREFIX_PATH={tmp_path / 'there'}"], user)
     run([cmake, "--build", "build"], user)
     run(["build/controller"], user)
-
-
-def test_prefixes_that_cmake_and_make_keep_for_themselves(arm: WorstCaseObjective, tmp_path: Path) -> None:
-    cmake, make = need("cmake"), need("make")
-    need_compiler()
-    prefixes = ("test", "all", "install", "clean")
-    for prefix in prefixes:
-        (tmp_path / prefix).mkdir()
-        export(arm, tmp_path / prefix, prefix=prefix, check=False)
-    folders = "\n".join(f"add_subdirectory({prefix})" for prefix in prefixes)
-    (tmp_path / "CMakeLists.txt").write_text(f"cmake_minimum_required(VERSION 3.16)\nproject(user C)\n{folders}\n")
-    run([cmake, "-S", ".", "-B", "build"], tmp_path)
-    run([cmake, "-S", "test", "-B", "alone"], tmp_path)
-    run([cmake, "--build", "alone"], tmp_path)
-    assert "agrees" in run(["alone/example"], tmp_path)
-    run([make, "-s", "CFLAGS=-O0", "check"], tmp_path / "all")
 
 
 def test_a_prefix_that_hides_a_header_of_c(arm: WorstCaseObjective, tmp_path: Path) -> None:
