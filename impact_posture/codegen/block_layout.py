@@ -54,13 +54,7 @@ class Layout:
 
 
 def lay_out(graph: Graph, functions: Sequence[Sequence[str]], block: int = _BLOCK) -> Layout:
-    """Divide a graph.
-
-    Args:
-        graph: The operations.
-        functions: The outputs of each exported function.
-        block: Largest number of statements in a block.
-    """
+    """Divide a graph among exported ``functions`` (their outputs) and blocks of at most ``block`` statements."""
     order = _depth_first(graph, [k for names in functions for name in names for k in graph.outputs[name]])
     angles, trig = _trig(graph, order)
     leaves = frozenset(k for k in order if graph.nodes[k].op in ("const", "in", "lane") or k in trig)

@@ -63,13 +63,9 @@ class CSource:
 
 
 def build_c_source(exported: Sequence[NamedObjective], prefix: str, real: Real, *, portable: bool = False) -> CSource:
-    """Generate the functions of each objective, or read them from the user's cache.
+    """Generate the functions of objectives of one robot, or read them from the user's cache.
 
-    Args:
-        exported: The objectives, all of one robot.
-        prefix: Beginning of the names that functions share.
-        real: The number type.
-        portable: Use no vectors, for compilers without them.
+    ``portable`` code has no vectors, for compilers without them.
     """
     library = export_library(exported)
     models = [

@@ -116,13 +116,10 @@ def largest_difference(
     build_reference: Callable[[WorstCaseObjective], Reference],
     samples: int,
 ) -> float:
-    """Return the largest relative difference of a compiled export from a reference; infinite if a call fails.
+    """Return the largest relative difference of an export from a reference, at random postures and normals.
 
-    Args:
-        gradient: The export.
-        objective: The exported objective.
-        build_reference: :func:`~impact_posture.codegen.self_test.casadi_reference` or ``oracle_reference``.
-        samples: The number of random postures and normals.
+    ``build_reference`` is :func:`~impact_posture.codegen.self_test.casadi_reference` or ``oracle_reference``.  The
+    difference is infinite if a call fails.
     """
     reference = build_reference(objective)
     normals = np.random.default_rng(2).normal(size=(samples, 3))

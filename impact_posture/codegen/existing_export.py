@@ -23,12 +23,7 @@ def existing_export(objective: WorstCaseObjective, out: Path, *, build: bool) ->
     """Return the export of an objective in a folder such as ``c/`` of a result; ``None`` if there is none.
 
     The manifest may also state a posture and the compression of the impact.  Everything else must equal the output of
-    :func:`~impact_posture.codegen.export.export`.
-
-    Args:
-        objective: The objective.
-        out: The folder.
-        build: As in :func:`~impact_posture.codegen.export.write_export`.
+    :func:`~impact_posture.codegen.export.export`.  With ``build``, the library is built and checked.
 
     Raises:
         CompilerError: The compiler failed, or the numbers of its code are wrong.

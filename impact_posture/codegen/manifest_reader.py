@@ -67,10 +67,7 @@ class _Manifest(Loose):
 
 
 def read_manifest(path: Path) -> tuple[dict[str, Any], Path]:
-    """Read the manifest of an export; return it and the export's folder.
-
-    Args:
-        path: The folder, or the manifest itself.
+    """Read the manifest of an export at ``path``, the folder or the manifest; return it and the export's folder.
 
     Raises:
         SpecError: There is no manifest or more than one, or it is damaged.

@@ -47,9 +47,7 @@ class MujocoNumeric:
     def jacobian(self, site: str, offset: ArrayLike = (0.0, 0.0, 0.0)) -> Array:
         """Return ``J``, shape (6, nv), of the linear and angular velocity of a point in world axes.
 
-        Args:
-            site: The frame that carries the point.
-            offset: The point from the origin of the frame, in the axes of the frame, m, shape (3,).
+        The point is at ``offset`` from the origin of the frame ``site``, in its axes, m, shape (3,).
         """
         linear, angular = np.zeros((3, self.model.nv)), np.zeros((3, self.model.nv))
         point = np.array(self.data.site(site).xpos) + self.rotation(site) @ np.asarray(offset, dtype=float)

@@ -23,10 +23,8 @@ def template(operation: Callable[P, Result]) -> Callable[P, Result]:
     """Decorate an operation: its expressions are built once for each size of arguments, and then reused.
 
     A tree applies a few operations to every joint, and calls from Python would take most of the time.  CasADi inserts
-    the arguments into the expressions, and simplifies products with their zeros and ones.
-
-    Args:
-        operation: Function of ``SX`` matrices that returns one matrix or a tuple.  Keyword arguments are options.
+    the arguments into the expressions, and simplifies products with their zeros and ones.  ``operation`` takes ``SX``
+    matrices, with options as keyword arguments, and returns a matrix or a tuple.
     """
     functions: dict[tuple[object, ...], ca.Function] = {}
 

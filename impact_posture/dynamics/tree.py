@@ -120,11 +120,9 @@ class Tree(Kinematics):
         return ca.vertcat(force, moment + cross(position, force))
 
     def generalized_force(self, wrenches: Sequence[Wrench], gravity: ca.SX | None = None) -> ca.SX:
-        """Return ``Σ Jᵀ [force; moment]`` of the wrenches and, with ``gravity``, of the weights, shape (nv,).
+        """Return ``Σ Jᵀ [force; moment]`` of the wrenches, and of the weights under ``gravity``, shape (nv,).
 
-        Args:
-            wrenches: The wrenches.
-            gravity: Acceleration of gravity in world axes, shape (3,).
+        ``gravity`` is an acceleration in world axes, shape (3,).
         """
         forces: ByJoint = dict.fromkeys(self._R, _ZERO)
         if gravity is not None:

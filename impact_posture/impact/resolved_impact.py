@@ -168,8 +168,7 @@ class ResolvedImpact:
     def to_dict(self, q: Array | None = None) -> dict[str, object]:
         """Return the blocks of ``result.json`` that state the impact: robot, contacts, supports, metric.
 
-        Args:
-            q: Posture at which normals that turn with the robot are stated in world axes; by default :attr:`q`.
+        Normals are in world axes at ``q``, by default at :attr:`q`.
         """
         q = self.q if q is None else q
         return {

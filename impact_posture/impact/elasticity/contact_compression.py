@@ -182,11 +182,7 @@ def compression(
 ) -> Compression | None:
     """Return T, peak force and x of the impact at the leading contact; ``None`` if all of them are unknown.
 
-    Args:
-        objective: Robot, contact, metric, kind and supports.
-        q: Configuration, shape (nq,).
-        speed: Approach speed, m/s.
-        contact: The contact; ``None`` gives x for each material.
+    ``q`` has shape (nq,), and ``speed`` is the approach speed, m/s.  Without a ``contact``, x is for each material.
     """
     springs = springs_along(objective.case, q)
     quantities = objective.oracle.quantities(q)
@@ -212,8 +208,7 @@ def compression(
 def springs_along(case: ImpactCase, q: Array) -> tuple[float, float] | None:
     """Return ``G = jM⁻¹jᵀ`` of the links alone, 1/kg, and ``C = jK⁻¹jᵀ`` of the joint springs, m/N.
 
-    Returns:
-        ``None`` if no spring of known stiffness yields to the contact.
+    ``None`` if no spring of known stiffness yields to the contact.
     """
     try:
         compliance = ElasticImpact(case).compliance(q)

@@ -167,13 +167,7 @@ class QuadraticKind(ImpactKind):
         return self.factor * form
 
     def lift_direction(self, tree: Tree, n: ca.SX, label: str) -> UnknownJump:
-        """Return the unknown jump of one direction of the form.
-
-        Args:
-            tree: The tree at the program's configuration.
-            n: The direction in the axes of the contact's normal, shape (3,).
-            label: Suffix of the names of the unknowns.
-        """
+        """Return the unknown jump of a direction ``n`` of the form, in the axes of the normal, shape (3,)."""
         return self.unknowns(tree, n, label)
 
     def lift_entry(self, world: ca.SX, first: UnknownJump, second: UnknownJump) -> ca.SX:

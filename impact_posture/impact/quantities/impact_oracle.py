@@ -138,9 +138,7 @@ class ImpactOracle:
     def gradient_H(self, q: Array, normal: Array | None = None) -> Array:
         """Return the tangent gradient of H, shape (nv,).
 
-        Args:
-            q: Configuration, shape (nq,).
-            normal: Normal in the axes of the contact's normal, shape (3,); by default the contact's normal.
+        ``normal`` replaces the contact's normal, in the same axes, shape (3,).
         """
         self.at(q)
         normal, n = self._normals(normal)

@@ -21,7 +21,7 @@ class ImpactQuantities:
         G: ``nᵀJM⁻¹Jᵀn = 1/m_eff``, 1/kg.
         V: ``H/G²``, squared jump per squared approach speed (frictionless, e = 0).
         S: Squared jump per squared approach speed if the contact sticks; ``None`` where it does not exist.
-        E: ``1/(2G)``, energy dissipated per squared approach speed, kg.
+        E: ``1/(2G)``, energy dissipated per squared approach speed (e = 0), half the effective mass, kg.
         jump: ``a = M⁻¹Jᵀn``, shape (nv,).
         sticking_jump: Jump per unit approach speed of a contact that sticks, shape (nv,), or ``None``.
         sticking_impulse: Impulse per unit approach speed of a contact that sticks, world, shape (3,), or ``None``.
@@ -52,15 +52,7 @@ class ImpactQuantities:
 
 @dataclass(frozen=True)
 class Scalars:
-    """H, G, V, S and E of an impact; ``None`` for a value that does not exist.
-
-    Attributes:
-        H: Squared jump per squared impulse.
-        G: Inverse effective mass along the normal, 1/kg.
-        V: Squared jump per squared approach speed, frictionless, e = 0.
-        S: Squared jump per squared approach speed if the contact point sticks.
-        E: Energy dissipated per squared approach speed, e = 0, which is half the effective mass, kg.
-    """
+    """H, G, V, S and E as in :class:`ImpactQuantities`; ``None`` for a value that does not exist."""
 
     H: float
     G: float

@@ -74,12 +74,9 @@ def cone_axes(n: Array) -> Array:
 
 
 def worst_normal(A: Array, axis: Array, cone_deg: float) -> WorstNormal:
-    """Maximize ``nᵀAn`` over the unit vectors within ``cone_deg`` of ``axis``.
+    """Maximize ``nᵀAn`` over the unit vectors within ``cone_deg`` degrees (0 < α < 90) of ``axis``.
 
-    Args:
-        A: Symmetric, shape (3, 3); of either sign.
-        axis: Unit vector, shape (3,).
-        cone_deg: Half angle of the cone, 0 < α < 90 degrees.
+    ``A`` is symmetric and may be indefinite, shape (3, 3).  ``axis`` is a unit vector, shape (3,).
     """
     alpha = np.deg2rad(cone_deg)
     c, s = float(np.cos(alpha)), float(np.sin(alpha))
