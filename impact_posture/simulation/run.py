@@ -159,7 +159,7 @@ class _Loop:
         return np.array(speeds)
 
     def _in_c(self, n: int, reference: Reference | None) -> Array:
-        assert self.compiled is not None  # noqa: S101 (the caller has asked)
+        assert self.compiled is not None  # noqa: S101 (the caller has checked it)
         distances: list[float] = []
         levels: list[float] = []
         # A driver that overrides `level` knows it before the tick.

@@ -98,8 +98,6 @@ def _check_base(robot: Robot, scenario: Scenario) -> None:
         raise SpecError(f"{robot.name} would fall: it has no rotors and {missing}", where=scenario.source, hint=feet)
     rank = allocation(robot.model, propulsion).rank
     if rank < 6:
-        raise SpecError(
-            f"the rotors of {robot.name} push and turn its base in {rank} of 6 directions",
-            where=scenario.source,
-            hint="the controllers need all 6: tilt the rotors, or take another robot",
-        )
+        what = f"the rotors of {robot.name} push and turn its base in {rank} of 6 directions"
+        hint = "the controllers need all 6: tilt the rotors, or take another robot"
+        raise SpecError(what, where=scenario.source, hint=hint)

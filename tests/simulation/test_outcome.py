@@ -66,7 +66,7 @@ def test_links_without_shapes_behind_a_surface_are_a_warning() -> None:
     data = setup.robot.model.createData()
     pin.forwardKinematics(setup.robot.model, data, setup.q)
     elbow = n @ (data.oMi[setup.robot.joint_id("elbow_pitch")].translation - point)
-    for depth, told in ((0.01, False), (0.05, True)):
+    for depth, reported in ((0.01, False), (0.05, True)):
         q = np.tile(setup.q, (1000, 1))
         q[600:700, :3] -= (elbow + depth) * n
         # The elbow has the shape, which the surface stops.  The joints above are still in front of the surface.
@@ -74,7 +74,7 @@ def test_links_without_shapes_behind_a_surface_are_a_warning() -> None:
         q[600:700, :3] = setup.q[:3] - ((setup.q[:3] - point) @ n + depth) * n
         warnings = links_behind(setup, [Run(by_hand(setup, 1000, q=q), ())])
         assert bool(warnings) and f"the surface '{surface}'" in warnings[0] and "shoulder" in warnings[0]
-        assert ("root_joint" in warnings[0]) is told
+        assert ("root_joint" in warnings[0]) is reported
     assert links_behind(setup, [Run(by_hand(setup, 1000), ())]) == ()
 
 

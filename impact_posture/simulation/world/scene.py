@@ -167,11 +167,8 @@ class Scene(StrictTable):
             slow = (("the time constant", a, 2), ("its product with the damping ratio", a * b, 1))
             for words, value, least in slow if a > 0 else (("1/√k", (-a) ** -0.5, 1),):
                 if value < least * step * (1 - 1e-9):
-                    raise InputError(
-                        f"solref {[a, b]}: {words} is {value:.3g} s, below {least} × the time step of {step:g} s",
-                        where=name,
-                        hint="raise it, or lower the time step",
-                    )
+                    what = f"solref {[a, b]}: {words} is {value:.3g} s, below {least} × the time step of {step:g} s"
+                    raise InputError(what, where=name, hint="raise it, or lower the time step")
         frame, frames = self.sensors.force_frame, [s.frame for s in self.shapes]
         if frame is not None and frame not in frames:
             hint = f"one of: {', '.join(frames)}" if frames else "add a shape"
