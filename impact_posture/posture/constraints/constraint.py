@@ -172,12 +172,7 @@ class Constraint(ABC):
         return Guess(np.zeros(0), np.zeros(0))
 
     def linearize(self, model: Numeric, auxiliaries: Array) -> Linearization:
-        """Return the rows at ``model.q`` by Pinocchio, without rows that are far from their bounds.
-
-        Args:
-            model: The model at the posture.
-            auxiliaries: Values of the auxiliaries of :meth:`lift`, shape (k,).
-        """
+        """Return the rows at ``model.q`` and auxiliaries, shape (k,); rows far from their bounds may be left out."""
         value, jacobian = self.evaluate(model)
         names = [self.row_name(row) for row in range(self.rows)]
         return Linearization(names, value, self.lower, self.upper, jacobian, np.zeros((self.rows, 0)))
@@ -185,9 +180,7 @@ class Constraint(ABC):
     def grown(self, model: Numeric, auxiliaries: Array | None = None) -> Self:
         """Return the constraint with the parts that its program lacks at ``model.q``, or itself if none are missing.
 
-        Args:
-            model: The model at the posture.
-            auxiliaries: The auxiliaries of the program, shape (k,), if the posture is the end of a run.
+        If the posture is the end of a run, ``auxiliaries`` are the values of the program there, shape (k,).
         """
         return self
 

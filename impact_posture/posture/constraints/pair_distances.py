@@ -136,11 +136,6 @@ def _corners(body: ConvexBody) -> Array:
 
 
 def _moved(now: Array, then: Array) -> Array:
-    """Return the largest motion ``|Δc| + |ΔR| r`` of a point of each body, m, shape (k,).
-
-    Args:
-        now: Axes ``R`` times reach ``r``, and center ``c`` of each body, shape (k, 12).
-        then: These values at the earlier posture.
-    """
+    """Return the largest motion ``|Δc| + |ΔR| r`` of a point of each body between :meth:`_places`, m, shape (k,)."""
     change = (now - then) ** 2
     return np.asarray(np.sqrt(change[:, 9:].sum(axis=1)) + np.sqrt(change[:, :9].sum(axis=1)))

@@ -88,13 +88,7 @@ class ConvexBody:
         return np.asarray(self.point.placement.act(center)) if self.turns else center
 
     def rates(self, model: Numeric, direction: Array, positions: Array) -> Array:
-        """Return the tangent gradients of the heights of points of the body, shape (k, nv).
-
-        Args:
-            model: The model at the posture.
-            direction: Direction ``n`` of the heights ``n·x``, world, shape (3,).
-            positions: Places of the points in the world, shape (k, 3).
-        """
+        """Return the tangent gradients, shape (k, nv), of heights ``direction·x`` at world ``positions``, (k, 3)."""
         if self.point.joint == 0:
             return np.zeros((len(positions), model.model.nv))
         J = model.jacobian(self.point)
@@ -250,9 +244,7 @@ class SeparatingPlane:
     def linearize(self, model: Numeric, unknowns: Array | None) -> Linearization:
         """Return the rows of corners near the plane over the tangent space and (n, c); see :class:`Constraint`.
 
-        Args:
-            model: The model at the posture.
-            unknowns: Unknowns of :meth:`lift`; ``None`` for the plane between the closest points.
+        The plane is given by the unknowns of :meth:`lift`; ``None`` stands for the plane between the closest points.
         """
         if unknowns is not None and not self.known:
             rows = self.linearize_at(model, unknowns[:3], float(unknowns[3]))

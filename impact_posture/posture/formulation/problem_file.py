@@ -67,11 +67,7 @@ def read_settings(path: Path, over: dict[str, object] | None = None) -> ProblemS
 
 
 def prepare(settings: ProblemSettings, impact: ResolvedImpact | None = None) -> Prepared:
-    """Resolve all defaults and build the problem without solving it.
-
-    Args:
-        settings: The settings of the problem.
-        impact: The impact, if it is resolved already.
+    """Resolve all defaults (and the impact, if the caller has none) and build the problem without solving it.
 
     Raises:
         ImpactPostureError: A setting is wrong; the error names the first fault in one line.

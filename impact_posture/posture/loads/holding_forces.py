@@ -54,14 +54,7 @@ class HoldingForces:
 
     @staticmethod
     def of(load: str, rest: Equilibrium, unreachable: Array, q: Array) -> HoldingForces:
-        """Distribute the forces at ``q``.
-
-        Args:
-            load: The load in words.
-            rest: The robot at rest under it.
-            unreachable: Combinations of the base wrench that the rotors cannot make, shape (k, 6).
-            q: The posture, shape (nq,).
-        """
+        """Distribute the forces at ``q``; rotors cannot make the base wrenches in ``unreachable``, shape (k, 6)."""
         distribution = rest.distribute(q)
         z, shares = distribution.forces, distribution.shares
         unbalanced = distribution.unbalanced

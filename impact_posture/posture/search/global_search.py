@@ -273,25 +273,19 @@ def _mapped(
 
 
 def unseen_share(hits: Sequence[int]) -> float:
-    """Return the share of further starts that would end in an optimum not seen yet.
+    """Return the share of further starts that would end in an optimum not seen yet, from the hits of each optimum.
 
     This is the Good–Turing estimate, the share of starts that ended in an optimum with one hit (I. J. Good, "The
     population frequencies of species and the estimation of population parameters", Biometrika 1953).
-
-    Args:
-        hits: Number of starts that ended in each optimum, at least one.
     """
     return sum(count == 1 for count in hits) / sum(hits)
 
 
 def estimated_optima(hits: Sequence[int]) -> float:
-    """Return an estimate of the number of optima, seen and unseen, that tends to be low.
+    """Return an estimate of the number of optima, seen and unseen, that tends to be low, from the hits of each.
 
     This is the bias-corrected Chao1 estimate ``n + f₁(f₁ − 1)/(2(f₂ + 1))`` with the numbers ``f_k`` of optima with k
     hits (A. Chao, "Nonparametric estimation of the number of classes in a population", Scand. J. Statist. 1984).
-
-    Args:
-        hits: Number of starts that ended in each optimum.
     """
     once, twice = (sum(count == k for count in hits) for k in (1, 2))
     return len(hits) + once * (once - 1) / (2 * (twice + 1))

@@ -269,12 +269,6 @@ class GrowingSearch:
 
 
 def feasible(problem: ConstrainedProblem, q: Array, numeric: Numeric | None = None) -> bool:
-    """Return whether ``q`` satisfies all constraints, also constraints that the program lacks.
-
-    Args:
-        problem: The posture problem.
-        q: The posture, shape (nq,).
-        numeric: The model, if the caller has it; it is moved.
-    """
+    """Return whether ``q``, shape (nq,), satisfies all constraints, also constraints that the program lacks."""
     violations = problem.violations((numeric or Numeric(problem.robot.model)).at(q))
     return all(float(np.abs(excess).max(initial=0.0)) <= FEASIBLE for excess in violations)
