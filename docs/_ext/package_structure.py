@@ -1,8 +1,12 @@
-"""``package-structure``: files, lines and imports of each folder of the library, counted when the pages are built."""
+"""Tables of the library that are counted or read when the pages are built.
+
+``package-structure`` has the files, lines and imports of each folder, ``module-map`` the first sentence of each module.
+"""
 
 from __future__ import annotations
 
 import ast
+import re
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
@@ -67,6 +71,23 @@ def markdown() -> str:
     return "\n".join(rows)
 
 
+def module_map() -> str:
+    """Write a table for each folder, with the first paragraph of the docstring of each module."""
+    folders: dict[Path, list[Path]] = {}
+    for path in sorted(p for folder in PACKAGES.values() for p in folder.rglob("*.py") if p.name != "__init__.py"):
+        folders.setdefault(path.parent, []).append(path)
+    parts = []
+    for folder, paths in sorted(folders.items()):
+        parts += [f"### `{folder.relative_to(ROOT)}/`", "", "| module | content |", "|---|---|"]
+        for path in paths:
+            text = ast.get_docstring(ast.parse(path.read_text(encoding="utf-8"))) or ""
+            sentence = " ".join(text.split("\n\n")[0].split()).replace("``", "`").replace("|", "\\|")
+            parts.append(f"| `{path.name}` | {re.sub(':[a-z]+:', '', sentence)} |")
+        parts.append("")
+    return "\n".join(parts)
+
+
 def setup(app: Sphinx) -> dict[str, Any]:
     """Register the directive."""
+    add_directive(app, "module-map", lambda _: module_map())
     return add_directive(app, "package-structure", lambda _: markdown())
