@@ -37,7 +37,7 @@ def fill_optional(arguments: Sequence[str]) -> list[str]:
         filled.append(word)
         if word in _OPTIONAL and not _OPTIONAL[word].match(following):
             # Imported here, because --help does without.
-            from impact_posture.config.settings import TRADEOFF_POINTS
+            from impact_posture.config.problem_settings import TRADEOFF_POINTS
 
             filled.append(str(TRADEOFF_POINTS) if word == "--tradeoff" else "")
     return filled

@@ -12,8 +12,8 @@ from typing import Annotated, Any, TypeVar, Union, get_args, get_origin, get_typ
 
 import typer
 
+from impact_posture.config.problem_settings import RobotSettings
 from impact_posture.config.setting import CONTACT, LIMITS, METRIC, ROBOT, SEARCH, TASK, Setting
-from impact_posture.config.settings import RobotSettings
 from impact_posture.config.table_validation import validate
 from impact_posture.errors import ImpactPostureError
 from impact_posture_cli.error_boundary import UsageError

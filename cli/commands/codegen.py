@@ -10,7 +10,7 @@ from dataclasses import fields
 from pathlib import Path
 from typing import TYPE_CHECKING
 
-from impact_posture.config.settings import ImpactSettings, LoadOptions, RobotSettings
+from impact_posture.config.problem_settings import ImpactSettings, LoadOptions, RobotSettings
 from impact_posture_cli import options
 from impact_posture_cli.error_boundary import UsageError
 from impact_posture_cli.output import Page, print_json

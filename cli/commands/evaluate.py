@@ -4,7 +4,7 @@ from __future__ import annotations
 
 from typing import TYPE_CHECKING
 
-from impact_posture.config.settings import ImpactSettings
+from impact_posture.config.problem_settings import ImpactSettings
 from impact_posture_cli import options
 from impact_posture_cli.impact_tables import alone_line, contact_names, impact_rows, worst_lines, worst_tables
 from impact_posture_cli.output import Page, number, print_json, vector

@@ -5,15 +5,15 @@ from __future__ import annotations
 from pathlib import Path
 from typing import TYPE_CHECKING, Annotated, Any
 
+from impact_posture.config.problem_settings import RobotSettings
 from impact_posture.config.setting import OUTPUT
-from impact_posture.config.settings import RobotSettings
 from impact_posture_cli import options
 from impact_posture_cli.error_boundary import UsageError
 from impact_posture_cli.output import Page, number, print_json
 from impact_posture_cli.settings_options import TypedSettings, with_settings
 
 if TYPE_CHECKING:
-    from impact_posture.config.settings import LoadOptions
+    from impact_posture.config.problem_settings import LoadOptions
 
 
 WriteRobotToml = Annotated[

@@ -9,7 +9,7 @@ from typing import TYPE_CHECKING, Annotated
 
 import typer
 
-from impact_posture.config.settings import ProblemSettings
+from impact_posture.config.problem_settings import ProblemSettings
 from impact_posture_cli import options
 from impact_posture_cli.optimize_summary import announce, summarize
 from impact_posture_cli.output import Page, print_json

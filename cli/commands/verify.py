@@ -9,8 +9,8 @@ from typing import TYPE_CHECKING, Annotated
 import typer
 
 from impact_posture.config.demand import Direction, Vector3
+from impact_posture.config.problem_settings import ImpactSettings
 from impact_posture.config.setting import CONTACT, OUTPUT
-from impact_posture.config.settings import ImpactSettings
 from impact_posture_cli import options
 from impact_posture_cli.output import Page, complain, print_json
 from impact_posture_cli.progress_line import progress

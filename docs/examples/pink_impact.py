@@ -23,7 +23,7 @@ from pink.tasks import FrameTask, Task
 
 from impact_posture.codegen.export import export
 from impact_posture.codegen.impact_gradient import ImpactGradient
-from impact_posture.config.settings import ProblemSettings
+from impact_posture.config.problem_settings import ProblemSettings
 from impact_posture.config.table_validation import validate
 from impact_posture.posture.formulation.problem_file import Prepared, prepare
 from impact_posture.posture.search.multistart import PostureSolution, solve

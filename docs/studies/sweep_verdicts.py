@@ -13,7 +13,7 @@ from collections.abc import Iterator
 from itertools import product
 from pathlib import Path
 
-from impact_posture.config.settings import ProblemSettings
+from impact_posture.config.problem_settings import ProblemSettings
 from impact_posture.dynamics.numeric import Numeric
 from impact_posture.errors import ImpactPostureError
 from impact_posture.impact.impact_contact import point_on

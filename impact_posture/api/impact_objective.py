@@ -12,7 +12,7 @@ from numpy.typing import ArrayLike
 
 from impact_posture.config.checked import checked
 from impact_posture.config.demand import Factors, HalfAngle, NonNegative
-from impact_posture.config.settings import JointModel, MetricKind, ObjectiveKind
+from impact_posture.config.problem_settings import JointModel, MetricKind, ObjectiveKind
 from impact_posture.errors import InputError
 from impact_posture.impact.evaluation.evaluation import Evaluation, evaluate
 from impact_posture.impact.impact_contact import ImpactContact

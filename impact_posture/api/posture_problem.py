@@ -9,7 +9,7 @@ from typing import Any
 import numpy as np
 
 from impact_posture.config.checked import checked
-from impact_posture.config.settings import (
+from impact_posture.config.problem_settings import (
     ImpactSettings,
     ProblemSettings,
     RobotSettings,
@@ -40,7 +40,7 @@ class PostureProblem:
         posture: Start of the search: a name, a file, or a configuration (nq,); ``None`` for the default posture.
         speed: Approach speed of the predicted jumps, m/s.
         restitution: Coefficient of restitution of the predicted jumps.
-        task: Other fields of :class:`~impact_posture.config.settings.ProblemSettings` about the task, such as
+        task: Other fields of :class:`~impact_posture.config.problem_settings.ProblemSettings` about the task, such as
             ``base="level"``, ``target_position=(x, y, z)``, ``keep_contacts=True`` or ``hold=("joint",)``.
 
     Attributes:

@@ -13,7 +13,7 @@ import numpy as np
 from impact_posture.api.posture_problem import PostureProblem
 from impact_posture.config.checked import checked
 from impact_posture.config.demand import OneOrMore, ZeroOrMore
-from impact_posture.config.settings import Against, Search
+from impact_posture.config.problem_settings import Against, Search
 from impact_posture.errors import InputError
 from impact_posture.output.result_folder import FORMATS, Written, finish_result
 from impact_posture.output.result_reader import SolvedPostures, result_view

@@ -19,7 +19,7 @@ from impact_posture.codegen.export_files import environment
 from impact_posture.codegen.expression_graph import graph_of
 from impact_posture.codegen.manifest_builder import configuration_names
 from impact_posture.codegen.sum_order import reorder_sums
-from impact_posture.config.settings import Vector3
+from impact_posture.config.problem_settings import Vector3
 from impact_posture.controller_export.controller_parameters import RULES, Field
 from impact_posture.controller_export.controller_structure import Structure
 from impact_posture.controller_export.moving_tree import MovingTree

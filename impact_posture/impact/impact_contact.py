@@ -9,7 +9,7 @@ import numpy as np
 
 from impact_posture.config.checked import checked
 from impact_posture.config.demand import Direction, FiniteVector, Vector3, between
-from impact_posture.config.settings import FRICTION, NormalFrame
+from impact_posture.config.problem_settings import FRICTION, NormalFrame
 from impact_posture.dynamics.tree import PointOnLink
 from impact_posture.errors import ContactError
 from impact_posture.robot.robot import Robot

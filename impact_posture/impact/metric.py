@@ -11,7 +11,7 @@ import numpy as np
 
 from impact_posture.config.checked import checked
 from impact_posture.config.demand import Positive
-from impact_posture.config.settings import MetricKind
+from impact_posture.config.problem_settings import MetricKind
 from impact_posture.config.table_validation import read_toml
 from impact_posture.errors import MetricError
 from impact_posture.robot.model_joints import v_slice

@@ -4,7 +4,7 @@ from __future__ import annotations
 
 from dataclasses import dataclass
 
-from impact_posture.config.settings import ImpactSettings, ObjectiveKind, Vector3
+from impact_posture.config.problem_settings import ImpactSettings, ObjectiveKind, Vector3
 from impact_posture.config.text_parsers import parse_contact
 from impact_posture.errors import ContactError, FrameNotFound
 from impact_posture.impact.elasticity.contact_compression import ContactStiffness

@@ -7,7 +7,7 @@ from typing import get_args
 
 import numpy as np
 
-from impact_posture.config.settings import SupportKind
+from impact_posture.config.problem_settings import SupportKind
 from impact_posture.errors import ContactError, FrameNotFound, InputError
 from impact_posture.impact.impact_contact import ImpactContact, point_on
 from impact_posture.robot.guessed_parts import feet

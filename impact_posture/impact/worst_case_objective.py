@@ -10,7 +10,7 @@ import numpy as np
 
 from impact_posture.config.checked import checked
 from impact_posture.config.demand import HalfAngle, NonNegative
-from impact_posture.config.settings import ObjectiveKind
+from impact_posture.config.problem_settings import ObjectiveKind
 from impact_posture.dynamics.tree import Tree
 from impact_posture.impact.impact_case import ImpactCase
 from impact_posture.impact.impact_contact import ImpactContact

@@ -11,7 +11,7 @@ from typing import TYPE_CHECKING, Any
 
 import numpy as np
 
-from impact_posture.config.settings import Against
+from impact_posture.config.problem_settings import Against
 from impact_posture.errors import SpecError, shown
 from impact_posture.posture.analysis.result_document import SCHEMA
 from impact_posture.posture.formulation.problem_file import Prepared, prepare, read_settings

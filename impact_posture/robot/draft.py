@@ -10,7 +10,7 @@ from pathlib import Path
 
 import numpy as np
 
-from impact_posture.config.settings import LoadOptions, Root
+from impact_posture.config.problem_settings import LoadOptions, Root
 from impact_posture.errors import InputError, OutputError
 from impact_posture.robot import guessed_parts as guess
 from impact_posture.robot.draft_text import Draft, comment_lines

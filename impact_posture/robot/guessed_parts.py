@@ -10,7 +10,7 @@ from pathlib import Path
 
 import pinocchio as pin
 
-from impact_posture.config.settings import Root
+from impact_posture.config.problem_settings import Root
 from impact_posture.errors import PostureError
 from impact_posture.robot.model_joints import joint_range
 from impact_posture.robot.named_postures import states_with_base

@@ -14,7 +14,7 @@ import numpy as np
 import pinocchio as pin
 from numpy.typing import NDArray
 
-from impact_posture.config.settings import JointModel
+from impact_posture.config.problem_settings import JointModel
 from impact_posture.errors import InputError
 from impact_posture.robot.inertia_checks import check_mass_matrix
 from impact_posture.robot.model_joints import joint_index, v_slice

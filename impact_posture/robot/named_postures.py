@@ -8,7 +8,7 @@ from pathlib import Path
 import numpy as np
 import pinocchio as pin
 
-from impact_posture.config.settings import Root
+from impact_posture.config.problem_settings import Root
 from impact_posture.errors import SpecError, UrdfError
 from impact_posture.robot.model_joints import joint_index, q_slice, scalar_entries
 from impact_posture.robot.robot_spec import RobotSpec

@@ -10,7 +10,7 @@ import numpy as np
 import pinocchio as pin
 
 from impact_posture.config.checked import checked
-from impact_posture.config.settings import ContactPose, JointModel, RobotSettings, Root
+from impact_posture.config.problem_settings import ContactPose, JointModel, RobotSettings, Root
 from impact_posture.errors import (
     FrameNotFound,
     JointLocked,

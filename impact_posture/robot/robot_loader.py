@@ -13,7 +13,7 @@ import numpy as np
 import pinocchio as pin
 
 from impact_posture.config.checked import checked
-from impact_posture.config.settings import LoadOptions, RobotSettings, Root, Vector3
+from impact_posture.config.problem_settings import LoadOptions, RobotSettings, Root, Vector3
 from impact_posture.config.table_validation import validate
 from impact_posture.errors import InputError, JointNotFound, PackageNotFound, RobotNotFound, SpecError, UrdfError
 from impact_posture.robot.armature import armature_warning, set_armature
@@ -38,7 +38,7 @@ def load_robot(robot: str, options: LoadOptions | None = None, **settings: Any) 
     Args:
         robot: Name, path or URI.
         options: Options of loading.
-        settings: Fields of :class:`~impact_posture.config.settings.LoadOptions` in place of ``options``, such as
+        settings: Fields of :class:`~impact_posture.config.problem_settings.LoadOptions` in place of ``options``, such as
             ``root="fixed"``.
 
     Raises:

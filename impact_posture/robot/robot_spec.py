@@ -8,7 +8,7 @@ from typing import Any, ClassVar, Literal
 
 from impact_posture.config.checked import checked
 from impact_posture.config.demand import NonNegative, Positive, Vector3
-from impact_posture.config.settings import ContactPose, Root, SupportKind, TransmissionKind
+from impact_posture.config.problem_settings import ContactPose, Root, SupportKind, TransmissionKind
 from impact_posture.config.table_validation import read_toml, validate
 from impact_posture.errors import SpecError, shown
 

@@ -6,7 +6,7 @@ from dataclasses import dataclass, replace
 
 import numpy as np
 
-from impact_posture.config.settings import FRICTION, ProblemSettings
+from impact_posture.config.problem_settings import FRICTION, ProblemSettings
 from impact_posture.dynamics.chart import Chart
 from impact_posture.dynamics.numeric import Numeric
 from impact_posture.errors import Infeasible, SolverFailed

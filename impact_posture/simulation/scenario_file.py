@@ -12,7 +12,7 @@ import numpy as np
 
 from impact_posture.config.checked import checked
 from impact_posture.config.demand import Direction, Finite, NonNegative, OneOrMore, Positive, Share, Vector3
-from impact_posture.config.settings import FRICTION, RobotSettings
+from impact_posture.config.problem_settings import FRICTION, RobotSettings
 from impact_posture.config.table_validation import StrictTable, read_toml, validate
 from impact_posture.errors import InputError, ScenarioNotFound, SpecError, shown
 from impact_posture.robot.robot_loader import from_folder

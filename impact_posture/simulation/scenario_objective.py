@@ -13,7 +13,7 @@ import numpy as np
 
 from impact_posture.codegen.export import write_export
 from impact_posture.codegen.impact_gradient import ImpactGradient
-from impact_posture.config.settings import ObjectiveKind
+from impact_posture.config.problem_settings import ObjectiveKind
 from impact_posture.errors import MetricError, OutputError
 from impact_posture.impact.impact_contact import ImpactContact
 from impact_posture.impact.metric import Metric

@@ -15,7 +15,7 @@ from matplotlib.lines import Line2D
 from matplotlib.patches import Patch, Rectangle
 from numpy.typing import NDArray
 
-from impact_posture.config.settings import ProblemSettings
+from impact_posture.config.problem_settings import ProblemSettings
 from impact_posture.config.table_validation import validate
 from impact_posture.errors import InputError, SpecError, nearest
 from impact_posture.output.plot.style import GRAY, INK, PALE, VERMILLION, framed, save, shared_legend

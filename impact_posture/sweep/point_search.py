@@ -8,7 +8,7 @@ from typing import Any, NamedTuple
 
 import numpy as np
 
-from impact_posture.config.settings import ProblemSettings
+from impact_posture.config.problem_settings import ProblemSettings
 from impact_posture.errors import ImpactPostureError, Infeasible, SolverFailed
 from impact_posture.posture.formulation.build_problem import retarget
 from impact_posture.posture.manifold.feasible_start import FEASIBLE, Projector, random_posture

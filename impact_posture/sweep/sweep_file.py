@@ -13,7 +13,7 @@ from typing import Annotated, Any, Literal
 import numpy as np
 
 from impact_posture.config.demand import between
-from impact_posture.config.settings import ProblemSettings
+from impact_posture.config.problem_settings import ProblemSettings
 from impact_posture.config.table_validation import StrictTable, read_toml, validate
 from impact_posture.errors import SpecError, nearest, printable
 from impact_posture.impact.impact_contact import LARGEST

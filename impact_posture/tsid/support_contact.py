@@ -11,7 +11,7 @@ import pinocchio as pin
 
 from impact_posture.config.checked import checked
 from impact_posture.config.demand import NonNegative, Positive
-from impact_posture.config.settings import SupportKind
+from impact_posture.config.problem_settings import SupportKind
 from impact_posture.errors import ContactError
 from impact_posture.robot.robot import Robot
 from impact_posture.system.arrays import Array

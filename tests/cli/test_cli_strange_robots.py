@@ -9,7 +9,7 @@ from typing import Any
 import pytest
 import typer.main
 
-from impact_posture.config.settings import ImpactSettings, LoadOptions
+from impact_posture.config.problem_settings import ImpactSettings, LoadOptions
 from impact_posture.errors import FrameNotFound, InertiaError, JointNotFound, not_one_of
 from impact_posture.impact.resolved_impact import resolve
 from impact_posture.posture.formulation.problem_file import prepare, resolved_settings

@@ -19,7 +19,7 @@ from impact_posture.codegen.compile_and_check import largest_difference
 from impact_posture.codegen.export import Export, export
 from impact_posture.codegen.export_files import Verbatim, environment
 from impact_posture.codegen.self_test import casadi_reference, oracle_reference, sample_postures
-from impact_posture.config.settings import ObjectiveKind
+from impact_posture.config.problem_settings import ObjectiveKind
 from impact_posture.impact.impact_contact import ImpactContact
 from impact_posture.impact.metric import Metric
 from impact_posture.impact.worst_case_objective import WorstCaseObjective

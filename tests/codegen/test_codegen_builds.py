@@ -17,7 +17,7 @@ from impact_posture.codegen.compile_and_check import largest_difference
 from impact_posture.codegen.export import export, write_export
 from impact_posture.codegen.impact_gradient import ImpactGradient
 from impact_posture.codegen.self_test import casadi_reference, oracle_reference, sample_postures, self_test_tolerance
-from impact_posture.config.settings import LoadOptions
+from impact_posture.config.problem_settings import LoadOptions
 from impact_posture.errors import CompilerError, InputError, OutputError
 from impact_posture.impact.impact_contact import ImpactContact
 from impact_posture.impact.metric import Metric

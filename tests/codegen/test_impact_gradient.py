@@ -18,7 +18,7 @@ from impact_posture.codegen.c_literals import DOUBLE, FLOAT, Real
 from impact_posture.codegen.export import export
 from impact_posture.codegen.impact_gradient import ImpactGradient
 from impact_posture.codegen.self_test import sample_postures
-from impact_posture.config.settings import LoadOptions
+from impact_posture.config.problem_settings import LoadOptions
 from impact_posture.errors import (
     CompilerError,
     FrameNotFound,

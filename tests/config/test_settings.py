@@ -8,7 +8,7 @@ from typing import Any
 
 import pytest
 
-from impact_posture.config.settings import ProblemSettings
+from impact_posture.config.problem_settings import ProblemSettings
 from impact_posture.config.table_validation import validate
 from impact_posture.errors import SpecError
 from impact_posture.posture.formulation.problem_file import dump_settings, prepare, read_settings, resolved_settings

@@ -12,7 +12,7 @@ from typing import get_args, get_type_hints
 
 import pytest
 
-from impact_posture.config.settings import ContactPose, ProblemSettings
+from impact_posture.config.problem_settings import ContactPose, ProblemSettings
 from impact_posture.posture.analysis.pareto_front import pareto_front
 from impact_posture.posture.analysis.result_document import result_document
 from impact_posture.posture.formulation.problem_file import prepare

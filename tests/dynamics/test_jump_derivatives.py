@@ -6,7 +6,7 @@ import casadi as ca
 import numpy as np
 import pytest
 
-from impact_posture.config.settings import ProblemSettings
+from impact_posture.config.problem_settings import ProblemSettings
 from impact_posture.posture.formulation.problem_file import prepare
 from impact_posture.posture.program.program import Program
 from impact_posture.posture.program.program_rows import Derivatives

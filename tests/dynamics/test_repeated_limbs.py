@@ -20,7 +20,7 @@ from impact_posture.codegen.export_library import ExportLibrary, NamedObjective,
 from impact_posture.codegen.expression_graph import ARITHMETIC, COSINE, Graph
 from impact_posture.codegen.self_test import oracle_reference
 from impact_posture.codegen.sum_order import reorder_sums
-from impact_posture.config.settings import LoadOptions
+from impact_posture.config.problem_settings import LoadOptions
 from impact_posture.dynamics.repeated_limbs import RepeatedLimbs
 from impact_posture.impact.impact_case import ImpactCase
 from impact_posture.impact.impact_contact import ImpactContact

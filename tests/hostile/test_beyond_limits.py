@@ -15,7 +15,7 @@ import pytest
 import typer
 
 from impact_posture.codegen.manifest_reader import read_manifest
-from impact_posture.config.settings import ImpactSettings
+from impact_posture.config.problem_settings import ImpactSettings
 from impact_posture.errors import CompilerError, InputError, PostureError, SpecError, UrdfError
 from impact_posture.impact.evaluation.evaluation import evaluate
 from impact_posture.impact.impact_contact import ImpactContact

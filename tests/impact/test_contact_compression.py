@@ -12,7 +12,7 @@ import scipy.integrate
 from hypothesis import given, settings
 from hypothesis import strategies as st
 
-from impact_posture.config.settings import MATERIALS
+from impact_posture.config.problem_settings import MATERIALS
 from impact_posture.dynamics.numeric import Numeric
 from impact_posture.errors import InputError, SpecError
 from impact_posture.impact.elasticity.contact_compression import (

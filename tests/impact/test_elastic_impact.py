@@ -10,7 +10,7 @@ import pinocchio as pin
 import pytest
 from scipy.integrate import solve_ivp
 
-from impact_posture.config.settings import MetricKind, NormalFrame
+from impact_posture.config.problem_settings import MetricKind, NormalFrame
 from impact_posture.errors import ContactError, ImpactPostureError, InputError
 from impact_posture.impact.elasticity.elastic_impact import ElasticImpact, ElasticResponse
 from impact_posture.impact.impact_case import ImpactCase

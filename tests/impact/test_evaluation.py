@@ -8,7 +8,7 @@ from pathlib import Path
 import numpy as np
 import pytest
 
-from impact_posture.config.settings import ImpactSettings
+from impact_posture.config.problem_settings import ImpactSettings
 from impact_posture.config.text_parsers import parse_armature, parse_contact
 from impact_posture.errors import ContactError, FrameNotFound, InputError
 from impact_posture.impact.evaluation.ellipsoids import classical_ellipsoids, ellipsoid_of, force_ellipsoid

@@ -11,7 +11,7 @@ import numpy as np
 import pinocchio as pin
 import pytest
 
-from impact_posture.config.settings import ObjectiveKind
+from impact_posture.config.problem_settings import ObjectiveKind
 from impact_posture.dynamics.tree import Tree
 from impact_posture.impact.impact_case import ImpactCase
 from impact_posture.impact.impact_contact import ImpactContact

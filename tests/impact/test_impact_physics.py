@@ -9,7 +9,7 @@ import numpy as np
 import pinocchio as pin
 import pytest
 
-from impact_posture.config.settings import LoadOptions
+from impact_posture.config.problem_settings import LoadOptions
 from impact_posture.errors import ContactError, MetricError
 from impact_posture.impact.impact_case import ImpactCase
 from impact_posture.impact.impact_contact import ImpactContact

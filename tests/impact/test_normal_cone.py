@@ -14,7 +14,7 @@ from hypothesis import given
 from hypothesis import strategies as st
 
 from impact_posture.codegen.export import export
-from impact_posture.config.settings import ObjectiveKind
+from impact_posture.config.problem_settings import ObjectiveKind
 from impact_posture.errors import InputError, MetricError
 from impact_posture.impact.evaluation.evaluation import evaluate
 from impact_posture.impact.impact_contact import ImpactContact

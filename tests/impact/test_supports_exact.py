@@ -16,7 +16,7 @@ import pytest
 
 from impact_posture.codegen.export import export
 from impact_posture.codegen.impact_gradient import ImpactGradient
-from impact_posture.config.settings import ImpactSettings
+from impact_posture.config.problem_settings import ImpactSettings
 from impact_posture.errors import InputError
 from impact_posture.impact.impact_contact import ImpactContact
 from impact_posture.impact.quantities.impact_oracle import ImpactOracle

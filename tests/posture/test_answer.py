@@ -18,7 +18,7 @@ from impact_posture.codegen import c_source as code_module
 from impact_posture.codegen.c_literals import DOUBLE, FLOAT
 from impact_posture.codegen.c_source import build_c_source
 from impact_posture.codegen.export_library import named_objectives
-from impact_posture.config.settings import ProblemSettings
+from impact_posture.config.problem_settings import ProblemSettings
 from impact_posture.dynamics.numeric import Numeric
 from impact_posture.impact.worst_case_objective import WorstCaseObjective
 from impact_posture.output.report import drawn_robot as report_shapes
@@ -172,7 +172,7 @@ def test_an_answer_of_a_small_robot_imports_no_part_of_scipy() -> None:
         from impact_posture.api.posture_result import optimize
         from impact_posture.api.posture_problem import PostureProblem
         from impact_posture.posture.formulation.problem_file import prepare
-        from impact_posture.config.settings import ProblemSettings
+        from impact_posture.config.problem_settings import ProblemSettings
 
         prepared = prepare(ProblemSettings(robot="tilthex_arm", frame="ee", normal=(0, 0, 1)))
         assert optimize(PostureProblem.of(prepared), starts=2, jobs=1).document

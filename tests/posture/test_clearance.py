@@ -15,7 +15,7 @@ from hypothesis import strategies as st
 
 from impact_posture.collision.swept_hull import SweptHull
 from impact_posture.config.obstacle import Obstacle
-from impact_posture.config.settings import ProblemSettings
+from impact_posture.config.problem_settings import ProblemSettings
 from impact_posture.config.table_validation import validate
 from impact_posture.dynamics.chart import Chart
 from impact_posture.dynamics.numeric import Numeric

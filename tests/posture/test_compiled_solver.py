@@ -11,7 +11,7 @@ import numpy as np
 import pytest
 import threadpoolctl
 
-from impact_posture.config.settings import ProblemSettings
+from impact_posture.config.problem_settings import ProblemSettings
 from impact_posture.errors import CompilerError, InputError, OutputError
 from impact_posture.posture.analysis.result_document import result_document
 from impact_posture.posture.formulation.problem_file import Prepared, prepare

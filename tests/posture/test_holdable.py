@@ -13,7 +13,7 @@ from hypothesis import given, settings
 from hypothesis import strategies as st
 from scipy.optimize import linprog
 
-from impact_posture.config.settings import FRICTION
+from impact_posture.config.problem_settings import FRICTION
 from impact_posture.dynamics.chart import Chart
 from impact_posture.dynamics.mjcf import build_mjcf
 from impact_posture.dynamics.numeric import Numeric

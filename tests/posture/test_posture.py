@@ -9,7 +9,7 @@ import pinocchio as pin
 import pytest
 import scipy
 
-from impact_posture.config.settings import ProblemSettings
+from impact_posture.config.problem_settings import ProblemSettings
 from impact_posture.dynamics.numeric import Numeric
 from impact_posture.errors import Infeasible, InputError
 from impact_posture.impact.impact_contact import point_on

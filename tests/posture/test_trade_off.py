@@ -14,7 +14,7 @@ import numpy as np
 import pinocchio as pin
 import pytest
 
-from impact_posture.config.settings import TRADEOFF_POINTS
+from impact_posture.config.problem_settings import TRADEOFF_POINTS
 from impact_posture.dynamics.chart import Chart
 from impact_posture.errors import InputError
 from impact_posture.posture.analysis import pareto_front as follow

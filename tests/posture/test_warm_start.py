@@ -7,7 +7,7 @@ from dataclasses import replace
 import numpy as np
 import pytest
 
-from impact_posture.config.settings import ProblemSettings
+from impact_posture.config.problem_settings import ProblemSettings
 from impact_posture.dynamics.numeric import Numeric
 from impact_posture.impact.impact_contact import point_on
 from impact_posture.posture.formulation.build_problem import retarget

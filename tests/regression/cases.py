@@ -6,7 +6,7 @@ import shlex
 from dataclasses import dataclass
 from pathlib import Path
 
-from impact_posture.config.settings import ProblemSettings
+from impact_posture.config.problem_settings import ProblemSettings
 from impact_posture.posture.formulation.problem_file import Prepared, prepare
 from impact_posture.posture.search.multistart import PostureSolution, solve
 from tests.support.settings import make_settings

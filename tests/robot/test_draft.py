@@ -11,7 +11,7 @@ import numpy as np
 import pinocchio as pin
 import pytest
 
-from impact_posture.config.settings import LoadOptions
+from impact_posture.config.problem_settings import LoadOptions
 from impact_posture.errors import InputError, OutputError
 from impact_posture.posture.formulation.problem_file import prepare
 from impact_posture.posture.search.multistart import solve

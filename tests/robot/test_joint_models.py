@@ -14,7 +14,7 @@ from hypothesis import strategies as st
 
 from impact_posture.codegen.export import export
 from impact_posture.codegen.impact_gradient import ImpactGradient
-from impact_posture.config.settings import JointModel, ObjectiveKind
+from impact_posture.config.problem_settings import JointModel, ObjectiveKind
 from impact_posture.errors import ImpactPostureError, InertiaError, InputError, JointNotFound
 from impact_posture.impact.friction.contact_stability import contact_stability
 from impact_posture.impact.impact_contact import ImpactContact

@@ -8,7 +8,7 @@ import numpy as np
 import pinocchio as pin
 import pytest
 
-from impact_posture.config.settings import LoadOptions
+from impact_posture.config.problem_settings import LoadOptions
 from impact_posture.robot.model_hash import _axis
 from impact_posture.robot.robot_loader import load_robot
 from tests.robot.test_robot_loader import ARM, spec

@@ -9,7 +9,7 @@ import numpy as np
 import pinocchio as pin
 import pytest
 
-from impact_posture.config.settings import LoadOptions
+from impact_posture.config.problem_settings import LoadOptions
 from impact_posture.errors import ImpactPostureError, InputError, JointNotFound
 from impact_posture.robot.robot_loader import load_robot
 from impact_posture.simulation.scenario_file import read_scenario

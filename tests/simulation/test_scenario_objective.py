@@ -16,7 +16,7 @@ import numpy as np
 import pinocchio as pin
 import pytest
 
-from impact_posture.config.settings import ObjectiveKind
+from impact_posture.config.problem_settings import ObjectiveKind
 from impact_posture.errors import MetricError
 from impact_posture.impact.impact_contact import ImpactContact
 from impact_posture.impact.metric import Metric

@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from impact_posture.config.settings import ProblemSettings
+from impact_posture.config.problem_settings import ProblemSettings
 from impact_posture.config.table_validation import validate
 
 

@@ -19,7 +19,7 @@ from hypothesis import given
 from hypothesis import strategies as st
 
 import impact_posture as ip
-from impact_posture.config.settings import ProblemSettings
+from impact_posture.config.problem_settings import ProblemSettings
 from impact_posture.errors import ImpactPostureError, InputError, OutputError, SpecError
 from impact_posture.posture.approach.attainable_speed import AttainableSpeed
 from impact_posture.posture.formulation.build_problem import build_problem, retarget

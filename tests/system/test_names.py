@@ -27,7 +27,7 @@ from impact_posture.codegen.c_literals import DOUBLE
 from impact_posture.codegen.c_source import build_c_source
 from impact_posture.codegen.export import default_prefix, export
 from impact_posture.codegen.export_library import named_objectives
-from impact_posture.config.settings import LoadOptions, ProblemSettings
+from impact_posture.config.problem_settings import LoadOptions, ProblemSettings
 from impact_posture.config.table_validation import validate
 from impact_posture.dynamics.mjcf import build_mjcf
 from impact_posture.experiment.reproduction import Reproduction

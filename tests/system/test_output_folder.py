@@ -14,7 +14,7 @@ import pytest
 from matplotlib.figure import Figure
 
 import impact_posture as ip
-from impact_posture.config.settings import LoadOptions
+from impact_posture.config.problem_settings import LoadOptions
 from impact_posture.errors import InputError, OutputError
 from impact_posture.experiment.run_reports import write_run_report
 from impact_posture.output.plot.style import save

@@ -12,7 +12,7 @@ import numpy as np
 import pinocchio as pin
 import pytest
 
-from impact_posture.config.settings import LoadOptions
+from impact_posture.config.problem_settings import LoadOptions
 from impact_posture.errors import InputError
 from impact_posture.impact.impact_contact import ImpactContact
 from impact_posture.impact.worst_case_objective import WorstCaseObjective

@@ -15,7 +15,7 @@ import pinocchio as pin
 import pytest
 
 from impact_posture.codegen.compile_and_check import deviation
-from impact_posture.config.settings import ImpactSettings
+from impact_posture.config.problem_settings import ImpactSettings
 from impact_posture.dynamics.chart import Chart
 from impact_posture.errors import InputError
 from impact_posture.impact.resolved_impact import resolve

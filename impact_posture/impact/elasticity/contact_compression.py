@@ -20,7 +20,7 @@ from math import gamma, pi, sqrt
 
 import numpy as np
 
-from impact_posture.config.settings import MATERIALS, JointModel
+from impact_posture.config.problem_settings import MATERIALS, JointModel
 from impact_posture.errors import InputError
 from impact_posture.impact.elasticity.elastic_impact import ElasticImpact
 from impact_posture.impact.impact_case import ImpactCase

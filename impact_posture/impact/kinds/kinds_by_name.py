@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from impact_posture.config.settings import ObjectiveKind
+from impact_posture.config.problem_settings import ObjectiveKind
 from impact_posture.impact.kinds.coulomb_kind import CoulombKind
 from impact_posture.impact.kinds.energy_kind import EnergyKind
 from impact_posture.impact.kinds.impact_kind import ImpactKind

@@ -10,7 +10,7 @@ from typing import TYPE_CHECKING, TypeVar
 import numpy as np
 from numpy.typing import NDArray
 
-from impact_posture.config.settings import Against
+from impact_posture.config.problem_settings import Against
 from impact_posture.errors import InputError, MetricError
 from impact_posture.impact.evaluation.objective_value import objective_value
 from impact_posture.impact.evaluation.velocity_jump import tangent_units

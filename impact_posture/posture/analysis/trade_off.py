@@ -7,7 +7,7 @@ from dataclasses import dataclass
 import numpy as np
 
 from impact_posture.config.json_block import json_block
-from impact_posture.config.settings import Against
+from impact_posture.config.problem_settings import Against
 from impact_posture.posture.program.certificate import Certificate
 from impact_posture.system.arrays import Array
 

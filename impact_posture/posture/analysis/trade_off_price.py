@@ -7,7 +7,7 @@ from dataclasses import dataclass
 import numpy as np
 import pinocchio as pin
 
-from impact_posture.config.settings import Against
+from impact_posture.config.problem_settings import Against
 from impact_posture.dynamics.chart import Chart
 from impact_posture.impact.elasticity.contact_compression import ContactStiffness
 from impact_posture.impact.worst_case_objective import WorstCaseObjective

@@ -7,7 +7,7 @@ from dataclasses import dataclass
 from impact_posture.config.checked import checked
 from impact_posture.config.demand import Lengths, NonNegative, Position, UnitQuaternion
 from impact_posture.config.obstacle import Obstacle
-from impact_posture.config.settings import CLEARANCE
+from impact_posture.config.problem_settings import CLEARANCE
 
 
 @checked

@@ -13,7 +13,7 @@ from impact_posture.collision.mesh_check import HalfSpace, MeshCheck
 from impact_posture.collision.robot_shapes import load_shapes
 from impact_posture.collision.swept_hull import SweptHull, obstacle_hull
 from impact_posture.config.obstacle import Obstacle
-from impact_posture.config.settings import PATCH
+from impact_posture.config.problem_settings import PATCH
 from impact_posture.dynamics.numeric import Numeric
 from impact_posture.dynamics.tree import PointOnLink
 from impact_posture.errors import InputError

@@ -10,7 +10,7 @@ import numpy as np
 import pinocchio as pin
 
 from impact_posture.config.demand import tilt_of
-from impact_posture.config.settings import Vector3
+from impact_posture.config.problem_settings import Vector3
 from impact_posture.dynamics.chart import Chart
 from impact_posture.dynamics.numeric import Numeric
 from impact_posture.errors import InputError

@@ -8,7 +8,7 @@ from pathlib import Path
 
 import numpy as np
 
-from impact_posture.config.settings import ProblemSettings
+from impact_posture.config.problem_settings import ProblemSettings
 from impact_posture.config.table_validation import read_toml, validate
 from impact_posture.errors import InputError, SpecError
 from impact_posture.impact.elasticity.contact_compression import ContactStiffness

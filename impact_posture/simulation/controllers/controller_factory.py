@@ -10,7 +10,7 @@ from typing import Literal, get_args
 
 import numpy as np
 
-from impact_posture.config.settings import ObjectiveKind
+from impact_posture.config.problem_settings import ObjectiveKind
 from impact_posture.controller_export.controller_structure import structure_of
 from impact_posture.errors import ControllerNotFound, ImpactPostureError, InputError
 from impact_posture.impact.worst_case_objective import WorstCaseObjective

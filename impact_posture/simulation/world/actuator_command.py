@@ -7,7 +7,7 @@ from typing import Any, NamedTuple
 
 import numpy as np
 
-from impact_posture.config.settings import Vector3
+from impact_posture.config.problem_settings import Vector3
 from impact_posture.dynamics.mjcf import import_mujoco
 from impact_posture.errors import InputError
 from impact_posture.robot.robot import Robot
