@@ -38,8 +38,8 @@ def load_robot(robot: str, options: LoadOptions | None = None, **settings: Any) 
     Args:
         robot: Name, path or URI.
         options: Options of loading.
-        settings: Fields of :class:`~impact_posture.config.problem_settings.LoadOptions` in place of ``options``, such as
-            ``root="fixed"``.
+        settings: Fields of :class:`~impact_posture.config.problem_settings.LoadOptions` in place of ``options``, for
+            example ``root="fixed"``.
 
     Raises:
         RobotNotFound: No robot has this name; carries the nearest names.
