@@ -1,6 +1,6 @@
 """Tables of the library that are counted or read when the pages are built.
 
-``package-structure`` has the files, lines and imports of each folder; ``module-map`` the first sentence of each module.
+``package-structure`` lists files, lines and imports of each folder, ``module-map`` the first sentence of each module.
 """
 
 from __future__ import annotations
