@@ -1,10 +1,17 @@
-"""Rules for files that linters do not check: short files, no paths of a machine, no options in library errors."""
+"""Rules for files that linters do not check.
+
+Files are short and have unique names, folders are not crowded, no line has a path of one machine, and errors of the
+library name no options.
+"""
 
 from __future__ import annotations
 
 import ast
 import re
+from collections import Counter
 from pathlib import Path
+
+import pytest
 
 import impact_posture
 import impact_posture_cli
@@ -20,10 +27,40 @@ def texts() -> list[Path]:
     return [p for p in paths if p.suffix in SUFFIXES and p.is_file() and "_build" not in p.parts]
 
 
+def modules() -> list[Path]:
+    return [p for package in (impact_posture, impact_posture_cli) for p in Path(package.__path__[0]).rglob("*.py")]
+
+
 def test_files_are_short() -> None:
-    code = [p for package in (impact_posture, impact_posture_cli) for p in Path(package.__path__[0]).rglob("*.py")]
-    long = [p for p in code if len(p.read_text(encoding="utf-8").splitlines()) >= 500]
-    assert code and not long
+    long = [p for p in modules() if len(p.read_text(encoding="utf-8").splitlines()) >= 500]
+    assert modules() and not long
+
+
+def test_a_name_says_which_file_or_class_is_meant() -> None:
+    files = Counter(path.name for path in modules() if path.name != "__init__.py")
+    # ``ip.ImpactObjective`` and the like have one definition each, too.
+    classes = Counter(
+        node.name
+        for path in modules()
+        for node in ast.parse(path.read_text(encoding="utf-8")).body
+        if isinstance(node, ast.ClassDef) and not node.name.startswith("_")
+    )
+    assert [name for name, count in (files + classes).items() if count > 1] == []
+
+
+def test_no_folder_is_crowded() -> None:
+    library = Path(impact_posture.__path__[0])
+    assert {p.name for p in library.glob("*.py")} == {"__init__.py", "__main__.py", "errors.py", "version.py"}
+    assert len([p for p in (ROOT / "tests").iterdir() if not p.name.startswith("__pycache__")]) <= 30
+
+
+@pytest.mark.skipif(not (ROOT / "docs").is_dir(), reason="not in a checkout")
+def test_the_index_of_the_code_names_files_that_exist() -> None:
+    page = (ROOT / "docs" / "developer.md").read_text(encoding="utf-8")
+    named = {Path(name) for name in re.findall(r"`([\w/]+\.py)`", page)}
+    known = [path for folder in ("impact_posture", "cli", "tests") for path in (ROOT / folder).rglob("*.py")]
+    assert len(named) > 100
+    assert [str(name) for name in named if not any(p.parts[-len(name.parts) :] == name.parts for p in known)] == []
 
 
 def test_no_path_of_one_machine() -> None:
