@@ -21,11 +21,9 @@ _PLACES = np.array([(i, j, 4 - i - j) for i in range(5) for j in range(5 - i)]) 
 
 
 class Body(NamedTuple):
-    """Shapes with a common hull.
+    """Shapes with a common hull: ascending indices in the geometry, and the corners of the hull of each shape.
 
-    Attributes:
-        shapes: Indices of the shapes in the geometry, ascending.
-        corners: Corners of the hull of each shape in the axes of the joint, shape (k, 3) each, m.
+    The corners are in the axes of the joint, shape (k, 3) each, m.
     """
 
     shapes: tuple[int, ...]

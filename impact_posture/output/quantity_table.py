@@ -10,14 +10,9 @@ if TYPE_CHECKING:
 
 
 class QuantityRow(NamedTuple):
-    """A quantity at the initial and at the optimal posture.
+    """A quantity at the initial and at the optimal posture, with its unit and its meaning in a few words.
 
-    Attributes:
-        key: Symbol or name.
-        before: Value at the initial posture; ``None`` if undefined.
-        after: Value at the optimal posture; ``None`` if undefined.
-        unit: Unit.
-        meaning: Meaning in a few words.
+    ``key`` is its symbol or name.  A value is ``None`` where it is undefined.
     """
 
     key: str

@@ -59,18 +59,11 @@ def finish_result(
     jobs: int,
     progress: Progress | None,
 ) -> Written:
-    """Draw the figures of a result, export its C code and write its report.
+    """Draw the figures of a result, export, build and check its C code, and write ``report.html``.
 
-    Args:
-        folder: The folder, which holds ``problem.toml`` and the path to the optimum, if a path was searched.
-        prepared: The problem.
-        postures: Its solution.
-        codegen: Whether to export, build and check the C code.
-        formats: Formats of the figures.
-        report: Whether to write ``report.html``.
-        meshes: Whether the report may hold the meshes of the user's own URDF.
-        jobs: Processes that draw and compile side by side.
-        progress: Called with the numbers of finished files and of all files.
+    The folder holds ``problem.toml`` and the path to the optimum, if a path was searched.  ``meshes`` permits the
+    report to hold the meshes of the user's own URDF.  ``jobs`` processes draw and compile side by side.  ``progress``
+    is called with the numbers of finished files and of all files.
     """
     from impact_posture.output.plot import draw_all, drawable
     from impact_posture.output.report.result_report import result_scene, write_result_report

@@ -51,11 +51,7 @@ class SolvedPostures:
 
 
 def load_view(folder: Path) -> ResultView:
-    """Read the view of a result folder.
-
-    Raises:
-        SpecError: As :func:`load_result`.
-    """
+    """Read the view of a result folder, with the errors of :func:`load_result`."""
     return load_result(folder)[1]
 
 

@@ -20,13 +20,9 @@ class ActuatorLimits:
     """Limits on the load ``M ν̇ + h`` of a motion.
 
     Motors, rotors and feet carry the load as in :class:`~impact_posture.posture.loads.equilibrium.Equilibrium`.
-
     They are built from a posture with the feet in place, shape (nq,), and from the friction in the requirements.
-
-    Attributes:
-        names: Names of the actuators with a limit.
-        kinds: Kind of each of these actuators: ``torque`` or ``thrust``.
-        missing: Why the limits of this robot are not known; empty if they are known.
+    ``names`` and ``kinds`` (``torque`` or ``thrust``) belong to the actuators with a limit.  ``missing`` says why the
+    limits of this robot are not known; it is empty if they are known.
     """
 
     def __init__(self, objective: Objective, q: Array, requirements: Requirements) -> None:

@@ -30,8 +30,7 @@ _SLIDING = {"free-flyer": 3, "planar": 2, "prismatic": 1, "translation": 3}
 class PathSpace:
     """Postures on the constraints and within the joint limits of a problem, and checked motions between them.
 
-    Attributes:
-        pulls: Number of postures pulled onto the constraints so far, which measures the effort.
+    ``pulls`` counts the postures pulled onto the constraints so far, which measures the effort.
     """
 
     def __init__(self, problem: ConstrainedProblem) -> None:

@@ -13,12 +13,7 @@ _WIDTH = 100
 
 @dataclass
 class Draft:
-    """Text of a ``robot.toml``, written line by line.
-
-    Attributes:
-        lines: Lines of the text.
-        guesses: Values that the user must check, one line each.
-    """
+    """Text of a ``robot.toml``, written line by line, and values that the user must check, one line each."""
 
     lines: list[str] = field(default_factory=list)
     guesses: list[str] = field(default_factory=list)

@@ -65,11 +65,7 @@ def massless_joints(model: pin.Model) -> tuple[str, ...]:
 
 
 def check_moved_mass(model: pin.Model, where: str) -> None:
-    """Refuse joints that move no mass, because the mass matrix would be singular.
-
-    Raises:
-        InertiaError: Joints move no mass; the message names all of them.
-    """
+    """Raise ``InertiaError`` with the names of joints that move no mass, which make the mass matrix singular."""
     if not (joints := massless_joints(model)):
         return
     named = ", ".join(f"'{name}'" for name in joints)

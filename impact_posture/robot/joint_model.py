@@ -49,11 +49,7 @@ class Transmissions:
 
 
 def transmissions(robot: Robot) -> Transmissions:
-    """Return the ``[transmission]`` of robot.toml by velocity entry.
-
-    Raises:
-        JointNotFound: The table names a joint that the robot lacks.
-    """
+    """Return the ``[transmission]`` of robot.toml by velocity entry; an unknown joint raises ``JointNotFound``."""
     spec, model, nv = robot.spec.transmission, robot.model, robot.nv
     result = Transmissions(np.zeros(nv, dtype=bool), np.zeros(nv, dtype=bool), np.full(nv, np.inf), np.zeros(nv))
     for joint in spec.joints:

@@ -40,11 +40,7 @@ def scalar_entries(model: pin.Model, index: int, value: float) -> tuple[float, .
 
 
 def joint_index(model: pin.Model, joint: str, where: str) -> int:
-    """Return the index of a movable joint.
-
-    Raises:
-        JointNotFound: No movable joint has this name; carries the nearest names.
-    """
+    """Return the index of a movable joint; for another name raise ``JointNotFound`` with the nearest names."""
     known = movable_joints(model)
     if joint not in known:
         raise JointNotFound(joint, known, where=where)

@@ -22,12 +22,7 @@ MOST_VARIANTS = 12
 @checked
 @dataclass(frozen=True)
 class Payload:
-    """A point mass at the origin of a frame.
-
-    Attributes:
-        frame: The frame that carries it.
-        mass: kg.
-    """
+    """A point mass (kg) at the origin of a frame."""
 
     frame: str
     mass: Positive

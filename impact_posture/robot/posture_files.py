@@ -161,13 +161,10 @@ def _by_name(robot: Robot, joints: Mapping[str, object], base: object, where: st
 
 
 def set_joints(robot: Robot, q: Array, joints: Mapping[str, object], where: str) -> Array:
-    """Return a copy of a posture with some joints at other values, without a check of the result.
+    """Return a copy of a posture, shape (nq,), with some joints at other values, without a check of the result.
 
-    Args:
-        robot: The robot.
-        q: The posture, shape (nq,).
-        joints: Values by name: a number for a joint of one degree of freedom, the entries of ``q`` for other joints.
-        where: Option or file to name in errors.
+    Values are by name: a number for a joint of one degree of freedom, the entries of ``q`` for other joints.  Errors
+    name ``where``, an option or file.
 
     Raises:
         JointNotFound: The robot lacks a joint; carries the nearest names.

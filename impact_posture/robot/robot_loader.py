@@ -52,11 +52,7 @@ def load_robot(robot: str, options: LoadOptions | None = None, **settings: Any) 
 
 
 def build_robot(located: Located, options: LoadOptions) -> Robot:
-    """Build the robot that a URDF and a ``robot.toml`` describe.
-
-    Raises:
-        ImpactPostureError: See :func:`load_robot`.
-    """
+    """Build the robot that a URDF and a ``robot.toml`` describe, with the errors of :func:`load_robot`."""
     spec, urdf, source, base, name = located
     root: Root = options.root or spec.model.root
     _check_package_dirs(options.package_dir, Path(), "package_dir")
@@ -167,11 +163,7 @@ def locate(robot: str, options: LoadOptions) -> Located:
 
 
 def srdf_path(spec: RobotSpec, options: LoadOptions, base: Path) -> Path | None:
-    """Return the SRDF of a robot, or ``None``.
-
-    Raises:
-        UrdfError: There is no such file.
-    """
+    """Return the SRDF of a robot, or ``None``; raise ``UrdfError`` if there is no such file."""
     text = options.srdf or spec.model.srdf
     if text is None:
         return None
@@ -226,11 +218,7 @@ def _check_limits(model: pin.Model, source: str) -> None:
 
 
 def _named(model: pin.Model, patterns: Sequence[str], where: str) -> tuple[str, ...]:
-    """Return the joints that names or patterns select, without repetition.
-
-    Raises:
-        JointNotFound: A name or pattern selects no joint; carries the nearest names.
-    """
+    """Return the joints that names or patterns select, without repetition; each has to select a joint."""
     known = movable_joints(model)
     selected: dict[str, None] = {}
     for pattern in patterns:

@@ -26,11 +26,7 @@ EXAMPLE_PREFIX = "example-robot-data:"
 
 @cache
 def example_robot_data() -> Path:
-    """Return the ``robots/`` folder of the installed example-robot-data package.
-
-    Raises:
-        PackageNotFound: The package is not installed, or its files are elsewhere.
-    """
+    """Return ``robots/`` of the package example-robot-data; raise ``PackageNotFound`` if it is not installed."""
     from importlib.metadata import PackageNotFoundError
     from importlib.metadata import files as dist_files
 
@@ -143,11 +139,7 @@ def _mimics(root: ET.Element) -> tuple[dict[str, str], list[str]]:
 
 
 def parse_urdf(path: Path) -> ET.Element:
-    """Return the root of the URDF at ``path``.
-
-    Raises:
-        UrdfError: The file is missing or is not a URDF.
-    """
+    """Return the root of the URDF at ``path``; raise ``UrdfError`` if it is missing or is not a URDF."""
     if os.path.isdir(path):
         raise UrdfError("is a folder", where=str(path), hint="name the .urdf file in it")
     try:

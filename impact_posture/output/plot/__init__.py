@@ -2,7 +2,8 @@
 
 Figures of simulated runs: :func:`figures_of_run`, :func:`figures_of_comparison` and :func:`bars_figure`.
 
-The package does not change the global state of pyplot and shows no window.
+A figure raises :class:`~impact_posture.errors.InputError` if there is no data for it, or if its runs are of
+different scenarios or robots.  The package does not change the global state of pyplot and shows no window.
 """
 
 from __future__ import annotations

@@ -44,11 +44,7 @@ class Bar:
 
 
 def bars_figure(rows: Sequence[Bar]) -> Figure:
-    """Draw horizontal bars with intervals and the numbers of the paper, in rows of two panels.
-
-    Raises:
-        InputError: No rows.
-    """
+    """Draw horizontal bars with intervals and the numbers of the paper, in rows of two panels."""
     if not rows:
         raise InputError("there is nothing to draw", where="figure bars", hint="give at least one row")
     scenarios = list(dict.fromkeys(row.scenario for row in rows))

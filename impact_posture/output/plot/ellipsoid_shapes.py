@@ -19,12 +19,9 @@ _AROUND = np.array([[np.cos(angle), np.sin(angle)] for angle in np.arange(16) * 
 
 @dataclass(frozen=True, eq=False)
 class Plane:
-    """A picture plane.
+    """A picture plane, with the names of its axes.
 
-    Attributes:
-        axes: Rows are the orthonormal world directions drawn to the right and up, shape (2, 3).
-        right: Name of the first.
-        up: Name of the second.
+    The rows of ``axes``, shape (2, 3), are the orthonormal world directions drawn to the right and up.
     """
 
     axes: Array
@@ -111,12 +108,8 @@ def _ring(axes: Array, points: int) -> Array:
 def polar(matrix: Array, infinite: float) -> tuple[Array, Array]:
     """Return the matrix of the polar dual ``{f: fᵀAf ≤ 1}`` of ``{x: xᵀA⁻¹x ≤ 1}``, and its unbounded directions.
 
-    Args:
-        matrix: ``A``, positive semidefinite, shape (3, 3).
-        infinite: Half-length to draw in unbounded directions.
-
-    Returns:
-        ``A⁻¹`` with those directions cut at ``infinite``, and the unbounded directions as columns, shape (3, k).
+    ``A`` is positive semidefinite, shape (3, 3).  The result is ``A⁻¹`` with these directions cut at the half-length
+    ``infinite``, and the directions as columns, shape (3, k).
     """
     values, vectors = np.linalg.eigh((matrix + matrix.T) / 2)
     bounded = values > 1e-10 * max(float(values[-1]), 1e-300)

@@ -140,11 +140,7 @@ _EXTRA = {"distance": "distance", "force": "extra force"}
 
 
 def tradeoff_figure(view: ResultView) -> Figure:
-    """Draw the objective over the distance (log axis if it spreads widely), and below it H, G, V and S.
-
-    Raises:
-        InputError: The view has no trade-off.
-    """
+    """Draw the objective over the distance (log axis if it spreads widely), and below it H, G, V and S."""
     data = required(view.tradeoff, "trade-off", "tradeoff", "run optimize again with `tradeoff`")
     knee = [_KNEE.format(_EXTRA[data.against])] if data.knee is not None else []
     notes = [NOTES[data.against] + _LINES, *knee, share_notes("at these postures", data)]
@@ -231,11 +227,7 @@ _NOTES = {
 
 
 def motion_figure(view: ResultView) -> Figure:
-    """Draw how far each joint has moved, the objective, and the shares of the limits over time.
-
-    Raises:
-        InputError: The view has no motion.
-    """
+    """Draw how far each joint has moved, the objective, and the shares of the limits over time."""
     motion = required(view.motion, "motion", "path", "run optimize again with `path`")
     use = required(motion.use, "motion", "path", "run optimize again with `path`")
     notes = [_NOTES.get(motion.timing, "")]

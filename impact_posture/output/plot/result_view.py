@@ -210,11 +210,7 @@ def _worst_values(view: ResultView) -> str:
 
 
 def required(data: _Data | None, name: str, figure: str, hint: str) -> _Data:
-    """Return the data of a figure.
-
-    Raises:
-        InputError: The view has no such data.
-    """
+    """Return the data of a figure; raise ``InputError`` if the view has none."""
     if data is None:
         raise InputError(f"there is no {name} to draw", where=f"figure {figure}", hint=hint)
     return data

@@ -67,18 +67,11 @@ def time_figure(
     title_at: str = "center",
     air: float = 0.75,
 ) -> Figure:
-    """Draw rows of cells with the header of the runs above and the legend beside them.
+    """Draw rows of cells with the header of the runs above and the legend beside them; ``None`` leaves a place blank.
 
     Cells of the same panel share their upright axis.  Cells of a column with the same axis of time name it once.
-
-    Args:
-        views: The runs.
-        cells: Rows of equal length; ``None`` leaves a place blank.
-        height: Height of a row, inches.
-        notes: Sentences below the figure.
-        widths: Ratios of the widths of the columns; equal if empty.
-        title_at: Where titles stand: ``center`` or ``left``.
-        air: Additional height, inches.
+    ``height`` of a row and additional ``air`` are in inches.  ``widths`` are ratios of the columns, and ``notes`` are
+    sentences below the figure.  Titles stand at ``center`` or ``left``.
     """
     columns = len(cells[0])
     shown: dict[Panel, list[Any]] = {}
@@ -196,12 +189,10 @@ def _common_handles(views: Sequence[RunView], panels: Sequence[Panel]) -> list[A
 
 
 def _legend(body: Any, shared: Sequence[Any], named: Sequence[tuple[str, Any]]) -> None:
-    """Put the legend right of the panels, or below them if no curve has a name.
+    """Put the legend right of the panels of ``body``, or below them if no curve has a name.
 
-    Args:
-        body: The part of the figure with the panels.
-        shared: Legend entries that all panels share.
-        named: Headings, each with the axes of its curves.  A single group of curves gets no heading.
+    ``shared`` are entries of all panels, and ``named`` headings with the axes of their curves.  A single group of
+    curves gets no heading.
     """
     groups = [(what, handles) for what, axes in named if (handles := axes.get_legend_handles_labels()[0])]
     if not groups:

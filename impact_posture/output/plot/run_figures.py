@@ -48,11 +48,7 @@ def figures_of_run(view: RunView) -> dict[str, Figure]:
 def figures_of_comparison(views: Sequence[RunView]) -> dict[str, Figure]:
     """Return the figures ``comparison-metric``, ``-controls``, ``-joints`` and ``snapshots`` of several controllers.
 
-    Args:
-        views: A run of each controller (of a push: with the same sign). The nominal controller is drawn first.
-
-    Raises:
-        InputError: No view, or views of different scenarios or robots.
+    The views are a run of each controller (of a push: with the same sign).  The nominal controller is drawn first.
     """
     figures = {"comparison-metric": comparison_figure(views)}
     if control_panels(views):
@@ -77,11 +73,7 @@ def controls_figure(view: RunView) -> Figure:
 
 
 def joints_figure(views: Sequence[RunView]) -> Figure:
-    """Draw the positions of joints of one degree of freedom, the controllers below each other (nominal first).
-
-    Raises:
-        InputError: No view, or views of different scenarios or robots.
-    """
+    """Draw the positions of joints of one degree of freedom, the controllers below each other (nominal first)."""
     views = check_same(views, "figure joints")
     panels = joint_panels(views)
     cells = [_run_and_impact(panel, k, view) for k, view in enumerate(views) for panel in panels]
@@ -98,9 +90,6 @@ def comparison_figure(views: Sequence[RunView]) -> Figure:
     """Draw H of all controllers over time, and below it ``‖ν‖`` around the first impact.
 
     In the lower panel, time counts from the impact of each run.  For pushes, it does so in the upper panel as well.
-
-    Raises:
-        InputError: No view, or views of different scenarios or robots.
     """
     views = check_same(views, "figure comparison-metric")
     spans = [_since_impact(view) for view in views]
@@ -121,11 +110,7 @@ def comparison_figure(views: Sequence[RunView]) -> Figure:
 
 
 def controls_comparison_figure(views: Sequence[RunView]) -> Figure:
-    """Draw the commands around the impacts with their limits (dashed), a column for each controller, nominal left.
-
-    Raises:
-        InputError: No view, or views of different scenarios or robots.
-    """
+    """Draw the commands around the impacts with their limits (dashed), a column for each controller, nominal left."""
     views = check_same(views, "figure comparison-controls")
     panels = control_panels(views)
     columns = min(len(views), COLUMNS)

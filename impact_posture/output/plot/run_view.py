@@ -75,11 +75,7 @@ class RunView:
     facts: tuple[str, ...] = ()
 
     def __post_init__(self) -> None:
-        """Refuse arrays that do not fit together.
-
-        Raises:
-            InputError: A wrong shape, fewer than two ticks, or times that do not increase.
-        """
+        """Refuse arrays of a wrong shape, fewer than two ticks, or times that do not increase."""
         n, nv = len(self.t), self.robot.nv
         rotors = np.shape(self.rotor_command)[1:]
         shapes: dict[str, tuple[int, ...]] = {

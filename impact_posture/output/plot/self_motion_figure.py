@@ -33,11 +33,7 @@ _LABELS = {"ends": "optima of multi-start", "start": "start", "optimum": "optimu
 
 
 def self_motion_figure(view: ResultView) -> Figure:
-    """Draw the objective over the path length of each curve, or as a map of each surface.
-
-    Raises:
-        InputError: The view has no map.
-    """
+    """Draw the objective over the path length of each curve, or as a map of each surface."""
     data = required(view.self_motion, "map", "self_motion", "run optimize again with `search` global")
     curves, known = bool(data.s.any()), np.isfinite(data.objective) & (data.objective > 0)
     y = np.where(known, data.objective, np.nan)

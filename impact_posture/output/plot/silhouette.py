@@ -29,13 +29,7 @@ _LEAST = 1e-4
 
 @dataclass(frozen=True, eq=False)
 class PlacedHull:
-    """A swept hull in the world.
-
-    Attributes:
-        vertices: Corners, shape (k, 3), m.
-        radius: Sweep radius, m.
-        hit: Whether the hull is in a collision.
-    """
+    """A swept hull in the world: corners, shape (k, 3), and sweep radius, m, and whether it is in a collision."""
 
     vertices: Array
     radius: float
@@ -53,10 +47,7 @@ class _Silhouette(PathPatch):
 def place_hulls(robot: Robot, data: pin.Data, collisions: Iterable[tuple[str, str]] = ()) -> tuple[PlacedHull, ...]:
     """Place the hulls of a robot at the joint placements in ``data``.
 
-    Args:
-        robot: The robot.
-        data: Data with the placements of the joints.
-        collisions: Pairs of names of shapes or bodies in a collision; other names are ignored.
+    ``collisions`` are pairs of names of shapes or bodies in a collision; other names are ignored.
     """
     shapes = load_shapes(robot)
     links = {name.partition("[")[0] for pair in collisions for name in pair}

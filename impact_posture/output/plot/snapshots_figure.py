@@ -55,9 +55,6 @@ def snapshots_figure(views: Sequence[RunView]) -> Figure:
     """Draw the robot from the side that shows n and most of the motion, with the surface, or the push as an arrow.
 
     All panels share a scale, in meters.
-
-    Raises:
-        InputError: No view, or views of different scenarios or robots.
     """
     views = check_same(views, "figure snapshots")
     rows = [

@@ -91,13 +91,9 @@ def style() -> Iterator[None]:
 def framed(
     title: str, lines: Sequence[str], height: float, notes: Sequence[str] = ()
 ) -> Iterator[tuple[Figure, Any]]:
-    """Yield a figure with a header and notes, and the part to draw in; apply :func:`style`.
+    """Yield a figure with a header and notes, and the part to draw in, ``height`` inches high; apply :func:`style`.
 
-    Args:
-        title: First line of the header.
-        lines: Small print below the title; long lines break between facts.
-        height: Height of the part to draw in, inches.
-        notes: Sentences below the figure.
+    Long ``lines`` of small print below the title break between facts.  ``notes`` are sentences below the figure.
     """
     title = printable(title, longest=_LONGEST_TITLE)
     small = [part for line in lines for part in wrap(printable(line), SEPARATOR)]
@@ -195,11 +191,7 @@ def _measure_once(axes: Any) -> None:
 
 
 def check_formats(formats: Iterable[str]) -> tuple[str, ...]:
-    """Return the formats in order, once each.
-
-    Raises:
-        InputError: An unknown format.
-    """
+    """Return the formats in order, once each; raise ``InputError`` for an unknown format."""
     wanted = tuple(dict.fromkeys(f.lower().lstrip(".") for f in formats))
     for extension in wanted:
         if extension not in FORMATS:

@@ -73,10 +73,8 @@ class Solid:
 class PlacedSolids:
     """Meshes and their placements.
 
-    Attributes:
-        solids: The meshes.
-        places: For each shape: name, joint, index of its mesh, and placement in the axes of the joint.
-        warnings: Shapes that are left out, one line each.
+    ``places`` has for each shape its name, joint, index of its mesh, and placement in the axes of the joint.
+    ``warnings`` name shapes that are left out, one line each.
     """
 
     solids: tuple[Solid, ...]

@@ -31,13 +31,7 @@ _LEFT, _RIGHT, _TOP, _BOTTOM = 60.0, 390.0, 8.0, 92.0
 
 @dataclass(frozen=True)
 class Table:
-    """A table of text.
-
-    Attributes:
-        title: Title.
-        head: Titles of the columns.
-        rows: Cells; a name, then numbers or short words.
-    """
+    """A table of text, whose cells are a name, then numbers or short words."""
 
     title: str
     head: tuple[str, ...]

@@ -33,15 +33,10 @@ def write_result_report(
     meshes: bool = False,
     scene: ReportScene | None = None,
 ) -> Path:
-    """Write ``report.html`` of a result into its folder; return its path.
+    """Write ``report.html`` of a result into its folder with ``problem.toml`` and the figures; return its path.
 
-    Args:
-        folder: The folder, with ``problem.toml`` and the figures.
-        prepared: The problem.
-        view: Its solution.
-        document: The content of ``result.json``.
-        meshes: Whether the report may hold the meshes of the user's own URDF.
-        scene: The result of :func:`result_scene`, if the caller has it.
+    ``document`` is the content of ``result.json``, and ``scene`` is from :func:`result_scene`, if the caller has it.
+    ``meshes`` permits the report to hold the meshes of the user's own URDF.
 
     Raises:
         OutputError: It cannot be written.

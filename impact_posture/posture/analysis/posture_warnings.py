@@ -19,12 +19,8 @@ def posture_warnings(
 ) -> list[str]:
     """Return warnings about holding, approach, surface and ground, for the initial and the optimal posture.
 
-    Args:
-        prepared: The problem.
-        initial: Initial posture, shape (nq,).
-        q: Optimal posture, shape (nq,).
-        holding: Forces that hold the optimal posture, if they are known.
-        attainable: Speed at which the joints can arrive in the optimal posture, m/s, if it is bounded.
+    ``holding`` are the forces that hold the optimal posture, and ``attainable`` is the speed at which the joints can
+    arrive there, m/s.  Either is ``None`` if it is unknown.
     """
     verb = "hold" if prepared.impact.robot.spec.propulsion is None else "hover in"
     loads = holding.violations() if holding else []

@@ -90,9 +90,9 @@ class TradeOff:
 
 
 def find_knee(distances: Array, objectives: Array) -> int | None:
-    """Return the index of the point whose share of the gain exceeds its share of the distance most.
+    """Return the index of the point whose share of the gain most exceeds its share of the distance, or ``None``.
 
-    Return ``None`` if the excess is below :data:`KNEE`, or if there is no gain.
+    There is no such point if the excess is below :data:`KNEE`, or without a gain.
     """
     far, gain = distances[-1] - distances[0], objectives[0] - objectives[-1]
     if not (far > 0 and gain > 0):

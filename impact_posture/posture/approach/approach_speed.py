@@ -18,13 +18,9 @@ _PRICE = 1e-3
 
 
 class ApproachSpeed(Constraint):
-    """``s − σ(q) ≤ 0``: the joints can bring the contact to the surface at the speed s.
+    """``s − σ(q) ≤ 0``: the joints can bring the contact to the surface at the speed s, m/s.
 
     In the program the velocities are unknowns, in shares of their limits.
-
-    Args:
-        attainable: The attainable speed ``σ``.
-        speed: ``s``, m/s.
 
     Raises:
         InputError: The joints are too few to move the contact along the normal.

@@ -24,13 +24,7 @@ class KeptContacts(ExpressionConstraint):
     These impulses of feet with compliance ε are one member of the set of
     :mod:`impact_posture.impact.friction.contact_stability`.  So the constraint is sufficient for the feet to stay,
     and stricter than necessary where that set has several members.  ``A`` is scaled so that the largest impulse at
-    the given posture is 1.
-
-    Args:
-        objective: Impact along the normal of the leading contact, and its supports.
-        numeric: Model at the given posture, which gives the axes of the soles, because the feet are held.
-        friction: Friction coefficient.
-        variant: Name of the model variant, if there are several.
+    the given posture is 1.  The model at this posture (``numeric``) gives the axes of the soles, which are held.
     """
 
     def __init__(self, objective: WorstCaseObjective, numeric: Numeric, friction: float, variant: str = "") -> None:

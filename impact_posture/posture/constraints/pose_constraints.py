@@ -139,12 +139,8 @@ class HeldPose(ExpressionConstraint):
 class AxisInCone(ExpressionConstraint):
     """An axis of the frame stays within a cone, ``−dᵀR(q)c ≤ −cos α``, and the frame may turn about it.
 
-    Args:
-        name: Name of the constraint.
-        point: Point on the link of the frame.
-        axis: Unit axis ``c`` in the frame, shape (3,).
-        direction: Axis ``d`` of the cone, world, shape (3,).
-        degrees: Half angle α of the cone, degrees.
+    ``axis`` is the unit vector ``c`` in the frame, ``direction`` the axis ``d`` of the cone in the world, shape (3,)
+    each, and ``degrees`` the half angle α of the cone.  ``point`` is a point on the link of the frame.
     """
 
     def __init__(self, name: str, point: PointOnLink, axis: Array, direction: Array, degrees: float) -> None:
@@ -167,11 +163,8 @@ class AxisInCone(ExpressionConstraint):
 class HeldTurn(ExpressionConstraint):
     """The base does not turn about one of its axes: ``2 axis·vec(Q*⁻¹ ⊗ Q(q)) = 0``.
 
-    Args:
-        point: Origin of the base.
-        target: Orientation without a turn, shape (3, 3).
-        axis: Unit axis in the base, shape (3,).
-        name: Name of the constraint.
+    ``point`` is the origin of the base, ``target`` its orientation without a turn, shape (3, 3), and ``axis`` a unit
+    axis in the base, shape (3,).
     """
 
     def __init__(self, point: PointOnLink, target: Array, axis: Array, name: str) -> None:

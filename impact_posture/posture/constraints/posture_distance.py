@@ -62,14 +62,9 @@ def distance_gradient(chart: Chart, q: Array, reference: Array) -> Array:
 
 
 class WithinDistance(ExpressionConstraint):
-    """The posture stays in a ball: ``distance_squared(q, reference) ≤ radius²``.
+    """The posture stays in a ball: ``distance_squared(q, reference) ≤ radius²``, about ``‖q ⊖ reference‖ ≤ radius``.
 
-    The radius is a bound and the reference a parameter, so one program serves all radii.
-
-    Args:
-        chart: Coordinates of the robot.
-        reference: Center of the ball, shape (nq,).
-        radius: Radius, about ``‖q ⊖ reference‖``, > 0.
+    The radius (> 0) is a bound and the reference a parameter, so one program serves all radii.
     """
 
     def __init__(self, chart: Chart, reference: Array, radius: float) -> None:

@@ -19,7 +19,7 @@ class Requirements:
         contact_pose: Held part of the pose of the leading contact frame, as in the setting ``contact_pose``.
         other_poses: Held part of the pose of each other contact frame.
         target_position: Position of the contact frame, world, meters; ``None`` for its initial position.
-        target_quaternion: UnitQuaternion | None = None
+        target_quaternion: Orientation of the contact frame, x y z w; ``None`` for its initial orientation.
         box: Half extents of the box of ``contact_pose = box``, meters.
         base: Freedom of the floating base: ``free``, ``level`` (tilt zero, yaw free), ``level:DEG`` (tilt from its
             default posture at most DEG degrees, yaw free), ``fixed`` or ``box``.
@@ -40,7 +40,6 @@ class Requirements:
         collision: Keep the links clear of each other, the surface, the ground and the obstacles.
         clearance: Least distance between any two of these, m.
         surface: ``plane``, ``none``, or the edge length of a square patch in m; ``None`` to choose by the robot.
-
         obstacles: Bodies in the world.
         limit_margin: Distance from the joint limits, rad or m.
         regularization: Weight of the squared distance from the initial posture, relative to the initial objective.

@@ -107,12 +107,9 @@ class Corners(NamedTuple):
 
 
 class SeparatingPlane:
-    """The rows and unknowns of the plane that keeps body ``a`` clear of body ``b``.
+    """The rows and unknowns of the plane that keeps body ``a`` clear of body ``b`` by ``margin``, δ in meters.
 
-    Args:
-        a: A swept hull.
-        b: A swept hull, or a half-space.
-        margin: Clearance δ, meters.
+    ``a`` is a swept hull, ``b`` a swept hull or a half-space.
     """
 
     def __init__(self, a: ConvexBody, b: ConvexBody, margin: float) -> None:
@@ -153,12 +150,8 @@ class SeparatingPlane:
     def lift(self, tree: Tree, label: str, known: ca.SX) -> LiftedRows:
         """Return the equations, the unknowns ``n, c, m, d, s`` (``m, d, s`` for a half-space), and the slack.
 
-        The unknown ``s`` is in units of 2 cm.
-
-        Args:
-            tree: The dynamics at the posture.
-            label: End of the names of the unknowns.
-            known: ``n, c`` of a half-space, shape (4, 1); not used for a swept hull.
+        The unknown ``s`` is in units of 2 cm.  ``label`` ends the names of the unknowns.  ``known`` is ``n, c`` of a
+        half-space, shape (4, 1); a swept hull does not use it.
         """
         plane = ca.SX(0, 1) if self.known else ca.SX.sym(f"plane{label}", 4)
         m, d, s = ca.SX.sym(f"m{label}", 3), ca.SX.sym(f"d{label}"), ca.SX.sym(f"s{label}")

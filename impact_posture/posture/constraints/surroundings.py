@@ -45,11 +45,8 @@ class _Wall:
 class Surroundings:
     """The bodies around a robot at a given posture, and the constraints that keep it clear of them.
 
-    Args:
-        robot: The robot.
-        numeric: The model at the given posture.
-        held: Joints that do not move.
-        clearance: Least distance of all pairs, m.
+    ``numeric`` is the model at the given posture, ``held`` are joints that do not move, and ``clearance`` is the
+    least distance of all pairs, m.
     """
 
     def __init__(self, robot: Robot, numeric: Numeric, held: Sequence[str], clearance: float) -> None:
@@ -94,11 +91,8 @@ class Surroundings:
         the plane, such as a foot beside the struck one, or at the same surface, such as the other hand at a wall.  If
         a foot or a fixed base lies behind the plane, the surface must end before it, and becomes a patch.
 
-        Args:
-            contact: The contact.
-            width: Edge length of the patch, m; infinite for the plane, ``None`` to choose.
-            feet: Contact points of the feet.
-            contacts: Contacts that act at the same time.
+        ``width`` is the edge length of the patch, m; infinite for the plane, ``None`` to choose.  ``feet`` are the
+        contact points of the feet, and ``contacts`` act at the same time.
         """
         point = point_on(self.robot, contact.frame, contact.offset)
         turns = contact.normal_frame == "contact"

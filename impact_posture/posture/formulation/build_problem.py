@@ -103,13 +103,10 @@ def retarget(
     quaternion: tuple[float, float, float, float] | None,
     numeric: Numeric | None = None,
 ) -> ConstrainedProblem:
-    """Return the problem with another target of its only contact, which can use the same program.
+    """Return the problem with another target of its only contact frame, which can use the same program.
 
-    Args:
-        problem: A problem with one contact.
-        position: Position of the contact frame, world, meters; ``None`` for its initial position.
-        quaternion: Orientation of the contact frame, x y z w; ``None`` for its initial orientation.
-        numeric: The model, if the caller has it; it is moved to the given posture.
+    The target is a position, world, meters, and a quaternion x y z w; ``None`` for the initial pose.  A model
+    ``numeric`` of the caller is moved to the given posture.
 
     Raises:
         InputError: The contact pose takes no target, or the quaternion does not have unit length.

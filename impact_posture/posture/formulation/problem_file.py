@@ -41,13 +41,7 @@ _WORKED_OUT = {"contact_pose", "base", "hold", "com_margin", "limit_margin"}
 
 @dataclass(frozen=True)
 class Prepared:
-    """A problem ready to be solved.
-
-    Attributes:
-        settings: Merged settings of file and command line.
-        impact: Robot, contact, metric, supports and given posture.
-        problem: The posture problem.
-    """
+    """A problem ready to be solved: the merged settings of file and command line, their impact, and the problem."""
 
     settings: ProblemSettings
     impact: ResolvedImpact

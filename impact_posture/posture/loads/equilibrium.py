@@ -46,13 +46,9 @@ class Distribution:
 
 @dataclass(frozen=True, eq=False)
 class Thrusts:
-    """Thrusts that the wrench on the base determines, ``u = P τ_base``.
+    """Thrusts of the rotors ``names``, which the wrench on the base determines, ``u = P τ_base``, and their limits.
 
-    Attributes:
-        names: Name of each rotor.
-        matrix: ``P``, N per N and N·m, shape (k, 6).
-        lower: Least thrusts, N, shape (k,).
-        upper: Largest thrusts, N, shape (k,).
+    ``matrix`` is ``P`` in N per N and N·m, shape (k, 6).  The limits are in N, shape (k,).
     """
 
     names: tuple[str, ...] = ()

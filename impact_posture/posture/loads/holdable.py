@@ -138,12 +138,8 @@ class Holdable(Constraint):
 class ReachableWrench(ExpressionConstraint):
     """The rotors can make the wrench on the base: ``R h(q) = 0`` for the combinations that they cannot make.
 
-    For example, rotors in one plane make no side force, so the robot has to be level to hold its weight.
-
-    Args:
-        name: The load in words, such as ``at rest``.
-        load: The robot at rest, with what pushes on it.
-        rows: ``R`` on the base wrench, shape (6 − rank of the allocation, 6), in weights.
+    For example, rotors in one plane make no side force, so the robot has to be level to hold its weight.  ``rows``
+    are ``R`` on the base wrench in weights, shape (6 − rank of the allocation, 6).
     """
 
     price = _PRICE

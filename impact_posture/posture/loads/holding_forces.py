@@ -15,13 +15,9 @@ _ROUNDING = 1e-6
 
 @dataclass(frozen=True)
 class ActuatorLoad:
-    """Load of one actuator.
+    """Torque (N·m), force of a prismatic joint (N) or thrust (N) of an actuator between its limits.
 
-    Attributes:
-        value: Torque (N·m), force of a prismatic joint (N) or thrust (N).
-        low: Lower limit.
-        high: Upper limit.
-        share: Distance of the value from the middle of its range, divided by half the range: 1 at a limit.
+    ``share`` is the distance from the middle of the range divided by half the range, 1 at a limit.
     """
 
     value: float

@@ -57,12 +57,9 @@ class LoadCase:
 
 @dataclass(frozen=True, eq=False)
 class LoadCases:
-    """The load cases of a problem.
+    """The load cases of a problem, with notes for the user about missing data.
 
-    Attributes:
-        cases: The load cases; empty if the data of the robot are not sufficient.
-        notes: Notes for the user about missing data.
-        unknown: Why there are no load cases; empty if there are any.
+    ``unknown`` says why there are no load cases; it is empty if there are any.
     """
 
     cases: tuple[LoadCase, ...] = ()
@@ -78,15 +75,10 @@ class LoadCases:
 
 
 def load_cases(objective: Objective, q: Array, requirements: Requirements) -> LoadCases:
-    """Return the load cases for which the data of the robot are sufficient.
+    """Return the load cases for which the data of the robot are sufficient, at a posture with the feet in place.
 
     Before the impact the contact bears no force.  With a ``hold_force`` the robot must also hold this force along the
     normal of every contact.  Each payload that the robot may carry adds these cases once more.
-
-    Args:
-        objective: The objective, with its contacts, supports and model variants.
-        q: A posture with the feet in place, shape (nq,).
-        requirements: The friction of the feet, the force to hold, and the share of the limits that holding may take.
 
     Raises:
         InputError: A force has to be held, but the data of the robot are not sufficient.

@@ -44,12 +44,10 @@ class ForceSource:
 
 @dataclass(frozen=True, eq=False)
 class StaticTorque:
-    """``τ(q, z)`` at one posture.
+    """``τ(q, z)`` at one posture, shape (nv,), and its derivatives.
 
-    Attributes:
-        value: ``τ``, shape (nv,).
-        by_posture: Tangent Jacobian ``∂τ/∂q``, shape (nv, nv); zero if it was not asked for.
-        by_force: ``∂τ/∂z``, shape (nv, k).
+    ``by_posture`` is the tangent Jacobian ``∂τ/∂q``, shape (nv, nv), zero if it was not asked for.  ``by_force`` is
+    ``∂τ/∂z``, shape (nv, k).
     """
 
     value: Array
@@ -58,12 +56,7 @@ class StaticTorque:
 
 
 class StaticLoad:
-    """Torques ``τ(q, z)`` of a robot at rest.
-
-    Args:
-        model: The robot, with gravity.
-        sources: Wrenches on its links.
-    """
+    """Torques ``τ(q, z)`` of a robot at rest under gravity, with wrenches on its links."""
 
     def __init__(self, model: pin.Model, sources: Sequence[ForceSource]) -> None:
         self.model, self.sources = model, tuple(sources)

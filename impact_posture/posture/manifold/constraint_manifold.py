@@ -29,28 +29,18 @@ _LONGEST_STEP = 0.5
 
 @dataclass(frozen=True)
 class Projected:
-    """Postures pulled onto the manifold.
-
-    Attributes:
-        x: Chart coordinates, shape (N, nx).
-        converged: Whether each posture satisfies the rows, shape (N,).
-    """
+    """Postures pulled onto the manifold, in chart coordinates, shape (N, nx), and whether each satisfies the rows."""
 
     x: Array
     converged: NDArray[np.bool_]
 
 
 class ConstraintManifold:
-    """``{q : c(q) = 0}`` for the equalities of a problem, in chart coordinates ``x`` and tangent vectors ``v``.
+    """``{q : c(q) = 0}`` for the equalities of a problem with an impact objective.
 
-    Postures that differ by full turns of joints are the same, so a joint with a range of a turn or more has no limit.
-
-    Args:
-        problem: The posture problem, with an impact objective.
-
-    Attributes:
-        lower: Lower limits, −∞ for joints that can turn fully, shape (nx,).
-        upper: Upper limits, ∞ for these joints, shape (nx,).
+    Coordinates are chart coordinates ``x`` and tangent vectors ``v``.  Postures that differ by full turns of joints
+    are the same, so a joint with a range of a turn or more has no limit: its entries of ``lower`` and ``upper``,
+    shape (nx,), are infinite.
     """
 
     def __init__(self, problem: ConstrainedProblem) -> None:
@@ -118,12 +108,9 @@ class ConstraintManifold:
         return np.asarray(moved - 2 * np.pi * turns)
 
     def project(self, x: Array, steps: int = 20, *, within: bool = False) -> Projected:
-        """Pull postures onto the equalities by Gauss–Newton steps of least norm.
+        """Pull postures, shape (N, nx), onto the equalities by Gauss–Newton steps of least norm.
 
-        Args:
-            x: Postures, shape (N, nx).
-            steps: Most steps.
-            within: Also stay within the limits.
+        ``within`` also keeps them within the limits.
         """
         x, left = x.copy(), np.arange(len(x))
         converged = np.zeros(len(x), dtype=bool)

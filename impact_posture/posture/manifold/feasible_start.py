@@ -28,12 +28,7 @@ _ROUNDING = 1e-13
 
 @dataclass(frozen=True)
 class Projection:
-    """A posture pulled towards the constraints.
-
-    Attributes:
-        q: Configuration, shape (nq,).
-        violation: Largest violation (m, rad, or the unit of the constraint).
-    """
+    """A posture pulled towards the constraints, and its largest violation (m, rad, or the unit of the constraint)."""
 
     q: Array
     violation: float
@@ -139,17 +134,10 @@ def feasible_start(
 ) -> Array | None:
     """Return the ``index``-th feasible start of a seed, or ``None`` if no attempt reached the constraints.
 
-    Start 0 is the given posture, pulled onto the constraints.  Odd starts lie near ``around``, and even starts
-    anywhere within the limits: near starts reach the constraints more often, far starts find other optima.  Among
-    ``candidates`` postures on the projected constraints, the start violates the other constraints least.
-
-    Args:
-        problem: The posture problem.
-        index: Index of the start.
-        seed: Seed of all starts.
-        candidates: Most postures on the projected constraints to choose from.
-        around: Posture near odd starts, shape (nq,); by default the given posture.
-        projector: Projector of the problem, or of a problem that grew into it, if the caller has it.
+    Start 0 is the given posture, pulled onto the constraints.  Odd starts lie near the posture ``around``, by default
+    the given one, and even starts anywhere within the limits.  Near starts reach the constraints more often, far
+    starts find other optima.  Among ``candidates`` postures on the projected constraints, the start violates the
+    other constraints least.  ``projector`` may belong to a problem that grew into this one.
     """
     if index == 0:
         projection = (projector or Projector(problem)).project(problem.given)

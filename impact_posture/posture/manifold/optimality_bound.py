@@ -79,10 +79,7 @@ class _Patches:
 def bound_objective(motion: SelfMotion, best: float, gap: float = 0.01) -> OptimalityBound:
     """Split patches until none can contain a feasible posture with an objective below ``(1 − gap) best``.
 
-    Args:
-        motion: The mapped manifold.
-        best: Objective of a known feasible posture, or infinity.
-        gap: The wanted gap.
+    ``best`` is the objective of a known feasible posture, or infinity.
     """
     manifold, dimension = motion.manifold, motion.dimension
     x = np.concatenate([component.x for component in motion.components])

@@ -85,12 +85,7 @@ def map_self_motion(
 ) -> SelfMotion:
     """Map every component that random starts reach, until ``patience`` starts in a row reach no new component.
 
-    Args:
-        manifold: The manifold of the problem.
-        dimension: Degrees of freedom, 1 or 2.
-        known: Postures on the manifold whose components come first, shape (N, nx).
-        patience: Number of starts.
-        seed: Seed of the starts.
+    The components of the postures ``known``, shape (N, nx), come first.
 
     Raises:
         InputError: There are not one or two degrees of freedom.
@@ -187,8 +182,7 @@ def _curve(manifold: ConstraintManifold, x: Array) -> Component:
 def _branch(manifold: ConstraintManifold, start: Array, tangent: Array) -> tuple[list[Array], list[float], str]:
     """Follow a curve in one direction by predictor and corrector.
 
-    Returns:
-        The nodes from the start on, the lengths of the steps, and how the curve ends.
+    Return the nodes from the start on, the lengths of the steps, and how the curve ends.
     """
     nodes, x, direction, step = [start], start, tangent, _FIRST
     lengths: list[float] = []

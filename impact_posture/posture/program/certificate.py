@@ -103,14 +103,10 @@ def certify(
     auxiliaries: Array | None = None,
     numeric: Numeric | None = None,
 ) -> Certificate:
-    """Certify ``q``.
+    """Certify the posture ``q``.
 
-    Args:
-        problem: The posture problem.
-        q: The posture, shape (nq,).
-        scale: The initial objective f₀.
-        auxiliaries: Auxiliaries of the constraints at ``q``; by default the guesses of the constraints.
-        numeric: The model, if the caller has it; it is moved to ``q``.
+    ``scale`` is the initial objective f₀.  ``auxiliaries`` are values for the constraints at ``q``, by default their
+    guesses.  A model ``numeric`` of the caller is moved to ``q``.
     """
     numeric = (numeric or Numeric(problem.robot.model)).at(q)
     gradients, gaps = objective_gradients(problem, q, scale)
@@ -145,10 +141,9 @@ def certify(
 
 
 def objective_gradients(problem: ConstrainedProblem, q: Array, scale: float) -> tuple[Array, Array]:
-    """Return vectors that span the subdifferential of objective/scale plus the regularization.
+    """Return tangent gradients, shape (k, nv), and gaps of their values, shape (k,).
 
-    Returns:
-        Tangent gradients, shape (k, nv), with k = 1 where the objective is smooth; gaps of their values, shape (k,).
+    The gradients span the subdifferential of objective/scale plus the regularization; k = 1 where it is smooth.
     """
     members = problem.objective.subgradients(q, _TIED * scale)
     gradients = members.gradients / scale
@@ -196,14 +191,11 @@ def _limits(problem: ConstrainedProblem, q: Array) -> Linearization:
 
 
 def _multipliers(gradients: Array, equalities: Array, near: Sequence[_NearBound]) -> tuple[Array, Array, Array]:
-    """Return the multipliers with the least residual.
+    """Return weights of the gradients (≥ 0, sum 1), multipliers of the inequalities (≥ 0) and their least residual.
 
     Multipliers of equalities have any sign, so all gradients are projected onto the null space of the equalities.
     The product of a multiplier and its slack is a residual as well.  Otherwise a bound that is near and not active
     could replace an active one.
-
-    Returns:
-        Weights of the gradients (≥ 0, sum 1), multipliers of the inequalities (≥ 0) and the residual.
     """
     count = len(gradients)
     free = null_space(equalities, RANK_TOLERANCE)

@@ -47,15 +47,10 @@ def compiled_solver(
     starts: int,
     derivatives: Mapping[str, ca.Function],
 ) -> BuiltSolver:
-    """Build ``nlpsol`` on the expressions, compiled or interpreted.
+    """Build ``nlpsol`` on the expressions ``x``, ``p``, ``f`` and ``g``, compiled or interpreted.
 
-    Args:
-        problem: The problem.
-        symbols: The expressions ``x``, ``p``, ``f`` and ``g``.
-        options: Options of IPOPT.
-        mode: Whether to compile.
-        starts: Number of runs that share the cost of compiling.
-        derivatives: Options of ``nlpsol`` with known derivatives.
+    ``options`` are options of IPOPT, ``starts`` is the number of runs that share the cost of compiling, and
+    ``derivatives`` are options of ``nlpsol`` with known derivatives.
 
     Raises:
         InputError: There is no such mode.

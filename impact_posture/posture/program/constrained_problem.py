@@ -101,10 +101,8 @@ class ConstrainedProblem:
     ) -> ConstrainedProblem:
         """Return the problem with the parts that its program lacks at the postures, or itself if none are missing.
 
-        Args:
-            postures: The postures, shape (nq,) each.
-            numeric: The model, if the caller has it; it is moved.
-            auxiliaries: Auxiliaries of the program, shape (k,) each, if the postures are ends of runs.
+        If the postures are ends of runs, ``auxiliaries`` are the values of the program there, shape (k,) each.  A
+        model ``numeric`` of the caller is moved.
         """
         constraints, numeric = list(self.constraints), numeric or Numeric(self.robot.model)
         for index, q in enumerate(postures):

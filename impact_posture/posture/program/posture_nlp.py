@@ -128,14 +128,11 @@ class PostureNLP:
         price: float = SLACK_PRICE,
         warm: WarmStart | None = None,
     ) -> SolveRecord:
-        """Solve from ``start``.
+        """Solve from the configuration ``start``, shape (nq,).
 
-        Args:
-            start: Configuration, shape (nq,).
-            scale: Divisor of the objective; by default its value at ``start``.
-            attempt: Index of the guess of the objective.
-            price: Price of a meter of slack.
-            warm: End of a run at ``start`` with another target; it is ignored if it belongs to another program.
+        ``scale`` divides the objective, by default its value at ``start``.  ``attempt`` is the index of the guess of
+        the objective, and ``price`` the price of a meter of slack.  ``warm`` is the end of a run at ``start`` with
+        another target; it is ignored if it belongs to another program.
         """
         scale = scale or self.problem.objective.value(start)
         if warm is None or warm.program != self.number:
@@ -211,14 +208,9 @@ def build_nlp(
     program: Program | None = None,
     rows: ProgramRows | None = None,
 ) -> PostureNLP:
-    """Build the program.
+    """Build the program for a number of runs, which decides whether compiling pays.
 
-    Args:
-        problem: The posture problem.
-        compile: Whether to compile.
-        starts: Number of runs, which decides whether compiling pays.
-        program: Expressions of a problem that grew into this one.
-        rows: Rows of the constraints of such a problem, if another program has them.
+    ``program`` has the expressions of a problem that grew into this one, and ``rows`` the rows of its constraints.
 
     Raises:
         CompilerError, OutputError: As :func:`impact_posture.posture.program.compiled_solver.compiled_solver`.

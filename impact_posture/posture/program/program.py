@@ -29,12 +29,9 @@ from impact_posture.system.arrays import Array
 class Program:
     """The expressions of a program, most of which stay the same while the problem grows.
 
-    Args:
-        problem: The problem before it grows.
-        rows: Rows of its constraints, if another program of the problem has them.
+    ``rows`` are the rows of its constraints, which programs of the same problem share.
 
     Attributes:
-        rows: Rows of the constraints.
         chart: Coordinates of the robot.
         numeric: The model in Pinocchio, shared by all runs.
         bounded: Number of inequalities ``≤ 0`` of the objective, which are the last rows.

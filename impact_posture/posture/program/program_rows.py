@@ -61,9 +61,6 @@ class Derivatives:
 class ProgramRows:
     """Lifted constraints of a problem, and of all problems that it grows into, shared by all programs of it.
 
-    Args:
-        problem: The problem before it grows.
-
     Attributes:
         chart: Coordinates of the robot.
         x: Chart coordinates, shape (nx, 1).

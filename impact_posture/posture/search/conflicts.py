@@ -60,15 +60,11 @@ def find_conflicts(
     guesses: Sequence[Array] = (),
     beside: float = 0.0,
 ) -> LeastViolation:
-    """Minimize the slack ``Σ (s⁺ + s⁻)`` with ``c(q) + s⁺ − s⁻`` within bounds, from several starts.
+    """Minimize the slack ``Σ (s⁺ + s⁻)`` with ``c(q) + s⁺ − s⁻`` within bounds, from ``guesses`` and other starts.
 
-    Args:
-        problem: The posture problem.
-        seed: Seed of the starts.
-        program: Program of the same problem with another target, or of a problem that grew into this one.
-        guesses: First starts.
-        beside: Least violation at a target nearby.  A few starts confirm it; the others run only if these leave less
-            than half of it.
+    ``program`` may belong to the same problem with another target, or to a problem that grew into this one.
+    ``beside`` is the least violation at a target nearby.  A few starts confirm it; the others run only if these leave
+    less than half of it.
     """
     chart = Chart.of(problem.robot.model)
     program = program or ElasticProgram(problem)
@@ -122,13 +118,8 @@ def _relax(problem: ConstrainedProblem, chart: Chart, program: ElasticProgram, s
 class ElasticProgram:
     """The elastic program, most of whose expressions stay the same while the problem grows.
 
-    Args:
-        problem: The problem before it grows.
-        rows: Rows of its constraints, if another program of the problem has them.
-
-    Attributes:
-        problem: The problem as far as it has grown.
-        time_s: Wall time of the solver so far, s.
+    ``rows`` are the rows of its constraints, if another program of the problem has them.  ``problem`` is the problem
+    as far as it has grown, and ``time_s`` the wall time of the solver so far.
     """
 
     def __init__(self, problem: ConstrainedProblem, rows: ProgramRows | None = None) -> None:

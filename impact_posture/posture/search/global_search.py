@@ -171,14 +171,10 @@ def search_globally(
     compile: CompileMode = "auto",
     progress: Progress | None = None,
 ) -> GlobalSolution:
-    """Continue from the solution of the multi-start search.
+    """Continue from the solution of a multi-start search whose problem passes :func:`check_searchable`.
 
-    Args:
-        solution: The solution of a problem that passes :func:`check_searchable`.
-        seed: Seed of the random postures.
-        jobs: Processes that search side by side.
-        compile: Whether to compile the program.
-        progress: Called with the numbers of finished and planned solves.
+    ``seed`` is the seed of the random postures.  ``progress`` is called with the numbers of finished and planned
+    solves.
     """
     problem = solution.problem
     # A singular posture has more freedom than the manifold, so the larger rank counts.

@@ -83,12 +83,8 @@ def run_start(
 ) -> tuple[SolveRecord, Certificate]:
     """Solve from a feasible start and certify the end; if this fails, try the other guesses of the objective.
 
-    Args:
-        nlp: The program.
-        start: The start, shape (nq,).
-        scale: The initial objective.
-        price: Price of a meter of slack.
-        first: Result of the first guess, if the caller has it.
+    ``scale`` is the initial objective, ``price`` the price of a meter of slack, and ``first`` the result of the first
+    guess, if the caller has it.
     """
     record = first or nlp.solve(start, scale=scale, price=price)
     certificate = certify(nlp.problem, record.q, scale, record.auxiliaries, nlp.program.numeric)
@@ -105,13 +101,8 @@ def run_start(
 class GrowingSearch:
     """Runs from all starts, repeated with a grown program until it lacks no part at any end.
 
-    Args:
-        problem: The posture problem.
-        draws: The starts.
-        scale: The initial objective.
-        compile: Whether to compile the program.
-        finish_all: Whether to finish starts that cannot become the best; small programs always finish them.
-        rows: Rows of the constraints, if another program of the problem has them.
+    ``scale`` is the initial objective.  ``finish_all`` also finishes starts that cannot become the best; small
+    programs always finish them.  ``rows`` may come from another program of the problem.
     """
 
     def __init__(

@@ -33,13 +33,7 @@ _MANY = 8
 
 @dataclass(frozen=True)
 class Optimum:
-    """A distinct local optimum.
-
-    Attributes:
-        q: Posture, shape (nq,).
-        objective: Value of the objective.
-        hits: Number of starts that ended there.
-    """
+    """A distinct local optimum: posture, shape (nq,), objective, and number of starts that ended there."""
 
     q: Array
     objective: float

@@ -10,14 +10,9 @@ from impact_posture.system.arrays import Array
 class StartDraws:
     """Known starts, then random starts (:func:`impact_posture.posture.manifold.feasible_start.feasible_start`).
 
-    The process that runs a start draws it.  The constraints of the starts do not grow with the problem.
-
-    Args:
-        problem: The posture problem.
-        known: The first starts, at least one.  Odd random starts lie near the first, because the posture of the
-            problem may be far from all postures that satisfy the constraints.
-        count: Number of starts.
-        seed: Seed of the random starts.
+    The process that runs a start draws it.  The constraints of the starts do not grow with the problem.  There is at
+    least one known start.  Odd random starts lie near the first, because the posture of the problem may be far from
+    all postures that satisfy the constraints.
     """
 
     def __init__(self, problem: ConstrainedProblem, known: tuple[Array, ...], count: int, seed: int) -> None:
@@ -27,10 +22,8 @@ class StartDraws:
     def choose(self, index: int, trapped: int = 0) -> Array | None:
         """Return a start; ``None`` if no attempt reached the constraints.
 
-        Args:
-            index: Index of the start.
-            trapped: Number of runs from this start that ended in a trap.  After the first, the start is drawn with
-                more care, and after each further one, another start is drawn.
+        ``trapped`` is the number of runs from this start that ended in a trap.  After the first, the start is drawn
+        with more care, and after each further one, another start is drawn.
         """
         if index < len(self._known) and trapped <= 1:
             return self._known[index]
