@@ -34,14 +34,7 @@ _ROTORS = 64
 
 
 class Ticks(NamedTuple):
-    """Record of n ticks.
-
-    Attributes:
-        trace: True states after the ticks.
-        rotor_speed: Commanded rotor speeds, shape (n, rotors).
-        level: Level of the impact-robust term, shape (n,).
-        status: Status number, shape (n,).
-    """
+    """True states after n ticks, commanded rotor speeds, shape (n, rotors), and levels and status numbers, shape (n,)."""
 
     trace: Trace
     rotor_speed: Array
@@ -57,7 +50,6 @@ class CompiledWorld:
     """
 
     def __init__(self, world: World, tick: CompiledTick, contents: dict[str, Any], library: ctypes.CDLL) -> None:
-        """Take over a world (:func:`compiled_world`)."""
         self._world, self._tick, self._run = world, tick, library.world_ticks
         self._members, self._arrays = _members(), dict[str, Array]()
         kinds = {"int": ctypes.c_int, "double": ctypes.c_double}

@@ -38,7 +38,6 @@ class OfflinePosture:
     """Offline optimum of a scenario.
 
     Attributes:
-        solution: Solution of the optimizer.
         objective: Objective at the posture.
         initial: Objective at the start posture after its projection onto the constraints.
         distance: Distance from the projected start, rad (m).
@@ -71,13 +70,8 @@ def offline_posture(
     at most :data:`SHARE` of the limits of motors and rotors to hold the posture.  The end effector is at the surface,
     as far as its task controls it.  The base of a flying robot stays level.  The feet of a standing robot stay in
     place, the center of mass is above them, and the base tilts no further than the reference flow may tilt it.  If
-    every posture has collisions, the best one is taken with a note.
-
-    Args:
-        setup: The scenario.
-        objective: The objective.
-        starts: Number of starts of the optimizer.
-        at_contact: Whether the end effector is at the surface; otherwise it is at its start.
+    every posture has collisions, the best one is taken with a note.  Without ``at_contact``, the end effector stays
+    at its start.
 
     Raises:
         Infeasible, SolverFailed: As :func:`impact_posture.posture.search.multistart.solve`.
@@ -106,7 +100,7 @@ def offline_posture(
 
 
 def scenario_requirements(setup: Setup, objective: WorstCaseObjective, *, at_contact: bool = True) -> Requirements:
-    """Return the requirements of a scenario without margins; for the arguments see :func:`offline_posture`."""
+    """Return the requirements of a scenario without margins, for the arguments of :func:`offline_posture`."""
     control, contact, base, target = setup.scenario.control, objective.contact, "free", None
     if setup.robot.floating:
         base = "level" if control.tilt is not None else f"level:{np.rad2deg(FlowOptions().tilt)}"

@@ -27,13 +27,7 @@ _DEEP = 0.02
 
 @dataclass(frozen=True)
 class Event:
-    """Broken bound.
-
-    Attributes:
-        status: Status of the run because of this event.
-        time: Time, s.
-        what: Description.
-    """
+    """Description of a broken bound, its time (s), and the status that it gives the run."""
 
     status: Outcome
     time: float

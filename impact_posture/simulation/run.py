@@ -40,7 +40,6 @@ class Run:
     """Record of a run.
 
     Attributes:
-        series: Time series.
         windows: An impact window for each contact or push, then the dwell and recovery windows.
         sign: Sign of the push, 1 for contacts.
         waited: Time of the push, s, NaN for contacts.
@@ -129,11 +128,7 @@ class _Loop:
         return speeds
 
     def check_length(self, t: float) -> None:
-        """Refuse a run of duration ``t`` (s) with fewer than two ticks, or with more than :data:`_MOST`.
-
-        Raises:
-            InputError: The run is too short or too long.
-        """
+        """Refuse a run of duration ``t`` (s) with fewer than two ticks, or with more than :data:`_MOST`."""
         if not 2 * self.period <= t <= _MOST * self.period:
             fault, hint = f"more than {_MOST:.0e}", "lower the contacts' count or the times, or raise control.period"
             if t < 2 * self.period:

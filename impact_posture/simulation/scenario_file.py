@@ -161,11 +161,7 @@ class ScenarioTable(Scene, RobotSettings):
 @checked
 @dataclass(frozen=True, eq=False, kw_only=True)
 class Scenario(ScenarioTable):
-    """Experiment as its file describes it, before the robot is loaded.
-
-    Attributes:
-        source: Path of the file, for errors.
-    """
+    """Experiment as its file describes it, before the robot is loaded.  Errors name the file, ``source``."""
 
     source: str = ""
 

@@ -22,14 +22,7 @@ _KEYS = {field.name for field in fields(ScenarioTable)}
 
 @dataclass(frozen=True, eq=False)
 class Setup:
-    """Scenario that is ready to run.
-
-    Attributes:
-        scenario: The scenario.
-        robot: The loaded robot.
-        q: Start posture, shape (nq,).
-        world: The simulated world, before its first reset.
-    """
+    """Scenario that is ready to run: its robot, start posture, shape (nq,), and world before its first reset."""
 
     scenario: Scenario
     robot: Robot

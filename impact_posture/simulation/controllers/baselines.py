@@ -20,20 +20,12 @@ from impact_posture.tsid.tasks.impact_robust import ImpactRobustPosture, curvatu
 
 
 def spring_of_term(robot: Robot, gradient: Gradient, q: Array, strength: float) -> Array:
-    """Return ``[K ∇²H(q)/λ]₊``, the stiffness of the impact-robust term at ``q``.
+    """Return ``[K ∇²H(q)/λ]₊``, the stiffness of the impact-robust term at ``q``, 1/s², shape (nv, nv).
 
+    ``gradient`` is ``q → (H, ∇H)``, ``strength`` is ``K/λ``, and the term rests at ``q``, shape (nq,).
     A posture task with this added stiffness has the spring of the term without its posture.  The difference between
     the two controllers is the effect of the posture.  ``∇²H`` is symmetrized.  The base of a floating robot is left
     out, because other tasks control it.  Negative curvature is left out, because it is not a stiffness.
-
-    Args:
-        robot: The robot.
-        gradient: ``q → (H, ∇H)``.
-        q: Posture where the term rests, shape (nq,).
-        strength: ``K/λ`` of the term.
-
-    Returns:
-        Stiffness, 1/s², shape (nv, nv).
     """
     added = strength * curvature(gradient, robot.model, q, np.eye(robot.nv))
     if robot.floating:
@@ -47,12 +39,8 @@ def resting_posture(driver: Driver, seconds: float, *, ahead: float = 0.0) -> Ar
     """Return the posture in which a driver comes to rest after :meth:`Driver.brace`, shape (nq,).
 
     The robot executes the planned acceleration exactly, without physics engine, sensors and motors.  It rests once
-    ``‖ν‖`` has been below 1e-3 at the full level of the driver for 0.2 s.
-
-    Args:
-        driver: The driver, which is reset.
-        seconds: Longest time to come to rest, s.
-        ahead: Distance that the end effector then moves towards the surface, m.
+    ``‖ν‖`` has been below 1e-3 at the full level of the driver for 0.2 s, or after ``seconds``.  Then the end effector
+    moves ``ahead`` (m) towards the surface, and the robot comes to rest again.
     """
     setup, period = driver.setup, driver.controller.period
     q, v, t = setup.q.copy(), np.zeros(setup.robot.nv), 0.0
@@ -84,7 +72,6 @@ class FlowPosture(ImpactRobustPosture):
     """
 
     def reset(self, state: State) -> None:
-        """Hold the present posture."""
         super().reset(state)
         self.basis: Array | None = None
         self._flow = np.zeros(state.nv)
@@ -94,7 +81,6 @@ class FlowPosture(ImpactRobustPosture):
         self.activation.enter(Phase.CONTACT)
 
     def advance(self, state: State, dt: float) -> None:
-        """Move ``q_des``."""
         super().advance(state, dt)
         if self.basis is None or self.level <= 0:
             self._flow[:] = 0.0
@@ -104,7 +90,6 @@ class FlowPosture(ImpactRobustPosture):
         self._target[:] = pin.integrate(self._model, self._target, dt * self._flow)
 
     def feedforward(self, state: State) -> Array:
-        """Return the flow as velocity reference."""
         return np.asarray(self.kd * self._flow)
 
 
@@ -114,7 +99,6 @@ class WalkerDriver(RobustDriver):
     posture: FlowPosture
 
     def reset(self, q: Array) -> Command:
-        """Begin at rest."""
         command = super().reset(q)
         self.posture.basis = self.controller.assembly.redundancy(self.controller.state)
         self._ticks = 0
@@ -147,7 +131,6 @@ class ReleaseDriver(RobustDriver):
     PATIENCE, LEAST = 0.5, 0.01
 
     def __init__(self, setup: Setup, term: ImpactRobustPosture, gradient: Gradient, optimum: Array) -> None:
-        """Measure both curvatures."""
         super().__init__(setup, term)
         scales = []
         for q in (setup.q, optimum):
@@ -158,14 +141,12 @@ class ReleaseDriver(RobustDriver):
         self._ticks, self._reached, self._braced = 0, np.inf, False
 
     def reset(self, q: Array) -> Command:
-        """Begin at rest."""
         command = super().reset(q)
         self.posture.scale = self._scale
         self._ticks, self._reached, self._braced = 0, np.inf, False
         return command
 
     def brace(self) -> None:
-        """Switch the term on."""
         super().brace()
         self._braced = True
 

@@ -32,14 +32,9 @@ _QUICK = ("-O1",)
 
 
 class CompiledTick:
-    """Controller in C that follows the targets of the tasks in Python.
-
-    Attributes:
-        library: The controller in C.
-    """
+    """Controller in C (``library``) that follows the targets of the tasks in Python."""
 
     def __init__(self, controller: Controller, structure: Structure, library: CompiledController) -> None:
-        """Connect a controller in Python and the library of its formulation."""
         self.library, self._controller, self._structure = library, controller, structure
         self._tasks = [t for t in controller.formulation.tasks if isinstance(t, TargetTask)]
         self._sent: dict[str, tuple[object, bytes, bytes]] = {}
@@ -63,10 +58,9 @@ class CompiledTick:
         return self.library.tick(reading.t, reading.q, reading.v, reading.force)
 
     def plan(self, times: Sequence[float], lead: Callable[[float], None]) -> tuple[Array, Array]:
-        """Return the targets that a function moves before the ticks at n times.
+        """Return whether ``lead`` moves each target before the ticks at n times, and the numbers of the target.
 
-        Returns:
-            Whether each target moves, shape (n, targets), and its numbers, shape (n, targets, 25).
+        The shapes are (n, targets) and (n, targets, 25).
         """
         targets = self.library.targets
         before = {name: row.copy() for name, row in targets.items()}

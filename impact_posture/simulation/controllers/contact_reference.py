@@ -13,13 +13,7 @@ from impact_posture.simulation.scenario_file import RepeatedContacts
 
 
 class ReferencePoint(NamedTuple):
-    """Reference along the approach, relative to the start of the shape.
-
-    Attributes:
-        distance: m.
-        speed: m/s.
-        acceleration: m/s².
-    """
+    """Distance (m), speed (m/s) and acceleration (m/s²) along the approach, relative to the start of the shape."""
 
     distance: float
     speed: float
@@ -34,7 +28,6 @@ class Reference:
     acceleration and at most the same speed.  A pause follows.
 
     Attributes:
-        task: The contacts.
         inward: Duration of the approach, s.
         cycle: Time from one approach to the next, s.
         total: Duration of the run, s.

@@ -102,7 +102,6 @@ class ControllerFactory:
     """Builds the controllers of a scenario.  Shared parts are built at their first use.
 
     Attributes:
-        setup: The scenario.
         free: Whether gradients and the offline optimum ignore the feet.
         gradient_of: Function that builds the gradient of an objective, compiled or interpreted.
         offline_of: Function with the arguments and result of
@@ -206,7 +205,6 @@ class ControllerFactory:
         return driver
 
     def _build(self, name: str, mode: Mode, gain: float | None) -> Driver:
-        """Build a controller of this package."""
         setup, robot = self.setup, self.setup.robot
         if name == "stiff":
             return self._stiffened("nominal", "robust", gain)
@@ -271,7 +269,6 @@ class ControllerFactory:
         return driver
 
     def _driver_from_outside(self, name: str, mode: Mode, gain: float | None) -> Driver:
-        """Build a controller of another installed package."""
         added = metadata.entry_points(group=GROUP)
         if name not in added.names:
             known = (*CONTROLLERS, *sorted(added.names))

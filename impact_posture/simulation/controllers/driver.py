@@ -29,8 +29,6 @@ class Driver:
     """Nominal controller: task-space inverse dynamics with a posture task.
 
     Attributes:
-        setup: The scenario.
-        posture: The posture task.
         controller: The controller in Python.
         compiled: The same controller as machine code.  If it is set, it gives the commands.
     """
@@ -38,7 +36,6 @@ class Driver:
     compiled: CompiledTick | None = None
 
     def __init__(self, setup: Setup, posture: JointPosture) -> None:
-        """Build the tasks of the scenario around a posture task."""
         self.setup, self.posture = setup, posture
         self._end_effector = end_effector_task(setup)
         formulation = build_formulation(setup, posture, self._end_effector)
@@ -106,7 +103,6 @@ class RobustDriver(Driver):
     posture: ImpactRobustPosture
 
     def brace(self) -> None:
-        """Switch the term on."""
         self._call_posture("brace")
 
     def hold(self) -> None:
@@ -126,16 +122,13 @@ class FlowDriver(Driver):
     _now = 0.0
 
     def lead(self, t: float, reference: ReferencePoint | None = None) -> None:
-        """Store the time."""
         self._now = t
         super().lead(t, reference)
 
     def brace(self) -> None:
-        """Start the flow of the posture."""
         self._call_posture("brace")
 
     def hold(self) -> None:
-        """Hold the posture that the flow has reached."""
         self._call_posture("contact")
 
     def expect(self, t: float) -> None:
@@ -145,10 +138,9 @@ class FlowDriver(Driver):
 
 
 class PostureDriver(Driver):
-    """Nominal controller that moves to an offline posture from :meth:`brace` on."""
+    """Nominal controller that moves to an offline posture, ``target`` of shape (nq,), from :meth:`brace` on."""
 
     def __init__(self, setup: Setup, posture: JointPosture, target: Array) -> None:
-        """Set the target posture, shape (nq,)."""
         super().__init__(setup, posture)
         self._goal = target
         self._since: float | None = None
@@ -156,7 +148,6 @@ class PostureDriver(Driver):
         self._moves: list[tuple[CenterOfMass | BaseOrientation, Any, Any]] = []
 
     def reset(self, q: Array) -> Command:
-        """Begin at rest."""
         self._since, self._moves = None, []
         return super().reset(q)
 
@@ -174,7 +165,6 @@ class PostureDriver(Driver):
         self._since = 0.0
 
     def lead(self, t: float, reference: ReferencePoint | None = None) -> None:
-        """Move the targets of the body tasks."""
         if self._since is not None and self._since < MOVE:
             self._since = min(MOVE, self._since + self.controller.period)
             for task, begin, end in self._moves:
@@ -201,25 +191,21 @@ class PathDriver(Driver):
     """
 
     def __init__(self, setup: Setup, posture: JointPosture, path: PosturePath) -> None:
-        """Set the path."""
         super().__init__(setup, posture)
         self.path = path
         self._since: float | None = None
         self._body = BodyTaskLead(setup.robot.model)
 
     def reset(self, q: Array) -> Command:
-        """Begin at rest."""
         self._since = None
         rest = np.zeros(self.setup.robot.nv)
         self.posture.lead(q, rest, rest)
         return super().reset(q)
 
     def brace(self) -> None:
-        """Start the path."""
         self._since = 0.0
 
     def lead(self, t: float, reference: ReferencePoint | None = None) -> None:
-        """Move posture and body tasks along the path."""
         if self._since is not None and self.level < 1:
             self._since += self.controller.period
             path, model = self.path, self.setup.robot.model

@@ -30,7 +30,6 @@ class ImpactFeedbackDriver(Driver):
     EARLY = 0.2
 
     def __init__(self, setup: Setup, posture: JointPosture) -> None:
-        """Build the nominal controller."""
         super().__init__(setup, posture)
         self._point = Point(setup.scenario.task.frame, setup.scenario.offset)
         points = (*self.controller.formulation.points, self._point)
@@ -38,13 +37,11 @@ class ImpactFeedbackDriver(Driver):
         self._at, self._felt = np.inf, False
 
     def reset(self, q: Array) -> Command:
-        """Begin at rest, without an expected impact."""
         self._at, self._felt = np.inf, False
         self._lead(None)
         return super().reset(q)
 
     def expect(self, t: float) -> None:
-        """Expect an impact at time ``t``, s.  An impact that the force sensor feels moves the time."""
         self._at, self._felt = t, False
 
     def _feel(self, reading: Reading) -> bool:
@@ -86,7 +83,6 @@ class InvariantDriver(ImpactFeedbackDriver):
     WINDOW, FADE = 0.05, 0.0025
 
     def tick(self, reading: Reading, reference: ReferencePoint | None = None) -> Command:
-        """Return the command with a velocity feedback that impulses do not change."""
         self._feel(reading)
         self._lead(reference)
         share = self.share(reading.t)
@@ -138,29 +134,24 @@ class ReferenceSpreadingDriver(ImpactFeedbackDriver):
     _done: float | None
 
     def __init__(self, setup: Setup, posture: JointPosture) -> None:
-        """Build the nominal controller."""
         super().__init__(setup, posture)
         task = setup.scenario.contacts
         self._speed, self._acceleration = (0.0, 0.0) if task is None else (task.speed, task.acceleration)
         self._impact = ImpactLimits(
             setup.robot, self._point, setup.scenario.normal, self.controller.formulation.contacts
         )
-        self._clear()
 
     def reset(self, q: Array) -> Command:
-        """Begin at rest, without an expected impact."""
         self._clear()
         command = super().reset(q)
         self._origin = self._state.update(q, np.zeros(self.setup.robot.nv)).at(self._point).position.copy()
         return command
 
     def expect(self, t: float) -> None:
-        """Expect an impact at time ``t``, s, and begin the next approach."""
         super().expect(t)
         self._clear()
 
     def tick(self, reading: Reading, reference: ReferencePoint | None = None) -> Command:
-        """Return the command with the reference of the present mode."""
         acts = self._feel(reading) if reading.force is not None else reading.t >= self._at
         state = self._state.update(reading.q, reading.v)
         if reference is None or reference.speed < 0 or not math.isfinite(self._at):
@@ -210,7 +201,6 @@ class ImpactAwareDriver(Driver):
     """
 
     def __init__(self, setup: Setup, posture: JointPosture) -> None:
-        """Add the limits to the tasks of the scenario."""
         super().__init__(setup, posture)
         formulation, period = self.controller.formulation, setup.scenario.control.period
         point = Point(setup.scenario.task.frame, setup.scenario.offset)
@@ -219,16 +209,13 @@ class ImpactAwareDriver(Driver):
         self.controller = Controller(setup.robot, replace(formulation, row_limits=(self.limits,)), period=period)
 
     def reset(self, q: Array) -> Command:
-        """Begin at rest, without an expected impact."""
         self.limits.active = False
         return super().reset(q)
 
     def expect(self, t: float) -> None:
-        """Expect an impact, and apply its limits from now on."""
         self.limits.active = True
 
     def tick(self, reading: Reading, reference: ReferencePoint | None = None) -> Command:
-        """Return the command, with limits until the end effector returns."""
         if reference is not None and reference.speed < 0:
             self.limits.active = False
         return super().tick(reading, reference)

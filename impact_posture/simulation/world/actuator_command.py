@@ -34,11 +34,7 @@ class ActuatorCommand:
 
 
 class CommandLimits:
-    """Limits of joint torques and rotor speeds.
-
-    Attributes:
-        effort: Largest torques, N·m or N, shape (joints,); infinite where the model states none.
-    """
+    """Limits of rotor speeds and joint torques (``effort``, N·m or N, infinite where the model states none)."""
 
     def __init__(self, robot: Robot, rotors: Rotors | None) -> None:
         propulsion = robot.spec.propulsion
@@ -86,11 +82,7 @@ class Push:
 
 
 class ActivePushes:
-    """Pushes that act on a world.
-
-    Attributes:
-        active: Body, point in the axes of the body, force, and last step of each push.
-    """
+    """Pushes that act on a world: body, point in the axes of the body, force, and last step of each."""
 
     def __init__(self, model: Any) -> None:
         self._model, self._apply = model, import_mujoco().mj_applyFT
@@ -103,11 +95,7 @@ class ActivePushes:
                 "push": [[*point, *force] for point, force in zip(points, forces, strict=True)]}  # fmt: skip
 
     def begin(self, push: Push, body: int, point: Array, step: int) -> None:
-        """Begin a push of a body at a point in the axes of the body.
-
-        Raises:
-            InputError: The force is not finite, or the duration is shorter than a time step.
-        """
+        """Begin a push of a body at a point in the axes of the body, as :meth:`World.push`."""
         count = round(push.duration / self._model.opt.timestep) if np.isfinite(push.duration) else 0
         if count < 1 or not np.isfinite(push.force).all():
             raise InputError("has no force or no duration", where=f"push at '{push.frame}'",
@@ -124,11 +112,7 @@ class ActivePushes:
 
 
 class JointStops:
-    """Position limits of joints.
-
-    Attributes:
-        names: Joints with limits, in the order of :class:`Trace`.
-    """
+    """Position limits of the joints ``names``, in the order of ``Trace.stopped``."""
 
     def __init__(self, model: Any) -> None:
         limited = np.array(model.jnt_limited, dtype=bool)

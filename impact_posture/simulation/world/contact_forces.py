@@ -121,11 +121,9 @@ class ContactLog:
         return list(force.tolist())
 
     def look(self) -> tuple[Array, ...]:
-        """Return the contacts at all n marks, and clear the marks.
+        """Return the quantities of :class:`ShapeTruth` at all n marks, without the frame, and clear the marks.
 
-        Returns:
-            The quantities of :class:`ShapeTruth` in their order, without the frame.  The first axis counts marks, the
-            second axis shapes.  ``began`` is NaN where a shape was not touched since the previous mark.
+        Axes are marks and shapes.  ``began`` is NaN where a shape was not touched since the previous mark.
         """
         ends, count = np.array([number for number, _ in self._marks]), self._count
         numbers, n = np.array([step.number for step in self._steps]), ends.size

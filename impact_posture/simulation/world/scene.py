@@ -133,12 +133,6 @@ class Scene(StrictTable):
     """Surroundings of a robot.
 
     Every shape can touch every surface.  Other contacts do not exist.
-
-    Attributes:
-        surfaces: Surfaces around the robot.
-        shapes: Shapes on the robot.
-        physics: Time step, gravity, and the stops of the joints.
-        sensors: Errors of the sensors.
     """
 
     surfaces: tuple[Surface, ...] = ()

@@ -40,11 +40,7 @@ NO_FORCE = [0.0, 0.0, 0.0]
 
 
 class ForceFilter:
-    """Low-pass filter of a force sensor.  ``turns`` is the cutoff frequency times the time step.
-
-    Attributes:
-        force: The filtered force, N, three numbers.
-    """
+    """Low-pass filter of a ``force`` (N, three numbers).  ``turns`` is the cutoff frequency times the time step."""
 
     def __init__(self, turns: float) -> None:
         self._share, self.force = -math.expm1(-2 * math.pi * turns), NO_FORCE

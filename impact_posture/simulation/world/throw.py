@@ -79,13 +79,8 @@ def thrown_jumps(oracle: ImpactOracle, q: Array, throw: Throw, speed: float) -> 
 
     The contact has the mobility ``B = J M⁻¹Jᵀ`` of the robot plus ``D`` of the ball, which is ``1/m`` along the
     normal and ``3.5/m`` across it.  Without rebound, the impulse is ``v n/(nᵀ(B + D)n)`` without friction and
-    ``v (B + D)⁻¹n`` if the ball sticks.  A sliding ball is assumed to slide against its sticking impulse.
-
-    Args:
-        oracle: Impact of the robot at the shape, with the direction of flight as normal.
-        q: Posture, shape (nq,).
-        throw: The ball.
-        speed: Approach speed, m/s.
+    ``v (B + D)⁻¹n`` if the ball sticks.  A sliding ball is assumed to slide against its sticking impulse.  ``v`` is
+    the approach ``speed``, m/s, and ``n`` the normal of the oracle, which is the direction of flight.
     """
     quantities = oracle.quantities(q)
     n, jump_per_impulse = quantities.normal, oracle.solve(oracle.J.T)

@@ -43,8 +43,6 @@ class World:
     Call :meth:`reset` first.  All coordinates are in the convention of Pinocchio.
 
     Attributes:
-        robot: The robot.
-        scene: Surroundings of the robot.
         built: MuJoCo model and places of the surfaces.
         timestep: Time step of the physics, s.
         limits: Limits of the commands.
@@ -52,11 +50,6 @@ class World:
     """
 
     def __init__(self, robot: Robot, scene: Scene, built: BuiltScene) -> None:
-        """Compile the model.
-
-        Raises:
-            InputError: MuJoCo is not installed or refuses the model.
-        """
         self._mujoco = import_mujoco()
         self.robot, self.scene, self.built = robot, scene, built
         self.timestep = scene.physics.timestep
@@ -153,11 +146,7 @@ class World:
         self._mujoco.mj_step1(self._model, self._data)
 
     def step(self, command: Command | ActuatorCommand, count: int = 1) -> None:
-        """Take physics steps under one command.
-
-        Args:
-            command: Rotor speeds and joint torques, which are clipped to their limits.
-            count: Number of steps.
+        """Take ``count`` physics steps under one command, which is clipped to the limits.
 
         Raises:
             InputError: There was no reset, or the command does not fit or is not finite.
@@ -288,16 +277,12 @@ class World:
 
 
 def build_world(robot: Robot, scene: Scene, q: ArrayLike | None = None, throw: Throw | None = None) -> World:
-    """Build the simulation of a robot in its surroundings.
+    """Build the simulation of a robot in its surroundings, with a ball that can be thrown.
 
-    Args:
-        robot: The robot.
-        scene: Surroundings of the robot.
-        q: Posture that surfaces with a gap refer to, shape (nq,).  By default, the default posture of the robot.
-        throw: Ball that is thrown.
+    The gaps of surfaces refer to the posture ``q``, shape (nq,), by default the default posture of the robot.
 
     Raises:
-        InputError: MuJoCo is not installed, or the scene does not fit the robot.
+        InputError: MuJoCo is not installed or refuses the model, or the scene does not fit the robot.
     """
     start = robot.posture() if q is None else robot.check_posture(np.asarray(q, dtype=float), where="start posture")
     return World(robot, scene, build_scene(robot, scene, start, throw))

@@ -38,7 +38,6 @@ class BuiltScene:
         points: Point on each surface, world, m, by name.
         gaps: Distance of each shape from each surface in the start posture, m, by surface and shape.
         shape_geoms: Name of the geom of each shape, in the order of the scene.
-        throw: Ball that is thrown, or ``None``.
     """
 
     mjcf: Mjcf
@@ -171,11 +170,10 @@ def _add_motors(mjcf: Mjcf, robot: Robot) -> None:
     transmission = import_mujoco().mjtTrn.mjTRN_JOINT
     for slot in Chart(robot.model).slots[1 if robot.floating else 0 :]:
         if slot.kind.family not in _DRIVEN:
-            what, hint = (
-                f"no motor drives joint '{slot.name}' ({slot.kind.family})",
-                "lock it (`lock`), or model it as",
+            what = f"no motor drives joint '{slot.name}' ({slot.kind.family})"
+            raise UnsupportedJoint(
+                what, where="simulation", hint="lock it (`lock`), or model it as slides and hinges"
             )
-            raise UnsupportedJoint(what, where="simulation", hint=f"{hint} slides and hinges")
         targets = mjcf.joints[slot.index]
         motors = [(f"motor {name}", name, np.eye(3)[0]) for name in targets]
         if slot.kind.family == "spherical":
