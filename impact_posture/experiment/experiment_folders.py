@@ -28,9 +28,7 @@ class Output:
     """Output folder, and what it contains besides the numbers.
 
     Attributes:
-        folder: The folder.
         force: Whether an earlier result there may be replaced.
-        formats: Formats of the figures.
         report: Whether ``report.html`` is written.
         meshes: Whether the report shows the meshes of the robot.
     """
@@ -79,10 +77,7 @@ def write_comparison(output: Output, comparison: Reproduction, store: JobStore) 
 
 
 def write_reproduction(output: Output, reproduction: Reproduction, store: JobStore) -> Document:
-    """Write ``reproduction.json``, ``SUMMARY.md``, all documents in ``runs/``, and figures, and remove the store.
-
-    Returns:
-        The content of ``reproduction.json``.
+    """Write ``SUMMARY.md``, ``runs/``, figures and ``reproduction.json``, return the latter, and remove the store.
 
     Raises:
         OutputError: As :func:`write_simulation`.

@@ -1,4 +1,4 @@
-"""JobStore of finished jobs, so that an interrupted comparison continues instead of starting again."""
+"""Store of finished jobs, so that an interrupted comparison continues instead of starting again."""
 
 from __future__ import annotations
 
@@ -167,22 +167,13 @@ def _scenario(scenario: str) -> str:
 
 
 def run_batch(
-    jobs: Sequence[Job],
-    *,
-    processes: int = 1,
-    store: JobStore | None = None,
-    progress: Progress | None = None,
+    jobs: Sequence[Job], *, processes: int = 1, store: JobStore | None = None, progress: Progress | None = None
 ) -> list[Document]:
     """Run the jobs that are not stored yet, and return all documents in the order of the jobs.
 
     A job that fails (for example where a metric is undefined) has a document without runs and with the status
-    ``control lost``.
-
-    Args:
-        jobs: The jobs.
-        processes: Number of processes.
-        store: Folder of finished jobs.  It also keeps the time series of the jobs that figures and reports show.
-        progress: Callback with (done, all).
+    ``control lost``.  The store also keeps the time series of the jobs that figures and reports show.  ``progress``
+    is called with (done, all).
 
     Raises:
         ImpactPostureError: A scenario cannot be set up, or a controller does not exist.

@@ -21,13 +21,7 @@ Plan = Mapping[str, Sequence[str]]
 
 @dataclass(frozen=True)
 class PaperRow:
-    """Row of Table I: ``q_total_impact`` of two controllers, and the reduction that the text of the paper states.
-
-    Attributes:
-        nominal: Nominal TSID.
-        robust: Impact-robust TSID.
-        reduction: Reduction, a share.
-    """
+    """Row of Table I: ``q_total_impact`` of both TSID controllers, and the reduction in the text of the paper."""
 
     nominal: float
     robust: float
@@ -126,13 +120,7 @@ def gather(scenario: str, labels: Sequence[str], documents: Sequence[Document]) 
 
 @dataclass(frozen=True, eq=False)
 class Reproduction:
-    """Results of all controllers in all scenarios.
-
-    Attributes:
-        seeds: Number of seeds.
-        rows: Rows, scenario by scenario, nominal first.
-        jobs: Jobs of the rows.
-    """
+    """Results of all controllers in all scenarios: rows, scenario by scenario, nominal first, and their jobs."""
 
     seeds: int
     rows: tuple[ControllerRow, ...]

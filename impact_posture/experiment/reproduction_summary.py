@@ -92,20 +92,15 @@ def summary(results: Reproduction) -> str:
         LEGEND,
     ]
     for scenario in results.scenarios:
-        parts += [
-            f"## {markdown(scenario)}",
-            scenario_table(results.of(scenario)),
-            "\n".join(remarks(results, scenario)),
-        ]
+        notes = "\n".join(remarks(results, scenario))
+        parts += [f"## {markdown(scenario)}", scenario_table(results.of(scenario)), notes]
     return "\n\n".join(parts) + "\n"
 
 
 def advice(results: Reproduction, others: Reproduction | None = None) -> list[str]:
-    """Return one line for each scenario: the best controller, its reduction, and its disadvantages.
+    """Return one line for each scenario: the best controller of ``results``, its reduction, and its disadvantages.
 
-    Args:
-        results: Results of the controllers that may be best.
-        others: Results of more controllers, which may contain the held variant of the best one.
+    ``others`` may contain the held variant of the best controller, if ``results`` does not.
     """
     lines = []
     for scenario in results.scenarios:

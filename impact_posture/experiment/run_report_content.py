@@ -50,15 +50,11 @@ def run_content(folder: Path, document: Document, view: RunView, job: Job) -> Co
     metrics, status = document["metrics"], document["status"]
     verdict = [f"{status}: its numbers are not a result" if metrics is None else f"{status}: {_summary(metrics)}"]
     verdict += [f"t = {event['time']:.2f} s: {event['what']}" for event in document["events"]]
-    rows = (
-        []
-        if metrics is None
-        else [(key, number(metrics[key]), unit, words) for key, unit, words in table_metrics(view)]
-    )
+    wanted = [] if metrics is None else table_metrics(view)
+    rows = [(key, number(metrics[key]), unit, words) for key, unit, words in wanted]
     if document["prediction"] is not None:
-        rows.append(
-            ("H before", number(document["prediction"]["H"]), "jump²/(N·s)²", "jump² per impulse² at the impacts")
-        )
+        H = number(document["prediction"]["H"])
+        rows.append(("H before", H, "jump²/(N·s)²", "jump² per impulse² at the impacts"))
     return Content(
         title=run_header([view])[0],
         command=typed_command(folder) or shlex.join(["impact-posture", *options]),
@@ -93,9 +89,9 @@ def comparison_content(folder: Path, document: Document, view: RunView) -> Conte
         if row["reduction"] is not None and row["controller"] != "nominal":
             share = row["reduction"]["mean"]
             verdict.append(f"{row['controller']} moves {abs(share):.0%} {'less' if share > 0 else 'more'}")
-    line = (
-        f"Within the impact windows, against nominal: {'; '.join(verdict)}." if verdict else "No reduction is known."
-    )
+    line = "No reduction is known."
+    if verdict:
+        line = f"Within the impact windows, against nominal: {'; '.join(verdict)}."
     seeds = len(document["seeds"])
     alike = without_noise(Interval(**interval) for row in rows for interval in row["metrics"].values())
     intervals = ", with 95 % intervals" if seeds >= FEWEST else ""

@@ -133,11 +133,7 @@ def write_run_report(folder: Path, scenario: str = "", *, meshes: bool = False) 
 def thin(series: Series, windows: Iterable[Window]) -> Series:
     """Return the ticks of a run that a report shows.  A force is the largest one since the previous shown tick.
 
-    The ticks end where the state diverges.
-
-    Args:
-        series: All ticks.
-        windows: Windows of the run.  Ticks within windows of kind ``impact`` are denser.
+    The ticks end where the state diverges, and are denser within windows of kind ``impact``.
 
     Raises:
         InputError: The state diverges within two ticks.

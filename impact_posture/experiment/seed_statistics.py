@@ -27,9 +27,7 @@ class Interval:
     """Mean with its 95 % confidence interval (Student's t).
 
     Attributes:
-        mean: Mean of the samples.
         half_width: Half width of the interval, ``None`` for one sample.
-        samples: Number of samples.
     """
 
     mean: float
@@ -65,10 +63,8 @@ class ControllerRow:
     """Results of a controller in a scenario, over all seeds.
 
     Attributes:
-        scenario: Name of the scenario.
         controller: Label of the controller.
         status: ``completed`` if all runs completed, else the gravest status.
-        runs: Number of runs.
         completed: Number of runs that completed.
         failed: Reason why a run did not complete, one line each.
         metrics: Means of the completed runs, by name of :data:`QUANTITIES`.  Empty if no run completed.
@@ -120,14 +116,7 @@ def fate(document: Document) -> str:
 def row_of(
     scenario: str, controller: str, documents: Sequence[Document], nominal: Sequence[Document]
 ) -> ControllerRow:
-    """Summarize the runs of a controller.
-
-    Args:
-        scenario: Name of the scenario.
-        controller: Label of the controller.
-        documents: Documents of its runs.
-        nominal: Documents of the nominal controller, paired by seed.  Without them there is no comparison.
-    """
+    """Summarize the runs of a controller, compared to runs of the nominal controller with the same seeds, if any."""
     good = [d for d in documents if d["status"] == "completed"]
     base = {d["seed"]: d for d in nominal}
     pairs = [(d, base[d["seed"]]) for d in documents if d["seed"] in base]

@@ -34,7 +34,7 @@ _ROTORS = 64
 
 
 class Ticks(NamedTuple):
-    """True states after n ticks, commanded rotor speeds, shape (n, rotors), and levels and status numbers, shape (n,)."""
+    """True states after n ticks, rotor commands, shape (n, rotors), and levels and status numbers, shape (n,)."""
 
     trace: Trace
     rotor_speed: Array

@@ -33,10 +33,6 @@ _Value = TypeVar("_Value")
 class CaseSolver:
     """Robot, problems and programs of a case, which a process keeps from shard to shard.
 
-    Attributes:
-        timer: Time of the solver.
-        robot: The robot.
-
     Raises:
         ImpactPostureError: A setting is wrong.
     """

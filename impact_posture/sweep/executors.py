@@ -37,10 +37,7 @@ def process_pool(workers: int) -> Iterator[Executor]:
 
 @contextmanager
 def dask_cluster(address: str) -> Iterator[Executor]:
-    """Yield the executor of a Dask cluster.
-
-    Args:
-        address: Address of the scheduler, such as ``tcp://host:8786``.
+    """Yield the executor of the Dask cluster with a scheduler at an address, such as ``tcp://host:8786``.
 
     Raises:
         InputError: The package is missing, or no scheduler answers at the address.

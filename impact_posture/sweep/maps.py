@@ -49,7 +49,6 @@ class Shown:
         counts: Number of solved points of each status.
         switches: Number of pairs of neighbors in the maps between which the best posture switches.
         best: Values and objective of the best point of each case.
-        files: The pictures.
     """
 
     points: int
@@ -65,13 +64,10 @@ class Shown:
 
 
 def draw_maps(folder: Path, out: Path, axes: Sequence[str] | None = None, formats: Sequence[str] = ("png",)) -> Shown:
-    """Draw a map of each case of a sweep folder, with other axes at their middle values.
+    """Draw a map of each case of a finished or unfinished sweep folder into ``out``.
 
-    Args:
-        folder: The sweep folder, finished or unfinished.
-        out: Folder of the pictures.
-        axes: Names of the horizontal and the vertical axis; by default the two axes with the most values.
-        formats: Formats of the pictures.
+    ``axes`` names the horizontal and the vertical axis, by default the two axes with the most values.  Other axes are
+    at their middle values.
 
     Raises:
         InputError: An axis is unknown.
@@ -133,12 +129,9 @@ def _plane(grid: Grid, across: int, upwards: int | None) -> NDArray[np.int64]:
 
 
 class _Slice:
-    """Points of one map, in arrays of shape (rows, columns).
+    """Points of one map: status (empty if unsolved) and objective (NaN without posture), shape (rows, columns).
 
-    Attributes:
-        status: Status of each point; empty for an unsolved point.
-        value: Objectives, NaN for a point without posture.
-        switches: Pairs of neighbors ``(row, column), (row, column)`` between which the best posture switches.
+    The best posture switches between the neighbors ``(row, column), (row, column)`` in ``switches``.
     """
 
     def __init__(self, data: Any, points: NDArray[np.int64], problem: ConstrainedProblem) -> None:

@@ -93,14 +93,10 @@ class Walk:
 
 
 def search(walk: Walk, place: Place, guesses: Sequence[Start], beside: float = 0.0) -> PointResult:
-    """Solve one point from the guesses and the given posture, and from many starts where they disagree.
+    """Solve one point from optima of neighbors and the given posture, and from many starts where they disagree.
 
-    Args:
-        walk: Problem and program, which earlier points have let grow.
-        place: Target position and orientation.
-        guesses: Optima of neighbors.
-        beside: Least violation at infeasible neighbors, if no neighbor has an optimum.  This point is then likely
-            infeasible.
+    ``beside`` is the least violation at infeasible neighbors, if no neighbor has an optimum.  This point is then
+    likely infeasible.
     """
     attempt = _Attempt(walk, place, walk.settings.starts - 1)
     try:
@@ -143,12 +139,9 @@ class _Attempt:
     def certified(
         self, guesses: Sequence[Start], *, alone: bool = False, rounds: int = _ROUNDS
     ) -> PointResult | None:
-        """Return the best certified result.  The program grows by the parts that the ends of the runs need.
+        """Return the best certified result from the guesses and, if they are not ``alone``, from other starts.
 
-        Args:
-            guesses: Starts besides the given posture and the random ones.
-            alone: Whether the guesses are the only starts.
-            rounds: Most rounds in which the program grows.
+        The program grows by the parts that the ends of the runs need, in at most ``rounds`` rounds.
         """
         price = SLACK_PRICE
         for _ in range(rounds):

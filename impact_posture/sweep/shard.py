@@ -30,15 +30,7 @@ _SOLVERS: OrderedDict[tuple[str, int], CaseSolver] = OrderedDict()
 
 @dataclass(frozen=True)
 class ShardResult:
-    """A shard after a pass.
-
-    Attributes:
-        index: Index of the shard.
-        content: Parquet file of the shard.
-        counts: Number of points of each status.
-        solver_s: Wall time within IPOPT and the functions that it calls, s.
-        total_s: Wall time of the pass, s.
-    """
+    """Parquet file of a shard after a pass, points of each status, and wall times within IPOPT and in all, s."""
 
     index: int
     content: bytes

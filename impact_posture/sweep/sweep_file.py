@@ -36,12 +36,7 @@ _NEIGHBORS = 2
 
 @dataclass(frozen=True)
 class Axis:
-    """Axis of a grid.
-
-    Attributes:
-        name: ``x``, ``y`` or ``z`` (offset of the target, world, m), or the name of a setting.
-        values: Values in the order of the file.
-    """
+    """Values of ``x``, ``y`` or ``z`` (offset of the target, world, m) or of a setting, in the order of the file."""
 
     name: str
     values: tuple[Any, ...]
@@ -49,11 +44,7 @@ class Axis:
 
 @dataclass(frozen=True)
 class Grid:
-    """All combinations of the values of several axes.  The last axis varies fastest.
-
-    Attributes:
-        axes: The axes, from the slowest to the fastest.
-    """
+    """All combinations of the values of several axes.  The last axis varies fastest."""
 
     axes: tuple[Axis, ...]
 
@@ -111,12 +102,7 @@ class SweepSettings(StrictTable):
 
 @dataclass(frozen=True)
 class Case:
-    """Combination of values that needs a separate program.
-
-    Attributes:
-        settings: The problem at the first point of the grid.
-        values: Value of each outer axis.
-    """
+    """Values of the outer axes, which need a separate program, and the problem at the first point of the grid."""
 
     settings: ProblemSettings
     values: Mapping[str, Any]

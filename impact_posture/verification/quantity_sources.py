@@ -31,29 +31,18 @@ _FLOOR = 1e-3
 
 @dataclass(frozen=True, eq=False)
 class PostureSample:
-    """A configuration and a normal.
-
-    Attributes:
-        q: Configuration, shape (nq,).
-        normal: Unit vector, shape (3,), in the contact's normal frame.
-    """
+    """Configuration, shape (nq,), and unit normal, shape (3,), in the normal frame of the contact."""
 
     q: Array
     normal: Array
 
 
 def random_samples(robot: Robot, count: int, seed: int, normal: Array | None = None) -> tuple[PostureSample, ...]:
-    """Return random postures with random normals, which depend on the seed only.
+    """Return random postures with random normals, which depend on the seed only.  ``normal`` replaces the first one.
 
     Joints are uniform within their limits.  Without limits, angles are within ±π and lengths within 1 m of the
-    default posture, and orientations are uniform.  A limit that is missing on
-    one side is at this distance from the default posture.
-
-    Args:
-        robot: The robot.
-        count: Number of samples.
-        seed: The seed.
-        normal: Normal of the first sample, shape (3,).
+    default posture, and orientations are uniform.  A limit that is missing on one side is at this distance from the
+    default posture.
     """
     generator, chart = np.random.default_rng(seed), Chart(robot.model)
     start = chart.to_x(robot.posture())
@@ -203,12 +192,8 @@ def difference_gradient(value: Callable[[Array], float], model: pin.Model, q: Ar
     """Return ``d/dε value(q ⊕ ε e_i)``, shape (nv,), by Ridders' extrapolation of central differences.
 
     Each entry is the extrapolation of its tableau that differs least from its neighbors.  So stiff supports and flat
-    directions need no tuned steps (Ridders 1982, "Accurate computation of F'(x) and F'(x)F''(x)").
-
-    Args:
-        value: The function.
-        model: The model that defines ``⊕``.
-        q: Configuration, shape (nq,).
+    directions need no tuned steps (Ridders 1982, "Accurate computation of F'(x) and F'(x)F''(x)").  ``model`` defines
+    ``⊕``.
     """
     directions = np.eye(model.nv)
 

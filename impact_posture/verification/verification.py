@@ -36,7 +36,6 @@ REFERENCE = "Pinocchio"
 CASADI, COMPILED, DIFFERENCES, MUJOCO = "CasADi", "compiled C", "finite differences", "MuJoCo"
 NO_COMPILER = f"no C compiler: {GET_ONE}"
 
-
 # Largest relative errors that pass: M and J from MuJoCo; H, G, Λ_c and gradients by adjoints; and gradients by finite
 # differences.
 _MODEL, _VALUES, _DIFFERENCES = 1e-9, 1e-9, 1e-8
@@ -71,13 +70,7 @@ class VerificationRow:
 
 @dataclass(frozen=True, eq=False)
 class VerificationReport:
-    """Comparison of all sources.
-
-    Attributes:
-        rows: Rows in the order of the sources.
-        samples: The samples.
-        seed: Seed of the samples.
-    """
+    """Comparison of all sources, in their order, at samples that depend on the seed."""
 
     rows: tuple[VerificationRow, ...]
     samples: tuple[PostureSample, ...]

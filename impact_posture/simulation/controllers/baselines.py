@@ -39,8 +39,8 @@ def resting_posture(driver: Driver, seconds: float, *, ahead: float = 0.0) -> Ar
     """Return the posture in which a driver comes to rest after :meth:`Driver.brace`, shape (nq,).
 
     The robot executes the planned acceleration exactly, without physics engine, sensors and motors.  It rests once
-    ``‖ν‖`` has been below 1e-3 at the full level of the driver for 0.2 s, or after ``seconds``.  Then the end effector
-    moves ``ahead`` (m) towards the surface, and the robot comes to rest again.
+    ``‖ν‖`` has been below 1e-3 at the full level of the driver for 0.2 s, or after ``seconds``.  Then the end
+    effector moves ``ahead`` (m) towards the surface, and the robot comes to rest again.
     """
     setup, period = driver.setup, driver.controller.period
     q, v, t = setup.q.copy(), np.zeros(setup.robot.nv), 0.0
