@@ -24,13 +24,9 @@ Standing = tuple[SweptHull, pin.SE3, Collection[int]]
 
 @dataclass(frozen=True, eq=False)
 class HalfSpace:
-    """The half-space behind a plane.
+    """The half-space behind a plane through ``point`` with the unit normal out of it, world, shape (3,), m.
 
-    Attributes:
-        name: Name in messages.
-        point: A point of the plane, world, shape (3,), m.
-        normal: Unit normal out of the half-space, world, shape (3,).
-        exempt: Joints whose links may be behind the plane.
+    Links of the joints ``exempt`` may be behind the plane.
     """
 
     name: str

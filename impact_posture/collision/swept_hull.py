@@ -94,13 +94,9 @@ class SweptHull:
 
 
 class Separation(NamedTuple):
-    """Signed distance of two swept hulls.
+    """Signed distance of two swept hulls with their radii, m; negative where the hulls penetrate each other.
 
-    Attributes:
-        distance: Distance with the sweep radii, m; negative where the hulls penetrate each other.
-        normal: Unit normal from ``b`` to ``a`` in world axes, shape (3,).
-        point_a: Closest point of ``a`` in the world, shape (3,), m.
-        point_b: Closest point of ``b`` in the world, shape (3,), m.
+    The unit normal points from ``b`` to ``a``.  It and the closest points are in world axes, shape (3,), m.
     """
 
     distance: float

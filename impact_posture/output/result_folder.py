@@ -27,13 +27,10 @@ FORMATS = ("png",)
 
 @dataclass(frozen=True)
 class Written:
-    """A result folder that was written.
+    """A result folder that was written, with its C export or ``None``.
 
-    Attributes:
-        out: The folder.
-        export: The C export, or ``None``.
-        compiler_error: Reason if the C code could not be built; empty otherwise, and without a compiler.
-        report_error: Reason if the report could not be written; empty otherwise.
+    The errors say why the C code could not be built or the report not be written; they are empty otherwise, the first
+    also without a compiler.
     """
 
     out: Path

@@ -35,12 +35,8 @@ _BROKEN = (LookupError, ValueError, TypeError, AttributeError, OSError, Recursio
 class SolvedPostures:
     """The postures and numbers of a result folder.
 
-    Attributes:
-        initial: Posture before, shape (nq,).
-        optimal: Posture after, shape (nq,).
-        path: The null-space path between the postures.
-        document: The content of ``result.json``.
-        mapped: The self-motion map, if it was computed.
+    Postures have the shape (nq,).  ``path`` is the null-space path between them, ``document`` the content of
+    ``result.json``, and ``mapped`` the self-motion map, if it was computed.
     """
 
     initial: Array

@@ -27,10 +27,8 @@ _AT_CORNERS, _BETWEEN = 8, 2
 class PathCurve:
     """The cubic spline ``q(s) = q₀ ⊕ z(s)``, ``0 ≤ s ≤ 1``, through two or more postures.
 
-    Attributes:
-        s: Values of ``s`` at the postures, evenly by path length, shape (n,).
-        z: Tangent coordinates of the postures at the first posture, shape (n, nv).
-        spline: The function ``z(s)``.
+    ``s`` has the values at the postures, evenly by path length, and ``z`` their tangent coordinates at the first
+    posture, shape (n, nv).
     """
 
     def __init__(self, space: PathSpace, postures: Sequence[Array]) -> None:

@@ -27,14 +27,11 @@ Mask = NDArray[np.bool_]
 
 @dataclass(frozen=True, eq=False)
 class Transmissions:
-    """Transmission of each velocity entry; a floating base has none.
+    """Transmission of each velocity entry, shape (nv,); a floating base has none.
 
-    Attributes:
-        rigid: Whether the rotor moves with the link.
-        locked: Whether the joint cannot be driven from its link.
-        stiffness: Stiffness of the spring between rotor and link, N·m/rad (N/m if prismatic), shape (nv,); infinite
-            where the robot states none.
-        damping: Damping beside the spring, N·m·s/rad (N·s/m), shape (nv,).
+    The rotor of a ``rigid`` joint moves with the link.  A ``locked`` joint cannot be driven from its link.  The
+    ``stiffness`` between rotor and link, N·m/rad (N/m if prismatic), is infinite where the robot states none.
+    ``damping`` is beside this spring, N·m·s/rad (N·s/m).
     """
 
     rigid: Mask

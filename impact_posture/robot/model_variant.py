@@ -30,14 +30,7 @@ class Payload:
 
 @dataclass(frozen=True, eq=False)
 class ModelVariant:
-    """A possible model of the robot.
-
-    Attributes:
-        name: Name in outputs.
-        robot: The robot under these assumptions.
-        armature_factor: Factor on the stated armature.
-        payload: Payload that the robot carries, or ``None``.
-    """
+    """A possible model of the robot, with a factor on the stated armature and a payload or ``None``."""
 
     name: str
     robot: Robot

@@ -84,13 +84,9 @@ class PlacedSolids:
 
 @dataclass(frozen=True)
 class MeshLicense:
-    """The terms of the meshes of a package.
+    """The terms of the meshes of a package (a folder in example-robot-data), as the package states them.
 
-    Attributes:
-        package: Folder of the package in example-robot-data.
-        license: Name of the license, as the package states it; empty if it states none.
-        upstream: Address of the original.
-        text: Text of the license, if the package holds it.
+    ``upstream`` is the address of the original.  ``license`` and ``text`` are empty if the package has none.
     """
 
     package: str

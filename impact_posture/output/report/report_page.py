@@ -43,11 +43,9 @@ class Content:
     """The text and tables of a page.
 
     Attributes:
-        title: Title.
         command: Command that makes the same result again.
         facts: Small print below the title.
         verdict: Lines, the most important first.
-        tables: Tables.
         moves: Sentences on the motion of the slider.
         notes: Notes, one line each.
         sources: Name and content of the files that the command reads.

@@ -34,9 +34,9 @@ class VariantOptimum:
     Attributes:
         name: Name of the model variant.
         at_robust: Objective of the variant at the robust optimum.
-        own: Objective of the variant at its own optimum; ``None`` if no start certified.
-        q: The own optimum, shape (nq,), or ``None``.
-        moved: Tangent distance of the own optimum from the robust optimum, or ``None``.
+        own: Objective of the variant at its own optimum; ``None`` (as ``q`` and ``moved``) if no start certified.
+        q: The own optimum, shape (nq,).
+        moved: Tangent distance of the own optimum from the robust optimum.
     """
 
     name: str

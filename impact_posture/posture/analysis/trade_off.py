@@ -18,17 +18,12 @@ KNEE = 1 / 3
 
 @dataclass(frozen=True, eq=False)
 class TradePoint:
-    """The best posture within one bound.
+    """The best posture within one bound, with H, G, V and S (``None`` where undefined) of its impact.
 
     Attributes:
         within: The bound on the distance from the initial posture (rad mixed with m), or on the peak force (N).
         distance: Distance or force of the posture, below ``within`` if the objective gains nothing there.
         q: Posture, shape (nq,).
-        objective: Objective at the posture.
-        H: Squared jump per squared impulse.
-        G: Inverse effective mass, 1/kg.
-        V: Squared jump per squared approach speed.
-        S: V of a contact that sticks, ``None`` where undefined.
         certificate: Certificate of the problem with the bound; its stationarity has no meaning at the first point.
         first: Whether this is the only posture at the least distance or force.
     """
@@ -58,16 +53,10 @@ class TradePoint:
 
 @dataclass(frozen=True, eq=False)
 class TradeOff:
-    """The best objective within each distance from the initial posture, or within each peak force.
+    """The best objective within each distance from the initial posture, or (``against``) within each peak force.
 
-    Attributes:
-        points: Points in the order of distance or force.
-        knee: Index of the point at the knee (:func:`find_knee`), or ``None``.
-        solves: Runs of the solver.
-        solve_time_s: Wall time of these runs.
-        build_time_s: Time to build the program.
-        notes: Notes for the user about the curve.
-        against: What the points bound.
+    ``points`` are in the order of distance or force.  ``knee`` is the index of the point at the knee
+    (:func:`find_knee`), or ``None``.  The solver ran ``solves`` times.
     """
 
     points: tuple[TradePoint, ...]

@@ -107,9 +107,9 @@ class Corners(NamedTuple):
 
 
 class SeparatingPlane:
-    """The rows and unknowns of the plane that keeps body ``a`` clear of body ``b`` by ``margin``, δ in meters.
+    """The rows and unknowns of the plane that keeps a swept hull ``a`` clear of a swept hull or half-space ``b``.
 
-    ``a`` is a swept hull, ``b`` a swept hull or a half-space.
+    ``margin`` is the clearance δ, m.
     """
 
     def __init__(self, a: ConvexBody, b: ConvexBody, margin: float) -> None:

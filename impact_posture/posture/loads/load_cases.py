@@ -32,13 +32,9 @@ _RANK = 1e-9
 
 @dataclass(frozen=True, eq=False)
 class LoadCase:
-    """One load that the robot has to hold.
+    """One load that the robot has to hold, with its name in words, such as ``at rest``.
 
-    Attributes:
-        name: The load in words, such as ``at rest``.
-        description: Description of the constraint in one line.
-        equilibrium: The robot at rest under this load.
-        unreachable: Combinations of the base wrench that the rotors cannot make, shape (6 − r, 6).
+    ``unreachable`` are combinations of the base wrench that the rotors cannot make, shape (6 − r, 6).
     """
 
     name: str

@@ -15,16 +15,10 @@ from impact_posture.system.arrays import Array
 
 @dataclass(frozen=True)
 class NullSpacePath:
-    """Postures that satisfy the constraints, and the impact along them.
+    """Postures that satisfy the constraints, shape (N, nq), and the impact along them.
 
-    Attributes:
-        q: Postures, shape (N, nq).
-        s: Path length, tangent norm, shape (N,).
-        H: Squared jump per squared impulse, shape (N,).
-        G: Inverse effective mass, shape (N,).
-        V: Squared jump per squared approach speed, shape (N,).
-        S: V of a contact that sticks, NaN where undefined, shape (N,).
-        objective: The objective, shape (N,).
+    ``s`` is the path length, tangent norm, shape (N,).  The objective, H, G, V and S have the same shape.  S is NaN
+    where undefined.
     """
 
     q: Array

@@ -59,14 +59,10 @@ class Component:
 
 @dataclass(frozen=True, eq=False)
 class SelfMotion:
-    """The mapped self-motion manifold.
+    """The mapped self-motion manifold of one or two dimensions, and the components that starts reached.
 
-    Attributes:
-        manifold: The manifold of the problem.
-        dimension: Degrees of freedom, 1 or 2.
-        components: The components that starts reached.
-        starts: Number of random postures that reached the manifold within the limits.
-        unsuccessful: Number of the last starts in a row that were on no new component.
+    ``starts`` is the number of random postures that reached the manifold within the limits.  The last
+    ``unsuccessful`` starts were on no new component.
     """
 
     manifold: ConstraintManifold

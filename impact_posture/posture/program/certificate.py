@@ -32,12 +32,9 @@ _MULTIPLIER = 1e-6
 
 @dataclass(frozen=True)
 class Active:
-    """An active inequality.
+    """An active inequality, such as ``joint 'elbow'``, ``lower``.
 
-    Attributes:
-        constraint: Name, such as ``joint 'elbow'``.
-        side: ``lower`` or ``upper``.
-        multiplier: Rise of the scaled objective per unit of the bound, ≥ 0.
+    ``multiplier`` is the rise of the scaled objective per unit of the bound, ≥ 0.
     """
 
     constraint: str

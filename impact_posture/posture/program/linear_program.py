@@ -20,12 +20,9 @@ _OPTIONS: dict[str, Any] = {
 
 @dataclass(frozen=True, eq=False)
 class LinearOptimum:
-    """Solution of ``min cᵀx`` with ``lower ≤ A x ≤ upper`` and ``low ≤ x ≤ high``.
+    """Solution ``x`` and ``cᵀx`` of ``min cᵀx`` with ``lower ≤ A x ≤ upper`` and ``low ≤ x ≤ high``.
 
-    Attributes:
-        x: Unknowns, shape (n,).
-        value: ``cᵀx``.
-        multipliers: Multiplier of each row of ``A``, positive at its upper bound, shape (m,).
+    ``multipliers`` of the rows of ``A``, shape (m,), are positive at upper bounds.
     """
 
     x: Array

@@ -27,13 +27,10 @@ _NUMBERS = count()
 
 @dataclass(frozen=True, eq=False)
 class WarmStart:
-    """End of a run, from which a run of the same program with another target continues.
+    """End of a run, from which a run of the same program (a number) with another target continues.
 
     Attributes:
-        program: Number of the program.
-        x: All unknowns, shape (n,).
-        lower: Lower bounds of the unknowns, shape (n,).
-        upper: Upper bounds of the unknowns, shape (n,).
+        x: All unknowns, shape (n,), between ``lower`` and ``upper``.
         of_bounds: Multipliers of these bounds, shape (n,).
         of_rows: Multipliers of the rows, shape (m,).
         scale: Divisor of the objective with these multipliers.
@@ -50,16 +47,10 @@ class WarmStart:
 
 @dataclass(frozen=True)
 class SolveRecord:
-    """Result of one run of the solver.
+    """Result of one run of the solver, with the return status and iterations of IPOPT and the wall time of the call.
 
-    Attributes:
-        q: Final configuration, shape (nq,).
-        status: Return status of IPOPT.
-        iterations: Iterations of IPOPT.
-        time_s: Wall time of the call.
-        auxiliaries: Final auxiliaries of the constraints, shape (k,).
-        minimized: Value that the solver minimized, in units of the scale.
-        end: All values that a warm start needs.
+    ``auxiliaries`` are final values for the constraints, shape (k,), ``minimized`` is the value that the solver
+    minimized, in units of the scale, and ``end`` has all values that a warm start needs.
     """
 
     q: Array
@@ -78,12 +69,9 @@ class SolveRecord:
 
 @dataclass(frozen=True)
 class PostureNLP:
-    """A built program.
+    """A built program: its expressions, and ``nlpsol`` of CasADi.
 
     Attributes:
-        problem: The posture problem.
-        program: Its expressions.
-        solver: ``nlpsol`` of CasADi.
         build_time_s: Time to build and compile the program.
         compiled: Whether its functions run as machine code.
         compiler_fault: Why a compilation failed; empty if none failed.

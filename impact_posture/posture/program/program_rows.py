@@ -22,12 +22,9 @@ from impact_posture.posture.program.constrained_problem import ConstrainedProble
 
 @dataclass(frozen=True, eq=False)
 class Derivatives:
-    """Derivatives of rows ``g(x, z)``.
+    """Derivatives of rows ``g(x, z)`` and of ``λᵀg``, with the symbols ``λ``, shape (m, 1), as ``multipliers``.
 
-    Attributes:
-        multipliers: Symbols ``λ``, shape (m, 1).
-        jacobian: ``∂g/∂(x, z)``, shape (m, nx + k).
-        hessian: Second derivatives of ``λᵀg``, shape (nx + k, nx + k).
+    The Jacobian has the shape (m, nx + k), the Hessian (nx + k, nx + k).
     """
 
     multipliers: ca.SX
