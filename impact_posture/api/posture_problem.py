@@ -9,11 +9,7 @@ from typing import Any
 import numpy as np
 
 from impact_posture.config.checked import checked
-from impact_posture.config.problem_settings import (
-    ImpactSettings,
-    ProblemSettings,
-    RobotSettings,
-)
+from impact_posture.config.problem_settings import ImpactSettings, ProblemSettings, RobotSettings
 from impact_posture.config.table_validation import validate
 from impact_posture.errors import InputError
 from impact_posture.impact.elasticity.contact_compression import ContactStiffness

@@ -76,10 +76,7 @@ class FigureNotFound(NameNotFound):
 
 
 def draw_all(
-    view: ResultView,
-    out: Path,
-    formats: Iterable[str] = DEFAULT_FORMATS,
-    only: Collection[str] | None = None,
+    view: ResultView, out: Path, formats: Iterable[str] = DEFAULT_FORMATS, only: Collection[str] | None = None
 ) -> list[Path]:
     """Write the figures of ``view`` into ``out`` as ``<name>.<format>``; return the paths.
 

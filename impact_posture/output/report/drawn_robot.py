@@ -41,9 +41,7 @@ _HEAD = 200_000
 
 Color = tuple[float, ...]
 _Placement = Annotated[
-    pin.SE3,
-    PlainValidator(lambda rows: pin.SE3(np.array(rows))),
-    PlainSerializer(lambda at: at.homogeneous.tolist()),
+    pin.SE3, PlainValidator(lambda rows: pin.SE3(np.array(rows))), PlainSerializer(lambda at: at.homogeneous.tolist())
 ]
 
 

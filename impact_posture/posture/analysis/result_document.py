@@ -72,11 +72,7 @@ def result_document(
             "holding": before and before.to_dict(),
             "attainable_speed": attainable[0],
         },
-        "optimal": {
-            **optimal.to_dict(),
-            "holding": after and after.to_dict(),
-            "attainable_speed": attainable[1],
-        },
+        "optimal": {**optimal.to_dict(), "holding": after and after.to_dict(), "attainable_speed": attainable[1]},
         "reduction": solution.reduction,
         **({} if robustness is None else {"robustness": robustness.to_dict()}),
         "redundancy": solution.redundancy,

@@ -123,10 +123,7 @@ def retarget(
 
 
 def _surroundings(
-    objective: Objective,
-    numeric: Numeric,
-    requirements: Requirements,
-    struck: Sequence[tuple[ImpactContact, str]],
+    objective: Objective, numeric: Numeric, requirements: Requirements, struck: Sequence[tuple[ImpactContact, str]]
 ) -> Surroundings:
     """Return the bodies to stay clear of; a contact with a free pose is a push and has no surface."""
     around = Surroundings(objective.robot, numeric, requirements.hold, requirements.clearance)

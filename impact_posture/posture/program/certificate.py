@@ -68,12 +68,7 @@ class Certificate:
     active: tuple[Active, ...]
 
     def holds(
-        self,
-        *,
-        stationarity: float = 1e-6,
-        complementarity: float = 1e-7,
-        pose: float = 1e-6,
-        primal: float = 1e-8,
+        self, *, stationarity: float = 1e-6, complementarity: float = 1e-7, pose: float = 1e-6, primal: float = 1e-8
     ) -> bool:
         """Return whether every number is within its tolerance."""
         return (
