@@ -50,8 +50,7 @@ def write_path(folder: Path, robot: Robot, path: PosturePath) -> None:
 def read_path(folder: Path, block: Mapping[str, Any], robot: Robot) -> PosturePath:
     """Read a path of a robot from ``path.npz`` and the block ``path`` of ``result.json``.
 
-    Raises:
-        ValueError: The arrays do not fit each other or the robot.
+    Raise ``ValueError`` if the arrays do not fit each other or the robot.
     """
     arrays = {key: np.asarray(array, dtype=float) for key, array in read_arrays(folder / "path.npz").items()}
     shares = {key.removeprefix("share_"): array for key, array in arrays.items() if key.startswith("share_")}

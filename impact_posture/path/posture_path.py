@@ -83,11 +83,7 @@ class PosturePath:
 
 
 def check_package() -> None:
-    """Check early that the package of the extra ``path`` is installed.
-
-    Raises:
-        InputError: The package is not installed.
-    """
+    """Raise ``InputError`` early if the package of the extra ``path`` is not installed."""
     if find_spec("toppra") is None:
         raise InputError(
             "toppra, which times a motion, is not installed",

@@ -57,8 +57,7 @@ def read_posture(robot: Robot, text: str | None, where: str = "posture") -> Arra
 def write_posture(robot: Robot, q: Array) -> dict[str, object]:
     """Return the content of ``posture.json`` for ``q``, shape (nq,); :func:`read_posture` reads it back.
 
-    Raises:
-        PostureError: ``q`` cannot be a posture of this robot.
+    Raise ``PostureError`` if ``q`` cannot be a posture of this robot.
     """
     q = robot.check_posture(q, limits=False)
     return {

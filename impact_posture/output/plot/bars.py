@@ -26,12 +26,10 @@ _FAR = 2.0
 
 @dataclass(frozen=True)
 class Bar:
-    """``q_total_impact`` of a controller in a scenario.
+    """``q_total_impact = ∫‖ν‖dt`` over the impact windows for a controller in a scenario; scenarios have panels.
 
     Attributes:
-        scenario: Name of the scenario; bars of a scenario share a panel.
-        controller: Name of the controller.
-        mean: ``∫‖ν‖dt`` over the impact windows, mean over the runs; NaN where no run completed.
+        mean: Mean over the runs; NaN where no run completed.
         half_width: Half of the 95 % interval; 0 for a single run.
         paper: Number of the paper for the same controller, if the paper has it.
     """

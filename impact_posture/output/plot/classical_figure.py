@@ -34,10 +34,9 @@ _ENDLESS = 1e3
 
 @dataclass(frozen=True, eq=False)
 class Kind:
-    """A kind of ellipsoid in both postures.
+    """A kind of ellipsoid in both postures: ``velocity``, ``force`` or ``impact``.
 
     Attributes:
-        name: ``velocity``, ``force`` or ``impact``.
         formula: Formula of the matrix.
         unit: Unit of the semi-axes.
         scale: The longest finite semi-axis before.

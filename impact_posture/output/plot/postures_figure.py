@@ -44,14 +44,12 @@ _FRONT = 50.0
 
 @dataclass(frozen=True, eq=False)
 class DrawnSurface:
-    """A contact plane.
+    """A contact plane, drawn as a square of ``side`` (m) with an arrow for its unit normal, shape (3,).
 
     Attributes:
         point: Middle of the plane, shape (3,).
-        normal: Unit normal n, shape (3,).
-        side: Side of the square, m.
-        contact: Tail of the arrow n, shape (3,).
-        reach: Length of the arrow n, m.
+        contact: Tail of the arrow, shape (3,).
+        reach: Length of the arrow, m.
         name: Name of the arrow.
         color: Color of the posture; gray for a plane of both postures.
     """

@@ -43,16 +43,11 @@ _UNITS = {"H": "‖Δν‖²/(N·s)²", "G": "1/kg", "V": "‖Δν‖²/(m/s)²"
 class TradeOffData:
     """The best posture within each distance from the initial posture, or within each peak force.
 
-    The initial posture comes first.
+    The initial posture comes first.  Arrays have the shape (k,).  S is NaN where it does not exist.
 
     Attributes:
-        within: Bounds on the distance (rad mixed with m) or force (N), increasing, shape (k,).
-        objective: Objective of each posture, shape (k,).
-        H: ``nᵀΛ_c n``, shape (k,).
-        G: ``1/m_eff`` along the normal, 1/kg, shape (k,).
-        V: ``H/G²``, shape (k,).
-        S: The sticking counterpart of V, shape (k,); NaN where it does not exist.
-        certified: Whether the certificate of each posture holds, shape (k,).
+        within: Bounds on the distance (rad mixed with m) or force (N), increasing.
+        certified: Whether the certificate of each posture holds.
         knee: Index of the knee, if the curve has a knee.
         against: The bounded quantity.
     """

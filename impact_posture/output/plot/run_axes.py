@@ -37,13 +37,10 @@ _BINS = 1000
 
 @dataclass(frozen=True)
 class Cell:
-    """A panel at a place of a figure.
+    """A panel at a place of a figure, with a title above it.
 
-    Attributes:
-        panel: The curves.
-        clips: Stretch of time to draw of each run, by the index of the run.
-        frame: Index of the run whose windows are shaded, and the stretch of time of the axis.
-        title: Line above the panel.
+    ``clips`` are the stretches of time to draw of each run, by the index of the run.  ``frame`` is the index of the
+    run whose windows are shaded, and the stretch of time of the axis.
     """
 
     panel: Panel

@@ -179,10 +179,9 @@ def run_header(views: Sequence[RunView]) -> tuple[str, list[str]]:
 
 
 def check_same(views: Sequence[RunView], where: str) -> tuple[RunView, ...]:
-    """Return the views of a scenario and robot, the nominal controller first.
+    """Return the views, the nominal controller first.
 
-    Raises:
-        InputError: No view, or views of different scenarios or robots.
+    Raise ``InputError`` without a view, or if views are of different scenarios or robots.
     """
     if not views:
         raise InputError("there is no run to draw", where=where, hint="give at least one view")

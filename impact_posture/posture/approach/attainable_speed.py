@@ -76,12 +76,10 @@ class MovingPoint:
 
 @dataclass(frozen=True, eq=False)
 class Attained:
-    """The fastest approach at a posture.
+    """The fastest approach ``σ`` at a posture, m/s; infinite where no limit bounds it.
 
-    Attributes:
-        speed: ``σ``, m/s; infinite where no limit bounds it.
-        velocities: Free entries of the velocity at ``min(σ, FASTEST)``, in units of their scales, shape (k,).
-        gradient: Tangent gradient of the speed, shape (nv,).
+    ``velocities`` are the free entries of the velocity at ``min(σ, FASTEST)``, in units of their scales, shape (k,).
+    ``gradient`` is the tangent gradient of the speed, shape (nv,).
     """
 
     speed: float

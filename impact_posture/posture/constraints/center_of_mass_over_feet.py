@@ -15,11 +15,8 @@ from impact_posture.system.arrays import Array
 class CenterOfMassOverFeet(ExpressionConstraint):
     """The center of mass stays above the feet: ``A xy − b ≤ −margin``, meters.
 
-    Args:
-        normals: ``A``, outward unit normals of the edges of the support polygon, shape (k, 2).
-        offsets: ``b``, shape (k,).
-        margin: Least distance from the edges, m.
-        loaded: Another model, with its name, whose center of mass counts instead.
+    ``normals`` are ``A``, the outward unit normals of the edges of the support polygon, shape (k, 2), and ``offsets``
+    are ``b``.  ``loaded`` is another model, with its name, whose center of mass counts instead.
     """
 
     def __init__(

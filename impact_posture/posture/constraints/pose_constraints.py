@@ -53,17 +53,12 @@ class PositionBox(HeldPosition):
 
 
 class HeldOrientation(ExpressionConstraint):
-    """The frame keeps its orientation, or the direction of one of its axes.
+    """The frame keeps its world orientation ``target``, shape (3, 3), or the direction of one of its axes.
 
     The rows are ``2 vec(Q_left* ⊗ Q(q) ⊗ Q_right)``, the vector part of the error quaternion.  To first order this is
     the rotation vector in radians.  It is zero at the target only and largest at 180°, where a skew-symmetric error
-    is zero again.  Its first two components alone hold the direction of ``axis``.
-
-    Args:
-        name: Name of the constraint.
-        point: Point on the link whose orientation is held.
-        target: Desired world rotation, shape (3, 3).
-        axis: Axis in the frame whose direction is held and about which it may turn; ``None`` holds all three.
+    is zero again.  Its first two components alone hold the direction of ``axis``, a vector in the frame, about which
+    the frame may turn; ``None`` holds all three.
     """
 
     def __init__(self, name: str, point: PointOnLink, target: Array, axis: Array | None = None) -> None:

@@ -128,8 +128,7 @@ class Surroundings:
     def add_obstacles(self, obstacles: Sequence[Obstacle]) -> None:
         """Add bodies that stand in the world; links that cannot move may touch them.
 
-        Raises:
-            InputError: Two bodies have the same name, so messages could not tell them apart.
+        Raise ``InputError`` if two bodies have the same name, so that messages could not tell them apart.
         """
         taken = {body.name for body in self._bodies} | {wall.body.name for wall in self._walls}
         for obstacle in obstacles:

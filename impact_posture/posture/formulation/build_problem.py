@@ -44,8 +44,7 @@ from impact_posture.system.arrays import Array
 def build_problem(robot: Robot, objective: Objective, given: Array, requirements: Requirements) -> ConstrainedProblem:
     """Turn requirements into constraints without solving anything.
 
-    Raises:
-        InputError: The requirements contradict each other or the robot.
+    Raise ``InputError`` if the requirements contradict each other or the robot.
     """
     _check(robot, requirements)
     numeric = Numeric(robot.model).at(given)

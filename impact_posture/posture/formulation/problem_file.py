@@ -95,8 +95,7 @@ def _held_by_default(robot: Robot) -> tuple[str, ...]:
 def requirements(settings: ProblemSettings, objective: Objective) -> Requirements:
     """Return the requirements of the settings; settings that are ``None`` get the values of the robot.
 
-    Raises:
-        InputError: A setting is about feet, but there are no supports.
+    Without supports, settings about feet raise ``InputError``.
     """
     robot, spec = objective.robot, objective.robot.spec.constraints
     poses = [settings.contact_pose or robot.contact_pose(contact.frame) for contact in objective.contacts]
@@ -234,11 +233,7 @@ def _armature_by_joint(impact: ResolvedImpact) -> str | dict[str, float]:
 
 
 def dump_settings(settings: ProblemSettings) -> str:
-    """Write settings as TOML in the order of the fields, without values that are ``None``.
-
-    Raises:
-        SpecError: The path of a file is not UTF-8.
-    """
+    """Write settings as TOML in the order of the fields, without ``None``; a path must be UTF-8 (``SpecError``)."""
     lines = [f"schema = {toml(settings.schema)}"]
     # Readers look for the robot first.
     for key in sorted((field.name for field in fields(ProblemSettings)), key=lambda name: name != "robot"):

@@ -33,11 +33,10 @@ _HALF = 0.52
 
 @dataclass(frozen=True, eq=False)
 class OptimalityBound:
-    """The best posture on the mapped components, and a bound below all of them.
+    """The best posture on the mapped components, and an estimated lower bound on the objective on all of them.
 
     Attributes:
         best: Least objective of a feasible posture.
-        lower: Estimated lower bound on the objective.
         x: Center of a patch with the objective ``best``, shape (nx,); ``None`` if the known posture is best.
         patches: Number of evaluated patches.
         finished: Whether every patch reached the wanted gap.

@@ -53,11 +53,7 @@ class ConstrainedProblem:
 
     @property
     def impact(self) -> WorstCaseObjective:
-        """The objective as an impact objective.
-
-        Raises:
-            InputError: The objective is not an impact objective.
-        """
+        """The objective as an impact objective; another objective raises ``InputError``."""
         if not isinstance(self.objective, WorstCaseObjective):
             raise InputError(
                 f"is '{self.objective.name}', which is not an impact objective",

@@ -148,11 +148,7 @@ class GlobalSolution:
 
 
 def check_searchable(problem: ConstrainedProblem) -> None:
-    """Refuse a problem that :func:`search_globally` cannot search.
-
-    Raises:
-        InputError: The objective is not an impact objective, or the problem has a regularization.
-    """
+    """Raise ``InputError`` unless the objective is an impact objective without a regularization."""
     _ = problem.impact
     if problem.requirements.regularization:
         raise InputError(

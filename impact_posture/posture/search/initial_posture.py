@@ -68,10 +68,9 @@ def _turn_hint(problem: ConstrainedProblem, seed: int) -> str:
 
 
 def initial_objective(problem: ConstrainedProblem, initial: Array) -> float:
-    """Return the objective at the start, which scales the program and so must exist.
+    """Return the objective at the start, which scales the program.
 
-    Raises:
-        ContactError: The contact point cannot move along the normal at the start.
+    It must exist there: if the contact point cannot move along the normal, raise ``ContactError``.
     """
     objective = problem.objective
     # If nothing can move along the normal, the value would be rounding.
