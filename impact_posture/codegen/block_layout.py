@@ -33,8 +33,6 @@ class Layout:
     """Blocks in the order of their calls, and the values that later blocks use.
 
     Attributes:
-        graph: The operations.
-        blocks: The blocks.
         inlined: Nodes that are computed within the statement of their only user.
         slots: Node → its index in the work array of its width.
         sizes: Width → length of the work array.

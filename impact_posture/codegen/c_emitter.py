@@ -44,12 +44,7 @@ class BlockText:
 
 
 class Constants:
-    """Tables of the constants in the blocks of a library.  A reference is shorter than the digits of a number.
-
-    Args:
-        prefix: Beginning of the names of the tables.
-        real: The type of the numbers.
-    """
+    """Tables of the constants in the blocks of a library.  A reference is shorter than the digits of a number."""
 
     def __init__(self, prefix: str, real: Real) -> None:
         self._prefix, self._real = prefix, real
@@ -85,14 +80,9 @@ def _short(width: int) -> str:
 class Emitter:
     """The C of one layout.
 
-    Args:
-        layout: The layout.
-        prefix: Beginning of the names of the blocks.
-        real: The type of literals.
-        types: Width → C type of a number or vector of this width.
-        constants: Tables for the constants.
-        size: Bytes of the type of width one, if it is not ``real``.
-        work: Name of the structure with inputs and work arrays; empty if inputs are separate arguments.
+    The names of blocks begin with ``prefix``.  ``types`` has the C type of each width, and ``size`` is the bytes of
+    width one if its type is not ``real``.  ``work`` names the structure with inputs and work arrays.  It is empty if
+    inputs are separate arguments.
     """
 
     def __init__(

@@ -65,11 +65,7 @@ class Real:
 
 
 DOUBLE = Real("double", 8, 1e-6)
-
-
 FLOAT = Real("float", 4, 1e-5)
-
-
 REALS = {real.name: real for real in (DOUBLE, FLOAT)}
 
 

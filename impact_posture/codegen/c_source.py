@@ -72,17 +72,8 @@ def build_c_source(exported: Sequence[NamedObjective], prefix: str, real: Real, 
         (v.stem, v.joint, v.free, v.objective.contact, v.objective.scale, v.objective.is_multiple_of_H)
         for v in exported
     ]
-    content = (
-        ca.CasadiMeta.version(),
-        library.constants,
-        library.seeds,
-        library.functions,
-        models,
-        prefix,
-        real,
-        portable,
-    )
-    key = source_key([repr(content), library.function.serialize()], "codegen")
+    content = (library.constants, library.seeds, library.functions, models, prefix, real, portable)
+    key = source_key([ca.CasadiMeta.version(), repr(content), library.function.serialize()], "codegen")
     code = read_stored("code", key, CSource)
     if code is None:
         code = _generate(exported, library, prefix, real, portable=portable)

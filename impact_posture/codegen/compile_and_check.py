@@ -54,11 +54,8 @@ def compile_and_check(
 ) -> float:
     """Build an export, compare it at random postures and normals, and return the largest relative difference.
 
-    Args:
-        export_dir: The folder of the export.
-        prefix: The prefix of the export.
-        objectives: The exported objectives, one for each frame.
-        keep: Leave the library in the folder of the export, even if it fails.
+    There is one of the ``objectives`` for each frame.  With ``keep`` the library stays in the folder of the export,
+    even if it fails.
 
     Raises:
         CompilerError: There is no compiler, it failed, or the numbers of its code are wrong.

@@ -38,8 +38,6 @@ class WrittenCode:
 
     Attributes:
         out: The folder of the files.
-        robot: The robot.
-        files: The files.
         manifest: The content of ``<prefix>.json``.
         library: The shared library, where one stays in the folder.
     """
@@ -195,16 +193,9 @@ def write_export(
 ) -> Export:
     """Write an export into a new folder, whole or not at all, and build its library there on request.
 
-    Args:
-        objectives: One objective for each frame.
-        out: The folder; ``./<prefix>-c`` by default.
-        prefix: As in :func:`export`.
-        posture: As in :func:`export`.
-        compression: As in :func:`export`.
-        single: Compute in ``float``.
-        portable: As in :func:`export`.
-        build: Build ``lib<prefix>.so`` in the folder.  Without a compiler there is neither a library nor an error.
-        force: Replace an earlier export.
+    The folder ``out`` is ``./<prefix>-c`` by default.  With ``single`` the code computes in ``float``.  ``build``
+    builds ``lib<prefix>.so`` in the folder.  Without a compiler there is neither a library nor an error.  ``force``
+    replaces an earlier export.  The other arguments are as in :func:`export`.
 
     Raises:
         OutputError: The folder exists without ``force``, is not an export, or is not writable.

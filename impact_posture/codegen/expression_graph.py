@@ -65,7 +65,6 @@ class Graph:
 
     Attributes:
         inputs: Names of the inputs.
-        nodes: The operations.
         outputs: Output name → the nodes of its entries, column by column.
     """
 

@@ -139,13 +139,8 @@ class ImpactGradient:
     def call(self, name: str, q: ArrayLike, n: ArrayLike | None = None) -> tuple[int, tuple[Array, ...]]:
         """Call a C function of :data:`~impact_posture.codegen.export_functions.SIGNATURES`.
 
-        Args:
-            name: Name of the function.
-            q: Configuration, shape (nq,).
-            n: Unit normal out of the surface, in the manifest's ``normal_frame``, shape (3,).
-
-        Returns:
-            The code of the function, and views of its results, also if the code is not zero.
+        ``q`` has shape (nq,).  ``n`` is the unit normal out of the surface, in the manifest's ``normal_frame``, shape
+        (3,).  Return the code of the function, and views of its results, also if the code is not zero.
 
         Raises:
             ValueError: An input has the wrong shape.
@@ -172,12 +167,7 @@ class ImpactGradient:
         return results
 
     def value_and_gradient(self, q: ArrayLike, n: ArrayLike) -> tuple[float, Array]:
-        """Return ``H`` and its tangent gradient, a view of shape (nv,).
-
-        Args:
-            q: Configuration, shape (nq,).
-            n: Unit normal out of the surface, in the manifest's ``normal_frame``, shape (3,).
-        """
+        """Return ``H`` and its tangent gradient, a view of shape (nv,), with ``q`` and ``n`` as in :meth:`call`."""
         # Without self._results, because control loops call this method in every tick.
         code, (H, gradient) = self.call("eval", q, n)
         if code:
@@ -207,12 +197,9 @@ class ImpactGradient:
     ) -> tuple[Array, Array]:
         """Return ``H``, shape (N,), and tangent gradients, shape (N, nv), of many configurations in new arrays.
 
-        A row whose configuration would raise an error is NaN, and the other rows are valid.
-
-        Args:
-            q: Configurations, shape (N, nq).
-            n: Unit normals, shape (N, 3), or one normal for all, shape (3,).
-            out: Contiguous arrays of the library's type for the results.
+        A row whose configuration would raise an error is NaN, and the other rows are valid.  ``q`` has shape (N, nq),
+        and ``n`` shape (N, 3), or (3,) for one normal.  ``out`` has contiguous arrays of the library's type for the
+        results.
 
         Raises:
             InputError: A shape or a type is wrong.

@@ -17,7 +17,6 @@ from impact_posture.codegen.manifest_reader import SCHEMA
 from impact_posture.codegen.self_test import self_test
 from impact_posture.dynamics.chart import Chart
 from impact_posture.impact.elasticity.contact_compression import Compression
-from impact_posture.impact.impact_contact import ImpactContact
 from impact_posture.impact.worst_case_objective import WorstCaseObjective
 from impact_posture.robot.robot import Robot
 from impact_posture.system.arrays import Array
@@ -112,19 +111,12 @@ def build_manifest(
     }
 
 
-def _contact_block(contact: ImpactContact) -> dict[str, Any]:
-    return {
-        "frame": contact.frame,
-        "normal": list(contact.normal),
-        "normal_frame": contact.normal_frame,
-        "impulse_bound": contact.impulse,
-        "friction": contact.friction,
-    }
-
-
 def _joint_block(objective: WorstCaseObjective, stem: str, real: Real) -> dict[str, Any]:
+    contacts = [contact.to_dict() for contact in objective.contacts]
+    for contact in contacts:
+        del contact["offset"]
     return {
-        "contacts": [_contact_block(contact) for contact in objective.contacts],
+        "contacts": contacts,
         "bilateral": objective.bilateral,
         "symbols": {"objective": f"{stem}_objective"},
         "self_test": self_test(objective, real),
@@ -133,9 +125,7 @@ def _joint_block(objective: WorstCaseObjective, stem: str, real: Real) -> dict[s
 
 def _frame_block(objective: WorstCaseObjective, stem: str, real: Real) -> dict[str, Any]:
     return {
-        "frame": objective.contact.frame,
-        "offset": list(objective.contact.offset),
-        **_contact_block(objective.contact),
+        **objective.contact.to_dict(),
         "symbols": {name: f"{stem}_{name}" for name in FUNCTIONS},
         "self_test": self_test(objective, real),
     }

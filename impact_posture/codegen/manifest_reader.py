@@ -89,12 +89,8 @@ def read_checked(
 ) -> tuple[dict[str, Any], _Checked, Path]:
     """Read and validate a manifest; return its content, the validated model, and its file.
 
-    Args:
-        path: The folder, or the manifest itself.
-        schema: The schema.
-        model: The model that validates the content.
-        what: Name of the kind of folder in messages.
-        command: The command that writes it.
+    ``path`` is the folder or the manifest itself.  Messages name ``what`` is in the folder, and the ``command`` that
+    writes it.
 
     Raises:
         SpecError: There is no manifest or more than one, or it is damaged.

@@ -68,8 +68,6 @@ def oracle_along(objective: WorstCaseObjective, normal: Array) -> ImpactOracle:
 
 # A unit vector that is not along an axis, so that no entry of a gradient vanishes.
 _NORMAL = (0.48, -0.6, 0.64)
-
-
 _SCALARS = frozenset({"H", "objective", "G", "V"})
 
 

@@ -35,10 +35,7 @@ def pack_lanes(
 ) -> Graph:
     """Return the same computation with vector operations for equal operations of repeated limbs.
 
-    Args:
-        graph: Operations on single numbers.
-        seeds: Input name and index → its limb.
-        values: Values of the inputs that are constants, by name.
+    ``seeds`` has the limb of each input name and index, and ``values`` the inputs that are constants, by name.
     """
     widths: dict[int, int] = {}
     for seed in seeds.values():

@@ -90,7 +90,6 @@ def joint_spin(kind: JointKind, q: ca.SX) -> Spin | None:
 
 
 def _cosine_sine(kind: JointKind, q: ca.SX) -> tuple[ca.SX, ca.SX]:
-    """Return cosine and sine of the angle of a joint."""
     return (ca.cos(q[0]), ca.sin(q[0])) if kind.family == "revolute" else (q[-2], q[-1])
 
 

@@ -46,24 +46,14 @@ class Foot:
 
 @dataclass(frozen=True, eq=False)
 class _Motion:
-    """``U`` and ``A`` of one velocity of the robot, for every joint beyond a root.
-
-    Attributes:
-        turned: ``U_j``, shape (6, joints).
-        changed: ``A_j``, shape (6, joints).
-    """
+    """``U_j`` (``turned``) and ``A_j`` (``changed``) of one velocity for every joint beyond a root, (6, joints)."""
 
     turned: ca.SX
     changed: ca.SX
 
 
 class JumpDerivatives:
-    """Derivatives of the equations of jumps at one symbolic configuration.
-
-    Args:
-        tree: The tree at the configuration, without extra inertias.
-        feet: The feet.
-    """
+    """Derivatives of the equations of jumps at the configuration of a tree without extra inertias."""
 
     def __init__(self, tree: Kinematics, feet: Sequence[Foot]) -> None:
         self._tree, self._feet = tree, tuple(feet)
@@ -82,12 +72,8 @@ class JumpDerivatives:
     def of(self, a: ca.SX, f: ca.SX, b: ca.SX, multipliers: ca.SX, compliance: float) -> tuple[ca.SX, ca.SX]:
         """Return the Jacobian of the equations and the Hessian of ``φ`` over chart coordinates, ``a`` and ``f``.
 
-        Args:
-            a: Jump, shape (nv,).
-            f: Impulses on the feet, one after the other, in the axes of each foot.
-            b: Multipliers of ``M a − J_sᵀf``, shape (nv,).
-            multipliers: Multipliers of ``J_s a + εf``, shape of ``f``.
-            compliance: ε, 1/kg.
+        ``f`` stacks the impulses in the axes of each foot.  ``b`` are the multipliers of ``M a − J_sᵀf``, and
+        ``multipliers`` the multipliers ``l`` of ``J_s a + εf``, with ``compliance`` ε in 1/kg.
         """
         under_a, under_b = self._motion(a, -f), self._motion(b, multipliers)
         nx, others = self._tree.chart.nx, a.numel() + f.numel()

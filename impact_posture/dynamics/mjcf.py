@@ -68,12 +68,9 @@ class Mjcf:
     def add_geom(self, joint: int, name: str, kind: Geom, size: Sequence[float], placement: pin.SE3) -> None:
         """Add a massless shape, which collides only in contact pairs.
 
-        Args:
-            joint: Index of the Pinocchio joint that moves it, or :data:`WORLD`.
-            name: Name of the geom.
-            kind: ``sphere``, ``box`` or ``plane`` (endless, normal to its z axis).
-            size: Radius, or three half extents, m.
-            placement: Pose in the frame of the joint.
+        ``joint`` is the index of the Pinocchio joint that moves it, or :data:`WORLD`, and ``placement`` its pose in
+        the frame of the joint.  ``size`` is its radius, or three half extents, m.  A plane is endless, normal to its
+        z axis.
         """
         type_ = getattr(import_mujoco().mjtGeom, f"mjGEOM_{kind.upper()}")
         size = (*size, 0.0, 0.0)[:3]
@@ -132,10 +129,6 @@ def build_mjcf(model: pin.Model, name: str = "robot") -> Mjcf:
     free joint, and any other free-flyer three slides and a ball.  A planar joint becomes two slides and a hinge, and
     a translation three slides.  A massless body gets the least mass and moments that MuJoCo accepts, 1e-15.  The
     model has no friction, damping or effort limits, because the dynamics of Pinocchio have none.
-
-    Args:
-        model: The model, which is not changed.
-        name: Name of the MuJoCo model.
 
     Raises:
         UnsupportedJoint: The joint type is not possible in a URDF.

@@ -46,12 +46,8 @@ class MjcfLayout:
     """Conversions between Pinocchio and MuJoCo coordinates of one model.
 
     The map ``T(q)`` of velocities, ``qvel = T v``, is orthogonal, because it rotates linear parts and permutes
-    entries.
-
-    Args:
-        model: The Pinocchio model.
-        order: Joint indices in the (depth-first) order of the MuJoCo bodies.
-        free: Indices of the joints that are free joints in MuJoCo.
+    entries.  ``order`` has the joint indices in the (depth-first) order of the MuJoCo bodies.  ``free`` has the
+    indices of the joints that are free joints in MuJoCo.
     """
 
     def __init__(self, model: pin.Model, order: Sequence[int], free: frozenset[int]) -> None:

@@ -66,10 +66,7 @@ class RepeatedLimbs:
     def constant(self, joint: int, tag: str, of: Callable[[int], ArrayLike]) -> ca.SX:
         """Return ``of(joint)`` as an expression, with parameters where the counterparts of the joint differ.
 
-        Args:
-            joint: The joint.
-            tag: Name of the kind of constant.
-            of: The numbers of a joint: a vector, or a matrix (symmetry is kept).
+        ``of`` returns a vector or a matrix, whose symmetry is kept.  ``tag`` names the kind of constant.
         """
         place = self.places.get(joint)
         if place is None:

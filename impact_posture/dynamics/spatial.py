@@ -137,12 +137,7 @@ def spin_power(inertia: ca.SX, x: ca.SX, y: ca.SX, *, axis: int, sense: float) -
 def inertia_to_parent(inertia: ca.SX, R: ca.SX, p: ca.SX, *spin: ca.SX, axis: int | None = None) -> ca.SX:
     """Return a symmetric 6×6 inertia of a child in the coordinates of its parent.
 
-    Args:
-        inertia: Inertia in child coordinates.
-        R: Rotation of the child; with a spin, rotation of its rest position.
-        p: Origin of the child, shape (3, 1).
-        spin: Cosine and sine of the rotation about ``axis``, which is applied before ``R``.
-        axis: Coordinate axis of the spin, 0, 1 or 2.
+    ``spin`` is cosine and sine of a rotation about the coordinate ``axis`` 0, 1 or 2, which is applied before ``R``.
     """
     blocks = [symmetric(inertia[:3, :3]), inertia[:3, 3:], symmetric(inertia[3:, 3:])]
     if axis is not None:

@@ -36,7 +36,6 @@ class Wrench:
     """A force and a moment at a point of a link, constant in the world or in the frame.
 
     Attributes:
-        point: The point.
         force: The force, shape (3,), in world axes; in the axes of the frame if ``in_frame``.
         moment: The moment about the point, shape (3,), in the same axes.
         in_frame: Whether the wrench turns with the link.
@@ -58,7 +57,6 @@ class Response:
         before: Spatial velocity of every link without the motion of its joint, ``v⁻``.
         forces: Spatial force through every joint, on its link.
         passed: The part of this force that does not depend on the motion of the parent.
-        wrenches: The wrenches.
     """
 
     a: ca.SX
@@ -91,13 +89,9 @@ class Tree(Kinematics):
     def mass_times(
         self, v: ca.SX, velocities: ByJoint | None = None, *, extra: bool = True, less: Sequence[Wrench] = ()
     ) -> ca.SX:
-        """Return ``M(q) v − Σ Jᵀ w`` in O(n), armature included, shape (nv,).
+        """Return ``M(q) v − Σ Jᵀ w`` in O(n), armature included, shape (nv,), for the wrenches ``less``.
 
-        Args:
-            v: Generalized velocity, shape (nv,).
-            velocities: Spatial velocity of every link under ``v``, if it is known.
-            extra: Include the extra inertias.
-            less: The wrenches ``w``.
+        ``velocities`` are the known results of :meth:`velocities`.  ``extra`` includes the extra inertias.
         """
         velocities = self.velocities(v) if velocities is None else velocities
         inertia = self._inertia if extra else self._own_inertia

@@ -18,7 +18,6 @@ class ImpactCase:
     """Inputs of the velocity jump of a single impact, except the posture.
 
     Attributes:
-        robot: The robot.
         contact: Point and normal of the impact.
         metric: Weight ``W`` of the squared norm of the jump.
         supports: Feet that stay on the ground; empty for a robot that flies or is bolted down.

@@ -59,6 +59,17 @@ class ImpactContact:
         object.__setattr__(self, "offset", tuple(float(v) for v in self.offset))
         object.__setattr__(self, "impulse", float(self.impulse))
 
+    def to_dict(self) -> dict[str, object]:
+        """Return JSON content."""
+        return {
+            "frame": self.frame,
+            "offset": list(self.offset),
+            "normal": list(self.normal),
+            "normal_frame": self.normal_frame,
+            "impulse_bound": self.impulse,
+            "friction": self.friction,
+        }
+
 
 def point_on(robot: Robot, frame: str, offset: Vector3 = (0.0, 0.0, 0.0)) -> PointOnLink:
     """Resolve a frame and an offset in it to a point on a link.

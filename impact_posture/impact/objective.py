@@ -75,7 +75,7 @@ class WorstCase(Minimized, Protocol):
         """The oracle of the leading contact, on the robot as modeled."""
 
     def expressions(self, k: ImpactKernel) -> tuple[ca.SX, ca.SX]:
-        """Return value and tangent gradient (nv) in the symbols of a kernel of the objective's robot and contact."""
+        """Return value and tangent gradient (nv) of the worst member in the symbols of a kernel of its contact."""
 
 
 class Objective(Minimized, Protocol):

@@ -173,7 +173,7 @@ class ResolvedImpact:
         q = self.q if q is None else q
         return {
             "robot": robot_block(self.robot),
-            "contacts": [_contact_block(single, q) for single in self.objective.singles],
+            "contacts": [o.contact.to_dict() | {"normal": o.oracle.at(q).n.tolist()} for o in self.objective.singles],
             "scenarios": [variant.to_dict() for variant in self.objective.model_variants],
             "supports": [{"frame": s.frame, "kind": s.kind} for s in self.supports],
             "support_compliance": self.objective.compliance if self.supports else None,
@@ -190,28 +190,11 @@ class ResolvedImpact:
         }
 
 
-def _contact_block(single: WorstCaseObjective, q: Array) -> dict[str, object]:
-    """Return the block of a contact, with its normal in world axes at ``q``."""
-    contact = single.contact
-    return {
-        "frame": contact.frame,
-        "offset": list(contact.offset),
-        "normal": single.oracle.at(q).n.tolist(),
-        "normal_frame": contact.normal_frame,
-        "impulse_bound": contact.impulse,
-        "friction": contact.friction,
-    }
-
-
 def robot_block(robot: Robot) -> dict[str, object]:
     """Return the ``robot`` block of ``result.json``."""
     keys = ("name", "source", "model_sha256", "nq", "nv", "joint_names", "root", "convention", "joint_model")
-    block = {key: getattr(robot, key) for key in (*keys, "armature_source", "locked")}
-    return block | {
-        "joint_names": list(robot.joint_names),
-        "armature": robot.armature.tolist(),
-        "locked": list(robot.locked),
-    }
+    lists = {"joint_names": [*robot.joint_names], "armature": robot.armature.tolist(), "locked": [*robot.locked]}
+    return {key: getattr(robot, key) for key in (*keys, "armature_source", "locked")} | lists
 
 
 def missing_support(robot: Robot) -> str:

@@ -41,7 +41,6 @@ class WorstCaseObjective:
     variants.  Each type of maximum is a class in :mod:`impact_posture.impact.worst_case`.
 
     Attributes:
-        robot: The robot.
         contact: Point and normal of the impact.
         metric: Weight of the jump.
         kind: ``impulse``, ``speed``, ``sticking``, ``coulomb`` or ``energy``.

@@ -196,12 +196,7 @@ class ElasticImpact:
 class _Compression:
     """Springs and contact from touch to greatest compression, at unit approach speed.
 
-    Args:
-        mobility: ``A``, shape (m+1, m+1).
-        columns: ``P = −M⁻¹Cᵀ``, shape (nv, m+1), with its support impulses.
-        kappa: Stiffness of springs and contact, shape (m+1,).
-        d: Damping of springs and contact, shape (m+1,).
-        oracle: The oracle of the impact.
+    ``mobility`` is ``A``, and ``columns`` is ``P = −M⁻¹Cᵀ``, shape (nv, m+1), with its support impulses.
     """
 
     def __init__(

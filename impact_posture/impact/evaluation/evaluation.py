@@ -157,12 +157,7 @@ def evaluate(
 ) -> Evaluation:
     """Compute all impact quantities at ``q`` with Pinocchio, and predict the velocity jump.
 
-    Args:
-        objective: Robot, contact, metric, kind and supports.
-        q: Configuration, shape (nq,).
-        speed: Approach speed ``v_n``, m/s.
-        restitution: Coefficient of restitution ``e``.
-        contact_stiffness: Elasticity of the contact, if it is known.
+    ``q`` has shape (nq,), ``speed`` is the approach speed ``v_n``, m/s, and ``restitution`` the coefficient ``e``.
 
     Raises:
         InputError: The speed is negative or not finite, or the restitution lies outside [0, 1].

@@ -77,10 +77,7 @@ def merged_entries(
 def frictionless_jump(objective: WorstCaseObjective, quantities: ImpactQuantities, rebound: float) -> Jump | None:
     """Return ``Δν = (1+e) v_n a/G`` with the impulse ``(1+e) v_n/G`` along n; ``None`` if the contact is blocked.
 
-    Args:
-        objective: Robot, contact, metric and supports.
-        quantities: Quantities at the posture.
-        rebound: ``(1+e) v_n`` with the coefficient of restitution e and the approach speed v_n, m/s.
+    ``rebound`` is ``(1+e) v_n`` with the coefficient of restitution e and the approach speed v_n, m/s.
     """
     if quantities.blocked:
         return None

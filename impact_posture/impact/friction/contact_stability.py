@@ -115,9 +115,7 @@ def contact_stability(oracle: ImpactOracle, supports: tuple[Support, ...], q: Ar
 class FrictionCones:
     """The friction cones as inequalities ``A f ≤ 0`` on the stacked impulses.
 
-    Args:
-        supports: Feet that stay on the ground.
-        axes: World axes of the frame of each foot, shape (3, 3).  The size of a sole is along them.
+    ``axes`` holds the world axes of the frame of each foot, shape (3, 3), along which a sole has its size.
     """
 
     def __init__(self, supports: tuple[Support, ...], axes: Sequence[Array]) -> None:

@@ -29,11 +29,8 @@ _FROZEN = 1e-9
 class ImpactKernel:
     """Symbolic ``H, G, V, S, E, Λ_c`` and gradients of one impact.
 
-    Args:
-        case: Robot, contact, metric and supports.
-        q: Configuration symbols, shape (nq, 1).
-        n: Normal symbols, shape (3, 1), in the axes of the contact's normal.
-        limbs: Repeated limbs whose expressions take the same form.
+    The symbols ``q`` have shape (nq, 1), and ``n``, in the axes of the contact's normal, shape (3, 1).  The
+    expressions of repeated ``limbs`` take the same form.
     """
 
     def __init__(self, case: ImpactCase, q: ca.SX, n: ca.SX, limbs: RepeatedLimbs | None = None) -> None:

@@ -42,13 +42,9 @@ class StickingPoint:
 
     @staticmethod
     def of(kkt: Array, J: Array, mobility: Array, mobile: NDArray[np.bool_]) -> StickingPoint:
-        """Build the system.
+        """Build the system from ``kkt = [M, −J_sᵀ; J_s, εI]``, the world ``J``, and ``mobility = JM⁻¹Jᵀ``, 1/kg.
 
-        Args:
-            kkt: ``[M, −J_sᵀ; J_s, εI]``.
-            J: Jacobian of the point, world, shape (3, nv).
-            mobility: ``JM⁻¹Jᵀ``, 1/kg, shape (3, 3).
-            mobile: Velocities whose joints are not locked, shape (nv,).
+        ``mobile`` marks the velocities whose joints are not locked, shape (nv,).
         """
         values, vectors = np.linalg.eigh((mobility + mobility.T) / 2)
         kept = values > SINGULAR * max(float(values[-1]), 1e-300)
