@@ -38,7 +38,6 @@ class CoulombKind(ImpactKind):
     no_cone = "coulomb is not a quadratic form of the normal, so its exact worst case over a cone is not known"
 
     def value(self, q: Array) -> float:
-        """Return the value, computed with Pinocchio; see the base for errors."""
         jump = coulomb_impact(self.oracle, q).jump
         return float(jump @ self.oracle.weigh(jump))
 

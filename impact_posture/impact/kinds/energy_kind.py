@@ -28,15 +28,12 @@ class EnergyKind(FrictionlessKind, QuadraticKind):
         return jump.variables[-1] / 2
 
     def form(self, mobility: Array, world: Array, jumps: Array) -> Array:
-        """Return ``−JM⁻¹Jᵀ`` along the directions."""
         return np.asarray(-world.T @ mobility @ world)
 
     def form_gradient(self, q: Array, n: Array) -> Array:
-        """Return ``−∇G`` along ``n``."""
         return -self.oracle.gradient_G(q, n)
 
     def form_expression(self, k: ImpactKernel) -> ca.SX:
-        """Return ``−JM⁻¹Jᵀ``."""
         return -k.mobility
 
     def of_form(self, form: Array) -> Array:
@@ -44,21 +41,16 @@ class EnergyKind(FrictionlessKind, QuadraticKind):
         return np.asarray(np.where(form < 0, -1 / (2 * np.where(form < 0, form, -1.0)), np.inf))
 
     def of_form_slope(self, form: Array) -> Array:
-        """Return ``1/(2K²)``."""
         return np.asarray(1 / (2 * form**2))
 
     def of_form_expression(self, form: ca.SX) -> ca.SX:
-        """Return ``−1/(2K)``."""
         return -1 / (2 * form)
 
     def lift_direction(self, tree: Tree, n: ca.SX, label: str) -> UnknownJump:
-        """Return the jump under the unit impulse along the direction."""
         return unknown_jump(self.case, tree, impact_at(self.case, n), label)
 
     def lift_entry(self, world: ca.SX, first: UnknownJump, second: UnknownJump) -> ca.SX:
-        """Return ``−eᵀJa``."""
         return -ca.dot(world, second.contact_velocity)
 
     def form_unit(self, value: Any) -> Any:
-        """Return ``1/(2E)``."""
         return 1 / (2 * value)

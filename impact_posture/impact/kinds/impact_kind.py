@@ -43,7 +43,6 @@ class ImpactKind(ABC):
         adds_up: Whether the impulses of several contacts at once are known, so that their jumps add up.
         kink: Where the value has a kink, and which gradient it has there; empty for a smooth value.
         no_cone: Reason why no exact worst case over a cone of normals exists.
-        attempts: Number of guesses of the lifted form.
     """
 
     oracle: ImpactOracle

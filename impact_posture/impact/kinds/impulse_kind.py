@@ -21,7 +21,6 @@ class ImpulseKind(QuadraticKind):
 
     @property
     def factor(self) -> float:
-        """``λ̄²``."""
         return self.case.contact.impulse**2
 
     def unknowns(self, tree: Tree, n: ca.SX, label: str = "") -> UnknownJump:
@@ -29,13 +28,10 @@ class ImpulseKind(QuadraticKind):
         return unknown_jump(self.case, tree, impact_at(self.case, n), label)
 
     def jump(self, q: Array) -> tuple[Array, Array]:
-        """Return ``a = M⁻¹Jᵀn``; no impulse is unknown."""
         return self.oracle.quantities(q).jump, np.zeros(0)
 
     def form_gradient(self, q: Array, n: Array) -> Array:
-        """Return ``∇H`` along ``n``."""
         return self.oracle.gradient_H(q, n)
 
     def form_expression(self, k: ImpactKernel) -> ca.SX:
-        """Return ``Λ_c``."""
         return k.ellipsoid

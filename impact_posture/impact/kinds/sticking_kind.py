@@ -37,16 +37,13 @@ class StickingKind(QuadraticKind):
         return quantities.sticking_jump, quantities.sticking_impulse
 
     def directions(self, mobility: Array, world: Array) -> Array:
-        """Return ``B⁻¹`` times the directions."""
         sizes = np.linalg.eigvalsh((mobility + mobility.T) / 2)
         if sizes[0] <= SINGULAR * sizes[-1]:
             raise no_sticking()
         return np.asarray(np.linalg.solve(mobility, world))
 
     def form_gradient(self, q: Array, n: Array) -> Array:
-        """Return ``∇S`` along ``n``."""
         return self.oracle.gradient_S(q, n)
 
     def form_expression(self, k: ImpactKernel) -> ca.SX:
-        """Return ``B⁻¹Λ_cB⁻¹``."""
         return k.sticking_form

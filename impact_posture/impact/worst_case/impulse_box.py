@@ -111,7 +111,6 @@ class ImpulseBox:
     Attributes:
         oracles: The oracle of each contact, the leading contact first.
         bilateral: Whether the contacts can pull as well as push.
-        attempts: Number of guesses of the lifted form.
     """
 
     oracles: tuple[ImpactOracle, ...]
@@ -120,7 +119,6 @@ class ImpulseBox:
 
     @property
     def oracle(self) -> ImpactOracle:
-        """See :class:`~impact_posture.impact.objective.WorstCase`."""
         return self.oracles[0]
 
     @cached_property
@@ -137,11 +135,9 @@ class ImpulseBox:
         return WorstImpulses(float(values[tied[0]]), impulses, self.corners[tied], jumps @ impulses)
 
     def value(self, q: Array) -> float:
-        """See :class:`~impact_posture.impact.objective.WorstCase`."""
         return float(self._jumps_and_values(q)[1].max())
 
     def subgradients(self, q: Array, within: float = 0.0) -> Subgradients:
-        """See :class:`~impact_posture.impact.objective.Minimized`; all corners that tie contribute."""
         tied, gaps = finite_maximum(self._jumps_and_values(q)[1], within)
         return Subgradients(np.array([self._gradient(q, self.corners[k]) for k in tied]), gaps)
 
@@ -165,7 +161,6 @@ class ImpulseBox:
         return np.asarray(2 * gradient + first.metric_gradient(x.a))
 
     def expressions(self, k: ImpactKernel) -> tuple[ca.SX, ca.SX]:
-        """See :class:`~impact_posture.impact.objective.WorstCase`; the gradient at the worst corner."""
         impacts = self._impacts(k.n)
         jumps = [k.respond([impact]) for impact in impacts]
         K = _gram(len(jumps), lambda i, j: k.product(jumps[i], jumps[j]))
@@ -175,14 +170,12 @@ class ImpulseBox:
         return k.product(worst, worst), k.size_gradient(worst)
 
     def lift(self, tree: Tree, parameters: ca.SX, scale: ca.SX) -> Lifted:
-        """See :class:`~impact_posture.impact.objective.Minimized`; ``t`` bounds the value at each corner."""
         case = self.oracle.case
         jumps = [unknown_jump(case, tree, impact, f"{i}_") for i, impact in enumerate(self._impacts(parameters))]
         K = _gram(len(jumps), lambda i, j: weighed(case.metric, jumps[i], jumps[j]))
         return worst_of(jumps, [ca.bilin(K, row, row) for row in map(ca.SX, self.corners)], scale)
 
     def guess(self, q: Array, scale: float, attempt: int = 0) -> Guess:
-        """See :class:`~impact_posture.impact.objective.WorstCase`."""
         parts = [Guess.unbounded(o.with_support_impulses(o.quantities(q).jump)) for o in self.oracles]
         return worst_of_guesses(parts, self.value(q) / scale, attempt)
 

@@ -26,21 +26,17 @@ class ModelSet:
 
     ``min_q max_k f_k(q)``, where ``f_k`` is the objective on the k-th model, becomes ``min t`` with ``t ≥ f_k(q)``.
     Models between the variants are not included.  :mod:`impact_posture.posture.analysis.robustness` samples them.
-
-    Attributes:
-        members: The worst case on each model, the robot as modeled first.
+    ``members`` holds the worst case on each model, the robot as modeled first.
     """
 
     members: tuple[WorstCase, ...]
 
     @property
     def oracle(self) -> ImpactOracle:
-        """See :class:`WorstCase`."""
         return self.members[0].oracle
 
     @property
     def attempts(self) -> int:
-        """See :class:`Minimized`."""
         return max(len(ABOVE), *[member.attempts for member in self.members])
 
     def values(self, q: Array) -> Array:
@@ -48,11 +44,9 @@ class ModelSet:
         return np.array([member.value(q) for member in self.members])
 
     def value(self, q: Array) -> float:
-        """See :class:`Minimized`."""
         return float(self.values(q).max())
 
     def subgradients(self, q: Array, within: float = 0.0) -> Subgradients:
-        """See :class:`Minimized`; all models that tie contribute."""
         tied, gaps = finite_maximum(self.values(q), within)
         # The gap between a model and the worst model is a part of ``within``.
         parts = [self.members[k].subgradients(q, max(within - gap, 0.0)) for k, gap in zip(tied, gaps, strict=True)]
@@ -62,7 +56,6 @@ class ModelSet:
         )
 
     def expressions(self, k: ImpactKernel) -> tuple[ca.SX, ca.SX]:
-        """See :class:`WorstCase`; the gradient on the worst model."""
         pairs = []
         for member in self.members:
             # The kernel's repeated limbs belong to its own model.  A payload on one limb makes limbs differ.
@@ -71,7 +64,6 @@ class ModelSet:
         return first_of_largest([value for value, _ in pairs], [gradient for _, gradient in pairs])
 
     def lift(self, tree: Tree, parameters: ca.SX, scale: ca.SX) -> Lifted:
-        """See :class:`Minimized`; each model has its own unknowns, and ``t`` bounds all values."""
         parts = []
         for member in self.members:
             model = member.oracle.robot.model
@@ -79,7 +71,6 @@ class ModelSet:
         return worst_of(parts, [part.value for part in parts], scale)
 
     def guess(self, q: Array, scale: float, attempt: int = 0) -> Guess:
-        """See :class:`Minimized`."""
         parts = [member.guess(q, scale, min(attempt, member.attempts - 1)) for member in self.members]
         return worst_of_guesses(parts, self.value(q) / scale, attempt)
 

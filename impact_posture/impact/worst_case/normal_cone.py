@@ -58,7 +58,6 @@ class NormalCone:
     Attributes:
         kind: The kind of the objective.
         degrees: Half angle of the cone.
-        attempts: Number of guesses of the lifted form.
     """
 
     kind: QuadraticKind
@@ -67,7 +66,6 @@ class NormalCone:
 
     @property
     def oracle(self) -> ImpactOracle:
-        """See :class:`~impact_posture.impact.objective.WorstCase`."""
         return self.kind.oracle
 
     @property
@@ -90,7 +88,6 @@ class NormalCone:
         return self.worst(q).turned(self.oracle.at(q).axes)
 
     def value(self, q: Array) -> float:
-        """See :class:`~impact_posture.impact.objective.Minimized`."""
         return float(self.kind.of_form(np.array(self.worst(q).value)))
 
     def subgradients(self, q: Array, within: float = 0.0) -> Subgradients:
@@ -177,14 +174,10 @@ class NormalCone:
         return float(np.cos(alpha)), float(np.sin(alpha))
 
     def _form(self, q: Array, directions: Array | None = None) -> tuple[Array, Array, Array]:
-        """Compute ``K`` along three directions: columns in the axes of the normal, by default these axes.
+        """Return ``K`` along three directions, shape (3, 3), their jumps, and the impulses that cause these.
 
-        Returns:
-            ``K``, shape (3, 3), the velocity jumps along the directions (columns, shape (nv, 3)), and the impulses
-            that cause them (columns, world axes, shape (3, 3)).
-
-        Raises:
-            MetricError: The form does not exist at ``q``.
+        The directions are columns in the axes of the normal, by default these axes.  The jumps are columns of shape
+        (nv, 3), and the impulses columns in world axes, shape (3, 3).
         """
         world = self.oracle.at(q).axes
         if directions is not None:
