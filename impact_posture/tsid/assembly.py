@@ -64,11 +64,8 @@ class Assembly:
         self.qp = qp = QP.empty(n, m)
         self.strict = TaskStack(strict, nv, qp.A[levels, :nv])
         self.weighted = TaskStack(formulation.weighted, nv)
-        self.bounds = (
-            None
-            if formulation.law is None
-            else AccelerationBounds(robot, formulation.law, qp.lower[:nv], qp.upper[:nv])
-        )
+        law = formulation.law
+        self.bounds = None if law is None else AccelerationBounds(robot, law, qp.lower[:nv], qp.upper[:nv])
         self._place_rows(blind, hard, levels, controls, cones)
         self._place_cost(robot)
         self.levels = self._name_levels(hard, levels)
@@ -169,7 +166,6 @@ class Assembly:
         return slice(self.qp.n + rows.start, self.qp.n + rows.stop)
 
     def _equate(self, rows: slice, value: Array) -> None:
-        """Set both bounds of rows to a value."""
         at = self._at(rows)
         self.qp.lower[at] = value
         self.qp.upper[at] = value

@@ -22,12 +22,7 @@ _FLAT, _EYE = _SHIFT.reshape(3, 36), np.eye(6).reshape(36)
 @checked
 @dataclass(frozen=True, eq=False)
 class Point:
-    """A point that moves with a frame of the robot.
-
-    Attributes:
-        frame: Name of the frame.
-        offset: Point from the origin of the frame, in the frame, meters.
-    """
+    """A point that moves with a frame of the robot, at an offset from its origin, in the frame, meters."""
 
     frame: str
     offset: tuple[float, float, float] = (0.0, 0.0, 0.0)

@@ -42,12 +42,7 @@ class Relaxed:
 
 @dataclass(frozen=True, eq=False)
 class Outcome:
-    """Result of the QP of a tick.
-
-    Attributes:
-        solved: Solution; ``None`` if the relaxed QPs have no solution either.
-        relaxed: Levels and limits that gave way, the most important first.
-    """
+    """Solution, or ``None`` if the relaxed QPs have none, and what gave way, the most important level first."""
 
     solved: Solved | None
     relaxed: tuple[Relaxed, ...] = ()
@@ -75,11 +70,6 @@ def solve(assembly: Assembly, solver: DaqpSolver) -> Outcome:
         solved = DaqpSolver(qp.n, qp.m, proximal=_FLAT).solve(qp)
     if solved is not None or not qp.finite:
         return Outcome(solved)
-    return _relax(assembly)
-
-
-def _relax(assembly: Assembly) -> Outcome:
-    """Solve the QP of the assembly lexicographically."""
     nearest = lexicographic(_hierarchy(assembly), assembly.rank.units)
     if nearest is None:
         return Outcome(None)

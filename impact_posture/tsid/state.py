@@ -116,11 +116,8 @@ class State:
             return self._views[point]
         except KeyError:
             known = ", ".join(p.frame for p in self.points) or "none"
-            raise InputError(
-                f"the state has no kinematics of this point of '{point.frame}' (it has: {known})",
-                where="state",
-                hint="name the point in the task's `points`",
-            ) from None
+            what = f"the state has no kinematics of this point of '{point.frame}' (it has: {known})"
+            raise InputError(what, where="state", hint="name the point in the task's `points`") from None
 
     @property
     def base_rotation(self) -> Array:

@@ -157,9 +157,8 @@ def legged_formulation(
     """
     contacts = support_contacts(robot, friction=friction) if contacts is None else contacts
     if not contacts:
-        raise InputError(
-            "has no supports", where=robot.name, hint="name [[supports]] in robot.toml, or give contacts"
-        )
+        hint = "name [[supports]] in robot.toml, or give contacts"
+        raise InputError("has no supports", where=robot.name, hint=hint)
     weighted = (center_of_mass or CenterOfMass(kp=kp, weight=10.0), base or BaseOrientation(kp=kp, weight=1.0))
     return TaskFormulation((), weighted, posture, contacts, force_point, law)
 

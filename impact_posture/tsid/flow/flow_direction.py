@@ -89,14 +89,7 @@ class FlowDirection:
     """
 
     def __init__(self, robot: Robot, edges: Array, controls: int, options: FlowOptions) -> None:
-        """Size the buffers.
-
-        Args:
-            robot: The robot.
-            edges: Normals of the support polygon, shape (k, 2).
-            controls: Number of static controls with limits.
-            options: Parameters of the flow.
-        """
+        """Size the buffers for the normals of the support polygon, shape (k, 2), and a number of limited controls."""
         nv, ranges = robot.nv, JointRanges(robot)
         self._joints = np.flatnonzero(np.isfinite(ranges.lower) & np.isfinite(ranges.upper))
         width = (ranges.upper - ranges.lower)[self._joints]
@@ -126,13 +119,10 @@ class FlowDirection:
         self.T += np.multiply.outer(slope - self.T @ z, z)
 
     def limit(self, state: State, rooms: Array, shares: Array, coasting: Array) -> None:
-        """Set the rows for a state at ``ν = 0``, less the braking distance of the flow.
+        """Set the rows for a state at ``ν = 0``, less the displacement ``coasting`` in which the present flow brakes.
 
-        Args:
-            state: The state.
-            rooms: Distance of the center of mass to each edge of the polygon, less its margin, m, shape (k,).
-            shares: Static controls, shape (controls,).
-            coasting: Displacement in which the present flow brakes, shape (nv,).
+        ``rooms`` are the distances of the center of mass to the edges of the polygon, less the margin, m, shape (k,).
+        ``shares`` are the static controls, shape (controls,).
         """
         upper, lower = self._qp.upper[self._qp.n :], self._qp.lower[self._qp.n :]
         count, k = self._joints.size, self._edges.shape[0]
@@ -164,12 +154,8 @@ class FlowDirection:
     def newton(self, space: Redundancy, gradient: Array, value: float, offset: Array, error: Array) -> Array:
         """Return the step δ, shape (nv,).
 
-        Args:
-            space: The redundancy.
-            gradient: ``∇H/H₀``, shape (nv,).
-            value: ``H/H₀``.
-            offset: ``q_r ⊖ q₀``, shape (nv,).
-            error: Error of the constraints, shape (rows,).
+        It follows from ``∇H/H₀`` (nv,), the value ``H/H₀``, the offset ``q_r ⊖ q₀`` (nv,), and the error of the
+        constraints (rows,).
         """
         Z, root = space.basis, math.sqrt(max(abs(value), _LEAST))
         slope = Z.T @ (gradient / root + self._pull * offset)
@@ -191,12 +177,8 @@ class FlowDirection:
     def downhill(self, Z: Array, gradient: Array, flow: Array, stop: Array, step: Array) -> Array:
         """Return a change of the flow without the part that raises ``H`` now or at the point where the flow stops.
 
-        Args:
-            Z: Basis of the redundancy, shape (nv, r).
-            gradient: ``∇H/H₀``, shape (nv,).
-            flow: ``u``, shape (nv,).
-            stop: Displacement in which it stops, shape (nv,).
-            step: Change of ``u``, shape (nv,).
+        ``Z`` is the basis of the redundancy, shape (nv, r), and ``gradient`` is ``∇H/H₀``.  The flow ``u`` stops in
+        the displacement ``stop``.  The argument ``step`` is a change of ``u``.
         """
         for slope in (gradient + self.B @ stop, gradient):
             uphill = Z @ (Z.T @ slope)
@@ -225,11 +207,7 @@ class FlowDirection:
     def along(self, Z: Array, flow: Array, time: float, step: Array) -> Array:
         """Return a change of the flow without the parts that cross limits, taken out row by row.
 
-        Args:
-            Z: Basis of the redundancy, shape (nv, r).
-            flow: ``u``, shape (nv,).
-            time: Time for which ``flow + step`` goes on, s.
-            step: Change of ``u``, shape (nv,).
+        ``Z`` is the basis of the redundancy, shape (nv, r).  The flow ``u + step`` goes on for ``time`` seconds.
         """
         for k, (row, high, low) in enumerate(zip(self._rows, *self._room, strict=True)):
             displacement = time * (flow + step)

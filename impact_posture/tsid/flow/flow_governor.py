@@ -39,11 +39,9 @@ class FlowGovernor:
         self.flow, self.returning = np.zeros((2, direction.B.shape[0]))
 
     def back(self, remaining: Array, period: float) -> Array:
-        """Change the velocity of the return within speed and acceleration, and return it, shape (nv,).
+        """Change the velocity of the return for ``period`` seconds, within speed and acceleration, and return it.
 
-        Args:
-            remaining: Displacement that leads back to the constraints, shape (nv,).
-            period: Time in which the velocity changes, s.
+        ``remaining`` is the displacement that leads back to the constraints.  Both have the shape (nv,).
         """
         options, size = self._options, max(float(np.abs(remaining).max(initial=0.0)), _TINY)
         # Two fifths of the acceleration stop a speed of sqrt(4/5 a d) within the distance d.
@@ -66,13 +64,8 @@ class FlowGovernor:
         out the part that moves the zero moment point too far, unless it slows the flow down.  The result is the first
         attempt from which the flow can stop within the limits, by braking evenly as hard as it lately could.
 
-        Args:
-            space: The redundancy.
-            step: ``δ``, shape (nv,).
-            fastest: Largest speed of an entry, rad/s (m/s).
-            period: Time in which the flow changes, s.
-            slope: ``∇H/H₀``, shape (nv,), along which the flow must not climb; ``None`` where it may.
-            zmp: Bounds of the acceleration.
+        The step is ``δ``, shape (nv,).  No entry gets faster than ``fastest``, rad/s (m/s), and the flow changes for
+        ``period`` seconds.  It must not climb along the slope ``∇H/H₀``, shape (nv,), unless the slope is ``None``.
         """
         options, direction, Z, flow = self._options, self._direction, space.basis, self.flow
         most = options.acceleration * period

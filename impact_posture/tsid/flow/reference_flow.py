@@ -77,15 +77,9 @@ class ReferenceFlow:
         options: FlowOptions,
         path: Sequence[Array] = (),
     ) -> None:
-        """Size the buffers.
+        """Size the buffers for a gradient ``q → (H, ∇H)`` and a path of postures to visit first, each of shape (nq,).
 
-        Args:
-            robot: The robot.
-            gradient: ``q → (H, ∇H)``.
-            formulation: Tasks and contacts.
-            actuators: Rotors and motors.
-            options: Parameters.
-            path: Postures to visit first, each of shape (nq,); the last may be the optimum of an offline solution.
+        The last posture of the path may be the optimum of an offline solution.
         """
         self._model, self._gradient, self.options = robot.model, gradient, options
         self._contacts = formulation.contacts

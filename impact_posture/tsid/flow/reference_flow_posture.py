@@ -102,7 +102,7 @@ class ReferenceFlowPosture(JointPosture):
         self.flow.on = False
 
     def release(self) -> None:
-        """Stop the flow and hold the reached posture, as :meth:`contact` does."""
+        """Do the same as :meth:`contact`."""
         self.contact()
 
     @property

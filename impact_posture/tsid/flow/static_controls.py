@@ -61,9 +61,7 @@ class StaticControls:
     def shares(self, state: State, J: Array) -> Array:
         """Return the shares at a state with ``ν = 0``, shape (m,); within ±1 the posture can be held.
 
-        Args:
-            state: The state, whose ``h`` is gravity.
-            J: Jacobian whose first rows belong to the contacts, shape (≥ contact rows, nv).
+        The first rows of ``J``, shape (≥ contact rows, nv), belong to the contacts.
         """
         if self._count:
             J = J[: self._count]

@@ -43,11 +43,8 @@ class LimitLaw:
     def __post_init__(self) -> None:
         """Refuse a law that does not stop the joints."""
         if not self.rate >= 4 * self.approach:
-            raise InputError(
-                f"rate {self.rate:g} is below four times approach {self.approach:g}",
-                where="limit law",
-                hint="raise rate or lower approach",
-            )
+            what = f"rate {self.rate:g} is below four times approach {self.approach:g}"
+            raise InputError(what, where="limit law", hint="raise rate or lower approach")
 
 
 class AccelerationBounds:

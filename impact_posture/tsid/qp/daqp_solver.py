@@ -82,7 +82,6 @@ class WhitenedSolver(DaqpSolver):
         self._others = self._qp.A[dense:, dense:]
 
     def solve(self, qp: QP) -> Solved | None:
-        """Return the solution, or ``None``."""
         n, d, white = self._n, self._dense, self._qp
         R, failed = self._factorize(qp.H[:d, :d])
         if failed:

@@ -22,12 +22,9 @@ _RANK = 1e-9
 
 @dataclass(frozen=True, eq=False)
 class Level:
-    """Rows ``lower ≤ A z ≤ upper`` of one level; equal bounds make equations.
+    """Rows ``lower ≤ A z ≤ upper`` of one level, with ``A`` of shape (k, n).
 
-    Attributes:
-        A: Shape (k, n).
-        lower: Shape (k,); may be minus infinity.
-        upper: Shape (k,); may be infinity.
+    Equal bounds make equations, and infinite bounds do not limit.
     """
 
     A: Array
@@ -41,12 +38,7 @@ def lexicographic(levels: Sequence[Level], units: Array | float = 1.0) -> Array 
     DAQP decides which rows are missed and which bounds are met.  With these as equations, a refinement gives the last
     digits.
 
-    Args:
-        levels: The levels, the most important first.
-        units: Value of each variable that compares with 1, shape (n,).
-
-    Returns:
-        Shape (n,); ``None`` if the solver gave up.
+    ``units`` are the values of the variables that compare with 1, shape (n,).  Return ``None`` if the solver gave up.
     """
     levels = [level for level in levels if level.lower.size]
     z = _nearest(levels)
@@ -66,7 +58,6 @@ def lexicographic(levels: Sequence[Level], units: Array | float = 1.0) -> Array 
 
 
 def _stacked(levels: Sequence[Level]) -> Level:
-    """Return one level with the rows of all levels."""
     return Level(*(np.concatenate([getattr(level, key) for level in levels]) for key in ("A", "lower", "upper")))
 
 
@@ -159,14 +150,10 @@ def _nearest(levels: Sequence[Level]) -> Array | None:
 
 
 def balanced(A: Array, b: Array) -> tuple[Array, Array]:
-    """Return ``QA`` and ``Qb`` with an orthogonal ``Q`` that makes all rows of ``QA`` equally long.
+    """Return ``QA`` (k, n) and ``Qb`` (k,) with an orthogonal ``Q`` that makes all rows of ``QA`` equally long.
 
     Each rotation combines the shortest and the longest row and gives the shortest row the mean length
     (Bendel and Mickey 1978, "Population correlation matrices for sampling experiments").
-
-    Args:
-        A: Shape (k, n).
-        b: Shape (k,).
     """
     A, b = A.copy(), b.copy()
     mean = float(np.sum(A * A)) / max(b.size, 1)

@@ -47,14 +47,9 @@ class LevelRank:
     """
 
     def __init__(self, qp: QP, always: int, levels: Sequence[slice], accelerations: int, units: Array) -> None:
-        """Size the buffers.
+        """Size the buffers for the QP with all rows: ``always`` rows that always hold, then the rows of the levels.
 
-        Args:
-            qp: The QP with all rows.
-            always: Number of its first rows, which always hold.
-            levels: Rows of each level, which follow.
-            accelerations: Number of its first variables, which are accelerations.
-            units: Value of each variable that compares with an acceleration of 1, shape (n,).
+        The first ``accelerations`` variables are accelerations.
         """
         self._full, self._always, self._levels = qp, always, tuple(levels)
         self._accelerations, self.units = accelerations, units

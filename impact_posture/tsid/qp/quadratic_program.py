@@ -38,14 +38,8 @@ class QP:
     @classmethod
     def empty(cls, n: int, m: int) -> QP:
         """Return a program without cost or bounds."""
-        return cls(
-            np.eye(n),
-            np.zeros(n),
-            np.zeros((m, n)),
-            np.full(n + m, -np.inf),
-            np.full(n + m, np.inf),
-            np.zeros(n + m, dtype=np.int32),
-        )
+        lower, sense = np.full(n + m, -np.inf), np.zeros(n + m, dtype=np.int32)
+        return cls(np.eye(n), np.zeros(n), np.zeros((m, n)), lower, -lower, sense)
 
     @property
     def n(self) -> int:

@@ -44,7 +44,6 @@ class Activation:
     """
 
     def __init__(self, *, ramp: Positive = 0.3, live: bool = False) -> None:
-        """Start in FREE."""
         self.ramp, self.live = ramp, live
         self.reset()
 
@@ -60,9 +59,8 @@ class Activation:
         """
         if phase not in _FOLLOWS[self.phase]:
             names = " or ".join(p.value for p in _FOLLOWS[self.phase])
-            raise InputError(
-                f"'{phase.value}' does not follow '{self.phase.value}'", where="activation", hint=f"enter {names}"
-            )
+            what = f"'{phase.value}' does not follow '{self.phase.value}'"
+            raise InputError(what, where="activation", hint=f"enter {names}")
         self.phase = phase
         on = phase is Phase.BRACE or (phase is Phase.CONTACT and self.live)
         self.goal = 1.0 if on else 0.0

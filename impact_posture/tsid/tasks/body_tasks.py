@@ -20,7 +20,6 @@ class _BaseTurn(TargetTask[Array]):
     constant = True
 
     def jacobian(self, state: State) -> Array:
-        """Return the rows of the base's ω, shape (size, nv)."""
         return np.eye(self.size, state.nv, 3)
 
 
@@ -37,11 +36,9 @@ class Tilt(_BaseTurn):
     title, rows = "tilt", 2
 
     def default_target(self) -> Array:
-        """Return the vertical axis."""
         return np.array([0.0, 0.0, 1.0])
 
     def present(self, state: State) -> Array:
-        """Return the base's z axis in the world, shape (3,)."""
         return state.base_rotation[:, 2].copy()
 
     def reset(self, state: State) -> None:
@@ -76,16 +73,14 @@ class BaseOrientation(_BaseTurn):
     title, rows = "base orientation", 3
 
     def present(self, state: State) -> Array:
-        """Return the present rotation, shape (3, 3)."""
         return np.array(state.base_rotation)
 
     def error(self, state: State) -> Array:
-        """Return ``log₃(RᵀR_des)``."""
         return np.asarray(pin.log3(state.base_rotation.T @ self.required_target()))
 
 
 class CenterOfMass(TargetTask[Array]):
-    """Regulate the world position of the center of mass of a floating robot (3 × nv).
+    """Regulate the world position ``c`` of the center of mass of a floating robot: ``e = c_des − c`` (3 × nv).
 
     Attributes:
         target: Meters, shape (3,); by default, the position at ``reset``.
@@ -94,19 +89,15 @@ class CenterOfMass(TargetTask[Array]):
     title, rows = "center of mass", 3
 
     def present(self, state: State) -> Array:
-        """Return the present position, shape (3,)."""
         return state.center_of_mass()[0]
 
     def error(self, state: State) -> Array:
-        """Return ``c_des − c``."""
         return np.asarray(self.required_target() - state.center_of_mass()[0])
 
     def jacobian(self, state: State) -> Array:
-        """Return ``∂c/∂ν``."""
         return state.center_of_mass()[1]
 
     def drift(self, state: State) -> Array:
-        """Return ``J̇ν``."""
         return state.center_of_mass()[2]
 
 

@@ -60,15 +60,9 @@ class FrameTask(TargetTask[Target]):
         weight: ArrayLike = 1.0,
         impedance: Impedance | None = None,
     ) -> None:
-        """Set the point and the gains.
+        """Set the point, the gains of :class:`~impact_posture.tsid.tasks.task.Task`, and the law of an impedance.
 
-        Args:
-            point: The point.
-            name: Name in reports.
-            kp: Stiffness, 1/s².
-            kd: Damping, 1/s; critical by default.
-            weight: Weight in the cost of a weighted formulation.
-            impedance: Law by which a measured force accelerates the frame; ``None`` ignores the force.
+        Without an impedance, the task ignores a measured force.
 
         Raises:
             InputError: A gain or weight is negative, is not finite, or has another shape.
@@ -82,12 +76,10 @@ class FrameTask(TargetTask[Target]):
         """Select the task's rows from a linear and an angular part in world axes, shape (6,) or (6, nv)."""
 
     def jacobian(self, state: State) -> Array:
-        """Return the task's rows of the point's Jacobian."""
         here = state.at(self.point)
         return self.select(here, here.jacobian)
 
     def drift(self, state: State) -> Array:
-        """Return the task's rows of the point's acceleration at ``ν̇ = 0``."""
         here = state.at(self.point)
         return self.select(here, here.drift)
 
@@ -108,15 +100,12 @@ class FramePosition(FrameTask[Array]):
     title, rows = "position", 3
 
     def present(self, state: State) -> Array:
-        """Return the present position, shape (3,)."""
         return state.at(self.point).position.copy()
 
     def error(self, state: State) -> Array:
-        """Return ``p_des − p``."""
         return np.asarray(self.required_target() - state.at(self.point).position)
 
     def select(self, here: PointState, six: Array) -> Array:
-        """Select the linear rows."""
         return six[:3]
 
 
@@ -133,7 +122,6 @@ class FramePose(FrameTask[pin.SE3]):
     title, rows = "pose", 6
 
     def present(self, state: State) -> pin.SE3:
-        """Return the present pose."""
         return placement(state.at(self.point))
 
     def error(self, state: State) -> Array:
@@ -149,7 +137,6 @@ class FramePose(FrameTask[pin.SE3]):
         return state.at(self.point).spatial_drift
 
     def select(self, here: PointState, six: Array) -> Array:
-        """Select all rows."""
         return six
 
 
@@ -183,7 +170,6 @@ class FrameAligned(FrameTask[pin.SE3]):
         self._across = np.linalg.svd(self._axis[None])[2][1:]
 
     def present(self, state: State) -> pin.SE3:
-        """Return the present pose."""
         return placement(state.at(self.point))
 
     def error(self, state: State) -> Array:

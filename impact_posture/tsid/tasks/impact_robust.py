@@ -220,7 +220,6 @@ class ImpactRobustPosture(JointPosture):
         return pull
 
     def feedforward(self, state: State) -> Array | None:
-        """Return the term at the present level."""
         level = self.activation.level
         if level <= 0:
             return None
@@ -248,7 +247,6 @@ class ImpactRobustPosture(JointPosture):
         self.term, self._spare = term, self.term
 
     def _fade(self, term: Array, rooms: Array) -> None:
-        """Fade out the entries that push towards a near position limit."""
         size = term.size
         for at in (rooms < self._farthest).nonzero()[0].tolist():
             # The first half of the rooms belongs to the upper limits.
@@ -284,7 +282,6 @@ def curvature_scale(gradient: Gradient, model: pin.Model, q: Array, redundancy: 
     change = curvature(gradient, model, q, np.eye(model.nv))
     scale = max(float(np.linalg.norm(Z.T @ change @ Z, 2)), _FLAT * abs(gradient(q)[0]))
     if not (np.isfinite(scale) and scale > 0):
-        raise MetricError(
-            "the objective vanishes with its curvature", where=name, hint="start elsewhere, or give `scale`"
-        )
+        what = "the objective vanishes with its curvature"
+        raise MetricError(what, where=name, hint="start elsewhere, or give `scale`")
     return scale

@@ -90,7 +90,6 @@ class JointPosture(Task):
         return 0.0
 
     def reset(self, state: State) -> None:
-        """Take the target of the constructor at rest, or the present posture if the target is ``None``."""
         self.lead(state.q if self._given is None else self._given, 0.0, 0.0)
 
     @checked
@@ -114,14 +113,12 @@ class JointPosture(Task):
         self._velocity[:], self._acceleration[:] = v, a
 
     def advance(self, state: State, dt: float) -> None:
-        """Advance a fade by ``dt`` seconds."""
         if self._blend < 1:
             self._blend += dt / self._over
             if self._blend >= 1:
                 self._target[:], self._blend = self._next, 1.0
 
     def error(self, state: State) -> Array:
-        """Return ``q_des ⊖ q``, shape (nv,)."""
         error = np.asarray(pin.difference(self._model, state.q, self._target))
         if self._blend < 1:
             share = smooth(self._blend)
@@ -130,7 +127,6 @@ class JointPosture(Task):
         return error
 
     def jacobian(self, state: State) -> Array:
-        """Return the identity."""
         return self._eye
 
     def pull(self, state: State) -> Array:
@@ -139,7 +135,6 @@ class JointPosture(Task):
         return np.asarray(self.kp * error if self.stiffness is None else self.stiffness @ error)
 
     def desired(self, state: State) -> Array:
-        """Return ``ν̇*``, shape (nv,)."""
         wanted = self.pull(state)
         wanted += self._acceleration
         error = self._velocity - state.v

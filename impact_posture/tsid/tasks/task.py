@@ -48,12 +48,7 @@ class Task(ABC):
     ) -> None:
         """Set gains and weight; each is one number, or one number per row.
 
-        Args:
-            name: Name in reports.
-            size: Number of rows k.
-            kp: Stiffness, 1/s².
-            kd: Damping, 1/s; critical damping ``2√kp`` by default.
-            weight: Weight in the cost of a weighted formulation.
+        The damping ``kd`` is critical by default, ``2√kp``.
 
         Raises:
             InputError: A gain or weight is negative, is not finite, or has another shape.
