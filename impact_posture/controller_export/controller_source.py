@@ -109,7 +109,6 @@ def objective_code(objective: WorstCaseObjective) -> GeneratedCode:
 
 
 def _generated(inputs: dict[str, ca.SX], targets: dict[str, ca.SX]) -> GeneratedCode:
-    """Generate C that assigns expressions to targets in C."""
     names = [f"o{k}" for k in range(len(targets))]
     function = ca.Function("code", [*inputs.values()], [*targets.values()], [*inputs], names, {"cse": True})
     graph = reorder_sums(graph_of(function))
@@ -126,8 +125,7 @@ def _generated(inputs: dict[str, ca.SX], targets: dict[str, ca.SX]) -> Generated
     work = layout.sizes.get(1, 1)
     largest = max((block.local_bytes for block in emitter.blocks), default=0)
     stack = 8 * (work + 2 * len(angles)) + largest
-    text = constants.text({1: "double"})
-    return GeneratedCode(text, emitter.blocks, angles or (0,), work, outputs, fixed, stack)
+    return GeneratedCode(constants.text({1: "double"}), emitter.blocks, angles or (0,), work, outputs, fixed, stack)
 
 
 def render(
@@ -140,22 +138,16 @@ def render(
     *,
     shared: bool = False,
 ) -> dict[str, str]:
-    """Return file name → text of the header and the sources.
+    """Return file name → text of the header and the sources, whose C names begin with ``prefix``.
 
-    Args:
-        s: Structure of the controller.
-        fields: Parameters.
-        prefix: Beginning of the C names.
-        identity: Identity of the manifest, which the library contains.
-        metric: Prefix of the C names of the gradient, if the controller has one.
-        objective: The objective, if its code is :func:`objective_code` and not an exported gradient.
-        shared: Whether the last parameter is ``numbers``, in which models with the same code differ.
+    The library contains the ``identity`` of the manifest.  ``metric`` is the prefix of the gradient, if there is one.
+    The gradient is exported, or it is the :func:`objective_code` of an ``objective``.  With ``shared``, the last
+    parameter is ``numbers``, in which models with the same code differ.
     """
     points, robot = tuple((p.frame, p.offset, p in s.turning) for p in s.points), s.robot
     code = dynamics_code(robot, points, shared=shared)
     sizes = s.sizes
-    bounds = sizes["SIMPLE"] + sizes["GENERAL"]
-    nv, equations = sizes["NV"], sizes["EQUATIONS"]
+    nv, equations, bounds = sizes["NV"], sizes["EQUATIONS"], sizes["SIMPLE"] + sizes["GENERAL"]
     n, m = sizes["VARIABLES"], sizes["GENERAL"] - sizes["BOUNDED"]
     more = {
         "SCRATCH": max(3 * nv * nv, 2 * n * (n + equations) + 2 * equations * equations),
@@ -170,8 +162,7 @@ def render(
     solver = 8 * (n * (n + 1) // 2 + 12 * n + 2 * max(bounds, 2 * rows)) + 2048
     tables = [(name, *_table(values)) for name, values in s.tables.items()]
     tables.append(("gravity", *_table(np.array(robot.model.gravity.linear, dtype=float))))
-    allocation = s.actuators.G[: sizes["BASE"], : sizes["ROTORS"]]
-    tables.append(("allocation", *_table(allocation)))
+    tables.append(("allocation", *_table(s.actuators.G[: sizes["BASE"], : sizes["ROTORS"]])))
     named_fields = [(field.name, k) for k, field in enumerate(fields, 1) if field.name in _NAMED]
     context: dict[str, Any] = {
         "robot": robot.name, "version": __version__, "prefix": prefix, "sizes": sizes, "room": room, "fields": fields,
@@ -205,7 +196,6 @@ def render(
 
 
 def _files(sizes: dict[str, int]) -> list[str]:
-    """Return the files of ``c/`` for a structure."""
     needed = {"eigen.c": sizes["ROBUST"] or sizes["FLOW"]}
     needed |= {name: sizes["FLOW"] for name in _CORE if name.startswith("reference_flow")}
     return [name for name in _CORE if needed.get(name, True)]

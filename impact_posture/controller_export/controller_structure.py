@@ -129,22 +129,17 @@ def structure_of(robot: Robot, formulation: TaskFormulation) -> Structure:
     }
     always = sizes["BLIND"] + hard + sizes["STRICT"]
     bounds = joints if law is not None and dense else 0
-    sizes |= {
-        "BOUNDED": bounds,
-        "EQUATIONS": always,
-        "GENERAL": always + actuators.controls + sizes["CONES"] + bounds,
-    }
-    ranges = JointRanges(robot)
-    task_rows = np.cumsum([0, *(t.size for t in tasks)])
+    sizes |= {"BOUNDED": bounds, "EQUATIONS": always}
+    sizes["GENERAL"] = always + actuators.controls + sizes["CONES"] + bounds
     tables = {
         "joint_family": [_FAMILIES[s.kind.family] for s in slots],
         "joint_q": [s.q.start for s in slots],
         "joint_v": [s.v.start for s in slots],
-        "limit_q": ranges.index.tolist(),
+        "limit_q": JointRanges(robot).index.tolist(),
         "unit": [x for part in units for x in (part.start, part.stop - part.start)],
         "task_kind": [_KINDS.index(type(t)) for t in tasks],
         "task_point": [points.index(t.point) if isinstance(t, FrameTask) else -1 for t in tasks],
-        "task_row": task_rows.tolist(),
+        "task_row": np.cumsum([0, *(t.size for t in tasks)]).tolist(),
         "task_impedance": [int(isinstance(t, FrameTask) and t._soften is not None) for t in tasks],
         "contact_point": [points.index(c.point) for c in contacts],
         "contact_row": np.cumsum([0, *(c.size for c in contacts)]).tolist(),

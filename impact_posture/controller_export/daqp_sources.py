@@ -121,11 +121,6 @@ def _from_archive(tar: tarfile.TarFile, name: str) -> bytes | None:
 
 
 def _download(folder: Path) -> None:
-    """Download the distribution into a folder.
-
-    Raises:
-        InputError: pip is missing or failed; with its last error.
-    """
     if importlib.util.find_spec("pip") is None:
         raise InputError("pip is missing", where=f"DAQP {VERSION}", hint=f"install pip, or {_FOLDER_HINT}")
     backend, wanted = folder / "backend" / "setuptools", folder / "wanted.txt"
@@ -143,8 +138,5 @@ def _download(folder: Path) -> None:
     )
     if run.returncode:
         lines = [line for line in run.stderr.splitlines() if line.startswith("ERROR")] or ["ERROR: it said nothing"]
-        raise InputError(
-            f"its sources cannot be downloaded ({lines[-1].removeprefix('ERROR: ')})",
-            where=f"DAQP {VERSION}",
-            hint=f"connect to the network once, or {_FOLDER_HINT}",
-        )
+        what = f"its sources cannot be downloaded ({lines[-1].removeprefix('ERROR: ')})"
+        raise InputError(what, where=f"DAQP {VERSION}", hint=f"connect to the network once, or {_FOLDER_HINT}")
