@@ -22,13 +22,7 @@ def contact_names(contacts: Sequence[ImpactContact]) -> list[str]:
 
 
 def impact_rows(impact: ResolvedImpact, normals: Sequence[Iterable[Any]], axes: str) -> list[tuple[str, str]]:
-    """Describe an impact: normals, contact point, supports, metric, armature.
-
-    Args:
-        impact: The impact.
-        normals: Normal of each contact.
-        axes: Frame of the normals, in words.
-    """
+    """Describe an impact: normals in the frame that ``axes`` names, contact point, supports, metric, armature."""
     objective, contact, metric = impact.objective, impact.contact, impact.metric
     rows = []
     for name, struck, normal in zip(contact_names(objective.contacts), objective.contacts, normals, strict=True):
@@ -51,10 +45,7 @@ def impact_rows(impact: ResolvedImpact, normals: Sequence[Iterable[Any]], axes: 
 def worst_tables(page: Page, frames: Sequence[str], blocks: Mapping[str, Mapping[str, Any]]) -> None:
     """Show each of several contacts alone, and the objective of each model variant.
 
-    Args:
-        page: Where to write.
-        frames: Names of the contacts.
-        blocks: Evaluations by name, as in ``result.json``.  The contacts are those of the last evaluation.
+    ``blocks`` are evaluations by name, as in ``result.json``.  The last evaluation has the contacts.
     """
     last = list(blocks.values())[-1]
     if "by_contact" in last:
@@ -89,7 +80,6 @@ def worst_lines(page: Page, frames: Sequence[str], blocks: Mapping[str, Mapping[
 
 
 def _impulses(frames: Sequence[str], worst: Mapping[str, Any]) -> str:
-    """Name the worst impulses of several contacts."""
     parts = [f"{value:g} N·s at {frame}" for frame, value in zip(frames, worst["impulses"], strict=True) if value]
     tied = len(worst["corners"]) - 1
     others = f" ({tied} other {'corner is' if tied == 1 else 'corners are'} as bad)" if tied else ""

@@ -125,7 +125,6 @@ def _holding(page: Page, before: dict[str, Any] | None, after: dict[str, Any] | 
 
 
 def _tradeoff(page: Page, document: dict[str, Any], notes: list[str]) -> None:
-    """Show the trade-off between the objective and the distance or force."""
     from impact_posture.posture.search.impact_notes import percent
 
     points = document["tradeoff"]
@@ -148,7 +147,6 @@ def _tradeoff(page: Page, document: dict[str, Any], notes: list[str]) -> None:
 
 
 def _path(page: Page, path: dict[str, Any]) -> None:
-    """Show the path to the optimum."""
     page.gap()
     end = "the optimum" if path["found"] else f"objective {number(path['objective'])}"
     limit = path["limits"].get("active")

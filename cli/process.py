@@ -41,9 +41,8 @@ def memory_fault() -> str:
     limit = resource.getrlimit(resource.RLIMIT_AS)[0]
     if limit == resource.RLIM_INFINITY or limit >= _LEAST_MEMORY:
         return ""
-    return (
-        f"ulimit -v: the process may use {limit >> 20} MB of address space; allow at least {_LEAST_MEMORY >> 20} MB"
-    )
+    least = _LEAST_MEMORY >> 20
+    return f"ulimit -v: the process may use {limit >> 20} MB of address space; allow at least {least} MB"
 
 
 def _open_streams() -> None:

@@ -26,12 +26,7 @@ NoSupport = Annotated[bool, typer.Option("--no-support", rich_help_panel=ROBOT, 
 
 @dataclass(frozen=True)
 class TypedSettings:
-    """Settings that stand on the command line, without defaults.
-
-    Attributes:
-        context: Context of the command in Typer.
-        values: The settings by name.
-    """
+    """Settings that stand on the command line, by name and without defaults."""
 
     context: typer.Context
     values: dict[str, Any]
@@ -61,9 +56,8 @@ class TypedSettings:
             return False
         for name in self.context.params:
             if name not in {"robot", "json", "quiet", *free} and _on_command_line(self.context, name):
-                raise UsageError(
-                    f"{_spelled(name)} contradicts RESULT_DIR, which says what the problem is: leave it out."
-                )
+                what = f"{_spelled(name)} contradicts RESULT_DIR, which says what the problem is"
+                raise UsageError(f"{what}: leave it out.")
         return True
 
 
@@ -138,7 +132,6 @@ def _options(settings: type[RobotSettings], without: Collection[str]) -> dict[st
 
 
 def _option_type(kind: Any, setting: Setting, optional: bool) -> Any:
-    """Return the type of an option for Typer from the type of a field."""
     if setting.repeatable:
         return list[str] | None
     inner = [t for t in get_args(kind) if t is not type(None)] if get_origin(kind) in (Union, UnionType) else [kind]
@@ -164,7 +157,6 @@ def demanding(annotation: Any, setting: Setting | None = None) -> Callable[[Any]
 
 
 def _value(setting: Setting | None, value: Any) -> Any:
-    """Return the value of a setting from the text of its option."""
     if setting is not None and setting.parse is not None:
         return setting.parse(value)
     return tuple(value) if isinstance(value, list) else value

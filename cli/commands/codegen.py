@@ -47,7 +47,6 @@ def codegen(
     json: options.Json = False,
     quiet: options.Quiet = False,
 ) -> None:
-    """Run ``impact-posture codegen``."""
     from_result = typed.is_result(robot, {"prefix", "out", "float_", "portable", "compile", "force"})
     if controller is None:
         if flow or scenario is not None or daqp is not None:

@@ -37,7 +37,6 @@ def compare(
     json: options.Json = False,
     quiet: options.Quiet = False,
 ) -> None:
-    """Run ``impact-posture compare``."""
     labels = [text.strip() for text in controllers.split(",") if text.strip()]
     if not labels:
         raise typer.BadParameter("name at least one controller", param_hint="--controllers")

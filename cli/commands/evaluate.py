@@ -20,12 +20,8 @@ if TYPE_CHECKING:
 
 @with_settings(ImpactSettings)
 def evaluate(
-    typed: TypedSettings,
-    robot: options.RobotName,
-    json: options.Json = False,
-    quiet: options.Quiet = False,
+    typed: TypedSettings, robot: options.RobotName, json: options.Json = False, quiet: options.Quiet = False
 ) -> None:
-    """Run ``impact-posture evaluate``."""
     typed.check_contact()
     from impact_posture.impact.evaluation.ellipsoids import classical_ellipsoids
     from impact_posture.impact.resolved_impact import resolve

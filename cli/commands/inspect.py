@@ -35,7 +35,6 @@ def inspect(
     json: options.Json = False,
     quiet: options.Quiet = False,
 ) -> None:
-    """Run ``impact-posture inspect``."""
     from impact_posture.robot.robot_loader import load_robot
     from impact_posture.robot.robot_summary import summarize
 
@@ -60,7 +59,6 @@ def inspect(
 
 
 def _write(robot: str, load: LoadOptions, out: str, *, force: bool, json: bool, quiet: bool) -> None:
-    """Draft a robot.toml."""
     from impact_posture.robot.draft import write_draft
 
     path, draft = write_draft(robot, load, Path(out) if out else None, force=force)

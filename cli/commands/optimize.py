@@ -45,7 +45,6 @@ def optimize(
     json: options.Json = False,
     quiet: options.Quiet = False,
 ) -> None:
-    """Run ``impact-posture optimize``."""
     # Most objects live until the result is printed, so garbage collection only takes time.
     gc.set_threshold(*_RARELY)
     settings = _settings(robot, typed)
@@ -116,9 +115,8 @@ def _settings(robot: str, typed: TypedSettings) -> ProblemSettings:
         from impact_posture.robot.robot_loader import known_robots
 
         if robot not in known_robots():
-            raise typer.BadParameter(
-                f"a result folder is not a robot; its problem is {problem}", param_hint="'ROBOT'"
-            )
+            what = f"a result folder is not a robot; its problem is {problem}"
+            raise typer.BadParameter(what, param_hint="'ROBOT'")
     if not from_file or "contact" in typed.values:
         typed.check_contact()
     if not from_file:

@@ -32,7 +32,6 @@ def plot(
     json: options.Json = False,
     quiet: options.Quiet = False,
 ) -> None:
-    """Run ``impact-posture plot``."""
     from impact_posture.output.plot import draw_all
     from impact_posture.output.result_folder import FORMATS
     from impact_posture.output.result_reader import load_view

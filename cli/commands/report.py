@@ -20,12 +20,8 @@ OutputFolder = Annotated[
 
 
 def report(
-    folder: OutputFolder,
-    meshes: options.Meshes = False,
-    json: options.Json = False,
-    quiet: options.Quiet = False,
+    folder: OutputFolder, meshes: options.Meshes = False, json: options.Json = False, quiet: options.Quiet = False
 ) -> None:
-    """Run ``impact-posture report``."""
     from impact_posture.system.output_folder import add_to_record
 
     place = Path(folder)

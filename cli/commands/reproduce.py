@@ -12,8 +12,7 @@ from impact_posture_cli.progress_line import progress
 
 All = Annotated[bool, options.option("--all", RUN, "Run every controller, not only the recommended ones.")]
 Scenarios = Annotated[
-    list[str] | None,
-    options.option("--scenario", RUN, "One scenario; repeatable.", show_default="all four"),
+    list[str] | None, options.option("--scenario", RUN, "One scenario; repeatable.", show_default="all four")
 ]
 Out = Annotated[str, options.out_option("Folder of the results.")]
 
@@ -30,7 +29,6 @@ def reproduce(
     json: options.Json = False,
     quiet: options.Quiet = False,
 ) -> None:
-    """Run ``impact-posture reproduce``."""
     from impact_posture.errors import ScenarioNotFound
     from impact_posture.experiment.experiment_folders import FORMATS, Output, store_beside, write_reproduction
     from impact_posture.experiment.reproduction import PAPER, controllers_of

@@ -7,7 +7,6 @@ from impact_posture_cli.output import Page, print_json
 
 
 def robots(json: options.Json = False, quiet: options.Quiet = False) -> None:
-    """Run ``impact-posture robots``."""
     from impact_posture.robot.robot_summary import WAYS_TO_NAME, catalogue
 
     entries = catalogue()

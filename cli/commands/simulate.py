@@ -49,8 +49,7 @@ ExportWorld = Annotated[
     str | None, options.option("--export-world", RUN, "Write the world for C++ and run nothing.", metavar="DIR")
 ]
 Out = Annotated[
-    str | None,
-    options.out_option("Folder for run.json, the time series and the figures.", "./SCENARIO-CONTROLLER"),
+    str | None, options.out_option("Folder for run.json, the time series and the figures.", "./SCENARIO-CONTROLLER")
 ]
 
 
@@ -72,7 +71,6 @@ def simulate(
     json: options.Json = False,
     quiet: options.Quiet = False,
 ) -> None:
-    """Run ``impact-posture simulate``."""
     from impact_posture.simulation.scenario_file import read_scenario
 
     # A name that is none is refused before all that takes long to import.
@@ -140,10 +138,10 @@ def _show(page: Page, document: dict[str, Any], label: str, folder: Path) -> Non
     counted = ("relaxed_ticks", "failed_ticks", "contacts", "contacts_asked")
     count = {key: sum(part["metrics"][key] for part in runs) for key in counted}
     ticks = sum(part["ticks"] for part in runs)
-    relaxed = f"{count['relaxed_ticks']} of {ticks} ticks, in which limits made a task give way"
-    rows.append(("relaxed", relaxed))
-    held = f"{count['failed_ticks']} ticks, in which no command was found and the last one was kept"
-    rows.append(("held", held))
+    rows += [
+        ("relaxed", f"{count['relaxed_ticks']} of {ticks} ticks, in which limits made a task give way"),
+        ("held", f"{count['failed_ticks']} ticks, in which no command was found and the last one was kept"),
+    ]
     if any(window["kind"] == "dwell" for window in document["windows"]):
         rows.append(("contacts", f"{count['contacts']} of {count['contacts_asked']}"))
     page.pairs(rows)
@@ -157,16 +155,14 @@ def _show(page: Page, document: dict[str, Any], label: str, folder: Path) -> Non
         page.table(("  push", "q_total_impact", "peak jump", "pushed after s"), parts, right=(1, 2, 3))
     if document["events"]:
         page.gap()
-        several = len(runs) > 1
         for event in document["events"]:
-            which = f" (push {event['sign']:+d})" if several else ""
+            which = f" (push {event['sign']:+d})" if len(runs) > 1 else ""
             page.line(f"  t = {event['time']:.2f} s: {event['status']}{which}: {event['what']}")
     page.gap()
     notes = list(document["warnings"])
-    if document["offline"] and document["offline"]["note"]:
-        notes.append(document["offline"]["note"])
-    if document["path"] and document["path"]["reason"]:
-        notes.append(document["path"]["reason"])
+    for key, note in (("offline", "note"), ("path", "reason")):
+        if document[key] and document[key][note]:
+            notes.append(document[key][note])
     if document["metrics"] is not None and not document["metrics"]["rested"]:
         notes.append("the robot was not at rest before the push: the numbers include its own motion")
     page.warnings(notes)
@@ -174,7 +170,6 @@ def _show(page: Page, document: dict[str, Any], label: str, folder: Path) -> Non
 
 
 def _numbers(metrics: dict[str, Any], prediction: dict[str, Any]) -> list[tuple[str, str]]:
-    """Return the metrics of a completed run as rows."""
     saturation = metrics["saturation_s"]
     joints = f"base {number(metrics['q_total_impact_base'])}, joints {number(metrics['q_total_impact_joints'])}"
     rows = [("q_total_impact", f"{number(metrics['q_total_impact'])}  ({joints}; rad, mixed with m)")]

@@ -36,8 +36,7 @@ Out = Annotated[
     str | None, options.out_option("Folder of the sweep; with show, of the maps.", "./SWEEP, or DIR/maps")
 ]
 MapAxes = Annotated[
-    str | None,
-    options.option("--axes", "Maps", "Axes of the maps.", metavar="A,B", show_default="the two longest"),
+    str | None, options.option("--axes", "Maps", "Axes of the maps.", metavar="A,B", show_default="the two longest")
 ]
 
 
@@ -54,7 +53,6 @@ def sweep(
     json: options.Json = False,
     quiet: options.Quiet = False,
 ) -> None:
-    """Run ``impact-posture sweep``."""
     if target == "show":
         if folder is None:
             raise UsageError("Missing argument 'DIR': the folder that sweep wrote.")
@@ -106,7 +104,6 @@ def sweep(
 def _executor(
     workers: int, scheduler: str | None, slurm: list[str] | None, out: Path, *, mpi: bool
 ) -> AbstractContextManager[Executor | None]:
-    """Return what runs the shards."""
     from impact_posture.sweep import executors
 
     if scheduler is not None:

@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable
 from pathlib import Path
 from typing import TYPE_CHECKING, Annotated
 
@@ -18,7 +17,7 @@ from impact_posture_cli.settings_options import TypedSettings, demanding, with_s
 
 if TYPE_CHECKING:
     from impact_posture.impact.resolved_impact import ResolvedImpact
-    from impact_posture.verification.verification import VerificationReport, VerificationRow
+    from impact_posture.verification.verification import VerificationRow
 
 NormalOfFirst = Annotated[
     Vector3 | None,
@@ -45,7 +44,6 @@ def verify(
     json: options.Json = False,
     quiet: options.Quiet = False,
 ) -> None:
-    """Run ``impact-posture verify``."""
     from_result = typed.is_result(robot, {"samples", "seed"})
     if "contact" in typed.values:
         typed.check_contact()
@@ -63,7 +61,12 @@ def verify(
         print_json(document | {"warnings": list(impact.warnings)})
     else:
         page = Page(quiet=quiet)
-        _asked(page.title, impact, report)
+        feet = f", standing on {len(impact.supports)}" if impact.supports else ""
+        postures = "posture" if len(report.samples) == 1 else "postures"
+        page.title(
+            f"{impact.robot.name} at {impact.contact.frame}{feet}",
+            f"against Pinocchio at {len(report.samples)} random {postures}, seed {report.seed}",
+        )
         head = ("way", "", "largest error", "allowed", "", "where")
         page.table(head, [_cells(row) for row in report.rows], right=(2, 3), fold=5)
         page.warnings(impact.warnings)
@@ -83,15 +86,6 @@ def _of_result(folder: Path) -> ResolvedImpact:
 
     view = load_view(folder)
     return ResolvedImpact(view.objective, view.q_optimal, "the result's optimum", view.speed, view.restitution)
-
-
-def _asked(title: Callable[[str, str], None], impact: ResolvedImpact, report: VerificationReport) -> None:
-    feet = f", standing on {len(impact.supports)}" if impact.supports else ""
-    count = len(report.samples)
-    title(
-        f"{impact.robot.name} at {impact.contact.frame}{feet}",
-        f"against Pinocchio at {count} random posture{'s' if count > 1 else ''}, seed {report.seed}",
-    )
 
 
 def _cells(row: VerificationRow) -> tuple[str, ...]:

@@ -10,7 +10,6 @@ from impact_posture_cli.commands.report import OutputFolder, show_written
 
 
 def view(folder: OutputFolder, json: options.Json = False, quiet: options.Quiet = False) -> None:
-    """Run ``impact-posture view``."""
     import webbrowser
 
     from impact_posture.errors import InputError
