@@ -53,10 +53,8 @@ def parameters(s: Structure, period: float) -> Iterator[Field]:
     gains = (("kp", "stiffness, 1/s2"), ("kd", "damping, 1/s"), ("weight", "weight in the cost"))
     yield field("period", "positive", "expected time between ticks, s", period)
     for name, text in gains:
-        rows = [getattr(task, name) for task in s.tasks]
-        yield field(
-            f"task_{name}", "nonnegative", f"{text}, of each row of the tasks", np.hstack([np.zeros(0), *rows])
-        )
+        rows = np.hstack([np.zeros(0), *(getattr(task, name) for task in s.tasks)])
+        yield field(f"task_{name}", "nonnegative", f"{text}, of each row of the tasks", rows)
     soft = [t._soften if isinstance(t, FrameTask) and t._soften is not None else np.zeros(6) for t in s.tasks]
     yield field("task_softness", "nonnegative", "inverse apparent inertia of each task, 1/kg and 1/(kg m2)", soft)
     for name, text in gains:
@@ -81,9 +79,8 @@ def parameters(s: Structure, period: float) -> Iterator[Field]:
     weights = [1.0 if c.weight is None else c.weight for c in contacts]
     yield field("contact_weight", "positive", "weight in the cost of each contact that is not hard", weights)
     yield field("force_weight", "positive", "weight of contact forces, 1/N2", formulation.force_weight)
-    yield field(
-        "spare_weight", "positive", "weight of the choice of redundant rotors, 1/N2", formulation.spare_weight
-    )
+    spare = formulation.spare_weight
+    yield field("spare_weight", "positive", "weight of the choice of redundant rotors, 1/N2", spare)
     for name in ("lower", "upper"):
         yield field(f"control_{name}", "limit", "thrusts, N, and torques, N m", getattr(actuators, name))
     for name in ("lower", "upper"):

@@ -36,9 +36,6 @@ class Structure:
     """Formulation, with the numbers and tables that its C code needs.
 
     Attributes:
-        robot: The robot.
-        formulation: The formulation.
-        actuators: Rotors and motors.
         tasks: Tasks of the strict levels, then the weighted tasks.
         points: Points whose kinematics a tick needs.
         sizes: Name → number, of every size that the code fixes.

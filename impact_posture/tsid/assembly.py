@@ -40,7 +40,6 @@ class Assembly:
     Bounds on the variables are the acceleration bounds of the joint limits.
 
     Attributes:
-        formulation: The formulation.
         qp: The QP of the last :meth:`build_qp`.
         rank: The independent rows of the levels, and the QP without the dependent rows.
         levels: Names and rows of the strict levels, the most important first; hard contacts come first of all, as
@@ -201,10 +200,8 @@ class Assembly:
         diagonal = self.qp.H.reshape(-1)[:: self.qp.n + 1]
         self._diagonal = diagonal[:nv]
         diagonal[self._w] = self.formulation.spare_weight
-        units = [1.0] * 3 + [_MOMENT] * 3
-        diagonal[self._f] = self.formulation.force_weight * np.array(
-            [x for c in contacts.contacts for x in units[: c.size]]
-        )
+        units = [weight for c in contacts.contacts for weight in ([1.0] * 3 + [_MOMENT] * 3)[: c.size]]
+        diagonal[self._f] = self.formulation.force_weight * np.array(units)
         self._H, self._g = self.qp.H[:nv, :nv], self.qp.g[:nv]
         self._posture_weight = np.zeros(nv)
 

@@ -218,8 +218,7 @@ class Controller:
         """
         self._check_ready()
         assembly, state, posture = self.assembly, self.state, self.formulation.posture
-        residuals, active, dynamics = {}, [], float("nan")
-        deficient: tuple[Relaxed, ...] = ()
+        residuals, active, deficient, dynamics = {}, [], tuple[Relaxed, ...](), math.nan
         solved = self._outcome.solved
         if solved is not None:
             z = solved.z
@@ -243,7 +242,7 @@ class Controller:
             tuple(active),
             dynamics,
             0.0 if posture is None else posture.level,
-            float("nan") if posture is None else posture.value,
+            math.nan if posture is None else posture.value,
             0 if solved is None else solved.iterations,
         )
 

@@ -141,14 +141,13 @@ def _gave_way(assembly: Assembly, z: Array) -> tuple[Relaxed, ...]:
 
 def _hierarchy(assembly: Assembly) -> list[Level]:
     """Return the hard rows, the acceleration bounds, and the strict levels."""
-    qp, limits, rank = assembly.rank.qp, assembly.limits, assembly.rank
-    n = qp.n
+    qp, limits, n = assembly.rank.qp, assembly.limits, assembly.qp.n
     always = np.ones(qp.m, dtype=bool)
     for _, rows in assembly.levels:
         always[rows] = False
     always[limits[limits >= n] - n] = False
     lower, upper = qp.lower[n:], qp.upper[n:]
-    levels = [rank.rows(level, equations=True) for _, level in assembly.levels]
+    levels = [assembly.rank.rows(level, equations=True) for _, level in assembly.levels]
     return [
         Level(qp.A[always], lower[always], upper[always]),
         Level(np.vstack([np.eye(n), qp.A])[limits], qp.lower[limits], qp.upper[limits]),

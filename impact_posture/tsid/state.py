@@ -19,7 +19,6 @@ class State:
     """``M``, ``h``, point Jacobians, drifts and center of mass at ``(q, ν)``.
 
     Attributes:
-        robot: The robot.
         points: Points whose kinematics the state holds.
         q: Configuration, shape (nq,), a copy with unit quaternions and cosine-sine pairs.
         v: ν, shape (nv,), a copy.

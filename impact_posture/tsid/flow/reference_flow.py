@@ -54,7 +54,6 @@ class ReferenceFlow:
     mass, base orientation) follow the flow.  Joints that ``robot.toml`` holds do not move.
 
     Attributes:
-        robot: The robot.
         q: ``q_r``, shape (nq,).
         velocity: ``u`` with ``q̇_r = u``, rad/s (m/s), shape (nv,).
         acceleration: ``u̇``, shape (nv,).

@@ -81,11 +81,10 @@ class ReferenceFlowPosture(JointPosture):
         return self._flow
 
     def brace(self, t_impact: float | None = None) -> None:
-        """Start the flow because an impact is coming.  It moves for at most ``options.duration``.
+        """Start the flow because an impact is coming, in ``t_impact`` seconds if this is known.
 
-        Args:
-            t_impact: Time until the impact, s.  The flow rests :attr:`settle` before it, as far as its acceleration
-                permits.
+        The flow moves for at most ``options.duration``.  It rests :attr:`settle` before a known impact, as far as its
+        acceleration permits.
 
         Raises:
             InputError: The time is not finite, or no controller with this task has been reset.

@@ -78,14 +78,9 @@ class StaticControls:
     def permitted(self, M: Array, known: Array, more: Array, shares: Array, most: float) -> float:
         """Return the share of ``more``, 0 to 1, that the actuators permit.
 
-        It uses the contact forces of the last :meth:`shares`.
-
-        Args:
-            M: Mass matrix, shape (nv, nv).
-            known: Acceleration that must not change, shape (nv,).
-            more: Acceleration to add, shape (nv,).
-            shares: Static controls at the state, shape (m,).
-            most: Largest share of the room beside the static controls that both accelerations may use.
+        The acceleration ``known``, shape (nv,), must not change.  Both accelerations may use at most the share
+        ``most`` of the room beside the static controls ``shares``, shape (m,).  The contact forces come from the
+        last :meth:`shares`.
         """
         self._pair[:, 0], self._pair[:, 1] = known, more
         taken, added = self._needed(M @ self._pair).T

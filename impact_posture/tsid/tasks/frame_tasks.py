@@ -194,13 +194,10 @@ EndEffector = FramePose | FramePosition | FrameAligned
 
 
 def pose_task(point: Point, pose: str, axis: Array | None, **options: Any) -> EndEffector:
-    """Return the task that holds the rows of a pose mode at a point.
+    """Return the task that holds the rows of a pose mode at a point; ``box`` holds the position.
 
-    Args:
-        point: The point.
-        pose: The pose mode.  ``box`` holds the position, as ``position`` does.
-        axis: Unit vector of ``aligned`` in the frame, shape (3,); with ``None``, the task holds the whole pose.
-        options: Gains, weight and name of the task.
+    ``aligned`` also holds the direction of ``axis``, a unit vector in the frame, shape (3,); without an axis, the
+    whole pose.
     """
     if pose in ("position", "box"):
         return FramePosition(point, **options)
