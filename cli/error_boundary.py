@@ -62,11 +62,9 @@ def run(command: Any, arguments: Sequence[str]) -> int:
             return 1
         if os.environ.get(DEBUG_VARIABLE):
             traceback.print_exc()
-        return (
-            _usage(error, wants_json)
-            if isinstance(error, UsageError)
-            else _report(_explain(error, arguments), wants_json)
-        )
+        if isinstance(error, UsageError):
+            return _usage(error, wants_json)
+        return _report(_explain(error, arguments), wants_json)
 
 
 @dataclass(frozen=True)

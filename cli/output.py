@@ -70,14 +70,10 @@ class Page:
         dim: int | None = None,
         fold: int = -1,
     ) -> None:
-        """Write a table of plain text, which Rich does not read as markup.
+        """Write a table of plain text, which Rich does not read as markup; empty ``headers`` leave the titles out.
 
-        Args:
-            headers: Titles of the columns; empty for a table without titles.
-            rows: Cells as text.
-            right: Columns of numbers, which are aligned to the right.
-            dim: Column in dim letters.
-            fold: Column that wraps where the terminal is too narrow. The other columns do not wrap.
+        The columns ``right`` are aligned to the right, and the column ``dim`` has dim letters. Only the column
+        ``fold`` wraps where the terminal is too narrow.
         """
         from rich.table import Table
         from rich.text import Text

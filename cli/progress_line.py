@@ -21,13 +21,8 @@ def progress(
     """Show what the program is doing while the block runs.
 
     The line shows what the library tells (:func:`impact_posture.system.progress.tell`) and what the block counts.
-    Yield the function that takes ``(done, all)``; ``None`` where nothing is shown.
-
-    Args:
-        doing: What is counted, as an activity.
-        unit: Name of what is counted; without it the line shows a bar and no numbers.
-        shown: Whether to show anything.
-        first: Activity until the first count; ``doing`` if empty.
+    Yield the function that takes ``(done, all)``; ``None`` where nothing is shown.  Without the ``unit`` of a count,
+    the line shows a bar and no numbers.  Until the first count, it shows ``first`` instead of ``doing``.
     """
     from rich.console import Console
 

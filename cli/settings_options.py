@@ -36,22 +36,14 @@ class TypedSettings:
         return validate(settings, self.values | more, "options")
 
     def check_contact(self) -> None:
-        """Check that either ``--normal`` or ``--contact`` is given.
-
-        Raises:
-            UsageError: Exit code 2.
-        """
+        """Check that either ``--normal`` or ``--contact`` is given."""
         if "contact" not in self.values and "normal" not in self.values:
             raise UsageError("Missing option '--normal X Y Z': the direction out of the surface, towards the robot.")
         if "contact" in self.values and ("frame" in self.values or "normal" in self.values):
             raise UsageError("--contact stands instead of --frame and --normal: give one of the two.")
 
     def is_result(self, robot: str, free: Collection[str]) -> bool:
-        """Return whether ROBOT|RESULT_DIR is a result folder; only the options ``free`` go with one.
-
-        Raises:
-            UsageError: An option contradicts the result folder; exit code 2.
-        """
+        """Return whether ROBOT|RESULT_DIR is a result folder; with one, refuse all options but ``free``."""
         if not os.path.isfile(Path(robot) / "result.json"):
             return False
         for name in self.context.params:
@@ -64,12 +56,9 @@ class TypedSettings:
 def with_settings(
     settings: type[RobotSettings], *, without: Collection[str] = (), **changed: Any
 ) -> Callable[[Callable[..., None]], Callable[..., None]]:
-    """Give a command the options of all settings. The command receives ``typed`` and its own parameters.
+    """Give a command the options of all settings, except ``without``. It receives ``typed`` and its own parameters.
 
-    Args:
-        settings: The dataclass whose annotated fields become options.
-        without: Fields that the command does not take.
-        changed: Annotations of the fields whose options differ in this command.
+    ``changed`` are annotations of the fields whose options differ in this command.
     """
     options = _options(settings, without) | {name: (hint, None) for name, hint in changed.items()}
     if "support" in options:
