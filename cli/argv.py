@@ -15,25 +15,18 @@ _OPTIONAL = {
 
 
 def put_right(arguments: Sequence[str]) -> list[str]:
-    """Join pairs and fill in optional values."""
-    return fill_optional(_in_pairs(arguments))
+    """Write ``--payload FRAME MASS`` as ``--payload FRAME:MASS``, and give options of ``_OPTIONAL`` a missing value.
 
-
-def _in_pairs(arguments: Sequence[str]) -> list[str]:
-    """Write ``--payload FRAME MASS`` as ``--payload FRAME:MASS``: Typer has no repeatable options of two values."""
+    Typer has neither repeatable options of two values nor options with an optional value.
+    """
     words, rest = [], list(arguments)
     while rest:
         word = rest.pop(0)
         words.append(word)
         if word == "--payload" and len(rest) > 1 and not rest[1].startswith("--"):
             words.append(f"{rest.pop(0)}:{rest.pop(0)}")
-    return words
-
-
-def fill_optional(arguments: Sequence[str]) -> list[str]:
-    """Give options of ``_OPTIONAL`` a value where none follows: Typer has no options with an optional value."""
     filled: list[str] = []
-    for word, following in zip_longest(arguments, arguments[1:], fillvalue=""):
+    for word, following in zip_longest(words, words[1:], fillvalue=""):
         filled.append(word)
         if word in _OPTIONAL and not _OPTIONAL[word].match(following):
             # Imported here, because --help does without.

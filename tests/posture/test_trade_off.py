@@ -26,7 +26,7 @@ from impact_posture.posture.manifold.feasible_start import Projector
 from impact_posture.posture.program import posture_nlp as nlp
 from impact_posture.posture.program.constrained_problem import ConstrainedProblem
 from impact_posture.posture.search.multistart import PostureSolution, solve
-from impact_posture_cli.argv import fill_optional
+from impact_posture_cli.argv import put_right
 from tests.posture.test_posture import walk
 from tests.support.command import run
 from tests.support.helpers import central_gradient, relative, rng
@@ -338,8 +338,8 @@ def test_the_curve_is_drawn_again_and_only_where_there_is_one(written: tuple[Pat
 
 def test_the_number_may_be_left_out() -> None:
     default = str(TRADEOFF_POINTS)
-    assert fill_optional(["optimize", "--tradeoff", "ur5"]) == ["optimize", "--tradeoff", default, "ur5"]
-    assert fill_optional(["ur5", "--tradeoff", "--json"]) == ["ur5", "--tradeoff", default, "--json"]
-    assert fill_optional(["ur5", "--tradeoff"]) == ["ur5", "--tradeoff", default]
+    assert put_right(["optimize", "--tradeoff", "ur5"]) == ["optimize", "--tradeoff", default, "ur5"]
+    assert put_right(["ur5", "--tradeoff", "--json"]) == ["ur5", "--tradeoff", default, "--json"]
+    assert put_right(["ur5", "--tradeoff"]) == ["ur5", "--tradeoff", default]
     for argv in (["--tradeoff", "5"], ["--tradeoff=5"], ["--tradeoff", "-1"], ["--tradeoff", "2.5"], ["--trade"], []):
-        assert fill_optional(argv) == argv
+        assert put_right(argv) == argv
