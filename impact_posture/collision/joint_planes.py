@@ -29,7 +29,6 @@ class JointPlanes:
     """Planes ``normals θ ≤ bounds`` for the joints between two bodies.  Within them the shapes do not touch.
 
     Attributes:
-        bodies: Names of the bodies.
         joints: Names of the m joints between the bodies, one to three.
         normals: Normals of the planes, shape (k, m), per rad (m); no rows if the shapes touch nowhere.
         bounds: Bounds of the planes, shape (k,).

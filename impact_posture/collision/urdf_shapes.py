@@ -48,11 +48,9 @@ class UrdfShape:
 
     Attributes:
         name: Unique name: the link, with ``[k]`` if the link has several shapes.
-        link: Name of the link.
         placement: Placement in the axes of the link.
         kind: Tag of the URDF, such as ``box`` or ``mesh``.
         sizes: Sizes in the order of the URDF, m, or the scale of a mesh.
-        mesh: File of a mesh.
         color: Red, green, blue and opacity, 0 to 1, if the URDF states them.
     """
 

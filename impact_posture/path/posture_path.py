@@ -96,12 +96,8 @@ def posture_path(solution: PostureSolution, *, seed: int = 0, effort: int = EFFO
     """Find a path from ``solution.initial`` to ``solution.q`` along which all constraints hold, and time it.
 
     If the search does not reach the optimum, it tries other certified optima, best first, and then the best posture
-    that it has reached.
-
-    Args:
-        solution: A solved posture problem.
-        seed: Seed of the samples.
-        effort: Largest number of postures that the search pulls onto the constraints for each optimum.
+    that it has reached.  ``effort`` is the largest number of postures that it pulls onto the constraints for each
+    optimum.
 
     Raises:
         InputError: The package of the extra ``path`` is not installed.

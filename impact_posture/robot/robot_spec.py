@@ -57,7 +57,6 @@ class Support(_Table):
     """A foot that stays on the ground; its velocities are zero up to the compliance.
 
     Attributes:
-        frame: Frame of the foot.
         kind: ``point`` holds the velocity of the contact point, ``surface`` also the angular velocity.
         offset: Contact point from the frame's origin, in the frame, meters.
         size: Half extents (x, y) of the sole around the contact point, in the frame, meters.

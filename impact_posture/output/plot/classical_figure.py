@@ -37,7 +37,6 @@ class Kind:
     """A kind of ellipsoid in both postures: ``velocity``, ``force`` or ``impact``.
 
     Attributes:
-        formula: Formula of the matrix.
         unit: Unit of the semi-axes.
         scale: The longest finite semi-axis before.
         matrices: Before and after, divided by ``scale²``; unbounded directions are cut far outside of the panel.

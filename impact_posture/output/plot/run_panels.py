@@ -36,14 +36,9 @@ _NEAR = 1e-3
 
 @dataclass(frozen=True)
 class Clip:
-    """A stretch of time of a run.  The axis shows ``scale (t − origin)``.
+    """A stretch of time of a run, s.  The axis with this label shows ``scale (t − origin)``.
 
-    Attributes:
-        begin: First time, s.
-        end: Last time, s.
-        origin: Time at the zero of the axis, s.
-        scale: Units of the axis per second: 1, or 1000 for milliseconds.
-        label: Name of the axis.
+    ``scale`` is the number of units of the axis per second: 1, or 1000 for milliseconds.
     """
 
     begin: float

@@ -31,9 +31,6 @@ class RunView:
     The robot holds the limits of the commands: ``model.effortLimit`` and the rotor speeds of its propulsion.
 
     Attributes:
-        scenario: Name of the scenario.
-        controller: Name of the controller.
-        robot: The robot.
         contact: Impact contact: frame, offset, and the world normal out of the surface (or along the push).
         t: s, increasing, shape (n,).
         q: Configuration, shape (n, nq).

@@ -103,9 +103,7 @@ class DrawnRobot:
     """The shapes of a robot.
 
     Attributes:
-        solids: The meshes.
         parts: For each shape: joint, index of its mesh, placement in the axes of the joint, and color (RGB, opacity).
-        licenses: Licenses of the meshes.
         notes: Notes on replaced or missing shapes, one line each.
     """
 

@@ -64,9 +64,6 @@ class ReportScene:
     """Everything that the viewer draws.
 
     Attributes:
-        drawn: The shapes of the robot.
-        objective: The impact.
-        tracks: Motions to choose from.
         planes: Name (``surface`` or ``ground``), point (m) and unit normal of each plane, world.
         bodies: Points of each convex body in the world, shape (k, 3), m.
         ghost: Whether the first frame stays visible while the robot moves on.

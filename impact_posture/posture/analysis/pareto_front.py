@@ -61,14 +61,9 @@ def pareto_front(
 ) -> TradeOff:
     """Follow the curve in ``points`` equal steps from the least price to the price of the optimum.
 
-    The regularization is left out, because the bound on the distance replaces it.
-
-    Args:
-        solution: The solved problem.
-        points: Number of steps.
-        force: Contact and approach speed (m/s) whose peak force is the price; ``None`` for the distance.
-        compile: Whether to compile the program.
-        progress: Called with the numbers of finished and planned solves.
+    The regularization is left out, because the bound on the distance replaces it.  ``force`` is the contact and the
+    approach speed (m/s) whose peak force is the price; ``None`` for the distance.  ``progress`` is called with the
+    numbers of finished and planned solves.
 
     Raises:
         InputError: The number of points is below 1, or there are several contacts whose forces would compete.

@@ -32,7 +32,6 @@ class VariantOptimum:
     """A model variant and its own optimum, the best posture for this variant alone.
 
     Attributes:
-        name: Name of the model variant.
         at_robust: Objective of the variant at the robust optimum.
         own: Objective of the variant at its own optimum; ``None`` (as ``q`` and ``moved``) if no start certified.
         q: The own optimum, shape (nq,).
@@ -62,7 +61,6 @@ class Robustness:
             exist, or violates a constraint for another model variant.
         broken: Names of the violated constraints.
         between: Largest objective at the robust optimum among models drawn between the model variants.
-        drawn: Number of drawn models.
     """
 
     model_variants: tuple[VariantOptimum, ...]

@@ -21,11 +21,8 @@ from impact_posture.system.arrays import Array
 class DistancePrice:
     """The distance from the initial posture, rad mixed with m.
 
-    Attributes:
-        model: The robot.
-        nearest: The posture at the least price, shape (nq,).
-        against: Name of the price in options and files.
-        nothing: Message if the optimum has the least price.
+    ``nearest`` is the posture at the least price, shape (nq,), ``against`` the name of the price in options and
+    files, and ``nothing`` the message if the optimum has the least price.
     """
 
     model: pin.Model

@@ -54,8 +54,7 @@ class Verdict:
         impulse: Relative change of the size of the impulse.
         peak_force: Relative change of the peak force without friction.
         advice: The jump without friction, a better objective, or a joint model that fits, one line each.
-        before: The impact in the initial posture; ``None`` if it is unknown.
-        after: The impact in the optimal posture.
+        before: The impact in the initial posture; ``None`` if it is unknown, as ``after`` in the optimal posture.
         assumptions: Assumptions behind the numbers, one line each.
     """
 

@@ -33,8 +33,6 @@ class MovingPoint:
     """Demands on the motion of a point during the approach: rows of ``D v`` and ``D ω`` equal ``−σ d``.
 
     Attributes:
-        name: Name of the frame.
-        point: The point.
         axes: ``D``, shape (3, 3): the normal and two tangents, or the axes of the world.
         rows: Constrained rows of ``(D v, D ω)``.
         comes: Whether the first row is the approach, ``nᵀv = −σ``; otherwise it is zero like the other rows.

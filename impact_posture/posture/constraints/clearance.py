@@ -37,9 +37,6 @@ class Clearance(Constraint):
     The program contains only active pairs.  :meth:`grown` adds pairs that a posture violates.
 
     Args:
-        name: Name of the constraint.
-        pairs: The pairs.
-        description: Description in one line.
         active: Pairs in the program, by index, with the corners that have rows there.
         lifted: Rows of pairs by tree and index with their corners, shared by all constraints that grow from this one.
         distances: Distances of all pairs of the surroundings, and the indices of these pairs there.

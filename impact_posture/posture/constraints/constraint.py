@@ -64,8 +64,7 @@ class Linearization:
     Attributes:
         names: Name of each row.
         value: ``g(q, z)``, shape (m,).
-        lower: Lower bounds, shape (m,).
-        upper: Upper bounds, shape (m,).
+        lower, upper: Bounds, shape (m,).
         posture: Tangent Jacobian ``∂g/∂q``, shape (m, nv).
         auxiliary: ``∂g/∂z``, shape (m, k).
     """
@@ -111,8 +110,7 @@ class Constraint(ABC):
     Attributes:
         name: Name in lists of active and of conflicting constraints.
         parameters: Numbers that may change without rebuilding the program (targets, polygons).
-        lower: Lower bounds, shape (rows,).
-        upper: Upper bounds, shape (rows,).
+        lower, upper: Bounds, shape (rows,).
         projected: Whether starts are pulled onto the constraint; else the program alone satisfies it.
         grows: Whether :meth:`grown` is likely to add parts to the program.
         by_row: Whether conflicts name each row instead of the constraint.

@@ -30,7 +30,6 @@ class Requirements:
         com_asked: Whether the user set ``com_over_feet``.  If not, it is dropped where the feet span no area.
         com_margin: Least distance of the center of mass from the edges of the polygon, meters.
         keep_contacts: The impact must neither lift nor slide a foot.
-        friction: Friction coefficient of the feet.
         holdable: Thrusts, torques and forces of the feet that hold the posture stay within their limits.
         limit_share: Share of the limits of torques and thrusts that holding may take, about the middle of a range.
         hold_force: Force with which each contact pushes back after the impact, N, which has to be held as well.
@@ -40,7 +39,6 @@ class Requirements:
         collision: Keep the links clear of each other, the surface, the ground and the obstacles.
         clearance: Least distance between any two of these, m.
         surface: ``plane``, ``none``, or the edge length of a square patch in m; ``None`` to choose by the robot.
-        obstacles: Bodies in the world.
         limit_margin: Distance from the joint limits, rad or m.
         regularization: Weight of the squared distance from the initial posture, relative to the initial objective.
     """

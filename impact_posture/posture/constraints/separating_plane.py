@@ -51,7 +51,6 @@ class ConvexBody:
     """A swept hull or half-space that moves with a link, stands in the world, or follows a point without turning.
 
     Attributes:
-        name: Name in messages.
         hull: Corners and sweep radius in the axes of ``point``; ``None`` for the half-space behind a plane.
         point: The point and axes that carry the body; joint 0 is the world.
         turns: Whether the body turns with the link; otherwise it keeps world axes.

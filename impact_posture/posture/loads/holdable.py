@@ -37,8 +37,6 @@ class Holdable(Constraint):
 
     Args:
         name: The load in words, such as ``at rest``.
-        equilibrium: The robot at rest.
-        description: Description in one line.
         active: Whether the program has the rows.  Most optima keep the limits anyway, and a program without the rows
             is faster, so :meth:`grown` adds them only where an optimum violates a limit.
     """

@@ -33,7 +33,6 @@ class HoldingForces:
     Attributes:
         load: The load in words, such as ``at rest``.
         feasible: Whether the robot can hold it.
-        largest_share: The largest share of an actuator.
         unbalanced: Sum of the absolute entries of the unbalanced wrench on the base, in weights (moments over 1 m).
         actuators: Load of each actuator with known limits.
         contact_forces: Force on each foot, world axes, N.

@@ -26,9 +26,7 @@ class ForceSource:
     Attributes:
         point: Point of the link, with the axes of the frame.
         columns: ``W``, force (N) above moment (N·m) about the point per unit z, shape (6, k).
-        lower: Lower bounds of z, shape (k,).
-        upper: Upper bounds of z, shape (k,).
-        names: Name of each entry of z.
+        lower, upper: Bounds of z, shape (k,).
         in_frame: Whether the wrench has the axes of the frame and turns with the link.
         constant: ``p``, shape (6,).
     """

@@ -28,9 +28,6 @@ class ConstrainedProblem:
     """``min_q objective(q)`` under constraints, from a given posture.
 
     Attributes:
-        robot: The robot.
-        objective: The function that is minimized.
-        requirements: Demands of the task.
         given: Posture of the user, shape (nq,).
         constraints: All constraints except joint limits.
         lower: Lower joint limits plus margin, chart coordinates, shape (nx,); the limits of a held joint are equal.

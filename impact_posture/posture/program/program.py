@@ -32,7 +32,6 @@ class Program:
     ``rows`` are the rows of its constraints, which programs of the same problem share.
 
     Attributes:
-        chart: Coordinates of the robot.
         numeric: The model in Pinocchio, shared by all runs.
         bounded: Number of inequalities ``≤ 0`` of the objective, which are the last rows.
     """

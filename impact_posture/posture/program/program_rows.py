@@ -59,9 +59,7 @@ class ProgramRows:
     """Lifted constraints of a problem, and of all problems that it grows into, shared by all programs of it.
 
     Attributes:
-        chart: Coordinates of the robot.
         x: Chart coordinates, shape (nx, 1).
-        tree: The dynamics at ``x``.
         norms: Squared norms of the quaternions less one.
         reference: Symbols of the chart coordinates of the given posture, shape (nx, 1).
         away: Squared distance from the given posture.

@@ -77,7 +77,6 @@ class GlobalSearch:
         improvement: Share by which the objective is below the best objective of the multi-start search.
         missed_rate: Share of the certified starts that ended more than 0.1 % above the best posture.
         unseen_share: Estimated share of further starts that would end in an optimum not seen yet.
-        estimated_optima: Estimated number of optima.
         hops: Number of hops; 0 with a map.
         motion: The map, or ``None``.
         bound: The bound on the map, or ``None``.

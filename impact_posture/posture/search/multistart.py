@@ -45,23 +45,18 @@ class PostureSolution:
     """The solution of a posture problem.
 
     Attributes:
-        problem: The posture problem.
         initial: The given posture, moved onto the constraints if it does not satisfy them, shape (nq,).
         moved: Length of this move, tangent norm.
         q: The best certified posture, shape (nq,).
-        certificate: Certificate of ``q``.
         redundancy: Degrees of freedom that the equalities leave at ``q``.
         optima: Distinct optima, best first.
-        starts: Number of starts.
         feasible_starts: Starts that reached the constraints.
         certified_starts: Starts that ended at a certified posture where no original shapes touch.
         colliding_starts: Starts that ended at a certified posture where original shapes touch.
         dominated_starts: Starts that were stopped because they could not become the best.
         status: Return status of IPOPT for the best run.
-        iterations: Iterations of the best run.
         solve_time_s: Wall time of all runs together.
         start_time_s: Median wall time of the runs from one start.
-        build_time_s: Time to build the program.
         compiled: Whether the program ran as machine code.
         notes: Notes for the user about the solution.
         compiler_fault: Why a compilation failed; empty if none failed.
@@ -107,17 +102,10 @@ def solve(
     guesses: Sequence[Array] = (),
     finish_all: bool = False,
 ) -> PostureSolution:
-    """Solve from the given posture, from feasible ``guesses`` and from random feasible postures.
+    """Solve from the given posture, from feasible ``guesses``, shape (nq,) each, and from random feasible postures.
 
-    Args:
-        problem: The posture problem.
-        starts: Number of all starts.
-        seed: Seed of the random postures.
-        jobs: Number of processes.
-        compile: Whether to compile the program.
-        progress: Called with the numbers of finished starts and of all starts.
-        guesses: Feasible postures, shape (nq,) each.
-        finish_all: Also finish starts that can no longer become the best.
+    ``starts`` counts all starts, and ``seed`` is for the random postures.  ``progress`` is called with the numbers of
+    finished starts and of all starts.  ``finish_all`` also finishes starts that can no longer become the best.
 
     Raises:
         Infeasible: No posture satisfies the constraints; the error names the conflicting constraints.
