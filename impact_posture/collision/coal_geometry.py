@@ -23,13 +23,10 @@ _UPRIGHT = pin.SE3(pin.rpy.rpyToMatrix(np.pi / 2, 0.0, 0.0), np.zeros(3))
 
 
 class Geometry(NamedTuple):
-    """The shapes of a robot.
+    """The shapes of a robot at their joints, without pairs, and the link of each shape.
 
-    Attributes:
-        model: The shapes at their joints, without pairs.
-        links: Link of each shape.
-        apart: Whether two shapes must not touch, by the joints and the SRDF, shape (n, n).
-        warnings: Shapes that are left out, one line each.
+    ``apart`` tells whether two shapes must not touch, by the joints and the SRDF, shape (n, n).  ``warnings`` are
+    about shapes that are left out, one line each.
     """
 
     model: pin.GeometryModel

@@ -26,12 +26,9 @@ _WORTH = 0.05
 
 @dataclass(frozen=True, eq=False)
 class JointPlanes:
-    """Planes ``normals θ ≤ bounds`` for the joints between two bodies.  Within them the shapes do not touch.
+    """Planes ``normals θ ≤ bounds`` for one to three joints between two bodies.  Within them the shapes do not touch.
 
-    Attributes:
-        joints: Names of the m joints between the bodies, one to three.
-        normals: Normals of the planes, shape (k, m), per rad (m); no rows if the shapes touch nowhere.
-        bounds: Bounds of the planes, shape (k,).
+    ``normals`` are per rad (m), shape (k, m), without rows if the shapes touch nowhere.
     """
 
     bodies: tuple[str, str]

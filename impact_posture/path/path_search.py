@@ -24,13 +24,10 @@ _BANDS, _SWEEPS = (9, 17, 33), 12
 
 @dataclass(frozen=True, eq=False)
 class Connection:
-    """Result of a search between two postures.
+    """Result of a search between two postures, by ``continuation`` (walks alone) or ``sampling``.
 
-    Attributes:
-        path: Postures from the first to the second with valid motions between them; ``None`` if no path was found.
-        reached: All postures that the search reached from the first.
-        method: ``continuation`` if walks alone reached the second posture, else ``sampling``.
-        proof: Why no path exists; empty if this is not known.
+    ``path`` has postures with valid motions between them; it is ``None`` if no path was found.  ``reached`` are all
+    postures that the search reached from the first.  ``proof`` says why no path exists, if this is known.
     """
 
     path: list[Array] | None

@@ -158,15 +158,11 @@ def _exceeded(space: PathSpace, curve: PathCurve, motion: TimedCurve, limits: Ac
 
 @dataclass(frozen=True, eq=False)
 class LimitUse:
-    """Shares of the limits that a motion needs over time; 1 is at a limit.
+    """Largest shares of the limits that a motion needs at each time, shape (m,); 1 is at a limit.
 
-    Attributes:
-        at: Times, s, shape (m,).
-        velocity: Largest share of a velocity limit at each time, shape (m,).
-        torque: Largest share of a torque limit, NaN where not known, shape (m,).
-        thrust: Largest distance from the middle of a thrust range, as a share of half the range, NaN where not known,
-            shape (m,).
-        largest: Largest shares, their actuators, and the active limit, as in ``result.json``.
+    The share of a thrust is its distance from the middle of its range, divided by half the range.  Torques and
+    thrusts are NaN where not known.  ``largest`` has the largest shares, their actuators, and the active limit, as in
+    ``result.json``.
     """
 
     at: Array

@@ -14,13 +14,10 @@ SAMPLE_TIME, _LEAST_POINTS = 0.01, 21
 
 @dataclass(frozen=True, eq=False)
 class TimedCurve:
-    """A motion along a curve.
+    """A motion along a curve: times, s, shape (n,), velocities ``ν`` and accelerations ``ν̇``, shape (n, nv).
 
     Attributes:
-        t: Times, s, shape (n,).
         z: Tangent coordinates on the curve, shape (n, nv).
-        v: Velocities ``ν``, shape (n, nv).
-        a: Accelerations ``ν̇``, shape (n, nv).
         method: ``time-optimal`` (fixed base), ``scaled`` (one time scale for the whole motion) or ``slowed`` (slower
             at corners of the curve).
         notes: Limits that the motion does not respect, and why.

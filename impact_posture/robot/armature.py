@@ -18,11 +18,9 @@ ArmatureOption = Mapping[str, float] | str | None
 
 
 def set_armature(model: pin.Model, spec: RobotSpec, srdf: Path | None, option: ArmatureOption, name: str) -> str:
-    """Set ``model.armature``, kg·m² (kg for prismatic joints).
+    """Set ``model.armature``, kg·m² (kg for prismatic joints); return the source of the values in words.
 
     The values come from the option, else from robot.toml, else from rotor data of the SRDF, else they are zero.
-
-    Returns the source of the values in words.
 
     Raises:
         InputError: A joint does not exist, a value is below zero, or a file cannot be read.

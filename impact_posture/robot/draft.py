@@ -31,11 +31,8 @@ _LEAST_DEPTH = 0.02
 def write_draft(robot: str, options: LoadOptions, out: Path | None, *, force: bool = False) -> tuple[Path, Draft]:
     """Write a commented ``robot.toml`` that can be loaded without changes; return its path and its content.
 
-    Args:
-        robot: Path to a ``.urdf``, or ``example-robot-data:<path>``.
-        options: Data that the user states; other data are read or guessed.
-        out: File; by default ``robot.toml`` beside the URDF, or ``./<name>.toml`` for a URDF in a package.
-        force: Whether an existing file may be replaced.
+    ``options`` are data that the user states; other data are read or guessed.  By default, ``out`` is ``robot.toml``
+    beside the URDF, or ``./<name>.toml`` for a URDF in a package.
 
     Raises:
         InputError: The robot is known by name, so that it has a ``robot.toml``.

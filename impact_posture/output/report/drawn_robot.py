@@ -47,13 +47,9 @@ _Placement = Annotated[
 
 @dataclass(frozen=True, eq=False)
 class Solid:
-    """A triangle mesh with integer coordinates.
+    """A triangle mesh, whose corners are integer multiples of ``step`` (m) from ``low`` (m), shape (k, 3).
 
-    Attributes:
-        corners: Corners as multiples of ``step`` from ``low``, shape (k, 3).
-        faces: Triangles as indices, shape (n, 3).
-        low: Least coordinates, m, shape (3,).
-        step: Length of a unit, m.
+    The faces are indices of corners, shape (n, 3).
     """
 
     corners: StoredArray

@@ -47,7 +47,6 @@ class Content:
         facts: Small print below the title.
         verdict: Lines, the most important first.
         moves: Sentences on the motion of the slider.
-        notes: Notes, one line each.
         sources: Name and content of the files that the command reads.
     """
 

@@ -13,7 +13,6 @@ import pinocchio as pin
 from numpy.typing import NDArray
 
 from impact_posture.config.json_block import json_block
-from impact_posture.impact.evaluation.evaluation import Evaluation
 from impact_posture.posture.analysis.posture_warnings import posture_warnings
 from impact_posture.posture.analysis.robustness import Robustness
 from impact_posture.posture.analysis.trade_off import TradeOff
@@ -35,12 +34,6 @@ _SOLVER = (
 )  # fmt: skip
 
 
-def evaluations(prepared: Prepared, solution: PostureSolution) -> tuple[Evaluation, Evaluation]:
-    """Evaluate the impact at the initial (feasible) and at the optimal posture."""
-    impact = prepared.impact
-    return impact.evaluate(solution.initial), impact.evaluate(solution.q)
-
-
 def result_document(
     prepared: Prepared,
     solution: PostureSolution,
@@ -50,8 +43,8 @@ def result_document(
     global_search: GlobalSearch | None = None,
 ) -> dict[str, object]:
     """Return the content of ``result.json``, with a block for each of the last four arguments that is given."""
-    initial, optimal = evaluations(prepared, solution)
     impact, around = prepared.impact, prepared.problem.surroundings
+    initial, optimal = impact.evaluate(solution.initial), impact.evaluate(solution.q)
     loads = load_cases(impact.objective, solution.initial, prepared.problem.requirements)
     before, after = (loads.holding(q) for q in (solution.initial, solution.q))
     approach = AttainableSpeed(impact.robot, impact.objective, prepared.problem.requirements)

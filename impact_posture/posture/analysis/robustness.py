@@ -31,11 +31,8 @@ _NOISE = 1e-6
 class VariantOptimum:
     """A model variant and its own optimum, the best posture for this variant alone.
 
-    Attributes:
-        at_robust: Objective of the variant at the robust optimum.
-        own: Objective of the variant at its own optimum; ``None`` (as ``q`` and ``moved``) if no start certified.
-        q: The own optimum, shape (nq,).
-        moved: Tangent distance of the own optimum from the robust optimum.
+    ``at_robust`` is the objective of the variant at the robust optimum, and ``own`` at its own optimum ``q``, shape
+    (nq,).  ``moved`` is the tangent distance between both.  The last three are ``None`` if no start certified.
     """
 
     name: str

@@ -24,10 +24,9 @@ _SAME = 0.01
 
 @dataclass(frozen=True)
 class PredictedImpact:
-    """The impact at the stated approach speed in one posture.
+    """The impact at the stated approach speed in one posture, with the jump ``‖Δν‖_W``.
 
     Attributes:
-        jump: ``‖Δν‖_W``.
         impulse: Size of the impulse of the first contact, N·s.
         peak_force: Peak force without friction, N; ``None`` without a stated contact or with several contacts.
         sticks: Whether the first contact point sticks; ``None`` for a jump without friction.

@@ -93,15 +93,10 @@ class AttainableSpeed:
     The base and feet of a standing robot do not move; the base of a robot without feet moves at any speed.  At a
     contact with a free pose something hits the robot, at any speed.
 
-    Args:
-        robot: The robot, with the velocity limits of its URDF.
-        objective: The contacts and supports.
-        requirements: Held parts of the base, of contact poses and of other frames.
-
     Attributes:
         unknown: Why the speed is undefined; empty if it is defined, although infinite at some postures.
         scale: Unit of each free entry of the velocity, rad/s or m/s, shape (k,).
-        upper: Limit of each free entry in its unit, or infinity, shape (k,).
+        upper: Velocity limit of each free entry by the URDF, in its unit, or infinity, shape (k,).
     """
 
     def __init__(self, robot: Robot, objective: Objective, requirements: Requirements) -> None:

@@ -23,15 +23,13 @@ from impact_posture.system.arrays import Array
 
 
 class ImpactBounds(ExpressionConstraint):
-    """``1/G(q) ≤ 1/G_min`` and ``|a_i(q)|/G(q) ≤ b`` at every joint.
+    """``1/G(q) ≤ 1/G_min`` and ``|a_i(q)|/G(q) ≤ b`` at every joint, for the leading contact of the objective.
 
     Both limits are bounds of rows, so one program serves all values of them.
 
     Args:
-        objective: The impact; the normal of its leading contact counts.
         least_mobility: ``G_min``, 1/kg, the least G with which the peak force stays below its bound; 0 for no bound.
         jump: ``b = Δν_max/((1+e) v)``, the largest jump of a joint per approach speed; infinite for no bound.
-        variant: Name of the model variant, if there are several.
     """
 
     def __init__(self, objective: WorstCaseObjective, least_mobility: float, jump: float, variant: str = "") -> None:

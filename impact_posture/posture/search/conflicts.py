@@ -36,14 +36,10 @@ _ROUNDS = 20
 
 @dataclass(frozen=True)
 class LeastViolation:
-    """The least violation that the search found.
+    """The least violation that the search found, at ``q``, and the problem with all parts that its program needed.
 
-    Attributes:
-        q: Configuration with the least violation, shape (nq,).
-        problem: The problem with all parts that its program needed.
-        conflicts: Violation of each violated constraint; empty if all are satisfied.
-        at_limits: Joints on a limit at ``q``.
-        violation: Sum of the violations at the price of each constraint.
+    ``conflicts`` is the violation of each violated constraint; it is empty if all are satisfied.  ``at_limits`` are
+    joints on a limit.  ``violation`` is the sum of the violations at the price of each constraint.
     """
 
     q: Array

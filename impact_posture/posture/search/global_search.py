@@ -53,8 +53,7 @@ class SelfMotionMap:
         s: Path length along the component, rad mixed with m, shape (N,); zeros for two degrees of freedom.
         objective: The objective, shape (N,).
         feasible: Whether limits and inequalities hold, shape (N,).
-        start: Index of the node nearest to the initial posture, shape (1,).
-        optimum: Index of the node nearest to the best posture, shape (1,).
+        start, optimum: Index of the node nearest to the initial and to the best posture, shape (1,).
         ends: Index of the node nearest to each optimum of the multi-start search, shape (M,).
     """
 
