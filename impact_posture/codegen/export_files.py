@@ -98,7 +98,6 @@ def wrapped(words: Iterable[str], indent: str) -> str:
 
 
 def _parameters(real: Real, sizes: Mapping[str, int], function: str) -> str:
-    """Return the C parameters of an exported function."""
     inputs, results = SIGNATURES[function]
     parameters = [f"const {real.name} {name}[{sizes[name]}]" for name in inputs]
     parameters += [

@@ -22,7 +22,6 @@ class NamedObjective:
     """An objective with the beginning of its C names.
 
     Attributes:
-        objective: The objective.
         stem: Beginning of its C names.
         free: Whether it is the objective without the supports of a standing robot.
         joint: Whether it is the objective of several contacts at once, which has no ``H``.
@@ -84,7 +83,6 @@ class ExportLibrary:
         function: ``(q, n, constants)`` → all outputs.
         constants: Values of the input ``constants``, in which repeated limbs differ.
         seeds: Input name and index → its limb.
-        functions: The exported functions.
     """
 
     function: ca.Function

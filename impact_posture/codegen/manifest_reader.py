@@ -154,7 +154,6 @@ def check_library(library: ctypes.CDLL, manifest: Mapping[str, Any], *, where: s
 
 
 def _is_manifest(path: Path, schema: str) -> bool:
-    """Return whether a file is the manifest of an export."""
     try:
         document = json.loads(read_text(path))
     except (OSError, ValueError, RecursionError):

@@ -117,7 +117,6 @@ class JumpDerivatives:
 
     @cached_property
     def _places(self) -> dict[int, tuple[ca.SX, ca.SX]]:
-        """Rotation and origin of every link."""
         root = {i: int(list(self._tree.model.supports[i])[1]) for i in set(self._of_v)}
         return {i: self._tree.relative(root[i], i) for i in root}
 
@@ -146,7 +145,6 @@ class JumpDerivatives:
         return self._gathered(self._inertias)
 
     def _gathered(self, of_links: ByJoint) -> ByJoint:
-        """Return sums over the subtrees of all joints."""
         sums = dict(of_links)
         for i in sorted(sums, reverse=True):
             if parent := self._parents[i]:

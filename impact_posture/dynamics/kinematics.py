@@ -42,19 +42,13 @@ class PointOnLink:
 
 
 class Kinematics:
-    """A ``pin.Model`` at the configuration ``q`` (``SX``), with optional extra inertias on its links.
+    """A ``pin.Model`` at the configuration ``q``, shape (nq, 1), with joints of all types of Pinocchio's URDF parser.
 
-    Attributes:
-        locked: Velocity entries of locked joints.
-
-    Args:
-        model: The model, with joints of every type that the URDF parser of Pinocchio makes.  An infinite armature
-            locks a joint: it does not move in an impact.
-        q: Configuration, shape (nq, 1).
-        chart_x: The chart coordinates of ``q``, which only :attr:`quaternions` needs.
-        extra_inertia: Constant 6×6 matrices in link coordinates, added to the inertias of the model.  A foot held
-            with compliance ε is a foot with the point mass 1/ε.
-        limbs: Repeated limbs whose constants become parameters, so that their expressions have the same form.
+    An infinite armature locks a joint: it does not move in an impact.  ``locked`` has the velocity entries of locked
+    joints.  ``extra_inertia`` has constant 6×6 matrices in link coordinates, which add to the inertias of the model.
+    A foot held with compliance ε is a foot with the point mass 1/ε.  The constants of repeated ``limbs`` become
+    parameters, so that their expressions have the same form.  Only :attr:`quaternions` needs ``chart_x``, the chart
+    coordinates of ``q``.
     """
 
     def __init__(

@@ -84,11 +84,7 @@ class Mjcf:
         self.add_geom(WORLD, name, "plane", (1.0, 1.0, 1.0), pin.SE3(upright, np.array(point)))
 
     def compile(self) -> Any:
-        """Build the ``mujoco.MjModel``.
-
-        Raises:
-            InputError: MuJoCo refuses the model.
-        """
+        """Return the ``mujoco.MjModel``, or raise InputError if MuJoCo refuses the model."""
         mujoco = import_mujoco()
         try:
             model = self.spec.compile()
@@ -102,11 +98,7 @@ class Mjcf:
 
 
 def import_mujoco() -> Any:
-    """Return the ``mujoco`` module.
-
-    Raises:
-        InputError: It is not installed.
-    """
+    """Return the ``mujoco`` module, or raise InputError if it is not installed."""
     try:
         import mujoco
     except ImportError:

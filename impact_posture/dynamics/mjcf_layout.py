@@ -28,8 +28,6 @@ class MjcfSlot:
 
     Attributes:
         joint: Type of the joint, and its entries in the Pinocchio vectors.
-        qpos: Its entries of ``qpos``.
-        qvel: Its entries of ``qvel``.
         placement: Rest frame of the joint in its parent.
         moved: Whether it is a MuJoCo free joint with a rest frame other than the world.  MuJoCo has the pose and the
             linear velocity of a free joint in world axes, but of three slides and a ball in the rest frame.

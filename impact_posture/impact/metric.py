@@ -84,11 +84,7 @@ def build_metric(robot: Robot, kind: MetricKind, weights: str | tuple[float, ...
 
 
 def check_weights(robot: Robot, weights: Sequence[float] | None) -> None:
-    """Refuse weights that are not one number for each of the nv velocities.
-
-    Raises:
-        MetricError: The number of weights differs from nv.
-    """
+    """Raise MetricError for weights that are not one number for each of the nv velocities."""
     if weights is not None and np.shape(weights) != (robot.nv,):
         hint = f"give {robot.nv} numbers above zero"
         raise MetricError(f"has {np.size(weights)} entries", where="weights", hint=hint)

@@ -36,11 +36,7 @@ def least_compliance(robot: Robot) -> float:
 
 
 def check_compliance(robot: Robot, compliance: float) -> None:
-    """Refuse a support compliance ε, 1/kg, that is below :func:`least_compliance` or not finite.
-
-    Raises:
-        InputError: The compliance is too small, negative or not finite.
-    """
+    """Raise InputError for a support compliance ε, 1/kg, that is below :func:`least_compliance` or not finite."""
     least = least_compliance(robot)
     if not (np.isfinite(compliance) and compliance >= least):
         hint = f"give at least {least:.3g}, which is 1e-6 over the mass; stiffer feet are lost in rounding errors"

@@ -46,11 +46,7 @@ def _support(robot: Robot, text: str, known: Mapping[str, Support]) -> Support:
 
 
 def refuse_held(robot: Robot, contact: ImpactContact, supports: Sequence[Support]) -> None:
-    """Refuse an impact at a point that a support holds, because the answer would depend on the compliance alone.
-
-    Raises:
-        ContactError: A support holds the contact point.
-    """
+    """Raise ContactError if a support holds the contact point, so that its compliance alone would matter."""
     point = point_on(robot, contact.frame, contact.offset)
     for support in supports:
         foot = point_on(robot, support.frame, support.offset)
@@ -64,11 +60,7 @@ def refuse_held(robot: Robot, contact: ImpactContact, supports: Sequence[Support
 
 
 def refuse_rigid(robot: Robot, supports: Sequence[Support]) -> None:
-    """Refuse a standing robot whose joints are all locked, because only the compliance of its feet would yield.
-
-    Raises:
-        InputError: No joint of the standing robot moves.
-    """
+    """Raise InputError if all joints of a standing robot are locked, so that only the supports would yield."""
     if supports and np.isinf(robot.model.armature[6:]).all():
         what = f"all joints of {robot.name} are locked and its feet stay, so nothing moves in an impact"
         hint = "choose reflected or link, or no `support` for a robot off the ground"

@@ -225,7 +225,6 @@ def _without_supports(objective: WorstCaseObjective, q: Array, H: float) -> tupl
 def _elastic(
     objective: WorstCaseObjective, q: Array, speed: float, contact: ContactStiffness | None
 ) -> ElasticResponse | None:
-    """Return the response of elastic joints to the contact; ``None`` for another joint model than ``elastic``."""
     if objective.robot.joint_model != "elastic":
         return None
     if contact is None:

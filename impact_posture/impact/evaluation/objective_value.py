@@ -19,7 +19,6 @@ class VariantValue:
     """The impact on one model variant.
 
     Attributes:
-        name: Name of the model variant.
         objective: The objective on this variant; ``None`` where it does not exist.
         scalars: H, G, V, S, E of the leading contact on this variant.
     """

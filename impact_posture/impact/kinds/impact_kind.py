@@ -36,7 +36,6 @@ class ImpactKind(ABC):
     kind adds the equations of its lifted form.
 
     Attributes:
-        oracle: The oracle of the impact.
         name: Name in options, files and outputs.
         symbol: Name of the scalar: H, G, V, S or E.
         units: Units in words.

@@ -41,11 +41,7 @@ _UPPER = ((0, 0), (0, 1), (0, 2), (1, 1), (1, 2), (2, 2))
 
 
 def check_cone(kind: type[ImpactKind], degrees: float) -> None:
-    """Refuse a kind without an exact worst case over a cone.
-
-    Raises:
-        MetricError: The kind is not a quadratic form of the normal.
-    """
+    """Raise MetricError for a kind that is not a quadratic form of the normal, if there is a cone."""
     if degrees and not issubclass(kind, QuadraticKind):
         hint = "choose `objective` impulse, sticking or energy, or `normal_cone` 0"
         raise MetricError(kind.no_cone, where="normal_cone", hint=hint)
@@ -53,12 +49,7 @@ def check_cone(kind: type[ImpactKind], degrees: float) -> None:
 
 @dataclass(frozen=True)
 class NormalCone:
-    """The worst normal within ``degrees`` of the contact's normal.
-
-    Attributes:
-        kind: The kind of the objective.
-        degrees: Half angle of the cone.
-    """
+    """The worst normal within ``degrees`` of the contact's normal."""
 
     kind: QuadraticKind
     degrees: float
@@ -112,14 +103,10 @@ class NormalCone:
 
     def expressions(self, k: ImpactKernel) -> tuple[ca.SX, ca.SX]:
         """Return the expressions of a single impact along the worst normal, which is held fixed (Danskin)."""
-        worst = ImpactKernel(k.case, k.q, self.worst_normal_expression(k), k.tree.limbs)
-        return self.kind.expressions(worst)
-
-    def worst_normal_expression(self, k: ImpactKernel) -> ca.SX:
-        """Return the worst normal for the symbols of a kernel in closed form, in the axes of ``n``, shape (3,)."""
         R = in_world(k.case, k.tree, ca.SX.eye(3))
         K = R.T @ self.kind.form_expression(k) @ R
-        return worst_normal_symbolic((K + K.T) / 2, k.n, self.degrees)
+        n = worst_normal_symbolic((K + K.T) / 2, k.n, self.degrees)
+        return self.kind.expressions(ImpactKernel(k.case, k.q, n, k.tree.limbs))
 
     def lift(self, tree: Tree, parameters: ca.SX, scale: ca.SX) -> Lifted:
         """Return the dual over the cone, with three jumps, ``τ``, ``ρ`` and the six entries of ``L`` as unknowns."""
