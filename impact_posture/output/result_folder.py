@@ -29,8 +29,8 @@ FORMATS = ("png",)
 class Written:
     """A result folder that was written, with its C export or ``None``.
 
-    The errors say why the C code could not be built or the report not be written; they are empty otherwise, the first
-    also without a compiler.
+    ``compiler_error`` says why the C code could not be built; it is empty without a compiler.  ``report_error`` says
+    why the report could not be written.
     """
 
     out: Path

@@ -47,7 +47,7 @@ class SolvedPostures:
 
 
 def load_view(folder: Path) -> ResultView:
-    """Read the view of a result folder, with the errors of :func:`load_result`."""
+    """Read the view of a result folder; see :func:`load_result` for errors."""
     return load_result(folder)[1]
 
 

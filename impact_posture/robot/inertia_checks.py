@@ -65,7 +65,7 @@ def massless_joints(model: pin.Model) -> tuple[str, ...]:
 
 
 def check_moved_mass(model: pin.Model, where: str) -> None:
-    """Raise ``InertiaError`` with the names of joints that move no mass, which make the mass matrix singular."""
+    """Raise ``InertiaError`` if joints move no mass, and name them, because the mass matrix would be singular."""
     if not (joints := massless_joints(model)):
         return
     named = ", ".join(f"'{name}'" for name in joints)

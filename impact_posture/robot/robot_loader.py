@@ -52,7 +52,7 @@ def load_robot(robot: str, options: LoadOptions | None = None, **settings: Any) 
 
 
 def build_robot(located: Located, options: LoadOptions) -> Robot:
-    """Build the robot that a URDF and a ``robot.toml`` describe, with the errors of :func:`load_robot`."""
+    """Build the robot that a URDF and a ``robot.toml`` describe; see :func:`load_robot` for errors."""
     spec, urdf, source, base, name = located
     root: Root = options.root or spec.model.root
     _check_package_dirs(options.package_dir, Path(), "package_dir")

@@ -26,7 +26,7 @@ _FAR = 2.0
 
 @dataclass(frozen=True)
 class Bar:
-    """``q_total_impact = ∫‖ν‖dt`` over the impact windows for a controller in a scenario; scenarios have panels.
+    """``q_total_impact = ∫‖ν‖dt`` of a controller over the impact windows of a scenario, which has its own panel.
 
     Attributes:
         mean: Mean over the runs; NaN where no run completed.

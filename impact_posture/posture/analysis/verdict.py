@@ -53,7 +53,7 @@ class Verdict:
         impulse: Relative change of the size of the impulse.
         peak_force: Relative change of the peak force without friction.
         advice: The jump without friction, a better objective, or a joint model that fits, one line each.
-        before: The impact in the initial posture; ``None`` if it is unknown, as ``after`` in the optimal posture.
+        before, after: The impact in the initial and in the optimal posture; ``None`` if it is unknown.
         assumptions: Assumptions behind the numbers, one line each.
     """
 

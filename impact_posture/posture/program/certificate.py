@@ -32,7 +32,7 @@ _MULTIPLIER = 1e-6
 
 @dataclass(frozen=True)
 class Active:
-    """An active inequality, such as ``joint 'elbow'``, ``lower``.
+    """An active inequality: a constraint, such as ``joint 'elbow'``, and its ``lower`` or ``upper`` side.
 
     ``multiplier`` is the rise of the scaled objective per unit of the bound, ≥ 0.
     """

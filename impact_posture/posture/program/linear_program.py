@@ -20,7 +20,7 @@ _OPTIONS: dict[str, Any] = {
 
 @dataclass(frozen=True, eq=False)
 class LinearOptimum:
-    """Solution ``x`` and ``cᵀx`` of ``min cᵀx`` with ``lower ≤ A x ≤ upper`` and ``low ≤ x ≤ high``.
+    """Solution ``x`` of ``min cᵀx`` with ``lower ≤ A x ≤ upper`` and ``low ≤ x ≤ high``, and its value ``cᵀx``.
 
     ``multipliers`` of the rows of ``A``, shape (m,), are positive at upper bounds.
     """

@@ -27,7 +27,7 @@ _NUMBERS = count()
 
 @dataclass(frozen=True, eq=False)
 class WarmStart:
-    """End of a run, from which a run of the same program (a number) with another target continues.
+    """End of a run, from which a run of the program with the same number and another target continues.
 
     Attributes:
         x: All unknowns, shape (n,), between ``lower`` and ``upper``.

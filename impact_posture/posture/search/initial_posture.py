@@ -70,7 +70,7 @@ def _turn_hint(problem: ConstrainedProblem, seed: int) -> str:
 def initial_objective(problem: ConstrainedProblem, initial: Array) -> float:
     """Return the objective at the start, which scales the program.
 
-    It must exist there: if the contact point cannot move along the normal, raise ``ContactError``.
+    Raise ``ContactError`` if the contact point cannot move along the normal, because there is no objective then.
     """
     objective = problem.objective
     # If nothing can move along the normal, the value would be rounding.
