@@ -58,8 +58,6 @@ class ApproachSpeed(Constraint):
         speed = attained.speed if np.isfinite(attained.speed) else 2 * self._speed
         return np.array([self._speed - speed]), -attained.gradient[None, :]
 
-    # ---- lifted form ------------------------------------------------------------------------------------------
-
     @property
     def lifted_bounds(self) -> tuple[Array, Array]:
         zero = np.zeros(len(self._kept))

@@ -76,8 +76,6 @@ class Clearance(Constraint):
     def row_name(self, row: int) -> str:
         return self._pairs[row].name
 
-    # ---- numbers ----------------------------------------------------------------------------------------------
-
     def evaluate(self, model: Numeric) -> tuple[Array, Array]:
         """Return distances and their Jacobian; a distance beyond 1 cm may be a lower bound with a zero Jacobian."""
         values = self._distances.within(model, _NEAR, self._indices)
@@ -134,8 +132,6 @@ class Clearance(Constraint):
         counts = [pair.count for _, pair, _ in self._program]
         parts = np.split(auxiliaries, np.cumsum(counts)[:-1]) if counts else []
         return {k: z for k, z in zip(self.active, parts, strict=True) if z.size}
-
-    # ---- lifted form ------------------------------------------------------------------------------------------
 
     @property
     def _program(self) -> list[tuple[int, SeparatingPlane, Corners]]:

@@ -186,8 +186,6 @@ class Constraint(ABC):
         """Return the slack (m) in the auxiliaries of :meth:`lift`, shape (k,), at the end of a run."""
         return 0.0
 
-    # ---- messages ---------------------------------------------------------------------------------------------
-
     def excess(self, value: Array) -> Array:
         """Return how far ``c(q)`` lies outside its bounds, signed, shape (rows,)."""
         return value - np.clip(value, self.lower, self.upper)

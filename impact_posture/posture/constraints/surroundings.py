@@ -63,8 +63,6 @@ class Surroundings:
             text = "pairs of shapes may touch, because they do so at most postures"
             self.notes.append(f"{len(touching)} {text}: {', '.join(pairs)}")
 
-    # ---- bodies -----------------------------------------------------------------------------------------------
-
     def add_ground(self, supports: Sequence[Support], struck: Sequence[ImpactContact]) -> None:
         """Put level ground under the lowest foot; the feet and the struck links may touch it."""
         if not supports:
@@ -143,8 +141,6 @@ class Surroundings:
         """Return the distance of the surface behind the contact point, m; zero if a contact has no surface."""
         return self._depths.get(contact, 0.0)
 
-    # ---- constraints and checks -------------------------------------------------------------------------------
-
     @cached_property
     def nested(self) -> list[NestedLinks]:
         """Constraints of links whose hulls overlap (:class:`NestedLinks`)."""
@@ -212,8 +208,6 @@ class Surroundings:
             elif wall.body.hull is not None:
                 solids.append((wall.body.hull, at, wall.exempt))
         return planes, solids
-
-    # ---- helpers ----------------------------------------------------------------------------------------------
 
     def _stands_behind(self, plane: ConvexBody, exempt: frozenset[int]) -> str:
         """Return the name of a fixed body behind a plane, which may be a foot or the base; empty if there is none."""

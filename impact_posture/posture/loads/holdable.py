@@ -81,8 +81,6 @@ class Holdable(Constraint):
             return self
         return type(self)(self._load, self._rest, self._description, active=True)
 
-    # ---- lifted form ------------------------------------------------------------------------------------------
-
     @property
     def _bounds(self) -> tuple[Array, Array]:
         upper = np.ones(len(self._rest.rows))

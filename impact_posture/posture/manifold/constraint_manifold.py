@@ -71,8 +71,6 @@ class ConstraintManifold:
         self._middle = np.where(limited, self.lower, 0.0) / 2 + np.where(limited, self.upper, 0.0) / 2
         self.lower[self._turning], self.upper[self._turning] = -np.inf, np.inf
 
-    # ---- values at many postures ------------------------------------------------------------------------------
-
     def equalities(self, x: Array) -> tuple[Array, Array]:
         """Return ``c``, shape (N, m), and its tangent Jacobian, shape (N, m, nv)."""
         value, jacobian = _call(self._equalities, x)
@@ -98,8 +96,6 @@ class ConstraintManifold:
     def tangents(self, x: Array, dimension: int) -> Array:
         """Return an orthonormal basis of the tangent space of the manifold, shape (N, dimension, nv)."""
         return np.asarray(np.linalg.svd(self.equalities(x)[1])[2][:, self.chart.nv - dimension :])
-
-    # ---- moves ------------------------------------------------------------------------------------------------
 
     def move(self, x: Array, v: Array) -> Array:
         """Return postures moved by tangent vectors, shape (N, nv), without full turns; to first order for a base."""
