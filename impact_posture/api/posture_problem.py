@@ -67,9 +67,8 @@ class PostureProblem:
         if isinstance(objective, WorstCaseObjective):
             values["friction"] = objective.contact.friction
         for name in _OF_THE_OBJECTIVE & set(task):
-            raise InputError(
-                "belongs to the objective", where=name, hint="give it to ImpactObjective or ImpactContact"
-            )
+            fault = "belongs to the objective"
+            raise InputError(fault, where=name, hint="give it to ImpactObjective or ImpactContact")
         settings = validate(ProblemSettings, values | task, "PostureProblem")
         self.prepared: Prepared | None = None
         if isinstance(objective, WorstCaseObjective):

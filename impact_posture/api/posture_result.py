@@ -98,11 +98,8 @@ class PostureResult:
     @property
     def _prepared(self) -> Prepared:
         if self.problem.prepared is None:
-            raise InputError(
-                f"is '{self.problem.problem.objective.name}', which is not an impact objective",
-                where="objective",
-                hint="give an ImpactObjective",
-            )
+            fault = f"is '{self.problem.problem.objective.name}', which is not an impact objective"
+            raise InputError(fault, where="objective", hint="give an ImpactObjective")
         return self.problem.prepared
 
     @checked

@@ -78,9 +78,8 @@ def load_result(folder: Path) -> tuple[Prepared, ResultView, dict[str, Any]]:
     try:
         document = json.loads(read_text(folder / "result.json"), parse_constant=_refuse_constant)
         if document["schema"] != SCHEMA:
-            raise SpecError(
-                f"schema '{shown(document['schema'])}'", where=str(folder / "result.json"), hint="run optimize again"
-            )
+            fault = f"schema '{shown(document['schema'])}'"
+            raise SpecError(fault, where=str(folder / "result.json"), hint="run optimize again")
         prepared = prepare(read_settings(folder / "problem.toml"))
         arrays = read_arrays(folder / "result.npz")
         path = NullSpacePath(**{key: arrays[f"path_{key}"] for key in ("q", "s", "H", "G", "V", "S", "objective")})

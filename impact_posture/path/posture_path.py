@@ -85,11 +85,8 @@ class PosturePath:
 def check_package() -> None:
     """Raise ``InputError`` early if the package of the extra ``path`` is not installed."""
     if find_spec("toppra") is None:
-        raise InputError(
-            "toppra, which times a motion, is not installed",
-            where="the extra 'path'",
-            hint="pip install 'impact-posture[path]'",
-        )
+        fault = "toppra, which times a motion, is not installed"
+        raise InputError(fault, where="the extra 'path'", hint="pip install 'impact-posture[path]'")
 
 
 def posture_path(solution: PostureSolution, *, seed: int = 0, effort: int = EFFORT) -> PosturePath:

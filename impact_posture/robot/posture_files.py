@@ -138,9 +138,8 @@ def _in_order(robot: Robot, data: Mapping[str, object], where: str) -> Array:
         if tuple(names) != robot.joint_names:
             missing = [name for name in robot.joint_names if name not in names]
             fault = f"leaves out joint '{missing[0]}'" if missing else "has the joints in another order"
-            raise PostureError(
-                f"{fault}, so that q cannot be read", where=where, hint='give them by name: "joints": {"name": value}'
-            )
+            fault = f"{fault}, so that q cannot be read"
+            raise PostureError(fault, where=where, hint='give them by name: "joints": {"name": value}')
     q = _numbers(data["q"], "q", where)
     if not robot.floating and len(q) == robot.nq + 7:
         raise PostureError("begins with a base pose" + _FIXED, where=where, hint=_NO_BASE)

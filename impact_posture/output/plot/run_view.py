@@ -86,9 +86,8 @@ class RunView:
                 actual = np.shape(getattr(self, name))
                 raise InputError(f"{name} has the shape {actual}", where=where, hint=f"give {shape}")
         if len(rotors) != 1 or n < 2 or not (np.diff(self.t) > 0).all():
-            raise InputError(
-                "there is no course of time", where=where, hint="give at least two ticks at increasing times"
-            )
+            fault = "there is no course of time"
+            raise InputError(fault, where=where, hint="give at least two ticks at increasing times")
 
     @property
     def name(self) -> str:
@@ -192,9 +191,6 @@ def check_same(views: Sequence[RunView], where: str) -> tuple[RunView, ...]:
         }
         for what, (value, expected) in compared.items():
             if value != expected:
-                raise InputError(
-                    f"the {what} of {view.name} is {value}, of {first.name} {expected}",
-                    where=where,
-                    hint="compare runs of the same scenario",
-                )
+                fault = f"the {what} of {view.name} is {value}, of {first.name} {expected}"
+                raise InputError(fault, where=where, hint="compare runs of the same scenario")
     return tuple(sorted(views, key=lambda view: view.controller != "nominal"))

@@ -91,9 +91,8 @@ def _price(
         return DistancePrice(problem.robot.model, solution.initial)
     objective, (contact, speed) = problem.impact, force
     if objective.others:
-        raise InputError(
-            "is of one contact, and there are several", where="tradeoff_against", hint="give one `contact`"
-        )
+        fault = "is of one contact, and there are several"
+        raise InputError(fault, where="tradeoff_against", hint="give one `contact`")
     # The least E = 1/(2G) has the least force, which falls as G rises.
     energy = replace(objective, kind="energy", normal_cone_deg=0.0, model_variants=())
     least = solve(replace(problem, objective=energy), starts=_FORCE_STARTS, compile=compile, guesses=[solution.q])

@@ -131,9 +131,8 @@ class Surroundings:
         taken = {body.name for body in self._bodies} | {wall.body.name for wall in self._walls}
         for obstacle in obstacles:
             if obstacle.name in taken:
-                raise InputError(
-                    f"'{obstacle.name}' is the name of another body", where="obstacles", hint="give it another name"
-                )
+                fault = f"'{obstacle.name}' is the name of another body"
+                raise InputError(fault, where="obstacles", hint="give it another name")
             taken.add(obstacle.name)
             self._walls.append(_Wall(ConvexBody.of_link(obstacle_hull(obstacle)), self._rigid([0])))
 

@@ -138,11 +138,8 @@ def _surroundings(
 
 def _check(robot: Robot, requirements: Requirements) -> None:
     if not robot.floating and requirements.base != "free":
-        raise InputError(
-            f"base '{requirements.base}' does not fit a robot whose root is fixed",
-            where="base",
-            hint="leave it out or use `root` free-flyer",
-        )
+        fault = f"base '{requirements.base}' does not fit a robot whose root is fixed"
+        raise InputError(fault, where="base", hint="leave it out or use `root` free-flyer")
     if requirements.keep_contacts and not requirements.friction > 0:
         raise InputError(f"is {requirements.friction:g}", where="friction", hint="give a coefficient above zero")
     if requirements.hold_force and not requirements.holdable:
@@ -189,11 +186,8 @@ def _contact_constraints(
     name = f"pose of {contact.frame}"
     if mode == "free":
         if requirements.target_position is not None or requirements.target_quaternion is not None:
-            raise InputError(
-                "a target is given but the contact pose is free",
-                where="contact_pose",
-                hint="use full, position, aligned or box",
-            )
+            fault = "a target is given but the contact pose is free"
+            raise InputError(fault, where="contact_pose", hint="use full, position, aligned or box")
         return []
     if mode == "full":
         return [HeldPose(name, point, target)]
@@ -254,9 +248,6 @@ def _bounds(chart: Chart, given: Array, requirements: Requirements) -> tuple[Arr
         if slot.name in requirements.hold:
             lower[slot.x] = upper[slot.x] = x[slot.x]
         elif (lower[slot.x] > upper[slot.x]).any():
-            raise InputError(
-                f"a margin of {margin:g} leaves joint '{slot.name}' no room",
-                where="limit_margin",
-                hint="give a smaller one",
-            )
+            fault = f"a margin of {margin:g} leaves joint '{slot.name}' no room"
+            raise InputError(fault, where="limit_margin", hint="give a smaller one")
     return lower, upper

@@ -26,11 +26,8 @@ def impact_constraints(
         InputError: Feet should stay under contacts that also pull.
     """
     if requirements.keep_contacts and objective.bilateral:
-        raise InputError(
-            "contacts that pull as well as push would have to leave the feet without any impulse",
-            where="keep_contacts",
-            hint="leave out `bilateral` or `keep_contacts`",
-        )
+        fault = "contacts that pull as well as push would have to leave the feet without any impulse"
+        raise InputError(fault, where="keep_contacts", hint="leave out `bilateral` or `keep_contacts`")
     added: list[Constraint] = []
     centers = [constraint for constraint in constraints if isinstance(constraint, CenterOfMassOverFeet)]
     for k, member in enumerate((objective, *objective.by_variant[1:])):

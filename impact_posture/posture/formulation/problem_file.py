@@ -104,9 +104,8 @@ def requirements(settings: ProblemSettings, objective: Objective) -> Requirement
     if settings.obstacles and not settings.collision:
         raise InputError("do nothing without `collision`", where="obstacles", hint="leave one of them out")
     if com and not objective.supports:
-        raise InputError(
-            "there are no feet to keep the center of mass over", where="com", hint="add `support`, or choose no `com`"
-        )
+        fault = "there are no feet to keep the center of mass over"
+        raise InputError(fault, where="com", hint="add `support`, or choose no `com`")
     if settings.keep_contacts and not objective.supports:
         raise InputError("there are no feet to keep", where="keep_contacts", hint="add `support` or leave it out")
     if settings.approach and not 0 < settings.speed <= FASTEST:
@@ -242,7 +241,6 @@ def dump_settings(settings: ProblemSettings) -> str:
             try:
                 lines.append(f"{key} = {toml(value)}")
             except UnicodeEncodeError:
-                raise SpecError(
-                    f"'{value}' is not UTF-8, as TOML has to be", where=key, hint="rename the file or folder"
-                ) from None
+                fault = f"'{value}' is not UTF-8, as TOML has to be"
+                raise SpecError(fault, where=key, hint="rename the file or folder") from None
     return "\n".join(lines) + "\n"

@@ -87,9 +87,8 @@ def map_self_motion(
         InputError: There are not one or two degrees of freedom.
     """
     if dimension not in (1, 2):
-        raise InputError(
-            f"{dimension} degrees of freedom are left", where="search", hint="a map needs 1 or 2: add constraints"
-        )
+        fault = f"{dimension} degrees of freedom are left"
+        raise InputError(fault, where="search", hint="a map needs 1 or 2: add constraints")
     rng, components = np.random.default_rng(seed), _missing(manifold, dimension, (), known)
     starts = unsuccessful = idle = 0
     # If less than a tenth of the postures reach the manifold, the limits leave almost nothing of it.

@@ -52,11 +52,8 @@ class ConstrainedProblem:
     def impact(self) -> WorstCaseObjective:
         """The objective as an impact objective; another objective raises ``InputError``."""
         if not isinstance(self.objective, WorstCaseObjective):
-            raise InputError(
-                f"is '{self.objective.name}', which is not an impact objective",
-                where="objective",
-                hint="use a WorstCaseObjective for what needs H, G, V and S",
-            )
+            fault = f"is '{self.objective.name}', which is not an impact objective"
+            raise InputError(fault, where="objective", hint="use a WorstCaseObjective for what needs H, G, V and S")
         return self.objective
 
     def carried(self, index: int) -> list[int]:

@@ -46,11 +46,8 @@ def initial_posture(problem: ConstrainedProblem, seed: int, rows: ProgramRows) -
         )
     projection = Projector(problem).project(least.q)
     if projection.violation > FEASIBLE:
-        raise SolverFailed(
-            f"a posture within {projection.violation:.1e} of the constraints was found, but none on them",
-            where="problem",
-            hint="start from a `posture` nearer to the target",
-        )
+        fault = f"a posture within {projection.violation:.1e} of the constraints was found, but none on them"
+        raise SolverFailed(fault, where="problem", hint="start from a `posture` nearer to the target")
     return replace(least.problem, given=given), projection.q
 
 
