@@ -126,11 +126,9 @@ class PostureResult:
         if against == "force":
             impact = self._prepared.impact
             if impact.contact_stiffness is None:
-                raise InputError(
-                    "force needs the elasticity of the contact",
-                    where="tradeoff_against",
-                    hint="add `contact_stiffness` (N/m, or a material) or `contact_duration`",
-                )
+                fault = "force needs the elasticity of the contact"
+                hint = "add `contact_stiffness` (N/m, or a material) or `contact_duration`"
+                raise InputError(fault, where="tradeoff_against", hint=hint)
             force = impact.contact_stiffness, impact.speed
         curve = pareto_front(self.solution, points, force=force, compile=compile, progress=progress)
         return replace(self, tradeoff=curve)

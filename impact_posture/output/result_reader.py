@@ -87,11 +87,9 @@ def load_result(folder: Path) -> tuple[Prepared, ResultView, dict[str, Any]]:
         mapped = SelfMotionMap(**{name: arrays[f"self_motion_{name}"] for name in names}) if names else None
         robot, recorded = prepared.impact.robot, str(document["robot"]["model_sha256"])
         if recorded != robot.model_sha256:
-            raise SpecError(
-                f"was made with another model of {robot.name} (sha256 {recorded[:12]}…)",
-                where=str(folder),
-                hint="run optimize again, or use the URDF and armature of that result",
-            )
+            fault = f"was made with another model of {robot.name} (sha256 {recorded[:12]}…)"
+            hint = "run optimize again, or use the URDF and armature of that result"
+            raise SpecError(fault, where=str(folder), hint=hint)
         initial, optimal = (
             robot.check_posture(document[key]["q"], limits=False, where=f"{folder / 'result.json'}: {key}.q")
             for key in ("initial", "optimal")

@@ -59,11 +59,9 @@ def path_figure(view: ResultView) -> Figure:
     path = required(view.path, "path", "nullspace", "give ResultView.path")
     sizes = {name: np.shape(getattr(path, name)) for name in ("s", *QUANTITIES)}
     if len(path.s) < 2 or set(sizes.values()) != {(len(path.s),)}:
-        raise InputError(
-            f"the path's arrays have shapes {', '.join(f'{k} {v}' for k, v in sizes.items())}",
-            where="figure nullspace",
-            hint="give at least two postures and one number of each quantity for each",
-        )
+        fault = f"the path's arrays have shapes {', '.join(f'{k} {v}' for k, v in sizes.items())}"
+        hint = "give at least two postures and one number of each quantity for each"
+        raise InputError(fault, where="figure nullspace", hint=hint)
     with framed(*header_lines(view), 3.1, [share_notes("along the path", path)]) as (figure, body):
         axes = body.subplots()
         drawn = draw_shares(axes, path.s, path)

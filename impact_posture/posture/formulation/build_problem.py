@@ -152,11 +152,9 @@ def _check(robot: Robot, requirements: Requirements) -> None:
 def _check_target(requirements: Requirements) -> None:
     quaternion = requirements.target_quaternion
     if requirements.other_poses and (quaternion is not None or requirements.target_position is not None):
-        raise InputError(
-            "is one target for several contacts",
-            where="target_quaternion" if quaternion is not None else "target_position",
-            hint="leave it out and start from a `posture` that has the contacts in place",
-        )
+        fault = "is one target for several contacts"
+        hint = "leave it out and start from a `posture` that has the contacts in place"
+        raise InputError(fault, where="target_quaternion" if quaternion is not None else "target_position", hint=hint)
 
 
 def _held_support(robot: Robot, numeric: Numeric, support: Support) -> Constraint:
@@ -230,11 +228,9 @@ def _com_constraint(
             corners.append(placement.act(np.array([x, y, 0.0]))[:2])
     edges = polygon_edges(corners)
     if edges is None:
-        raise InputError(
-            "the feet span no area to keep the center of mass above",
-            where="com_over_feet",
-            hint="give three feet or soles with a size, set com_over_feet = false, or choose no `com`",
-        )
+        fault = "the feet span no area to keep the center of mass above"
+        hint = "give three feet or soles with a size, set com_over_feet = false, or choose no `com`"
+        raise InputError(fault, where="com_over_feet", hint=hint)
     return CenterOfMassOverFeet(*edges, margin)
 
 

@@ -68,11 +68,9 @@ def prepare(settings: ProblemSettings, impact: ResolvedImpact | None = None) -> 
     """
     impact = resolve(settings) if impact is None else impact
     if impact.robot.joint_model == "elastic":
-        raise InputError(
-            "elastic predicts the impact at one posture",
-            where="joint_model",
-            hint="optimize with link or reflected, as the number x says, and evaluate the optimum with elastic",
-        )
+        fault = "elastic predicts the impact at one posture"
+        hint = "optimize with link or reflected, as the number x says, and evaluate the optimum with elastic"
+        raise InputError(fault, where="joint_model", hint=hint)
     if settings.q is not None:
         impact = replace(impact, q=impact.robot.check_posture(np.array(settings.q), where="q"))
     if impact.missing_support:
@@ -135,11 +133,9 @@ def _least_mobility(settings: ProblemSettings) -> float:
         ("tradeoff_against", settings.tradeoff > 0 and settings.tradeoff_against == "force"),
     ):
         if asked and settings.contact_stiffness is None and settings.contact_duration is None:
-            raise InputError(
-                "needs the elasticity of the contact",
-                where=name,
-                hint="add `contact_stiffness` (N/m, or a material) or `contact_duration`",
-            )
+            fault = "needs the elasticity of the contact"
+            hint = "add `contact_stiffness` (N/m, or a material) or `contact_duration`"
+            raise InputError(fault, where=name, hint=hint)
         if asked and settings.speed == 0:
             raise InputError("needs an approach speed", where=name, hint="give `speed` above zero")
     contact = ContactStiffness.of(settings.contact_stiffness, settings.contact_duration)
@@ -151,11 +147,9 @@ def _least_mobility(settings: ProblemSettings) -> float:
 def _largest_jump(settings: ProblemSettings) -> float:
     """Return the largest jump of a joint per approach speed, from ``max_joint_jump`` and ``max_torque``."""
     if (settings.max_torque is None) != (settings.velocity_gain is None):
-        raise InputError(
-            "bounds the velocity gain times the jump of a joint, so each of the two needs the other",
-            where="max_torque" if settings.velocity_gain is None else "velocity_gain",
-            hint="give `max_torque` and `velocity_gain`, or none of them",
-        )
+        fault = "bounds the velocity gain times the jump of a joint, so each of the two needs the other"
+        hint = "give `max_torque` and `velocity_gain`, or none of them"
+        raise InputError(fault, where="max_torque" if settings.velocity_gain is None else "velocity_gain", hint=hint)
     jumps = [] if settings.max_joint_jump is None else [settings.max_joint_jump]
     if settings.max_torque is not None and settings.velocity_gain is not None:
         jumps.append(settings.max_torque / settings.velocity_gain)

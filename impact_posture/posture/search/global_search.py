@@ -149,11 +149,9 @@ def check_searchable(problem: ConstrainedProblem) -> None:
     """Raise ``InputError`` unless the objective is an impact objective without a regularization."""
     _ = problem.impact
     if problem.requirements.regularization:
-        raise InputError(
-            "bounds the objective alone, but `regularization` adds the distance from the start",
-            where="search global",
-            hint="leave `regularization` away, or use the search multistart",
-        )
+        fault = "bounds the objective alone, but `regularization` adds the distance from the start"
+        hint = "leave `regularization` away, or use the search multistart"
+        raise InputError(fault, where="search global", hint=hint)
 
 
 @one_blas_thread()

@@ -74,9 +74,7 @@ def initial_objective(problem: ConstrainedProblem, initial: Array) -> float:
     value = objective.value(initial) if objective.movable(initial) else 0.0
     if not (np.isfinite(value) and value > 0):
         frames = ", ".join(f"'{contact.frame}'" for contact in objective.contacts)
-        raise ContactError(
-            f"the contact point at {frames} cannot move along the normal",
-            where="normal",
-            hint="choose another frame, normal or posture: an impact along it moves nothing",
-        )
+        fault = f"the contact point at {frames} cannot move along the normal"
+        hint = "choose another frame, normal or posture: an impact along it moves nothing"
+        raise ContactError(fault, where="normal", hint=hint)
     return value

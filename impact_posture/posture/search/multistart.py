@@ -124,11 +124,9 @@ def solve(
         raise _failure(runs)
     good, touching = _without_collisions(problem, certified)
     if not good:
-        raise SolverFailed(
-            f"original shapes touch at all {len(certified)} certified postures: {touching}",
-            where="solver",
-            hint="try more `starts`, another `posture`, or a larger `clearance`",
-        )
+        fault = f"original shapes touch at all {len(certified)} certified postures: {touching}"
+        hint = "try more `starts`, another `posture`, or a larger `clearance`"
+        raise SolverFailed(fault, where="solver", hint=hint)
     # The first of equally good runs counts, so that the solution does not depend on the speed of processes.
     best = min(good, key=lambda r: round(r.minimized, 9))
     assert best.record is not None and best.certificate is not None  # noqa: S101 (narrows types)
