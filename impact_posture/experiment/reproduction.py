@@ -15,7 +15,7 @@ from impact_posture.simulation.controllers.controller_factory import CONTROLLERS
 SCHEMA, COMPARISON_SCHEMA = "impact-posture/reproduction/3", "impact-posture/comparison/3"
 # ``held`` shows the effect of the posture that a term reaches, ``free`` the effect of the metric without the feet.
 HELD, FREE = ("robust:held", "walker:held"), "robust:free"
-# Labels of controllers by scenario.
+# Labels of controllers (:func:`parse_controller`) by name or file of the scenario.
 Plan = Mapping[str, Sequence[str]]
 
 
@@ -174,15 +174,10 @@ def reproduce(
     progress: Progress | None = None,
     compile: CompileMode = "auto",
 ) -> Reproduction:
-    """Run every controller in its scenarios with every seed.
+    """Run the controllers of a plan in their scenarios with every seed, from 0.
 
-    Args:
-        plan: Controllers (:func:`~impact_posture.experiment.jobs.parse_controller`) by name or file of the scenario.
-        seeds: Number of seeds, from 0.
-        processes: Number of processes.
-        store: Folder where finished runs are kept, with the time series of the first seed.
-        progress: Callback with (done, all).
-        compile: Whether controllers run as machine code: where that pays, always or never.
+    The store keeps finished runs, with the time series of the first seed.  ``progress`` is called with (done, all).
+    Controllers run as machine code where that pays (``auto``), always or never.
 
     Raises:
         ImpactPostureError: A scenario cannot be set up, there is no such controller, MuJoCo is not installed, or the

@@ -44,9 +44,6 @@ def keep_runs(folder: Path, jobs: Sequence[Job], store: JobStore) -> None:
     """Write the document and the shown ticks of each stored job into ``runs/`` of a comparison.
 
     A run whose state diverges at once is left out.
-
-    Raises:
-        OSError: The files cannot be written.
     """
     (folder / RUNS).mkdir()
     for job in jobs:
@@ -59,11 +56,7 @@ def keep_runs(folder: Path, jobs: Sequence[Job], store: JobStore) -> None:
 
 
 def stored_run(job: Job, store: JobStore) -> tuple[Document, Series] | None:
-    """Return the document of a stored job and the series of its first run; ``None`` if it has no runs.
-
-    Raises:
-        OutputError: As :meth:`JobStore.finished`.
-    """
+    """Return the document of a stored job and the series of its first run; ``None`` if it has no runs."""
     document = store.finished(job)
     if not document["runs"]:
         return None

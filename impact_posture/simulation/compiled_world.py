@@ -58,7 +58,6 @@ class CompiledWorld:
         self._give(**_functions(), **tick.library.addresses(), **contents)
 
     def _command(self) -> ActuatorCommand:
-        """Return the last command of the controller."""
         struct = self._struct
         places = (struct.u, struct.rotors + struct.joints), (struct.rotor_speed, struct.rotors)
         u, speed = (np.array((ctypes.c_double * size).from_address(address)) for address, size in places)

@@ -102,7 +102,6 @@ class Recorder:
         )  # fmt: skip
 
     def _trace(self) -> Trace:
-        """Return the true states of all ticks."""
         if self._rows:
             self.take_all(self._world.trace(), *map(np.array, zip(*self._rows, strict=True)))
             self._rows = []

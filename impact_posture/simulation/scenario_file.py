@@ -190,20 +190,12 @@ class Scenario(ScenarioTable):
 
     @property
     def surface(self) -> Surface:
-        """The surface that is hit.
-
-        Raises:
-            InputError: The robot is pushed instead.
-        """
+        """The surface that is hit.  Raises an InputError if the robot is pushed."""
         return next(s for s in self.surfaces if s.name == self._contacts("surface that is hit").surface)
 
     @property
     def shape(self) -> Shape:
-        """The shape that hits the surface, or that is hit.
-
-        Raises:
-            InputError: The robot is pushed instead.
-        """
+        """The shape that hits the surface, or that is hit.  Raises an InputError if the robot is pushed."""
         frame = self._contacts("shape that hits").frame if self.throw is None else self.throw.frame
         return next(s for s in self.shapes if s.frame == frame)
 

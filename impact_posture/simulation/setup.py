@@ -31,11 +31,7 @@ class Setup:
 
     @property
     def gap(self) -> float:
-        """Distance of the shape that hits from its surface at the start, m.
-
-        Raises:
-            InputError: The robot is pushed instead.
-        """
+        """Distance of the shape that hits from its surface at the start, m.  Raises an InputError for a push."""
         return self.world.built.gaps[self.scenario.surface.name, self.scenario.shape.frame]
 
 

@@ -26,9 +26,6 @@ from impact_posture.simulation.world.throw import Throw
 from impact_posture.system.output_folder import whole_folder
 
 MODEL, PARAMETERS = "world.mjb", "world.txt"
-# Joint families that the file supports: joints with one number, and a floating base.
-_PLAIN = ("revolute", "prismatic")
-_BASE = "free-flyer"
 
 
 def export_world(setup: Setup, out: Path, *, force: bool = False) -> None:
@@ -76,9 +73,9 @@ def _joints(setup: Setup) -> Iterable[tuple[str, Iterable[float]]]:
     for slot in setup.world.built.mjcf.layout.slots:
         family = slot.joint.kind.family
         indices = [slot.joint.q.start, slot.qpos.start, slot.joint.v.start, slot.qvel.start]
-        if family == _BASE and not slot.moved and slot.qpos.stop - slot.qpos.start == 7:
+        if family == "free-flyer" and not slot.moved and slot.qpos.stop - slot.qpos.start == 7:
             yield "base", indices
-        elif family in _PLAIN:
+        elif family in ("revolute", "prismatic"):
             yield "joint", indices
         else:
             what = f"joint '{slot.joint.name}' is of the family {family}"

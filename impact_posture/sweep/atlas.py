@@ -2,13 +2,13 @@
 
 from __future__ import annotations
 
-import builtins
 import fcntl
 import json
 import os
 from collections.abc import Iterator
 from contextlib import contextmanager, suppress
 from functools import lru_cache
+from importlib.util import find_spec
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
@@ -80,7 +80,7 @@ class Atlas:
         if known["key"] != self._key:
             other = "another version" if known["version"] != __version__ else "another sweep, or other code or robots"
             raise OutputError(f"holds results of {other}", where=str(self.folder), hint="choose another `out`")
-        with builtins.open(manifest, "rb") as held:
+        with manifest.open("rb") as held:
             try:
                 fcntl.flock(held, fcntl.LOCK_EX | fcntl.LOCK_NB)
             except BlockingIOError:
@@ -112,11 +112,7 @@ class Atlas:
         return self._content(shard), beside
 
     def write(self, shard: int, content: bytes, passes: int) -> None:
-        """Write the file of a shard as a whole.
-
-        Raises:
-            OutputError: The file cannot be written.
-        """
+        """Write the file of a shard as a whole."""
         before = self._passes(self._path(shard), shard)
         if before == 1 < passes:
             # The neighbors still need the first pass.
@@ -217,13 +213,7 @@ def open_atlas(folder: str | Path) -> Dataset:
 
 
 def check_package(name: str, extra: str) -> None:
-    """Check that the package of an extra is installed.
-
-    Raises:
-        InputError: The package is missing.
-    """
-    from importlib.util import find_spec
-
+    """Raise an InputError if the package of an extra is not installed."""
     if find_spec(name) is None:
         what = f"needs the package {name}"
         raise InputError(what, where="sweep", hint=f"pip install 'impact-posture[{extra}]'")

@@ -40,11 +40,7 @@ class ShardResult:
 
 
 def solve_shard(sweep: Sweep, key: str, index: int) -> ShardResult:
-    """Solve all points of shard ``index``, each from its neighbors before it.  ``key`` identifies the sweep.
-
-    Raises:
-        ImpactPostureError: A setting is wrong.
-    """
+    """Solve all points of shard ``index``, each from its neighbors before it.  ``key`` identifies the sweep."""
     return _passed(sweep, key, index, 1, [], _Shard.solve)
 
 
@@ -54,9 +50,6 @@ def revise_shard(
     """Improve the points of a shard after its first pass (``content``) from postures of neighboring points.
 
     ``beside`` has the postures of the neighboring points in other shards after the first pass.
-
-    Raises:
-        ImpactPostureError: A setting is wrong.
     """
     return _passed(sweep, key, index, 2, read_shard(content), lambda shard: shard.revise(beside))
 

@@ -86,11 +86,7 @@ GROUP = "impact_posture.controllers"
 
 
 def check_gain(name: str, gain: float | None) -> None:
-    """Refuse a gain for a controller of this package that does not have a gain.
-
-    Raises:
-        InputError: The controller has no gain.
-    """
+    """Raise an InputError for a gain of a controller of this package that has none."""
     has = name.startswith(("robust", "walker", "stiff")) and not name.startswith("robust-flow")
     if gain is not None and name in CONTROLLERS and not (has or name.endswith(_STIFF)):
         hint = "robust, its variants, walker and stiff have one"
@@ -177,12 +173,8 @@ class ControllerFactory:
         """Build a controller.
 
         A name of another package is looked up among the entry points :data:`GROUP` of the installed packages.  The
-        entry point is a function of this factory, the mode and the gain that returns the driver.
-
-        Args:
-            name: Name of the controller.
-            mode: ``live`` keeps the impact-robust term on through the impact, ``held`` holds the reached posture.
-            gain: K in place of the value in the scenario, 1/s².
+        entry point is a function of this factory, the mode and the gain that returns the driver.  For the arguments
+        see :func:`impact_posture.simulation.run.run`.
 
         Raises:
             ControllerNotFound: The controller is unknown.

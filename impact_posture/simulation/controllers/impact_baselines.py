@@ -182,7 +182,6 @@ class ReferenceSpreadingDriver(ImpactFeedbackDriver):
         return self._command(reading, -fade * self._after)
 
     def _clear(self) -> None:
-        """Forget the last impact."""
         self._touch, self._lasted, self._done = 0.0, 0.0, None
         self._before = self._after = np.zeros(self.setup.robot.nv)
 

@@ -36,11 +36,7 @@ class Rotors:
         self._changes: dict[int, tuple[Array, Array]] = {}
 
     def reset(self, speeds: ArrayLike) -> None:
-        """Set the speeds, cut to the limits.
-
-        Raises:
-            InputError: ``speeds`` does not have one finite number for each rotor.
-        """
+        """Set the speeds, cut to the limits.  They must be finite."""
         speeds = np.asarray(speeds, dtype=float)
         if speeds.shape != self.speeds.shape or not np.isfinite(speeds).all():
             raise InputError("no speeds of the rotors", where="reset", hint=f"give {self.speeds.size} finite numbers")

@@ -90,7 +90,6 @@ def build_scene(robot: Robot, scene: Scene, q: Array, throw: Throw | None = None
 
 
 def _add_pair(mjcf: Mjcf, first: str, second: str, law: ContactLaw) -> None:
-    """Add a contact pair of two geoms."""
     mjcf.spec.add_pair(
         geomname1=first,
         geomname2=second,
