@@ -43,8 +43,7 @@ class Output:
 def write_simulation(output: Output, job: Job, runs: Sequence[Run], document: Document) -> str:
     """Write ``run.json``, ``series.npz`` (``series-minus.npz`` for a push with sign -1), figures and ``report.html``.
 
-    Returns:
-        Reason why the report is missing; empty if it was written or not requested.
+    Return the reason why the report is missing, empty if it was written or not requested.
 
     Raises:
         OutputError: The folder exists without ``force``, has foreign files, or cannot be written.
@@ -60,8 +59,7 @@ def write_simulation(output: Output, job: Job, runs: Sequence[Run], document: Do
 def write_comparison(output: Output, comparison: Reproduction, store: JobStore) -> str:
     """Write ``comparison.json``, figures, ``runs/`` and ``report.html`` of the first seed, and remove the store.
 
-    Returns:
-        Reason why the report is missing; empty if it was written or not requested.
+    Return the reason why the report is missing, empty if it was written or not requested.
 
     Raises:
         OutputError: As :func:`write_simulation`.

@@ -18,7 +18,6 @@ _COLUMNS = {
     "peak_jump": 3, "peak_recovery": 3, "saturation_inside": 2, "saturation_outside": 2, "relaxed_ticks": 2,
     "peak_force": 3,
 }  # fmt: skip
-# What the columns of the tables mean.
 LEGEND = (
     "Recovery is the same integral and peak until 1 s after each impact began. In a relaxed tick, limits made a task "
     "give way. The status is `completed`, or how many runs completed. There is no reduction if a run did not "

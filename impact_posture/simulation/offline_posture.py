@@ -76,8 +76,7 @@ def offline_posture(
     Raises:
         Infeasible, SolverFailed: As :func:`impact_posture.posture.search.multistart.solve`.
     """
-    words = "looking for the offline posture"
-    tell(words)
+    tell("looking for the offline posture")
     wanted, note = scenario_requirements(setup, objective, at_contact=at_contact), ""
     # For a robot that does not stand, the margin of the center of mass has no meaning.
     margins = dict.fromkeys((stops, edges if wanted.com_over_feet else 0.0) for stops, edges in _MARGINS)
@@ -87,9 +86,7 @@ def offline_posture(
         try:
             with naming_keys(setup.scenario):
                 problem = build_problem(setup.robot, objective, setup.q, demands)
-                solution = solve(
-                    problem, starts=starts, jobs=1, progress=lambda done, total: tell(words, done / total)
-                )
+                solution = solve(problem, starts=starts, jobs=1, progress=_tell)
         except (Infeasible, SolverFailed) as error:
             if (collision, stops, edges) == attempts[-1]:
                 raise
@@ -123,3 +120,7 @@ def scenario_requirements(setup: Setup, objective: WorstCaseObjective, *, at_con
     )
     demands = requirements(settings, objective)
     return replace(demands, com_over_feet=bool(objective.supports), com_asked=False, limit_share=SHARE)
+
+
+def _tell(done: int, total: int) -> None:
+    tell("looking for the offline posture", done / total)

@@ -17,7 +17,7 @@ from impact_posture.simulation.controllers.controller_factory import ControllerF
 from impact_posture.simulation.controllers.driver import Driver
 from impact_posture.simulation.recorder import Recorder
 from impact_posture.simulation.scenario_file import RepeatedContacts, SinglePush
-from impact_posture.simulation.series import RECOVERY, Series, Window
+from impact_posture.simulation.series import RECOVERY, SAME, Series, Window
 from impact_posture.simulation.world.throw import FLIGHT, Throw
 from impact_posture.system.arrays import Array
 from impact_posture.system.processes import fork_call
@@ -27,8 +27,6 @@ from impact_posture.system.progress import tell
 BRACE = 0.1
 # Ticks between two progress messages, in Python and in C, where a call costs as much as ten ticks.
 _TELL, _TELL_IN_C = 100, 1000
-# Times that differ by less count as equal, because sums of periods are not exact, s.
-_SAME = 1e-9
 # Most ticks of a run, nearly three hours at 1 kHz.  A tick of an arm needs about a kilobyte of memory.
 _MOST = 10**7
 # Most physics steps of a tick, because a signal cannot interrupt a tick.
@@ -138,7 +136,7 @@ class _Loop:
 
     def until(self, t: float) -> int:
         """Return the number of ticks until a time (s), at least one."""
-        return max(1, math.ceil((t - _SAME - self.t) / self.period))
+        return max(1, math.ceil((t - SAME - self.t) / self.period))
 
     def _in_python(self, n: int, reference: Reference | None) -> Array:
         speeds = []
@@ -188,7 +186,7 @@ def _contacts(loop: _Loop, task: RepeatedContacts, mode: Mode) -> Run:
     events.sort(key=lambda event: event[0])
     left = round(reference.total / loop.period)
     while left and loop.away is None:
-        while events and loop.t >= events[0][0] - _SAME:
+        while events and loop.t >= events[0][0] - SAME:
             events.pop(0)[1]()
         n = min(left, loop.until(events[0][0])) if events else left
         loop.ticks(n, reference)
@@ -244,10 +242,10 @@ def _push(loop: _Loop, task: SinglePush | Throw, sign: int, rested: bool) -> Run
 def _settle(loop: _Loop, task: SinglePush | Throw, least: float, brace: list[Callable[[], None]]) -> bool:
     """Run until ``least`` (s), and until the robot has been quiet for long enough.  Return whether it has rested."""
     still, end = 0.0, max(least, loop.t) + task.patience
-    while loop.t < least - _SAME or still < task.still - _SAME:
+    while loop.t < least - SAME or still < task.still - SAME:
         if loop.t > end or loop.away is not None:
             return False
-        if brace and loop.t >= BRACE - _SAME:
+        if brace and loop.t >= BRACE - SAME:
             brace.pop()()
         # The robot cannot be at rest before the first of these times.
         waits = [max(least, loop.t + task.still - still), end, *([BRACE] if brace else [])]

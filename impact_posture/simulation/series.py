@@ -18,7 +18,7 @@ Flags = NDArray[np.bool_]
 
 STATUSES: tuple[Status, ...] = tuple(Status)
 # Times that differ by less count as equal, because sums of time steps are not exact, s.
-_SAME = 1e-9
+SAME = 1e-9
 # Length of the recovery from the begin of an impact, in which a delayed motion may appear, s.
 RECOVERY = 1.0
 
@@ -95,7 +95,7 @@ class Series:
 
     def slice(self, begin: float, end: float) -> slice:
         """Return the ticks in ``(begin, end]``, except for rounding of the times."""
-        first, last = np.searchsorted(self.t, [begin + _SAME, end + _SAME], side="right")
+        first, last = np.searchsorted(self.t, [begin + SAME, end + SAME], side="right")
         return slice(int(first), int(last))
 
     def save(self, file: Path | BinaryIO) -> None:

@@ -246,7 +246,6 @@ def _edge(cell: tuple[int, int], other: tuple[int, int]) -> list[tuple[float, fl
 
 
 def _label(axis: Any, grid_axis: Axis) -> None:
-    """Label an axis of a panel with a few values of a grid axis."""
     count = len(grid_axis.values)
     shown = np.unique(np.linspace(0, count - 1, min(count, _TICKS)).round().astype(int))
     # On the horizontal axis, long labels would overlap, so the entries of a vector are one below the other.

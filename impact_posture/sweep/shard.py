@@ -23,7 +23,6 @@ from impact_posture.system.arrays import Array
 _ALONE = threading.Lock()
 # Cases whose robots and programs a worker keeps.
 _KEPT = 4
-# Walks that a shard keeps.
 _KEPT_WALKS = 64
 _SOLVERS: OrderedDict[tuple[str, int], CaseSolver] = OrderedDict()
 
@@ -57,7 +56,6 @@ def revise_shard(
 def _passed(
     sweep: Sweep, key: str, index: int, passes: int, known: list[PointResult], work: Callable[[_Shard], None]
 ) -> ShardResult:
-    """Run a pass over a shard with known results."""
     with _ALONE, one_blas_thread():
         began = time.perf_counter()
         case, points = sweep.span(index)

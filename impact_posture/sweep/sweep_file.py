@@ -234,7 +234,6 @@ def _check_names(names: Sequence[str], where: str) -> None:
 
 
 def _checked(name: str, values: Sequence[Any], problem: dict[str, Any], where: str) -> tuple[Any, ...]:
-    """Return the values as validated settings."""
     # An offset must be valid as an entry of a position.
     key, wrap = ("target_position", lambda v: [v, 0.0, 0.0]) if name in OFFSETS else (name, lambda v: v)
     checked = []

@@ -164,7 +164,6 @@ class ReferenceSpreadingDriver(ImpactFeedbackDriver):
             self._lead(ReferencePoint(distance, speed, self._acceleration if speed < self._speed else 0.0))
             return self._command(reading, None)
         if not self._touch:
-            # This is the first tick of the touch.
             self._touch = distance
             self._after = self._before + self._impact.jump(state)[0] @ self._before
         self._lasted = self._lasted + self.controller.period if acts else 0.0

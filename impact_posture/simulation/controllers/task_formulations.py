@@ -86,7 +86,6 @@ def nominal_posture(setup: Setup) -> JointPosture:
 
 
 def _check_gains(setup: Setup) -> None:
-    """Refuse gains of tasks that do not exist."""
     control, source = setup.scenario.control, setup.scenario.source
     stands, flies = control.footing is not None, setup.robot.floating
     for key, gains, fits, reason in (
