@@ -72,7 +72,7 @@ def markdown() -> str:
 
 
 def module_map() -> str:
-    """Write a table for each folder, with the first paragraph of the docstring of each module."""
+    """Write a table for each folder, with the first sentence of each module."""
     folders: dict[Path, list[Path]] = {}
     for path in sorted(p for folder in PACKAGES.values() for p in folder.rglob("*.py") if p.name != "__init__.py"):
         folders.setdefault(path.parent, []).append(path)
@@ -81,7 +81,8 @@ def module_map() -> str:
         parts += [f"### `{folder.relative_to(ROOT)}/`", "", "| module | content |", "|---|---|"]
         for path in paths:
             text = ast.get_docstring(ast.parse(path.read_text(encoding="utf-8"))) or ""
-            sentence = " ".join(text.split("\n\n")[0].split()).replace("``", "`").replace("|", "\\|")
+            paragraph = " ".join(text.split("\n\n")[0].split())
+            sentence = re.split(r"(?<=\.) +(?=[A-Z])", paragraph)[0].replace("``", "`").replace("|", "\\|")
             parts.append(f"| `{path.name}` | {re.sub(':[a-z]+:', '', sentence)} |")
         parts.append("")
     return "\n".join(parts)
