@@ -9,6 +9,7 @@ from typing import TYPE_CHECKING, Annotated, Any, Literal
 import typer
 
 from impact_posture.config.demand import Positive
+from impact_posture.errors import SimulationDiverged
 from impact_posture_cli import options
 from impact_posture_cli.experiments import RUN, Compile, Mode, ScenarioName
 from impact_posture_cli.output import Page, complain, number, print_json
@@ -17,9 +18,6 @@ from impact_posture_cli.settings_options import demanding
 
 if TYPE_CHECKING:
     from impact_posture.simulation.scenario_file import Scenario
-
-# Exit code of a run that did not complete.
-_FAILED = 4
 
 Controller = Annotated[
     str,
@@ -105,7 +103,7 @@ def simulate(
     if document["status"] != "completed":
         sys.stdout.flush()
         complain(f"error: {experiment.name}, {job.label}: {fate(document)}; its numbers are not a result")
-        raise typer.Exit(_FAILED)
+        raise typer.Exit(SimulationDiverged.exit_code)
 
 
 def _export_world(page: Page, scenario: Scenario, out: Path, force: bool) -> None:

@@ -13,11 +13,11 @@ import numpy as np
 from impact_posture.config.problem_settings import LoadOptions, Root
 from impact_posture.errors import InputError, OutputError
 from impact_posture.robot import guessed_parts as guess
-from impact_posture.robot.draft_text import Draft, comment_lines
 from impact_posture.robot.foot_shape import foot_specs, support_depth
 from impact_posture.robot.robot import Robot
 from impact_posture.robot.robot_loader import Located, build_robot, known_robots, load_robot, locate
 from impact_posture.robot.robot_spec import SCHEMA, ModelSpec, RobotSpec, Support
+from impact_posture.robot.toml_lines import Draft, comment_lines
 from impact_posture.robot.urdf import EXAMPLE_PREFIX, example_robot_data, resolve_path
 from impact_posture.system.escape import toml
 from impact_posture.system.output_folder import check_name

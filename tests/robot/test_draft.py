@@ -16,11 +16,11 @@ from impact_posture.errors import InputError, OutputError
 from impact_posture.posture.formulation.problem_file import prepare
 from impact_posture.posture.search.multistart import solve
 from impact_posture.robot.draft import write_draft
-from impact_posture.robot.draft_text import Draft
 from impact_posture.robot.foot_shape import support
 from impact_posture.robot.guessed_parts import feet, tips
 from impact_posture.robot.robot_loader import load_robot
 from impact_posture.robot.robot_spec import RobotSpec, read_spec
+from impact_posture.robot.toml_lines import Draft
 from impact_posture.robot.urdf import EXAMPLE_PREFIX, example_robot_data, robots_data
 from tests.support.helpers import NAMES
 from tests.support.settings import make_settings
