@@ -162,11 +162,7 @@ def _is_manifest(path: Path, schema: str) -> bool:
 
 
 def check_robot(manifest: Mapping[str, Any], robot: Robot, *, where: str = "manifest") -> None:
-    """Refuse an export of another robot, and name the first difference.
-
-    Raises:
-        ManifestMismatch: Joint order, convention, armature, or another part of the model differs.
-    """
+    """Raise ManifestMismatch with the first difference if an export belongs to another robot."""
     joints = list(manifest["joint_names"])
     if joints != list(robot.joint_names):
         pairs = zip([*joints, None], [*robot.joint_names, None], strict=False)
@@ -185,11 +181,7 @@ def check_robot(manifest: Mapping[str, Any], robot: Robot, *, where: str = "mani
 
 
 def frame_block(manifest: Mapping[str, Any], frame: str | None) -> Mapping[str, Any]:
-    """Return the block of a frame, by default of the first.
-
-    Raises:
-        FrameNotFound: The manifest has no such frame.  The error lists its frames.
-    """
+    """Return the block of a frame, by default of the first; raise FrameNotFound with the known frames."""
     blocks: dict[str, Mapping[str, Any]] = {str(block["frame"]): block for block in manifest["frames"]}
     if frame is None:
         return next(iter(blocks.values()))

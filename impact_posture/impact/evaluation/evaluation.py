@@ -236,11 +236,9 @@ def _elastic(
 
 def _joint_model_warning(objective: WorstCaseObjective, q: Array, squeezed: Compression | None) -> tuple[str, ...]:
     """Return a warning with the objective of both joint models where the joint model does not fit x."""
-    if (
-        squeezed is None
-        or squeezed.x is None
-        or objective.robot.joint_model in (squeezed.fitting, "locked", "elastic")
-    ):
+    if squeezed is None or squeezed.x is None:
+        return ()
+    if objective.robot.joint_model in (squeezed.fitting, "locked", "elastic"):
         return ()
     values = {name: objective_value(other, q) for name, other in both_models(objective).items()}
     listed = ", ".join(f"{value:.4g} with '{name}'" for name, value in values.items() if value is not None)
