@@ -45,7 +45,7 @@ def impact_rows(impact: ResolvedImpact, normals: Sequence[Iterable[Any]], axes: 
 def worst_tables(page: Page, frames: Sequence[str], blocks: Mapping[str, Mapping[str, Any]]) -> None:
     """Show each of several contacts alone, and the objective of each model variant.
 
-    ``blocks`` are evaluations by name, as in ``result.json``.  The last evaluation has the contacts.
+    ``blocks`` are evaluations by name, as in ``result.json``.  The last evaluation lists the contacts.
     """
     last = list(blocks.values())[-1]
     if "by_contact" in last:

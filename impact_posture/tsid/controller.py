@@ -271,11 +271,10 @@ class Controller:
 
     def _held(self, status: Status, v: Array) -> Command:
         """Return the previous command, with damping of the joints whose measured rates are valid."""
-        rotors, actuators = self.actuators.rotors, self.actuators
+        actuators, u = self.actuators, self._u.copy()
         self._status, self._outcome = status, Outcome(None)
-        u = self._u.copy()
         rates = v[actuators.base :]
-        u[rotors:] -= self._damping * np.where(np.abs(rates) < math.sqrt(_ABSURD), rates, 0.0)
+        u[actuators.rotors :] -= self._damping * np.where(np.abs(rates) < math.sqrt(_ABSURD), rates, 0.0)
         np.clip(u, actuators.lower, actuators.upper, out=u)
         return self._command(u, status, np.zeros(self.robot.nv), np.zeros(self.assembly.contacts.size))
 

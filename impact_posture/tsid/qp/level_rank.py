@@ -139,6 +139,5 @@ class LevelRank:
 
 
 def _mean_weight(H: Array, Z: Array, count: int) -> float:
-    """Return the mean weight of the cost over the directions ``Z``."""
     Z = Z[:count]
     return float(np.sum(Z * (H[:count, :count] @ Z)) / np.sum(Z * Z))

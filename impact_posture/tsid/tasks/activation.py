@@ -36,7 +36,6 @@ class Activation:
     it is 0 and the robot holds the reached posture during the impact.  The level moves by at most ``1.5 dt/ramp``.
 
     Attributes:
-        phase: The present phase.
         ramp: Seconds from 0 to 1 and back.
         live: Whether the term stays on during the contact.
         level: The present level α.
