@@ -1,4 +1,4 @@
-"""Caches, polygons of feet and rounds of a search make answers fast and must not change them."""
+"""Caches, foot polygons and search rounds make answers faster and must not change them."""
 
 from __future__ import annotations
 
@@ -58,7 +58,7 @@ def test_the_polygon_of_the_feet_is_the_convex_hull(corners: list[tuple[float, f
     assert edges is not None
     normals, offsets = edges
     np.testing.assert_allclose(np.linalg.norm(normals, axis=1), 1, atol=1e-9)
-    # As many edges as corners of the hull, and the same half-planes.
+    # The polygon has as many edges as the hull has corners, and the same half-planes.
     expected = np.unique(np.round(hull.equations, 7), axis=0)
     assert len(normals) == len(expected)
     for *n, b in hull.equations:
@@ -102,7 +102,7 @@ def test_code_from_the_cache_is_the_code(
 
     first = texts()
     assert texts() == first and len(count) == 1
-    # Each change of the code gives another key.
+    # Each of these changes gives the cache entry another key.
     other = replace(objective, contact=replace(objective.contact, normal=(0.0, 0.6, 0.8)))
     for changed in ({"objective": other}, {"real": FLOAT}, {"portable": True}):
         assert texts(**changed) != first
@@ -141,7 +141,7 @@ def test_an_end_that_lacks_parts_is_certified_in_the_last_round_only(monkeypatch
     search = GrowingSearch(problem, draws, scale, compile="never", finish_all=True)
     runs = [search._run(index, last=False) for index in range(2)]
     lacking = [index for index, run in enumerate(runs) if run.lacks]
-    # Without such an end the test shows nothing.
+    # The test needs at least one run that ended without the required constraint rows.
     assert lacking
     for index, run in enumerate(runs):
         assert (run.certificate is None) == run.lacks
@@ -161,12 +161,12 @@ def test_postures_held_by_even_forces_need_no_linear_program(monkeypatch: pytest
     model = Numeric(problem.robot.model).at(problem.given)
     exact = held[0].evaluate(model)[0]
     monkeypatch.setattr(held[0], "evaluate", None)
-    # Both say that nothing is violated.
+    # The exact evaluation and the bound both report no violation.
     assert (exact <= 1e-8).all() and (held[0].value(model) <= held[0].upper).all()
 
 
 def test_an_answer_of_a_small_robot_imports_no_part_of_scipy() -> None:
-    """A part of SciPy takes longer to import than such a problem takes to solve."""
+    """Importing a part of SciPy takes longer than solving this problem."""
     program = """if True:
         import sys
         from impact_posture.api.posture_result import optimize
@@ -208,7 +208,7 @@ def test_starts_that_share_a_run_end_where_their_own_runs_would(
 def test_a_start_that_is_left_would_not_have_been_the_best(
     robot: str, normal: tuple[float, float, float], starts: int, monkeypatch: pytest.MonkeyPatch
 ) -> None:
-    # As if a program of a few starts were a large one.
+    # Set the thresholds as if a program of a few starts were a large program.
     monkeypatch.setattr(search_module, "_SMALL", 0)
     monkeypatch.setattr(search_module, "_BATCH", 500)
     problem = prepare(ProblemSettings(robot=robot, normal=normal)).problem

@@ -1,4 +1,4 @@
-"""The fastest approach within velocity limits, and the constraint that asks for it."""
+"""The fastest approach within velocity limits, and the constraint on this approach speed."""
 
 from __future__ import annotations
 
@@ -26,7 +26,8 @@ from tests.support.constraints import check_lifted_rows
 from tests.support.helpers import Vector, rng
 from tests.support.settings import make_settings
 
-# Fixed base and standing, one contact and two, a normal that turns with the frame, a held joint and a kept frame.
+# Problems with fixed and standing bases, one and two contacts, a normal in the contact frame, a held joint and a kept
+# frame.
 PROBLEMS: dict[str, dict[str, object]] = {
     "ur5": {"normal": (0.2, -0.1, 1.0)},
     "panda": {"normal": (0, 0, 1), "hold": ("panda_joint1",)},
@@ -57,7 +58,7 @@ def posture(posed: Prepared, seed: int) -> Vector:
 
 
 def fastest(posed: Prepared, q: Vector) -> float:
-    """Another program from raw Jacobians: all entries of the velocity, with those that may not move as bounds."""
+    """Return the fastest approach by an independent program on raw Jacobians, which bounds each velocity entry."""
     robot, wanted = posed.problem.robot, posed.problem.requirements
     model, data = robot.model, robot.model.createData()
     pin.computeJointJacobians(model, data, q)
@@ -78,7 +79,7 @@ def fastest(posed: Prepared, q: Vector) -> float:
         if wanted.contact_pose == "full":
             rows, arrives = [*rows, *J[3:]], [*arrives, 0.0, 0.0, 0.0]
         elif wanted.contact_pose.startswith("aligned"):
-            # Two of three rows: the third is their sum, because the turn about the normal is free.
+            # Two of the three rows are independent, because the rotation about the normal is free.
             rows, arrives = [*rows, *((np.eye(3) - np.outer(n, n)) @ J[3:])], [*arrives, 0.0, 0.0, 0.0]
     for frame in wanted.keep:
         J = pin.getFrameJacobian(model, data, model.getFrameId(frame), pin.ReferenceFrame.LOCAL_WORLD_ALIGNED)
@@ -119,7 +120,7 @@ def test_reduced_form_has_the_gradient_of_the_manifold(name: str, seed: int) -> 
 
     gradient, slope = constraint.evaluate(numeric.at(q))[1][0], rng(seed, 1).normal(size=model.nv)
     sides = [side * (value(pin.integrate(model, q, side * 1e-6 * slope)) - value(q)) / 1e-6 for side in (1, -1)]
-    # The speed has a kink where another joint comes to its limit.
+    # The speed has a kink where another joint reaches its velocity limit.
     margin = 1e-4 + 1e-3 * np.abs(sides).max()
     assert min(sides) - margin <= gradient @ slope <= max(sides) + margin
 
@@ -134,7 +135,7 @@ def test_lifted_rows_agree_with_pinocchio_and_with_differences(name: str) -> Non
 
 @pytest.mark.parametrize(("name", "speed"), [("tiago", 0.8), ("talos", 1.0)])
 def test_an_optimum_that_is_too_slow_moves_to_a_fast_one(name: str, speed: float) -> None:
-    """Both certify; the optimum without the demand arrives too slowly, and is the better one for that."""
+    """Both optima certify.  Without the constraint on the speed, the optimum is better but approaches too slowly."""
     free, asked = (prepared(name, speed, approach=approach) for approach in (False, True))
     attainable = AttainableSpeed(asked.problem.robot, asked.problem.objective, asked.problem.requirements)
     found = [solve(posed.problem, starts=4, jobs=1) for posed in (free, asked)]
@@ -182,7 +183,7 @@ def test_a_kept_foot_does_not_count_as_a_leg_that_moves_the_hand() -> None:
 
 
 def chain(path: Path, axes: str, limits: Sequence[float]) -> str:
-    """An arm of links along z; a limit of zero is none."""
+    """Write an arm of links along z; a velocity limit of zero stands for an unlimited joint."""
     turns = {"x": "1 0 0", "y": "0 1 0", "z": "0 0 1"}
     parts = ['<robot name="chain"><link name="ground"/>']
     for k, (axis, limit) in enumerate(zip(axes, limits, strict=True)):
@@ -205,14 +206,14 @@ def chain(path: Path, axes: str, limits: Sequence[float]) -> str:
 @pytest.mark.parametrize(
     ("axes", "limits", "pose"),
     [
-        # Rows out of the plane are zero.
+        # Rows out of the plane of this arm are zero.
         ("yyyy", [2, 2, 2, 2], "full"),
-        # Limits that stand for none.
+        # The huge velocity limits act like no limit.
         ("zyzyzyz", [2, 2, 2, 2, 2, 2, 1e6], "full"),
         ("zyzyzyz", [5e9, 5e9, 5e9, 5e9, 5e9, 5e9, 2], "full"),
-        # Only the first joint has a limit, so nothing bounds the speed at most postures.
+        # Only the first joint has a limit, so the speed is unbounded at most postures.
         ("zyzyzyz", [2, 0, 0, 0, 0, 0, 0], "full"),
-        # Five joints cannot hold the turn of the tip, which then turns.
+        # Five joints cannot fix the rotation of the tip, so the tip may turn.
         ("zyyyz", [2, 2, 2, 2, 2], "position"),
     ],
 )

@@ -1,4 +1,4 @@
-"""Separating planes: their rows in numbers and as expressions, their derivatives, the postures that they allow."""
+"""Separating planes: their rows as numbers and expressions, their derivatives, and the postures that they allow."""
 
 from __future__ import annotations
 
@@ -98,7 +98,7 @@ def test_guess_satisfies_the_rows_where_bodies_are_apart(name: str) -> None:
         value = np.array(rows(chart.to_x(q), guess)).ravel()
         lower, upper = (np.append(np.zeros(EQUATIONS), side) for side in separator.bounds(corners))
         outside = np.maximum(lower - value, value - upper)
-        # The guess of the normal is 2 % short, so a gap of a few millimeters may not show.
+        # The initial guess shortens the normal by 2 %, so a gap of a few millimeters may be reported as none.
         if abs(distance) > 0.03:
             assert (outside.max() < 1e-9) == (distance > 0)
             apart, touching = apart + (distance > 0), touching + (distance < 0)
@@ -108,11 +108,11 @@ def test_guess_satisfies_the_rows_where_bodies_are_apart(name: str) -> None:
 @pytest.mark.parametrize("name", ROBOTS)
 @pytest.mark.parametrize("kind", KINDS)
 def test_linearization_is_the_derivative_of_the_rows(name: str, kind: str) -> None:
-    """Against manifold differences of the heights of corners over a plane."""
+    """Compare with finite differences of the heights of corners above a plane."""
     robot, rng = load_robot(name), np.random.default_rng(2)
     separator, numeric = _separator(robot, kind), Numeric(robot.model)
     q, n = _random(robot, rng), rng.normal(size=3)
-    # A plane far on the wrong side of both bodies, so that every corner has a row.
+    # Put the plane far on the wrong side of both bodies, so that every corner has a row.
     height = 50.0
     rows = separator.linearize_at(numeric.at(q), n, height)
     assert len(rows.names) == len(BOX) + (0 if separator.known else 1)
@@ -133,14 +133,14 @@ def test_distances_and_their_gradient(name: str) -> None:
         q = _random(robot, rng)
         jacobian = constraint.evaluate(numeric.at(q))[1]
         slopes = central_gradient(lambda p: constraint.evaluate(numeric.at(p))[0], robot.model, q, 1e-6)
-        # Distances are smooth between two edges that are not parallel, for example.
+        # Distances are differentiable at most postures, for example between two edges that are not parallel.
         for row in np.flatnonzero(np.abs(jacobian).max(axis=1) > 0):
             smooth += bool(np.allclose(slopes[row], jacobian[row], atol=1e-5))
     assert smooth > 10
 
 
 def test_a_pair_that_stays_violated_has_rows_for_all_corners_in_the_end() -> None:
-    """Else a plane of the program that cuts corners without rows would look like a trap."""
+    """Otherwise the program would report no solution where its plane only cuts corners that have no rows."""
     robot, rng = load_robot("tilthex_arm"), np.random.default_rng(5)
     constraint = Clearance("c", [_separator(robot, kind) for kind in KINDS], "words")
     numeric, seen = Numeric(robot.model), set[bool]()
@@ -159,7 +159,10 @@ def test_a_pair_that_stays_violated_has_rows_for_all_corners_in_the_end() -> Non
 
 
 def test_a_pair_that_slack_lets_off_gets_no_more_corners() -> None:
-    """More rows do not keep bodies apart where to penetrate pays; without slack it is corners that are missing."""
+    """With slack, more rows cannot separate bodies that the objective pushes together.
+
+    Without slack, rows are missing.
+    """
     robot, rng = load_robot("tilthex_arm"), np.random.default_rng(5)
     constraint = Clearance("c", [_separator(robot, kind) for kind in KINDS], "words")
     numeric, seen = Numeric(robot.model), 0
@@ -167,7 +170,7 @@ def test_a_pair_that_slack_lets_off_gets_no_more_corners() -> None:
         q = _random(robot, rng)
         first = constraint.grown(numeric.at(q))
         numeric.at(pin.integrate(robot.model, q, 0.3 * rng.normal(size=robot.nv)))
-        # The guess of each pair has the slack for what it violates, as the end of a run has where that pays.
+        # The guess sets the slack of each pair to its violation, as a run does if penetration improves the objective.
         let_off = first.guess(numeric).values
         strict = let_off.copy()
         strict[[int(own[-1]) for own in first._unknowns(np.arange(strict.size)).values()]] = 0.0
@@ -183,14 +186,14 @@ def test_a_pair_that_slack_lets_off_gets_no_more_corners() -> None:
 @settings(max_examples=25, deadline=None)
 @given(seed=st.integers(0, 10_000))
 def test_bounds_on_distances_are_never_above_them(seed: int) -> None:
-    """Spheres around the bodies are never farther apart than the distance that counts."""
+    """The distance of the bounding spheres is never larger than the distance of the bodies."""
     robot = load_robot("tilthex_arm")
     separators = [_separator(robot, kind) for kind in KINDS]
     constraint = Clearance("c", separators, "words")
     rng = np.random.default_rng(seed)
     numeric, q = Numeric(robot.model), _random(robot, rng)
     for size in (0.0, 1e-3, 0.03, 0.3, 1.0):
-        # What was exact before bounds what comes after.
+        # A distance computed at an earlier posture bounds the distances at later postures.
         q = pin.integrate(robot.model, q, size * rng.normal(size=robot.nv))
         values = constraint.evaluate(numeric.at(q))[0]
         exact = np.array([one.distance(numeric)[0] for one in separators])
@@ -220,12 +223,15 @@ def _problem(**changes: object) -> ProblemSettings:
 
 
 def test_a_body_in_the_way_of_the_optimum() -> None:
-    """The optimum without the obstacle runs through it; with it, it touches the obstacle and certifies."""
+    """Without the obstacle, the optimum passes through it.
+
+    With it, the optimum touches the obstacle and certifies.
+    """
     free = solve(prepare(_problem()).problem, starts=4, jobs=1, compile="never")
     model = free.problem.robot.model
     data = model.createData()
     pin.forwardKinematics(model, data, free.q)
-    # The last link moves with the contact frame, which is held; the one before it does not.
+    # The last link is fixed to the held contact frame, so the obstacle is placed at the link before it.
     shoulder = tuple(float(v) for v in data.oMi[model.njoints - 2].translation)
     blocked = prepare(_problem(obstacles=(Obstacle(name="ball", sphere=0.05, position=shoulder),))).problem
     assert not feasible(blocked, free.q)
@@ -254,7 +260,7 @@ def test_an_obstacle_without_a_name_to_print_is_refused(name: str) -> None:
 
 
 def test_an_obstacle_at_the_contact_is_named() -> None:
-    """An obstacle around the contact point can never be left, whatever the posture."""
+    """If the obstacle contains the contact point, no posture avoids the collision."""
     robot = load_robot("tilthex_arm")
     numeric = Numeric(robot.model).at(robot.posture())
     tool = numeric.data.oMi[robot.model.njoints - 1].translation
@@ -269,7 +275,7 @@ def test_an_obstacle_at_the_contact_is_named() -> None:
     ("pose", "position"), [("full", None), ("full", (3.0, 0.0, 0.0)), ("position", (3.0, 0.0, 0.0))]
 )
 def test_a_turn_that_solves_a_conflict_is_the_hint(pose: str, position: tuple[float, ...] | None) -> None:
-    """The wrist of z1 is in a floor that its hand faces, and nothing helps a hand that is out of reach."""
+    """The wrist of z1 is inside the floor that the hand faces.  For a target out of reach, no turn helps."""
     settings = {"robot": "z1", "normal": (0.0, 0.0, 1.0), "contact_pose": pose, "target_position": position}
     problem = prepare(validate(ProblemSettings, settings, "options")).problem
     with pytest.raises(Infeasible) as caught:
@@ -294,7 +300,7 @@ def test_a_surface_lies_where_the_link_of_the_contact_reaches(name: str, normal:
     own = [shape for shape in around.shapes.geometry.geometryObjects if shape.parentJoint == point.joint]
 
     def touched(above: float) -> bool:
-        """Whether coal finds a mesh of the link in the half-space so far above the surface, m."""
+        """Whether coal reports a collision of a link mesh with the half-space this far above the surface (m)."""
         half = coal.Halfspace(np.array(normal), height - around.depth(contact) + above)
         request = coal.CollisionRequest()
         at = [data.oMi[point.joint] * shape.placement for shape in own]
@@ -308,7 +314,7 @@ def test_a_surface_lies_where_the_link_of_the_contact_reaches(name: str, normal:
 
     assert around.depth(contact) > 0
     assert not touched(-1e-6)
-    # A swept hull is a few millimeters larger than the mesh inside.
+    # A swept hull is a few millimeters larger than the mesh that it contains.
     assert touched(0.015)
 
 
@@ -337,7 +343,7 @@ def test_derivatives_of_a_grown_program_agree_with_casadi(name: str) -> None:
     rng, projector = np.random.default_rng(3), Projector(problem)
     first = nlp = build_nlp(problem, compile="never")
     for _ in range(3):
-        # Postures anywhere bring in pairs and corners, as the ends of runs do.
+        # Random postures add pairs and corners to the program, as the final postures of runs do.
         ends = [random_posture(problem, projector.chart, rng) for _ in range(3)]
         problem = problem.grown(ends)
         nlp = nlp.grown(problem, compile="never")
@@ -353,7 +359,7 @@ def test_derivatives_of_a_grown_program_agree_with_casadi(name: str) -> None:
 
 
 def test_starts_lie_near_a_posture_that_is_clear() -> None:
-    # The given posture reaches far through the wall, and most starts near it end between bodies.
+    # The given posture reaches far through the wall, and most starts near it end with bodies on both sides.
     posed = prepare(ProblemSettings(robot="xarm7", normal=(-1, 0, 0), holdable=False)).problem
     found = solve(posed, starts=16, jobs=1, compile="never", finish_all=True)
     assert found.certified_starts == 16
@@ -361,13 +367,13 @@ def test_starts_lie_near_a_posture_that_is_clear() -> None:
 
 @pytest.mark.parametrize("seed", [1, 9, 33])
 def test_the_way_past_a_wall_is_found_from_every_seed(seed: int) -> None:
-    # Few random postures lead to the free part.
+    # Few random postures lead to the part that is free of collisions.
     posed = prepare(ProblemSettings(robot="xarm7", normal=(-1, 0, 0))).problem
     assert not find_conflicts(posed, seed).conflicts
 
 
 def test_no_slack_is_left_where_the_objective_falls_steeply() -> None:
-    # The first price of the slack lets every start end 0.6 mm inside the clearance of the surface.
+    # With the initial penalty on the slack, every start would end 0.6 mm inside the clearance of the surface.
     urdf = "example-robot-data:ur_description/urdf/ur10_robot.urdf"
     posed = prepare(ProblemSettings(robot=urdf, frame="tool0", normal=(0, 0, 1))).problem
     found = solve(posed, starts=4, jobs=1, compile="never", finish_all=True)

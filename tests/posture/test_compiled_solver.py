@@ -1,4 +1,4 @@
-"""The program as machine code: the same answers, kept in the cache, and one thread for its linear algebra."""
+"""Compiled programs: the same answers as the interpreter, the cache, and one thread for linear algebra."""
 
 from __future__ import annotations
 
@@ -43,7 +43,7 @@ def problem(prepared: Prepared) -> ConstrainedProblem:
 def test_the_same_answer_from_machine_code(
     problem: ConstrainedProblem, tmp_path: Path, monkeypatch: pytest.MonkeyPatch, optimized: int
 ) -> None:
-    """Optimized or not: the iterations of the interpreter, and from the cache without a compiler."""
+    """Compiled programs need as many iterations as interpreted programs, and cached programs need no compiler."""
     monkeypatch.setenv("IMPACT_POSTURE_CACHE", str(tmp_path))
     monkeypatch.setattr(compiled, "_OPTIMIZED", optimized)
     interpreted = build_nlp(problem, compile="never").solve(problem.given)
@@ -63,7 +63,7 @@ def test_the_same_answer_from_machine_code(
 def test_the_same_answer_from_machine_code_of_a_program_that_grows(
     tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
-    """The problem of the command line, clear of collisions, whose derivatives are put together by pieces."""
+    """The default problem of the command line avoids collisions, and its derivatives are assembled from parts."""
     need_compiler()
     monkeypatch.setenv("IMPACT_POSTURE_CACHE", str(tmp_path))
     problem = prepare(ProblemSettings(robot="tilthex_arm", normal=(-1.0, 0.0, 0.0))).problem
@@ -99,7 +99,7 @@ def test_a_damaged_library_is_built_again(
     assert build_nlp(small, compile="always").compiled
     (library,) = tmp_path.glob("*.so")
     whole = library.stat().st_size
-    # Mapped in this process: another file takes its name.
+    # This process has mapped the library, so it is renamed and a damaged copy takes its name.
     library.write_bytes(library.rename(library.with_suffix(".old")).read_bytes()[: whole // 2])
     assert build_nlp(small, compile="always").compiled
     assert library.stat().st_size == whole and libraries.is_cached(library)
@@ -173,9 +173,9 @@ def test_a_mode_that_does_not_exist_is_refused(problem: ConstrainedProblem) -> N
 
 
 def test_one_thread_within_and_as_before_after() -> None:
-    """All of them: NumPy's, SciPy's and the one that IPOPT works with."""
+    """The limit of one thread applies to the BLAS libraries of NumPy, SciPy and IPOPT."""
     with one_blas_thread():
-        pass  # all are loaded now
+        pass  # all BLAS libraries are loaded now
     libraries = threadpoolctl.ThreadpoolController().lib_controllers
     assert libraries
     if list(Path(ca.__file__).parent.glob("libcasadi-tp-openblas*")):
@@ -189,13 +189,13 @@ def test_one_thread_within_and_as_before_after() -> None:
             raise KeyboardInterrupt
         assert [library.num_threads for library in libraries] == [2] * len(libraries)
     finally:
-        # The tests after this one would share the cores with threads that wait for work.
+        # Restore the numbers of threads, because waiting threads would slow down later tests.
         for library, count in zip(libraries, before, strict=True):
             library.set_num_threads(count)
 
 
 def test_compilers_run_beside_each_other_and_none_stays(tmp_path: Path) -> None:
-    """The first failure is what is said; what still runs then is killed, its own children too."""
+    """The first failure is reported.  Compilers that still run are killed, together with their child processes."""
     marks = [tmp_path / name for name in ("child", "never")]
     slow = ["sh", "-c", f"(sleep 3; touch {marks[0]}) & sleep 3; touch {marks[1]}", "-o", "slow.o"]
     began = time.perf_counter()

@@ -1,4 +1,4 @@
-"""Both forms of every constraint agree, and its Jacobian agrees with differences on the manifold."""
+"""Both forms of every constraint agree, and its Jacobian agrees with finite differences on the manifold."""
 
 from __future__ import annotations
 
@@ -69,7 +69,7 @@ def test_constraint_agrees_with_itself_and_with_finite_differences(name: str, ki
     point = point_on(robot, ROBOTS[name], (0.05, -0.02, 0.1))
     given = _random(robot, rng)
     constraint = FACTORIES[kind](point, Numeric(robot.model).at(given).placement(point).copy())
-    # A quaternion and its negative are the same orientation.
+    # A quaternion and its negative describe the same orientation.
     turns = slice(0) if kind in ("position", "box", "center of mass") else slice(3 if "pose" in kind else 0, None)
     check_expression(constraint, robot.model, [_random(robot, rng) for _ in range(4)], turns)
 
@@ -82,7 +82,7 @@ def test_a_distance_agrees_with_itself_on_joints_of_all_kinds() -> None:
 
 @pytest.mark.parametrize("angle", [1e-9, 1.0, np.pi - 1e-6, np.pi])
 def test_orientation_error_is_zero_at_the_target_only(angle: float) -> None:
-    """The skew-symmetric error vanishes at 180° as well; this error is largest there."""
+    """The skew-symmetric error also vanishes at 180°, but the tested error is largest there."""
     robot = load_robot("tilthex_arm")
     base = PointOnLink(1, np.zeros(3), np.eye(3))
     constraint = HeldOrientation("x", base, np.eye(3))
@@ -110,7 +110,7 @@ def test_level_base_leaves_yaw_free_and_nothing_else() -> None:
 def test_a_base_tilts_from_its_default_posture() -> None:
     robot = load_robot("solo8")
     q = robot.posture()
-    # A base link whose axes lie on their side.
+    # Use a base link whose z axis is horizontal.
     q[3:7] = pin.Quaternion(pin.exp3(np.array([np.pi / 2, 0.0, 0.3]))).coeffs()
     lying = replace(robot, postures={**robot.postures, robot.default_posture: q})
     objective = WorstCaseObjective(lying, ImpactContact("base_link", (1.0, 0.0, 0.0)))

@@ -1,4 +1,4 @@
-"""Friction in the program, the C export and the command line."""
+"""Friction in the optimization program, the C export and the command line."""
 
 from __future__ import annotations
 
@@ -63,7 +63,7 @@ def test_solutions_are_certified(
 def test_known_results(
     robot: str, normal: tuple[float, float, float], friction: float, before: float, after: float
 ) -> None:
-    """C at the initial posture and at the optimum, as they once came out."""
+    """Compare the objective C at the initial posture and at the optimum with recorded values."""
     problem = problem_of(robot, normal, friction)
     solution = solve(problem, starts=3, jobs=1, compile="never")
     assert problem.objective.value(solution.initial) == pytest.approx(before, rel=1e-8)
@@ -79,7 +79,7 @@ def test_its_ends_are_the_solutions_of_speed_and_of_sticking() -> None:
 
 
 def test_an_optimum_on_the_verge_of_slipping_is_certified_by_both_sides() -> None:
-    """On this table ur5 sticks with more slip nearby and slips with less: the best posture lies at the kink."""
+    """On this table, ur5 sticks in some postures and slips in others.  The best posture is at the kink."""
     problem = problem_of("ur5", (0.0, 0.6, 0.8), 0.4, contact_pose="position")
     assert isinstance(problem.objective, WorstCaseObjective)
     nlp = build_nlp(problem, compile="never")
@@ -101,7 +101,7 @@ def test_an_optimum_on_the_verge_of_slipping_is_certified_by_both_sides() -> Non
 
 
 def test_planar_robots_are_optimized() -> None:
-    """Nothing holds the friction across the plane, in the program as little as in the robot."""
+    """The friction across the plane of motion has no effect, neither in the program nor in the robot."""
     robot = arm([Y, Y, Y, Y], [0.3, 0.7, -0.5, 0.4], floating=False)
     for friction in (0.0, 0.05, 0.3, 3.0):
         contact = ImpactContact(TIP, (0.6, 0.0, 0.8), friction=friction)

@@ -1,4 +1,4 @@
-"""The search ``global`` from the settings to the result folder, and its estimates of what a search missed."""
+"""The search ``global`` from the settings to the result folder, and its estimates of missed optima."""
 
 from __future__ import annotations
 
@@ -34,7 +34,7 @@ def test_a_map_finds_the_component_that_few_starts_miss() -> None:
     document = result.document["global"]
     assert document["method"] == "self-motion"
     assert search.redundancy == 1 and len(document["components"]) == 8
-    # The two starts end far above: the map finds what many starts find, or better.
+    # The two starts end far above the optimum.  The map reaches the result of many starts or a better one.
     many = solve(result.problem.problem, starts=24, jobs=1, compile="never")
     assert many.problem.objective.value(result.q) <= many.optima[0].objective * (1 + 1e-6)
     assert search.missed_rate == 1 and search.improvement > 0.1
@@ -43,7 +43,7 @@ def test_a_map_finds_the_component_that_few_starts_miss() -> None:
     assert 0 <= document["gap"] <= 0.01 and document["finished"] and document["word"] == "bounded"
     best = min(part["objective"] for part in document["components"])
     assert best == pytest.approx(document["lower"], rel=0.02)
-    # What tells of the starts stays that of the starts.
+    # The statistics of the starts must not include optima from the map.
     assert sum(o.hits for o in result.solution.optima) == result.solution.certified_starts <= 2
     json.dumps(document, allow_nan=False)
 
@@ -110,6 +110,6 @@ def test_estimates_are_right_in_the_mean(optima: int, seed: int) -> None:
         estimates.append(unseen_share(hits[hits > 0]))
         truths.append(shares[hits == 0].sum())
         numbers.append(estimated_optima(hits[hits > 0]))
-    # Good–Turing is off by less than 1/16 in the mean, for any shares; Chao's bound holds in the mean.
+    # Good–Turing errs by less than 1/16 on average for any shares; Chao's bound is valid on average.
     assert abs(np.mean(estimates) - np.mean(truths)) < 1 / 16 + 0.02
     assert np.mean(numbers) < optima * 1.3 + 1

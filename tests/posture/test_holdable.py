@@ -1,4 +1,4 @@
-"""Forces that hold a posture: statics by other formulas, the linear program by another, and the program's answers."""
+"""Forces that hold a posture, against independent statics and linear programs, and in optimized postures."""
 
 from __future__ import annotations
 
@@ -41,7 +41,7 @@ PUSHED = {name: {"hold_force": 2.0} for name in ("tilthex_arm", "talos", "panda"
 
 @functools.cache
 def problem(name: str, **more: object) -> ConstrainedProblem:
-    """Without what else a robot may touch, which has tests of its own."""
+    """Return the problem without forces at other objects that a robot may touch, which have separate tests."""
     values = {"robot": name, "normal": (0.3, -0.2, 1.0), "holdable": True, **more}
     return prepare(make_settings(values)).problem
 
@@ -57,7 +57,7 @@ def posture(posed: ConstrainedProblem, seed: int, *, near: bool = True) -> Vecto
 
 
 def statics(posed: ConstrainedProblem, case: LoadCase, q: Vector, z: Vector) -> Vector:
-    """``h(q) − Σ Jᵀ f`` with Pinocchio's Jacobians of frames, not links, and allocation of the rotors."""
+    """Return ``h(q) − Σ Jᵀ f``, with Pinocchio's Jacobians of frames instead of links, and the rotor allocation."""
     model, contact = posed.robot.model, posed.impact.contact
     tau = np.array(pin.computeGeneralizedGravity(model, model.createData(), q))
     for source, own in zip(case.equilibrium.load.sources, case.equilibrium.load.split(z), strict=True):
@@ -66,7 +66,7 @@ def statics(posed: ConstrainedProblem, case: LoadCase, q: Vector, z: Vector) -> 
         elif own.size:
             support = next(s for s in posed.objective.supports if s.frame == source.names[0])
             index = model.getFrameId(support.frame)
-            # Where the source is on its link, in the frame of the foot.
+            # Point of the force source on its link, in the frame of the foot.
             offset = model.frames[index].placement.actInv(source.point.position)
             assert np.abs(offset - support.offset)[:2] == pytest.approx(support.size if support.has_sole else (0, 0))
             tau -= frame_jacobian(model, q, index, offset)[:3].T @ (source.columns @ own)[:3]
@@ -81,7 +81,7 @@ def statics(posed: ConstrainedProblem, case: LoadCase, q: Vector, z: Vector) -> 
 @given(seed=SIZE)
 @settings(max_examples=3)
 def test_torques_agree_with_statics_the_expression_and_differences(name: str, seed: int) -> None:
-    """Statics uses other algorithms of Pinocchio for gravity and forces."""
+    """The statics here use other Pinocchio algorithms for gravity and forces than the code under test."""
     posed, generator = problem(name, **PUSHED.get(name, {})), np.random.default_rng(seed)
     case = cases(name, **PUSHED.get(name, {}))[-1]
     load, model, q = case.equilibrium.load, posed.robot.model, posture(posed, seed)
@@ -101,7 +101,7 @@ def test_torques_agree_with_statics_the_expression_and_differences(name: str, se
 
 @pytest.mark.parametrize("name", ["talos", "solo12"])
 def test_mujoco_stands_still_under_the_torques_and_forces(name: str) -> None:
-    """MuJoCo applies the forces at the feet and the torques at the joints, and nothing accelerates."""
+    """MuJoCo applies the forces at the feet and the torques at the joints; no acceleration results."""
     mujoco = pytest.importorskip("mujoco", reason="mujoco is not installed (the extra 'sim')")
     posed, (case,) = problem(name), cases(name)
     rest, model, q = case.equilibrium, posed.robot.model, posed.given
@@ -130,7 +130,7 @@ def test_mujoco_stands_still_under_the_torques_and_forces(name: str) -> None:
 
 
 def least_share(posed: ConstrainedProblem, q: Vector) -> float:
-    """The same minimum over forces in x, y and z with faces of the pyramids, and thrusts in N; NaN if unbalanced."""
+    """Return the same minimum by another program, on friction-pyramid faces and thrusts (N); NaN if unbalanced."""
     model, spec = posed.robot.model, posed.robot.spec
     blocks, cones = [], []
     for support in posed.objective.supports:
@@ -173,7 +173,7 @@ def least_share(posed: ConstrainedProblem, q: Vector) -> float:
 @given(seed=SIZE)
 @settings(max_examples=4)
 def test_least_largest_share_agrees_with_another_program(name: str, seed: int) -> None:
-    """Both programs report lost balance at random postures of feet; side forces of rotors are left out."""
+    """Both programs report lost balance at random postures of legged robots; lateral rotor forces are excluded."""
     posed, (case,) = problem(name), cases(name)
     q = posture(posed, seed) if name != "borinot" else posed.given
     distribution = case.equilibrium.distribute(q)
@@ -194,7 +194,7 @@ def test_thrusts_agree_with_hover() -> None:
         rest = case.equilibrium
         shares = dict(zip(rest.actuators, rest.distribute(posed.given).shares, strict=True))
         spans = dict(zip(rest.actuators, zip(rest.lower, rest.upper, strict=True), strict=True))
-        # Six rotors in one plane share the load in many ways, whose tightest rotor is the same.
+        # Six rotors in one plane can share the load in many ways, but the most loaded rotor is always the same.
         thrusts = [a + (b - a) * (1 + shares[k]) / 2 for k, (a, b) in spans.items() if k.startswith("rotor")]
         assert min(thrusts) == pytest.approx(min(expected.thrusts), abs=1e-6)
         if name != "borinot":
@@ -218,7 +218,7 @@ def test_reduced_form_has_the_gradient_of_its_largest_row(name: str, seed: int) 
     top = largest(q)
     slope = rng(seed).normal(size=posed.robot.nv)
     ahead, behind = (largest(pin.integrate(posed.robot.model, q, step * slope)) for step in (1e-6, -1e-6))
-    # The largest share has a kink where another actuator takes over; there the slopes of both sides differ.
+    # The largest share has a kink where another actuator becomes the most loaded: the one-sided slopes differ there.
     sides = [(ahead - top) / 1e-6, (top - behind) / 1e-6]
     above = value == value[0] if value[0] else value > top - 1e-9
     if sides[0] == pytest.approx(sides[1], rel=1e-3, abs=1e-3):
@@ -242,7 +242,7 @@ def test_lifted_rows_agree_with_pinocchio_and_with_differences(name: str) -> Non
 
 
 def test_an_optimum_beyond_the_limits_moves_to_them_and_certifies() -> None:
-    """This start of an arm on four legs ends at torques that the legs do not have, so the program gets the rows."""
+    """From this start, an arm on four legs ends beyond the torque limits of the legs, so the program adds rows."""
     posed = problem("anymal_kinova", normal=(1.0, 0.0, 0.0))
     begin, scale = feasible_start(posed, 1, seed=0), posed.objective.value(posed.given)
     assert begin is not None
@@ -261,13 +261,13 @@ def test_an_optimum_beyond_the_limits_moves_to_them_and_certifies() -> None:
 
 
 def test_a_program_without_the_rows_is_certified_by_the_best_forces() -> None:
-    """Far from the limits there are no rows; beyond them the rows show the violation."""
+    """Far within the limits, the program has no rows; beyond the limits, the rows show the violation."""
     (case,) = cases("solo12")
     posed, q = problem("solo12"), problem("solo12").given
     constraint, numeric = Holdable("at rest", case.equilibrium, ""), Numeric(problem("solo12").robot.model)
     assert constraint.grown(numeric.at(q)) is constraint
     assert not constraint.linearize(numeric.at(q), np.zeros(0)).names
-    # All feet in front of the center of mass.
+    # Lean the robot until all feet are behind its center of mass.
     leaning = pin.integrate(posed.robot.model, q, np.eye(posed.robot.nv)[4] * 0.9)
     found = constraint.linearize(numeric.at(leaning), np.zeros(0))
     outside = np.maximum(found.lower - found.value, found.value - found.upper)
@@ -287,7 +287,7 @@ def test_every_start_certifies_and_holds(name: str) -> None:
 
 
 def test_a_tight_limit_is_kept_and_has_a_multiplier() -> None:
-    """A limit below what the free optimum takes costs objective, and the certificate names the joint."""
+    """A torque limit below the demand of the free optimum worsens the objective; the certificate names the joint."""
     posed = problem("panda", normal=(1.0, 0.0, 0.0))
     (case,) = cases("panda", normal=(1.0, 0.0, 0.0))
     best = solve(posed, starts=1, jobs=1)

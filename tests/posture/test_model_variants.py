@@ -1,4 +1,4 @@
-"""Uncertain models: model variants, the worst of several, how far the optimum moves."""
+"""Uncertain models: model variants, their worst case, and the displacement of the optimum."""
 
 from __future__ import annotations
 
@@ -162,7 +162,7 @@ def few(objective: WorstCaseObjective) -> ModelSet:
     return objective.worst_case
 
 
-# All kinds on the smallest robot, and on the others what differs with feet or a fixed root.
+# All variants on the smallest robot; on the other robots only variants that depend on feet or a fixed base.
 EACH = [("tilthex_arm", False, kind) for kind in MORE]
 EACH += [(name, name == "bolt", kind) for name in ("panda", "bolt") for kind in ("plain", "pulling")]
 EACH += [("bolt", True, "cone")]
@@ -196,7 +196,7 @@ def test_the_largest_of_separate_objectives(name: str, feet: bool, kind: str) ->
 
 
 def test_subgradients_where_two_payloads_are_as_bad() -> None:
-    """A weight may hang on either side; of what mass the second is as bad as the first is found by bisection."""
+    """A payload may hang on either side.  Bisection determines the mass at which both sides are equally bad."""
     found = robot("solo12")
     q = random_configurations(found.model, 1, "either side", spread=0.3)[0]
     contact = ImpactContact("base_link", (0.0, 0.3, 1.0))
@@ -220,7 +220,8 @@ def test_subgradients_where_two_payloads_are_as_bad() -> None:
         there = np.array(pin.integrate(found.model, q, step * direction))
         rise = (tied.value(there) - tied.value(q)) / step
         slopes = points.gradients @ direction
-        # Within the hull, and at its far end: the maximum of smooth functions.
+        # The slope lies within the hull of the gradients and equals its far end, as for a maximum of smooth
+        # functions.
         assert rise == pytest.approx(slopes.max(), rel=1e-3, abs=1e-4 * tied.value(q))
         assert rise > slopes.min() - 1e-3 * tied.value(q)
 
@@ -252,7 +253,7 @@ def test_optima_certify(name: str) -> None:
 
 
 def test_how_far_the_optimum_moves() -> None:
-    """Every number of the comparison, again and by hand."""
+    """Recompute every number of the comparison by hand."""
     problem = problem_of(TASKS["aerial"])
     both = solve_robustly(problem, starts=3, seed=4, jobs=1, compile="never")
     found, q = both.robustness, both.solution.q
@@ -307,7 +308,7 @@ def test_words_of_every_finding() -> None:
 
 
 def test_balance_and_feet_hold_in_every_model_variant() -> None:
-    """A weight in the hand moves the center of mass: a posture found for it must not tip over with it."""
+    """A payload in the hand moves the center of mass: a posture optimized with the payload must not tip over."""
     frame = FRAMES["talos"]
     task = {"robot": "talos", "frame": frame, "normal": (-1, 0, 0), "contact_pose": "position"}
     problem = prepare(make_settings(task | {"payload": ((frame, 16.0),)})).problem
@@ -326,7 +327,7 @@ def test_balance_and_feet_hold_in_every_model_variant() -> None:
         lambda x: centers[1].evaluate(Numeric(problem.robot.model).at(x))[0], problem.robot.model, solution.q, 1e-4
     )
     assert_close(jacobian, expected, 1e-7, "Jacobian of the loaded center of mass")
-    # With the plain problem's posture it does tip: the constraint is no decoration.
+    # The optimum without the payload tips over with it, so the constraint is necessary.
     plain = prepare(make_settings(task)).problem
     alone = solve(plain, starts=2, jobs=1, compile="never")
     assert centers[1].evaluate(Numeric(plain.robot.model).at(alone.q))[0].max() > -centers[1].margin

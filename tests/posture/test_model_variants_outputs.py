@@ -1,4 +1,4 @@
-"""Uncertain models as a user gets them: exported, commanded."""
+"""Uncertain models in the C export and on the command line."""
 
 from __future__ import annotations
 

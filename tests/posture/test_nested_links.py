@@ -1,4 +1,4 @@
-"""Links whose hulls overlap: planes in the joints between them keep their shapes apart."""
+"""Links with overlapping hulls: planes in joint coordinates keep their shapes from touching."""
 
 from __future__ import annotations
 
@@ -27,7 +27,7 @@ from tests.support.constraints import check_expression
 CUBE = np.array([[x, y, z] for x in (-0.5, 0.5) for y in (-0.5, 0.5) for z in (-0.5, 0.5)])
 SIDES = np.array([[0, 1, 3, 2], [4, 6, 7, 5], [0, 4, 5, 1], [2, 3, 7, 6], [0, 2, 6, 4], [1, 5, 7, 3]])
 FACES = np.concatenate([SIDES[:, [0, 1, 2]], SIDES[:, [0, 2, 3]]])
-# Inner half width of a channel, thickness of its walls, half width of the rod in it, m.
+# Inner half width of a channel, thickness of its walls, and half width of the rod in it, in m.
 INNER, WALL, ROD = 0.1, 0.02, 0.02
 
 
@@ -40,7 +40,7 @@ def box(low: tuple[float, float, float], high: tuple[float, float, float]) -> Ar
 
 
 def rod_in_channel(folder: Path, turn: Array) -> tuple[Robot, RobotShapes]:
-    """A rod that slides by ±12 cm along y and z in a channel along x, turned as a whole."""
+    """A rod that slides by ±12 cm along y and z in a channel along x; channel and rod are rotated together."""
     width = INNER + WALL
     channel = np.concatenate([
         box((-0.15, -width, -WALL), (0.15, width, 0)),
@@ -67,7 +67,7 @@ def rod_in_channel(folder: Path, turn: Array) -> tuple[Robot, RobotShapes]:
 
 
 def within(robot: Robot, planes: JointPlanes, q: Array) -> bool:
-    """Tell whether a posture is within the planes of two bodies."""
+    """Whether a posture satisfies the planes of two bodies."""
     at = [robot.model.idx_qs[robot.joint_id(name)] for name in planes.joints]
     return bool((planes.normals @ q[at] <= planes.bounds).all())
 
@@ -96,7 +96,7 @@ def test_a_rod_may_be_in_a_channel_and_not_in_its_walls(
 
 @pytest.mark.parametrize("name", ["hextilt", "g1", "icub"])
 def test_nested_bodies_keep_apart_and_most_of_their_free_positions(name: str) -> None:
-    """Two joints between them, such as pelvis and hip of g1, and three at the hips of iCub."""
+    """Two joints connect bodies such as pelvis and hip of g1; three joints connect the hip bodies of iCub."""
     robot = load_robot(name)
     shapes = load_shapes(robot)
     assert shapes.hulls_touching == () and shapes.joint_planes
@@ -111,13 +111,13 @@ def test_nested_bodies_keep_apart_and_most_of_their_free_positions(name: str) ->
         inside = np.array([within(robot, planes, q) for planes in shapes.joint_planes])
         assert not (inside & ~apart).any()
         free, kept = free + apart, kept + inside
-    # Most postures collide at the hips of iCub, and what is left is far from convex.
+    # Most postures collide at the hips of iCub, and the set of collision-free postures is far from convex.
     least = [0.7 if len(planes.joints) == 2 else 0.1 for planes in shapes.joint_planes]
     assert (kept > least * free).all()
 
 
 def test_bodies_that_nest_and_never_touch_are_free() -> None:
-    """The upper legs of HyQ turn in its body's hull, and touch its shapes at no position of the hips."""
+    """The upper legs of HyQ turn inside the hull of the body, but never touch its shapes."""
     shapes = load_shapes(load_robot("hyq"))
     assert shapes.hulls_touching == () and [len(planes.bounds) for planes in shapes.joint_planes] == [0] * 4
     names = [body.name for body in shapes.bodies]
@@ -136,7 +136,7 @@ def planes_where(
     first: str = "waist_yaw_joint",
     ranges: Mapping[str, tuple[float, float]] | None = None,
 ) -> JointPlanes | None:
-    """Planes for bodies of g1 that touch where a function of the positions of the waist says so."""
+    """Return planes for two bodies of g1 that touch if ``touches`` is true for the positions of the waist joints."""
     robot = load_robot("g1")
     model = robot.model.copy()
     for name, limits in (ranges or {}).items():
@@ -146,7 +146,7 @@ def planes_where(
     last = robot.joint_id(WAIST[-1])
 
     def touch(data: pin.Data) -> bool:
-        # Rotations about x, then y.
+        # Rotate about x, then about y.
         R = (data.oMi[robot.joint_id("waist_yaw_joint")].inverse() * data.oMi[last]).rotation
         return touches(np.array([np.arctan2(R[2, 1], R[1, 1]), np.arctan2(R[0, 2], R[0, 0])]))
 
@@ -185,7 +185,7 @@ def test_a_joint_without_a_range_stays_where_it_is() -> None:
 
     planes = planes_where(touches, ranges={WAIST[0]: (0.0, 0.0)})
     assert planes is not None and planes.joints == WAIST[1:]
-    # Neighbors on a grid over many turns are no neighbors.
+    # On a grid over many turns, adjacent points are too far apart.
     assert planes_where(touches, ranges={WAIST[0]: (-75.4, 75.4)}) is None
 
 

@@ -1,4 +1,4 @@
-"""The optimization against brute force, its certificate against what it must refuse, its diagnosis."""
+"""The optimization against brute force, its certificate against wrong solutions, and its diagnosis."""
 
 from __future__ import annotations
 
@@ -35,7 +35,7 @@ def problem_of(robot: str, normal: tuple[float, float, float] = (0, 0, 1), **mor
 
 
 def walk(problem: ConstrainedProblem, q: np.ndarray, step: float, count: int) -> list[np.ndarray]:
-    """Follow the one-dimensional null space of the equalities, within the limits."""
+    """Follow the one-dimensional null space of the equalities within the joint limits."""
     projector, numeric = Projector(problem), Numeric(problem.robot.model)
     line, previous = [q], None
     for _ in range(count):
@@ -66,7 +66,7 @@ def walk(problem: ConstrainedProblem, q: np.ndarray, step: float, count: int) ->
 def test_no_posture_along_the_null_space_is_better(
     robot: str, normal: tuple[float, float, float], more: dict
 ) -> None:
-    """With one degree of freedom left, brute force sees everything that is connected to the optimum."""
+    """With one degree of freedom left, brute force covers all postures connected to the optimum."""
     problem = problem_of(robot, normal, **more)
     solution = solve(problem, starts=6, jobs=1)
     assert solution.redundancy == 1
@@ -133,7 +133,7 @@ def test_certificate_refuses_postures_that_are_not_optimal() -> None:
 
 
 def test_certificate_refuses_a_multiplier_of_the_wrong_sign() -> None:
-    """On a limit that the objective pushes away from, the posture is no optimum."""
+    """A limit that the objective pulls away from does not make the posture an optimum."""
     problem = problem_of("tilthex_arm")
     scale = problem.objective.value(problem.given)
     line = walk(problem, problem.given, 0.02, 400), walk(problem, problem.given, -0.02, 400)
@@ -147,7 +147,7 @@ def test_multipliers_and_null_spaces_agree_with_scipy() -> None:
         rows, columns = rng.integers(1, 20, 2)
         matrix, right = rng.normal(size=(rows, columns)), rng.normal(size=rows)
         if case % 3 == 0 and columns > 1:
-            # Repeated columns have many solutions, all with the same residual.
+            # With repeated columns there are many solutions, all with the same residual.
             matrix[:, 1] = matrix[:, 0]
         x, (_, least) = nonnegative_least_squares(matrix, right), scipy.optimize.nnls(matrix, right)
         assert x.min() >= 0
@@ -179,7 +179,7 @@ def test_infeasible_names_the_conflicting_constraint() -> None:
     with pytest.raises(Infeasible, match="pose of panda_hand_tcp") as caught:
         solve(problem, starts=4, jobs=1)
     assert caught.value.exit_code == 3
-    # The reach of the arm is 0.855 m from the shoulder: more than a meter is missing.
+    # The arm reaches 0.855 m from the shoulder, so more than a meter is missing.
     assert sum(caught.value.conflicts.values()) > 0.9
 
 
@@ -309,7 +309,7 @@ def test_settings_know_their_defaults() -> None:
 
 @pytest.mark.parametrize("more", [{"target_position": (0.4, 0.2, 0.4), "contact_pose": "full"}, {}])
 def test_singular_start_drops_no_equation(more: dict) -> None:
-    """A straight UR5 has dependent rows at its own posture only: everywhere else all of them count."""
+    """The rows of a straight UR5 are dependent only at this posture.  All rows are needed at other postures."""
     problem = problem_of("ur5", posture="neutral", **more)
     assert all(len(problem.carried(i)) == len(c.lifted_bounds[0]) for i, c in enumerate(problem.constraints))
     solution = solve(problem, starts=6, jobs=1)
@@ -317,7 +317,7 @@ def test_singular_start_drops_no_equation(more: dict) -> None:
 
 
 def test_turns_that_change_nothing_are_fixed() -> None:
-    """The whole robot may turn about n without changing anything; with an offset the held point is not the pivot."""
+    """Rotating the whole robot about n changes nothing.  With an offset, the held point is not the pivot."""
     offset = problem_of("tilthex_arm", contact_pose="position", offset=(0.05, 0, 0))
     assert "base yaw" in [c.name for c in offset.constraints]
     sideways = problem_of("hextilt", (1, 0, 0), base="free", contact_pose="free")
@@ -328,7 +328,7 @@ def test_turns_that_change_nothing_are_fixed() -> None:
 
 
 def test_impact_that_moves_nothing_is_refused() -> None:
-    """Both hinges of the pendulum turn about x."""
+    """Both hinges of the pendulum rotate about x."""
     for objective in ("impulse", "speed"):
         problem = problem_of(PENDULUM, (1, 0, 0), frame="link2", contact_pose="free", objective=objective)
         with pytest.raises(InputError, match="cannot move along the normal"):

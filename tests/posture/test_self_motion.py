@@ -1,4 +1,4 @@
-"""Self-motion manifolds of planar arms, whose topology is known, and of robots of the catalogue."""
+"""Self-motion manifolds of planar arms with known topology, and of catalogue robots."""
 
 from __future__ import annotations
 
@@ -28,7 +28,7 @@ Vector = NDArray[np.float64]
 
 
 def planar(rods: list[float], joints: list[float]) -> ConstrainedProblem:
-    """Hinges about y in a row that hold the position of the tip."""
+    """Return a problem with hinges about y in series that hold the position of the tip."""
     robot = arm([Y] * len(rods), joints, floating=False, rods=[(0, 0, -rod) for rod in rods])
     objective = ip.ImpactObjective(robot, ip.ImpactContact(TIP, (0.3, 0, 1)))
     return ip.PostureProblem(objective, contact_pose="position").problem
@@ -55,7 +55,7 @@ def reach(rods: list[float], joints: list[float]) -> float:
 
 
 def scan(problem: ConstrainedProblem, rods: list[float], count: int) -> Vector:
-    """The objective of a planar arm by brute force: angles of the first hinges on a grid, the last two solved."""
+    """Return the objective of a planar arm by brute force: first hinges on a grid, last two hinges solved."""
     model, q = problem.robot.model, problem.given
     tip = model.getFrameId(TIP)
     data = model.createData()
@@ -65,7 +65,7 @@ def scan(problem: ConstrainedProblem, rods: list[float], count: int) -> Vector:
     values = []
     for first in np.stack(np.meshgrid(*[grid] * (len(rods) - 2)), axis=-1).reshape(-1, len(rods) - 2):
         angles = np.cumsum(first)
-        # Rods hang straight down at zero, and turn about y: (−sin, −cos).
+        # At zero angle, a rod hangs straight down.  After a rotation about y, its direction is (−sin, −cos).
         elbow = -np.array([np.sin(angles), np.cos(angles)]) @ rods[: len(first)]
         gap = target - elbow
         length = np.hypot(*gap)
@@ -88,7 +88,7 @@ ANGLES = st.floats(-2.5, 2.5)
 @settings(max_examples=12, deadline=None)
 @given(st.lists(LENGTHS, min_size=3, max_size=3), st.lists(ANGLES, min_size=3, max_size=3))
 def test_a_planar_arm_of_three_hinges_has_the_components_of_its_four_bar_linkage(rods, joints):
-    # Grashof: a four-bar linkage has two components if its shortest and longest bars are shorter than the others.
+    # Grashof: a four-bar linkage has two components if shortest plus longest bar is below the sum of the other two.
     bars = np.sort([*rods, reach(rods, joints)])
     margin = bars[1] + bars[2] - bars[0] - bars[3]
     if abs(margin) < 0.02 or bars[0] < 0.02 or bars[3] > bars[:3].sum() - 0.02:
@@ -101,7 +101,7 @@ def test_a_planar_arm_of_three_hinges_has_the_components_of_its_four_bar_linkage
     truth = scan(problem, rods, 2000).min()
     assert bound.finished and bound.gap <= 0.005 + 1e-9
     assert bound.lower <= truth * (1 + 1e-9)
-    # The best is that of a posture, so the scan may miss it and it cannot be too low.
+    # `bound.best` belongs to a posture, so it is not below the optimum.  The scan may miss this posture.
     assert bound.best <= truth * 1.0051
     at = motion.manifold.project(bound.x[None])
     assert at.converged[0]
@@ -135,7 +135,7 @@ def test_three_position_joints_on_a_base_that_flies_are_followed_from_limit_to_l
     numeric = Numeric(manifold.problem.robot.model)
     for x in component.x[::10]:
         assert max(np.abs(v).max() for v in manifold.problem.violations(numeric.at(manifold.to_q(x)))) < 1e-8
-    # Path length is that of Pinocchio's tangent space.
+    # Path length is measured in the tangent space of Pinocchio.
     steps = [
         np.linalg.norm(pin.difference(manifold.problem.robot.model, manifold.to_q(a), manifold.to_q(b)))
         for a, b in zip(component.x[:-1], component.x[1:], strict=True)
@@ -172,7 +172,7 @@ def test_a_batch_has_the_numbers_of_pinocchio(robot):
         assert values[k] == pytest.approx(problem.objective.value(posture), rel=1e-9)
         gradient = problem.objective.gradient(posture)
         np.testing.assert_allclose(gradients[k], gradient, atol=1e-8 * np.abs(gradient).max())
-        # Both Jacobians leave the same motions.
+        # Both Jacobians have the same null space.
         own = manifold.equalities(one[None])[1][0]
         theirs = equality_jacobian(problem, numeric.at(posture))
         free = np.linalg.svd(theirs)[2][np.linalg.matrix_rank(theirs, tol=1e-7) :]
@@ -192,7 +192,7 @@ def test_points_of_the_embedding_are_as_far_apart_as_the_postures():
 
 
 class WithoutExpression(WithinDistance):
-    """A constraint that has no expression in q alone, as one with auxiliaries."""
+    """A constraint without an expression in q alone, like constraints with auxiliary variables."""
 
     projected = False
 

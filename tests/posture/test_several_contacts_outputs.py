@@ -1,4 +1,4 @@
-"""Several contacts at once as a user gets them: exported, commanded."""
+"""Several contacts at once in the C export and on the command line."""
 
 from __future__ import annotations
 
@@ -33,7 +33,7 @@ from tests.support.tools import need, need_compiler
 )
 def test_exported_hands(tmp_path: Path, name: str, hands: tuple[str, str], real: Real) -> None:
     need_compiler()
-    # Legs and torso are made rigid: half the code to compile, and every hand is where it was.
+    # Legs and torso are locked: this halves the code to compile, and the hands do not move.
     legs = tuple(joint for joint in robot(name).joint_names if joint.startswith(("leg", "head", "gripper", "torso")))
     found = load_robot(name, LoadOptions(lock=legs))
     right, left = (ImpactContact(frame, (-1.0, 0.1, 0.0), impulse=i) for frame, i in zip(hands, (1, 3), strict=True))
@@ -49,7 +49,7 @@ def test_exported_hands(tmp_path: Path, name: str, hands: tuple[str, str], real:
         value, gradient = both.objective(q)
         assert_close(value, objective.value(q), tolerance, "value")
         assert_close(gradient, objective.gradient(q), tolerance, "gradient", scale=value)
-        # Whichever frame is asked about, the problem's own objective is that of both.
+        # For either frame, the problem's objective covers both contacts.
         assert alone.objective(q)[0] == value
         single = objective.singles[1]
         H, _ = alone.value_and_gradient(q, single.contact.normal)

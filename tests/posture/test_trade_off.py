@@ -1,4 +1,4 @@
-"""The trade-off of objective against distance: against brute force, its certificates, what it must not hide."""
+"""The trade-off of objective against distance: against brute force, its certificates, and its warnings."""
 
 from __future__ import annotations
 
@@ -49,19 +49,19 @@ def solved(case: str) -> tuple[PostureSolution, TradeOff]:
 
 
 def moved(problem: ConstrainedProblem, q: np.ndarray, start: np.ndarray) -> float:
-    """The distance, written down anew; a joint that q holds as a cosine and a sine counts the chord."""
+    """Return the distance by an independent formula.  For a joint given by cosine and sine, it is the chord."""
     step = np.array(q[-(problem.robot.nq - 7) :] - start[7:] if problem.robot.floating else q - start)
     base = 0.0
     if problem.robot.floating:
         turn = np.linalg.norm(pin.Quaternion(q[3:7]).matrix() - pin.Quaternion(start[3:7]).matrix()) ** 2
-        # |R − R'|² = 4 (1 − cos Δ) for a turn by Δ, and 4 sin²(Δ/2) = 2 (1 − cos Δ).
+        # A rotation by Δ satisfies |R − R'|² = 4 (1 − cos Δ) and 4 sin²(Δ/2) = 2 (1 − cos Δ).
         base = float(np.sum((q[:3] - start[:3]) ** 2) + turn / 2)
     return float(np.sqrt(step @ step + base))
 
 
 @pytest.mark.parametrize("case", ["fixed", "floating"])
 def test_a_solve_goes_on_from_the_end_of_the_one_before(case: str, monkeypatch: pytest.MonkeyPatch) -> None:
-    """Without its multipliers the curve is the same and takes more iterations."""
+    """Without the multipliers of the previous solve, the curve is the same but needs more iterations."""
     iterations: list[int] = []
     curves: list[list[float]] = []
     solution = solve(prepare(make_settings(CASES[case])).problem, starts=4, jobs=1)
@@ -89,7 +89,7 @@ def test_a_solve_goes_on_from_the_end_of_the_one_before(case: str, monkeypatch: 
 
 @cache
 def all_joints() -> pin.Model:
-    """Return a chain of all joint types that the URDF parser of Pinocchio makes, and two more."""
+    """Return a chain of all joint types of Pinocchio's URDF parser, and two more types."""
     model, parent = pin.Model(), 0
     kinds = [pin.JointModelFreeFlyer(), pin.JointModelRUBX(), pin.JointModelRX(), pin.JointModelPlanar()]
     kinds += [pin.JointModelPZ(), pin.JointModelSpherical(), pin.JointModelTranslation()]
@@ -106,7 +106,7 @@ def test_distance_is_the_tangent_norm_of_small_moves_and_has_the_right_gradient(
     q, p = (np.array(pin.integrate(model, pin.neutral(model), generator.normal(size=model.nv))) for _ in range(2))
     near = np.array(pin.integrate(model, q, 1e-3 * generator.normal(size=model.nv)))
     assert distance(chart, near, q) == pytest.approx(np.linalg.norm(pin.difference(model, q, near)), rel=1e-5)
-    # Either sign of a quaternion is the same posture.
+    # A quaternion and its negative describe the same posture.
     assert distance(chart, q, q) == pytest.approx(0, abs=1e-7)
     other = q.copy()
     other[3:7] *= -1
@@ -155,7 +155,7 @@ def test_every_point_is_certified_and_has_the_stated_values(case: str) -> None:
 
 @pytest.mark.parametrize("case", ["floating", "cone"])
 def test_no_posture_of_a_null_space_of_one_dimension_is_better(case: str) -> None:
-    """Brute force sees every posture that is connected to the initial one."""
+    """Brute force covers every posture connected to the initial posture."""
     solution, curve = solved(case)
     problem, start = solution.problem, solution.initial
     assert solution.redundancy == 1
@@ -166,7 +166,8 @@ def test_no_posture_of_a_null_space_of_one_dimension_is_better(case: str) -> Non
     for point in curve.points:
         best = values[away <= point.within].min()
         assert point.objective <= best * (1 + 1e-9)
-        # Nor too good to be true: the walk may miss 0.01 of the last stretch, and the bottom by half of that.
+        # The curve is not too good either: the walk may overshoot by 0.01 in distance, and its minimum by half of
+        # that.
         assert point.objective >= values[away <= point.within + 0.011].min() - 1e-5 * values.max()
 
 
@@ -177,7 +178,7 @@ def test_no_feasible_neighbor_within_the_distance_is_better() -> None:
     compared = 0
     for point in curve.points[1:-1]:
         for _ in range(12):
-            # Half of them inward: a random step from a ball's edge mostly leaves it.
+            # Half of the steps point inward, because a random step from the edge of a ball mostly leaves the ball.
             inward = 0.03 * pin.difference(model, point.q, solution.initial)
             step = generator.normal(size=model.nv) * 0.01 + generator.integers(2) * inward
             there = projector.project(pin.integrate(model, point.q, step), tolerance=1e-12)
@@ -188,7 +189,7 @@ def test_no_feasible_neighbor_within_the_distance_is_better() -> None:
 
 
 def test_parts_that_are_not_convex_are_there() -> None:
-    """A penalty on the distance would jump over them: no straight line supports the curve there."""
+    """A penalty on the distance would skip these points, because the curve is not convex there."""
     _, curve = solved("fixed")
     y = np.array([p.objective for p in curve.points])
     bulge = y[1:-1] - (y[:-2] + y[2:]) / 2
@@ -197,7 +198,7 @@ def test_parts_that_are_not_convex_are_there() -> None:
 
 
 def test_separate_postures_make_steps() -> None:
-    """With no redundancy left the robot has a handful of postures: between them more distance buys nothing."""
+    """Without redundancy, the robot has only a few postures: between them, more distance does not help."""
     solution, curve = solved("separate")
     assert solution.redundancy == 0
     idle = [p for p in curve.points if p.distance < 0.9 * p.within]
@@ -257,7 +258,7 @@ def test_points_that_do_not_certify_are_kept_and_named(monkeypatch: pytest.Monke
 
 
 def test_a_better_posture_than_the_optimum_is_said() -> None:
-    """As if the starts had ended at a worse posture, beyond the optimum."""
+    """Replace the optimum by a worse posture beyond it, as if the starts had ended there."""
     solution, curve = solved("floating")
     beyond = next(
         q for q in walk(solution.problem, solution.q, 0.02, 40) + walk(solution.problem, solution.q, -0.02, 40)
@@ -266,7 +267,7 @@ def test_a_better_posture_than_the_optimum_is_said() -> None:
     longer = pareto_front(replace(solution, q=beyond), 6)
     assert any("found a better posture" in note for note in longer.notes)
     assert min(p.objective for p in longer.points) == pytest.approx(curve.points[-1].objective, rel=1e-6)
-    # Within more distance than the optimum needs, the optimum is the best posture.
+    # If the permitted distance exceeds the distance of the optimum, the optimum is the best posture.
     assert longer.points[-1].distance < longer.points[-1].within - 0.1
 
 

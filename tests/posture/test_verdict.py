@@ -1,4 +1,4 @@
-"""The verdict on a posture: the predicted jumps in words, what would do better, and the objective ``auto``."""
+"""The verdict on a posture: predicted jumps in words, better settings, and the objective ``auto``."""
 
 from __future__ import annotations
 
@@ -83,7 +83,7 @@ def test_advice_names_the_joint_model_that_fits() -> None:
 
 
 def test_the_hand_of_talos_gets_worse_unless_the_jump_is_minimized() -> None:
-    """The objective of the paper falls, but the jump at a given speed does not."""
+    """The objective of the paper decreases, but the jump at a given speed does not."""
     settings = make_settings({"robot": "talos", "normal": (-1.0, 0.0, 0.0), "frame": "gripper_right_base_link"})
     for kind, outcome in (("impulse", "worse"), ("coulomb", "better")):
         prepared = prepare(replace(settings, objective=kind))
@@ -117,7 +117,7 @@ def test_several_contacts_come_at_once() -> None:
     assert ", all contacts at once, the jump stays" in line
     assert "the impulse at gripper_right_base_link stays" in line
     assert known.together is not None and known.coulomb is not None
-    # If the jump of all is unknown at one posture, the first contact alone is compared, and the line tells it.
+    # If the combined jump is unknown at one posture, only the first contact is compared, and the line says so.
     unknown = replace(known, together=None)
     pulls = resolve(make_settings(task | {"bilateral": True}))
     for told in (verdict(impact, known, unknown), verdict(impact, unknown, known), verdict(pulls, unknown, unknown)):
@@ -153,7 +153,7 @@ def test_the_command_prints_the_verdict_first(tmp_path: Path) -> None:
         ("impulse", {"friction": 0.0}, "coulomb"),
         ("impulse", {"normal_cone": 5.0}, "sticking"),
         ("impulse", {"normal_cone": 5.0, "friction": 0.0}, None),
-        # What minimizes the very jump of the verdict is not blamed for it.
+        # The verdict does not blame an objective that minimizes the compared jump.
         ("speed", {"friction": 0.0}, None),
         ("sticking", {"friction": 5.0}, None),
         ("sticking", {"friction": 0.0}, "coulomb"),
@@ -164,7 +164,7 @@ def test_another_objective_is_advised_only_if_it_minimizes_the_jump(
 ) -> None:
     prepared = prepare(make_settings({"robot": "panda", **NORMAL, "objective": kind, **more}))
     evaluation = prepared.impact.evaluate()
-    # The given posture is no better than itself.
+    # The given posture cannot be better than itself.
     told = verdict(prepared.impact, evaluation, evaluation)
     assert told.outcome == "no better"
     advised = [line for line in told.advice if "minimizes this jump" in line]

@@ -1,4 +1,4 @@
-"""A run of the solver that goes on from the end of one with another target."""
+"""Runs of the solver that start from the end of a run with another target."""
 
 from __future__ import annotations
 
@@ -31,7 +31,7 @@ Solved = tuple[PostureNLP, SolveRecord, float]
 
 @pytest.fixture(scope="module", params=CASES)
 def solved(request: pytest.FixtureRequest) -> Solved:
-    """The program of a solved problem, with all parts that its optimum needs, and the run from that optimum."""
+    """Return the program of a solved problem, grown for its optimum, and the run that starts from this optimum."""
     settings = ProblemSettings(**{"robot": request.param, **CASES[request.param]})
     solution = solve(prepare(settings).problem, starts=2, jobs=1, finish_all=True)
     scale = solution.problem.objective.value(solution.q)
@@ -40,7 +40,7 @@ def solved(request: pytest.FixtureRequest) -> Solved:
 
 
 def moved(problem: ConstrainedProblem, step: float) -> ConstrainedProblem:
-    """The problem with its target moved along y."""
+    """Return the problem with its target moved along y."""
     numeric = Numeric(problem.robot.model).at(problem.given)
     home = numeric.placement(point_on(problem.robot, problem.impact.contact.frame)).translation
     return retarget(problem, (home[0], home[1] + step, home[2]), None)
@@ -49,13 +49,13 @@ def moved(problem: ConstrainedProblem, step: float) -> ConstrainedProblem:
 def test_it_ends_where_a_cold_run_does_with_fewer_iterations(solved: Solved) -> None:
     nlp, home, scale = solved
     there = nlp.at(moved(nlp.problem, 0.003))
-    # The multipliers belong to a scale, so another scale is no other end.
+    # The multipliers depend on the scale of the objective, but a warm start works for any scale.
     for factor in (1.0, 2.0):
         cold = there.solve(home.q, scale=factor * scale)
         warm = there.solve(home.q, scale=factor * scale, warm=home.end)
         assert cold.converged and warm.converged
         assert warm.iterations < 0.8 * cold.iterations
-        # A cold run moves off the bounds first, and may come back to a neighboring, worse optimum.
+        # A cold run first moves away from the bounds, and may return to a neighboring, worse optimum.
         assert (1 - 1e-3) * cold.minimized < warm.minimized < (1 + 1e-6) * cold.minimized
         assert certify(there.problem, warm.q, factor * scale, warm.auxiliaries).holds()
 

@@ -1,4 +1,4 @@
-"""Arms for tests, on a fixed base or below the hexarotor of ``tilthex_arm``."""
+"""Arms for tests, on a fixed base or mounted below the hexarotor of ``tilthex_arm``."""
 
 from __future__ import annotations
 
@@ -27,11 +27,11 @@ def arm(
     """Build a serial arm of hinges with frames ``link_0``, ``link_1``, …, and ``tip`` on the last link.
 
     Args:
-        axes: Axis of each hinge in the frame of the body before it.
+        axes: Axis of each hinge in the frame of the preceding body.
         joints: Angles of the default posture.
-        floating: Whether the arm hangs below the hexarotor of ``tilthex_arm``, or is hinged to the world.
+        floating: If true, the arm is mounted below the hexarotor of ``tilthex_arm``; else its base is fixed.
         rods: Vector from each hinge to the next, and from the last hinge to the tip, m; by default 0.3 m down.
-        effort: Torque limit of the motors, N·m; zero for no limit.
+        effort: Torque limit of the motors, N·m; zero if the motors have no limit.
     """
     rods = [(0, 0, -0.3)] * len(axes) if rods is None else rods
     hexarotor, model, parent, start = robot("tilthex_arm"), pin.Model(), 0, np.zeros(3)
@@ -66,6 +66,6 @@ def yaw_and_pitches() -> Robot:
 
 
 def seven_joints() -> Robot:
-    """Build seven hinges between rods of 0.15 m and 0.2 kg on a fixed base, bent."""
+    """Build a bent arm on a fixed base: seven hinges, connected by rods of 0.15 m and 0.2 kg."""
     bent = [0.3, -0.7, 0.5, 1.1, -0.4, 0.8, 0.2]
     return arm([Z, Y, Z, Y, Z, Y, X], bent, floating=False, rods=[(0.02, 0.01, -0.15)] * 7)

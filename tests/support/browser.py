@@ -1,4 +1,4 @@
-"""A headless Chromium without a network, controlled through a pipe (Chrome DevTools Protocol)."""
+"""A headless Chromium without network access, controlled through a pipe (Chrome DevTools Protocol)."""
 
 from __future__ import annotations
 
@@ -25,7 +25,7 @@ SIZE = (640, 480)
 
 
 class Tab:
-    """A tab; ``events`` holds the reports of the browser about it."""
+    """Tab of the browser; ``events`` lists the browser's reports about the tab."""
 
     def __init__(self, write: int, read: int) -> None:
         self.write, self.read, self.count, self.session, self.said = write, read, itertools.count(1), "", b""
@@ -67,7 +67,7 @@ class Tab:
         self.send("Emulation.setDeviceMetricsOverride", width=width, height=height, deviceScaleFactor=1, mobile=False)
 
     def open(self, page: Path, ready: str | None = "drawn") -> None:
-        """Load a page and wait until it says that it is ready."""
+        """Load a page and wait until the page reports that it is ready."""
         self.events.clear()
         self.send("Page.navigate", url=page.as_uri())
         for _ in range(600):
@@ -78,7 +78,7 @@ class Tab:
         pytest.fail(f"{page} is not '{ready}' after 30 s: {self.complaints()}")
 
     def picture(self, selector: str) -> np.ndarray:
-        """Return the pixels of an element as they are on the screen, shape (height, width, 3)."""
+        """Return the pixels of an element as displayed, shape (height, width, 3)."""
         self.evaluate("new Promise((done) => requestAnimationFrame(() => requestAnimationFrame(done)))")
         box = self.evaluate(
             f"(({{x, y, width, height}}) => ({{x: x + scrollX, y: y + scrollY, width, height, scale: 1}}))"
@@ -88,7 +88,7 @@ class Tab:
         return np.asarray(PIL.Image.open(io.BytesIO(base64.b64decode(data))).convert("RGB"), dtype=int)
 
     def complaints(self) -> list[str]:
-        """Return errors of scripts, refusals of the security policy, and requests that left the page."""
+        """Return script errors, violations of the security policy, and requests to addresses outside the page."""
         complaints = []
         for event in self.events:
             kind, about = event.get("method"), event.get("params", {})
@@ -103,7 +103,7 @@ class Tab:
 
 @contextmanager
 def browser(folder: Path) -> Iterator[Tab]:
-    """Start Chromium with its profile in a folder; skip the test without a browser."""
+    """Start Chromium with a separate profile folder; skip the test if no browser is installed."""
     program = next((path for name in NAMES if (path := shutil.which(name))), None)
     if program is None:
         pytest.skip(f"no browser is installed ({', '.join(NAMES)})")
@@ -114,7 +114,7 @@ def browser(folder: Path) -> Iterator[Tab]:
     (theirs_in, ours_out), (ours_in, theirs_out) = os.pipe(), os.pipe()
 
     def channels() -> None:
-        # The protocol is read from descriptor 3 and written to 4.
+        # Chromium reads the protocol from file descriptor 3 and writes it to 4.
         read, write = os.dup(theirs_in), os.dup(theirs_out)
         os.dup2(read, 3)
         os.dup2(write, 4)

@@ -1,4 +1,4 @@
-"""Run the command line in a fork of the test process, which need not import everything again."""
+"""Run the command line in a fork of the test process, so that modules need not be imported again."""
 
 from __future__ import annotations
 
@@ -26,7 +26,7 @@ import rich.table
 import typer.rich_utils
 from matplotlib.figure import Figure
 
-# Modules that the commands import when they run, imported once here.
+# The commands import these modules when they run.  Import the modules once here.
 import impact_posture.codegen.export
 import impact_posture.experiment.experiment_folders
 import impact_posture.experiment.jobs
@@ -48,17 +48,17 @@ from impact_posture_cli.app import COMMANDS, app, load
 with contextlib.suppress(ImportError):
     import mujoco  # noqa: F401
 
-# These libraries read or build data once in a process.
+# These libraries read or build their data only once per process.
 PIL.Image.preinit()
 rich.cells.cell_len("×")
 PARSER = typer.main.get_command(app)
 for name in COMMANDS:
     load(name)
 
-# The figures of a result.
+# Names of all figures of a result.
 ALL_PICTURES = tuple(impact_posture.output.plot.FIGURES)
 
-# The program that the installation puts on the path.
+# Entry point of the installed program ``impact-posture``.
 (MAIN,) = (entry.load() for entry in entry_points(group="console_scripts", name="impact-posture"))
 
 
@@ -70,10 +70,10 @@ def run(
     timeout: float = 600,
     pictures: Collection[str] = (),
 ) -> subprocess.CompletedProcess[str]:
-    """Run ``impact-posture`` with arguments, as its entry point does; ``env`` is added to the environment.
+    """Run ``impact-posture`` with arguments, as its entry point does; ``env`` extends the environment variables.
 
-    All figures except the named ``pictures`` are blank, because drawing takes most of the time of a small robot.
-    The timeout ends commands that hang.  It does not bound how long a command may take.
+    Only the figures named in ``pictures`` are drawn; all others are blank.  Drawing takes most of the time for a
+    small robot.  The timeout only ends commands that hang.  It does not test the duration of a command.
     """
     with tempfile.TemporaryFile() as out, tempfile.TemporaryFile() as errors:
         child = start(arguments, out.fileno(), errors.fileno(), cwd, env, prepare, pictures)
@@ -89,7 +89,7 @@ def run(
 
 
 def refused(done: subprocess.CompletedProcess[str], code: int, *words: str) -> None:
-    """Check that a command failed with this code and one error line, without a traceback."""
+    """Check that a command failed with this exit code and one error line, without a traceback."""
     assert done.returncode == code, (done.returncode, done.stdout, done.stderr)
     lines = [line for line in done.stderr.splitlines() if line.startswith("error:")]
     assert len(lines) == 1, done.stderr
@@ -99,7 +99,7 @@ def refused(done: subprocess.CompletedProcess[str], code: int, *words: str) -> N
 
 
 def on_terminal(*arguments: object, cwd: Path) -> str:
-    """Run with standard error on a terminal, and return the text on it."""
+    """Run a command whose standard error is a terminal, and return the text on the terminal."""
     ours, theirs = os.openpty()
     with tempfile.TemporaryFile() as out:
         child = start(arguments, out.fileno(), theirs, cwd, {"TERM": "xterm"})
@@ -111,7 +111,7 @@ def on_terminal(*arguments: object, cwd: Path) -> str:
 
 
 def read_terminal(ours: int) -> str:
-    """Read a terminal until no process has it open, then close ``ours``."""
+    """Read a terminal until every process has closed it, then close the descriptor ``ours``."""
     said = b""
     with contextlib.suppress(OSError):
         while part := os.read(ours, 65536):
@@ -129,7 +129,7 @@ def start(
     prepare: Callable[[], None] | None = None,
     pictures: Collection[str] = (),
 ) -> BaseProcess:
-    """Start a command for :func:`run`, with standard output and error on these descriptors."""
+    """Start a command for :func:`run`, with standard output and standard error on these descriptors."""
     words = [str(argument) for argument in arguments]
     variables = {"COLUMNS": "80", "NO_COLOR": "1", "BROWSER": "true", **(env or {})}
     target = words, cwd, variables, prepare, out, errors, pictures
@@ -147,8 +147,8 @@ def _command(
     errors: int,
     pictures: Collection[str],
 ) -> None:
-    """Run the command with streams, folder, signals and warnings of a new program."""
-    # Without this, the garbage collector would touch and so copy the memory of the test.
+    """Run the command with the streams, folder, signal handlers and warnings that a new program would have."""
+    # Without `gc.freeze`, the garbage collector would write to the memory shared with the test, and so copy it.
     gc.freeze()
     # A new program starts without cached controllers.
     impact_posture.experiment.jobs.controller_factory.cache_clear()
@@ -164,11 +164,11 @@ def _command(
         warnings.simplefilter("ignore", category)
     impact_posture.output.plot.FIGURES.update(dict.fromkeys(set(ALL_PICTURES) - set(pictures), blank))
     if not pictures:
-        # Runs keep their snapshots, as blank figures.
+        # Simulated runs still write their snapshots, as blank figures.
         figures = impact_posture.experiment.experiment_folders
         figures.figures_of_run = figures.figures_of_comparison = lambda views: {"snapshots": blank(views)}
         if words[0] != "report":
-            # Only tests of reports write the page.
+            # Only tests of the report need ``report.html``.
             impact_posture.output.report.result_report.write_result_report = lambda *arguments, **options: None
             impact_posture.output.report.result_report.result_scene = lambda *arguments: None
             impact_posture.experiment.experiment_folders.try_report = lambda *arguments, **options: ""

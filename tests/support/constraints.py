@@ -1,4 +1,4 @@
-"""Compare the two forms of a constraint, CasADi's and Pinocchio's, and its Jacobians with finite differences."""
+"""Compare the CasADi and Pinocchio forms of a constraint, and their Jacobians with finite differences."""
 
 from __future__ import annotations
 
@@ -18,7 +18,10 @@ from tests.support.helpers import Vector, assert_close, central_gradient, rng
 def check_expression(
     constraint: ExpressionConstraint, model: pin.Model, postures: Iterable[Vector], turns: slice = slice(0)
 ) -> None:
-    """Check value and Jacobian of ``c(q)``; rows in ``turns`` may change their signs together, as quaternions do."""
+    """Check value and Jacobian of ``c(q)``.
+
+    All rows in ``turns`` may change sign together, because quaternions may.
+    """
     chart, numeric = Chart(model), Numeric(model)
     x, p = ca.SX.sym("x", chart.nx), ca.SX.sym("p", constraint.parameters.size)
     symbolic = ca.Function("c", [x, p], [constraint.symbolic(Tree(model, chart.configuration(x), x), p)])
@@ -33,7 +36,7 @@ def check_expression(
 
 
 def check_lifted_rows(constraint: Constraint, model: pin.Model, q: Vector, z: Vector) -> None:
-    """Check lifted rows at a posture and auxiliaries: values, bounds, and both Jacobians of the linearization."""
+    """Check lifted rows at a posture and its auxiliary variables: values, bounds, and both Jacobians."""
     chart, numeric = Chart(model), Numeric(model)
     x, p = ca.SX.sym("x", chart.nx), ca.SX.sym("p", constraint.parameters.size)
     lifted = constraint.lift(Tree(model, chart.configuration(x), x), p)

@@ -1,6 +1,7 @@
-"""Measure branch coverage of both packages by the whole suite, and write the page.
+"""Measure the branch coverage of both packages by the whole test suite, and write the coverage page.
 
-Run it as ``python -m tests.support.coverage_report`` (``make coverage``); it takes about twice as long as the suite.
+Run this module as ``python -m tests.support.coverage_report`` (``make coverage``).  The measurement takes about twice
+as long as the suite.
 """
 
 from __future__ import annotations
@@ -16,7 +17,7 @@ from pathlib import Path
 ROOT = Path(__file__).parents[2]
 PAGE = ROOT / "docs" / "generated" / "coverage.md"
 LEAST = 90.0
-# Reasons for files below.
+# Why the coverage of these files may be below `LEAST`.
 REASONS = {
     "cli/commands/reproduce.py": "the page for people: tests ask for JSON",
     "impact_posture/posture/program/posture_nlp.py": "what Ctrl-C does while IPOPT runs in the main process",
@@ -25,7 +26,7 @@ REASONS = {
 
 
 def measured(arguments: list[str]) -> dict[str, dict[str, int]]:
-    """Run the suite; return statements and branches of each file, in all and reached."""
+    """Run the suite.  Return for each file how many statements and branches exist, and how many were executed."""
     with tempfile.TemporaryDirectory() as folder:
         environment = {**os.environ, "COVERAGE_FILE": str(Path(folder) / "data")}
 
@@ -42,14 +43,14 @@ def measured(arguments: list[str]) -> dict[str, dict[str, int]]:
 
 
 def share(files: list[dict[str, int]]) -> float:
-    """Return the share of statements and branches that were reached, in percent."""
+    """Return the percentage of statements and branches that were executed."""
     reached = sum(f["covered_lines"] + f["covered_branches"] for f in files)
     every = sum(f["num_statements"] + f["num_branches"] for f in files)
     return 100.0 * reached / every if every else 100.0
 
 
 def markdown(files: dict[str, dict[str, int]]) -> str:
-    """Write a table by folder, and the files below :data:`LEAST` with the reason."""
+    """Write a table by folder, and list the files below :data:`LEAST` with the reason."""
     folders = defaultdict(list)
     for name, summary in files.items():
         folders[str(Path(name).parent)].append(summary)

@@ -1,4 +1,4 @@
-"""The sources of DAQP for tests."""
+"""Sources of DAQP for tests."""
 
 from __future__ import annotations
 
@@ -12,7 +12,7 @@ from impact_posture.errors import InputError
 
 
 def sources_or_skip() -> dict[str, bytes]:
-    """Return the sources in ``$DAQP_SOURCES`` or from pip; skip the test without sources."""
+    """Return the DAQP sources from ``$DAQP_SOURCES`` or from pip; skip the test if neither has them."""
     folder = os.environ.get("DAQP_SOURCES")
     if folder:
         return daqp_sources(Path(folder))

@@ -1,4 +1,4 @@
-"""The contact-consistent quantities to sixty digits.
+"""Contact-consistent quantities, computed with sixty digits.
 
 The system ``[M, −J_sᵀ; J_s, εI]`` with Pinocchio's doubles for ``M, J, J_s`` is solved in decimal arithmetic, so that
 both this solution and the oracle use exactly the same numbers.
@@ -27,7 +27,7 @@ DIGITS = 60
 
 @contextmanager
 def digits(count: int = DIGITS) -> Iterator[None]:
-    """Use decimal arithmetic with this number of digits."""
+    """Use decimal arithmetic with this number of digits inside the ``with`` block."""
     with decimal.localcontext() as context:
         context.prec = count
         yield
@@ -72,11 +72,11 @@ def solve(matrix: Exact, right: Exact) -> Exact:
 
 @dataclass(frozen=True, eq=False)
 class ExactImpact:
-    """Quantities and gradients at one posture, W = I, with a normal in the world.
+    """Exact quantities and gradients at one posture, for W = I and a normal in the world frame.
 
     Attributes:
         oracle: Oracle at the posture, which gives ``M, J, J_s, n`` and their derivatives as doubles.
-        compliance: ε, 1/kg, which may differ from the oracle's.
+        compliance: Compliance ε of the supports, 1/kg; may differ from the oracle's compliance.
     """
 
     oracle: ImpactOracle
@@ -93,7 +93,7 @@ class ExactImpact:
 
     @cached_property
     def inverse(self) -> Exact:
-        """Inverse ``K⁻¹``, whose first nv rows and columns are ``M̃⁻¹``."""
+        """Inverse ``K⁻¹``; its first nv rows and columns are ``M̃⁻¹``."""
         return solve(self.K, exact(np.eye(len(self.K))))
 
     @property
@@ -101,7 +101,7 @@ class ExactImpact:
         return len(self.oracle.M)
 
     def answer(self, tau: Exact) -> tuple[Exact, Exact]:
-        """Return ``a`` and ``f`` for ``τ``."""
+        """Return the solutions ``a`` and ``f`` for the right-hand side ``τ``."""
         solution = self.inverse[:, : self.nv] @ tau
         return solution[: self.nv], solution[self.nv :]
 
@@ -125,7 +125,7 @@ class ExactImpact:
 
     @cached_property
     def second(self) -> tuple[Exact, Exact]:
-        """Solutions ``b`` and ``g`` for ``τ = a``."""
+        """Solutions ``b`` and ``g`` for the right-hand side ``τ = a``."""
         return self.answer(self.jump)
 
     @property
@@ -142,7 +142,7 @@ class ExactImpact:
 
     @cached_property
     def K_held(self) -> Exact:
-        """Matrix K with the contact point held too: three more rows ``J a = v`` and columns ``−Jᵀs``."""
+        """Matrix K in which the contact point is also fixed: three more rows ``J a = v`` and columns ``−Jᵀs``."""
         size = len(self.K)
         K = exact(np.zeros((size + 3, size + 3)))
         K[:size, :size], K[: self.nv, size:], K[size:, : self.nv] = self.K, -self.J.T, self.J
@@ -154,7 +154,7 @@ class ExactImpact:
 
     @cached_property
     def sticking(self) -> tuple[Exact, Exact, Exact]:
-        """Sticking impulse ``s``, with its jump and the impulses of the feet."""
+        """Sticking impulse ``s``, the velocity jump that it causes, and the impulses of the feet."""
         return self._held(np.concatenate([exact(np.zeros(len(self.K))), self.n]))
 
     @property
@@ -215,12 +215,12 @@ class ExactImpact:
 
     @cached_property
     def jump_rates(self) -> Exact:
-        """``∂_k a``, column k."""
+        """Derivative ``∂_k a`` in column k."""
         return self._moved(self.jump, self.impulse, np.tensordot(self.n, exact(self.dJ), (0, 0)))
 
     @cached_property
     def second_rates(self) -> Exact:
-        """``∂_k b``, column k."""
+        """Derivative ``∂_k b`` in column k."""
         return self._moved(*self.second, self.jump_rates)
 
 

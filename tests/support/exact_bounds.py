@@ -7,11 +7,11 @@ to sixty digits:
   (theorem 9.4).
 - A Cholesky factorization of ``M̃ = M + J_sᵀJ_s/ε`` solves ``(M̃ + ΔM̃)x = b`` with ``|ΔM̃| ≤ γ_(3n+1) d dᵀ``,
   ``d_i² = M̃_ii`` (theorem 10.4).  A factorization with 1/ε added to the feet, such as the articulated bodies of the
-  kernel, cannot promise more.
+  kernel, cannot guarantee a smaller error.
 
-Each bound is the condition of a quantity with respect to such a change of its matrix.  If a quantity takes several
-solves, the sum of their bounds would be far too large.  Its bound is the change of the exact quantity when its input
-doubles are rounded once more.
+Each bound multiplies the size of such a change of the matrix by the condition number of the quantity.  If a quantity
+needs several solves, the sum of their bounds would be far too large.  Its bound is therefore the change of the exact
+quantity when its input doubles are rounded once more.
 """
 
 from __future__ import annotations
@@ -34,13 +34,13 @@ def gamma(count: int) -> float:
 
 
 def eliminated(matrix: Exact) -> Vector:
-    """Return ``|L||U|`` in the rows of the matrix, which elimination rounds."""
+    """Return the product ``|L||U|`` of the pivoted LU factors, in the row order of the matrix."""
     P, L, U = scipy.linalg.lu(rounded(matrix))
     return np.asarray(P @ np.abs(L) @ np.abs(U))
 
 
 class RoundedOnce(ExactImpact):
-    """Exact impact in which ``|L||U|`` of the system with the held point is rounded once, with signs from a seed."""
+    """Exact impact after a random change by one rounding of ``|L||U|`` in the system with the fixed contact."""
 
     def __init__(self, oracle: ImpactOracle, compliance: float, seed: int) -> None:
         super().__init__(oracle, compliance)
@@ -50,11 +50,11 @@ class RoundedOnce(ExactImpact):
 
 
 class Bounded(ExactImpact):
-    """Exact impact with error bounds of two solution methods."""
+    """Exact impact with error bounds for two solution methods."""
 
     @cached_property
     def share(self) -> float:
-        """Bias ``ε/(σ+ε)`` of the effect of the feet, with the least positive eigenvalue σ of ``J_sM⁻¹J_sᵀ``."""
+        """Bias ``ε/(σ+ε)`` of the effect of the feet; σ is the smallest positive eigenvalue of ``J_sM⁻¹J_sᵀ``."""
         root = np.linalg.cholesky(self.oracle.M)
         held = np.linalg.svd(np.linalg.solve(root, self.oracle.Js.T), compute_uv=False) ** 2
         return float(self.compliance / (held[held > 1e-12 * held[0]][-1] + self.compliance))
@@ -63,31 +63,31 @@ class Bounded(ExactImpact):
 
     @cached_property
     def _backward(self) -> Vector:
-        """``γ_3n |L||U|`` in the rows of K."""
+        """Bound ``γ_3n |L||U|`` on the rounding errors of elimination, in the row order of K."""
         return gamma(3 * len(self.K)) * eliminated(self.K)
 
     @cached_property
     def lost_by_elimination(self) -> Vector:
-        """Largest error of ``a`` and ``f``, entry by entry; the three columns of ``Jᵀ`` are solved and combined."""
+        """Largest error of each entry of ``a`` and ``f``.  The three columns of ``Jᵀ`` are solved and combined."""
         x = np.abs(rounded(self.inverse[:, : self.nv] @ self.J.T))
         return (np.abs(rounded(self.inverse)) @ self._backward @ x + gamma(3) * x) @ np.abs(self.oracle.n)
 
     @cached_property
     def H_by_elimination(self) -> float:
-        """Largest error of ``aᵀa``."""
+        """Largest rounding error of ``aᵀa``."""
         a = np.abs(rounded(self.jump))
         return 2 * float(a @ self.lost_by_elimination[: self.nv]) + gamma(self.nv) * float(self.H)
 
     @cached_property
     def G_by_elimination(self) -> float:
-        """Largest error of ``nᵀJa``."""
+        """Largest rounding error of ``nᵀJa``."""
         along = np.abs(self.oracle.n) @ np.abs(self.oracle.J)
         a = np.abs(rounded(self.jump))
         return float(along @ (self.lost_by_elimination[: self.nv] + gamma(self.nv + 3) * a))
 
     @cached_property
     def gradient_by_elimination(self) -> Vector:
-        """Largest error of ∇H, shape (nv,), to first order."""
+        """Largest first-order error of each entry of ∇H, shape (nv,)."""
         x, (b, g) = np.concatenate([self.jump, self.impulse]), self.second
         y = np.concatenate([b, g])
         inverse, (a, f), (b, g) = np.abs(rounded(self.inverse)), self._split(x), self._split(y)
@@ -106,7 +106,7 @@ class Bounded(ExactImpact):
 
     @cached_property
     def sticking_by_elimination(self) -> tuple[float, float]:
-        """Largest errors of S and of ∇S's entries: ``γ_3n`` is 3n roundings, each as bad as the worst of five."""
+        """Largest errors of S and ∇S: 3n roundings, each as bad as the worst of five random roundings."""
         others = [RoundedOnce(self.oracle, self.compliance, seed) for seed in range(5)]
         roundings = 3 * len(self.K_held)
         moved_S = max(abs(float(o.S - self.S)) for o in others)
@@ -126,23 +126,23 @@ class Bounded(ExactImpact):
 
     @cached_property
     def jump_by_heavy_feet(self) -> Vector:
-        """Largest error ``|M̃⁻¹ΔM̃ a|``, entry by entry, shape (nv,)."""
+        """Largest error ``|M̃⁻¹ΔM̃ a|`` of each entry, shape (nv,)."""
         responses = np.abs(rounded(self.inverse[: self.nv, : self.nv]))
         return np.asarray(gamma(3 * self.nv + 1) * (responses @ self._scale) * self._size(self.jump))
 
     @cached_property
     def H_by_heavy_feet(self) -> float:
-        """Largest error of H: ``2 bᵀΔM̃ a``."""
+        """Largest error of H, ``2 bᵀΔM̃ a``."""
         return float(2 * gamma(3 * self.nv + 1) * self._size(self.jump) * self._size(self.second[0]))
 
     @cached_property
     def G_by_heavy_feet(self) -> float:
-        """Largest error of G: ``aᵀΔM̃ a``."""
+        """Largest error of G, ``aᵀΔM̃ a``."""
         return float(gamma(3 * self.nv + 1) * self._size(self.jump) ** 2)
 
     @cached_property
     def gradient_by_heavy_feet(self) -> Vector:
-        """Largest error of ∇H, shape (nv,): ``2 ∂_k(bᵀΔM̃ a)``, where a unit turn changes ``ΔM̃`` by its own size."""
+        """Largest error of ∇H, ``2 ∂_k(bᵀΔM̃ a)``, shape (nv,).  A unit rotation changes ``ΔM̃`` by its own size."""
         a, b = self._size(self.jump), self._size(self.second[0])
         rates = self._size(self.jump_rates) * b + a * self._size(self.second_rates)
         return np.asarray(2 * gamma(3 * self.nv + 1) * (rates + a * b))

@@ -21,12 +21,12 @@ Vector = NDArray[Any]
 
 @dataclass(frozen=True)
 class Exported:
-    """Functions of one frame.  Results are NaN before a call and copied after it."""
+    """C functions of one frame.  Result buffers are filled with NaN before a call and copied after the call."""
 
     gradient: ImpactGradient
 
     def free(self) -> Exported:
-        """Return the same frame without its supports."""
+        """Return the functions of the same frame without its supports."""
         gradient = self.gradient
         return Exported(ImpactGradient(gradient._library, gradient.manifest, gradient.frame, free=True))
 
@@ -47,7 +47,7 @@ class Exported:
         return code, a, float(G[0]), float(V[0])
 
     def _call(self, name: str, *inputs: Vector) -> tuple[int, tuple[Vector, ...]]:
-        # A copy has separate buffers, so that threads may call at once.
+        # A copy has separate buffers, so that several threads may call the functions at once.
         gradient = self.gradient.copy()
         for result in gradient._functions[name][1]:
             result[:] = np.nan

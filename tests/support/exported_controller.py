@@ -1,4 +1,4 @@
-"""Exported controllers for tests, each built once a run, without optimization to save time."""
+"""Exported controllers for tests.  Each is built once per run, without compiler optimization to save time."""
 
 from __future__ import annotations
 
@@ -42,10 +42,10 @@ def exported(
     """Return the folder of a robot's controller with default gains and a library.
 
     Args:
-        name: The robot.
+        name: Name of the robot.
         objective: Objective whose gradient the posture task follows.
         flags: Flags for the compiler.
-        path: Follow by a reference flow that visits this posture first; empty for none.
+        path: Posture that the reference flow visits first; empty for a controller without a flow.
     """
     sources_or_skip()
     return _exported(name, objective, flags, path)
@@ -69,7 +69,7 @@ def _exported(name: str, objective: WorstCaseObjective | None, flags: str, path:
 
 
 def abuse_program(folder: Path, out: Path) -> Path:
-    """Return a program that abuses the library of a controller (:data:`ABUSE`)."""
+    """Return a program that misuses the controller library (:data:`ABUSE`)."""
     library, program = library_path(folder, "ctl"), out / "abuse"
     command = [*need_compiler(), "-std=gnu99", "-O1", f"-I{folder}", str(ABUSE), str(library), "-o", str(program)]
     subprocess.run([*command, f"-Wl,-rpath,{folder}", "-lm", "-lpthread"], check=True)
@@ -99,6 +99,6 @@ def impact_of(robot: Robot, frame: str, normal: tuple[float, float, float]) -> W
 
 
 def random_state(robot: Robot, rng: np.random.Generator, size: float) -> tuple[Array, Array]:
-    """Return a state around the default posture."""
+    """Return a random state near the default posture."""
     q = np.asarray(pin.integrate(robot.model, robot.posture(), size * rng.normal(size=robot.nv)))
     return q, size * rng.normal(size=robot.nv)

@@ -23,17 +23,17 @@ NAMES = known_robots()
 
 @functools.cache
 def robot(name: str) -> Robot:
-    """Load a known robot once a process."""
+    """Load a known robot once per process."""
     return load_robot(name)
 
 
 def rng(*key: object) -> np.random.Generator:
-    """Return a generator for a key, the same on every run and machine."""
+    """Return a random generator for a key, the same on every run and machine."""
     return np.random.default_rng(zlib.crc32(repr(key).encode()))
 
 
 def random_configurations(model: pin.Model, count: int, *key: object, spread: float = 1.0) -> list[Vector]:
-    """Draw configurations ``neutral ⊕ v`` with normal ``v``."""
+    """Draw configurations ``neutral ⊕ v``, where ``v`` is normally distributed."""
     generator = rng(*key)
     return [
         np.array(pin.integrate(model, pin.neutral(model), spread * generator.normal(size=model.nv)))
@@ -48,9 +48,9 @@ def unit(generator: np.random.Generator, size: int = 3) -> Vector:
 
 
 def relative(actual: ArrayLike, expected: ArrayLike, scale: float = 0.0) -> float:
-    """Return the largest deviation over the largest expected entry, or over ``scale`` if this is larger.
+    """Return the largest deviation, divided by the largest expected entry or by ``scale``, whichever is larger.
 
-    Use a scale for values that may vanish, such as the value that belongs to a gradient.
+    Use a scale for values that may vanish: for a gradient, use the function value.
     """
     x, y = np.array(actual, dtype=float), np.array(expected, dtype=float)
     assert x.size == y.size, (x.shape, y.shape)
@@ -79,13 +79,13 @@ def central_gradient(f: Callable[[Vector], ArrayLike], model: pin.Model, q: Vect
 
 
 def mass_matrix(model: pin.Model, q: Vector) -> Vector:
-    """Return Pinocchio's ``M``, whose CRBA fills only the upper triangle."""
+    """Return the mass matrix of Pinocchio, with the lower triangle that CRBA leaves empty."""
     upper = np.triu(pin.crba(model, model.createData(), q))
     return np.asarray(upper + np.triu(upper, 1).T)
 
 
 def frame_jacobian(model: pin.Model, q: Vector, frame: int, offset: ArrayLike = (0, 0, 0)) -> Vector:
-    """Return Pinocchio's 6 × nv Jacobian of a point in a frame, LOCAL_WORLD_ALIGNED, from an added frame."""
+    """Return Pinocchio's 6 × nv Jacobian of a point that is fixed in a frame, in LOCAL_WORLD_ALIGNED axes."""
     copy = model.copy()
     old = copy.frames[frame]
     placement = old.placement * pin.SE3(np.eye(3), np.array(offset, dtype=float))

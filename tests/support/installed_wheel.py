@@ -1,8 +1,8 @@
-"""Build sdist and wheel, install the wheel far from the checkout, and use it there as a user would.
+"""Build sdist and wheel, install the wheel outside the checkout, and use the wheel there as a user would.
 
 ``python -m tests.support.installed_wheel`` compares the content with ``git ls-files``, runs every command once, and
-lets mypy read the installed copy.  ``--tests`` then runs tests against this copy, ``--lowest`` installs the lowest
-versions that ``pyproject.toml`` allows, and ``--python`` takes another interpreter.
+lets mypy check the installed copy.  ``--tests`` then runs tests against the installed copy.  ``--lowest`` installs
+the lowest versions that ``pyproject.toml`` allows.  ``--python`` selects another interpreter.
 """
 
 from __future__ import annotations
@@ -24,10 +24,10 @@ from pathlib import Path
 
 ROOT = Path(__file__).resolve().parents[2]
 PACKAGES = {"impact_posture": "impact_posture", "cli": "impact_posture_cli", "robots": "impact_posture_robots"}
-# Files that only a checkout has.
+# Files that only a checkout contains.
 UNSHIPPED = (".ci/", ".gitignore")
 
-# Every command of the app, as cheap as possible.  Commands of one row run one after the other.
+# Every command of the app with fast options.  The commands of one row run one after the other.
 COMMANDS = [
     ["simulate solo8-push --format png --out run"],
     ["compare solo8-push --controllers nominal --seeds 1 --jobs 1 --format png --out comparison"],
@@ -42,7 +42,7 @@ COMMANDS = [
     ["codegen ur5 --normal 0 0 1 --compile --out exported", "codegen ur5 --controller arm --out arm"],
     ["sweep grid.toml --workers 1 --out grid", "sweep show grid"],
 ]
-# Input of the command `sweep`.
+# Input file of the command `sweep`.
 GRID = """grid = { x = [0.0, 0.05] }
 [problem]
 robot = "ur5"
@@ -53,11 +53,11 @@ starts = 1
 
 
 class Failed(Exception):
-    """A check failed; the message says which."""
+    """Failed check, with a message that names it."""
 
 
 def run(command: list[str], folder: Path, fine: tuple[int, ...] = (0,)) -> subprocess.CompletedProcess[str]:
-    """Run a command outside the checkout, without variables of Python that lead back into it."""
+    """Run a command outside the checkout, without environment variables that make Python import from the checkout."""
     environment = {k: v for k, v in os.environ.items() if not k.startswith("PYTHON") and k != "MYPYPATH"}
     environment |= {"IMPACT_POSTURE_CACHE": str(folder / "cache"), "COLUMNS": "100", "BROWSER": "true"}
     done = subprocess.run(command, cwd=folder, env=environment, capture_output=True, text=True, check=False)
@@ -102,7 +102,7 @@ def compare(what: str, content: dict[str, str], expected: dict[str, str]) -> Non
 
 
 def build(work: Path) -> Path:
-    """Build the sdist from this checkout, and the wheel from the sdist and from a clean copy; compare all three."""
+    """Build the sdist from the checkout, and the wheel from the sdist and from a clean copy.  Compare all three."""
     names, builder = tracked(), [sys.executable, "-m", "build", "--quiet"]
     source = copy(names, work / "source")
     with ThreadPoolExecutor() as pool:
@@ -132,11 +132,11 @@ def build(work: Path) -> Path:
 
 
 def install(work: Path, wheel: Path, extras: str, lowest: bool) -> None:
-    """Install the wheel with extras only."""
+    """Install the wheel with these extras, and no other dependency."""
     python = str(work / "env" / "bin" / "python")
     pip = [python, "-m", "pip", "install", "--quiet", "--no-compile", "--disable-pip-version-check"]
     if lowest:
-        # pip cannot install the lowest versions.
+        # pip cannot select the lowest versions, but uv can.
         run([*pip, "uv"], work)
         uv = [python, "-m", "uv", "pip", "install", "--quiet", "--python", python, "--resolution", "lowest-direct"]
         named = [word for extra in extras.split(",") for word in ("--extra", extra)]
@@ -181,7 +181,7 @@ def planted(file: Path, text: str) -> Iterator[None]:
 
 
 def types(work: Path, programs: Path) -> None:
-    """Let mypy read the installed copy.  It must report an error that is planted there."""
+    """Let mypy check the installed copy.  mypy must report the error that this function adds."""
     command = [str(programs / "mypy"), "--config-file", str(ROOT / "pyproject.toml"), "--cache-dir", "mypy"]
     for package in PACKAGES.values():
         command += ["-p", package]
@@ -195,7 +195,7 @@ def types(work: Path, programs: Path) -> None:
 
 
 def suite(work: Path, programs: Path, arguments: list[str]) -> None:
-    """Run tests from a copy of the checkout without the packages, so that they import the installed packages."""
+    """Run tests from a copy of the checkout without the two packages, so that they import the installed packages."""
     folder = copy([n for n in tracked() if n.split("/")[0] not in PACKAGES], work / "tests")
     done = subprocess.run([str(programs / "python"), "-m", "pytest", "-q", *arguments], cwd=folder, check=False)
     if done.returncode:
@@ -229,8 +229,8 @@ def main() -> None:
             commands(work, programs)
         with step("install, with all extras"):
             install(work, wheel, "sim,sweep,test,docs", options.lowest)
-        # mypy needs current types of other packages, for the Python version in pyproject.toml.
-        # It cannot read NumPy's types for newer versions as 3.11.
+        # mypy needs recent type stubs of other packages, for the Python version in pyproject.toml.  For an older
+        # Python, mypy cannot read the stubs of newer NumPy versions.
         if not options.lowest and options.python == sys.executable:
             with step("types"):
                 types(work, programs)

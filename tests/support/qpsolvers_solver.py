@@ -1,4 +1,4 @@
-"""Solvers of the qpsolvers package on the programs of the online controllers, to compare DAQP with."""
+"""Solvers of the qpsolvers package, to compare DAQP with them on the programs of the online controllers."""
 
 from __future__ import annotations
 
@@ -9,16 +9,16 @@ from impact_posture.tsid.qp.quadratic_program import EQUALITY, QP, Solved
 
 
 class QpsolversSolver:
-    """Solver with a name in qpsolvers (``proxqp``, ``quadprog``, …), cold at every program."""
+    """Solver named in qpsolvers (``proxqp``, ``quadprog``, …), which starts every program without a warm start."""
 
     def __init__(self, name: str, **settings: float) -> None:
         self._name, self._settings = name, settings
 
     def solve(self, qp: QP) -> Solved | None:
-        """Return the solution, or ``None``.
+        """Return the solution, or ``None`` if the program has no solution.
 
         Raises:
-            qpsolvers.SolverNotFound: No solver of that name is installed.
+            qpsolvers.SolverNotFound: The named solver is not installed.
         """
         equal = qp.sense == EQUALITY
         rows = np.vstack([np.eye(qp.n), qp.A])
@@ -34,7 +34,7 @@ class QpsolversSolver:
         try:
             answer = qpsolvers.solve_problem(problem, solver=self._name, **self._settings)
         except ValueError:
-            # quadprog raises this for a program without a solution.
+            # quadprog raises this exception if a program has no solution.
             return None
         if not answer.found or answer.x is None:
             return None

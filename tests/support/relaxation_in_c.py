@@ -1,4 +1,4 @@
-"""The relaxation in C for tests: its library, a call, and a certificate of its solutions."""
+"""The relaxation in C for tests: its compiled library, one call, and a certificate of its solutions."""
 
 from __future__ import annotations
 
@@ -39,7 +39,7 @@ class _Report(ctypes.Structure):
 
 @dataclass(frozen=True)
 class Answer:
-    """Code, point, number of iterations, largest violation of level 0, and the shortest time of a call, s."""
+    """Return code, solution, number of iterations, largest violation of level 0, and shortest time of a call (s)."""
 
     code: int
     z: np.ndarray
@@ -49,10 +49,10 @@ class Answer:
 
 
 class Relaxation:
-    """The compiled relaxation with a workspace for each size, which keeps the active rows."""
+    """Compiled relaxation with one workspace per problem size; a workspace remembers its active rows."""
 
     def __init__(self, folder: Path, *flags: str) -> None:
-        """Compile in a folder; warnings of our code are errors."""
+        """Compile in a folder; warnings about the project's code are errors."""
         for name, content in sources_or_skip().items():
             (folder / name).write_bytes(content)
         for name, text in render.relaxation().items():
@@ -73,15 +73,15 @@ class Relaxation:
         self._work = dict[tuple[int, ...], np.ndarray]()
 
     def forget(self) -> None:
-        """Start the next problem without active rows."""
+        """Make the next problem start without active rows."""
         self._work.clear()
 
     def solve(self, tick: RelaxedTick, budget: int = 2000, repeats: int = 1) -> Answer:
-        """Solve the program of a tick, each time from the same active rows."""
+        """Solve the program of a tick repeatedly, each time from the same active rows."""
         m, n = tick.A.shape
         levels = int(tick.level.max())
         values = {name: np.ascontiguousarray(getattr(tick, name), dtype=float) for name in _ARRAYS}
-        # The search measures forces as give_way.c does; the certificate keeps Python's units.
+        # The C search scales forces as give_way.c does, but the certificate keeps the units of Python.
         values["unit"] = np.where(tick.unit == 1.0, 1.0, FORCE_UNIT * tick.unit)
         values["level"] = np.ascontiguousarray(tick.level, dtype=np.intc)
         problem = _Problem(n, m, levels, *(values[name].ctypes.data for name in _ARRAYS))
@@ -98,32 +98,33 @@ class Relaxation:
 
 # ---- certificate --------------------------------------------------------------------------------------------------
 
-# Violation that counts, relative to the length of a row times the size of the point.
+# Smallest violation that is significant, relative to the length of a row times the size of the point.
 COUNTS = 1e-7
 
 
 def violations(tick: RelaxedTick, z: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
-    """Return the signed violation of each entry of ``[z; A z]``, and the violation that counts."""
+    """Return the signed violation of each entry of ``[z; A z]``, and its smallest significant value."""
     values = np.concatenate([z, tick.A @ z])
     rows = np.vstack([np.diag(tick.unit), tick.A * tick.unit])
     size, lengths = max(1.0, float(np.max(np.abs(z) / tick.unit))), np.linalg.norm(rows, axis=1)
-    # A vanishing row cannot be satisfied, so it does not count.
+    # A row of zeros cannot be satisfied by any z, so its violation is ignored.
     return np.where(lengths > 0, values - np.clip(values, tick.lower, tick.upper), 0.0), COUNTS * size * lengths
 
 
 def missed(tick: RelaxedTick, z: np.ndarray) -> list[float]:
-    """Return the largest violation of each level, level 0 first, in units of the size of the point."""
+    """Return the largest violation of each level, starting with level 0, in units of the size of the point."""
     over, counts = violations(tick, z)
     sizes = COUNTS * np.abs(over) / np.where(counts > 0, counts, np.inf)
     return [float(np.max(sizes[tick.level == k], initial=0.0)) for k in range(int(tick.level.max()) + 1)]
 
 
 def stationarity(tick: RelaxedTick, z: np.ndarray) -> list[float]:
-    """Return the stationarity residual of each level's sum of squares, and last of the cost.
+    """Return the stationarity residual of each level's sum of squares, followed by the residual of the cost.
 
-    At the lexicographic solution, the negative gradient is a combination of the rows above: of any sign for equations
-    and missed rows, non-negative for active bounds.  The residual is relative to the terms of the gradient.  It is 0
-    for a level that holds.  This function shares no code with C.
+    At the lexicographic solution, the negative gradient is a combination of the rows of higher levels.  The
+    coefficients of active bounds are non-negative; equations and violated rows have coefficients of any sign.  The
+    residual is relative to the terms of the gradient.  The residual of a satisfied level is 0.  This function shares
+    no code with the C solver.
     """
     rows = np.vstack([np.diag(tick.unit), tick.A * tick.unit])
     lengths = np.linalg.norm(rows, axis=1)

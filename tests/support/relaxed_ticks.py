@@ -1,4 +1,7 @@
-"""Ticks that need the relaxation, with Python's solution, recorded from simulated robots and random states."""
+"""Ticks in which the controller needs the relaxation, with the Python solution.
+
+The ticks come from simulated robots and random states.
+"""
 
 from __future__ import annotations
 
@@ -19,7 +22,7 @@ from impact_posture.tsid.assembly import Assembly
 from impact_posture.tsid.qp.daqp_solver import DaqpSolver
 from impact_posture.tsid.qp.hierarchy import Level
 
-# Scenario, force (N) on the frame of the push from 0.2 s to 0.6 s, seconds.
+# Scenario, force (N) that acts on the frame from 0.2 s to 0.6 s, and simulated time (s).
 RUNS = {
     "tilthex_arm": ("aerial-vertical", "ee", (0.0, 60.0, 40.0), 2.0),
     "solo8": ("solo8-push", "base_link", (150.0, 80.0, 0.0), 2.0),
@@ -30,17 +33,17 @@ RUNS = {
 
 @dataclass(frozen=True, eq=False)
 class RelaxedTick:
-    """Program of a tick, with Python's solution.
+    """Program of a tick, with the Python solution.
 
     Attributes:
-        H: Shape (n, n).
-        g: Shape (n,).
-        A: Shape (m, n).
-        lower: Shape (n + m,).
-        upper: Shape (n + m,).
-        level: 0 for hard constraints, 1 for joint limits, then the strict levels, shape (n + m,).
-        unit: Value of each variable that compares with an acceleration of 1, shape (n,).
-        z: Python's solution, shape (n,); NaN if Python has none.
+        H: Cost matrix, shape (n, n).
+        g: Cost vector, shape (n,).
+        A: Constraint matrix, shape (m, n).
+        lower: Lower bounds of ``[z; A z]``, shape (n + m,).
+        upper: Upper bounds of ``[z; A z]``, shape (n + m,).
+        level: Level of each bound, shape (n + m,): 0 for hard constraints, 1 for joint limits, then the strict levels.
+        unit: Scale of each variable, the value that corresponds to an acceleration of 1, shape (n,).
+        z: Solution of the Python controller, shape (n,); NaN if this controller has no solution.
     """
 
     H: np.ndarray
@@ -67,7 +70,7 @@ def problem_of(assembly: Assembly, z: np.ndarray | None) -> RelaxedTick:
 
 @contextmanager
 def recording() -> Iterator[list[RelaxedTick]]:
-    """Record each relaxed tick of any controller."""
+    """Record each relaxed tick of all controllers inside the ``with`` block."""
     ticks, relaxed = list[RelaxedTick](), list[Assembly]()
     solve, hierarchy = relaxation.solve, relaxation._hierarchy
 
@@ -92,7 +95,8 @@ def pushed(name: str) -> tuple[list[RelaxedTick], int]:
     """Push a simulated robot with its nominal controller.
 
     Returns:
-        Its relaxed ticks, and the number of them before it falls, which means that its base has sunk by a third.
+        The relaxed ticks, and how many of them precede the fall.  The robot falls when its base is a third lower
+        than at the start.
     """
     scenario, frame, force, seconds = RUNS[name]
     setup = set_up(read_scenario(scenario))

@@ -1,4 +1,4 @@
-"""Restitution of a contact law, measured with a ball in the simulated world."""
+"""Restitution of a contact law, measured with a simulated ball."""
 
 from __future__ import annotations
 
@@ -17,22 +17,22 @@ from impact_posture.simulation.world.scene import Physics, Scene, Shape, Surface
 from impact_posture.simulation.world.world import World, build_world
 
 _RADIUS = 0.02
-# Number of time constants of the law after which a contact counts as endless.
+# The test assumes that a contact never ends if it lasts longer than this number of time constants of the law.
 _PATIENCE = 200
-# Shares of a time step after which the ball touches, because restitution depends on it a little.
+# Fractions of a time step at which the first touch occurs, because restitution depends slightly on this moment.
 _PHASES = (0.1, 0.3, 0.5, 0.7, 0.9)
 
 
 @dataclass(frozen=True)
 class Bounce:
-    """An impact, averaged over the parts of a time step where it may begin.
+    """Measured impact, averaged over the moments of a time step at which the touch may occur.
 
     Attributes:
-        restitution: Normal speed after over before.
-        spread: Largest minus smallest restitution over those parts.
-        duration: Time from the first to the last force, s.
-        depth: Largest depth of the ball, m.
-        peak: Largest force times duration over impulse, 1 for a constant force.
+        restitution: Normal speed after the impact, divided by the normal speed before.
+        spread: Largest minus smallest restitution over these moments.
+        duration: Duration of the contact force, s.
+        depth: Largest penetration of the ball, m.
+        peak: Peak force times duration, divided by the impulse; 1 if the force is constant.
     """
 
     restitution: float
@@ -43,13 +43,13 @@ class Bounce:
 
 
 def ideal_restitution(damping: float) -> float:
-    """Return the restitution of ``r'' = −2ζω r' − ω² r`` at any ω; the contact ends when it would have to pull.
+    """Return the restitution of ``r'' = −2ζω r' − ω² r`` for any ω; the contact ends when its force vanishes.
 
     ``exp(−2ζ arccos ζ/√(1 − ζ²))`` below ζ = 1, ``e⁻²`` there, ``exp(−2ζ arcosh ζ/√(ζ² − 1))`` above.  A
-    :class:`ContactLaw` approaches it when its share d is near 1 and its time constant is many time steps.
+    :class:`ContactLaw` approaches this value if its share d is near 1 and its time constant is many time steps.
 
     Args:
-        damping: ζ, at least zero.
+        damping: Damping ratio ζ, at least zero.
     """
     if abs(damping - 1) < 1e-9:
         return float(np.exp(-2.0))
@@ -58,7 +58,7 @@ def ideal_restitution(damping: float) -> float:
 
 
 def ball(mass: float = 1.0, radius: float = _RADIUS) -> Robot:
-    """Return a robot without joints: a solid ball, with the frame ``ball`` in its center."""
+    """Return a robot without joints: a solid ball with the frame ``ball`` at its center."""
     model = pin.Model()
     joint = model.addJoint(0, pin.JointModelFreeFlyer(), pin.SE3.Identity(), "root_joint")
     model.appendBodyToJoint(joint, pin.Inertia.FromSphere(mass, radius), pin.SE3.Identity())
@@ -70,16 +70,17 @@ def ball(mass: float = 1.0, radius: float = _RADIUS) -> Robot:
 def measure_restitution(
     law: ContactLaw, *, speed: float = 0.5, timestep: float = Physics().timestep, mass: float = 1.0
 ) -> Bounce:
-    """Let a ball hit a surface squarely, without gravity.
+    """Let a ball hit a surface along the normal, without gravity.
 
     Args:
         law: Contact law of the surface.
         speed: Approach speed, m/s.
         timestep: Time step of the physics, s.
-        mass: Mass of the ball, kg.  It makes no difference, because MuJoCo scales the law by the mass that it feels.
+        mass: Mass of the ball, kg.  The result does not depend on it, because MuJoCo scales the law by the mass
+            at the contact.
 
     Raises:
-        InputError: The ball stays on the surface, or the law does not fit the time step.
+        InputError: The ball stays on the surface, or the time step is too long for the law.
     """
     bounces = [_one(law, speed, timestep, mass, phase) for phase in _PHASES]
     restitutions = [b.restitution for b in bounces]
@@ -105,7 +106,7 @@ def _one(law: ContactLaw, speed: float, timestep: float, mass: float, phase: flo
 
 
 def _follow(world: World, surface: Surface, speed: float) -> Bounce:
-    """Step until the contact ends."""
+    """Step the simulation until the contact ends."""
     idle = ActuatorCommand(np.zeros(0), np.zeros(0))
     time = surface.solref[0]
     constant = time if time > 0 else 1 / np.sqrt(-time)

@@ -1,4 +1,4 @@
-"""Impact of a robot whose feet are held exactly, by Pinocchio's impulse dynamics."""
+"""Impact of a robot whose feet are fixed exactly, by the impulse dynamics of Pinocchio."""
 
 from __future__ import annotations
 
@@ -10,7 +10,7 @@ from tests.support.helpers import Vector, frame_jacobian, mass_matrix
 
 
 class Rigid:
-    """Jumps and impulses of the feet for unit impacts along the three world axes, by ``pin.impulseDynamics``."""
+    """Velocity jumps and foot impulses for unit impulses along the world axes, by ``pin.impulseDynamics``."""
 
     def __init__(self, base: WorstCaseObjective, q: Vector) -> None:
         self._base = base

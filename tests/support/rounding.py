@@ -1,8 +1,8 @@
-"""Linear algebra as another processor may round it.
+"""Linear algebra with the rounding errors of another processor.
 
-OpenBLAS has a kernel for each family of processors, and kernels round differently.  The result of each is the exact
-solution for a matrix that differs in the last digits.  So a matrix whose last digits change before a factorization
-stands for all kernels.  A test that passes on one processor by luck fails with such a matrix.
+OpenBLAS has a kernel for each family of processors, and each kernel rounds differently.  Each result is the exact
+solution for a matrix that differs in the last digits.  A random change of these digits before a factorization
+therefore represents all kernels.  A test that passes on one processor only by luck fails with this change.
 """
 
 from __future__ import annotations
@@ -16,7 +16,7 @@ from unittest import mock
 import numpy as np
 import scipy.linalg
 
-# Units in the last place by which entries move.
+# Size of the random change of an entry, in units in the last place.
 _ULP = 2
 _SYMMETRIC = ("cholesky", "eigh", "eigvalsh")
 _NUMPY = (*_SYMMETRIC, "solve", "inv", "lstsq", "pinv", "qr", "svd")
@@ -25,7 +25,7 @@ _SCIPY = ("lu_factor", "null_space", "orth", "qr")
 
 @contextmanager
 def other_rounding(seed: int) -> Iterator[None]:
-    """Round the matrices of NumPy's and SciPy's factorizations once more, in the same way for the same seed."""
+    """Change the last digits of all matrices that NumPy and SciPy factorize; the seed determines the changes."""
     rng = np.random.default_rng(seed)
 
     def rounded(function: Callable[..., Any], symmetric: bool) -> Callable[..., Any]:

@@ -1,4 +1,4 @@
-"""Settings of a problem as tests write them."""
+"""Settings of a problem in the short form that tests use."""
 
 from __future__ import annotations
 
@@ -7,9 +7,10 @@ from impact_posture.config.table_validation import validate
 
 
 def make_settings(values: dict[str, object]) -> ProblemSettings:
-    """Check values like options.  Collisions and loads count only if the values ask for them.
+    """Validate values like options.  Collisions and motor loads are ignored unless the values request them.
 
-    Tests with these settings are about the impact and the program.  Shapes and motors would make some normals
-    impossible (a wall through the robot).  ``test_clearance.py``, ``test_holdable.py`` and the commands test them.
+    Tests with these settings examine the impact and the program.  With shapes and motors, some normals would be
+    infeasible, for example because of a wall through the robot.  ``test_clearance.py``, ``test_holdable.py`` and the
+    tests of the commands cover shapes and motors.
     """
     return validate(ProblemSettings, {"collision": False, "holdable": False, **values}, "options")

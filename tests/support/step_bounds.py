@@ -1,4 +1,4 @@
-"""Largest changes of the posture tasks within a time step by ramps and fades."""
+"""Largest change of the desired posture acceleration within a time step that ramps and fades can cause."""
 
 from __future__ import annotations
 
@@ -9,19 +9,20 @@ import impact_posture as ip
 from impact_posture.tsid.state import State
 from impact_posture.tsid.tasks.activation import Activation
 
-# The largest slope of 3x² − 2x³, at 1/2.
+# Largest slope of the ramp 3x² − 2x³, reached at x = 1/2.
 STEEPEST = 1.5
 
 
 def level_bound(activation: Activation, dt: float) -> float:
-    """Return the largest change of the level within ``dt`` seconds."""
+    """Return the largest change of the activation level within ``dt`` seconds."""
     return min(1.0, STEEPEST * dt / activation.ramp)
 
 
 def step_bound(posture: ip.tsid.JointPosture, state: State, dt: float) -> float:
-    """Return the largest change of an entry of ``ν̇*`` within ``dt`` by ramps and fades alone (``q``, ν, ∇H fixed).
+    """Return the largest change of an entry of ``ν̇*`` within ``dt`` that ramps and fades cause (``q``, ν, ∇H fixed).
 
-    It is ``1.5 dt/ramp·(K·reach + K_p|q_des ⊖ q|)`` for the level, plus the fade of the posture.
+    The level contributes ``1.5 dt/ramp·(K·reach + K_p|q_des ⊖ q|)``; the fade of the target posture adds its own
+    part.
     """
     bound, model = 0.0, posture._model
     if posture._blend < 1:

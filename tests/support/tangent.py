@@ -1,4 +1,4 @@
-"""Tangent map of the configuration manifold as an expression, for derivatives by CasADi on the tangent space."""
+"""Tangent map of the configuration manifold as a CasADi expression, for derivatives on the tangent space."""
 
 from __future__ import annotations
 
@@ -32,13 +32,13 @@ def tangent_map(chart: Chart, q: ca.SX) -> ca.SX:
 
 
 def _quaternion_rate(quaternion: ca.SX) -> ca.SX:
-    """Return ``½ quaternion ⊗ [w; 0]`` as a (4, 3) matrix on the body angular velocity ``w``."""
+    """Return the map ``w ↦ ½ quaternion ⊗ [w; 0]`` as a (4, 3) matrix, where w is the body angular velocity."""
     x, y, z, w = quaternion[0], quaternion[1], quaternion[2], quaternion[3]
     return 0.5 * ca.blockcat([[w, -z, y], [z, w, -x], [-y, x, w], [-x, -y, -z]])
 
 
 def composite_mass_matrix(tree: Tree) -> ca.SX:
-    """``M(q)`` by composite rigid bodies (Featherstone 2008, §6.2), shape (nv, nv), armature included."""
+    """Mass matrix ``M(q)`` by composite rigid bodies (Featherstone 2008, §6.2), shape (nv, nv), with armature."""
     composite = dict(tree._inertia)
     M = ca.SX.zeros(tree.nv, tree.nv)
     for slot, i, parent in reversed(tree._joints):

@@ -1,4 +1,4 @@
-"""Tools that a machine may lack.  A test that needs a missing tool skips and names it."""
+"""Tools that a machine may lack.  A test that needs a missing tool is skipped and names the tool."""
 
 from __future__ import annotations
 
@@ -11,7 +11,7 @@ import pytest
 
 from impact_posture.system.toolchain import find_compiler, words_of
 
-# Warnings that the generated C must not give.
+# The generated C must compile without these warnings.
 STRICT = ("-Wall", "-Wextra", "-pedantic", "-Werror")
 
 
@@ -30,13 +30,13 @@ def need(tool: str) -> str:
 
 
 def cxx_compiler() -> list[str] | None:
-    """Return ``$CXX``, g++, clang++ or c++, or ``None``."""
+    """Return the compiler ``$CXX``, g++, clang++ or c++, or ``None`` if there is no compiler."""
     candidates = (words_of("CXX"), ["g++"], ["clang++"], ["c++"])
     return next((words for words in candidates if words and shutil.which(words[0])), None)
 
 
 def eigen_headers() -> Path | None:
-    """Return the headers of ``$EIGEN3_INCLUDE_DIR``, the wheel cmeel-eigen, the system, or the wheel of CasADi."""
+    """Return the Eigen headers of ``$EIGEN3_INCLUDE_DIR``, the wheel cmeel-eigen, the system, or CasADi."""
     installed = [Path(folder) for folder in sys.path]
     folders = [folder / "cmeel.prefix" / "include" for folder in installed]
     folders += [
