@@ -1,4 +1,4 @@
-"""Compression time, peak force and x, against integrated contacts; bounds on force and jump in a search."""
+"""Compression time, peak force and x, compared with integrated contacts; bounds on force and jump in a search."""
 
 from __future__ import annotations
 
@@ -42,8 +42,8 @@ masses, speeds = st.floats(0.05, 500.0), st.floats(0.01, 20.0)
 
 
 def touch(power: float, stiffness: float, mass: float, speed: float) -> tuple[float, float]:
-    """Integrate ``m δ̈ = −k δ^p`` from touch to rest, and return T and the force at T."""
-    # In units of the greatest compression, and of this compression divided by the speed.
+    """Integrate ``m δ̈ = −k δ^p`` from touch to rest; return the compression time T and the force at T."""
+    # Depth is in units of the greatest compression, time in units of this compression divided by the speed.
     depth = ((power + 1) * mass * speed**2 / (2 * stiffness)) ** (1 / (power + 1))
     ratio = stiffness * depth**power * depth / (mass * speed**2)
 
@@ -69,7 +69,7 @@ def test_time_and_force_equal_an_integrated_contact(mass: float, speed: float, s
         time, force = touch(power, stiffness, mass, speed)
         assert contact.compression_time(1 / mass, speed) == pytest.approx(time, rel=1e-6)
         assert contact.peak_force(1 / mass, speed) == pytest.approx(force, rel=1e-6)
-        # A contact with this T and G has the impulse mv, whatever its law.
+        # A contact with these T and G transmits the impulse mv, whatever its force law.
         alike = ContactStiffness(duration=time)
         assert alike.peak_force(1 / mass, speed) == pytest.approx(np.pi / 2 * mass * speed / time)
         for one in (contact, alike):
@@ -125,7 +125,7 @@ def test_x_of_a_standing_robot_equals_the_elastic_response() -> None:
         squeezed = compression(objective, q, 1.0, ContactStiffness(linear=1e9))
         response = ElasticImpact(objective.case).response(q, 1e9)
         assert squeezed is not None and squeezed.x is not None and G > 0
-        # The contact is so short that T belongs to the links alone.
+        # The contact is so stiff that T depends only on the links.
         assert squeezed.x == pytest.approx(response.compliance_ratio, rel=0.02)
 
 
@@ -252,7 +252,7 @@ def test_the_front_of_jump_and_force_equals_searches_with_a_bound() -> None:
     middle = curve.points[2]
     bounded = prepare(make_settings({**settings_, "max_force": middle.within}))
     again = solve(bounded.problem, starts=4, compile="never")
-    # Another search finds no better posture.
+    # A second search does not reach a better posture.
     assert middle.objective <= bounded.problem.objective.value(again.q) * (1 + 1e-6)
 
 
@@ -293,7 +293,7 @@ def test_bounds_that_cannot_be_met_name_their_rows_and_units() -> None:
 
 
 def test_edges_of_speed_and_of_locked_joints(tmp_path: Path) -> None:
-    """Without speed a material has no T, and without moving joints there is no joint jump to bound."""
+    """At zero speed a material contact has no T.  If all joints are locked, there is no joint jump to bound."""
     still = ("evaluate", "panda", "--normal", 0, 0, 1, "--speed", 0, "--contact-stiffness", "steel", "--json")
     done = json.loads(run(*still).stdout)["evaluation"]["compression"]
     assert done["compression_time"] is None and done["peak_force"] == 0 and done["x"] is None

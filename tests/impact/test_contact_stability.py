@@ -1,4 +1,4 @@
-"""Whether feet lift or slip, against statics by hand and the impulse dynamics of Pinocchio."""
+"""Whether feet lift or slip, compared with statics by hand and with the impulse dynamics of Pinocchio."""
 
 from __future__ import annotations
 
@@ -41,7 +41,7 @@ def oracle_of(name: str, normal: tuple[float, float, float], frame: str = "base_
 
 @pytest.mark.parametrize("name", ["solo8", "solo12"])
 def test_an_impact_from_above_presses_all_feet(name: str) -> None:
-    """Every foot pushes up, in total less than the impact, because knees without stiff motors yield."""
+    """Every foot pushes up, but the total is less than the impact, because knees without motor stiffness yield."""
     loaded, supports = standing(name)
     q = loaded.posture()
     result = contact_stability(oracle_of(name, (0.0, 0.0, -1.0)), supports, q)
@@ -65,7 +65,7 @@ def test_an_impact_from_below_lifts(name: str) -> None:
 
 @pytest.mark.parametrize(("name", "normal"), [("solo12", (0.3, 0.2, -1.0)), ("talos", (1.0, 0.2, -0.4))])
 def test_impulses_equal_impulse_dynamics(name: str, normal: tuple[float, float, float]) -> None:
-    """Where the impulses on the feet are unique, they equal the rigid impulse dynamics of Pinocchio."""
+    """If the foot impulses are unique, they equal the rigid impulse dynamics of Pinocchio."""
     loaded, supports = standing(name)
     frame = "base_link"
     q = np.asarray(
@@ -89,7 +89,7 @@ def test_impulses_equal_impulse_dynamics(name: str, normal: tuple[float, float, 
 
 
 def test_the_set_matters_where_the_rank_drops() -> None:
-    """The planar legs of solo8 can press against each other.  The impulses with the least pull use this."""
+    """The planar legs of solo8 can press against each other.  The impulses with the smallest pull use this."""
     loaded, supports = standing("solo8")
     q = loaded.posture()
     oracle = oracle_of("solo8", (0.0, 1.0, -0.6))
@@ -104,7 +104,7 @@ def test_the_set_matters_where_the_rank_drops() -> None:
 
 
 def test_soles_tip_over_their_edges() -> None:
-    """An impact at the torso of talos turns the soles, and friction cannot replace the size of a sole."""
+    """An impact at the torso of talos tips the soles; more friction does not replace a larger sole."""
     loaded, supports = standing("talos")
     q = loaded.posture()
     frame = "torso_2_link"
@@ -123,7 +123,7 @@ def test_soles_tip_over_their_edges() -> None:
     ("name", "frame"), [("solo12", "base_link"), ("solo8", "base_link"), ("talos", "torso_2_link")]
 )
 def test_kept_feet_as_expression_and_in_numbers_agree(name: str, frame: str) -> None:
-    """Compare expression, Pinocchio and finite differences."""
+    """Compare the CasADi expression, the Pinocchio computation and finite differences."""
     loaded, supports = standing(name)
     contact = ImpactContact(frame, (0.3, -0.2, -1.0))
     objective = WorstCaseObjective(loaded, contact, supports=supports, compliance=1e-2 / loaded.mass)
@@ -141,7 +141,10 @@ def test_kept_feet_as_expression_and_in_numbers_agree(name: str, frame: str) -> 
 
 
 def test_kept_feet_change_the_optimum() -> None:
-    """Without kept contacts the optimum pulls at the ground.  With them, the chosen friction is enough."""
+    """Without `keep_contacts`, the optimum pulls at the ground.
+
+    With `keep_contacts`, the given friction suffices.
+    """
     values = {"robot": "solo12", "frame": "base_link", "normal": (0.0, 0.0, -1.0)}
     free = prepare(make_settings(dict(values)))
     kept = prepare(make_settings({**values, "keep_contacts": True, "friction": 1.0}))

@@ -1,4 +1,4 @@
-"""Stick or slip at one contact: Coulomb's law, its limits, and gradients by differences."""
+"""Stick or slip at one contact: Coulomb's law, its limit cases, and gradients by finite differences."""
 
 from __future__ import annotations
 
@@ -29,17 +29,17 @@ STEP = 2e-4
 
 
 def required(B: Vector, n: Vector) -> float:
-    """Return the least friction with which a point of mobility B sticks: tangential over normal part of ``B⁻¹n``."""
+    """Return the least friction at which a point of mobility B sticks: tangential over normal part of ``B⁻¹n``."""
     s = np.linalg.solve(B, n)
     return float(np.linalg.norm(s - (n @ s) * n) / (n @ s))
 
 
 def assert_coulomb(B: Vector, n: Vector, friction: float, impulse: Vector, tolerance: float) -> None:
-    """Check Coulomb's law for the plastic impact of a point that approaches at ``−n``."""
+    """Check Coulomb's law for the plastic impact of a point with approach velocity ``−n``."""
     after = B @ impulse - n
     normal, tangential = float(n @ impulse), impulse - (n @ impulse) * n
     size, slip = float(np.linalg.norm(tangential)), float(np.linalg.norm(after))
-    # The scale of rounding errors of the velocity after the impact.
+    # Scale of the rounding errors of the velocity after the impact.
     scale = float(np.linalg.norm(B) * np.linalg.norm(impulse)) + 1
     assert abs(n @ after) <= tolerance * scale
     assert normal > 0 and size <= friction * normal + tolerance * (1 + normal + size)
@@ -47,7 +47,7 @@ def assert_coulomb(B: Vector, n: Vector, friction: float, impulse: Vector, toler
         assert abs(size - friction * normal) <= tolerance * (1 + normal + size)
         opposed = np.linalg.norm(tangential * slip + after * friction * normal)
         assert opposed <= tolerance * scale * (1 + normal + size)
-    # The energy does not grow.  Its change is the impulse times the mean velocity of the point.
+    # The impact does not add energy.  The energy change is the impulse times the mean velocity of the point.
     assert impulse @ (after - n) / 2 <= tolerance * scale
 
 
@@ -61,7 +61,7 @@ def _direction() -> ca.Function:
 def test_a_fixed_number_of_steps_solves_the_secular_equation_to_rounding(
     seed: int, powers: list[float], share: float
 ) -> None:
-    """Random B of any condition up to 1e5, with 1e-10 to 2 times the friction that sticking requires."""
+    """Random B with condition up to 1e5; friction is 1e-10 to 2 times the least value at which the point sticks."""
     generator = np.random.default_rng(seed)
     n, Q = unit(generator), np.linalg.qr(generator.normal(size=(3, 3)))[0]
     B = Q @ np.diag(10.0 ** np.array(powers)) @ Q.T
@@ -78,7 +78,7 @@ def test_a_fixed_number_of_steps_solves_the_secular_equation_to_rounding(
 
 @given(st.integers(0, 2**32 - 1))
 def test_kinetic_energy_rises_with_friction_from_frictionless_to_sticking(seed: int) -> None:
-    """With W = M the value is ``p B p`` at unit approach speed: 1/G without friction, ``nB⁻¹n`` for sticking."""
+    """For W = M and unit approach speed, the value is ``p B p``: 1/G without friction, ``nB⁻¹n`` for sticking."""
     generator = np.random.default_rng(seed)
     n, A = unit(generator), generator.normal(size=(3, 3))
     B = A @ A.T + 1e-3 * np.eye(3)
@@ -91,7 +91,7 @@ def test_kinetic_energy_rises_with_friction_from_frictionless_to_sticking(seed: 
 
 @pytest.mark.parametrize("name", SOME)
 def test_value_and_gradient_agree_three_ways(name: str) -> None:
-    """Pinocchio, the symbolic kernel and differences agree at any friction, for every metric and support."""
+    """Pinocchio, the symbolic kernel and finite differences agree for any friction, metric and supports."""
     for index, (loaded, contact, metric, supports) in enumerate(combinations(name)):
         friction = FRICTIONS[index % len(FRICTIONS)]
         objective = WorstCaseObjective(loaded, replace(contact, friction=friction), metric, "coulomb", supports)
@@ -103,14 +103,14 @@ def test_value_and_gradient_agree_three_ways(name: str) -> None:
         assert_coulomb(o.mobility, o.normal, friction, impact.impulse, 1e-8)
         assert_close(oracle.at(q).solve(oracle.J.T @ impact.impulse), impact.jump, 1e-8, where)
         limit = o.S if impact.sticks else o.V if friction == 0 else None
-        # Both solve with M, in different orders.
+        # Both methods solve with M, but in different orders.
         rounding = 4 * np.finfo(float).eps * np.linalg.cond(oracle.M)
         assert limit is None or abs(value / limit - 1) < rounding, where
         differences = central_gradient(objective.value, loaded.model, q, STEP)
         assert_close(gradient, differences, 1e-6, f"differences ({where})", value)
         if name in WHOLE or index == 0:
             numbers = [np.array(x).ravel() for x in objective.gradient_fun()(q, contact.normal)]
-            # Stiff feet cost digits.
+            # Stiff feet reduce the number of accurate digits.
             assert_close(numbers[0], value, 1e-9, where)
             assert_close(numbers[1], gradient, 1e-6 if supports else 1e-9, where, value)
 
@@ -139,7 +139,10 @@ def test_planar_robots(friction: float) -> None:
 
 
 def test_a_point_on_a_line_slides_or_jams() -> None:
-    """With one hinge the tip moves along one direction, at an angle to the normal.  Enough friction blocks it."""
+    """With one hinge, the tip moves along one direction, oblique to the normal.
+
+    Enough friction blocks this motion.
+    """
     loaded = arm([Y], [0.0], floating=False)
     q, normal = np.array([0.4]), (0.0, 0.0, 1.0)
     slides, jams = hung(loaded, normal, 0.1), hung(loaded, normal, 5.0)
@@ -197,7 +200,7 @@ def test_the_value_is_continuous_at_the_switch_and_has_one_gradient_on_each_side
             there = np.array(pin.integrate(loaded.model, q, sign * step))
             assert coulomb_impact(objective.oracle, there).sticks == (sign < 0)
             assert_close(objective.gradient(there), side, 1e-4, f"side {sign}")
-        # With W = M, the slope always falls where the contact begins to slip.
+        # For W = M, the slope of the objective always drops where the contact begins to slip.
         assert metric == "euclidean" or (sides[1] - sides[0]) @ outward < 0
         exported = np.array(objective.gradient_fun()(q, objective.contact.normal)[1]).ravel()
         assert_close(exported, sides[0], 1e-6, "at the switch the gradient of sticking")

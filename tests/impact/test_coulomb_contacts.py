@@ -1,4 +1,4 @@
-"""Several contacts at once with friction: Coulomb's law at each, uncoupled contacts, and MuJoCo."""
+"""Several contacts at once with friction: Coulomb's law at each contact, uncoupled contacts, and MuJoCo."""
 
 from __future__ import annotations
 
@@ -22,7 +22,7 @@ FEET = ("FL_FOOT", "FR_FOOT", "HL_FOOT", "HR_FOOT")
 
 
 def assert_laws(B: Vector, normals: Vector, friction: Vector, p: Vector, tolerance: float) -> None:
-    """Check Signorini's and Coulomb's laws at every contact, and that energy is lost."""
+    """Check Signorini's and Coulomb's laws at every contact, and check that the impact dissipates energy."""
     before = -normals
     after = before + (B @ p.ravel()).reshape(p.shape)
     scale = float(np.abs(p).max())
@@ -32,7 +32,7 @@ def assert_laws(B: Vector, normals: Vector, friction: Vector, p: Vector, toleran
         assert normal >= -tolerance * scale and n @ u >= -tolerance
         assert abs(normal * (n @ u)) <= tolerance * scale
         assert np.linalg.norm(tangential) <= mu * normal + tolerance * scale
-        # The friction on a sliding point has the largest size and opposes the slip.
+        # The friction at a sliding point has its maximum size and opposes the slip.
         assert np.linalg.norm(tangential * np.linalg.norm(slip) + mu * normal * slip) <= tolerance * scale
     assert (p * (before + after)).sum() <= tolerance * scale
 
@@ -83,7 +83,7 @@ def test_one_contact_is_the_single_solution(friction: float) -> None:
 
 
 def feet_of(friction: float) -> tuple[WorstCaseObjective, Vector]:
-    """Return solo12 in the air, whose four feet meet tilted ground."""
+    """Return the objective of solo12 in the air, whose four feet hit tilted ground, and its posture."""
     loaded = robot("solo12")
     n = np.array([0.35, 0.1, 1.0])
     contacts = [ImpactContact(foot, tuple(n / np.linalg.norm(n)), friction=friction) for foot in FEET]
@@ -95,7 +95,10 @@ def feet_of(friction: float) -> tuple[WorstCaseObjective, Vector]:
 
 @pytest.mark.parametrize("friction", (0.0, 0.15, 0.4, 2.0))
 def test_four_feet_land_in_mujoco(friction: float) -> None:
-    """MuJoCo lifts a foot that slides, because its friction is convex.  So sticking feet are compared closely."""
+    """In MuJoCo a sliding foot also lifts, because its friction model is convex.
+
+    So the tolerance is tight for sticking feet only.
+    """
     objective, q = feet_of(friction)
     jumps = coulomb_jumps(objective, q, 1.0)
     assert jumps is not None
@@ -105,7 +108,7 @@ def test_four_feet_land_in_mujoco(friction: float) -> None:
     assert_close(oracles[0].solve(impulse), velocity, 1e-9, "jump")
     measured = drop(objective, q)
     if friction in (0.0, 2.0):
-        # Without slip, or without friction, both friction laws are equal.
+        # Without slip or without friction, MuJoCo and Coulomb's law agree.
         assert all(jump.sticks for jump in jumps) is (friction == 2.0)
         assert_close(measured, velocity, 0.02, "Δν")
     else:
@@ -115,7 +118,7 @@ def test_four_feet_land_in_mujoco(friction: float) -> None:
 
 
 def drop(objective: WorstCaseObjective, q: Vector) -> Vector:
-    """Return ``Δν`` in MuJoCo for a robot that translates along ``−n`` without gravity and motors."""
+    """Return ``Δν`` in MuJoCo for a robot that moves along ``−n`` without gravity and motor torques."""
     mujoco, result = import_mujoco(), objective.robot
     written = build_mjcf(result.model)
     n, radius, time = objective.oracle.at(q).n.copy(), 0.005, 2e-4

@@ -1,4 +1,4 @@
-"""Links, rotors and springs in a contact: time stepping, energy, limits, differences, and bad input."""
+"""Links, rotors and springs during a contact: time stepping, energy, limit cases, differences, and invalid input."""
 
 from __future__ import annotations
 
@@ -42,7 +42,7 @@ def on_springs(loaded: Robot, table: TransmissionSpec) -> Robot:
 
 
 def springs(stiffness: float, damping: float = 0.0, **joints: JointTransmissionSpec) -> TransmissionSpec:
-    """Return springs at all joints except ``joints``."""
+    """Return springs for all joints except ``joints``."""
     return TransmissionSpec("elastic", stiffness, damping, joints)
 
 
@@ -55,7 +55,7 @@ class Setup(NamedTuple):
 
 
 def case_of(name: str) -> Setup:
-    """Return robots with and without base, feet and dampers, stiff, locked and unstated joints, and all metrics."""
+    """Return the test case of a robot; the cases differ in base, feet, dampers, joint types and metric."""
     generator = rng(name, "elastic")
     rigid, locked = JointTransmissionSpec("rigid"), JointTransmissionSpec("locked")
     if name == "panda":
@@ -88,7 +88,7 @@ CASES = ("panda", "arm", "mixed arm", "talos", "tilthex_arm", "solo12")
 
 
 class Stepped(NamedTuple):
-    """Results of time stepping at the end of the compression, and the largest values before."""
+    """Results of time stepping at the end of the compression, and the largest values until then."""
 
     duration: float
     x: Vector
@@ -103,7 +103,7 @@ class Stepped(NamedTuple):
 
 
 def stepped(case: ImpactCase, q: Vector, stiffness: float, speed: float) -> Stepped:
-    """Integrate the equations of motion with matrices of Pinocchio, by an adaptive Runge–Kutta method."""
+    """Integrate the equations of motion with Pinocchio's matrices, by an adaptive Runge–Kutta method."""
     result, spec = case.robot, case.robot.spec.transmission
     nv, base = result.nv, 6 if result.floating else 0
     own = [spec.joints.get(joint, JointTransmissionSpec()) for joint in result.joint_names]
@@ -180,7 +180,8 @@ def test_time_stepping_finds_the_same(name: str) -> None:
     assert (response.peak_torque >= np.abs(response.torque) * (1 - 1e-12)).all()
     assert response.peak_jump_norm >= response.jump_norm * (1 - 1e-12)
     assert response.value == pytest.approx((response.jump_norm / speed) ** 2, rel=1e-12)
-    # Free flight continues at the approach speed, so the force times this speed is the power of the contact.
+    # Without the contact, the motion would keep the approach speed, so the contact power is the force times this
+    # speed.
     assert response.impulse * response.speed == pytest.approx(other.energy + other.loss, rel=1e-8)
     assert (other.loss > 0) == (name in ("mixed arm", "talos", "solo12"))
 
@@ -197,7 +198,7 @@ def test_gradient_equals_differences(name: str) -> None:
 
 @pytest.mark.parametrize("name", ["panda", "arm", "tilthex_arm"])
 def test_limits_are_the_joint_models(name: str) -> None:
-    """Stiff contacts meet the links; soft contacts and stiff springs meet links and rotors."""
+    """A stiff contact feels only the links.  A soft contact with stiff springs feels links and rotors."""
     case, q, _ = case_of(name)
     case = replace(case, metric=Metric(), robot=on_springs(case.robot, springs(5e3 if name == "panda" else 150.0)))
     elastic, stiff = ElasticImpact(case), {}
@@ -223,7 +224,7 @@ def test_dampers_hold_rotors_to_links() -> None:
 
 
 def test_first_greatest_compression_of_many() -> None:
-    """With soft wrists the compression rises, stops and rises again.  The impact ends at the first stop."""
+    """With soft wrists, the compression rises, stops and rises again.  The impact phase ends at the first stop."""
     generator, close = rng("first root"), 0
     case, _, _ = case_of("arm")
     case = replace(case, metric=Metric())
@@ -242,7 +243,7 @@ def test_first_greatest_compression_of_many() -> None:
 
 
 def test_ratio_of_a_robot_on_its_feet() -> None:
-    """The base yields through the springs of the legs, while feet and rotors are fixed."""
+    """The base yields through the springs of the legs, although feet and rotors are fixed."""
     case, q, stiffness = case_of("solo12")
     oracle = ElasticImpact(case).oracle.at(q)
     Js, j = oracle.Js, oracle.n @ oracle.J
@@ -343,7 +344,7 @@ def test_contact_that_cannot_move() -> None:
 
 
 def test_extreme_but_allowed_numbers_answer() -> None:
-    """Extreme stiffness, damping and inertia give a finite result or a one-line error."""
+    """Extreme stiffness, damping and inertia give a finite result or an error in one line."""
     case, q, _ = case_of("arm")
     for inertia in (1e-14, 1e-9, 1e6, 1e18, 1e40):
         model = pin.Model(case.robot.model)

@@ -1,4 +1,4 @@
-"""``evaluate``: numbers against dense algebra on Pinocchio, and predictions against the physics of an impact."""
+"""``evaluate``: numbers compared with dense algebra on Pinocchio matrices, and predictions with impact physics."""
 
 from __future__ import annotations
 
@@ -57,7 +57,7 @@ def planar(tmp_path: Path) -> str:
 
 
 def dense(loaded: Robot, frame: str, q: np.ndarray, n: np.ndarray, W: np.ndarray | None, feet: tuple[Support, ...]):
-    """Return H, G, V, S, Λ_c, a and the sticking jump by inverting ``M + J_sᵀJ_s/ε``."""
+    """Return H, G, V, S, Λ_c, a and the sticking jump, computed by inverting ``M + J_sᵀJ_s/ε``."""
     M = mass_matrix(loaded.model, q)
     J = frame_jacobian(loaded.model, q, loaded.frame_id(frame))[:3]
     inertia = M.copy()
@@ -93,7 +93,7 @@ def test_numbers_against_dense_algebra(name: str, frame: str, metric: str) -> No
     evaluation = evaluate(impact.objective, impact.q, 0.7, 0.3)
     W = mass_matrix(loaded.model, impact.q) if metric == "kinetic" else None
     expected = dense(loaded, frame, impact.q, n, W, impact.supports)
-    # In the inverse, 1/ε of the feet in addition to the masses of the links costs digits.
+    # The sum of 1/ε and the link masses in the inverse reduces the accuracy.
     tolerance = 1e-6 if impact.supports else 1e-10
     for key in ("H", "G", "V", "S", "E"):
         assert_close(evaluation.to_dict()[key], expected[key], tolerance, key)  # type: ignore[arg-type]

@@ -1,4 +1,4 @@
-"""``H, G, V, S, E, Λ_c``, their gradients and lifted form: symbolic, with Pinocchio, and by differences."""
+"""``H, G, V, S, E, Λ_c``, their gradients and lifted form, by three methods: symbolic, Pinocchio, differences."""
 
 from __future__ import annotations
 
@@ -39,12 +39,15 @@ from tests.support.helpers import (
 KINDS: tuple[ObjectiveKind, ...] = ("impulse", "speed", "sticking", "energy")
 OFFSET = (0.01, -0.02, 0.03)
 VALUE, GRADIENT = 1e-9, 1e-6
-# The best step for differences of a value that is exact to 1e-11 (stiff feet): 1e-9 relative error.
+# Best finite-difference step for a value that is accurate to 1e-11 (stiff feet): relative error 1e-9.
 STEP = 2e-4
 
 
 def supports_of(loaded: Robot) -> tuple[Support, ...]:
-    """Return the robot's feet, or for a robot without feet a point brace at a third of the path to the contact."""
+    """Return the robot's feet.
+
+    A robot without feet gets a point support a third of the way along its kinematic chain.
+    """
     if loaded.spec.supports:
         return loaded.spec.supports
     assert loaded.spec.contact.frame is not None
@@ -56,14 +59,14 @@ def supports_of(loaded: Robot) -> tuple[Support, ...]:
     return (Support(str(frame.name), "point", (0.02, 0.03, -0.01)),)
 
 
-# Robots for all combinations, and robots for three: continuous and sliding joints, branches, feet.  The dynamics of
-# every known robot are tested in test_dynamics.py.
+# Robots that run all combinations, and robots that run three.  Together they cover continuous and sliding joints,
+# branches and feet.  test_dynamics.py tests the dynamics of every known robot.
 WHOLE = ("solo8", "panda", "tilthex_arm")
 SOME = (*WHOLE, "kinova", "tiago", "talos", "anymal_kinova", "borinot", "bolt", "ur5")
 
 
 def combinations(name: str) -> Iterator[tuple[Robot, ImpactContact, Metric, tuple[Support, ...]]]:
-    """Yield metric × supports × frame of the normal: all twelve, or three with each metric once, by the robot."""
+    """Yield combinations of metric, supports and normal frame: all twelve, or three with different metrics."""
     loaded, generator = robot(name), rng(name, "combinations")
     assert loaded.spec.contact.frame is not None
     weights = tuple(float(w) for w in generator.uniform(0.5, 2.0, loaded.nv))
@@ -117,7 +120,7 @@ def test_symbolic_oracle_and_differences_agree(name: str) -> None:
 
 @pytest.mark.parametrize("name", NAMES)
 def test_oracle_by_its_definition(name: str) -> None:
-    """Write out the inverses, with matrices from Pinocchio alone."""
+    """Compute all quantities with explicit inverses of Pinocchio's matrices."""
     for loaded, contact, metric, supports in combinations(name):
         if metric.kind == "weighted":
             continue
@@ -138,7 +141,7 @@ def test_oracle_by_its_definition(name: str) -> None:
         s = np.linalg.solve(mobility, n)
         G = n @ mobility @ n
         o = ImpactOracle(ImpactCase(loaded, contact, metric, supports, epsilon)).quantities(q)
-        # Forming M + JᵀJ/ε loses digits that the KKT system of the oracle keeps.
+        # The sum M + JᵀJ/ε loses digits that the KKT system of the oracle preserves.
         tolerance = 1e-8 if supports else 1e-10
         assert o.S is not None
         for what, value, expected in (
@@ -151,9 +154,9 @@ def test_oracle_by_its_definition(name: str) -> None:
 
 @pytest.mark.parametrize("name", SOME)
 def test_lifted_form(name: str) -> None:
-    """At the guess the equations hold, the value equals the oracle, and the equations determine the unknowns."""
+    """The guess satisfies the equations and has the oracle's value; the equations determine the unknowns."""
     for k, (loaded, contact, metric, supports) in enumerate(combinations(name)):
-        # WHOLE robots combine with every kind, other robots with three kinds.
+        # Robots in WHOLE run every combination with every kind, other robots with three kinds.
         for kind in KINDS if name in WHOLE else [KINDS[(NAMES.index(name) + k) % len(KINDS)]]:
             objective = WorstCaseObjective(loaded, contact, metric, kind, supports)
             q, n = ca.SX.sym("q", loaded.nq), ca.SX.sym("n", 3)
@@ -175,7 +178,8 @@ def test_lifted_form(name: str) -> None:
 @pytest.mark.parametrize("name", WHOLE)
 def test_objective_functions_agree_with_its_own_numbers(name: str, kind: ObjectiveKind) -> None:
     all_of_them = list(combinations(name))
-    # All metrics, both frames, with and without supports.  The search of CasADi for common subexpressions is slow.
+    # Use all metrics and both frames, with and without supports.  Other robots are left out, because CasADi's search
+    # for common subexpressions is slow.
     for result, contact, metric, supports in (all_of_them[k] for k in (0, 5, 7, 10)):
         objective = WorstCaseObjective(result, contact, metric, kind, supports)
         where = describe(contact, metric, supports)
@@ -184,7 +188,8 @@ def test_objective_functions_agree_with_its_own_numbers(name: str, kind: Objecti
         assert_close(value, objective.value(q), VALUE, f"value ({where})")
         if metric.kind == "euclidean":
             assert_close(objective.value_fun()(q, contact.normal), objective.value(q), VALUE, f"value_fun ({where})")
-        # Stiff feet cost digits if the contact can hardly move, because the inverse of its mobility is large.
+        # With stiff feet, the accuracy decreases if the contact can hardly move, because its inverse mobility is
+        # large.
         agreed = GRADIENT if supports else 1e-8
         assert_close(gradient, objective.gradient(q), agreed, f"gradient ({where})")
         differences = central_gradient(lambda at, o=objective: o.value(at), result.model, q, STEP)
@@ -197,7 +202,7 @@ def test_objective_functions_agree_with_its_own_numbers(name: str, kind: Objecti
 
 
 def test_an_oracle_that_returns_to_a_posture_has_the_same_numbers() -> None:
-    """This includes more postures than the oracle keeps."""
+    """There are more postures than the cache of the oracle can contain."""
     talos = robot("talos")
     contact = ImpactContact("gripper_right_base_link", normal=(0, 0.6, 0.8))
     postures = random_configurations(talos.model, 36, "returns", spread=0.2)

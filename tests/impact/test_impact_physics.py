@@ -1,4 +1,4 @@
-"""Physical laws of the impact quantities: balances, identities, invariances and limits."""
+"""Physical laws of the impact quantities: momentum and energy balances, identities, invariances and limits."""
 
 from __future__ import annotations
 
@@ -60,7 +60,7 @@ def feet(loaded: Robot) -> tuple[Support, ...]:
 
 
 def jacobians(loaded: Robot, q: Vector, supports: tuple[Support, ...]) -> tuple[Vector, Vector, Vector]:
-    """Return ``M``, the contact's 3-row ``J`` and the stacked ``J_s`` of the supports from Pinocchio."""
+    """Return ``M``, the 3-row contact Jacobian ``J`` and the stacked support Jacobian ``J_s`` from Pinocchio."""
     assert loaded.spec.contact.frame is not None
     J = frame_jacobian(loaded.model, q, loaded.frame_id(loaded.spec.contact.frame), OFFSET)[:3]
     parts = [
@@ -74,7 +74,10 @@ def jacobians(loaded: Robot, q: Vector, supports: tuple[Support, ...]) -> tuple[
 
 @pytest.mark.parametrize("name", NAMES)
 def test_an_impact_stops_the_contact_and_dissipates_e(name: str) -> None:
-    """``λ = v_n/G`` stops the approach and dissipates ``E v_n²``.  Sticking stops the whole point."""
+    """The impulse ``λ = v_n/G`` stops the approach and dissipates ``E v_n²``.
+
+    A sticking impact stops all point motion.
+    """
     loaded = robot(name)
     generator = rng(name, "energy")
     for q in random_configurations(loaded.model, 2, name, "energy"):
@@ -112,7 +115,7 @@ def test_kinetic_identities(name: str) -> None:
         assert o.S is not None
         assert pytest.approx(float(o.normal @ np.linalg.solve(o.mobility, o.normal)), rel=1e-7) == o.S
         assert o.S >= (1 - 1e-10) / o.G
-        # Along an eigenvector a frictionless and a sticking impact are equal.
+        # For a normal along an eigenvector of Λ_c, frictionless and sticking impacts are equal.
         values, vectors = np.linalg.eigh(o.mobility)
         own = quantities(loaded, q, vectors[:, 1], Metric("kinetic"))
         assert own.S == pytest.approx(own.V, rel=1e-6)
@@ -121,7 +124,7 @@ def test_kinetic_identities(name: str) -> None:
 
 @pytest.mark.parametrize("name", STANDING)
 def test_feet_never_add_mobility(name: str) -> None:
-    """``G`` falls with each foot, and with the stiffness of the feet."""
+    """``G`` decreases with each additional foot and with the stiffness of the feet."""
     loaded = robot(name)
     generator = rng(name, "mobility")
     (q,) = random_configurations(loaded.model, 1, name, "mobility")
@@ -135,7 +138,7 @@ def test_feet_never_add_mobility(name: str) -> None:
 @pytest.mark.parametrize("metric", ["euclidean", "kinetic", "weighted"])
 @pytest.mark.parametrize("name", ["solo8", "panda", "tilthex_arm", "talos"])
 def test_root_h_is_the_ellipsoids_half_width(name: str, metric: str) -> None:
-    """The ellipsoid is the image of the unit ball under ``JM⁻¹W^½``.  Its farthest point along n is at ``√H``."""
+    """The ellipsoid is the image of the unit ball under ``JM⁻¹W^½``.  Its largest extent along n is ``√H``."""
     loaded, generator = robot(name), rng(name, metric, "width")
     weights = generator.uniform(0.5, 2.0, loaded.nv)
     chosen = Metric("weighted", tuple(weights)) if metric == "weighted" else Metric(metric)  # type: ignore[arg-type]
@@ -152,7 +155,7 @@ def test_root_h_is_the_ellipsoids_half_width(name: str, metric: str) -> None:
     assert reach.max() <= np.sqrt(o.H)
     farthest = image.T @ n / np.linalg.norm(image.T @ n)
     assert n @ image @ farthest == pytest.approx(np.sqrt(o.H), rel=1e-10)
-    # The radius along n, where the surface meets the line, is smaller.
+    # The distance from the center to the surface of the ellipsoid along n is smaller than ``√H``.
     radius = 1 / np.sqrt(n @ np.linalg.solve(o.ellipsoid, n))
     assert radius < np.sqrt(o.H)
 
@@ -162,7 +165,7 @@ def test_root_h_is_the_ellipsoids_half_width(name: str, metric: str) -> None:
 
 @pytest.mark.parametrize("name", FLOATING)
 def test_moving_the_base(name: str) -> None:
-    """The quantities are equal after a translation of the robot, and after a rotation of robot and normal."""
+    """The quantities do not change if the robot is translated, or if robot and normal are rotated together."""
     loaded = robot(name)
     generator = rng(name, "moved")
     for supports in {(), feet(loaded)}:
@@ -199,11 +202,11 @@ def test_the_sign_of_the_normal_does_not_matter(name: str) -> None:
 
 
 def test_the_kinetic_metric_does_not_depend_on_the_base_point() -> None:
-    """The euclidean metric depends on the base point."""
+    """The euclidean metric depends on the choice of the base origin."""
     loaded = robot("borinot")
     moved = loaded.model.copy()
     shift = pin.SE3(np.eye(3), np.array([0.2, -0.1, 0.3]))
-    # With another base origin, everything on the body moves in the opposite direction.
+    # If the base origin is shifted, everything on the body moves in the opposite direction.
     moved.inertias[1] = shift.actInv(moved.inertias[1])
     for k in range(2, moved.njoints):
         if moved.parents[k] == 1:
@@ -226,7 +229,7 @@ def test_the_kinetic_metric_does_not_depend_on_the_base_point() -> None:
 
 
 def test_feet_are_heavier_links() -> None:
-    """The inertia of held feet equals point masses 1/ε welded to the feet of solo8, by CRBA of Pinocchio."""
+    """Fixed feet have the inertia of point masses 1/ε welded to the feet of solo8, computed by Pinocchio's CRBA."""
     loaded = robot("solo8")
     epsilon = default_compliance(loaded)
     heavy = loaded.model.copy()
@@ -253,7 +256,7 @@ def test_solo8_on_its_feet_is_not_solo8_in_the_air(normal: tuple[float, float, f
     contact, q = ImpactContact("base_link", normal), loaded.posture()
     free, standing = WorstCaseObjective(loaded, contact), WorstCaseObjective(loaded, contact, supports=feet(loaded))
     assert relative(standing.value(q), free.value(q)) > 0.1
-    # The motion that the feet allow and that lowers the base without other base motion.
+    # Motion that the feet allow and that lowers the base without any other base motion.
     _, _, J_s = jacobians(loaded, q, feet(loaded))
     allowed = np.linalg.svd(J_s)[2][np.linalg.matrix_rank(J_s, tol=1e-9) :].T
     crouch = allowed @ np.linalg.lstsq(allowed[:6], np.array([0, 0, -1.0, 0, 0, 0]), rcond=None)[0]
@@ -261,12 +264,12 @@ def test_solo8_on_its_feet_is_not_solo8_in_the_air(normal: tuple[float, float, f
     assert (free.gradient(q) @ crouch) * (standing.gradient(q) @ crouch) < 0
     if normal == (1.0, 0.0, 0.0):
         assert free.gradient(q) @ crouch < 0 < standing.gradient(q) @ crouch
-    # Held feet cannot increase mobility.
+    # Fixed feet cannot increase the mobility of the contact.
     assert standing.oracle.quantities(q).G < free.oracle.quantities(q).G
 
 
 def test_point_feet_lose_rank_and_stay_smooth() -> None:
-    """Four point feet of solo8 hold 9 to 11 directions.  With compliance the gradient exists and is correct."""
+    """Four point feet of solo8 constrain 9 to 11 directions.  With compliance, the gradient exists and is correct."""
     loaded = robot("solo8")
     q = loaded.posture("standing")
     _, _, J_s = jacobians(loaded, q, feet(loaded))
@@ -282,14 +285,14 @@ def test_point_feet_lose_rank_and_stay_smooth() -> None:
 
 @functools.cache
 def pendulum() -> Robot:
-    """Return a robot with two parallel axes, whose tip moves in a vertical plane."""
+    """Return a robot with two parallel joint axes, whose tip moves in a vertical plane."""
     return load_robot(
         "example-robot-data:double_pendulum_description/urdf/double_pendulum.urdf", LoadOptions(root="fixed")
     )
 
 
 def _plane(loaded: Robot, q: Vector) -> tuple[Vector, Vector]:
-    """Return the contact's Jacobian and the normal of the plane in which the contact moves."""
+    """Return the contact Jacobian, and the normal of the plane in which the contact moves."""
     J = frame_jacobian(loaded.model, q, loaded.frame_id("link2"), OFFSET)[:3]
     return J, np.linalg.svd(J)[0][:, 2]
 
@@ -319,7 +322,7 @@ def test_s_in_the_plane_by_the_pseudo_inverse() -> None:
         n /= np.linalg.norm(n)
         o = quantities(loaded, q, n, frame="link2")
         M = mass_matrix(loaded.model, q)
-        # Two joints move in two directions, so J alone determines the jump.
+        # Two joints move the tip in two directions, so J alone determines the jump.
         jump = np.linalg.pinv(J) @ n
         assert o.S is not None
         assert o.S == pytest.approx(float(jump @ jump), rel=1e-8)

@@ -1,4 +1,4 @@
-"""The worst case over a cone of normals: against samples, by two independent methods, at ties, and in searches."""
+"""The worst case over a cone of normals: compared with samples and two other methods, at ties, and in searches."""
 
 from __future__ import annotations
 
@@ -56,7 +56,7 @@ def cone_of(objective: WorstCaseObjective) -> NormalCone:
 
 
 def cone_samples(axis: np.ndarray, degrees: float, count: int = 100_000) -> np.ndarray:
-    """Return unit vectors of a cone, a third on its edge, the others spread evenly inside, shape (count, 3)."""
+    """Return unit vectors in a cone, a third of them on its edge, the others evenly inside, shape (count, 3)."""
     edge = count // 3
     k = np.arange(count - edge) + 0.5
     height = np.concatenate([np.full(edge, np.cos(np.deg2rad(degrees))), np.ones(count - edge)])
@@ -64,7 +64,7 @@ def cone_samples(axis: np.ndarray, degrees: float, count: int = 100_000) -> np.n
     turn = np.concatenate([2 * np.pi * np.arange(edge) / edge, np.pi * (3 - np.sqrt(5)) * k])
     radius = np.sqrt(1 - height**2)
     local = np.stack([height, radius * np.cos(turn), radius * np.sin(turn)])
-    # Axes that are independent of the code under test.
+    # Compute the axes independently of the code under test.
     side = np.cross(axis, np.eye(3)[np.abs(axis).argmin()])
     side /= np.linalg.norm(side)
     return np.asarray((np.stack([axis, side, np.cross(axis, side)], axis=1) @ local).T)
@@ -120,7 +120,7 @@ def test_no_cone_is_the_plain_problem() -> None:
         and "cone" not in evaluation.to_dict()
         and np.array_equal(evaluation.worst_normal, evaluation.normal)
     )
-    # The value converges to this limit as the cone closes.
+    # The value converges to the single-normal value as the cone angle vanishes.
     narrow = WorstCaseObjective(robot("tilthex_arm"), contact, normal_cone_deg=1e-3)
     assert 1 < narrow.value(q) / none.value(q) < 1 + 1e-3
 
@@ -230,7 +230,7 @@ def test_subgradients_at_a_mirror_symmetric_posture() -> None:
             objective.value(np.array(pin.integrate(loaded.model, q, step * direction))) - objective.value(q)
         ) / step
         assert rise == pytest.approx((points.gradients @ direction).max(), rel=1e-4, abs=1e-4 * objective.value(q))
-    # The gradient of the C export is one of them.
+    # The C export returns the gradient of one of the tied normals.
     value, gradient = (np.array(v).ravel() for v in objective.gradient_fun()(q, objective.contact.normal))
     assert value[0] == pytest.approx(objective.value(q), rel=1e-12)
     assert min(relative(gradient, g) for g in points.gradients) < 1e-6
@@ -251,7 +251,7 @@ LINK = """<link name="{0}"><inertial><origin xyz="0.03 0.02 0.2"/><mass value="{
 
 @pytest.mark.parametrize("degrees", [5.0, 45.0])
 def test_solution_equals_brute_force(degrees: float, tmp_path: Path) -> None:
-    """Search without duals and gradients: 3,000 sampled normals, Nelder–Mead from many starts."""
+    """Search without duals and gradients: 3,000 sampled normals and Nelder–Mead from many starts."""
     links = "".join(LINK.format(name, mass) for name, mass in (("a", 2.0), ("b", 1.0), ("c", 0.5)))
     (tmp_path / "arm.urdf").write_text(ARM.format(links=links))
     arm = load_robot(str(tmp_path / "arm.urdf"))
@@ -298,7 +298,7 @@ def test_starts_certify(name: str, kind: ObjectiveKind) -> None:
 
 
 def test_solved_from_and_at_mirror_symmetric_postures() -> None:
-    """solo8 starts and ends at a tie.  No gradient is zero there, but a convex combination balances."""
+    """solo8 starts and ends at a tie of two normals.  Neither gradient vanishes, but a convex combination does."""
     settings = {"robot": "solo8", "frame": "base_link", "normal": (1, 0, 0), "normal_cone": 20.0}
     problem = prepare(make_settings(settings)).problem
     assert cone_of(problem.impact).worst(problem.given).tied

@@ -1,4 +1,4 @@
-"""Several contacts at once: against enumeration and samples of the box, at ties, and in searches."""
+"""Several contacts at once: compared with enumeration and samples of the impulse box, at ties, and in searches."""
 
 from __future__ import annotations
 
@@ -45,7 +45,7 @@ HANDS = ("gripper_right_base_link", "gripper_left_base_link")
 
 
 def random_robot(generator: np.random.Generator, *, floating: bool) -> Robot:
-    """Return a random branching tree of five joints with six frames."""
+    """Return a random branching tree with five joints and six frames."""
     kinds = [*(["FreeFlyer"] if floating else []), *generator.choice(["RX", "RUBY", "PZ", "RevoluteUnaligned"], 5)]
     climbs = [int(v) for v in generator.integers(0, 3, len(kinds))]
     model = random_tree([str(k) for k in kinds], climbs, int(generator.integers(1000)), armature=True)
@@ -62,7 +62,7 @@ def box_of(objective: WorstCaseObjective) -> ImpulseBox:
 
 
 def jumps_of(objective: WorstCaseObjective, q: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
-    """Return the jumps of unit impacts as columns and the weight matrix W, by dense algebra on M and J."""
+    """Return the velocity jumps of unit impulses as columns, and the weight matrix W, by dense algebra on M and J."""
     model = objective.robot.model
     M = mass_matrix(model, q)
     impacts = []
@@ -83,7 +83,7 @@ def jumps_of(objective: WorstCaseObjective, q: np.ndarray) -> tuple[np.ndarray, 
 
 
 def enumerated(objective: WorstCaseObjective, q: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
-    """Return all corners of the box with the origin, and ``‖Σ λ_i a_i‖²_W`` at each."""
+    """Return all corners of the impulse box and the origin, with ``‖Σ λ_i a_i‖²_W`` at each corner."""
     jumps, W = jumps_of(objective, q)
     ends = [(-c.impulse if objective.bilateral else 0.0, c.impulse) for c in objective.contacts]
     rows = np.array(list(itertools.product(*ends)))
@@ -136,7 +136,7 @@ def test_every_box(floating: bool, count: int, feet: int, metric: str, axes: str
     assert_close(worst.impulses @ jumps.T @ W @ jumps @ worst.impulses, value, 1e-9, "attained there")
     assert_close(worst.jump, jumps @ worst.impulses, 1e-8, "its jump")
 
-    # With both signs every corner ties with its opposite, so the second best pair is considered.
+    # With bilateral impulses every corner ties with its opposite corner, so compare with the third largest value.
     best = np.sort(values)[::-1]
     if best[2 if bilateral else 1] < value * (1 - 1e-3):
         gradient = objective.gradient(q)
@@ -151,7 +151,7 @@ def test_every_box(floating: bool, count: int, feet: int, metric: str, axes: str
 @pytest.mark.parametrize(("name", "frames"), [("solo12", ("FL_SHOULDER", "FR_SHOULDER")),
                                               ("solo8", ("FL_UPPER_LEG", "FR_UPPER_LEG"))])  # fmt: skip
 def test_subgradients_at_a_mirror_symmetric_posture(name: str, frames: tuple[str, str]) -> None:
-    """Under impacts from both sides, each impact alone ties, and the objective rises like the larger value."""
+    """Equal impacts from both sides tie, so the objective rises like the larger of both values."""
     loaded = robot(name)
     one, other = (ImpactContact(f, (0.0, side, 0.0)) for f, side in zip(frames, (1.0, -1.0), strict=True))
     objective = WorstCaseObjective(loaded, one, others=(other,))
@@ -166,10 +166,10 @@ def test_subgradients_at_a_mirror_symmetric_posture(name: str, frames: tuple[str
         there = np.array(pin.integrate(loaded.model, q, step * direction))
         rise = (objective.value(there) - objective.value(q)) / step
         slopes = points.gradients @ direction
-        # The rise is the largest slope, as for a maximum of smooth functions.
+        # The rise of the objective is the largest slope, as for a maximum of smooth functions.
         assert rise == pytest.approx(slopes.max(), rel=1e-3, abs=1e-3 * objective.value(q))
         assert slopes.min() < rise + 1e-3 * objective.value(q)
-    # The symbolic gradient is one of them.
+    # The symbolic gradient is the gradient of one of the tied corners.
     value, gradient = (np.array(v).ravel() for v in objective.gradient_fun()(q, one.normal))
     assert value[0] == pytest.approx(objective.value(q), rel=1e-9)
     assert min(relative(gradient, g) for g in points.gradients) < 1e-6
@@ -225,7 +225,7 @@ def test_every_start_certifies(name: str) -> None:
     solution = solve(problem, starts=3, jobs=1, compile="never")
     assert solution.certified_starts == solution.feasible_starts == 3
     assert solution.reduction > 0 and solution.certificate.holds()
-    # The optimum of one contact alone is a lower bound.
+    # The optimum of a single contact is a lower bound for both contacts.
     first = problem.impact.singles[0]
     alone = solve(replace(problem, objective=first), starts=3, jobs=1, compile="never", guesses=(solution.q,))
     assert problem.objective.value(solution.q) >= first.value(alone.q) * (1 - 1e-9)
@@ -234,7 +234,7 @@ def test_every_start_certifies(name: str) -> None:
 
 
 def test_no_feasible_posture_is_better() -> None:
-    """Fixed hand and elbow leave two degrees of freedom, which random feasible postures cover."""
+    """If hand and elbow are fixed, two degrees of freedom remain, which random feasible postures cover."""
     problem = problem_of(ELBOW)
     solution = solve(problem, starts=8, jobs=1, compile="never")
     assert solution.redundancy == 2
@@ -247,7 +247,7 @@ def test_no_feasible_posture_is_better() -> None:
 
 
 def test_an_optimum_at_a_kink_certifies_by_a_mixture() -> None:
-    """Where two corners tie, neither gradient vanishes on the constraints, but a convex combination does."""
+    """If two corners tie, neither gradient vanishes on the constraints, but a convex combination vanishes."""
     problem = problem_of(TASKS["two feet"], bilateral=True)
     solution = solve(problem, starts=6, jobs=1, compile="never")
     points = problem.objective.subgradients(solution.q)
@@ -260,7 +260,7 @@ def test_an_optimum_at_a_kink_certifies_by_a_mixture() -> None:
 
 
 def test_optima_far_below_their_start_certify() -> None:
-    """Where the objective falls ten-thousandfold, corners tie to the accuracy of the solver only."""
+    """If the objective decreases ten-thousandfold, corners tie only up to the accuracy of the solver."""
     task = {"robot": "icub", "contact_pose": "free", "com": False, "contact": (
         "r_gripper_joint:-0.033,-0.472,-0.830:0.92", "l_gripper_joint:-0.983,-1.982,0.553:2.89",
         "root_joint:0.586,-0.165,1.748:2.53", "l_leg_ft_sensor:0.826,2.150,0.821:2.87")}  # fmt: skip
@@ -269,7 +269,7 @@ def test_optima_far_below_their_start_certify() -> None:
 
 
 class _Frozen:
-    """An objective with only its first subgradient."""
+    """Objective that reports only its first subgradient."""
 
     def __init__(self, objective: WorstCaseObjective) -> None:
         self._objective = objective
@@ -288,7 +288,7 @@ def test_pulling_is_never_milder() -> None:
 
 
 def test_two_frames_of_one_link_are_held_once() -> None:
-    """The rows of the two poses repeat each other, in the search for starts and in the program."""
+    """The constraints of the two poses repeat each other, both in the search for starts and in the program."""
     problem = problem_of({"robot": "ur5", "contact": ("tool0:1,0,0", "wrist_3_link-tool0_fixed_joint:0,1,0")})
     assert problem.rows, "rows that repeat others are left out"
     assert sum(feasible_start(problem, k, seed=0) is not None for k in range(12)) == 12
@@ -307,7 +307,7 @@ def test_struck_feet_that_are_balls_are_held_in_place_only() -> None:
     ("normals", "stops"),
     [
         (((-1, 0, 0), (-1, 0, 0)), False),
-        # The left hand meets another surface, and stays clear of the surface of the right hand.
+        # The left hand meets another surface, and must not touch the surface of the right hand.
         (((-1, 0, 0), (0, 1, 0)), True),
     ],
 )

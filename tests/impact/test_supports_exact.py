@@ -1,4 +1,4 @@
-"""Feet that stay, against sixty digits and the impulse dynamics of Pinocchio, at every rank of their Jacobian."""
+"""Fixed feet, compared with sixty digits and Pinocchio's impulse dynamics, at every rank of their Jacobian."""
 
 from __future__ import annotations
 
@@ -33,15 +33,16 @@ from tests.support.helpers import Vector, central_gradient, random_configuration
 from tests.support.rigid import Rigid
 from tests.support.rounding import other_rounding
 
-# Compliance times the mass of the robot: the default, and stiffer feet.
+# Compliance times the robot's mass: the default, and values for stiffer feet.
 STIFFNESS = (1e-4, 1e-6, 1e-9)
 ENDS = STIFFNESS[::2]
-# Ranks of the four feet of solo8, at their centers: straight legs, equal knees, unequal knees.
+# Postures in which the four feet of solo8 (at their centers) have different ranks: straight legs, equal knees,
+# unequal knees.
 SOLO8 = {"straight": 9, "equal knees": 10, "one knee moved by 1e-6": 11, "one knee moved by 1e-3": 11, "random": 11}
 CASES = [*[("solo8", posture) for posture in SOLO8], ("solo12", "random"), ("bolt", "random"), ("talos", "random")]
 STIFFENED = [(*case, e) for case in CASES for e in (ENDS if case[0] == "talos" else STIFFNESS)]
 
-# The rounding of this processor, and another one.
+# Seeds of the simulated rounding: None for this processor, 1 for another processor.
 SEEDS = (None, 1)
 
 
@@ -52,7 +53,7 @@ def sixty_digits() -> Iterator[None]:
 
 
 def feet(loaded: Robot) -> tuple[Support, ...]:
-    """Return the robot's feet; for solo8 by their centers, where straight legs are singular."""
+    """Return the feet of a robot.  For solo8, use the foot centers, which are singular when the legs are straight."""
     own = loaded.spec.supports
     return tuple(replace(s, offset=(0.0, 0.0, 0.0)) for s in own) if loaded.name == "solo8" else own
 
@@ -85,7 +86,7 @@ def bounded(name: str, label: str, relative_compliance: float) -> Bounded:
 
 
 def within(values: object, expected: Exact | Decimal, bound: Vector | float, what: str) -> None:
-    """Check that every entry is within its bound."""
+    """Check that the error of every entry is within its bound."""
     error = distance(values, np.asarray(expected, dtype=object))
     assert (error <= bound).all(), f"{what}: error {error.max():.1e}, allowed {np.max(bound):.1e}"
 
@@ -126,14 +127,14 @@ def test_the_oracle_solves_what_it_is_given(
     lost_V = float(x.V) * (x.H_by_elimination / float(x.H) + 2 * x.G_by_elimination / float(x.G))
     within(result.V, x.V, 1.01 * lost_V, "V")
     within(gradient, x.grad_H, x.gradient_by_elimination, "∇H")
-    # The condition of the jump is the condition of the motion, not 1/ε.  Between ranks it is at most its root.
+    # The error of the jump depends on the condition of the motion, not on 1/ε; between ranks, at most on its root.
     assert size(distance(result.jump, x.jump)) <= 1e-9 * size(x.jump)
 
 
 @pytest.mark.parametrize("seed", SEEDS)
 @pytest.mark.parametrize(("name", "label"), CASES)
 def test_the_oracles_sticking_impact(name: str, label: str, seed: int | None) -> None:
-    """S and ∇S lose as much as rounded matrices, on any processor, not the square of a condition."""
+    """The errors of S and ∇S are as large as after rounding the matrices, not a squared condition number."""
     x = bounded(name, label, 1e-4)
     with elsewhere(seed):
         oracle = objective(name, 1e-4).oracle
@@ -145,7 +146,7 @@ def test_the_oracles_sticking_impact(name: str, label: str, seed: int | None) ->
 
 
 def heavy_feet(x: Bounded, H: object, gradient: object, jump: object, G: object) -> None:
-    """Check the bounds of a factorization with heavy feet; at the default compliance nine digits are left."""
+    """Check the bounds of a factorization with heavy feet; at the default compliance, nine digits are correct."""
     within(jump, x.jump, x.jump_by_heavy_feet, "jump")
     within(H, x.H, x.H_by_heavy_feet, "H")
     within(G, x.G, x.G_by_heavy_feet, "G")
@@ -194,9 +195,10 @@ def _compiled(library: Exported, x: Bounded) -> None:
     ("name", "label"), [("solo8", "straight"), ("solo8", "equal knees"), ("solo12", "random"), ("talos", "random")]
 )
 def test_the_effect_of_compliance_is_bounded(name: str, label: str, relative_compliance: float) -> None:
-    """The effect is at most ``ε/(σ+ε)`` of the effect of the feet, with σ the least eigenvalue that they hold."""
+    """The effect of ε is at most ``ε/(σ+ε)`` of the effect of the feet; σ is the least nonzero eigenvalue."""
     x = bounded(name, label, relative_compliance)
-    # Stiff enough that the bias is below doubles, and soft enough that the rounding of J_s holds nothing.
+    # This compliance is so small that its bias is below double precision, but too large for rounding of J_s to
+    # matter.
     rigid = ExactImpact(x.oracle, 1e-14 / x.oracle.robot.mass)
     M, Js = x.oracle.M, x.oracle.Js
     share = x.share
@@ -208,18 +210,18 @@ def test_the_effect_of_compliance_is_bounded(name: str, label: str, relative_com
     assert 0 <= float(x.G - rigid.G) <= share * (G_free - float(rigid.G)) * (1 + 1e-6)
     least = np.sqrt(np.linalg.eigvalsh(M)[0])
     assert abs(np.sqrt(float(x.H)) - np.sqrt(float(rigid.H))) <= kinetic / least * (1 + 1e-6)
-    # Along motions that the feet allow, the momentum is the impact's, whatever the compliance.
+    # Along motions that the feet allow, the momentum equals the impulse for any compliance.
     allowed = np.linalg.svd(Js)[2][np.linalg.matrix_rank(Js, tol=1e-9) :]
     assert np.abs(allowed @ M @ off).max() <= 1e-9 * np.abs(M @ off).max()
 
 
 def test_the_limit_of_no_compliance_is_not_smooth() -> None:
-    """With one knee of solo8 moved by 1e-6 rad, the limit differs and the value at the default is equal."""
+    """Moving one knee of solo8 by 1e-6 rad changes the rigid limit, but not the value at the default compliance."""
     sideways = np.array([0.0, 1.0, 0.0])
     values = {}
     for label in ("equal knees", "one knee moved by 1e-6"):
         oracle = objective("solo8", 1e-4, sideways).oracle.at(posture("solo8", label))
-        # Between 1e-12, which the moved knee holds, and 1e-32, which rounding holds.
+        # The compliance 1e-22 is between 1e-12 (the effect of the moved knee) and 1e-32 (the effect of rounding).
         values[label] = [float(ExactImpact(oracle, e).H) for e in (1e-22, oracle.compliance)]
     (rigid, soft), (rigid_moved, soft_moved) = values.values()
     assert rigid_moved < 1e-6 * rigid
@@ -235,7 +237,7 @@ def test_the_limit_of_no_compliance_is_not_smooth() -> None:
     [("talos", 1), ("talos", 2), ("g1", 2), ("solo12", 4), ("go2", 4), ("anymal_c", 4), ("bolt", 2)],
 )
 def test_full_rank_feet_tend_to_impulse_dynamics(name: str, count: int) -> None:
-    """Compare with rigid contacts of Pinocchio: within ``ε/(σ+ε)``, and extrapolated to zero compliance."""
+    """Compare with rigid contacts of Pinocchio: within ``ε/(σ+ε)``, and after extrapolation to zero compliance."""
     loaded = robot(name)
     supports = loaded.spec.supports[:count]
     base = replace(objective(name, 1e-4), supports=supports)
@@ -250,7 +252,8 @@ def test_full_rank_feet_tend_to_impulse_dynamics(name: str, count: int) -> None:
     share = base.compliance / (held + base.compliance)
     assert share < 0.02
     assert 0 < np.sqrt(off @ M @ off) <= share * np.sqrt(done @ M @ done) * (1 + 1e-9)
-    # The extrapolation removes two powers of ε/σ.  The third is left, and grows with each inverse.
+    # The extrapolation removes the first two powers of ε/σ.  The third power remains and is amplified by each
+    # inverse.
     tolerance = 20 * share**3 + 1e-10
     expected = rigid.quantities(q)
     for what in ("H", "G", "V", "S", "jump", "support_impulse", "ellipsoid"):
@@ -261,7 +264,7 @@ def test_full_rank_feet_tend_to_impulse_dynamics(name: str, count: int) -> None:
 
 
 def _extrapolated(values: list[object]) -> Vector:
-    """Extrapolate from ε, ε/2 and ε/4 to zero (Richardson)."""
+    """Extrapolate values at ε, ε/2 and ε/4 to zero compliance (Richardson)."""
     one, half, quarter = (np.asarray(v, dtype=float) for v in values)
     return np.asarray(one / 3 - 2 * half + 8 * quarter / 3)
 

@@ -223,10 +223,7 @@ def _problem(**changes: object) -> ProblemSettings:
 
 
 def test_a_body_in_the_way_of_the_optimum() -> None:
-    """Without the obstacle, the optimum passes through it.
-
-    With it, the optimum touches the obstacle and certifies.
-    """
+    """The unconstrained optimum passes through the obstacle; the constrained optimum touches it and certifies."""
     free = solve(prepare(_problem()).problem, starts=4, jobs=1, compile="never")
     model = free.problem.robot.model
     data = model.createData()

@@ -1,4 +1,4 @@
-"""Skip all tests of simulations without MuJoCo."""
+"""Skip all simulation tests if MuJoCo is not installed."""
 
 from __future__ import annotations
 

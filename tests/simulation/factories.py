@@ -28,7 +28,7 @@ def needs_mujoco() -> None:
 
 
 def shortened(source: str | Path, **changes: Any) -> Setup:
-    """Set up a scenario with one contact or a short wait, and with changes of its task."""
+    """Set up a scenario with a single contact or a short wait, and with changed task settings."""
     scenario = read_scenario(source)
     if scenario.contacts:
         short: dict[str, Any] = {"count": 1, "settle": 0.3, "dwell": 0.2, "pause": 0.05}
@@ -39,7 +39,7 @@ def shortened(source: str | Path, **changes: Any) -> Setup:
 
 
 def controller_factory(setup: Setup, free: bool = False) -> ControllerFactory:
-    """Return a factory with interpreted gradients and an offline optimum from few starts."""
+    """Return a factory with interpreted gradients, whose offline optimum uses few starts."""
     return ControllerFactory(setup, free=free, gradient_of=interpreted, starts=2)
 
 
@@ -55,24 +55,27 @@ def near(name: str, **changes: Any) -> Setup:
 
 @functools.cache
 def shared_factory(name: str, settle: float | None = None) -> ControllerFactory:
-    """Return the factory of a scenario of :func:`near`, which all tests of a process share."""
+    """Return the factory of a scenario from :func:`near`, shared by all tests of a process."""
     return controller_factory(near(name) if settle is None else near(name, settle=settle))
 
 
 def driven(factory: ControllerFactory, controller: str, *, mode: Mode = "live", seed: int = 0) -> Run:
-    """Run contacts, or a push with sign 1, with one start for offline postures."""
+    """Run contacts (or a push with sign 1) and optimize offline postures from one start."""
     factory.starts = 1
     return run(factory, controller, mode=mode, seed=seed, only=1)[0]
 
 
 @functools.cache
 def lived(name: str, controller: str, mode: Mode, settle: float | None) -> Run:
-    """Return a run of :func:`shared_factory`, cached.  It has no defaults, which would confuse the cache."""
+    """Return a cached run of :func:`shared_factory`.
+
+    The arguments have no defaults, so that equal calls share a cache entry.
+    """
     return driven(shared_factory(name, settle), controller, mode=mode)
 
 
 def by_hand(setup: Setup, n: int, period: float = 1e-3, begin: float = 0.0, **columns: Any) -> Series:
-    """Return a series of n ticks at rest, with other values in ``columns``."""
+    """Return a time series of n ticks at rest; ``columns`` replaces some values."""
     robot, propulsion = setup.robot, setup.robot.spec.propulsion
     joints = robot.nv - (6 if robot.floating else 0)
     rotors = 0 if propulsion is None else len(propulsion.rotors)
@@ -89,5 +92,5 @@ def by_hand(setup: Setup, n: int, period: float = 1e-3, begin: float = 0.0, **co
 
 
 def fields_of(series: Series) -> dict[str, np.ndarray[Any, Any]]:
-    """Return the columns by name."""
+    """Return the columns of the series by name."""
     return {name: getattr(series, name) for name in series.__dataclass_fields__}

@@ -1,4 +1,4 @@
-"""Controllers for comparison with the impact-robust term follow the equations of their papers."""
+"""Comparison controllers follow the equations of their papers."""
 
 from __future__ import annotations
 
@@ -28,7 +28,7 @@ from tests.support.helpers import Vector, central_gradient, frame_jacobian, mass
 
 
 def moving(factory: ControllerFactory, *key: object) -> Reading:
-    """Return a moving state near the start."""
+    """Return a state near the start that has a velocity."""
     generator, robot = rng(*key), factory.setup.robot
     q = np.array(pin.integrate(robot.model, factory.setup.q, 0.02 * generator.normal(size=robot.nv)))
     return Reading(0.5, q, 0.3 * generator.normal(size=robot.nv), None)
@@ -41,7 +41,7 @@ def moving(factory: ControllerFactory, *key: object) -> Reading:
 def test_the_spring_of_the_term_is_its_hessian(name: str) -> None:
     factory = shared_factory(name)
     robot, objective, q = factory.setup.robot, factory.objective(), factory.setup.q
-    # Differences of the gradients of the oracle, with a larger step and to fourth order.
+    # Differentiate the gradients of the oracle with a larger step and fourth-order differences.
     hessian = central_gradient(objective.gradient, robot.model, q, 1e-3)
     joints = (hessian + hessian.T)[6:, 6:] / 2
     values, vectors = np.linalg.eigh(joints)
@@ -59,7 +59,7 @@ def test_stiff_has_the_spring_of_robust_at_rest(name: str) -> None:
     robust, setup = factory.driver("robust"), factory.setup
     assert isinstance(robust, RobustDriver)
     reached = resting_posture(robust, setup.scenario.task.settle)
-    # The posture differs from the start and has a smaller H.
+    # The target posture differs from the start and has a smaller H.
     assert factory.objective().value(reached) < factory.objective().value(setup.q)
     posture, control = factory.driver("stiff").posture, setup.scenario.control
     assert posture.stiffness is not None
@@ -79,7 +79,7 @@ def test_the_offline_posture_of_S_is_reached_at_the_surface() -> None:
     optimum, sticking = factory.offline("posture-sticking"), factory.objective("sticking").value
     assert optimum is not None and factory.offline("nominal") is None
     there = resting_posture(factory.driver("posture-sticking"), 3.0, ahead=setup.gap)
-    # With the foot at its start, the robot cannot reach this posture.
+    # If the foot stays at its start, the robot cannot reach this posture.
     here = resting_posture(factory.driver("posture-sticking"), 3.0)
     away = [np.linalg.norm(pin.difference(setup.robot.model, q, optimum.q)) for q in (there, here)]
     assert away[0] < 0.01 < away[1]
@@ -101,7 +101,7 @@ def test_robust_release_moves_further_and_holds(monkeypatch: pytest.MonkeyPatch)
     assert not driver.posture.activation.live
     assert value(reached) < 0.5 * value(resting_posture(factory.driver("robust"), 3.0))
     assert value(reached) < 1.05 * value(factory.offline().q)
-    # The held posture is the posture that the term has reached.
+    # The controller holds the last posture that the impact term has reached.
     away = pin.difference(setup.robot.model, reached, driver.posture.target)[6:]
     assert np.abs(away).max() < 0.02
     driver.reset(setup.q)
@@ -147,7 +147,7 @@ def test_the_simulated_robot_reaches_the_resting_posture(name: str) -> None:
 
 
 def walk(name: str, seconds: float) -> tuple[WalkerDriver, Any, Vector]:
-    """Run `walker`; return the driver, the world, and the last velocity of its reference."""
+    """Run the controller `walker`; return the driver, the world, and the last velocity of the reference flow."""
     factory = shared_factory(name)
     driver, world = factory.driver("walker"), factory.setup.world
     assert isinstance(driver, WalkerDriver)
@@ -170,9 +170,9 @@ def test_the_flow_is_free_of_other_tasks_and_lowers_the_metric(name: str) -> Non
     rows = np.vstack([assembly.contacts.J, assembly.strict.J, assembly.weighted.J])
     rank = np.linalg.matrix_rank(rows, tol=1e-6 * np.linalg.norm(rows, 2))
     if rank == state.nv:
-        # If the weighted tasks leave no motion free, the flow is free of contacts and strict levels.
+        # If the weighted tasks leave no free motion, only contacts and strict levels constrain the flow.
         rows = np.vstack([assembly.contacts.J, assembly.strict.J])
-    # The projector is updated every fifth tick only.
+    # The tolerance allows for a projector that is updated only every fifth tick.
     assert np.linalg.norm(rows @ flow) < 0.02 * np.linalg.norm(rows, 2) * np.linalg.norm(flow)
     objective = factory.objective()
     assert objective.gradient(state.q) @ flow < 0
@@ -188,7 +188,7 @@ def test_the_flow_is_the_projected_gradient() -> None:
     control = factory.setup.scenario.control
     q, v = factory.setup.q, np.zeros(9)
     for k in range(400):
-        # The robot stays in place and only the reference flows.
+        # The robot does not move; only the reference flow advances.
         last = driver.posture.target.copy()
         driver.tick(Reading(1e-3 * k, q, v, None))
     assert driver.level == 1
@@ -196,7 +196,7 @@ def test_the_flow_is_the_projected_gradient() -> None:
     Z = np.linalg.svd(J)[2][8:].T
     assert Z.shape == (9, 1)
     term = -control.robust.gain / driver.posture.scale * factory.objective().gradient(q)
-    # The term is bounded by K times its reach.
+    # The impact term is bounded by K times its reach.
     bound = control.robust.gain * driver.posture.reach
     term *= min(1.0, bound / np.linalg.norm(term))
     expected = Z @ (Z.T @ term) / control.posture.kd
@@ -224,7 +224,7 @@ def invariant(name: str) -> InvariantDriver:
 
 
 def impulses(name: str, q: Vector) -> Vector:
-    """Return ``M⁻¹Jᵀ`` of the impact with fixed feet, shape (nv, 3), from raw Pinocchio."""
+    """Return ``M⁻¹Jᵀ`` of the impact with fixed feet, shape (nv, 3), computed with Pinocchio."""
     setup = shared_factory(name).setup
     model, frame = setup.robot.model, setup.scenario.task.frame
     M = mass_matrix(model, q)
@@ -256,7 +256,7 @@ def test_the_correction_removes_velocities_of_impulses_only(name: str) -> None:
         correction = driver._correction(Reading(quiet.t, quiet.q, impact, None))
         # The corrected velocity is zero.
         np.testing.assert_allclose(impact + correction, 0, atol=1e-6 * np.abs(impact).max())
-    # A motion that no impulse improves, because the task errors are orthogonal to the effect of impulses.
+    # No impulse improves this motion, because the task errors are orthogonal to the effect of impulses.
     state = driver._state.update(quiet.q, quiet.v)
     J = np.vstack([task.jacobian(state) for task in leading(driver)])
     v = generator.normal(size=quiet.v.size)
@@ -280,7 +280,7 @@ def test_the_invariant_part_of_a_velocity_is_kept(name: str) -> None:
 
 
 def test_the_approach_is_not_a_velocity_error() -> None:
-    # During the approach, the end effector follows its reference, so the correction is zero.
+    # During the approach, the end effector follows its reference, so the velocity correction is zero.
     factory = shared_factory("aerial-vertical")
     task = factory.setup.scenario.task
     assert isinstance(task, RepeatedContacts)
@@ -309,7 +309,7 @@ def test_only_the_feedback_is_corrected() -> None:
     reading = moving(factory, "feedback")
     driver.expect(reading.t)
     driver.tick(reading)
-    # The dynamics use the measured velocity.
+    # The dynamics constraints use the measured velocity.
     np.testing.assert_array_equal(driver.controller.state.v, reading.v)
     seen = reading.v + driver.share(reading.t) * driver._correction(reading)
     state, posture = driver.controller.state, driver.posture

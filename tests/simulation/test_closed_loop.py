@@ -26,7 +26,7 @@ EXAMPLE = Path(__file__).parents[2] / "docs" / "examples" / "cpp" / "closed_loop
 
 
 def quiet(name: str) -> Setup:
-    """Set up a shipped scenario with sensors without noise, one contact and a short wait."""
+    """Set up a shipped scenario with noise-free sensors, one contact and a short wait."""
     scenario = read_scenario(name)
     sensors = scenario.sensors
     sensors = Sensors(force_frame=sensors.force_frame, force_cutoff=sensors.force_cutoff, delay=0.001)

@@ -1,4 +1,4 @@
-"""Controllers in C in a simulation: comparison with Python, and when they are built."""
+"""C controllers in simulations: comparison with Python controllers, and conditions under which they are built."""
 
 from __future__ import annotations
 
@@ -23,13 +23,13 @@ from impact_posture.system.libraries import cache_path
 from tests.simulation.factories import driven, shared_factory
 from tests.support.daqp import sources_or_skip
 
-# Relative differences between Python and C.  A wall amplifies the last digits, the ground does not.
+# Tolerated relative differences between Python and C, larger for a wall, because its contact amplifies rounding.
 BANDS = {"solo8-push": 1e-6, "aerial-vertical": 2e-2}
 
 
 @pytest.fixture(scope="module", autouse=True)
 def _built(tmp_path_factory: pytest.TempPathFactory) -> Any:
-    """Use a separate cache, in which compilers do not optimize."""
+    """Use a separate cache and compile without optimization."""
     sources_or_skip()
     with pytest.MonkeyPatch.context() as patch:
         patch.setenv("CFLAGS", "-O0")
@@ -56,7 +56,7 @@ def test_a_run_in_c_agrees_with_python(name: str, controller: str, mode: Any) ->
     assert compiled.peak_jump == pytest.approx(wanted.peak_jump, rel=BANDS[name])
     assert (compiled.contacts, compiled.failed_ticks) == (wanted.contacts, wanted.failed_ticks)
     np.testing.assert_array_equal(ours.series.level, theirs.series.level)
-    # Until the impact, they differ by rounding only.
+    # Before the impact, the runs differ only by rounding.
     calm = slice(0, 300)
     np.testing.assert_allclose(theirs.series.q[calm], ours.series.q[calm], rtol=0, atol=1e-9)
     np.testing.assert_allclose(theirs.series.torque[calm], ours.series.torque[calm], rtol=0, atol=1e-7)
@@ -97,7 +97,7 @@ def test_auto_compiles_from_two_runs_on() -> None:
     assert in_c("solo8-push", compile="never").driver("robust").compiled is None
     factory = in_c("solo8-push", compile="auto")
     assert factory.driver("robust").compiled is not None and factory.in_c
-    # `walker` reads the state of its controller, so it runs in Python.
+    # `walker` reads the internal state of its controller, so `walker` runs in Python.
     assert factory.driver("walker").compiled is None and not factory.in_c
 
 
@@ -118,6 +118,6 @@ def test_controllers_that_cannot_run_in_c(monkeypatch: pytest.MonkeyPatch) -> No
     assert factory.driver("nominal").compiled is None
     (warning,) = factory.warnings
     assert warning.startswith("the controller runs in Python")
-    # The failed build is not repeated.
+    # The second controller does not repeat the failed build.
     assert factory.driver("nominal").compiled is None
     assert factory.warnings == []

@@ -1,4 +1,4 @@
-"""Ticks of a world in C, compared with the same controller in the world in Python."""
+"""Simulations with the world in C, compared with simulations of the same controller with the world in Python."""
 
 from __future__ import annotations
 
@@ -29,8 +29,8 @@ from tests.simulation.factories import (
 )
 from tests.support.daqp import sources_or_skip
 
-# Largest difference of a column, relative to its largest number.  A wall amplifies rounding as soon as an encoder
-# counts another step, so the comparison ends at the impact there.
+# Largest tolerated difference of a column, relative to its largest number.  In the scenario with a wall, the
+# comparison ends at the impact, because the contact amplifies rounding as soon as an encoder reading differs.
 BAND = 1e-7
 
 
@@ -42,7 +42,7 @@ def _quick(monkeypatch: pytest.MonkeyPatch) -> None:
 
 @pytest.fixture
 def in_python(monkeypatch: pytest.MonkeyPatch) -> Iterator[Any]:
-    """Return a function that runs the controller in C in the world in Python."""
+    """Return a function that simulates the controller in C with the world in Python."""
 
     def call(*arguments: Any, **options: Any) -> Any:
         with monkeypatch.context() as patch:
@@ -74,7 +74,7 @@ def test_a_pushed_robot_moves_as_in_python(controller: str, mode: Any, in_python
 
 
 def test_references_sensors_and_propellers_agree_with_python(in_python: Any) -> None:
-    # This scenario has noise of every sensor, vibration, encoders and a force sensor.
+    # This scenario uses noise of all sensors, vibration, encoders and a force sensor.
     factory = in_c(shared_factory("aerial-vertical"))
     ours, theirs = (how(factory, "posture") for how in (in_python, driven))
     touch = int(np.flatnonzero(ours.series.touching)[0])

@@ -1,4 +1,4 @@
-"""Drivers before the impact, while they hold a posture, and after a reset."""
+"""Drivers of the controllers before an impact, while they hold a posture, and after a reset."""
 
 from __future__ import annotations
 
@@ -23,7 +23,7 @@ from tests.simulation.factories import AERIAL, PUSHES, SHIPPED, shared_factory
 
 
 class Stage:
-    """Driver in its world, without reference and recorder."""
+    """Driver with its simulated world, but without reference and recorder."""
 
     def __init__(self, factory: ControllerFactory, driver: Driver, seed: int = 0) -> None:
         setup = factory.setup
@@ -39,7 +39,7 @@ class Stage:
         return self.world.truth()
 
     def moved(self, q: Any) -> float:
-        """Return the largest distance of a joint from the start."""
+        """Return the largest deviation of a joint from its start."""
         return float(np.abs(pin.difference(self.factory.setup.robot.model, self.factory.setup.q, q)[6:]).max())
 
     def H(self) -> float:
@@ -75,7 +75,7 @@ def test_robust_lowers_the_metric_after_brace_only(name: str) -> None:
     on.driver.brace()
     on.go(0.45)
     assert on.driver.level == 1
-    # Robots differ in how far they move in the first half second.
+    # How far the joints move in the first half second differs between robots.
     assert on.H() < idle * (1 - 2e-3)
 
 
@@ -100,7 +100,7 @@ def test_other_gradients_lower_their_metrics(controller: str) -> None:
 def test_all_controllers_share_gains_tasks_and_weights(monkeypatch: pytest.MonkeyPatch) -> None:
     for name in ("aerial-lateral", "talos-push"):
         factory = shared_factory(name)
-        # Formulations do not depend on the ends of posture and path.
+        # Formulations do not depend on the offline optimum or the path, so both are replaced.
         monkeypatch.setitem(vars(factory), "_optimum", lambda name, q=factory.setup.q: SimpleNamespace(q=q))
         monkeypatch.setitem(vars(factory), "path", SimpleNamespace(duration=0.0))
         nominal = factory.driver("nominal").controller.formulation
@@ -110,7 +110,7 @@ def test_all_controllers_share_gains_tasks_and_weights(monkeypatch: pytest.Monke
             for task, other in zip(formulation.tasks, nominal.tasks, strict=True):
                 np.testing.assert_array_equal(task.kp, other.kp)
                 np.testing.assert_array_equal(task.weight, other.weight)
-                # `stiff` is critically damped for another stiffness.
+                # The controllers named `stiff` have other damping, because their stiffness differs.
                 if "stiff" not in controller or task is not formulation.posture:
                     np.testing.assert_array_equal(task.kd, other.kd)
             assert [c.friction for c in formulation.contacts] == [c.friction for c in nominal.contacts]
@@ -139,7 +139,7 @@ def test_held_freezes_posture_center_of_mass_and_base(name: str, controller: str
     assert driver.level == 0
     target = driver.posture.target
     moved = pin.difference(play.factory.setup.robot.model, reached, target)[6:]
-    # The held posture is the measured posture of the tick before.
+    # The held posture is the posture measured one tick earlier.
     assert np.abs(moved).max() < 0.01
     wanted = [np.array(t.target) for t in driver.controller.formulation.weighted]  # type: ignore[attr-defined]
     last = play.go(1.8 if name in AERIAL else 0.8).q
@@ -190,7 +190,7 @@ def test_the_end_effector_follows_its_reference_into_the_surface() -> None:
     assert hand.target is not None
     home = hand.target.translation.copy()
     driver.tick(factory.setup.world.read(), ReferencePoint(0.1, 0.3, 0.8))
-    # The motion is against the normal of the wall, which is −x.
+    # The robot moves against the normal of the wall, which is −x.
     np.testing.assert_allclose(hand.target.translation - home, [0.1, 0, 0], atol=1e-15)
     np.testing.assert_allclose(hand.target_velocity, [0.3, 0, 0, 0, 0, 0])
     np.testing.assert_allclose(hand.target_acceleration, [0.8, 0, 0, 0, 0, 0])
@@ -207,7 +207,7 @@ def test_the_posture_driver_reaches_its_goal(name: str) -> None:
     if name in AERIAL:
         goal[-1] += 0.1
     else:
-        # All legs bend by 10 % more: the base moves down and the feet stay.
+        # All legs bend by 10 % more: the base moves down and the feet do not move.
         goal[7:] *= 1.1
         data = robot.model.createData()
         pin.framesForwardKinematics(robot.model, data, factory.setup.q)

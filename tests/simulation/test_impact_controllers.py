@@ -1,4 +1,4 @@
-"""Reference spreading and impact-aware limits, in single ticks and in runs."""
+"""The controllers `reference-spreading` and `impact-aware`, in single ticks and in runs."""
 
 from __future__ import annotations
 
@@ -17,7 +17,7 @@ NAME = "aerial-vertical"
 
 
 def spreading() -> tuple[ReferenceSpreadingDriver, Reference]:
-    """Return a driver in its first approach, and the reference of the scenario."""
+    """Return a driver in its first approach, and the reference motion of the scenario."""
     factory = shared_factory(NAME)
     driver, task = factory.driver("reference-spreading"), factory.setup.scenario.task
     assert isinstance(driver, ReferenceSpreadingDriver)
@@ -29,7 +29,7 @@ def spreading() -> tuple[ReferenceSpreadingDriver, Reference]:
 
 
 def reading(t: float, deeper: float, v: Vector, force: float = 0.0) -> Reading:
-    """Return a reading with the robot at its start, moved into the surface."""
+    """Return a sensor reading of the robot at its start, but shifted into the surface."""
     q = shared_factory(NAME).setup.q.copy()
     q[2] -= deeper
     return Reading(t, q, v, np.array([0.0, 0.0, force]))
@@ -41,7 +41,7 @@ def test_before_the_impact_the_reference_is_a_function_of_the_position() -> None
     for deeper in (0.01, 0.03, 0.4):
         led = driver._end_effector
         assert led is not None
-        # The reference does not depend on time.
+        # The reference depends on the distance, not on time.
         for late in (0.0, 0.05):
             driver.tick(reading(t + late, deeper, np.zeros(9)), reference.at(t + late))
             expected = min(np.sqrt(2 * task.acceleration * deeper), task.speed)
@@ -83,7 +83,7 @@ def test_after_the_impact_the_targets_begin_at_the_rigid_impact() -> None:
     for task in driver.controller.formulation.tasks:
         wanted = fade * task.jacobian(driver.controller.state) @ after
         np.testing.assert_allclose(task.target_velocity, wanted, atol=1e-6)
-    # The contact point is at rest, but the robot moves.
+    # After the impact, the contact point is at rest, but the robot moves.
     assert abs((J @ after)[2]) < 1e-9
     assert np.linalg.norm(after) > 0.3
 
@@ -91,7 +91,7 @@ def test_after_the_impact_the_targets_begin_at_the_rigid_impact() -> None:
 def test_reference_spreading_makes_its_contact() -> None:
     run = lived(NAME, "reference-spreading", "live", None)
     assert [window.touched for window in run.of("impact")] == [True]
-    # The contact has the speed of the scenario at any time.
+    # The reference of the contact always has the speed of the scenario.
     k = before(run.series, run.of("impact")[0])
     assert run.series.v[k, 2] == pytest.approx(-0.5, abs=0.06)
 

@@ -1,4 +1,4 @@
-"""Metrics of synthetic series whose values are known."""
+"""Metrics of synthetic time series with known results."""
 
 from __future__ import annotations
 
@@ -42,13 +42,13 @@ def test_the_integral_of_speed_against_its_closed_form() -> None:
     v = np.zeros((1000, 9))
     v[:, 2] = np.where(t > 0.4, np.exp(-(t - 0.4) / 0.05), 0.0)
     metrics = measured({"v": v}, touch(0.4))
-    # The error of the sum is half a step times the fall of the speed.
+    # The integration error of the sum is half a time step times the drop in speed.
     assert metrics.q_total_impact == pytest.approx(0.05 * (1 - np.exp(-6)), abs=1e-3 / 2 * 1.01)
 
 
 def test_ticks_outside_the_windows_do_not_count() -> None:
     v, slip, peak = np.zeros((1000, 9)), np.zeros(1000), np.zeros(1000)
-    # Ticks end at 1, 2, … ms, so the window (0.2, 0.5] has the ticks 201 to 500.
+    # Ticks end at 1, 2, … ms, so the window (0.2, 0.5] contains the ticks 201 to 500.
     for k in (0, 199, 500, 999):
         v[k], slip[k], peak[k] = 1.0, 1.0, 99.0
     metrics = measured({"v": v, "slip": slip, "peak": peak}, touch(0.2))
@@ -64,7 +64,7 @@ def test_ticks_outside_the_windows_do_not_count() -> None:
 @pytest.mark.parametrize("begin", [0.2, 0.20000000000001, 0.19999999999999, 0.2003, 0.2007, 0.3 - 0.1])
 def test_a_window_always_has_the_same_number_of_ticks(begin: float) -> None:
     setup = shared_factory("aerial-vertical").setup
-    # Times of the world (steps times the time step) and of MuJoCo (their sum).
+    # Compare the time of the world (steps times time step) with the time of MuJoCo (sum of time steps).
     for t in (0.25e-3 * 4 * np.arange(1, 1001), np.cumsum(np.full(4000, 0.25e-3))[3::4]):
         part = by_hand(setup, 1000, t=t).slice(begin, begin + 0.3)
         assert part.stop - part.start == 300
@@ -75,7 +75,7 @@ def test_a_delayed_motion_is_in_the_recovery() -> None:
     setup = shared_factory("aerial-vertical").setup
     v = np.zeros((1000, 9))
     v[:201, 0] = 0.5
-    # The robot moves after the window only.
+    # The robot moves only after the window.
     v[600:800, 3] = 2.0
     windows = (touch(0.2), touch(0.2, 0.5, kind="recovery"), touch(0.9, 0.1, 1, touched=False))
     metrics = measure(setup, Run(by_hand(setup, 1000, v=v), windows))
@@ -106,7 +106,7 @@ def test_the_jump_begins_at_the_last_tick_before_the_touch() -> None:
     setup = shared_factory("aerial-vertical").setup
     v = np.arange(1000)[:, None] * np.ones(9)
     series = by_hand(setup, 1000, v=v)
-    # The touch is in the middle of tick 200, which ends at 0.201 s, so tick 199 is before it.
+    # The first touch is in tick 200, which ends at 0.201 s, so tick 199 is the last tick before the touch.
     assert before(series, touch(0.2004)) == 199
     assert jump(setup, series, touch(0.2004)) == pytest.approx(3 * 15)
     assert before(series, touch(0.0)) == 0
@@ -145,7 +145,7 @@ def test_relaxed_and_failed_ticks_stops_and_contacts() -> None:
     status[10:13] = STATUSES.index(Status.RELAXED)
     status[500] = STATUSES.index(Status.UNSOLVED)
     status[501] = STATUSES.index(Status.NON_FINITE)
-    # One joint at its stop from the start, one outside the window, and one that counts.
+    # Of three joints at their stops, one is there from the start and one only outside the window, so one is reported.
     at_stop[:, 6], at_stop[700, 7], at_stop[300, 8] = True, True, True
     metrics = measured({"status": status, "at_stop": at_stop}, touch(0.2))
     assert (metrics.relaxed_ticks, metrics.failed_ticks) == (3, 2)

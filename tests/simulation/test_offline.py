@@ -1,4 +1,4 @@
-"""Offline posture of a scenario: constraints of optimize, and load of the motors."""
+"""Offline posture of a scenario: the constraints of `optimize`, and the load of the motors."""
 
 from __future__ import annotations
 
@@ -37,7 +37,7 @@ def test_the_posture_satisfies_the_constraints_of_optimize(name: str) -> None:
 
 @pytest.mark.parametrize("name", ["aerial-vertical", "aerial-lateral"])
 def test_a_flying_robot_can_hold_the_posture(name: str) -> None:
-    """The loads follow from inverse dynamics and the allocation."""
+    """The expected loads come from inverse dynamics and the rotor allocation."""
     setup = set_up(read_scenario(name))
     q, robot = offline_posture(setup, scenario_objective(setup), starts=1).q, setup.robot
     torque = pin.computeGeneralizedGravity(robot.model, robot.model.createData(), q)
@@ -51,7 +51,7 @@ def test_a_flying_robot_can_hold_the_posture(name: str) -> None:
 
 
 def test_the_share_of_the_limits_counts() -> None:
-    """A posture can be held exactly up to the share that it needs, about the middle of the range of the rotors."""
+    """A posture is feasible if ``limit_share`` is at least its largest load, measured from the rotors' mid-range."""
     setup = set_up(read_scenario("aerial-lateral"))
     objective = scenario_objective(setup)
     assert is_held(setup, objective)
@@ -69,7 +69,7 @@ def test_the_share_of_the_limits_counts() -> None:
 def test_a_note_reports_possible_collisions(monkeypatch: pytest.MonkeyPatch) -> None:
     setup = set_up(read_scenario("aerial-vertical"))
     objective = scenario_objective(setup)
-    # No posture keeps all links a meter apart.
+    # No posture keeps a distance of one meter between all links.
     demands = replace(scenario_requirements(setup, objective), clearance=1.0)
     monkeypatch.setattr(offline, "scenario_requirements", lambda *_, **__: demands)
     monkeypatch.setattr(offline, "_MARGINS", offline._MARGINS[-1:])
@@ -101,6 +101,6 @@ def test_the_end_effector_is_at_the_surface() -> None:
     start = place(setup.q)
     np.testing.assert_allclose(place(there), start - setup.gap * setup.scenario.normal, atol=1e-8)
     np.testing.assert_allclose(place(here), start, atol=1e-8)
-    # The base tilts no further than the flow may tilt it.
+    # The base tilts at most by the tilt limit of the reference flow.
     for q in (there, here):
         assert pin.Quaternion(q[3:7]).matrix()[2, 2] >= np.cos(FlowOptions().tilt) - 1e-9

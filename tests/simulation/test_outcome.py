@@ -1,4 +1,4 @@
-"""Outcome of runs: bounds on synthetic series, robots that fall, and robots that nothing holds."""
+"""Outcome of runs: limits on synthetic series, robots that fall, and unsupported robots."""
 
 from __future__ import annotations
 
@@ -38,7 +38,7 @@ def judged(setup: Setup, columns: dict[str, Any], **run: Any) -> tuple[Event, ..
 
 
 def turned(setup: Setup, axis: tuple[float, float, float], degrees: float) -> np.ndarray[Any, Any]:
-    """Return the start posture, whose base is turned about an axis of the world from tick 400 on."""
+    """Return postures in which the base is rotated about an axis of the world from tick 400 on."""
     q = np.tile(setup.q, (1000, 1))
     turn = pin.AngleAxis(np.radians(degrees), np.array(axis)).matrix() @ pin.Quaternion(setup.q[3:7]).matrix()
     q[400:, 3:7] = pin.Quaternion(turn).coeffs()
@@ -69,7 +69,8 @@ def test_links_without_shapes_behind_a_surface_are_a_warning() -> None:
     for depth, reported in ((0.01, False), (0.05, True)):
         q = np.tile(setup.q, (1000, 1))
         q[600:700, :3] -= (elbow + depth) * n
-        # The elbow has the shape, which the surface stops.  The joints above are still in front of the surface.
+        # Move the elbow behind the surface.  Its shape touches the surface there, and the joints above are still in
+        # front.
         assert links_behind(setup, [Run(by_hand(setup, 1000, q=q), ())]) == ()
         q[600:700, :3] = setup.q[:3] - ((setup.q[:3] - point) @ n + depth) * n
         warnings = links_behind(setup, [Run(by_hand(setup, 1000, q=q), ())])
@@ -92,7 +93,7 @@ def test_a_base_below_the_surface_or_its_start_fell(name: str) -> None:
     q[700:, 2] -= 1.001
     events = judged(setup, {"q": q})
     assert "sank by more than 1 m" in "; ".join(e.what for e in events)
-    # The base may follow a reference that leads the arm down.
+    # The base may sink if the reference moves the arm down.
     if n[2] == 1 and "aerial" in name:
         reference = np.where(np.arange(1000) < 700, 0.0, 0.5)
         assert "sank" not in "; ".join(e.what for e in judged(setup, {"q": q, "reference": reference}))

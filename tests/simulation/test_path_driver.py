@@ -1,4 +1,4 @@
-"""Controller that follows a path to the offline optimum."""
+"""Controllers that follow a path to the offline optimum."""
 
 from __future__ import annotations
 
@@ -22,7 +22,7 @@ pytest.importorskip("toppra", reason="toppra is not installed (the extra 'path')
 @functools.cache
 def _made(name: str) -> ControllerFactory:
     factory = controller_factory(near(name))
-    # One start suffices for tests of the path.
+    # One start is enough for tests of the path.
     factory.starts = 1
     return factory
 
@@ -37,7 +37,7 @@ def test_the_robot_follows_the_path_to_its_end(name: str) -> None:
     assert path.duration > 0.1
     q, v, period = factory.setup.q.copy(), np.zeros(model.nv), driver.controller.period
     first = driver.reset(q).u.copy()
-    # The path begins at the projection of the start onto the constraints.
+    # The path begins at the start posture, projected onto the constraints.
     off = float(np.linalg.norm(pin.difference(model, q, path.q[0])))
     assert driver.level == 0
     driver.brace()

@@ -1,4 +1,4 @@
-"""Predicted impacts against simulated impacts of an uncontrolled robot."""
+"""Predicted impacts, compared with simulated impacts of an uncontrolled robot."""
 
 from __future__ import annotations
 
@@ -31,7 +31,7 @@ WEIGHTLESS = Physics(gravity=(0.0, 0.0, 0.0))
 
 @functools.cache
 def adrift(law: ContactLaw, timestep: float) -> Setup:
-    """Set up the aerial robot without rotors and weight, with its tip 2 mm above the floor."""
+    """Set up the aerial robot without rotors and gravity, with its tip 2 mm above the floor."""
     scenario, original = read_scenario("aerial-vertical"), shared_factory("aerial-vertical").setup
     body = replace(original.robot, spec=replace(original.robot.spec, propulsion=None))
     floor = replace(scenario.surfaces[0], gap=0.002, **vars(law))
@@ -40,7 +40,7 @@ def adrift(law: ContactLaw, timestep: float) -> Setup:
 
 
 def drop(law: ContactLaw, q: Vector, speed: float = 0.5, timestep: float = 2.5e-4) -> tuple[Prediction, Run, Setup]:
-    """Let the robot drift into the floor with its motors at rest."""
+    """Let the robot drift into the floor with its motors off."""
     setup = adrift(law, timestep)
     objective, world = scenario_objective(setup), setup.world
     v = np.zeros(9)
@@ -59,7 +59,7 @@ def drop(law: ContactLaw, q: Vector, speed: float = 0.5, timestep: float = 2.5e-
 
 
 def restitution(setup: Setup, run: Run, speed: float) -> float:
-    """Return the restitution from the largest normal speed of the tip after the touch."""
+    """Return the restitution, from the largest normal speed of the tip after the touch."""
     k = before(run.series, run.windows[0])
     frame = setup.robot.frame_id("ee")
     ticks = zip(run.series.q[k + 1 : k + 9], run.series.v[k + 1 : k + 9], strict=True)
@@ -67,7 +67,7 @@ def restitution(setup: Setup, run: Run, speed: float) -> float:
 
 
 def postures() -> list[Vector]:
-    """Return the start and other postures with a vertical lower link, so that the same point touches."""
+    """Return the start and other postures whose lower link is vertical, so that the same point touches."""
     start = shared_factory("aerial-vertical").setup.q
     configurations = [start]
     for pitch, elbow in ((-0.3, 0.3), (-1.2, 1.2)):
@@ -79,7 +79,7 @@ def postures() -> list[Vector]:
 
 @pytest.mark.parametrize("k", range(3))
 def test_a_frictionless_impact_jumps_as_predicted(k: int) -> None:
-    # Raise the posture so that the tip is 1 mm above the surface.
+    # Raise the robot so that its tip is 1 mm above the surface.
     q = postures()[k]
     setup = adrift(ContactLaw(friction=0.0), 2.5e-4)
     frame, data = setup.robot.frame_id("ee"), setup.robot.model.createData()
@@ -93,11 +93,11 @@ def test_a_frictionless_impact_jumps_as_predicted(k: int) -> None:
     assert prediction.approach == pytest.approx(0.5, rel=1e-6)
     e = restitution(setup, run, 0.5)
     assert 0.05 < e < 0.25
-    # The band is 5 % because the contact lasts 4 ms (3 % in test_world.py, for the impact alone).
+    # The tolerance is 5 %, because the contact lasts 4 ms (test_world.py allows 3 % for the impact alone).
     assert prediction.measured == pytest.approx((1 + e) * 0.5 * np.sqrt(prediction.V), rel=0.05)
     assert prediction.frictionless == pytest.approx(0.5 * np.sqrt(prediction.V))
     assert prediction.coulomb == pytest.approx(prediction.frictionless)
-    # V, H and G follow their formulas.
+    # V, H and G agree with their formulas.
     M = mass_matrix(setup.robot.model, q)
     J = frame_jacobian(setup.robot.model, q, frame)[2]
     a = np.linalg.solve(M, J)

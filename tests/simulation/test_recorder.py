@@ -1,4 +1,4 @@
-"""Recorder with a synthetic world."""
+"""The recorder, tested with a synthetic world."""
 
 from __future__ import annotations
 
@@ -20,7 +20,7 @@ def metric(q: Any) -> float:
 
 
 class SyntheticWorld:
-    """Synthetic world that returns given rows as traces."""
+    """Synthetic world that returns given rows as its traces."""
 
     def __init__(self, setup: Setup) -> None:
         self.stops, self._setup, self.marks, self.next = setup.world.stops, setup, 0, 0
@@ -29,7 +29,7 @@ class SyntheticWorld:
     def add(
         self, t: float, *, began: float | None = None, touching: bool = False, stop: str = "", slip: float = 0.1
     ) -> None:
-        """Add a state in which all shapes have the same contact, but a slip that grows from shape to shape."""
+        """Add a state in which all shapes have the same contact, but the slip increases from shape to shape."""
         robot, shapes = self._setup.robot, len(self._setup.scenario.shapes)
         rotors = 0 if robot.spec.propulsion is None else len(robot.spec.propulsion.rotors)
         ones = np.ones(shapes)
@@ -49,7 +49,7 @@ class SyntheticWorld:
 
 
 def recording(name: str, metric: Callable[[Any], float]) -> tuple[Recorder, SyntheticWorld]:
-    """Return a recorder with its synthetic world."""
+    """Return a recorder and its synthetic world."""
     setup = shared_factory(name).setup
     recorder, world = Recorder(setup, metric), SyntheticWorld(setup)
     recorder._world = world  # type: ignore[assignment]
@@ -62,17 +62,17 @@ def command(speed: float = 50.0, status: Status = Status.SOLVED) -> Command:
 
 def test_a_lasting_touch_is_reported_once() -> None:
     recorder, world = recording("aerial-vertical", metric)
-    # The shape touches in the third tick, stays for four ticks, and bounces.
+    # The shape touches in the third tick, stays in contact for four ticks, and rebounds.
     course = [(None, False), (None, False), (0.0025, True), (0.003, True), (0.004, True), (0.005, False),
               (None, False), (0.0072, True), (0.008, True)]  # fmt: skip
     for k, (began, touching) in enumerate(course):
         world.add(1e-3 * (k + 1), began=began, touching=touching)
         recorder.take(command(), 0.0, 0.0)
         if k == 4:
-            # The border between two blocks of ticks makes no difference.
+            # The border between two recorded blocks of ticks does not change the time of the first touch.
             assert recorder.first_touch(0.0, 1.0) == 0.0025
     assert recorder.first_touch(0.0, 1.0) == 0.0025
-    # A touch that began earlier does not count.
+    # A touch that began before the interval is ignored.
     assert recorder.first_touch(0.003, 0.007) is None
     assert recorder.first_touch(0.003, 1.0) == 0.0072
     assert recorder.first_touch(0.0, 0.002) is None and recorder.first_touch(0.0025, 0.0026) == 0.0025
@@ -94,7 +94,7 @@ def test_columns_have_the_values_of_their_ticks() -> None:
     np.testing.assert_array_equal(series.status, np.arange(len(STATUSES)))
     np.testing.assert_array_equal(series.at_stop[:, -1], np.arange(len(STATUSES)) % 2 == 1)
     assert not series.at_stop[:, :-1].any()
-    # Recorded commands are clipped to their limits.
+    # Recorded commands are clipped to the actuator limits.
     assert series.rotor_command[0, 0] == propulsion.speed_min and series.rotor_command[1, 0] == propulsion.speed_max
     np.testing.assert_allclose(series.level, np.arange(len(STATUSES)) / 9)
 

@@ -1,7 +1,7 @@
 """Nominal and robust controller in the shipped scenarios, with one contact or push, within bands.
 
-The bands contain the values of seeds 0 to 2 (talos: 0 and 1).  They are a few times wider than the spread of the
-seeds.  So they allow another version of the physics, and detect a change of a controller or a scenario.
+The bands contain the values of seeds 0 to 2 (talos: 0 and 1), and are a few times wider than their spread.  Therefore
+the bands tolerate another MuJoCo version, but reveal a change of a controller or a scenario.
 """
 
 from __future__ import annotations
@@ -18,8 +18,8 @@ from tests.simulation.factories import controller_factory, driven, shortened
 Band = tuple[float, float]
 
 
-# Measured: q of nominal 0.280-0.309, 0.112-0.127, 0.409, 0.284; reductions of q 74-75, 80-81, 12.2, 52 %; of H 97.8,
-# 69, 2.2, 78 %.
+# Measured motion q of `nominal`: 0.280-0.309, 0.112-0.127, 0.409, 0.284.  Measured reductions of q: 74-75, 80-81,
+# 12.2, 52 %; of H: 97.8, 69, 2.2, 78 %.
 @pytest.mark.parametrize(
     ("name", "settle", "changes", "nominal", "reduction", "lowered"),
     [
@@ -33,14 +33,14 @@ def test_robust_against_nominal(
     name: str, settle: float, changes: dict[str, Any], nominal: Band, reduction: Band, lowered: Band
 ) -> None:
     metrics, before = [], []
-    # The robust controller reaches its posture in this time (q and H as after 6 s, within 8 %).
+    # The settling time in which the robust controller reaches its posture (q and H as after 6 s, within 8 %).
     for controller, seconds in (("nominal", 0.5), ("robust", settle)):
         factory = controller_factory(shortened(name, settle=seconds, **changes))
         record = driven(factory, controller)
         metrics.append(measure(factory.setup, record))
         before.append(predict(factory.setup, factory.objective(), record)[0].H)
         assert record.rested and metrics[-1].failed_ticks == 0 and metrics[-1].stops == ()
-        # The last recorded H is at most ten ticks before the impact.
+        # H is recorded every ten ticks, so the last value is at most ten ticks older than the impact.
         (window,) = record.of("impact")
         course = record.series.objective[: record.series.slice(window.begin, window.end).start]
         assert course[np.isfinite(course)][-1] == pytest.approx(before[-1], rel=0.05)

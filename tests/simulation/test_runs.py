@@ -1,4 +1,4 @@
-"""Short runs: every controller completes, runs are reproducible, and windows are in the right places."""
+"""Short runs: every controller completes, runs are reproducible, and time windows are correct."""
 
 from __future__ import annotations
 
@@ -31,9 +31,9 @@ from tests.simulation.factories import (
     shortened,
 )
 
-# Without an approach, these are the nominal controller.
+# In scenarios without an approach, these controllers equal the nominal controller.
 APPROACH = ("reference-spreading", "impact-aware")
-# `path` has tests of its own.
+# The controller `path` has separate tests.
 ALL = [("aerial-vertical", name, "live") for name in CONTROLLERS if name != "path"]
 ALL += [("solo8-push", name, "live") for name in CONTROLLERS if name not in ("path", *APPROACH)]
 FEW = ("nominal", "robust", "robust-flow", "walker", "invariant")
@@ -48,7 +48,7 @@ ALL += [(name, "walker", "held") for name in ("aerial-vertical", "solo8-push")]
 
 @pytest.mark.parametrize(("name", "controller", "mode"), ALL)
 def test_every_controller_completes(name: str, controller: str, mode: Mode) -> None:
-    # A posture must be reached before it is held.
+    # The robot must reach a posture before it can hold the posture.
     settle = 1.0 if mode == "held" and name in AERIAL else None
     factory, record = shared_factory(name, settle), lived(name, controller, mode, settle)
     series, setup = record.series, factory.setup
@@ -61,11 +61,11 @@ def test_every_controller_completes(name: str, controller: str, mode: Mode) -> N
     assert metrics.failed_ticks == 0 and metrics.contacts == metrics.contacts_asked == 1
     assert metrics.relaxed_ticks < series.t.size / 4
     assert 0 < metrics.q_total_impact < 3 and 0 < metrics.peak_jump < 30
-    # The robot neither falls nor flies away.
+    # The robot neither falls nor drifts away.
     tilt = 2 * np.arccos(np.clip(np.abs(series.q[:, 6]), 0, 1))
     assert tilt.max() < 0.3 and np.linalg.norm(series.q[:, :3] - setup.q[:3], axis=1).max() < 0.6
     prepares = controller not in ("nominal", "stiff", "invariant", *APPROACH)
-    # The motion to an offline posture takes a second.
+    # The transition to an offline posture takes a second.
     assert (series.level.max() > (0.1 if controller.startswith("posture") else 0.7)) == prepares
     assert mode == "live" or series.level[-1] == 0.0
     (prediction,) = predict(setup, factory.objective(), record)
@@ -130,7 +130,7 @@ def test_windows_begin_at_the_first_touch(name: str) -> None:
         impact, dwell, recovery = record.windows
         series = record.series
         assert (impact.kind, dwell.kind, recovery.kind, impact.touched) == ("impact", "dwell", "recovery", True)
-        # The next approach would begin before a second is over.
+        # The recovery lasts one second, or ends with the reference if this is earlier.
         assert recovery.begin == impact.begin
         assert recovery.end == pytest.approx(min(impact.begin + 1, reference.total))
         first = int(np.argmax(series.touching > 0))
@@ -139,7 +139,7 @@ def test_windows_begin_at_the_first_touch(name: str) -> None:
         assert (dwell.begin, dwell.end) == (impact.begin, pytest.approx(leaves))
         part = series.slice(impact.begin, impact.end)
         assert part.stop - part.start == 300
-        # The contact is not earlier than the reference.  A robot that still reconfigures may come late.
+        # The contact is never earlier than the reference, but may be late while the robot still reconfigures.
         crossing = task.settle + reference.inward - 2 * task.beyond / task.speed
         assert crossing - 0.03 < impact.begin < (crossing + 0.03 if controller == "nominal" else leaves)
 
@@ -163,7 +163,7 @@ def test_the_window_of_a_push_begins_after_rest(name: str) -> None:
 
 def test_the_window_of_a_missed_contact_begins_at_the_expected_time(monkeypatch: pytest.MonkeyPatch) -> None:
     factory = controller_factory(shortened("aerial-vertical", beyond=0.0, window=0.1))
-    # The reference ends before the surface.
+    # The reference motion ends before the surface.
     for key in factory.setup.world.built.gaps:
         monkeypatch.setitem(factory.setup.world.built.gaps, key, 0.14)  # type: ignore[arg-type]
     record = driven(factory, "nominal")
@@ -179,7 +179,7 @@ def test_the_window_of_a_missed_contact_begins_at_the_expected_time(monkeypatch:
 
 
 def test_tight_limits_relax_the_tasks() -> None:
-    # The conflict in the paper: 1 m/s into the surface, with weak motors.
+    # The conflict from the paper: 1 m/s into the surface, with weak motors.
     setup = shortened("aerial-vertical", speed=1.0, acceleration=4.0)
     weak = setup.robot.model.effortLimit.copy()
     weak[6:] /= 3

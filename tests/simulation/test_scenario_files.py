@@ -1,4 +1,4 @@
-"""Scenario files: shipped scenarios, scenarios of users, and wrong files."""
+"""Scenario files: shipped scenarios, user scenarios, and invalid files."""
 
 from __future__ import annotations
 
@@ -63,9 +63,9 @@ def test_every_shipped_scenario_stays_at_its_start(name: str) -> None:
         command = driver.tick(setup.world.read())
         setup.world.step(command, count)
     truth = setup.world.truth()
-    # The feet sink by less than a millimeter, and sensor noise moves the robot.
+    # The feet sink by less than a millimeter, and sensor noise moves the robot slightly.
     assert np.linalg.norm(pin.difference(setup.robot.model, setup.q, truth.q)) < 0.05
-    # The feet touch the ground, and other shapes do not touch yet.
+    # The feet touch the ground; other shapes do not touch anything yet.
     feet = feet_of(setup)
     assert all(s.touching == (s.frame in feet) for s in truth.shapes)
     lifted = () if setup.scenario.control.footing is None else setup.scenario.control.footing.lifted
@@ -209,7 +209,7 @@ def test_a_robot_with_one_joint_runs(folder: Path) -> None:
     factory = ControllerFactory(one)
     command = factory.driver("nominal").reset(one.q)
     assert command.torque.shape == (1,) and np.isfinite(command.torque).all()
-    # The end effector task determines the only joint, so the posture term changes nothing.
+    # The end effector task determines the only joint, so the posture term has no effect.
     (nominal,), (flow,) = (run(factory, name) for name in ("nominal", "robust-flow"))
     np.testing.assert_allclose(flow.series.q, nominal.series.q, atol=1e-9)
     assert flow.series.peak.max() == pytest.approx(nominal.series.peak.max(), rel=1e-6) and nominal.series.peak.any()
@@ -272,7 +272,8 @@ def test_the_reference_hits_the_surface_at_its_speed_and_returns(acceleration: f
     slopes = np.array([p.acceleration for p in points])
     assert distance[0] == distance[-1] == 0 and distance.max() == pytest.approx(0.2 + beyond)
     assert np.abs(speed).max() == pytest.approx(0.5, rel=1e-3)
-    # Distance, speed and acceleration are consistent.  Without a braking distance, the speed drops to zero at once.
+    # Distance, speed and acceleration are consistent.  If the braking distance is zero, the speed drops to zero at
+    # once.
     errors = np.sort(np.abs(np.diff(distance) - speed[:-1] * 1e-4))
     assert errors[-3] < 1e-6 and errors[-1] < (1e-6 if beyond else 0.5e-4)
     steps = np.diff(speed) - slopes[:-1] * 1e-4

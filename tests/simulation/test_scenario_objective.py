@@ -1,4 +1,4 @@
-"""Objective of the impact of a scenario and its gradient, interpreted and compiled."""
+"""Impact objective of a scenario and its gradient, interpreted and compiled."""
 
 from __future__ import annotations
 
@@ -34,7 +34,7 @@ from tests.support.helpers import Vector, assert_close, central_gradient, frame_
 from tests.support.helpers import robot as known_robot
 from tests.support.tools import need_compiler
 
-# Fixed and floating bases, joints with several numbers, with and without feet.
+# Robots with fixed and floating bases, with joints of several coordinates, with and without feet.
 OBJECTIVES: tuple[tuple[str, str, ObjectiveKind, bool], ...] = (
     ("tilthex_arm", "ee", "speed", False),
     ("panda", "panda_hand_tcp", "sticking", False),
@@ -52,7 +52,7 @@ def objective_of(name: str, frame: str, kind: ObjectiveKind, feet: bool) -> Wors
 
 
 def near(objective: WorstCaseObjective, *key: object) -> Vector:
-    """Return a posture near the default posture."""
+    """Return a random posture near the default posture."""
     step = 0.1 * rng(*key).normal(size=objective.robot.nv)
     return np.array(pin.integrate(objective.robot.model, objective.robot.posture(), step))
 
@@ -88,7 +88,7 @@ def test_a_gradient_outlives_its_objective() -> None:
     points = [near(objective, "kept", k) for k in range(8)]
     expected = [objective.gradient(q) for q in points]
     del objective
-    # These arrays overwrite freed memory.
+    # The new arrays overwrite freed memory.
     for _ in range(3):
         gc.collect()
         rubbish = [np.full(n, 7.7) for n in (1, 3, 9, 12) for _ in range(500)]
@@ -153,7 +153,7 @@ def test_the_contact_has_the_offset_of_the_shape() -> None:
 
 @pytest.fixture
 def builds(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> list[Path]:
-    """Return the folders that are built in a new cache."""
+    """Return the cache folders after builds in a new cache."""
     need_compiler()
     monkeypatch.setenv("IMPACT_POSTURE_CACHE", str(tmp_path / "cache"))
     folders: list[Path] = []
@@ -196,7 +196,7 @@ def test_a_damaged_build_is_repeated(builds: list[Path]) -> None:
     objective = objective_of("ur5", "tool0", "impulse", False)
     compiled(objective)
     library = builds[0] / "libimpact.so"
-    # This process has mapped the library, so the damaged file must be another one.
+    # This process has mapped the library, so the damaged library must be a new file.
     library.write_bytes(library.rename(builds[0].parents[1] / "mapped.so").read_bytes()[:5000])
     (builds[0] / "impact.c").write_text("half")
     q = near(objective, "again")
@@ -208,7 +208,7 @@ def test_a_damaged_build_is_repeated(builds: list[Path]) -> None:
 def test_a_gradient_that_cannot_be_compiled_is_interpreted(
     fault: str, builds: list[Path], monkeypatch: pytest.MonkeyPatch, tmp_path: Path
 ) -> None:
-    """There is one warning, and the numbers are the same."""
+    """The user gets one warning, and the numbers are the same."""
     setup = shared_factory("aerial-vertical").setup
     if fault == "no compiler":
         monkeypatch.setenv("PATH", str(tmp_path))
@@ -222,7 +222,7 @@ def test_a_gradient_that_cannot_be_compiled_is_interpreted(
         write: Callable[..., Any] = module.write_export
 
         def elsewhere(objectives: Any, folder: Path, **options: Any) -> Any:
-            """Build like another machine: the library is complete, but cannot be loaded here."""
+            """Build like another machine: the library is complete, but this machine cannot load it."""
             written = write(objectives, folder, **options)
             written.library.unlink()
             written.library.write_text("of another machine")

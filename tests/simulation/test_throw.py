@@ -1,4 +1,4 @@
-"""Thrown balls against mechanics and the rigid model, and the scenarios with real impacts."""
+"""Thrown balls, compared with mechanics and the rigid model, and the scenarios with real impacts."""
 
 from __future__ import annotations
 
@@ -24,13 +24,13 @@ from impact_posture.simulation.world.world import World, build_world
 from tests.simulation.factories import controller_factory
 from tests.support.helpers import Vector, frame_jacobian, mass_matrix
 
-# Robot, direction of flight and sign.
+# Scenario, flight direction and sign.
 THROWS = [("solo8-throw", (-1, 0, 0), 1), ("solo8-throw", (0.3, -0.4, -1.0), -1), ("talos-throw", (0.5, 1.0, 0.0), 1)]
 
 
 @functools.cache
 def thrown(name: str, direction: tuple[float, float, float] = (-1, 0, 0)) -> Setup:
-    """Set up a scenario with an early throw in a direction, whose contact is short."""
+    """Set up a scenario with an early throw along a direction and a short contact."""
     scenario = read_scenario(name)
     assert scenario.throw is not None
     quick = {"settle": 0.1, "patience": 0.2, "after": 0.1, "solref": (0.002, 1.0)}
@@ -39,7 +39,7 @@ def thrown(name: str, direction: tuple[float, float, float] = (-1, 0, 0)) -> Set
 
 
 def ball(world: World) -> tuple[Vector, Vector]:
-    """Return position and velocity of the ball, whose joint is the last."""
+    """Return position and velocity of the ball, which belong to the last joint."""
     return world._data.qpos[-7:-4].copy(), world._data.qvel[-6:-3].copy()
 
 
@@ -48,7 +48,7 @@ def test_a_ball_obeys_mechanics(name: str, direction: tuple[float, float, float]
     setup = thrown(name, direction)
     world, throw, robot = setup.world, setup.scenario.throw, setup.robot
     assert throw is not None
-    # Without gravity and motors, only the contact acts on ball and robot.
+    # Without gravity and motor torques, only the contact force acts on ball and robot.
     scene = replace(setup.scenario, physics=replace(setup.scenario.physics, gravity=(0, 0, 0)), surfaces=())
     world = build_world(robot, scene, setup.q, throw)
     world.reset(setup.q)
@@ -57,7 +57,7 @@ def test_a_ball_obeys_mechanics(name: str, direction: tuple[float, float, float]
     target = world._data.geom_xpos[world.ball._target].copy()
     begin, speed = ball(world)
     np.testing.assert_allclose(speed, sign * throw.speed * setup.scenario.normal, atol=1e-12)
-    # The ball flies at the center of the shape and touches at the expected time.
+    # The ball flies toward the center of the shape and touches at the expected time.
     np.testing.assert_allclose(np.cross(target - begin, speed), 0, atol=1e-9)
     still = ActuatorCommand(np.zeros(robot.nv - 6), np.zeros(0))
     frame = [s.frame for s in setup.scenario.shapes].index(throw.frame)
@@ -70,15 +70,15 @@ def test_a_ball_obeys_mechanics(name: str, direction: tuple[float, float, float]
         shape = world.truth().shapes[frame]
         touches += [] if shape.began is None else [shape.began]
     assert touches[0] == pytest.approx(FLIGHT, abs=2 * world.timestep)
-    # The impulse on the shape is the momentum that the ball loses and the robot gains.
+    # The impulse on the shape equals the momentum that the ball loses and the robot gains.
     impulse, after = shape.impulse, ball(world)[1]
     np.testing.assert_allclose(throw.mass * (speed - after), impulse, rtol=1e-6, atol=1e-9)
     data = robot.model.createData()
     truth = world.truth()
     momentum = pin.computeCentroidalMomentum(robot.model, data, truth.q, truth.v)
-    # The armature of the motors has no momentum here.
+    # The armature of the motors has no momentum in this balance.
     np.testing.assert_allclose(momentum.linear, impulse, rtol=2e-3, atol=1e-3 * np.linalg.norm(impulse))
-    # The ball neither sticks in the shape nor passes through it.
+    # The ball neither sticks to the shape nor passes through it.
     assert 0 < depth < 0.5 * throw.speed * throw.solref[0] * 2
     assert sign * setup.scenario.normal @ impulse > throw.mass * throw.speed * 0.5
 
@@ -89,13 +89,13 @@ def test_the_prediction_is_the_rigid_impact_of_two_bodies(name: str) -> None:
     objective = controller_factory(setup, free=True).objective()
     throw, q, model = setup.scenario.throw, setup.q, setup.robot.model
     assert throw is not None
-    # Robot and ball are one system with six more velocities.
+    # Robot and ball form one system with six additional velocities.
     J = frame_jacobian(model, q, setup.robot.frame_id(throw.frame))[:3]
     M = np.zeros((setup.robot.nv + 6,) * 2)
     M[:-6, :-6] = mass_matrix(model, q)
     M[-6:-3, -6:-3], M[-3:, -3:] = throw.mass * np.eye(3), 0.4 * throw.mass * throw.radius**2 * np.eye(3)
     n = setup.scenario.normal
-    # The contact point of the ball is r n from its center.
+    # The contact point of the ball is at r n from its center.
     arm = throw.radius * np.array([[0, -n[2], n[1]], [n[2], 0, -n[0]], [-n[1], n[0], 0]])
     gap = np.hstack([J, -np.eye(3), arm])
     spread = np.linalg.solve(M, gap.T)
@@ -118,7 +118,7 @@ def test_a_standing_robot_jumps_as_predicted() -> None:
     assert metrics.contacts == metrics.contacts_asked == 1
     (impact,) = predict(setup, factory.objective(), record)
     assert impact.approach == pytest.approx(3.0, abs=0.02)
-    # The contact rebounds with 0.13, and the controller acts for 15 ms.
+    # The ball rebounds with restitution 0.13, and the controller acts during the contact of 15 ms.
     assert impact.coulomb is not None
     assert 0.95 < metrics.peak_jump / impact.coulomb < 1.25
     assert metrics.peak_force > 10

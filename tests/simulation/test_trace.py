@@ -1,4 +1,4 @@
-"""Traces of many ticks against single ticks, and contact forces against MuJoCo."""
+"""Traces of many ticks, compared with single ticks; contact forces, compared with MuJoCo."""
 
 from __future__ import annotations
 
@@ -14,19 +14,19 @@ from tests.support.helpers import rng
 
 mujoco = pytest.importorskip("mujoco", reason="mujoco is not installed (the extra 'sim')")
 
-# A flying robot, a standing robot and a fixed base, which all move into their surfaces.
+# A flying robot, a standing robot and a fixed-base robot, which all move into their surfaces.
 SCENARIOS = ("aerial-vertical", "solo8-push", "panda-tap")
 
 
 def shaken(name: str, ticks: int = 40) -> tuple[World, list[ActuatorCommand]]:
-    """Return a world near its surface, and commands that move the robot."""
+    """Return a world near its surface, and commands that move the robot toward it."""
     setup, random = shared_factory(name).setup, rng(name)
     robot, world = setup.robot, setup.world
     rotors = 0 if robot.spec.propulsion is None else len(robot.spec.propulsion.rotors)
     joints = robot.nv - (6 if robot.floating else 0)
     v = np.zeros(robot.nv)
     if robot.floating:
-        # The flying robot must reach the surface within the ticks.
+        # The flying robot must reach the surface within the simulated ticks.
         v[2] = -10.0 if rotors else -1.0
     world.reset(setup.q, v, seed=1)
     return world, [ActuatorCommand(random.normal(size=joints), np.full(rotors, 16.0)) for _ in range(ticks)]
@@ -43,7 +43,7 @@ def test_a_trace_has_the_state_of_every_tick(name: str, monkeypatch: pytest.Monk
     monkeypatch.setattr(contact_forces, "_MOST", 5)
     for k, command in enumerate(commands):
         world.step(command, 3)
-        # The first ticks are not marked, so their steps are evaluated before the first look.
+        # The trace is marked only after the first ticks, so all earlier steps are evaluated at the first mark.
         if k > 15:
             world.mark()
     trace = world.trace()
@@ -59,7 +59,7 @@ def test_a_trace_has_the_state_of_every_tick(name: str, monkeypatch: pytest.Monk
             if k:
                 assert trace.peak[k, j] == shape.peak
                 assert np.isnan(trace.began[k, j]) if shape.began is None else trace.began[k, j] == shape.began
-    # The first mark has the peaks and touches of the earlier ticks.
+    # The first mark includes the force peaks and touches of all earlier ticks.
     for j in range(len(truths[0].shapes)):
         assert trace.peak[0, j] == max(truth.shapes[j].peak for truth in truths[:17])
         began = [t.shapes[j].began for t in truths[:17] if t.shapes[j].began is not None]
@@ -76,7 +76,8 @@ def test_forces_agree_with_mujoco() -> None:
         mujoco.mj_copyData(copy, model, data)
         world.step(command)
         truth = world.truth()
-        # The contacts of a step are the contacts at its begin, which the world has overwritten.
+        # Use the contacts from the beginning of the step.  The step of the world has overwritten them, so compute
+        # them in a copy.
         copy.ctrl[:] = truth.torques
         mujoco.mj_step2(model, copy)
         forces = np.zeros((len(shape_of), 3))

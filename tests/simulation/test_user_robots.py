@@ -1,4 +1,4 @@
-"""Scenarios of users: arms on a fixed base with and without robot.toml, and other standing robots."""
+"""User scenarios: fixed-base arms with and without robot.toml, and other standing robots."""
 
 from __future__ import annotations
 
@@ -114,7 +114,7 @@ def arm(folder: Path, which: str) -> ControllerFactory:
         shutil.copytree(RAIL, folder / "rail")
         name = "rail/rail_arm.urdf"
     elif which == "stranger":
-        # The URDF has no robot.toml beside it.
+        # The folder of the URDF contains no robot.toml.
         shutil.copy(RAIL / "rail_arm.urdf", folder / "stranger.urdf")
         name = "stranger.urdf"
         more = "armature = { rail = 6.0 }\njoints = { shoulder_pitch = 0.6, elbow = 1.2, wrist_pitch = 0.9 }"
@@ -123,7 +123,7 @@ def arm(folder: Path, which: str) -> ControllerFactory:
 
 
 def standing(folder: Path, name: str, force: float) -> ControllerFactory:
-    """Return the factory of a known robot on its supports."""
+    """Return the factory of a known robot that stands on its feet."""
     robot = known_robot(name)
     shapes = "\n".join(f'[[shapes]]\nframe = "{s.frame}"\nsize = [0.016]' for s in robot.spec.supports)
     path = folder / f"{name}.toml"
@@ -145,16 +145,16 @@ def test_an_arm_on_a_fixed_base_meets_a_table(folder: Path, which: str, controll
     metrics = measure(factory.setup, record)
     assert metrics.contacts == 1 and metrics.failed_ticks == 0 and metrics.relaxed_ticks < 30
     assert 0 < metrics.q_total_impact < 1
-    # The base is fixed.
+    # The base is fixed, so only joints move.
     assert metrics.q_total_impact_base == 0 and metrics.q_total_impact_joints == metrics.q_total_impact
     (impact,) = predict(factory.setup, factory.objective(), record)
-    # The arm arrives as fast as its reference, unless limits of the joints slow it down.
+    # The arm reaches the surface at its reference speed, unless joint limits slow it down.
     assert controller == "impact-aware" or impact.approach == pytest.approx(0.2, rel=0.1)
 
 
 @pytest.mark.parametrize(("pose", "size"), [("position", 3), ("aligned", 5)])
 def test_the_end_effector_task_can_leave_the_spin_or_orientation_free(folder: Path, pose: str, size: int) -> None:
-    """All controllers have this task, and the offline optimum has the same freedom."""
+    """All controllers use this end effector task, and the offline optimum leaves the same motion free."""
     text = HIT.format(robot="panda", frame=known_robot("panda").spec.contact.frame, more="")
     path = folder / f"{pose}.toml"
     path.write_text(text.replace("kp = 100", f'pose = "{pose}"\nkp = 100'), encoding="utf-8")
@@ -190,7 +190,7 @@ def test_another_standing_robot_is_pushed(folder: Path, name: str, force: float)
 def test_a_standing_robot_hits_a_wall(folder: Path) -> None:
     standing(folder, "solo12", 1.0)
     text = (folder / "solo12.toml").read_text(encoding="utf-8")
-    # The base moves into the wall, so no other task may hold it.
+    # The base moves into the wall, so the scenario must have no other task for the base.
     begin, end = text.index("[push]"), text.index("[control.posture]")
     wall = (
         '[[surfaces]]\nname = "wall"\nnormal = [-1, 0, 0]\npoint = [0.27, 0, 0]\n\n'

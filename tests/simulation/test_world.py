@@ -1,4 +1,4 @@
-"""Simulated world: dynamics against Pinocchio, impacts against the rigid model, and actuators."""
+"""Simulated world: dynamics compared with Pinocchio, impacts compared with the rigid model, and actuators."""
 
 from __future__ import annotations
 
@@ -96,7 +96,7 @@ def test_free_flight_keeps_momentum_and_energy() -> None:
         errors.append([np.abs(h1[:3] - h0[:3] - fallen).max(), np.abs(h1[3:] - h0[3:]).max(), abs(e1 - e0)])
         scale = [np.abs(h0[:3]).max(), np.abs(h0[3:]).max(), e0]
         assert (np.array(errors[-1]) < 2e-3 * np.array(scale)).all(), errors
-    # The errors of the integrator are of first order in the time step.
+    # The integration errors are of first order in the time step.
     np.testing.assert_allclose(np.array(errors[0]) / errors[1], 2, rtol=0.3)
 
 
@@ -104,7 +104,7 @@ def test_free_flight_keeps_momentum_and_energy() -> None:
 
 
 def impact(law: ContactLaw, timestep: float, speed: float = 0.5) -> tuple[WorstCaseObjective, Vector, Vector, Truth]:
-    """Let a flying arm hit the floor; return the objective, q, Δν, and the state after the impact."""
+    """Let a flying arm hit the floor; return the objective, q, Δν, and the true state after the impact."""
     robot = without_rotors("tilthex_arm")
     q = robot.posture()
     scene = Scene(
@@ -152,7 +152,7 @@ def test_a_sticking_impact_agrees_with_the_rigid_model() -> None:
     e = restitution(objective, truth, 0.5)
     predicted = (1 + e) * 0.5 * np.asarray(quantities.sticking_jump)
     assert_close(jump, predicted, 0.03, "jump")
-    # The frictionless jump differs clearly.
+    # The frictionless jump differs clearly from the simulated jump.
     assert np.linalg.norm(jump - (1 + e) * 0.5 * quantities.jump / quantities.G) > 0.2 * np.linalg.norm(jump)
 
 
@@ -165,7 +165,7 @@ def test_the_impulse_of_the_surface_changes_the_momentum() -> None:
     h1 = np.array(pin.computeCentroidalMomentum(robot.model, data, truth.q, truth.v).linear)
     assert_close(h1 - h0, truth.shapes[0].impulse, 1e-3, "momentum")
     f = truth.shapes[0].impulse
-    # The contact slides at times, and the tangential impulse stays within the Coulomb limit.
+    # The contact slides at times, so the tangential impulse must stay within the Coulomb limit.
     assert 0 < np.linalg.norm(f[:2]) <= 0.3 * f[2] * (1 + 1e-6)
 
 
@@ -183,7 +183,7 @@ def test_a_ball_hits_surfaces_of_any_direction(normal: tuple[float, float, float
     assert shape.peak > 0 and not shape.touching
     assert_close(shape.impulse, np.linalg.norm(shape.impulse) * n, 1e-6, "direction")
     assert truth.v[:3] @ n > 0
-    # The first touch is reported once.
+    # The first touch is reported only once.
     assert world.truth().shapes[0].began is None
 
 
@@ -191,7 +191,7 @@ def test_a_box_rests_on_a_face() -> None:
     turned = pin.SE3ToXYZQUAT(pin.SE3(pin.utils.rotate("y", np.pi / 2), np.zeros(3)))
     scene = Scene((FLOOR,), (Shape("ball", (0.1, 0.06, 0.02), "box", offset=(0.0, 0.0, 0.0)),))
     world = build_world(ball(2.0), scene, turned)
-    # The axis −x of the frame points up, so the origin of the frame is on the bottom face.
+    # The axis −x of the frame points up, so the frame origin is on the bottom face of the shape.
     assert world.built.points["floor"][2] == pytest.approx(0.0, abs=1e-12)
     world.reset(turned)
     world.step(ActuatorCommand(NONE, NONE), 4000)
@@ -210,7 +210,7 @@ def test_a_shape_has_the_friction_of_each_surface() -> None:
     world.step(ActuatorCommand(NONE, NONE), 100)
     (shape,) = world.truth().shapes
     assert shape.impulse[0] < -1 and shape.impulse[2] > 0
-    # Only the wall has friction, and its force stays below the limit.
+    # Only the wall has friction, so the tangential force stays below its friction limit.
     assert -0.5 * abs(shape.impulse[0]) * (1 + 1e-9) <= shape.impulse[1] < -0.05
 
 
@@ -318,7 +318,7 @@ def test_the_seed_determines_noise_only() -> None:
     a, b, other = run(first, 5), run(again, 5), run(again, 6)
     np.testing.assert_array_equal(a, b)
     np.testing.assert_array_equal(a, run(first, 5))
-    # Another seed changes the noise and not the true state.
+    # Another seed changes the noise, but not the true state.
     truth = robot.nq + robot.nv + 3
     assert not np.array_equal(np.array(a)[:, :truth], np.array(other)[:, :truth])
     np.testing.assert_array_equal(np.array(a)[:, truth:], np.array(other)[:, truth:])

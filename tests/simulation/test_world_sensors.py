@@ -1,4 +1,4 @@
-"""Simulated world: sensors, restitution of contact laws, and bad input."""
+"""Simulated world: sensors, restitution of contact laws, and invalid input."""
 
 from __future__ import annotations
 
@@ -71,7 +71,7 @@ def test_noise_has_the_stated_deviation() -> None:
     for noise, sigma in zip((q, v), expected, strict=True):
         np.testing.assert_allclose(noise.std(axis=0), sigma, rtol=0.08)
         assert (np.abs(noise.mean(axis=0)) < 4 * sigma / np.sqrt(2000)).all()
-        # Successive readings are uncorrelated.
+        # Successive noise values are uncorrelated.
         assert np.abs(np.mean(noise[1:] * noise[:-1], axis=0) / sigma**2).max() < 0.1
     np.testing.assert_array_equal(world.truth().q, truth.q)
 
@@ -144,7 +144,8 @@ def test_the_vibration_follows_from_the_forces_of_the_unbalance() -> None:
     ahead = vibration.twist(speeds, phases + 2 * np.pi * speeds * step)
     back = vibration.twist(speeds, phases - 2 * np.pi * speeds * step)
     wrench = inertia @ (ahead - back) / (2 * step)
-    # Each force is perpendicular to the axis of its propeller and has the size U(2πω)².  The wrench is their sum.
+    # The imbalance force of a propeller is perpendicular to its axis and has magnitude U(2πω)².  The wrench is the
+    # sum of these forces.
     total = np.zeros(6)
     for k, rotor in enumerate(spec.rotors):
         turn = pin.Quaternion.FromTwoVectors(np.array([0.0, 0, 1]), np.array(rotor.direction)).matrix()
@@ -297,7 +298,7 @@ def test_a_diverged_state_is_an_error_without_a_log_file(tmp_path: Path, monkeyp
     world = build_world(robot, Scene(physics=Physics(0.05, stop_solref=(0.2, 1.0))))
     world.reset(robot.posture())
     with pytest.raises(SimulationDiverged, match="ran away at t = ") as caught:
-        # The damping overshoots more in every step.
+        # The commanded damping overshoots more with every step, so the simulation diverges.
         for _ in range(400):
             world.step(ActuatorCommand(-2.7 * np.sign(world.truth().v[6:] + 1e-3), NONE))
             world.push(Push("base_link", tuple(-2e3 * world.truth().v[:3] + 1.0), 0.05))  # type: ignore[arg-type]

@@ -41,7 +41,7 @@ class RelaxedTick:
         A: Constraint matrix, shape (m, n).
         lower: Lower bounds of ``[z; A z]``, shape (n + m,).
         upper: Upper bounds of ``[z; A z]``, shape (n + m,).
-        level: Level of each bound, shape (n + m,): 0 for hard constraints, 1 for joint limits, then the strict levels.
+        level: Level of a bound, shape (n + m,): 0 for hard constraints, 1 for joint limits, then the strict levels.
         unit: Scale of each variable, the value that corresponds to an acceleration of 1, shape (n,).
         z: Solution of the Python controller, shape (n,); NaN if this controller has no solution.
     """
