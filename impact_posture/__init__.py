@@ -1,7 +1,7 @@
 """Impact-robust posture optimization for kinematically redundant robots.
 
-The velocity jump of a rigid impact is ``Δν = M⁻¹(q) Jᵀ n λ``.  This package measures it, finds the posture that
-keeps it small under the constraints of a task, shows why, and exports what a controller needs::
+The velocity jump of a rigid impact is ``Δν = M⁻¹(q) Jᵀ n λ``.  This package computes the jump, and
+optimizes the posture so that the jump is small under the constraints of a task.  It also exports C code::
 
     import impact_posture as ip
 
@@ -10,7 +10,7 @@ keeps it small under the constraints of a task, shows why, and exports what a co
     result = ip.optimize(ip.PostureProblem(objective, base="level"))
     result.save("out")
 
-Names are imported when they are first used, so that the online part (``ip.tsid``) never loads CasADi.
+Each name is imported at its first use, so that the online part (``ip.tsid``) never loads CasADi.
 """
 
 from __future__ import annotations

@@ -1,4 +1,4 @@
-"""Errors that a user can correct, with a common root class, data and a hint.
+"""Errors that a user can correct.  All derive from one class, and contain data and a hint.
 
 The command line prints ``what``, ``where`` and ``hint`` as one line and exits with ``exit_code``.
 """
@@ -11,9 +11,9 @@ import unicodedata
 from collections.abc import Iterable
 from typing import ClassVar
 
-# Longest name in a message.  A longer name loses its middle.
+# Largest number of characters of a name in a message.  The middle of a longer name is left out.
 _LONGEST_NAME = 200
-# Longest part of a message, which may list the 200 joints of a large robot.
+# Largest number of characters of one part of a message.  A message may list the 200 joints of a large robot.
 _LONGEST_PART = 10_000
 
 
@@ -24,8 +24,8 @@ def printable(text: str, *, keep: str = "", longest: int = 0) -> str:
 
     Args:
         text: Any text.
-        keep: Characters that stay, such as line breaks.
-        longest: Longest result, without the middle of a longer text; 0 keeps the whole text.
+        keep: Characters that are not replaced, such as line breaks.
+        longest: Largest length of the result.  The middle of a longer text is left out; 0 sets no limit.
     """
     if longest and len(text) > longest:
         half = longest // 2
@@ -50,20 +50,21 @@ def nearest(name: str, known: Iterable[str], count: int = 5) -> list[str]:
 
 
 def one_line(text: str) -> str:
-    """Return a message on one line, of limited length, without characters that control a terminal."""
+    """Return a message as one line of limited length, without characters that control a terminal."""
     return printable(" ".join(text.split()), longest=_LONGEST_PART)
 
 
 def shown(value: object) -> str:
-    """Return a value as text for a message, without the middle of a long value.
+    """Return a value as text for a message; the middle of a long value is left out.
 
-    The aliases of a short YAML file can make a list of lists that would fill the memory as text.
+    The length is limited during the conversion, because aliases in a short YAML file can define nested lists whose
+    text would fill the memory.
     """
     if isinstance(value, str):
         return printable(value, longest=_LONGEST_NAME)
     try:
         return printable(reprlib.repr(value), longest=_LONGEST_NAME)
-    except Exception:  # Python refuses integers of more than 4300 digits, and repr may raise anything.
+    except Exception:  # Python prints no integer of over 4300 digits, and repr may raise any error.
         return type(value).__name__
 
 
@@ -93,7 +94,7 @@ class ImpactPostureError(Exception):
         self.reword(what, where, hint)
 
     def reword(self, what: str, where: str, hint: str) -> None:
-        """Replace the message; type and data stay."""
+        """Replace the message, but keep the type and data of the error."""
         self.what, self.where, self.hint = (one_line(text) for text in (what, where, hint))
         self.args = (self.line,)
 
@@ -104,7 +105,8 @@ class ImpactPostureError(Exception):
         return f"{text}; {self.hint}" if self.hint else text
 
     def __reduce__(self) -> tuple[object, ...]:
-        # Worker processes return errors, but subclasses take other arguments.
+        # Worker processes pickle errors.  Unpickling must not call the constructors, because subclasses have other
+        # arguments.
         return BaseException.__new__, (type(self), self.line), self.__dict__.copy()
 
 
@@ -113,7 +115,7 @@ class InputError(ImpactPostureError):
 
 
 class NameNotFound(InputError):
-    """A name that does not exist; carries the nearest valid names."""
+    """A name does not exist; the error contains the nearest valid names."""
 
     kind: ClassVar[str] = "name"
 
@@ -145,7 +147,7 @@ class JointNotFound(NameNotFound):
 
 
 class JointLocked(JointNotFound):
-    """The joint is locked, so that it has no entry in ``q``."""
+    """The joint is locked and therefore has no entry in ``q``."""
 
     def __init__(self, name: str, *, where: str = "") -> None:
         self.name, self.nearest = name, []
@@ -222,11 +224,11 @@ class OutputError(InputError):
 
 
 class CompilerError(InputError):
-    """The C compiler is missing or failed; carries its output and the command."""
+    """The C compiler is missing or failed; the error contains the command and the output."""
 
 
 class ManifestMismatch(InputError):
-    """A C export was made for another robot; carries the key that differs, and both values."""
+    """A C export was made for another robot; the error contains the key that differs, and both values."""
 
     def __init__(self, key: str, exported: object, found: object, *, where: str = "manifest", hint: str = "") -> None:
         self.key, self.exported, self.found = key, exported, found
@@ -247,7 +249,7 @@ _MOST_NAMED = 6
 
 
 class Infeasible(ImpactPostureError):
-    """No posture satisfies the constraints; carries the conflicting constraints."""
+    """No posture satisfies the constraints; the error contains the conflicting constraints."""
 
     exit_code = 3
 
@@ -282,7 +284,7 @@ class WorkerDied(ImpactPostureError):
 
 
 class SimulationDiverged(ImpactPostureError):
-    """The state of a simulation diverged; carries the time."""
+    """The state of a simulation diverged; the error contains the time."""
 
     exit_code = 4
 

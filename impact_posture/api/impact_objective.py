@@ -1,4 +1,4 @@
-"""The objective behind ``ip.ImpactObjective``, with the defaults of the robot."""
+"""Objective class ``ip.ImpactObjective``; the robot provides defaults for missing arguments."""
 
 from __future__ import annotations
 
@@ -26,7 +26,7 @@ from impact_posture.robot.model_variant import ModelVariant, Payload, build_mode
 from impact_posture.robot.robot import Robot
 from impact_posture.robot.robot_spec import Support
 
-# The C export is imported where it is used, because that takes longer than a small problem.
+# Functions that need the C export import it, because this import takes longer than solving a small problem.
 if TYPE_CHECKING:
     from impact_posture.codegen.export import Export
 
@@ -37,24 +37,27 @@ class ImpactObjective(WorstCaseObjective):
 
     Args:
         robot: The robot.
-        contact: Contact of the impact, or several contacts that act at once.  A contact without an offset at the
-            contact frame of robot.toml takes the offset from there.
+        contact: Contact of the impact, or several simultaneous contacts.  A contact at the contact frame of
+            robot.toml gets the offset of robot.toml if it has no offset.
         metric: ``euclidean``, ``kinetic`` or ``weighted``, or a :class:`~impact_posture.impact.metric.Metric`.
         kind: ``impulse`` (λ̄²H), ``speed`` (V), ``sticking`` (S), ``coulomb`` (C) or ``energy`` (E).
-        supports: Feet that stay, as ``FRAME[:point|surface]``; ``None`` for the feet of robot.toml, ``()`` for none.
-        compliance: ε of the supports, 1/kg; 0 for 1e-4 divided by the mass of the robot.
-        normal_cone_deg: Half angle of the cone of normals, degrees; the worst normal counts.
-        others: More contacts that act at the same time.
+        supports: Feet that stay in place during the impact, as ``FRAME[:point|surface]``; ``None`` selects the feet
+            of robot.toml, ``()`` selects no feet.
+        compliance: Compliance ε of the supports, 1/kg; 0 selects 1e-4 divided by the mass of the robot.
+        normal_cone_deg: Half angle of the cone of possible normals, degrees.  The objective is the worst value over
+            the cone.
+        others: Further contacts that act at the same time as ``contact``.
         bilateral: Whether several contacts can pull as well as push.
-        model_variants: Robot models, the robot as modeled first; the worst model counts.
+        model_variants: Robot models, the nominal model first.  The objective is the worst value over the models.
         weights: Weights of the weighted metric: nv numbers, a TOML file, or ``velocity-limits``.
-        armature_range: Lowest and highest factor on the armature; the worst counts.
-        payloads: Frame and mass in kg of payloads that the robot may carry, one at a time; the worst counts.
-        joint_model: Inertia at the joints: ``reflected``, ``link`` or ``locked``
-            (:func:`~impact_posture.robot.joint_model.with_joint_model`); ``None`` for the value of the robot.
+        armature_range: Lowest and highest factor on the armature.  The objective is the worst value over both.
+        payloads: Payloads that the robot may carry, one at a time: frame and mass in kg.  The objective is the worst
+            value over the payloads.
+        joint_model: Model of the inertia at the joints: ``reflected``, ``link`` or ``locked``
+            (:func:`~impact_posture.robot.joint_model.with_joint_model`); ``None`` selects the model of the robot.
 
     Raises:
-        ImpactPostureError: An argument does not fit the robot.
+        ImpactPostureError: An argument is not valid for this robot.
     """
 
     def __init__(
@@ -95,7 +98,7 @@ class ImpactObjective(WorstCaseObjective):
         super().__init__(
             robot, leading, metric, kind, feet, compliance, normal_cone_deg, tuple(more), bilateral, variants
         )
-        # This is a hint, not an error, because the evaluation of an impact needs no support.
+        # A missing support is a hint, not an error, because an impact can be evaluated without supports.
         object.__setattr__(self, "_missing", missing_support(robot) if supports is None and not feet else "")
 
     @checked
@@ -105,14 +108,14 @@ class ImpactObjective(WorstCaseObjective):
 
     @checked
     def export(self, out: str | Path, *, build: bool = True, **options: Any) -> Export:
-        """Write the C code of H, its gradient and this objective into a folder, and build its library.
+        """Write C code for H, its gradient and this objective into a folder, and build the library.
 
-        A folder that holds this code already, such as ``c/`` of a result, is used as it is.
+        If the folder already contains this code, as ``c/`` of a result does, the code is not written again.
 
         Args:
             out: The folder.
             build: Whether to build and check the library, if a C compiler is installed.
-            options: Options ``prefix``, ``posture``, ``single``, ``portable`` and ``force`` of :func:`write_export`.
+            options: Options of :func:`write_export`: ``prefix``, ``posture``, ``single``, ``portable`` and ``force``.
         """
         from impact_posture.codegen.existing_export import existing_export
         from impact_posture.codegen.export import write_export
@@ -122,7 +125,7 @@ class ImpactObjective(WorstCaseObjective):
 
 
 def _with_offset(robot: Robot, contact: ImpactContact) -> ImpactContact:
-    """Return the contact with the offset of robot.toml if it has the frame of robot.toml and no offset."""
+    """Give a contact the offset of robot.toml if it is at the frame of robot.toml and has no offset."""
     default = robot.spec.contact
     missing = contact.frame == default.frame and not any(contact.offset) and any(default.offset)
     return replace(contact, offset=default.offset) if missing else contact

@@ -1,4 +1,4 @@
-"""The problem behind ``ip.PostureProblem``, with the defaults of the robot."""
+"""Problem class ``ip.PostureProblem``; the robot provides defaults for missing arguments."""
 
 from __future__ import annotations
 
@@ -22,29 +22,30 @@ from impact_posture.posture.program.constrained_problem import ConstrainedProble
 from impact_posture.robot.posture_files import read_posture
 from impact_posture.system.arrays import Array
 
-# Settings that the objective and its robot hold already.
+# Settings that the objective and its robot define, so that PostureProblem must not redefine them.
 _OF_THE_OBJECTIVE = {field.name for field in fields(ImpactSettings)} - {"contact_stiffness", "contact_duration"}
 
 
 @checked
 class PostureProblem:
-    """``min_q objective(q)`` under the constraints of a task; a missing argument comes from the robot.
+    """``min_q objective(q)`` under the constraints of a task; the robot provides defaults for missing arguments.
 
     Args:
         objective: An :class:`ImpactObjective`, or another implementation of
             :class:`~impact_posture.impact.objective.Objective`.
-        posture: Start of the search: a name, a file, or a configuration (nq,); ``None`` for the default posture.
+        posture: Start of the search: the name of a posture, a file, or a configuration of shape (nq,); ``None``
+            selects the default posture.
         speed: Approach speed of the predicted jumps, m/s.
         restitution: Coefficient of restitution of the predicted jumps.
-        task: Other fields of :class:`~impact_posture.config.problem_settings.ProblemSettings` about the task, such as
-            ``base="level"``, ``target_position=(x, y, z)``, ``keep_contacts=True`` or ``hold=("joint",)``.
+        task: Fields of :class:`~impact_posture.config.problem_settings.ProblemSettings` that describe the task, such
+            as ``base="level"``, ``target_position=(x, y, z)``, ``keep_contacts=True`` or ``hold=("joint",)``.
 
     Attributes:
-        problem: Constraints and bounds, before any solver sees them.
-        prepared: The problem with its settings; ``None`` unless the objective is an impact objective.
+        problem: Objective, constraints and bounds, independent of a solver.
+        prepared: The problem together with its settings; ``None`` if the objective is not an impact objective.
 
     Raises:
-        ImpactPostureError: An argument is wrong.
+        ImpactPostureError: An argument is not valid.
     """
 
     def __init__(
@@ -82,11 +83,11 @@ class PostureProblem:
 
     @classmethod
     def of(cls, prepared: Prepared) -> PostureProblem:
-        """Return the problem of settings from a file or a command line."""
+        """Return the problem that settings from a file or a command line describe."""
         problem = cls.__new__(cls)
         problem.prepared, problem.problem = prepared, prepared.problem
         return problem
 
     def describe(self) -> list[str]:
-        """Describe the constraints, one line each."""
+        """Describe each constraint in one line."""
         return self.problem.describe()

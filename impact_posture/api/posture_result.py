@@ -1,4 +1,4 @@
-"""The result behind ``ip.PostureResult``, and ``ip.optimize``, which computes it."""
+"""Result class ``ip.PostureResult``, and function ``ip.optimize``, which computes a result."""
 
 from __future__ import annotations
 
@@ -32,7 +32,7 @@ from impact_posture.robot.posture_files import write_posture
 from impact_posture.system.arrays import Array
 from impact_posture.system.output_folder import whole_folder, write_json
 
-# The C export and the pictures are imported where they are used, because that takes longer than a small problem.
+# Functions that need the C export or the figures import them, because these imports take longer than a small problem.
 if TYPE_CHECKING:
     from impact_posture.codegen.export import Export
     from impact_posture.path.posture_path import PosturePath
@@ -40,15 +40,16 @@ if TYPE_CHECKING:
 
 @dataclass(frozen=True, eq=False)
 class PostureResult:
-    """An optimized posture with its certificate, which can be saved, drawn and exported.
+    """Optimized posture with its certificate.  The result can be saved, drawn and exported.
 
     Attributes:
         problem: The solved problem.
         solution: Result of the search.
-        robustness: Cost and gain of the model variants; ``None`` without model variants.
-        tradeoff: The best objective within each distance from the start; ``None`` before :meth:`trade_off`.
-        motion: The path from the start to the optimum; ``None`` before :meth:`path`.
-        global_search: Result of the search ``global``; ``None`` after another search.
+        robustness: Comparison with the optima of the model variants; ``None`` if there are no model variants.
+        tradeoff: Best objective within each of several distances from the start; ``None`` before a call of
+            :meth:`trade_off`.
+        motion: Timed path from the start to the optimum; ``None`` before a call of :meth:`path`.
+        global_search: Result of the search ``global``; ``None`` if another search was used.
     """
 
     problem: PostureProblem
@@ -111,16 +112,16 @@ class PostureResult:
         compile: CompileMode = "auto",
         progress: Progress | None = None,
     ) -> PostureResult:
-        """Return the same result with the best objective within each of ``points`` prices.
+        """Return this result with a trade-off: the best objective under each of ``points`` bounds on ``against``.
 
         Args:
-            points: Number of points.
-            against: The price: the ``distance`` from the start, or the peak ``force`` of the impact.
-            compile: Whether to compile the program.
-            progress: Called with the solves done and planned.
+            points: Number of bounds.
+            against: Bounded quantity: the ``distance`` from the start, or the peak ``force`` of the impact.
+            compile: When to compile the program: ``auto`` (if it saves time), ``always`` or ``never``.
+            progress: Function that is called with the numbers of finished and planned solves.
 
         Raises:
-            InputError: The force is asked for, but the elasticity of the contact is not known.
+            InputError: ``against`` is ``force``, but the elasticity of the contact is not known.
         """
         force = None
         if against == "force":
@@ -135,10 +136,10 @@ class PostureResult:
 
     @checked
     def path(self, *, seed: ZeroOrMore = 0) -> PostureResult:
-        """Return the same result with a path from the start to the optimum, timed within the robot's limits.
+        """Return this result with a path from the start to the optimum, timed within the robot's limits.
 
-        See :func:`~impact_posture.path.posture_path.posture_path`.  Without a path to the optimum, it tries the other
-        optima.  A large program has all of them only after a search with ``finish_all``.
+        See :func:`~impact_posture.path.posture_path.posture_path`.  If there is no path to the best optimum, the
+        other optima are tried.  For a large program, all optima are known only after a search with ``finish_all``.
 
         Args:
             seed: Seed of the sampling planner.
@@ -163,23 +164,25 @@ class PostureResult:
         jobs: OneOrMore = 2,
         progress: Progress | None = None,
     ) -> Written:
-        """Write the result folder: result.json, problem.toml, posture.json, pictures and C code; whole or not at all.
+        """Write the complete result folder or nothing: result.json, problem.toml, posture.json, pictures and C code.
 
         Args:
             out: The folder.
-            force: Replace an earlier result.
+            force: Whether to replace an earlier result in the folder.
             codegen: Whether to export, build and check the C code as well.
-            formats: Formats of the pictures: ``png``, ``svg``, ``pdf``.
+            formats: File formats of the pictures: ``png``, ``svg``, ``pdf``.
             report: Whether to write ``report.html``, a page with the result and the robot in 3-D.
-            meshes: Whether the page may hold, and so pass on, the meshes of the user's own URDF.
+            meshes: Whether ``report.html`` may contain the meshes of the user's own URDF. Everyone who gets the page
+                gets these meshes.
             jobs: Number of parallel processes that draw and compile.
-            progress: Called after each figure, the C code and the report with the numbers of finished and all files.
+            progress: Function that is called after each figure, the C code and the report.  Its arguments are the
+                number of finished files and the number of all files.
 
         Returns:
-            The folder, the export in it, and the reason if its C code could not be built.
+            The folder, the export inside the folder, and the reason if its C code could not be built.
 
         Raises:
-            OutputError: The folder exists without ``force``, or cannot be written.
+            OutputError: The folder exists and ``force`` is false, or the folder cannot be written.
         """
         prepared, postures = self._prepared, self._postures
         with whole_folder(Path(out), force=force, kind="result") as folder:
@@ -202,7 +205,7 @@ class PostureResult:
     def plot(
         self, out: str | Path, formats: Sequence[str] = FORMATS, only: Sequence[str] | None = None
     ) -> list[Path]:
-        """Draw the figures into a folder; return their paths."""
+        """Draw the figures into a folder, and return the paths of the figures."""
         from impact_posture.output.plot import draw_all
 
         return draw_all(result_view(self._prepared, self._postures, self.motion), Path(out), formats, only)
@@ -228,20 +231,21 @@ def optimize(
     progress: Progress | None = None,
     finish_all: bool = False,
 ) -> PostureResult:
-    """Find the posture with the least objective, from many starts, and certify it.
+    """Search from many starts for the posture with the smallest objective, and certify this posture.
 
     Args:
         problem: The problem.
-        starts: Number of starts: the given posture, then random feasible postures.
+        starts: Number of starts.  The first is the given posture, the others are random feasible postures.
         seed: Seed of the random starts.
         jobs: Number of parallel processes.
         compile: When to compile the program: ``auto`` (if it saves time), ``always`` or ``never``.
         search: ``multistart``, or ``global`` (:func:`~impact_posture.posture.search.global_search.search_globally`).
-        progress: Called after each start with the numbers of finished and all starts.
-        finish_all: Also finish starts that can no longer become the best.  The search ``global`` always does.
+        progress: Function that is called after each start with the numbers of finished and of all starts.
+        finish_all: Also finish starts that can no longer become the best.  The search ``global`` always finishes all
+            starts.
 
     Raises:
-        InputError: An argument is wrong, or the search ``global`` cannot solve the problem.
+        InputError: An argument is not valid, or the search ``global`` cannot solve the problem.
         Infeasible: No posture satisfies the constraints; the error names the conflicting constraints.
         SolverFailed: No run ended at a certified posture.
     """

@@ -1,1 +1,1 @@
-"""Settings, the demands on their values, and the files and arguments that hold them."""
+"""Settings, the checks of their values, and readers of files and arguments that contain settings."""

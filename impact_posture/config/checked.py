@@ -1,7 +1,7 @@
-"""Check of the arguments from Python against the annotations of the function that takes them.
+"""Check the arguments of a Python call against the annotations of the called function.
 
-Pydantic's ``validate_call`` takes text for numbers, and refuses NumPy arrays for sequences.  Users of this package
-pass arrays, so it has its own check.
+The function ``validate_call`` of Pydantic accepts text as a number, and rejects a NumPy array as a sequence.  Users
+of this package pass arrays, so this module has its own check.
 """
 
 from __future__ import annotations
@@ -25,13 +25,14 @@ _WORDS = {int: "a whole number", float: "a number", str: "text", bool: "True or 
 
 
 def checked(target: _Target) -> _Target:
-    """Let a function, or the constructor of a class, refuse arguments that do not fit their annotations.
+    """Make a function, or the constructor of a class, reject arguments that contradict their annotations.
 
-    An argument has to have the type and to meet each :class:`Demand` of its annotation.  NumPy's numbers and arrays
-    count as numbers and sequences.  Types that the check does not understand allow everything.
+    Each argument must have the annotated type and meet each :class:`Demand` of its annotation.  NumPy numbers and
+    arrays are accepted as numbers and sequences.  If the check does not understand an annotation, it accepts every
+    value.
 
     Raises:
-        InputError: The call has an argument that does not fit; the error names the parameter.
+        InputError: An argument contradicts its annotation; the error names the parameter.
     """
     function: Callable[..., Any] = target.__init__ if isinstance(target, type) else target  # type: ignore[misc]
     signature = inspect.signature(function)
@@ -41,7 +42,7 @@ def checked(target: _Target) -> _Target:
         try:
             values = signature.bind(*arguments, **options).arguments
         except TypeError:
-            return function(*arguments, **options)  # Python says which argument is missing or too many.
+            return function(*arguments, **options)  # This call raises a TypeError that names the argument.
         annotations = _annotations(target)
         for name, value in values.items():
             hint = hint_for(value, annotations[name]) if name in annotations else ""
@@ -56,11 +57,11 @@ def checked(target: _Target) -> _Target:
 
 
 class _Named:
-    """Base of stand-ins for classes that only type checkers import, whose instances are known by their names."""
+    """Base of stand-ins for classes that only type checkers import.  Instances are recognized by the class name."""
 
 
 class _Names(dict[str, Any]):
-    """Names of a module, with a stand-in for each missing one."""
+    """Names of a module, with a stand-in for each missing name."""
 
     def __missing__(self, name: str) -> type:
         return type(name, (_Named,), {})
@@ -68,10 +69,10 @@ class _Names(dict[str, Any]):
 
 @cache
 def _annotations(target: Callable[..., object]) -> dict[str, Any]:
-    """Return the annotations of the parameters of a function or constructor, without the open ended ``**options``."""
+    """Return the annotations of the parameters of a function or constructor, without ``**options``."""
     function: Callable[..., object] = target.__init__ if isinstance(target, type) else target  # type: ignore[misc]
     names = {p.name for p in inspect.signature(function).parameters.values() if p.kind is not p.VAR_KEYWORD}
-    # A dataclass inherits fields, whose annotations hold names of the base's module.
+    # A dataclass inherits fields.  Their annotations contain names of the module that defines the base.
     is_dataclass = isinstance(target, type) and "__dataclass_params__" in vars(target)
     annotations: dict[str, Any] = {}
     for owner in reversed(target.__mro__) if is_dataclass else [function]:  # type: ignore[attr-defined]
@@ -91,12 +92,12 @@ def _refusal(value: object, annotation: Any, name: str, hint: str) -> InputError
 
 
 def hint_for(value: object, annotation: Any) -> str:
-    """Return what to give instead of a value; empty if it fits."""
+    """Return a hint that says which values are valid; empty if ``value`` is valid."""
     if get_origin(annotation) in (Union, UnionType):
         parts = _alternatives(get_args(annotation))
         if any(_fits(value, part) for part in parts):
             return ""
-        # Of the alternatives, the one whose type fits says what the value lacks.
+        # If the value has the type of an alternative, the demand of this alternative gives the hint.
         close = [part for part in parts if get_origin(part) is Annotated and _fits(value, get_args(part)[0])]
         return hint_for(value, close[0]) if close else f"give {_words(annotation)}"
     base, *demands = get_args(annotation) if get_origin(annotation) is Annotated else (annotation,)
@@ -112,7 +113,7 @@ def hint_for(value: object, annotation: Any) -> str:
 
 
 def _fits(value: object, annotation: Any) -> bool:
-    """Whether a value may be of a type; true for types that are not understood."""
+    """Return whether a value has an annotated type; true for annotations that the check does not understand."""
     import numpy as np
     from numpy.typing import ArrayLike
 
@@ -137,7 +138,7 @@ def _fits(value: object, annotation: Any) -> bool:
         if isinstance(value, str | bytes | Mapping) or not isinstance(value, Collection):
             return False
         if (isinstance(value, np.ndarray) and value.ndim == 0) or (isinstance(value, Set) and parts[0] is float):
-            # An array without axes has no entries, and those of a set have no order.
+            # An array without axes has no entries, and the entries of a set have no order.
             return False
         if origin is tuple and parts[-1] is not ...:
             return len(value) == len(parts) and all(map(_fits, value, parts))
@@ -157,7 +158,7 @@ def _fits(value: object, annotation: Any) -> bool:
 
 
 def _alternatives(parts: tuple[Any, ...]) -> tuple[Any, ...]:
-    """Return the parts of a union, with the many parts of ``ArrayLike``, which Python merges into it, as one."""
+    """Return the alternatives of a union, with ``ArrayLike``, which Python splits into many alternatives, as one."""
     from numpy.typing import ArrayLike
 
     numeric = get_args(ArrayLike)
@@ -183,7 +184,7 @@ def _is_float(value: Any) -> bool:
 
 
 def _words(annotation: Any) -> str:
-    """Return the name of a type for people."""
+    """Return the readable name of a type for a message."""
     origin, parts = get_origin(annotation), get_args(annotation)
     if origin is Annotated:
         return next((part.words for part in parts if isinstance(part, Demand)), _words(parts[0]))

@@ -1,7 +1,7 @@
-"""Types of values with a demand, such as :data:`Positive`, for files, options and arguments from Python.
+"""Annotated types with a demand on the value, such as :data:`Positive`, for files, options and Python arguments.
 
 Pydantic checks the demand in files, :func:`~impact_posture.config.checked.checked` in Python calls and on the command
-line.  Nothing heavy is imported here, because ``--help`` reads this module.
+line.  This module imports no slow package, because ``--help`` loads it.
 """
 
 from __future__ import annotations
@@ -15,27 +15,28 @@ from impact_posture.config.text_parsers import parse_contact
 from impact_posture.errors import ImpactPostureError, not_one_of
 
 _INFINITE = float("inf")
-# Largest length (m), beyond which the solver does not come back, and largest mass (kg), beyond which a mass matrix
-# is singular in double precision.
+# Largest length (m) and largest mass (kg).  For a greater length, the solver does not return; for a greater mass, the
+# mass matrix is singular in double precision.
 _FARTHEST, _HEAVIEST = 1e100, 1e12
-# Degrees below which the cosine of a tilt says nothing at the precision that certifies.
+# Smallest tilt, degrees.  The cosine of a smaller tilt is not accurate enough for the tolerance of the certificate.
 _LEAST_TILT = 0.1
 
 
 @dataclass(frozen=True)
 class Demand:
-    """Demand on a value, as the metadata of ``Annotated``.
+    """Demand on a value, used as metadata of ``Annotated``.
 
     Attributes:
-        holds: Whether a value of the right type meets the demand; may raise a ``ValueError`` that says more.
-        words: What to give, as an error says it.
+        holds: Function that returns whether a value of the right type meets the demand.  It may raise a
+            ``ValueError`` with a more exact message.
+        words: Description of valid values for error messages.
     """
 
     holds: Callable[[Any], bool]
     words: str
 
     def check(self, value: Any) -> Any:
-        """Return the value.
+        """Return the value if it meets the demand.
 
         Raises:
             ValueError: The value does not meet the demand.
@@ -51,7 +52,7 @@ class Demand:
 
 
 def between(low: float, high: float, unit: str = "", names: Sequence[str] = ()) -> Demand:
-    """Return the demand for a number within bounds, or for one of several names."""
+    """Return the demand that a value is a number within bounds, or one of several names."""
     named = f", or one of {', '.join(names)}" if names else ""
     return Demand(
         lambda value: value in names if isinstance(value, str) else low <= value <= high,
@@ -60,7 +61,7 @@ def between(low: float, high: float, unit: str = "", names: Sequence[str] = ()) 
 
 
 def kind_or_tilt(kinds: Sequence[str], tilted: str) -> Demand:
-    """Return the demand for one of these kinds, or ``tilted:DEG``; a misspelt kind gets a suggestion."""
+    """Return the demand that a text is a kind or ``tilted:DEG``; the error for a misspelt kind has a suggestion."""
 
     def holds(value: str) -> bool:
         if value in kinds or value.startswith(f"{tilted}:"):
@@ -84,7 +85,7 @@ def _finite(values: Iterable[float]) -> bool:
 
 
 def _has_direction(vector: Iterable[float]) -> bool:
-    # A vector with shorter entries is zero up to rounding.
+    # A vector is treated as zero if all its entries are smaller than this bound on rounding errors.
     return _finite(vector) and max(abs(value) for value in vector) >= 1e-9
 
 

@@ -1,4 +1,4 @@
-"""An obstacle as a setting; :mod:`impact_posture.collision.swept_hull` makes its shape."""
+"""Setting of an obstacle; :mod:`impact_posture.collision.swept_hull` builds the collision shape."""
 
 from __future__ import annotations
 
@@ -10,7 +10,7 @@ from impact_posture.config.demand import Demand, Lengths, Position, Positive, Un
 from impact_posture.config.table_validation import StrictTable
 from impact_posture.errors import InputError
 
-# Most characters of the name of an obstacle, which errors print.
+# Largest number of characters in the name of an obstacle, because error messages contain the name.
 _LONGEST_NAME = 60
 _Name = Annotated[
     str,
@@ -23,7 +23,7 @@ _Name = Annotated[
 @checked
 @dataclass(frozen=True, kw_only=True)
 class Obstacle(StrictTable):
-    """A box or a ball that the robot stays clear of.
+    """Box or ball that the robot must not touch.
 
     Attributes:
         name: Name in messages.
@@ -33,7 +33,7 @@ class Obstacle(StrictTable):
         quaternion: Orientation of a box in the world, x y z w.
 
     Raises:
-        InputError: A value does not fit, or there is not exactly one of ``box`` and ``sphere``.
+        InputError: A value is not valid, or not exactly one of ``box`` and ``sphere`` is given.
     """
 
     name: _Name
@@ -43,7 +43,7 @@ class Obstacle(StrictTable):
     quaternion: UnitQuaternion = (0.0, 0.0, 0.0, 1.0)
 
     def __post_init__(self) -> None:
-        """Refuse an obstacle that is not exactly one shape."""
+        """Raise an error if the obstacle is not exactly one shape."""
         if (self.box is None) == (self.sphere is None):
             what = "neither edge lengths nor a radius" if self.box is None else "edge lengths and a radius"
             where = f"obstacle '{self.name}'"

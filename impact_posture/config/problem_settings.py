@@ -1,10 +1,10 @@
 """Settings of a problem, described once for the command line, ``problem.toml`` and Python.
 
-A setting is a field of :class:`RobotSettings`, :class:`ImpactSettings` or :class:`ProblemSettings`.  It carries its
-type, allowed values, meaning and spelling as an option.  The command line makes its options from these fields,
-``problem.toml`` its keys, and Python its keyword arguments.
+A setting is a field of :class:`RobotSettings`, :class:`ImpactSettings` or :class:`ProblemSettings`.  The field
+defines the type, allowed values, meaning and option spelling of the setting.  The options of the command line, the
+keys of ``problem.toml`` and the keyword arguments of Python all follow from these fields.
 
-Nothing heavy is imported here, because ``--help`` reads this module.
+This module imports no slow package, because ``--help`` loads it.
 """
 
 from __future__ import annotations
@@ -49,37 +49,39 @@ Search = Literal["multistart", "global"]
 JointModel = Literal["reflected", "link", "locked", "elastic"]
 TransmissionKind = Literal["rigid", "elastic", "locked"]
 
-# Young's modulus (Pa) and Poisson's ratio of what a contact may touch: the middle of the ranges in J. M. Gere,
-# Mechanics of Materials, 5th ed. (steel; oak in bending; concrete).  The rubber is stiff (0.01 to 0.1 GPa); Gere has
-# 0.0007 to 0.004 GPa.
+# Young's modulus (Pa) and Poisson's ratio of surface materials: the middle of the ranges in J. M. Gere, Mechanics of
+# Materials, 5th ed. (steel; oak in bending; concrete).  The value for rubber is for stiff rubber (0.01 to 0.1 GPa);
+# Gere lists 0.0007 to 0.004 GPa.
 MATERIALS = {"steel": (200e9, 0.28), "wood": (11.5e9, 0.3), "rubber": (0.03e9, 0.48), "ground": (24e9, 0.15)}
 
-# Least distance (m) of links that stay apart, and edge length (m) of a surface that ends before the robot's stand.
+# Smallest distance (m) between links that must not touch; edge length (m) of the surface if the robot stands behind
+# it.
 CLEARANCE, PATCH = 0.001, 0.3
-# Coulomb coefficient of an ordinary surface.
+# Default friction coefficient (Coulomb).
 FRICTION = 0.7
-# Number of distances of --tradeoff without a number.
+# Number of distances if --tradeoff is given without a number.
 TRADEOFF_POINTS = 16
 
 
 @dataclass(frozen=True, kw_only=True)
 class LoadOptions(StrictTable):
-    """Options of loading a robot; the ``robot.toml`` provides a value for ``None``.
+    """Options of loading a robot.  ``None`` selects the value of ``robot.toml``.
 
     Attributes:
-        lock: Joints made rigid at the default posture: names, or patterns such as ``gripper_*``.
-        lock_massless: Whether all joints that move no mass are also made rigid.
+        lock: Joints that become rigid at the default posture: names, or patterns such as ``gripper_*``.
+        lock_massless: Whether all joints that move no mass also become rigid.
         root: ``free-flyer`` puts the robot on a floating base, ``fixed`` welds it to the world.
-        armature: ``"none"``, path of a TOML file, or values by joint, kg·m² (kg if prismatic).  ``None`` takes
-            the values of robot.toml, else the rotor data of the SRDF, else zero.
-        config: Path of a robot.toml that replaces the one beside the URDF.
-        srdf: SRDF: a path, or ``example-robot-data:<path below robots/>``.
-        package_dir: Folders of ``package://`` paths.  Dynamics need none, but pictures may.
-        mounting: Displacement of joints from their place in the URDF, by joint, meters, in the parent joint's axes.
+        armature: ``"none"``, the path of a TOML file, or a value for each named joint, kg·m² (kg if prismatic).
+            ``None`` selects the values of robot.toml, or else the rotor data of the SRDF, or else zero.
+        config: Path of a robot.toml that is read instead of the robot.toml beside the URDF.
+        srdf: SRDF file: a path, or ``example-robot-data:<path below robots/>``.
+        package_dir: Folders in which ``package://`` paths are searched.  Dynamics do not need these folders, but
+            pictures may.
+        mounting: Displacement of each named joint from its place in the URDF, m, in the axes of the parent joint.
     """
 
     lock: tuple[str, ...] = setting(
-        (), "Make a joint rigid, or all that fit a pattern such as 'gripper_*'; repeatable.", ROBOT, "JOINT",
+        (), "Make a joint rigid, or all joints that match a pattern such as 'gripper_*'; repeatable.", ROBOT, "JOINT",
         repeatable=True,
     )  # fmt: skip
     lock_massless: bool = setting(False, "Make all joints that move no mass rigid.", ROBOT)
@@ -88,7 +90,9 @@ class LoadOptions(StrictTable):
         None, "Rotor inertia at the joint, kg·m²; JOINT=VALUE is repeatable.", ROBOT, "none|FILE|JOINT=VALUE",
         "robot.toml's, else the SRDF's", parse=parse_armature, repeatable=True,
     )  # fmt: skip
-    config: str | None = setting(None, "Data that the URDF cannot hold.", ROBOT, "ROBOT.TOML", "beside the URDF")
+    config: str | None = setting(
+        None, "File of data that a URDF cannot contain.", ROBOT, "ROBOT.TOML", "beside the URDF"
+    )
     srdf: str | None = setting(
         None, "Named postures and rotor data: a path, or example-robot-data:PATH.", ROBOT, "FILE", "robot.toml's"
     )
@@ -100,7 +104,7 @@ class LoadOptions(StrictTable):
 
 @dataclass(frozen=True, kw_only=True)
 class RobotSettings(LoadOptions):
-    """The robot, and the options of loading it.
+    """Name of a robot, and options of loading it.
 
     Attributes:
         robot: Known name, path to a ``.urdf``, or ``example-robot-data:<path>``.
@@ -111,7 +115,7 @@ class RobotSettings(LoadOptions):
 
 @dataclass(frozen=True, kw_only=True)
 class ImpactSettings(RobotSettings):
-    """An impact of a robot; the robot provides a value for ``None``."""
+    """Settings of an impact of a robot; ``None`` selects the value of the robot."""
 
     frame: str | None = setting(None, "Contact frame.", CONTACT, "F", "the robot's")
     normal: Direction | None = setting(
@@ -120,7 +124,7 @@ class ImpactSettings(RobotSettings):
     offset: Position | None = setting(None, "Contact point in the contact frame, m.", CONTACT, "X Y Z", "0 0 0")
     normal_frame: NormalFrame = setting("world", "Axes of the normal.", CONTACT)
     contact: Contacts | None = setting(
-        None, "Replaces --frame and --normal; repeatable for up to 6 contacts at once.", CONTACT,
+        None, "Contact that replaces --frame and --normal; repeatable for up to 6 simultaneous contacts.", CONTACT,
         "FRAME:NX,NY,NZ[:IMPULSE]", repeatable=True,
     )  # fmt: skip
     bilateral: bool = setting(False, "Contacts can also pull, as in a grasp.", CONTACT)
@@ -145,12 +149,12 @@ class ImpactSettings(RobotSettings):
     joint_model: JointModel = setting(
         "reflected", "Inertia of the rotors at the joints; elastic only with evaluate.", METRIC
     )
-    normal_cone: HalfAngle = setting(0.0, "Half angle of a cone of normals; the worst counts.", METRIC, "DEG")
+    normal_cone: HalfAngle = setting(0.0, "Half angle of a cone of normals; the worst normal is used.", METRIC, "DEG")
     armature_range: Factors | None = setting(
-        None, "Lowest and highest factor on the armature; the worst case counts.", METRIC, "LOW HIGH", "as stated"
+        None, "Lowest and highest factor on the armature; the worst case is used.", METRIC, "LOW HIGH", "as stated"
     )
     payload: Payloads = setting(
-        (), "Mass at a frame that the robot may carry, kg; the worst case counts; repeatable.", METRIC, "FRAME MASS",
+        (), "Mass at a frame that the robot may carry, kg; the worst case is used; repeatable.", METRIC, "FRAME MASS",
         parse=parse_payloads, repeatable=True,
     )  # fmt: skip
     posture: str | None = setting(
@@ -165,15 +169,15 @@ class ImpactSettings(RobotSettings):
 
 @dataclass(frozen=True, kw_only=True)
 class ProblemSettings(ImpactSettings):
-    """Content of a ``problem.toml``; the robot or the default of the option provides a value for ``None``."""
+    """Content of a ``problem.toml``.  ``None`` selects the value of the robot or the default of the option."""
 
     schema: Literal["impact-posture/problem/1"] = "impact-posture/problem/1"
     q: tuple[float, ...] | None = None
     target_position: Position | None = setting(
-        None, "Position of the contact frame, world, m.", TASK, "X Y Z", "where it is"
+        None, "Position of the contact frame in the world, m.", TASK, "X Y Z", "where it is"
     )
     target_quaternion: UnitQuaternion | None = setting(
-        None, "Orientation of the contact frame, world, scalar last.", TASK, "X Y Z W", "as it is"
+        None, "Orientation of the contact frame in the world, scalar last.", TASK, "X Y Z W", "as it is"
     )
     contact_pose: Annotated[str, kind_or_tilt(get_args(ContactPose), "aligned")] | None = setting(
         None, "Hold the contact frame: full, position, aligned, aligned:DEG, free or box.", TASK, "KIND",
@@ -182,7 +186,7 @@ class ProblemSettings(ImpactSettings):
     box: Lengths = setting((0.05, 0.05, 0.05), "Half extents of --contact-pose box, m.", TASK, "X Y Z")
     keep: tuple[str, ...] = setting((), "Hold the pose of another frame; repeatable.", TASK, "FRAME", repeatable=True)
     hold: tuple[str, ...] | None = setting(
-        None, "Keep a joint at its value, in place of robot.toml's; repeatable.", TASK, "JOINT", "robot.toml's",
+        None, "Keep a joint at its value; replaces robot.toml's joints; repeatable.", TASK, "JOINT", "robot.toml's",
         repeatable=True,
     )  # fmt: skip
     base: Annotated[str, kind_or_tilt(get_args(BaseMode), "level")] | None = setting(
@@ -202,13 +206,13 @@ class ProblemSettings(ImpactSettings):
     )  # fmt: skip
     approach: bool = setting(False, "Joint velocity limits must allow --speed at the contact.", LIMITS)
     hold_force: Annotated[float, between(0.0, 1e6, "N")] = setting(
-        0.0, "Force along the normal that the robot also holds after the impact, N.", LIMITS, "N"
+        0.0, "Force along the normal that the robot must also sustain after the impact, N.", LIMITS, "N"
     )
     max_force: Annotated[float, between(1e-6, 1e9, "N")] | None = setting(
         None, "Bound on the peak force, N; needs --contact-stiffness or --contact-duration.", LIMITS, words="no bound"
     )
     max_joint_jump: Annotated[float, between(1e-6, 1e9, "rad/s or m/s")] | None = setting(
-        None, "Bound on the velocity jump of each joint without friction, rad/s or m/s.", LIMITS, words="no bound"
+        None, "Bound on the frictionless velocity jump of each joint, rad/s or m/s.", LIMITS, words="no bound"
     )
     max_torque: Annotated[float, between(1e-6, 1e9, "N·m")] | None = setting(
         None, "Bound on the controller's torque after the jump, N·m; needs --velocity-gain.", LIMITS, words="no bound"
@@ -221,7 +225,7 @@ class ProblemSettings(ImpactSettings):
         option="--collision/--no-collision",
     )  # fmt: skip
     clearance: Annotated[float, between(1e-4, 1.0, "m")] = setting(
-        CLEARANCE, "Least distance of links that stay apart, m.", LIMITS
+        CLEARANCE, "Least distance between links that must not touch, m.", LIMITS
     )
     surface: Annotated[str | float, between(1e-3, 1e3, "m", ("plane", "none"))] | None = setting(
         None, "Surface at the contact: an endless plane, none, or a square of this edge length, m.", LIMITS,
@@ -239,7 +243,11 @@ class ProblemSettings(ImpactSettings):
     path: bool = setting(
         False, "Find a timed path from the start to the optimum, on which all constraints hold.", TASK
     )
-    search: Search = setting("multistart", "global also maps self-motions, or hops from the best optimum.", SEARCH)
+    search: Search = setting(
+        "multistart", "multistart; or global, which adds a map of self-motions or basin hopping.", SEARCH
+    )
     starts: OneOrMore = setting(16, "Number of starting points of the search.", SEARCH)
-    finish_all: bool = setting(False, "Finish starts that can no longer be the best; lists all optima.", SEARCH)
+    finish_all: bool = setting(
+        False, "Also finish starts that can no longer become the best; lists all optima.", SEARCH
+    )
     seed: ZeroOrMore = setting(0, "Seed of the random starts.", SEARCH)

@@ -12,15 +12,15 @@ TASK, LIMITS, SEARCH, OUTPUT = "Task", "Limits of the task", "Search", "Output"
 
 @dataclass(frozen=True)
 class Setting:
-    """Description of a setting, besides its annotation and default.
+    """Description of a setting, apart from its annotation and default.
 
     Attributes:
         help: Meaning in one line.
-        panel: Part of ``--help`` with the option.
+        panel: Panel of ``--help`` that lists the option.
         takes: Placeholder of the value in ``--help``.
-        words: Default in words, if it comes from the robot.
-        option: Spelling of the option, if it differs from the field.
-        parse: Function from all words of the command line to the value.
+        words: Description of the default, if the robot determines the default.
+        option: Spelling of the option, if it differs from the name of the field.
+        parse: Function that converts all texts given for the option to the value.
         repeatable: Whether the option may be given several times.
     """
 

@@ -17,26 +17,26 @@ _Table = TypeVar("_Table")
 
 
 class StrictTable:
-    """Base of dataclasses that refuse unknown keys, numbers in quotes, and ``true`` for 1 in a file."""
+    """Base of dataclasses that reject unknown keys, numbers in quotes, and ``true`` in place of 1 in a file."""
 
     __pydantic_config__: ClassVar[dict[str, Any]] = {"extra": "forbid", "strict": True}
 
 
 def validate(cls: type[_Table], data: object, where: str) -> _Table:
-    """Make a dataclass of a table; the first fault becomes one line with the nearest valid key.
+    """Convert a table to a dataclass.  The error describes the first fault in one line.
 
     Args:
-        cls: Dataclass, whose fields may be dataclasses; its ``__pydantic_config__`` defines how strict it is.
-        data: Table from :func:`read_toml`; the key ``schema`` fills a field ``schema_``.
-        where: File to name in errors.
+        cls: Dataclass, whose fields may be dataclasses; its ``__pydantic_config__`` defines how strict the check is.
+        data: Table from :func:`read_toml`; its key ``schema`` is stored in a field ``schema_``.
+        where: File that errors name.
 
     Raises:
-        SpecError: A key is unknown or missing, or a value does not fit.
+        SpecError: A key is unknown or missing, or a value is not valid.
     """
     from pydantic import ValidationError
 
     try:
-        # As JSON, because strict dataclasses do not accept Python dictionaries.
+        # Pass the table as JSON, because strict dataclasses do not accept Python dictionaries.
         text = json.dumps(data, default=_plain)
     except ValueError as error:  # An integer with more digits than Python converts.
         raise SpecError(f"cannot be read ({error})", where=where, hint="correct the value") from None
@@ -44,10 +44,10 @@ def validate(cls: type[_Table], data: object, where: str) -> _Table:
         table: _Table = adapter(cls).validate_json(text)  # type: ignore[arg-type]
         return table
     except ValidationError as error:
-        # A misspelt key is reported before the key that is then missing.
+        # Report a misspelt key first, because the key that it should be is also missing.
         faults = error.errors()
         fault = next((f for f in faults if f["type"] in _UNKNOWN), faults[0])
-    # Pydantic also names the alternative of a union.
+    # Leave out the alternative of a union, which Pydantic adds to the location.
     location = tuple(p for p in fault["loc"] if not (isinstance(p, str) and ("[" in p or p in ("str", "float"))))
     path = ".".join(str(part) for part in location)
     what, hint = f"key '{path}': {fault['msg']}", "correct the value"
@@ -71,7 +71,7 @@ _UNKNOWN = ("extra_forbidden", "unexpected_keyword_argument")
 
 @cache
 def adapter(cls: type) -> Any:
-    """Return the ``TypeAdapter`` of a dataclass, made once."""
+    """Return the ``TypeAdapter`` of a dataclass, which is built once and cached."""
     from pydantic import TypeAdapter
 
     return TypeAdapter(cls)

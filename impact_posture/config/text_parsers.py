@@ -72,7 +72,7 @@ def parse_payloads(texts: Sequence[str]) -> tuple[tuple[str, float], ...]:
 
 
 def parse_number_or_name(text: str) -> float | str:
-    """Read a number, or else a name."""
+    """Return a text as a number if it is a number, else unchanged."""
     try:
         return float(text)
     except ValueError:

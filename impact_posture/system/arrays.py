@@ -1,4 +1,4 @@
-"""The array type of signatures, and linear algebra without the slow import of SciPy."""
+"""Array type for annotations, and linear algebra functions that do not need the slow import of SciPy."""
 
 import numpy as np
 from numpy.typing import NDArray
@@ -9,15 +9,15 @@ Array = NDArray[np.float64]
 def null_space(rows: Array, tolerance: float) -> Array:
     """Return an orthonormal basis of the null space of a matrix of shape (k, n), as columns, shape (n, r).
 
-    Singular values up to ``tolerance`` times the largest count as zero.  The import of SciPy, which has the same
-    function, takes longer than many problems take to solve.
+    Singular values up to ``tolerance`` times the largest are treated as zero.  SciPy has the same function, but
+    importing SciPy takes longer than solving many problems.
     """
     _, values, axes = np.linalg.svd(rows)
     return np.asarray(axes[int((values > tolerance * values.max(initial=0.0)).sum()) :].T)
 
 
 def independent_rows(rows: Array, tolerance: float) -> list[int]:
-    """Return the indices of independent rows of shape (k, n) that span all rows, by pivoted Gram-Schmidt.
+    """Return the indices of independent rows that span all rows, shape (k, n), by pivoted Gram-Schmidt.
 
     A row is dependent if its remainder after projection is at most ``tolerance``.
     """

@@ -1,6 +1,6 @@
 """Escape names of robots, joints, frames and files for output languages.
 
-Names are data and not code.  Each output language has a function that every name passes.
+A name must never act as code in an output file.  For each output language, one function escapes every name.
 """
 
 from __future__ import annotations
@@ -12,14 +12,15 @@ from dataclasses import asdict, is_dataclass
 
 from impact_posture.errors import is_visible, printable
 
-# ASCII for the symbols of our texts, because some compilers refuse other characters in C comments.
+# ASCII replacements for symbols in our texts, because some compilers reject other characters in C comments.
 _ASCII = str.maketrans({"·": " ", "²": "^2", "×": "x", "λ": "l", "ε": "eps", "⁻": "^-", "¹": "1"})
-# Linkers and file systems accept more (255 bytes per file name), which leaves room for suffixes.
+# Largest numbers of characters.  Linkers and file systems accept more (255 bytes per file name), so suffixes can be
+# added.
 _LONGEST_IDENTIFIER, _LONGEST_FILE_NAME, _LONGEST_LABEL = 100, 120, 60
 
 
 def identifier(text: str) -> str:
-    """Return an identifier of ASCII letters, digits and single underscores; a long one ends in a checksum."""
+    """Return an identifier of ASCII letters, digits and single underscores; a long identifier ends in a checksum."""
     name = re.sub(r"_{2,}", "_", re.sub(r"[^A-Za-z0-9]", "_", text)).strip("_")
     if len(name) <= _LONGEST_IDENTIFIER:
         return name
@@ -27,13 +28,13 @@ def identifier(text: str) -> str:
 
 
 def file_name(text: str) -> str:
-    """Return a name for a file or folder, without separators or a leading dot or dash, and of limited length."""
+    """Return a file name of limited length, without path separators and without a dot or dash at the start."""
     name = re.sub(r"[^\w.+@=-]", "_", text).lstrip(".-")
     return name.encode("utf-8", "replace")[:_LONGEST_FILE_NAME].decode("utf-8", "ignore") or "_"
 
 
 def c_comment(text: str) -> str:
-    """Return text that neither ends a comment of C or C++ nor continues it on the next line."""
+    """Return text that can neither end a C or C++ comment nor continue a comment on the next line."""
     return re.sub(r"[^A-Za-z0-9 _.,:;+()\[\]=<>^'/|@#%&!-]", "_", text.translate(_ASCII))
 
 
@@ -41,7 +42,8 @@ def toml(value: object) -> str:
     """Return a value as TOML on one line.
 
     Raises:
-        UnicodeEncodeError: A text contains half a surrogate pair (a path that is not UTF-8), which TOML forbids.
+        UnicodeEncodeError: A text contains half of a surrogate pair, as paths that are not UTF-8 do.  TOML forbids
+            surrogates.
     """
     if is_dataclass(value) and not isinstance(value, type):
         value = {key: item for key, item in asdict(value).items() if item is not None}
@@ -51,20 +53,20 @@ def toml(value: object) -> str:
         return "[" + ", ".join(map(toml, value)) + "]"
     if isinstance(value, float):
         return repr(value)
-    # JSON and TOML write integers, booleans and strings alike, except that TOML has no surrogate pairs.
+    # JSON and TOML have the same syntax for integers, booleans and strings, but TOML has no surrogate pairs.
     text = json.dumps(value, ensure_ascii=False)
     text.encode("utf-8")
     return "".join(c if is_visible(c) else rf"\U{ord(c):08X}" for c in text)
 
 
 def xml_name(text: str) -> str:
-    """Return a name that XML can hold and MuJoCo can find, also for an empty name."""
+    """Return a name that is valid in XML and that MuJoCo can look up, also if ``text`` is empty."""
     return printable(text) or "(empty)"
 
 
 def markdown(text: str) -> str:
-    """Return text that Markdown shows unchanged, also in a table cell."""
-    # A bracket alone is not a link, and an underscore between letters is not emphasis.
+    """Escape text so that Markdown shows the text unchanged, also in a table cell."""
+    # A single bracket and an underscore between letters need no escape: they make no link and no emphasis.
     return re.sub(r"[\\`*<>|&$~#!]|\](?=[\[(:]|$)|_+", _escape_markdown, printable(text))
 
 
@@ -75,6 +77,6 @@ def _escape_markdown(match: re.Match[str]) -> str:
 
 
 def plot_label(text: str) -> str:
-    """Return a label for matplotlib, which reads dollars as math and hides labels that begin with an underscore."""
+    """Escape a label for matplotlib, which reads ``$`` as math and hides labels that begin with an underscore."""
     label = printable(text, longest=_LONGEST_LABEL).replace("$", r"\$")
     return f" {label}" if label.startswith("_") else label

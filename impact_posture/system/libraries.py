@@ -1,7 +1,8 @@
 """Build, load and cache shared libraries.
 
-Loading a library runs its code, and loading a truncated library can end the process.  Therefore the SHA-256 of each
-library that is built here lies beside it, and :func:`load_library` compares it.  Only the user can write the cache.
+Loading a library runs its code, and loading a truncated library can end the process.  Therefore this module stores
+the SHA-256 of each library that it builds in a file beside the library.  Before loading, :func:`load_library`
+compares this hash with the library.  Only the user can write to the cache.
 """
 
 from __future__ import annotations
@@ -23,23 +24,24 @@ from impact_posture.version import __version__
 
 # ---- building -----------------------------------------------------------------------------------------------------
 
-# Strict C forbids fused multiply-adds by default.
+# In the strict mode -std=c99, GCC fuses multiplications and additions only with -ffp-contract=fast.
 _FLAGS = ("-std=c99", "-O2", "-ffp-contract=fast", "-fPIC")
 
 
 def library_path(folder: Path, prefix: str) -> Path:
-    """Return ``lib<prefix>.so`` in a folder."""
+    """Return the path of ``lib<prefix>.so`` in a folder."""
     return folder / f"lib{prefix}.so"
 
 
 def build_library(folder: Path, prefix: str, library: Path | None = None, flags: Sequence[str] = ()) -> Path:
     """Compile ``<prefix>.c`` in ``folder`` into a shared library, and return the path of the library.
 
-    The library is ``lib<prefix>.so`` beside the source by default.  ``flags`` of the compiler follow the flags of
-    strict C and of ``$CFLAGS``.
+    By default, the library is ``lib<prefix>.so`` beside the source.  The compiler gets the flags of strict C, then
+    ``$CFLAGS``, then ``flags``.
 
     Raises:
-        CompilerError: There is no compiler, or it failed; with its first error line and the command.
+        CompilerError: There is no compiler, or the compiler failed; the error contains the first error line and the
+            command.
         OutputError: The library cannot be written.
     """
     compiler = require_compiler("codegen")
@@ -55,11 +57,13 @@ def build_library(folder: Path, prefix: str, library: Path | None = None, flags:
 def build_parts(folder: Path, library: Path, parts: Mapping[str, Sequence[str]]) -> Path:
     """Compile sources in parallel into a shared library, and return the path of the library.
 
-    ``parts`` has the sources in ``folder``, each with compiler flags after the flags of strict C and of ``$CFLAGS``.
-    The cache keeps the object file of each preprocessed source and its flags, so that libraries share them.
+    ``parts`` maps each source in ``folder`` to its compiler flags, which follow the flags of strict C and
+    ``$CFLAGS``.  The cache stores an object file for each preprocessed source and its flags, so that libraries can
+    share object files.
 
     Raises:
-        CompilerError: There is no compiler, or it failed; with its first error line and the command.
+        CompilerError: There is no compiler, or the compiler failed; the error contains the first error line and the
+            command.
         OutputError: The library or the cache cannot be written.
     """
     compiler = require_compiler("codegen")
@@ -83,10 +87,10 @@ def build_parts(folder: Path, library: Path, parts: Mapping[str, Sequence[str]])
 
 @contextmanager
 def building(library: Path) -> Iterator[Path]:
-    """Yield a temporary folder.  After the block, the file of the library's name in it replaces the library.
+    """Yield a temporary folder.  After the block, the library that was built in this folder replaces ``library``.
 
-    The SHA-256 of the library is written beside it.  An interruption leaves the old library or the new library
-    without a hash.
+    The SHA-256 of the library is written beside it.  An interruption leaves either the old library, or the new
+    library without a hash.
 
     Raises:
         OutputError: The library cannot be written, for example because the disk is full.
@@ -110,12 +114,12 @@ def _replace(library: Path, built: Path) -> None:
 
 
 def hash_path(library: Path) -> Path:
-    """Return the file with the SHA-256 of a library; ``sha256sum --check`` reads it."""
+    """Return the path of the SHA-256 file of a library.  ``sha256sum --check`` can read this file."""
     return library.with_name(f"{library.name}.sha256")
 
 
 def has_its_hash(library: Path) -> bool | None:
-    """Return whether the content of a library has the SHA-256 beside it; ``None`` if there is no such file."""
+    """Return whether a library matches the SHA-256 file beside it; ``None`` if the file is missing."""
     try:
         words = hash_path(library).read_text(encoding="utf-8", errors="replace").split()
     except FileNotFoundError:
@@ -132,7 +136,7 @@ def _sha256(path: Path) -> str:
 
 
 def load_library(library: Path) -> ctypes.CDLL:
-    """Load a shared library, which runs its code.
+    """Load a shared library.  Loading runs code of the library.
 
     Raises:
         SpecError: The library differs from the SHA-256 beside it, is truncated, or cannot be loaded.
@@ -155,7 +159,7 @@ def load_library(library: Path) -> ctypes.CDLL:
 def _is_truncated(library: Path) -> bool:
     """Return whether a 64-bit ELF file ends before its section headers, which linkers write last.
 
-    The system kills a process that loads such a file and reads a missing page (SIGBUS).
+    The system kills a process that loads a truncated file and reads a missing page (SIGBUS).
     """
     with library.open("rb") as file:
         header = file.read(64)
@@ -186,7 +190,7 @@ def cache_folder(*parts: str) -> Path:
     """Return a folder of the cache; make it with mode 0700 if it is missing.
 
     Raises:
-        OutputError: The folder cannot be made, or another user owns it or may write it.
+        OutputError: The folder cannot be made, or another user owns the folder or may write to it.
     """
     folder = cache_path()
     try:
@@ -203,7 +207,8 @@ def cache_folder(*parts: str) -> Path:
 def source_key(content: Iterable[str], *packages: str) -> str:
     """Return a short hash of everything that compiled code depends on.
 
-    This is texts (``content``), and the source code of the packages below ``impact_posture`` that write the code.
+    The hash includes the texts ``content`` and the source code of the packages below ``impact_posture`` that generate
+    the code.
     """
     text = "\n".join([__version__, *content, *map(_source_hash, packages)])
     return hashlib.sha256(text.encode()).hexdigest()[:32]
@@ -211,7 +216,7 @@ def source_key(content: Iterable[str], *packages: str) -> str:
 
 @cache
 def _source_hash(package: str) -> str:
-    """Return a hash of the source code of a package.  Later changes on the disk do not count."""
+    """Return a hash of the source code of a package.  Later changes on the disk do not change the hash."""
     digest = hashlib.sha256()
     for path in sorted((Path(__file__).parents[1] / package).glob("**/*")):
         if path.suffix in (".py", ".jinja", ".c", ".h"):
@@ -220,10 +225,10 @@ def _source_hash(package: str) -> str:
 
 
 def check_private(path: Path) -> None:
-    """Refuse a path that another user controls, because that user could choose the code that runs.
+    """Raise an error if another user controls a path, because this user could choose the code that runs.
 
     Raises:
-        OutputError: Another user owns the path or may write it.
+        OutputError: Another user owns the path or may write to it.
     """
     status = path.stat()
     if status.st_uid not in (os.geteuid(), 0):
@@ -233,10 +238,10 @@ def check_private(path: Path) -> None:
 
 
 def is_cached(library: Path) -> bool:
-    """Return whether the cache has a library with its SHA-256; delete a library that has another.
+    """Return whether the cache has a library that matches its SHA-256; delete a library that does not match.
 
     Raises:
-        OutputError: Another user owns or may write the library or its folder.
+        OutputError: Another user owns the library or its folder, or may write to them.
     """
     with suppress(OSError):
         check_private(library.parent)

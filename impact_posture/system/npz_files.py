@@ -1,4 +1,4 @@
-"""Read NPZ files of users within bounds of memory."""
+"""Read NPZ files of users with limited memory."""
 
 from __future__ import annotations
 
@@ -10,7 +10,7 @@ from typing import TYPE_CHECKING, Any
 if TYPE_CHECKING:
     from numpy.typing import NDArray
 
-# Size of the arrays of a run of an hour at 1 kHz.
+# Largest size of the arrays in a file, bytes: enough for a run of an hour at 1 kHz.
 MOST_BYTES = 1 << 32
 
 
@@ -19,9 +19,9 @@ def read_arrays(path: Path) -> dict[str, NDArray[Any]]:
 
     Raises:
         OSError: The file cannot be read, or its arrays are larger than :data:`MOST_BYTES`.
-        ValueError: The file is not an NPZ, is damaged, or states more numbers than it has.
+        ValueError: The file is not an NPZ, is damaged, or its header states more numbers than the file contains.
     """
-    # Imported here, because the help page does not need it.
+    # These modules are imported here, because the help page does not need them.
     import zlib
     from zipfile import BadZipFile
 
@@ -36,12 +36,12 @@ def read_arrays(path: Path) -> dict[str, NDArray[Any]]:
                 raise OSError(errno.EFBIG, os.strerror(errno.EFBIG), str(path))
             arrays = {name: file[name] for name in file.files}
     except MemoryError:
-        # The header of a small file may state any size.
+        # Compare the sizes, because the header of a small file may state any size.
         raise ValueError(f"{path.name} states more numbers than it has") from None
     except (BadZipFile, EOFError, RuntimeError, zlib.error) as error:
-        # A RuntimeError means that the file states another compression or a password.
+        # A RuntimeError means that the file has another compression or a password.
         raise ValueError(f"{path.name} is damaged: {error}") from None
-    # NumPy returns bytes for an entry that is not an array.
+    # NumPy returns bytes if an entry of the file is not an array.
     if strange := [name for name, array in arrays.items() if not isinstance(array, np.ndarray)]:
         raise ValueError(f"'{strange[0]}' of {path.name} is not an array")
     return arrays

@@ -1,4 +1,4 @@
-"""Write output folders whole or not at all, and never over foreign files.
+"""Write each output folder completely or not at all, and never overwrite foreign files.
 
 Each output folder has a record, ``.impact-posture.json``, of the files that were written into it.  ``--force``
 replaces a folder only if the record names every file in it.
@@ -28,11 +28,11 @@ Kind = Literal["result", "export", "run", "comparison", "reproduction", "sweep",
 
 
 def check_output(out: Path, *, force: bool, kind: Kind) -> None:
-    """Refuse an unusable output folder before the work begins; ``force`` allows an earlier result of the same kind.
+    """Raise an error before the work begins if the output folder cannot be used; ``force`` allows an earlier result.
 
     Raises:
-        OutputError: The path exists and is not a folder, the folder exists without ``force`` or has foreign files, or
-            it cannot be written.
+        OutputError: The path is not a folder, the folder exists and ``force`` is false, the folder has foreign files,
+            or the folder cannot be written.
     """
     check_name(out)
     if out.is_symlink():
@@ -54,10 +54,10 @@ def check_output(out: Path, *, force: bool, kind: Kind) -> None:
 
 
 def check_name(out: Path) -> None:
-    """Refuse a name that no file or folder can have.
+    """Raise an error if no file or folder can have this name.
 
     Raises:
-        OutputError: The system refuses the name.
+        OutputError: The system rejects the name.
     """
     try:
         os.lstat(out)
@@ -70,12 +70,13 @@ def check_name(out: Path) -> None:
 
 @contextmanager
 def whole_folder(out: Path, *, force: bool, kind: Kind, products: Sequence[str] = ()) -> Iterator[Path]:
-    """Yield a temporary folder beside ``out``.  After the block it replaces ``out``; after an error it is removed.
+    """Yield a temporary folder, which replaces ``out`` after the block and is removed after an error.
 
-    ``products`` are files that may be built there later, such as libraries; they are not foreign.
+    ``products`` are files that may be built later in the folder, such as libraries.  These files are not treated as
+    foreign.
 
     Raises:
-        OutputError: See :func:`check_output`; or the disk is full or not writable.
+        OutputError: ``out`` cannot be used (:func:`check_output`), or the disk is full or not writable.
     """
     check_output(out, force=force, kind=kind)
     out = out.absolute()
@@ -84,7 +85,7 @@ def whole_folder(out: Path, *, force: bool, kind: Kind, products: Sequence[str] 
             try:
                 yield beside
             except OutputError as error:
-                # The user knows only the final folder.
+                # Name the final folder, because the user does not know the temporary folder.
                 where = error.where.replace(str(beside), str(out))
                 raise OutputError(error.what, where=where, hint=error.hint) from None
             write_record(beside, kind, products)
@@ -93,14 +94,14 @@ def whole_folder(out: Path, *, force: bool, kind: Kind, products: Sequence[str] 
     except OSError as error:
         reason = error.strerror or str(error)
         if isinstance(error, FileNotFoundError) and error.filename:
-            # The missing file may be outside the folder.
+            # Name the missing file, because it may be outside the folder.
             reason = f"{reason}: {error.filename}"
         fault = f"cannot be written ({reason})"
         raise OutputError(fault, where=str(out), hint="free space or choose another `out`") from error
 
 
 def write_record(folder: Path, kind: Kind, products: Sequence[str] = ()) -> None:
-    """Write the record of a folder: all its files, and ``products`` that may be built there later.
+    """Write the record of a folder: all its files, and ``products``, which may be built in the folder later.
 
     Raises:
         OSError: The record cannot be written.
@@ -111,7 +112,7 @@ def write_record(folder: Path, kind: Kind, products: Sequence[str] = ()) -> None
 
 
 def typed_command(folder: Path) -> str:
-    """Return the command line that wrote an output folder; empty if it was not a command line."""
+    """Return the command line that wrote an output folder; empty if another program wrote the folder."""
     try:
         return str(json.loads(read_text(folder / RECORD)).get("command", ""))
     except (OSError, ValueError, AttributeError, RecursionError):
@@ -119,19 +120,19 @@ def typed_command(folder: Path) -> str:
 
 
 def is_ours(folder: Path, kind: Kind) -> bool:
-    """Return whether a folder has a record of this kind; it may have foreign files as well."""
+    """Return whether a folder has a record of this kind.  The folder may also contain foreign files."""
     content = _read_record(folder)
     return content is not None and content["kind"] == kind
 
 
 def own_files(folder: Path, kind: Kind) -> list[str]:
-    """Return the files that the record of a folder lists, without the record; empty without a record of this kind."""
+    """Return the files that the record of a folder lists, without the record; empty without this kind of record."""
     content = _read_record(folder)
     return [] if content is None or content["kind"] != kind else [name for name in content["files"] if name != RECORD]
 
 
 def add_to_record(folder: Path, paths: Iterable[Path]) -> None:
-    """Add files to the record of a folder; do nothing in a folder without a record.
+    """Add files to the record of a folder; do nothing if the folder has no record.
 
     Raises:
         OutputError: The record cannot be written.
@@ -145,12 +146,12 @@ def add_to_record(folder: Path, paths: Iterable[Path]) -> None:
 
 
 def write_json(path: Path, document: object) -> None:
-    """Write a document as JSON.  NaN fails here instead of in the program that reads the file."""
+    """Write a document as JSON.  A NaN raises an error here, before another program reads the file."""
     path.write_text(json.dumps(document, indent=1, allow_nan=False) + "\n", encoding="utf-8")
 
 
 def write_whole(path: Path, content: str | bytes) -> None:
-    """Write a file that appears whole or not at all.
+    """Write a file so that it appears completely or not at all.
 
     Raises:
         OutputError: The file cannot be written.
@@ -164,7 +165,7 @@ def write_whole(path: Path, content: str | bytes) -> None:
     try:
         with undone(remove):
             beside.unlink(missing_ok=True)
-            # Mode x follows no symbolic link of another user.
+            # Mode x does not follow a symbolic link of another user.
             with beside.open("xb") as file:
                 file.write(content.encode() if isinstance(content, str) else content)
             os.replace(beside, path)
@@ -217,21 +218,22 @@ def _read_record(folder: Path) -> dict[str, Any] | None:
     return content if sound and isinstance(content.get("kind"), str) else None
 
 
-# ---- taking a place ------------------------------------------------------------------------------------------------
+# ---- replacing a folder ------------------------------------------------------------------------------------------
 
 
 def _replace(beside: Path, out: Path, force: bool, kind: Kind) -> None:
-    """Replace ``out`` by ``beside``.  After any interruption, one of the two results is there."""
+    """Replace ``out`` by ``beside``.  After an interruption at any time, the old or the new folder exists."""
     if not force or not out.exists():
         try:
-            # This is atomic, and fails if another process has filled the folder in the meantime.
+            # The rename is atomic.  It fails if another process has filled the folder in the meantime.
             os.rename(beside, out)
         except OSError as error:
             if error.errno in (errno.ENOTEMPTY, errno.EEXIST):
                 raise OutputError("exists", where=str(out), hint=_EXISTS) from None
             raise
         return
-    # This name is never swept.  After a kill between the two renames, the user finds the old result there.
+    # A folder of this name is never swept.  If the process is killed between the two renames, the folder contains the
+    # old result.
     old = out.with_name(f"{out.name}.old-{secrets.token_hex(4)}")
     os.rename(out, old)
     try:
@@ -249,7 +251,7 @@ def _replace(beside: Path, out: Path, force: bool, kind: Kind) -> None:
 
 @contextmanager
 def parents_of(out: Path) -> Iterator[None]:
-    """Make the folders above ``out``, and remove those that stay empty."""
+    """Make the folders above ``out``.  After the block, remove the new folders that are empty."""
     missing = [folder for folder in out.parents if not folder.exists()]
 
     def remove() -> None:

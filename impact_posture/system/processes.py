@@ -19,13 +19,14 @@ _Result = TypeVar("_Result")
 # Signals by which a user or a system ends a process.  A closed terminal sends SIGHUP.
 ENDING = (signal.SIGINT, signal.SIGTERM, signal.SIGHUP)
 
-# Forked workers find the function here, because the objects that it holds (a CasADi solver) cannot be sent to them.
+# Forked workers read the function here, because its objects (a CasADi solver) cannot be sent to another process.
 _WORK: dict[str, Callable[[int], Any]] = {}
 
-# Functions to call when a process ends early, each with the process that added it, because a fork inherits the list.
+# Functions to call when a process ends early.  Each entry has the id of the process that added it, because a fork
+# inherits the list.
 _UNFINISHED: list[tuple[int, Callable[[], None]]] = []
 
-# Number of blocks that hold signals, and the ends that signals have requested in these blocks.
+# Number of active blocks that delay signals, and the exit functions that signals have requested in these blocks.
 _HELD = [0]
 _LATER: list[Callable[[], None]] = []
 
@@ -37,7 +38,7 @@ _PR_SET_PDEATHSIG = 1
 
 @contextmanager
 def undone(undo: Callable[[], None]) -> Iterator[None]:
-    """Call ``undo`` when the block ends, also when a signal ends the process within it (:func:`end_early`).
+    """Call ``undo`` at the end of the block, also if a signal ends the process inside the block (:func:`end_early`).
 
     A signal may come while ``undo`` runs, so a second call of ``undo`` must do no harm.
     """
@@ -53,8 +54,8 @@ def undone(undo: Callable[[], None]) -> Iterator[None]:
 @contextmanager
 def signals_held() -> Iterator[None]:
     """Delay signals that would end the process until the end of the block."""
-    # The mask protects processes that are forked here.  The count protects this process, because any thread may get
-    # a signal.
+    # Processes that are forked in the block inherit the signal mask.  This process also needs the count, because
+    # another of its threads may get the signal.
     before = signal.pthread_sigmask(signal.SIG_BLOCK, ENDING)
     _HELD[0] += 1
     try:
@@ -67,10 +68,10 @@ def signals_held() -> Iterator[None]:
 
 
 def end_early(leave: Callable[[], None]) -> None:
-    """Kill the workers, call the functions of :func:`undone`, newest first, and ``leave``.
+    """Kill the workers, call the functions of :func:`undone`, newest first, then call ``leave``.
 
     A signal handler calls this function, and ``leave`` calls ``os._exit``.  An exception is not enough, because the
-    wrappers of C++ libraries take a ``KeyboardInterrupt`` for a failed conversion and continue.
+    wrappers of C++ libraries treat a ``KeyboardInterrupt`` as a failed conversion and continue.
     """
     if _HELD[0]:
         _LATER.append(leave)
@@ -99,7 +100,8 @@ def fork_map(function: Callable[[int], _Result], count: int, jobs: int) -> Itera
     """Yield ``(index, function(index))`` for each index below ``count``, in the order in which they finish.
 
     The calls run in forked processes if ``jobs`` is more than one and the system can fork, else in this process, one
-    after the other.  No process outlives the block, not even after Ctrl-C; on Linux none outlives this process.
+    after the other.  All workers end with the block, also after Ctrl-C. On Linux, they also end if this process is
+    killed.
 
     Raises:
         WorkerDied: A worker was killed, for example for lack of memory.
@@ -111,8 +113,8 @@ def fork_map(function: Callable[[int], _Result], count: int, jobs: int) -> Itera
     others = set(multiprocessing.active_children())
     pool = ProcessPoolExecutor(min(jobs, count), multiprocessing.get_context("fork"), depend, (os.getpid(),))
     try:
-        # The workers are forked here.  A signal reaches every process of the terminal, but workers must ignore it,
-        # even at their start.
+        # Delay signals while the workers are forked.  A signal reaches every process of the terminal, but workers
+        # must ignore signals from their start.
         with signals_held():
             futures = [pool.submit(_worker, index) for index in range(count)]
         yield _finished(futures)
@@ -134,8 +136,8 @@ def _finished(futures: list[Future[tuple[int, _Result]]]) -> Iterator[tuple[int,
 def fork_call(function: Callable[[], _Result]) -> Iterator[Callable[[], _Result]]:
     """Start ``function()`` in a copy of this process and yield a function that waits for its result.
 
-    The copy has state that cannot be copied otherwise (physics, solvers).  Exceptions of the copy are raised here.
-    The copy ends with the block.
+    The copy includes state that cannot be copied in another way (physics, solvers).  Exceptions of the copy are
+    raised here.  The copy ends with the block.
 
     Raises:
         OSError: The system cannot fork.
@@ -152,7 +154,7 @@ def fork_call(function: Callable[[], _Result]) -> Iterator[Callable[[], _Result]
     sender.close()
 
     def kill() -> None:
-        # After the first call, another process may have this process id.
+        # Kill only a child that still runs, because the system may give the id of an ended child to another process.
         with suppress(ChildProcessError):
             if os.waitpid(child, os.WNOHANG) == (0, 0):
                 os.kill(child, signal.SIGKILL)
@@ -172,7 +174,7 @@ def fork_call(function: Callable[[], _Result]) -> Iterator[Callable[[], _Result]
 
 
 def _send_result(function: Callable[[], Any], sender: Any) -> NoReturn:
-    """Send the error and the result from the copy, and end without the clean-up of the original process."""
+    """Send the error and the result from the copy; end the copy without the clean-up of the original process."""
     try:
         try:
             sender.send((None, function()))
@@ -183,7 +185,7 @@ def _send_result(function: Callable[[], Any], sender: Any) -> NoReturn:
 
 
 def depend(parent: int) -> None:
-    """Ignore signals except SIGTERM, with which a pool ends its workers; end when the parent ends."""
+    """Ignore signals except SIGTERM, by which a pool ends its workers; end when the parent ends."""
     for number in ENDING:
         signal.signal(number, signal.SIG_DFL if number == signal.SIGTERM else signal.SIG_IGN)
     signal.pthread_sigmask(signal.SIG_UNBLOCK, ENDING)

@@ -1,7 +1,7 @@
-"""Temporary folders that are removed even after a process was killed.
+"""Temporary folders that are also removed after their process was killed.
 
-A temporary folder has a record, ``.impact-posture.json``, which the process that works in it locks.  A folder without
-a lock is left by a killed process.  The next process that works in the same parent folder removes it.
+A temporary folder has a record, ``.impact-posture.json``, which the process that works in it locks.  If the record is
+not locked, the process was killed.  The next process that works in the same parent folder removes the folder.
 """
 
 from __future__ import annotations
@@ -28,7 +28,7 @@ _PROGRAM = "impact-posture"
 
 
 def made_by() -> dict[str, str]:
-    """Return the command line of this program for a record; nothing for another program."""
+    """Return the command line of this program for a record; empty if another program runs this code."""
     program, *words = sys.argv or [""]
     return {"command": shlex.join([_PROGRAM, *words])} if Path(program).stem == _PROGRAM else {}
 
@@ -37,7 +37,8 @@ def made_by() -> dict[str, str]:
 def scratch_folder(parent: Path | None = None, mode: int = 0o700) -> Iterator[Path]:
     """Yield a temporary folder, which is removed after the block and after a signal.
 
-    It lies in ``parent``, by default the temporary folder of the system.  By default, only the user can read it.
+    The folder is made in ``parent``, by default in the temporary folder of the system.  By default, only the user can
+    read it.
 
     Raises:
         OutputError: The system has no temporary folder.
@@ -49,15 +50,15 @@ def scratch_folder(parent: Path | None = None, mode: int = 0o700) -> Iterator[Pa
         raise OutputError("no temporary folder can be written", where="TMPDIR", hint="set it to a folder") from None
     _sweep(parent)
     folder = parent / f"{SCRATCH}{secrets.token_hex(4)}"
-    # The folder is made inside the block, so that no signal can leave it behind.
+    # Make the folder inside this block, so that a signal cannot leave the folder behind.
     with undone(lambda: remove_scratch(folder)):
         folder.mkdir(mode)
         record = os.open(folder / RECORD, os.O_RDWR | os.O_CREAT | os.O_EXCL, 0o666)
         try:
-            # Where files cannot be locked, folders are not swept.
+            # If files cannot be locked, old folders are not swept.
             with suppress(OSError):
                 fcntl.flock(record, fcntl.LOCK_EX)
-            # Written after the lock, because other processes ignore an empty record without a lock.
+            # Write the record after locking it, because other processes ignore an empty record without a lock.
             content = {"schema": SCHEMA, "host": os.uname().nodename, **made_by()}
             os.write(record, json.dumps(content).encode())
             yield folder
@@ -75,13 +76,14 @@ def _sweep(parent: Path) -> None:
 
 
 def _remove_unlocked(folder: Path) -> None:
-    # Without O_NONBLOCK, a pipe of that name would block.
+    # Without O_NONBLOCK, opening a pipe of this name would block.
     record = os.open(folder / RECORD, os.O_RDWR | os.O_NOFOLLOW | os.O_NONBLOCK)
     try:
-        # This fails while the process of the folder lives.
+        # Locking fails while the process that uses the folder runs.
         fcntl.flock(record, fcntl.LOCK_EX | fcntl.LOCK_NB)
         content = json.loads(os.read(record, 1 << 24))
-        # Locks may not work across machines.  The record of a finished folder names no machine.
+        # Compare the machines, because locks may not work across machines.  The record of a finished folder names no
+        # machine.
         if content["schema"] == SCHEMA and content.get("host", os.uname().nodename) == os.uname().nodename:
             remove_scratch(folder)
     finally:
@@ -89,7 +91,10 @@ def _remove_unlocked(folder: Path) -> None:
 
 
 def remove_scratch(folder: Path) -> None:
-    """Remove a temporary folder, and its record last, so that the next sweep recognizes an interrupted removal."""
+    """Remove a temporary folder.
+
+    The record is removed last, so that the next sweep recognizes an interrupted removal.
+    """
     with suppress(OSError):
         for entry in os.scandir(folder):
             if entry.is_dir(follow_symlinks=False):

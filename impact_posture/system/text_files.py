@@ -6,12 +6,13 @@ import errno
 import os
 from pathlib import Path
 
-# The largest file of this package, a result of a long search, has about a million characters.
+# Largest number of characters in a file.  The largest file of this package, the result of a long search, has about a
+# million.
 MOST_CHARACTERS = 1 << 26
 
 
 def read_text(path: Path) -> str:
-    """Return the content of a UTF-8 file; refuse an endless device such as ``/dev/zero``.
+    """Return the content of a UTF-8 file; raise an error for an endless device such as ``/dev/zero``.
 
     Raises:
         OSError: The file cannot be read, or is larger than :data:`MOST_CHARACTERS`.

@@ -25,7 +25,7 @@ _GUARD = (
 
 
 def find_compiler() -> list[str] | None:
-    """Return the C compiler as the head of a command: ``$CC`` (with its options), cc, gcc or clang; else ``None``.
+    """Return the first words of a compiler command: ``$CC`` with its options, cc, gcc, clang, or else ``None``.
 
     Raises:
         CompilerError: ``$CC`` has an open quote.
@@ -37,7 +37,7 @@ def find_compiler() -> list[str] | None:
 
 
 def require_compiler(where: str) -> list[str]:
-    """Return the result of :func:`find_compiler`; ``where`` names the work that needs a compiler.
+    """Return the compiler from :func:`find_compiler`; ``where`` names, for errors, the work that needs a compiler.
 
     Raises:
         CompilerError: There is no compiler, or ``$CC`` has an open quote.
@@ -71,7 +71,7 @@ def run_compilers(commands: Sequence[list[str]], folder: Path) -> None:
     """Run compiler commands in ``folder``, started in this order, as many in parallel as there are cores.
 
     Raises:
-        CompilerError: A command failed; with the first error line of the first failure.
+        CompilerError: A command failed; the error contains the first error line of the first failure.
     """
     waiting, running = list(commands), list[tuple[list[str], subprocess.Popen[str]]]()
     reader, writer = os.pipe()
@@ -101,7 +101,8 @@ def run_compilers(commands: Sequence[list[str]], folder: Path) -> None:
 
 def _start(command: list[str], folder: Path, guard: int) -> subprocess.Popen[str]:
     pipe = subprocess.PIPE
-    # A killed compiler leaves temporary files.  In the folder of its result, they are removed with the folder.
+    # Put temporary files into the folder of the result.  A killed compiler leaves them, but they are removed with
+    # this folder.
     temporary = (folder / command[command.index("-o") + 1]).absolute().parent
     try:
         return subprocess.Popen(
@@ -113,7 +114,7 @@ def _start(command: list[str], folder: Path, guard: int) -> subprocess.Popen[str
 
 
 def _check(command: list[str], folder: Path, code: int, output: str) -> None:
-    """Raise if a command failed; ``output`` is its standard error and then its standard output."""
+    """Raise an error if a command failed; ``output`` is its standard error followed by its standard output."""
     if code == 0 and (folder / command[command.index("-o") + 1]).is_file():
         return
     lines = [line for line in output.splitlines() if line.strip()]
