@@ -1,4 +1,4 @@
-"""Run a command line in a fork of this process, which has imported everything, and judge how it ends."""
+"""Run a command line in a fork of this process, which has imported all modules, and assess the result."""
 
 from __future__ import annotations
 
@@ -20,11 +20,11 @@ from impact_posture_cli.error_boundary import run
 from tests.support.command import PARSER
 
 CODES = {0, 1, 2, 3, 4, 130, 143}
-# Beginnings of the lines of a usage error.
+# First words of the lines of a usage error.
 USAGE = ("Usage: ", "Try ", "Error: ")
-# Words that only libraries and interpreters write.
+# Texts that only libraries and interpreters print.
 NOISE = ("Traceback", "internal error", "Warning:", "Exception ignored", "terminate called", "Segmentation", "DEBUG")
-# Processor seconds that one attack may take, and seconds until it counts as hanging.
+# Permitted processor time of one attack, s, and time after which it is treated as hanging, s.
 BUSY, PATIENCE = 60, 120
 
 SMALL = """<robot name="small">
@@ -45,7 +45,7 @@ SMALL = """<robot name="small">
 
 @dataclass(frozen=True)
 class Outcome:
-    """Exit code of a command line (below zero for a signal), its output and the changed files."""
+    """Outcome of a command line: exit code (negative for a signal), output and changed files."""
 
     argv: tuple[str, ...]
     code: int
@@ -55,7 +55,7 @@ class Outcome:
 
     @property
     def complaints(self) -> list[str]:
-        """Faults of this outcome."""
+        """Return a list of the faults of this outcome."""
         lines = [line for line in self.err.splitlines() if line.strip() and not line.startswith("warning: ")]
         errors = [line for line in lines if line.startswith(("error: ", "Error: "))]
         complaints = [f"says {word!r}" for word in NOISE if word in self.err or word in self.out]
@@ -73,7 +73,7 @@ class Outcome:
 
 
 def strike(folder: Path, *argv: str) -> Outcome:
-    """Run a command line in a folder."""
+    """Run a command line in a folder and return the outcome."""
     before = _content(folder)
     streams = [os.memfd_create(name) for name in ("out", "err")]
     child = os.fork()
@@ -93,7 +93,7 @@ def strike(folder: Path, *argv: str) -> Outcome:
 def attack(
     cases: Iterable[tuple[str, ...]], folder: Path, arrange: Callable[[int], object] = lambda k: None
 ) -> list[Outcome]:
-    """Run all command lines, each after ``arrange(k)``, and fail with all complaints."""
+    """Run all command lines, each after ``arrange(k)``; fail with a list of all complaints."""
     outcomes, failures = [], []
     for k, argv in enumerate(cases):
         arrange(k)

@@ -1,4 +1,4 @@
-"""A folder to attack in, with a small robot and a file that must survive."""
+"""Folder for attacks, with a small robot and a file that no command may change."""
 
 from __future__ import annotations
 
@@ -11,7 +11,7 @@ from tests.hostile.arena import SMALL, strike
 
 @pytest.fixture(scope="session")
 def sound(tmp_path_factory: pytest.TempPathFactory) -> None:
-    """Check that the small robot can be evaluated, and import everything once for all forks."""
+    """Check that the small robot can be evaluated, and import all modules once before the forks."""
     import tests.support.command  # noqa: F401
 
     folder = tmp_path_factory.mktemp("sound")

@@ -1,4 +1,4 @@
-"""Inputs that are too large or too deep end in one line."""
+"""Inputs that are too large or too deeply nested give an error in one line."""
 
 from __future__ import annotations
 

@@ -1,4 +1,4 @@
-"""Small files that would fill memory, time or screen end in one short line."""
+"""Small files that would exhaust memory, time or screen give an error in one short line."""
 
 from __future__ import annotations
 
@@ -50,7 +50,7 @@ FILES = {
 def test_files_that_grow(name: str, arena: Path) -> None:
     file, text, argv, words = FILES[name]
     (arena / file).write_text(text)
-    # The limit also holds for the fork, so that an attack cannot fill the memory of the machine.
+    # The limit also applies to the fork, so that an attack cannot exhaust the memory of the machine.
     limits = resource.getrlimit(resource.RLIMIT_AS)
     resource.setrlimit(resource.RLIMIT_AS, (8 << 30, limits[1]))
     try:

@@ -1,6 +1,6 @@
-"""Every option of every command refuses senseless values in one line, and loses nothing.
+"""For invalid values of any option, every command prints an error in one line and leaves files intact.
 
-``--hostile-full`` tries twenty times as many.
+``--hostile-full`` tries twenty times as many values.
 """
 
 from __future__ import annotations
@@ -16,7 +16,7 @@ from tests.hostile.arena import attack
 from tests.hostile.values import value
 
 PUSH = ("small.urdf", "--frame", "tip", "--normal", "0", "0", "1")
-# A folder that must not be replaced stops commands that would work for long.
+# Commands that would run for long stop early, because their output folder exists and must not be replaced.
 STOP = ("--out", "precious", "--force")
 SOUND: dict[str, tuple[str, ...]] = {
     "inspect": ("small.urdf",),
@@ -37,7 +37,7 @@ def parameters(command: str) -> list[Any]:
 
 
 def spoil(command: str, rng: random.Random) -> tuple[str, ...]:
-    """Return a sound command line with one or two more options, or with another argument."""
+    """Return a valid command line with one or two additional options, or with another argument."""
     words = [command, *SOUND[command]]
     for _ in range(rng.choice((1, 1, 2))):
         parameter = rng.choice(parameters(command))
@@ -59,7 +59,7 @@ def test_values_that_make_no_sense(command: str, arena: Path, hostile_full: bool
     rng = random.Random(command)
     stops = SOUND[command][-3:] == STOP
     cases = [spoil(command, rng) for _ in range(COUNT * (20 if hostile_full else 1))]
-    # The last --out counts.
+    # If `--out` is repeated, the last value applies.
     outcomes = attack([(*case, *STOP) if stops else case for case in cases], arena)
     assert len({outcome.code for outcome in outcomes}) > 1
     assert (arena / "precious" / "thesis.txt").read_text() == "ten years"

@@ -1,6 +1,6 @@
-"""Spoiled input files and result folders end in one line that names the file, and lose nothing.
+"""Damaged input files and result folders give a one-line error that names the file, and other files stay intact.
 
-``--hostile-full`` tries twenty times as many.
+``--hostile-full`` tries twenty times as many files.
 """
 
 from __future__ import annotations
@@ -91,7 +91,7 @@ JSON_VALUES = (
     "NaN", "Infinity", "-1e999", "[]", "{}", "null", "true", '"a"', '[["a"]]', "[1, 2, 3]", "1e308", '"\\u0000"'
 )  # fmt: skip
 
-# Name of a file, its sound content, and the command that reads it.
+# Name of a file, its valid content, and the command that reads the file.
 FILES: dict[str, tuple[str, Callable[[], str], tuple[str, ...]]] = {
     "problem": ("problem.toml", lambda: PROBLEM, ("optimize", "problem.toml", *STOP)),
     "robot": ("robot.toml", lambda: ROBOT, ("inspect", "small.urdf", "--config", "robot.toml")),
@@ -127,7 +127,7 @@ def test_spoiled_files(name: str, arena: Path, hostile_full: bool) -> None:
 
 @pytest.fixture(scope="module")
 def result(tmp_path_factory: pytest.TempPathFactory) -> Path:
-    """A result without pictures."""
+    """A result folder without figures."""
     from tests.hostile.arena import SMALL
 
     place = tmp_path_factory.mktemp("result")

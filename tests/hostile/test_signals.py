@@ -1,6 +1,6 @@
-"""Signals at random times end the process in one line, and leave nothing behind.
+"""Signals at random times end the process with one error line and leave no files or processes.
 
-``--hostile-full`` sends more of them.
+``--hostile-full`` sends more signals.
 """
 
 from __future__ import annotations
@@ -18,7 +18,7 @@ import pytest
 
 COMMAND = Path(sys.executable).parent / "impact-posture"
 PUSH = ("tilthex_arm", "--normal", "0", "0", "1")
-# Commands, and the least processor time of their first process, s.
+# Commands, and the minimum processor time of their first process, s.
 COMMANDS = {
     "evaluate": (("evaluate", *PUSH), 0.7),
     "codegen": (("codegen", *PUSH, "--compile", "--out", "deep/er/out"), 1.0),
@@ -32,7 +32,7 @@ pytestmark = pytest.mark.skipif(sys.platform != "linux", reason="looks at proces
 
 
 def caught(pid: int) -> int:
-    """The signals that a process handles, as bits."""
+    """Return the signals that a process handles, as a bit mask."""
     for line in Path(f"/proc/{pid}/status").read_text().splitlines():
         if line.startswith("SigCgt"):
             return int(line.split()[1], 16)
@@ -40,31 +40,31 @@ def caught(pid: int) -> int:
 
 
 def busy(pid: int) -> float:
-    """Processor time of a process so far, s."""
+    """Return the processor time that a process has used, s."""
     fields = Path(f"/proc/{pid}/stat").read_text().rpartition(")")[2].split()
     return (int(fields[11]) + int(fields[12])) / TICKS
 
 
 def session(leader: int) -> list[str]:
-    """The command lines of the living processes of a session."""
+    """Return the command lines of the running processes of a session."""
     commands = []
     for entry in Path("/proc").iterdir():
         with contextlib.suppress(OSError, ValueError):
             fields = (entry / "stat").read_text().rpartition(")")[2].split()
             if int(entry.name) and int(fields[3]) == leader and fields[0] not in "ZX":
                 commands.append((entry / "cmdline").read_text().replace("\0", " "))
-    # A process without a command line is about to end.
+    # A process without a command line is terminating.
     return [command for command in commands if command]
 
 
 def times(count: int) -> list[tuple[str, int, signal.Signals]]:
-    """Return the command, the number and the signal of each case."""
+    """Return command, number and signal of each case."""
     return [(name, k, SIGNALS[(k + n) % len(SIGNALS)]) for k in range(count) for n, name in enumerate(COMMANDS)]
 
 
 def send(name: str, k: int, number: signal.Signals, folder: Path) -> None:
     arguments, whole = COMMANDS[name]
-    # The moment is processor time, because the speed of the machine varies.
+    # The time of the signal is processor time, because the speed of machines differs.
     moment = random.Random(f"{name} {k}").uniform(0.0, whole)
     work, temporary = folder / "work", folder / "temporary"
     for place in (work, temporary):
@@ -73,12 +73,12 @@ def send(name: str, k: int, number: signal.Signals, folder: Path) -> None:
     process = subprocess.Popen(
         [str(COMMAND), *arguments], cwd=work, stdout=subprocess.PIPE, stderr=subprocess.PIPE, text=True,
         start_new_session=True, env=os.environ | cache | {"TMPDIR": str(temporary)},
-        # A shell that runs the tests in the background has it ignored.
+        # If a shell runs the tests in the background, the child would ignore SIGINT.
         preexec_fn=lambda: signal.signal(signal.SIGINT, signal.default_int_handler),
     )  # fmt: skip
     try:
         with contextlib.suppress(OSError):
-            # Wait until the program handles the signal.
+            # Wait until the program has installed its signal handler.
             while process.poll() is None and not caught(process.pid) >> (signal.SIGTERM - 1) & 1:
                 time.sleep(0.002)
             begin = busy(process.pid)
@@ -97,12 +97,12 @@ def send(name: str, k: int, number: signal.Signals, folder: Path) -> None:
         assert process.returncode == 128 + number, about
         assert len(lines) == 1 and lines[0].startswith("error: "), about
     assert "Traceback" not in errors and "ignored" not in errors, about
-    # A process that ends before the signal has written its folder as a whole.
+    # A process that ends before the signal has written its complete output folder.
     names = {path.name for path in work.iterdir()}
     assert names <= {"out", "deep"}, about
     if "deep" in names:
         assert [path.name for path in (work / "deep" / "er").iterdir()] == ["out"], about
-    # Matplotlib makes its own folder if it cannot write its cache.
+    # Matplotlib creates a temporary folder if its cache is not writable.
     assert not [path for path in temporary.iterdir() if not path.name.startswith("matplotlib-")], about
     assert not list((folder / "cache").rglob(".impact-posture-*")), about
     assert not left, about
@@ -123,7 +123,7 @@ def test_many_signals(tmp_path: Path, hostile_full: bool) -> None:
 
 
 def test_a_signal_during_an_import_ends_the_process() -> None:
-    """The module that cleans up may be there without its functions yet."""
+    """During its own import, the module that cleans up exists without its functions."""
     code = (
         "import os, signal, sys, types\n"
         "from impact_posture_cli.process import prepare\n"

@@ -1,4 +1,4 @@
-"""Commands in unusual surroundings: closed streams, read-only folders, settings of other programs."""
+"""Commands in unusual environments: closed streams, read-only folders, settings of other programs."""
 
 from __future__ import annotations
 
@@ -35,7 +35,7 @@ def test_streams_that_are_closed_or_full(line: str, code: set[int], err: str) ->
 
 
 def test_files_never_take_the_number_of_a_closed_stream(tmp_path: Path) -> None:
-    """A library that writes to standard output must not write into the first file that is opened."""
+    """If standard output is closed, the next opened file gets its descriptor; no library may print into this file."""
     line = f'{sys.executable} -c "$1" >&- 2>&-'
     program = (
         "import os, sys\nfrom impact_posture_cli.process import prepare\nprepare()\n"
@@ -46,7 +46,7 @@ def test_files_never_take_the_number_of_a_closed_stream(tmp_path: Path) -> None:
     assert (tmp_path / "file").read_bytes() == b""
 
 
-# Simulates a system without a folder for temporary files, which works for root as well.
+# Simulate a system without a folder for temporary files, which also works for root.
 NO_TEMPORARY_FOLDER = """
 import sys, tempfile
 def refuse():

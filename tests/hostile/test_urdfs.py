@@ -1,6 +1,6 @@
-"""Spoiled URDFs load or end in one line that names the file, in bounded time and memory.
+"""Damaged URDFs load or give a one-line error that names the file, within bounded time and memory.
 
-``--hostile-full`` tries twenty times as many.
+``--hostile-full`` tries twenty times as many files.
 """
 
 from __future__ import annotations
@@ -20,7 +20,7 @@ COUNT = 16
 
 
 def spoiled(rng: random.Random) -> bytes:
-    """Return the small robot with one to three random faults."""
+    """Return the URDF of the small robot with one to three random faults."""
     root = ET.fromstring(SMALL)
     for _ in range(rng.choice((1, 1, 2, 3))):
         rng.choice((remove, duplicate, set_attribute, set_number, rename, reconnect, move, add))(root, rng)
@@ -54,7 +54,7 @@ def with_attributes(root: ET.Element, rng: random.Random) -> ET.Element:
 
 
 def printable(texts: tuple[str, ...]) -> list[str]:
-    """Return the short texts that XML can hold."""
+    """Return short texts that XML can represent."""
     return [
         text for text in texts if len(text) < 1000 and all(c >= " " and not "\ud800" <= c <= "\udfff" for c in text)
     ]
@@ -83,7 +83,7 @@ def rename(root: ET.Element, rng: random.Random) -> None:
 
 
 def reconnect(root: ET.Element, rng: random.Random) -> None:
-    """Cycles, two roots, a link with two parents, a link of itself."""
+    """Make cycles, two roots, a link with two parents, or a link that is its own parent."""
     ends = [end for end in root.iter() if end.tag in ("parent", "child")]
     if ends:
         rng.choice(ends).set("link", rng.choice(("world_link", "upper", "lower", "tip", "nowhere", "universe")))
@@ -123,7 +123,7 @@ def test_spoiled_urdfs(argv: tuple[str, ...], arena: Path, hostile_full: bool) -
     assert outcomes[0].code == 0
     refused = [outcome for outcome in outcomes if outcome.code]
     assert len(refused) > COUNT / 4
-    # Other lines name a missing frame or joint.
+    # Other error lines name a missing frame or joint.
     assert sum("bad.urdf" in outcome.err for outcome in refused) > len(refused) / 2
 
 
@@ -161,7 +161,7 @@ def test_files_made_to_break_parsers(name: str, arena: Path) -> None:
 
 
 def test_shapes_of_which_no_two_can_meet(arena: Path) -> None:
-    """Only two neighbors have shapes, so that a result has no distance to state."""
+    """Only two adjacent links have shapes, so the result has no distance to report."""
     box = '<collision><geometry><box size="0.1 0.1 0.5"/></geometry></collision>'
     (arena / "boxes.urdf").write_text(SMALL.replace("</inertial>", f"</inertial>{box}"))
     push = ("--frame", "tip", "--normal", "1", "0", "0", "--contact-pose", "free")

@@ -1,4 +1,4 @@
-"""Wrong values for options and files, as attackers and tired users write them."""
+"""Invalid values for options and files, as attackers and tired users write them."""
 
 from __future__ import annotations
 
@@ -22,7 +22,7 @@ TEXTS = (
 
 
 def value(rng: random.Random) -> str:
-    """Return a random number or text."""
+    """Return a random number or a random text."""
     return rng.choice(NUMBERS if rng.random() < 0.5 else TEXTS)
 
 

@@ -178,8 +178,8 @@ def test_lifted_form(name: str) -> None:
 @pytest.mark.parametrize("name", WHOLE)
 def test_objective_functions_agree_with_its_own_numbers(name: str, kind: ObjectiveKind) -> None:
     all_of_them = list(combinations(name))
-    # Use all metrics and both frames, with and without supports.  Other robots are left out, because CasADi's search
-    # for common subexpressions is slow.
+    # These four cover all metrics, both frames, and cases with and without supports.  The other combinations are left
+    # out, because CasADi's search for common subexpressions is slow.
     for result, contact, metric, supports in (all_of_them[k] for k in (0, 5, 7, 10)):
         objective = WorstCaseObjective(result, contact, metric, kind, supports)
         where = describe(contact, metric, supports)

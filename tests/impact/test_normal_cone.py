@@ -215,7 +215,7 @@ def test_gradient_where_the_worst_normal_is_unique(name: str, kind: ObjectiveKin
 
 
 def test_subgradients_at_a_mirror_symmetric_posture() -> None:
-    """In every direction the objective rises at the rate of its largest gradient: the gradients span the hull."""
+    """In every direction, the slope of the objective is its largest gradient component: no gradient is missing."""
     loaded = robot("solo8")
     objective = WorstCaseObjective(loaded, ImpactContact("base_link", (1.0, 0.0, 0.0)), normal_cone_deg=20.0)
     q = loaded.posture()

@@ -1,1 +1,1 @@
-"""The pictures: written in all formats without a warning, and true to the numbers."""
+"""Figures: written in all formats without a warning, and consistent with the numbers."""

@@ -1,4 +1,4 @@
-"""Fixtures of the tests of the pictures."""
+"""Fixtures for the tests of the figures."""
 
 from __future__ import annotations
 
@@ -16,7 +16,7 @@ from tests.output.views import PENDULUM, make_view
 
 @pytest.fixture(autouse=True)
 def _no_warnings(caplog: pytest.LogCaptureFixture) -> Iterator[None]:
-    """Matplotlib warns by warnings and by its log; neither may speak."""
+    """Fail if Matplotlib issues a warning or writes to its log."""
     with warnings.catch_warnings():
         warnings.simplefilter("error")
         yield
@@ -30,7 +30,7 @@ def tilthex() -> ResultView:
 
 @pytest.fixture(scope="module")
 def surface(tilthex: ResultView) -> ResultView:
-    """A map of two degrees of freedom."""
+    """Return a result whose self-motion map has two dimensions."""
     assert tilthex.self_motion is not None
     return dataclasses.replace(tilthex, self_motion=dataclasses.replace(tilthex.self_motion, s=np.zeros(24)))
 
@@ -42,7 +42,7 @@ def talos() -> ResultView:
 
 @pytest.fixture(scope="module")
 def two_hands(talos: ResultView) -> ResultView:
-    """Both hands at once, along two normals."""
+    """Return a result with impacts at both hands, along two normals."""
     other = ImpactContact("gripper_left_base_link", (0, -1, 0))
     return dataclasses.replace(talos, objective=dataclasses.replace(talos.objective, others=(other,)))
 
@@ -54,21 +54,21 @@ def solo8() -> ResultView:
 
 @pytest.fixture(scope="module")
 def solo8_cone(solo8: ResultView) -> ResultView:
-    """The robot as it stands: the mirror image of its worst normal is as bad."""
+    """Return solo8 in its initial posture, where the mirror image of the worst normal is equally bad."""
     objective = dataclasses.replace(solo8.objective, normal_cone_deg=20.0)
     return dataclasses.replace(solo8, objective=objective, q_optimal=solo8.q_initial)
 
 
 @pytest.fixture(scope="module")
 def torso() -> ResultView:
-    """Numbers of many digits: what is widest in a legend."""
+    """Return a result whose numbers have many digits, so that its legends are widest."""
     view = make_view("talos", (1, 0, 0), "torso_2_link", path=False)
     return dataclasses.replace(view, objective=dataclasses.replace(view.objective, normal_cone_deg=12.5))
 
 
 @pytest.fixture(scope="module")
 def turned() -> ResultView:
-    """A cone that turns with the contact frame."""
+    """Return a result whose cone of normals turns with the contact frame."""
     view = make_view("ur5", (0.3, 0.4, 1), normal_frame="contact", path=False)
     return dataclasses.replace(view, objective=dataclasses.replace(view.objective, normal_cone_deg=30.0))
 

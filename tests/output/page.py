@@ -1,4 +1,4 @@
-"""Check a page of figures for defects."""
+"""Check a page of figures for layout defects."""
 
 from __future__ import annotations
 
@@ -14,14 +14,14 @@ from mpl_toolkits.mplot3d import Axes3D
 
 from impact_posture.output.plot.style import lay_out
 
-# Lines are darker than this in some color; grids, walls and faint fills are lighter.
+# In their darkest color channel, lines are below this value; grids, walls and faint fills are above it.
 _INK = 0.6
 _NUMBER = re.compile("[−0-9.e]+")
 
 
 @dataclass(frozen=True)
 class Words:
-    """A text as it stands on the page: the middle of its box, half of its sides and its turn, pixels."""
+    """Placed text: center of its box, half side lengths, and rotation matrix, in pixels."""
 
     text: str
     center: np.ndarray
@@ -33,7 +33,7 @@ class Words:
         box, angle = text.get_window_extent(), np.radians(text.get_rotation())
         c, s = abs(np.cos(angle)), abs(np.sin(angle))
         size = text.get_fontsize() * text.figure.get_dpi() / 72 * (1 + 1.3 * text.get_text().count("\n"))
-        # A slanted text is smaller than the upright box around it.
+        # The box of a rotated text is smaller than the upright box around it.
         width = (box.width - size * s) / c if c > s else (box.height - size * c) / s
         height = box.height if s < 0.01 else box.width if c < 0.01 else size
         center = np.array([box.x0 + box.width / 2, box.y0 + box.height / 2])
@@ -41,21 +41,21 @@ class Words:
         return cls(text.get_text(), center, np.array([width, height]) / 2, turn)
 
     def holds(self, points: np.ndarray, less: float = 1.0) -> np.ndarray:
-        """Which points, shape (n, 2), lie in it, ``less`` pixels from its edge."""
+        """Return which points, shape (n, 2), lie inside the box, at least ``less`` pixels from its edge."""
         return (np.abs((points - self.center) @ self.turn.T) < self.half - less).all(axis=1)
 
     @property
     def points(self) -> np.ndarray:
-        """Points all over it, shape (n, 2)."""
+        """Return a grid of points inside the box, shape (n, 2)."""
         x, y = (np.linspace(-h + 1, h - 1, max(int(h), 3)) for h in self.half)
         return np.stack(np.meshgrid(x, y), axis=-1).reshape(-1, 2) @ self.turn + self.center
 
 
 def defects(figure: Figure) -> list[str]:
-    """List defects: texts on each other, on lines or off the page, axes without units, several legends."""
+    """List defects: texts that overlap texts or lines or leave the page, axes without units, several legends."""
     figure.set_dpi(100)
     canvas = FigureCanvasAgg(figure)
-    # It draws everything as well, so that texts know where they stand.
+    # The layout also draws the figure, which determines the positions of its texts.
     lay_out(figure)
     texts = [t for t in figure.findobj(Text) if t.get_visible() and t.get_text().strip() and _shown(t, figure)]
     words = [Words.of(text) for text in texts]
@@ -66,7 +66,7 @@ def defects(figure: Figure) -> list[str]:
         and other.holds(one.points).any()
     ]
     for text in texts:
-        # With the plate behind it, which would only hide the line that it stands on.
+        # Hide the texts together with their background, which would hide lines below them.
         text.set_visible(False)
     canvas.draw()
     image = np.asarray(canvas.buffer_rgba())[::-1, :, :3].min(axis=2) / 255
@@ -88,14 +88,14 @@ def defects(figure: Figure) -> list[str]:
 
 
 def check_page(figure: Figure) -> None:
-    """Check that a page has no defects, and that its parts keep to their places and off each other."""
+    """Check that a page has no defects, and that its parts neither leave their places nor overlap."""
     assert defects(figure) == []
     head, body, foot = figure.subfigs
     for part in (head, foot):
         for words in part.texts:
             box = words.get_window_extent()
             assert box.y0 >= part.bbox.y0 and box.y1 <= part.bbox.y1
-    # A pixel less on each side, because boxes that only touch do not overlap.
+    # Shrink each box by one pixel, because adjacent boxes do not overlap.
     boxes = [axes.get_tightbbox().padded(-1) for axes in body.axes if axes.get_visible()]
     for legend in body.legends:
         box = legend.get_window_extent()
@@ -106,7 +106,7 @@ def check_page(figure: Figure) -> None:
 
 
 def _shown(text: Text, figure: Figure) -> bool:
-    """Whether a text is drawn: ticks beyond an axis' end are not."""
+    """Whether a text is visible; ticks beyond the end of an axis are not."""
     for axes in figure.axes:
         for axis in _axes(axes):
             every = [t.label1 for t in axis.majorTicks + axis.minorTicks] + [t.label2 for t in axis.majorTicks]
@@ -127,7 +127,7 @@ def _axes(axes: object) -> list[object]:
 
 
 def labels(figure: Figure) -> list[str]:
-    """Names of all axes that show numbers."""
+    """Return the labels of all axes that show numbers."""
     names = []
     for axes in figure.axes:
         for axis in _axes(axes) if axes.axison and axes.get_visible() else ():

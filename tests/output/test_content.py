@@ -1,4 +1,4 @@
-"""Compare figures with the numbers that they show."""
+"""Compare figures with the numbers that the figures show."""
 
 from __future__ import annotations
 
@@ -83,7 +83,7 @@ def test_ellipsoid_panels_are_equal_and_tangents_touch(tilthex: ResultView) -> N
         assert box.width == pytest.approx(box.height, rel=1e-6)
         assert axes.get_xlim() == axes.get_ylim() == panels[0].get_xlim()
         assert "(m/s, rad/s)/(N·s)" in axes.get_xlabel()
-    # n is z: the xz panel has horizontal tangents at ±√H of both postures, and the curves end there.
+    # The normal is z, so in the xz panel the curves touch horizontal tangents at ±√H for both postures.
     curves = [line.get_ydata() for line in panels[1].lines if len(line.get_ydata()) > 100]
     tangents = [line.get_ydata() for line in panels[1].lines if line.get_linewidth() == 0.7]
     heights = sorted(float(y[0]) for y in tangents)
@@ -108,7 +108,7 @@ def test_oblique_normal_gets_its_own_plane() -> None:
 def test_free_ellipsoid_stands_beside_the_consistent_one(solo8: ResultView, tilthex: ResultView) -> None:
     assert tilthex.free == () and "free" not in text_of(ellipsoid_figure(tilthex))
     assert len(solo8.free) == 2
-    # The oracle's numbers without feet: M alone.
+    # Expected ellipsoid without feet, from M alone.
     J, M = solo8.jacobian(solo8.q_optimal), solo8.objective.oracle.at(solo8.q_optimal).M
     expected = np.linalg.solve(M, J.T).T @ np.linalg.solve(M, J.T)
     np.testing.assert_allclose(solo8.free[1].ellipsoid, expected, rtol=1e-9, atol=1e-12 * expected.max())
@@ -132,12 +132,12 @@ def test_cone_and_all_tied_worst_normals_are_drawn(solo8_cone: ResultView, solo8
     for axes, plane in zip(panels_of(figure), COORDINATE_PLANES, strict=True):
         limit = axes.get_xlim()[1]
         tips = [np.array(text.xy) for text in axes.texts if text.arrow_patch is not None]
-        # Two before and two after, at the same posture; and n, if it is drawn as an arrow.
+        # Each of the two equal postures has two arrows for worst normals.  There is one more arrow if n is visible.
         assert len(tips) == 4 + plane.contains(solo8_cone.after.normal)
         for normal in worst.normals:
             assert sum(np.allclose(tip, 0.92 * limit * plane.axes @ normal, atol=1e-9) for tip in tips) >= 2
         (patch,) = axes.patches
-        # A worst normal on the edge of the cone ends on the edge of its shadow.
+        # A worst normal on the edge of the cone ends on the edge of the cone's shadow.
         assert np.abs(patch.get_xy()).max() <= 0.92 * limit * (1 + 1e-12)
     value = number(solo8_cone.objective.value(solo8_cone.q_optimal))
     assert f"objective impulse {value} → {value}" in text_of(figure)
@@ -243,7 +243,7 @@ def test_skeleton_meets_pinocchio(
     centers = rotors.mean(axis=2) - tilthex.q_initial[:3]
     expected = [r.position for r in tilthex.robot.spec.propulsion.rotors]  # type: ignore[union-attr]
     np.testing.assert_allclose(centers, expected, atol=1e-9)
-    # Both links of the pendulum are there, the second one down to its center of mass.
+    # Both links of the pendulum are drawn, and the second link ends at its center of mass.
     assert len({tuple(p.round(9)) for bone in skeleton(pendulum, pendulum.q_optimal).bones for p in bone}) == 4
 
 
@@ -282,7 +282,7 @@ def test_a_surface_is_drawn_at_its_depth(tilthex: ResultView, solo8: ResultView)
 def test_each_contact_has_its_planes(
     tilthex: ResultView, turned: ResultView, two_hands: ResultView, solo8: ResultView
 ) -> None:
-    # Two where the contact moves along n or n turns, for each contact.
+    # If the contact moves along n, or n turns, the figure shows two surfaces per contact.
     assert [s.name for s in surfaces(tilthex)] == ["n₀", "n₁"] == [s.name for s in surfaces(turned)]
     assert [s.name for s in surfaces(two_hands)] == ["n₀ A", "n₁ A", "n₀ B", "n₁ B"]
     for view in (tilthex, turned, two_hands):
@@ -301,11 +301,11 @@ def test_each_contact_has_its_planes(
         hatched = [patch for patch in flat.patches if patch.get_hatch()]
         seen = [s for s in drawn if np.linalg.norm(side_plane(*both(view)).axes @ s.normal) > 0.05]
         assert len(hatched) == len(seen) > 0
-    # One, where the same plane is touched before and after.
+    # If both postures touch the same plane, the figure shows one surface.
     still = dataclasses.replace(solo8, q_optimal=solo8.q_initial)
     (one,) = surfaces(still)
     assert one.name == "n" and "surface before" not in text_of(postures_figure(still))
-    # A push has a direction, and no surface.
+    # A push has a direction, but no surface.
     text = text_of(postures_figure(dataclasses.replace(still, pushed=True)))
     assert "surface |" in text_of(postures_figure(still)) and "surface |" not in text and "| n |" in text
     assert "impact at gripper_right_base_link (A), gripper_left_base_link (B)" in text_of(jump_figure(two_hands))
@@ -319,13 +319,13 @@ def test_a_base_with_legs_is_a_body(name: str) -> None:
     hips = np.array([model.jointPlacements[k].translation for k in range(2, model.njoints) if model.parents[k] == 1])
     corners = np.array([base.actInv(corner) for corner in seen.body])
     assert len(hips) == 4 and corners.shape == (8, 3)
-    # The hips are on the box: at its corners as seen from above.
+    # Seen from above, the hips are at the corners of the box.
     np.testing.assert_allclose(corners.min(axis=0)[:2], hips.min(axis=0)[:2], atol=1e-12)
     np.testing.assert_allclose(corners.max(axis=0)[:2], hips.max(axis=0)[:2], atol=1e-12)
     assert np.ptp(corners[:, 2]) > 0.3 * np.ptp(hips, axis=0)[:2].min()
-    # It stands for the sticks from the base to the hips.
+    # The box replaces the sticks from the base to the hips.
     assert not any(np.allclose(end, base.translation) for bone in seen.bones for end in bone)
-    # The shapes show the body better.  A robot without shapes has its box.
+    # Collision shapes replace the box of the body.  A robot without shapes keeps the box.
     assert "body" not in text_of(postures_figure(view)).split(" | ")
     assert "body" in text_of(postures_figure(without_shapes(view))).split(" | ")
 
@@ -342,7 +342,7 @@ def silhouettes(axes: Axes) -> list[PathPatch]:
 
 
 def encloses(ring: Path, points: np.ndarray) -> bool:
-    """Whether a ring encloses points, whatever its direction."""
+    """Whether a ring of points encloses all points, for either direction of the ring."""
     return any(bool(ring.contains_points(points, radius=radius).all()) for radius in (1e-9, -1e-9))
 
 
@@ -359,7 +359,7 @@ def test_silhouettes_are_the_shadows_of_the_hulls(talos: ResultView, panda: Resu
             for ring, hull in zip(rings, state.hulls, strict=True):
                 shadow = hull.vertices @ plane.axes.T
                 assert encloses(ring, shadow)
-                # In every direction, the outline is farther out by the sweep.
+                # The sweep moves the outline outward by the sweep radius in every direction.
                 around = np.array([[np.cos(a), np.sin(a)] for a in np.linspace(0, 6, 20)])
                 out = (ring.vertices @ around.T).max(axis=0) - (shadow @ around.T).max(axis=0)
                 assert (out <= max(hull.radius, 1e-4) + 1e-12).all() and (out >= 0.86 * hull.radius).all()
@@ -367,7 +367,7 @@ def test_silhouettes_are_the_shadows_of_the_hulls(talos: ResultView, panda: Resu
         pin.forwardKinematics(view.robot.model, data, view.q_optimal)
         for body, hull in zip(bodies, states[1].hulls, strict=True):
             np.testing.assert_allclose(hull.vertices[0], data.oMi[body.joint].act(body.vertices[0]), atol=1e-12)
-        # In 3-D the corners of each hull are in its outline on the picture.
+        # The corners of each three-dimensional hull project into its outline in the figure.
         for state, patch in zip(states, silhouettes(space), strict=True):
             rings = [Path(ring) for ring in patch.get_path().to_polygons(closed_only=False)]
             for ring, hull in zip(rings, state.hulls, strict=True):
@@ -403,7 +403,7 @@ def test_jump_bars_carry_the_jump(tilthex: ResultView, panda: ResultView) -> Non
     panels = np.array(figure.axes).reshape(3, 2)
     for column, factor in ((0, [1.0, 1.0]), (1, [0.6 / tilthex.before.G, 0.6 / tilthex.after.G])):
         widths = [[bar.get_width() for bar in axes.patches] for axes in panels[:, column]]
-        # Each panel holds the bars before, then those after.
+        # In each panel, the bars of the initial posture precede the bars of the optimum.
         drawn = [[w for panel in widths for w in np.split(np.array(panel), 2)[k]] for k in (0, 1)]
         for state, values, gain in zip((tilthex.before, tilthex.after), drawn, factor, strict=True):
             np.testing.assert_allclose(values, gain * state.jump, rtol=1e-12)
@@ -433,7 +433,7 @@ def test_path_axis_is_log_where_values_spread(factor: float, scale: str, panda: 
     (axes,) = path_figure(view).axes
     assert axes.get_yscale() == scale
     assert {"start", "optimum"} <= {t.get_text() for t in axes.texts}
-    # S is undefined at the start, so it is divided by its first value.
+    # S is undefined at the start, so the curve is normalized by the first defined value.
     (drawn,) = (line.get_ydata() for line in axes.lines if str(line.get_label()).startswith("S"))
     np.testing.assert_array_equal(np.isnan(drawn), np.isnan(S))
     assert np.nanmax(drawn) == 1.0

@@ -1,4 +1,4 @@
-"""Files in all formats, pages without overlap, degenerate robots, bad input."""
+"""Figures in all formats, pages without overlap, degenerate robots, and invalid input."""
 
 from __future__ import annotations
 
@@ -25,7 +25,7 @@ from tests.output.views import PENDULUM, make_view, text_of
 
 
 def test_figures_are_written_in_all_formats(tilthex: ResultView, tmp_path: Path) -> None:
-    # Surfaces and hatches are written in every format, and the other figures in one format each.
+    # Surfaces and hatched areas are written in every format, the other figures in one format each.
     first = draw_all(tilthex, tmp_path / "figures", FORMATS, only=["ellipsoid", "jump"])
     assert [p.name for p in first] == [f"{n}.{f}" for n in ("ellipsoid", "jump") for f in ("png", "svg", "pdf")]
     paths = first + draw_all(tilthex, tmp_path / "figures", (".PNG",), only=["postures"])
@@ -39,7 +39,7 @@ def test_figures_are_written_in_all_formats(tilthex: ResultView, tmp_path: Path)
         if path.suffix == ".png":
             image = matplotlib.image.imread(path)
             assert image.shape[1] == round(200 * WIDTH)
-            # Something other than paper everywhere: left and right, top and bottom half.
+            # The drawing covers the left and right, the top and bottom half of the page.
             rows, columns = (image[..., :3].min(axis=2) < 0.9).nonzero()
             assert rows.min() < 0.1 * len(image) < 0.8 * len(image) < rows.max()
             assert columns.min() < 0.1 * image.shape[1] < 0.8 * image.shape[1] < columns.max()
@@ -114,7 +114,7 @@ def test_degenerate_robot_draws(pendulum: ResultView) -> None:
 
 
 def test_a_contact_that_cannot_move_draws() -> None:
-    # Across the pendulum's plane nothing gives: H = G = 0, V is infinite.
+    # Perpendicular to its plane, the pendulum cannot move: H = G = 0, and V is infinite.
     view = make_view(PENDULUM, (1, 0, 0), q0=np.array([0.4, 0.9]))
     assert view.before.G == view.after.G == 0
     assert "G = 0" in text_of(jump_figure(view))

@@ -39,7 +39,7 @@ HOSTILE = "</script><script>document.title='taken'</script><img src=x onerror=\"
 
 @pytest.fixture(scope="module")
 def folder(tmp_path_factory: pytest.TempPathFactory) -> Path:
-    """A result with two figures."""
+    """A result folder with two figures."""
     place = tmp_path_factory.mktemp("report") / "out"
     options = ("--normal", 0, 0, 1, "--starts", 1, "--jobs", 1, "--no-codegen", "--out", place)
     done = run("optimize", "tilthex_arm", "--frame", "ee", *options, pictures=("jump", "nullspace"))
@@ -54,7 +54,7 @@ def scene(folder: Path) -> ReportScene:
 
 
 class Reader(HTMLParser):
-    """The tags of a page with attributes, and the text of each tag."""
+    """Tags of a page with their attributes, and the text of each tag."""
 
     def __init__(self, page: str) -> None:
         super().__init__()
@@ -75,14 +75,14 @@ class Reader(HTMLParser):
 
 
 def arrays(page: str) -> tuple[dict[str, Any], bytes]:
-    """The scene of a page and the buffer that it points into."""
+    """Return the scene of a page, and the buffer with its arrays."""
     texts = [re.search(rf'id="{name}">(.*?)</script>', page, re.S) for name in ("scene", "arrays")]
     first, second = (text[1] for text in texts if text)
     return json.loads(first), gzip.decompress(base64.b64decode(second))
 
 
 def levels(packed: dict[str, Any], buffer: bytes) -> np.ndarray:
-    """Decode what the viewer decodes: sums that wrap, then levels; shape (rows, columns)."""
+    """Decode like the viewer: cumulative sums modulo 2¹⁶, then scaled levels; shape (rows, columns)."""
     _, offset, count = packed["values"]
     rows = np.frombuffer(buffer, np.uint16, count, offset).reshape(-1, len(packed["low"]))
     return np.cumsum(rows, axis=0, dtype=np.uint16) * np.array(packed["step"]) + np.array(packed["low"])
@@ -98,18 +98,18 @@ def test_the_page_holds_the_result_and_reaches_nothing(folder: Path) -> None:
     assert document["verdict"]["line"] in "".join(reader.texts["p"])
     images = sum(tag == "img" for tag, _ in reader.tags)
     assert "jump" in reader.texts["figcaption"] and images == len(list(folder.glob("*.png")))
-    # The command as the user typed it.
+    # The page shows the command as the user typed it.
     command = reader.texts["code"][0]
     assert command.startswith("impact-posture optimize tilthex_arm --frame ee --normal 0 0 1 --starts 1")
     assert (folder / "problem.toml").read_text().split("\n")[0] in "".join(reader.texts["pre"])
-    # All addresses lie within the page.
+    # All addresses refer to content of the page itself.
     for _, attributes in reader.tags:
         for name in ("src", "href", "srcset", "data", "action"):
             assert (attributes.get(name) or "data:").startswith("data:")
     (policy,) = [a["content"] or "" for t, a in reader.tags if t == "meta" and "http-equiv" in a]
     assert policy.startswith("default-src 'none';") and "unsafe" not in policy and "http" not in policy
     loader, style = (page.rpartition(f"<{tag}>")[2].partition(f"</{tag}>")[0] for tag in ("script", "style"))
-    # Only the loader and the viewer that it unpacks may run.
+    # The policy permits only the loader script and the viewer that it unpacks.
     viewer = gzip.decompress(base64.b64decode(reader.packed["viewer"])).decode()
     hashes = [
         f"'sha256-{base64.b64encode(hashlib.sha256(text.encode()).digest()).decode()}'"
@@ -152,7 +152,7 @@ def test_a_result_is_kept_without_its_report(tmp_path: Path, monkeypatch: pytest
     assert written.report_error == "RuntimeError: no room"
     assert (tmp_path / "out" / "posture.json").is_file() and not (tmp_path / "out" / "report.html").exists()
     assert not result.save(tmp_path / "bare", codegen=False, report=False, jobs=1).report_error
-    # A result from Python gets a page with the command that makes it again.
+    # A result made in Python gets a page with the command that recreates the result.
     assert not rewrite_report(tmp_path / "bare").name.startswith(".")
     page = (tmp_path / "bare" / "report.html").read_text()
     assert Reader(page).texts["code"][0] == "impact-posture optimize problem.toml"
@@ -174,7 +174,7 @@ def test_every_contact_is_shown(tmp_path: Path, monkeypatch: pytest.MonkeyPatch)
     problem = ip.PostureProblem(objective, contact_pose="position", collision=False)
     result = ip.optimize(problem, starts=1, jobs=1, compile="never")
     result.save(tmp_path / "out", codegen=False, report=False, jobs=1)
-    # A jump takes 15 ms.
+    # The jump of the impact takes 15 ms.
     monkeypatch.setattr(
         "impact_posture.output.report.result_report._frames", lambda view: (np.arange(2.0), "", view.path.q[:2])
     )
@@ -186,7 +186,7 @@ def test_every_contact_is_shown(tmp_path: Path, monkeypatch: pytest.MonkeyPatch)
     pin.framesForwardKinematics(model, data, q)
     at = levels(track["points"], arrays)[-1].reshape(2, 3)
     assert np.allclose(at, [data.oMf[robot.frame_id(one.frame)].translation for one in contacts], atol=1e-4)
-    # Each ellipsoid squared is Λ_c of its contact, and the arrow is the jump of both together.
+    # The square of each ellipsoid is Λ_c of its contact; the arrow is the jump of both impacts together.
     for packed_root, single in zip(
         levels(track["ellipsoids"], arrays)[-1].reshape(2, 6), view.objective.singles, strict=True
     ):
@@ -223,7 +223,7 @@ def test_texts_stay_texts(scene: ReportScene, text: str) -> None:
     light = Packed(**vars(scene))
     page = written(text, light)
     hostile, plain = Reader(page), Reader(written("x", light))
-    # The page has the same tags and attributes as with a harmless text, and keeps the direction of writing.
+    # The page has the same tags and attributes as with a harmless text, and the same writing direction.
     assert [(tag, list(attributes)) for tag, attributes in hostile.tags] == [(t, list(a)) for t, a in plain.tags]
     assert "\u202e" not in page
 
@@ -251,7 +251,7 @@ def test_the_viewer_gets_the_robot_where_it_is(folder: Path) -> None:
             assert np.allclose(placed[j].homogeneous, data.oMi[j].homogeneous, atol=2e-4)
             tip = data.oMi[j].act(model.inertias[j].lever) + packed["scale"]["jump"] * jumps[k, j]
             assert np.linalg.norm(tip - packed["center"]) < packed["radius"] + 1e-3
-    # The arrow of a link is the velocity of its center of mass, by a difference along the predicted jump.
+    # The arrow of a link shows the velocity of its center of mass, from differences along the predicted jump.
     jump, centers = coulomb_jump(view.objective, view.q_optimal, 1.0), []
     assert jump is not None
     for sign in (-1, 1):
@@ -276,7 +276,7 @@ def test_a_run_is_thinned_where_nothing_happens() -> None:
     inside = (thinned.t >= 1.0) & (thinned.t <= 1.3)
     assert np.allclose(np.diff(thinned.t[inside]), 0.001) and inside.sum() >= 300
     assert np.diff(thinned.t).max() <= 0.0251 and len(thinned.t) < 450 and thinned.t[-1] == columns["t"][3499]
-    # No peak is lost between two frames.
+    # The thinned frames still contain the largest peak.
     assert thinned.peak.max() == columns["peak"][:3500].max()
     sizes = np.linalg.norm(columns["force"][:3500], axis=1)
     assert np.linalg.norm(thinned.force, axis=1).max() == sizes.max()
@@ -294,7 +294,7 @@ def test_known_robots_come_with_meshes_and_their_license(name: str, largest: flo
     drawn = draw_robot(robot)
     assert [one.license for one in drawn.licenses] == [license] and drawn.licenses[0].upstream.startswith("https://")
     size = sum(4 / 3 * (solid.corners.nbytes + 2 * solid.faces.size) for solid in drawn.solids)
-    # As large as after compression by half, which every mesh reaches.
+    # Estimate the size after compression, which reduces every mesh by at least half.
     assert 0.5 * size < largest and sum(len(solid.faces) for solid in drawn.solids) <= 150_000
     assert robot.settings is not None
     links = parse_urdf(locate(name, robot.settings).urdf).findall("link")
@@ -311,7 +311,7 @@ INERTIAL = '<inertial><mass value="1"/><inertia ixx="1" iyy="1" izz="1" ixy="0" 
 
 
 def user_robot(folder: Path, a: str, b: str) -> ip.Robot:
-    # The last corner but one is in a dent, so the hull lacks it.
+    # The second last point is in a dent, so it is not a corner of the hull.
     corners = [f"v {x} {y} {z}" for x, y, z in [*TETRAHEDRON, [0, 0, 0]]]
     faces = ["f 1 2 4", "f 2 3 4", "f 3 1 4", "f 1 5 2", "f 2 5 3", "f 3 5 1"]
     (folder / "dent.obj").write_text("\n".join([*corners, *faces]))
@@ -330,14 +330,14 @@ def test_own_meshes_go_in_only_if_asked(tmp_path: Path) -> None:
     hulls, meshes = draw_robot(robot), draw_robot(robot, True)
     assert [len(one.solids[0].corners) for one in (hulls, meshes)] == [4, 5] and hulls.licenses == ()
     assert "hulls" in hulls.notes[0] and not meshes.notes
-    # Equal files of different size are two meshes.
+    # Equal files with different scales are two meshes.
     extents = [np.ptp(solid.points, axis=0) for solid in meshes.solids]
     assert np.allclose(extents, [[0.1, 0.2, 0.3], [0.2, 0.4, 0.6]], atol=1e-5)
     assert meshes.parts[0][3] == (0.5, 0.6, 0.7, 1.0)
 
 
 def test_small_shapes_beside_large_meshes_are_drawn() -> None:
-    """The base of this robot is a box of 1 mm, which is less than the length within which its meshes are welded."""
+    """The base of this robot is a box of 1 mm, smaller than the distance within which mesh points are merged."""
     robot = ip.load_robot("example-robot-data:b1_description/urdf/b1-z1.urdf")
     solids = draw_robot(robot).solids
     assert all(len(solid.faces) for solid in solids)
@@ -354,7 +354,7 @@ def test_primitives_and_robots_without_shapes(tmp_path: Path) -> None:
     sticks = draw_robot(user_robot(tmp_path / "bare", "", visual('<mesh filename="missing.obj"/>')))
     assert len(sticks.parts) == 1 and "sticks" in sticks.notes[-1] and "missing.obj" in sticks.notes[0]
     assert np.ptp(sticks.solids[0].points[:, 2]) >= 0.5
-    # The last stick goes on to the farthest frame of the last link, where contacts are.
+    # The last stick ends at the farthest frame of the last link, because contacts may be there.
     tool = """<link name="tool"/><joint name="flange" type="fixed"><origin xyz="0.3 0 0"/><parent link="b"/>
     <child link="tool"/></joint></robot>"""
     (tmp_path / "tool.urdf").write_text(URDF.format(inertial=INERTIAL, a="", b="").replace("</robot>", tool))
@@ -367,12 +367,12 @@ def test_primitives_and_robots_without_shapes(tmp_path: Path) -> None:
 
 
 def different(a: np.ndarray, b: np.ndarray) -> float:
-    """The share of the pixels that differ."""
+    """Return the fraction of the pixels that differ."""
     return float((np.abs(a - b).sum(axis=2) > 40).mean())
 
 
 def near(picture: np.ndarray, color: tuple[int, int, int], within: int = 40) -> float:
-    """The share of the pixels near a color."""
+    """Return the fraction of the pixels near a color."""
     return float((np.abs(picture - np.array(color)).sum(axis=2) < within).mean())
 
 
@@ -386,7 +386,7 @@ def test_a_browser_draws_it_offline(folder: Path, scene: ReportScene, tmp_path: 
     with browser(tmp_path / "profile") as tab:
         tab.open(folder / "report.html")
         before = tab.picture("#view")
-        # The surface and the robot are there: without them the picture is another.
+        # The picture shows surface and robot, because hiding them changes the picture.
         hide(tab, "surface")
         without_surface = tab.picture("#view")
         assert different(before, without_surface) > 0.05
@@ -396,7 +396,7 @@ def test_a_browser_draws_it_offline(folder: Path, scene: ReportScene, tmp_path: 
         for name in ("robot", "jumps", "surface"):
             hide(tab, name)
         assert different(before, tab.picture("#view")) == 0
-        # The slider moves the robot, and says so; the robot before stays as a ghost.
+        # The slider moves the robot and shows its position; the initial posture stays visible as a ghost.
         tab.evaluate("document.getElementById('end').click()")
         after = tab.picture("#view")
         assert different(before, after) > 0.03
@@ -407,14 +407,14 @@ def test_a_browser_draws_it_offline(folder: Path, scene: ReportScene, tmp_path: 
             "[document.getElementById('where').textContent, document.querySelector('figure output').textContent]"
         )
         assert shown[0] == "100 % of the way" and float(shown[1]) == pytest.approx(document["optimal"]["H"], rel=1e-3)
-        # On a telephone nothing is wider than the screen.
+        # On a phone, nothing is wider than the screen.
         tab.resize(360, 640)
         assert tab.evaluate("document.documentElement.scrollWidth") <= 360
         assert not tab.complaints()
-        # Texts that are scripts do nothing.
+        # Text that looks like a script is not executed.
         tab.open(hostile)
         assert tab.evaluate("document.title") != "taken" and not tab.complaints()
-        # Without WebGL: words, curves and figures.
+        # Without WebGL, the page still shows text, curves and figures.
         none = "HTMLCanvasElement.prototype.getContext = () => null"
         number = tab.send("Page.addScriptToEvaluateOnNewDocument", source=none)["identifier"]
         tab.open(folder / "report.html", "words")

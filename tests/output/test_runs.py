@@ -1,4 +1,4 @@
-"""Pictures of simulated runs, from small made-up runs of real robots."""
+"""Figures of simulated runs, from short synthetic runs of real robots."""
 
 from __future__ import annotations
 
@@ -46,7 +46,7 @@ TICKS = 400
 
 
 def make_run(name: str, *, push: bool = False) -> RunView:
-    """A robot that swings about its posture for 4 s, hit at 1 s and 2.5 s, or pushed at 1 s."""
+    """A robot that oscillates about its posture for 4 s, with impacts at 1 s and 2.5 s, or a push at 1 s."""
     robot = load_robot(name)
     t = np.arange(1, TICKS + 1) * 0.01
     base = 6 if robot.floating else 0
@@ -101,19 +101,19 @@ def panels(figure: Figure) -> list[Axes]:
 
 
 def curves(axes: Axes) -> dict[str, tuple[np.ndarray, np.ndarray]]:
-    """The named lines of a panel."""
+    """Return the labeled lines of a panel."""
     named = [line for line in axes.lines if not str(line.get_label()).startswith("_")]
     return {str(line.get_label()): (np.asarray(line.get_xdata()), np.asarray(line.get_ydata())) for line in named}
 
 
 def shaded(axes: Axes, kind: str) -> np.ndarray:
-    """Begin and end of each shaded span, in order."""
+    """Return begin and end of each shaded interval, sorted."""
     spans: list[Any] = [p for p in axes.patches if to_hex(p.get_facecolor()) == SHADES[kind]["facecolor"]]
     return np.array(sorted((p.get_x(), p.get_x() + p.get_width()) for p in spans))
 
 
 def limits(axes: Axes) -> list[float]:
-    """Heights of the dashed lines."""
+    """Return the heights of the dashed lines."""
     lines = [
         line for line in axes.lines if line.get_linestyle() == "--" and line.get_linewidth() == LIMIT["linewidth"]
     ]
@@ -124,7 +124,7 @@ def test_windows_are_shaded_when_they_are(flying: RunView) -> None:
     whole, first = panels(metric_figure(flying))[:2]
     np.testing.assert_allclose(shaded(whole, "impact"), [(1.0, 1.3), (2.5, 2.8)])
     np.testing.assert_allclose(shaded(whole, "dwell"), [(1.0, 1.8), (2.5, 3.3)])
-    # Beside it, milliseconds from the first touch.
+    # The panel beside it shows milliseconds since the first touch.
     np.testing.assert_allclose(shaded(first, "impact"), [(0.0, 300.0)], atol=1e-9)
     np.testing.assert_allclose(first.get_xlim(), (-60.0, 405.0))
     assert "ms" in panels(metric_figure(flying))[-1].get_xlabel()
@@ -159,11 +159,11 @@ def test_controls_show_rotors_torques_limits_and_saturation(flying: RunView) -> 
     torque = np.outer(np.sin(flying.t), flying.torque_limits)
     figure = controls_figure(dataclasses.replace(flying, rotor_command=command, torque=torque))
     rotors, _, joints, _ = panels(figure)
-    # As shares of the highest speed: a robot.toml does not name the unit.
+    # Rotor speeds are relative to the largest speed, because a robot.toml does not define the unit.
     assert limits(rotors) == [propulsion.speed_min / propulsion.speed_max, 1.0]
     share = flying.rotor_speed[:, 0] / propulsion.speed_max
     np.testing.assert_allclose(curves(rotors)["rotor 1"][1], share)
-    # Noisy curves are thin and without dashes.
+    # Noisy curves are drawn thin and without dashes.
     lines = [line for line in rotors.lines if line.get_label()[:5] == "rotor"]
     assert {(line.get_linestyle(), line.get_linewidth()) for line in lines} == {("-", 0.7)}
     assert limits(joints) == [-1.0, 1.0] and joints.get_ylabel() == "torque / limit  [1]"
@@ -281,7 +281,7 @@ def test_snapshots_show_the_robot_where_it_was(flying: RunView, pushed: RunView)
         state = build_skeleton(flying.robot, flying.q[flying.index(time)], [flying.contact])
         spots = [line.get_xydata()[0] for line in axes.lines if len(line.get_xdata()) == 1]  # type: ignore[index, arg-type]
         assert any(np.allclose(spot, state.contact[[0, 2]]) for spot in spots)
-        # The surface x = −0.5 stands upright.
+        # The surface x = −0.5 is a vertical line.
         assert any(np.allclose(line.get_xdata(), -0.5) for line in axes.lines)
         x, y = axes.get_xlim(), axes.get_ylim()
         assert (state.points[:, 0] > x[0]).all() and (state.points[:, 2] < y[1]).all() and x[0] < -0.5
@@ -310,7 +310,7 @@ def test_bars_carry_means_intervals_and_the_papers_numbers() -> None:
     np.testing.assert_allclose(segment[:, 0], [0.274, 0.294])
     places = {m: [float(line.get_xdata()[0]) for line in humanoid.lines if line.get_marker() == m] for m in "D>"}  # type: ignore[index]
     assert places == {"D": [0.305, 0.166], ">": []}
-    # Far off the axis: an arrow within the panel, and the number in words.
+    # Values far beyond the axis appear as an arrow at the edge of the panel, with the number as text.
     beyond = [line for line in vertical.lines if line.get_marker() == ">"]
     assert len(beyond) == 2 and all(line.get_xdata()[0] < vertical.get_xlim()[1] for line in beyond)  # type: ignore[index]
     text = text_of(bars_figure(ROWS))
@@ -355,7 +355,7 @@ def test_files_in_all_formats_and_the_same_each_time(flying: RunView, fixed: Run
 
 
 def test_long_curves_are_simplified_and_keep_their_peaks(tmp_path: Path) -> None:
-    """Matplotlib leaves out what cannot be seen when it draws, in files as well."""
+    """When drawing, Matplotlib removes invisible points, also in files."""
     t = np.arange(30_000) * 1e-3
     values = np.sin(t)
     values[12_345], values[23_456] = 7.0, -9.0

@@ -1,4 +1,4 @@
-"""Shadows, half widths, sections, polars and cones against sampled points."""
+"""Shadows, half widths, sections, polars and cones, compared with sampled points."""
 
 from __future__ import annotations
 
@@ -41,7 +41,7 @@ def sphere(count: int) -> np.ndarray:
 
 
 def sampled(matrix: np.ndarray, count: int = 200_000) -> np.ndarray:
-    """Points of the ellipsoid's surface by a factor that is not the symmetric root, shape (3, count)."""
+    """Return points on the ellipsoid by a matrix root that is not symmetric, shape (3, count)."""
     values, vectors = np.linalg.eigh(matrix)
     return (vectors * np.sqrt(np.maximum(values, 0))) @ sphere(count)
 
@@ -56,7 +56,7 @@ def test_shadow_is_the_projection_of_sampled_points(rank: int, plane: Plane) -> 
     directions = np.array([np.cos(angle), np.sin(angle)]).T
     reach = (directions @ edge).max(axis=1)
     seen = (directions @ points).max(axis=1)
-    # The shadow's support function bounds the samples' and is met by them, up to the sampling.
+    # The support function of the shadow is an upper bound for the samples, tight up to the sampling.
     assert (seen <= reach + 1e-5).all()
     np.testing.assert_allclose(seen, reach, atol=2e-3)
 
@@ -123,7 +123,7 @@ def test_cone_shadow_is_the_projection_of_the_cone(degrees: float, plane: Plane)
     np.testing.assert_allclose(axis @ rim, 2.0 * np.cos(np.radians(degrees)), rtol=1e-12)
     outline = cone_shadow(axis, degrees, 2.0, plane.axes)
     np.testing.assert_array_equal(outline[:, 0], outline[:, -1])
-    # The outline has the same support function as the apex and the rim.
+    # The outline has the same support function as the apex together with the rim.
     angle = np.linspace(0, 2 * np.pi, 73)
     directions = np.array([np.cos(angle), np.sin(angle)]).T
     seen = np.maximum((directions @ plane.axes @ rim).max(axis=1), 0.0)
@@ -137,7 +137,7 @@ def test_an_outline_is_the_convex_hull(count: int) -> None:
     np.testing.assert_array_equal(ring[:, 0], ring[:, -1])
     hull = points[:, ConvexHull(points.T).vertices]
     assert sorted(map(tuple, ring[:, 1:].T)) == sorted(map(tuple, hull.T))
-    # Counter-clockwise, as the corners of SciPy.
+    # The corners are sorted counter-clockwise, like the corners of SciPy.
     x, y = ring
     assert float(x[:-1] @ y[1:] - x[1:] @ y[:-1]) / 2 == pytest.approx(ConvexHull(points.T).volume, rel=1e-12)
 

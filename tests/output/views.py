@@ -1,4 +1,4 @@
-"""Views to draw, shared by the tests of the pictures."""
+"""Result views that several tests of the figures draw."""
 
 from __future__ import annotations
 
@@ -27,7 +27,7 @@ def sample_path(objective: WorstCaseObjective, postures: list[np.ndarray]) -> Nu
     model = objective.robot.model
     steps = [np.linalg.norm(pin.difference(model, q, p)) for q, p in pairwise(postures)]
     impacts = [objective.oracle.quantities(q) for q in postures]
-    # A missing S becomes NaN.
+    # Undefined values of S become NaN.
     curves = {name: np.array([getattr(f, name) for f in impacts], dtype=float) for name in "HGVS"}
     values = np.array([objective.value(q) for q in postures])
     return NullSpacePath(np.array(postures), np.concatenate([[0.0], np.cumsum(steps)]), **curves, objective=values)
@@ -67,7 +67,7 @@ def make_view(
 
 
 def map_of(objective: WorstCaseObjective, postures: list[np.ndarray]) -> SelfMotionMap:
-    """Two components to draw, there and back; the end of the second is infeasible."""
+    """Return a map with two components, the path forward and backward; the end of the second is infeasible."""
     path = sample_path(objective, postures)
     count = len(postures)
     return SelfMotionMap(
@@ -83,14 +83,14 @@ def map_of(objective: WorstCaseObjective, postures: list[np.ndarray]) -> SelfMot
 
 
 def trade_of(objective: WorstCaseObjective, postures: list[np.ndarray], knee: int | None = None) -> TradeOffData:
-    """A curve to draw, better or worse as it may be; its last but one point is not certified."""
+    """Return a synthetic trade-off curve, not necessarily decreasing; its second last point is not certified."""
     path = sample_path(objective, postures)
     certified = np.arange(len(postures)) != len(postures) - 2
     return TradeOffData(path.s, path.objective, path.H, path.G, path.V, path.S, certified, knee)
 
 
 def motion_of(objective: WorstCaseObjective, postures: list[np.ndarray], v: np.ndarray) -> PosturePath:
-    """A motion at a constant velocity in 1 s, whose thrusts are not known."""
+    """Return a motion with constant velocity in 1 s and unknown thrusts."""
     t = np.linspace(0, 1, len(postures))
     use = LimitUse(t, np.full(t.size, 0.4), 0.5 + 0.3 * t, np.full(t.size, np.nan), {"active": None})
     values = np.array([objective.value(q) for q in postures])
@@ -106,5 +106,5 @@ def spin(seed: int = 0) -> np.ndarray:
 
 
 def text_of(figure: Figure) -> str:
-    """All words of a figure; broken lines joined."""
+    """Return all texts of a figure, with line breaks replaced by spaces."""
     return " | ".join(" ".join(t.get_text().split()) for t in figure.findobj(matplotlib.text.Text))

@@ -1,4 +1,4 @@
-"""The optimizations whose results are committed, each as the one command that gives it."""
+"""Optimizations whose results are committed, each defined by one command."""
 
 from __future__ import annotations
 
@@ -18,14 +18,14 @@ PAGE = ROOT / "docs" / "generated" / "regression.md"
 
 @dataclass(frozen=True)
 class Case:
-    """One optimization.
+    """Optimization whose result is committed.
 
     Attributes:
-        name: Its key in ``expected.json``.
-        robot: As given to the command, relative to the repository.
+        name: Key of the result in ``expected.json``.
+        robot: Robot name, or URDF path relative to the repository.
         frame: Contact frame.
-        normal: Contact normal, world.
-        many: Whether there are so many optima that rounding decides which of them the command finds.
+        normal: Contact normal in the world frame.
+        many: If true, there are so many optima that rounding decides which optimum the command returns.
     """
 
     name: str
@@ -36,20 +36,20 @@ class Case:
 
     @property
     def command(self) -> str:
-        """What a user types."""
+        """Command that a user types for this optimization."""
         normal = " ".join(f"{v:g}" for v in self.normal)
         return f"impact-posture optimize {shlex.quote(self.robot)} --frame {self.frame} --normal {normal}"
 
     @property
     def settings(self) -> ProblemSettings:
-        """The same as settings."""
+        """Settings equal to the command."""
         robot = str(ROOT / self.robot) if self.robot.endswith(".urdf") else self.robot
         return make_settings(
             {"robot": robot, "frame": self.frame, "normal": self.normal, "collision": True, "holdable": True}
         )
 
     def solve(self) -> tuple[Prepared, PostureSolution]:
-        """Solve with the command's defaults."""
+        """Solve the problem with the defaults of the command."""
         prepared = prepare(self.settings)
         settings = prepared.settings
         return prepared, solve(prepared.problem, starts=settings.starts, seed=settings.seed)

@@ -1,6 +1,6 @@
 """Recompute the committed reference results and the page that shows them.
 
-Run: make regression
+Run this script with: make regression
 """
 
 from __future__ import annotations
@@ -61,7 +61,7 @@ def _both(before: float, after: float) -> str:
 
 
 def _order(value: float) -> str:
-    # The exact size of rounding differs between machines; its order is what is claimed.
+    # The exact rounding error differs between machines, so the page shows only its order of magnitude.
     return "< 1e-8" if value < 1e-8 else f"{value:.0e}"
 
 

@@ -1,4 +1,4 @@
-"""The committed results are what the commands still give."""
+"""The commands still give the committed results."""
 
 from __future__ import annotations
 
@@ -17,7 +17,7 @@ from tests.regression.cases import CASES, EXPECTED, PAGE, Case
 
 @pytest.mark.parametrize("case", [case for case in CASES if not case.many], ids=lambda case: case.name)
 def test_result_is_reproduced(case: Case) -> None:
-    """Objective within 1e-6, redundancy exactly; the posture itself may be a mirror image."""
+    """The objective agrees within 1e-6, the redundancy exactly; the posture itself may be mirrored."""
     expected = json.loads(EXPECTED.read_text())[case.name]
     prepared, solution = case.solve()
     assert solution.certificate.holds()
@@ -28,7 +28,7 @@ def test_result_is_reproduced(case: Case) -> None:
 
 @pytest.mark.parametrize("case", [case for case in CASES if case.many], ids=lambda case: case.name)
 def test_result_is_still_an_optimum(case: Case) -> None:
-    """The certificate of the committed posture, computed anew; which optimum a search finds depends on rounding."""
+    """Recompute the certificate of the committed posture, because rounding decides which optimum a search returns."""
     expected = json.loads(EXPECTED.read_text())[case.name]
     prepared = prepare(case.settings)
     problem, q = prepared.problem, np.array(expected["q"])
@@ -41,7 +41,7 @@ def test_result_is_still_an_optimum(case: Case) -> None:
 
 
 def check(case: Case, prepared: Prepared, q: Array) -> None:
-    """Check what is committed of a posture."""
+    """Check the committed values of a posture."""
     expected = json.loads(EXPECTED.read_text())[case.name]
     assert prepared.impact.robot.model_sha256 == expected["model_sha256"], "the robot's data changed: make regression"
     assert expected["command"] == case.command

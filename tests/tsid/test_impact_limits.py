@@ -1,4 +1,4 @@
-"""Limits of the effects of an impact: the jump is a rigid impact, and a controller obeys the limits."""
+"""Limits on the effects of an impact: the jump is a rigid impact, and a controller keeps within the limits."""
 
 from __future__ import annotations
 
@@ -22,7 +22,7 @@ ROBOTS = {"tilthex_arm": "ee", "panda": "panda_hand", "solo12": "base_link", "ta
 
 
 def limits_of(name: str, normal: Vector, **options: float) -> tuple[ImpactLimits, State, tuple[SupportContact, ...]]:
-    """Return the limits of an impact at a frame, a state near the default posture, and the contacts of the feet."""
+    """Return the limits of an impact at a frame, a state near the default posture, and the foot contacts."""
     r, generator = robot(name), rng(name, "impact limits")
     contacts, point = support_contacts(r), Point(ROBOTS[name])
     limits = ImpactLimits(r, point, normal, contacts)
@@ -42,12 +42,12 @@ def test_the_jump_is_the_least_change_of_energy(name: str) -> None:
     rows = np.vstack([J, *feet])
     wanted = np.zeros(rows.shape[0])
     wanted[:3] = -(1 + e) * normal * (normal @ J @ v)
-    # Gauss: the contacts allow many jumps, and the impact makes the jump with the least kinetic energy.
+    # Gauss: of all jumps that the contacts allow, the impact causes the jump with the least kinetic energy.
     root = np.linalg.cholesky(M).T
     expected = np.linalg.solve(root, np.linalg.lstsq(rows @ np.linalg.inv(root), wanted, rcond=1e-7)[0])
     jump, impulse = limits.jump(state)
     np.testing.assert_allclose(jump @ v, expected, atol=1e-5 * np.abs(expected).max())
-    # The impulses of the contact and of the feet produce the jump.
+    # The impulses of the contact and of the feet cause exactly this jump.
     rest = M @ (jump @ v) - impulse @ v
     if contacts:
         rest -= np.vstack(feet).T @ np.linalg.lstsq(np.vstack(feet).T, rest, rcond=1e-9)[0]
@@ -90,7 +90,7 @@ def test_a_controller_approaches_only_as_fast_as_the_limits_allow() -> None:
         speeds[active] = -float(state.at(point).jacobian[2] @ v)
         limits.active = True
         _, lower, upper = limits.rows(state)
-        # Violation of the limits by an impact now, relative to the limits.
+        # Largest violation of the limits if the impact occurred now, relative to the limits.
         over = np.maximum(lower, -upper).max() / np.abs(upper).max()
         assert (over > 1e-3) if not active else (over < 1e-3), over
     assert speeds[False] == pytest.approx(1.0, abs=0.05)

@@ -1,4 +1,4 @@
-"""The whole controller on an aerial manipulator: dynamics, limits, hierarchy, relaxation, mistakes."""
+"""The complete controller of an aerial manipulator: dynamics, limits, hierarchy, relaxation, invalid input."""
 
 from __future__ import annotations
 
@@ -32,7 +32,7 @@ ARM = "tilthex_arm"
 
 
 def integrate(r: Robot, q: np.ndarray, v: np.ndarray, command: Command) -> tuple[np.ndarray, np.ndarray]:
-    """Integrate the planned acceleration, as with perfect dynamics."""
+    """Integrate the planned acceleration, which assumes perfect dynamics."""
     v = v + DT * command.acceleration
     return np.array(pin.integrate(r.model, q, DT * v)), v
 
@@ -53,7 +53,7 @@ def far_posture(r: Robot) -> np.ndarray:
 
 
 def assert_dynamics(controller: Controller, command: Command, force: np.ndarray | None = None) -> None:
-    """Compare with the recursion of Pinocchio, with the forces of the command."""
+    """Compare with the recursive Newton-Euler algorithm of Pinocchio under the forces of the command."""
     state, r = controller.state, controller.robot
     load = pin.rnea(r.model, r.model.createData(), state.q, state.v, command.acceleration)
     applied = controller.actuators.G @ command.u
@@ -85,14 +85,14 @@ def test_a_conflicting_posture_moves_neither_tilt_nor_end_effector() -> None:
         assert np.abs(report.residuals["tilt"]).max() <= 1e-8
         assert np.abs(report.residuals["ee pose"]).max() <= 1e-8
         here = controller.state.at(controller.formulation.points[0]).position
-        # Integration in steps of a millisecond has a second-order error, which the feedback corrects.
+        # Integration in steps of a millisecond has a second-order error, which the feedback of the task corrects.
         assert np.linalg.norm(here - pose) < 1e-4
         moved = float(np.abs(now[7:] - r.posture()[7:]).max())
     assert moved > 0.1
 
 
 def pushed(r: Robot, meters: float) -> Controller:
-    """Return a controller whose end effector has a target too far to the side for the rotors at level tilt."""
+    """Return a controller whose end effector target is too far to the side to be held by level rotors."""
     ee = FramePose(Point("ee"), kp=60.0)
     controller = Controller(r, aerial_formulation(r, JointPosture(r), end_effector=ee))
     controller.reset(r.posture(), np.zeros(r.nv))
@@ -138,12 +138,12 @@ def test_measured_force_enters_the_dynamics() -> None:
     assert_dynamics(controller, command, force)
     there = controller.state.at(ee.point)
     assert np.allclose(there.jacobian[:3] @ command.acceleration, force / 3.0, atol=1e-8)
-    # The next tick without a force forgets it.
+    # A tick without a measured force does not use an earlier force.
     assert_dynamics(controller, controller.tick(1e-3, q, v))
 
 
 class Refusing:
-    """Solver that gives up."""
+    """Solver that always fails."""
 
     infeasible = False
 
@@ -155,7 +155,7 @@ class Refusing:
 
 
 def _without_cost(solve: Callable[..., Any]) -> Callable[..., Any]:
-    """Return a solver that solves only levels, which have no cost."""
+    """Return a solver that solves only programs of the levels, which have no cost."""
     return lambda H, *rest, **settings: (None, 0.0, -1, {}) if H is not None else solve(H, *rest, **settings)
 
 
@@ -165,19 +165,19 @@ def test_a_solver_that_gives_up_holds_the_last_command(monkeypatch: pytest.Monke
     controller.reset(r.posture(), np.zeros(r.nv))
     before = controller.tick(0.0, r.posture(), np.zeros(r.nv))
     working = controller._solver
-    # The relaxation solves without the solver of the ticks ...
+    # The relaxation solves the tick although the usual solver fails ...
     controller._solver = Refusing()
     monkeypatch.setattr(relaxation, "DaqpSolver", lambda n, m, **options: Refusing())
     command = controller.tick(0.001, r.posture(), np.zeros(r.nv))
     assert command.status is Status.SOLVED and np.allclose(command.u, before.u, rtol=0, atol=1e-6)
-    # ... the levels have an answer without the cost ...
+    # ... the solution of the levels is used if the program with the cost fails ...
     monkeypatch.setattr(relaxation.daqp, "solve", _without_cost(relaxation.daqp.solve))
     bare = controller.tick(0.001, r.posture(), 0.05 * rng("bare").normal(size=r.nv))
     assert bare.status is Status.SOLVED
     assert np.abs(controller.report().residuals["tilt"]).max() <= 1e-5
     assert np.abs(controller.report().residuals["ee pose"]).max() <= 1e-4
     assert_limits(controller, bare)
-    # ... and without an answer of the levels, the last command is held.
+    # ... and if the levels have no solution either, the last command is repeated.
     monkeypatch.setattr(relaxation, "lexicographic", lambda levels, units: None)
     held = controller.tick(0.001, r.posture(), np.zeros(r.nv))
     assert held.status is Status.UNSOLVED
@@ -206,7 +206,7 @@ def test_joints_stop_at_their_limits(margin: float) -> None:
 
 
 def test_acceleration_bounds_never_cross() -> None:
-    """Inside the limits and far outside, slow and too fast."""
+    """The states are within the limits and far outside, slow and too fast."""
     for name in ("tilthex_arm", "talos", "panda"):
         r = robot(name)
         for law in (LimitLaw(), LimitLaw(acceleration=30.0, margin=0.1)):
@@ -230,7 +230,7 @@ def test_joint_ranges_equal_the_limits_of_the_model() -> None:
 
 
 def more_rotors(r: Robot) -> Robot:
-    """Return the same hexarotor with two more rotors."""
+    """Return the same hexarotor with two additional rotors."""
     assert r.spec.propulsion is not None
     rotors = r.spec.propulsion.rotors
     return with_rotors(r, (*rotors, *(replace(rotors[k], name=f"extra_{k}") for k in (0, 3))))
@@ -262,7 +262,7 @@ def test_more_rotors_than_needed() -> None:
 
 
 def test_rotors_that_cannot_push_sideways() -> None:
-    """A hexarotor with parallel propellers has rank 4.  The other two rows of the dynamics bind accelerations."""
+    """A hexarotor with parallel propellers has rank 4, so two rows of the dynamics constrain the accelerations."""
     r = robot(ARM)
     assert r.spec.propulsion is not None
     up = (replace(rotor, direction=(0.0, 0.0, 1.0)) for rotor in r.spec.propulsion.rotors)
@@ -287,7 +287,7 @@ def test_mistakes_are_refused(wrong: str) -> None:
             controller.tick(0.0, r.posture(), np.zeros(r.nv))
         if wrong == "report":
             controller.report()
-        # Torques of such a velocity are not finite.
+        # At such a velocity, the computed torques are not finite.
         controller.reset(r.posture(), np.full(r.nv, 1e200 if wrong == "size" else 0.0))
         controller.reset(r.posture(), np.full(r.nv, np.nan if wrong == "velocity" else 0.0))
         controller.reset(r.posture(), np.zeros(3 if wrong == "shape" else r.nv))

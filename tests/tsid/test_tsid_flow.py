@@ -1,4 +1,4 @@
-"""The reference flow lowers the objective on the constraints and within limits, and rests in time."""
+"""The reference flow lowers the objective, stays on the constraints and within limits, and comes to rest."""
 
 from __future__ import annotations
 
@@ -35,20 +35,20 @@ Well = Callable[[Vector], tuple[float, Vector]]
 
 
 def well(r: Robot, goal: Vector, depth: float = 0.1) -> Well:
-    """Return a bowl around a posture, with ``depth`` as its least value."""
+    """Return a quadratic objective around a posture, with ``depth`` as its minimum."""
     base = 6 if r.floating else 0
 
     def function(q: Vector) -> tuple[float, Vector]:
         away = np.array(pin.difference(r.model, goal, q))
         away[:base] = 0.0
-        # Joints add, hence the gradient is the difference itself.
+        # Joint coordinates are vectors, so the gradient is the difference itself.
         return depth + 0.5 * float(away @ away), away
 
     return function
 
 
 def goal_of(r: Robot, key: object, size: float) -> Vector:
-    """Return a posture whose joints are up to ``size`` rad from the default posture."""
+    """Return a posture whose joints deviate by at most ``size`` rad from the default posture."""
     step = size * rng(r.name, key).uniform(-1, 1, r.nv)
     step[: 6 if r.floating else 0] = 0.0
     return np.array(pin.integrate(r.model, r.posture(), step))
@@ -65,7 +65,7 @@ def flow_of(r: Robot, function: Well, weaker: float = 1.0, **options: float) -> 
 
 @dataclass(frozen=True)
 class Course:
-    """Last posture of a flow, ``H/H₀`` at each update, time of rest (s), and largest error of contacts and tasks."""
+    """Last posture of a flow, ``H/H₀`` at each update, time of rest (s), and largest contact and task errors."""
 
     q: Vector
     values: Vector
@@ -74,7 +74,7 @@ class Course:
 
 
 def course(flow: ReferenceFlow, q: Vector, longest: float) -> Course:
-    """Let the flow go from ``q`` until it rests; the robot follows exactly."""
+    """Advance the flow from ``q`` until it rests; the robot follows the flow exactly."""
     flow.reset(q)
     flow.on = True
     values, missed = [flow.value], 0.0
@@ -123,7 +123,7 @@ def test_no_limit_is_crossed_wherever_the_goal_is(name: str, seed: int) -> None:
 
 
 def valley(r: Robot, key: object) -> Well:
-    """Return a steep valley with a bend, in which the flow has to turn while it is fast."""
+    """Return an objective like a steep, curved valley, in which the flow must turn while it moves fast."""
     base = 6 if r.floating else 0
     along, across = rng(r.name, key).normal(size=(2, r.nv - base)) / np.sqrt(r.nv - base)
 
@@ -144,9 +144,9 @@ def valley(r: Robot, key: object) -> Well:
 def test_it_does_not_climb_where_it_turns_or_brakes(
     key: int, epsilon: float, climb: float, least: float, rested: float
 ) -> None:
-    """In the first case it turns in the bend, in the second it rests there.
+    """In the first case the flow turns in the bend of the valley, in the second case it rests there.
 
-    A flow that does not look ahead climbs by 2e-2 and by 1e-1.
+    A flow that does not evaluate the objective ahead lets it increase by 2e-2 and by 1e-1.
     """
     r = robot("talos")
     run = course(flow_of(r, valley(r, key), epsilon=epsilon), r.posture(), 3.0)
@@ -156,7 +156,7 @@ def test_it_does_not_climb_where_it_turns_or_brakes(
 
 @pytest.mark.parametrize("name", ["solo8", "talos"])
 def test_the_base_tilts_no_further_than_it_may(name: str) -> None:
-    """The objective falls as the base tilts about an axis between roll and pitch."""
+    """The objective decreases as the base tilts about an axis between roll and pitch."""
     r, downhill = robot(name), np.array([0.4, 1.0, 0.0])
 
     def tilted(q: Vector) -> tuple[float, Vector]:
@@ -166,7 +166,7 @@ def test_the_base_tilts_no_further_than_it_may(name: str) -> None:
         return 2.0 + float(downhill @ vertical), slope
 
     def tilt(q: Vector) -> float:
-        """Return the angle of the base's z axis from the vertical."""
+        """Return the angle between the z axis of the base and the vertical."""
         return float(np.arccos(pin.Quaternion(q[3:7]).matrix()[2, 2]))
 
     bound = 0.12
@@ -177,7 +177,7 @@ def test_the_base_tilts_no_further_than_it_may(name: str) -> None:
 
 @pytest.mark.parametrize(("name", "weaker"), [("panda", 0.5), ("talos", 1.0)])
 def test_acceleration_uses_its_share_of_the_torque_beside_rest(name: str, weaker: float) -> None:
-    """The oracle is the recursive Newton-Euler algorithm, with a least-norm division of the base's wrench."""
+    """The oracle is the recursive Newton-Euler algorithm; a least-norm solution distributes the base wrench."""
     r = robot(name)
     flow = flow_of(r, well(r, goal_of(r, "haste", 2.0)), weaker, speed=20.0, acceleration=100.0)
     data, none, base = r.model.createData(), np.zeros(r.nv), 6 if r.floating else 0
@@ -194,7 +194,7 @@ def test_acceleration_uses_its_share_of_the_torque_beside_rest(name: str, weaker
 
     flow.on = True
     ratios = []
-    # Later, talos brakes before a limit with a larger share.
+    # Stop after 500 ticks, because later talos brakes before a joint limit with a larger share of its torques.
     for k in range(500):
         flow.advance(DT, flow.q)
         if k % UPDATE_TICKS == UPDATE_TICKS - 1:
@@ -205,12 +205,12 @@ def test_acceleration_uses_its_share_of_the_torque_beside_rest(name: str, weaker
 
 
 def test_the_zero_moment_point_stays_within_the_feet(monkeypatch: pytest.MonkeyPatch) -> None:
-    """The force of the recursive Newton-Euler algorithm acts within the feet."""
+    """The contact force from the recursive Newton-Euler algorithm acts inside the support polygon."""
     r = robot("talos")
     data, none = r.model.createData(), np.zeros(r.nv)
 
     def least_room() -> float:
-        """Return the least distance from the point to an edge of the polygon of the feet, m."""
+        """Return the smallest distance from the point to an edge of the support polygon, m."""
         flow = flow_of(r, well(r, goal_of(r, "feet", 2.0)), acceleration=10.0)
         ground = flow._state.at(flow._contacts[0].point).position[2]
         flow.on, least = True, np.inf
@@ -237,7 +237,7 @@ def test_feet_that_share_the_weight_with_a_fixed_base_are_refused() -> None:
 
 
 def test_the_rest_is_an_optimum_under_the_constraints() -> None:
-    """SLSQP of SciPy cannot improve the posture."""
+    """SciPy's SLSQP cannot improve the posture at rest."""
     r = robot("panda")
     function = well(r, goal_of(r, "optimum", 1.0))
     flow = flow_of(r, function, rho=0.0, epsilon=1e-9)
@@ -317,14 +317,14 @@ def test_it_rests_before_an_impact_at_a_known_time() -> None:
         command = controller.tick(k * DT, q, v)
         assert command.status is Status.SOLVED
         if k * DT > t_impact - posture.settle + 0.01:
-            # The remaining velocity leads back to contacts and tasks.
+            # The remaining velocity only corrects contact and task errors.
             assert not np.abs(posture.flow.velocity).max() > 1e-3
         if k * DT >= t_impact:
             assert np.abs(v).max() < 5e-3
         q, v = integrate(robot("tilthex_arm"), q, v, command)
         moved = float(np.abs(posture.target[7:] - start[7:]).max())
     assert moved > 0.005
-    # It rests until the next brace.
+    # The flow rests until the next call of `brace`.
     posture.brace()
     for k in range(400):
         controller.tick(t_impact + 0.5 + k * DT, q, v)
@@ -336,7 +336,7 @@ def test_it_moves_for_its_duration_after_each_start() -> None:
     flow = flow_of(r, arm_well(), duration=0.5)
     flow.on, moved = True, list[float]()
     for late in (0, UPDATE_TICKS):
-        # The second time, it rests until the next update.
+        # The second time, the flow rests until the next update of the gradient.
         for _ in range(round(0.5 / DT) + late):
             flow.advance(DT, flow.q)
         assert not np.abs(flow.velocity).max() > 1e-4
@@ -388,7 +388,7 @@ def test_a_reset_gives_led_tasks_their_present_output(name: str) -> None:
 
 
 def test_the_return_to_tasks_keeps_speed_and_acceleration() -> None:
-    """The target of the end effector moves away before the flow starts."""
+    """The target of the end effector moves away before the flow begins."""
     r = robot("panda")
     flow = flow_of(r, well(r, goal_of(r, "back", 0.3)))
     task = flow._tasks[0]
@@ -396,7 +396,7 @@ def test_the_return_to_tasks_keeps_speed_and_acceleration() -> None:
     flow.on, before = True, flow.velocity.copy()
     for _ in range(round(3.0 / DT)):
         flow.advance(DT, flow.q)
-        # The flow itself has limits of the same size.
+        # The velocity and acceleration limits of the flow have the same size.
         assert np.abs(flow.velocity).max() < 1.5 * flow.options.speed
         assert np.abs(flow.velocity - before).max() < 2.1 * flow.options.acceleration * DT
         before = flow.velocity.copy()
@@ -414,7 +414,7 @@ def test_a_flow_goes_on_from_a_moved_posture() -> None:
     posture.move_to(other)
     for k in range(4000):
         if k in (200, 3000):
-            # Once in the middle of the fade, and once at its end.
+            # The first call comes in the middle of the fade, the second call at its end.
             posture.brace()
         if k == 400:
             posture.contact()
@@ -426,7 +426,7 @@ def test_a_flow_goes_on_from_a_moved_posture() -> None:
         if k == 2999:
             np.testing.assert_allclose(q, other, atol=0.02)
         q, v = integrate(r, q, v, command)
-    # The flow begins a few ticks later.
+    # The flow begins a few ticks after the phase.
     assert max(steps[200], steps[3000]) < 0.1
 
 

@@ -1,4 +1,4 @@
-"""The impact-robust posture: its gain, its phases, its rest, and the offline optimum that it reaches."""
+"""The impact-robust posture task: its gain, phases and rest, and the offline optimum that the task reaches."""
 
 from __future__ import annotations
 
@@ -50,7 +50,7 @@ def problem(objective: str = "impulse") -> ConstrainedProblem:
 
 @pytest.fixture(scope="session")
 def folders(tmp_path_factory: pytest.TempPathFactory) -> dict[str, Path]:
-    """Folders of exports by objective."""
+    """Return the folders of the exports, with the objective as key."""
     need_compiler()
     paths = {name: tmp_path_factory.mktemp(name) for name in ("impulse", "speed")}
     for name, folder in paths.items():
@@ -60,7 +60,7 @@ def folders(tmp_path_factory: pytest.TempPathFactory) -> dict[str, Path]:
 
 @pytest.fixture(scope="session")
 def exported(folders: dict[str, Path]) -> dict[str, ImpactGradient]:
-    """Compiled exports by objective, built once."""
+    """Return the compiled exports, built once, with the objective as key."""
     return {name: ImpactGradient.load(folder, robot=robot(ARM)) for name, folder in folders.items()}
 
 
@@ -86,7 +86,7 @@ def test_scale_is_the_curvature_along_the_redundancy(exported: dict[str, ImpactG
 
 
 def test_the_compiled_gradient_differentiates_its_value(exported: dict[str, ImpactGradient]) -> None:
-    """For both functions of the export: at a normal, and for the objective of the problem."""
+    """Check both gradients of the export: for a given normal, and of the problem's objective."""
     model = robot(ARM).model
     q = np.array(pin.integrate(model, robot(ARM).posture(), 0.1 * rng("g").normal(size=model.nv)))
     for function in (gradient_of(exported["impulse"], UP), gradient_of(exported["speed"])):
@@ -102,7 +102,7 @@ def _offline(objective: str) -> tuple[np.ndarray, ...]:
 
 @pytest.mark.parametrize(("objective", "K"), [("impulse", 4.0), ("speed", 100.0)])
 def test_online_meets_offline(exported: dict[str, ImpactGradient], objective: str, K: float) -> None:
-    """With damping alone, ``K H/λ + ½‖ν‖²`` falls to an optimum of the offline program."""
+    """With damping only, ``K H/λ + ½‖ν‖²`` decreases until the robot reaches an optimum of the offline program."""
     r, dt = robot(ARM), 4e-3
     posture = ImpactRobustPosture(
         r,
@@ -115,7 +115,7 @@ def test_online_meets_offline(exported: dict[str, ImpactGradient], objective: st
         reach=1e6,
         activation=Activation(ramp=1e-6),
     )
-    # The offline problem keeps this distance from the limits.
+    # The offline problem uses the same margin to the joint limits.
     formulation = aerial_formulation(r, posture, law=LimitLaw(margin=0.05))
     controller = Controller(r, formulation, period=dt)
     q, v = r.posture(), np.zeros(r.nv)
@@ -128,11 +128,11 @@ def test_online_meets_offline(exported: dict[str, ImpactGradient], objective: st
         assert command.status is Status.SOLVED
         v = v + dt * command.acceleration
         q = np.array(pin.integrate(r.model, q, dt * v))
-        # A hundred slow ticks are rest, fewer may be a turning point.
+        # A robot that is slow for a hundred ticks rests; for fewer ticks, it may only turn around.
         slow = slow + 1 if np.abs(v).max() < 2e-4 else 0
         if slow > 100:
             break
-    # Integration in steps may raise the energy by a millionth.
+    # The integration in time steps may raise the energy by a millionth.
     assert np.diff(energy).max() <= 1e-6 * energy[0]
     assert energy[-1] < energy[0]
     distances = [np.abs(pin.difference(r.model, q, best)).max() for best in _offline(objective)]
@@ -153,7 +153,7 @@ def test_with_the_spring_it_rests_where_the_two_pulls_are_equal(exported: dict[s
 
 
 def rest(exported: dict[str, ImpactGradient], spring: str) -> float:
-    """Return ``H`` at rest over ``H`` at the start."""
+    """Return the ratio of ``H`` at rest to ``H`` at the start."""
     posture = ImpactRobustPosture(
         robot(ARM), gradient_of(exported["impulse"]), K=20.0, kp=10.0, spring=spring  # type: ignore[arg-type]
     )  # fmt: skip
@@ -187,7 +187,7 @@ def test_the_course_of_an_impact_makes_no_step(exported: dict[str, ImpactGradien
         level = posture.activation.level
         bound = step_bound(posture, state, DT)
         command = controller.tick(k * DT, q, v)
-        # At the same state, only ramps, fades and the new gradient change the acceleration.
+        # If the state does not change, only ramps, fades and the new gradient change the acceleration.
         step = float(np.abs(posture.desired(controller.state) - before).max())
         allowed = max(bound, step_bound(posture, state, DT)) + 0.05 * max(level, posture.activation.level)
         assert step <= allowed + 1e-9, (k, step, allowed)
@@ -199,7 +199,7 @@ def test_the_course_of_an_impact_makes_no_step(exported: dict[str, ImpactGradien
     assert [phases[k] for k in (0, 500, 950, 1050, 1599)] == [
         Phase.FREE, Phase.BRACE, Phase.CONTACT, Phase.RELEASE, Phase.FREE,
     ]  # fmt: skip
-    # The reached posture is held.
+    # The task holds the reached posture.
     assert np.abs(posture.target[7:] - reached[7:]).max() < 0.05
     assert np.abs(q[7:] - reached[7:]).max() < 0.1
     assert np.abs(q[7:] - robot(ARM).posture()[7:]).max() > 0.1
@@ -242,7 +242,7 @@ def test_the_term_fades_out_before_a_limit_and_is_bounded() -> None:
         posture.advance(state, 0.0)
         assert posture.term[6] == pytest.approx(3.0 * share, abs=1e-12)
         assert posture.term[7] == pytest.approx(3.0)
-    # A push away from the limit does not fade.
+    # A push away from the limit is not faded.
     push[6] = 1.0
     posture.advance(state, 0.0)
     assert posture.term[6] == pytest.approx(-3.0)
@@ -256,14 +256,14 @@ def test_the_term_fades_out_before_a_limit_and_is_bounded() -> None:
 def test_a_posture_task_goes_to_the_offline_optimum_without_a_gradient() -> None:
     r = robot(ARM)
     best = _offline("impulse")[0]
-    # The end effector holds its pose, so only the joints must agree.
+    # The end effector holds its pose, so the test compares only the joints.
     controller, q, v = flying(JointPosture(r, best, kp=10.0))
     *_, (_, _, q, _) = run(controller, q, v, 4000)
     assert np.abs(q[7:] - best[7:]).max() < 1e-2
 
 
 def test_a_standing_robot_braces_on_its_feet() -> None:
-    """The contact-consistent H of a push at the base of solo8 falls, and the feet stay."""
+    """The contact-consistent H of a push at the base of solo8 decreases, and the feet do not move."""
     r = robot("solo8")
     supports = tuple(Support(s.frame, s.kind, s.offset) for s in r.spec.supports)
     value = WorstCaseObjective(r, ImpactContact("base_link", (1.0, 0.0, 0.0)), supports=supports)
@@ -293,13 +293,13 @@ def test_a_standing_robot_braces_on_its_feet() -> None:
 
 
 def test_an_export_of_another_robot_is_refused(exported: dict[str, ImpactGradient]) -> None:
-    """The other robot has the same joints, so that nothing but this check would notice."""
+    """The other robot has the same joints, so only this check can detect the difference."""
     other = load_robot(ARM, armature={joint: 0.5 for joint in robot(ARM).joint_names})
     for make in (ImpactRobustPosture, ReferenceFlowPosture):
         with pytest.raises(ManifestMismatch, match="armature"):
             make(other, exported["impulse"])
         make(with_joint_model(robot(ARM), "link"), exported["impulse"])
-        # A function of the gradient is not checked.
+        # The gradient is a plain Python function, so its robot is not checked.
         make(other, gradient_of(exported["impulse"]))
 
 
@@ -329,7 +329,7 @@ def test_the_example_of_the_documentation_runs(folders: dict[str, Path]) -> None
 
 
 def test_the_scale_of_the_term_does_not_depend_on_the_basis_of_the_redundancy() -> None:
-    """The exported controller has another basis, and differences along a basis depend on it by their error."""
+    """The exported controller uses another null-space basis, and finite differences along a basis have an error."""
     r, generator = robot("panda"), rng("basis")
     Z, turn = (np.linalg.qr(generator.normal(size=shape))[0] for shape in ((r.nv, 3), (3, 3)))
 

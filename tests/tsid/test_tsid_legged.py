@@ -1,4 +1,4 @@
-"""Standing robots: cones, limits, and the same tick over all variables (ν̇, f, τ) by another solver."""
+"""Standing robots: friction cones, limits, and the tick solved over all variables (ν̇, f, τ) by another solver."""
 
 from __future__ import annotations
 
@@ -26,7 +26,7 @@ def controller_of(name: str, kp: float = 20.0, weight: float = 0.1, **more: floa
 
 
 def displaced(name: str, amount: float) -> np.ndarray:
-    """A posture near the nominal one, within the joint limits."""
+    """Return a posture near the nominal posture, within the joint limits."""
     r = robot(name)
     q = np.array(pin.integrate(r.model, r.posture(), amount * rng(name, "away").uniform(-1, 1, r.nv)))
     low, high = r.model.lowerPositionLimit[7:], r.model.upperPositionLimit[7:]
@@ -36,7 +36,7 @@ def displaced(name: str, amount: float) -> np.ndarray:
 
 @pytest.mark.parametrize("name", LEGGED)
 def test_feet_stay_where_they_are(name: str) -> None:
-    # The posture has little weight, because it resists the motion of the center of mass.
+    # The posture task has a small weight, because it opposes the motion of the center of mass.
     controller = controller_of(name, kp=40.0, weight=1e-3)
     q, v = robot(name).posture(), np.zeros(robot(name).nv)
     controller.reset(q, v)
@@ -49,21 +49,21 @@ def test_feet_stay_where_they_are(name: str) -> None:
         assert (contacts.cone @ command.forces >= contacts.least - 1e-7).all()
         if k % 20 == 0:
             assert_dynamics(controller, command)
-    # At rest, the feet carry the weight.
+    # At rest, the contact forces of the feet equal the weight.
     normal = sum(float(command.forces[rows][2]) for rows in contacts.rows)
     assert normal == pytest.approx(9.81 * robot(name).mass, rel=0.1)
     reached = controller.state.center_of_mass()[0]
     for contact, place in zip(controller.formulation.contacts, start, strict=True):
         assert np.linalg.norm(controller.state.at(contact.point).position - place) < 1e-4
-    # solo8 cannot move sideways on its feet; down they all go.
+    # solo8 cannot move sideways on its feet, but all robots can move down.
     assert abs(reached[2] - com.target[2]) < 2e-3  # type: ignore[attr-defined]
 
 
 def dense_torques(controller: Controller, q: np.ndarray, v: np.ndarray) -> np.ndarray:
     """Return the torques of the same tick over (ν̇, f, τ), from raw Pinocchio calls.
 
-    A sole has forces at its four corners with the cost of their wrench, so that the optimum is the same.
-    The solver is qpOASES of CasADi, as in the paper.
+    Each sole is modeled by forces at its four corners.  The cost is applied to their wrench, so that the optimum is
+    the same. The solver is qpOASES of CasADi, as in the paper.
     """
     r, formulation = controller.robot, controller.formulation
     model, nv, nj = r.model, r.nv, r.nv - 6
@@ -122,14 +122,14 @@ def dense_torques(controller: Controller, q: np.ndarray, v: np.ndarray) -> np.nd
     n = nv + nf + nj
     A, w, b = np.vstack(rows), np.concatenate(weight), np.concatenate(wanted)
     H, g = np.zeros((n, n)), np.zeros(n)
-    # The solver needs a positive definite H, hence small weights where none is set.
+    # The solver needs a positive definite H, so variables without a weight get a small weight.
     H[:nv, :nv], g[:nv] = A.T * w @ A + 1e-8 * np.eye(nv), -A.T * w @ b
     H[-nj:, -nj:] = 1e-13 * np.eye(nj)
     start = nv
     for W in wrenches:
         scale = 1e-6 * np.array([1.0, 1, 1, 100, 100, 100][: W.shape[0]])
         at = slice(start, start + W.shape[1])
-        # A small weight chooses among corner forces with the same wrench.
+        # A small weight selects one of the many corner forces with the same wrench.
         H[at, at] = W.T * scale @ W + 1e-12 * np.eye(W.shape[1])
         start += W.shape[1]
     S = np.vstack([np.zeros((6, nj)), np.eye(nj)])
@@ -174,7 +174,7 @@ def test_torques_equal_a_dense_program_over_all_variables(name: str) -> None:
         q, v = displaced(name, amount), 3 * amount * rng(name, k).normal(size=r.nv)
         command = controller.tick(k * DT, q, v)
         assert command.status is Status.SOLVED
-        # The dense formulation has no joint limits, so none of them may be active here.
+        # The dense formulation omits joint limits, so no joint limit may be active here.
         assert not [name for name, _ in controller.report().active if name in r.tangent_names[6:]]
         difference = dense_torques(controller, q, v) - command.torque
         assert np.abs(difference).max() <= 1e-6 * np.abs(command.torque).max()
@@ -200,7 +200,7 @@ def test_other_solvers_agree_on_the_program_of_a_tick(name: str) -> None:
 
 
 def test_a_solution_certifies_itself() -> None:
-    """Whitened or not: feasible, stationary, multipliers of the right sign."""
+    """With and without whitening, a solution is feasible and stationary, and its multipliers have the right sign."""
     for name in ("solo8", "talos"):
         controller = controller_of(name)
         r = robot(name)
@@ -218,7 +218,7 @@ def test_a_solution_certifies_itself() -> None:
 
 
 def test_the_wrench_cone_of_a_sole_contains_exactly_the_corner_forces() -> None:
-    """Caron's closed form equals linear programs: a wrench is inside exactly if corner forces produce it."""
+    """Caron's closed form agrees with linear programs: a wrench is inside if and only if corner forces produce it."""
     from scipy.optimize import linprog
 
     half, friction = (0.1, 0.06), 0.7
@@ -266,7 +266,7 @@ def test_slippery_ground_binds_the_cone() -> None:
 
 
 def test_feet_too_fast_for_the_motors_relax_the_contacts() -> None:
-    """At 30 m/s upwards, the legs lack the torque to hold the feet on the ground, so the contacts give way."""
+    """At 30 m/s upwards, the legs lack the torque to keep the feet on the ground, so the contacts are relaxed."""
     controller = controller_of("talos")
     r = robot("talos")
     controller.reset(r.posture(), np.zeros(r.nv))

@@ -1,4 +1,4 @@
-"""A tick always gives a command, at hard states, with broken measurements and functions, and clocks that jump."""
+"""A tick always returns a command: at extreme states, with invalid input, and after jumps of the clock."""
 
 from __future__ import annotations
 
@@ -35,7 +35,7 @@ PROGRAMS = [
 
 
 def well(r: Robot) -> Gradient:
-    """Return the gradient of a quadratic well around another posture."""
+    """Return the gradient of a quadratic objective around another posture."""
     goal = np.array(pin.integrate(r.model, r.posture(), 0.3 * rng(r.name, "well").normal(size=r.nv)))
 
     def gradient(q: np.ndarray) -> tuple[float, np.ndarray]:
@@ -66,7 +66,7 @@ def bracing(name: str, kind: str, spring: Spring = "keep") -> tuple[Controller, 
 
 @pytest.mark.parametrize(("name", "kind"), PROGRAMS)
 def test_hard_states_are_answered(name: str, kind: str) -> None:
-    """Far from the posture, too fast, pushed with up to 10 kN, a tick keeps the hard constraints."""
+    """Far from the posture, too fast, or pushed with up to 10 kN, a tick satisfies the hard constraints."""
     controller, _ = bracing(name, kind)
     r, generator = controller.robot, rng(name, kind)
     seen = set()
@@ -92,7 +92,7 @@ def test_hard_states_are_answered(name: str, kind: str) -> None:
 
 @pytest.mark.parametrize(("name", "kind"), [("tilthex_arm", "strict"), ("kinova", "arm"), ("talos", "legged")])
 def test_broken_measurements_hold_the_command_and_are_forgotten(name: str, kind: str) -> None:
-    """A good measurement follows each broken one, and the last command is the same without broken ones."""
+    """A valid measurement follows each invalid one, and the last command is the same as without invalid ones."""
     controller, posture = bracing(name, kind)
     r = controller.robot
     q, v, force = r.posture(), 0.01 * rng(name).normal(size=r.nv), np.zeros(6)
@@ -144,7 +144,7 @@ def test_arrays_of_another_shape_are_refused() -> None:
 
 
 def test_nearly_unit_numbers_are_normalized() -> None:
-    """Quaternions, and cosines with sines, of estimators do not have exactly unit length."""
+    """Estimators return quaternions, and pairs of cosine and sine, whose length is not exactly one."""
     for name, kind in (("tilthex_arm", "strict"), ("kinova", "arm")):
         controller, posture = bracing(name, kind)
         q, v = controller.robot.posture(), np.zeros(controller.robot.nv)
@@ -155,7 +155,7 @@ def test_nearly_unit_numbers_are_normalized() -> None:
         controller.reset(q, v)
         posture.brace()
         assert np.allclose(controller.tick(0.0, off, v).u, exact.u, rtol=0, atol=1e-9)
-        # The reached posture becomes the target without another check.
+        # The reached posture becomes the target without further checks.
         posture.contact()
         assert controller.tick(DT, off, v).status is Status.SOLVED
 
@@ -199,7 +199,7 @@ def test_a_gradient_that_fails_keeps_the_last_term(how: str) -> None:
 
 
 def test_clocks_that_stand_jump_and_run_backwards() -> None:
-    """A tick advances the time by 0 to 10 periods, and the controller goes on after each jump."""
+    """A tick advances the time by 0 to 10 periods, and the controller continues after each jump of the clock."""
     controller, posture = bracing("tilthex_arm", "strict")
     q, v = controller.robot.posture(), np.zeros(controller.robot.nv)
     level, longest = 0.0, level_bound(posture.activation, 10 * DT)
@@ -211,7 +211,7 @@ def test_clocks_that_stand_jump_and_run_backwards() -> None:
 
 
 def test_motors_without_torque() -> None:
-    """With almost no torque, all levels give way, but dynamics, limits and cones hold."""
+    """With almost no torque, all levels are relaxed, but the command satisfies dynamics, limits and cones."""
     for name, kind in (("panda", "arm"), ("solo8", "legged")):
         controller, _ = bracing(name, kind)
         for bound, sign in ((controller.actuators.lower, -1.0), (controller.actuators.upper, 1.0)):
@@ -239,7 +239,7 @@ def test_balanced_rows_keep_the_least_squares() -> None:
 
 @pytest.mark.parametrize("refined", [True, False])
 def test_levels_against_one_quadratic_program_after_the_other(refined: bool, monkeypatch: pytest.MonkeyPatch) -> None:
-    """quadprog solves each level with the results of the levels above as equations."""
+    """quadprog solves each level; equations keep the results of the higher levels."""
     quadprog = pytest.importorskip("quadprog")
     if not refined:
         monkeypatch.setattr(hierarchy, "_no_worse", lambda *points: False)
@@ -255,7 +255,7 @@ def test_levels_against_one_quadratic_program_after_the_other(refined: bool, mon
         for A, b in ((first, wanted[0]), (second, wanted[1])):
             x = quadprog.solve_qp(A.T @ A + 1e-9 * np.eye(n), A.T @ b, rows.T, least)[0]
             assert np.linalg.norm(A @ z - b) == pytest.approx(np.linalg.norm(A @ x - b), rel=1e-4, abs=1e-4)
-            # The reached values become bounds, with room for rounding.
+            # The reached values become bounds, with a tolerance for rounding.
             rows = np.vstack([rows, A, -A])
             least = np.concatenate([least, A @ x - 1e-7, -A @ x - 1e-7])
 

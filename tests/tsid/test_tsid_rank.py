@@ -1,4 +1,4 @@
-"""Strict levels of any rank: dependent rows, rows that contradict each other, postures near a singularity."""
+"""Strict levels of any rank: dependent rows, contradictory rows, and postures near a singularity."""
 
 from __future__ import annotations
 
@@ -48,10 +48,10 @@ FLYING_ARMS: dict[str, Callable[[], Robot]] = {"yaw, three pitches": yaw_and_pit
 @pytest.mark.parametrize("noise", [0.0, 1e-3])
 @pytest.mark.parametrize("name", FLYING_ARMS)
 def test_gentle_flight_is_solved_at_every_tick(name: str, noise: float) -> None:
-    """The arm cannot roll the end effector, hence the base's tilt and the pose share a row."""
+    """The arm cannot roll the end effector, so base tilt and end effector pose share a row."""
     r = FLYING_ARMS[name]()
     controller, generator = Controller(r, aerial_formulation(r, JointPosture(r))), rng(name, noise)
-    # A small velocity makes the two demands on the shared row differ in the seventh digit.
+    # With a small velocity, the two requirements on the shared row differ in the seventh digit.
     q, v = r.posture(), 1e-7 * generator.normal(size=r.nv)
     assert controller.reset(q, v).status is Status.SOLVED
     for k in range(300):
@@ -74,7 +74,7 @@ def test_rows_that_agree_hold_exactly_and_others_are_reported(name: str) -> None
     hand = controller.formulation.levels[1][0]
     assert report.status is Status.SOLVED and report.relaxed == report.deficient == ()
     assert np.abs(report.residuals["tilt"]).max() <= 1e-8 and np.abs(report.residuals[hand.name]).max() <= 1e-8
-    # A target that is rolled about the arm's plane: the tilt holds, and the pose comes as near as it can.
+    # For a target rolled about the arm's plane, the tilt is exact and the pose error is as small as possible.
     assert isinstance(hand, FramePose) and hand.target is not None
     hand.target = pin.SE3(pin.exp3(np.array([0.1, 0.05, 0.0])) @ hand.target.rotation, hand.target.translation)
     command, report = controller.tick(0.0, r.posture(), np.zeros(r.nv)), controller.report()
@@ -88,7 +88,10 @@ def test_rows_that_agree_hold_exactly_and_others_are_reported(name: str) -> None
 
 @pytest.mark.parametrize(("kind", "rows"), [(FramePosition, 3), (FrameAligned, 5)])
 def test_a_task_with_fewer_rows_is_not_deficient(kind: type[EndEffector], rows: int) -> None:
-    """The tool points forward, and the task leaves free the spin about its axis, which the arm cannot produce."""
+    """The tool points forward.
+
+    The task does not constrain the spin about the tool axis, which the arm cannot produce.
+    """
     r = arm([Z, Y, Y, Y], [0.3, -0.8, 0.3, -0.5], floating=True)
     axis: Any = {} if kind is FramePosition else {"axis": rotation(r).T @ np.array([np.cos(0.3), np.sin(0.3), 0.0])}
     task = kind(Point(TIP), kp=60.0, **axis)
@@ -109,7 +112,7 @@ def rotation(r: Robot) -> Vector:
 
 
 class Scaled(Task):
-    """Express another task in another unit."""
+    """Another task, expressed in another unit."""
 
     def __init__(self, inner: Task, factor: float) -> None:
         super().__init__(f"{inner.name}, scaled", inner.size, kp=inner.kp, kd=inner.kd)
@@ -155,7 +158,7 @@ def turn_away(task: Task, by: Vector) -> None:
 
 @st.composite
 def stacks(draw: st.DrawFn, *, limited: bool, far: float, fast: float) -> tuple[Controller, Vector, Vector]:
-    """Draw a controller of a strange arm, with copied, scaled and contradictory tasks, and a state."""
+    """Return a controller of a random arm, with copied, scaled and contradictory tasks, and a random state."""
     floating, generator = draw(st.booleans()), np.random.default_rng(draw(st.integers(0, 2**32 - 1)))
     axes = draw(st.lists(st.sampled_from([X, Y, Z, None]), min_size=1 if floating else 2, max_size=7))
     n = len(axes)
@@ -196,7 +199,7 @@ def stacks(draw: st.DrawFn, *, limited: bool, far: float, fast: float) -> tuple[
 
 
 def levels_of(controller: Controller) -> list[tuple[Vector, Vector]]:
-    """Return ``J`` and ``ÿ* − J̇ν`` of each level, computed by the tasks."""
+    """Return ``J`` and ``ÿ* − J̇ν`` of each level, computed from the tasks."""
     state = controller.state
     return [
         (
@@ -208,7 +211,7 @@ def levels_of(controller: Controller) -> list[tuple[Vector, Vector]]:
 
 
 def free_answer(controller: Controller) -> tuple[Vector, Vector, list[float], float]:
-    """Return the answer without limits, the free directions, each level's miss, and the least singular value."""
+    """Return the solution without limits, the free directions, the residuals, and the least singular value."""
     x, Zs, missed, least = np.zeros(controller.robot.nv), np.eye(controller.robot.nv), [], np.inf
     for J, b in levels_of(controller):
         values = np.linalg.svd(J @ Zs, compute_uv=False) / max(np.linalg.norm(J, axis=1).max(), 1e-3)
@@ -227,7 +230,7 @@ def reached(controller: Controller, command: Command) -> list[float]:
 @settings(max_examples=60)
 @given(stacks(limited=False, far=0.1, fast=0.3))
 def test_any_stack_has_the_lexicographic_answer(drawn: tuple[Controller, Vector, Vector]) -> None:
-    """NumPy solves the levels by least squares one after the other, then the posture in the free directions."""
+    """NumPy solves the levels one after the other by least squares, then the posture task in the free directions."""
     controller, q, v = drawn
     command = controller.tick(0.0, q, v)
     assert command.status is Status.SOLVED
@@ -235,7 +238,7 @@ def test_any_stack_has_the_lexicographic_answer(drawn: tuple[Controller, Vector,
     assume(least > 1.5 * SINGULAR)
     posture = controller.formulation.posture
     assert posture is not None
-    # An acceleration without a weight has a small weight towards zero.
+    # Accelerations without a weight get a small weight that pulls them to zero.
     weight, wanted = np.maximum(posture.weight, 1e-8), posture.weight * posture.desired(controller.state)
     best = x + Zs @ np.linalg.solve(Zs.T @ (weight[:, None] * Zs), Zs.T @ (wanted - weight * x))
     np.testing.assert_allclose(command.acceleration, best, rtol=0, atol=1e-6 * (1 + np.abs(best).max()))
@@ -251,7 +254,7 @@ def test_any_stack_has_the_lexicographic_answer(drawn: tuple[Controller, Vector,
 @settings(max_examples=40)
 @given(stacks(limited=True, far=0.5, fast=3.0))
 def test_any_stack_is_answered_within_limits(drawn: tuple[Controller, Vector, Vector]) -> None:
-    """quadprog solves one quadratic program for each level, in the directions that the levels above leave."""
+    """quadprog solves one quadratic program per level, in the directions that the higher levels leave free."""
     quadprog = pytest.importorskip("quadprog")
     controller, q, v = drawn
     command = controller.tick(0.0, q, v)
@@ -269,11 +272,11 @@ def test_any_stack_is_answered_within_limits(drawn: tuple[Controller, Vector, Ve
     x, Zs, misses = command.acceleration, np.eye(n), reached(controller, command)
     for k, (J, b) in enumerate(levels_of(controller)):
         A = J @ Zs
-        # No step in the free directions may bring this level nearer.
+        # No step in the free directions may reduce the residual of this level.
         step = quadprog.solve_qp(
             A.T @ A + 1e-9 * np.eye(A.shape[1]), A.T @ (b - J @ x), (C @ Zs).T, d - C @ x - 1e-7 * (1 + np.abs(d))
         )[0]
-        # A level that gave way is held to four digits of the terms of its rows.
+        # A relaxed level is accurate to four digits, relative to the terms of its rows.
         assert misses[k] <= np.linalg.norm(A @ step + J @ x - b) + 1e-4 * (1 + (np.abs(J) @ np.abs(x)).max())
         values, right = np.linalg.svd(A)[1:]
         Zs = Zs @ right[np.count_nonzero(values > 1e-7) :].T
@@ -289,7 +292,7 @@ def test_any_stack_is_answered_within_limits(drawn: tuple[Controller, Vector, Ve
 
 
 def planar(position: type[EndEffector] = FramePosition) -> tuple[Robot, TaskFormulation]:
-    """Three parallel hinges cannot move the tip sideways, nor along the stretched arm."""
+    """Three parallel hinges cannot move the tip sideways, and a stretched arm cannot move the tip along itself."""
     r = arm([Y, Y, Y], [0.3, 0.4, -0.2], floating=False, effort=0.0)
     return r, arm_formulation(r, JointPosture(r), end_effector=position(Point(TIP), kp=60.0))
 
@@ -300,19 +303,22 @@ def wrist() -> tuple[Robot, TaskFormulation]:
 
 
 def flying() -> tuple[Robot, TaskFormulation]:
-    """The second hinge rolls the tip.  Where the first link hangs straight down, it yaws the tip as the base does."""
+    """The second hinge rolls the tip.
+
+    If the first link hangs straight down, the hinge yaws the tip like the base.
+    """
     r = arm([Y, Z, Y], [0.3, 0.4, -0.2], floating=True)
     return r, aerial_formulation(r, JointPosture(r), law=None)
 
 
 def two_levels() -> tuple[Robot, TaskFormulation]:
-    """Both levels are singular at once, and the lower one needs the direction that the upper one releases."""
+    """Both levels are singular at the same posture; the lower level needs the direction that the upper one frees."""
     r = arm([Z, Y, Y, X, Y, X], [0.3, 0.4, 0.8, 0.2, 0.5, 0.1], floating=False, effort=0.0)
     tip, elbow = FramePosition(Point(TIP), kp=60.0), FramePosition(Point("link_2", (0, 0, -0.3)), kp=60.0)
     return r, TaskFormulation(((tip,), (elbow,)), (), JointPosture(r), law=None)
 
 
-# Distance of the targets of a sweep, m (rad), so small that no limit is reached.
+# Distance of the targets from a swept state, m (rad), so small that no limit becomes active.
 AHEAD = {"flying": 1e-3}
 SWEEPS: dict[str, tuple[Callable[[], tuple[Robot, TaskFormulation]], list[float], list[float]]] = {
     "planar": (planar, [0.3, 0.0, 0.0], [0.0, 0.8, 0.5]),
@@ -355,7 +361,7 @@ def swept(
 
 @pytest.mark.parametrize("name", SWEEPS)
 def test_a_slow_sweep_through_a_singular_posture_is_continuous(name: str) -> None:
-    """Half the step halves the change, so that there is no jump, and accelerations stay bounded."""
+    """Half the step halves the change of the accelerations, so they do not jump, and they stay bounded."""
     coarse, seen, _ = swept(name, 401)
     fine, again, controller = swept(name, 801)
     assert seen == again == {Status.SOLVED}
@@ -368,7 +374,7 @@ def test_a_slow_sweep_through_a_singular_posture_is_continuous(name: str) -> Non
 
 @pytest.mark.parametrize(("name", "torque"), [("wrist", 1.0), ("two levels", 0.3)])
 def test_a_relaxed_answer_is_damped_alike(name: str, torque: float) -> None:
-    """At limits near a singularity, quadprog has the same minimum of the damped cost."""
+    """At limits near a singularity, quadprog gets the same minimum of the damped cost."""
     quadprog, damped = pytest.importorskip("quadprog"), []
 
     def look(controller: Controller, command: Command) -> None:
@@ -393,7 +399,7 @@ def test_a_relaxed_answer_is_damped_alike(name: str, torque: float) -> None:
 
 @pytest.mark.parametrize("name", SWEEPS)
 def test_there_is_no_hysteresis(name: str) -> None:
-    """The same states in another order give the same commands."""
+    """The same states in another order give the same commands, so the controller has no memory of them."""
     count = 201
     forth, _, _ = swept(name, count)
     order = rng(name, "order").permutation(count)

@@ -1,4 +1,4 @@
-"""Every robot of the catalogue, and an unknown robot, under each formulation that suits it."""
+"""Every catalogue robot and an unknown robot, with each formulation that is applicable."""
 
 from __future__ import annotations
 
@@ -38,7 +38,7 @@ from tests.tsid.test_tsid_never_fails import ANSWERED, PROGRAMS, bracing, progra
 
 
 def formulations(r: Robot, posture: JointPosture) -> list[TaskFormulation]:
-    """Return all formulations that suit the robot."""
+    """Return all formulations that are applicable to the robot."""
     result = []
     if not r.floating:
         result += [arm_formulation(r, posture, order=order) for order in ("strict", "weighted")]  # type: ignore[arg-type]
@@ -50,10 +50,10 @@ def formulations(r: Robot, posture: JointPosture) -> list[TaskFormulation]:
 
 
 def assert_flies(r: Robot, formulation: TaskFormulation, ticks: int) -> None:
-    """Check that perfect dynamics stay finite and within all limits at each tick."""
+    """Check that the state stays finite and within all limits at each tick, under perfect dynamics."""
     controller = Controller(r, formulation)
     q, v = r.posture(), 0.05 * rng(r.name, "start").normal(size=r.nv)
-    # A joint at its limit cannot stop at once.
+    # A joint that starts at its limit with a velocity cannot stop at once.
     v[controller.state.update(q, v).room.min(axis=0) < 0.01] = 0.0
     controller.reset(q, v)
     if isinstance(formulation.posture, ImpactRobustPosture):
@@ -74,7 +74,7 @@ def test_every_robot_under_every_formulation(name: str) -> None:
     r = robot(name)
     gains = {"kp": 20.0, "weight": 0.1, "base_weight": 0.0}
     count = len(formulations(r, JointPosture(r)))
-    # Aerial robots without data of propellers have no formulation.
+    # Aerial robots without propeller data have no formulation.
     assert count or (r.spec.kind == "aerial" and r.spec.propulsion is None)
     for k in range(count):
         assert_flies(r, formulations(r, JointPosture(r, **gains))[k], 60)  # type: ignore[arg-type]
@@ -96,10 +96,10 @@ OWN = """<robot name="own">
 
 @pytest.mark.parametrize("root", ["fixed", "free-flyer"])
 def test_an_unknown_urdf_is_controlled(root: str, tmp_path: Path) -> None:
-    """It has a continuous joint about an odd axis, a joint whose limits leave no room, and a joint without limits."""
+    """The robot has a continuous joint about an oblique axis, a joint with equal limits, and an unlimited joint."""
     (tmp_path / "own.urdf").write_text(OWN)
     r = load_robot(str(tmp_path / "own.urdf"), LoadOptions(root=root))  # type: ignore[arg-type]
-    # In free fall, with an unlimited motor, a strict task would ask for unlimited torque.
+    # For a falling robot with an unlimited motor, a strict task would demand unlimited torque.
     for level in (((FramePosition(Point("d")),),), ()) if root == "fixed" else ((),):
         posture = ImpactRobustPosture(r, well(r), K=20.0, kp=20.0)
         controller = Controller(r, TaskFormulation(level, () if level else (FramePosition(Point("d")),), posture))
@@ -146,7 +146,7 @@ def test_a_push_at_a_standing_robot_enters_its_dynamics() -> None:
     [("tilthex_arm", "strict", "keep"), ("tilthex_arm", "strict", "follow"), ("kinova", "arm", "release")],
 )
 def test_events_at_odd_moments_make_no_step(name: str, kind: str, spring: Spring) -> None:
-    """At a constant state, only ramps and fades change ``ν̇*``, by at most their bound."""
+    """If the state is constant, only ramps and fades change ``ν̇*``, by at most their bound."""
     r, generator = robot(name), rng(name, spring)
     posture = ImpactRobustPosture(
         r, well(r), K=20.0, kp=20.0, base_weight=0.0, spring=spring, every=3, activation=Activation(ramp=0.05)
@@ -160,10 +160,11 @@ def test_events_at_odd_moments_make_no_step(name: str, kind: str, spring: Spring
     for _ in range(300):
         before = posture.desired(state).copy()
         if generator.random() < 0.08:
-            # A phase that does not follow the present phase is refused.
+            # A phase that cannot follow the present phase raises an error.
             with suppress(InputError):
                 getattr(posture, generator.choice(["brace", "contact", "release"]))()
-        # The event itself moves nothing (a floating base's orientation is blended by its logarithm, not exactly).
+        # The call itself does not change the acceleration (for a floating base only approximately: its orientation is
+        # blended by logarithm).
         assert np.abs(posture.desired(state) - before)[base:].max() <= 1e-9
         dt = float(generator.choice([0.0, DT, DT, 4 * DT, 1.0]))
         t += dt
@@ -171,7 +172,7 @@ def test_events_at_odd_moments_make_no_step(name: str, kind: str, spring: Spring
         controller.tick(t, q, v)
         allowed = max(allowed, step_bound(posture, state, min(dt, 10 * DT)))
         steps.append(float(np.abs(posture.desired(state) - before)[base:].max()))
-        # `follow` moves the target in addition, with its time constant.
+        # The method `follow` also moves the target, with its time constant.
         follows = 20.0 * 2.0 * min(dt, 10 * DT) / 0.5 if spring == "follow" else 0.0
         assert steps[-1] <= allowed + follows + 1e-9
     assert max(steps) > 0.1
@@ -179,7 +180,7 @@ def test_events_at_odd_moments_make_no_step(name: str, kind: str, spring: Spring
 
 @pytest.mark.parametrize(("name", "kind"), PROGRAMS)
 def test_same_inputs_give_same_bits_under_every_formulation(name: str, kind: str) -> None:
-    """The course has all phases, kicks, pushes and invalid measurements."""
+    """The simulated course includes all phases, kicks, pushes and invalid measurements."""
 
     def record(controller: Controller, posture: ImpactRobustPosture) -> np.ndarray:
         r, generator, rows = controller.robot, rng(name, kind, "bits"), []
@@ -203,7 +204,7 @@ def test_same_inputs_give_same_bits_under_every_formulation(name: str, kind: str
 
 
 def test_ticks_leave_no_memory_behind() -> None:
-    """The ticks are solved, relaxed and held."""
+    """The course contains solved, relaxed and held ticks."""
     controller, _ = bracing("tilthex_arm", "strict")
     q, v = controller.robot.posture(), np.zeros(controller.robot.nv)
     hard, broken = np.array([0.0, 30.0, -20.0]), np.full(3, np.nan)
@@ -216,8 +217,8 @@ def test_ticks_leave_no_memory_behind() -> None:
 
     tracemalloc.start()
     try:
-        # A number kept at each tick would be 7,200 bytes a round.  The first rounds fill the caches of NumPy for
-        # small arrays, which depend on the tests before.
+        # Storing one number per tick would take 7,200 bytes per round.  The first rounds fill NumPy's cache for small
+        # arrays; its content depends on earlier tests.
         assert any(after - before < 3_000 for before, after in pairwise(fly(300) for _ in range(9)))
     finally:
         tracemalloc.stop()
@@ -227,7 +228,7 @@ def test_ticks_leave_no_memory_behind() -> None:
 
 
 def own_gradient(r: Robot, normal: tuple[float, float, float]) -> Gradient:
-    """Return the interpreted gradient of ``H`` at the default contact frame."""
+    """Return the interpreted gradient of ``H`` for the default contact frame."""
     value = WorstCaseObjective(r, ImpactContact(r.spec.contact.frame or "", normal))
     function = value.gradient_fun()
 
@@ -240,7 +241,7 @@ def own_gradient(r: Robot, normal: tuple[float, float, float]) -> Gradient:
 
 @pytest.mark.parametrize("name", ["panda", "tiago"])
 def test_energy_never_grows(name: str) -> None:
-    """With damping alone, ``K H/λ + ½‖ν‖²`` falls until ``∇H`` cannot move a joint any more."""
+    """With damping only, ``K H/λ + ½‖ν‖²`` decreases until ``∇H`` cannot move any joint."""
     r, dt, K = robot(name), 2e-3, 10.0
     gradient = own_gradient(r, (0.0, 0.0, 1.0))
     posture = ImpactRobustPosture(
@@ -260,7 +261,7 @@ def test_energy_never_grows(name: str) -> None:
         v = v + dt * command.acceleration
         q = np.array(pin.integrate(r.model, q, dt * v))
     assert np.diff(energy).max() <= 1e-6 * energy[0] and energy[-1] < energy[0]
-    # Motion that neither the end effector nor a joint limit prevents.
+    # Motion that is possible within the end effector task and the joint limits.
     stopped = np.eye(r.nv)[controller.state.room.min(axis=0) < 1e-2]
     rows = np.vstack([controller.assembly.strict.J, stopped])
     Z = np.linalg.svd(rows)[2][np.linalg.matrix_rank(rows, tol=1e-6) :].T

@@ -1,4 +1,4 @@
-"""The tasks of the controller: Jacobians and drifts against differences, errors, and desired accelerations."""
+"""Tasks of the controller: Jacobians and drifts compared with finite differences, errors, desired accelerations."""
 
 from __future__ import annotations
 
@@ -58,7 +58,7 @@ def sample(name: str, key: object) -> tuple[np.ndarray, np.ndarray]:
 
 @pytest.mark.parametrize(("name", "k"), CASES)
 def test_error_falls_by_jacobian(name: str, k: int) -> None:
-    """``ė = −Jν`` at the target, where the error is small enough to be a vector."""
+    """``ė = −Jν`` is exact at the target, because small errors behave like vectors."""
     task, model = tasks(name)[k], robot(name).model
     q, _ = sample(name, k)
     at_target = state_of(name, task, q, np.zeros(model.nv))
@@ -85,7 +85,7 @@ def test_drift_is_the_rate_of_the_jacobian_along_the_motion(name: str, k: int) -
     q, v = sample(name, k)
     state = state_of(name, task, q, v)
     if isinstance(task, FramePose):
-        # The output is the body twist in world axes, and the drift is the rate of the body twist.
+        # The task output is the body twist in world axes; the drift is its time derivative at zero acceleration.
         def rate(s: float) -> np.ndarray:
             there = state_of(name, task, pin.integrate(robot(name).model, q, s * v), v).at(task.points[0])
             return np.concatenate([there.rotation.T @ there.velocity[:3], there.rotation.T @ there.velocity[3:]])
@@ -119,7 +119,7 @@ def test_the_state_agrees_with_pinocchio(name: str) -> None:
 
 
 def test_an_updated_state_equals_a_new_one() -> None:
-    """The views on the data of Pinocchio stay valid."""
+    """Views on Pinocchio's data remain valid after an update."""
     point = Point("ee")
     old = State(robot("tilthex_arm"), [point])
     for k in range(5):
@@ -131,7 +131,7 @@ def test_an_updated_state_equals_a_new_one() -> None:
 
 
 class Reach(Task):
-    """Task of a user, with two methods, for the distance of a point from the vertical axis through the origin."""
+    """User-defined task with two methods: distance of a point from the vertical axis through the origin."""
 
     def __init__(self, point: Point) -> None:
         super().__init__("reach", 1, kp=50.0)
@@ -166,7 +166,7 @@ def test_two_methods_make_a_task() -> None:
     acceleration = np.linalg.lstsq(stack.J, stack.a, rcond=None)[0]
 
     def reach(t: float) -> float:
-        """Along the motion with constant acceleration; panda's joints are numbers."""
+        """Return the distance at time t of a motion with constant acceleration; panda has vector coordinates."""
         there = state_of("panda", task, q + t * v + 0.5 * t**2 * acceleration, v)
         return 0.5 - float(task.error(there)[0])
 
@@ -231,7 +231,7 @@ def test_posture_fades_without_a_step() -> None:
         bound = step_bound(task, state, 1e-3)
         task.advance(state, 1e-3)
         now = task.desired(state)
-        # Only the joints: base orientations are blended by their logarithms, which is not exact.
+        # The test covers only joints, because base orientations are blended by logarithms, which is not exact.
         assert np.abs(now - before)[6:].max() <= bound + 1e-9
         before = now
     assert_close(task.target, r.posture(), 1e-12, "target")
@@ -257,7 +257,7 @@ def test_invalid_tasks_are_refused(make: Callable[[], object]) -> None:
 
 
 def test_no_casadi_online() -> None:
-    """A controller needs NumPy, Pinocchio and DAQP only."""
+    """A controller imports only NumPy, Pinocchio and DAQP."""
     code = """
 import sys, numpy as np
 from impact_posture.robot.robot_loader import load_robot
