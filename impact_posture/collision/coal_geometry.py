@@ -18,15 +18,15 @@ from impact_posture.robot.robot import Robot
 from impact_posture.system.arrays import Array
 from impact_posture.system.libraries import source_key
 
-# Turns the y axis of a mesh up.
+# Rotation that turns the y axis of a mesh upwards.
 _UPRIGHT = pin.SE3(pin.rpy.rpyToMatrix(np.pi / 2, 0.0, 0.0), np.zeros(3))
 
 
 class Geometry(NamedTuple):
     """The shapes of a robot at their joints, without pairs, and the link of each shape.
 
-    ``apart`` tells whether two shapes must not touch, by the joints and the SRDF, shape (n, n).  ``warnings`` are
-    about shapes that are left out, one line each.
+    ``apart``, shape (n, n), is true for two shapes that must not touch, according to the joints and the SRDF.
+    ``warnings`` are about shapes that are left out, one line each.
     """
 
     model: pin.GeometryModel
@@ -84,7 +84,7 @@ def _placed(
 
 
 def _gaps(model: pin.Model, objects: list[pin.GeometryObject]) -> float:
-    """Return the sum over the joints of the distance to the shapes of the link before it (to their boxes), m."""
+    """Return a sum over all joints, m: each joint's distance to the boxes around the shapes of its parent link."""
     boxes: dict[int, list[Array]] = {}
     for solid in objects:
         points = shape_points(solid.geometry) @ solid.placement.rotation.T + solid.placement.translation

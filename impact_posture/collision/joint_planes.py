@@ -20,7 +20,7 @@ _TRIED, _MOST_JOINTS = 25, 3
 _MOST_HALF = 6.5
 # Largest number of planes of a pair, and the least share of the free positions that remains.
 _MOST_PLANES, _LEFT = 12, 1 / 3
-# A plane costs the free positions that it removes, plus this share of all free positions.
+# The cost of a plane is the number of free positions that it removes, plus this share of all free positions.
 _WORTH = 0.05
 
 

@@ -38,7 +38,7 @@ class HalfSpace:
 class MeshCheck:
     """Collision check of the shapes of a robot, prepared for many postures.
 
-    A collision counts from a depth of 1 µm.  Meshes are surfaces: a mesh wholly inside another does not collide.
+    Overlaps of less than 1 µm are ignored.  Meshes are surfaces: a mesh wholly inside another does not collide.
     """
 
     def __init__(self, robot: Robot, shapes: RobotShapes) -> None:
@@ -55,7 +55,7 @@ class MeshCheck:
     def collisions(
         self, q: Array, obstacles: Sequence[Standing] = (), planes: Sequence[HalfSpace] = ()
     ) -> list[tuple[str, str]]:
-        """Return the names in each collision at a posture, shape (nq,).
+        """Return the names of the two shapes in each collision at a posture, shape (nq,).
 
         The shapes must not touch each other or the obstacles, and must stay in front of the planes.
         """
@@ -103,7 +103,7 @@ def mesh_collisions(
 
 
 def _deep(a: Any, at_a: pin.SE3, b: Any, at_b: pin.SE3) -> bool:
-    """Tell whether two shapes still collide after a move apart by the tolerance."""
+    """Tell whether two shapes still collide after they are moved apart by the tolerance."""
     request, result = coal.CollisionRequest(), coal.CollisionResult()
     if not coal.collide(a, transform(at_a), b, transform(at_b), request, result):
         return False

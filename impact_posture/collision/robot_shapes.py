@@ -29,8 +29,8 @@ class FittedShapes:
     Attributes:
         bodies: Swept hulls that contain all shapes.
         pairs: Pairs of bodies that must not touch, as indices into ``bodies``, shape (k, 2).
-        always_touching: Names of shapes that touch at the default posture and at most other postures.  They overlap
-            by design and may touch.
+        always_touching: Names of shapes that touch at the default posture and at most other postures.  These shapes
+            overlap by design, so their contact is allowed.
         joint_planes: Bounds on joints for nested bodies, whose hulls touch at most postures at which their shapes do
             not.  ``pairs`` leaves out nested bodies.
         hulls_touching: Names of nested bodies for which no planes are found.  Only :class:`MeshCheck` finds their
@@ -66,7 +66,7 @@ class RobotShapes(FittedShapes):
 
 @dataclass(frozen=True)
 class _Source:
-    """Description of shapes; equal keys and warnings give equal shapes."""
+    """Describe the shapes; equal keys and warnings give equal shapes."""
 
     key: str
     robot: Robot = field(compare=False)
@@ -104,7 +104,7 @@ def fit_shapes(robot: Robot, described: list[UrdfShape]) -> FittedShapes:
         apart[i, j] = apart[j, i] = False
     merged = merged_bodies(shapes, apart)
     hulls = [_fitted(body, loaded) for body in merged]
-    # All shapes of a body must not touch the same shapes.
+    # All shapes of one body have the same list of shapes that they must not touch.
     first = [body.shapes[0] for body in merged]
     pairs = pairs_of(apart[np.ix_(first, first)])
     touch = touch_of(shapes)

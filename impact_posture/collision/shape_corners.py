@@ -2,8 +2,8 @@
 
 A node of a file may have several parts, one for each material.  coal 3.0 appends the corners of all parts, but
 numbers the triangles of each part from the first corner of the node.  A part begins with its corners 0, 1 and 2 and
-uses all of its corners.  So the beginnings of the parts can be found and checked.  If the check fails, the convex
-hull of the corners replaces the mesh, because it contains the mesh.
+uses all of its corners.  So the first corner of each part can be identified and checked.  If the check fails, the
+convex hull of the corners replaces the mesh, because it contains the mesh.
 """
 
 from __future__ import annotations

@@ -46,7 +46,7 @@ def pairs_of(apart: NDArray[np.bool_]) -> list[Pair]:
 def mostly_touching(robot: Robot, shapes: Sequence[pin.GeometryObject], pairs: list[Pair]) -> list[Pair]:
     """Return the pairs of shapes that touch at the default posture and at most of 1,000 random postures.
 
-    These shapes overlap by design, such as the covers of a wrist.
+    Such shapes overlap by design, for example the covers of a wrist.
     """
     data, touch = robot.model.createData(), touch_of(shapes)
     pin.forwardKinematics(robot.model, data, robot.posture())

@@ -24,12 +24,12 @@ _THIN = 1e-4
 _REQUEST = coal.DistanceRequest(True)
 _REQUEST.gjk_tolerance = 1e-12
 _POINT = coal.Sphere(0.0)
-# A hull gets corners until no point is farther (m) outside.
+# The fit adds corners to a hull until no point is farther outside than this (m).
 _TOLERANCE = 0.004
-# Largest number of candidates for corners; the sweep radius counts all points.
+# Largest number of candidates for corners; the sweep radius is computed from all points.
 _MOST_CANDIDATES = 4000
 _CHUNK = 20_000
-# For fewer points, a convex hull costs more than it saves.
+# For fewer points, computing a convex hull takes more time than it saves.
 _FEW = 50
 # Error (m) of distances by coal.
 _ROUNDING = 1e-9
@@ -181,7 +181,8 @@ def fit_hull(points: Array, tolerance: float = _TOLERANCE) -> Fit:
     candidates = corners[:: -(-len(corners) // _MOST_CANDIDATES)]
     axes = np.linalg.eigh(np.cov(candidates.T))[1] if len(candidates) > 1 else np.eye(3)
     chosen = list(dict.fromkeys(int(np.argmax(candidates @ axis)) for axis in np.hstack([axes, -axes]).T))
-    # Distances only fall while the hull grows, so old distances are bounds and only the largest are computed again.
+    # A growing hull only reduces the distances of the points. Old distances are therefore upper bounds, and only
+    # the largest are computed again.
     bounds = np.linalg.norm(candidates[:, None] - candidates[chosen], axis=2).min(axis=1)
     queue = [(-bound, k) for k, bound in enumerate(bounds.tolist())]
     heapify(queue)

@@ -12,7 +12,7 @@ from impact_posture.posture.constraints.requirements import Requirements
 from impact_posture.posture.loads.load_cases import load_cases
 from impact_posture.system.arrays import Array
 
-# Least share of the weight that counts as a base wrench that the rotors cannot make.
+# If the rotors miss a base wrench by less than this share of the weight, the difference is ignored.
 _UNREACHABLE = 1e-7
 
 

@@ -12,13 +12,13 @@ from impact_posture.path.path_search import even
 from impact_posture.path.path_space import STEP, PathSpace
 from impact_posture.system.arrays import Array
 
-# Largest tangent distance of the curve from the constraints.
+# Largest permitted distance of the curve from the constraints, measured in the tangent space.
 DEVIATION = 1e-5
 # How often the number of knots may double; at corners of a path along bodies, each time halves the deviation.
 _DOUBLINGS = 7
 # Step of central differences along the curve, whose length is 1.
 _STEP = 1e-5
-# At a corner, the curve bends so many times more than at the median knot.
+# A knot is a corner if the curve bends this many times more there than at the median knot.
 _SHARP = 5.0
 # Parts between two knots for the check of limits, at corners and elsewhere.
 _AT_CORNERS, _BETWEEN = 8, 2

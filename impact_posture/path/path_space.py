@@ -19,7 +19,7 @@ EQUALITY, INEQUALITY = 1e-6, 1e-8
 CHECK_DISTANCE = 2e-2
 # Tangent length of a step along the constraints, rad mixed with m.
 STEP = 0.05
-# A step that comes nearer to its target by less than this share of its length counts as stuck.
+# A step is stuck if it comes nearer to its target by less than this share of its length.
 _PROGRESS = 0.05
 # Largest factor between the step on the constraints and the planned step.  A longer step jumps to another branch.
 _JUMP = 2.0

@@ -74,8 +74,9 @@ def time_optimal(space: PathSpace, curve: PathCurve, limits: ActuatorLimits) -> 
 def scaled(space: PathSpace, curve: PathCurve, limits: ActuatorLimits) -> TimedCurve:
     """Return the fastest motion of the form ``s(t) = 10 τ³ − 15 τ⁴ + 6 τ⁵``, ``τ = t/T``, within all known limits.
 
-    The load of a motion is the load of gravity plus ``1/T²`` times a load that does not depend on ``T``.  So a linear
-    program at each instant gives the least ``T`` there, and the largest of these counts.  The instants are spread
+    The load of a motion is the load of gravity plus ``1/T²`` times a load that does not depend on ``T``.  So a
+    linear program gives the smallest ``T`` at each instant, and the motion takes the largest of these.  The instants
+    are spread
     evenly, plus those at the places of the curve, most of which are at corners.  If a curve has corners and
     :func:`slowed` takes less time, the result is the slowed motion.
     """
@@ -160,8 +161,8 @@ def _exceeded(space: PathSpace, curve: PathCurve, motion: TimedCurve, limits: Ac
 class LimitUse:
     """Largest shares of the limits that a motion needs at each time, shape (m,); 1 is at a limit.
 
-    The share of a thrust is its distance from the middle of its range, divided by half the range.  Torques and
-    thrusts are NaN where not known.  ``largest`` has the largest shares, their actuators, and the active limit, as in
+    The share of a thrust is its distance from the middle of its range, divided by half the range.  Unknown torques
+    and thrusts are NaN.  ``largest`` has the largest shares, their actuators, and the active limit, as in
     ``result.json``.
     """
 
@@ -175,10 +176,12 @@ class LimitUse:
 def limit_use(space: PathSpace, motion: TimedCurve, postures: Array, limits: ActuatorLimits) -> LimitUse:
     """Return the shares of the limits along a motion with its postures on the constraints, shape (n, nq).
 
-    Forces of feet and of more than six rotors are not unique.  The forces with the least largest share count.
+    Forces of feet and of more than six rotors are not unique.  The result uses the forces whose largest share of a
+    limit is smallest.
     """
     robot, count = space.problem.robot, len(motion.t)
-    # For a floating robot, each instant is a linear program, so only some count: evenly, and at large accelerations.
+    # For a floating robot, each instant needs a linear program. Only some instants are checked: evenly spread ones,
+    # and those with large accelerations.
     even = [round(k) for k in np.linspace(0, count - 1, INSTANTS)]
     bent = np.argsort(-np.abs(motion.a).max(axis=1), kind="stable")[:INSTANTS].tolist()
     every = sorted({*even, *bent}) if robot.floating else list(range(count))

@@ -20,7 +20,7 @@ from impact_posture.system.arrays import Array
 
 # Largest number of optima to try, best first.
 _OPTIMA = 5
-# Tangent length of a path up to which there is no motion, and relative gain that does not count.
+# Tangent length below which a path is not a motion, and relative gain that is too small to matter.
 _NO_MOTION, _NO_GAIN = 1e-6, 1e-6
 # Largest number of reached postures to evaluate if no optimum is reached.
 _MOST_VISITED = 400

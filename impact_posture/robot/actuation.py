@@ -86,7 +86,8 @@ def thrust_limits(propulsion: PropulsionSpec) -> tuple[float, float]:
 def torque_limits(model: pin.Model) -> Array:
     """Return the largest torque of each velocity entry, N·m or N, shape (nv,).
 
-    It is infinite where the model states none (zero), at a floating base, and at a locked joint (infinite armature).
+    The torque is infinite if the model states no limit (zero), for a floating base, and for a locked joint
+    (infinite armature).
     """
     limits = np.array(model.effortLimit, dtype=float)
     unknown = ~(np.isfinite(limits) & (limits > 0)) | finite_armature(model)[1]
@@ -151,9 +152,10 @@ def actuation_matrix(model: pin.Model, propulsion: PropulsionSpec | None = None)
 def hover(model: pin.Model, propulsion: PropulsionSpec, q: ArrayLike) -> Hover:
     """Return the thrusts and torques that hold posture ``q`` at rest: ``h(q, 0) = G u``.
 
-    The rows of the base determine the thrusts, which are unique for six independent rotors.  Of more rotors, the
-    result has the thrusts farthest from their limits.  If the rotors cannot make the wrench, it has the nearest
-    thrusts within the limits.  The other rows are the torques, which must be within the effort limits of the model.
+    The rows of the base determine the thrusts, which are unique for six independent rotors.  With more rotors, the
+    result is the solution whose thrusts are farthest from their limits.  If the rotors cannot produce the wrench,
+    the result is the nearest solution within the limits.  The other rows are the torques, which must be within the
+    effort limits of the model.
     """
     matrix = allocation_matrix(model, propulsion)
     low, high = thrust_limits(propulsion)

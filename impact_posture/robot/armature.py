@@ -51,7 +51,7 @@ def set_armature(model: pin.Model, spec: RobotSpec, srdf: Path | None, option: A
 
 
 def armature_warning(model: pin.Model, source: str, held: Sequence[str] = ()) -> tuple[str, ...]:
-    """Return a warning about joints without armature, or nothing.  Joints that are held by default do not count."""
+    """Return a warning about joints without armature, or nothing; joints that are held by default are ignored."""
     armature = np.asarray(model.armature)
     counted = {i: str(model.names[i]) for i in joint_range(model) if model.names[i] not in held}
     bare = [name for i, name in counted.items() if not (armature[v_slice(model, i)] > 0).any()]

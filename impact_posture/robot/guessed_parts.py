@@ -150,7 +150,7 @@ def flies(robot: Robot) -> bool:
 
 
 def srdf_near(urdf: Path) -> Path | None:
-    """Return the SRDF beside the URDF or in ``../srdf`` with which the URDF's name begins, or the only SRDF there."""
+    """Return the SRDF beside the URDF or in ``../srdf`` whose name begins the URDF's name, or the only SRDF there."""
     folders = (urdf.parent, urdf.parent.parent / "srdf")
     near = [path for folder in folders for path in sorted(folder.glob("*.srdf"))]
     fitting = [path for path in near if urdf.stem.startswith(path.stem)]

@@ -12,7 +12,8 @@ from impact_posture.errors import InertiaError
 from impact_posture.robot.model_joints import v_slice
 from impact_posture.robot.robot import Robot
 
-# A mass (kg) or a moment (kg m²) below _TINY counts as zero.  A relative fault below the slack counts as rounding.
+# A mass (kg) or a moment (kg m²) below _TINY is treated as zero.  A relative fault below the slack is treated as a
+# rounding error.
 _TINY = 1e-10
 # Products of larger entries of a mass matrix overflow.
 _LARGEST = 1e100
@@ -22,7 +23,7 @@ _SINGULAR = 1e-12
 
 
 def check_inertias(root: ET.Element, model: pin.Model, path: Path, accept: bool) -> tuple[str, ...]:
-    """Refuse links with impossible masses or inertias; return warnings.
+    """Raise an error for links with impossible masses or inertias; return warnings.
 
     A fault is a warning with ``accept``, or if it is too small to matter in the body that contains the link.
 

@@ -1,7 +1,8 @@
 """Joint models: the inertia at the joints in an impact, with rotors, without rotors, or with locked joints.
 
-A short impact ends before a soft spring between rotor and link has turned the rotor.  Then only the link reacts
-(``M``).  With a stiff transmission, the rotor moves along (``M + B``, with the armature ``B``).  A joint that cannot
+A short impact ends before a soft spring between rotor and link has turned the rotor.  In that case, only the link
+reacts (``M``).  With a stiff transmission, the rotor moves with the link (``M + B``, with the armature ``B``).  A
+joint that cannot
 be driven from its link does not move at all.  Each joint model sets the armature to the rotor inertia, zero, or
 infinity.
 """
@@ -31,7 +32,7 @@ class Transmissions:
 
     The rotor of a ``rigid`` joint moves with the link.  A ``locked`` joint cannot be driven from its link.  The
     ``stiffness`` between rotor and link, N·m/rad (N/m if prismatic), is infinite where the robot states none.
-    ``damping`` is beside this spring, N·m·s/rad (N·s/m).
+    ``damping`` acts in parallel with this spring, N·m·s/rad (N·s/m).
     """
 
     rigid: Mask
@@ -62,13 +63,14 @@ def transmissions(robot: Robot) -> Transmissions:
 
 
 def with_joint_model(robot: Robot, joint_model: JointModel) -> Robot:
-    """Return the robot with the armature that counts in an impact.
+    """Return the robot with the armature that an impact meets.
 
     - ``reflected`` keeps the armature at all joints.
     - ``link`` removes it, except at joints with a ``rigid`` transmission.
     - ``locked`` locks all joints, as position control with stiff gears does, so that only a floating base moves.
     - ``elastic`` removes it at joints with springs of known stiffness, whose rotors follow later
-      (:mod:`impact_posture.impact.elasticity.elastic_impact`).  H, G, V, S and E are for the first instant.
+      (:mod:`impact_posture.impact.elasticity.elastic_impact`).  H, G, V, S and E describe the first instant of the
+      impact.
 
     A joint with a ``locked`` transmission moves in no joint model.
 
@@ -105,7 +107,7 @@ def with_joint_model(robot: Robot, joint_model: JointModel) -> Robot:
 
 
 def describe_joints(robot: Robot) -> str:
-    """Return in words which inertia counts at the joints in an impact."""
+    """Describe in words which inertia an impact meets at the joints."""
     armature = np.asarray(robot.model.armature)[6 if robot.floating else 0 :]
     held, kept = int(np.isinf(armature).sum()), int((np.isfinite(armature) & (armature > 0)).sum())
     words = {

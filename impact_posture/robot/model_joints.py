@@ -35,7 +35,7 @@ def v_slice(model: pin.Model, index: int) -> slice:
 
 
 def scalar_entries(model: pin.Model, index: int, value: float) -> tuple[float, ...]:
-    """Return the entries in ``q`` of a joint with one degree of freedom: its value, or the cosine and sine of it."""
+    """Return the entries in ``q`` of a joint with one degree of freedom: its value, or its cosine and sine."""
     return (value,) if model.nqs[index] == 1 else (math.cos(value), math.sin(value))
 
 

@@ -1,4 +1,4 @@
-"""Postures of users: a name, ``posture.json``, joints by name, or a ``sensor_msgs/JointState`` in YAML."""
+"""Read postures that users give by name, in ``posture.json``, by joint names, or as ``sensor_msgs/JointState``."""
 
 from __future__ import annotations
 

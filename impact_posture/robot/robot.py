@@ -30,7 +30,7 @@ CONVENTION = (
 )
 FIXED_CONVENTION = "q = [joints]; v = [joint rates]; SI units, radians"
 
-# Largest distance (rad, m) beyond a position limit that counts as on it.
+# A joint that is beyond a position limit by less than this (rad, m) is treated as on the limit.
 _ON_LIMIT = 1e-6
 
 
@@ -135,7 +135,7 @@ class Robot:
 
     @cached_property
     def impact_sha256(self) -> str:
-        """The same hash with the armature of the joint model."""
+        """Hash like :attr:`model_sha256`, but with the armature of the joint model."""
         return dynamics_hash(self.model, np.asarray(self.model.armature))
 
     @cached_property
@@ -165,7 +165,7 @@ class Robot:
         frames = list(enumerate(self.model.frames))
         links = [(i, frame.name) for i, frame in frames if frame.type == pin.FrameType.BODY]
         others = [(i, frame.name) for i, frame in frames if frame.name != "universe"]
-        # The first frame of a name counts, and links count before other frames.
+        # If several frames have one name, the first link is used, or else the first frame.
         return {name: i for i, name in reversed([*links, *others])}
 
     @checked
@@ -240,7 +240,7 @@ class Robot:
                 raise PostureError(f"{what} has norm {norm:.4g}", where=where, hint=f"give a unit {kind}{order}")
 
     def _check_swapped(self, quaternion: Array, where: str) -> None:
-        """Refuse a base quaternion that is clearly in the order w x y z."""
+        """Raise an error for a base quaternion that is clearly in the order w x y z."""
         rotation = pin.Quaternion(*[float(quaternion[k]) for k in (3, 0, 1, 2)]).matrix()
         swapped = pin.Quaternion(*[float(v) for v in quaternion]).matrix()
         # Upside down in the order x y z w, but upright in the order w x y z.  These robots do not start upside down.

@@ -57,7 +57,7 @@ class Support(_Table):
     """A foot that stays on the ground; its velocities are zero up to the compliance.
 
     Attributes:
-        kind: ``point`` holds the velocity of the contact point, ``surface`` also the angular velocity.
+        kind: ``point`` keeps the velocity of the contact point at zero, ``surface`` also the angular velocity.
         offset: Contact point from the frame's origin, in the frame, meters.
         size: Half extents (x, y) of the sole around the contact point, in the frame, meters.
     """
@@ -69,7 +69,7 @@ class Support(_Table):
 
     @property
     def rows(self) -> int:
-        """Number of velocities that the foot holds."""
+        """Number of velocity components that the foot keeps at zero."""
         return 3 if self.kind == "point" else 6
 
     @property
@@ -181,7 +181,7 @@ class RobotSpec(_Table):
 def read_spec(path: Path, over: Path | None = None) -> RobotSpec:
     """Read and check a ``robot.toml``; the file ``over`` provides missing values, with paths relative to its folder.
 
-    A file with a URDF of its own describes another robot and takes nothing from ``over``.
+    A file that names its own URDF describes another robot, so it takes no values from ``over``.
     """
     data = read_toml(path)
     model = data.get("model", {})

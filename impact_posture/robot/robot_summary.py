@@ -131,7 +131,8 @@ def _posture(robot: Robot, name: str) -> dict[str, Any]:
 def _actuation(robot: Robot, propulsion: PropulsionSpec) -> dict[str, Any]:
     """Return rank and condition of the allocation, and lateral force and hover at each posture.
 
-    The condition number mixes N and N·m.  It is ``None`` below rank 6, and the force without a level base.
+    The condition number mixes N and N·m.  The condition number is ``None`` below rank 6. The force is ``None``
+    without a level base.
     """
     model = robot.model
     rotors = allocation(model, propulsion)

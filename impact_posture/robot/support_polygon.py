@@ -8,7 +8,7 @@ import numpy as np
 
 from impact_posture.system.arrays import Array
 
-# Points nearer to a line than this (m) lie on it.  Edges are rounded to so many digits.
+# Points nearer to a line than this (m) lie on it.  Number of digits to which edges are rounded.
 _ROUNDING, _DIGITS = 1e-9, 12
 
 

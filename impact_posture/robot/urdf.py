@@ -76,7 +76,9 @@ def example_models(suffix: str = ".urdf") -> list[str]:
 def build_model(
     path: Path, *, free_flyer: bool, accept_inertias: bool = False
 ) -> tuple[pin.Model, tuple[str, ...], dict[str, str]]:
-    """Parse the URDF at ``path`` without opening meshes; return the model, warnings, and mimicked joint by joint.
+    """Parse the URDF at ``path`` without opening meshes; return the model, warnings, and mimics.
+
+    The mimics are a dictionary from each mimicking joint to its mimicked joint.
 
     ``free_flyer`` adds a free-flyer joint before the root link.  ``accept_inertias`` turns errors into warnings.
 
@@ -107,7 +109,7 @@ def build_model(
 
 
 def _check_depth(root: ET.Element, path: Path) -> None:
-    """Refuse deep trees and circles, because the URDF parser follows them until its stack overflows."""
+    """Raise an error for deep trees and circles, because the URDF parser follows them until its stack overflows."""
     joints = [(joint.find("parent"), joint.find("child")) for joint in root.findall("joint")]
     parents = {c.get("link"): p.get("link") for p, c in joints if p is not None and c is not None}
     children: dict[str | None, list[str | None]] = {}
@@ -126,7 +128,7 @@ def _check_depth(root: ET.Element, path: Path) -> None:
 
 
 def _mimics(root: ET.Element) -> tuple[dict[str, str], list[str]]:
-    """Return the mimicked joint by joint, and a warning for each ``<mimic>`` of a joint that does not exist."""
+    """Return the mimicked joint of each mimicking joint, and a warning for each ``<mimic>`` without its joint."""
     joints = {joint.get("name", ""): joint.find("mimic") for joint in root.findall("joint")}
     mimics = {name: mimic.get("joint", "") for name, mimic in joints.items() if mimic is not None}
     lost = [
