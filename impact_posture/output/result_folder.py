@@ -73,7 +73,8 @@ def finish_result(
     scene: ReportScene | None = None
     with fork_map(lambda index: tasks[index](), len(tasks), jobs) as results:
         if report:
-            # This process would only wait.  An error occurs again when the report is written.
+            # The main process prepares the scene while it waits for the workers.  An error here occurs again when
+            # the report is written, and is reported then.
             with suppress(Exception):
                 scene = result_scene(prepared, view, meshes)
                 _ = scene.packed

@@ -65,7 +65,7 @@ def bars_figure(rows: Sequence[Bar]) -> Figure:
 def _panel(axes: Any, name: str, group: Sequence[Bar], room: int) -> None:
     ours = max((row.mean + row.half_width for row in group if np.isfinite(row.mean)), default=0.0)
     papers = [row.paper for row in group if row.paper is not None]
-    # The paper used another robot.  Its numbers must not shorten the bars.
+    # The paper used another robot.  The numbers of the paper must not make the bars short.
     near = [paper for paper in papers if paper <= _FAR * ours or ours == 0]
     end = 1.08 * (max([ours, *near]) or 1.0)
     for place, row in enumerate(group):
@@ -75,7 +75,7 @@ def _panel(axes: Any, name: str, group: Sequence[Bar], room: int) -> None:
                 axes.errorbar(row.mean, place, xerr=row.half_width, color=INK, linewidth=1.0, capsize=2.5, zorder=4)
         if row.paper is not None:
             axes.plot(min(row.paper, 0.975 * end), place, **(_PAPER if row.paper in near else _BEYOND))
-        # The numbers stand right of the panel, clear of the bars.
+        # The numbers are drawn to the right of the panel, where no bar covers them.
         look = {"xycoords": ("axes fraction", "data"), "textcoords": "offset points", "va": "center", "fontsize": 7}
         axes.annotate(_words(row), (1.0, place), (5, 0), **look)
     axes.set_xlim(0.0, end)

@@ -192,7 +192,7 @@ def _legend(axes: Any, states: list[_State], unit: str, view: ResultView) -> Non
         radii = np.sqrt(np.maximum(np.linalg.eigvalsh(state.at.ellipsoid)[::-1], 0.0))
         largest = max(float(radii[0]), 1e-300)
         rows.append(f"{state.word}  " + "  ".join(number(r if r > 1e-7 * largest else 0.0) for r in radii))
-    # Below the legend, whatever its length.
+    # The radii are written below the legend, for any length of the legend.
     look = {"xycoords": legend, "textcoords": "offset points", "va": "top", "fontsize": 7.0, "linespacing": 1.4}
     axes.annotate("\n".join(rows), (0, 0), (0, -8), **look)
 
@@ -205,7 +205,7 @@ def draw_uncertainty(axes: Any, plane: Plane, view: ResultView, limit: float) ->
         axes.plot(*outline, color=GRAY, linewidth=0.6, zorder=0.6)
     for word, worst, _, line in _worst(view):
         for normal in worst.normals:
-            # The dashes lie on top, as with the ellipsoids.
+            # Dashed lines are drawn on top, as for the ellipsoids.
             zorder = 4.6 if word == "before" else 4.5
             draw_arrow(axes, np.zeros(2), plane.axes @ normal * REACH * limit, zorder, mutation_scale=8, **line)
 

@@ -9,7 +9,7 @@ import numpy as np
 from impact_posture.robot.support_polygon import convex_ring
 from impact_posture.system.arrays import Array
 
-# A direction within 1° of a plane counts as in the plane: its half-width differs by less than 2e-4.
+# A direction within 1° of a plane is treated as in the plane, because its half-width differs by less than 2e-4.
 IN_PLANE = float(np.cos(np.radians(1.0)))
 # A semi-axis below this share of the longest is a rounding error, or too short to be seen.
 _NEGLIGIBLE = 1e-6

@@ -21,7 +21,9 @@ _ROW = 0.17
 
 
 def jump_figure(view: ResultView) -> Figure:
-    """Draw Δν as horizontal bars: left ``a = M⁻¹Jᵀn`` per N·s, right ``a(1+e)v/G`` for the approach speed v.
+    """Draw Δν as horizontal bars, per impulse and for the approach speed v.
+
+    The left column shows ``a = M⁻¹Jᵀn`` per N·s, the right column ``a(1+e)v/G``.
 
     Linear and angular velocities of the base, turning joints and sliding joints have separate panels.  Diamonds on
     the right show the jump with the friction of the contact, if it is defined.

@@ -14,7 +14,8 @@ from numpy.typing import NDArray
 from impact_posture.output.plot.ellipsoid_shapes import Plane
 from impact_posture.system.arrays import Array
 
-# Distances from the point, points; directions to try, rad; least distance of a letter from lines, points.
+# Distances of a letter from its point (in points), directions to try (rad), and smallest distance of a letter from
+# lines (in points).
 _GAPS = (2.0, 5.0, 9.0, 14.0, 20.0, 27.0, 36.0)
 _ANGLES = np.linspace(0.0, 2 * np.pi, 24, endpoint=False)
 _CLEAR = 1.4
@@ -37,7 +38,7 @@ class Label(Annotation):
         )  # fmt: skip
         self.point = np.asarray(point, dtype=float)
         self.toward = toward
-        # The layout must not make room for a letter whose place is not known yet.
+        # The layout ignores letters, because their places are not known yet.
         self.set_in_layout(False)
 
 

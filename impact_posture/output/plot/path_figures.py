@@ -205,7 +205,7 @@ def _title(data: TradeOffData) -> str:
     return f"half of the {_EXTRA[data.against]} yields {100 * (y[0] - half) / gain:.0f} % of the gain; no knee"
 
 
-# Number of joints with a color and a name, which move most.  The other joints are gray.
+# Number of joints that get a color and a name: the joints that move most.  The other joints are gray.
 _NAMED = 8
 # Joints that move less are not drawn, rad or m.
 _MOVES = 1e-4

@@ -38,7 +38,7 @@ _PUSHED = "n is the direction of the impulse on the robot, which strikes no surf
 _BEHIND = "The surface lies behind the link of the contact where that reaches behind the contact point."
 _BODY = "The body is the box between the hips, of no true height."
 HATCH = "/////"
-# 3-D axes number the areas from 3 up, whatever their order.
+# 3-D axes always give areas a drawing order from 3 upwards.
 _FRONT = 50.0
 
 
@@ -82,8 +82,8 @@ class DrawnSurface:
 def postures_figure(view: ResultView) -> Figure:
     """Draw both postures in the same axes: in 3-D, and from the side that shows n and most of the motion.
 
-    The axes are equal, in meters.  A contact plane is a square in 3-D, and a hatched edge from the side.  If it moves
-    or turns, both planes are drawn.
+    The axes are equal, in meters.  A contact plane is a square in 3-D, and a hatched edge from the side.  If the
+    contact plane moves or turns, both planes are drawn.
     """
     first, second = (
         build_skeleton(view.robot, q, view.objective.contacts, view.objective.supports, collisions)
@@ -97,7 +97,7 @@ def postures_figure(view: ResultView) -> Figure:
     normal = _PUSHED if view.pushed else _NORMAL
     notes = [*stick_notes(first), _ENDS, normal, *([_BEHIND] if any(view.depths) and not view.pushed else [])]
     low, high = _window([first, second], plane, surfaces)
-    # The view from the side sets the height, within the limits of a page.
+    # The side view determines the height of the figure, within the limits of a page.
     height = float(np.clip(3.1 * (high - low)[1] / (high - low)[0], 2.3, 3.6)) + 1.0
     with framed(*header_lines(view), height, notes) as (figure, body):
         grid = body.add_gridspec(1, 2)
@@ -140,9 +140,9 @@ def side_plane(first: Skeleton, second: Skeleton) -> Plane:
         candidates = [plane for plane in candidates if not plane.contains(second.across)] or candidates
 
     def shown(plane: Plane) -> float:
-        # If there is little motion, the size of the robot decides.
+        # If there is little motion, the size of the robot in the plane decides.
         seen = float(np.linalg.norm(motion @ plane.axes.T) + 0.2 * np.linalg.norm(size @ plane.axes.T))
-        # A view from above is harder to read, so it must show much more.
+        # A view from above is harder to read, so it is used only if it shows much more motion.
         return seen / 2 if plane is XY else seen
 
     return max(candidates, key=shown)

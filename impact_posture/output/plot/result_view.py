@@ -224,7 +224,7 @@ def number(value: float | None) -> str:
 
 
 def _short(source: str) -> str:
-    """Return a source without the explanation in parentheses and without folders."""
+    """Shorten the text that names a source: drop the explanation in parentheses and the folders."""
     return source.split(" (")[0].rsplit("/", 1)[-1]
 
 

@@ -73,7 +73,7 @@ def controls_figure(view: RunView) -> Figure:
 
 
 def joints_figure(views: Sequence[RunView]) -> Figure:
-    """Draw the positions of joints of one degree of freedom, the controllers below each other (nominal first)."""
+    """Draw the positions of joints with one degree of freedom, one row for each controller, nominal first."""
     views = check_same(views, "figure joints")
     panels = joint_panels(views)
     cells = [_run_and_impact(panel, k, view) for k, view in enumerate(views) for panel in panels]
@@ -89,7 +89,8 @@ def joints_figure(views: Sequence[RunView]) -> Figure:
 def comparison_figure(views: Sequence[RunView]) -> Figure:
     """Draw H of all controllers over time, and below it ``‖ν‖`` around the first impact.
 
-    In the lower panel, time counts from the impact of each run.  For pushes, it does so in the upper panel as well.
+    In the lower panel, the time is relative to the impact of each run.  For pushes, the time of the upper panel is
+    also relative to the push.
     """
     views = check_same(views, "figure comparison-metric")
     spans = [_since_impact(view) for view in views]

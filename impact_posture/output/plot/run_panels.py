@@ -13,9 +13,9 @@ from impact_posture.output.plot.run_view import Flags, RunView
 from impact_posture.output.plot.style import BLUE, GRAY, GREEN, INK, ORANGE, PURPLE, SKY, VERMILLION
 from impact_posture.system.arrays import Array
 
-# Most joints that a panel shows.
+# Largest number of joints in a panel.
 SHOWN = 8
-# Looks of the curves of a panel, which differ by color and dashes.
+# Line styles of the curves of a panel, which differ in color and dashes.
 LINES: tuple[dict[str, Any], ...] = (
     {"color": BLUE, "linestyle": "-", "linewidth": 1.3},
     {"color": VERMILLION, "linestyle": (0, (4, 1.5)), "linewidth": 1.3},
@@ -26,11 +26,11 @@ LINES: tuple[dict[str, Any], ...] = (
     {"color": ORANGE, "linestyle": (0, (3, 1, 1, 1, 1, 1)), "linewidth": 1.3},
     {"color": GRAY, "linestyle": (0, (2, 2)), "linewidth": 1.0},
 )
-# Looks of runs in a panel.  The first run looks like the posture before, and the second like the posture after.
+# Line styles of runs in a panel.  The first run looks like the posture before, and the second like the posture after.
 RUNS: tuple[dict[str, Any], ...] = (LINES[1] | {"zorder": 3.5}, LINES[0] | {"linewidth": 1.6}, *LINES[2:])
 # A limit above this multiple of the largest value is named below the figure, not drawn.
 _FAR = 4.0
-# A command within this share of the range from a limit counts as at the limit.
+# A command is treated as at a limit if its distance from the limit is at most this share of the range.
 _NEAR = 1e-3
 
 

@@ -78,9 +78,9 @@ def draw_silhouettes(axes: Any, hulls: Iterable[PlacedHull], color: str, plane: 
             if hull.hit is hit
         ]
         if rings:
-            # One path for all, because overlapping patches would get darker.
+            # One path contains all outlines, because overlapping patches would get darker.
             patch = _Silhouette(Path.make_compound_path(*[Path(ring, closed=True) for ring in rings]), **look)
-            # Measuring it would take the layout long, and the limits of the panel are known.
+            # The layout does not measure the path, because that is slow and the limits of the panel are known.
             patch.set_in_layout(False)
             axes.add_artist(patch)
 

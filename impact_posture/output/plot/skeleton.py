@@ -17,7 +17,7 @@ from impact_posture.system.arrays import Array
 
 # Least height of a body as a share of its shorter side.
 _LEAST_HEIGHT = 0.35
-# Axes count as parallel up to this sine of their angle.
+# Two axes are treated as parallel if the sine of their angle is at most this.
 _PARALLEL = 1e-3
 _AROUND = np.array([[0, 0], [1, 0], [1, 1], [0, 1]])
 
@@ -114,7 +114,7 @@ def build_skeleton(
         for point, end in zip(hanging, ends, strict=True)
         if point.joint >= first or not len(body)
     ]
-    # A link with a stick to its foot or contact needs no tip.
+    # A link that already has a line to its foot or contact gets no line to its tip.
     done = {int(model.parents[i]) for i in range(1, model.njoints)}
     done |= {point.joint for point in hanging if np.linalg.norm(point.position) > 1e-3}
     for leaf in range(first, model.njoints):

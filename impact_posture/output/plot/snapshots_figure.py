@@ -32,9 +32,9 @@ from impact_posture.system.escape import plot_label
 _START_NOTE = "Gray sticks show the robot at the start of the run."
 _NOW: dict[str, Any] = {"color": BLUE, "linestyle": "-", "linewidth": 1.5, "zorder": 3.0}
 _START: dict[str, Any] = {"color": "#a9a9a9", "linestyle": "-", "linewidth": 1.0, "zorder": 2.0}
-# The arrow of a push that is to come, and of a push that acts.
+# Line styles of the arrow before a push and during a push.
 _PUSH: dict[int, dict[str, Any]] = {1: {"linestyle": (0, (2, 1.5)), "linewidth": 1.2}, 2: {"linewidth": 1.8}}
-# This long before the impact, no tick contains it, s.
+# Time before the impact, s, at which no tick contains the impact yet.
 _BEFORE = 0.005
 
 
@@ -104,7 +104,7 @@ def _window(low: Array, high: Array, view: RunView, plane: Plane) -> tuple[Array
     if view.surface is not None:
         touched = plane.axes @ view.surface
         n = plane.axes @ np.array(view.contact.normal)
-        # Across its normal, the surface has no end.
+        # Perpendicular to its normal, the surface is unlimited.
         edge = touched - 0.05 * float((high - low).max()) * n
         for axis in range(2):
             if abs(n[axis]) > 0.5:

@@ -61,7 +61,7 @@ _RC: dict[str, Any] = {
     "axes.linewidth": 0.7,
     "axes.grid": False,
     "axes.axisbelow": True,
-    # No ticks are above a panel.  By default matplotlib looks for them each time that it measures or draws a panel.
+    # No ticks are above a panel.  By default, matplotlib searches for them whenever it measures or draws a panel.
     "axes.titley": 1.0,
     "grid.color": PALE,
     "grid.linewidth": 0.5,
@@ -70,7 +70,7 @@ _RC: dict[str, Any] = {
     "figure.dpi": 200,
     # At this resolution letters need no hinting, which takes a third of the time to draw them.
     "text.hinting": "none",
-    # TrueType in the PDF (publishers refuse Type 3), and files that do not change when nothing changed.
+    # PDF files use TrueType fonts, because publishers reject Type 3. Equal figures give equal files.
     "pdf.fonttype": 42,
     "svg.hashsalt": "impact-posture",
 }
@@ -114,7 +114,7 @@ def wrap(line: str, separator: str) -> list[str]:
     """Break a line of small print at separators so that it fits the page, by the widths of the font."""
     parts, room, used = [""], 72 * WIDTH * 0.975, 0.0
     for piece in line.split(separator):
-        # Widths of single pieces are cached, because most pieces come again.
+        # Widths of pieces of text are cached, because most pieces occur several times.
         width = text_width(f"{separator}{piece}".replace("$", ""), _SMALL)
         if parts[-1] and used + width > room:
             parts.append("")
@@ -160,7 +160,7 @@ def lay_out(figure: Figure) -> FigureCanvasAgg:
             engine.execute(figure)
         for axes in equal:
             del axes.get_tightbbox
-        # With an engine, even one that does nothing, `savefig` would draw twice.
+        # With any layout engine set, even an empty one, `savefig` would draw the figure twice.
         figure.set_layout_engine(None)
         # Rounded, because the solver of the layout differs in the last digits from run to run.
         for part in figure.subfigs:
@@ -221,7 +221,7 @@ def save(figure: Figure, out_dir: Path, name: str, formats: Iterable[str] = DEFA
             with scratch_folder(path.parent) as beside, style():
                 if path.suffix == ".png":
                     # `savefig` would draw the figure again.  Three channels suffice and take a quarter less time.
-                    # A higher level of compression takes long for 3 %.
+                    # A higher level of compression takes much longer and makes files only 3 % smaller.
                     picture = Image.fromarray(np.asarray(canvas.buffer_rgba())).convert("RGB")
                     picture.save(beside / path.name, compress_level=3, dpi=(figure.dpi, figure.dpi))
                 else:

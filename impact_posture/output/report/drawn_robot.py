@@ -24,7 +24,8 @@ from impact_posture.robot.urdf import example_robot_data
 from impact_posture.system.arrays import Array
 from impact_posture.system.libraries import source_key
 
-# Most triangles of all meshes of a page, which bounds its size and the time to draw it in software.
+# Largest number of triangles of all meshes on a page. It limits the size of the page and the time to draw it in
+# software.
 _MOST_TRIANGLES = 150_000
 # Corners of a mesh are integer multiples of its extent divided by this.
 _LEVELS = 65535
@@ -36,7 +37,7 @@ _BOX_FACES = np.array(
     [[0, 2, 1, 1, 2, 3, 4, 5, 6, 5, 7, 6, 0, 1, 4, 1, 5, 4], [2, 6, 3, 3, 6, 7, 0, 4, 2, 2, 4, 6, 1, 3, 5, 3, 7, 5]],
     dtype=np.uint32,
 ).reshape(-1, 3)
-# Bytes at the begin of a COLLADA file in which its colors are sought.
+# Number of bytes at the beginning of a COLLADA file that are searched for colors.
 _HEAD = 200_000
 
 Color = tuple[float, ...]

@@ -22,10 +22,10 @@ from impact_posture.system.output_folder import write_whole
 from impact_posture.version import __version__
 
 _VIEWER = Path(__file__).parent / "viewer"
-# Colors of a figure.  Lines and letters have few, and 64 colors make a figure four times smaller.
+# Colors of a figure.  Lines and letters need few colors, and 64 colors make a figure four times smaller.
 _COLORS = 64
 _TYPES = {".png": "image/png", ".svg": "image/svg+xml"}
-# Place of a curve in its chart, in the units of its view box.
+# Area of a curve in its chart, in the units of the view box.
 _LEFT, _RIGHT, _TOP, _BOTTOM = 60.0, 390.0, 8.0, 92.0
 
 
@@ -75,7 +75,7 @@ def render(content: Content, scene: ReportScene, pictures: Sequence[tuple[str, s
     packed, arrays = scene.packed
     files = ("viewer.min.js", "loader.js", "page.css")
     viewer, loader, style = ((_VIEWER / name).read_text(encoding="utf-8") for name in files)
-    # Scripts end at "</", wherever it stands.
+    # A script ends at the first "</", even inside text.
     data = packed.replace("<", "\\u003c")
     text: str = _template().render(
         content=content, scene=scene, pictures=pictures, data=data, arrays=arrays, style=style, loader=loader,
@@ -88,7 +88,7 @@ def render(content: Content, scene: ReportScene, pictures: Sequence[tuple[str, s
 
 def figures(folder: Path) -> list[tuple[str, str]]:
     """Return name and address of each figure in a folder and below: SVG, or else PNG in fewer colors."""
-    # The page would pass on the target of a link, which may not belong to the result.
+    # Links are skipped, because the page would contain their target, which may not belong to the result.
     paths = (p for p in sorted(folder.rglob("*")) if p.suffix in _TYPES and p.is_file() and not p.is_symlink())
     # An SVG follows the PNG of the same name and replaces it.
     by_name = {str(path.relative_to(folder).with_suffix("")): path for path in paths}
@@ -125,7 +125,7 @@ def _template() -> Any:
     def shown(value: object) -> object:
         return printable(value, keep="\n\t") if isinstance(value, str) and not isinstance(value, Markup) else value
 
-    # Every text is escaped, without characters that change the direction of writing.
+    # Every text is escaped, and characters that change the writing direction are removed.
     environment = Environment(
         loader=FileSystemLoader(_VIEWER), autoescape=True, undefined=StrictUndefined, finalize=shown,
         trim_blocks=True, lstrip_blocks=True,
@@ -142,7 +142,8 @@ def _charts(track: Track) -> list[dict[str, Any]]:
         low, high = (float(values[known].min()), float(values[known].max())) if known.any() else (0.0, 0.0)
         low = min(low, 0.0) if low < 0.4 * high else low
         y = _BOTTOM - (_BOTTOM - _TOP) * (values - low) / ((high - low) or 1.0)
-        # The dictionary drops repeated points, because frames 1 ms apart mostly share a place.
+        # The dictionary drops repeated points, because most frames that are 1 ms apart have the same rounded
+        # position.
         points = [(f"{a:.1f},{b:.1f}", bool(good)) for a, b, good in zip(x, y, known, strict=True)]
         runs = [(good, dict(each)) for good, each in groupby(points, key=lambda point: point[1])]
         ends = [number(float(values[k])) for k in (0, -1)]

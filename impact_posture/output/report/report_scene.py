@@ -28,7 +28,7 @@ from impact_posture.system.arrays import Array
 _TYPES = {"uint16": "u2", "uint32": "u4", "float32": "f4"}
 # Directions from which the camera may look first.
 _EYES = np.array([[x, y, 0.55] for x in (1.1, -1.1) for y in (-1.25, 1.25)])
-# The camera sees the surface under this cosine with its normal best: neither edge-on nor from behind.
+# Best cosine between the viewing direction and the normal of the surface: neither edge-on nor from behind.
 _SLANT = 0.35
 # A curve: name, unit, and values at the frames.
 Curve = tuple[str, str, Array]

@@ -20,7 +20,7 @@ from impact_posture.posture.formulation.problem_file import Prepared
 from impact_posture.system.arrays import Array
 from impact_posture.system.output_folder import typed_command
 
-# Most frames of a motion.
+# Largest number of frames of a motion.
 _MOST = 121
 
 
@@ -121,7 +121,7 @@ def _content(folder: Path, prepared: Prepared, view: ResultView, document: dict[
     title, small = header_lines(view)
     facts = [fact for fact in small[0].split(SEPARATOR) if not fact.startswith(ALONE)]
     certificate, solver = document["certificate"], document["solver"]
-    # Results of former versions lack this number.
+    # Results of earlier versions do not have this number.
     dominated = solver.get("dominated_starts", 0)
     checks = [
         ("stationarity", certificate["stationarity"], ""),
