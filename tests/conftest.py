@@ -1,4 +1,4 @@
-"""Settings that every test shares."""
+"""Settings that all tests share."""
 
 from __future__ import annotations
 
@@ -8,15 +8,15 @@ import sys
 from collections.abc import Iterator
 from pathlib import Path
 
-# Where no bytecode may be written beside the sources, each process that a test starts would compile all that it
-# imports, for seconds.  They share what the first of them has compiled.
+# If Python may not write bytecode next to the sources, every test process would compile all imports again, which
+# takes seconds.  A shared bytecode folder avoids this.
 if sys.dont_write_bytecode and not sys.pycache_prefix:
     sys.pycache_prefix = str(Path(__file__).parents[1] / "build" / "bytecode")
     sys.dont_write_bytecode = False
     os.environ["PYTHONPYCACHEPREFIX"] = sys.pycache_prefix
     os.environ.pop("PYTHONDONTWRITEBYTECODE", None)
 
-# Before numpy is imported: workers that share the cores must not each start a thread on every core.
+# Set this before importing numpy, because parallel test workers must not each start a thread on every core.
 for name in ("OMP_NUM_THREADS", "MKL_NUM_THREADS"):
     os.environ.setdefault(name, "1")
 
@@ -28,7 +28,7 @@ from impact_posture.impact.worst_case_objective import WorstCaseObjective  # noq
 from impact_posture.robot.robot_loader import load_robot  # noqa: E402
 from tests.support.rounding import other_rounding  # noqa: E402
 
-# The same examples on every run and on every worker; a slow machine is no failure.
+# Every run and every worker use the same examples; a slow machine must not cause a failure.
 settings.register_profile(
     "impact-posture", deadline=None, derandomize=True, max_examples=20, suppress_health_check=[HealthCheck.too_slow]
 )
@@ -41,7 +41,7 @@ def pytest_addoption(parser: pytest.Parser) -> None:
 
 
 def pytest_collection_finish() -> None:
-    """Leave to the collector what the tests make: what was imported stays, and was looked through again and again."""
+    """Freeze all imported objects, so that the garbage collector only examines objects that tests create."""
     gc.collect()
     gc.freeze()
     gc.set_threshold(20_000, 20, 20)
@@ -49,7 +49,7 @@ def pytest_collection_finish() -> None:
 
 @pytest.fixture(scope="module", autouse=True)
 def unoptimized(request: pytest.FixtureRequest) -> Iterator[None]:
-    """Compile C code for its numbers alone; at -O2, as it is shipped, in modules that say ``OPTIMIZED = True``."""
+    """Compile C code without optimization; modules with ``OPTIMIZED = True`` use -O2, as users do."""
     with pytest.MonkeyPatch.context() as patch:
         if not getattr(request.module, "OPTIMIZED", False):
             patch.setenv("CFLAGS", "-O0")
@@ -71,7 +71,7 @@ def rounding_of_this_run(request: pytest.FixtureRequest) -> Iterator[None]:
         yield
 
 
-# One link about z: where it points along x, it cannot move along x at all.
+# A link that rotates about z.  If the link points along x, its tip cannot move along x.
 PENDULUM = """<robot name="pendulum">
   <link name="base"/>
   <link name="arm"><inertial><origin xyz="0.5 0 0"/><mass value="2"/>

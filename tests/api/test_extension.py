@@ -1,4 +1,4 @@
-"""Extensions from outside the package: an objective, a constraint, a task, and a controller of experiments."""
+"""Extensions from outside the package: an objective, a constraint, a task, and an experiment controller."""
 
 from __future__ import annotations
 
@@ -45,7 +45,7 @@ EXAMPLE = Path(__file__).parents[2] / "docs" / "examples" / "setback"
 
 @dataclass(frozen=True)
 class JointDistance:
-    """``1 + ‖q − q*‖²`` of a robot whose joints are all revolute."""
+    """Objective ``1 + ‖q − q*‖²`` for a robot whose joints are all revolute."""
 
     robot: Robot
     target: tuple[float, ...]
@@ -79,7 +79,7 @@ class JointDistance:
 
 
 class Coupled(ExpressionConstraint):
-    """The first two joints' angles add up to a value."""
+    """Constraint that the angles of the first two joints add up to a given value."""
 
     def __init__(self, total: float) -> None:
         self.name = "coupled joints"
@@ -105,7 +105,7 @@ def test_another_objective_with_another_constraint(name: str) -> None:
     assert "coupled joints held" in problem.describe()
     solution = solve(problem, starts=2, jobs=1)
     expected = np.clip(target, problem.lower, problem.upper)
-    # The projection of the target onto q₁ + q₂ = c moves both joints alike.
+    # The projection of the target onto q₁ + q₂ = c changes both angles equally.
     expected[:2] += (total - expected[:2].sum()) / 2
     assert solution.certificate.holds()
     np.testing.assert_allclose(solution.q, expected, atol=1e-7)
@@ -115,11 +115,11 @@ def test_another_objective_with_another_constraint(name: str) -> None:
 
 @pytest.fixture
 def setback(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> ModuleType:
-    """The package docs/examples/setback, as installed: a module, and metadata with its entry points."""
+    """The package docs/examples/setback as if installed: a module, and metadata with its entry points."""
     shutil.copy(EXAMPLE / "setback.py", tmp_path)
     project = tomllib.loads((EXAMPLE / "pyproject.toml").read_text(encoding="utf-8"))["project"]
     added = [f"{name} = {value}" for name, value in project["entry-points"][GROUP].items()]
-    # Of other packages: one cannot be imported, one makes something else.
+    # Further entry points of other packages: `gone` cannot be imported, `number` and `odd` do not create drivers.
     added += ["gone = setback_gone:make", "number = setback:len", "odd = setback:Vector"]
     metadata = tmp_path / "setback-1.0.dist-info"
     metadata.mkdir()
@@ -131,7 +131,7 @@ def setback(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> ModuleType:
 
 
 def test_another_task_in_the_controller(setback: ModuleType) -> None:
-    """A critically damped joint: ``e(t) = e₀ (1 + ωt) exp(−ωt)`` with ``ω = √K_p``."""
+    """Error of a critically damped joint: ``e(t) = e₀ (1 + ωt) exp(−ωt)`` with ``ω = √K_p``."""
     arm, dt, omega = robot("panda"), 1e-3, 6.0
     q, v = arm.posture(), np.zeros(arm.nv)
     task = setback.JointAngle(arm, "panda_joint4", q[3] + 0.2, omega**2)
@@ -161,7 +161,7 @@ def test_another_controller_lives_through_a_scenario(setback: ModuleType) -> Non
 
 
 def test_the_installed_command_runs_a_registered_controller(setback: ModuleType, tmp_path: Path) -> None:
-    """Two faults that only the other package can correct, and a misspelt name, are one line each."""
+    """Two faults of the other package and a misspelled name give a one-line error each."""
     needs_mujoco()
     scenario = tmp_path / "aerial.toml"
     scenario.write_text(cut("aerial-vertical", count=1, settle=0.1, dwell=0.2, pause=0.05), encoding="utf-8")
@@ -188,7 +188,7 @@ def test_what_another_package_makes_must_be_a_driver(setback: ModuleType, name: 
 
 
 def test_a_registered_controller_is_compared_and_runs_again(setback: ModuleType, tmp_path: Path) -> None:
-    """A stored run of it does not count, because its code may be another."""
+    """Stored runs of a registered controller are ignored, because its code may have changed."""
     needs_mujoco()
     scenario = tmp_path / "aerial.toml"
     scenario.write_text(cut("aerial-vertical", count=1, settle=0.1, dwell=0.2, pause=0.05), encoding="utf-8")

@@ -1,4 +1,4 @@
-"""``import impact_posture as ip``: the main job from Python, with the defaults of the command line."""
+"""``import impact_posture as ip``: the main task from Python, with the defaults of the command line."""
 
 from __future__ import annotations
 
@@ -117,7 +117,7 @@ def test_evaluation_has_its_numbers() -> None:
 def test_a_result_saves_what_the_command_line_writes(
     result: ip.PostureResult, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
-    # Blank pictures, as the command draws here.
+    # Replace the figures by blank ones, as the test of the command does.
     for name in ALL_PICTURES:
         monkeypatch.setitem(plot.FIGURES, name, blank)
     written = result.save(tmp_path / "python", codegen=False, report=False, jobs=1)
@@ -132,7 +132,7 @@ def test_a_result_saves_what_the_command_line_writes(
             document["solver"].pop(key)
     assert python == cli
     toml = [(folder / "problem.toml").read_text().splitlines() for folder in (written.out, theirs)]
-    # In Python, the number of starts is not part of the problem.
+    # In Python, the number of starts does not belong to the problem.
     assert [a for a, b in zip(*toml, strict=True) if a != b] == ["starts = 16"]
     assert run("optimize", written.out / "problem.toml", "--out", "again", "--starts", 2, "--no-codegen",
                cwd=tmp_path).returncode == 0  # fmt: skip
@@ -149,7 +149,7 @@ def test_a_result_draws_and_exports_itself(result: ip.PostureResult, tmp_path: P
     value, slope = gradient.objective(result.q)
     assert value == pytest.approx(result.problem.problem.objective.value(result.q), rel=1e-9)
     for q, n in ((0.1, UP), ([0.1], UP), (result.q, 1.0), (result.q, [1.0]), (result.q[None], UP), (result.q, None)):
-        # A number that is broadcast over all joints must not give an answer.
+        # A scalar must not be broadcast over all joints; it must raise an error.
         with pytest.raises((TypeError, ValueError)):
             gradient.value_and_gradient(q, n)
     robot = result.problem.problem.robot
@@ -186,7 +186,7 @@ def test_the_code_of_a_result_is_the_code_of_its_objective(result: ip.PostureRes
     portable = objective.export(tmp_path / "portable", portable=True, build=False).out
     with pytest.raises(OutputError, match="`force` to replace it"):
         objective.export(portable)
-    # An export with other options than the defaults is never reused.
+    # An existing export with other options than the defaults is never reused.
     with pytest.raises(OutputError, match="choose another `out`"):
         objective.export(folder, prefix="arm")
     manifest = folder / "tilthex_arm_ee.json"
@@ -219,7 +219,7 @@ def test_an_objective_from_outside_is_optimized_and_cannot_be_saved(tmp_path: Pa
 def test_the_shown_lines_run(page: str, tmp_path: Path) -> None:
     text = (Path(__file__).parents[2] / page).read_text(encoding="utf-8")
     blocks = re.findall(r"^```python\n(.*?)^```", text, re.MULTILINE | re.DOTALL)
-    # One figure stands for all: other tests draw them.
+    # Draw only one figure, because other tests cover the others.
     code = "import impact_posture.output.plot as p; p.drawable = lambda view: ['jump']\n" + "\n".join(blocks)
     done = subprocess.run([sys.executable, "-c", code], cwd=tmp_path, capture_output=True, text=True, check=False)
     assert done.returncode == 0, done.stderr

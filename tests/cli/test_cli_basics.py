@@ -1,4 +1,4 @@
-"""The installed ``impact-posture``: commands, JSON, exit codes, one-line errors and the time of the help."""
+"""The installed ``impact-posture``: commands, JSON, exit codes, one-line errors, and how fast the help appears."""
 
 from __future__ import annotations
 
@@ -30,7 +30,7 @@ PUSH = ("evaluate", "tilthex_arm", "--normal", "0", "0", "1")
 
 @functools.cache
 def document(*arguments: str) -> dict[str, Any]:
-    """Return the JSON document of a successful run, strictly parsed."""
+    """Return the JSON document of a successful run, parsed strictly."""
 
     def refuse(constant: str) -> None:
         raise AssertionError(f"{constant} is not JSON")
@@ -51,14 +51,14 @@ def test_help_comes_at_once_and_names_the_commands() -> None:
         before = resource.getrusage(resource.RUSAGE_CHILDREN)
         done = subprocess.run([str(COMMAND), "--help"], capture_output=True, text=True, timeout=60)
         after = resource.getrusage(resource.RUSAGE_CHILDREN)
-        # Processor time, because a loaded machine makes a program wait.
+        # Measure processor time, because programs wait on a loaded machine.
         times.append(after.ru_utime - before.ru_utime + after.ru_stime - before.ru_stime)
         assert done.returncode == 0
         if times[-1] < 1.0:
             break
     for name in ("robots", "inspect", "evaluate", "optimize", "plot"):
         assert f" {name} " in done.stdout
-    # The limit is 0.3 s, with a margin for slow processors.
+    # The limit is 0.3 s plus a margin for slow processors.
     assert min(times) < 1.0
 
 
@@ -308,7 +308,7 @@ def test_a_package_folder_is_looked_for_where_the_user_is(tmp_path: Path) -> Non
 
 
 class Raises:
-    """A command that raises an error."""
+    """Replacement for a command, which raises an error."""
 
     def __init__(self, error: BaseException) -> None:
         self.error = error
@@ -355,5 +355,5 @@ def test_a_long_wait_is_estimated_from_the_pace_so_far() -> None:
     from impact_posture_cli.progress_line import _time_left
 
     assert _time_left(30.0, 10, 20) == ", 0:01:00 left"
-    # There is no pace yet, or nothing is left.
+    # The time left is unknown without a first duration, and not shown if nothing is left.
     assert [_time_left(1.0, 10, 20), _time_left(30.0, 0, 20), _time_left(30.0, 30, 0)] == ["", "", ""]

@@ -1,4 +1,4 @@
-"""``optimize`` and ``plot`` as a user runs them: what they write, say and show."""
+"""``optimize`` and ``plot`` as a user runs them: output files, printed lines and figures."""
 
 from __future__ import annotations
 
@@ -27,7 +27,7 @@ FAST = ("--starts", "2", "--jobs", "1", "--no-codegen", "--format", "png")
 
 @pytest.fixture(scope="module")
 def result(tmp_path_factory: pytest.TempPathFactory) -> Path:
-    """One result of the main job, pictures and C code included."""
+    """Return a result folder of `optimize`, with figures and C code."""
     folder = tmp_path_factory.mktemp("main-job")
     done = run("optimize", "tilthex_arm", "--frame", "ee", "--normal", 0, 0, 1, cwd=folder, pictures=ALL_PICTURES)
     assert done.returncode == 0, done.stderr
@@ -40,7 +40,7 @@ def test_main_job_leaves_everything(result: Path) -> None:
     for figure in ("ellipsoid", "postures", "jump", "nullspace"):
         assert (result / f"{figure}.png").stat().st_size > 3000
     assert not [name for name in names if name.endswith((".svg", ".pdf"))]
-    # Only where it is asked for.
+    # Without `--tradeoff`, the result contains no trade-off.
     assert not (result / "tradeoff.png").exists()
     assert "tradeoff" not in json.loads((result / "result.json").read_text())
     assert any((result / "c").glob("*.c")) and any((result / "c").glob("*.h"))
@@ -173,7 +173,7 @@ def test_no_redundancy_is_said(tmp_path: Path) -> None:
 
 
 def test_aerial_robot_that_cannot_hover_is_warned_about(tmp_path: Path) -> None:
-    """Rotors that reach half of their speed cannot carry the weight; no optimum hides it."""
+    """Rotors limited to half of their speed cannot carry the weight, and the warning says so despite an optimum."""
     from impact_posture_robots import DATA
 
     spec = (DATA / "tilthex_arm" / "robot.toml").read_text().replace("speed_max = 100.0", "speed_max = 50.0")
@@ -189,7 +189,7 @@ def test_aerial_robot_that_cannot_hover_is_warned_about(tmp_path: Path) -> None:
 
 
 def test_surface_and_locking_are_warned_about(tmp_path: Path) -> None:
-    """A normal that points into the surface puts the whole robot behind it."""
+    """If the normal points into the surface, the whole robot is behind the surface."""
     wrong = ("optimize", "tilthex_arm", "--normal", 0, 0, -1, "--json", *FAST)
     done = run(*wrong, "--no-collision", cwd=tmp_path)
     assert any("check its sign" in w for w in json.loads(done.stdout)["warnings"])
@@ -201,7 +201,7 @@ def test_surface_and_locking_are_warned_about(tmp_path: Path) -> None:
 
 
 def test_knees_below_the_ground_and_a_growing_jump_are_said(tmp_path: Path) -> None:
-    """The best posture of this quadruped folds two knees under its feet, and V rises while H falls."""
+    """In the best posture, this quadruped folds two knees below its feet, and V increases while H decreases."""
     command = ("optimize", "anymal_c", "--normal", 0, 1, 0, "--json", "--no-codegen", "--no-report")
     done = run(*command, "--starts", 6, "--out", "clear", cwd=tmp_path)
     clear = json.loads(done.stdout)
@@ -245,7 +245,7 @@ def test_progress_is_shown_on_a_terminal_only(tmp_path: Path) -> None:
     draw = ("plot", "ur5-tool0", "--figure", "jump")
     for other in ("--quiet", "--json"):
         assert on_terminal(*draw, other, cwd=tmp_path) == ""
-    # And of the program as a shell starts it.
+    # Repeat the check for the program started from a shell.
     ours, theirs = os.openpty()
     with subprocess.Popen([COMMAND, *draw], cwd=tmp_path, stdout=subprocess.DEVNULL, stderr=theirs) as process:
         os.close(theirs)
@@ -254,7 +254,7 @@ def test_progress_is_shown_on_a_terminal_only(tmp_path: Path) -> None:
 
 
 def test_the_answer_stands_before_pictures_and_c_code(tmp_path: Path) -> None:
-    """A compiler that waits for a file: the answer is there before it ends, and what it says comes after."""
+    """The compiler waits for a file.  The result is printed before the compiler ends, its error afterwards."""
     compiler = tmp_path / "cc"
     compiler.write_text(
         '#!/bin/sh\nwhile [ ! -e go ] && [ ! -e "$GO" ]; do sleep 0.05; done\necho "error: no" >&2\nexit 1\n'
@@ -271,7 +271,7 @@ def test_the_answer_stands_before_pictures_and_c_code(tmp_path: Path) -> None:
             first += line
             if line.startswith("optima") or "starts certified" in line:
                 break
-        # Nothing has been written yet, and the compiler still waits.
+        # The output folder does not exist yet, and the compiler still waits.
         assert "reduction" in first and "certificate" in first and not (tmp_path / "ur5-tool0").exists()
         (tmp_path / "go").touch()
         rest = out.read()
@@ -296,7 +296,7 @@ def test_pictures_that_fail_after_the_answer_end_in_one_line(tmp_path: Path) -> 
 
 
 def test_what_holds_the_posture_is_told(tmp_path: Path) -> None:
-    """The three tightest actuators under each load, on the terminal and in the document."""
+    """The output lists the three most loaded actuators under each load, on the terminal and in the JSON document."""
     asked = ("optimize", "tilthex_arm", "--normal", 0, 0, 1, "--hold-force", 3, *FAST)
     done = run(*asked, cwd=tmp_path)
     assert done.returncode == 0, done.stderr
@@ -311,7 +311,7 @@ def test_what_holds_the_posture_is_told(tmp_path: Path) -> None:
             assert max(shares) == load["largest_share"] <= 1
             assert all(one["low"] <= one["value"] <= one["high"] for one in load["actuators"].values())
         thrusts = [sum(v["value"] for k, v in one["actuators"].items() if "rotor" in k) for one in (block, pushing)]
-        # The surface carries what the tool presses on it.
+        # The surface supports the force with which the tool pushes, so the thrust is smaller.
         assert thrusts[1] < thrusts[0]
     again = run("optimize", tmp_path / "tilthex_arm-ee" / "problem.toml", "--out", "again", "--json", cwd=tmp_path)
     assert json.loads(again.stdout)["optimal"]["holding"]["other_loads"][0]["load"] == "while it pushes with 3 N"

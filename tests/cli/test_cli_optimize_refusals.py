@@ -1,4 +1,4 @@
-"""``optimize`` refuses bad input, conflicts and interrupts, and leaves nothing behind."""
+"""``optimize`` rejects invalid input and conflicts, can be interrupted, and leaves no partial files behind."""
 
 from __future__ import annotations
 
@@ -99,7 +99,7 @@ def test_existing_output_is_kept(tmp_path: Path) -> None:
 
 
 def test_the_home_folder_in_the_output(tmp_path: Path) -> None:
-    """A shell does not replace the tilde of ``--out=~/taken``."""
+    """A shell does not expand the tilde in ``--out=~/taken``."""
     (tmp_path / "home/taken").mkdir(parents=True)
     (tmp_path / "home/taken/note").touch()
     done = run(*BASE, "--out=~/taken", cwd=tmp_path, env={"HOME": str(tmp_path / "home")})
@@ -151,14 +151,14 @@ def test_interrupt_in_mid_solve_leaves_nothing(jobs: int, tmp_path: Path) -> Non
     command = [str(COMMAND), *map(str, BASE), "--starts", "100000", "--jobs", str(jobs)]
     process = subprocess.Popen(
         command, cwd=tmp_path, stdout=subprocess.PIPE, stderr=subprocess.PIPE, text=True, start_new_session=True,
-        # A shell starts programs in the background with this signal ignored.
+        # A shell starts background programs with this signal ignored.
         preexec_fn=lambda: signal.signal(signal.SIGINT, signal.SIG_DFL),
     )  # fmt: skip
     assert process.stdout is not None
     while "joint limits" not in process.stdout.readline():
         assert process.poll() is None
     time.sleep(0.7)
-    # As a terminal does: to every process of the group.
+    # Send SIGINT to every process of the group, as a terminal does on Ctrl-C.
     os.killpg(process.pid, signal.SIGINT)
     try:
         _, errors = process.communicate(timeout=30)

@@ -1,4 +1,4 @@
-"""Robots without a robot.toml on the command line: hints, warnings, locked joints and drafts."""
+"""Robots without a robot.toml on the command line: hints, warnings, locked joints, and drafted files."""
 
 from __future__ import annotations
 
@@ -29,7 +29,7 @@ UP = ("--normal", "0", "0", "1")
 
 
 def call(capsys: pytest.CaptureFixture[str], *arguments: str) -> tuple[int, str, str]:
-    """Run the command line in this process: exit code, standard output, standard error."""
+    """Run the command line in this process; return exit code, standard output and standard error."""
     code = run(typer.main.get_command(app), put_right(arguments))
     return code, *capsys.readouterr()
 
@@ -53,7 +53,7 @@ def test_a_floating_robot_without_feet_or_rotors_needs_a_support(
     assert code == 1 and errors.count("\n") == 1
     for word in (words, "--no-support", "--base", "robot.toml", "--write-robot-toml"):
         assert word in errors
-    # An evaluation only warns.
+    # The command `evaluate` only prints a warning.
     code, _, errors = call(capsys, "evaluate", DATA + path, *asked)
     assert code == 0
     assert any("floating freely" in line and words in line for line in errors.splitlines())
@@ -64,7 +64,7 @@ def test_a_stated_support_needs_no_hint(more: dict[str, Any]) -> None:
     settings = {"robot": B1_Z1, "root": "free-flyer", "frame": "link06", "normal": (0, 0, 1), **more}
     prepared = prepare(make_settings(settings))
     assert not any("floating freely" in line for line in prepared.impact.warnings)
-    # The resolved problem also states the support.
+    # The problem file with resolved settings also names the support, so it can be prepared again.
     prepare(resolved_settings(prepared))
 
 
@@ -119,7 +119,7 @@ def test_an_srdf_in_the_data_package() -> None:
     load = {"robot": B1_Z1, "srdf": SRDF, "root": "free-flyer", "frame": "link06", "normal": (0, 0, 1), "support": ()}
     prepared = prepare(make_settings(load))
     assert prepared.impact.robot.default_posture == "standing_with_arm_home"
-    # The name does not become a path of this machine.
+    # The name of the SRDF must not become a path on this machine.
     assert resolved_settings(prepared).srdf == SRDF
 
 

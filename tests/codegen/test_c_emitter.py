@@ -1,4 +1,4 @@
-"""Every CasADi operation as C, and literals that read back exactly."""
+"""Every CasADi operation is written as C, and number literals are read back exactly."""
 
 from __future__ import annotations
 
@@ -21,7 +21,7 @@ OPTIMIZED = True
 
 
 def c_function(function: ca.Function) -> str:
-    """Return the C of ``void f(inputs..., outputs...)`` for an SX function."""
+    """Return the C code of ``void f(inputs..., outputs...)`` for a CasADi SX function."""
     graph = graph_of(function)
     layout = lay_out(graph, [function.name_out()], block=10)
     constants = Constants("f", DOUBLE)

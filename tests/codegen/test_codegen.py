@@ -1,4 +1,4 @@
-"""The C export is generated, compiled, loaded, and compared with CasADi, finite differences and Pinocchio."""
+"""The C export is generated, compiled and loaded, then compared with CasADi, finite differences and Pinocchio."""
 
 from __future__ import annotations
 
@@ -93,13 +93,14 @@ def built(request: pytest.FixtureRequest, tmp_path_factory: pytest.TempPathFacto
 
 
 def test_agrees_with_casadi(built: Built) -> None:
-    # The C code multiplies by reciprocals.  Stiff feet (1/ε of 1e4 robots) amplify the difference in the last digits.
+    # The C code multiplies by reciprocals.  Stiff feet (1/ε of 1e4 robot masses) amplify the rounding difference.
     tolerance = 1e-10 if built.objective.supports else 1e-12
     assert largest_difference(built.library.gradient, built.objective, casadi_reference, 10) <= tolerance
 
 
 def test_agrees_with_pinocchio(built: Built) -> None:
-    # The oracle solves the KKT system of feet at compliance 1e-4/m, whose condition costs at least four digits.
+    # The oracle solves a KKT system for feet with compliance 1e-4/m.  Its condition number costs at least four
+    # digits.
     tolerance = 1e-8 if built.objective.supports else 1e-11
     assert largest_difference(built.library.gradient, built.objective, oracle_reference, 10) <= tolerance
 
@@ -121,7 +122,7 @@ def test_gradients_equal_differences_of_the_values(built: Built) -> None:
 
 
 def test_free_beside_standing(built: Built) -> None:
-    """The export of a standing robot also has the functions without supports, equal to Pinocchio without supports."""
+    """The export of a standing robot also has functions without supports, equal to Pinocchio without supports."""
     objective, frame = built.objective, built.export.manifest["frames"][0]
     assert (frame["free"] is None) == (not objective.supports)
     if objective.supports:
@@ -153,7 +154,7 @@ def test_codes(built: Built) -> None:
         broken[-1] = bad
         code, H, gradient = library.eval(broken, UNIT)
         assert code == library.objective(broken)[0] == library.value(broken, UNIT)[0] == 1
-        assert np.isnan(H) and np.isnan(gradient).all()  # as the caller left them
+        assert np.isnan(H) and np.isnan(gradient).all()  # outputs are still the NaN of the caller
         assert library.eval(q, np.array([bad, 0, 0]))[0] == library.value(q, np.array([0, bad, 0]))[0] == 1
 
 
@@ -194,7 +195,7 @@ def test_library_holds_no_writable_data(built: Built) -> None:
         [need("nm"), built.library.gradient._library._name], capture_output=True, text=True, check=True
     ).stdout.splitlines()
     symbols = [line.split()[-2:] for line in lines]
-    # The symbols of every library begin with an underscore, except ``completed``.
+    # Ignore compiler symbols: their names begin with an underscore or with ``completed``.
     own = [(kind, name) for kind, name in symbols if not name.startswith(("_", "completed."))]
     assert not [name for kind, name in own if kind in "bBdDcCsSgG"]
     names = {name for kind, name in own if kind in "TR"}
@@ -220,7 +221,7 @@ def test_posture_is_a_constant(built: Built) -> None:
     np.testing.assert_array_equal(built.export.manifest["posture"], np.array(array))
 
 
-# A robot with vectors and comparisons, and a robot without both.
+# Robots whose code contains vectors and comparisons, and a robot without both.
 @pytest.mark.parametrize("built", ["solo12-standing", "hextilt"], indirect=True)
 def test_compiles_as_cpp(built: Built, tmp_path: Path) -> None:
     compiler = need("g++")

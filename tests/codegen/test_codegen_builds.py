@@ -1,4 +1,4 @@
-"""The export over joint types, metrics, objectives and number types; build tools; its folder and its command."""
+"""The export for all joint types, metrics, objectives and number types; build tools, export folder and command."""
 
 from __future__ import annotations
 
@@ -37,7 +37,7 @@ JOINTS = [
 
 
 def chain(joints: list[tuple[str, str]] = JOINTS) -> str:
-    """Return a robot with every joint type of a URDF, or with some of them."""
+    """Return a robot with every joint type of a URDF, or with the given ones."""
     inertial = (
         '<inertial><origin xyz="0.05 0.02 -0.03" rpy="0.1 0.2 0.3"/><mass value="{m}"/>'
         '<inertia ixx="0.02" ixy="0.001" ixz="0" iyy="0.03" iyz="-0.002" izz="0.025"/></inertial>'
@@ -59,7 +59,7 @@ def run(command: list[str], folder: Path) -> str:
     return done.stdout + done.stderr
 
 
-# Every kind, metric, joint, base and number type, in different combinations.
+# Every objective, metric, joint type, base and number type occurs in some combination.
 GRID = [
     ("euclidean", "impulse", "fixed", DOUBLE, JOINTS),
     ("weighted", "speed", "free-flyer", DOUBLE, JOINTS),
@@ -137,7 +137,8 @@ def test_frames_must_differ_in_the_contact_alone(two: tuple[WorstCaseObjective, 
     assert not list(tmp_path.iterdir())
 
 
-# Every lane width, also wider than this processor's, and compilers that inline functions or store all variables.
+# Flags for every lane width (also wider than this processor supports), with inlining and with all variables in
+# memory.
 STACK_FLAGS = ("-O0", "-O3 -march=native", "-O3 -mavx2 -mfma", "-O3 -mavx512f -mfma", "-O0 -mavx512f")
 
 
@@ -148,7 +149,7 @@ def test_stack_stays_below_its_bound(arm: WorstCaseObjective, tmp_path: Path, re
     bound = export(arm, tmp_path, prefix="arm", real=real, check=False).manifest["stack_bytes"]
     assert f"#define ARM_STACK_BYTES {bound}\n" in (tmp_path / "arm.h").read_text()
     assert f"at most {bound} bytes" in (tmp_path / "README.md").read_text()
-    # Floats need half the stack of doubles, so no vectors and the widest vectors are enough.
+    # Floats need half the stack of doubles, so two of the flag sets suffice: without vectors, and with wide vectors.
     for flags in STACK_FLAGS if real is DOUBLE else STACK_FLAGS[::3]:
         if deepest := deepest_stack(tmp_path, "arm", tool, flags):
             assert deepest <= bound, flags
@@ -162,12 +163,12 @@ def test_stack_of_a_robot_that_stands(tmp_path: Path, tool: str) -> None:
     objective = WorstCaseObjective(solo8, ImpactContact("base_link", (1, 0, 0)), supports=feet)
     bound = export(objective, tmp_path, prefix="solo8", check=False).manifest["stack_bytes"]
     deepest = deepest_stack(tmp_path, "solo8", tool, "-O3 -mavx512f -mfma")
-    # The bound is at most twice the real depth, because users reserve a stack of this size.
+    # The bound is at most twice the measured depth, because users reserve a stack of this size.
     assert bound / 2 <= deepest <= bound
 
 
 def deepest_stack(folder: Path, prefix: str, tool: str, flags: str) -> int:
-    """Return the bytes of the deepest call, by the compiler; 0 if it does not know the flags."""
+    """Return the stack bytes of the deepest call, as reported by the compiler; 0 if the flags are unsupported."""
     command = [tool, "-std=c99", "-ffp-contract=fast", *flags.split(), "-fstack-usage", "-c", f"{prefix}.c"]
     try:
         run_compiler([*command, "-o", str(folder / "made.o")], folder)
@@ -176,7 +177,7 @@ def deepest_stack(folder: Path, prefix: str, tool: str, flags: str) -> int:
     (usage,) = folder.glob("*.su")
     rows = [line.split("\t") for line in usage.read_text().splitlines()]
     usage.unlink()
-    # "dynamic,bounded" is an aligned frame; "dynamic" alone would be an alloca.
+    # "dynamic,bounded" marks an aligned stack frame; "dynamic" alone would mark an alloca.
     assert {row[2] for row in rows} <= {"static", "dynamic,bounded"}
     sizes = {row[0].split(":")[-1]: int(row[1]) for row in rows}
     inner = [size for name, size in sizes.items() if "_block" in name or "sincos" in name]
@@ -184,7 +185,8 @@ def deepest_stack(folder: Path, prefix: str, tool: str, flags: str) -> int:
         size for name, size in sizes.items() if "_lanes" in name and "_block" not in name and "sincos" not in name
     ]
     entries = [size for name, size in sizes.items() if "_block" not in name and "_lanes" not in name]
-    # Two nested entries or an entry with the batch, a block or the sines, and a return address for each.
+    # The outer functions are two nested entries, or an entry with the batch.  Blocks and sines follow.  Each call
+    # adds a return address.
     outer = max(sum(sorted(entries)[-2:]), max(entries) + max(lanes, default=0))
     return outer + max(inner) + 4 * 8
 
@@ -269,7 +271,7 @@ def test_example_under_sanitizers(plain_export: Path, tmp_path: Path) -> None:
 def test_folder_is_replaced_only_if_it_is_an_export(arm: WorstCaseObjective, tmp_path: Path) -> None:
     out = tmp_path / "project"
     out.mkdir()
-    # A file with the name of a manifest does not make a folder an export.
+    # A file with the name of a manifest does not make its folder an export.
     (out / "arm.json").write_text('{"name": "mine"}')
     for force in (False, True):
         with pytest.raises(OutputError):
@@ -392,7 +394,7 @@ def test_one_library_checks_a_source_with_any_posture(tmp_path: Path, monkeypatc
         written.append(export(objective, folder, posture=posture))
     assert written[0].agreement == written[1].agreement and written[0].manifest != written[1].manifest
     (library,) = (tmp_path / "cache" / "exports").glob("*.so")
-    # A damaged library is built again.  Without a writable cache, a library is built elsewhere.
+    # A damaged library is rebuilt.  If the cache is not writable, the library is built in another folder.
     library.unlink()
     library.write_bytes(b"")
     assert export(objective, folder, posture=posture, force=True).agreement == written[0].agreement

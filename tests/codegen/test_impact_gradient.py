@@ -1,4 +1,4 @@
-"""The compiled export from Python: numbers, views, batches, refusals and threads."""
+"""The compiled export in Python: numbers, views, batches, errors and threads."""
 
 from __future__ import annotations
 
@@ -109,7 +109,7 @@ def test_batches(loaded: Loaded, count: int) -> None:
     n /= np.linalg.norm(n, axis=1, keepdims=True)
     H, grad = gradient.value_and_gradient_batch(q, n)
     assert H.shape == (count,) and grad.shape == (count, robot.nv)
-    # The order of sums in a batch differs from a single call.
+    # A batch adds terms in another order than a single call, so the results differ by rounding.
     tolerance = 1e-12 if gradient.dtype == np.float64 else 1e-5
     for k in range(count):
         value, row = gradient.value_and_gradient(q[k], n[k])

@@ -1,4 +1,4 @@
-"""Unusable shapes, damaged caches, and impossible obstacles."""
+"""Unusable collision shapes, damaged caches, and impossible obstacles."""
 
 from __future__ import annotations
 
@@ -55,14 +55,14 @@ def joint(parent: str, child: str) -> str:
 
 
 def arm(folder: Path, *shapes: str, tag: str = "collision") -> RobotShapes:
-    """Return the shapes of an arm with three links: a box, these shapes, and a box."""
+    """Return the shapes of an arm with three links: a box, the given shapes, and a box."""
     text = f'<robot name="arm">{link("base", BOX)}{link("middle", *shapes, tag=tag)}{link("tip", BOX)}'
     (folder / "arm.urdf").write_text(f"{text}{joint('base', 'middle')}{joint('middle', 'tip')}</robot>")
     return load_shapes(load_robot(str(folder / "arm.urdf"), armature="none"))
 
 
 def fresh() -> None:
-    """Clear the cache in memory, as in a new process."""
+    """Clear the memory cache of shapes, as in a new process."""
     collision_shapes._shapes.cache_clear()
 
 
@@ -134,7 +134,7 @@ def test_a_bad_description_is_left_out_by_name(tmp_path: Path, geometry: str, fa
     urdf = tmp_path / "arm.urdf"
     urdf.write_text(text)
     robot = load_robot(str(urdf), armature="none")
-    # Some versions of Pinocchio refuse some of these shapes when they read the joints.
+    # Load the robot before the shape is added, because some versions of Pinocchio cannot read it.
     urdf.write_text(text.replace(link("middle", BOX), link("middle", geometry)))
     shapes, (line,) = read_urdf_shapes(robot)
     assert [shape.name for shape in shapes] == ["base"]
@@ -178,7 +178,7 @@ def test_an_open_mesh_is_closed_by_its_hull(tmp_path: Path) -> None:
 
 
 def test_a_corner_with_hundreds_of_edges(tmp_path: Path) -> None:
-    """A fine cone beside a box: coal takes 255 edges at a corner, and the tip has 400."""
+    """A fine cone next to a box: coal supports 255 edges per corner, but the tip of the cone has 400."""
     angles = np.linspace(0, 2 * np.pi, 401)
     rim = 0.08 * np.stack([np.cos(angles), np.sin(angles), 0 * angles], axis=1)
     tip = np.broadcast_to([0.0, 0.0, 0.2], (400, 3))
@@ -218,7 +218,7 @@ def test_a_robot_without_shapes_says_so(tmp_path: Path) -> None:
 
 
 def test_a_hundred_thousand_faces_take_less_than_five_seconds(tmp_path: Path) -> None:
-    """The mesh is the surface of a wavy ball."""
+    """The mesh is the surface of a ball with waves."""
     count = 224
     polar, around = np.meshgrid(np.linspace(0, np.pi, count), np.linspace(0, 2 * np.pi, count), indexing="ij")
     radius = 0.1 * (1 + 0.1 * np.sin(5 * polar) * np.cos(4 * around))
@@ -232,7 +232,7 @@ def test_a_hundred_thousand_faces_take_less_than_five_seconds(tmp_path: Path) ->
     assert time.process_time() - start < 5
     body = next(body for body in shapes.bodies if body.link == "middle")
     assert len(body.vertices) <= 40 and body.radius < 0.02
-    # A second robot with the same content has the same shapes.
+    # A second robot with the same content reuses the shapes.
     assert arm(tmp_path, mesh("fine.stl")) is shapes
 
 
@@ -267,7 +267,7 @@ def test_a_damaged_cache_is_fitted_again(tmp_path: Path, own_cache: Path, damage
     path = stored(own_cache)
     raw = path.read_bytes()
     if damage == "fields":
-        # The checksum fits, but a field is missing.
+        # The checksum is correct, but a field is missing.
         content = json.loads(raw.split(b"\n", 1)[1])
         del content["pairs"]
         changed = json.dumps(content)

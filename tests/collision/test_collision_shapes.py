@@ -1,4 +1,4 @@
-"""Collision shapes of robots: hulls that contain all shapes, pairs that must not touch, and the check of meshes."""
+"""Collision shapes of robots: hulls that contain all shapes, pairs that must not touch, and mesh collision checks."""
 
 from __future__ import annotations
 
@@ -38,7 +38,7 @@ def check_of(name: str) -> MeshCheck:
 
 
 def surface(shape: pin.GeometryObject, random: np.random.Generator, count: int) -> Array:
-    """Return points on the surface of a shape in the axes of its joint, by independent formulas."""
+    """Return points on the surface of a shape in joint axes, computed by independent formulas."""
     solid, unit = shape.geometry, random.normal(size=(count, 3))
     unit /= np.linalg.norm(unit, axis=1)[:, None]
     match solid:
@@ -60,7 +60,7 @@ def surface(shape: pin.GeometryObject, random: np.random.Generator, count: int) 
 
 
 def outside(body: SweptHull, points: Array) -> Array:
-    """Return the distances of points outside a swept hull, m."""
+    """Return the distances by which points are outside a swept hull, m."""
     if len(body.vertices) > 3:
         planes = ConvexHull(body.vertices).equations
         points = points[np.max(points @ planes[:, :3].T + planes[:, 3], axis=1) > 0]
@@ -90,12 +90,12 @@ def test_pairs_leave_out_neighbors_and_links_that_the_srdf_allows_to_touch(name:
     if robot.spec.model.srdf:
         path = resolve_path(robot.spec.model.srdf, robots_data() / name)
         pin.removeCollisionPairs(robot.model, srdf, str(path), False)
-    # Pinocchio finds no more pairs to remove.
+    # Pinocchio does not remove any further pair.
     assert len(srdf.collisionPairs) == len(shapes.geometry.collisionPairs)
     for i, j in shapes.pairs:
         a, b = shapes.bodies[i].joint, shapes.bodies[j].joint
         assert a != b and parents[a] != b and parents[b] != a
-    # There is a pair of bodies for each pair of shapes that must not touch, and no other pair.
+    # Each pair of shapes that must not touch belongs to a pair of bodies, and there are no other pairs of bodies.
     joints = {(shapes.bodies[i].joint, shapes.bodies[j].joint) for i, j in shapes.pairs}
     named = {body.name: body.joint for body in shapes.bodies}
     nested = (*shapes.hulls_touching, *(planes.bodies for planes in shapes.joint_planes))
@@ -151,7 +151,7 @@ def test_obstacles_and_planes_are_found_by_name() -> None:
     )
     assert {name for _, name in hits} == {"ball"}
     assert {shape.partition("[")[0] for shape, _ in hits} <= {"panda_hand", "panda_leftfinger", "panda_rightfinger"}
-    # The whole robot is above the ground, but parts of its base reach below.
+    # The whole robot is above the ground except parts of its base, which are exempt.
     base = {0}
     ground = SimpleNamespace(name="ground", point=np.zeros(3), normal=np.array([0.0, 0.0, 1.0]), exempt=base)
     assert mesh_collisions(robot, shapes, q, planes=[ground]) == []
@@ -171,7 +171,7 @@ def test_a_check_of_many_postures_equals_coal_on_each_shape(name: str, seed: int
     collisions = check.collisions(q)
     assert collisions == mesh_collisions(robot, shapes, q)
     pin.forwardKinematics(robot.model, data, q)
-    # coal finds no collisions of meshes with swept hulls, so the radius is zero.
+    # coal cannot check meshes against swept hulls, so the sweep radius is zero.
     body = replace(shapes.bodies[int(random.integers(len(shapes.bodies)))], name="body", radius=0.0)
     at = pin.SE3(pin.exp3(random.normal(size=3)), random.normal(size=3) * 0.3)
     normal = random.normal(size=3)
@@ -220,7 +220,7 @@ def _lowest(shape: pin.GeometryObject, at: pin.SE3) -> float:
 
 @pytest.mark.parametrize("name", ["icub", "hextilt"])
 def test_default_postures_of_robots_with_turned_meshes_are_free(name: str) -> None:
-    """Both have COLLADA files with y up, but only the URDF of icub needs turned meshes."""
+    """Both robots have COLLADA files with y up, but only the URDF of icub needs rotated meshes."""
     robot = robot_of(name)
     shapes = load_shapes(robot)
     assert mesh_collisions(robot, shapes, robot.posture()) == []

@@ -1,4 +1,4 @@
-"""Meshes of several parts, whose triangles coal numbers wrongly, have the triangles of their files."""
+"""Meshes of several parts have the triangles of their files, although coal numbers their triangles wrongly."""
 
 from __future__ import annotations
 
@@ -26,7 +26,7 @@ __all__ = ["own_cache"]
 CUBE = np.array([[x, y, z] for x in (-0.05, 0.05) for y in (-0.05, 0.05) for z in (-0.05, 0.05)])
 SIDES = np.array([[0, 1, 3, 2], [4, 6, 7, 5], [0, 4, 5, 1], [2, 3, 7, 6], [0, 2, 6, 4], [1, 5, 7, 3]])
 FACES = np.concatenate([SIDES[:, [0, 1, 2]], SIDES[:, [0, 2, 3]]])
-# Centers of the parts of the mesh, m.
+# Centers of the parts of the mesh, in m.
 PARTS = ((0.0, 0.0, 0.0), (0.3, 0.0, 0.0), (0.6, 0.0, 0.1))
 
 
@@ -67,18 +67,18 @@ def test_the_check_sees_every_part_of_a_mesh(tmp_path: Path, monkeypatch: pytest
     q, seen = shapes.robot.posture(), []
     middle = np.array([0.0, 0.0, 0.3])
     for part in PARTS:
-        # A plate through this part alone.
+        # This plate intersects only one part of the mesh.
         plate = obstacle_hull(Obstacle(name="plate", box=(0.02, 0.2, 0.02), position=tuple((middle + part).tolist())))
         seen.append(bool(mesh_collisions(shapes.robot, shapes, q, obstacles=[(plate, pin.SE3.Identity(), ())])))
     assert seen == [True, right, right]
-    # The correct triangles reach as far as the corners.
+    # The correct triangles extend to the farthest corners.
     reach = mesh_points(solid)[mesh_triangles(solid)][..., 0].max()
     assert bool(np.isclose(reach, PARTS[-1][0] + 0.05)) is right
     assert not shapes.warnings
 
 
 def probes(triangles: Array, shape: coal.BVHModelBase) -> Array:
-    """Return whether a ball of 10 µm at the center of each triangle, shape (n, 3, 3), touches a mesh."""
+    """Return for each triangle, shape (n, 3, 3), whether a 10 µm ball at its center touches the mesh."""
     ball, here, touching = coal.Sphere(1e-5), coal.Transform3s(), []
     for center in triangles.mean(axis=1):
         at = coal.Transform3s(np.eye(3), center)
@@ -98,7 +98,7 @@ def test_meshes_of_robots(name: str, changed: int, monkeypatch: pytest.MonkeyPat
     ]
     assert len(different) == changed
     for a, b in different:
-        # The corners are the same, and so is their hull, but coal leaves out most of the surface.
+        # The corners and their hull are the same, but coal leaves out most of the surface.
         assert np.array_equal(mesh_points(a), mesh_points(b))
         assert np.array_equal(np.unique(mesh_triangles(a)), np.arange(len(mesh_points(a))))
         surface = mesh_points(a)[mesh_triangles(a)][:: max(1, a.num_tris // 200)]
@@ -108,7 +108,7 @@ def test_meshes_of_robots(name: str, changed: int, monkeypatch: pytest.MonkeyPat
 
 @given(st.lists(st.lists(st.integers(3, 30), min_size=1, max_size=4), min_size=1, max_size=3))
 def test_parts_of_a_file_are_separated(nodes: list[list[int]]) -> None:
-    """The nodes have several parts; coal numbers each part from the first corner of its node."""
+    """The nodes contain several parts.  coal numbers the corners of each part from the first corner of its node."""
     numbered, true, base = [], [], 0
     for parts in nodes:
         node = base
@@ -131,7 +131,7 @@ def test_the_hull_replaces_parts_that_cannot_be_separated(tmp_path: Path, monkey
         "export it as one part"
     )
     (solid,) = [shape.geometry for shape in shapes.geometry.geometryObjects if shape.name == "middle"]
-    # The hull of the cubes contains the space between them.
+    # The hull of the cubes also contains the space between the cubes.
     ball, at = coal.Sphere(0.04), coal.Transform3s(np.eye(3), np.array([0.15, 0.06, 0.0]))
     assert coal.collide(solid, coal.Transform3s(), ball, at, coal.CollisionRequest(), coal.CollisionResult())
     (drawn,) = [s for s in draw_robot(shapes.robot, True).solids if np.ptp(s.points[:, 0]) > 0.5]

@@ -1,4 +1,4 @@
-"""Swept hulls: distances against a quadratic program, and fits that contain all points."""
+"""Swept hulls: distances compared with a quadratic program, and hulls that contain all given points."""
 
 from __future__ import annotations
 
@@ -26,7 +26,7 @@ SEEDS = st.integers(0, 2**32 - 1)
 
 
 def distance_of_hulls(a: Array, b: Array) -> float:
-    """Return the distance of the hulls of two sets of points, by non-negative least squares of convex weights."""
+    """Return the distance between the hulls of two point sets, by non-negative least squares of convex weights."""
     weight = 1e4
     rows = np.vstack([np.hstack([a.T, -b.T]), weight * np.r_[np.ones(len(a)), np.zeros(len(b))],
                       weight * np.r_[np.zeros(len(a)), np.ones(len(b))]])  # fmt: skip
@@ -55,16 +55,16 @@ def test_distance_equals_the_quadratic_program(seed: int, count_a: int, count_b:
     if apart < 1e-6:
         assert result.distance <= -0.03 + 1e-6
         return
-    # The penalty on the weights causes an error of about 1e-8.
+    # The penalty on the convex weights causes an error of about 1e-8.
     assert result.distance == pytest.approx(apart - 0.03, abs=1e-7)
     assert np.linalg.norm(result.normal) == pytest.approx(1, abs=1e-9)
     np.testing.assert_allclose(result.point_a - result.point_b, result.distance * result.normal, atol=1e-8)
-    # The normal from b to a separates the two.
+    # The normal points from b to a and separates both hulls.
     assert np.min(world_a @ result.normal) - np.max(world_b @ result.normal) == pytest.approx(apart, abs=1e-7)
 
 
 def test_penetration_is_the_shortest_way_out() -> None:
-    """Two boxes are 1 m wide, 0.9 m apart along x, and swept by 2 cm together."""
+    """Two boxes of width 1 m overlap by 0.1 m along x.  Sweep radii of 1 cm increase the penetration to 0.12 m."""
     box = obstacle_hull(Obstacle(name="box", box=(1.0, 1.0, 1.0)))
     swept = hull(box.vertices, 0.01)
     result = separation(swept, pin.SE3(np.eye(3), np.array([0.9, 0.1, 0.2])), swept, pin.SE3.Identity())
@@ -84,13 +84,13 @@ def test_fit_contains_all_points(seed: int, count: int, form: str) -> None:
     vertices, radius = fit_hull(points)
     assert len(vertices) <= MOST_VERTICES
     assert max(distance_of_hulls(vertices, p[None]) for p in points[:60]) <= radius + 1e-7
-    # The sweep radius is the largest distance outside, plus the thickness of a flat hull.
+    # The sweep radius is the largest distance of a point from the hull, plus the thickness of a flat hull.
     outside = max(distance_of_hulls(vertices, p[None]) for p in points)
     assert radius <= outside + 2.1e-4
 
 
 def test_fit_stops_at_the_tolerance() -> None:
-    """A box with edges rounded by 3 mm needs hardly more than its 8 corners."""
+    """A box with edges rounded by 3 mm needs hardly more vertices than the 8 corners."""
     random = np.random.default_rng(0)
     box = np.array(np.meshgrid(*[[-0.1, 0.1]] * 3)).reshape(3, -1).T
     edges = random.normal(size=(3000, 3))
@@ -102,7 +102,7 @@ def test_fit_stops_at_the_tolerance() -> None:
 
 @pytest.mark.parametrize("kind", ["Box", "Sphere", "Cylinder", "Capsule"])
 def test_points_contain_a_primitive_shape(kind: str) -> None:
-    """In many directions, the points reach as far as the shape, or up to 3 % farther."""
+    """In many directions, the points extend as far as the shape, or up to 3 % farther."""
     import coal
 
     sizes = {"Box": (0.2, 0.3, 0.4), "Sphere": (0.2,), "Cylinder": (0.1, 0.6), "Capsule": (0.1, 0.6)}[kind]
@@ -131,7 +131,7 @@ def test_faces_center_and_reach_of_a_box() -> None:
 
 
 def test_a_corner_on_a_corner_has_a_distance() -> None:
-    """Points at all corners of a box touch it, also with a sweep radius."""
+    """A point at a corner of a box touches the box, with and without a sweep radius."""
     box = obstacle_hull(Obstacle(name="box", box=(1.0, 1.0, 1.0), position=(0.5, 0.5, 0.5)))
     for corner in box.vertices:
         for point in (hull(corner[None], 0.01), hull(corner[None])):

@@ -1,4 +1,4 @@
-"""Every public function and class refuses wrong arguments in one line that names the parameter."""
+"""Every public function and class rejects invalid arguments with a one-line error that names the parameter."""
 
 from __future__ import annotations
 
@@ -67,7 +67,7 @@ GOOD: list[tuple[Callable[..., Any], dict[str, Any]]] = [
     ],
     (tsid.support_contacts, {"robot": ROBOT}),
 ]
-# A posture task makes a ReferenceFlow, and Task is a base class.  The others are results.
+# Posture tasks create ReferenceFlow objects, and Task is a base class.  The other names are result types.
 OTHERS = {
     "Export", "ImpactPostureError", "PostureResult", "Robot", "__version__", "known_robots", "sweep", "tsid",
     "ImpactGradient", "CompiledController",
@@ -76,7 +76,7 @@ OTHERS = {
 
 
 class Odd:
-    """A value that fits no parameter."""
+    """Value that is invalid for every parameter."""
 
 
 def _parameters() -> list[Any]:
@@ -143,7 +143,7 @@ def test_the_line_says_what_to_give(call: Callable[[], Any], line: str) -> None:
 
 
 def test_what_fits_passes() -> None:
-    """NumPy's numbers and arrays, and names of classes that only type checkers import."""
+    """NumPy numbers and arrays are valid, also for parameters whose type is imported only for type checking."""
 
     @checked
     def function(

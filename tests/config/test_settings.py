@@ -1,4 +1,4 @@
-"""The settings of a problem: the same on the command line, in problem.toml and in Python."""
+"""The settings of a problem are the same on the command line, in problem.toml and in Python."""
 
 from __future__ import annotations
 
@@ -17,7 +17,7 @@ from impact_posture_cli.output import as_options
 from impact_posture_cli.settings_options import settings_of
 from tests.support.command import run
 
-# Keys of a problem.toml without an option.
+# Keys of problem.toml that have no command line option.
 NO_OPTION = {"robot", "schema", "q", "support_compliance", "mounting", "obstacles"}
 
 
@@ -87,7 +87,7 @@ def test_resolved_settings_are_the_same_problem(more: dict[str, object], tmp_pat
     frame = {} if "contact" in more else {"frame": "tool0" if name == "ur5" else "ee", "normal": (0.3, 0.0, 2.0)}
     first = prepare(validate(ProblemSettings, {"robot": name, **frame, **more}, "test"))
     path = tmp_path / "problem.toml"
-    # Some editors put a byte-order mark first.
+    # Some editors write a byte-order mark at the beginning of a file.
     path.write_text(dump_settings(resolved_settings(first)), encoding="utf-8-sig" if more else "utf-8")
     again = prepare(read_settings(path))
     assert again.impact.to_dict() == first.impact.to_dict()

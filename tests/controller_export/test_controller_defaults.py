@@ -1,4 +1,4 @@
-"""The end effector's task of controllers with default gains leaves the redundancy that `optimize` uses."""
+"""With default gains, the end effector task leaves free the same motions as `optimize`."""
 
 from __future__ import annotations
 
@@ -28,7 +28,7 @@ BARE_ARM = f"""<robot name="bare"><link name="base">{INERTIAL}</link><link name=
 
 
 def tip(formulation: TaskFormulation) -> FrameTask[Any]:
-    """Return the task of the end effector."""
+    """Return the task of the end effector in the formulation."""
     task = formulation.levels[-1][0]
     assert isinstance(task, FrameTask)
     return task
@@ -46,7 +46,7 @@ def test_the_task_has_the_rows_of_the_contact_pose(
     objective = WorstCaseObjective(robot, ImpactContact(frame, (0, 0, 1)))
     assert type(tip(default_formulation(robot, kind, objective))) is kept
     assert tip(default_formulation(robot, kind, objective)).point.frame == frame
-    # Without an impact, an alignment has no normal.
+    # Without an impact, an aligned end effector has no normal.
     assert type(tip(default_formulation(robot, kind))) is (FramePose if kept is FrameAligned else kept)
 
 

@@ -1,4 +1,4 @@
-"""The exported controller has the commands, statuses and reports of the controller in Python."""
+"""The exported controller returns the commands, statuses and reports of the Python controller."""
 
 from __future__ import annotations
 
@@ -31,7 +31,7 @@ from tests.support.relaxed_ticks import problem_of
 
 
 def difference(a: Command, b: Command) -> float:
-    """Largest relative difference of controls, accelerations and forces."""
+    """Largest permitted relative difference of controls, accelerations and forces."""
     pairs = ((a.u, b.u), (a.acceleration, b.acceleration), (a.forces, b.forces), (a.rotor_speed, b.rotor_speed))
     return max(float(np.max(np.abs(x - y)) / max(1.0, float(np.max(np.abs(x))))) for x, y in pairs if x.size)
 
@@ -46,7 +46,7 @@ def assert_same_report(a: Report, b: Report, size: float) -> None:
 
 
 def both_at_rest(name: str) -> tuple[Controller, CompiledController, Array, Array]:
-    """Return the controllers in Python and in C after a reset at rest in the default posture, and this state."""
+    """Return the Python and C controllers after a reset at rest in the default posture, and this state."""
     robot, formulation = formulation_of(name)
     python, c = Controller(robot, formulation), compiled(name)
     q, v = robot.posture(), np.zeros(robot.nv)
@@ -54,7 +54,7 @@ def both_at_rest(name: str) -> tuple[Controller, CompiledController, Array, Arra
     return python, c, q, v
 
 
-# The study of the controller (make study-controller) has the other robots of KINDS.
+# The study of the controller (make study-controller) tests the other robots of KINDS.
 @pytest.mark.parametrize("name", ["tilthex_arm", "panda", "solo8", "talos"])
 def test_commands_agree_with_python(name: str) -> None:
     python, c, q, v = both_at_rest(name)
@@ -75,7 +75,7 @@ def test_commands_agree_with_python(name: str) -> None:
 
 
 def test_commands_in_long_saturation_are_optimal() -> None:
-    """The cost has the condition 4e10, so that controls agree to a few digits only, but the certificate is exact."""
+    """The cost has condition number 4e10, so the controls agree only to a few digits; the certificate is exact."""
     python, c, q, v = both_at_rest("solo8")
     rng, push, checked = np.random.default_rng(7), np.zeros(python.robot.nv), 0
     for k in range(800):
@@ -95,7 +95,7 @@ def test_commands_in_long_saturation_are_optimal() -> None:
 
 
 def test_the_iterations_of_a_tick_are_bounded_and_suffice() -> None:
-    """Unrelated far states need more iterations than a run, and at most half of the maximum in the header."""
+    """Far, unrelated states need more iterations than a run, but at most half of the maximum in the header."""
     robot, rng = formulation_of("talos")[0], np.random.default_rng(3)
     c = compiled("talos")
     c.reset(robot.posture(), np.zeros(robot.nv))
@@ -120,7 +120,7 @@ def test_a_relaxed_tick_misses_its_levels_as_in_python(name: str) -> None:
             continue
         relaxed += 1
         in_python, in_c = ({r.level: r.amount for r in x.report().relaxed} for x in (python, c))
-        # Only the first level that gives way: the lower levels depend on it and agree to fewer digits.
+        # Compare only the first relaxed level, because lower levels depend on it and agree to fewer digits.
         first = next(iter(in_python))
         assert in_c.get(first, 0.0) <= in_python[first] * (1 + 1e-5) + 1e-6
         assert np.all(b.u <= python.actuators.upper * (1 + 1e-6))
@@ -153,7 +153,7 @@ def test_the_impact_robust_term_agrees_with_python_in_all_phases(name: str, fram
     c.reset(q, v)
     levels = set()
     phases = (("brace", 3), ("contact", 40), ("release", 75))
-    # In Python, a phase begins at the call.  In C, it has a time, and the call may be early.
+    # In Python, a phase begins at the call.  In C, the phase has a time, and the call may come earlier.
     for phase, at in phases[:2]:
         getattr(c, phase)(1e-3 * at)
     for wrong, at in (("brace", 0.08), ("contact", 0.08), ("release", 0.03), ("release", np.nan)):
@@ -243,7 +243,7 @@ def test_targets_are_set_by_the_name_of_their_task() -> None:
     c.move_to(goal, 0.01)
     for k in range(4):
         assert difference(python.tick(0.004 * k, q, v), c.tick(0.004 * k, q, v)) < 1e-9
-    # Without a target, the task holds the pose at the next reset.
+    # Without a target, the task holds the pose of the next reset.
     c.forget_target(name)
     fresh = compiled("panda")
     for controller in (c, fresh):
@@ -270,7 +270,7 @@ def test_a_reset_forgets_a_led_posture() -> None:
     _, c, q, v = both_at_rest("panda")
     first = c.reset(q, v)
     c.lead_posture(q, v + 0.5, v + 2.0)
-    # A program in C resets it like this, without ip_init.
+    # A program in C resets the task in this way, without ip_init.
     c._call("reset", *c._pointers[:2], ctypes.byref(c._command))
     np.testing.assert_allclose(c._commanded().u, first.u, rtol=0, atol=1e-9)
 

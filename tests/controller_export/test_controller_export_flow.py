@@ -1,4 +1,4 @@
-"""The reference flow of an exported controller moves as in Python, and rests where its solver fails."""
+"""The reference flow of an exported controller moves as in Python, and rests if its solver fails."""
 
 from __future__ import annotations
 
@@ -38,7 +38,7 @@ IMPACTS = {"tilthex_arm": ("ee", (0.0, 0.0, 1.0)), "panda": ("panda_hand_tcp", (
            "talos": ("gripper_right_base_link", (-1.0, 0.0, 0.0))}  # fmt: skip
 # The arm of panda turns about the line from shoulder to wrist.
 ELBOW = (0.3, -0.7, 0.3, -2.3, 0.1, 1.6, 0.9, 0.035, 0.035)
-# A pitch of solo8 and joints that differ from leg to leg.
+# A pitch angle of solo8 and joint angles that differ from leg to leg.
 LEANING = np.array([0, 0, 0, 0, 0.05, 0, 0.3, -0.15, -0.3, 0.1, 0.15, 0.3, -0.06, 0.12])
 DT = 2e-3
 
@@ -49,7 +49,7 @@ def objective_of(name: str) -> WorstCaseObjective:
 
 
 def both(name: str, path: tuple[float, ...] = ()) -> tuple[Controller, ReferenceFlowPosture, CompiledController]:
-    """Return the controllers in Python and in C after a reset, with the same gradient."""
+    """Return the Python and C controllers after a reset, with the same gradient."""
     r, objective = robot(name), objective_of(name)
     folder = exported(name, objective, path=path)
     gradient = ImpactGradient(load_library(library_path(folder, "ctl")), read_manifest(folder / "ctl_metric.json")[0])
@@ -73,7 +73,7 @@ def both(name: str, path: tuple[float, ...] = ()) -> tuple[Controller, Reference
 def test_the_reference_moves_as_in_python(
     name: str, path: tuple[float, ...], options: dict[str, float], ticks: int, monkeypatch: pytest.MonkeyPatch
 ) -> None:
-    """Each controller moves its robot through all phases."""
+    """Each controller moves its simulated robot through all phases."""
     edges: list[int] = []
 
     def keep(zmp: ZeroMomentPoint, space: Redundancy, period: float, step: Array) -> Array:
@@ -87,7 +87,7 @@ def test_the_reference_moves_as_in_python(
     posture.options = replace(posture.options, **options)
     for option, value in options.items():
         c.parameters[f"flow_{option}"][:] = value
-    # From its level default posture, solo8 does not tilt.
+    # In its level default posture, solo8 has no reason to tilt.
     tilt = options.get("tilt", 0.8)
     start = np.array(pin.integrate(r.model, r.posture(), LEANING)) if tilt < 0.5 else r.posture()
     for controller in (python, c):
@@ -98,7 +98,7 @@ def test_the_reference_moves_as_in_python(
         for phase, at in (("brace", 0), ("contact", ticks // 2), ("brace", ticks // 2 + 20), ("release", ticks - 10)):
             if k == at:
                 for target in (posture, c):
-                    # The second brace is before an impact at a known time.
+                    # The second `brace` prepares for an impact at a known time.
                     getattr(target, phase)(**({"t_impact": posture.settle + 0.1} if phase == "brace" and k else {}))
         for i, controller in enumerate((python, c)):
             q, v = states[i]
@@ -114,11 +114,11 @@ def test_the_reference_moves_as_in_python(
         assert report.level == posture.level and report.objective == pytest.approx(posture.value, rel=1e-7)
     away = np.abs(pin.difference(r.model, start, c.target)).max()
     assert away > 0.02 and c.flow_failures == 0
-    # Without the limit, the tilt reaches 0.0608.
+    # Without the tilt limit, the tilt would reach 0.0608.
     assert tilt > 0.5 or 0.0515 < most < tilt
     assert path or posture.value < 0.95 * first
     assert np.abs(posture.flow.velocity).max() < 0.02
-    # The zero moment point of talos reaches two edges at once, in the same order in both languages.
+    # The zero moment point of talos reaches two edges at once, in the same order in Python and C.
     assert (max(edges) > 1) == (name == "talos")
 
 
@@ -193,7 +193,7 @@ def test_a_stopped_flow_goes_on_from_a_moved_posture_as_in_python() -> None:
             commands = [controller.tick(k * DT, r.posture(), at_rest) for controller in (python, c)]
             np.testing.assert_allclose(commands[1].u, commands[0].u, rtol=0, atol=1e-6)
             if not 200 <= k < 250:
-                # In a fade, the target is its end in Python and its beginning in C.
+                # During a fade, the target is its end value in Python and its start value in C.
                 np.testing.assert_allclose(c.target, posture.target, rtol=0, atol=1e-9)
     np.testing.assert_allclose(firsts[1], firsts[0], rtol=0, atol=1e-9)
 
@@ -234,7 +234,7 @@ def test_invalid_times_parameters_and_tasks_are_refused() -> None:
         structure_of(r, replace(arm_formulation(r, flow), contacts=(SupportContact(Point("panda_link4")),)))
 
 
-# solo8 has the same parts of the source as talos.
+# The code of solo8 contains the same parts as the code of talos, so solo8 is left out.
 @pytest.mark.parametrize("name", ["tilthex_arm", "panda", "talos"])
 def test_the_code_has_no_warnings(name: str) -> None:
     folder = exported(name, objective_of(name), path=ELBOW if name == "panda" else ())

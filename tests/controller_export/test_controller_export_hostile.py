@@ -1,4 +1,4 @@
-"""Mistakes that an exported controller refuses, and states that no robot has."""
+"""Calling errors that an exported controller rejects, and states that no robot can have."""
 
 from __future__ import annotations
 
@@ -35,7 +35,7 @@ def compile_c(folder: Path, *flags: str) -> subprocess.CompletedProcess[str]:
 
 
 def abuse_with(sanitizers: str, folder: Path, program: Path, *more: str) -> None:
-    """Build the abuse program with the sources of a controller and sanitizers, or skip the test."""
+    """Build the abuse program with the controller sources and sanitizers; skip the test if this is impossible."""
     flags = [f"-fsanitize={sanitizers}", "-fno-sanitize-recover=all", "-O0", "-g0", f"-I{folder}", str(ABUSE)]
     sources = ["ctl.c", "ctl_defaults.c", "ctl_dynamics.c", "ctl_relaxation.c", "ctl_daqp.c", *more]
     built = compile_c(folder, *flags, *sources, "-o", str(program), "-lm", "-lpthread")
@@ -73,7 +73,7 @@ def test_ten_thousand_random_ticks_take_no_memory_and_stay_within_the_limits(nam
 
 
 def test_no_tick_reads_unwritten_memory(tmp_path: Path) -> None:
-    """valgrind also reports reads and writes out of bounds."""
+    """valgrind also reports reads and writes outside arrays."""
     valgrind, program = need("valgrind"), abuse_program(exported("panda"), tmp_path)
     ran = subprocess.run([valgrind, "-q", "--error-exitcode=9", program, "24"], capture_output=True, text=True)
     assert ran.returncode == 0 and not ran.stderr, ran.stderr
@@ -95,7 +95,7 @@ def test_a_held_command_is_within_its_limits_and_damps_the_joints() -> None:
         held = controller.tick(0.0, np.full(robot.nq, wrong), v)
         assert held.status is Status.NON_FINITE
         assert np.array_equal(held.u, first.u)
-    # A rate beyond all measurements damps nothing.
+    # An unmeasurable velocity is ignored, so the controller repeats the last command.
     for rate in (2e8, -np.inf, np.nan):
         glitch = v.copy()
         glitch[0] = rate

@@ -1,4 +1,4 @@
-"""Sources of DAQP: the download, the checks, and refusals in one line."""
+"""Sources of DAQP: download, checks, and one-line errors."""
 
 from __future__ import annotations
 
@@ -19,7 +19,7 @@ from tests.support.daqp import sources_or_skip
 
 @pytest.fixture
 def cache(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> Path:
-    """An empty cache, without a network."""
+    """Use an empty cache and no network."""
     monkeypatch.setenv("IMPACT_POSTURE_CACHE", str(tmp_path / "cache"))
     monkeypatch.setenv("PIP_NO_INDEX", "1")
     monkeypatch.setenv("PIP_FIND_LINKS", str(tmp_path / "nothing"))
@@ -27,7 +27,7 @@ def cache(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> Path:
 
 
 def archive(path: Path, **members: tarfile.TarInfo | bytes) -> None:
-    """Write a distribution in which members replace files with a byte of content; a name has _ for its dot."""
+    """Write a distribution whose listed members contain one byte; in a name, _ stands for the dot."""
     with tarfile.open(path, "w:gz") as tar:
         for name, place in FILES.items():
             entry = members.get(name.replace(".", "_"), b"?")

@@ -38,7 +38,7 @@ def relaxation(tmp_path_factory: pytest.TempPathFactory) -> Relaxation:
 
 @functools.cache
 def ticks_of(name: str, kind: str) -> list[RelaxedTick]:
-    """Return the relaxed ticks of a controller at random states, too far and too fast."""
+    """Return the relaxed ticks of a controller at random states, far from the posture and too fast."""
     controller, _ = bracing(name, kind)
     robot, generator = controller.robot, rng(name, "relaxed in C")
     with recording() as ticks:
@@ -52,7 +52,7 @@ def ticks_of(name: str, kind: str) -> list[RelaxedTick]:
 
 
 def squares(tick: RelaxedTick, z: np.ndarray) -> list[float]:
-    """Return the length of the violation of each level below level 0."""
+    """Return for each level below level 0 the norm of its violations."""
     over = violations(tick, z)[0]
     return [float(np.linalg.norm(over[tick.level == k])) for k in range(1, int(tick.level.max()) + 1)]
 
@@ -67,7 +67,7 @@ def test_robots_in_hard_states(relaxation: Relaxation, name: str, kind: str) -> 
             assert missed(tick, z)[0] <= 1e-9
             *levels, cost = stationarity(tick, z)
             assert max(levels) <= 1e-7
-            # The cost of a quadruped is so flat that it takes a proximal term.
+            # The cost of a quadruped has a nearly flat direction, so the solver adds a proximal term.
             assert cost <= (1e-5 if name == "solo8" else 1e-7)
         terms = float(np.max(np.abs(tick.A) @ np.abs(tick.z)))
         assert np.allclose(squares(tick, answer.z), squares(tick, tick.z), rtol=0, atol=1e-9 * terms)
@@ -89,13 +89,13 @@ def test_the_active_rows_of_the_last_tick_change_no_answer(relaxation: Relaxatio
 
 @given(st.integers(0, 2**32 - 1))
 def test_random_stacks(relaxation: Relaxation, seed: int) -> None:
-    """Dependent, contradictory and vanishing rows, pinned variables, numbers up to 1e6."""
+    """The problems have dependent, contradictory and zero rows, fixed variables, and numbers up to 1e6."""
     g = np.random.default_rng(seed)
     n = int(g.integers(2, 9))
     sizes = [int(g.integers(0, 4)), int(g.integers(0, 6)), *g.integers(1, 5, size=int(g.integers(1, 4)))]
     A = g.normal(size=(sum(sizes), n))
     level = np.concatenate([np.ones(n), np.repeat([0, *range(len(sizes) - 1)], sizes)]).astype(np.intc)
-    # Level 0: equations through a point inside, and inequalities around it.
+    # Level 0 contains equations through a point, and inequalities that this point satisfies strictly.
     inside = g.normal(size=n)
     values = A @ inside
     lower, upper = (
@@ -127,7 +127,7 @@ def test_random_stacks(relaxation: Relaxation, seed: int) -> None:
 
 
 def small(**changes: np.ndarray) -> RelaxedTick:
-    """Return a problem of two variables: the first is at most 1, and a level demands z = (2, 3)."""
+    """Return a problem of two variables: level 0 bounds the first by 1, and a lower level demands z = (2, 3)."""
     inf = np.inf
     tick = RelaxedTick(
         H=np.eye(2), g=np.zeros(2), A=np.array([[1.0, 0.0], [1.0, 0.0], [0.0, 1.0]]),
@@ -142,7 +142,7 @@ def test_a_level_that_a_bound_stops(relaxation: Relaxation) -> None:
 
 
 def test_the_cost_decides_in_the_free_directions(relaxation: Relaxation) -> None:
-    """SciPy solves the same problem: an equation, bounds, and a cost of any shape."""
+    """SciPy solves the same problem: an equation, bounds, and an arbitrary convex cost."""
     g = rng("cost")
     for _ in range(5):
         root, row = g.normal(size=(3, 3)), g.normal(size=3)
@@ -161,7 +161,7 @@ def test_the_cost_decides_in_the_free_directions(relaxation: Relaxation) -> None
 
 
 def test_without_levels_or_rows(relaxation: Relaxation) -> None:
-    """The minimum of z²/2 with z ≥ 1 is at 1 for both levels of the bound."""
+    """The minimum of z²/2 subject to z ≥ 1 is 1, whichever level contains the bound."""
     for level in (0, 1):
         one = np.ones(1)
         tick = RelaxedTick(np.eye(1), 0 * one, np.zeros((0, 1)), one, np.inf * one, np.array([level]), one, one)
@@ -170,7 +170,7 @@ def test_without_levels_or_rows(relaxation: Relaxation) -> None:
 
 
 def test_a_budget_is_kept(relaxation: Relaxation) -> None:
-    """With too few iterations, the result is a code.  The next tick goes on with the active rows of this one."""
+    """If the iterations do not suffice, the result is an error code.  The next tick starts from these active rows."""
     tick = ticks_of("talos", "legged")[-1]
     relaxation.forget()
     needed = relaxation.solve(tick).iterations

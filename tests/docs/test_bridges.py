@@ -1,4 +1,4 @@
-"""Examples of docs/bridges.md: the impact term in pink and in C++, against independent numbers."""
+"""Examples of docs/bridges.md: the impact term in pink and in C++, compared with independent numbers."""
 
 from __future__ import annotations
 
@@ -31,7 +31,7 @@ EXAMPLES = DOCS / "examples"
 
 
 def shown_output() -> dict[str, list[str]]:
-    """Return the lines of pink's output on the page, by contact."""
+    """Return the lines of pink's output that the page shows, by contact."""
     page = (DOCS / "bridges.md").read_text(encoding="utf-8")
     lines: dict[str, list[str]] = {}
     for line in re.findall(r"^```text\n(.*?)^```", page, re.MULTILINE | re.DOTALL)[0].splitlines():
@@ -44,7 +44,7 @@ def shown_output() -> dict[str, list[str]]:
 
 @pytest.mark.parametrize("file", sorted(EXAMPLES.rglob("*.py")), ids=lambda p: p.stem)
 def test_examples_need_no_file_of_the_checkout(file: Path) -> None:
-    """Readers download the examples; the package ``tests`` is not installed."""
+    """Readers download the examples, so they must not import the package ``tests``, which is not installed."""
     assert not re.search(r"^\s*(from|import) tests\b", file.read_text(encoding="utf-8"), re.MULTILINE)
 
 
@@ -57,7 +57,7 @@ def example() -> ModuleType:
     spec = importlib.util.spec_from_file_location("pink_impact", EXAMPLES / "pink_impact.py")
     assert spec is not None and spec.loader is not None
     module = importlib.util.module_from_spec(spec)
-    # Dataclasses look up their module here.
+    # Dataclasses look up their module in ``sys.modules``.
     sys.modules[spec.name] = module
     spec.loader.exec_module(module)
     return module
@@ -98,7 +98,7 @@ def test_pink_holds_the_frame(pink_run: PinkRun, name: str) -> None:
     before, after = (frame_placement(model, q, frame) for q in (start, outcome.q))
     turned = np.linalg.norm(pin.log3(before.rotation.T @ after.rotation))
     assert np.abs(after.translation - before.translation).max() <= 1e-9
-    # Within a tick, linearization leaves a small error.
+    # Linearization within a tick causes a small error.
     assert 0 < outcome.errors.max() <= 1e-5
     if name == TABLE:
         assert turned > 0.5, "the ball tip must turn, because it is redundant"
@@ -139,7 +139,7 @@ def test_pink_prints_what_the_page_shows(pink_run: PinkRun) -> None:
 
 
 def test_held_tasks_have_the_jacobian_of_their_error(example: ModuleType) -> None:
-    """In pink, ``J Δq = −e``, so J is the derivative of e on the manifold."""
+    """In pink, ``J Δq = −e``, so J is the derivative of the error e on the manifold."""
     arm = robot("tilthex_arm")
     model = arm.model.copy()
     pink = importlib.import_module("pink")
@@ -157,7 +157,7 @@ def test_held_tasks_have_the_jacobian_of_their_error(example: ModuleType) -> Non
 
 
 def eigen_program(folder: Path, floating: bool) -> Path:
-    """Build the C++ example with the export in a folder; skip without a compiler or Eigen."""
+    """Build the C++ example and the export in a folder; skip the test without a compiler or Eigen."""
     compiler, eigen = cxx_compiler(), eigen_headers()
     if compiler is None or eigen is None:
         pytest.skip("no C++ compiler (g++, clang++, $CXX), or no Eigen headers (cmeel-eigen, $EIGEN3_INCLUDE_DIR)")
@@ -183,7 +183,7 @@ def exported(name: str, frame: str, folder: Path, real: Real) -> WorstCaseObject
 
 
 def pairs(model: pin.Model, floating: bool) -> list[tuple[Vector, Vector]]:
-    """Return pairs ``(q, q_des)`` whose bases cover every branch of the logarithm."""
+    """Return pairs ``(q, q_des)`` whose base rotations cover every branch of the logarithm."""
     rng = np.random.default_rng(11)
 
     def step(q: Vector, angle: float) -> Vector:
@@ -221,7 +221,7 @@ def test_cpp_computes_the_posture_acceleration(
     assert len(printed) == len(states)
     for (q, v, q_des), line in zip(states, printed, strict=True):
         expected = gains[0] * pin.difference(arm.model, q, q_des) - gains[1] * v
-        # The gradient comes from Pinocchio, not from the export.
+        # The gradient is computed with Pinocchio, not by the export.
         expected -= gains[2] * objective.oracle.gradient_H(q)
         assert_close(np.array(line.split(), dtype=float), expected, tolerance, f"{name}, {line}")
     if arm.floating:

@@ -1,4 +1,4 @@
-"""Documentation: every shown command runs and prints what the page shows.  ``make docs`` builds the site."""
+"""Documentation: every shown command runs and prints the output on the page.  ``make docs`` builds the site."""
 
 from __future__ import annotations
 
@@ -30,7 +30,7 @@ _EXAMPLE = re.compile(r"[\w./-]*examples/[\w./-]+")
 
 @dataclass(frozen=True)
 class Shown:
-    """A command on a page: its arguments, its exit code, and the output lines that the page shows."""
+    """Command on a page: its arguments, its exit code, and the output lines that the page shows."""
 
     arguments: tuple[str, ...]
     code: int
@@ -38,7 +38,7 @@ class Shown:
 
 
 def shown_commands(page: Path) -> list[Shown]:
-    """Return the commands in the ``console`` blocks of a page, in order."""
+    """Return the commands in the ``console`` blocks of a page, in order of appearance."""
     commands: list[Shown] = []
     for block in _BLOCK.findall(page.read_text(encoding="utf-8")):
         current: Shown | None = None
@@ -57,7 +57,7 @@ def shown_commands(page: Path) -> list[Shown]:
 
 
 def example_files(page: Path) -> Iterator[Path]:
-    """Yield files of ``docs/examples`` that a page shows or offers."""
+    """Yield the files of ``docs/examples`` that a page shows or offers for download."""
     for text in dict.fromkeys(_EXAMPLE.findall(page.read_text(encoding="utf-8"))):
         path = (page.parent / text).resolve()
         if path.is_file() and path.is_relative_to(DOCS / "examples"):
@@ -70,7 +70,7 @@ def squeezed(text: str) -> str:
 
 @dataclass(frozen=True)
 class Ran:
-    """A shown command with its exit code and output."""
+    """A command of a page with its exit code and output."""
 
     shown: Shown
     code: int
@@ -82,7 +82,7 @@ class Ran:
 
 
 def run_page(page: Path, folder: Path) -> Iterator[Ran]:
-    """Run the commands of a page in a folder, one after the other."""
+    """Run the commands of a page one after the other in a folder."""
     for file in dict.fromkeys(example_files(page)):
         shutil.copy(file, folder / file.name)
     for shown in shown_commands(page):
@@ -107,11 +107,11 @@ def test_shown_commands_run(page: Path, tmp_path: Path) -> None:
         assert all(change[k] > 1.01 for k in rises), f"{page.name}: {result} {change}"
 
 
-# Statements of the tutorials about results: result folder, quantities that fall, quantities that rise.
+# What the tutorials say about results: result folder, quantities that decrease, quantities that increase.
 CLAIMS: dict[str, list[tuple[str, str, str]]] = {
     "aerial": [("floor", "HVS", "G"), ("wall", "HV", "S"), ("wall-sticking", "S", "")],
     "arm": [("box", "HGV", "S")],
-    # The optimum of the hand, and V with it, depends on rounding.
+    # Rounding decides which optimum of the hand is reached, so V varies too.
     "humanoid": [("hand", "H", "S")],
 }
 
@@ -124,7 +124,7 @@ def test_claims_are_about_results_of_shown_commands() -> None:
 
 
 def test_commands_are_shown_at_all() -> None:
-    """Each tutorial shows commands, and each command of the app is shown."""
+    """Each tutorial shows commands, and some tutorial shows each command of the app."""
     tutorials = [p for p in PAGES if p.parent.name == "tutorials"]
     assert len(tutorials) >= 5
     assert all(shown_commands(p) for p in tutorials)

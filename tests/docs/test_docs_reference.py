@@ -1,4 +1,4 @@
-"""Reference pages: every key and option has its row with its default, and every row has its key."""
+"""Reference pages: every key and option has a table row with its default, and every row has a key or option."""
 
 from __future__ import annotations
 
@@ -28,7 +28,7 @@ DOCS = Path(__file__).parents[2] / "docs"
 
 
 def rows(page: Path) -> dict[str, list[str]]:
-    """Map the code in the first cell of each table row of a page to the other cells."""
+    """Map the code in the first cell of each table row to the other cells of the row."""
     cells_of: dict[str, list[str]] = {}
     for line in page.read_text(encoding="utf-8").splitlines():
         if not line.startswith("| `"):
@@ -41,14 +41,14 @@ def rows(page: Path) -> dict[str, list[str]]:
 
 
 def nested(annotation: object) -> type | None:
-    """Return the dataclass in ``Table``, ``Table | None``, ``tuple[Table, ...]`` or ``dict[str, Table]``."""
+    """Return the dataclass that a type such as ``Table``, ``Table | None`` or ``tuple[Table, ...]`` contains."""
     if inspect.isclass(annotation) and is_dataclass(annotation):
         return annotation
     return next((m for a in getattr(annotation, "__args__", ()) if (m := nested(a)) is not None), None)
 
 
 def keys(table: type, prefix: str = "") -> dict[str, object]:
-    """Map the dotted keys of a dataclass to their defaults, or to ``...`` for required keys."""
+    """Map the dotted keys of a dataclass to their defaults; a required key maps to ``...``."""
     defaults: dict[str, object] = {}
     hints = get_type_hints(table)
     for key in fields(table):
@@ -63,7 +63,7 @@ def keys(table: type, prefix: str = "") -> dict[str, object]:
 
 
 def shown_default(value: object) -> str:
-    """Write a default as the pages do."""
+    """Write a default value in the notation of the pages."""
     if value is ... or value is None:
         return "required" if value is ... else "none"
     if isinstance(value, tuple):
@@ -75,7 +75,7 @@ def shown_default(value: object) -> str:
 def test_every_key_has_its_row(page: str, table: type) -> None:
     expected = keys(table)
     assert {"schema", "name"} <= set(expected) and any(key.count(".") == 2 for key in expected)
-    # Rows of other tables have names of poses.
+    # Other tables have rows for names of poses.
     shown = {key: cells for key, cells in rows(DOCS / "reference" / page).items() if key not in get_args(ContactPose)}
     assert set(shown) == set(expected)
     for key, value in expected.items():
@@ -94,7 +94,7 @@ def test_every_problem_toml_key_has_its_row() -> None:
     assert set(cells) == set(expected)
     for key, value in expected.items():
         shown = cells[key][1]
-        # None means "from the robot" or "where it is", which the page says in words.
+        # For the default None, the page describes the effect in words, such as "from the robot".
         if value is None:
             assert not shown.startswith("`"), f"default of {key}"
         elif key != "normal":
@@ -102,7 +102,7 @@ def test_every_problem_toml_key_has_its_row() -> None:
 
 
 def test_every_option_is_in_the_reference(monkeypatch: pytest.MonkeyPatch) -> None:
-    """The reference reads signatures, so it must agree with the parser of Typer."""
+    """The reference is generated from signatures, so it must agree with Typer's parser."""
     monkeypatch.syspath_prepend(str(DOCS / "_ext"))
     reference = importlib.import_module("cli_reference").markdown()
     sections = dict(re.findall(r"^## (\S+)\n(.*?)(?=^## |\Z)", reference, re.MULTILINE | re.DOTALL))
@@ -120,7 +120,7 @@ def test_every_problem_key_is_an_option() -> None:
     command = build("optimize")
     names = {o[2:].replace("-", "_") for p in command.params for o in p.opts if o.startswith("--")}
     names |= {"schema", "robot"}
-    # These keys have no option: the page says so, or the tool writes them itself.
+    # For keys without an option, the page says so, or the tool itself writes the key.
     without = {key.partition(".")[0] for key in set(keys(ProblemSettings)) - names}
     assert without == {"q", "support_compliance", "mounting", "obstacles"}
 

@@ -1,4 +1,4 @@
-"""Check the walk of the developer notes, from a normal on the command line to the C code: every stop, in order."""
+"""Check the code tour of the developer notes: every stop, in order, from a normal on the command line to C code."""
 
 from __future__ import annotations
 

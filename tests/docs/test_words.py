@@ -1,4 +1,4 @@
-"""Plain words: old names do not come back, and phrases that are hard to read stay rare."""
+"""Plain words: old names must not return, and hard phrases stay rare."""
 
 from __future__ import annotations
 
@@ -12,7 +12,7 @@ ROOT = Path(__file__).parents[2]
 CODE = ("impact_posture", "cli")
 READ = (*CODE, "robots", "docs", "README.md", "CHANGELOG.md")
 SUFFIXES = {".py", ".md", ".toml", ".c", ".h", ".cpp", ".hpp", ".txt", ".jinja"}
-# Old names and their replacements.
+# Old names and the names that replace them.
 LEFT = {
     r"blows?": "impact",
     r"mends?": "hint",
@@ -23,7 +23,7 @@ LEFT = {
     r"ImpactScenario": "Scenario",
     r"Footing": "ContactStability, StanceGains",
 }
-# Phrases that are hard to read, where they are counted, and the largest number of lines with them.
+# Hard phrases, the files in which they are counted, and the largest permitted number of lines with them.
 RARE = {r"found": (CODE, 100), r"that of|those of|is no \w+": (READ, 60)}
 pytestmark = pytest.mark.skipif(not (ROOT / "docs").is_dir(), reason="not in a checkout")
 
@@ -49,7 +49,7 @@ def lines_with(words: str, names: Iterable[str], flags: int = 0) -> list[str]:
 
 @pytest.mark.parametrize("word", LEFT)
 def test_old_names_do_not_come_back(word: str) -> None:
-    # The changelog names what was renamed.
+    # The changelog may contain old names, because it lists renamed items.
     lines = lines_with(word, [name for name in READ if name != "CHANGELOG.md"])
     assert not lines, f"say '{LEFT[word]}': " + "\n".join(lines)
 

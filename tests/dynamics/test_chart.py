@@ -1,4 +1,4 @@
-"""The chart of the optimizer, and gradients on the tangent space."""
+"""Coordinate chart of the optimizer, and gradients on the tangent space."""
 
 from __future__ import annotations
 
@@ -70,7 +70,7 @@ def test_adjoint_gradients_are_casadis_derivatives_on_the_tangent_space(name: st
     cases: dict[str, tuple[ca.SX, ca.SX]] = {"vMv": (energy, tree.energy_gradient(tree.velocities(v)))}
     direction = tree.rotation(point) @ force
     cases["turning"] = (ca.dot(direction, moment), tree.turning_gradient(point, direction, moment))
-    # The gradient of a pair holds both responses fixed although they depend on q: d(τᵀM⁻¹τ') = −a'ᵀ dM a.
+    # The derivative treats both accelerations as constant although they depend on q: d(τᵀM⁻¹τ') = −a'ᵀ dM a.
     x, y = tree.respond(tau=tau), tree.respond(tau=other_tau)
     cases["τᵀM⁻¹τ'"] = (ca.dot(other_tau, x.a), tree.pair_gradient(x, y))
     for in_frame in (False, True):

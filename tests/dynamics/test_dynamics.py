@@ -1,4 +1,4 @@
-"""Symbolic dynamics against Pinocchio: every known robot, random trees of every joint, unusual URDFs."""
+"""Symbolic dynamics compared with Pinocchio: all known robots, random trees of all joint types, unusual URDFs."""
 
 from __future__ import annotations
 
@@ -47,7 +47,7 @@ def point_at(model: pin.Model, frame: int, offset: Vector = OFFSET) -> PointOnLi
 
 @dataclass(frozen=True)
 class Symbolic:
-    """Every expression of a tree as two functions: of (q, v, tau, wrench) and of chart coordinates."""
+    """All expressions of a tree as two functions, of (q, v, tau, wrench) and of chart coordinates."""
 
     model: pin.Model
     frame: int
@@ -104,7 +104,7 @@ OUTPUTS = (
 
 
 def compare(symbolic: Symbolic, q: Vector, generator: np.random.Generator) -> None:
-    """Check every quantity at one configuration against Pinocchio."""
+    """Compare every quantity at one configuration with Pinocchio."""
     model, frame = symbolic.model, symbolic.frame
     v, u, tau = (generator.normal(size=model.nv) for _ in range(3))
     w = generator.normal(size=6)
@@ -137,7 +137,7 @@ def compare(symbolic: Symbolic, q: Vector, generator: np.random.Generator) -> No
     }
     for name, value in expected.items():
         assert_close(result[name], value, TOLERANCE, name)
-    # The derivative algorithms of Pinocchio are independent of the backward sweeps.
+    # Pinocchio's derivative algorithms are independent of the backward sweeps under test.
     numeric, point = Numeric(model).at(q), point_at(model, frame)
     terms = (
         (numeric.coupling_gradient(point, w, other), np.abs(w) @ np.abs(J @ other)),
@@ -168,7 +168,7 @@ def symbolic_of(name: str) -> Symbolic:
 
 @pytest.mark.parametrize("name", NAMES)
 def test_robot_agrees_with_pinocchio(name: str) -> None:
-    # Zeros and right angles of the named postures take other branches of Pinocchio than random numbers.
+    # Named postures contain zeros and right angles, for which Pinocchio uses other branches than for random numbers.
     symbolic = symbolic_of(name)
     for k, q in enumerate(
         [*random_configurations(symbolic.model, 3, name, "dynamics"), *robot(name).postures.values()]
@@ -252,7 +252,7 @@ _AXIS = np.array([1.0, -2.0, 3.0]) / np.sqrt(14.0)
 
 @functools.cache
 def _continuous_about_an_odd_axis() -> pin.JointModel:
-    # Only the URDF parser can make this joint, Python cannot.
+    # Only the URDF parser can create this joint type; Python cannot.
     joint = '<parent link="a"/><child link="b"/><axis xyz="1 -2 3"/>'
     xml = f'<link name="a"/>{_LINK.format("b", 1.0)}<joint name="j" type="continuous">{joint}</joint>'
     return pin.buildModelFromXML(f'<robot name="r">{xml}</robot>').joints[1]
@@ -271,12 +271,12 @@ JOINTS: dict[str, Callable[[], pin.JointModel]] = {
 
 
 def random_tree(kinds: list[str], climbs: list[int], seed: int, armature: bool) -> pin.Model:
-    """Build a tree; the parent of joint k is the joint before it, or ``climbs[k]`` ancestors above."""
+    """Build a tree.  The parent of joint k is the preceding joint, or its ancestor ``climbs[k]`` levels above."""
     pin.seed(seed)
     generator = np.random.default_rng(seed)
     model, path = pin.Model(), [0]
     for k, kind in enumerate(kinds):
-        # With parents on the path from the root, the numbering is depth-first, as CRBA of Pinocchio requires.
+        # Choose parents on the path from the root, so that numbers are depth-first, as Pinocchio's CRBA requires.
         del path[max(1, len(path) - climbs[k]) :]
         joint = model.addJoint(path[-1], JOINTS[kind](), pin.SE3.Random(), f"{k} {kind}")
         body = pin.Inertia.Random()
@@ -324,7 +324,7 @@ def test_joints_that_no_urdf_makes_are_refused_by_name() -> None:
 
 
 def write_urdf(path: Path, joints: list[tuple[str, str]]) -> Path:
-    """Write a chain of links; ``joints`` are (type, axis)."""
+    """Write the URDF of a chain of links; ``joints`` lists pairs of type and axis."""
     text = ["<robot name='chain'>", _LINK.format("l0", 2.0)]
     for k, (kind, axis) in enumerate(joints):
         text.append(_LINK.format(f"l{k + 1}", 1.0 + 0.3 * k))

@@ -1,4 +1,4 @@
-"""The closed derivatives of the equations of a jump, against automatic differentiation of these equations."""
+"""Closed-form derivatives of the jump equations, compared with automatic differentiation."""
 
 from __future__ import annotations
 
@@ -48,7 +48,7 @@ def test_of_contacts_that_act_at_once() -> None:
 
 
 def functions_of(program: Program) -> tuple[ca.Function, ca.Function]:
-    """Return Jacobian and upper Hessian of the objective and its equations, in closed form and automatically."""
+    """Return Jacobian and upper Hessian of the objective and its equations, in closed form and by CasADi."""
     lifted = program.lifted
     assert lifted.jumps
     unknowns = ca.vertcat(program.rows.x, lifted.variables)
@@ -61,9 +61,9 @@ def functions_of(program: Program) -> tuple[ca.Function, ca.Function]:
 
 
 def same_as_automatic(program: Program) -> None:
-    """Compare at random unknowns, which do not satisfy the constraints."""
+    """Compare at random values of the unknowns, which do not satisfy the constraints."""
     ours, theirs = functions_of(program)
-    # At most 2 % more entries, because the solver factorizes all of them.
+    # The closed form may have at most 2 % more entries, because the solver factorizes all of them.
     assert ours.nnz_out() <= 1.02 * theirs.nnz_out()
     rng = np.random.default_rng(3)
     for _ in range(3):

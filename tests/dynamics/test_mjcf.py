@@ -38,7 +38,7 @@ SUPPORTED = sorted(JOINTS)
 
 
 class InMujoco:
-    """A model in MuJoCo without limits, because random postures violate them."""
+    """A MuJoCo model without joint limits, because random postures violate them."""
 
     def __init__(self, model: pin.Model) -> None:
         self.written = build_mjcf(model)
@@ -53,7 +53,7 @@ def in_mujoco(name: str) -> InMujoco:
 
 
 def qacc(layout: MjcfLayout, q: Vector, v: Vector, a: Vector) -> Vector:
-    """Return ``qacc = T a + Ṫ v``, shape (nv,).  ``Ṫ`` is due to linear parts that rotate with their body."""
+    """Return ``qacc = T a + Ṫ v``, shape (nv,).  ``Ṫ`` occurs because linear velocities are in rotating body axes."""
     turning = np.zeros(layout.nv)
     for slot in layout.slots:
         piece = v[slot.joint.v]
@@ -65,7 +65,7 @@ def qacc(layout: MjcfLayout, q: Vector, v: Vector, a: Vector) -> Vector:
 
 
 def compare(model: pin.Model, simulated: InMujoco, q: Vector, generator: np.random.Generator) -> None:
-    """Compare mass matrix, pose and Jacobian of every frame, and accelerations under gravity, velocity and torque."""
+    """Compare mass matrices, frame poses and Jacobians, and accelerations under gravity, velocity and torque."""
     layout, data = simulated.written.layout, simulated.data
     v, tau = generator.normal(size=model.nv), generator.normal(size=model.nv)
     T = layout.velocity_map(q)
@@ -108,7 +108,7 @@ def test_indices_equal_the_compiled_model(name: str) -> None:
         first = int(body.jntadr[0])
         assert simulated.model.jnt_qposadr[first] == slot.qpos.start
         assert simulated.model.jnt_dofadr[first] == slot.qvel.start
-    # A point mass gets 1e-15 kg m² of rotational inertia.  Nothing else is changed.
+    # Point masses get 1e-15 kg m² of rotational inertia; all other inertias are unchanged.
     assert simulated.model.body_mass.sum() == pytest.approx(pin.computeTotalMass(model), rel=1e-12)
     named = {f.name for f in model.frames} - {"universe"}
     assert {simulated.model.site(k).name for k in range(simulated.model.nsite)} == named
@@ -118,10 +118,10 @@ def test_indices_equal_the_compiled_model(name: str) -> None:
 
 
 def without_base_armature(model: pin.Model) -> pin.Model:
-    """Only armature that means the same to both: along axes that turn with the body it differs in what moves it.
+    """Remove armature that MuJoCo and Pinocchio interpret differently: of base joints, and partly of ball joints.
 
-    Mass matrices with it agree (below), accelerations do not: its momentum is the body's in one, the world's in the
-    other.  Balls have one number in MuJoCo.
+    With such armature the mass matrices still agree (below), but the accelerations differ.  In one program its
+    momentum is constant in body axes, in the other in world axes.  MuJoCo accepts one armature value per ball joint.
     """
     armature = np.array(model.armature)
     for joint in list(model.joints)[1:]:
@@ -151,7 +151,7 @@ def test_random_tree_agrees_with_pinocchio(kinds: list[str], seed: int, armature
 
 
 def test_joints_numbered_across_branches() -> None:
-    """Pinocchio may number a sister before a daughter, while MuJoCo numbers depth first."""
+    """Pinocchio may number a sibling before a child, but MuJoCo numbers depth-first."""
     pin.seed(3)
     model = pin.Model()
     for k, (parent, joint) in enumerate(
@@ -164,7 +164,7 @@ def test_joints_numbered_across_branches() -> None:
     simulated = InMujoco(model)
     assert [slot.joint.index for slot in simulated.written.layout.slots] == [1, 2, 4, 3, 5]
     (q,) = random_configurations(model, 1, "across")
-    # CRBA of Pinocchio requires depth-first numbers, and ABA does not.
+    # Pinocchio's CRBA requires depth-first numbers, its ABA does not.
     layout, data = simulated.written.layout, simulated.data
     v, tau = rng("v").normal(size=model.nv), rng("tau").normal(size=model.nv)
     data.qpos[:], data.qvel[:] = layout.qpos(q), layout.qvel(q, v)

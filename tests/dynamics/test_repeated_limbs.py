@@ -1,4 +1,4 @@
-"""Repeated limbs in SIMD lanes, against Pinocchio, on random robots and on known robots."""
+"""Repeated limbs in SIMD lanes, compared with Pinocchio on random and known robots."""
 
 from __future__ import annotations
 
@@ -44,7 +44,7 @@ COMPUTE: dict[str, Callable[..., np.ndarray]] = {
 
 
 def limbs_urdf(limb: list[int], limbs: int, seed: int, *, odd: bool) -> str:
-    """Return a body with limbs of equal joints and random numbers; with ``odd``, one more limb with other joints."""
+    """Return the URDF of a body with equal limbs and random numbers; ``odd`` adds a limb with other joints."""
     generator = np.random.default_rng(seed)
 
     def numbers(low: float, high: float, count: int = 3) -> str:
@@ -52,7 +52,7 @@ def limbs_urdf(limb: list[int], limbs: int, seed: int, *, odd: bool) -> str:
 
     def link(name: str) -> str:
         a, b, c = generator.uniform(0.01, 0.05, 3)
-        # Sums of two of three positive numbers satisfy the triangle inequality of inertias.
+        # Moments of inertia that are sums of two of three positive numbers satisfy the triangle inequality.
         return (
             f'<link name="{name}"><inertial><origin xyz="{numbers(-0.1, 0.1)}" rpy="{numbers(-1, 1)}"/>'
             f'<mass value="{generator.uniform(0.5, 3):.6f}"/><inertia ixx="{a + b:.6f}" ixy="0" ixz="0"'
@@ -76,7 +76,7 @@ def limbs_urdf(limb: list[int], limbs: int, seed: int, *, odd: bool) -> str:
 
 
 def values_of(graph: Graph, inputs: dict[str, np.ndarray]) -> dict[str, np.ndarray]:
-    """Return the outputs of a graph, with its vectors as arrays."""
+    """Evaluate a graph in Python and return its outputs; vectors become arrays."""
     result: list[np.ndarray | float] = []
     for node in graph.nodes:
         x = [result[a] for a in node.operands]
@@ -98,7 +98,7 @@ def values_of(graph: Graph, inputs: dict[str, np.ndarray]) -> dict[str, np.ndarr
 
 
 def shares(graph: Graph) -> dict[int, int]:
-    """Return width → number of operations of this width that an output needs."""
+    """Return how many operations an output needs, with the vector width as key."""
     needed: set[int] = set()
     waiting = [k for nodes in graph.outputs.values() for k in nodes]
     while waiting:
@@ -161,7 +161,7 @@ def test_random_limbs_against_pinocchio(
 
 
 def longest(graph: Graph) -> int:
-    """Return the length of the longest chain of operations."""
+    """Return the length of the longest chain of dependent operations."""
     depth: list[int] = []
     for node in graph.nodes:
         depth.append((node.op in ARITHMETIC) + max((depth[a] for a in node.operands), default=0))
@@ -198,7 +198,7 @@ def test_vectors_and_the_order_of_sums_keep_the_values(name: str, frame: str, wi
 
 
 def blocks_are_shared(library: ExportLibrary) -> None:
-    """Check that ``eval`` calls all blocks of ``value``, and that every node is computed once."""
+    """Check that ``eval`` calls all blocks of ``value``, and that each node is computed only once."""
     layout = lay_out(library.vector_graph(), [f.outputs for f in library.functions])
     calls = {
         function.name: {b for b, block in enumerate(layout.blocks) if k in block.functions}
@@ -225,7 +225,7 @@ def test_limbs_are_outermost_and_disjoint() -> None:
                 assert model.joints[i].shortname() == model.joints[j].shortname()
 
 
-# Five limbs are a vector of four and a single limb.
+# Five limbs give a vector of four lanes and one single limb.
 @pytest.mark.parametrize("count", [2, 5])
 def test_compiled_limbs(tmp_path: Path, count: int) -> None:
     need_compiler()
@@ -234,7 +234,7 @@ def test_compiled_limbs(tmp_path: Path, count: int) -> None:
     objective = WorstCaseObjective(loaded, ImpactContact("b1_2", (0.3, -0.4, 0.9)), kind="sticking")
     export(objective, tmp_path, prefix="t", check=False)
     strict = ("-Wall", "-Wextra", "-pedantic", "-Werror")
-    # test_angles_near_and_far covers vectors of two with the instructions of this processor.
+    # Native instructions are used only for five limbs; test_angles_near_and_far uses them for vectors of two.
     with built(tmp_path, "t", strict if count == 2 else (*strict, "-O3", "-march=native")) as compiled:
         assert largest_difference(compiled.gradient, objective, oracle_reference, 5) <= 1e-10
 
@@ -253,7 +253,7 @@ def test_portable_has_no_vectors_and_the_same_numbers(tmp_path: Path) -> None:
 
 @pytest.mark.parametrize("flags", [(), ("-O3", "-march=native")], ids=["plain", "native"])
 def test_angles_near_and_far(tmp_path: Path, flags: tuple[str, ...]) -> None:
-    """H of two links depends on the difference of their angles alone, also for angles near pi/2 and large angles."""
+    """H of two links depends only on the difference of their angles, also near pi/2 and for large angles."""
     need_compiler()
     (tmp_path / "t.urdf").write_text(limbs_urdf([0, 0], 2, 3, odd=False))
     loaded = load_robot(str(tmp_path / "t.urdf"), LoadOptions(root="fixed"))
@@ -267,7 +267,7 @@ def test_angles_near_and_far(tmp_path: Path, flags: tuple[str, ...]) -> None:
             expected = ImpactOracle(ImpactCase(loaded, objective.contact, objective.metric)).quantities(reduced)
             code, H, _ = compiled.eval(q, n)
             assert code == 0
-            # The rounding of a large angle limits the accuracy.
+            # The rounding of a large angle limits the attainable accuracy.
             assert pytest.approx(expected.H, rel=1e-11) == H, angle
 
 
@@ -281,7 +281,10 @@ def test_a_limb_with_another_axis_is_not_repeated() -> None:
 
 
 def test_two_exports_in_one_unit(tmp_path: Path) -> None:
-    """In a unity build both files are one unit, and the macros of the first do not disturb the second."""
+    """In a unity build, both C files form one translation unit.
+
+    Macros of the first file must not affect the second.
+    """
     compiler = need_compiler()
     for name, frame in (("solo8", "base_link"), ("panda", "panda_hand_tcp")):
         (tmp_path / name).mkdir()
@@ -293,7 +296,7 @@ def test_two_exports_in_one_unit(tmp_path: Path) -> None:
 
 
 def test_the_prefix_costs_no_room(tmp_path: Path) -> None:
-    """The names in thousands of operations are short, whatever the prefix."""
+    """Names in thousands of operations remain short for any prefix."""
     objective = WorstCaseObjective(robot("talos"), ImpactContact("gripper_right_base_link", (0.0, 0.6, 0.8)))
     export(objective, tmp_path, check=False)
     (source,) = tmp_path.glob("talos*.c")

@@ -11,7 +11,7 @@ from impact_posture.simulation.scenario_file import SHIPPED
 
 
 def shortened(name: str, **values: float) -> str:
-    """Return the text of a shipped scenario with other values of some keys."""
+    """Return the text of a shipped scenario with changed values of some keys."""
     text = (SHIPPED / f"{name}.toml").read_text(encoding="utf-8")
     for key, value in values.items():
         text, count = re.subn(rf"(?m)^{key} = [^#\n]*", f"{key} = {value} ", text)
@@ -21,7 +21,7 @@ def shortened(name: str, **values: float) -> str:
 
 @pytest.fixture(scope="session")
 def aerial(tmp_path_factory: pytest.TempPathFactory) -> Path:
-    """One early contact with the wall."""
+    """A scenario with one early contact with the wall."""
     pytest.importorskip("mujoco", reason="mujoco is not installed (the extra 'sim')")
     path = tmp_path_factory.mktemp("scenarios") / "aerial.toml"
     text = shortened("aerial-lateral", count=1, settle=0.1, dwell=0.2, pause=0.05, gap=0.06)
@@ -31,7 +31,7 @@ def aerial(tmp_path_factory: pytest.TempPathFactory) -> Path:
 
 @pytest.fixture(scope="session")
 def push(tmp_path_factory: pytest.TempPathFactory) -> Path:
-    """Early pushes in both directions."""
+    """A scenario with early pushes in both directions."""
     pytest.importorskip("mujoco", reason="mujoco is not installed (the extra 'sim')")
     path = tmp_path_factory.mktemp("scenarios") / "push.toml"
     path.write_text(shortened("solo8-push", settle=0.3, quiet=0.5, still=0.05, after=0.1), encoding="utf-8")

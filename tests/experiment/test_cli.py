@@ -1,4 +1,4 @@
-"""Commands ``simulate``, ``compare`` and ``reproduce``."""
+"""The commands ``simulate``, ``compare`` and ``reproduce``."""
 
 from __future__ import annotations
 
@@ -40,11 +40,11 @@ def test_simulate(aerial: Path, tmp_path: Path) -> None:
     speed = np.linalg.norm(series.v[series.slice(window["begin"], window["end"])], axis=1)
     assert speed.sum() * 1e-3 == pytest.approx(result["metrics"]["q_total_impact"])
     assert list((tmp_path / "run").glob("*.png")) and not list((tmp_path / "run").glob("*.pdf"))
-    # An existing folder needs --force.  The same command gives the same result.
+    # Replacing an existing folder requires --force.  The same command gives the same result.
     refused = start("simulate", str(aerial), "--controller", "robust", "--out", "run", cwd=tmp_path)
     assert refused.returncode == 1 and "--force" in refused.stderr
     assert document(*command, "--force", cwd=tmp_path) == result
-    # A series whose time does not advance has no report.
+    # A time series whose time does not increase cannot be reported.
     columns = vars(series) | {"t": np.zeros_like(series.t)}
     Series(**columns).save(tmp_path / "run" / "series.npz")
     refused = start("report", "run", cwd=tmp_path)
@@ -52,7 +52,7 @@ def test_simulate(aerial: Path, tmp_path: Path) -> None:
 
 
 def test_simulate_without_a_compiler(aerial: Path, tmp_path: Path) -> None:
-    """There is one warning, and the numbers are those of the compiled gradient."""
+    """The user gets one warning, and the numbers equal the results with the compiled gradient."""
     command = ("simulate", aerial, "--controller", "robust", "--format", "png", "--out")
     bare = {"PATH": str(tmp_path), "CC": "", "IMPACT_POSTURE_CACHE": str(tmp_path / "cache")}
     done = start(*command, "bare", cwd=tmp_path, env=bare)
@@ -80,7 +80,7 @@ def test_simulate_prints_a_summary(push: Path, tmp_path: Path) -> None:
 
 @pytest.fixture(scope="session")
 def falls(push: Path, tmp_path_factory: pytest.TempPathFactory) -> Path:
-    """A push after which every controller falls."""
+    """A push that makes every controller's robot fall."""
     path = tmp_path_factory.mktemp("scenarios") / "falls.toml"
     text, count = re.subn(r"(?m)^force = \[6.5, 0, 0\]", "force = [60, 0, 0]", push.read_text(encoding="utf-8"))
     assert count == 1
@@ -114,7 +114,7 @@ def test_compare_robots_that_fall(falls: Path, tmp_path: Path) -> None:
     for row in json.loads((tmp_path / "both" / "comparison.json").read_text())["rows"]:
         assert (row["status"], row["runs"], row["completed"]) == ("fell", 1, 0)
         assert row["metrics"] == {} and row["reduction"] is None and len(row["failed"]) == 1
-    # The page can be written later.
+    # The report can be written afterwards.
     assert not (tmp_path / "both" / "report.html").exists()
     done = start("report", "both", "--quiet", cwd=tmp_path)
     assert (done.returncode, done.stderr) == (0, "") and "(fell)" in (tmp_path / "both" / "report.html").read_text()
@@ -157,7 +157,7 @@ def test_compare(aerial: Path, tmp_path: Path) -> None:
     assert result["rows"][1]["reduction"]["mean"] == pytest.approx(1 - robust["mean"] / nominal["mean"], abs=0.05)
     assert json.loads((tmp_path / "both" / "comparison.json").read_text()) == result
     assert sorted(path.name for path in tmp_path.iterdir()) == ["both"], "the store is removed"
-    # The page shows both runs from the files of the folder.
+    # The report shows both runs, read from the files of the folder.
     assert start("report", "both", "--quiet", cwd=tmp_path).returncode == 0
     page = (tmp_path / "both" / "report.html").read_text()
     assert "default-src 'none'" in page and len(page) < 2e6

@@ -1,4 +1,4 @@
-"""Reports of run folders that were damaged or changed: an error in one line, or a page without foreign content."""
+"""Reports of damaged or changed run folders: a one-line error, or a page without foreign content."""
 
 from __future__ import annotations
 
@@ -26,7 +26,7 @@ SCRIPT = "<script>alert(1)</script>"
 
 @pytest.fixture(scope="module")
 def comparison(push: Path, tmp_path_factory: pytest.TempPathFactory) -> Path:
-    """A comparison of two controllers, without pictures and page."""
+    """A comparison of two controllers, without figures and report."""
     folder = tmp_path_factory.mktemp("comparison")
     options = "--controllers nominal,stiff --seeds 1 --jobs 1 --out both --format png --quiet --no-report".split()
     done = start("compare", str(push), *options, cwd=folder)
@@ -77,7 +77,7 @@ def archive(**entries: bytes) -> bytes:
 
 
 def array(shape: tuple[int, ...]) -> bytes:
-    """Return an NPY file with 10 numbers whose header states a shape."""
+    """Return an NPY file with 10 numbers whose header claims another shape."""
     header = io.BytesIO()
     np.lib.format.write_array_header_1_0(header, {"descr": "<f8", "fortran_order": False, "shape": shape})
     return header.getvalue() + bytes(80)
@@ -110,7 +110,7 @@ def test_arrays_larger_than_any_run_are_refused(both: Path, monkeypatch: pytest.
 
 
 def picture(width: int, height: int) -> bytes:
-    """Return a PNG that states a size and has no content."""
+    """Return a PNG file that claims a size but has no pixels."""
 
     def part(kind: bytes, data: bytes) -> bytes:
         return struct.pack(">I", len(data)) + kind + data + struct.pack(">I", zlib.crc32(kind + data))
@@ -119,7 +119,7 @@ def picture(width: int, height: int) -> bytes:
     return b"\x89PNG\r\n\x1a\n" + part(b"IHDR", head) + part(b"IDAT", zlib.compress(bytes(99))) + part(b"IEND", b"")
 
 
-# A picture of another format.  Pillow starts other programs for some formats.
+# A bitmap instead of a PNG.  Such formats must be rejected, because Pillow starts other programs for some formats.
 BITMAP = b"BM" + struct.pack("<IIIIiiHHIIIIII", 58, 0, 54, 40, 1, 1, 1, 24, 0, 4, 0, 0, 0, 0) + bytes(4)
 
 

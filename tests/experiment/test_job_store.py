@@ -1,4 +1,4 @@
-"""Jobs and their store: finished jobs do not run again unless one of their inputs has changed."""
+"""Simulation jobs and their store: a finished job runs again only if one of its inputs has changed."""
 
 from __future__ import annotations
 
@@ -70,7 +70,7 @@ def test_results_do_not_depend_on_processes_and_order(aerial: Path, store: JobSt
 def test_an_interrupted_batch_continues(aerial: Path, store: JobStore, monkeypatch: pytest.MonkeyPatch) -> None:
     jobs = [Job(str(aerial), "nominal", seed) for seed in range(3)]
     seeds: list[int] = []
-    # The same job has the same result (above), so each is run once.
+    # Equal jobs have equal results (tested above), so each job is simulated only once.
     cached = functools.cache(job_store.execute)
 
     def interrupted(job: Job, **options: Any) -> Any:

@@ -1,4 +1,4 @@
-"""Means, intervals, reductions, targets and texts, from synthetic documents."""
+"""Means, intervals, reductions, targets and texts, computed from synthetic documents."""
 
 from __future__ import annotations
 
@@ -51,14 +51,14 @@ def test_interval_follows_students_t() -> None:
     assert interval.mean - interval.half_width == pytest.approx(low)
     assert interval.mean + interval.half_width == pytest.approx(high)
     assert Interval.of([3.0]) == Interval(3.0, None, 1)
-    # Without noise, runs differ only by rounding.
+    # Without sensor noise, runs differ only by rounding.
     same = Interval.of([0.1 + 0.2, 0.3, 0.3])
     assert same.alike and same.shown is None and not interval.alike
     assert without_noise([same, same]) and not without_noise([same, interval]) and not without_noise([])
 
 
 def test_reductions_are_paired_by_seed() -> None:
-    # Half of the nominal value for each seed, in another order, and a seed without a nominal run.
+    # Each value is half of the nominal value of its seed, in another order; seed 9 has no nominal run.
     documents = [document("robust", k, (2.0 + 0.1 * k) / 2) for k in (3, 1, 0, 2)] + [document("robust", 9, 50.0)]
     row = row_of("aerial-vertical", "robust", documents, NOMINAL)
     assert row.reduction is not None
@@ -79,7 +79,7 @@ def test_failed_runs_are_reported_and_left_out() -> None:
     row = row_of("aerial-vertical", "robust", documents, NOMINAL)
     assert (row.status, row.completed, row.runs) == ("fell", 1, 2)
     assert row.failed == ("seed 1: fell: broke bound 1 at t = 2.50 s",) and row.metrics["peak_jump"].samples == 1
-    # There is no comparison if either robot fell.
+    # If either robot fell, there is no comparison.
     assert row.reduction is None and row.recovery is None and not row.change and missed_targets(row) is None
     against = row_of("aerial-vertical", "robust", [document("robust", 0, 1.0)], [failed("nominal", 0, "fell")])
     assert against.status == "completed" and against.reduction is None
@@ -105,7 +105,7 @@ def test_the_gravest_event_of_two_pushes_is_reported() -> None:
     [
         ({}, ()),
         ({"q": 1.1}, ("reduction",)),
-        # The motion is stored in the window and released after it.
+        # Motion that a controller delays during the window reappears in the recovery.
         ({"q_total_recovery": 4.7}, ("recovery",)),
         ({"q_total_recovery": 4.2}, ()),
         ({"peak_recovery": 3.1}, ("peak_recovery",)),
@@ -132,7 +132,7 @@ def rows() -> list[Any]:
 def test_the_best_row_meets_the_targets_or_else_moves_least() -> None:
     best = best_of(rows())
     assert best is not None and best.controller == "posture"
-    # Without `posture`, no row meets every target.  `walker` moves least, but was not at rest.
+    # Without `posture`, no row meets all targets.  `walker` moves least, but did not come to rest.
     best = best_of([row for row in rows() if row.controller != "posture"])
     assert best is not None and best.controller == "robust"
     assert best_of(rows()[:1]) is None
@@ -185,7 +185,7 @@ def test_values_of_the_paper_fit_the_scenarios() -> None:
     assert set(PAPER) == set(RECOMMENDED) < set(known_scenarios())
     assert set(MEANING) == set(CONTROLLERS)
     for name, row in PAPER.items():
-        # The percentages in the text follow from the rounded numbers of the table.
+        # The percentages in the text are computed from the rounded numbers of the table.
         assert row.reduction == pytest.approx(1 - row.robust / row.nominal, abs=6e-3)
         assert controllers_of(name, False)[:2] == ("nominal", "robust")
         assert set(CONTROLLERS) < set(controllers_of(name, True))

@@ -1,4 +1,4 @@
-"""Paths on the constraints: around a disc, on a curve of two components, by sampling, and reasons without a path."""
+"""Paths on the constraints: around a disc, on a curve of two components, by sampling, and why no path exists."""
 
 from __future__ import annotations
 
@@ -35,7 +35,7 @@ from tests.support.settings import make_settings
 
 
 class OutsideDisc(ExpressionConstraint):
-    """A frame of a planar arm stays outside a disc: ``|p(q) − c|² ≥ r²``."""
+    """Constraint that keeps a frame of a planar arm outside a disc: ``|p(q) − c|² ≥ r²``."""
 
     def __init__(self, problem: ConstrainedProblem, frame: str, center: Array, radius: float) -> None:
         self.name, self.parameters = f"disc at {frame}", np.zeros(0)
@@ -51,7 +51,7 @@ class OutsideDisc(ExpressionConstraint):
 
 
 def planar(rods: list[float], joints: list[float]) -> ConstrainedProblem:
-    """Return the problem of a planar arm whose tip is held in position."""
+    """Return the problem of a planar arm with a fixed tip position."""
     loaded = arm([Z] * len(rods), joints, floating=False, rods=[(length, 0, 0) for length in rods])
     objective = WorstCaseObjective(loaded, ImpactContact(TIP, (0.6, 0.8, 0.0)))
     return build_problem(loaded, objective, loaded.posture(), Requirements(contact_pose="position"))
@@ -64,20 +64,20 @@ def with_disc(problem: ConstrainedProblem, frame: str, center: Array, radius: fl
 
 
 def elbows(rods: list[float], q: Array) -> Array:
-    """Return all joints and the tip of a planar arm by an independent formula, shape (n + 1, 2)."""
+    """Return all joints and the tip of a planar arm, computed independently, shape (n + 1, 2)."""
     angles = np.cumsum(q)
     steps = np.array(rods)[:, None] * np.column_stack([np.cos(angles), np.sin(angles)])
     return np.vstack([np.zeros(2), np.cumsum(steps, axis=0)])
 
 
 def solution_of(problem: ConstrainedProblem, start: Array, end: Array) -> PostureSolution:
-    """Return a solution without a search."""
+    """Return a solution without running a search."""
     values = {name: None for name in PostureSolution.__dataclass_fields__}
     return PostureSolution(**values | {"problem": problem, "initial": start, "q": end, "optima": ()})  # type: ignore[arg-type]
 
 
 def dense(problem: ConstrainedProblem, postures: list[Array], parts: int = 5) -> list[Array]:
-    """Return a path with more postures on the constraints between its postures."""
+    """Return a path with additional postures on the constraints between its postures."""
     space = PathSpace(problem)
     between = [pin.interpolate(space.model, a, b, k / parts) for a, b in pairwise(postures) for k in range(parts)]
     return [*(space.projector.project(np.asarray(q)).q for q in between), postures[-1]]
@@ -109,7 +109,7 @@ def test_a_walk_around_a_disc_holds_the_tip_and_stays_outside(seed: int, place: 
 
 
 def test_a_path_passes_a_disc_on_the_straight_walk() -> None:
-    """The test above would also pass if the disc were never in the way."""
+    """The previous test would also pass if the disc never blocked the straight path."""
     problem = planar(RODS, [0.4, 0.5, -0.9, 0.6])
     space, start = PathSpace(problem), problem.given
     end = space.projector.project(start + np.array([0.9, -1.2, 0.5, 0.3])).q
@@ -130,7 +130,7 @@ def test_no_frame_moves_more_than_the_check_distance_between_two_checks() -> Non
         objective = WorstCaseObjective(loaded, ImpactContact(frame, (0, 0, 1)))
         requirements = Requirements(contact_pose="free", com_over_feet=False)
         problem = build_problem(loaded, objective, loaded.posture(), requirements)
-        # The distance of frames counts only with an inequality.
+        # Distances of frames are checked only if the problem has an inequality, so add one.
         space = PathSpace(with_disc(problem, frame, np.full(2, 9.0), 0.1))
         data = loaded.model.createData()
         for seed in range(5):
@@ -172,18 +172,18 @@ def test_no_frame_moves_more_than_the_check_distance_beside_a_disc() -> None:
     assert count > len(path)
 
 
-# The crank turns fully (0.1 + 0.5 < 0.4 + 0.4), so the two assemblies of the linkage are two components.
+# The crank can turn fully (0.1 + 0.5 < 0.4 + 0.4), so the two assemblies of the linkage are separate components.
 CRANK = [0.1, 0.4, 0.4]
 
 
 def crank() -> tuple[ConstrainedProblem, Array, Array]:
-    """Return the linkage with its tip at (0.5, 0), and a posture of each component."""
+    """Return the linkage with its tip at (0.5, 0), and one posture of each component."""
     up = assembled(0.3, 1.0)
     return planar(CRANK, up.tolist()), up, assembled(2.0, -1.0)
 
 
 def assembled(crank_angle: float, side: float) -> Array:
-    """Return the posture at a crank angle with the elbow on a side of the diagonal, by the law of cosines."""
+    """Return the posture for a crank angle, by the law of cosines; the sign ``side`` selects the elbow."""
     pivot = 0.1 * np.array([np.cos(crank_angle), np.sin(crank_angle)])
     diagonal = np.array([0.5, 0.0]) - pivot
     size = float(np.linalg.norm(diagonal))
@@ -219,7 +219,7 @@ def test_a_path_takes_the_open_side_and_two_cuts_prove_that_none_exists() -> Non
         path = posture_path(solution_of(blocked, up, target))
         assert path.found is not cut and ("cut the self-motion in both directions" in path.reason) is cut
         if not cut:
-            # Down from 0.3 rad to 2.6 rad, on the side without the disc.
+            # The path goes from 0.3 rad down to 2.6 − 2π rad, on the side without the disc.
             assert path.q[-1][0] - up[0] == pytest.approx(2.3 - 2 * np.pi, abs=1e-6) and path.max_violation < 1e-8
 
 
@@ -229,7 +229,7 @@ def test_an_optimum_on_another_component_cannot_be_reached() -> None:
     path = posture_path(solution)
     assert not path.found and "(the optimum is on another component of the self-motion)" in path.reason
     assert path.objective < problem.objective.value(solution.initial) and path.max_violation < 1e-8
-    # A walk along the null space of Pinocchio's Jacobian, all around or to both limits, does not come near.
+    # A walk along the null space of Pinocchio's Jacobian does not approach the optimum in either direction.
     space, known = PathSpace(problem), list[Array]()
     for side in (1.0, -1.0):
         q, ahead = solution.initial, np.zeros(problem.robot.nv)
@@ -286,7 +286,7 @@ def test_sampling_ends_without_a_path() -> None:
 
 @pytest.mark.parametrize("name", ["tilthex_arm", "solo8", "g1"])
 def test_random_postures_of_robots_are_reached_on_the_constraints(name: str) -> None:
-    """The robots have floating bases, and g1 redundant rows of two feet."""
+    """The robots have floating bases; for g1, the constraint rows of the two feet are redundant."""
     frame = robot(name).spec.contact.frame
     problem = prepare(make_settings({"robot": name, "normal": (-1, 0, 0), "frame": frame})).problem
     space = PathSpace(problem)

@@ -1,4 +1,4 @@
-"""Output of ``--path``: files that agree, a block of ``result.json``, a figure, and an error without the extra."""
+"""Output of ``--path``: consistent files, a block of ``result.json``, a figure, and an error without the extra."""
 
 from __future__ import annotations
 
@@ -67,12 +67,12 @@ def test_csv_npz_and_yaml_agree(settings: dict[str, object], tmp_path: Path) -> 
             column = head.index(f"q:{name}")
             assert angle == values[k, column]
             assert (speed, gain) == (values[k, head.index(f"v:{name}")], values[k, head.index(f"a:{name}")])
-            # The angle equals the entry of q, which may be a cosine and a sine.
+            # The written angle equals the angle in q, which may be stored as cosine and sine.
             index = loaded.model.getJointId(name)
             entries = path.q[k][loaded.model.idx_qs[index] :][: loaded.model.nqs[index]]
             of_q = entries[0] if len(entries) == 1 else np.arctan2(entries[1], entries[0])
             assert np.cos(angle - of_q) == pytest.approx(1)
-    # A continuous joint does not jump where its angle wraps.
+    # The written angle of a continuous joint does not jump by 2π.
     assert np.abs(np.diff(values[:, 1 : 1 + nx], axis=0)).max() < 0.2
 
     block = json.loads(json.dumps(path.to_dict(), allow_nan=False))

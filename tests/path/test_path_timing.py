@@ -1,4 +1,4 @@
-"""Motions along paths: analytic durations, limits by RNEA at ten times the resolution, forces that exist."""
+"""Timed paths: analytic durations, torque limits by RNEA at ten times the resolution, feasible contact forces."""
 
 from __future__ import annotations
 
@@ -45,7 +45,7 @@ def solved(name: str) -> PostureSolution:
 
 @pytest.fixture(params=CASES, scope="module")
 def dense(request: pytest.FixtureRequest) -> tuple[Robot, PosturePath]:
-    """The same motion at ten times the resolution."""
+    """The same timed path at ten times the resolution."""
     solution = solved(request.param)
     coarse = posture_path(solution)
     with pytest.MonkeyPatch.context() as patch:
@@ -61,16 +61,16 @@ def test_positions_velocities_and_accelerations_agree(dense: tuple[Robot, Postur
     loaded, path = dense
     dt = np.diff(path.t)[:, None]
     steps = np.array([pin.difference(loaded.model, a, b) for a, b in zip(path.q, path.q[1:], strict=False)])
-    # Postures are pulled onto the constraints by up to 1e-5 each.
+    # Projection onto the constraints moves each posture by up to 1e-5.
     assert np.abs(steps - dt * (path.v[1:] + path.v[:-1]) / 2).max() < 3e-5
-    # The time-optimal acceleration jumps; elsewhere it is the slope of the velocity.
+    # The time-optimal acceleration has jumps; between the jumps it is the slope of the velocity.
     off = np.abs(np.diff(path.v, axis=0) / dt - (path.a[1:] + path.a[:-1]) / 2).max(axis=1)
     assert np.median(off) < 0.01 * np.abs(path.a).max()
     assert np.abs(path.v[[0, -1]]).max() < 1e-6
 
 
 def test_limits_hold_at_ten_times_the_resolution(dense: tuple[Robot, PosturePath]) -> None:
-    """The oracle is RNEA on the model of the robot, and forces as sums of rays in the friction cones."""
+    """The oracle is RNEA on the robot's model, with contact forces as sums of friction cone rays."""
     loaded, path = dense
     model, data = loaded.model, loaded.model.createData()
     base = 6 if loaded.floating else 0
@@ -92,12 +92,12 @@ def test_limits_hold_at_ten_times_the_resolution(dense: tuple[Robot, PosturePath
         )  # fmt: skip
         assert np.abs(fit.fun).max() < 1e-5 * loaded.mass * 9.81
     if not base:
-        # The motion is fast, because it reaches a limit.
+        # The motion is as fast as possible, because it reaches a limit.
         assert max(largest, float((np.abs(path.v) / model.velocityLimit).max())) > 0.98
 
 
 def forces(loaded: Robot, q: Array) -> tuple[Array, Array, Array]:
-    """Return generalized forces of rotors, or of rays on the friction cones of the feet, and their bounds."""
+    """Return the generalized forces of rotors, or of friction cone rays at the feet, and their bounds."""
     if loaded.spec.propulsion is not None:
         matrix = np.vstack([allocation_matrix(loaded.model, loaded.spec.propulsion), np.zeros((loaded.nv - 6, 6))])
         low, high = thrust_limits(loaded.spec.propulsion)
@@ -117,7 +117,7 @@ def forces(loaded: Robot, q: Array) -> tuple[Array, Array, Array]:
 
 
 def pendulum(effort: float, *, gravity: float = 0.0) -> PathSpace:
-    """Return the postures of a hinge, whose axis is vertical without gravity, else level."""
+    """Return the posture space of a hinge; its axis is horizontal with gravity and vertical without."""
     loaded = arm([(0, 1, 0) if gravity else Z], [0.0], floating=False, rods=[(0.5, 0, 0)], effort=effort)
     objective = WorstCaseObjective(loaded, ImpactContact(TIP, (0, 0, 1) if gravity else (0, 1, 0)))
     return PathSpace(build_problem(loaded, objective, loaded.posture(), Requirements(contact_pose="free")))
@@ -133,7 +133,7 @@ def curve_of(space: PathSpace, angle: float) -> PathCurve:
 
 @pytest.mark.parametrize(("effort", "angle"), [(0.5, 1.0), (2.0, -0.7)])
 def test_a_pendulum_has_the_duration_of_bang_bang_control(effort: float, angle: float) -> None:
-    """T = 2 √(I Δ/τ).  With the smooth law, the largest acceleration is 10/√3 Δ/T²."""
+    """T = 2 √(I Δ/τ) for bang-bang torque.  With the smooth law, the largest acceleration is 10/√3 Δ/T²."""
     space = pendulum(effort)
     inertia = float(pin.crba(space.model, space.model.createData(), space.problem.given)[0, 0])
     limits = limits_of(space)
@@ -165,7 +165,7 @@ def test_a_motion_is_slow_only_at_a_corner(name: str, monkeypatch: pytest.Monkey
         assert shares is not None
         largest = max(largest, float(np.abs(shares).max()), float((np.abs(v) / loaded.velocity_limits).max()))
     assert 0.5 < largest < 1.0
-    # On straight parts of the curve, the motion is much faster than at the corner.
+    # The motion is much faster on straight parts of the curve than at its corner.
     slow = np.linalg.norm(motion.z - curve.z[48], axis=1).argmin()
     assert np.abs(motion.v[slow]).max() < 0.3 * np.abs(motion.v).max()
 
@@ -177,13 +177,13 @@ def test_without_a_torque_limit_only_velocities_count() -> None:
     assert motion.method == "scaled" and motion.notes == (
         "no effort limit of a joint is known: timed by velocities alone",
     )
-    # The joint may turn at 10 rad/s, and the smooth law is fastest in its middle: 15/8 Δ/T.
+    # The joint may turn at 10 rad/s.  The smooth law reaches its maximum speed of 15/8 Δ/T in the middle.
     assert np.abs(motion.v).max() == pytest.approx(10.0, rel=1e-3)
     assert motion.t[-1] == pytest.approx(15 / 8 / 10.0, rel=1e-3)
 
 
 def test_the_known_torque_limits_count_beside_an_unknown_limit() -> None:
-    """The first of two vertical hinges has a known torque limit and the duration of bang-bang control."""
+    """Only the first of two vertical hinges has a known torque limit; the duration equals its bang-bang control."""
     loaded = arm([Z, Z], [0.0, 0.0], floating=False, rods=[(0.5, 0, 0)] * 2, effort=0.5)
     loaded.model.effortLimit = np.array([0.5, 0.0])
     objective = WorstCaseObjective(loaded, ImpactContact(TIP, (0, 1, 0)))
@@ -215,7 +215,7 @@ def test_a_floating_base_without_rotors_or_feet_has_no_limits() -> None:
 
 @pytest.mark.parametrize("name", ["solo8", "go2", "anymal_c"])
 def test_a_light_standing_robot_rests_and_a_slippery_one_does_not(name: str) -> None:
-    """On level ground, a symmetric stance needs no friction at rest, but a push sideways needs friction."""
+    """On level ground, a symmetric stance needs no friction at rest, but a lateral push requires friction."""
     loaded = robot(name)
     supports = loaded.spec.supports
     objective = WorstCaseObjective(loaded, ImpactContact(loaded.spec.contact.frame, (1, 0, 0)), supports=supports)
@@ -227,7 +227,7 @@ def test_a_light_standing_robot_rests_and_a_slippery_one_does_not(name: str) -> 
     assert shares is not None and np.abs(shares).max() < 1
     rate = limits.largest_rate(q, rest, sideways)
     assert rate is not None
-    # μ g bounds the acceleration of the center of mass, even with unlimited motors.
+    # Even with unlimited motors, μ g bounds the acceleration of the center of mass.
     assert 0 < rate < 0.7 * 9.81 * 1.5
     slippery = ActuatorLimits(objective, q, Requirements(friction=0.07)).largest_rate(q, rest, sideways)
     assert slippery is None or slippery < 0.3 * rate

@@ -197,7 +197,7 @@ class WithoutExpression(WithinDistance):
     projected = False
 
     def symbolic(self, tree, parameters):
-        raise AssertionError("the manifold asks for an expression that such a constraint does not have")
+        raise AssertionError("the manifold requests an expression, but this constraint has none")
 
 
 @pytest.mark.parametrize("kind", [WithinDistance, WithoutExpression])

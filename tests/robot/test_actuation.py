@@ -1,4 +1,4 @@
-"""Rotors and motors: allocation, hover in every named posture, lateral force."""
+"""Rotors and motors: thrust allocation, hovering in every named posture, and lateral force."""
 
 from __future__ import annotations
 
@@ -41,7 +41,7 @@ def model() -> pin.Model:
 
 
 def flat(count: int, **changes: object) -> PropulsionSpec:
-    """Return coplanar rotors that all push up."""
+    """Return coplanar rotors whose thrusts all point up."""
     rotors = [
         RotorSpec(
             name=f"r{i}",
@@ -85,7 +85,7 @@ def test_rotor_directions_follow_the_stated_tilts(propulsion: PropulsionSpec) ->
 
 
 def test_one_rotor_by_hand(model: pin.Model) -> None:
-    # A rotor 0.5 m ahead that pushes up and turns left-handed about its thrust (spin +1 makes -κ f about it).
+    # The rotor is 0.5 m ahead, pushes up, and has spin +1, so its drag torque is -κ f about the thrust.
     one = RotorSpec(name="r", position=(0.5, 0.0, 0.0), direction=(0.0, 0.0, 1.0), spin=1)
     matrix = allocation_matrix(model, flat(4, rotors=(one,)))
     np.testing.assert_allclose(matrix[:, 0], [0, 0, 1, 0, -0.5, -0.02], atol=1e-15)
@@ -126,7 +126,7 @@ def test_hovers_level_in_every_named_posture(posture: str, model: pin.Model, pro
     assert result.thrust_margin > 0.25
     assert result.torque_margin > 0.75
     np.testing.assert_allclose(propulsion.thrust_coefficient * result.speeds**2, result.thrusts)
-    # Independent check: with these inputs, inverse and forward dynamics give rest.
+    # Independent check: for these inputs, inverse and forward dynamics give zero acceleration.
     inputs = np.r_[result.thrusts, result.joint_torques]
     forces = actuation_matrix(model, propulsion) @ inputs
     zero = np.zeros(model.nv)
@@ -140,12 +140,12 @@ def test_lateral_force_is_about_five_newtons(posture: str, model: pin.Model, pro
     assert pin.computeTotalMass(model) == pytest.approx(3.02)
     for value in (force.forward, force.backward, force.left, force.right):
         assert 3.0 < value < 6.0
-    # The arm moves in the plane of symmetry.
+    # The arm moves in the symmetry plane of the robot.
     assert force.left == pytest.approx(force.right, rel=1e-6)
 
 
 def test_lateral_force_is_the_last_feasible_one(model: pin.Model, propulsion: PropulsionSpec) -> None:
-    # Six rotors fix the thrusts: at the reported force one of them is at a limit.
+    # Six rotors determine the thrusts uniquely: at the reported lateral force, one rotor is at a limit.
     q = model.referenceConfigurations["brace_forward"]
     force_range = lateral_force_range(model, propulsion, q)
     low, high = thrust_limits(propulsion)

@@ -1,4 +1,4 @@
-"""Bad models and specs: each error is a line with the fault, the place and a hint."""
+"""Invalid models and specs: each error is one line with the fault, the place and a hint."""
 
 from __future__ import annotations
 
@@ -34,7 +34,7 @@ def inertia(xx: float, yy: float, zz: float, xy: float = 0.0, mass: float = 1.0)
 
 @pytest.fixture
 def load(tmp_path: Path) -> Callable[..., object]:
-    """Load a robot made of the given elements, or a file with the given text."""
+    """Load a robot that consists of the given elements, or a file with the given text."""
 
     def make(*elements: str, text: str | None = None, toml: str | None = None, **options: object) -> object:
         path = tmp_path / "bad.urdf"
@@ -52,7 +52,7 @@ Load = Callable[..., object]
 
 
 def one_line(error: ImpactPostureError, *words: str) -> None:
-    """Check that the error is a complete line with all words and an exit code, and that it can be pickled."""
+    """Check that the error is one line with all words and an exit code, and that the error can be pickled."""
     assert "\n" not in error.line
     assert str(error) == error.line
     assert error.what and error.where and error.hint
@@ -96,12 +96,12 @@ def test_files_that_are_no_robot(
     with pytest.raises(UrdfError) as caught:
         load(text=text)
     one_line(caught.value, *words)
-    # Messages of the parser do not reach the terminal.
+    # Messages of the parser must not appear on the terminal.
     assert capfd.readouterr() == ("", "")
 
 
 def test_a_mimic_of_a_joint_that_does_not_exist_is_a_warning(load: Load) -> None:
-    """Pinocchio ignores it, and published robots have such joints."""
+    """Pinocchio ignores such a mimic, and published robots contain such joints."""
     parts = link("a", GOOD), link("b", OFF_AXIS), link("c", OFF_AXIS), joint("a", "b")
     for other in ("a_bb", ""):
         loaded = load(*parts, joint("b", "c").replace("</joint>", f'<mimic joint="{other}"/></joint>'))
@@ -176,7 +176,7 @@ def test_impossible_inertias(load: Load, inertial: str, words: tuple[str, ...]) 
 
 
 def test_rounding_in_an_inertia_is_allowed(load: Load) -> None:
-    # A thin plate printed with four digits: izz = ixx + iyy up to the last digit.
+    # A thin plate, printed with four digits: izz = ixx + iyy except in the last digit.
     load(link("a", GOOD), link("b", inertia(0.01234, 0.02345, 0.0358)), joint("a", "b"))
 
 
@@ -205,7 +205,7 @@ def test_a_joint_that_moves_no_mass(load: Load) -> None:
     with pytest.raises(InertiaError) as caught:
         load(*elements)
     one_line(caught.value, "joint 'b_c' moves no mass", "`lock_massless`")
-    # An armature gives the joint an inertia, and a lock removes the joint.
+    # An armature gives the joint an inertia; locking removes the joint.
     load(*elements, armature={"b_c": 0.01})
     load(*elements, lock=("b_c",))
 
@@ -247,7 +247,7 @@ def test_a_joint_through_a_point_mass(load: Load) -> None:
     with pytest.raises(InertiaError) as caught:
         load(link("a", GOOD), link("b", OFF_AXIS), link("c", on_axis), joint("a", "b"), joint("b", "c"))
     one_line(caught.value, "b_c moves no inertia")
-    # Off the axis, a point mass has inertia.
+    # A point mass that is off the axis has inertia.
     load(link("a", GOOD), link("b", OFF_AXIS), link("c", on_axis), joint("a", "b"), joint("b", "c", "1 0 0"))
 
 
@@ -261,7 +261,7 @@ def test_two_joints_about_one_axis_without_mass_between(load: Load) -> None:
 
 
 def test_units_do_not_make_a_mass_matrix_singular(load: Load) -> None:
-    # Grams behind tons are badly scaled, but every joint moves an inertia.
+    # A mass of grams on a base of tons makes the matrix badly scaled, but every joint moves an inertia.
     tiny = '<origin xyz="0.001 0 0"/>' + inertia(1e-9, 1e-9, 1e-9, mass=1e-3)
     heavy = inertia(500.0, 500.0, 500.0, mass=2000.0)
     load(link("a", heavy), link("b", tiny), joint("a", "b"), root="free-flyer")

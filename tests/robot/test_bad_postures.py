@@ -1,4 +1,4 @@
-"""Bad postures, contacts and weights: each error is a line with the fault, the place and a hint."""
+"""Invalid postures, contacts and weights: each error is one line with the fault, the place and a hint."""
 
 from __future__ import annotations
 
@@ -109,7 +109,7 @@ def test_posture_outside_the_limits() -> None:
     assert caught.value.upper == loaded.model.upperPositionLimit[k]
     one_line(caught.value, "panda_joint4", "0.5", "limits")
     np.testing.assert_array_equal(loaded.check_posture(q, limits=False), q)
-    # A value beyond the limit by a rounding error is allowed.
+    # A value may exceed the limit by a rounding error.
     q[k] = loaded.model.upperPositionLimit[k] + 1e-9
     loaded.check_posture(q)
 

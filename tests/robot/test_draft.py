@@ -1,4 +1,4 @@
-"""Guesses from names and geometry of a robot, and the drafted ``robot.toml``."""
+"""Guesses from the names and the geometry of a robot, and the drafted ``robot.toml``."""
 
 from __future__ import annotations
 
@@ -61,7 +61,7 @@ def test_feet_and_tips_by_names_and_geometry(path: str, expected: tuple[str, ...
     assert feet(loaded) == expected
     ordered = tips(loaded, feet(loaded))
     assert ordered[0] == tip
-    # Nothing that moves is left out.
+    # The order includes every moving frame.
     assert set(ordered) == {str(f.name) for f in loaded.model.frames if f.parentJoint > 0} - {"root_joint"}
 
 
@@ -75,14 +75,14 @@ def test_feet_and_tips_by_names_and_geometry(path: str, expected: tuple[str, ...
     ],
 )
 def test_a_sole_is_read_from_balls_and_boxes(path: str, foot: str, kind: str, size: tuple[float, float]) -> None:
-    """A foot is a ball on b1, a box on talos, four balls on g1, and a mesh, which is not opened, on go2."""
+    """The foot is a ball on b1, a box on talos, four balls on g1, and a mesh on go2, which is not read."""
     loaded = load_robot(uri(path), LoadOptions(root="free-flyer"))
     spec = support(loaded, foot, example_robot_data() / path, flat=False)
     assert spec.kind == kind
     assert spec.size == pytest.approx(size, abs=1e-3)
     assert any(spec.offset) == ("go2" not in path)
     if kind == "point" and any(spec.offset):
-        # The lowest point of a ball lies straight below its center, one radius down.
+        # The lowest point of a ball is one radius below its center.
         data = loaded.model.createData()
         pin.framesForwardKinematics(loaded.model, data, loaded.posture())
         down = data.oMf[loaded.frame_id(foot)].rotation @ np.array(spec.offset)
@@ -90,7 +90,7 @@ def test_a_sole_is_read_from_balls_and_boxes(path: str, foot: str, kind: str, si
 
 
 def commented(text: str) -> list[str]:
-    """Return the lines with a key without a comment, neither beside nor above the key."""
+    """Return the lines with a key that have no comment in the same line or the line above."""
     lines = text.splitlines()
     keys = [k for k, line in enumerate(lines) if " = " in line and not line.startswith(("#", "schema"))]
     return [lines[k] for k in keys if "  # " not in lines[k] and not lines[k - 1].startswith("# ")]
@@ -98,7 +98,7 @@ def commented(text: str) -> list[str]:
 
 @pytest.mark.parametrize("name", [*CATALOGUE, "b1-z1"])
 def test_a_draft_loads_without_change(name: str, tmp_path: Path) -> None:
-    """The draft from the URDF alone has the root and the feet of the known robot."""
+    """The draft, made from the URDF alone, has the root and feet of the known robot."""
     known = CATALOGUE.get(name)
     source = B1_Z1 if known is None else known.model.urdf
     assert source is not None
@@ -153,7 +153,7 @@ def test_names_cannot_break_out_of_a_comment() -> None:
 
 
 def test_b1_z1_stays_upright_with_its_draft(tmp_path: Path) -> None:
-    """Without a robot.toml, the optimal posture was upside down."""
+    """Without a robot.toml, the optimal posture would be upside down."""
     out, _ = write_draft(B1_Z1, LoadOptions(), tmp_path / "b1-z1.toml")
     prepared = prepare(make_settings({"robot": B1_Z1, "config": str(out), "normal": (-1, 0, 0)}))
     solution = solve(prepared.problem, starts=2, jobs=1, compile="never")

@@ -1,4 +1,4 @@
-"""Joint models: the inertia in an impact, against Pinocchio models without rotors or without joints."""
+"""Joint models: their inertia in an impact, compared with Pinocchio models without rotors or without joints."""
 
 from __future__ import annotations
 
@@ -40,7 +40,7 @@ KINDS: tuple[ObjectiveKind, ...] = ("impulse", "speed", "sticking", "energy")
 
 
 def stated(loaded: Robot, **table: object) -> Robot:
-    """Return the robot with another ``[transmission]``."""
+    """Return the robot with another ``[transmission]`` table."""
     return replace(loaded, spec=replace(loaded.spec, transmission=TransmissionSpec(**table)))  # type: ignore[arg-type]
 
 
@@ -52,7 +52,7 @@ def objective(
 
 
 def with_some_locked(loaded: Robot, count: int = 2) -> Robot:
-    """Return the link model of a robot whose last joints are locked and whose first joint is rigid."""
+    """Return the link model of a robot with locked last joints and a rigid first joint."""
     names = loaded.joint_names
     joints = {name: JointTransmissionSpec("locked") for name in names[-count:]}
     joints[names[0]] = JointTransmissionSpec("rigid")
@@ -98,7 +98,7 @@ def test_links_alone_are_the_robot_without_armature(name: str, kind: ObjectiveKi
 @pytest.mark.parametrize("metric", ["euclidean", "kinetic"])
 @pytest.mark.parametrize("kind", KINDS)
 def test_locked_joints_equal_a_model_without_them(name: str, kind: ObjectiveKind, metric: str) -> None:
-    """Pinocchio builds the reduced model at each posture."""
+    """Pinocchio builds the reduced model separately for each posture."""
     loaded = robot(name)
     supports = () if name == "talos" else loaded.spec.supports
     joints = {joint: JointTransmissionSpec("locked") for joint in loaded.joint_names[1::3]}
@@ -116,7 +116,7 @@ def test_locked_joints_equal_a_model_without_them(name: str, kind: ObjectiveKind
         short = np.concatenate([q[q_slice(loaded.model, i)] for i in range(1, loaded.model.njoints) if i not in ids])
         assert mine.value(q) == pytest.approx(other.value(short), rel=1e-9)
         assert not mine.oracle.quantities(q).jump[~kept].any()
-        # Gradients are compared along the joints that exist in both models.
+        # The gradients are compared only along joints of both models.
         assert relative(mine.gradient(q)[kept], other.gradient(short)) < 1e-8
 
 
@@ -158,7 +158,7 @@ def test_random_arms_with_random_transmissions(data: st.DataObject) -> None:
     assert float(value) == pytest.approx(quantities.H, rel=1e-9, abs=1e-12)
     scale = max(np.abs(mine.gradient(q)).max(), 1e-6 * quantities.H, 1e-12)
     assert np.abs(np.array(gradient).ravel() - mine.gradient(q)).max() < 1e-8 * scale + 1e-13
-    # More inertia at a joint never makes the contact easier to move.
+    # Additional inertia at a joint never increases the mobility of the contact.
     if floating:
         rigid = WorstCaseObjective(with_joint_model(plain, "locked"), mine.contact).oracle.quantities(q)
         free = WorstCaseObjective(with_joint_model(stated(plain), "link"), mine.contact).oracle.quantities(q)
@@ -177,7 +177,7 @@ def test_the_export_has_the_numbers_of_its_joint_model(name: str, tmp_path: Path
     build_library(tmp_path, "joints")
     assert manifest["joint_model"] == "link"
     np.testing.assert_array_equal(manifest["armature"], loaded.armature)
-    # A controller loads the export with the robot in its reflected joint model.
+    # A controller loads the export together with the robot in its reflected joint model.
     compiled = ImpactGradient.load(tmp_path, robot=robot(name))
     for q in random_configurations(loaded.model, 3, name, "export"):
         value, gradient = compiled.value_and_gradient(q, np.array(mine.contact.normal))
@@ -213,7 +213,7 @@ def test_variants_keep_the_joint_model() -> None:
 
 
 def test_feet_under_locked_joints() -> None:
-    """With one leg locked, finite impulses still hold the feet."""
+    """If one leg is locked, the support impulses at the feet are still finite."""
     loaded = robot("solo12")
     legs = {joint: JointTransmissionSpec("locked") for joint in loaded.joint_names[:3]}
     mine = objective(with_joint_model(stated(loaded, joints=legs), "link"), "base_link")

@@ -1,4 +1,4 @@
-"""The hash of a model depends on the data of the dynamics and on nothing else."""
+"""The hash of a model depends on the data of the dynamics and on no other data."""
 
 from __future__ import annotations
 
@@ -61,7 +61,7 @@ def test_the_hash_does_not_depend_on_limits_postures_or_comments(arm: Path) -> N
 
 
 def test_the_hash_of_a_joint_does_not_depend_on_its_place_in_a_chain() -> None:
-    """The motion subspace of a universal joint depends on its angle in the configuration."""
+    """The motion subspace of a universal joint depends on its angle, so the configuration matters."""
     joint, none = pin.JointModelUniversal(np.array([1.0, 0, 0]), np.array([0, 1.0, 0])), pin.SE3.Identity()
     alone, chain, parent = pin.Model(), pin.Model(), 0
     for k in range(3000):

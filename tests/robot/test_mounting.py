@@ -1,4 +1,4 @@
-"""Joints at another place than in the URDF (``LoadOptions.mounting``, ``mounting`` in scenario.toml)."""
+"""Joints whose place differs from the URDF (``LoadOptions.mounting``, ``mounting`` in scenario.toml)."""
 
 from __future__ import annotations
 
@@ -29,7 +29,7 @@ def test_a_joint_moves_with_its_subtree(name: str, joint: str) -> None:
     index = plain.model.getJointId(joint)
     data = plain.model.createData()
     pin.forwardKinematics(plain.model, data, q)
-    # In the axes of the joint before it.
+    # The vector is in the axes of the preceding joint.
     shift = data.oMi[plain.model.parents[index]].rotation @ np.array(MOVED)
     behind = set(plain.model.subtrees[index])
     assert len(behind) > 1
@@ -49,7 +49,7 @@ def test_masses_and_inertias_stay_and_the_dynamics_follow() -> None:
     np.testing.assert_array_equal(plain.armature, moved.armature)
     np.testing.assert_array_equal(plain.model.lowerPositionLimit, moved.model.lowerPositionLimit)
     M, N = (mass_matrix(r.model, plain.posture()) for r in (plain, moved))
-    # The inertia of the arm does not depend on its place, but its coupling with the base does.
+    # The inertia of the arm does not depend on its mounting, but the inertial coupling with the base does.
     np.testing.assert_allclose(N[6:, 6:], M[6:, 6:], atol=1e-12)
     assert np.abs(N[:6, :6] - M[:6, :6]).max() > 1e-3
 

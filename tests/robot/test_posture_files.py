@@ -1,4 +1,4 @@
-"""Postures by name and by file: written postures are read back, and each fault is a line with a hint."""
+"""Postures by name and by file: written postures are read back, and each fault gives one line with a hint."""
 
 from __future__ import annotations
 
@@ -44,7 +44,7 @@ def test_a_written_posture_is_read_back(name: str, tmp_path: Path) -> None:
     loaded = robot(name)
     q = inside_limits(loaded)
     path = save(tmp_path / "posture.json", write_posture(loaded, q))
-    # Quaternions and angles are normalized again, so their last digit may change.
+    # Reading normalizes quaternions and angles again, so their last digit may change.
     assert np.allclose(read_posture(loaded, path), q, rtol=0, atol=1e-15)
 
 
@@ -86,7 +86,8 @@ def test_joints_by_name(tmp_path: Path) -> None:
 
 def test_a_joint_state_keeps_base_and_unnamed_joints(tmp_path: Path) -> None:
     loaded = robot("tilthex_arm")
-    # As `ros2 topic echo` prints it, with its separator, and an exponent that YAML 1.1 takes for text.
+    # This is the format of `ros2 topic echo`, with its separator.  YAML 1.1 reads the number with an exponent as
+    # text.
     text = (
         "header:\n  frame_id: ''\nname:\n- elbow_pitch\n- shoulder_roll\nposition:\n- 0.5\n- 1e-3\n"
         "velocity: []\neffort: []\n---\n"

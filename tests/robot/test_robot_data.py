@@ -26,14 +26,14 @@ TILTHEX_POSTURES = ["home", "tucked", "brace_down", "brace_forward", "brace_up"]
 
 
 def kinematics(loaded: Robot, posture: str | None = None) -> pin.Data:
-    """Placements of all frames at a named posture."""
+    """Return the data of Pinocchio with all frame placements at a named posture."""
     data = loaded.model.createData()
     pin.framesForwardKinematics(loaded.model, data, loaded.posture(posture))
     return data
 
 
 def support_points(support: Support, loaded: Robot, data: pin.Data) -> np.ndarray:
-    """Corners of the sole (the same point four times for a point foot), in the world."""
+    """Corners of the sole in the world (for a point foot, the same point four times)."""
     placement = data.oMf[loaded.frame_id(support.frame)]
     corners = [np.array([*support.size, 0.0]) * (x, y, 0) for x, y in product((-1, 1), repeat=2)]
     return np.array([placement.act(np.add(support.offset, corner)) for corner in corners])
@@ -76,7 +76,7 @@ def test_feet_are_flat_on_one_plane_below_the_center_of_mass(name: str) -> None:
         if support.kind == "surface":
             assert data.oMf[loaded.frame_id(support.frame)].rotation[2, 2] > np.cos(np.radians(0.5))
             assert min(support.size) > 0
-    if name != "bolt":  # It has two point feet.
+    if name != "bolt":  # The robot has two point feet.
         assert spec.constraints.com_over_feet
         com = pin.centerOfMass(loaded.model, data, loaded.posture())
         hull = ConvexHull(np.unique(points[:, :2].round(12), axis=0))
@@ -135,7 +135,7 @@ def test_tilthex_reaches_past_its_propellers() -> None:
     assert forward[0] > 0.54
     assert down[2] < -0.54
     assert up[2] > radius * np.sin(np.radians(30.0))
-    # The arm leaves the disc plane between the two front rotors.
+    # The arm passes between the disks of the two front rotors.
     for rotor in loaded.spec.propulsion.rotors:
         assert np.linalg.norm(rotor.position[:2]) == pytest.approx(0.39)
         assert abs(rotor.position[1]) > radius

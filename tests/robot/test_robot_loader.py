@@ -1,4 +1,4 @@
-"""Load robots by name or path: files, wrong names, locked joints, armature."""
+"""Load robots by name or by path: files, invalid names, locked joints, armature."""
 
 from __future__ import annotations
 
@@ -111,7 +111,7 @@ def test_every_other_robot_of_example_robot_data_loads_or_says_why_not() -> None
             assert error.hint
         else:
             assert np.isfinite(mass_matrix(loaded.model, loaded.posture())).all()
-    # The neck turns about an axis through a point mass, so that neck_roll and neck_yaw are the same motion there.
+    # The axis of the neck passes through a point mass, so neck_roll and neck_yaw are the same motion there.
     assert "neck_roll" in refused.pop("icub.urdf").line
     assert len(refused) < len(paths) / 5
 
@@ -268,7 +268,7 @@ def test_nearest_prefers_close_then_contained_then_any() -> None:
     ("name", "lock"), [("talos", ("torso_1_joint", "torso_2_joint")), ("panda", ("panda_joint3",))]
 )
 def test_locking_reduces(name: str, lock: tuple[str, ...]) -> None:
-    """Locked joints give the same H as joints with a huge armature."""
+    """Locked joints give the same H as joints with an extremely large armature."""
     whole, locked = robot(name), load_robot(name, LoadOptions(lock=lock))
     assert locked.nv == whole.nv - len(lock)
     assert set(lock) <= set(locked.locked)
@@ -321,7 +321,7 @@ def test_locked_joints_stay_where_the_default_posture_has_them(arm: Path) -> Non
 
 
 def test_armature_order(arm: Path) -> None:
-    """The option wins over robot.toml, then come rotors of the SRDF, then zero with a warning."""
+    """The option has priority over robot.toml, then follow the rotors of the SRDF, then zero with a warning."""
     (arm.parent / "two.srdf").write_text(SRDF, encoding="utf-8")
 
     def load(text: str, option: dict[str, float] | str | None = None) -> tuple[list[float], str, bool]:
@@ -384,6 +384,6 @@ def test_an_armature_file_without_numbers_is_refused(arm: Path) -> None:
 
 
 def test_a_robot_prints_in_one_line() -> None:
-    """The model and the data file are too long for the representation of an objective."""
+    """The representation of a robot is short, because model and data file are left out."""
     robot = load_robot("panda")
     assert repr(robot).startswith("Robot('panda', root='fixed', nq=9, nv=9, source=") and "\n" not in repr(robot)

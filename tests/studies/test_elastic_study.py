@@ -1,4 +1,4 @@
-"""The study of elastic joints in short: MuJoCo's compression beside the elastic response, and its page."""
+"""The study of elastic joints in short: MuJoCo's compression compared with the elastic response, and its page."""
 
 from __future__ import annotations
 
@@ -24,7 +24,10 @@ pytest.importorskip("mujoco")
 @pytest.mark.parametrize("name", list(STUDIED))
 @pytest.mark.parametrize("stiffness", [1e4, 1e6])
 def test_mujoco_finds_the_same(name: str, stiffness: float) -> None:
-    """Slowly, so that the arm hardly moves: dampers, one rigid joint and one stiffer spring as well."""
+    """The impact is slow, so that the arm hardly moves.
+
+    The joints include dampers, a rigid joint and a stiffer spring.
+    """
     studied, generator = STUDIED[name], rng(name, "MuJoCo")
     plain = studied.robot()
     first, *others = studied.joints
@@ -43,7 +46,7 @@ def test_mujoco_finds_the_same(name: str, stiffness: float) -> None:
 
 
 def test_an_error_of_the_model_shows() -> None:
-    """A wrong spring causes errors above the goals of the study."""
+    """A wrong spring stiffness causes errors above the targets of the study."""
     studied = STUDIED["own arm"]
     arm = studied.robot()
     case = ImpactCase(arm, ImpactContact(studied.frame, (0.0, 0.0, 1.0)))

@@ -1,4 +1,4 @@
-"""The study of impacts in short: a few postures a robot, MuJoCo's jump beside the predicted one; and its page."""
+"""The study of impacts in short: few postures per robot, MuJoCo's jump compared with predictions, and its page."""
 
 from __future__ import annotations
 
@@ -36,7 +36,7 @@ def test_without_friction_speed_impulse_and_energy_hold(name: str) -> None:
     for objective in ("impulse", "speed", "energy"):
         np.testing.assert_allclose(row.ratios(objective), 1, atol=0.01, err_msg=objective)
     assert row.rank("speed") == pytest.approx(1)
-    # Nearly plastic, short, and the feet stay: what the predictions assume.
+    # The predictions assume a nearly plastic, short impact and feet that do not move.
     assert (np.abs(row.measured("restitution") - 0.05) < 0.02).all()
     assert (row.measured("duration") < 1e-3).all()
     assert (row.measured("feet") < 1e-3).all()
@@ -51,7 +51,7 @@ def test_where_the_point_sticks_sticking_holds_and_speed_does_not(name: str) -> 
     np.testing.assert_allclose(row.ratios("sticking"), 1, atol=0.01)
     missed, hit = (np.abs(row.ratios(objective) - 1).max() for objective in ("speed", "sticking"))
     assert missed > 5 * hit
-    # Friction never makes the contact dissipate less.
+    # Friction never reduces the energy that the contact dissipates.
     assert row.ratios("energy")[0] > 0.99
 
 
@@ -63,21 +63,21 @@ def test_a_rebound_and_another_speed_scale_the_jump() -> None:
 
 
 def test_the_sticking_impulse_says_which_postures_slide() -> None:
-    """Coulomb's law written out in the bench: it holds what the cone holds, and agrees with MuJoCo's there."""
+    """Coulomb's law, written out in the study, sticks inside the friction cone and agrees with MuJoCo there."""
     friction = 0.8
     row = dropped(FLYING).on(Surface(friction))
     held = [needed_friction(o.predicted) <= friction for o in row.outcomes]
     assert any(held)
     assert not all(held)
     assert [bool(slip < 0.01) for slip in row.measured("slip")] == held
-    # Sliding does not look like a rebound.
+    # A sliding contact is not mistaken for a rebound.
     assert (np.abs(row.measured("restitution") - 0.05) < 0.02).all()
     ours, mujocos = dropped(FLYING).on(Surface(10.0)), dropped(FLYING).on(Surface(STICKS))
     np.testing.assert_allclose(ours.measured("size"), mujocos.measured("size"), rtol=0.01)
 
 
 def test_the_page_says_only_what_the_bench_printed() -> None:
-    """Every decimal of the page stands in the generated tables, and the targets it calls met are met there."""
+    """Every decimal number of the page is in the generated tables, and targets reported as met are met there."""
     tables = page_of("impacts").read_text(encoding="utf-8")
     prose = (DOCS / "objectives.md").read_text(encoding="utf-8")
     printed = set(re.findall(r"\d+\.\d+", tables))

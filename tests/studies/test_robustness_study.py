@@ -1,4 +1,4 @@
-"""The robustness study in short: draws, failures, interruption, statistics, and the page."""
+"""The robustness study in short: random draws, failures, interruption, statistics, and its page."""
 
 from __future__ import annotations
 
@@ -85,7 +85,7 @@ def test_a_standing_draw_stands_where_the_robot_stood(scenario: str) -> None:
     for shape in setup.scenario.shapes:
         point = point_on(setup.robot, shape.frame, shape.center or (0.0, 0.0, 0.0))
         feet = [n.placement(point).translation for n in (here, there)]
-        # A foot is held at the point under it, so its center may roll a little.
+        # The support is the point below a foot, so the center of the foot may roll a little.
         np.testing.assert_allclose(feet[0], feet[1], atol=2e-2)
         gap = setup.world.built.gaps["ground", shape.frame]
         assert gap == pytest.approx(0, abs=2e-3)
@@ -98,7 +98,7 @@ def test_a_standing_draw_stands_where_the_robot_stood(scenario: str) -> None:
 
 
 def short(chosen: Draw) -> Setup:
-    """Build a draw with one contact that begins at once."""
+    """Build the setup of a draw with one contact that begins at once."""
     scenario = prepare(chosen).scenario
     assert isinstance(scenario.task, RepeatedContacts)
     brief = replace(scenario.task, count=1, settle=0.2, speed=0.5, dwell=0.3, pause=0.1)
@@ -125,7 +125,7 @@ def test_a_variation_changes_one_thing(scenario: str) -> None:
             "start": np.abs(setup.q - shipped.q).max() > 1e-6,
             "model": setup.robot.model_sha256 != shipped.robot.model_sha256,
         }
-        # The gap is kept, so another start or mounting also moves the base.
+        # The gap to the surface is constant, so another mounting also changes the start of the base.
         what = {key for key, differs in changed.items() if differs} - ({"start"} if "mount" in name else set())
         assert len(what) == 1, (name, what)
 
@@ -141,7 +141,7 @@ def test_the_robots_own_data_are_among_the_variations() -> None:
 
 
 def test_a_failure_is_an_outcome(monkeypatch: pytest.MonkeyPatch) -> None:
-    """The first draw is not admissible.  In the second, a controller runs away, and another has no optimum."""
+    """The first draw is invalid.  In the second draw, one controller diverges and another has no optimum."""
     monkeypatch.setattr(outcomes, "prepare", short)
     tried: list[str] = []
     ran: list[tuple[tuple[Run, ...], dict[str, Any]]] = []
@@ -163,7 +163,7 @@ def test_a_failure_is_an_outcome(monkeypatch: pytest.MonkeyPatch) -> None:
     assert record.draw == draw(AERIAL, number, attempt=1)
     assert {c for c in COMPARED if record.failure(c)} == {"robust", "posture"}
     assert all(record.missed(c) == {"completed": "no completed run"} for c in ("robust", "posture"))
-    # `stiff` got the run of `nominal`.
+    # The controller `stiff` received the run of `nominal`.
     assert record.documents["stiff"]["metrics"] == record.documents[NOMINAL]["metrics"]
     assert record.documents[NOMINAL]["metrics"]["contacts"] == 1
     assert record.documents[NOMINAL]["offset"] is not None
@@ -176,7 +176,7 @@ def test_a_failure_is_an_outcome(monkeypatch: pytest.MonkeyPatch) -> None:
     assert "control lost 1" in text
     assert "nominal control lost: 1" in text
     assert f"- `robust` fails in `{AERIAL}` number {number}" in text
-    # If a record lacks a controller, only this controller runs.
+    # If the record of one controller is missing, only this controller runs.
     tried.clear()
     known = replace(record, documents={c: d for c, d in record.documents.items() if c != "stiff"})
     assert not is_complete(known)
@@ -191,7 +191,7 @@ def test_a_point_without_an_admissible_draw_says_why() -> None:
     number = len(VARIATIONS[AERIAL]) + 5
     with pytest.raises(NotAdmissible, match=rf"{AERIAL} {number}: none of {ATTEMPTS} draws .*nominal control lost"):
         point(AERIAL, number, 0, play=play)
-    # A variation is not replaced.
+    # If a listed variation is not admissible, the study does not draw another one in its place.
     record = point(AERIAL, 1, 0, play=play)
     assert record.rejected == ("nominal control lost",) and not record.documents and is_complete(record)
     assert "K × 0.5 (nominal control lost)" in "\n".join(envelope.page({AERIAL: [record, *five()]}))
@@ -201,7 +201,7 @@ METRICS = Metrics(1.0, 0.5, 0.8, 2.0, 1.0, 1.0, 1.0, 1.0, 100.0, 0.0, 0.0, 0.0, 
 
 
 def make_record(scenario: str, number: int, of: dict[str, tuple[float, float] | str], **more: float) -> Record:
-    """Make up a record of a random draw with (motion, jump) of each controller, or its failure."""
+    """Return a synthetic record of a random draw, with (motion, jump) or the failure of each controller."""
     documents = {}
     number += len(VARIATIONS[scenario])
     for name in COMPARED:
@@ -226,7 +226,7 @@ def make_record(scenario: str, number: int, of: dict[str, tuple[float, float] | 
 
 
 def five() -> list[Record]:
-    """Make up five records: the motion is halved, a quarter less, equal, half more, or the run failed."""
+    """Return five synthetic records: the motion is half, a quarter less, equal, half more, or the run failed."""
     return [
         make_record(AERIAL, 0, {NOMINAL: (2.0, 4.0), "robust": (0.9, 5.0)}, H_robust=1.0, S_robust=5.0),
         make_record(AERIAL, 1, {NOMINAL: (2.0, 4.0), "robust": (1.5, 3.0)}, H_robust=2.0, S_robust=3.0),
@@ -240,15 +240,15 @@ def test_statistics_by_hand() -> None:
     records = five()
     summary = summarize(records, "robust")
     assert (summary.count, summary.helps, summary.gentler) == (5, 2, 2)
-    # Changes −0.55, −0.25, 0, 0.5, failed: the quartiles are the second and the fourth.
+    # Changes of the motion are −0.55, −0.25, 0, 0.5, failed; the quartiles are the second and the fourth value.
     assert summary.motion == summary.recovery == pytest.approx((-0.25, 0.0, 0.5))
-    # Changes of the jump: 0.25, −0.25, −0.5, 0.5, failed.
+    # Changes of the jump are 0.25, −0.25, −0.5, 0.5, failed.
     assert summary.jump == pytest.approx(0.25)
     assert summary.force == pytest.approx((1.0, 1.0))
     assert summary.failures == Counter(fell=1)
     assert summary.saturation == pytest.approx((0.74, 0.0))
     assert summarize(records, NOMINAL).saturation == pytest.approx((1.0, 0.0))
-    # The first record has the reduction of the paper, but a higher jump.
+    # The first record has the reduction reported in the paper, but a higher jump.
     missed = [set(record.missed("robust")) for record in records[:4]]
     assert missed[:3] == [{"peak_jump", "peak_recovery"}, {"reduction"}, {"reduction", "recovery"}]
     assert missed[3] == {"reduction", "recovery", "peak_jump", "peak_recovery", "saturation"}
@@ -260,7 +260,7 @@ def test_statistics_by_hand() -> None:
 
 def test_correlations_and_splits_by_hand() -> None:
     records = five()
-    # The more H fell, the less motion.  A constant has no rank.
+    # The motion decreases as H decreases more.  A constant has no rank correlation.
     assert rank(records, "robust", lambda r: -(r.documents["robust"]["prediction"]["H"])) == pytest.approx(1)
     assert rank(records, "robust", lambda r: float(r.draw.number)) == pytest.approx(-1)
     assert math.isnan(rank(records, "robust", lambda r: 1.0))
@@ -268,16 +268,16 @@ def test_correlations_and_splits_by_hand() -> None:
     chosen, others = statistics.split(records, "robust", lambda r: r.draw.number < first + 2)
     assert (chosen.count, chosen.helps, chosen.median) == (2, 2, pytest.approx(-0.4))
     assert (others.count, others.helps, others.median) == (3, 0, pytest.approx(0.5))
-    # H fell in the first three records and rose in the fourth.  One motion and one jump disagree.
+    # H decreased in the first three records and increased in the fourth.  One motion and one jump disagree with H.
     for metric in ("q_total_impact", "peak_jump"):
         assert statistics.agreement(records, ["robust"], "H", metric) == (3, 4)
-    # S follows the jump of robust.
+    # S correlates perfectly with the jump of `robust`.
     alone = [replace(r, documents={"robust": r.documents["robust"]}) for r in records]
     assert statistics.ranks_of_jumps(alone, ("H", "V", "S")) == pytest.approx(
         {"n": 4, "H": 0.2, "V": math.nan, "S": 1.0}, nan_ok=True
     )
     assert statistics.worst(records, "robust") is records[3]
-    # H fell in three records.  In the first of them, the jump rose.
+    # H decreased in three records.  In the first of these records, the jump increased.
     assert statistics.misled(records, "robust") is records[0]
     text = "\n".join(page({AERIAL: records}, 0))
     assert f"`robust` moves the robot most, compared with nominal, in `{AERIAL}` number {first + 3}" in text
@@ -321,14 +321,14 @@ def test_an_interrupted_study_continues_with_the_same_page(tmp_path: Path) -> No
     first, ran = ran, []
     with pytest.raises(KeyboardInterrupt):
         study(counts, 0, 1, parts, run=runner(4))
-    # An interrupted study has equally many points of each scenario, with every controller.
+    # After an interruption, all scenarios have equally many complete points, with every controller.
     assert [len(own) for own in parts.complete(scenarios).values()] == [2, 2]
     said: list[str] = []
     study(counts, 0, 1, parts, run=runner(9), tell=said.append)
     assert ran == first
     assert len(said) == 2
     assert "\n".join(page(parts.complete(scenarios), 0)) == "\n".join(page(whole.complete(scenarios), 0))
-    # Records with another seed or other ranges do not count.
+    # Records with another seed or other parameter ranges are ignored.
     assert Store(tmp_path / "parts", 1).get(AERIAL, 0) is None
     [file] = (tmp_path / "parts").rglob(f"{AERIAL}/000.json")
     file.write_text(file.read_text(encoding="utf-8").replace("'speed', 0.25", "'speed', 0.3"), encoding="utf-8")
@@ -346,7 +346,7 @@ def test_the_page_has_every_range_and_controller_and_the_prose_no_numbers() -> N
             assert f"| `{scenario}` | `{controller}` |" in written
     targets = page_of("envelope").read_text(encoding="utf-8")
     assert targets.startswith(STUDIES["envelope"].head)
-    # The study may have been stopped before the later variations.
+    # The study may have been stopped before the last variations.
     for scenario, variations in VARIATIONS.items():
         rows = targets.partition(f"`{scenario}`:\n")[2].partition("\n\n`")[0]
         for name in list(variations)[:3]:

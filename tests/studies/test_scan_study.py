@@ -1,4 +1,4 @@
-"""The scan along the redundancy in short: its postures, its caption and its picture."""
+"""The scan along the redundancy in short: its postures, caption and figure."""
 
 from __future__ import annotations
 
@@ -34,7 +34,7 @@ def test_the_arm_looks_at_the_floor_along_the_whole_scan() -> None:
 
 
 def places() -> list[Place]:
-    """The motion is double on the way to the lowest H, and halves at the highest one."""
+    """Return scan points: the motion doubles on the way to the lowest H, and halves at the highest H."""
     start = Place(0.9, 40.0, 9.0, 9.0, 1.0, 2.0, 300.0, "completed")
     return [
         replace(start, at=0.0, H=0.4, motion=0.1, jump=0.5, force=900.0),

@@ -1,4 +1,4 @@
-"""Benchmarks: numbers are checked before they are timed, operations are counted, and each study has its page."""
+"""Benchmarks: numbers are checked before timing, operations are counted, and each study has its page."""
 
 from __future__ import annotations
 
@@ -43,7 +43,7 @@ JOINT = (
 
 
 def arm(folder: Path, first: str) -> Samples:
-    """Load an arm with a turning, a sliding and another turning joint."""
+    """Load an arm with a revolute, a prismatic and another revolute joint."""
     parts = [LINK.format(name) for name in ("base", "upper", "rail", "tip")]
     parts += [
         JOINT.format("shoulder", first, "base", "upper", "0 1 0"),
@@ -57,7 +57,7 @@ def arm(folder: Path, first: str) -> Samples:
 
 @pytest.fixture(scope="module")
 def folder(tmp_path_factory: pytest.TempPathFactory) -> Path:
-    """Return a folder for the cache, so that code is compiled once."""
+    """Return a cache folder, so that code is compiled only once."""
     return tmp_path_factory.mktemp("benchmarks")
 
 
@@ -84,7 +84,7 @@ def test_implementations_are_checked_before_they_are_timed(folder: Path) -> None
         assert set(times) == set(kernel.functions)
         assert "-ffp-contract=fast" in kernel.built.flags
     ours, same = ([k.built.flags for k, _, _ in report.rows if k.group == group] for group in ("ours", "same graph"))
-    # Only the printer of the C differs, not the compiler or its options.
+    # Only the printer of the C code differs; compiler and options are the same.
     assert ours == same
     assert re.fullmatch(r"\d+\.\d \(\d+\.\d\)", report.compared("CasADi", ""))
     assert report.compared("ADAM", "") == "–"
@@ -152,7 +152,7 @@ def test_operations_of_a_function() -> None:
 
 
 def written(text: str, name: str) -> Counter[str]:
-    """Count the operators in the text of a C function and of the blocks that it calls."""
+    """Count the operators in the text of a C function and of the blocks that the function calls."""
     bodies = dict(re.findall(r"^\S.*?\b(\w+)\([^;]*?\)\n\{(.*?)^\}", text, re.M | re.S))
     called = [word for word in re.findall(r"\w+", bodies[name]) if word.startswith("k_block")]
     plain = re.sub(r"\[[^]]*\]|for \([^)]*\)", "", "".join(bodies[part] for part in [name, *called]))
@@ -163,13 +163,13 @@ def written(text: str, name: str) -> Counter[str]:
 
 @pytest.mark.parametrize(("name", "frame"), [("ur5", "tool0"), ("solo8", "base_link")])
 def test_counted_operations_agree_with_the_source(tmp_path: Path, name: str, frame: str) -> None:
-    """The portable C has the same arithmetic on single numbers; sums may be in another order."""
+    """The portable C code has the same operations on scalars, but may add in another order."""
     samples = Samples(robot(name), frame)
     export(samples.objective, tmp_path, prefix="k", check=False, portable=True)
     text, (counted, packed) = written((tmp_path / "k.c").read_text(), "k_eval"), of_export(samples.objective)
     for kind in ("add", "mul", "div"):
         assert counted[kind] == pytest.approx(text[kind], rel=0.02), kind
-    # Sines and cosines are a loop there.
+    # The C code computes all sines and cosines in one loop.
     assert counted["trig"] == 2 * (samples.robot.nv - (6 if samples.robot.floating else 0))
     assert (packed is None) == (name == "ur5")
     assert packed is None or 0.2 * total(counted) < packed < 0.6 * total(counted)

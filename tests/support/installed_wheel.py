@@ -190,7 +190,7 @@ def types(work: Path, programs: Path) -> None:
     with planted(file, '\nPLANTED: int = "a word"\n'):
         said = run([*command, "--show-absolute-path"], work, fine=(1,)).stdout
     if f"{file}:" not in said or "Found 1 error" not in said:
-        raise Failed(f"mypy did not see the error that was planted in {file}:\n{said}")
+        raise Failed(f"mypy did not report the error added to {file}:\n{said}")
     print(f"  {next(line for line in said.splitlines() if 'error:' in line).replace(str(work), '…')} (planted)")
 
 

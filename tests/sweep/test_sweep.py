@@ -1,4 +1,4 @@
-"""Sweeps: grid, warm starts, tables, continued folders, and bad input."""
+"""Sweeps: grid, warm starts, tables, resumed folders, and invalid input."""
 
 from __future__ import annotations
 
@@ -60,7 +60,7 @@ starts = 4
 x = { from = 0, to = 0.04, count = 3 }
 z = [0, 2]
 """
-# Optima of panda for the same pose differ by a factor of four.
+# For the same pose, the optima of panda differ by a factor of four in the objective.
 SWITCHING = """
 shard = {shard}
 [problem]
@@ -75,19 +75,19 @@ z = {{ from = -0.2, to = 0.2, count = 5 }}
 
 
 def write(text: str, folder: Path) -> Path:
-    """Write the text of a sweep into a file."""
+    """Write the text of a sweep file."""
     path = folder / "sweep.toml"
     path.write_text(text)
     return path
 
 
 def solve(text: str, folder: Path, executor: Any = None, name: str = "out", **options: Any) -> SweepRun:
-    """Run the sweep of a text."""
+    """Run the sweep described by a text."""
     return run_sweep(read_sweep(write(text, folder)), folder / name, executor, **options)
 
 
 def shards(folder: Path) -> dict[str, bytes]:
-    """Return the shards of a sweep folder by their paths."""
+    """Return the shards of a sweep folder, with their paths as keys."""
     return {str(path.relative_to(folder)): path.read_bytes() for path in sorted(folder.glob("data/*/*.parquet"))}
 
 
@@ -165,7 +165,7 @@ def test_every_point_has_a_row_with_a_valid_certificate(aerial: Path) -> None:
 
 
 def test_each_posture_has_an_attainable_speed(aerial: Path, arm: Path) -> None:
-    """The speed of a flying base is not bounded."""
+    """The speed of a flying base is unbounded."""
     assert ip.sweep.open(aerial).to_table()["attainable_speed"].to_pylist() == [None] * 8
     prepared = prepare(ProblemSettings(robot="panda", normal=(0.0, 0.0, 1.0), collision=False))
     approach = AttainableSpeed(prepared.impact.robot, prepared.impact.objective, prepared.problem.requirements)
@@ -249,7 +249,7 @@ def test_a_sweep_repeats_missing_and_damaged_shards(aerial: Path, tmp_path: Path
     left.write_bytes(b"part of a killed run")
     seen: list[tuple[int, int]] = []
     assert solve(AERIAL, tmp_path, progress=lambda done, all_of: seen.append((done, all_of))).shards == 2
-    # The second pass of two shards needs the first pass of all three shards.
+    # The second pass of two shards requires the first pass of all three shards.
     assert seen == [(0, 14), (3, 14), (6, 14), (8, 14), (11, 14), (14, 14)]
     assert shards(folder) == shards(aerial)
     assert (folder / "notes.txt").read_text() == "mine" and not left.exists()
@@ -259,14 +259,14 @@ def test_a_sweep_repeats_missing_and_damaged_shards(aerial: Path, tmp_path: Path
 
 @pytest.fixture(scope="module")
 def whole(tmp_path_factory: pytest.TempPathFactory) -> dict[str, bytes]:
-    """Return the shards of an uninterrupted sweep."""
+    """Return the shards of a sweep that was not interrupted."""
     folder = tmp_path_factory.mktemp("whole")
     solve(SWITCHING.format(starts=1, shard=7), folder)
     return shards(folder / "out")
 
 
 def test_an_interrupted_sweep_continues_in_either_pass(tmp_path: Path, whole: dict[str, bytes]) -> None:
-    """Each run ends after two shards, whose points are in the table.  A foreign file stays."""
+    """Each run stops after two shards, whose points are in the table.  A foreign file is not deleted."""
     sweep, folder, stops = SWITCHING.format(starts=1, shard=7), tmp_path / "out", 0
 
     def stop(done: int, count: int) -> None:
@@ -284,7 +284,7 @@ def test_an_interrupted_sweep_continues_in_either_pass(tmp_path: Path, whole: di
 
 
 def test_neighboring_shards_share_their_optima(tmp_path: Path) -> None:
-    """In the first pass, each point ends in a separate optimum."""
+    """In the first pass, each point ends in its own optimum."""
     sweep = read_sweep(write(SWITCHING.format(starts=2, shard=1), tmp_path))
     run_sweep(sweep, tmp_path / "out")
     rows = ip.sweep.open(tmp_path / "out").to_table().sort_by("point").to_pylist()
@@ -302,7 +302,7 @@ def test_neighboring_shards_share_their_optima(tmp_path: Path) -> None:
 
 
 def test_the_key_depends_on_files_of_the_robot_and_the_posture(pendulum: str, tmp_path: Path) -> None:
-    """Neither limits nor a posture file are part of the dynamics."""
+    """Neither limits nor posture files belong to the dynamics."""
     urdf, posture = Path(pendulum), tmp_path / "posture.json"
     text = f'[problem]\nrobot = {json.dumps(pendulum)}\nframe = "tip"\nnormal = [0, 1, 0]\nposture = "posture.json"\n'
     (tmp_path / "sweep.toml").write_text(text + '[grid]\nobjective = ["impulse"]\n', encoding="utf-8")
@@ -357,7 +357,7 @@ def test_a_folder_of_another_sweep_is_refused(aerial: Path, tmp_path: Path, monk
 
 
 def test_speeds_with_the_same_problem_have_the_same_result(monkeypatch: pytest.MonkeyPatch) -> None:
-    """The better optimum appears at the last point, and only points of the first speed are its neighbors along y."""
+    """The better optimum is at the last point; along y, only points of the first speed are adjacent to it."""
     values = {(0, 0): 9.0, (0, 1): 9.0, (1, 0): 9.0, (1, 1): 1.0}
     template = SimpleNamespace(problem=object())
     solver: Any = SimpleNamespace(

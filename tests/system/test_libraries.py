@@ -1,4 +1,4 @@
-"""Shared libraries: damaged libraries and wrong manifests are refused before any code runs; the cache is private."""
+"""Shared libraries: damaged libraries and wrong manifests are rejected before any code runs; the cache is private."""
 
 from __future__ import annotations
 
@@ -27,7 +27,7 @@ from impact_posture.system.libraries import build_library, build_parts
 from tests.output.views import PENDULUM
 from tests.support.tools import need, need_compiler
 
-# Loads each export folder and prints the result.  After a crash, the last line names the folder.
+# This program loads each export folder and prints the result.  After a crash, its last line names the folder.
 LOADER = """
 import sys
 from impact_posture.codegen.impact_gradient import ImpactGradient
@@ -44,7 +44,7 @@ for folder in sys.argv[1:]:
 
 
 def load_all(folders: list[Path]) -> dict[str, list[str]]:
-    """Load exports in another process and return the printed words by folder name."""
+    """Load exports in another process and return the printed lines, with the folder name as key."""
     done = subprocess.run(
         [sys.executable, "-c", LOADER, *map(str, folders)], capture_output=True, text=True, check=False, timeout=120
     )
@@ -55,7 +55,7 @@ def load_all(folders: list[Path]) -> dict[str, list[str]]:
 
 @pytest.fixture(scope="module")
 def built(tmp_path_factory: pytest.TempPathFactory) -> Path:
-    """An export of two frames with its library and hash."""
+    """An export of two frames, with its library and hash."""
     need_compiler()
     folder = tmp_path_factory.mktemp("export")
     robot = load_robot(PENDULUM)
@@ -73,7 +73,7 @@ def changed(**keys: object) -> Callable[[dict[str, Any]], object]:
 
 
 def resized(key: str, size: int) -> Callable[[dict[str, Any]], object]:
-    """Return a function that changes a size and every array of that size in a manifest."""
+    """Return a function that changes a size in a manifest, and every array of this size."""
     arrays = {"nq": ("q",), "nv": ("grad", "objective_grad", "jump")}[key]
 
     def change(manifest: dict[str, Any]) -> object:
@@ -105,7 +105,7 @@ WRONG_MANIFESTS = [
 
 
 def test_a_manifest_that_does_not_fit_is_refused(built: Path, tmp_path: Path) -> None:
-    """The library names the hash of its manifest."""
+    """The library contains the hash of its manifest."""
     text = (built / "arm.json").read_text()
     texts = [json.dumps(change(json.loads(text))) for change in WRONG_MANIFESTS]
     texts += ['{"schema"', "", "[" * 100_000, '{"schema":"impact-posture/codegen/1"}']
@@ -133,12 +133,12 @@ def test_a_prefix_that_is_not_an_identifier_is_refused(built: Path, tmp_path: Pa
 @pytest.mark.skipif(sys.platform != "linux", reason="ELF")
 @pytest.mark.parametrize("with_hash", [True, False])
 def test_a_damaged_library_is_refused(built: Path, tmp_path: Path, with_hash: bool) -> None:
-    """A truncated library would end the process that loads it."""
+    """A truncated library would crash the process that loads it."""
     data = (built / "libarm.so").read_bytes()
     contents = [data[:size] for size in (0, 1, 16, 63, 64, 500, 4096, len(data) // 2, len(data) - 1)]
     contents += [b"text", data[:4] + b"\xff\xff" + data[6:], Path(sys.executable).read_bytes()]
     if with_hash:
-        # Only the hash tells that a byte is another.
+        # Only the hash reveals the changed byte.
         contents += [data[:place] + bytes([data[place] ^ 1]) + data[place + 1 :] for place in (100, 9000, 12_000)]
     for k, content in enumerate(contents):
         folder = shutil.copytree(built, tmp_path / f"c{k}")
@@ -157,7 +157,7 @@ def test_a_library_of_another_export_is_refused(built: Path, tmp_path: Path) -> 
     export(objective, other, prefix="arm", check=False, portable=True)
     for name in ("libarm.so", "libarm.so.sha256"):
         shutil.copy(mine / name, other / name)
-    # This library does not name a manifest.
+    # This library does not contain the hash of a manifest.
     strange = shutil.copytree(built, tmp_path / "strange")
     (strange / "x.c").write_text("int arm_eval(void) { return 0; }\n")
     build_library(strange, "x", strange / "libarm.so")
@@ -199,7 +199,7 @@ def test_where_the_cache_is(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> 
 
 @pytest.fixture
 def kept(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> Path:
-    """A library in the cache."""
+    """A compiled library in the cache."""
     monkeypatch.setenv("IMPACT_POSTURE_CACHE", str(tmp_path / "cache"))
     library = libraries.cache_folder() / "kept.so"
     with libraries.building(library) as folder:
@@ -254,11 +254,11 @@ def test_common_parts_are_compiled_once(monkeypatch: pytest.MonkeyPatch, tmp_pat
 
     assert (built("a.so", 1), objects()) == (3, 2)
     assert (built("b.so", 5), objects()) == (7, 3)
-    # A comment does not change the key, but an included file does.
+    # A comment does not change the cache key, but an included file does.
     assert (built("c.so", 5), objects()) == (7, 3)
     (tmp_path / "two.h").write_text("#define TWO 20\n")
     assert (built("d.so", 5), objects()) == (25, 4)
-    # A damaged object is compiled again.
+    # A damaged object file is compiled again.
     for path in (tmp_path / "cache" / "objects").glob("*.o"):
         path.write_bytes(b"")
     assert (built("e.so", 5), objects()) == (25, 4)

@@ -58,7 +58,7 @@ NASTY = (
     "\u202eleft\u2066", "עברית", "🦾", "é", "../../etc", "/", "int", "while", "??/", "#include", "0lead", "", " ",
     "-rf", ".", "~", "\u2028line", "${prefix}", "$prefix", "{}", "%(name)s", "universe", "world", "a*b?c",
 )  # fmt: skip
-# A URDF is XML, which has no control characters.
+# A URDF is XML, which cannot contain control characters.
 IN_XML = [name for name in NASTY if not re.search("[\x00-\x08\x0b\x0c\x0e-\x1f]", name)]
 
 LINK = '<link name={name}><inertial><origin xyz="0.3 0 0.1"/><mass value="1"/><inertia ixx="0.02" ixy="0" ixz="0" '
@@ -68,7 +68,7 @@ JOINT += '<axis xyz="0 {y} {z}"/><limit lower="-2" upper="2" effort="9" velocity
 
 
 def urdf(links: list[str], *, moving: int = 3, name: str = "arm") -> str:
-    """Return the URDF of a chain; the joint before a link has the name of the link and a j."""
+    """Return the URDF of a chain; the name of a joint is the name of its child link followed by j."""
     parts = [LINK.format(name=quoteattr(link)) for link in links]
     for k, (parent, child) in enumerate(pairwise(links)):
         kind = "revolute" if k < moving else "fixed"
@@ -86,14 +86,14 @@ def arm(tmp_path_factory: pytest.TempPathFactory) -> Robot:
 
 @pytest.fixture(scope="module")
 def many(tmp_path_factory: pytest.TempPathFactory) -> Robot:
-    """Load a robot whose links, joints and frames have all names that XML allows."""
+    """Load a robot whose links, joints and frames have all the strange names that XML allows."""
     folder = tmp_path_factory.mktemp("many")
     (folder / "many.urdf").write_text(urdf(["base", *filter(None, IN_XML)], moving=len(IN_XML)), encoding="utf-8")
     return load_robot(str(folder / "many.urdf"))
 
 
 def renamed(robot: Robot, name: str) -> Robot:
-    """Return the robot with a name for itself, its last joint and its tip."""
+    """Return the robot with a given name for the robot, its last joint and its tip."""
     model = robot.model.copy()
     model.names[model.njoints - 1] = f"{name}j"
     for frame in model.frames:
@@ -103,7 +103,7 @@ def renamed(robot: Robot, name: str) -> Robot:
 
 
 def assert_plain(text: str) -> None:
-    """Check that no character controls a terminal or changes the writing direction."""
+    """Check that the text contains no control characters and no characters that change the writing direction."""
     bad = {c for c in text if c != "\n" and (unicodedata.category(c)[0] == "C" or c in "\u2028\u2029")}
     assert not bad, ascii(bad)
 
@@ -113,8 +113,8 @@ def assert_plain(text: str) -> None:
 
 @pytest.fixture(scope="module")
 def exports(arm: Robot, tmp_path_factory: pytest.TempPathFactory) -> dict[str, Path]:
-    """Write an export for each name and for a harmless name."""
-    # The functions do not depend on names and are built once.
+    """Write an export for each strange name and for a harmless name."""
+    # The C functions do not depend on names, so they are built only once.
     point = (0.3, 0.0, 0.0)
     harmless = WorstCaseObjective(arm, ImpactContact("tip", (0, 0.6, 0.8), point))
     code = build_c_source(named_objectives([harmless], "arm"), "arm", DOUBLE)
@@ -130,7 +130,7 @@ def exports(arm: Robot, tmp_path_factory: pytest.TempPathFactory) -> dict[str, P
 
 
 def code_of(folder: Path) -> dict[str, str]:
-    """Return the files for a compiler or a build tool, without comments."""
+    """Return the files that a compiler or a build tool reads, without comments."""
     files = {}
     for path in sorted(folder.iterdir()):
         if path.suffix not in (".json", ".md"):
@@ -149,7 +149,7 @@ def test_names_change_nothing_but_comments(exports: dict[str, Path]) -> None:
 
 def test_everything_compiles(exports: dict[str, Path]) -> None:
     compiler = need_compiler()
-    # All examples with the header, and some sources, which differ only in their titles.
+    # Compile all examples with their header, and some of the sources, which differ only in their titles.
     sources = [str(folder / "example.c") for folder in exports.values()]
     sources += [str(exports[name] / "arm.c") for name in NASTY[::6]]
     flags = ["-std=c99", "-trigraphs", "-fsyntax-only", "-Wall", "-Wextra", "-pedantic", "-Werror"]
@@ -303,7 +303,7 @@ def command(*words: str) -> tuple[int, str, str]:
 
 @pytest.fixture
 def shown(many: Robot, tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> str:
-    """Return the file of a robot whose name and folder would control the terminal."""
+    """Return the file of a robot whose name and folder contain terminal control characters."""
     monkeypatch.setenv("COLUMNS", "80")
     folder = tmp_path / "\x1b]0;x\x07[red]\n*"
     folder.mkdir()

@@ -1,4 +1,4 @@
-"""Output folders are whole or absent after any interruption; foreign files stay, and temporary files go."""
+"""After any interruption, output folders are complete or absent; foreign files remain, temporary files do not."""
 
 from __future__ import annotations
 

@@ -1,4 +1,4 @@
-"""Work in several processes: all results arrive, errors reach the caller, and no process is left behind."""
+"""Work in several processes: all results arrive, errors reach the caller, and all processes end."""
 
 from __future__ import annotations
 
@@ -27,7 +27,7 @@ pytestmark = pytest.mark.skipif(not Path("/proc/self/status").is_file(), reason=
 
 
 def alive(pid: int) -> bool:
-    """Whether a process runs, and is not a zombie."""
+    """Whether a process is running and is not a zombie."""
     try:
         return "\nState:\tZ" not in Path(f"/proc/{pid}/status").read_text(encoding="utf-8")
     except OSError:
@@ -45,11 +45,11 @@ def gone(pids: list[int], within: float = 10.0) -> bool:
 
 @pytest.mark.parametrize("jobs", [1, 2, 5])
 def test_every_index_comes_once_with_its_result(jobs: int) -> None:
-    # A file cannot be sent to a process, but a fork has it.
+    # An open file cannot be sent to another process, but a fork inherits it.
     with open(__file__, encoding="utf-8") as file:
 
         def work(index: int) -> tuple[int, int]:
-            # The first calls are the slowest, and end last in parallel processes.
+            # The first calls are the slowest, so they end last in parallel processes.
             time.sleep(0.02 * (3 - index) if index < 3 else 0)
             return index**2 * (file.name == __file__), os.getpid()
 
@@ -157,7 +157,7 @@ def test_ctrl_c_leaves_no_process_and_no_noise(tmp_path: Path, send: Callable[[i
         assert (process.returncode, out, err) == (130, "stopped\n", "")
         assert gone(workers)
     finally:
-        # The group has only processes of this session.
+        # Only processes of this test belong to the group.
         with contextlib.suppress(ProcessLookupError):
             os.killpg(process.pid, signal.SIGKILL)
 
@@ -248,7 +248,7 @@ def test_a_copy_has_the_same_state() -> None:
     numbers = np.random.default_rng(5)
     numbers.random(3)
 
-    # A pipe holds less: the copy waits, and this process does not.
+    # A pipe cannot buffer so many numbers, so the child waits until the parent reads them.
     with fork_call(lambda: numbers.random(100_000)) as collect:
         here = numbers.random(100_000)
         np.testing.assert_array_equal(collect(), here)

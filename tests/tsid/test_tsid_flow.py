@@ -146,7 +146,7 @@ def test_it_does_not_climb_where_it_turns_or_brakes(
 ) -> None:
     """In the first case the flow turns in the bend of the valley, in the second case it rests there.
 
-    A flow that does not evaluate the objective ahead lets it increase by 2e-2 and by 1e-1.
+    If the flow ignored the slope at its stopping point, the objective would increase by 2e-2 and by 1e-1.
     """
     r = robot("talos")
     run = course(flow_of(r, valley(r, key), epsilon=epsilon), r.posture(), 3.0)

@@ -1,4 +1,4 @@
-"""``verify``: agreement passes, an injected difference fails in its row, and missing sources are skipped."""
+"""``verify``: agreement passes, an injected difference fails in its table row, and missing sources are skipped."""
 
 from __future__ import annotations
 
@@ -108,7 +108,7 @@ def test_a_contact_with_one_direction_of_motion_passes(tmp_path: Path) -> None:
 
 @pytest.mark.parametrize("joints", [1, 3])
 def test_an_impact_across_the_plane_of_a_planar_robot_passes(tmp_path: Path, joints: int) -> None:
-    """G and H are exactly zero, so V is undefined.  The compared quantities are defined."""
+    """G and H are exactly zero, so V is undefined.  All compared quantities are defined."""
     link = '<link name="{}"><inertial><mass value="1"/><inertia {}/></inertial></link>'
     inertia = " ".join(f'{key}="{0.01 * (key[1] == key[2])}"' for key in ("ixx", "iyy", "izz", "ixy", "ixz", "iyz"))
     joint = (
@@ -138,7 +138,7 @@ def test_another_armature_fails_in_its_source(monkeypatch: pytest.MonkeyPatch) -
 
 
 def altered(how: Any) -> Any:
-    """Return a source with the numbers of Pinocchio, changed by ``how(number of the sample, values)``."""
+    """Return a source with Pinocchio's numbers, modified by ``how(number of the sample, values)``."""
 
     def build(objective: WorstCaseObjective) -> Any:
         count = iter(range(100))
@@ -274,7 +274,7 @@ def test_differences_of_a_known_function() -> None:
 
     np.testing.assert_allclose(difference_gradient(value, model, q), weights, rtol=1e-10, atol=1e-10)
     assert np.isnan(difference_gradient(lambda _: float("nan"), model, q)).all()
-    # The function is curved on a scale of 0.01, below the first step, as near singular postures of standing robots.
+    # The function varies on a scale of 0.01, below the first step, as near singular postures of standing robots.
     stiff = difference_gradient(lambda at: float(np.tanh(100 * weights @ pin.difference(model, q, at))), model, q)
     np.testing.assert_allclose(stiff, 100 * weights, rtol=1e-7)
 
