@@ -1,4 +1,4 @@
-"""Task-space inverse dynamics at 1 kHz with the impact-robust posture task; imports no CasADi."""
+"""Task-space inverse dynamics at 1 kHz with the impact-robust posture task.  This package does not import CasADi."""
 
 from impact_posture.tsid.controller import Command, Controller, Report, Status
 from impact_posture.tsid.flow.flow_direction import FlowOptions

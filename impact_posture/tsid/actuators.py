@@ -1,4 +1,4 @@
-"""Actuation of a robot: ``M ν̇ + h = G u + …`` solved for ``u``."""
+"""Actuation of a robot: solve ``M ν̇ + h = G u + …`` for the controls ``u``."""
 
 from __future__ import annotations
 
@@ -10,12 +10,12 @@ from impact_posture.system.arrays import Array
 
 
 class Actuators:
-    """Decomposition of ``G`` into the forces that it can produce, the forces that it cannot, and its null space.
+    """Decomposition of the actuation matrix ``G``: forces that ``G`` can produce, forces that it cannot, null space.
 
-    ``G = blkdiag(G_b, I)`` with ``G_b`` (6 × rotors) constant, because generalized forces are dual to ν.  For a
+    ``G = blkdiag(G_b, I)``.  ``G_b`` (6 × rotors) is constant, because generalized forces are dual to ν.  For a
     generalized force ``p = Mν̇ + h − …``:
 
-    - ``blindᵀ p = 0`` is the unactuated part (6 rows for a legged robot, none for six independent rotors);
+    - ``blindᵀ p_b = 0`` is the unactuated part (6 rows for a legged robot, none for six independent rotors);
     - ``u = [G_b⁺ p_b + spare w; p_joints]``, where ``w`` chooses among the thrusts of redundant rotors.
 
     Attributes:
@@ -23,11 +23,11 @@ class Actuators:
         base: 6 for a floating base, else 0.
         G: Shape (nv, controls).
         inverse: ``G_b⁺``, shape (rotors, base).
-        blind: Orthonormal basis of the complement of ``G_b``'s range, shape (base, base − rank).
-        spare: Orthonormal basis of ``G_b``'s null space, shape (rotors, rotors − rank).
+        blind: Orthonormal basis of the base wrenches that rotors cannot produce, shape (base, base − rank).
+        spare: Orthonormal basis of the null space of ``G_b``, shape (rotors, rotors − rank).
         rank: Rank of ``G_b``.
-        lower: Rotor thrusts (N) and joint torques (N·m), shape (controls,).
-        upper: As ``lower``; infinite where the model has no effort limit (or zero).
+        lower: Lower limits of rotor thrusts (N), then of joint torques (N·m), shape (controls,).
+        upper: Upper limits in the same order; infinite if the model has no effort limit or the limit zero.
         names: Names of the controls.
     """
 
@@ -56,7 +56,10 @@ class Actuators:
         return int(self.G.shape[1])
 
     def solve(self, force: Array, spare: Array) -> Array:
-        """Return ``u`` for a generalized force, shape (nv,), and the choice ``w``; a fresh array (controls,)."""
+        """Return the controls ``u``, shape (controls,), in a new array.
+
+        ``force`` is the generalized force ``p``, shape (nv,).  ``spare`` is ``w``, the choice among redundant rotors.
+        """
         return np.concatenate([self.inverse @ force[: self.base] + self.spare @ spare, force[self.base :]])
 
     def rotor_speeds(self, thrusts: Array) -> Array:

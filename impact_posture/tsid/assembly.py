@@ -19,32 +19,32 @@ from impact_posture.tsid.tasks.task import TaskStack
 _IDLE = 1e-8
 # Weight of a moment (N·m), relative to a force (N).
 _MOMENT = 100.0
-# Directions with a smaller singular value, relative to the largest of the tasks, are free.
+# If the singular value of a direction is below this share of the largest, the tasks leave the direction free.
 _REDUNDANT = 1e-6
 
 
 class Assembly:
-    """Buffers of the QP of a formulation, which each tick fills.
+    """Buffers of the QP of a formulation, which are filled at each tick.
 
-    The variables are ``z = [ν̇; w; f]``: accelerations, the choice of redundant rotors, contact forces in world axes.
-    Controls are not variables, because ``u`` follows from ``p = Mν̇ + h − Jᵀf − J_eᵀF̂`` (:class:`Actuators`).  The
-    rows are, in order:
+    The variables are ``z = [ν̇; w; f]``: the accelerations, the choice among redundant rotors, and the contact forces
+    in world axes.  Controls are not variables, because ``u`` follows from ``p = Mν̇ + h − Jᵀf − J_eᵀF̂``
+    (:class:`Actuators`).  The QP has these rows, in this order:
 
     - ``blind``: ``blindᵀ p_base = 0``, the unactuated part of the dynamics;
     - ``contacts``: ``J ν̇ = a`` of the hard contacts;
     - ``levels``: ``J ν̇ = a`` of each strict level;
     - ``controls``: ``u_min ≤ u(z) ≤ u_max``;
-    - ``cones``: friction;
+    - ``cones``: friction cones;
     - ``limits``: the row limits of the formulation.
 
-    Bounds on the variables are the acceleration bounds of the joint limits.
+    The variables ``ν̇`` have the acceleration bounds of the joint limits as bounds.
 
     Attributes:
         qp: The QP of the last :meth:`build_qp`.
         rank: The independent rows of the levels, and the QP without the dependent rows.
-        levels: Names and rows of the strict levels, the most important first; hard contacts come first of all, as
-            ``contacts``.
-        limits: Entries of ``[z; A z]`` that come from joint limits and row limits.
+        levels: Names and rows of the strict levels, the most important first.  If there are hard contacts, the first
+            entry is ``contacts``.
+        limits: Indices of the entries of ``[z; A z]`` with bounds from joint limits and row limits.
         names: Name of each entry of ``[z; A z]``.
     """
 
@@ -69,8 +69,8 @@ class Assembly:
         self._place_cost(robot)
         self.levels = self._name_levels(hard, levels)
         self.limits = np.concatenate([np.arange(nv), np.arange(qp.n + cones.stop, qp.n + m)])
-        # The unit of forces is the mass times an acceleration of 1.  With a unit of 1 N, lifting the robot would cost
-        # least.
+        # The unit of forces is the mass times an acceleration of 1.  With a unit of 1 N, least squares would reduce
+        # the contact forces by lifting the robot.
         units = np.ones(qp.n)
         units[self._f] = robot.mass
         self.rank = LevelRank(qp, blind.stop, [rows for _, rows in self.levels], nv, units)
@@ -92,7 +92,7 @@ class Assembly:
         self._free = np.zeros(nv)
 
     def reset(self, state: State) -> None:
-        """Read gains and weights again, and hold the contacts at their present places."""
+        """Read gains and weights again, and make the present places of the contacts their targets."""
         self.strict.refresh(state)
         self.weighted.refresh(state)
         self.contacts.reset(state)
@@ -108,7 +108,7 @@ class Assembly:
         self.rank.reset()
 
     def build_qp(self, state: State) -> QP:
-        """Fill the buffers at ``state``, and return the QP, which is the same object at each call."""
+        """Fill the buffers at ``state`` and return the QP.  Each call returns the same object."""
         self.strict.update(state)
         self.weighted.update(state)
         self.contacts.update(state)
@@ -141,9 +141,9 @@ class Assembly:
         return np.asarray(force)
 
     def controls(self, state: State, z: Array) -> Array:
-        """Return ``u``: rotor thrusts (N), then joint torques (N·m); a fresh array.
+        """Return the controls ``u`` in a new array: rotor thrusts (N), then joint torques (N·m).
 
-        The rows of the control limits give the same as ``actuators.solve(generalized_force(state, z), w)``.
+        The rows of the control limits give the same values as ``actuators.solve(generalized_force(state, z), w)``.
         """
         u = self._A_controls @ z
         u += self._known
@@ -152,7 +152,7 @@ class Assembly:
     def redundancy(self, state: State) -> Array:
         """Return an orthonormal basis of the accelerations that only the posture task determines, shape (nv, r).
 
-        If weighted tasks determine all of them, return the accelerations that contacts and strict levels leave.
+        If the weighted tasks leave no such accelerations, ignore the weighted tasks.
         """
         rows = [self.contacts.J, self.strict.J, self.weighted.J]
         Z = null_space(np.vstack(rows), _REDUNDANT)
@@ -161,7 +161,7 @@ class Assembly:
     # ---- filling the QP -------------------------------------------------------------------------------------------
 
     def _at(self, rows: slice) -> slice:
-        """Return the indices of rows of ``A`` in the bounds."""
+        """Return the indices that rows of ``A`` have in the bounds."""
         return slice(self.qp.n + rows.start, self.qp.n + rows.stop)
 
     def _equate(self, rows: slice, value: Array) -> None:
@@ -179,7 +179,8 @@ class Assembly:
         qp.A[thrusts, self._w] = actuators.spare
         self._A_hard, self._A_controls = qp.A[hard, :nv], qp.A[controls]
         self._free_blind, self._known = np.zeros(actuators.blind.shape[1]), np.zeros(actuators.controls)
-        # Rows of the dynamics, the buffer of their constants, their part of a generalized force, and its map to rows.
+        # For each block of the dynamics: its rows, the buffer of its constants, its entries of a generalized force,
+        # and the matrix that maps these entries to the rows (``None`` for the identity).
         base, joints = slice(actuators.base), slice(actuators.base, nv)
         parts: list[tuple[slice, Array, slice, Array | None]] = [
             (blind, self._free_blind, base, np.ascontiguousarray(actuators.blind.T) if actuators.rotors else None),

@@ -25,15 +25,15 @@ from impact_posture.tsid.task_formulation import TaskFormulation
 from impact_posture.tsid.tasks.impact_robust import ImpactRobustPosture
 from impact_posture.tsid.tasks.task import Task
 
-# Longest time step of ramps, in periods, after a longer pause between ticks.
+# Limit on the time step of ramps, in periods, for a tick after a long pause.
 _LONGEST = 10
-# Least nv for which LAPACK whitens a dense cost.  Measurements of a quadruped show no gain.
+# From this nv on, LAPACK transforms a dense cost (:class:`WhitenedSolver`).  On a quadruped, this saves no time.
 _LARGE = 20
 # Largest sum of squares of a valid measurement (1e8 m, rad/s or N).
 _ABSURD = 1e16
 # Largest violation of a control limit, relative to the largest limit.
 _EXCESS = 1e-6
-# Damping of a held command, 1/s, times the inertia of each joint.
+# Damping of a held command, divided by the inertia of each joint, 1/s.
 _HOLD = 10.0
 
 
@@ -45,23 +45,23 @@ class Status(Enum):
     RELAXED = "relaxed"
     """A strict level gave way to limits (``Report.relaxed``)."""
     INFEASIBLE = "infeasible"
-    """No acceleration satisfies the hard constraints, and the previous command is held."""
+    """No acceleration satisfies the hard constraints.  The previous command is repeated, with damping."""
     UNSOLVED = "unsolved"
-    """The QP solver gave up, or its answer violates a control limit, and the previous command is held."""
+    """The solver gave up, or its answer violates a control limit.  The previous command is repeated, with damping."""
     NON_FINITE = "non-finite"
-    """A measurement is not finite, exceeds 1e8, or is not a rotation, and the previous command is held."""
+    """A measurement is not finite, exceeds 1e8, or is not a rotation.  The reaction is the same as for UNSOLVED."""
 
 
 @dataclass(frozen=True, slots=True, eq=False)
 class Command:
-    """Command for the motors, in arrays that the controller does not write again.
+    """Command for the motors.  The controller does not change its arrays later.
 
     Attributes:
         u: Rotor thrusts (N), then joint torques (N·m), shape (controls,).
         torque: Joint torques, N·m (N for prismatic joints), shape (joints,).
         rotor_speed: Rotor speeds in the unit of ``speed_max`` in robot.toml, shape (rotors,).
         status: Result of the tick.
-        acceleration: Planned ``ν̇``, shape (nv,); zero in a held command.
+        acceleration: Planned ``ν̇``, shape (nv,); zero if the previous command is repeated.
         forces: Planned contact forces, world axes, in the order of the contacts, N and N·m.
     """
 
@@ -80,13 +80,14 @@ class Report:
     Attributes:
         status: Result of the tick.
         relaxed: Levels and limits that gave way, the most important first.
-        deficient: Levels that miss because of their rank and not because of limits.  Levels above determine their
-            motion, their rows contradict each other, or they are damped near a singularity (:class:`LevelRank`).
-        residuals: ``ÿ − ÿ*`` of each task by name, and of ``contacts``.
-        active: Names of the active bounds, with ``lower`` or ``upper``.
-        dynamics: ``‖Mν̇ + h − Gu − Jᵀf − J_eᵀF̂‖_∞``.
+        deficient: Levels that do not hold because of their rank and not because of limits.  Levels above determine
+            their motion, their rows contradict each other, or they are damped near a singularity
+            (:class:`LevelRank`).
+        residuals: Task name → ``ÿ − ÿ*``; the name ``contacts`` stands for all contacts.
+        active: Pairs of the name of an active bound and ``lower`` or ``upper``.
+        dynamics: Error of the equations of motion, ``‖Mν̇ + h − Gu − Jᵀf − J_eᵀF̂‖_∞``.
         level: Activation of a posture task that prepares for impacts, 0 to 1.
-        objective: ``H`` (or the objective) of that task; NaN without one.
+        objective: Value of the posture task's objective, for example ``H``; NaN if there is no such task.
         iterations: Iterations of the QP solver.
     """
 
@@ -115,7 +116,9 @@ class Controller:
     """
 
     def __init__(self, robot: Robot, formulation: TaskFormulation, *, period: Positive = 1e-3) -> None:
-        """Size all buffers.  ``period`` is the first time step, s, and limits the longest time step.
+        """Size all buffers.
+
+        ``period``, s, is the first time step.  Later time steps are limited to a multiple of it.
 
         Raises:
             FrameNotFound: The frame of a task does not exist.
@@ -129,7 +132,7 @@ class Controller:
         white = formulation.weighted and robot.nv >= _LARGE
         self._solver = WhitenedSolver(n, m, robot.nv) if white else DaqpSolver(n, m)
         self._tasks = formulation.tasks
-        # Most tasks have no memory to advance.
+        # Call ``advance`` only for tasks that define it, because most tasks keep no memory.
         self._advancing = [task for task in self._tasks if type(task).advance is not Task.advance]
         self._ready = False
         # Square of the largest violation of a control limit that is within the tolerance of the solver.
@@ -137,10 +140,10 @@ class Controller:
         self._excess = (_EXCESS * max(1.0, float(np.max(limits, where=np.isfinite(limits), initial=0.0)))) ** 2
 
     def reset(self, q: ArrayLike, v: ArrayLike) -> Command:
-        """Start again at ``(q, ν)``: set the targets that tasks lack, and clear ramps and warm starts.
+        """Start again at ``(q, ν)``: set the missing targets of tasks, and clear ramps and warm starts.
 
         Returns:
-            The first command, which is also held if the first tick fails.
+            The first command.  If the first tick fails, the tick returns this command with damping.
 
         Raises:
             PostureError: ``q`` is not a configuration, ``v`` is not a velocity, or an entry is too large.
@@ -183,14 +186,14 @@ class Controller:
 
         Raises:
             InputError: ``reset`` has not been called.
-            ValueError: An array has another shape.
+            ValueError: The shape of an array is wrong.
         """
         self._check_ready()
         state = self.state
         q, v = np.asarray(q, dtype=float), np.asarray(v, dtype=float)
         if q.shape != state.q.shape or v.shape != state.v.shape:
             raise ValueError(f"q and v have shapes {q.shape} and {v.shape}, not {state.q.shape} and {state.v.shape}")
-        # A sum of squares is finite and below a bound only if each number is.
+        # If the sum of squares is finite and below the bound, every number is finite and bounded too.
         total = q.dot(q) + v.dot(v)
         if force is not None:
             force = np.asarray(force, dtype=float)
@@ -211,7 +214,7 @@ class Controller:
             raise InputError("has not been reset", where="controller", hint="call reset(q, v) first")
 
     def report(self) -> Report:
-        """Return the diagnosis of the last tick, computed by this call.
+        """Compute and return the diagnosis of the last tick.
 
         Raises:
             InputError: ``reset`` has not been called.
@@ -247,7 +250,7 @@ class Controller:
         )
 
     def _finish(self, outcome: Outcome) -> Command:
-        """Return the command of a solution, or hold the previous command."""
+        """Return the command of a solution; if there is no valid solution, repeat the previous command."""
         state, assembly, solved = self.state, self.assembly, outcome.solved
         self._outcome = outcome
         if solved is None:
@@ -258,7 +261,7 @@ class Controller:
         over = np.minimum(u, self.actuators.upper)
         np.maximum(over, self.actuators.lower, out=over)
         over -= u
-        # Not ">", which is false for a NaN.
+        # A test with ">" would accept NaN, so the code tests "not <=".
         if not over.dot(over) <= self._excess:
             return self._held(Status.UNSOLVED, state.v)
         self._status = Status.RELAXED if outcome.relaxed else Status.SOLVED

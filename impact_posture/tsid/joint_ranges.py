@@ -11,10 +11,10 @@ class JointRanges:
     """Position and velocity limits along the entries of ν, infinite for the base and for continuous joints.
 
     Attributes:
-        lower: Position, rad or m, shape (nv,).
-        upper: As ``lower``.
-        velocity: rad/s or m/s, shape (nv,); infinite where the model has no limit (or zero).
-        index: Entry of ``q`` for each entry of ν with position limits, shape (nv,); arbitrary for the others.
+        lower: Lower position limits, rad or m, shape (nv,).
+        upper: Upper position limits, rad or m, shape (nv,).
+        velocity: Velocity limits, rad/s or m/s, shape (nv,); infinite if the model has no limit or the limit zero.
+        index: Index in ``q`` of each entry of ν with position limits, shape (nv,); arbitrary for the other entries.
     """
 
     def __init__(self, robot: Robot) -> None:

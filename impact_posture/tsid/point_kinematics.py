@@ -1,4 +1,4 @@
-"""Kinematics of points of the robot in one batch, from the joint Jacobians of Pinocchio."""
+"""Kinematics of several points of the robot, computed in one batch from the joint Jacobians of Pinocchio."""
 
 from __future__ import annotations
 
@@ -12,7 +12,7 @@ from impact_posture.config.checked import checked
 from impact_posture.robot.robot import Robot
 from impact_posture.system.arrays import Array
 
-# p @ _SHIFT, shape (6, 6), has -[p]x at the upper right, which shifts a body's velocity from the origin to p.
+# p @ _SHIFT is a 6 x 6 matrix with -[p]x at the upper right.  It moves a body's velocity from the origin to p.
 _SHIFT = np.zeros((3, 6, 6))
 _SHIFT[[2, 0, 1], [0, 1, 2], [4, 5, 3]] = 1.0
 _SHIFT[[1, 2, 0], [0, 1, 2], [5, 3, 4]] = -1.0
@@ -22,7 +22,12 @@ _FLAT, _EYE = _SHIFT.reshape(3, 36), np.eye(6).reshape(36)
 @checked
 @dataclass(frozen=True, eq=False)
 class Point:
-    """A point that moves with a frame of the robot, at an offset from its origin, in the frame, meters."""
+    """A point that is fixed in a frame of the robot.
+
+    Attributes:
+        frame: Name of the frame.
+        offset: Position of the point in the coordinates of the frame, m.
+    """
 
     frame: str
     offset: tuple[float, float, float] = (0.0, 0.0, 0.0)
@@ -30,15 +35,16 @@ class Point:
 
 @dataclass(frozen=True, eq=False)
 class PointState:
-    """Kinematics of a point, in views that the next update of the state overwrites.
+    """Kinematics of a point.  The arrays are views that the next update of the state overwrites.
 
     Attributes:
-        position: World, meters, shape (3,).
+        position: World position, m, shape (3,).
         rotation: Rotation of the frame, world from frame, shape (3, 3).
         jacobian: Jacobian of the linear and angular velocity of the point, world axes, shape (6, nv).
-        velocity: ``Jν``, shape (6,).
-        drift: ``J̇ν``, shape (6,), the classical and the angular acceleration at ``ν̇ = 0``.
-        spatial_drift: Spatial acceleration ``v̇ − ω × v``, which is the rate of the body twist in world axes.
+        velocity: ``Jν``, linear and angular velocity, shape (6,).
+        drift: ``J̇ν``, classical linear and angular acceleration at ``ν̇ = 0``, shape (6,).
+        spatial_drift: Spatial acceleration ``v̇ − ω × v`` at ``ν̇ = 0``, shape (6,): the rate of the body twist in
+            world axes.
     """
 
     position: Array
@@ -58,11 +64,11 @@ class PointKinematics:
         Before each update, the caller runs ``pin.computeJointJacobiansTimeVariation`` on ``data``.
 
         Raises:
-            FrameNotFound: The robot lacks a frame; carries the nearest names.
+            FrameNotFound: The robot lacks a frame; the exception contains the most similar names.
         """
         model, nv, count = robot.model, robot.nv, len(points)
         frames = [model.frames[robot.frame_id(point.frame)] for point in points]
-        # Reshaped, because Pinocchio returns vectors for a robot with one degree of freedom.
+        # Reshape the arrays, because Pinocchio returns vectors for a robot with one degree of freedom.
         self._J, self._dJ_transposed = data.J.reshape(6, nv), data.dJ.reshape(6, nv).T
         mask = np.zeros((count, nv))
         for k, frame in enumerate(frames):
@@ -70,7 +76,7 @@ class PointKinematics:
                 mask[k, model.idx_vs[joint] : model.idx_vs[joint] + model.nvs[joint]] = 1.0
         self._mask, self._rows_mask = mask, np.repeat(mask, 6, axis=0)
         self._position, rotation = np.zeros((count, 3)), np.zeros((count, 3, 3))
-        # Views on the same memory in the shapes of the products.
+        # Views on the same memory, in the shapes that the matrix products require.
         self._shift, self._turn = np.zeros((count, 36)), np.zeros((count, 36))
         self._shift_rows = self._shift.reshape(6 * count, 6)
         self._shifts, self._turns = self._shift.reshape(count, 6, 6), self._turn.reshape(count, 6, 6)
@@ -98,7 +104,10 @@ class PointKinematics:
         }
 
     def update(self, v: Array | None) -> None:
-        """Move to the configuration of the data and to ν, shape (nv,); ``None`` for zero, which is faster."""
+        """Compute the kinematics from the data of Pinocchio and ν, shape (nv,).
+
+        ``None`` means ν = 0 and is faster than an array of zeros.
+        """
         if not self._moving:
             return
         for R, t, offset, turn, position, rotation in self._moving:
@@ -111,7 +120,7 @@ class PointKinematics:
                 rotation[:] = R
             else:
                 np.dot(R, turn, out=rotation)
-        # J of Pinocchio is for the body's point at the world origin: v_p = v + ω × p.
+        # J of Pinocchio gives the velocity of the body's point at the world origin, hence v_p = v + ω × p.
         np.matmul(self._position, _FLAT, out=self._shift)
         self._shift += _EYE
         np.matmul(self._shift_rows, self._J, out=self._jacobian)
@@ -124,14 +133,14 @@ class PointKinematics:
         np.multiply(self._mask, v, out=self._masked)
         np.matmul(self._masked, self._dJ_transposed, out=self._world)
         np.matmul(self._shifts, self._worlds, out=self._spatials)
-        # The same operator computes ω × v_p.
+        # The matrix _FLAT also computes the product ω × v_p.
         np.matmul(self._linear, _FLAT, out=self._turn)
         np.matmul(self._turns, self._twists, out=self._drifts)
         self._drift += self._spatial
 
 
 def _fixed(frame: pin.Frame, point: Point) -> tuple[Array | None, Array | None]:
-    """Return offset and rotation on the joint's body; ``None`` for zero and for the identity."""
+    """Return offset and rotation of a point relative to its joint; ``None`` means no offset or no rotation."""
     placement = frame.placement
     offset = placement.act(np.array(point.offset, dtype=float))
     turn = np.array(placement.rotation)

@@ -1,4 +1,4 @@
-"""Solution of the QP of a tick.  It never fails, because strict levels give way, the least important first."""
+"""Solution of the QP of a tick.  If not all strict levels can hold, the least important level gives way first."""
 
 from __future__ import annotations
 
@@ -13,15 +13,15 @@ from impact_posture.tsid.qp.daqp_solver import SOLVED, DaqpSolver
 from impact_posture.tsid.qp.hierarchy import Level, lexicographic
 from impact_posture.tsid.qp.quadratic_program import EQUALITY, QP, Solved
 
-# Least miss that counts, relative to the terms of a row.
+# A row whose error is below this share of its terms counts as satisfied.
 _OFF = 1e-6
-# Least miss at which a row is held, relative to the length of the row times the size of the point.
+# A row that misses its bounds by more than this keeps its value.  Unit: length of the row times size of the point.
 _MISSES = 1e-9
-# Largest violation of a bound by the result, in the same units.
+# Largest violation of a bound that a result may have, in the unit of ``_MISSES``.
 _ROUNDING = 1e-13
-# Bound that DAQP takes for infinite, and its settings for the scaled program of the cost.
+# Bound that DAQP treats as infinite, and the settings of DAQP for the scaled program of the cost.
 _FAR, _SETTINGS = 1e30, {"primal_tol": 1e-11, "sing_tol": 1e-13, "iter_limit": 1000}
-# Least curvature of the cost, relative to the largest.
+# Smaller curvatures of the cost, relative to the largest, are raised to this value.
 _FLATTEST = 1e-14
 # Weight of the proximal-point iterations with which DAQP decides whether strict levels can hold.
 _FLAT = 1e-6
@@ -42,19 +42,25 @@ class Relaxed:
 
 @dataclass(frozen=True, eq=False)
 class Outcome:
-    """Solution, or ``None`` if the relaxed QPs have none, and what gave way, the most important level first."""
+    """Result of a tick's QP.
+
+    Attributes:
+        solved: Solution; ``None`` if not even the relaxed QPs have a solution.
+        relaxed: Levels and limits that gave way, the most important first.
+    """
 
     solved: Solved | None
     relaxed: tuple[Relaxed, ...] = ()
 
 
 def solve(assembly: Assembly, solver: DaqpSolver) -> Outcome:
-    """Solve the QP of the assembly from the solver's active set; if this fails, relax it.
+    """Solve the QP of the assembly, starting from the solver's active set.  If this fails, solve a relaxed QP.
 
     Dynamics, control limits and friction always hold, because every state has an acceleration that satisfies them.
-    The acceleration bounds of joint limits open only as far as these rows demand.  Then each level, from the most
-    important down, holds if it can hold together with the levels above it.  Otherwise it comes as close as possible
-    in the least-squares sense and stays there for the levels below.  Last, the cost decides what is still free.
+    The acceleration bounds of joint limits are exceeded only as far as these rows require.  Then come the levels,
+    the most important first.  A level holds if it can hold together with the levels above it.  Otherwise, its error
+    is minimized by least squares, and the levels below may not change this error.  Last, the cost determines the
+    accelerations that are still free.
     """
     qp = assembly.rank.qp
     if assembly.rank.changed:
@@ -65,8 +71,8 @@ def solve(assembly: Assembly, solver: DaqpSolver) -> Outcome:
         solver.reset()
         solved = solver.solve(qp)
     if solved is None and qp.finite:
-        # Nearly dependent rows look infeasible.  Proximal steps decide.  They start from the last answer of their
-        # workspace, hence a new one.
+        # DAQP can call nearly dependent rows infeasible, so proximal steps decide.  They would start from the last
+        # answer in their workspace, so this workspace is new.
         solved = DaqpSolver(qp.n, qp.m, proximal=_FLAT).solve(qp)
     if solved is not None or not qp.finite:
         return Outcome(solved)
@@ -78,11 +84,11 @@ def solve(assembly: Assembly, solver: DaqpSolver) -> Outcome:
 
 
 def _cheapest(qp: QP, units: Array, nearest: Array) -> Solved:
-    """Minimize the cost in the directions that a lexicographic answer leaves free.
+    """Minimize the cost in the directions that the lexicographic answer ``nearest`` leaves free.
 
-    Equations and missed rows keep their values, so the cost moves in their null space: ``z = nearest + W y``, with a
-    basis ``W`` in which the cost is a sum of squares.  The other bounds hold.  If they leave only rounding, return
-    ``nearest``.
+    Equations, and rows that miss their bounds, keep their values.  The cost is therefore minimized in their null
+    space: ``z = nearest + W y``.  In the basis ``W``, the cost is a sum of squares.  All other bounds hold.  If the
+    free motion is within rounding errors, return ``nearest``.
     """
     values, rows = qp.values(nearest), np.vstack([np.eye(qp.n), qp.A]) * units
     size, lengths = max(1.0, float(np.max(np.abs(nearest / units)))), np.linalg.norm(rows, axis=1)
@@ -97,7 +103,7 @@ def _cheapest(qp: QP, units: Array, nearest: Array) -> Solved:
     curvatures, axes = np.linalg.eigh((free.T * units) @ qp.H @ (units[:, None] * free))
     largest = float(curvatures[-1])
     W = free @ (axes / np.sqrt(np.maximum(curvatures / largest, _FLATTEST)))
-    # The held rows determine a row that moves along the free directions by rounding only.
+    # A row that the free directions change only by rounding errors depends on the held rows, so it needs no bound.
     sees = np.linalg.norm(rows @ free, axis=1) > _MISSES
     bound = np.flatnonzero(~held & sees & (np.isfinite(lower) | np.isfinite(upper)))
     seen, g = rows[bound] @ W, W.T @ (units * (qp.H @ nearest + qp.g)) / (size * largest)
@@ -106,7 +112,7 @@ def _cheapest(qp: QP, units: Array, nearest: Array) -> Solved:
     y, _, flag, info = daqp.solve(np.eye(g.size), g, seen / reach[:, None], *ends, senses, **_SETTINGS)
     if flag not in SOLVED:
         return only
-    # A correction makes held rows and active bounds exact to the last digit.
+    # Correct the step, so that held rows and active bounds are exact to the last digit.
     step, multipliers = W @ y, np.zeros(qp.n + qp.m)
     multipliers[bound] = largest * size / (lengths[bound] * reach) * info["lam"]
     active = multipliers != 0.0
@@ -120,7 +126,10 @@ def _cheapest(qp: QP, units: Array, nearest: Array) -> Solved:
 
 
 def missed(assembly: Assembly, z: Array, *, equations: bool) -> tuple[Relaxed, ...]:
-    """Return the levels that miss in their equations, or with ``equations=False`` in their rows that lack rank."""
+    """Return the strict levels that have errors.
+
+    If ``equations`` is true, compare the rows that are equations; otherwise, compare the rows that lack rank.
+    """
     levels = []
     for name, level in assembly.levels:
         rows = assembly.rank.rows(level, equations)
@@ -140,7 +149,7 @@ def _gave_way(assembly: Assembly, z: Array) -> tuple[Relaxed, ...]:
 
 
 def _hierarchy(assembly: Assembly) -> list[Level]:
-    """Return the hard rows, the acceleration bounds, and the strict levels."""
+    """Return the levels to relax, in this order: hard rows, acceleration bounds, strict levels."""
     qp, limits, n = assembly.rank.qp, assembly.limits, assembly.qp.n
     always = np.ones(qp.m, dtype=bool)
     for _, rows in assembly.levels:

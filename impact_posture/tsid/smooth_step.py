@@ -1,4 +1,4 @@
-"""Cubic step of levels and fades."""
+"""Cubic smooth step for activation levels and fades."""
 
 from __future__ import annotations
 
@@ -11,5 +11,5 @@ _Number = TypeVar("_Number", float, NDArray[np.float64])
 
 
 def smooth(x: _Number) -> _Number:
-    """Return ``3x² − 2x³``, which rises from 0 to 1 on [0, 1], with slope zero at the ends and at most 1.5."""
+    """Return ``3x² − 2x³``, which increases from 0 to 1 on [0, 1].  The slope is 0 at both ends and at most 1.5."""
     return x * x * (3.0 - 2.0 * x)

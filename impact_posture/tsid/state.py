@@ -19,17 +19,17 @@ class State:
     """``M``, ``h``, point Jacobians, drifts and center of mass at ``(q, ν)``.
 
     Attributes:
-        points: Points whose kinematics the state holds.
-        q: Configuration, shape (nq,), a copy with unit quaternions and cosine-sine pairs.
-        v: ν, shape (nv,), a copy.
-        M: Mass matrix with armature, shape (nv, nv); like ``h``, a view on the data of Pinocchio.
-        h: Coriolis, centrifugal and gravity terms, shape (nv,).
-        room: Distance of each joint to its upper, then to its lower limit, shape (2, nv); negative beyond a limit,
-            infinite without one.
+        points: Points whose kinematics the state computes.
+        q: Copy of the configuration, shape (nq,), with quaternions and cosine-sine pairs of unit length.
+        v: Copy of ν, shape (nv,).
+        M: Mass matrix with armature, shape (nv, nv); a view on the data of Pinocchio.
+        h: Coriolis, centrifugal and gravity terms, shape (nv,); a view on the data of Pinocchio.
+        room: Distances of the joints from their upper limits (first row) and lower limits (second row), rad (m),
+            shape (2, nv).  A distance is negative beyond the limit, and infinite if there is no limit.
         rooms: Flat view on ``room``, shape (2 nv,).
         least_room: Smallest entry of ``room``.
         force: Measured contact wrench on the robot ``[force (N); moment (N·m)]``, world axes, shape (6,).
-        pushed: Whether a wrench is measured.
+        pushed: Whether a contact wrench is measured at this tick.
         mass: Total mass, kg.
         unit_parts: Slices of quaternions and cosine-sine pairs in ``q``.
     """
@@ -38,7 +38,7 @@ class State:
         """Size the buffers for a robot and the points whose kinematics :meth:`at` returns.
 
         Raises:
-            FrameNotFound: The robot lacks a frame; carries the nearest names.
+            FrameNotFound: The robot lacks a frame; the exception contains the most similar names.
         """
         self.robot, self.points = robot, tuple(points)
         self._model = robot.model
@@ -51,7 +51,7 @@ class State:
         self.room, self._joints, self.least_room = np.zeros((2, robot.nv)), np.zeros(robot.nv), np.inf
         self._above, self._below, self.rooms = self.room[0], self.room[1], self.room.reshape(-1)
         self.force, self.pushed, self.mass = np.zeros(6), False, robot.mass
-        # Views stay valid, because Pinocchio writes into the same memory at each call.
+        # These views stay valid, because Pinocchio writes into the same memory at each call.
         self.M, self.h = data.M, data.nle
         self._gravity = np.array(robot.model.gravity.linear)
         base = data.oMi[1]
@@ -68,9 +68,10 @@ class State:
         return self.v.size
 
     def update(self, q: ArrayLike, v: ArrayLike | None) -> State:
-        """Move to ``(q, ν)`` of shapes (nq,) and (nv,), which are finite and have quaternions near unit norm.
+        """Compute the state at ``q``, shape (nq,), and ν, shape (nv,), and return the state.
 
-        ``None`` for ν is zero, which is faster.
+        All numbers must be finite, and the norms of quaternions must be close to 1.  ``None`` means ν = 0 and is
+        faster than an array of zeros.
         """
         model, data = self._model, self._data
         self.q[:] = q
@@ -80,7 +81,7 @@ class State:
             square = float(unit.dot(unit))
             if abs(square - 1.0) > 1e-12:
                 unit /= square**0.5
-        # Indices are valid by construction, and the mode that checks them is slower.
+        # The indices are valid by construction, and the mode "clip" is faster than the mode that checks them.
         self.q.take(self._index, out=self._joints, mode="clip")
         np.subtract(self._upper, self._joints, out=self._above)
         np.subtract(self._joints, self._lower, out=self._below)
@@ -106,10 +107,10 @@ class State:
             self.force[: force.size] = force
 
     def at(self, point: Point) -> PointState:
-        """Return the kinematics of a point of the constructor.
+        """Return the kinematics of a point that was given to the constructor.
 
         Raises:
-            InputError: The constructor did not get this point.
+            InputError: The point was not given to the constructor.
         """
         try:
             return self._views[point]
@@ -130,8 +131,8 @@ class State:
     def center_of_mass(self) -> tuple[Array, Array, Array]:
         """Return position (3,), Jacobian (3, nv) and drift ``J̇ν`` (3,) of the center of mass in the world.
 
-        They follow from ``M`` and ``h``, because the base's linear rows are the linear momentum in base axes:
-        ``m J_com = R M[:3]`` and ``m J̇_com ν = R h[:3] + m g``.
+        The first three rows of the dynamics are the linear momentum in base axes.  Hence ``m J_com = R M[:3]`` and
+        ``m J̇_com ν = R h[:3] + m g``.
 
         Raises:
             InputError: The base is fixed.
@@ -159,7 +160,7 @@ def checked_velocity(robot: Robot, v: ArrayLike) -> Array:
     """Return ν at a reset as an array of shape (nv,).
 
     Raises:
-        PostureError: It has another shape or is not finite.
+        PostureError: ν has the wrong shape or is not finite.
     """
     v = np.asarray(v, dtype=float)
     if v.shape != (robot.nv,) or not np.isfinite(v).all():

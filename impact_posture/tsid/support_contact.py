@@ -1,4 +1,4 @@
-"""Contacts that stay: their desired accelerations, and the friction pyramids of their forces."""
+"""Contacts that do not move: their desired accelerations, and the friction pyramids of their forces."""
 
 from __future__ import annotations
 
@@ -27,16 +27,16 @@ class SupportContact:
 
     Attributes:
         point: Contact point.
-        kind: ``point`` (3 forces) or ``surface`` (force and moment).
-        half: Half extents (x, y) of a surface around the point, in the frame, meters.
+        kind: ``point`` transmits a force; ``surface`` transmits a force and a moment.
+        half: Half extents of a surface around the point along the x and y axes of the frame, m.
         normal: Unit normal out of the ground, world.
         friction: Coulomb coefficient.
-        least: Least normal force, N.
-        kp: Stiffness that pulls the contact back to its place at ``reset``, 1/s².
+        least: Lower bound on the normal force, N.
+        kp: Stiffness that returns the contact to its place at ``reset``, 1/s².
         kd: Damping of the contact, 1/s.
-        weight: Weight of the contact's acceleration in the cost; ``None`` makes it a hard constraint.  Points on one
-            body can have dependent rows, whose rank changes with posture (the four feet of solo8 have rank 9 to 11
-            of 12).  As constraints, they would then demand unbounded accelerations.
+        weight: Weight of the contact's acceleration in the cost; with ``None``, the contact is a hard constraint.
+            The rows of several points can be dependent, and their rank can change with the posture (the four feet of
+            solo8 have rank 9 to 11 of 12).  As hard constraints, such rows would require unbounded accelerations.
     """
 
     point: Point
@@ -50,7 +50,7 @@ class SupportContact:
     weight: Positive | None = None
 
     def __post_init__(self) -> None:
-        """Refuse a surface without extent and a normal that is not a unit vector."""
+        """Raise :class:`ContactError` if a surface has no extent or the normal is not a unit vector."""
         where = f"contact at {self.point.frame}"
         if self.kind == "surface" and not min(self.half) > 0:
             raise ContactError("a surface without extent", where=where, hint="give half extents or kind 'point'")
@@ -59,13 +59,14 @@ class SupportContact:
 
     @property
     def size(self) -> int:
-        """Number of force components: 3, or 6 with the moment."""
+        """Number of force and moment components: 3 for a point, 6 for a surface."""
         return 3 if self.kind == "point" else 6
 
     def cone(self, rotation: Array) -> Array:
-        """Return the rows ``C f ≥ 0`` of the friction cone in world axes, shape (rows, size); normal force first.
+        """Return the matrix ``C`` of the friction cone ``C f ≥ 0`` in world axes, shape (rows, size).
 
-        ``rotation`` is world from frame, shape (3, 3).  The x axis of the frame is the x axis of a sole.
+        The first row is the normal force.  ``rotation`` is world from frame, shape (3, 3).  The x axis of a sole is
+        the x axis of the frame.
 
         Raises:
             ContactError: The sole stands on its edge.
@@ -78,9 +79,9 @@ class SupportContact:
 
 @checked
 def support_contacts(robot: Robot, *, friction: Positive = 0.7) -> tuple[SupportContact, ...]:
-    """Return the supports of ``robot.toml`` on level ground with a Coulomb coefficient.
+    """Return the supports of ``robot.toml`` as contacts on level ground.
 
-    Soles are hard constraints, points have a weight.
+    ``friction`` is the Coulomb coefficient.  Soles are hard constraints; point contacts have a weight in the cost.
     """
     return tuple(
         SupportContact(
@@ -94,16 +95,16 @@ class ContactStack:
     """Stack of contacts as ``J ν̇ = a`` and ``least ≤ cone · f``, with forces ``f`` in world axes.
 
     Attributes:
-        contacts: Contacts from top to bottom.
+        contacts: Contacts in the order of their rows.
         rows: Rows of each contact in ``J`` and in ``f``.
-        size: Number of all rows.
-        J: Shape (size, nv).
+        size: Total number of rows.
+        J: Jacobian of all contacts, shape (size, nv).
         a: Desired acceleration of the contacts minus drift, shape (size,): ``−K_d Jν + K_p e − J̇ν``.
-        cone: Shape (cone rows, size), constant after ``reset``.
+        cone: Friction cones of all contacts, shape (cone rows, size); constant after ``reset``.
         cone_rows: Rows of each contact in ``cone``.
-        least: Lower bounds of the cone's rows.
-        weight: Shape (size,), zero for hard rows.
-        hard: Whether a row is a hard constraint, shape (size,).
+        least: Lower bounds of the rows of ``cone``.
+        weight: Weight of each row in the cost, shape (size,); zero for hard rows.
+        hard: Whether each row is a hard constraint, shape (size,).
     """
 
     def __init__(self, robot: Robot, contacts: Sequence[SupportContact]) -> None:
@@ -121,7 +122,7 @@ class ContactStack:
         self.cone, self.least = np.zeros((count, self.size)), np.zeros(count)
 
     def reset(self, state: State) -> None:
-        """Hold the contacts at their present places."""
+        """Make the present places of the contacts their targets."""
         for k, (contact, rows, cone_rows) in enumerate(zip(self.contacts, self.rows, self.cone_rows, strict=True)):
             here = state.at(contact.point)
             self._home[k] = here.position.copy(), here.rotation.copy()
@@ -129,7 +130,7 @@ class ContactStack:
             self.least[cone_rows.start] = contact.least
 
     def update(self, state: State) -> None:
-        """Move to the present state."""
+        """Compute ``J`` and ``a`` at ``state``."""
         if not self.size:
             return
         for contact, rows, (position, rotation) in zip(self.contacts, self.rows, self._home, strict=True):
@@ -148,7 +149,7 @@ class ContactStack:
 
 
 def point_cone(friction: float) -> Array:
-    """Return the rows ``C f ≥ 0``: ``f_z ≥ 0`` and ``|f_x|, |f_y| ≤ μ' f_z``, shape (5, 3), z along the normal.
+    """Return ``C``, shape (5, 3), of ``C f ≥ 0``: ``f_z ≥ 0`` and ``|f_x|, |f_y| ≤ μ' f_z``, with z along the normal.
 
     With ``μ' = μ/√2``, the pyramid lies inside the Coulomb cone.
     """
@@ -157,11 +158,12 @@ def point_cone(friction: float) -> Array:
 
 
 def surface_cone(friction: float, half_x: float, half_y: float) -> Array:
-    """Return the cone of wrenches at a sole's center from forces in the pyramids at its four corners, shape (17, 6).
+    """Return the matrix of the contact wrench cone of a rectangular sole, shape (17, 6).
 
-    The rows are ``f_z ≥ 0``, four rows of friction, four rows that keep the center of pressure on the sole, and
-    eight rows that bound the yaw moment (Caron, Pham, Nakamura 2015, "Stability of surface contacts for humanoid
-    robots", eq. 16 to 20):
+    The cone contains the wrenches at the sole's center that forces in friction pyramids at its four corners can
+    produce (Caron, Pham, Nakamura 2015, "Stability of surface contacts for humanoid robots", eq. 16 to 20).  The
+    first row is ``f_z ≥ 0``.  Four rows limit friction, and four rows keep the center of pressure on the sole.  Eight
+    rows limit the yaw moment:
     ``−μ(X+Y)f_z + |Y f_x − μ τ_x| + |X f_y − μ τ_y| ≤ τ_z ≤ μ(X+Y)f_z − |Y f_x + μ τ_x| − |X f_y + μ τ_y|``.
     """
     mu, x, y = friction / np.sqrt(2), half_x, half_y
@@ -180,7 +182,7 @@ def to_world(cone: Array, normal: Array, heading: Array) -> Array:
     """Return a cone of forces (and moments) in world axes, with z along ``normal`` and x along ``heading``.
 
     Raises:
-        ContactError: The heading of a sole points along the normal.
+        ContactError: The ``heading`` of a sole is parallel to the normal.
     """
     x = heading - normal * (normal @ heading)
     if np.linalg.norm(x) < 1e-6:

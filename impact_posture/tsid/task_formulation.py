@@ -1,4 +1,4 @@
-"""Formulation of a controller: tasks in strict levels, tasks by weight, a posture, contacts and limits."""
+"""Formulation of a controller: strict levels of tasks, weighted tasks, a posture task, contacts and limits."""
 
 from __future__ import annotations
 
@@ -19,7 +19,7 @@ from impact_posture.tsid.tasks.joint_posture import JointPosture
 from impact_posture.tsid.tasks.task import Task
 
 Order = Literal["strict", "weighted"]
-# Stiffness of the end effector's task by default, 1/s².
+# Default stiffness of the end effector's task, 1/s².
 END_EFFECTOR_KP = 60.0
 
 
@@ -29,15 +29,17 @@ class TaskFormulation:
     """Tasks, contacts and limits of the QP of each tick.
 
     Attributes:
-        levels: Tasks that hold as equalities, the most important level first (Afifi et al. 2026, Problems 2 and 3).
+        levels: Levels of tasks as equality constraints, the most important level first (Afifi et al. 2026, Problems 2
+            and 3).
         weighted: Tasks in the cost, ``Σ wᵢ‖ÿᵢ − ÿᵢ*‖²`` (Problem 1).
-        posture: Posture task, in the cost: ``‖ν̇ − ν̇*‖²_W``.
+        posture: Posture task in the cost, ``‖ν̇ − ν̇*‖²_W``; ``None`` for no posture task.
         contacts: Contacts with the ground.
-        force_point: Point where a measured contact force acts; ``None`` leaves the force out of the dynamics.
-        law: Law that stops joints at their limits; ``None`` leaves the accelerations unlimited.
-        row_limits: Limits of expected impacts, which give way like the joint limits.
-        force_weight: Weight of contact forces in the cost, 1/N²; moments have a hundred times as much, 1/(N·m)².
-        spare_weight: Weight of the free choice among redundant rotors, 1/N².
+        force_point: Point where a measured contact force acts; with ``None``, the dynamics ignore measured forces.
+        law: Law that stops joints at their limits; with ``None``, the accelerations are unlimited.
+        row_limits: Limits for expected impacts.  Like joint limits, they are relaxed if they cannot hold.
+        force_weight: Weight of contact forces in the cost, 1/N².  The weight of moments is a hundred times as large,
+            1/(N·m)².
+        spare_weight: Weight of the thrusts in the null space of redundant rotors, 1/N².
     """
 
     levels: tuple[tuple[Task, ...], ...] = ()
@@ -51,7 +53,7 @@ class TaskFormulation:
     spare_weight: Positive = 1e-3
 
     def __post_init__(self) -> None:
-        """Refuse a formulation without tasks, and two tasks of the same name."""
+        """Raise :class:`InputError` if there are no tasks or two tasks have the same name."""
         names = [task.name for task in self.tasks]
         if not names:
             raise InputError("has no task", where="program", hint="give tasks or a posture")
@@ -61,13 +63,13 @@ class TaskFormulation:
 
     @property
     def tasks(self) -> tuple[Task, ...]:
-        """All tasks, levels first, posture last."""
+        """All tasks: first the strict levels, then the weighted tasks, last the posture task."""
         strict = tuple(task for level in self.levels for task in level)
         return (*strict, *self.weighted, *(() if self.posture is None else (self.posture,)))
 
     @property
     def points(self) -> tuple[Point, ...]:
-        """All points whose kinematics the state must hold, contacts first."""
+        """All points whose kinematics the state object computes, contacts first."""
         points = [c.point for c in self.contacts] + [p for task in self.tasks for p in task.points]
         points += [p for limit in self.row_limits for p in limit.points]
         return tuple(dict.fromkeys(points if self.force_point is None else [*points, self.force_point]))
@@ -83,16 +85,16 @@ def aerial_formulation(
     order: Order = "strict",
     law: LimitLaw | None = LimitLaw(),
 ) -> TaskFormulation:
-    """Return the paper's stack for an aerial manipulator: tilt, then end effector, then posture.
+    """Return the stack of Afifi et al. 2026 for an aerial manipulator: tilt, then end effector, then posture.
 
     Args:
-        robot: The robot; the end effector is its default contact frame.
-        posture: Nominal (:class:`JointPosture`), or impact-robust.
-        end_effector: Task of the end effector, by default a pose with ``kp = 60``; the measured force acts at its
-            point.
-        tilt: Task of the tilt, by default with ``kp = 100``.
-        order: ``strict`` makes tilt and end effector equalities (Problems 2 and 3).  ``weighted`` puts all tasks into
-            the cost, with their weights (Problem 1).
+        robot: The robot.  Its default contact frame is the end effector.
+        posture: Nominal posture task (:class:`JointPosture`), or an impact-robust posture task.
+        end_effector: Task of the end effector; by default, a pose task with ``kp = 60``.  A measured force acts at
+            the point of this task.
+        tilt: Task of the tilt; by default, with ``kp = 100``.
+        order: With ``strict``, tilt and end effector are equality constraints (Problems 2 and 3).  With ``weighted``,
+            all tasks are in the cost, with their weights (Problem 1).
         law: Law of the joint limits.
 
     Raises:
@@ -114,9 +116,9 @@ def arm_formulation(
     order: Order = "strict",
     law: LimitLaw | None = LimitLaw(),
 ) -> TaskFormulation:
-    """Return the stack of :func:`aerial_formulation` without the tilt, for an arm on a fixed base.
+    """Return the stack of :func:`aerial_formulation` without the tilt task, for an arm on a fixed base.
 
-    The arguments are the same.
+    The arguments have the same meaning as in :func:`aerial_formulation`.
 
     Raises:
         InputError: The base floats, or the robot has no default contact frame.
@@ -139,17 +141,20 @@ def legged_formulation(
     force_point: Point | None = None,
     law: LimitLaw | None = LimitLaw(),
 ) -> TaskFormulation:
-    """Return the paper's stack for a standing robot: contacts, center of mass, base orientation, posture.
+    """Return the task stack of Afifi et al. 2026 for a standing robot.
+
+    The tasks, which the contacts constrain, are: center of mass, base orientation, posture.
 
     Args:
-        robot: The robot; it stands on the supports of its ``robot.toml``.
-        posture: Nominal or impact-robust.  The weights of center of mass and base are 10 and 1.
+        robot: The robot.  It stands on the supports of its ``robot.toml``.
+        posture: Nominal or impact-robust posture task.
         kp: Stiffness of center of mass and base orientation, 1/s².
         friction: Coulomb coefficient of the ground.
-        center_of_mass: Task of the center of mass, by default with weight 10.
-        base: Task of the base orientation, by default with weight 1.
-        contacts: Contacts, by default the robot's supports.
-        force_point: Point where a measured contact force acts, not at a foot; ``None`` leaves the force out.
+        center_of_mass: Task of the center of mass; by default, with weight 10.
+        base: Task of the base orientation; by default, with weight 1.
+        contacts: Contacts with the ground; by default, the robot's supports.
+        force_point: Point, not at a foot, where a measured contact force acts.  With ``None``, the dynamics ignore
+            measured forces.
         law: Law of the joint limits.
 
     Raises:
@@ -171,7 +176,10 @@ def _manipulator(
     order: Order,
     law: LimitLaw | None,
 ) -> TaskFormulation:
-    """Return the stack of the tasks ``above``, the end effector and the posture, with one task a strict level."""
+    """Return the stack of the tasks ``above``, the end effector and the posture.
+
+    If the order is strict, each task is a level of its own.
+    """
     frame = robot.spec.contact.frame
     if end_effector is None:
         if frame is None:

@@ -1,1 +1,1 @@
-"""The reference flow to postures with lower impacts."""
+"""The reference flow, which moves the reference posture to postures with lower impacts."""

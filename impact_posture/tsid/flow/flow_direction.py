@@ -1,4 +1,4 @@
-"""Direction of the reference flow: a saddle-free Newton step on the constraints, as a QP with limits."""
+"""Direction of the reference flow: a saddle-free Newton step on the constraints, solved as a QP with limits."""
 
 from __future__ import annotations
 
@@ -18,19 +18,21 @@ from impact_posture.tsid.qp.daqp_solver import DaqpSolver
 from impact_posture.tsid.qp.quadratic_program import QP
 from impact_posture.tsid.state import State
 
-# Least ``H/H₀`` under the root.
+# A smaller ``H/H₀`` is replaced by this value in the square root.
 _LEAST = 1e-8
-# Sine of the tilt below which the tilt has no slope.
+# If the sine of the tilt is smaller, the slope of the tilt is set to zero, because the tilt axis is undefined.
 _LEVEL = 1e-6
-# Violation of a limit that a braking flow may reach, rad (m), or as a share.
+# Largest violation of a limit during braking, rad (m) for joints, and a share of the range for static controls.
 _NEAR = 1e-3
-# Largest violation at which the flow may still move along a limit.  With all of ``_NEAR``, it would creep across.
+# Largest violation at which the flow may still move along a limit.  It is below ``_NEAR``, because the flow would
+# otherwise slowly cross the limit.
 _SPENT = 9.9e-4
 # Distance that the flow keeps from the joint limits, rad (m).
 _AIM = 2e-3
-# Distance that it keeps from the limits of static controls, as a share.  Their slope is learned, hence inexact.
+# Distance that the flow keeps from the limits of the static controls, as a share of the range.  The distance is
+# larger, because the slope of the static controls is only estimated.
 _RESERVE = 8e-3
-# Least square of the length of a row on the constraints.
+# Squared length of a row, projected on the constraints, below which the row cannot be corrected.
 _FLAT = 1e-6
 _PositiveShare = Annotated[float, Demand(lambda value: 0 < value <= 1, "a number above zero, up to 1")]
 
@@ -38,22 +40,23 @@ _PositiveShare = Annotated[float, Demand(lambda value: 0 < value <= 1, "a number
 @checked
 @dataclass(frozen=True)
 class FlowOptions:
-    """Parameters of the reference flow; the same for every robot.
+    """Parameters of the reference flow.  The defaults suit every robot.
 
     Attributes:
         speed: Largest speed ``v`` of an entry of ``q_r``, rad/s (m/s).
-        acceleration: Largest acceleration ``a``, rad/s² (m/s²); two fifths of it stop the flow within its step.
-        rho: ρ, pull of the joints towards the start per rad², relative to ``H₀``.
-        mu: μ, least curvature per rad², relative to ``H₀``.
-        epsilon: ε, predicted decrease relative to ``H₀`` below which the flow rests; it resumes above 4 ε.
-        duration: Longest time that the flow moves after each start, s.  Time on a path or at rest does not count.
+        acceleration: Largest acceleration ``a``, rad/s² (m/s²).  Two fifths of ``a`` suffice to stop the flow within
+            its step.
+        rho: ρ, weight of the squared distance from the start in ``Φ``, per rad², relative to ``H₀``.
+        mu: μ, lower bound on the curvature that the flow uses, per rad², relative to ``H₀``.
+        epsilon: ε, relative to ``H₀``.  The flow rests if the predicted decrease is below ε and resumes above 4 ε.
+        duration: Longest time that the flow moves after each start, s.  Time on a path or at rest is not included.
         joint_margin: Distance from the joint limits, rad (m); at most an eighth of the range of a joint.
         com_margin: Distance of the center of mass from the edges of the support polygon, m.
         tilt: Largest angle between the vertical and :attr:`~impact_posture.robot.robot.Robot.upright`, rad.
-        share: Share of the actuators' limits that holding ``q_r`` may use.
-        haste: Share of the remaining actuators' limits that acceleration may use.  Braking before a limit may also
+        share: Share of the actuators' limits that the static controls at ``q_r`` may use.
+        haste: Share of the remaining actuators' limits that accelerations may use.  Braking before a limit may also
             use half of the rest.
-        tracking: Error of the joints at which the flow waits for the robot, rad (m).
+        tracking: If the joints of the robot lag behind ``q_r`` by this error, rad (m), the flow stops and waits.
     """
 
     speed: Positive = 1.0
@@ -73,36 +76,42 @@ class FlowOptions:
 class FlowDirection:
     """Newton step ``δ = Z y`` of ``Φ = 2√(H/H₀) + ρ/2 ‖q_r ⊖ q₀‖²`` on the constraints.
 
-    ``Φ`` has the root of ``H``, because the velocity jump grows with the root.  ``y`` minimizes
+    ``Φ`` contains the square root of ``H``, because the velocity jump is proportional to ``√H``.  ``y`` minimizes
     ``½ yᵀ|B_Z| y + (Zᵀ∇Φ)ᵀ y``.  ``B_Z`` is the curvature of ``H/H₀`` times ``√(H₀/H)`` plus the curvature of the
-    pull towards the start.  ``|B_Z|`` has the same eigenvectors and the eigenvalues ``max(|λᵢ|, μ)`` (saddle-free
-    Newton, Dauphin et al. 2014), so that the step leaves saddles.  The curvature ``B`` is learned from secants by the
-    Powell symmetric Broyden update, and the slope ``T`` of the static controls by the Broyden update.  Rows keep
-    joints, center of mass, tilt of the base and static controls within their limits.  A limit that is already
-    violated at ``q_r`` is not violated further.
+    pull towards the start.  ``|B_Z|`` has the same eigenvectors as ``B_Z`` and the eigenvalues ``max(|λᵢ|, μ)``
+    (saddle-free Newton, Dauphin et al. 2014), so that the step leaves saddle points.
+
+    The curvature ``B`` is estimated from gradient differences by the Powell symmetric Broyden update.  The slope
+    ``T`` of the static controls is estimated by the Broyden update.  Rows of the QP keep joints, center of mass, tilt
+    of the base and static controls within their limits.  If ``q_r`` already violates a limit, the step does not
+    increase the violation.
 
     Attributes:
-        B: Curvature of ``H/H₀`` on the constraints, shape (nv, nv).
-        T: Slope of the static controls (:class:`StaticControls`), shape (controls, nv).
-        gain: Predicted decrease of ``H/H₀`` by the last step, at most the first-order decrease.
+        B: Estimated curvature of ``H/H₀`` on the constraints, shape (nv, nv).
+        T: Estimated slope of the static controls (:class:`StaticControls`), shape (controls, nv).
+        gain: Predicted decrease of ``H/H₀`` by the last step; limited to the first-order prediction.
         failures: Number of steps for which the solver failed.  These steps are zero.
     """
 
     def __init__(self, robot: Robot, edges: Array, controls: int, options: FlowOptions) -> None:
-        """Size the buffers for the normals of the support polygon, shape (k, 2), and a number of limited controls."""
+        """Size the buffers.
+
+        ``edges`` are the normals of the support polygon, shape (k, 2).  ``controls`` is the number of controls with
+        limits.
+        """
         nv, ranges = robot.nv, JointRanges(robot)
         self._joints = np.flatnonzero(np.isfinite(ranges.lower) & np.isfinite(ranges.upper))
         width = (ranges.upper - ranges.lower)[self._joints]
         self._margin = np.minimum(options.joint_margin, width / 8)
         self._edges, self._mu, self._tilt = edges, options.mu, options.tilt
         self._up = robot.upright
-        # Index of the tilt's row, the tilt, and the vertical in the base.
+        # Index of the row of the tilt, the tilt angle, and the vertical in base axes.
         self._tilting, self._angle, self._vertical = self._joints.size + edges.shape[0], 0.0, np.zeros(3)
         # The pull towards the start acts on joints only.
         self._pull = np.full(nv, options.rho)
         self._pull[: 6 if robot.floating else 0] = 0.0
         self.B, self.gain, self.failures = np.zeros((nv, nv)), 0.0, 0
-        # The sizes never change.  Without redundancy in a direction, its column is zero.
+        # The QP always has nv variables.  The columns beyond the dimension of the redundancy are zero.
         self._qp = QP.empty(nv, self._joints.size + edges.shape[0] + (1 if robot.floating else 0) + controls)
         self._solver = DaqpSolver(nv, self._qp.m)
         self._rows, self._room = np.zeros((self._qp.m, nv)), np.zeros((2, self._qp.m))
@@ -110,7 +119,11 @@ class FlowDirection:
         self.T = self._rows[self._qp.m - controls :]
 
     def learn(self, z: Array, curvature: Array, slope: Array) -> None:
-        """Learn the curvature of ``H/H₀`` and the slope of the static controls along a unit vector, shape (nv,)."""
+        """Update the estimates ``B`` and ``T`` by differences along the unit vector ``z``, shape (nv,).
+
+        ``curvature`` is the change of the gradient of ``H/H₀`` per rad along ``z``, shape (nv,).  ``slope`` is the
+        change of the static controls per rad along ``z``, shape (controls,).
+        """
         missing = curvature - self.B @ z
         missing -= z @ missing / 2 * z
         outer = np.multiply.outer(missing, z)
@@ -119,10 +132,11 @@ class FlowDirection:
         self.T += np.multiply.outer(slope - self.T @ z, z)
 
     def limit(self, state: State, rooms: Array, shares: Array, coasting: Array) -> None:
-        """Set the rows for a state at ``ν = 0``, less the displacement ``coasting`` in which the present flow brakes.
+        """Set the rows of the limits at a state with ``ν = 0``.
 
-        ``rooms`` are the distances of the center of mass to the edges of the polygon, less the margin, m, shape (k,).
-        ``shares`` are the static controls, shape (controls,).
+        ``rooms`` are the distances from the center of mass to the edges of the polygon, minus the margin, m, shape
+        (k,).  ``shares`` are the static controls, shape (controls,).  ``coasting`` is the displacement during which
+        the present flow brakes, shape (nv,).  The limits are tightened by this displacement.
         """
         upper, lower = self._qp.upper[self._qp.n :], self._qp.lower[self._qp.n :]
         count, k = self._joints.size, self._edges.shape[0]
@@ -152,10 +166,10 @@ class FlowDirection:
         np.minimum(lower - np.minimum(ahead, 0.0), 0.0, out=lower)
 
     def newton(self, space: Redundancy, gradient: Array, value: float, offset: Array, error: Array) -> Array:
-        """Return the step δ, shape (nv,).
+        """Return the Newton step δ, shape (nv,).
 
-        It follows from ``∇H/H₀`` (nv,), the value ``H/H₀``, the offset ``q_r ⊖ q₀`` (nv,), and the error of the
-        constraints (rows,).
+        ``gradient`` is ``∇H/H₀``, shape (nv,), ``value`` is ``H/H₀``, and ``offset`` is ``q_r ⊖ q₀``, shape (nv,).
+        ``error`` is the error of the constraints, shape (rows,).
         """
         Z, root = space.basis, math.sqrt(max(abs(value), _LEAST))
         slope = Z.T @ (gradient / root + self._pull * offset)
@@ -166,19 +180,19 @@ class FlowDirection:
         values, vectors = np.linalg.eigh(curvature)
         axes = Z @ (vectors / np.sqrt(np.maximum(np.abs(values), self._mu)))
         step = self._solve(axes, axes.T @ (Z @ slope))
-        # H must decrease: a gain of the pull or of the springs does not count.
+        # Only a decrease of H is a gain; a decrease in the pull or in the springs is not.
         self.gain = min(self.gain * root, -float(gradient @ step))
         return step
 
     def towards(self, Z: Array, displacement: Array) -> Array:
-        """Return the step on the constraints and within the limits that is nearest to a displacement, shape (nv,)."""
+        """Return the step nearest to ``displacement`` that respects constraints and limits, shape (nv,)."""
         return self._solve(Z, -Z.T @ displacement)
 
     def downhill(self, Z: Array, gradient: Array, flow: Array, stop: Array, step: Array) -> Array:
-        """Return a change of the flow without the part that raises ``H`` now or at the point where the flow stops.
+        """Return ``step`` without the part that increases ``H`` now or at the point where the flow stops.
 
-        ``Z`` is the basis of the redundancy, shape (nv, r), and ``gradient`` is ``∇H/H₀``.  The flow ``u`` stops in
-        the displacement ``stop``.  The argument ``step`` is a change of ``u``.
+        ``step`` is a change of the velocity ``flow``, shape (nv,).  ``Z`` is the basis of the redundancy, shape
+        (nv, r), and ``gradient`` is ``∇H/H₀``.  ``stop`` is the displacement within which the flow stops.
         """
         for slope in (gradient + self.B @ stop, gradient):
             uphill = Z @ (Z.T @ slope)
@@ -188,7 +202,7 @@ class FlowDirection:
         return step
 
     def stops(self, flow: Array, time: float) -> bool:
-        """Return whether ``flow``, shape (nv,), stays within the limits for ``time`` seconds."""
+        """Return whether a motion with the velocity ``flow``, shape (nv,), respects limits for ``time`` seconds."""
         displacement = flow * time
         ahead = self._rows @ displacement
         if self._up is not None:
@@ -196,18 +210,20 @@ class FlowDirection:
         return not float(np.maximum(ahead - self._room[0], self._room[1] - ahead).max(initial=0.0)) > _NEAR
 
     def _tilt_change(self, displacement: Array, along: float) -> float:
-        """Return the change of the tilt in a displacement, shape (nv,), of which ``along`` acts on the tilt directly.
+        """Return the change of the tilt angle caused by a displacement, shape (nv,).
 
-        The part across the tilt raises it to second order.
+        ``along`` is the part of the base rotation about the tilt axis, rad.  The horizontal part across this axis
+        increases the tilt to second order.
         """
         turn = float(self._vertical @ displacement[3:6])
         aside = float(displacement[3:6] @ displacement[3:6]) - turn**2 - along**2
         return math.hypot(self._angle + along, math.sqrt(max(aside, 0.0))) - self._angle
 
     def along(self, Z: Array, flow: Array, time: float, step: Array) -> Array:
-        """Return a change of the flow without the parts that cross limits, taken out row by row.
+        """Return ``step`` without the parts that cross limits; the limits are treated one after the other.
 
-        ``Z`` is the basis of the redundancy, shape (nv, r).  The flow ``u + step`` goes on for ``time`` seconds.
+        ``step`` is a change of the velocity ``flow``, shape (nv,).  The robot moves with ``flow + step`` for ``time``
+        seconds.  ``Z`` is the basis of the redundancy, shape (nv, r).
         """
         for k, (row, high, low) in enumerate(zip(self._rows, *self._room, strict=True)):
             displacement = time * (flow + step)
@@ -223,12 +239,12 @@ class FlowDirection:
         return step
 
     def _solve(self, axes: Array, slope: Array) -> Array:
-        """Return ``δ = axes·y`` for the least ``½‖y‖² + slope·y``; zero if the solver fails."""
+        """Return ``δ = axes·y``, where ``y`` minimizes ``½‖y‖² + slope·y``; return zero if the solver fails."""
         qp, r = self._qp, axes.shape[1]
         qp.A[:, :r] = self._rows @ axes
         qp.A[:, r:] = 0.0
         qp.g[:r], qp.g[r:] = slope, 0.0
-        # A cold start, because a row that was zero in the last step would otherwise stay inactive.
+        # Start without an active set, because a row that was zero in the last step would otherwise stay inactive.
         self._solver.reset()
         solved = self._solver.solve(qp)
         if solved is None:

@@ -1,4 +1,4 @@
-"""Directions in which the reference flow measures the curvature beside its posture."""
+"""Directions along which the reference flow measures the curvature near its posture."""
 
 from __future__ import annotations
 
@@ -9,18 +9,19 @@ import numpy as np
 from impact_posture.system.arrays import Array
 from impact_posture.tsid.flow.redundancy import Redundancy
 
-# Least square of the length of a direction.
+# Least squared length of a direction, which prevents a division by zero.
 _EMPTY = 1e-24
-# A direction with a shorter new part is orthogonalized once more, because rounding would leave it inexact.
+# If the part of a direction that is orthogonal to the earlier ones is shorter, the direction is orthogonalized twice.
+# Rounding would otherwise leave it inexact.
 _NEW = 0.1
 
 
 class ProbeDirections:
-    """Unit vectors on the constraints, orthogonal to each other in a round over all directions that are left.
+    """Unit vectors on the constraints.  A round of r vectors is orthogonal and spans all r free directions.
 
-    They are projections of fixed directions, because the columns of the basis ``Z`` are not unique.  The fixed
-    directions leave out no entry and are the same, bit for bit, on every machine: the fractions of ``k² φ``, with the
-    golden ratio φ in 32 bits, are spread like random numbers.
+    The vectors are projections of fixed directions, because the columns of the basis ``Z`` are not unique.  The
+    entries of the fixed directions are the fractional parts of ``k² φ``, where φ is the golden ratio in 32 bits.
+    They are spread like random numbers and are equal, bit for bit, on every machine.
 
     Attributes:
         count: Number of directions in which the flow has measured.
@@ -33,7 +34,7 @@ class ProbeDirections:
         self.count = 0
 
     def next(self, space: Redundancy) -> Array:
-        """Return the part of the next fixed direction that is orthogonal to the round's earlier ones, shape (nv,)."""
+        """Return the next unit vector, shape (nv,), which is orthogonal to the earlier vectors of the round."""
         k = self.count % space.basis.shape[1]
         z, seen = self._seen[k], self._seen[:k]
         z[:] = self._fixed[k]

@@ -1,4 +1,4 @@
-"""Motions that contacts and tasks leave free, and motions that lead back to them."""
+"""Motions that do not change contacts and tasks, and motions that correct errors of contacts and tasks."""
 
 from __future__ import annotations
 
@@ -8,25 +8,26 @@ import numpy as np
 
 from impact_posture.system.arrays import Array
 
-# Directions with a smaller singular value, relative to the largest, are springs and not constraints.  The rows of
-# points on one body can be almost dependent: held exactly in one posture and free in the next, they would never let a
-# flow rest.
+# If the singular value of a direction is below this share of the largest, the direction gets a spring instead of a
+# constraint.  Rows of points on one body can be almost dependent.  As constraints, such rows would switch on and off
+# from posture to posture, and the flow would never rest.
 _SOFT = 2e-2
-# Stiffness of these springs relative to ``H₀``, 1/m²: an error of 6 mm costs half of ``H₀``.
+# Stiffness of the springs relative to ``H₀``, 1/m²: the energy at an error of 6 mm is about half of ``H₀``.
 _STIFFNESS = 3e4
-# Small weight of the base in a motion that the joints do not determine.
+# Small regularization for base motions that leave the joints at rest.
 _IDLE = 1e-9
 
 
 @dataclass(frozen=True)
 class Redundancy:
-    """Directions that the constraints leave, ``J = U S Vᵀ``, and a pseudo-inverse for the directions that they hold.
+    """Free directions of the constraints, from the decomposition ``J = U S Vᵀ``, and a pseudo-inverse of ``J``.
 
     Attributes:
-        basis: ``Z``, orthonormal, shape (nv, r).
-        inverse: ``J⁺`` of the held directions, shape (nv, rows).
-        springs: ``k JZ`` of nearly dependent constraints, shape (rows, r); ``None`` where there are none.
-        stiffness: Their stiffness ``k s²`` along each column of ``Z``, shape (r,), or ``None``.
+        basis: Orthonormal basis ``Z`` of the free directions, shape (nv, r).
+        inverse: Pseudo-inverse ``J⁺`` on the constrained directions, shape (nv, rows).
+        springs: ``k JZ`` of nearly dependent constraints, shape (rows, r); ``None`` if there are none.
+        stiffness: Stiffness ``k s²`` of the springs along each column of ``Z``, shape (r,); ``None`` if there are
+            none.
     """
 
     basis: Array
@@ -36,7 +37,7 @@ class Redundancy:
 
     @classmethod
     def of(cls, J: Array) -> Redundancy:
-        """Decompose ``J``, shape (rows, nv)."""
+        """Return the redundancy of the constraints with the Jacobian ``J``, shape (rows, nv)."""
         rows, nv = J.shape
         if not rows:
             return cls(np.eye(nv), np.zeros((nv, 0)))
@@ -55,9 +56,9 @@ class Redundancy:
         return np.asarray(self.basis @ (self.basis.T @ vector))
 
     def back(self, rate: Array, base: int) -> Array:
-        """Return a motion, shape (nv,), that changes the constraints at a rate, shape (rows,).
+        """Return a velocity, shape (nv,), that changes the constraints at ``rate``, shape (rows,).
 
-        Of all such motions, it moves the first ``base`` entries and spares the joints.
+        Of all such velocities, the result has the slowest joints.  The first ``base`` entries are not joints.
         """
         back, Z = self.inverse @ rate, self.basis
         if base:

@@ -1,4 +1,7 @@
-"""Flow of a reference posture to lower impacts, on contacts and tasks, limited in speed and acceleration."""
+"""Flow of a reference posture to lower impacts, with limited speed and acceleration.
+
+Contacts and tasks constrain the flow.
+"""
 
 from __future__ import annotations
 
@@ -26,45 +29,47 @@ from impact_posture.tsid.tasks.frame_tasks import FramePose, FramePosition
 from impact_posture.tsid.tasks.impact_robust import Gradient
 from impact_posture.tsid.tasks.task import Task
 
-# Step of the differences along the redundancy, rad.
+# Step of the finite differences along the redundancy, rad.
 _STEP = 1e-4
-# Least displacement of the flow between looks from which it learns, rad (m).
+# Least displacement between two evaluations that is used to update the curvature estimates, rad (m).
 _MOVED = 1e-6
-# Step below which a posture of the path counts as reached, or as near as the limits permit, rad (m).
+# If the step towards a posture of the path is shorter, rad (m), the flow continues to the next posture.  The posture
+# is then reached, or the limits permit no closer posture.
 _REACHED = 0.02
-# Speed below which a flow that is off stands still, rad/s (m/s).
+# Speed below which a flow that is off is set to rest, rad/s (m/s).
 _STILL = 1e-5
-# Length of the velocity below which a probe at the stopping point tells nothing.
+# If the velocity vector is shorter, the flow does not probe its stopping point, which is then too near.
 _SLOW = 1e-3
-# Ticks of an update.
+# Number of ticks over which one update is spread.
 UPDATE_TICKS = 14
-# Tick of the first change of the motion in an update, and ticks from the second change to the next look.
+# Tick of the first change of the motion in an update; number of ticks from the second change to the next evaluation.
 _UNTIL, _SINCE = 4, 3
 
 
 class ReferenceFlow:
     """Saddle-free Newton flow of a reference posture ``q_r`` in the null space of contacts and tasks.
 
-    ``H`` and ``∇H`` are evaluated at ``q_r`` and not at the measured posture, so that noise, tracking errors and the
-    impact itself do not matter.  An update takes :data:`UPDATE_TICKS` ticks and changes the motion twice.  The
-    controller in C changes the motion at the same ticks, and spreads the other work over the ticks between them.  All
-    arrays but the basis of the redundancy keep their sizes.
+    ``H`` and ``∇H`` are evaluated at ``q_r`` and not at the measured posture, so noise, tracking errors and the
+    impact have no influence on them.  An update takes :data:`UPDATE_TICKS` ticks and changes the motion twice.  The
+    controller in C changes the motion at the same ticks and spreads the other work over the ticks between them.  Only
+    the basis of the redundancy changes its size; all other arrays keep their sizes.
 
-    Contacts stay at their places, and strict and weighted tasks at their targets.  Only the ``led`` tasks (center of
-    mass, base orientation) follow the flow.  Joints that ``robot.toml`` holds do not move.
+    Contacts stay at their places.  Strict and weighted tasks stay at their targets.  Only the ``led`` tasks (center
+    of mass, base orientation) follow the flow.  Joints that ``robot.toml`` lists under ``hold`` do not move.
 
     Attributes:
-        q: ``q_r``, shape (nq,).
-        velocity: ``u`` with ``q̇_r = u``, rad/s (m/s), shape (nv,).
-        acceleration: ``u̇``, shape (nv,).
+        q: Reference posture ``q_r``, shape (nq,).
+        velocity: Velocity ``u`` of ``q_r`` (``q̇_r = u``), rad/s (m/s), shape (nv,).
+        acceleration: ``u̇``, rad/s² (m/s²), shape (nv,).
         value: ``H(q_r)`` at the last update.
-        start: ``H₀``, its value at the reset.
+        start: ``H₀``, the absolute value of ``H`` at the reset.
         on: Whether the flow may move.
-        resting: Whether no step predicts a decrease of more than ε, or the flow has moved as long as it may.
-        failed: Whether the last evaluation raised or was not finite.  The flow then brakes.
+        resting: Whether the flow rests, because the predicted decrease is below ε or its time is over.
+        failed: Whether the last evaluation raised an exception or was not finite.  The flow then brakes.
         led: Tasks that follow the flow.
-        error: Distance from contacts and tasks at the last update, m and rad, and zeros for held joints.
-        shares: Static controls there, within ±1 where the posture can be held (:class:`StaticControls`).
+        error: Errors of contacts and tasks at the last update, m and rad, then zeros for held joints.
+        shares: Static controls at the last update; the actuators can hold the posture if all entries are within ±1
+            (:class:`StaticControls`).
     """
 
     def __init__(
@@ -76,9 +81,10 @@ class ReferenceFlow:
         options: FlowOptions,
         path: Sequence[Array] = (),
     ) -> None:
-        """Size the buffers for a gradient ``q → (H, ∇H)`` and a path of postures to visit first, each of shape (nq,).
+        """Size the buffers.
 
-        The last posture of the path may be the optimum of an offline solution.
+        ``gradient`` is a function ``q → (H, ∇H)``.  The flow first visits the postures of ``path``, each of shape
+        (nq,).  The last posture of the path may be the optimum of an offline solution.
         """
         self._model, self._gradient, self.options = robot.model, gradient, options
         self._contacts = formulation.contacts
@@ -98,11 +104,11 @@ class ReferenceFlow:
         self._tick, self._elapsed, self.resting = 0, 0.0, False
 
     def reset(self, q: Array) -> None:
-        """Begin at rest at a posture, shape (nq,), and measure the curvature there.
+        """Begin at rest at the posture ``q``, shape (nq,), and measure the curvature of ``H`` at ``q``.
 
         Raises:
             InputError: The robot has feet and a fixed base.
-            MetricError: The gradient does not exist there, or ``H`` vanishes.
+            MetricError: At ``q``, the gradient does not exist or ``H`` is zero.
         """
         state = self._state
         self._first, self._here = self.q.copy(), self.q.copy()
@@ -137,7 +143,7 @@ class ReferenceFlow:
         self._probes.count = 0
 
     def advance(self, dt: float, measured: Array) -> None:
-        """Advance by ``dt`` seconds; ``measured`` is the configuration of the robot that follows, shape (nq,)."""
+        """Advance by ``dt`` seconds; ``measured`` is the measured configuration of the robot, shape (nq,)."""
         self._clock += dt
         self._elapsed += dt
         tick, self._tick = self._tick, (self._tick + 1) % UPDATE_TICKS
@@ -155,28 +161,28 @@ class ReferenceFlow:
             self.velocity[:] = self.acceleration[:] = 0.0
 
     def start_at(self, q: Array) -> None:
-        """Go on from another posture, at rest, and keep the learned curvature."""
+        """Start again at rest from the posture ``q``, shape (nq,), and keep the estimated curvature."""
         if not np.array_equal(q, self.q):
             self._place_at(q)
 
     def rest_at(self, after: float) -> None:
-        """Come to rest within ``after`` seconds from now, as far as the acceleration permits, and stay.
+        """Come to rest within ``after`` seconds from now, as far as the acceleration permits, and stay at rest.
 
-        The longest time of a motion counts from now.
+        The time limit :attr:`FlowOptions.duration` starts now.
         """
         self._deadline, self._moved, self._remains = self._clock + after, 0.0, np.inf
 
     @property
     def moves(self) -> bool:
-        """Whether :meth:`advance` has anything to do."""
+        """Whether the flow is on or still moves."""
         return self.on or bool(self.velocity.any())
 
-    # ---- the parts of an update -----------------------------------------------------------------------------------
+    # ---- steps of an update ---------------------------------------------------------------------------------------
 
     def _look(self) -> None:
-        """Evaluate objective, constraints and limits, and learn from the displacement since the last look.
+        """Evaluate objective, constraints and limits at ``q_r`` as predicted for the next change of the motion.
 
-        The posture of the look is ``q_r`` at the next change of the motion.
+        Update the curvature estimates from the differences to the last evaluation.
         """
         state, direction = self._state, self.direction
         dt = self._elapsed / _SINCE
@@ -194,7 +200,7 @@ class ReferenceFlow:
         self._reduced = self._slope - self._J.T @ self._multipliers
         self.shares = self._static.shares(state, self._J)
         length = math.sqrt(float(moved @ moved))
-        # The slope is zero after a look at which the gradient failed.
+        # The stored slope is zero if the gradient failed at the last evaluation.
         if length > _MOVED and not self.failed and slope.any():
             self._learn(moved / length, length, slope - self._before.T @ self._multipliers, shares)
         self._before[:] = self._J
@@ -205,9 +211,10 @@ class ReferenceFlow:
         direction.limit(state, rooms, self.shares, coasting)
 
     def _probe(self) -> None:
-        """Evaluate the reduced gradient and the static controls beside the posture of the last look, and learn.
+        """Evaluate the reduced gradient and the static controls at a posture near the last evaluated posture.
 
-        Every other probe is at the point where the flow stops, because the flow needs the slopes there.
+        Update the curvature estimates from the differences.  Every second probe is at the point where the flow would
+        stop, because the flow needs the slopes at this point.
         """
         if self.failed or not self._space.basis.shape[1]:
             return
@@ -228,11 +235,15 @@ class ReferenceFlow:
             self._probes.count += not ahead
 
     def _learn(self, z: Array, length: float, reduced: Array, shares: Array) -> None:
-        """Learn from reduced gradient and static controls at ``length`` along ``z`` from the last look."""
+        """Update the curvature estimates by the differences to the last evaluated posture.
+
+        ``reduced`` and ``shares`` are the reduced gradient and the static controls at the distance ``length`` along
+        the unit vector ``z``.
+        """
         self.direction.learn(z, (reduced - self._reduced) / length, (shares - self.shares) / length)
 
     def _direct(self) -> None:
-        """Compute the step, and whether it is worth moving."""
+        """Compute the step, and decide whether the flow rests."""
         self._wanted[:] = 0.0
         if self.failed:
             return
@@ -247,21 +258,22 @@ class ReferenceFlow:
         gain, least = self.direction.gain, self.options.epsilon
         self.resting = gain < (4 * least if self.resting else least) or self._remains <= 0.0
         if self.resting:
-            # The governor then brakes downhill.
+            # With a zero step, the governor brakes the flow without raising H.
             self._wanted[:] = 0.0
 
     def _govern(self, measured: Array) -> None:
-        """Limit speed and acceleration, and return to contacts and tasks."""
+        """Set the acceleration of the flow: limited, and with the return to contacts and tasks."""
         options = self.options
         period, self._elapsed = self._elapsed, 0.0
         if not period > 0:
-            # The clock stands still.
+            # No time has passed since the last change.
             return
         error = np.abs(pin.difference(self._model, measured, self.q)[self._base :]).max(initial=0.0)
         fastest = options.speed * max(1.0 - error / options.tracking, 0.0)
         if self.on and not self.resting and self._visited == len(self._path):
             self._moved += period
-        # The speed holds after the next change, and the change after it stops the flow with 2/5 of the acceleration.
+        # The flow keeps this speed until the next change.  The change after that one must stop the flow in the
+        # remaining time with 2/5 of the acceleration.
         self._remains = min(self._deadline - self._clock, options.duration - self._moved) - 2 * period
         fastest = min(fastest, 0.4 * options.acceleration * max(self._remains, 0.0))
         if not self.on:
@@ -279,31 +291,31 @@ class ReferenceFlow:
         known = (governor.flow + back + along - self.velocity) / period
         self._zmp.limit(self._state, known)
         change, brakes = governor.change(self._space, self._wanted, fastest, period, slope, self._zmp)
-        # A stop within the limits matters more than room for the actuators.
+        # Braking before a limit may use more of the actuators' remaining range.
         most = (1 + options.haste) / 2 if brakes else options.haste
         part = self._static.permitted(self._state.M, known, change / period, self.shares, most)
         self.acceleration[:] = known + governor.take(change, part) / period
 
     def _place_at(self, q: Array) -> None:
-        """Put ``q_r`` at rest at a posture, where the next update begins."""
+        """Set ``q_r`` to a posture at rest, and begin a new update."""
         self.q[:], self._first[:], self._here[:] = q, q, q
         for moving in self.velocity, self.acceleration, self._governor.flow, self._governor.returning:
             moving[:] = 0.0
         self._tick, self._elapsed, self.resting = 0, 0.0, False
 
     def _place(self, q: Array) -> None:
-        """Evaluate the Jacobian of the constraints at a posture."""
+        """Evaluate the state and the Jacobian of the constraints at a posture."""
         state = self._state.update(q, None)
         for task, J in self._turning:
             J[:] = task.jacobian(state)
 
     def _evaluate(self, q: Array) -> tuple[float, Array]:
-        """Return ``H`` and a copy of ``∇H/H₀``, zero where they do not exist."""
+        """Return ``H`` and a copy of ``∇H/H₀``.  If the gradient does not exist, return NaN and zeros."""
         try:
             value, gradient = self._gradient(q)
             slope = np.array(gradient, dtype=float) / self.start
             self.failed = not np.isfinite(slope).all()
         except Exception:
-            # A user's function may raise anything, but the tick must go on.  `failed` reports it.
+            # A user's function may raise any exception, but the tick must not fail.  `failed` reports the problem.
             self.failed = True
         return (np.nan, np.zeros(self.velocity.size)) if self.failed else (float(value), slope)

@@ -1,4 +1,4 @@
-"""Posture task whose target flows to a posture with lower impacts."""
+"""Posture task whose target moves to a posture with lower impacts."""
 
 from __future__ import annotations
 
@@ -26,12 +26,13 @@ from impact_posture.tsid.tasks.joint_posture import JointPosture
 class ReferenceFlowPosture(JointPosture):
     """``ν̇* = K_p (q_r ⊖ q) + K_d (u − ν) + u̇``, where ``q_r`` follows the reference flow.
 
-    ``∇H`` needs no gain: :class:`~impact_posture.tsid.flow.reference_flow.ReferenceFlow` has a speed, an acceleration
-    and a rule for resting that suit every robot.  Center of mass and base orientation of a standing robot follow
-    ``q_r``, too.  :meth:`move_to` may move a posture whose flow rests; the next :meth:`brace` goes on from there.
+    ``∇H`` requires no gain, because the speed, the acceleration and the stopping rule of
+    :class:`~impact_posture.tsid.flow.reference_flow.ReferenceFlow` suit every robot.  On a standing robot, the
+    targets of the center of mass and of the base orientation follow ``q_r``, too.  While the flow rests,
+    :meth:`move_to` can move the posture; the next :meth:`brace` starts from the new posture.
 
     Attributes:
-        settle: Time at rest before a known impact, s: four time constants ``1/√K_p``.
+        settle: Time for which the flow rests before a known impact, s: four time constants ``1/√K_p``.
     """
 
     def __init__(
@@ -48,16 +49,16 @@ class ReferenceFlowPosture(JointPosture):
 
         Args:
             robot: The robot.
-            gradient: ``q → (H, ∇H)``, or a compiled export, whose exported objective is then used.
+            gradient: Function ``q → (H, ∇H)``, or a compiled export.  For an export, its objective is used.
             options: Parameters of the flow.
-            path: Posture to visit first, shape (nq,), or postures, shape (k, nq), such as an optimum that was solved
-                offline or the path to it.  The flow goes on from the last of them.
+            path: Posture, shape (nq,), or postures, shape (k, nq), that ``q_r`` visits first, for example an offline
+                optimum or the path to it.  From the last posture, the flow takes over.
             name: Name in reports.
             gains: Arguments of :class:`~impact_posture.tsid.tasks.joint_posture.JointPosture`.
 
         Raises:
             PostureError: A posture of the path is not a configuration of the robot.
-            ManifestMismatch: The export is of another robot.
+            ManifestMismatch: The export belongs to another robot.
         """
         super().__init__(robot, name=name, **gains)
         self._function = fitting_gradient(robot, gradient)
@@ -71,7 +72,7 @@ class ReferenceFlowPosture(JointPosture):
 
     @property
     def flow(self) -> ReferenceFlow:
-        """The flow.
+        """The reference flow of this task.
 
         Raises:
             InputError: No controller with this task has been reset.
@@ -81,10 +82,11 @@ class ReferenceFlowPosture(JointPosture):
         return self._flow
 
     def brace(self, t_impact: float | None = None) -> None:
-        """Start the flow because an impact is coming, in ``t_impact`` seconds if this is known.
+        """Start the flow, because an impact is coming.
 
-        The flow moves for at most ``options.duration``.  It rests :attr:`settle` before a known impact, as far as its
-        acceleration permits.
+        ``t_impact`` is the time to the impact, s, or ``None`` if it is unknown.  The flow moves for at most
+        ``options.duration``.  It comes to rest :attr:`settle` seconds before a known impact, if its acceleration
+        permits this.
 
         Raises:
             InputError: The time is not finite, or no controller with this task has been reset.
@@ -110,22 +112,22 @@ class ReferenceFlowPosture(JointPosture):
         return 0.0 if self._flow is None else float(self._flow.on)
 
     def reset(self, state: State) -> None:
-        """Take the present posture as target, and the present outputs as targets of the tasks that the flow led."""
+        """Set the targets to the present state: the posture, and the outputs of the tasks that followed the flow."""
         super().reset(state)
         self._lead.reset(state)
 
     def begin(self, state: State, formulation: TaskFormulation, actuators: Actuators) -> None:
-        """Start the flow at a state; the controller calls this at ``reset``.
+        """Create the flow at ``state``.  The controller calls this method in its ``reset``.
 
         Raises:
-            MetricError: The gradient does not exist there, or ``H`` vanishes.
+            MetricError: At this state, the gradient does not exist or ``H`` is zero.
         """
         flow = ReferenceFlow(self._robot, self._function, formulation, actuators, self.options, self._path)
         flow.reset(state.q)
         self._flow, self.value = flow, flow.value
 
     def advance(self, state: State, dt: float) -> None:
-        """Advance the flow, and move the targets of the posture and of the tasks that it leads."""
+        """Advance the flow, and move the targets of the posture and of the tasks that follow the flow."""
         super().advance(state, dt)
         flow = self.flow
         if not flow.moves:

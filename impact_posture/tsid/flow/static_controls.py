@@ -1,4 +1,4 @@
-"""Controls that hold a posture at rest, as shares of the actuators' limits, and the polygon of the feet."""
+"""Controls that hold a posture at rest, as shares of the actuators' limits; support polygon of the feet."""
 
 from __future__ import annotations
 
@@ -16,59 +16,61 @@ from impact_posture.tsid.support_contact import SupportContact
 
 # Weight of a moment (N·m), relative to a force (N), in the choice of contact wrenches.
 _MOMENT = 100.0
-# Least share of the half range of a control that counts as available.
+# Accelerations may always use at least this share of the half range of a control.
 _LEFT = 0.1
-# Share of the weight that soles carry in equal parts.
+# Share of the weight of which each sole carries an equal part.
 _EVEN = 0.6
-# An edge whose direction is within this angle of the first direction counts as the last edge, rad.
+# If the direction of an edge is within this angle of −π, rad, the edge is sorted as if its direction were +π.
 _START = 1e-8
-# Share of the trace that keeps the balance of the base solvable where the feet cannot carry it.
+# This share of the trace is added to the diagonal, so that the equations are solvable even if the feet cannot carry
+# every wrench on the base.
 _TINY = 1e-12
 
 
 class StaticControls:
-    """Controls at rest, ``u = G⁺(h − Jᵀf)``, as distances from the middle of their ranges.
+    """Static controls ``u = G⁺(h − Jᵀf)``, measured from the middle of the control ranges.
 
-    The unit is a share of half the range.  The contact wrenches ``f`` are the least in a weighted norm that carry the
-    base.  Redundant rotors share evenly.
+    At ±1, a control reaches the permitted share of its limits.  Of all contact wrenches ``f`` that carry the base,
+    the result uses those with the least weighted norm.  Redundant rotors share the load evenly.
 
     Attributes:
         limited: Controls that have limits, shape (m,).
     """
 
     def __init__(self, actuators: Actuators, contacts: Sequence[SupportContact], share: float) -> None:
-        """Set the share of the limits that rest may use, 0 to 1."""
+        """Set ``share``, the share of the limits that the static controls may use, 0 to 1."""
         base = actuators.base
         self.limited = np.flatnonzero(np.isfinite(actuators.upper) & np.isfinite(actuators.lower))
         lower, upper = actuators.lower[self.limited], actuators.upper[self.limited]
         self._middle, self._half = (upper + lower) / 2, share * (upper - lower) / 2
-        # The whole limits, and the least room if the start needs more than its share.
+        # The full limits, and the least range for accelerations if the start needs more than its share.
         self._whole, self._least = 1.0 / share, _LEFT / share
         wrench = np.array([1.0] * 3 + [_MOMENT] * 3)
         self._ease = 1.0 / np.concatenate([np.zeros(0), *(wrench[: c.size] for c in contacts)])
         self._count, self._base = self._ease.size, base
-        # u = inverse · force, where the force is without the contacts' part.
+        # u = inverse · force, where the contact forces are already subtracted from the force.
         self._inverse = np.linalg.pinv(actuators.G, rcond=1e-9)[self.limited] / self._half[:, None]
-        # Generalized forces of the contacts, per unit of the wrench on the base that they carry.
+        # Generalized forces of the contacts per unit wrench on the base, shape (nv, base).
         self._carried = np.zeros((actuators.G.shape[0], base))
         if contacts:
-            # Imported here, because SciPy takes long to import.  NumPy takes three times as long for six unknowns.
+            # Imported here, because the import of SciPy is slow.  For six unknowns, NumPy needs three times as long.
             from scipy.linalg.lapack import dposv
 
             self._solve = dposv
         self._central, self._pair = self._middle / self._half, np.zeros((actuators.G.shape[0], 2))
 
     def shares(self, state: State, J: Array) -> Array:
-        """Return the shares at a state with ``ν = 0``, shape (m,); within ±1 the posture can be held.
+        """Return the static controls at a state with ``ν = 0``, shape (m,).
 
-        The first rows of ``J``, shape (≥ contact rows, nv), belong to the contacts.
+        The actuators can hold the posture if all entries are within ±1.  The first rows of ``J``, shape
+        (≥ contact rows, nv), belong to the contacts.
         """
         if self._count:
             J = J[: self._count]
             A = J[:, : self._base].T
             eased = A * self._ease
             square = eased @ A.T
-            # Feet on a line carry no moment about it.
+            # Feet on one line cannot carry a moment about this line, so the matrix would be singular.
             square.flat[:: self._base + 1] += _TINY * square.trace()
             _, wrenches, failed = self._solve(square, eased)
             if not failed:
@@ -76,11 +78,11 @@ class StaticControls:
         return np.asarray(self._needed(state.h) - self._central)
 
     def permitted(self, M: Array, known: Array, more: Array, shares: Array, most: float) -> float:
-        """Return the share of ``more``, 0 to 1, that the actuators permit.
+        """Return the share of the acceleration ``more``, 0 to 1, that the actuators permit.
 
-        The acceleration ``known``, shape (nv,), must not change.  Both accelerations may use at most the share
-        ``most`` of the room beside the static controls ``shares``, shape (m,).  The contact forces come from the
-        last :meth:`shares`.
+        The acceleration ``known``, shape (nv,), cannot be changed.  The static controls ``shares``, shape (m,), leave
+        a part of the control ranges.  Of this part, both accelerations together may use the share ``most``.  The
+        contact forces follow from the last call of :meth:`shares`.
         """
         self._pair[:, 0], self._pair[:, 1] = known, more
         taken, added = self._needed(M @ self._pair).T
@@ -89,7 +91,7 @@ class StaticControls:
         return max(float((left / np.maximum(np.abs(added), _TINY)).min(initial=1.0)), 0.0)
 
     def _needed(self, force: Array) -> Array:
-        """Return the controls that produce generalized forces, shape (m,) for (nv,) or (m, k) for (nv, k)."""
+        """Return the controls that produce generalized forces; shape (nv,) gives (m,), and (nv, k) gives (m, k)."""
         if self._count:
             force = force - self._carried @ force[: self._base]
         return np.asarray(self._inverse @ force)
@@ -98,13 +100,14 @@ class StaticControls:
 def support_edges(state: State, contacts: Sequence[SupportContact]) -> tuple[Array, Array]:
     """Return ``n`` (k, 2) and ``b`` (k,) of the polygon ``n·c + b ≤ 0`` of the feet on level ground, m.
 
-    A center of mass ``c`` in the polygon leaves each sole its equal part of 60 % of the weight, because a sole
-    without load leaves the ground at the least push.  For this, each corner of a sole moves towards the mean of the
-    same corners of all soles.  Point feet stay as they are, because three of four carry a robot.  Feet that span no
-    area allow no motion of the center of mass.  The result is then four edges at an infinite distance.
+    If the center of mass ``c`` is in the polygon, each sole carries at least its equal part of 60 % of the weight.
+    A sole without load would leave the ground at the smallest push.  For this, each corner of a sole is moved towards
+    the mean of the same corners of all soles.  Point feet are not moved, because three of four feet can carry a
+    robot.  If the feet do not span an area, the center of mass must not move.  The result is then four edges with
+    infinite ``b``.
 
     Raises:
-        InputError: The base is fixed, so the feet do not carry the weight alone.
+        InputError: There are contacts, but the base is fixed and carries weight, too.
     """
     if contacts and not state.robot.floating:
         what = "its base is fixed, and a flow with contacts needs a floating base"
@@ -123,7 +126,8 @@ def support_edges(state: State, contacts: Sequence[SupportContact]) -> tuple[Arr
     if edges is None:
         return np.vstack([np.eye(2), -np.eye(2)]), np.full(4, np.inf)
     normals, offsets = edges
-    # In the order of the C code, from the leftmost corner around, because edges act one after the other.
+    # The order is the same as in the C code, which begins at the leftmost corner, because the result depends on the
+    # order of the edges.
     turn = np.arctan2(normals[:, 1], normals[:, 0])
     order = np.argsort(np.where(turn < _START - np.pi, np.pi, turn))
     return normals[order], -offsets[order]

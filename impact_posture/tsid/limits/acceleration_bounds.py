@@ -21,17 +21,20 @@ from impact_posture.tsid.state import State
 class LimitLaw:
     """Law that stops joints at their limits.
 
-    A joint at distance ``x`` from a limit may move towards it with at most ``φ(x) = min(approach·x,
-    √(2·deceleration·x), velocity limit)``.  Beyond the limit, it must come back with ``φ``.  The acceleration reaches
-    this speed at ``rate``: ``rate·(−φ(q − q_min) − q̇) ≤ q̈ ≤ rate·(φ(q_max − q) − q̇)``.  ``φ`` is odd and
-    increasing, hence the lower bound never exceeds the upper bound, inside the limits or outside.
+    At distance ``x`` from a limit, a joint may move towards the limit with at most the speed
+    ``φ(x) = min(approach·x, √(2·deceleration·x), velocity limit)``.  Beyond the limit, the joint must return with the
+    speed ``φ``.  The bounds of the acceleration are
+    ``rate·(−φ(q − q_min) − q̇) ≤ q̈ ≤ rate·(φ(q_max − q) − q̇)``.  ``φ`` is odd and increasing, so the lower bound
+    never exceeds the upper bound, inside the limits or outside.
 
     Attributes:
-        approach: Speed towards a limit per distance, 1/s.
-        rate: Gain of the speed error, 1/s; below ``4·approach`` a joint could swing through its limit.
+        approach: Permitted speed towards a limit, divided by the distance from the limit, 1/s.
+        rate: Gain of the speed error, 1/s; at least ``4·approach``, because the joint could otherwise swing through
+            its limit.
         deceleration: Deceleration available for braking, rad/s² (m/s²).
         acceleration: Largest acceleration of a joint, rad/s² (m/s²); infinite means no bound.
-        margin: Distance kept from the position limits, rad (m); at most a quarter of the joint's range.
+        margin: Distance between a position limit and the place where joints stop, rad (m).  At most a quarter of the
+            joint's range is used.
     """
 
     approach: Positive = 10.0
@@ -41,22 +44,22 @@ class LimitLaw:
     margin: NonNegative = 0.0
 
     def __post_init__(self) -> None:
-        """Refuse a law that does not stop the joints."""
+        """Raise :class:`InputError` if the law does not stop the joints."""
         if not self.rate >= 4 * self.approach:
             what = f"rate {self.rate:g} is below four times approach {self.approach:g}"
             raise InputError(what, where="limit law", hint="raise rate or lower approach")
 
 
 class AccelerationBounds:
-    """Bounds that a :class:`LimitLaw` sets at each state.
+    """Bounds that a :class:`LimitLaw` sets on the accelerations at each state.
 
     Attributes:
-        lower: rad/s² (m/s²), shape (nv,); minus infinity where nothing is limited.
-        upper: As ``lower``.
+        lower: Lower bounds of the accelerations, rad/s² (m/s²), shape (nv,); minus infinity means no bound.
+        upper: Upper bounds, rad/s² (m/s²), shape (nv,); infinity means no bound.
     """
 
     def __init__(self, robot: Robot, law: LimitLaw, lower: Array | None = None, upper: Array | None = None) -> None:
-        """Size the buffers, or use ``lower`` and ``upper`` as buffers."""
+        """Allocate the bounds, or write them into the arrays ``lower`` and ``upper``, shape (nv,), if given."""
         ranges, nv = JointRanges(robot), robot.nv
         self.law = law
         self.lower = np.full(nv, -np.inf) if lower is None else lower
@@ -66,12 +69,12 @@ class AccelerationBounds:
         self._braking, self._margin = np.zeros(nv), np.minimum(law.margin, (ranges.upper - ranges.lower) / 4)
         self._to_upper, self._to_lower = self._speed
         self._twice = np.sqrt(2 * law.deceleration)
-        # The base has no limits.
+        # The six accelerations of a floating base have no limits.
         self._largest = np.full(nv, law.acceleration)
         self._largest[: 6 if robot.floating else 0] = np.inf
 
     def update(self, state: State) -> None:
-        """Move to the present state."""
+        """Compute the bounds at ``state``."""
         law, size, speed, signed = self.law, self._size, self._speed, state.room
         if law.margin:
             signed = np.subtract(signed, self._margin, out=self._signed)

@@ -14,12 +14,16 @@ from impact_posture.tsid.point_kinematics import Point
 from impact_posture.tsid.state import State
 from impact_posture.tsid.support_contact import SupportContact
 
-# Singular values of a contact Jacobian that count, relative to the largest.
+# Singular values of a contact Jacobian below this share of the largest are treated as zero.
 _RANK = 1e-6
 
 
 def supported_inverse(state: State, contacts: Sequence[SupportContact]) -> Array:
-    """Return ``M⁻¹``, or ``M⁻¹ − M⁻¹J_sᵀ(J_s M⁻¹J_sᵀ)⁺J_s M⁻¹`` for contacts that stay, shape (nv, nv)."""
+    """Return the inverse mass matrix of the robot on its contacts, shape (nv, nv).
+
+    Without contacts, the result is ``M⁻¹``.  Contacts with the Jacobian ``J_s`` change the result to
+    ``M⁻¹ − M⁻¹J_sᵀ(J_s M⁻¹J_sᵀ)⁺J_s M⁻¹``, because they do not move during the impact.
+    """
     inverse = np.linalg.inv(state.M)
     if not contacts:
         return np.asarray(inverse)
@@ -31,19 +35,20 @@ def supported_inverse(state: State, contacts: Sequence[SupportContact]) -> Array
 class ImpactLimits:
     """Limit the effects of an impact at the next tick (Wang et al. 2020, impact-aware constraints).
 
-    The impact has the velocity ``ν⁻ = ν + ν̇ dt`` of the next tick.  With restitution ``e`` and ``M_c⁻¹`` of
-    :func:`supported_inverse`, the impulse is ``λ = −(1 + e) (J M_c⁻¹Jᵀ)⁻¹ n nᵀJ ν⁻``, and the velocity jump is
-    ``Δν = M_c⁻¹Jᵀ λ``.  Both are linear in ``ν̇``.  For each joint, the limits are
+    Just before the impact, the robot has the velocity ``ν⁻ = ν + ν̇ dt`` of the next tick.  With restitution ``e`` and
+    ``M_c⁻¹`` from :func:`supported_inverse`, the impulse is ``λ = −(1 + e) (J M_c⁻¹Jᵀ)⁻¹ n nᵀJ ν⁻``.  The velocity
+    jump is ``Δν = M_c⁻¹Jᵀ λ``.  Impulse and jump are linear in ``ν̇``.  For each joint, the limits are
 
-    - ``|q̇⁻ + Δq̇| ≤ q̇_max``, the rate after the impact;
-    - ``|Jᵀλ|/δt ≤ τ_max``, the mean torque while the impact lasts ``δt``.
+    - ``|q̇⁻ + Δq̇| ≤ q̇_max`` for the rate after the impact;
+    - ``|Jᵀλ|/δt ≤ τ_max`` for the mean torque during the impact, which lasts ``δt``.
 
-    A tick can satisfy them only by a slower approach.  A joint without a limit in the model is not limited.
+    The controller can satisfy these limits only by a slower approach.  A joint is limited only if the model has a
+    limit for this joint.
 
     Attributes:
-        active: Whether an impact may come; otherwise, the limits are off.
-        restitution: ``e``.
-        duration: ``δt``, s.
+        active: Whether an impact is expected.  If false, the limits are off.
+        restitution: Coefficient of restitution ``e``.
+        duration: Duration ``δt`` of the impact, s.
         size: Number of rows.
         points: Points of the robot whose kinematics the limits read from the state.
 
@@ -51,8 +56,8 @@ class ImpactLimits:
         robot: The robot.
         point: The point that hits.
         normal: Unit normal out of the surface, world, shape (3,).
-        contacts: Contacts that stay through the impact.
-        period: Time to the next tick ``dt``, s.
+        contacts: Contacts that do not move during the impact.
+        period: Time ``dt`` to the next tick, s.
     """
 
     name = "impact limits"
@@ -76,7 +81,7 @@ class ImpactLimits:
         self.size, self.active = 2 * self._rate.size, False
 
     def jump(self, state: State) -> tuple[Array, Array]:
-        """Return the maps from ``ν⁻`` to ``Δν`` and to the generalized impulse ``Jᵀλ``, shape (nv, nv) each."""
+        """Return two matrices, shape (nv, nv) each: ``ν⁻`` → ``Δν``, and ``ν⁻`` → generalized impulse ``Jᵀλ``."""
         J = state.at(self._point).jacobian[:3]
         spread = supported_inverse(state, self._contacts) @ J.T
         mass = np.linalg.pinv(J @ spread, rcond=_RANK, hermitian=True)
@@ -84,7 +89,10 @@ class ImpactLimits:
         return spread @ impulse, J.T @ impulse
 
     def rows(self, state: State) -> tuple[Array, Array, Array]:
-        """Return the rows for post-impact rates, then for impulsive torques, with their bounds."""
+        """Return the rows on ``ν̇``, their lower bounds and their upper bounds.
+
+        The first half limits the joint rates after the impact; the second half limits the impulsive torques.
+        """
         nothing = np.full(self.size, np.inf)
         if not self.active:
             return np.zeros((self.size, state.nv)), -nothing, nothing

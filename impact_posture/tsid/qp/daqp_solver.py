@@ -1,4 +1,4 @@
-"""DAQP in a workspace that is kept across ticks, also in coordinates that make the Hessian the identity."""
+"""DAQP solver with a workspace that is reused at each tick; a variant first makes the Hessian the identity."""
 
 from __future__ import annotations
 
@@ -7,40 +7,40 @@ import numpy as np
 
 from impact_posture.tsid.qp.quadratic_program import QP, Solved
 
-# Exit flags of DAQP for a solution (2: soft constraints are active) and for an infeasible program.  4 is an answer
-# that violates bounds after a cycle.  -6 (dependent equations) does not mean infeasible, because DAQP also returns it
-# for bounds that were active before.
+# Exit flags of DAQP: 1 and 2 mean solved (2: soft constraints are active); -1 means infeasible.  Flag 4 is not a
+# solution, because the answer violates bounds after a cycle.  Flag -6 (dependent equations) does not mean infeasible,
+# because DAQP also returns -6 if bounds of the last active set depend on each other.
 SOLVED, _NONE = (1, 2), -1
-# Flag of a program that could not be solved for another reason.
+# Flag for a program that failed for another reason.
 _FAILED = 0
-# Largest violation of a bound, most iterations of a program, and squared sine of the least angle between a row and
-# the active rows.  The cost of a quadruped, with the condition 4e10, brings rows so close to each other that the
-# default of DAQP, 3.7e-11, takes them for dependent.
+# primal_tol is the largest violation of a bound.  iter_limit is the largest number of iterations.  sing_tol is the
+# squared sine of the smallest angle between a row and the active rows.  For a quadruped, the cost has the condition
+# number 4e10 and makes rows nearly parallel.  The DAQP default of 3.7e-11 would treat these rows as dependent.
 _SETTINGS = {"primal_tol": 1e-9, "iter_limit": 1000, "sing_tol": 1e-13}
 
 
 class DaqpSolver:
-    """DAQP (Arnström, Bemporad, Axehill 2022) in one workspace; each solution starts from the last active set.
+    """DAQP (Arnström, Bemporad, Axehill 2022) with one workspace.  Each call starts from the last active set.
 
-    After a reset, equal programs give bitwise equal answers.
+    After a reset, equal programs give answers that are equal in every bit.
     """
 
     def __init__(self, n: int, m: int, *, proximal: float | None = None) -> None:
         """Allocate a workspace for ``n`` variables and ``m`` rows.
 
-        ``proximal`` is the weight of proximal-point iterations.  They take more time and solve programs whose cost
-        is too flat for one factorization.  With ``None``, DAQP decides.
+        ``proximal`` is the weight of proximal-point iterations; with ``None``, DAQP decides whether to use them.
+        These iterations need more time, but can solve programs whose cost is too flat for one factorization.
         """
         self._flag = 1
         self._model = daqp.Model()
         self._model.settings = _SETTINGS if proximal is None else _SETTINGS | {"eps_prox": proximal}
-        # The first program only sets the dimensions.  Its bounds cannot be active.
+        # The first program only sets the dimensions.  Its bounds are so wide that they are never active.
         blank, upper = QP.empty(n, m), np.full(n + m, 1e30)
         self._model.setup(blank.H, blank.g, blank.A, upper, -upper, blank.sense)
         self._cold = True
 
     def reset(self) -> None:
-        """Start the next program without an active set, and read its types of bounds again."""
+        """Start the next program without an active set, and read again which of its rows are equations."""
         self._cold = True
 
     def solve(self, qp: QP) -> Solved | None:
@@ -49,7 +49,7 @@ class DaqpSolver:
         self._flag = self._model.update(qp.H, qp.g, qp.A, qp.upper, qp.lower, sense)
         if self._flag >= 0:
             z, _, self._flag, info = self._model.solve()
-        # The active set of a failed attempt is useless.
+        # The active set of a failed attempt cannot be used for the next start.
         self._cold = self._flag not in SOLVED
         if self._cold:
             return None
@@ -57,27 +57,27 @@ class DaqpSolver:
 
     @property
     def infeasible(self) -> bool:
-        """Whether the last program had no solution; false where the solver failed."""
+        """Whether the last program had no solution; false if it has a solution or if the solver failed."""
         return self._flag == _NONE
 
 
 class WhitenedSolver(DaqpSolver):
-    """DAQP with a change of variables ``y = Rz``, ``H = RᵀR`` by LAPACK.
+    """DAQP with the change of variables ``y = Rz``, where LAPACK factorizes ``H = RᵀR``.
 
-    DAQP computes this form by plain loops, which take most of its time for a humanoid.  LAPACK and one matrix product
-    take half as long.  Bounds on the dense variables become rows.  The rest of ``H`` must be diagonal.
+    DAQP itself computes this form by plain loops, which need most of its time for a humanoid.  LAPACK and one matrix
+    product need half of this time.  Bounds on the dense variables become rows.  The rest of ``H`` must be diagonal.
     """
 
     def __init__(self, n: int, m: int, dense: int) -> None:
-        """Allocate for ``n`` variables and ``m`` rows; the first ``dense`` variables have a dense Hessian."""
-        # Imported here, because SciPy takes long to import and only humanoids need it.
+        """Allocate buffers for ``n`` variables and ``m`` rows; the first ``dense`` variables have a dense Hessian."""
+        # Imported here, because the import of SciPy is slow and only humanoids need SciPy.
         from scipy.linalg.lapack import dpotrf, dtrtri
 
         super().__init__(n, dense + m)
         self._factorize, self._invert = dpotrf, dtrtri
         self._n, self._dense = n, dense
         self._qp = QP.empty(n, dense + m)
-        # Views of R⁻¹ and, below it, of A R⁻¹ in the whitened rows.
+        # Views on the rows of the transformed program: first R⁻¹, below it A R⁻¹.
         self._bounds, self._rows = self._qp.A[:dense, :dense], self._qp.A[dense:, :dense]
         self._others = self._qp.A[dense:, dense:]
 

@@ -11,12 +11,12 @@ import numpy as np
 from impact_posture.system.arrays import Array
 from impact_posture.tsid.qp.quadratic_program import EQUALITY, INEQUALITY
 
-# Bounds are scaled below this, because the tolerances of DAQP are absolute.
+# Bounds are scaled so that none exceeds this value, because the tolerances of DAQP are absolute.
 _LARGEST = 1e4
-# Distances within which a row counts as at its bound, relative to the length of the row times the size of the point.
-# The refinement uses the first of them that does not make the answer worse.
+# Tolerances within which a row is at its bound, relative to the length of the row times the size of the point.  The
+# refinement uses the first tolerance that does not make the answer worse.
 _AT = (1e-9, 1e-8, 1e-7, 1e-6, 1e-5, 1e-4)
-# Rank of rows, relative to the longest.
+# Singular values of rows below this value, relative to the spectral norm, are treated as zero.
 _RANK = 1e-9
 
 
@@ -24,7 +24,7 @@ _RANK = 1e-9
 class Level:
     """Rows ``lower ≤ A z ≤ upper`` of one level, with ``A`` of shape (k, n).
 
-    Equal bounds make equations, and infinite bounds do not limit.
+    A row with equal bounds is an equation.  An infinite bound does not limit the row.
     """
 
     A: Array
@@ -33,12 +33,12 @@ class Level:
 
 
 def lexicographic(levels: Sequence[Level], units: Array | float = 1.0) -> Array | None:
-    """Return the ``z`` that violates the first level least, then the second, and so on (least squares).
+    """Return the ``z`` that minimizes the violation of the first level, then of the second level, and so on.
 
-    DAQP decides which rows are missed and which bounds are met.  With these as equations, a refinement gives the last
-    digits.
+    The violation of a level is the norm of the violations of its rows.  DAQP determines which rows are violated and
+    which bounds are reached.  A refinement then treats these rows as equations and gives full precision.
 
-    ``units`` are the values of the variables that compare with 1, shape (n,).  Return ``None`` if the solver gave up.
+    ``units`` are typical sizes of the variables, shape (n,).  Return ``None`` if the solver gave up.
     """
     levels = [level for level in levels if level.lower.size]
     z = _nearest(levels)
@@ -52,7 +52,7 @@ def lexicographic(levels: Sequence[Level], units: Array | float = 1.0) -> Array 
     if missed:
         whole = _stacked(scaled[: missed + 1])
         if _holds(whole, _onto(whole, y)):
-            # DAQP gave up a level that can hold.
+            # DAQP violated a level that can hold.  Solve again, with this level as a part of the first.
             return lexicographic([_stacked(levels[: missed + 1]), *levels[missed + 1 :]], units)
     return np.asarray(units * y)
 
@@ -90,7 +90,7 @@ def _refined(levels: Sequence[Level], y: Array, near: float) -> Array:
         at = near * _size(y) * lengths
         low, high = values < level.lower + at, values > level.upper - at
         target = np.where(low, level.lower, level.upper)
-        # The hard rows of the first level are missed by rounding only.
+        # The rows of the first level are hard, so they can be violated only by rounding errors.
         off = equal | ((low | high) & (np.abs(values - target) > at)) if k else np.zeros_like(equal)
         met = (equal | low | high) & ~off
         exact.append(level.A[met] / lengths[met, None])
@@ -117,7 +117,7 @@ def _no_worse(levels: Sequence[Level], new: Array, old: Array) -> bool:
 
 
 def _onto(level: Level, y: Array) -> Array:
-    """Project ``y`` onto the points at which a level holds; return ``y`` if the solver fails."""
+    """Return the point nearest to ``y`` at which the level holds; return ``y`` if the solver fails."""
     lengths, size = _lengths(level), _size(y)
     A = np.ascontiguousarray(level.A / lengths[:, None])
     high, low = (np.clip((bound / lengths - A @ y) / size, -1e30, 1e30) for bound in (level.upper, level.lower))
@@ -150,9 +150,9 @@ def _nearest(levels: Sequence[Level]) -> Array | None:
 
 
 def balanced(A: Array, b: Array) -> tuple[Array, Array]:
-    """Return ``QA`` (k, n) and ``Qb`` (k,) with an orthogonal ``Q`` that makes all rows of ``QA`` equally long.
+    """Return ``QA`` (k, n) and ``Qb`` (k,), where ``Q`` is orthogonal and all rows of ``QA`` have equal length.
 
-    Each rotation combines the shortest and the longest row and gives the shortest row the mean length
+    Each rotation combines the shortest and the longest row, so that the shortest row gets the root-mean-square length
     (Bendel and Mickey 1978, "Population correlation matrices for sampling experiments").
     """
     A, b = A.copy(), b.copy()

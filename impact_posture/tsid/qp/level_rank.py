@@ -1,4 +1,4 @@
-"""Strict levels of any rank: dependent rows leave the QP of a tick, and nearly dependent rows are damped."""
+"""Strict levels of any rank: dependent rows are removed from the QP, and nearly dependent rows are damped."""
 
 from __future__ import annotations
 
@@ -11,10 +11,11 @@ from impact_posture.system.arrays import Array
 from impact_posture.tsid.qp.quadratic_program import EQUALITY, INEQUALITY, QP
 from impact_posture.tsid.smooth_step import smooth
 
-# Directions with a smaller singular value, over the length of the level's longest row, are damped.  The shipped
-# robots stay above 0.03 in their postures.
+# A direction is damped if its singular value, divided by the length of the level's longest row, is smaller than this.
+# In their home postures, all robots of the package are above 0.03.
 SINGULAR = 2e-2
-# Directions below this share of SINGULAR are dropped.  It is far above rounding and far below a visible effect.
+# Directions below this share of SINGULAR are removed.  The share is far above rounding errors, but too small for a
+# visible effect.
 _NOTHING = 1e-9
 # Least 1 − α, which bounds the weight of a damped row for the solver.
 _LEAST = 1e-8
@@ -23,33 +24,36 @@ _LEAST = 1e-8
 class LevelRank:
     """Keep the strict levels of a QP independent of each other and of the dynamics.
 
-    A level with rows ``J`` acts in the space that the levels above leave, with the basis ``Z``: ``J Z = U S Vᵀ``.
-    ``Uᵀ`` rotates its rows, which does not change the sum of squares.  Each row then belongs to one singular value
-    ``s``.  With ``x = s/s₀``, where ``s₀`` is :data:`SINGULAR` times the length of the level's longest row:
+    A level with rows ``J`` acts in the space that the levels above leave free.  With the basis ``Z`` of this space,
+    ``J Z = U S Vᵀ``.  The rows are rotated by ``Uᵀ``, which does not change the sum of squares.  Each rotated row
+    then belongs to one singular value ``s``.  ``s₀`` is :data:`SINGULAR` times the length of the level's longest
+    row.  With ``x = s/s₀``:
 
     - ``x ≥ 1``: the row is an equation.
-    - ``x = 0``: the levels above determine the row, or it contradicts other rows of its level.  It leaves the QP.
-      The other rows then give the least-squares answer of the level, which is exact where the rows agree.
-    - Otherwise, the row is damped.  It moves into the cost as ``α/(1 − α) (q·ν̇ − c/s)²`` with ``α = x²(3 − 2x)`` and
-      its direction of motion ``q``, together with ``x (q·ν̇)²``.  Both have the mean weight of the cost.  The row
-      fades from an equation to nothing, so that accelerations are continuous through a singular posture.  They are at
-      most ``3/s₀`` times the row's demand ``c``.  The levels below have ``√(1 − α)`` of the direction.
+    - ``x = 0``: the levels above determine the row, or the row contradicts other rows of its level.  The row is
+      removed from the QP.  The other rows give the least-squares answer of the level.
+    - Otherwise, the row is damped: it becomes a term ``α/(1 − α) (q·ν̇ − c/s)² + x (q·ν̇)²`` of the cost, with
+      ``α = x²(3 − 2x)``.  ``q`` is the row's direction of motion, and ``c`` is its right-hand side.  The term has the
+      mean weight of the cost.  With decreasing ``x``, the row changes smoothly from an equation to nothing, so
+      accelerations are continuous through a singular posture.  They are at most ``3/s₀`` times ``c``.  The levels
+      below can use the direction with the factor ``√(1 − α)``.
 
     The result depends only on the present rows and on their lengths at reset.  While all rows are independent, the QP
-    does not change.  Most ticks need no decomposition to decide this, because a singular value changes at most by the
-    change of the matrix (Weyl 1912).
+    does not change.  A singular value changes at most by the change of the matrix (Weyl 1912), so most ticks can
+    decide this without a decomposition.
 
     Attributes:
         qp: The QP to solve.
-        wanted: Right-hand sides of the first rows of ``qp.A``, also where a row is not an equation.
-        units: Value of each variable that compares with an acceleration of 1, shape (n,).
+        wanted: Right-hand sides of the rows of the levels, also for rows that are not equations.
+        units: Typical size of each variable if an acceleration has the size 1, shape (n,).
         changed: Whether the last :meth:`update` changed the set of equations.
     """
 
     def __init__(self, qp: QP, always: int, levels: Sequence[slice], accelerations: int, units: Array) -> None:
-        """Size the buffers for the QP with all rows: ``always`` rows that always hold, then the rows of the levels.
+        """Size the buffers.
 
-        The first ``accelerations`` variables are accelerations.
+        ``qp`` is the QP with all rows.  Its first ``always`` rows are always equations; the rows of the ``levels``
+        follow.  The first ``accelerations`` variables are accelerations.
         """
         self._full, self._always, self._levels = qp, always, tuple(levels)
         self._accelerations, self.units = accelerations, units
@@ -66,7 +70,7 @@ class LevelRank:
         self._begun = False
 
     def update(self) -> None:
-        """Determine the QP for the present rows."""
+        """Update the QP for the current values of the rows."""
         if not self._count:
             return
         if not self._begun:
@@ -74,7 +78,7 @@ class LevelRank:
         moved = self._moved
         np.subtract(self._rows, self._reference, out=moved)
         moved *= self._scale
-        # Not ">=", which is false for a NaN.
+        # A test with ">=" would be false for NaN, so the code tests "not <".
         if not self._flat.dot(self._flat) < self._room:
             self._measure()
         before = self.qp
@@ -85,7 +89,7 @@ class LevelRank:
         self.changed = self.qp is not before and not np.array_equal(self.qp.sense, before.sense)
 
     def rows(self, rows: slice, equations: bool) -> NDArray[np.intp]:
-        """Return the rows of a level that are equations, or with ``False`` its other rows."""
+        """Return the rows of a level that are equations, or the other rows if ``equations`` is false."""
         n = self._full.n
         held = self.qp.sense[n + rows.start : n + rows.stop] == EQUALITY
         return np.asarray(np.arange(rows.start, rows.stop)[held == equations])
@@ -99,7 +103,7 @@ class LevelRank:
         self._measure()
 
     def _measure(self) -> None:
-        """Measure the least singular value of all rows, which bounds the singular values of each level from below."""
+        """Compute the smallest singular value of all rows, a lower bound on the singular values of each level."""
         self._reference[:] = self._rows
         self._independent, self._room = True, 0.0
         if np.isfinite(self._rows).all():

@@ -1,4 +1,4 @@
-"""Quadratic program in buffers that are sized once."""
+"""Quadratic program with buffers that are allocated once."""
 
 from __future__ import annotations
 
@@ -20,12 +20,12 @@ class QP:
     """``min ½ zᵀHz + gᵀz`` subject to ``lower ≤ [z; A z] ≤ upper``.
 
     Attributes:
-        H: Shape (n, n), symmetric positive definite.
-        g: Shape (n,).
-        A: Shape (m, n).
-        lower: Bounds of the n variables, then of the m rows, shape (n + m,).
-        upper: As ``lower``.
-        sense: :data:`INEQUALITY` or :data:`EQUALITY` for each of them, shape (n + m,).
+        H: Hessian of the cost, symmetric positive definite, shape (n, n).
+        g: Gradient of the cost at zero, shape (n,).
+        A: Rows of the constraints, shape (m, n).
+        lower: Lower bounds of the n variables, then of the m rows, shape (n + m,).
+        upper: Upper bounds in the same order, shape (n + m,).
+        sense: :data:`INEQUALITY` or :data:`EQUALITY` for each variable and row, shape (n + m,).
     """
 
     H: Array
@@ -37,7 +37,7 @@ class QP:
 
     @classmethod
     def empty(cls, n: int, m: int) -> QP:
-        """Return a program without cost or bounds."""
+        """Return a program with the identity as Hessian, zero rows and infinite bounds."""
         lower, sense = np.full(n + m, -np.inf), np.zeros(n + m, dtype=np.int32)
         return cls(np.eye(n), np.zeros(n), np.zeros((m, n)), lower, -lower, sense)
 
@@ -76,8 +76,8 @@ class Solved:
     """Solution of a quadratic program.
 
     Attributes:
-        z: Shape (n,).
-        multipliers: Multipliers of the variables' bounds, then of the rows; positive at upper bounds, shape (n + m,).
+        z: Values of the variables, shape (n,).
+        multipliers: Multipliers of the variables' bounds, then of the rows, shape (n + m,); positive at upper bounds.
         iterations: Number of iterations, as the solver counts them.
     """
 
@@ -87,6 +87,6 @@ class Solved:
 
 
 def stacked_rows(sizes: Iterable[int]) -> tuple[tuple[slice, ...], int]:
-    """Return the rows of stacked blocks, and the number of all rows."""
+    """Return a slice of rows for each of the stacked blocks with ``sizes`` rows, and the total number of rows."""
     ends = list(accumulate(sizes, initial=0))
     return tuple(slice(start, stop) for start, stop in pairwise(ends)), ends[-1]
