@@ -1,4 +1,4 @@
-"""Ticks of a world under a controller in C, in a C loop that calls MuJoCo and the controller."""
+"""Simulation loop in C, which calls MuJoCo and a controller in C in every tick."""
 
 from __future__ import annotations
 
@@ -29,12 +29,19 @@ from impact_posture.system.libraries import (
 )
 
 _NAME = "world_ticks"
-# Most propellers, as in ``world_ticks.c``.
+# Maximum number of propellers in the C loop, the same as ``ROTORS`` in ``world_ticks.c``.
 _ROTORS = 64
 
 
 class Ticks(NamedTuple):
-    """True states after n ticks, rotor commands, shape (n, rotors), and levels and status numbers, shape (n,)."""
+    """Record of n ticks.
+
+    Attributes:
+        trace: True states after the ticks.
+        rotor_speed: Rotor commands, shape (n, rotors).
+        level: Levels of the term that prepares for the impact, shape (n,).
+        status: Status numbers of the controller, shape (n,).
+    """
 
     trace: Trace
     rotor_speed: Array
@@ -43,10 +50,11 @@ class Ticks(NamedTuple):
 
 
 class CompiledWorld:
-    """Loop of a world and its controller in C.
+    """Loop in C of a world and its controller.
 
-    The loop computes the same as :class:`World` and :class:`CompiledTick`, except for the order of some sums.  Pushes
-    and throws still go to the world, which knows the time.  Other methods of the world need a reset first.
+    The loop computes the same as :class:`World` and :class:`CompiledTick`, except for rounding errors.
+    :meth:`World.push` and :meth:`World.throw` still work between calls of :meth:`take`.  Before other methods of the
+    world, call :meth:`World.reset`, because the loop updates only the time of the world.
     """
 
     def __init__(self, world: World, tick: CompiledTick, contents: dict[str, Any], library: ctypes.CDLL) -> None:
@@ -73,10 +81,10 @@ class CompiledWorld:
                 setattr(self._struct, name, self._arrays[name].ctypes.data)
 
     def take(self, n: int, lead: Callable[[float], None]) -> Ticks:
-        """Run n ticks, or fewer if the state diverges.
+        """Run n ticks, or fewer if the state diverges.  ``lead`` moves the targets for a tick at a given time, s.
 
         Raises:
-            InputError: A command is not finite, or an unlimited torque is absurdly large.
+            InputError: A command is not finite, or the torque of a joint without limit is too large.
         """
         world, struct = self._world, self._struct
         times = [(struct.steps + k * struct.count) * struct.timestep for k in range(n)]
@@ -99,10 +107,10 @@ class CompiledWorld:
 
 
 def compiled_world(world: World, tick: CompiledTick | None, count: int) -> CompiledWorld | None:
-    """Return the loop for a world after its reset, or ``None`` where Python has to run the ticks.
+    """Return the C loop for a world after its reset, or ``None`` if Python must run the ticks.
 
-    Python runs them without a controller in C, without the headers of MuJoCo, and for some worlds
-    (:meth:`World.in_c`).
+    Python runs the ticks if there is no C controller, if the MuJoCo headers are missing, if the loop cannot be
+    compiled, or if C cannot simulate the world (:meth:`World.in_c`, or more than 64 rotors).
     """
     contents = None if tick is None else world.in_c(count)
     if tick is None or contents is None or contents["rotors"] > _ROTORS:
@@ -116,7 +124,7 @@ def compiled_world(world: World, tick: CompiledTick | None, count: int) -> Compi
 
 @cache
 def _members() -> dict[str, str]:
-    """Return the types of the members of the C struct by name, in order."""
+    """Return the members of the C struct in their order, as a map from name to type."""
     struct = re.sub(r"/\*.*?\*/", "", _source(), flags=re.DOTALL).partition("typedef struct {")[2].partition("}")[0]
     members = {}
     for declaration in filter(None, map(str.strip, struct.split(";"))):
@@ -136,14 +144,14 @@ def _source() -> str:
 
 @cache
 def _functions() -> dict[str, int]:
-    """Return the addresses of the MuJoCo functions by member name."""
+    """Return the addresses of the MuJoCo functions, by the name of the struct member that stores the address."""
     library = ctypes.CDLL(str(next(Path(import_mujoco().__file__).parent.glob("libmujoco.*"))))
     names = {"step1": library.mj_step1, "step2": library.mj_step2, "apply": library.mj_applyFT}
     return {name: ctypes.cast(function, ctypes.c_void_p).value or 0 for name, function in names.items()}
 
 
 def _library() -> ctypes.CDLL | None:
-    """Build the loop once, cache and load it; return ``None`` if the headers of MuJoCo are missing."""
+    """Load the compiled loop, which is built once and cached.  Return ``None`` if the MuJoCo headers are missing."""
     headers = Path(import_mujoco().__file__).parent / "include"
     if not (headers / "mujoco" / "mujoco.h").is_file():
         return None

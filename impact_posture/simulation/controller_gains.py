@@ -1,4 +1,4 @@
-"""Gains of a scenario, which all controllers share."""
+"""Gains of a scenario, which are the same for all its controllers."""
 
 from __future__ import annotations
 
@@ -19,9 +19,9 @@ class Gains(StrictTable):
     """Gains of one task.
 
     Attributes:
-        kp: Stiffness, 1/s², one number or a number for each row of the task.
-        kd: Damping, 1/s.  ``None`` is critical, ``2√kp``.
-        weight: Weight in the cost, if the task is not a strict level.
+        kp: Stiffness, 1/s², one number for all rows of the task or one number per row.
+        kd: Damping, 1/s; ``None`` for critical damping, ``2√kp``.
+        weight: Weight of the task in the cost.  A task that is a strict level does not use it.
     """
 
     kp: OneOrEach
@@ -35,8 +35,8 @@ class EndEffectorGains(Gains):
     """Gains of the end effector task.
 
     Attributes:
-        pose: What the task controls: the pose of the frame (``full``), its position (``position``), or its position
-            and the direction of the surface normal, with free spin about it (``aligned``).
+        pose: Controlled part of the pose.  ``full``: position and orientation of the frame.  ``position``: position
+            only.  ``aligned``: position and alignment with the surface normal; rotation about the normal is free.
     """
 
     pose: EndEffectorPose = "full"
@@ -48,9 +48,11 @@ class RobustTerm(StrictTable):
     """Impact-robust term of the posture task.
 
     Attributes:
-        gain: K of the term, scaled by the curvature of the objective, 1/s².  It compares to ``kp`` of the posture.
-        ramp: Time from off to on, s.
-        fade: The term fades out between these distances from a position limit, rad (m).
+        gain: K of the term, 1/s².  The term is scaled by the curvature of the objective, so K is comparable with
+            ``kp`` of the posture.
+        ramp: Time in which the term is switched on gradually, s.
+        fade: Two distances from a position limit, rad (m).  The term decreases to zero from the larger distance to
+            the smaller one.
     """
 
     gain: Positive
@@ -61,11 +63,11 @@ class RobustTerm(StrictTable):
 @checked
 @dataclass(frozen=True)
 class StanceGains(StrictTable):
-    """Contact constraints of the controller of a standing robot.
+    """Contact constraints in the controller of a standing robot.
 
     Attributes:
         friction: Coulomb coefficient that the controller assumes.
-        least: Least normal force of a contact point or of a whole sole, N.
+        least: Minimum normal force of a contact point, or of a whole sole, N.
         force_weight: Weight of contact forces in the cost, 1/N².
         lifted: Frames of supports that are in the air, for example the foot that hits the ground.
     """
@@ -79,18 +81,21 @@ class StanceGains(StrictTable):
 @checked
 @dataclass(frozen=True)
 class Control(StrictTable):
-    """Gains that all controllers of a scenario share.  A task without gains does not exist.
+    """Gains of a scenario, which are the same for all its controllers.
+
+    For an optional task, ``None`` means that the controllers do not have this task.
 
     Attributes:
         posture: Gains of the posture task.
-        robust: The impact-robust term.
-        period: Time from tick to tick, s, up to an hour.
-        tilt: Gains of the level base, which has the first priority.
-        end_effector: Gains of the end effector, which has the second priority; linear rows first.
-        apparent_mass: M_d of ``F̂/M_d`` in the law of the end effector, kg.  ``None`` ignores the force.
-        center_of_mass: Gains of the center of mass.
-        base: Gains of the base orientation.
-        footing: Contact constraints of a standing robot.
+        robust: Gain and activation of the impact-robust term.
+        period: Duration of a tick, s, at most an hour.
+        tilt: Gains of the task that keeps the base level (first priority).
+        end_effector: Gains of the end effector task (second priority); the rows of the position come first.
+        apparent_mass: Mass M_d in the term ``F̂/M_d`` of the end effector task, kg; ``None`` for a task that does not
+            use the measured force.
+        center_of_mass: Gains of the center of mass task.
+        base: Gains of the base orientation task.
+        footing: Contact constraints of a standing robot; ``None`` for a robot that does not stand.
     """
 
     posture: Gains

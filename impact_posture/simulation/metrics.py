@@ -1,4 +1,4 @@
-"""Metrics of a run: the metrics of the paper, and metrics without which they would mislead."""
+"""Metrics of a run: the metrics of the paper, and further metrics that are needed to interpret them."""
 
 from __future__ import annotations
 
@@ -10,37 +10,37 @@ from impact_posture.simulation.run import Run
 from impact_posture.simulation.series import Array, Flags, Series, Window
 from impact_posture.simulation.setup import Setup
 
-# Time after the first touch within which the velocity jump is measured, s.
+# The velocity jump is measured within this time after the first touch, s.
 JUMP = 0.015
-# Distance from a limit that counts as saturated, as a share of the range.
+# A command is saturated if its distance from a limit is below this share of the range.
 _NEAR = 1e-3
 
 
 @dataclass(frozen=True)
 class Metrics:
-    """Metrics of a run, summed over its contacts.
+    """Metrics of a run over all its contacts.
 
     Attributes:
         q_total_impact: ``∫‖ν‖dt`` over the impact windows (mixes m and rad, as in the paper).
-        q_total_impact_base: The same for the six entries of the floating base.
-        q_total_impact_joints: The same for the joints.
+        q_total_impact_base: Like ``q_total_impact``, but only with the six entries of the floating base.
+        q_total_impact_joints: Like ``q_total_impact``, but only with the joints.
         q_total_dwell: ``∫‖ν‖dt`` over the dwell windows, 0 for pushes.
-        q_total_recovery: ``∫‖ν‖dt`` over the recovery windows, which includes a delayed motion.
-        peak_jump: Largest ``‖ν(t) − ν⁻‖`` within 15 ms of the first touch, mean over the contacts (0 without
+        q_total_recovery: ``∫‖ν‖dt`` over the recovery windows, which are long enough to contain delayed motions.
+        peak_jump: Largest ``‖ν(t) − ν⁻‖`` within 15 ms after the first touch, averaged over the contacts (0 without
             contact).  For pushes, the largest ``‖ν‖`` within the window.
-        peak_jump_max: As ``peak_jump``, but the largest value over the contacts.
-        peak_recovery: As ``peak_jump``, but over the whole recovery window.
-        peak_force: Largest normal force within the impact windows, N.  For pushes, the push.
-        saturation_inside: Time within the impact windows with a rotor or a joint at a control limit, s.
-        saturation_outside: The same outside the impact windows, s.
-        saturation_rotors: Time within the impact windows with a rotor at a limit, s.
-        relaxed_ticks: Number of ticks in which a level gave way.
-        failed_ticks: Number of ticks that held the last command.
+        peak_jump_max: Like ``peak_jump``, but the largest value over the contacts.
+        peak_recovery: Like ``peak_jump``, but within the whole recovery window.
+        peak_force: Largest normal force within the impact windows, N.  For pushes, the force of the push.
+        saturation_inside: Time within the impact windows during which a rotor or a joint is at a control limit, s.
+        saturation_outside: Like ``saturation_inside``, but outside the impact windows, s.
+        saturation_rotors: Like ``saturation_inside``, but only for rotors, s.
+        relaxed_ticks: Number of ticks in which the controller relaxed a level.
+        failed_ticks: Number of ticks in which the controller repeated the last command.
         slip: Sliding distance of the shape (for pushes, of the fastest foot) within the impact windows, m.
-        stops: Joints that reached a position limit within the impact windows and did not start at it.
+        stops: Joints that reached a position limit within the impact windows and did not start at this limit.
         contacts: Number of contacts (or pushes) that happened.
-        contacts_asked: Number of contacts in the scenario.
-        rested: Whether the robot was at rest before it was pushed.  True for contacts.
+        contacts_asked: Number of contacts (or pushes) that the scenario requests.
+        rested: True if the robot was at rest before the push or throw, and for contacts.
     """
 
     q_total_impact: float
@@ -71,7 +71,7 @@ class Metrics:
 
 
 def measure(setup: Setup, run: Run) -> Metrics:
-    """Measure a run."""
+    """Compute the metrics of a run."""
     series, impacts, contacts = run.series, run.of("impact"), setup.scenario.contacts
     inside: Flags = np.zeros(series.t.size, dtype=bool)
     for window in impacts:
@@ -89,7 +89,7 @@ def measure(setup: Setup, run: Run) -> Metrics:
     def distance_in(kind: str) -> float:
         return sum(distance(series.v[series.slice(w.begin, w.end)]) for w in run.of(kind))
 
-    # A missed contact must not count as a small impact.
+    # Leave out missed contacts, because they would appear as small impacts.
     jumps = [jump(setup, series, w) for w in impacts if w.touched] or [0.0]
     later = [_peak(setup, series, w, w.end) for w in run.of("recovery") if w.touched] or [0.0]
     stopped = (series.at_stop[inside] & ~series.at_stop[0]).any(axis=0)
@@ -117,7 +117,7 @@ def measure(setup: Setup, run: Run) -> Metrics:
 
 
 def saturated(setup: Setup, series: Series) -> tuple[Flags, Flags]:
-    """Return the ticks in which a rotor command, and a joint command, was at its limit, each of shape (n,)."""
+    """Return two arrays of shape (n,): whether a rotor, and whether a joint, was at a control limit in each tick."""
     rotors: Flags = np.zeros(series.t.size, dtype=bool)
     propulsion = setup.robot.spec.propulsion
     if propulsion is not None:
@@ -130,17 +130,20 @@ def saturated(setup: Setup, series: Series) -> tuple[Flags, Flags]:
 
 
 def before(series: Series, window: Window) -> int:
-    """Return the last tick before a window begins."""
+    """Return the index of the last tick before a window begins."""
     return int(max(series.slice(window.begin, window.end).start - 1, 0))
 
 
 def jump(setup: Setup, series: Series, window: Window) -> float:
-    """Return the largest ``‖ν(t) − ν⁻‖`` within :data:`JUMP` of the begin, or for pushes ``‖ν‖`` in the window."""
+    """Return the largest ``‖ν(t) − ν⁻‖`` within :data:`JUMP` after the begin of a window.
+
+    For pushes, return the largest ``‖ν‖`` in the window.
+    """
     return _peak(setup, series, window, window.end if setup.scenario.push else window.begin + JUMP)
 
 
 def _peak(setup: Setup, series: Series, window: Window, end: float) -> float:
-    """Return the largest ``‖ν(t) − ν⁻‖`` from the begin of a window until ``end``, or for pushes ``‖ν‖``."""
+    """Return the largest ``‖ν(t) − ν⁻‖``, or for pushes ``‖ν‖``, from the begin of a window until ``end``."""
     after = series.v[series.slice(window.begin, end)]
     if not setup.scenario.push:
         after = after - series.v[before(series, window)]

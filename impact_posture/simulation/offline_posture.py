@@ -1,4 +1,4 @@
-"""Offline optimum for the impact of a scenario, under the constraints of ``impact-posture optimize``."""
+"""Offline posture optimization for the impact of a scenario, with the constraints of ``impact-posture optimize``."""
 
 from __future__ import annotations
 
@@ -22,26 +22,28 @@ from impact_posture.system.arrays import Array
 from impact_posture.system.progress import tell
 from impact_posture.tsid.flow.flow_direction import FlowOptions
 
-# Share of the limits that holding a posture may take.
+# Holding the posture may need at most this share of the limits of motors and rotors.
 SHARE = 0.8
-# Weight of the squared distance from the start, relative to the objective there.  With it, a humanoid moves half as
-# far and gives up 1 % of the objective.  So it avoids postures in which its controller loads the legs unevenly.
+# Weight of the squared distance from the start, relative to the objective at the start.  With this weight, a humanoid
+# moves half as far, and its objective is 1 % larger.  The humanoid thus avoids postures in which its controller loads
+# the legs unevenly.
 _NEARNESS = 0.005
-# Margins in the order of preference, because not every start allows them.  The first is the distance from the joint
-# stops, rad (m), because a joint at a stop rests on it.  The second is the distance of the center of mass from the
-# edges of the support polygon, m, because an impact tips a robot that stands near an edge.
+# Margins in the order of preference.  Smaller margins follow, because large ones are not feasible from every start.
+# First number: distance from the joint stops, rad (m), so that no joint rests on its stop.  Second number: distance
+# of the center of mass from the edges of the support polygon, m, so that an impact does not tip the robot.
 _MARGINS = ((0.1, 0.05), (0.0, 0.05), (0.0, 0.025), (0.0, 0.0))
 
 
 @dataclass(frozen=True, eq=False)
 class OfflinePosture:
-    """Offline optimum of a scenario.
+    """Optimal posture for the impact of a scenario.
 
     Attributes:
-        objective: Objective at the posture.
+        solution: Solution of the posture optimization.
+        objective: Objective at the optimal posture.
         initial: Objective at the start posture after its projection onto the constraints.
-        distance: Distance from the projected start, rad (m).
-        note: Requirement that was dropped, and the reason.
+        distance: Distance of the optimal posture from the projected start posture, rad (m).
+        note: Requirement that was dropped and the reason; empty if all requirements are satisfied.
     """
 
     solution: PostureSolution
@@ -66,19 +68,20 @@ def offline_posture(
 ) -> OfflinePosture:
     """Optimize the posture for the impact of a scenario.
 
-    The constraints are those of ``impact-posture optimize``: no collision with itself, the surface or the ground, and
-    at most :data:`SHARE` of the limits of motors and rotors to hold the posture.  The end effector is at the surface,
-    as far as its task controls it.  The base of a flying robot stays level.  The feet of a standing robot stay in
-    place, the center of mass is above them, and the base tilts no further than the reference flow may tilt it.  If
-    every posture has collisions, the best one is taken with a note.  Without ``at_contact``, the end effector stays
-    at its start.
+    The constraints are the same as in ``impact-posture optimize``.  The robot must not collide with itself, the
+    surface or the ground.  Holding the posture needs at most :data:`SHARE` of the limits of motors and rotors.  The
+    end effector is at the surface, in the directions that its task controls.  If ``at_contact`` is false, the end
+    effector stays at its start.  The base of a flying robot stays level.  The feet of a standing robot stay in place,
+    its center of mass is above the feet, and the limit for the tilt of its base is the same as in the reference flow.
+    If no posture without collisions is found, the result is the best posture with collisions, and its ``note`` says
+    so.
 
     Raises:
-        Infeasible, SolverFailed: As :func:`impact_posture.posture.search.multistart.solve`.
+        Infeasible, SolverFailed: As in :func:`impact_posture.posture.search.multistart.solve`.
     """
     tell("looking for the offline posture")
     wanted, note = scenario_requirements(setup, objective, at_contact=at_contact), ""
-    # For a robot that does not stand, the margin of the center of mass has no meaning.
+    # A robot that does not stand has no support polygon, so its margin of the center of mass is zero.
     margins = dict.fromkeys((stops, edges if wanted.com_over_feet else 0.0) for stops, edges in _MARGINS)
     attempts = [(collision, *margin) for collision in (True, False) for margin in margins]
     for collision, stops, edges in attempts:

@@ -1,4 +1,4 @@
-"""Outcome of a run: completed, or the bounds that it broke."""
+"""Outcome of a run: completed, or the bounds of the scenario that the run violated."""
 
 from __future__ import annotations
 
@@ -16,18 +16,18 @@ from impact_posture.simulation.series import Flags, Series
 from impact_posture.simulation.setup import Setup
 from impact_posture.system.arrays import Array
 
-# In increasing order of gravity.
+# The outcomes are listed from the best to the worst.
 Outcome = Literal["completed", "lost contact", "control lost", "fell"]
 OUTCOMES: tuple[Outcome, ...] = get_args(Outcome)
-# Stride of the ticks that are checked for links behind a surface.
+# Only every 25th tick is checked for links behind a surface.
 _EVERY = 25
-# A joint origin deeper behind a surface cannot come from a contact, m.
+# If a joint origin is deeper behind a surface than this, the cause is not the compression of a contact, m.
 _DEEP = 0.02
 
 
 @dataclass(frozen=True)
 class Event:
-    """Description of a broken bound, its time (s), and the status that it gives the run."""
+    """Violation of a bound: description ``what``, ``time`` (s), and resulting ``status`` of the run."""
 
     status: Outcome
     time: float
@@ -35,14 +35,15 @@ class Event:
 
 
 def gravest(outcomes: Iterable[Outcome]) -> Outcome:
-    """Return the gravest status, or ``completed`` if there is none."""
+    """Return the worst of the outcomes, or ``completed`` if there are no outcomes."""
     return max(outcomes, key=OUTCOMES.index, default="completed")
 
 
 def links_behind(setup: Setup, runs: Iterable[Run]) -> tuple[str, ...]:
-    """Return a warning about each surface that links without shapes passed through, because nothing stops such links.
+    """Return a warning for each surface that links without shapes moved through.
 
-    A joint counts if its origin was more than 2 cm behind the plane, and in front of the plane at the start.
+    The simulation does not stop a link without a shape at a surface.  The warning lists the joints whose origin was
+    in front of the plane at the start and later more than 2 cm behind the plane.
     """
     robot, built = setup.robot, setup.world.built
     shaped = {int(robot.model.frames[robot.frame_id(s.frame)].parentJoint) for s in setup.scenario.shapes}
@@ -72,13 +73,13 @@ def _origins(model: pin.Model, joints: Sequence[int], postures: Array) -> Array:
 
 
 def judge(setup: Setup, run: Run) -> tuple[Event, ...]:
-    """Return the bounds of the scenario that a run broke, in the order of time."""
+    """Return the bounds of the scenario that a run violated, sorted by time."""
     events = [*_falls(setup, run.series), *_losses(setup, run), *_contacts(setup, run)]
     return tuple(sorted(events, key=lambda event: event.time))
 
 
 def _falls(setup: Setup, series: Series) -> list[Event]:
-    """Check tilt, height above the surfaces, and sinking of a floating base."""
+    """Return violations of the bounds on tilt, clearance and sinking of a floating base."""
     if not setup.robot.floating:
         return []
     bounds, built, places = setup.scenario.bounds, setup.world.built, series.q[:, :3]
@@ -93,7 +94,7 @@ def _falls(setup: Setup, series: Series) -> list[Event]:
     }
     for name, n in built.normals.items():
         if (setup.q[:3] - built.points[name]) @ n < bounds.clearance:
-            # The base starts behind the plane, which in reality is bounded.
+            # If the base starts behind the plane, the bound has no meaning, because real surfaces end somewhere.
             continue
         words = f"the base came closer than {bounds.clearance:g} m to" if bounds.clearance else "the base went into"
         broken[f"{words} the surface '{name}'"] = (places - built.points[name]) @ n < bounds.clearance
@@ -101,7 +102,7 @@ def _falls(setup: Setup, series: Series) -> list[Event]:
 
 
 def _losses(setup: Setup, run: Run) -> list[Event]:
-    """Check for relaxed and held commands, and for a diverged state."""
+    """Return violations of the bounds on relaxed and repeated commands, and the divergence of the state."""
     bounds, series, period = setup.scenario.bounds, run.series, setup.scenario.control.period
     events, relaxed = [], series.relaxed
     if relaxed.mean() > bounds.relaxed:
@@ -117,7 +118,7 @@ def _losses(setup: Setup, run: Run) -> list[Event]:
 
 
 def _contacts(setup: Setup, run: Run) -> list[Event]:
-    """Check for missed contacts, and for feet that left the ground."""
+    """Return missed contacts, and the first foot that left the ground for too long."""
     bounds, series, period = setup.scenario.bounds, run.series, setup.scenario.control.period
     events, impacts = [], run.of("impact")
     missed = [window for window in impacts if not window.touched]
@@ -127,7 +128,7 @@ def _contacts(setup: Setup, run: Run) -> list[Event]:
     lifted = [(*_longest(~touches.astype(bool)), foot) for foot, touches in enumerate(series.feet.T)]
     lifted = [each for each in lifted if each[1] * period > bounds.lifted + 1e-9]
     if lifted:
-        # Report the first foot only, because others follow it.
+        # Report only the first foot, because other feet often leave the ground as a consequence.
         begin, length, foot = min(lifted)
         words = f"{feet_of(setup)[foot]} left the ground for {length * period:.3g} s"
         events.append(Event("lost contact", float(series.t[begin]), words))
@@ -135,7 +136,7 @@ def _contacts(setup: Setup, run: Run) -> list[Event]:
 
 
 def _longest(flags: Flags) -> tuple[int, int]:
-    """Return the begin and the length of the longest sequence of set flags."""
+    """Return the begin and the length of the longest sequence of true flags."""
     sequences = [ticks for (ticks,) in ndimage.find_objects(ndimage.label(flags)[0])]
     longest = max(sequences, key=lambda ticks: ticks.stop - ticks.start, default=slice(0, 0))
     return longest.start, longest.stop - longest.start

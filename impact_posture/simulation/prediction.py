@@ -1,4 +1,4 @@
-"""Impacts of a run: prediction of the rigid model, and measurement."""
+"""Impacts of a run: velocity jumps that the rigid-body model predicts, and measured velocity jumps."""
 
 from __future__ import annotations
 
@@ -18,22 +18,25 @@ from impact_posture.simulation.world.throw import thrown_jumps
 
 @dataclass(frozen=True)
 class Prediction:
-    """Prediction of one impact.
+    """Prediction and measurement of one impact.  "Jump" means the velocity jump ``‖Δν‖``.
 
     Attributes:
-        contact: Number of the contact, from 0.
-        H: ``nᵀΛ_c n`` just before the impact, squared jump per squared impulse.
-        G: 1/kg.
-        V: ``H/G²``.
-        S: Squared jump per squared approach speed if the contact sticks, or ``None`` where it is undefined.
-        approach: Approach speed of robot and surface (or ball) just before the impact, m/s.  For pushes, the impulse
-            of the push, N·s.
-        frictionless: Jump without friction and rebound, ``v √V``.  For pushes, ``√H`` times the impulse: the velocity
-            of a robot without controller at the end of the push.
-        sticking: Jump if the contact sticks, ``v √S`` (for an approach along the normal), or ``None`` for pushes.
-        coulomb: Jump with the friction of the surface, ``v √C`` (likewise), or ``None`` for pushes.
+        contact: Number of the contact, starting at 0.
+        H: ``nᵀΛ_c n`` just before the impact: squared jump per squared impulse.
+        G: ``nᵀBn`` just before the impact, with the mobility ``B = J M⁻¹Jᵀ``, 1/kg.
+        V: ``H/G²``: squared jump per squared approach speed without friction.
+        S: Squared jump per squared approach speed if the contact sticks; ``None`` if S is undefined.
+        approach: Approach speed ``v`` of robot and surface (or ball) just before the impact, m/s.
+            For pushes, the impulse of the push, N·s.
+        frictionless: Predicted jump without friction and rebound, ``v √V``.  For pushes, ``√H`` times the impulse:
+            the velocity of a robot without controller at the end of the push.
+        sticking: Predicted jump if the contact sticks, ``v √S``, for an approach along the normal; ``None`` for
+            pushes and if S is undefined.
+        coulomb: Predicted jump with the friction of the surface, ``v √C``, for an approach along the normal;
+            ``None`` for pushes.
         measured: Measured jump, as in :class:`~impact_posture.simulation.metrics.Metrics`.
-        ratio: ``measured`` over ``coulomb`` (for pushes, over ``frictionless``), or ``None`` if the latter vanishes.
+        ratio: ``measured`` divided by ``coulomb`` (for pushes, by ``frictionless``); ``None`` if the divisor is
+            almost zero.
     """
 
     contact: int
@@ -50,7 +53,7 @@ class Prediction:
 
 
 def predict(setup: Setup, objective: WorstCaseObjective, run: Run) -> tuple[Prediction, ...]:
-    """Predict the impacts of a run with the rigid model at the state before each."""
+    """Predict each impact of a run with the rigid-body model at the last state before the impact."""
     scenario, predictions = setup.scenario, []
     numeric = Numeric(setup.robot.model)
     point = point_on(setup.robot, objective.contact.frame, objective.contact.offset)

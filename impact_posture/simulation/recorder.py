@@ -1,4 +1,4 @@
-"""Recorder of a run."""
+"""Recorder of the states and commands of a run."""
 
 from __future__ import annotations
 
@@ -14,15 +14,15 @@ from impact_posture.simulation.world.actuator_command import Trace
 from impact_posture.system.arrays import Array
 from impact_posture.tsid.controller import Command
 
-# Stride of the ticks at which the metric is evaluated, because it is only drawn.
+# The metric is evaluated only at every tenth tick, because only figures need it.
 _EVERY = 10
-# Ticks after which their true states are taken from the world, to limit the contacts in its log.
+# After this number of ticks, the true states are read from the world.  So its log of contacts stays short.
 _BLOCK = 1000
 _NUMBERS = {status: k for k, status in enumerate(STATUSES)}
 
 
 def feet_of(setup: Setup) -> tuple[str, ...]:
-    """Return the frames of the shapes that must stay on the ground, if the robot stands."""
+    """Return the frames of the shapes that must stay on the ground; empty if the robot does not stand."""
     scenario, robot = setup.scenario, setup.robot
     if scenario.control.footing is None:
         return ()
@@ -32,7 +32,7 @@ def feet_of(setup: Setup) -> tuple[str, ...]:
 
 
 class Recorder:
-    """Record of a run with one row for each tick.  ``metric`` is ``q → H``."""
+    """Recorder of a run with one row for each tick.  ``metric`` computes H at a posture q."""
 
     def __init__(self, setup: Setup, metric: Callable[[Array], float]) -> None:
         self._setup, self._metric, self._world = setup, metric, setup.world
@@ -42,7 +42,8 @@ class Recorder:
         feet = feet_of(setup)
         self._feet = [k for k, frame in enumerate(shapes) if frame in feet]
         self._rows: list[tuple[Array, float, int, float]] = []
-        # Rotor commands, levels, status numbers and distances; then true states.
+        # Completed blocks of ticks: rotor commands, levels, status numbers and distances in ``_columns``, true states
+        # in ``_traces``.
         self._columns: list[tuple[Array, ...]] = []
         self._traces: list[Trace] = []
         self._push = (np.zeros(3), np.inf, -np.inf)
@@ -50,7 +51,7 @@ class Recorder:
         self._rotors = (0.0, 0.0) if propulsion is None else (propulsion.speed_min, propulsion.speed_max)
 
     def pushed(self, force: Array, begin: float, end: float) -> None:
-        """Record a push that acts from ``begin`` to ``end``."""
+        """Record a push with a force (world, N) that acts from ``begin`` to ``end``, s."""
         self._push = (force, begin, end)
 
     @property
@@ -66,22 +67,26 @@ class Recorder:
             self._trace()
 
     def take_all(self, trace: Trace, *columns: Array) -> None:
-        """Record ticks: the states after them, rotor commands, levels, status numbers, and distances."""
+        """Record several ticks.
+
+        ``trace`` contains the states after the ticks.  ``columns`` are rotor commands, levels, status numbers and
+        distances.
+        """
         self._traces.append(trace)
         self._columns.append(columns)
 
     def first_touch(self, begin: float, end: float) -> float | None:
-        """Return the time of the first touch within ``[begin, end)``, s; ``None`` without a touch."""
+        """Return the time of the first touch within ``[begin, end)``, s; ``None`` if there is no touch."""
         trace, k = self._trace(), self._shape
         assert k is not None  # noqa: S101 (a push has no shape)
-        # A lasting contact has a new time in every tick.
+        # During a lasting contact, ``began`` has a new time in every tick, so only the first of these ticks is used.
         before = np.concatenate([[False], trace.touching[:-1, k]])
         touches = trace.began[~before, k]
         touches = touches[(begin <= touches) & (touches < end)]
         return float(touches[0]) if touches.size else None
 
     def series(self) -> Series:
-        """Return the time series."""
+        """Return the time series of all recorded ticks."""
         trace = self._trace()
         command, level, status, distance = (np.concatenate(parts) for parts in zip(*self._columns, strict=True))
         t, q, (pushed, begin, end) = trace.t, trace.q, self._push

@@ -1,4 +1,4 @@
-"""Runs of a controller through a scenario, recorded tick by tick."""
+"""Run a controller through a scenario and record every tick."""
 
 from __future__ import annotations
 
@@ -23,13 +23,13 @@ from impact_posture.system.arrays import Array
 from impact_posture.system.processes import fork_call
 from impact_posture.system.progress import tell
 
-# Time when controllers begin to prepare, after the first transients of sensors and motors, s.
+# Controllers begin to prepare for the impact at this time, after the initial transients of sensors and motors, s.
 BRACE = 0.1
-# Ticks between two progress messages, in Python and in C, where a call costs as much as ten ticks.
+# Number of ticks between two progress messages, in Python and in C.  A call of the C loop takes as long as ten ticks.
 _TELL, _TELL_IN_C = 100, 1000
-# Most ticks of a run, nearly three hours at 1 kHz.  A tick of an arm needs about a kilobyte of memory.
+# Maximum number of ticks in a run, nearly three hours at 1 kHz.  A tick of an arm needs about a kilobyte of memory.
 _MOST = 10**7
-# Most physics steps of a tick, because a signal cannot interrupt a tick.
+# Maximum number of physics steps in a tick.  A tick must be short, because a signal cannot interrupt it.
 _MOST_STEPS = 10**5
 
 
@@ -38,12 +38,13 @@ class Run:
     """Record of a run.
 
     Attributes:
-        windows: An impact window for each contact or push, then the dwell and recovery windows.
-        sign: Sign of the push, 1 for contacts.
-        waited: Time of the push, s, NaN for contacts.
-        rested: Whether the robot was at rest before the push.  If it never rests, the push comes after the patience
-            of the scenario, and the metrics contain the motion before it.
-        away: Time when the state diverged and the run ended, s.
+        series: Time series of all ticks.
+        windows: First an impact window for each contact or push, then the dwell and recovery windows.
+        sign: Sign of the push or throw; 1 for contacts.
+        waited: Begin of the impact window of the push or throw, s; NaN for contacts.
+        rested: True if the robot was at rest before the push.  If the robot does not come to rest, the push starts
+            after the ``patience`` of the scenario, and the metrics contain the motion before the push.
+        away: Time at which the state diverged and the run ended, s; ``None`` if the state did not diverge.
     """
 
     series: Series
@@ -54,26 +55,30 @@ class Run:
     away: float | None = None
 
     def of(self, kind: str) -> tuple[Window, ...]:
-        """Return the windows of a kind."""
+        """Return the windows of one kind: ``impact``, ``dwell`` or ``recovery``."""
         return tuple(window for window in self.windows if window.kind == kind)
 
 
 def run(factory: ControllerFactory, controller: str, *, seed: int = 0, mode: Mode = "live", gain: float | None = None,
         only: int | None = None) -> tuple[Run, ...]:  # fmt: skip
-    """Run a controller through a scenario: one run, or one for each sign of the push.
+    """Run a controller through a scenario.
+
+    For contacts, there is one run.  For a push or throw, there is one run for each sign.
 
     Args:
-        factory: The scenario and the parts of its controllers.
+        factory: Factory of the scenario's controllers.
         controller: Name of the controller.
         seed: Seed of the sensor noise.
-        mode: ``live`` keeps the term on, ``held`` holds the reached posture before the first impact.
-        gain: K in place of the value in the scenario, 1/s².
-        only: Sign of the push to run; every sign of the scenario by default.
+        mode: ``live`` keeps the impact-robust term on.  ``held`` switches the term off before the first impact and
+            holds the posture that the robot has reached.
+        gain: K of the impact-robust term, 1/s², which replaces the value in the scenario.
+        only: Sign of the push to run; by default, every sign of the scenario.
 
     Raises:
-        SimulationDiverged: The state diverged within two ticks.  If it diverges later, the run ends there.
+        SimulationDiverged: The state diverged within two ticks.  If it diverges later, the run ends without an error.
         ControllerNotFound: The controller is unknown.
-        InputError: A tick is not a multiple of the physics step, or the sign is neither 1 nor -1.
+        InputError: A tick is not a multiple of the physics step, a tick or the run is too long, or ``only`` is not 1
+            or -1.
     """
     driver = factory.driver(controller, mode, gain)
     scenario = factory.setup.scenario
@@ -87,7 +92,7 @@ def run(factory: ControllerFactory, controller: str, *, seed: int = 0, mode: Mod
 
 
 class _Loop:
-    """Loop of controller and world, in C if both exist in C."""
+    """Loop of controller and world.  The loop runs in C if controller and world can run in C."""
 
     def __init__(self, factory: ControllerFactory, driver: Driver, seed: int) -> None:
         setup = factory.setup
@@ -109,7 +114,10 @@ class _Loop:
         return self.world.time
 
     def ticks(self, n: int, reference: Reference | None = None) -> Array:
-        """Run n ticks, fewer if the state diverges (:attr:`away`).  Return ``‖ν‖`` after each tick."""
+        """Run n ticks and return ``‖ν‖`` after each tick.
+
+        If the state diverges, run fewer ticks and set :attr:`away` to the time.
+        """
         take, most = (self._in_python, _TELL) if self.compiled is None else (self._in_c, _TELL_IN_C)
         speeds = np.zeros(0)
         while speeds.size < n:
@@ -117,7 +125,7 @@ class _Loop:
             new = take(count, reference)
             speeds = np.concatenate([speeds, new])
             if new.size < count:
-                # A figure needs two ticks.
+                # A run with fewer than two ticks cannot be drawn, so raise the error.
                 if self.recorder.ticks < 2:
                     raise SimulationDiverged(self.t, where=self.setup.robot.name)
                 self.away = self.t
@@ -126,7 +134,7 @@ class _Loop:
         return speeds
 
     def check_length(self, t: float) -> None:
-        """Refuse a run of duration ``t`` (s) with fewer than two ticks, or with more than :data:`_MOST`."""
+        """Raise an InputError if a run of duration ``t`` (s) has fewer than two or more than :data:`_MOST` ticks."""
         if not 2 * self.period <= t <= _MOST * self.period:
             fault, hint = f"more than {_MOST:.0e}", "lower the contacts' count or the times, or raise control.period"
             if t < 2 * self.period:
@@ -135,7 +143,7 @@ class _Loop:
             raise InputError(what, where=self.setup.scenario.source, hint=hint)
 
     def until(self, t: float) -> int:
-        """Return the number of ticks until a time (s), at least one."""
+        """Return the number of ticks until time ``t`` (s), at least one."""
         return max(1, math.ceil((t - SAME - self.t) / self.period))
 
     def _in_python(self, n: int, reference: Reference | None) -> Array:
@@ -155,7 +163,7 @@ class _Loop:
         assert self.compiled is not None  # noqa: S101 (the caller has checked it)
         distances: list[float] = []
         levels: list[float] = []
-        # A driver that overrides `level` knows it before the tick.
+        # If a driver overrides `level`, the level of a tick is known before the tick and is read here.
         overrides = type(self.driver).level is not Driver.level
 
         def lead(t: float) -> None:
@@ -175,13 +183,13 @@ class _Loop:
 def _contacts(loop: _Loop, task: RepeatedContacts, mode: Mode) -> Run:
     driver, reference = loop.driver, Reference(task, loop.setup.gap)
     loop.check_length(reference.total)
-    # The reference crosses the surface at this time of the approach, and brakes behind it.
+    # The reference reaches the surface at this time after the start of the approach, and brakes behind the surface.
     crossing = reference.inward - 2 * task.beyond / task.speed
     starts = [reference.start(k) for k in range(task.count)]
     events = [(BRACE, driver.brace)]
     if mode == "held":
         events.append((max(BRACE, starts[0] - 2 * loop.ramp), driver.hold))
-    # At the begin of each approach, the controller expects the next impact.
+    # At the begin of each approach, tell the controller the expected time of the impact.
     events += [(start, partial(driver.expect, start + crossing)) for start in starts]
     events.sort(key=lambda event: event[0])
     left = round(reference.total / loop.period)
@@ -204,13 +212,13 @@ def _contacts(loop: _Loop, task: RepeatedContacts, mode: Mode) -> Run:
 
 
 def _pushes(loop: _Loop, task: SinglePush | Throw, signs: Sequence[int], mode: Mode) -> tuple[Run, ...]:
-    """Settle once, then push with each sign, the second sign in a forked process."""
+    """Let the robot come to rest once, then push it with each sign.  The second sign runs in a forked process."""
     length = task.window if isinstance(task, Throw) else task.duration
     loop.check_length(task.settle + task.patience + length + task.after)
-    # All controllers begin to prepare before the push, even for a short patience.
+    # The push must be later than BRACE, so that all controllers begin to prepare before the push.
     rested = _settle(loop, task, max(task.settle, BRACE + loop.period), [loop.driver.brace])
     if mode == "held":
-        # The reached posture is held, and the robot comes to rest again without the term.
+        # Hold the reached posture without the term, and wait until the robot comes to rest again.
         loop.driver.hold()
         rested = _settle(loop, task, loop.t + 2 * loop.ramp, []) and rested
     if loop.away is not None:
@@ -240,14 +248,18 @@ def _push(loop: _Loop, task: SinglePush | Throw, sign: int, rested: bool) -> Run
 
 
 def _settle(loop: _Loop, task: SinglePush | Throw, least: float, brace: list[Callable[[], None]]) -> bool:
-    """Run until ``least`` (s), and until the robot has been quiet for long enough.  Return whether it has rested."""
+    """Run until time ``least`` (s), and until the robot has been at rest for the time ``task.still``.
+
+    ``brace`` contains the callback that prepares the controller.  Return false if the robot does not come to rest
+    within the patience.
+    """
     still, end = 0.0, max(least, loop.t) + task.patience
     while loop.t < least - SAME or still < task.still - SAME:
         if loop.t > end or loop.away is not None:
             return False
         if brace and loop.t >= BRACE - SAME:
             brace.pop()()
-        # The robot cannot be at rest before the first of these times.
+        # Before the earliest of these times, no decision is needed, so run until this time at once.
         waits = [max(least, loop.t + task.still - still), end, *([BRACE] if brace else [])]
         for speed in loop.ticks(min(map(loop.until, waits))):
             still = still + loop.period if speed < task.quiet else 0.0

@@ -1,4 +1,4 @@
-"""Content of ``scenario.toml``: the tables and keys of an experiment, which are checked when the file is read."""
+"""Content of ``scenario.toml``: the tables and keys of an experiment, checked when the file is read."""
 
 from __future__ import annotations
 
@@ -29,22 +29,22 @@ SHIPPED = Path(__file__).parent / "scenarios"
 @checked
 @dataclass(frozen=True)
 class RepeatedContacts(StrictTable):
-    """The end effector moves into a surface and back, several times.
+    """Contacts of the end effector with a surface: it moves into the surface and back, several times.
 
-    The reference starts at the shape.  It moves against the normal until it is ``beyond`` behind the surface, stays
-    there, and returns (:mod:`impact_posture.simulation.controllers.contact_reference`).
+    The reference starts at the shape.  It moves against the normal to a point at the distance ``beyond`` behind the
+    surface, stays there, and returns (:mod:`impact_posture.simulation.controllers.contact_reference`).
 
     Attributes:
-        frame: Frame of the shape that touches.
+        frame: Frame of the shape that touches the surface.
         surface: Name of the surface.
         speed: Speed of the reference at the surface, m/s.
-        acceleration: Acceleration of the reference before the surface and on its way back, m/s².
+        acceleration: Acceleration of the reference during the approach to the surface and during the return, m/s².
         count: Number of contacts.
         settle: Time before the first approach, s.
-        dwell: Time that the reference stays behind the surface, s.
-        beyond: Distance of the reference behind the surface, m.
-        pause: Time between the way back and the next approach, s.
-        window: Length of the impact window from the first touch on, s.
+        dwell: Time for which the reference stays behind the surface, s.
+        beyond: Distance between the surface and the deepest point of the reference behind it, m.
+        pause: Time between the end of the return and the next approach, s.
+        window: Duration of the impact window, which starts at the first touch, s.
     """
 
     frame: str
@@ -62,12 +62,12 @@ class RepeatedContacts(StrictTable):
 @checked
 @dataclass(frozen=True)
 class SinglePush(Settling):
-    """Push of a robot that stands and has come to rest.
+    """Push of a robot at rest.
 
     Attributes:
         frame: Frame that is pushed.
         force: Force of a push with sign 1, world, N.
-        duration: Duration of the push and of its impact window, s.
+        duration: Duration of the push, s.  The impact window has the same duration.
     """
 
     frame: str
@@ -75,7 +75,7 @@ class SinglePush(Settling):
     duration: Positive = 0.4
 
     def push(self, sign: int) -> Push:
-        """Return the push of a run."""
+        """Return the push with sign 1 or −1."""
         x, y, z = (sign * value for value in self.force)
         return Push(self.frame, (x, y, z), self.duration)
 
@@ -83,17 +83,17 @@ class SinglePush(Settling):
 @checked
 @dataclass(frozen=True)
 class Bounds(StrictTable):
-    """Bounds that a run must keep to count (:func:`impact_posture.simulation.outcome.judge`).
+    """Bounds that a run must not violate (:func:`impact_posture.simulation.outcome.judge`).
 
-    The first three are for a floating base.
+    The bounds ``tilt_deg``, ``clearance`` and ``sink`` are for a floating base.
 
     Attributes:
-        tilt_deg: Largest angle between the vertical and the base axis that was vertical at the start, degrees.
-        clearance: Least height of the base origin above every surface, m.
-        sink: Largest distance of the base below its start, or below its reference, m.
-        lifted: Longest loss of contact of a foot, s.
-        relaxed: Largest share of relaxed ticks.
-        held: Longest time for which a command is held, s.
+        tilt_deg: Maximum angle between the vertical and the base axis that was vertical at the start, degrees.
+        clearance: Minimum height of the base origin above every surface, m.
+        sink: Maximum distance by which the base sinks below its start, or below its reference, m.
+        lifted: Maximum time for which a supporting foot loses contact, s.
+        relaxed: Maximum share of ticks in which the controller relaxes a level.
+        held: Maximum time for which the controller repeats the last command, s.
     """
 
     tilt_deg: Positive = 60.0
@@ -111,14 +111,14 @@ class ScenarioTable(Scene, RobotSettings):
 
     Attributes:
         name: Name of the experiment.
-        description: One line.
-        posture: Name or file of the start posture.  ``None`` takes the default posture of the robot.
-        joints: Values by joint that replace values of the start posture, rad or m.
-        contacts: The contacts, or ``None``.
-        push: The push, or ``None``.
-        throw: The ball that is thrown at the robot, or ``None``.  Exactly one of the three is set.
-        control: The gains.
-        bounds: Bounds that a run must keep to count.
+        description: Description of the experiment in one line.
+        posture: Name or file of the start posture; ``None`` for the default posture of the robot.
+        joints: Joint name → value that replaces the value in the start posture, rad or m.
+        contacts: Contacts with a surface.  Exactly one of ``contacts``, ``push`` and ``throw`` is set.
+        push: Push of the robot, or ``None``.
+        throw: Throw of a ball at the robot, or ``None``.
+        control: Gains of the controllers.
+        bounds: Bounds that a run must not violate.
     """
 
     schema: Literal["impact-posture/scenario/1"] = "impact-posture/scenario/1"
@@ -134,11 +134,11 @@ class ScenarioTable(Scene, RobotSettings):
 
     @property
     def laws(self) -> tuple[tuple[str, tuple[float, float]], ...]:
-        """Name and ``solref`` of all contact laws, including the ball."""
+        """Pairs (name, ``solref``) of the contact laws of the joint stops, all surfaces, and the ball."""
         return super().laws if self.throw is None else (*super().laws, ("throw", self.throw.solref))
 
     def __post_init__(self) -> None:
-        """Refuse a scenario without exactly one task, and a task with an unknown shape or surface."""
+        """Check that there is exactly one task, and that its shape and its surface exist."""
         super().__post_init__()
         tasks = {key: getattr(self, key) for key in ("contacts", "push", "throw") if getattr(self, key) is not None}
         if len(tasks) != 1:
@@ -161,20 +161,23 @@ class ScenarioTable(Scene, RobotSettings):
 @checked
 @dataclass(frozen=True, eq=False, kw_only=True)
 class Scenario(ScenarioTable):
-    """Experiment as its file describes it, before the robot is loaded.  Errors name the file, ``source``."""
+    """Experiment as described in its file, before the robot is loaded.
+
+    ``source`` is the path of the file, which errors mention.
+    """
 
     source: str = ""
 
     @property
     def task(self) -> RepeatedContacts | SinglePush | Throw:
-        """The contacts, the push or the throw."""
+        """The task of the scenario: contacts, push or throw."""
         task = self.contacts or self.push or self.throw
         assert task is not None  # noqa: S101 (__post_init__ has checked it)
         return task
 
     @property
     def signs(self) -> tuple[int, ...]:
-        """Sign of each run of a push or throw; empty for contacts."""
+        """Signs of the push or throw, one for each run; empty for contacts."""
         return () if isinstance(self.task, RepeatedContacts) else self.task.signs
 
     @property
@@ -190,18 +193,21 @@ class Scenario(ScenarioTable):
 
     @property
     def surface(self) -> Surface:
-        """The surface that is hit.  Raises an InputError if the robot is pushed."""
+        """Surface that the robot hits.  Raises an InputError if the scenario has no contacts."""
         return next(s for s in self.surfaces if s.name == self._contacts("surface that is hit").surface)
 
     @property
     def shape(self) -> Shape:
-        """The shape that hits the surface, or that is hit.  Raises an InputError if the robot is pushed."""
+        """Shape that hits the surface, or at which the ball is thrown.  Raises an InputError for a push."""
         frame = self._contacts("shape that hits").frame if self.throw is None else self.throw.frame
         return next(s for s in self.shapes if s.frame == frame)
 
     @property
     def offset(self) -> Vector3:
-        """Contact point in the frame of the task, m: of the shape, center of a shape that is hit, or frame origin."""
+        """Contact point in the frame of the task, m.
+
+        For contacts, the ``offset`` of the shape; for a throw, the center of the shape; for a push, the frame origin.
+        """
         if self.throw:
             return self.shape.center or (0.0, 0.0, 0.0)
         return self.shape.offset if self.contacts else (0.0, 0.0, 0.0)
@@ -213,20 +219,22 @@ class Scenario(ScenarioTable):
 
 
 def known_scenarios() -> tuple[str, ...]:
-    """Return the sorted names of the scenarios that need no path."""
+    """Return the sorted names of the shipped scenarios."""
     return tuple(sorted(path.stem for path in SHIPPED.glob("*.toml")))
 
 
 def read_scenario(scenario: str | Path) -> Scenario:
-    """Read a shipped scenario by name, or another scenario from its file.  Paths in a file start from its folder.
+    """Read a shipped scenario by name, or another scenario from its file.
+
+    Paths in the file are relative to the folder of the file.
 
     Raises:
-        ScenarioNotFound: The scenario is unknown.  The error lists the nearest names.
-        SpecError: The file cannot be read, has an unknown key, or a value does not fit.
+        ScenarioNotFound: The scenario is unknown.  The error lists similar names.
+        SpecError: The file cannot be read, or has an unknown key or an invalid value.
     """
     path = scenario_path(scenario)
     data = read_toml(path)
-    # Check the schema first, because another schema may have other keys.
+    # Check the schema first, because a file with another schema may have other keys.
     schema = data.get("schema", SCHEMA)
     if schema != SCHEMA:
         raise SpecError(f"schema '{shown(schema)}'", where=str(path), hint=f'write schema = "{SCHEMA}"')
@@ -245,7 +253,7 @@ def scenario_path(scenario: str | Path) -> Path:
     """Return the path of a scenario file.
 
     Raises:
-        ScenarioNotFound: The scenario is unknown.  The error lists the nearest names.
+        ScenarioNotFound: The scenario is unknown.  The error lists similar names.
     """
     if isinstance(scenario, str):
         if scenario in known_scenarios():

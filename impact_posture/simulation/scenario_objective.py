@@ -29,9 +29,9 @@ Gradient = Callable[[Array], tuple[float, Array]]
 
 
 def scenario_objective(setup: Setup, kind: ObjectiveKind = "impulse", *, free: bool = False) -> WorstCaseObjective:
-    """Return the objective for the impact of a scenario, at the shape of the contacts or at the pushed frame.
+    """Return the objective for the impact of a scenario.
 
-    With ``free``, the feet of a standing robot do not count.
+    With ``free``, the objective ignores the contacts at the feet of a standing robot.
     """
     scenario, robot = setup.scenario, setup.robot
     x, y, z = (float(value) for value in scenario.normal)
@@ -43,7 +43,10 @@ def scenario_objective(setup: Setup, kind: ObjectiveKind = "impulse", *, free: b
 
 
 def interpreted(objective: WorstCaseObjective) -> Gradient:
-    """Return ``q → (objective, gradient)`` in the CasADi interpreter, without compiler but slower than C."""
+    """Return the function ``q → (objective, gradient)``, evaluated by the CasADi interpreter.
+
+    The interpreter needs no compiler, but it is slower than C.
+    """
     function, normal = objective.gradient_fun(), np.array(objective.contact.normal, dtype=float)
 
     def call(q: Array) -> tuple[float, Array]:
@@ -56,10 +59,10 @@ def interpreted(objective: WorstCaseObjective) -> Gradient:
 
 
 def compiled(objective: WorstCaseObjective) -> Gradient:
-    """Return ``q → (objective, gradient)`` from the C export, which is built once and cached.
+    """Return the function ``q → (objective, gradient)`` from the C export, which is built once and cached.
 
     Raises:
-        CompilerError: There is no compiler, it failed, or the library computes other numbers.
+        CompilerError: There is no compiler, the compiler failed, or the library computes other numbers than CasADi.
         OutputError: The cache folder cannot be written, or other users can write it.
         SpecError: The library cannot be loaded, for example because another machine built it.
     """
@@ -88,7 +91,7 @@ def objective_key(objective: WorstCaseObjective) -> str:
 
 @contextmanager
 def locked(path: Path) -> Iterator[None]:
-    """Lock a file, so that only one process at a time is within the block."""
+    """Lock a file, so that only one process at a time runs the ``with`` block."""
     try:
         file = path.open("w")
     except OSError as error:

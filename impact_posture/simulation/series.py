@@ -1,4 +1,4 @@
-"""Time series of a run, and its windows."""
+"""Time series of a run, and time windows of a run."""
 
 from __future__ import annotations
 
@@ -17,9 +17,9 @@ Array = NDArray[Any]
 Flags = NDArray[np.bool_]
 
 STATUSES: tuple[Status, ...] = tuple(Status)
-# Times that differ by less count as equal, because sums of time steps are not exact, s.
+# Times that differ by less than this are treated as equal, because sums of time steps have rounding errors, s.
 SAME = 1e-9
-# Length of the recovery from the begin of an impact, in which a delayed motion may appear, s.
+# Maximum duration of the recovery window, which starts with the impact and can contain a delayed motion, s.
 RECOVERY = 1.0
 
 
@@ -28,12 +28,13 @@ class Window:
     """Time window of a run.
 
     Attributes:
-        kind: ``impact``, ``dwell`` (from the first touch until the reference leaves), or ``recovery`` (until
-            :data:`RECOVERY` after the begin of the impact, the next approach, or the end of the run).
-        contact: Number of the contact or push, from 0.
-        begin: Begin, s.
-        end: End, s.
-        touched: Whether the impact happened.  If not, the window begins at the expected time.
+        kind: ``impact``, ``dwell`` or ``recovery``.  All windows start at the first touch.  A dwell window ends when
+            the reference leaves the surface.  A recovery window ends after :data:`RECOVERY`, at the next approach, or
+            at the end of the run.
+        contact: Number of the contact or push, starting at 0.
+        begin: Time at the begin of the window, s.
+        end: Time at the end of the window, s.
+        touched: True if the impact happened.  If it did not, the window begins at the expected time.
     """
 
     kind: str
@@ -45,25 +46,25 @@ class Window:
 
 @dataclass(frozen=True, eq=False)
 class Series:
-    """True states at the end of each of the n ticks of a run, after the command of the tick.
+    """Time series of the n ticks of a run, recorded at the end of each tick.
 
     Attributes:
         t: Time, s, shape (n,).
-        q: Configuration, shape (n, nq).
-        v: ν, shape (n, nv).
-        torque: Commanded joint torques, within the limits, shape (n, joints).
-        rotor_command: Commanded rotor speeds, within the limits, shape (n, rotors).
+        q: True configuration, shape (n, nq).
+        v: True velocity ν, shape (n, nv).
+        torque: Commanded joint torques after clipping to the limits, shape (n, joints).
+        rotor_command: Commanded rotor speeds after clipping to the limits, shape (n, rotors).
         rotor_speed: True rotor speeds, shape (n, rotors).
-        force: Force on the shape of the task, or of the push, world, N, shape (n, 3).
-        peak: Largest normal force on this shape within the tick, N, shape (n,).
-        slip: Tangential speed of this shape, or of the fastest foot, in contact, m/s, shape (n,).
+        force: Force on the shape of the task, or force of the push, world, N, shape (n, 3).
+        peak: Largest normal force on the shape of the task within the tick, N, shape (n,).
+        slip: Sliding speed of the shape of the task, or of the fastest foot for pushes, m/s, shape (n,).
         touching: Number of shapes in contact, shape (n,).
         feet: Whether each supporting foot is in contact, shape (n, feet).
-        objective: H of the impact, shape (n,), NaN in ticks without an evaluation.
-        level: Level of the term that prepares for the impact, shape (n,).
-        status: Index into :data:`STATUSES`, shape (n,).
-        at_stop: Whether a joint is at a position limit, shape (n, nv).
-        reference: Distance of the reference along its approach, m, shape (n,), zero for pushes.
+        objective: H of the impact, shape (n,); NaN in ticks in which H was not evaluated.
+        level: Level of the term that prepares for the impact, 0 to 1, shape (n,).
+        status: Status of the controller as an index into :data:`STATUSES`, shape (n,).
+        at_stop: Whether each joint is at a position limit, shape (n, nv).
+        reference: Distance of the reference along its approach, m, shape (n,); zero for pushes.
     """
 
     t: Array
@@ -85,29 +86,29 @@ class Series:
 
     @property
     def relaxed(self) -> Flags:
-        """Ticks in which a level gave way, shape (n,)."""
+        """True for ticks in which the controller relaxed a level, shape (n,)."""
         return np.asarray(self.status == STATUSES.index(Status.RELAXED))
 
     @property
     def held(self) -> Flags:
-        """Ticks without a new command, which held the last one, shape (n,)."""
+        """True for ticks in which the controller repeated the last command, shape (n,)."""
         return np.asarray(~self.relaxed & (self.status != STATUSES.index(Status.SOLVED)))
 
     def slice(self, begin: float, end: float) -> slice:
-        """Return the ticks in ``(begin, end]``, except for rounding of the times."""
+        """Return the slice of the ticks with times in ``(begin, end]``, up to rounding errors."""
         first, last = np.searchsorted(self.t, [begin + SAME, end + SAME], side="right")
         return slice(int(first), int(last))
 
     def save(self, file: Path | BinaryIO) -> None:
-        """Write as NPZ."""
+        """Write the time series to an NPZ file."""
         np.savez_compressed(file, **vars(self))
 
     @staticmethod
     def load(path: Path) -> Series:
-        """Read a file of :meth:`save`.
+        """Read a file that :meth:`save` has written.
 
         Raises:
-            SpecError: The file cannot be read, or is not a time series.
+            SpecError: The file cannot be read or does not contain a time series.
         """
         try:
             arrays = read_arrays(path)

@@ -16,13 +16,20 @@ from impact_posture.simulation.world.world import World, build_world
 from impact_posture.system.arrays import Array
 from impact_posture.system.progress import tell
 
-# Keys of a scenario, which may be the place of an error.
+# Keys of a scenario; an error may give one of them as its place.
 _KEYS = {field.name for field in fields(ScenarioTable)}
 
 
 @dataclass(frozen=True, eq=False)
 class Setup:
-    """Scenario that is ready to run: its robot, start posture, shape (nq,), and world before its first reset."""
+    """Scenario that is ready to run.
+
+    Attributes:
+        scenario: Content of the scenario file.
+        robot: Robot of the scenario.
+        q: Start posture, shape (nq,).
+        world: Simulated world before its first reset.
+    """
 
     scenario: Scenario
     robot: Robot
@@ -31,7 +38,7 @@ class Setup:
 
     @property
     def gap(self) -> float:
-        """Distance of the shape that hits from its surface at the start, m.  Raises an InputError for a push."""
+        """Distance between shape and surface at the start, m.  Raises an InputError without contacts."""
         return self.world.built.gaps[self.scenario.surface.name, self.scenario.shape.frame]
 
 
@@ -39,7 +46,7 @@ def set_up(scenario: Scenario) -> Setup:
     """Load the robot, set its start posture, and build the world around it.
 
     Raises:
-        ImpactPostureError: A value of the scenario does not fit the robot.
+        ImpactPostureError: The robot cannot be loaded, or a value of the scenario is invalid for the robot.
     """
     tell(f"loading {scenario.robot}")
     with naming_keys(scenario):
@@ -56,7 +63,7 @@ def set_up(scenario: Scenario) -> Setup:
 
 @contextmanager
 def naming_keys(scenario: Scenario) -> Iterator[None]:
-    """Replace settings in errors by keys of the scenario, and name its file."""
+    """In errors, replace names of settings by keys of the scenario, and add the path of its file."""
     try:
         yield
     except ImpactPostureError as error:
@@ -64,7 +71,8 @@ def naming_keys(scenario: Scenario) -> Iterator[None]:
         if {where.partition(" ")[0], where.rpartition(" ")[2]} & _KEYS and scenario.source:
             where = f"{scenario.source}, {where}"
         elif where in ("", "problem") or (isinstance(error, NameNotFound) and "." not in where):
-            # The scenario names a frame or joint that the robot lacks.  A key with a dot is from robot.toml.
+            # The scenario names a frame or joint that the robot does not have.  If the place of the error contains a
+            # dot, the place is a key of robot.toml and stays.
             where = scenario.source
         what, hint = (
             text.replace("`contact_pose`", "control.end_effector.pose").replace("`", "")
@@ -75,7 +83,7 @@ def naming_keys(scenario: Scenario) -> Iterator[None]:
 
 
 def _check_base(robot: Robot, scenario: Scenario) -> None:
-    """Refuse a floating base without feet and rotors, and rotors that cannot push it in every direction."""
+    """Raise a SpecError if a floating base has no feet and its rotors do not control all 6 directions."""
     if not robot.floating or scenario.control.footing is not None:
         return
     propulsion = robot.spec.propulsion

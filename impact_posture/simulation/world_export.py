@@ -1,9 +1,9 @@
 """Export of the world of a scenario for programs in other languages: the MuJoCo model and its parameters.
 
-``world.xml`` is the model for readers, with six digits.  ``world.mjb`` is the exact binary model for the version of
-MuJoCo that wrote it.  ``world.txt`` has one line for each parameter, a key and its numbers.
-``docs/examples/cpp/closed_loop`` reads the last two files.  The exported sensors have the delay and the filter of the
-force, but no noise.
+``world.xml`` is the readable model, with numbers of six digits.  ``world.mjb`` is the exact binary model, which only
+the same version of MuJoCo can load.  ``world.txt`` has one line per parameter: a key and its numbers.
+``docs/examples/cpp/closed_loop`` reads ``world.mjb`` and ``world.txt``.  The exported sensors have the delay and the
+force filter of the scenario, but no noise.
 """
 
 from __future__ import annotations
@@ -33,7 +33,8 @@ def export_world(setup: Setup, out: Path, *, force: bool = False) -> None:
 
     Raises:
         InputError: The scenario throws a ball, or a joint is neither revolute, prismatic nor a floating base.
-        OutputError: The folder exists without ``force``, has foreign files, or cannot be written.
+        OutputError: The folder exists and ``force`` is false, or the folder contains files that are not from this
+            export, or it cannot be written.
     """
     mjcf = setup.world.built.mjcf
     model = mjcf.compile()
@@ -69,7 +70,7 @@ def _parameters(setup: Setup, model: Any) -> Iterable[tuple[str, Iterable[float]
 
 
 def _joints(setup: Setup) -> Iterable[tuple[str, Iterable[float]]]:
-    """Yield the indices of each joint in q, qpos, v and qvel; the key of a floating base is ``base``."""
+    """Yield the indices of each joint in q, qpos, v and qvel.  A floating base has the key ``base``."""
     for slot in setup.world.built.mjcf.layout.slots:
         family = slot.joint.kind.family
         indices = [slot.joint.q.start, slot.qpos.start, slot.joint.v.start, slot.qvel.start]

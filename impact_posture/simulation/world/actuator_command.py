@@ -1,4 +1,4 @@
-"""Input and output of a simulated world: limited commands, pushes, joint stops, and the true state."""
+"""Input and output of a simulated world: commands and their limits, pushes, joint limits, and the true state."""
 
 from __future__ import annotations
 
@@ -22,7 +22,7 @@ RUNAWAY = 1e6
 
 @dataclass(frozen=True, eq=False)
 class ActuatorCommand:
-    """Joint torques and rotor speeds, the part of a controller's command that actuators execute.
+    """Joint torques and rotor speeds: the part of a controller's command that the actuators execute.
 
     Attributes:
         torque: Joint torques, N·m (N for prismatic joints), shape (joints,), in the order of ν.
@@ -34,26 +34,30 @@ class ActuatorCommand:
 
 
 class CommandLimits:
-    """Limits of rotor speeds and joint torques (``effort``, N·m or N, infinite where the model states none)."""
+    """Limits of rotor speeds and joint torques.
+
+    The torque limits ``effort`` (N·m or N) are infinite for joints to which the model gives no limit.
+    """
 
     def __init__(self, robot: Robot, rotors: Rotors | None) -> None:
         propulsion = robot.spec.propulsion
         self._rotors, self._count = rotors, 0 if propulsion is None else len(propulsion.rotors)
         effort = np.asarray(robot.model.effortLimit, dtype=float)[6 if robot.floating else 0 :]
-        # An effort limit of zero means that none is stated.
+        # An effort limit of zero means that the model gives no limit.
         self.effort: Array = np.where(effort > 0, effort, np.inf)
 
     def within(self, command: Command | ActuatorCommand) -> tuple[Array, Array]:
         """Return rotor speeds, shape (rotors,), and joint torques, shape (joints,), within their limits.
 
         Raises:
-            InputError: The sizes do not fit, a number is not finite, or an unlimited torque is absurdly large.
+            InputError: A size is wrong, a number is not finite, or the torque of a joint without limit is at least
+                :data:`RUNAWAY`.
         """
         speed, torque = np.asarray(command.rotor_speed, dtype=float), np.asarray(command.torque, dtype=float)
         if speed.shape != (self._count,) or torque.shape != self.effort.shape:
             sizes = f"give {self._count} and {self.effort.size}"
             raise InputError(f"{speed.size} rotor speeds and {torque.size} torques", where="command", hint=sizes)
-        # A moderate sum of squares excludes infinities and absurd torques.
+        # If the sum of squares is below the bound, every number is finite and every torque is below the bound.
         with np.errstate(over="ignore"):
             usual = speed.dot(speed) + torque.dot(torque) < RUNAWAY**2
         if not usual and not (np.isfinite(speed).all() and np.isfinite(torque).all()):
@@ -71,8 +75,8 @@ class Push:
     Attributes:
         frame: Frame of the point.
         force: Force, world, N.
-        duration: Duration, s, rounded to physics steps.
-        offset: Point from the origin of the frame, in the frame, m.
+        duration: Duration, s, rounded to a whole number of physics steps.
+        offset: Position of the point in the coordinates of ``frame``, m.
     """
 
     frame: str
@@ -82,20 +86,23 @@ class Push:
 
 
 class ActivePushes:
-    """Pushes that act on a world: body, point in the axes of the body, force, and last step of each."""
+    """Pushes that act on a world.
+
+    ``active`` lists body, point in the coordinates of the body, force, and end of each push as a number of steps.
+    """
 
     def __init__(self, model: Any) -> None:
         self._model, self._apply = model, import_mujoco().mj_applyFT
         self.active: list[tuple[int, Array, Array, int]] = []
 
     def in_c(self) -> dict[str, Any]:
-        """Return the members of ``c/world_ticks.c`` for the pushes."""
+        """Return the values of the pushes for the struct in ``c/world_ticks.c``."""
         bodies, points, forces, ends = zip(*self.active, strict=True) if self.active else ((), (), (), ())
         return {"pushes": len(bodies), "push_body": bodies, "push_end": ends,
                 "push": [[*point, *force] for point, force in zip(points, forces, strict=True)]}  # fmt: skip
 
     def begin(self, push: Push, body: int, point: Array, step: int) -> None:
-        """Begin a push of a body at a point in the axes of the body, as :meth:`World.push`."""
+        """Begin a push at ``point`` in the coordinates of ``body``; errors as in :meth:`World.push`."""
         count = round(push.duration / self._model.opt.timestep) if np.isfinite(push.duration) else 0
         if count < 1 or not np.isfinite(push.force).all():
             raise InputError("has no force or no duration", where=f"push at '{push.frame}'",
@@ -112,7 +119,7 @@ class ActivePushes:
 
 
 class JointStops:
-    """Position limits of the joints ``names``, in the order of ``Trace.stopped``."""
+    """Position limits of the joints ``names``, which have the same order as the columns of ``Trace.stopped``."""
 
     def __init__(self, model: Any) -> None:
         limited = np.array(model.jnt_limited, dtype=bool)
@@ -121,7 +128,10 @@ class JointStops:
         self.names = tuple(model.joint(int(k)).name for k in np.flatnonzero(limited))
 
     def reached(self, qpos: Array) -> Array:
-        """Return whether each joint is at a limit, shape (n, joints), for ``qpos`` of shape (n, numbers)."""
+        """Return whether each joint is at or beyond a limit, shape (n, joints).
+
+        ``qpos`` contains the MuJoCo positions of n states, shape (n, numbers).
+        """
         values = qpos[:, self._places]
         return np.asarray((values <= self._low) | (values >= self._high))
 
@@ -135,8 +145,8 @@ class Truth(NamedTuple):
         v: ν, shape (nv,).
         rotor_speeds: Rotor speeds in the unit of ``speed_max``, shape (rotors,).
         thrusts: Thrusts, N, shape (rotors,).
-        torques: Joint torques of the last step, within the limits, shape (joints,).
-        shapes: Contact of each shape with the surfaces, in the order of the scene.
+        torques: Joint torques of the last step, after clipping to the limits, shape (joints,).
+        shapes: Contact of each shape with the surfaces, in the order of the shapes in the scene.
         at_stops: Joints at or beyond a position limit.
     """
 
@@ -153,8 +163,8 @@ class Truth(NamedTuple):
 class Trace(NamedTuple):
     """True states of a world at n marks, with the quantities of :class:`Truth` and :class:`ShapeTruth`.
 
-    The first axis counts marks.  The second axis of ``stopped`` counts the joints with limits.  The second axis of
-    the later columns counts the shapes.
+    The first axis of each array has one entry per mark.  The second axis of ``stopped`` has one entry per joint with
+    limits.  The second axis of the arrays after ``stopped`` has one entry per shape.
     """
 
     t: Array

@@ -1,4 +1,4 @@
-"""Contact forces on each shape, which are recorded in every step and evaluated for many steps at once."""
+"""Contact forces on each shape, recorded in every step and evaluated for many steps together."""
 
 from __future__ import annotations
 
@@ -8,11 +8,11 @@ import numpy as np
 
 from impact_posture.system.arrays import Array
 
-# Rows of a contact with friction, and the only row of a contact without friction.
+# Constraint rows of a contact with friction.  A contact without friction has only the first row.
 _ROWS, _FIRST = np.arange(3), np.arange(3) == 0
-# Indices of the factors of a cross product.
+# Indices with which a cross product is computed: (a × b)ᵢ = a[_NEXT[i]] b[_LAST[i]] − a[_LAST[i]] b[_NEXT[i]].
 _NEXT, _LAST = [1, 2, 0], [2, 0, 1]
-# Number of recorded steps from which they are evaluated without a look.
+# With this number of recorded steps, the steps are evaluated even if :meth:`ContactLog.look` is not called.
 _MOST = 4096
 
 
@@ -21,12 +21,12 @@ class ShapeTruth(NamedTuple):
 
     Attributes:
         frame: Frame of the shape.
-        touching: Whether a surface pushed the shape in the last step.
+        touching: True if a surface pushed the shape in the last step.
         force: Force on the shape in the last step, world, N, shape (3,).
         impulse: Impulse on the shape since the reset, world, N·s, shape (3,).
-        peak: Largest sum of normal forces since the last look, N.
-        began: Time of the first push since the last look, s, or ``None``.
-        slip: Largest tangential speed of the contact points, m/s, 0 without contact.
+        peak: Largest sum of the normal forces since the last evaluation, N.
+        began: Time of the first push by a surface since the last evaluation, s; ``None`` if no surface pushed.
+        slip: Largest tangential speed of the contact points, m/s; 0 without contact.
     """
 
     frame: str
@@ -39,7 +39,7 @@ class ShapeTruth(NamedTuple):
 
 
 class _Step(NamedTuple):
-    """Contacts of a step as MuJoCo stores them, with the number of the step and the time of its end."""
+    """Contacts of a step as MuJoCo stores them, with the number of the step and the time at its end."""
 
     number: int
     time: float
@@ -65,8 +65,8 @@ class ContactLog:
 
     def __init__(self, model: Any, geoms: tuple[str, ...]) -> None:
         self._count, self._step = len(geoms), float(model.opt.timestep)
-        # MuJoCo names the plane of a contact first, so the contact pushes the second geom.  A ball may be first or
-        # second.
+        # In a contact with a plane, MuJoCo lists the plane first, so the contact force acts on the second geom.  A
+        # ball can be the first or the second geom.
         self._shape_of = np.full(model.ngeom, -1)
         for k, name in enumerate(geoms):
             self._shape_of[model.geom(name).id] = k
@@ -83,7 +83,7 @@ class ContactLog:
         self._peak, self._began = np.zeros(count), np.full(count, np.inf)
 
     def in_c(self) -> dict[str, Any]:
-        """Return the members of ``c/world_ticks.c`` for the contacts after a reset."""
+        """Return the values of the contacts after a reset for the struct in ``c/world_ticks.c``."""
         one, three = np.zeros(self._count), np.zeros((self._count, 3))
         return {"shapes": self._count, "shape_of": self._shape_of, "now": three, "normal": one, "impulse": three,
                 "peak": one, "began": one}  # fmt: skip
@@ -95,14 +95,14 @@ class ContactLog:
         self._steps.append(_Step(number, data.time, *(part.copy() for part in parts)))
 
     def fold(self, number: int) -> None:
-        """Evaluate the recorded steps if there are many and no mark is set."""
+        """Evaluate the recorded steps early if there are :data:`_MOST` or more and no mark is set."""
         if len(self._steps) >= _MOST and not self._marks:
             self._marks.append((number, None))
             *_, peak, began, _ = self.look()
             self._peak, self._began = peak[0], np.where(np.isnan(began[0]), np.inf, began[0])
 
     def mark(self, data: Any, number: int) -> None:
-        """Mark the state after a step for the next :meth:`look`."""
+        """Record the state after a step, so that the next :meth:`look` evaluates it."""
         mark = None
         if data.ncon:
             parts = data.contact.geom, data.contact.pos, data.contact.frame, data.cvel, data.subtree_com
@@ -121,16 +121,17 @@ class ContactLog:
         return list(force.tolist())
 
     def look(self) -> tuple[Array, ...]:
-        """Return the quantities of :class:`ShapeTruth` at all n marks, without the frame, and clear the marks.
+        """Return the quantities of :class:`ShapeTruth` except ``frame`` at all n marks, and clear the marks.
 
-        Axes are marks and shapes.  ``began`` is NaN where a shape was not touched since the previous mark.
+        The first axis has one entry per mark, the second one per shape.  ``began`` is NaN if no surface touched the
+        shape since the previous mark.
         """
         ends, count = np.array([number for number, _ in self._marks]), self._count
         numbers, n = np.array([step.number for step in self._steps]), ends.size
-        # A run that ends within a tick has steps after its last mark.
+        # If a run ends within a tick, some steps come after the last mark.  These steps stay recorded.
         looked = int(np.searchsorted(numbers, ends[-1], side="right"))
         steps, numbers, self._steps = self._steps[:looked], numbers[:looked], self._steps[looked:]
-        # Without a step since the last look, the contacts are unchanged.
+        # If no step was taken since the last evaluation, the contacts are unchanged.
         unmoved = ends == self._number
         force, normal = self._force * unmoved[:, None, None], self._normal * unmoved[:, None]
         impulse, peak, began = np.zeros((n, count, 3)), np.zeros((n, count)), np.full((n, count), np.inf)
@@ -153,22 +154,22 @@ class ContactLog:
         return normal > 0, force, impulse, peak, np.where(np.isinf(began), np.nan, began), slip
 
     def _evaluated(self, steps: list[_Step]) -> tuple[Array, Array]:
-        """Return forces, shape (steps, shapes, 3), and sums of normal forces, shape (steps, shapes)."""
+        """Return forces on shapes, shape (steps, shapes, 3), and sums of normal forces, shape (steps, shapes)."""
         counts, sizes = [s.sizes.size for s in steps], np.concatenate([s.sizes for s in steps])
         starts = np.cumsum([0, *(s.forces.size for s in steps[:-1])])
         first, at = np.concatenate([s.rows for s in steps]), np.repeat(np.arange(len(steps)), counts)
         geoms, frames = np.concatenate([s.geoms for s in steps]), np.concatenate([s.frames for s in steps])
-        # A contact just outside the surface does not push and has no address.
+        # MuJoCo also lists contacts just outside the surface.  They do not push and have no address (−1).
         pushing = first >= 0
         first = (first + np.repeat(starts, counts))[pushing]
         at, geoms, sizes, frames = at[pushing], geoms[pushing], sizes[pushing], frames[pushing].reshape(-1, 3, 3)
-        # A contact has three numbers with friction, else one.
+        # A contact with friction has three force components, a contact without friction only the normal force.
         rough = (sizes == 3)[:, None]
         local = np.concatenate([s.forces for s in steps])[first[:, None] + _ROWS * rough] * (rough | _FIRST)
         one, other = self._shape_of[geoms].T
         shape, sign = np.maximum(one, other), np.where(other >= 0, 1.0, -1.0)
         forces, normals = np.zeros((len(steps), self._count, 3)), np.zeros((len(steps), self._count))
-        # The rows of a contact frame are its axes, the normal first.
+        # The rows of a contact frame are its axes.  The first axis is the normal.
         np.add.at(forces, (at, shape), sign[:, None] * (local[:, None, :] @ frames)[:, 0])
         np.add.at(normals, (at, shape), local[:, 0])
         return forces, normals
@@ -187,7 +188,7 @@ class ContactLog:
         arms, spins = np.concatenate(points) - center, twist[:, :3]
         velocities = twist[:, 3:] + spins[:, _NEXT] * arms[:, _LAST] - spins[:, _LAST] * arms[:, _NEXT]
         velocities -= (normals * velocities).sum(axis=1, keepdims=True) * normals
-        # Sliding on a ball does not count.
+        # Slip is evaluated only for contacts with surfaces, not for contacts with a ball.
         ground = (self._body_of[geom[:, 0]] == 0) & (other >= 0)
         speeds = np.sqrt((velocities * velocities).sum(axis=1))[ground]
         np.maximum.at(slips, (np.array(touching)[at[ground]], other[ground]), speeds)

@@ -13,14 +13,14 @@ from impact_posture.errors import InputError
 @checked
 @dataclass(frozen=True, kw_only=True)
 class ContactLaw(StrictTable):
-    """Spring and damper with which a surface pushes in MuJoCo.  Both scale with the mass that the contact feels.
+    """Spring and damper with which MuJoCo models a contact.  Both are proportional to the mass at the contact.
 
-    At distance r (negative inside), the contact demands the acceleration ``r* = −b r' − k r`` with ``b = 2/(d₁T)``
-    and ``k = d/(d₁Tζ)²``, where ``solref = (T, ζ)``.  If both numbers are negative, they are ``(−k, −b)``.  The
-    contact gets the share d of it, ``r'' = d r* + (1 − d) r''₀``, where ``r''₀`` is the acceleration without contact.
-    With ``solimp = (d₀, d₁, width)``, d rises from ``d₀`` at depth 0 to ``d₁`` at depth ``width`` (m).
-    The restitution of a contact follows from its law.
-    ``make calibration`` measures the restitution of many laws (page on simulation).
+    At distance r (negative during penetration), the contact law demands the acceleration ``r* = −b r' − k r``.
+    With ``solref = (T, ζ)``, ``b = 2/(d₁T)`` and ``k = d/(d₁Tζ)²``.  If both numbers of ``solref`` are negative, they
+    are ``(−k, −b)``.  The resulting acceleration is ``r'' = d r* + (1 − d) r''₀``, where ``r''₀`` is the acceleration
+    without contact.  With ``solimp = (d₀, d₁, width)``, d rises from ``d₀`` at depth 0 to ``d₁`` at depth ``width``
+    (m).  The contact law determines the restitution.  ``make calibration`` measures the restitution of many contact
+    laws (page on simulation).
 
     Attributes:
         solref: Time constant T in s and damping ratio ζ.
@@ -33,7 +33,7 @@ class ContactLaw(StrictTable):
     friction: NonNegative = 0.7
 
     def __post_init__(self) -> None:
-        """Refuse numbers that MuJoCo would silently change."""
+        """Check that MuJoCo would not silently change a number."""
         a, b = self.solref
         if not ((a > 0 and b > 0) or (a < 0 and b <= 0)):
             hint = "give a time and a damping ratio above zero, or both numbers below"

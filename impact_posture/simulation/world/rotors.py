@@ -17,13 +17,13 @@ from impact_posture.system.arrays import Array
 class Rotors:
     """Speeds ω of the propellers, in the unit of ``speed_max``.
 
-    A speed follows its command ω*, cut to ``[speed_min, speed_max]``, with ``ω̇ = (ω* − ω)/τ``.  τ is the time
-    constant up (ω* > ω) or down, and a step integrates exactly.  The thrust is ``c_f ω²`` along the direction of the
-    rotor, and the drag moment is ``κ`` times the thrust against its spin.  There is no gyroscopic moment, because the
-    inertia of the propellers is not in the model.
+    Each speed follows its command ω*, clipped to ``[speed_min, speed_max]``, with ``ω̇ = (ω* − ω)/τ``.  τ is
+    ``time_constant_up`` if ω* > ω and ``time_constant_down`` otherwise.  Each step uses the exact solution.  The
+    thrust is ``c_f ω²`` along the direction of the rotor, and the drag moment is ``κ`` times the thrust, against the
+    spin.  Gyroscopic moments are not simulated, because the robot model contains no inertia of the propellers.
 
     Raises:
-        SpecError: The limits are wrong.
+        SpecError: ``speed_min`` is not below ``speed_max``.
     """
 
     def __init__(self, propulsion: PropulsionSpec, timestep: float) -> None:
@@ -32,24 +32,24 @@ class Rotors:
         self._up, self._down = -timestep / propulsion.time_constant_up, -timestep / propulsion.time_constant_down
         self._coefficient = propulsion.thrust_coefficient
         self.speeds: Array = np.full(len(propulsion.rotors), self._lowest)
-        # Change of a speed in 1, 2, … steps over its difference from the command, up and down, by number of steps.
+        # Number of steps n → ``exp(−k Δt/τ) − 1`` for k = 1 … n, with τ up and with τ down, both of shape (n, 1).
         self._changes: dict[int, tuple[Array, Array]] = {}
 
     def reset(self, speeds: ArrayLike) -> None:
-        """Set the speeds, cut to the limits.  They must be finite."""
+        """Set the speeds, shape (rotors,), after clipping to the limits.  The speeds must be finite."""
         speeds = np.asarray(speeds, dtype=float)
         if speeds.shape != self.speeds.shape or not np.isfinite(speeds).all():
             raise InputError("no speeds of the rotors", where="reset", hint=f"give {self.speeds.size} finite numbers")
         self.speeds = self.within(speeds)
 
     def within(self, command: Array) -> Array:
-        """Return a command cut to the limits."""
+        """Return a command clipped to the limits."""
         return np.asarray(np.minimum(np.maximum(command, self._lowest), self._highest))
 
     def steps(self, command: Array, count: int) -> Array:
-        """Take time steps under one command within the limits.  Return the speeds, shape (count, rotors)."""
+        """Take ``count`` time steps under a command within the limits.  Return the speeds, shape (count, rotors)."""
         difference = command - self.speeds
-        # A speed never passes its command, so the time constant does not change between the steps.
+        # A speed never overshoots its command, so the same time constant applies to all steps.
         speeds = self.speeds - np.where(difference > 0, *self._changes_in(count)) * difference
         self.speeds = speeds[-1]
         return np.asarray(speeds)
@@ -61,23 +61,24 @@ class Rotors:
         return self._changes[count]
 
     def in_c(self, count: int) -> dict[str, Any]:
-        """Return the members of ``c/world_ticks.c`` for the rotors and a number of steps in a tick."""
+        """Return the values of the rotors for the struct in ``c/world_ticks.c``; a tick has ``count`` steps."""
         up, down = self._changes_in(count)
         return {"rotors": self.speeds.size, "speeds": self.speeds, "phases": 0 * self.speeds, "up": up, "down": down,
                 "lowest": self._lowest, "highest": self._highest, "thrust": self._coefficient}  # fmt: skip
 
     def thrusts(self, speeds: Array) -> Array:
-        """Return thrusts ``c_f ω²``, N, in the shape of the speeds."""
+        """Return the thrusts ``c_f ω²``, N, an array of the same shape as the speeds."""
         return np.asarray(self._coefficient * speeds**2)
 
 
 class Vibration:
     """Vibration of unbalanced propellers in the measured twist of the base.  The body itself does not vibrate.
 
-    Propeller i at ``p_i`` with unbalance U (kg·m) turns with ω_i about ``d_i`` and pulls with ``U(2πω_i)² e_i``.  In
-    its disc, ``e_i = cos φ_i x_i + s_i sin φ_i y_i`` turns with its spin ``s_i`` and ``φ̇_i = 2πω_i``.  The integral
-    over time, with the joints held, is the twist ``Σ I⁻¹ [f_i; p_i × f_i]``.  The momentum is
-    ``f_i = 2πω_i U (sin φ_i x_i − s_i cos φ_i y_i)``, and I (6 × 6) is the inertia of the robot at the base.
+    Propeller i at ``p_i`` with unbalance U (kg·m) turns with the speed ω_i about ``d_i``.  Its centrifugal force is
+    ``U(2πω_i)² e_i``.  The unit vector ``e_i = cos φ_i x_i + s_i sin φ_i y_i`` turns in the plane of the propeller,
+    with the spin ``s_i`` and ``φ̇_i = 2πω_i``.  The time integral of the force is the momentum
+    ``f_i = 2πω_i U (sin φ_i x_i − s_i cos φ_i y_i)``.  With fixed joints, the resulting twist is
+    ``Σ I⁻¹ [f_i; p_i × f_i]``, where I (6 × 6) is the inertia of the robot at the base.
     """
 
     def __init__(self, model: pin.Model, propulsion: PropulsionSpec, unbalance: float) -> None:
@@ -95,22 +96,22 @@ class Vibration:
         self.phases: Array = np.zeros(len(propulsion.rotors))
 
     def reset(self, q: Array, phases: Array) -> None:
-        """Set the inertia of a configuration, shape (nq,), and the angles of the propellers, rad, shape (rotors,)."""
+        """Set the inertia at ``q``, shape (nq,), and the angles of the propellers, rad, shape (rotors,)."""
         M = np.triu(pin.crba(self._model, self._data, q)[:6, :6])
         self._inverse = np.linalg.inv(M + np.triu(M, 1).T)
         self.phases = np.array(phases)
 
     def steps(self, speeds: Array, timestep: float) -> Array:
-        """Turn the propellers for some time steps.  Speeds and returned angles have the shape (count, rotors)."""
+        """Turn the propellers with ``speeds``, one row per time step.  Return their angles, shape (count, rotors)."""
         phases = self.phases + 2 * np.pi * timestep * speeds.cumsum(axis=0)
         self.phases = phases[-1]
         return np.asarray(phases)
 
     def in_c(self) -> dict[str, Any]:
-        """Return the members of ``c/world_ticks.c`` for the vibration."""
+        """Return the values of the vibration for the struct in ``c/world_ticks.c``."""
         return {"vibrates": 1, "phases": self.phases, "along": self._x, "across": self._y, "inverse": self._inverse}
 
     def twist(self, speeds: Array, phases: Array) -> Array:
-        """Return the error of the measured base twist, base axes, shape (6,)."""
+        """Return the error of the measured base twist in base axes, shape (6,)."""
         rates = 2 * np.pi * speeds
         return np.asarray(self._inverse @ (self._x @ (rates * np.sin(phases)) + self._y @ (rates * np.cos(phases))))

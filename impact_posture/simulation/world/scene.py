@@ -29,9 +29,9 @@ class Surface(ContactLaw):
 
     Attributes:
         name: Name of the surface.
-        normal: Direction out of the surface, towards the robot, world, any length.
-        point: Point on the surface, world, m.  ``None`` places the surface by ``gap``.
-        gap: Distance from the nearest shape of the robot in the start posture, m.
+        normal: Direction out of the surface towards the robot, in world axes, of any length.
+        point: Point on the surface, world, m.  If ``None``, ``gap`` determines where the surface is.
+        gap: Distance of the surface from the nearest shape of the robot in the start posture, m.
     """
 
     name: str
@@ -46,12 +46,13 @@ class Shape(StrictTable):
     """Massless shape on the robot that can touch surfaces.
 
     Attributes:
-        frame: Frame that carries the shape, and name of the shape.
-        size: Radius, or three half extents, m.
-        kind: ``sphere`` or ``box`` (along the axes of the frame).
-        offset: Contact point from the origin of the frame, in the frame, m.
-        center: Center of the shape, in the frame, m.  By default, ``offset`` is the point of a sphere, or the middle
-            of the face of a box, that is nearest to the first surface in the start posture.
+        frame: Frame to which the shape is fixed.  The shape has the same name.
+        size: Radius of a sphere, or three half extents of a box, m.
+        kind: ``sphere``, or ``box`` with its edges along the axes of the frame.
+        offset: Contact point in the coordinates of the frame, m.
+        center: Center of the shape in the coordinates of the frame, m.  By default, ``offset`` determines the center:
+            In the start posture, ``offset`` is the point of the sphere that is nearest to the first surface, or the
+            middle of the nearest face of the box.
     """
 
     frame: str
@@ -61,7 +62,7 @@ class Shape(StrictTable):
     center: FiniteVector | None = None
 
     def __post_init__(self) -> None:
-        """Refuse a size that does not fit the kind of shape."""
+        """Check that ``size`` has one number for a sphere and three for a box."""
         count, words = (1, "a radius") if self.kind == "sphere" else (3, "three half extents")
         if len(self.size) != count:
             what, hint = f"size {list(self.size)} is not {words}", f"give {words} above zero (m)"
@@ -71,13 +72,13 @@ class Shape(StrictTable):
 @checked
 @dataclass(frozen=True)
 class Physics(StrictTable):
-    """Time step, gravity, and the stops of the joints.
+    """Time step, gravity, and the contact law of the joint stops.
 
     Attributes:
-        timestep: Time step, s, at least a picosecond.
-        gravity: Gravity, world, m/s².  ``None`` takes the gravity of the robot model.
+        timestep: Time step of the physics, s, at least a picosecond.
+        gravity: Gravity, world, m/s²; ``None`` for the gravity of the robot model.
         stop_solref: ``solref`` of the joint stops, as in :class:`ContactLaw`.
-        stop_solimp: ``solimp`` of the joint stops.
+        stop_solimp: ``solimp`` of the joint stops, as in :class:`ContactLaw`.
     """
 
     timestep: Annotated[float, between(1e-12, 1e100, "s")] = 2.5e-4
@@ -86,7 +87,7 @@ class Physics(StrictTable):
     stop_solimp: FiniteVector = (0.95, 0.99, 0.001)
 
     def __post_init__(self) -> None:
-        """Refuse stops that MuJoCo would silently change."""
+        """Check that MuJoCo would not silently change the contact law of the stops."""
         ContactLaw(solref=self.stop_solref, solimp=self.stop_solimp)
 
 
@@ -95,22 +96,22 @@ class Physics(StrictTable):
 class Sensors(StrictTable):
     """Errors of the measured state.  By default, all sensors are perfect.
 
-    The noise is white and normal.  Its numbers are standard deviations.
+    The noise is white and normally distributed.  Units in parentheses are for prismatic joints.
 
     Attributes:
-        base_position: m, each axis.
-        base_angle: rad, each axis.
-        base_velocity: m/s, each axis.
-        base_rate: rad/s, each axis (gyroscope).
-        joint_angle: rad (m).
-        joint_resolution: Step of the encoders, rad (m), 0 for none.
-        joint_rate: rad/s (m/s).
+        base_position: Standard deviation of the base position, m, the same for each axis.
+        base_angle: Standard deviation of the base orientation, rad, the same for each axis.
+        base_velocity: Standard deviation of the linear base velocity, m/s, the same for each axis.
+        base_rate: Standard deviation of the angular base velocity (gyroscope), rad/s, the same for each axis.
+        joint_angle: Standard deviation of the joint positions, rad (m).
+        joint_resolution: Resolution of the joint encoders, rad (m); 0 for encoders without rounding.
+        joint_rate: Standard deviation of the joint velocities, rad/s (m/s).
         unbalance: Mass times eccentricity of each propeller, kg·m.  The measured twist of the base vibrates at the
             frequency of each propeller.  Rotor speeds must be in Hz.
-        force_frame: Shape whose contact force is measured, or ``None`` for no force sensor.
-        force: N, each axis.
+        force_frame: Shape whose contact force is measured; ``None`` if the robot has no force sensor.
+        force: Standard deviation of the measured force, N, the same for each axis.
         force_cutoff: Cutoff frequency of the low-pass filter of the force, Hz.
-        delay: Age of a reading, s, up to an hour, rounded to physics steps.
+        delay: Age of a reading, s, at most an hour, rounded to a whole number of physics steps.
     """
 
     base_position: NonNegative = 0.0
@@ -132,7 +133,7 @@ class Sensors(StrictTable):
 class Scene(StrictTable):
     """Surroundings of a robot.
 
-    Every shape can touch every surface.  Other contacts do not exist.
+    Every shape can touch every surface.  Apart from contacts with a thrown ball, no other contacts are simulated.
     """
 
     surfaces: tuple[Surface, ...] = ()
@@ -142,11 +143,11 @@ class Scene(StrictTable):
 
     @property
     def laws(self) -> tuple[tuple[str, tuple[float, float]], ...]:
-        """Name and ``solref`` of all contact laws."""
+        """Pairs (name, ``solref``) of the contact laws of the joint stops and of all surfaces."""
         return (("stops", self.physics.stop_solref), *((s.name, s.solref) for s in self.surfaces))
 
     def __post_init__(self) -> None:
-        """Refuse repeated names, contact laws too fast for the time step, and an unknown force sensor."""
+        """Check unique names, contact laws that suit the time step, and the shape of the force sensor."""
         for words, names in (
             ("surfaces are called", [s.name for s in self.surfaces]),
             ("shapes are at", [s.frame for s in self.shapes]),
@@ -156,8 +157,8 @@ class Scene(StrictTable):
                 raise InputError(f"two {words} '{twice[0]}'", where="scene", hint="have one of each")
         step = self.physics.timestep
         for name, (a, b) in self.laws:
-            # MuJoCo silently applies the first two rules (refsafe).  A spring with 1/√k below the time step returns
-            # more energy than it stores (measured, docs/generated/restitution.md).
+            # MuJoCo silently enforces the first two of these limits (refsafe).  A spring with 1/√k below the time
+            # step returns more energy than it stores (measured, docs/generated/restitution.md).
             slow = (("the time constant", a, 2), ("its product with the damping ratio", a * b, 1))
             for words, value, least in slow if a > 0 else (("1/√k", (-a) ** -0.5, 1),):
                 if value < least * step * (1 - 1e-9):

@@ -1,4 +1,4 @@
-"""Readings of imperfect sensors."""
+"""Sensor readings with noise, encoder resolution and a filtered force."""
 
 from __future__ import annotations
 
@@ -15,7 +15,7 @@ from impact_posture.robot.robot import Robot
 from impact_posture.simulation.world.scene import Sensors
 from impact_posture.system.arrays import Array
 
-# Readings whose noise is drawn at once.
+# Number of readings whose noise is drawn in one call.
 _DRAWS = 64
 
 
@@ -26,8 +26,8 @@ class Reading(NamedTuple):
         t: Time of the reading, s.  The measured state may be older (``Sensors.delay``).
         q: Configuration, shape (nq,).
         v: ν, shape (nv,).
-        force: Filtered force of the surfaces on the shape of the sensor, world, N, shape (3,).  ``None`` without a
-            force sensor.
+        force: Filtered force of the surfaces on the shape with the force sensor, world, N, shape (3,); ``None`` if
+            there is no force sensor.
     """
 
     t: float
@@ -40,24 +40,27 @@ NO_FORCE = [0.0, 0.0, 0.0]
 
 
 class ForceFilter:
-    """Low-pass filter of a ``force`` (N, three numbers).  ``turns`` is the cutoff frequency times the time step."""
+    """First-order low-pass filter of a force.  ``turns`` is the cutoff frequency multiplied by the time step.
+
+    ``force`` is the filtered force, N, three numbers.
+    """
 
     def __init__(self, turns: float) -> None:
         self._share, self.force = -math.expm1(-2 * math.pi * turns), NO_FORCE
 
     def in_c(self) -> dict[str, Any]:
-        """Return the members of ``c/world_ticks.c`` for the filter."""
+        """Return the values of the filter for the struct in ``c/world_ticks.c``."""
         return {"share": self._share, "filtered": self.force}
 
     def feel(self, force: list[float]) -> None:
-        """Filter the force of a step."""
+        """Update the filtered force with the force of one step, N."""
         if force is not NO_FORCE or any(self.force):
             self.force = [old + self._share * (new - old) for old, new in zip(self.force, force, strict=True)]
 
 
 @dataclass(eq=False, slots=True)
 class Sample:
-    """True state after a step, with speeds and angles of the propellers and the filtered force."""
+    """True state after a step, with the propellers' speeds and angles and the filtered force."""
 
     layout: MjcfLayout
     qpos: Array
@@ -69,14 +72,14 @@ class Sample:
 
     @property
     def state(self) -> tuple[Array, Array]:
-        """``(q, ν)`` of Pinocchio, which callers must copy before a change."""
+        """``(q, ν)`` in the convention of Pinocchio.  Callers must copy the arrays before they change them."""
         if self._state is None:
             self._state = self.layout.state(self.qpos, self.qvel)
         return self._state
 
 
 class SensorNoise:
-    """White noise in the tangent space, and rounding to the steps of the encoders."""
+    """White noise on the state, in the tangent space, and rounding of joint angles to the encoder resolution."""
 
     def __init__(self, robot: Robot, sensors: Sensors) -> None:
         self._model, self._sensors = robot.model, sensors
@@ -84,32 +87,32 @@ class SensorNoise:
         if robot.floating:
             angles[:6] = [sensors.base_position] * 3 + [sensors.base_angle] * 3
             rates[:6] = [sensors.base_velocity] * 3 + [sensors.base_rate] * 3
-        # A sensor without noise draws no numbers.
+        # For a sensor without noise, no random numbers are drawn.
         force = np.full(0 if sensors.force_frame is None else 3, sensors.force)
         parts = [scale if scale.any() else scale[:0] for scale in (angles, rates, force)]
         self._scales = np.concatenate(parts)
         self._ends = np.cumsum([part.size for part in parts]).tolist()
-        # Only joints with one number have an encoder.
+        # Only joints with a single position value have an encoder.
         slots = Chart(robot.model).slots
         self._counted = np.array([s.q.start for s in slots if s.kind.family in ("revolute", "prismatic")], dtype=int)
         self.reset(np.random.default_rng(0))
 
     def reset(self, generator: np.random.Generator) -> None:
-        """Draw all noise from a generator from now on.  Nothing else may use the generator."""
+        """Use ``generator`` for all noise from now on.  Nothing else may draw from it."""
         self._generator, self._drawn = generator, iter(np.zeros((0, 0)))
 
     def draw(self, n: int) -> Array:
-        """Return the noise of the next n readings, equal to n single draws, shape (n, numbers)."""
+        """Return the noise of the next n readings, shape (n, numbers), the same as from n calls with one reading."""
         return np.asarray(self._scales * self._generator.standard_normal((n, self._ends[-1])))
 
     def in_c(self) -> dict[str, Any]:
-        """Return the members of ``c/world_ticks.c`` for the sensors."""
+        """Return the values of the sensors for the struct in ``c/world_ticks.c``."""
         first, second, third = self._ends
         return {"noises": third, "noisy_q": int(first > 0), "noisy_v": int(second > first),
                 "noisy_force": int(third > second), "resolution": self._sensors.joint_resolution}  # fmt: skip
 
     def read(self, t: float, q: Array, v: Array, force: Array | None) -> Reading:
-        """Return the true state with noise.  The arguments stay unchanged."""
+        """Return the reading for a true state, with noise.  The arguments are not modified."""
         sensors, (first, second, third) = self._sensors, self._ends
         drawn = next(self._drawn, None)
         if drawn is None:

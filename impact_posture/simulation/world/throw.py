@@ -1,4 +1,4 @@
-"""Ball that is thrown at a robot: the ball in MuJoCo, and its impact in the rigid model."""
+"""Ball that is thrown at a robot: the ball in MuJoCo, and its impact in the rigid-body model."""
 
 from __future__ import annotations
 
@@ -16,28 +16,28 @@ from impact_posture.simulation.world.contact_law import ContactLaw
 from impact_posture.system.arrays import Array
 from impact_posture.system.escape import xml_name
 
-# Time from the launch to the touch of a shape at rest, s.  In this short time, gravity bends the flight by less than
-# a millimeter.
+# Time from the launch until the ball touches a shape at rest, s.  In this short time, gravity deflects the ball by
+# less than a millimeter.
 FLIGHT = 0.01
 # Name of the body and of the geom of the ball.
 BALL = xml_name("thrown ball")
-# Position of the ball before the throw, m.  It falls there, far away from the robot.
+# Position of the ball before the throw, m.  The ball falls freely from there, far away from the robot.
 _AWAY = (0.0, 0.0, -1e3)
-# Tangential mobility of the surface of a solid sphere, times its mass: 1 + mr²/I with I = ⅖ mr².
+# Tangential mobility at the surface of a solid sphere, multiplied by its mass: 1 + mr²/I with I = ⅖ mr².
 _SPIN = 3.5
 
 
 @checked
 @dataclass(frozen=True, kw_only=True)
 class Settling(StrictTable):
-    """Time in which a robot comes to rest before a push or throw.
+    """Conditions for the start of a push or throw: the robot must have come to rest.
 
     Attributes:
-        signs: Signs of the direction, one run each.
-        settle: Least time before the impact, s.
-        quiet: ``‖ν‖`` below which the impact may come (mixes m/s and rad/s, as the metric of the paper does).
-        still: Time for which ``‖ν‖`` must have been below ``quiet``, s.
-        patience: Time after ``settle`` when the impact comes although the robot still moves, s.
+        signs: Signs of the direction; each sign is simulated in its own run.
+        settle: Minimum time before the push or throw, s.
+        quiet: The robot is at rest if ``‖ν‖`` is below this value (mixes m/s and rad/s, like the paper's metric).
+        still: Time for which ``‖ν‖`` must stay below ``quiet`` before the push or throw, s.
+        patience: Time after ``settle`` at which the push or throw starts even if the robot still moves, s.
         after: Duration of the run after the push or throw, s.
     """
 
@@ -54,16 +54,16 @@ class Settling(StrictTable):
 class Throw(ContactLaw, Settling):
     """Throw of a solid ball at a shape of a robot at rest.
 
-    The ball starts :data:`FLIGHT` before the touch.  It flies straight at the center of the shape, which must be a
-    sphere.  A frictionless impulse then passes through the center for every orientation of the shape.
+    The ball starts :data:`FLIGHT` before it touches the shape.  It flies straight towards the center of the shape,
+    which must be a sphere.  The frictionless impulse then passes through the center for any orientation of the shape.
 
     Attributes:
-        frame: Frame of the shape that is hit.
+        frame: Frame of the shape at which the ball is thrown.
         mass: Mass of the ball, kg.
         radius: Radius of the ball, m.
         speed: Speed of the ball, m/s.
-        direction: Direction of flight for sign 1, world, any length.
-        window: Length of the impact window from the first touch on, s.
+        direction: Direction of flight for sign 1, in world axes, of any length.
+        window: Duration of the impact window, which starts at the first touch, s.
     """
 
     frame: str
@@ -75,12 +75,13 @@ class Throw(ContactLaw, Settling):
 
 
 def thrown_jumps(oracle: ImpactOracle, q: Array, throw: Throw, speed: float) -> tuple[float, float, float]:
-    """Return the velocity jumps ``‖Δν‖`` of the robot: without friction, sticking, and with the friction of the ball.
+    """Return the robot's velocity jumps ``‖Δν‖`` without friction, for a sticking ball, and with the ball's friction.
 
-    The contact has the mobility ``B = J M⁻¹Jᵀ`` of the robot plus ``D`` of the ball, which is ``1/m`` along the
-    normal and ``3.5/m`` across it.  Without rebound, the impulse is ``v n/(nᵀ(B + D)n)`` without friction and
-    ``v (B + D)⁻¹n`` if the ball sticks.  A sliding ball is assumed to slide against its sticking impulse.  ``v`` is
-    the approach ``speed``, m/s, and ``n`` the normal of the oracle, which is the direction of flight.
+    The mobility at the contact is ``B + D``: ``B = J M⁻¹Jᵀ`` for the robot, and ``D`` for the ball, which is ``1/m``
+    along the normal and ``3.5/m`` in the tangent plane.  Without rebound, the impulse is ``v n/(nᵀ(B + D)n)`` without
+    friction and ``v (B + D)⁻¹n`` if the ball sticks.  If the ball slides, its friction force is assumed to have the
+    tangential direction of the sticking impulse.  ``v`` is the approach ``speed``, m/s.  ``n`` is the normal of the
+    oracle, which is the direction of flight.
     """
     quantities = oracle.quantities(q)
     n, jump_per_impulse = quantities.normal, oracle.solve(oracle.J.T)
@@ -98,7 +99,7 @@ def thrown_jumps(oracle: ImpactOracle, q: Array, throw: Throw, speed: float) -> 
 
 
 def add_ball(mjcf: Mjcf, throw: Throw) -> None:
-    """Add a solid ball that falls freely, as the last body that moves."""
+    """Add a solid, freely moving ball to the model, after all other moving bodies."""
     moment = 0.4 * throw.mass * throw.radius**2
     inertia = {"mass": throw.mass, "ipos": np.zeros(3), "inertia": np.full(3, moment), "explicitinertial": True}
     body = mjcf.spec.worldbody.add_body(name=BALL, pos=_AWAY, **inertia)
@@ -108,7 +109,7 @@ def add_ball(mjcf: Mjcf, throw: Throw) -> None:
 
 
 class Ball:
-    """Ball of a compiled model."""
+    """Ball in a compiled MuJoCo model."""
 
     def __init__(self, model: Any, throw: Throw) -> None:
         joint = int(model.body(BALL).jntadr[0])
@@ -119,7 +120,7 @@ class Ball:
         self._reach = (throw.radius + float(model.geom_size[self._target, 0]) + FLIGHT * throw.speed) * direction
 
     def throw(self, data: Any, sign: int) -> None:
-        """Place the ball so that it touches a shape at rest after :data:`FLIGHT`."""
+        """Place the ball and set its velocity, so that it touches a shape at rest after :data:`FLIGHT`."""
         start = data.geom_xpos[self._target] - sign * self._reach
         data.qpos[self._position : self._position + 7] = [*start, 1.0, 0.0, 0.0, 0.0]
         data.qvel[self._velocity : self._velocity + 6] = [*(sign * self._velocity_0), 0.0, 0.0, 0.0]

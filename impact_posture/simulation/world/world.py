@@ -43,10 +43,10 @@ class World:
     Call :meth:`reset` first.  All coordinates are in the convention of Pinocchio.
 
     Attributes:
-        built: MuJoCo model and places of the surfaces.
+        built: MuJoCo model and positions of the surfaces.
         timestep: Time step of the physics, s.
-        limits: Limits of the commands.
-        stops: Joints with position limits.
+        limits: Limits of rotor speeds and joint torques.
+        stops: Position limits of the joints.
     """
 
     def __init__(self, robot: Robot, scene: Scene, built: BuiltScene) -> None:
@@ -78,13 +78,14 @@ class World:
     def reset(
         self, q: ArrayLike, v: ArrayLike | None = None, seed: int = 0, *, rotor_speed: ArrayLike | None = None
     ) -> None:
-        """Begin again.
+        """Reset the simulation to a state at time zero.
 
         Args:
             q: Configuration, shape (nq,).
             v: ν, shape (nv,).  Zero by default.
             seed: Seed of all noise.
-            rotor_speed: Speeds of the propellers, shape (rotors,).  The default hovers at ``q``.
+            rotor_speed: Speeds of the propellers, shape (rotors,).  By default, the speeds that make the robot hover
+                at ``q``.
 
         Raises:
             PostureError: The configuration or the velocity does not fit the robot.
@@ -128,14 +129,15 @@ class World:
 
         Raises:
             FrameNotFound: The robot has no such frame.
-            InputError: The force is not finite, or the duration is shorter than a time step.
+            InputError: The force is not finite, the duration is not finite, or the duration is shorter than a time
+                step.
         """
         point = point_on(self.robot, push.frame, push.offset)
         body = int(self._model.body(self.built.mjcf.bodies[point.joint]).id)
         self._pushes.begin(push, body, point.position, self._steps)
 
     def throw(self, sign: int = 1) -> None:
-        """Throw the ball of the scenario now.
+        """Throw the ball now, along its direction (sign 1) or against its direction (sign −1).
 
         Raises:
             InputError: The scenario has no ball.
@@ -149,7 +151,7 @@ class World:
         """Take ``count`` physics steps under one command, which is clipped to the limits.
 
         Raises:
-            InputError: There was no reset, or the command does not fit or is not finite.
+            InputError: :meth:`reset` was not called, or the command has a wrong size or is not finite.
             SimulationDiverged: The state diverged.
         """
         self._check_ready()
@@ -160,17 +162,17 @@ class World:
         with unwarned():
             self._advance(speed, count)
         state = self._data.qpos, self._data.qvel
-        # Compute the largest number only if the sum of squares is large.
+        # If the sum of squares is below the bound, so is every number.  Only otherwise, check the numbers one by one.
         usual = state[0].dot(state[0]) + state[1].dot(state[1]) < RUNAWAY**2
         if not usual and not all(np.abs(part).max() < RUNAWAY for part in state):
             raise SimulationDiverged(self.time, where=self.robot.name)
 
     def _advance(self, command: Array, count: int) -> None:
-        """Take physics steps under rotor speeds within the limits."""
+        """Take ``count`` physics steps; ``command`` contains rotor speeds that are within the limits."""
         model, data, first, second = self._model, self._data, self._mujoco.mj_step1, self._mujoco.mj_step2
         rotors, vibration, speeds, phases = self._rotors, self._vibration, np.zeros((count, 0)), np.zeros((count, 0))
         if rotors is not None:
-            # The robot has no influence on the propellers, so all their steps are computed at once.
+            # The speeds of the propellers do not depend on the robot, so all their steps are computed at once.
             speeds = rotors.steps(command, count)
             thrusts = rotors.thrusts(speeds)
             phases = phases if vibration is None else vibration.steps(speeds, self.timestep)
@@ -187,7 +189,8 @@ class World:
                 log.step(data, self._steps)
             if self._felt is not None:
                 self._filter.feel(log.force(self._felt) if data.ncon else NO_FORCE)
-            # Positions, contacts and velocities now belong to the new state, forces to the step before it.
+            # After this call, MuJoCo stores positions, velocities and contacts of the new state, but the contact
+            # forces of the last step.
             first(model, data)
             if delayed or k == count - 1:
                 self._past.append(self._sample(speeds[k], phases[k]))
@@ -208,17 +211,17 @@ class World:
         return self._noise.read(self.time, q, v, None if self._felt is None else np.array(sample.force))
 
     def mark(self) -> None:
-        """Mark the present state for the next :meth:`trace`."""
+        """Record the present state, so that the next :meth:`trace` returns it."""
         self._check_ready()
         speeds = _NOTHING if self._rotors is None else self._rotors.speeds
         self._marks.append((self.time, self._past[-1], self._torques, speeds))
         self._log.mark(self._data, self._steps)
 
     def trace(self) -> Trace:
-        """Return the true states at all marks, and clear the marks.
+        """Return the true states recorded by :meth:`mark`, and clear the records.
 
         Raises:
-            InputError: There are no marks.
+            InputError: :meth:`mark` was not called since the last trace.
         """
         if not self._marks:
             raise InputError("has no marks", where="world", hint="call mark() first")
@@ -230,7 +233,7 @@ class World:
         return Trace._make([*parts, stopped, *self._log.look()])
 
     def truth(self) -> Truth:
-        """Return the true state, and clear all marks, peak forces and first touches."""
+        """Return the true state, and clear all marks, peak forces and times of first touches."""
         self.mark()
         t, q, v, speeds, torques, stopped, *contacts = (column[-1] for column in self.trace())
         shapes = tuple(
@@ -242,10 +245,10 @@ class World:
         return Truth(float(t), q, v, speeds, thrusts, torques, shapes, stops)
 
     def in_c(self, count: int) -> dict[str, Any] | None:
-        """Return the members of ``c/world_ticks.c`` for this world and a number of steps in a tick.
+        """Return the values of this world for the struct in ``c/world_ticks.c``; a tick has ``count`` physics steps.
 
-        ``None`` means that C cannot simulate this world: readings are delayed, or a joint is neither a floating base
-        nor a hinge nor a slide.
+        Return ``None`` if C cannot simulate this world, because the readings are delayed, or because a joint is not a
+        floating base, a hinge or a slide.
         """
         self._check_ready()
         places, sample, floating = self._layout.places, self._past[-1], self.robot.floating
@@ -264,7 +267,7 @@ class World:
         return {key: value for part in parts for key, value in part.items()}
 
     def next_in_c(self, n: int) -> dict[str, Any]:
-        """Return the members that change between calls: the noise of n readings, and the pushes."""
+        """Return the values for C that change between calls: the noise of n readings, and the pushes."""
         return {"noise": self._noise.draw(n), **self._pushes.in_c()}
 
     def go_to(self, steps: int) -> None:
@@ -277,12 +280,12 @@ class World:
 
 
 def build_world(robot: Robot, scene: Scene, q: ArrayLike | None = None, throw: Throw | None = None) -> World:
-    """Build the simulation of a robot in its surroundings, with a ball that can be thrown.
+    """Build the simulation of a robot in its surroundings.  With ``throw``, the world has a ball.
 
-    The gaps of surfaces refer to the posture ``q``, shape (nq,), by default the default posture of the robot.
+    The gaps of surfaces are measured at the posture ``q``, shape (nq,), by default the robot's default posture.
 
     Raises:
-        InputError: MuJoCo is not installed or refuses the model, or the scene does not fit the robot.
+        InputError: MuJoCo is not installed, MuJoCo cannot compile the model, or the scene does not match the robot.
     """
     start = robot.posture() if q is None else robot.check_posture(np.asarray(q, dtype=float), where="start posture")
     return World(robot, scene, build_scene(robot, scene, start, throw))

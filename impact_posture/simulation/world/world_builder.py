@@ -22,9 +22,9 @@ from impact_posture.simulation.world.throw import BALL, Throw, add_ball
 from impact_posture.system.arrays import Array
 from impact_posture.system.escape import xml_name
 
-# Joint families whose velocities agree in Pinocchio and MuJoCo.
+# Joint families whose velocities have the same meaning in Pinocchio and MuJoCo.
 _DRIVEN = ("revolute", "continuous", "prismatic", "translation", "spherical")
-# Midpoint and power of the rise of the share d within the width of ``solimp`` (MuJoCo defaults).
+# Last two numbers of ``solimp``: midpoint and power of the curve along which d rises (MuJoCo defaults).
 _SOLIMP_SHAPE = (0.5, 2.0)
 
 
@@ -33,11 +33,13 @@ class BuiltScene:
     """Model of a scene before MuJoCo compiles it.
 
     Attributes:
-        mjcf: The model.  Its actuators are the rotors (thrust, N), then the joints (N·m or N), in the order of ``u``.
+        mjcf: The MuJoCo model.  Its actuators have the order of ``u``: first the rotors (thrust, N), then the joints
+            (N·m or N).
         normals: Unit normal of each surface, by name.
         points: Point on each surface, world, m, by name.
-        gaps: Distance of each shape from each surface in the start posture, m, by surface and shape.
-        shape_geoms: Name of the geom of each shape, in the order of the scene.
+        gaps: Pair (surface, shape) → distance of the shape from the surface in the start posture, m.
+        shape_geoms: Name of the geom of each shape, in the order of the shapes in the scene.
+        throw: Throw of the ball; ``None`` if the scene has no ball.
     """
 
     mjcf: Mjcf
@@ -49,14 +51,16 @@ class BuiltScene:
 
 
 def build_scene(robot: Robot, scene: Scene, q: Array, throw: Throw | None = None) -> BuiltScene:
-    """Build the model of a robot in its surroundings, whose gaps and default centers refer to the posture ``q``.
+    """Build the model of a robot in its surroundings.
+
+    The gaps of surfaces and the default centers of shapes are computed at the posture ``q``.
 
     Raises:
         FrameNotFound: The frame of a shape does not exist.
         ContactError: The frame of a shape is welded to the world.
-        InputError: MuJoCo is not installed, a shape has no center and there is no surface, or a surface has no point
-            and there is no shape.
-        UnsupportedJoint: No motor can drive a joint.
+        InputError: MuJoCo is not installed.  Or a shape has no center and the scene has no surface, or a surface has
+            no point and the scene has no shape.
+        UnsupportedJoint: The robot has a joint that no MuJoCo motor can drive.
     """
     numeric = Numeric(robot.model).at(q)
     mjcf = build_mjcf(robot.model, robot.name)
@@ -133,7 +137,7 @@ def _placement(robot: Robot, numeric: Numeric, shape: Shape, normal: Array | Non
 
 
 def _point(surface: Surface, normal: Array, placed: list[tuple[Shape, pin.SE3]]) -> Array:
-    """Return the point of a surface, by default at its gap below the nearest shape."""
+    """Return the point of a surface.  By default, it is at the distance ``gap`` below the nearest shape."""
     if surface.point is not None:
         return np.array(surface.point, dtype=float)
     if not placed:
@@ -144,7 +148,7 @@ def _point(surface: Surface, normal: Array, placed: list[tuple[Shape, pin.SE3]])
 
 
 def _lowest(shape: Shape, placement: pin.SE3, normal: Array) -> Array:
-    """Return the point below the center of a shape, at the height of the lowest point of the shape along a normal."""
+    """Return the point below the center of a shape (against the normal) at the height of its lowest point."""
     reach = shape.size[0]
     if shape.kind == "box":
         reach = float(np.abs(placement.rotation.T @ normal) @ np.array(shape.size))
@@ -152,7 +156,7 @@ def _lowest(shape: Shape, placement: pin.SE3, normal: Array) -> Array:
 
 
 def _add_rotors(mjcf: Mjcf, robot: Robot) -> None:
-    """Add a motor for each rotor, whose control is the thrust and whose wrench acts on the base."""
+    """Add a MuJoCo motor for each rotor.  Its control is the thrust, and its wrench acts on the base."""
     propulsion = robot.spec.propulsion
     if propulsion is None:
         return
@@ -165,7 +169,7 @@ def _add_rotors(mjcf: Mjcf, robot: Robot) -> None:
 
 
 def _add_motors(mjcf: Mjcf, robot: Robot) -> None:
-    """Add a motor for each entry of ν behind the base."""
+    """Add a MuJoCo motor for each entry of ν after the entries of the floating base."""
     transmission = import_mujoco().mjtTrn.mjTRN_JOINT
     for slot in Chart(robot.model).slots[1 if robot.floating else 0 :]:
         if slot.kind.family not in _DRIVEN:
