@@ -1,1 +1,1 @@
-"""Benchmarks and studies; docs/reference/bench.md lists them."""
+"""Benchmarks and studies, which docs/reference/bench.md lists."""

@@ -19,7 +19,7 @@ from impact_posture.posture.program.ipopt import one_blas_thread
 
 @one_blas_thread()
 def main() -> int:
-    """Print the results of each study; with ``--write`` also renew its page of the documentation."""
+    """Print the results of each study.  With ``--write``, also write the page of the study into the documentation."""
     listed = "\n".join(f"  {study.name:13}{study.about}" for study in STUDIES.values())
     parser = argparse.ArgumentParser(
         prog="python -m docs.studies", description=f"benchmarks and studies:\n{listed}",

@@ -1,4 +1,4 @@
-"""Time of ``optimize`` until it prints its answer, and until figures and C code are written."""
+"""Time that ``optimize`` needs to print its answer, and to write figures and C code."""
 
 from __future__ import annotations
 
@@ -15,17 +15,17 @@ from typing import NamedTuple
 
 from docs.studies.core import Request, machine, table
 
-# Goals: answer and end on two idle cores with warm caches, s.
+# Goals on two idle cores with warm caches, s: time until the answer, and time until the end.
 CASES = {
     "tilthex_arm": ("tilthex_arm --normal 0 0 1", 1.2, 2.5),
     "talos, hand": ("talos --frame gripper_right_base_link --normal -1 0 0", 2.5, 5.0),
 }
-# The line that ends the answer.
+# Text in the last line of the answer.
 _ANSWER = b"starts certified in"
 
 
 class Run(NamedTuple):
-    """Times of a run, s: wall until the answer, wall and processor time until the end."""
+    """Times of a run, s: wall time until the answer, wall time until the end, processor time until the end."""
 
     answer: float
     end: float
@@ -33,7 +33,10 @@ class Run(NamedTuple):
 
 
 def lines(request: Request) -> Iterator[str]:
-    """Yield a row for each case and program; programs take turns, because other work changes the times."""
+    """Yield a row for each case and program.
+
+    Runs of the programs alternate, because other work changes the times.
+    """
     this = str(Path(sys.executable).with_name("impact-posture"))
     programs = {"this": this} | ({"other": request.against} if request.against else {})
     yield f"{machine()}; medians of {request.count} runs in a terminal, after one that warms the caches."
@@ -60,7 +63,7 @@ def _rows(request: Request, programs: dict[str, str]) -> Iterator[list[str]]:
 def timed(command: list[str]) -> Run:
     """Run a command in a new terminal, in a folder that is removed.
 
-    Bytecode is a cache like the others, so the command may write it.
+    The command may write Python bytecode, because bytecode is a cache, too.
     """
     ours, theirs = pty.openpty()
     environment = {key: value for key, value in os.environ.items() if key != "PYTHONDONTWRITEBYTECODE"}
@@ -89,7 +92,7 @@ def timed(command: list[str]) -> Run:
 
 
 def _read(terminal: int) -> bytes:
-    """Read what a terminal shows; nothing at its end, which Linux reports as an error."""
+    """Read the output of a terminal.  At the end, where Linux reports an error, return no bytes."""
     try:
         return os.read(terminal, 1 << 16)
     except OSError:

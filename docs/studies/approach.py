@@ -1,4 +1,4 @@
-"""How fast robots arrive in their optima, and the cost of arriving as fast as in the start."""
+"""Approach speed of robots in the optimum, and increase of the objective if it must be as fast as in the start."""
 
 from __future__ import annotations
 

@@ -1,4 +1,4 @@
-"""Compile sources into a shared library, which a cache keeps by a hash of command and sources."""
+"""Compile sources into a shared library.  A cache stores the library under a hash of command and sources."""
 
 from __future__ import annotations
 
@@ -15,15 +15,15 @@ from pathlib import Path
 from impact_posture.system.libraries import building, cache_folder, is_cached, load_library
 from impact_posture.system.toolchain import run_compiler
 
-# Strict C forbids fused multiply-adds unless asked; so does strict C++.
+# Strict C and strict C++ fuse multiplications and additions only with this flag.
 CONTRACT = "-ffp-contract=fast"
-# What gcc and clang mean by x86-64-v3.
+# Processor features that gcc and clang require for x86-64-v3.
 _V3 = frozenset({"avx2", "bmi1", "bmi2", "f16c", "fma", "abm", "movbe"})
 
 
 @dataclass(frozen=True)
 class Built:
-    """A loaded library, its compiler command without header folders, and processor seconds of the compiler."""
+    """Loaded library, its compiler command without header folders, and the processor time of the compiler, s."""
 
     library: ctypes.CDLL
     flags: str
@@ -37,7 +37,7 @@ class Built:
 def build(
     sources: Mapping[str, str], compiler: Sequence[str], flags: Sequence[str], headers: Sequence[Path] = ()
 ) -> Built:
-    """Compile ``name → text``.
+    """Compile sources, a mapping of file names to texts, into a library.
 
     Raises:
         CompilerError: The compiler failed.
@@ -66,13 +66,13 @@ def _compilers_time() -> float:
 
 
 def flag_sets() -> dict[str, list[str]]:
-    """Return sets of compiler flags by name; the set for AVX2 only if the processor has it."""
+    """Return sets of compiler flags by name.  A set for AVX2 is included only if the processor supports AVX2."""
     avx2 = {"-O3 AVX2": ["-O3", "-march=x86-64-v3"]} if set(processor()["flags"].split()) >= _V3 else {}
     return {"-O2": ["-O2"], **avx2, "-O3 native": ["-O3", "-march=native"]}
 
 
 def processor() -> dict[str, str]:
-    """Return name and instructions of the first processor; empty if the system does not state them."""
+    """Return the name and the features of the first processor; empty if the system does not report them."""
     file = Path("/proc/cpuinfo")
     lines = file.read_text(encoding="utf-8").splitlines() if file.is_file() else []
     entries = {key.strip(): value.strip() for key, _, value in (line.partition(":") for line in reversed(lines))}
@@ -80,6 +80,6 @@ def processor() -> dict[str, str]:
 
 
 def compiler_version(compiler: Sequence[str]) -> str:
-    """Return the first line of the version text of a compiler."""
+    """Return the first line that a compiler prints about its version."""
     done = subprocess.run([*compiler, "--version"], capture_output=True, text=True, errors="replace", check=True)
     return done.stdout.splitlines()[0]

@@ -16,12 +16,12 @@ _STRUCK = {"contact": ("FL_FOOT:0,0,1", "HR_FOOT:0,0,1"), "support": ("FR_FOOT",
 
 @dataclass(frozen=True)
 class Case:
-    """A problem as ``impact-posture optimize ROBOT --normal …`` poses it.
+    """Problem that ``impact-posture optimize ROBOT --normal …`` solves.
 
     Attributes:
-        name: In the tables.
-        robot: Known name.
-        normal: Contact normal, world; ``None`` where ``more`` has the contacts.
+        name: Name of the case in the tables.
+        robot: Name of a robot of the catalogue.
+        normal: Contact normal in the world; ``None`` if ``more`` contains the contacts.
         more: Further keys of ``problem.toml``.
     """
 
@@ -31,7 +31,10 @@ class Case:
     more: Mapping[str, object] = field(default_factory=dict)
 
     def problem(self, **more: object) -> ConstrainedProblem:
-        """Build the problem; contact frame and supports come from the robot unless ``more`` has others."""
+        """Build the problem.
+
+        The robot provides the contact frame and the supports, unless ``more`` contains others.
+        """
         values = {"robot": self.robot, "normal": self.normal, **self.more, **more}
         return prepare(make_settings(values)).problem
 
@@ -67,5 +70,5 @@ CASES = {case.name: case for case in _ALL}
 
 
 def cases(only: str, names: Iterator[str] | None = None) -> list[Case]:
-    """Return the cases with these names, or all, whose name contains ``only``."""
+    """Return the cases among ``names`` (by default all cases) whose name contains ``only``."""
     return [CASES[name] for name in (names or CASES) if only in name]

@@ -1,7 +1,7 @@
-"""The exported controller beside the Python controller, in three parts: equal answers, growth, and times of a tick.
+"""Compare the exported controller with the Python controller: equal answers, growth of memory, times of a tick.
 
-``python -m docs.studies.controller [TICKS] [equality|growth|times]`` writes a part, or all of them, into pages of
-the documentation.  Only times need a quiet machine.
+``python -m docs.studies.controller [TICKS] [equality|growth|times]`` writes one part or all parts into pages of the
+documentation.  Only the part ``times`` needs a quiet machine.
 """
 
 from __future__ import annotations
@@ -27,18 +27,18 @@ from impact_posture.tsid.controller import Controller
 from tests.support.exported_controller import KINDS, exported, formulation_of, impact_of
 
 HARNESS = Path(__file__).with_name("controller_times.c")
-# Other programs interrupt repetitions, so the shortest of some counts.
+# Number of repetitions of a tick.  Other programs interrupt some of them, so the shortest time is used.
 REPETITIONS = 7
-# Ticks that are timed, and random ticks in which the memory must not grow.
+# Number of timed ticks, and number of random ticks during which the memory must not grow.
 TIMED, RANDOM = 1000, 1_000_000
-# Frames of the impacts with which the impact-robust term is timed.
+# Contact frames of the impacts for which the impact-robust term is timed.
 IMPACTS = {"tilthex_arm": "ee", "panda": "panda_hand_tcp", "solo8": "base_link", "talos": "torso_2_link"}
 BUILDS = {"-O2": ["-O2"], "native": ["-O3", "-march=native"]}
 _HEAD = "<!-- Written by `make study-controller`; do not edit. -->"
 
 
 def quiet(name: str, ticks: int) -> tuple[list[Vector], list[float]]:
-    """Return the states of a robot that the Python controller holds, and the times of its ticks, µs."""
+    """Return the states of a robot at rest under the Python controller, and the times of the ticks, µs."""
     robot, formulation = formulation_of(name)
     controller, recorded, taken = Controller(robot, formulation), list[Vector](), list[float]()
     q, v = robot.posture(), np.zeros(robot.nv)
@@ -54,7 +54,7 @@ def quiet(name: str, ticks: int) -> tuple[list[Vector], list[float]]:
 
 
 def flowing(name: str, ticks: int) -> tuple[Path, list[Vector]]:
-    """Return the folder of a controller with a reference flow, and the states of a robot that follows the flow."""
+    """Return the folder of a controller with a reference flow, and the states of a robot under this controller."""
     objective = objective_of(name)
     folder, robot = exported(name, objective, path=()), objective.robot
     controller, recorded = CompiledController.load(folder), list[Vector]()
@@ -69,13 +69,13 @@ def flowing(name: str, ticks: int) -> tuple[Path, list[Vector]]:
 
 
 def times(folder: Path, recorded: list[Vector], flags: list[str], cold: bool) -> tuple[float, float]:
-    """Return median and 99th percentile of the ticks, each the least of its repetitions, µs."""
+    """Return median and 99th percentile of the times of ticks, µs.  Each time is the shortest of the repetitions."""
     least = _least(folder, recorded, flags, [["cold"] if cold else []])[0][:, 0]
     return float(np.median(least)), float(np.percentile(least, 99))
 
 
 def robust_over_nominal(name: str, frame: str, recorded: list[Vector]) -> list[str]:
-    """Return a row of ticks with the impact-robust term over nominal ticks, every fifth tick and every tick."""
+    """Return a row that compares nominal ticks with ticks that update the term at every tick or every fifth tick."""
     robot = formulation_of(name)[0]
     folder = exported(name, impact_of(robot, frame, (0.0, 0.0, 1.0)))
     nominal, fifth, every = _least(folder, recorded, ["-O2"], [[], ["5"], ["1"]])
@@ -86,7 +86,7 @@ def robust_over_nominal(name: str, frame: str, recorded: list[Vector]) -> list[s
 
 
 def _least(folder: Path, recorded: list[Vector], flags: list[str], variants: list[list[str]]) -> list[Vector]:
-    """Return, for each list of arguments, the least time of each tick and of its gradient, µs, shape (ticks, 2)."""
+    """Return the shortest time of each tick and of its gradient, µs, shape (ticks, 2), for each list of arguments."""
     with tempfile.TemporaryDirectory() as scratch:
         program, data = Path(scratch) / "times", Path(scratch) / "ticks.bin"
         np.array([recorded[0], *recorded]).tofile(data)
@@ -102,7 +102,7 @@ def _least(folder: Path, recorded: list[Vector], flags: list[str], variants: lis
 
 
 def equality(ticks: int) -> Iterator[str]:
-    """Yield the differences of both controllers over the same states."""
+    """Yield the differences between both controllers in the same states."""
     some, most = controller_equality.SOME, controller_equality.MOST
     yield (
         f"{ticks} ticks of each kind of states. Controls are compared relative to the largest. *Its own*: largest "
@@ -115,13 +115,13 @@ def equality(ticks: int) -> Iterator[str]:
 
 
 def growth(_: int) -> Iterator[str]:
-    """Yield the growth of memory over random ticks."""
+    """Yield a table of the growth of memory during random ticks."""
     head = ["robot", "random ticks", "growth", "statuses: solved, relaxed, infeasible, unsolved, not finite"]
     yield from table(head, controller_equality.growth(RANDOM))
 
 
 def times_of_ticks(_: int) -> Iterator[str]:
-    """Yield times of a tick in Python, in C, and by hand in C++, each row as soon as it is known."""
+    """Yield times of a tick in Python, in C, and in handwritten C++. Each row appears as soon as it is measured."""
     ratios = list[list[str]]()
     yield f"Median / p99 of {TIMED} quiet states, µs; each tick of C and C++ is the least of {REPETITIONS}."
     yield ""
@@ -156,7 +156,7 @@ PARTS = {"equality": equality, "growth": growth, "times": times_of_ticks}
 
 
 def main(ticks: int, parts: list[str]) -> None:
-    """Write parts, each into its page."""
+    """Write the results of each part into the page of this part."""
     for part in parts:
         lines = [_HEAD, "", machine("daqp"), ""]
         for line in PARTS[part](ticks):

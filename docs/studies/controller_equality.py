@@ -1,6 +1,6 @@
-"""Compare statuses and controls of the exported controller and the Python controller over the same states.
+"""Compare statuses and controls of the exported controller and the Python controller in the same states.
 
-Where they differ, an independent certificate (:mod:`tests.support.relaxation_in_c`) says which of them is right.
+If the controllers differ, an independent certificate (:mod:`tests.support.relaxation_in_c`) decides which is right.
 """
 
 from __future__ import annotations
@@ -37,23 +37,24 @@ HEAD = (
     "robot|states|solved|largest difference of u|over 1e-9|its own|relaxed|status differs (Python/C)|"
     "C: violation, optimality|Python's|held (C)|difference of q_r"
 ).split("|")
-# Largest violation of hard constraints, and largest residual of optimality, of a right answer.
+# Tolerances of a right answer: violation of hard constraints, and residual of optimality.
 HOLDS, OPTIMAL = 1e-9, 1e-7
-# One of SOME relaxed ticks is certified, and at most MOST of the solved ticks that differ.
+# Every SOME-th relaxed tick is certified.  Of the solved ticks whose controls differ, the first MOST are certified.
 SOME, MOST = 20, 500
-# Robots that tick a million times.
+# Robots whose controllers run a million ticks.
 GROWTH = ("tilthex_arm", "panda", "solo8", "talos")
 
 
 @dataclass(frozen=True)
 class States:
-    """A kind of states.
+    """Kind of states in which the controllers are compared.
 
     Attributes:
-        push: Acceleration of each joint that pushes the robot in half of the time, relative.
-        size: Size of random, unrelated states; 0 for the states of a robot that moves.
-        follows: Whether a ``term`` or a ``flow`` follows the gradient of an impact, through all phases.
-        again: Ticks after which the robot is set up again, because it may have fallen.
+        push: Acceleration of each joint by pushes during half of the time; each joint has a random factor.
+        size: Size of random, unrelated states; 0 selects the states of a moving robot.
+        follows: ``term`` or ``flow`` if this part of the controller follows the gradient of an impact, through all
+            phases.
+        again: Number of ticks after which the robot returns to its start, because the robot may have fallen.
     """
 
     push: float = 0.0
@@ -75,19 +76,20 @@ STATES = {
 
 @dataclass
 class Agreement:
-    """Ticks of one kind of states.
+    """Comparison of both controllers over the ticks of one kind of states.
 
     Attributes:
-        solved: Ticks that both solved.
-        worst: Largest relative difference of their controls.
-        differ: Solved ticks whose controls differ by more than 1e-9.
-        own: Largest relative change of Python's controls in these ticks when the last digits of the program change.
-        relaxed: Ticks that both relaxed.
-        other: Ticks with different statuses, as ``Python/C``.
-        held: Ticks in which C failed and held its command.
-        off: Largest violation and residual of optimality, of C and of Python, where answers differ or were relaxed.
-        wrong: Differences and certified relaxed ticks in which the answer of C, or of Python, is wrong.
-        reference: Largest difference of the postures that flows have reached, rad or m.
+        solved: Number of ticks that both controllers solved.
+        worst: Largest relative difference between the controls in these ticks.
+        differ: Number of solved ticks whose controls differ by more than 1e-9.
+        own: Largest relative change of the controls of Python in these ticks if the last digits of the program
+            change.
+        relaxed: Number of ticks that both controllers relaxed.
+        other: Number of ticks with different statuses, by ``Python/C``.
+        held: Number of ticks in which the controller in C failed and repeated its command.
+        off: Largest violation and residual of optimality in the certified ticks; rows: C, Python.
+        wrong: Number of certified ticks in which the answer of C, or of Python, is wrong.
+        reference: Largest difference between the postures that both flows have reached, rad or m.
     """
 
     solved: int = 0
@@ -113,12 +115,13 @@ class Agreement:
 
 
 def objective_of(name: str) -> WorstCaseObjective:
-    """Return the objective of the impact with which a robot flows in the studies."""
+    """Return the objective that the reference flow of a robot follows in the studies."""
     return next(case for case in CASES if case.robot == name).problem().objective
 
 
 def pair(name: str, follows: str) -> tuple[Controller, CompiledController]:
-    """Return a robot's controllers in Python and in C; both follow the same compiled gradient, if any."""
+    """Return a robot's controllers in Python and in C. If they follow a gradient, both use the same compiled
+    gradient."""
     objective = objective_of(name) if follows else None
     folder = exported(name, objective, "-O2", () if follows == "flow" else None)
     robot = load_robot(name) if objective is None else objective.robot
@@ -130,7 +133,7 @@ def pair(name: str, follows: str) -> tuple[Controller, CompiledController]:
 
 
 def agreement(name: str, kind: str, ticks: int) -> Agreement:
-    """Run both controllers over the same states: random states, or the states of a robot that Python controls."""
+    """Run both controllers in the same states: random states, or states of a robot under the Python controller."""
     states, tally = STATES[kind], Agreement()
     (ours, theirs), rng = pair(name, states.follows), np.random.default_rng(7)
     robot, posture, push = ours.robot, ours.formulation.posture, np.zeros(ours.robot.nv)
@@ -160,7 +163,7 @@ def agreement(name: str, kind: str, ticks: int) -> Agreement:
 
 
 def _compare(tally: Agreement, ours: Controller, a: Command, b: Command) -> None:
-    """Count a tick, and certify both answers where they differ, or in some relaxed ticks."""
+    """Count a tick.  Certify both answers if they differ, and in some relaxed ticks."""
     answered, certify = (Status.SOLVED, Status.RELAXED), a.status is not b.status
     tally.held += b.status not in answered
     if certify:
@@ -190,7 +193,7 @@ def _difference(u: Vector, other: Vector) -> float:
 
 
 def _moved(controller: Controller) -> Vector:
-    """Return the controls of the last program, each number of which is moved by a last digit."""
+    """Return the controls for the last program, after each number of the program is changed by its last digit."""
     qp, rng = controller.assembly.rank.qp, np.random.default_rng(0)
     digits = np.finfo(float).eps * rng.choice([-1.0, 1.0], size=(qp.n, qp.n))
     bounds = 1.0 + np.finfo(float).eps * rng.choice([-1.0, 1.0], size=qp.n + qp.m)
@@ -212,7 +215,7 @@ def equality(ticks: int) -> Iterator[list[str]]:
 
 
 def growth(ticks: int) -> Iterator[list[str]]:
-    """Yield what random ticks, half of them with limits that permit nearly nothing, take of each robot's memory."""
+    """Yield the growth of memory for each robot in random ticks, half of which have very tight limits."""
     for name in GROWTH:
         with tempfile.TemporaryDirectory() as scratch:
             program = abuse_program(exported(name, flags="-O2"), Path(scratch))

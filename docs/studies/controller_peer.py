@@ -1,4 +1,4 @@
-"""A tick by Pinocchio and DAQP in C++, beside the exported controller."""
+"""Tick of a controller in C++ with Pinocchio and DAQP, for comparison with the exported controller."""
 
 from __future__ import annotations
 
@@ -26,15 +26,15 @@ _PREFIX = Path(pin.__file__).parents[4]
 
 
 class Missing(Exception):
-    """A requirement of the peer that this machine lacks."""
+    """This machine lacks a requirement of the peer."""
 
 
 @contextmanager
 def peer() -> Iterator[Path]:
-    """Build the peer, which takes minutes, because Pinocchio's algorithms are compiled with it.
+    """Build the peer.  The build takes minutes, because it compiles the algorithms of Pinocchio.
 
     Raises:
-        Missing: There are no headers, no compiler, or DAQP's distribution is not in the cache.
+        Missing: Headers or a compiler are missing, or the source distribution of DAQP is not in the cache.
     """
     if not (_PREFIX / "include" / "pinocchio" / "algorithm" / "crba.hpp").is_file():
         raise Missing(f"no headers of Pinocchio in {_PREFIX.name}")
@@ -72,7 +72,7 @@ def _build(folder: Path, daqp: Path) -> Path:
 
 
 def times(program: Path, name: str, recorded: list[Vector]) -> tuple[float, float]:
-    """Return median and 99th percentile of the ticks that Python solves, each the least of its repetitions, µs."""
+    """Return median and 99th percentile of the times of ticks, µs.  Each time is the shortest of the repetitions."""
     robot, formulation = formulation_of(name)
     controller = Controller(robot, formulation)
     controller.reset(robot.posture(), np.zeros(robot.nv))

@@ -1,4 +1,4 @@
-"""Shared parts of the studies: list of studies, machine, clocks, starts, tables."""
+"""Functions that studies share: list of studies, description of the machine, timing, start postures, tables."""
 
 from __future__ import annotations
 
@@ -34,23 +34,23 @@ CRBA_CALLS = 2000
 
 @dataclass(frozen=True)
 class Study:
-    """A generator ``lines(request)`` of a module here, or another one by ``module:name``."""
+    """Study with a generator: ``lines(request)`` of a module in this folder, or another given by ``module:name``."""
 
     name: str
     source: str
     about: str
     count: int = 1
     page: bool = True
-    target: str = ""  # of make, which writes its page
+    target: str = ""  # target of make that writes the page
 
     def lines(self, request: Request) -> Iterator[str]:
-        """Yield the lines of its page or output."""
+        """Yield the lines of the page or output of the study."""
         module, _, function = self.source.partition(":")
         return getattr(import_module(f"docs.studies.{module}"), function or "lines")(request)
 
     @property
     def head(self) -> str:
-        """First line of its page."""
+        """First line of the page of the study."""
         command = f"make {self.target}" if self.target else f"python -m docs.studies {self.name} --write"
         return f"<!-- Written by `{command}`; do not edit. -->"
 
@@ -90,7 +90,7 @@ STUDIES = {
 
 @dataclass(frozen=True)
 class Request:
-    """Options of the command line for a study; ``missed`` collects the goals that it misses."""
+    """Options of the command line for a study; ``missed`` collects the goals that the study misses."""
 
     only: str = ""
     count: int = 1
@@ -113,7 +113,7 @@ def say(words: str, end: str = "\n") -> None:
 
 
 def collected(work: Callable[[int], _T], count: int, jobs: int, what: str) -> list[_T]:
-    """Return ``work(0)`` to ``work(count - 1)`` from several processes, and print progress."""
+    """Compute ``work(0)`` to ``work(count - 1)`` in several processes, print progress, and return the results."""
     results_by_index: dict[int, _T] = {}
     with fork_map(work, count, jobs) as results:
         for index, result in results:
@@ -124,7 +124,7 @@ def collected(work: Callable[[int], _T], count: int, jobs: int, what: str) -> li
 
 
 def table(head: Sequence[str], rows: Iterator[Sequence[str]] | Sequence[Sequence[str]]) -> Iterator[str]:
-    """Yield the lines of a Markdown table, each as soon as its row is known."""
+    """Yield the lines of a Markdown table.  Each line appears as soon as its row is computed."""
     yield f"| {' | '.join(head)} |"
     yield "|" + "---|" * len(head)
     yield from (f"| {' | '.join(row)} |" for row in rows)
@@ -147,7 +147,7 @@ def machine(*packages: str) -> str:
 
 @contextmanager
 def one_core() -> Iterator[None]:
-    """Keep this process on one core, where the system can."""
+    """Keep this process on one core, if the system supports this."""
     allowed = os.sched_getaffinity(0) if hasattr(os, "sched_setaffinity") else set()
     if allowed:
         os.sched_setaffinity(0, {max(allowed)})
@@ -159,7 +159,7 @@ def one_core() -> Iterator[None]:
 
 
 def median_time(call: Callable[[], object], repeats: int) -> float:
-    """Return the median processor time of a call, s, which leaves out other programs."""
+    """Return the median processor time of a call, s.  Processor time excludes other programs."""
     times = []
     for _ in range(repeats):
         began = time.thread_time()
@@ -169,12 +169,12 @@ def median_time(call: Callable[[], object], repeats: int) -> float:
 
 
 def crba_time(model: pin.Model) -> float:
-    """Return the median processor time of one Pinocchio ``crba`` from Python, s, as a unit for this machine."""
+    """Return the median processor time of a call of Pinocchio ``crba``, s, as a unit of the speed of this machine."""
     data, q = model.createData(), pin.randomConfiguration(model, -np.ones(model.nq), np.ones(model.nq))
     return median_time(lambda: pin.crba(model, data, q), CRBA_CALLS)
 
 
 def feasible_starts(problem: ConstrainedProblem, count: int, seed: int) -> list[Vector]:
-    """Return the first ``count`` feasible postures of random draws."""
+    """Draw random postures, and return the first ``count`` feasible postures."""
     starts = (feasible_start(problem, index, seed) for index in range(1, 4 * count))
     return [start for start in starts if start is not None][:count]

@@ -1,4 +1,4 @@
-"""Effect of the compliance of feet, and digits that double precision keeps, against sixty digits."""
+"""Effect of the compliance of feet, and accuracy of double precision against arithmetic with sixty digits."""
 
 from __future__ import annotations
 
@@ -22,7 +22,7 @@ from tests.support.helpers import random_configurations
 
 _CASES = ("solo8, four feet", "solo8, aside", "solo12", "bolt", "talos, two feet")
 COMPLIANCES = (1e-4, 1e-6, 1e-9)
-# At this compliance, the bias is below rounding, and the rounding of J_s has no effect.
+# Compliance that stands for rigid feet: the bias is below rounding, and rounding J_s has no effect.
 _RIGID = 1e-14
 _HEAD = "robot|n|rank of $J_s$|ε m|bound|$H$ moved|oracle: H|∇H|f|kernel: H|∇H|C: H|∇H".split("|")
 
@@ -81,7 +81,7 @@ def _row(case: Case, share: float, postures: int) -> list[str]:
 
 
 def _digits(value: object, expected: Exact, promised: object, least: float) -> tuple[float, float]:
-    """Return digits kept and digits promised, relative to the largest entry, or to ``least`` if this is larger."""
+    """Return the number of correct digits and of guaranteed digits, relative to the largest entry or ``least``."""
     scale = max(float(np.max(np.abs(np.asarray(expected, dtype=float)))), least)
     worst = float(np.max(distance(value, expected))) / scale
     return -np.log10(max(worst, 1e-16)), -np.log10(float(np.max(np.asarray(promised))) / scale)

@@ -1,4 +1,4 @@
-"""Time of exported H and ∇H: of a standing robot and the same robot free, and of a call from Python."""
+"""Time of exported H and ∇H: with and without the supports of a robot, and called from Python."""
 
 from __future__ import annotations
 
@@ -16,7 +16,7 @@ from impact_posture.codegen.export import export
 from impact_posture.codegen.impact_gradient import ImpactGradient
 from impact_posture.system.libraries import library_path
 
-# Robots that stand, with the goal for both times, µs.
+# Robots with feet on the ground, and the goal for both times, µs.
 _FEET = {"solo8, four feet": "–", "solo12": "–", "g1": "–", "talos, two feet": "2.5"}
 _LOADED = ("tilthex_arm", "solo8, four feet", "panda")
 _ROUNDS = 61
@@ -38,7 +38,8 @@ def _standing(name: str, target: str) -> Iterator[list[str]]:
 
 
 def loader(request: Request) -> Iterator[str]:
-    """Yield a row for each robot: a call through the loader, the same function called from C, and the difference."""
+    """Yield a row for each robot: time of a call through the loader, time of the same call from C, and the
+    difference."""
     yield from (machine(), "")
     rows = (_loaded(name, request.count) for name in _LOADED if request.only in name)
     yield from table(["robot", "call from Python, µs", "from C", "above"], rows)
@@ -51,7 +52,7 @@ def _loaded(name: str, passes: int) -> list[str]:
         export(objective, Path(folder), check=False)
         gradient = ImpactGradient.load(Path(folder))
         prefix = str(gradient.manifest["prefix"])
-        # The same library that the loader calls.
+        # Load the library that the loader calls.
         built = Built(ctypes.CDLL(str(library_path(Path(folder), prefix))), "", 0.0)
         kernel = Kernel(prefix, "ours", built, {"eval": built.symbol(f"{prefix}_eval")})
         pairs = list(zip(*samples.drawn, strict=True))

@@ -1,4 +1,4 @@
-"""Cost of feasibility: the optimum without demands, clear of collisions, and also held by the motors."""
+"""Effect of constraints on the optimum: no constraints, no collisions, and motors that can hold the posture."""
 
 from __future__ import annotations
 
@@ -23,13 +23,14 @@ STARTS = 16
 
 
 class Cost(NamedTuple):
-    """Searches with demands, one for each seed.
+    """Searches under constraints, one for each seed.
 
     Attributes:
         solutions: Best solution of each seed.
-        start: Median time of a start over the same time in a free search just before; the median over the seeds.
-        search: Time of the whole search, in the same way.
-        took: Time of the first search, s.
+        start: Median time of a start, divided by the median in an unconstrained search just before; median over the
+            seeds.
+        search: Time of the whole search, divided by the time of the unconstrained search; median over the seeds.
+        took: Time of the search with the first seed, s.
     """
 
     solutions: tuple[PostureSolution, ...]
@@ -39,7 +40,7 @@ class Cost(NamedTuple):
 
     @property
     def certified(self) -> str:
-        """Least number of certified ends of a seed."""
+        """Smallest number of certified solutions over the seeds."""
         return f"{min(solution.certified_starts for solution in self.solutions)}"
 
 
@@ -118,10 +119,10 @@ def _row(robot: str, name: str, request: Request, ends: list[int], left: list[in
 
 
 def _cost(asked: dict[str, object], demands: dict[str, object], seeds: Sequence[int]) -> Cost | str:
-    """Search with demands from several seeds; return the reason if one of the searches fails."""
+    """Search under constraints with several seeds; return the reason if a search fails."""
     solutions, starts, searches, times = list[PostureSolution](), list[float](), list[float](), list[float]()
     for seed in seeds:
-        # Other work on the machine changes the speed, so each ratio has a free search of its own.
+        # Other work changes the speed of the machine, so an unconstrained search is timed for each ratio.
         apart = solved(asked | {"seed": seed})[1]
         solution, took = solved(asked | demands | {"seed": seed})
         if not isinstance(solution, PostureSolution):

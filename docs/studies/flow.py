@@ -1,4 +1,5 @@
-"""Rest of the reference flow of ``robust-flow`` from random feasible starts; kinematics only."""
+"""Postures at which the reference flow of ``robust-flow`` comes to rest, from random feasible starts; kinematics
+only."""
 
 from __future__ import annotations
 
@@ -23,10 +24,10 @@ from impact_posture.robot.robot import Robot
 from impact_posture.system.processes import fork_map
 from impact_posture.tsid.flow.flow_direction import FlowOptions
 
-# Time in which a flow should rest, time after which it is stopped, and time of a finer flow, s.
+# Time within which a flow should come to rest, time at which a flow is stopped, and time of a finer flow, s.
 REST, LONGEST, FINE = 8.0, 16.0, 5.0
 FINER = FlowOptions(rho=0.0, mu=0.005, epsilon=1e-7)
-# Share of the start's H that counts: as distance from an optimum, and between basins.
+# Tolerance relative to H at the start: for the difference from an optimum, and for the difference between basins.
 CLOSE = 0.01
 CASES = (
     Case("tilthex_arm", "tilthex_arm", DOWN),
@@ -44,7 +45,7 @@ _HEAD = (
 
 
 def problem_of(case: Case) -> ConstrainedProblem:
-    """Build the offline problem with the rows of the flow except actuators and tilt."""
+    """Build the offline problem with the constraints of the flow, except the limits on actuators and tilt."""
     objective, options = case.problem().objective, FlowOptions()
     robot = objective.robot
     stands = bool(robot.spec.supports)
@@ -61,13 +62,14 @@ def problem_of(case: Case) -> ConstrainedProblem:
 
 @dataclass(frozen=True)
 class Outcome:
-    """A course beside the optimum of its basin.
+    """Course of the flow, and the optimum of its basin.
 
     Attributes:
-        course: The course.
-        optimum: ``H`` at the optimum of the basin, under the same rows.
-        q: That optimum.
-        program: Whether the offline program from the end of the flow gave it, and not a finer flow.
+        course: Course of the flow from the start.
+        optimum: ``H`` at the optimum of the basin, under the same constraints.
+        q: Posture of this optimum.
+        program: Whether the offline program, started at the end of the flow, gave this optimum; else a finer flow
+            did.
     """
 
     course: Course
@@ -87,13 +89,16 @@ class Outcome:
 
     @property
     def rise(self) -> float:
-        """Largest rise of ``H`` above its least value before, relative to ``H₀``."""
+        """Largest rise of ``H`` above its smallest earlier value, relative to ``H₀``."""
         values = self.course.values
         return float((values - np.minimum.accumulate(values)).max()) / self.start
 
 
 def lines(request: Request) -> Iterator[str]:
-    """Yield a row for each robot and seed.  Four seeds avoid tuning for one set of starts."""
+    """Yield a row for each robot and seed.
+
+    Four seeds are used so that the flow is not tuned for one set of starts.
+    """
     each = -(-request.count // len(CASES))
     yield machine("daqp")
     yield ""
@@ -131,7 +136,8 @@ def _row(case: Case, count: int, request: Request) -> list[str]:
         course = flow.course(starts[index], LONGEST, FlowOptions())
         start, end = course.values[[0, -1]]
         record, certificate = run_start(nlp, course.q, float(end))
-        # The program has no rows for actuators and tilt.  Where a start tilts more, the flow does not tilt further.
+        # The program does not limit actuators and tilt, so check both.  If a start tilts more than the limit, the
+        # flow must not tilt further.
         tilted = max(FlowOptions().tilt, _tilt(robot, course.q))
         fits = certificate.holds() and flow.share(record.q) < 1.001 and _tilt(robot, record.q) < tilted + 0.001
         away = np.abs(pin.difference(robot.model, course.q, record.q)[6 if robot.floating else 0 :]).max()
@@ -155,7 +161,7 @@ def _row(case: Case, count: int, request: Request) -> list[str]:
 
 
 def _tilt(robot: Robot, q: Vector) -> float:
-    """Return the angle between the vertical and its direction in the base at the default posture, rad."""
+    """Return the angle by which the base is tilted from its default posture, rad."""
     if robot.upright is None:
         return 0.0
     return float(np.arccos(np.clip(pin.Quaternion(q[3:7]).matrix()[2] @ robot.upright, -1.0, 1.0)))
@@ -188,7 +194,7 @@ def _cells(name: str, seed: int, outcomes: Sequence[Outcome], best: float, arriv
 
 
 def starts_of(problem: ConstrainedProblem, flow: CompiledFlow, count: int, seed: int) -> list[Vector]:
-    """Draw feasible postures whose static shares are within the limits."""
+    """Draw feasible postures whose static actuator loads are within the limits."""
     starts: list[Vector] = []
     for index in range(1, 20 * count):
         start = feasible_start(problem, index, seed)

@@ -1,4 +1,4 @@
-"""Courses of the reference flow in C: an exported controller with a small driver, without ticks."""
+"""Run the reference flow in C: an exported controller with a small driver, without ticks of the controller."""
 
 from __future__ import annotations
 
@@ -34,22 +34,23 @@ _BUILDERS = {"aerial": aerial_formulation, "arm": arm_formulation}
 
 
 def formulation_for(robot: Robot, posture: JointPosture) -> TaskFormulation:
-    """Return the formulation for the kind of robot."""
+    """Return the task formulation that is used for this kind of robot."""
     return _BUILDERS.get(robot.spec.kind, legged_formulation)(robot, posture)
 
 
 @dataclass(frozen=True)
 class Course:
-    """A flow from its start to its rest.
+    """Course of a flow from its start until it rests.
 
     Attributes:
         q: Posture at the end, shape (nq,).
         values: ``H`` at each update, shape (k,).
-        rested: Time at which it rested, s; infinite if it did not rest.
-        missed: Largest distance from contacts and tasks, m or rad.
-        share: Largest static actuator share on the way, over the allowed share, if the start was within it.
-        room: Least distance of a joint from its limit minus its margin, rad (m); the margin holds if this is ≥ 0.
-        failures: Steps in which the solver failed.
+        rested: Time at which the flow came to rest, s; infinite if it did not.
+        missed: Largest error of the contacts and tasks, m or rad.
+        share: Largest static actuator load during the flow, divided by the allowed load.
+        room: Smallest distance of a joint from its limit, minus the margin, rad or m; negative if the margin is
+            violated.
+        failures: Number of steps in which the solver failed.
     """
 
     q: Vector
@@ -62,10 +63,10 @@ class Course:
 
 
 class CompiledFlow:
-    """The reference flow of a problem, run by its controller in C.
+    """Reference flow of a problem, computed by an exported controller in C.
 
     Args:
-        problem: The problem, whose objective the flow follows.
+        problem: Problem with the objective that the flow minimizes.
         folder: New folder for the code.
     """
 
@@ -90,19 +91,19 @@ class CompiledFlow:
         self._moving = np.flatnonzero(moving & np.isfinite(self._ranges.upper - self._ranges.lower))
 
     def share(self, q: Vector) -> float:
-        """Return the static actuator share of a posture over the allowed share; infinite if the flow cannot begin."""
+        """Return the static actuator load of a posture over the allowed load; infinite if the flow cannot begin."""
         rows = self._begun(q, FlowOptions(), None)
         return np.inf if rows is None else float(rows[1])
 
     def course(self, q: Vector, longest: float, options: FlowOptions, first: Vector | None = None) -> Course:
-        """Run the flow from ``q`` for at most ``longest`` seconds; ``first`` is a posture to visit first."""
+        """Run the flow from ``q`` for at most ``longest`` seconds; the flow visits the posture ``first`` first."""
         begun = self._begun(q, options, first)
         if begun is None:
             raise MetricError("the flow cannot begin at this posture", where="course", hint="start elsewhere")
         rows = np.zeros((round(longest / UPDATE), begun.size))
         done = self._run(self._controller._context, ctypes.c_double(DT), len(rows), _pointer(rows))
         rows = np.vstack([begun, rows[:done]])
-        # An update evaluates its posture first.
+        # Each update first evaluates its posture, then moves.
         rested = done * UPDATE if done < round(longest / UPDATE) else np.inf
         share, missed = rows[:, 1].max(), rows[:, 2].max()
         room, failures = self._room(rows[:, 4:], options), int(rows[-1, 3])
@@ -119,7 +120,7 @@ class CompiledFlow:
         return None if refused else row
 
     def _room(self, q: Vector, options: FlowOptions) -> float:
-        """Return the least distance of a moving joint from its limit minus its margin."""
+        """Return the smallest distance of a moving joint from its limit, minus the margin of the joint."""
         at, ranges = q[:, self._ranges.index[self._moving]], self._ranges
         upper, lower = ranges.upper[self._moving], ranges.lower[self._moving]
         margin = np.minimum(options.joint_margin, (upper - lower) / 8)

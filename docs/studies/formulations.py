@@ -1,6 +1,6 @@
-"""Lifted and reduced form: the linear solve of the impact as equations of the program, or inside the objective.
+"""Compare the lifted form (the impact equations are constraints) with the reduced form (the objective solves them).
 
-IPOPT solves both with exact Hessians from the same starts, interpreted.
+IPOPT solves both forms with exact Hessians from the same starts, without compiled code.
 """
 
 from __future__ import annotations
@@ -48,7 +48,7 @@ def _rows(name: str, count: int) -> Iterator[list[str]]:
 
 
 def _reduced(nlp: PostureNLP) -> ca.Function:
-    """Build the program in ``x`` alone, whose objective comes from the adjoint kernel."""
+    """Build the reduced form: the only variable is ``x``, and the adjoint kernel computes the objective."""
     problem, objective, chart = nlp.problem, nlp.problem.objective, nlp.chart
     x, scale = ca.SX.sym("x", chart.nx), ca.SX.sym("scale")
     q = chart.configuration(x)

@@ -1,4 +1,4 @@
-"""Maps and bounds of the global search at small redundancy, and basin hopping beside multi-start."""
+"""Maps and bounds of the global search for small redundancy, and basin hopping compared with multi-start."""
 
 from __future__ import annotations
 
@@ -17,15 +17,15 @@ from impact_posture.posture.search.global_search import search_globally
 from impact_posture.posture.search.multistart import PostureSolution, solve
 
 _STARTS = 16
-# A run missed the best posture if it ended more than this share above it.
+# A run missed the best posture if its objective is more than this share above the best objective.
 _MISSED = 1e-3
-# The project asks for a gap of 1 % within a minute on these robots.
+# Robots for which the goal is a gap of 1 % within a minute.
 _GOALS = ("tilthex_arm", "panda", "ur5", "xarm7")
 _MAPPED = [
     Case(f"{robot}, {name}", robot, normal)
     for robot in (*_GOALS, "z1", "kinova", "tiago", "borinot")
     for name, normal in (("down", DOWN), ("ahead", AHEAD))
-    # An impact ahead leaves borinot three degrees of freedom.
+    # Leave out borinot with an impact ahead, because it then has three degrees of freedom.
     if (robot, name) != ("borinot", "ahead")
 ]
 _HOPPED = [
@@ -43,13 +43,13 @@ _HOP = (
 
 
 def maps(request: Request) -> Iterator[str]:
-    """Yield the page of maps, a row for each case."""
+    """Yield the page of maps.  Its table has a row for each case."""
     yield from _machine(request)
     yield from table(_MAP.split("|"), _maps(request))
 
 
 def hops(request: Request) -> Iterator[str]:
-    """Yield the page of searches at equal time, a row for each case."""
+    """Yield the page of searches with equal time.  Its table has a row for each case."""
     yield from _machine(request)
     yield from table(_HOP.split("|"), _searches(request))
 
@@ -119,20 +119,20 @@ def _run(problem: ConstrainedProblem, seed: int, starts: int = _STARTS, finish_a
 
 
 def _timed(search: _Search, arguments: tuple[ConstrainedProblem, int, float, float]) -> tuple[float, float, int]:
-    """Objective of a search, its processor time, s, and the number of its starts."""
+    """Run a search; return its objective, its processor time, s, and the number of its starts."""
     began = time.process_time()
     solution, count = search(*arguments)
     return solution.problem.objective.value(solution.q), time.process_time() - began, count
 
 
 def _many(problem: ConstrainedProblem, seed: int, budget: float, start_s: float) -> tuple[PostureSolution, int]:
-    """Solve from as many independent starts as the time allows."""
+    """Solve from as many independent starts as the time budget allows."""
     count = max(1, round(budget / start_s))
     return _run(problem, seed, count), count
 
 
 def _screened(problem: ConstrainedProblem, seed: int, budget: float, start_s: float) -> tuple[PostureSolution, int]:
-    """Draw feasible postures for half of the time, and solve from the best of them that are apart."""
+    """Draw feasible postures for half of the time, then solve from the best postures that are far from each other."""
     began, rng, kept, tried = time.process_time(), np.random.default_rng([seed, 2]), [], 0
     while time.process_time() - began < budget / 2:
         start = feasible_start(problem, len(kept) + tried, seed + 1000)

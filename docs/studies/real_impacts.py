@@ -1,8 +1,9 @@
-"""Impacts of robots that stand, reach and fly: the prediction of the rigid model for each controller, then its run.
+"""Impacts of standing, fixed and flying robots: prediction of the rigid model, and simulated run, for each
+controller.
 
-The prediction needs no run.  The controller braces in a robot that does exactly what it plans, and takes the end
-effector to the surface.  The rigid model takes the reached posture and the speed of the scenario.  Finished runs are
-kept in build/real-impacts.
+The prediction does not use the run.  The controller braces a robot that moves exactly as planned, and moves the end
+effector to the surface.  The inputs of the rigid model are the reached posture and the speed of the scenario.
+Finished runs are stored in build/real-impacts.
 """
 
 from __future__ import annotations
@@ -25,7 +26,7 @@ from impact_posture.simulation.scenario_file import RepeatedContacts, Scenario, 
 from impact_posture.simulation.setup import set_up
 from impact_posture.simulation.world.throw import Throw, thrown_jumps
 
-# A number replaces the speed of the hand in the scenario, m/s.
+# A number after a name replaces the approach speed of the scenario, m/s.
 SCENARIOS = (
     "talos-throw", "solo8-throw", "talos-strike", "talos-strike 0.5", "talos-strike 1.5", "g1-strike",
     "g1-strike 0.5", "g1-strike 1.5", "solo12-landing", "panda-tap", "hextilt-poke"
@@ -48,7 +49,10 @@ FOLDER = ROOT / "build" / "real-impacts"
 
 
 def scenario_of(name: str) -> Scenario:
-    """Read a shipped scenario.  A speed in the name replaces its speed, with enough acceleration for the gap."""
+    """Read a shipped scenario.
+
+    A speed in the name replaces the approach speed, with enough acceleration for the gap.
+    """
     shipped, *speed = name.split()
     scenario = read_scenario(shipped)
     if not speed:
@@ -62,7 +66,7 @@ def scenario_of(name: str) -> Scenario:
 
 
 def predicted(factory: ControllerFactory, name: str) -> dict[str, float | None]:
-    """Predict H, the sticking jump and the Coulomb jump in the posture in which a controller meets the impact."""
+    """Predict H, the sticking jump and the Coulomb jump in the posture that a controller has at the impact."""
     setup = factory.setup
     task, oracle = setup.scenario.task, factory.objective().oracle
     q = resting_posture(factory.driver(name), task.settle, ahead=setup.gap if setup.scenario.contacts else 0.0)
@@ -80,7 +84,7 @@ def predicted(factory: ControllerFactory, name: str) -> dict[str, float | None]:
 
 
 def result(scenario: str, name: str) -> dict[str, Any]:
-    """Return prediction and run of a controller; they are kept by scenario, robot and code."""
+    """Return prediction and run of a controller.  The result is stored under a hash of scenario, robot and code."""
     shipped = scenario.split()[0]
     key = key_of(Job(shipped, name, 0, compile="auto"))[:12]
     kept = FOLDER / f"{scenario.replace(' ', '-')}-{name}-{key}.json"
@@ -103,7 +107,7 @@ def result(scenario: str, name: str) -> dict[str, Any]:
 def lines(request: Request) -> Iterator[str]:
     """Yield a table for each scenario."""
     controllers = [c for c in COMPARED if c in CONTROLLERS]
-    # At other speeds, only controllers whose posture depends on the speed or impulse, beside the nominal one.
+    # At other speeds, run only the nominal controller and those whose posture depends on the speed or the impulse.
     others = [c for c in controllers if c.endswith(("nominal", "robust", "sticking"))]
     pairs = [(s, c) for s in SCENARIOS if request.only in s for c in (others if " " in s else controllers)]
     answers = collected(lambda k: result(*pairs[k]), len(pairs), request.jobs, "runs")

@@ -1,4 +1,4 @@
-"""Times and accuracy of the relaxation in C on the relaxed ticks of robots that are pushed over."""
+"""Times and accuracy of the relaxation in C, on relaxed ticks of robots that are pushed until they fall."""
 
 from __future__ import annotations
 
@@ -12,7 +12,7 @@ from docs.studies.core import Request, machine, one_core, table
 from tests.support.relaxation_in_c import BUDGET, SOLVED, Relaxation, missed, stationarity
 from tests.support.relaxed_ticks import RUNS, pushed
 
-# The most that the 99th percentile of a relaxed tick may take, µs, on an idle core.
+# Goals for the 99th percentile of the time of a relaxed tick on an idle core, µs.
 GOALS = {"tilthex_arm": 15, "solo8": 60, "talos": 300, "g1": 300}
 _HEAD = (
     "robot|ticks (before the fall)|median µs|p99 µs|goal|iterations median, p99|"

@@ -1,6 +1,6 @@
-"""Experiments of the paper for the documentation: its controllers over many seeds, every controller over a few.
+"""Experiments of the paper: the controllers of the paper with many seeds, and all controllers with a few seeds.
 
-Finished runs are kept in build/reproduction, so that an interrupted study can continue.
+Finished runs are stored in build/reproduction, so that an interrupted study can continue.
 """
 
 from __future__ import annotations
@@ -19,12 +19,12 @@ from impact_posture.experiment.reproduction import PAPER, Reproduction, controll
 from impact_posture.experiment.reproduction_summary import LEGEND, advice, remarks, scenario_table, table_one
 
 IMAGES = ROOT / "docs" / "images" / "reproduction"
-# Seeds of all controllers.
+# Number of seeds of the controllers that are not in the paper.
 OTHERS = 2
 
 
 def lines(request: Request) -> Iterator[str]:
-    """Yield the page, and draw its pictures if it is written."""
+    """Yield the page.  If the page is written to the documentation, also draw its pictures."""
     scenarios, store = tuple(s for s in PAPER if request.only in s), JobStore(ROOT / "build" / "reproduction")
     shared = {"processes": request.jobs, "store": store, "progress": lambda a, b: say(f"\r{a} of {b} runs", end="")}
     began = time.perf_counter()
@@ -40,7 +40,7 @@ def lines(request: Request) -> Iterator[str]:
 
 
 def _take_shown(folder: Path) -> None:
-    """Copy only the pictures that the documentation shows."""
+    """Copy the pictures that the documentation shows, and no others."""
     text = (ROOT / "docs" / "reproduction.md").read_text(encoding="utf-8")
     shutil.rmtree(IMAGES, ignore_errors=True)
     for name in re.findall(r"images/reproduction/(\S+\.png)", text):

@@ -1,4 +1,4 @@
-"""Restitution of each contact law, measured in the simulated world."""
+"""Coefficient of restitution of each contact law, measured in the simulated world."""
 
 from __future__ import annotations
 
@@ -18,7 +18,7 @@ _HEAD = "time step|T|ζ|*e*|range|ideal|duration|depth|peak force".split("|")
 
 
 def lines(request: Request) -> Iterator[str]:
-    """Yield a row for each law that its time step can follow."""
+    """Yield a row for each contact law that is slow enough for its time step."""
     import_mujoco()
     low, high, width = ContactLaw().solimp
     yield (
@@ -27,7 +27,7 @@ def lines(request: Request) -> Iterator[str]:
         "step\nthe contact begins. *Ideal*: the same spring and damper in continuous time."
     )
     yield ""
-    # The world refuses laws that are faster than the time steps.
+    # Leave out laws that are too fast for the time step, because the simulated world raises an error for them.
     laws = ((s, t, z) for s in STEPS for t in TIMES for z in DAMPINGS if t >= 2 * s and t * z >= s * (1 - 1e-9))
     yield from table(_HEAD, (_row(*law) for law in laws))
     default = Physics().timestep

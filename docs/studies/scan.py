@@ -1,6 +1,6 @@
-"""Scan along the redundancy of the arm over a floor, and from the start of the humanoid to its optimum.
+"""Scan postures of two robots: elbow angles of an arm over a floor, and the line from start to optimum of a humanoid.
 
-The nominal controller holds each posture and takes the impact there.  Only the posture changes.
+The nominal controller keeps the robot in each posture during the impact.  Only the posture changes.
 """
 
 from __future__ import annotations
@@ -30,11 +30,11 @@ from impact_posture.simulation.world.world import build_world
 
 ARM, HUMANOID = "aerial-vertical", "talos-push"
 PICTURE = ROOT / "docs" / "images" / "where-bracing-helps.png"
-# The elbow's bend at the start of the shipped scenario, and the largest one, rad.
+# Bend of the elbow at the start of the shipped scenario, and largest bend in the scan, rad.
 _SHIPPED, _LARGEST = 0.9, 1.5
-# Time in which the humanoid settles, s.  It holds its posture from the start.
+# Time before the push, s.  It can be short, because the humanoid starts in the posture that the controller keeps.
 _SETTLE = 1.0
-# For a push, the lines of jump and motion coincide, so the jump is dashed.
+# The line of the jump is dashed, because for a push it coincides with the line of the motion.
 _JUMP = {"color": GREEN, "linestyle": (0, (2, 2)), "linewidth": 1.6, "zorder": 3.2}
 
 
@@ -43,10 +43,10 @@ class Place:
     """Results at one posture of a scan.
 
     Attributes:
-        at: Place along the scan.
-        H: Squared jump per squared impulse before the impact.
-        V: The same per squared approach speed, without friction.
-        S: The same where the contact sticks, or ``None``.
+        at: Position along the scan: the elbow angle, rad, or the share of the line.
+        H: Predicted squared velocity jump per squared impulse.
+        V: Predicted squared velocity jump per squared approach speed, without friction.
+        S: Predicted squared velocity jump per squared approach speed if the contact sticks, or ``None``.
         motion: Motion in the impact windows, ``q_total_impact``.
         jump: Largest velocity jump, ``peak_jump``.
         force: Largest normal force, N.
@@ -64,7 +64,7 @@ class Place:
 
 
 def lines(request: Request) -> Iterator[str]:
-    """Run both scans, draw them where the page is written, and print their tables."""
+    """Run both scans, yield their tables, and draw the picture if the page is written."""
     scans = {name: _scan(name, request) for name in (ARM, HUMANOID) if request.only in name}
     yield " ".join(_caption(scans))
     yield from ("", MARK, "")
@@ -115,7 +115,7 @@ def _scan(name: str, request: Request) -> list[Place]:
 
 
 def _places(name: str, count: int) -> Vector:
-    """Return elbow angles from stretched to the largest, with the shipped start, or shares of the line."""
+    """Return the elbow angles of the arm, or the shares of the humanoid's line from start to optimum."""
     if name == HUMANOID:
         return np.linspace(0.0, 1.0, count)
     return np.unique(np.append(np.linspace(0.0, _LARGEST, count), _SHIPPED).round(6))
@@ -137,7 +137,7 @@ def _setups(name: str, count: int) -> Iterator[Setup]:
     scenario = replace(shipped.scenario, push=replace(task, settle=_SETTLE))
     way = pin.difference(robot.model, shipped.q, optimum)
     for share in places:
-        # A point on the straight line from the start to the optimum, pulled back onto the feet.
+        # Take a point on the straight line from start to optimum, and project it so that the feet keep their places.
         q = Projector(problem).project(np.asarray(pin.integrate(robot.model, shipped.q, share * way))).q
         yield Setup(scenario, robot, q, build_world(robot, scenario, q))
 

@@ -1,4 +1,4 @@
-"""Collision shapes of the catalogue: tightness of the hulls, number of pairs, and time of the fit."""
+"""Collision shapes of the robots: accuracy of the hulls, number of pairs, and time of fitting."""
 
 from __future__ import annotations
 
@@ -59,7 +59,7 @@ def _row(name: str) -> list[str]:
 
 
 def _overlap(robot: Robot, shapes: RobotShapes) -> Iterator[bool]:
-    """Whether each pair of hulls overlaps at the default posture."""
+    """Return whether each pair of hulls overlaps at the default posture."""
     data = robot.model.createData()
     pin.forwardKinematics(robot.model, data, robot.posture())
     for a, b in ((shapes.bodies[i], shapes.bodies[j]) for i, j in shapes.pairs):

@@ -1,4 +1,4 @@
-"""Cost of feet, cones and other options: a solve from one start, building it, the exported gradient."""
+"""Computation time with feet, cones and other options: build and solve from one start, and exported gradient."""
 
 from __future__ import annotations
 
@@ -18,7 +18,7 @@ from impact_posture.posture.search.growing_search import run_start
 from impact_posture.posture.search.multistart import solve
 from impact_posture.system.toolchain import find_compiler
 
-# Goals for one start, ms.
+# Goals for the time of a solve from one start, ms.
 TARGETS_MS = {
     "tilthex_arm": 5, "tilthex_arm, ahead": 5, "panda": 5, "tilthex_arm, cone 5°": 10, "tilthex_arm, cone 20°": 10,
     "tilthex_arm, cone 45°": 10, "solo8, four feet": 30, "solo8, four feet, cone 20°": None, "talos, two feet": 50,
@@ -30,7 +30,7 @@ _HEAD = "case|unknowns|mode|build s|processor s|again s|solve ms|processor ms|×
 
 
 def lines(request: Request) -> Iterator[str]:
-    """Yield a row for each case and mode of compiling, then the exported gradient with feet and without."""
+    """Yield a row for each case and compile mode, then times of the exported gradient with feet and without."""
     yield (
         f"{machine()}; medians of {request.count} random feasible starts, one at a time; × `crba` compares processor "
         "time. `again`: with the cache that the first build filled."
@@ -77,14 +77,14 @@ def _row(case: Case, problem: ConstrainedProblem, starts: Sequence[Vector], mode
 
 
 def _built(problem: ConstrainedProblem, mode: str) -> tuple[PostureNLP, float, float]:
-    """Build the program; return it with wall and processor seconds, including the compiler."""
+    """Build the program; return the program, the wall time and the processor time, s, including the compiler."""
     began, busy = time.perf_counter(), sum(os.times()[:4])
     nlp = build_nlp(problem, compile="never" if mode == "interpreted" else "always")
     return nlp, time.perf_counter() - began, sum(os.times()[:4]) - busy
 
 
 def optima(request: Request) -> Iterator[str]:
-    """Yield a row for each case: the best objective of 16 starts over the best of many."""
+    """Yield a row for each case: the best objective of 16 starts, relative to the best objective of many starts."""
     yield from (machine(), "")
     rows = ([name, _above(name, request.count)] for name, ms in TARGETS_MS.items() if ms and request.only in name)
     yield from table(["case", f"best of 16 above the best of {request.count}"], rows)

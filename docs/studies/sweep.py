@@ -1,8 +1,9 @@
 """Robustness and cost of sweeps: ``make study-sweep``.
 
-A Dask cluster that loses a worker, MPI ranks, Slurm jobs on this machine, and a parent that is killed at random
-times must give the bytes of the pool.  Then follow the speed, the memory of a long run, and the overhead of a task.
-``python -m docs.studies.sweep FOLDER ROBOT POINTS`` solves a large sweep, or continues it.
+Four runs must write the same bytes as a process pool: a Dask cluster that loses a worker, MPI ranks, Slurm jobs on
+this machine, and a parent that is killed at random times.  The study then measures the speed, the memory of a long
+run, and the overhead of a task.  ``python -m docs.studies.sweep FOLDER ROBOT POINTS`` starts or continues a large
+sweep.
 """
 
 from __future__ import annotations
@@ -57,7 +58,7 @@ z = { from = -0.15, to = 0.15, count = COUNT }
 
 
 def tilted(count: int) -> str:
-    """Write a sweep over ``count`` tilts of the surface and ``count`` tilts of the tool of the aerial manipulator."""
+    """Return a sweep for the aerial manipulator: ``count`` tilts of the surface times ``count`` tilts of the tool."""
     tilts = [(k / (count - 1) - 0.5, 3.1 * k / (count - 1) - 1.35) for k in range(count)]
     normals = [[0.0, math.sin(tilt), math.cos(tilt)] for tilt, _ in tilts]
     turns = [[math.cos(tilt / 2), 0.0, -math.sin(tilt / 2), 0.0] for _, tilt in tilts]
@@ -65,17 +66,17 @@ def tilted(count: int) -> str:
 
 
 def shards(folder: Path) -> dict[str, bytes]:
-    """Return the files of a sweep folder."""
+    """Return the content of each data file of a sweep folder."""
     return {str(path.relative_to(folder)): path.read_bytes() for path in sorted(folder.glob("data/*/*.parquet"))}
 
 
 def command(*words: object) -> list[str]:
-    """Return a command line of this installation."""
+    """Return a command line that runs ``impact-posture`` of this installation."""
     return [sys.executable, str(Path(sys.executable).with_name("impact-posture")), *map(str, words)]
 
 
 def killed_dask_worker(sweep: Sweep, folder: Path) -> None:
-    """Run on a local cluster of four worker processes, and kill one of them halfway."""
+    """Run the sweep on a local Dask cluster of four workers, and kill one worker during the run."""
     from distributed import LocalCluster
 
     with LocalCluster(n_workers=4, threads_per_worker=1, dashboard_address=None) as cluster:
@@ -93,25 +94,25 @@ def killed_dask_worker(sweep: Sweep, folder: Path) -> None:
 
 
 def mpi_ranks(file: Path, folder: Path) -> None:
-    """Run on three ranks of MPI, the first of which is the parent."""
+    """Run the sweep on three MPI ranks, the first of which is the parent."""
     mpiexec = shutil.which("mpiexec", path=f"{Path(sys.executable).parent}{os.pathsep}{os.environ['PATH']}")
     if mpiexec is None:
         raise FileNotFoundError("no mpiexec")
     words = command("sweep", file, "--mpi", "--out", folder)
     launched = [mpiexec, "-n", "3", sys.executable, "-m", "mpi4py.futures", *words[1:]]
-    # Open MPI counts cores, and there may be two.
+    # Open MPI by default allows no more ranks than cores, and the machine may have two cores.
     environment = os.environ | {"OMPI_MCA_rmaps_base_oversubscribe": "1"}
     subprocess.run(launched, check=True, capture_output=True, timeout=900, env=environment)
 
 
 def slurm_jobs(sweep: Sweep, folder: Path) -> None:
-    """Run as jobs of submitit on this machine."""
+    """Run the sweep as local jobs of submitit on this machine."""
     with SlurmJobs(folder.with_name("slurm-logs"), {"timeout_min": 30}, "local") as executor:
         run_sweep(sweep, folder, executor, in_hand=4)
 
 
 def slurm_cluster(file: Path, folder: Path) -> None:
-    """Run as job arrays of a Slurm cluster that this machine belongs to."""
+    """Run the sweep as job arrays on the Slurm cluster of this machine."""
     if shutil.which("sbatch") is None:
         raise FileNotFoundError("no sbatch")
     words = command("sweep", file, "--slurm", "timeout_min=30", "--out", folder)
@@ -119,7 +120,7 @@ def slurm_cluster(file: Path, folder: Path) -> None:
 
 
 def killed_parent(file: Path, folder: Path, seed: int) -> int:
-    """Kill a run at random times after its first shard, until it was killed often enough; return the kills."""
+    """Kill a run KILLS times, each at a random time after a new shard, and continue; return the number of kills."""
     rng, kills = random.Random(seed), 0
     while True:
         before = len(shards(folder))
@@ -140,7 +141,7 @@ def killed_parent(file: Path, folder: Path, seed: int) -> int:
 
 
 def robustness(folder: Path, only: str = "") -> None:
-    """Compare the bytes of all executors."""
+    """Compare the files that all executors write with the files of the process pool."""
     file = folder / "small.toml"
     file.write_text(SMALL)
     sweep = read_sweep(file)
@@ -168,7 +169,7 @@ def robustness(folder: Path, only: str = "") -> None:
 
 
 def speed(folder: Path, points: int) -> None:
-    """Measure the share of the solver, the memory of this process, and the gain of a second process."""
+    """Measure the share of the solver in the time, the memory of this process, and the gain of a second process."""
     file = folder / "long.toml"
     file.write_text(SMALL.replace("count = 10", f"count = {max(2, round((points / 6) ** 0.5))}").replace("20", "256"))
     sweep, seen = read_sweep(file), list[tuple[int, float]]()
@@ -190,7 +191,7 @@ def speed(folder: Path, points: int) -> None:
     began = time.perf_counter()
     with process_pool(2) as pool:
         run_sweep(sweep, folder / "two", pool)
-    # "Alone" counts the time of the shards in the first run without storing them.
+    # ``alone`` is the speed of the first run without the time of storing shards.
     alone, together = solved / result.total_s, solved / (time.perf_counter() - began)
     share = together / (2 * alone)
     print(f"the search alone {alone:.0f} a second, the sweep with two workers {together:.0f}: {100 * share:.0f} %")
@@ -202,13 +203,13 @@ def _resident(process: int | str = "self") -> float:
 
 
 class Watched(Executor):
-    """A pool that records the times of its shards.
+    """Executor that runs tasks on a pool and records the times of the shards.
 
     Args:
-        pool: The pool.
+        pool: Pool that runs the tasks.
 
     Attributes:
-        finished: Processor time within IPOPT and in all, s, of each finished shard.
+        finished: Processor time inside IPOPT and total processor time of each finished shard, s.
     """
 
     def __init__(self, pool: Executor) -> None:
@@ -222,7 +223,7 @@ class Watched(Executor):
 
 
 def atlas(folder: Path, name: str, points: int) -> None:
-    """Solve a large sweep with two processes, or continue it, and print times and results."""
+    """Start or continue a large sweep with two processes, and print times and results."""
     folder.mkdir(parents=True, exist_ok=True)
     file, count = folder / f"{name}.toml", math.isqrt(points - 1) + 1
     file.write_text(tilted(count) if name == "tilthex_arm" else TALOS.replace("COUNT", str(count)))
@@ -253,7 +254,7 @@ def atlas(folder: Path, name: str, points: int) -> None:
 
 
 def task_overhead() -> None:
-    """Measure the time of an executor for an empty task."""
+    """Measure the time that an executor needs for an empty task."""
 
     def each(executor: Executor, count: int) -> float:
         list(executor.map(len, [""] * 20))
@@ -283,5 +284,5 @@ if __name__ == "__main__":
             elif part == "overhead":
                 task_overhead()
             else:
-                # An executor by a word of its name, such as MPI.
+                # The argument is a word from the name of an executor, such as MPI.
                 robustness(Path(place), "" if part == "robustness" else part)

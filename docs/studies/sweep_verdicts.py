@@ -1,7 +1,7 @@
 """Compare the verdicts of a sweep with ``optimize``: ``python -m docs.studies.sweep_verdicts``.
 
-A sweep with 4 starts solves a grid of targets, and ``optimize`` with 16 starts solves each point alone.  A point that
-only one of them certifies is a false verdict of the other.
+A sweep with 4 starts solves a grid of targets, and ``optimize`` with 16 starts solves each point alone.  If only one
+of the two certifies a point, the other gives a false verdict.
 """
 
 from __future__ import annotations
@@ -24,15 +24,15 @@ from impact_posture.sweep.atlas import open_atlas
 from impact_posture.sweep.sweep_file import read_sweep
 from impact_posture.sweep.sweep_run import run_sweep
 
-# Robot, points along each axis, and half the length of an axis, m.
+# For each grid: robot, number of points along each axis, and half the length of an axis, m.
 GRIDS = (("xarm7", 5, 0.2), ("panda", 5, 0.3), ("ur5", 4, 0.3), ("kinova", 4, 0.3))
 NORMAL = (-1.0, 0.0, 0.0)
-# Optima that differ by more than this share count as different.
+# An optimum of the sweep is worse if its objective is higher by more than this share.
 _WORSE = 0.02
 
 
 def alone(robot: str, x: float, y: float) -> float | None:
-    """Return the objective of the best of 16 starts, or ``None`` without a certified start."""
+    """Return the best objective of 16 starts, or ``None`` if no start is certified."""
     loaded = load_robot(robot)
     place = Numeric(loaded.model).at(loaded.posture()).placement(point_on(loaded, loaded.spec.contact.frame or ""))
     at = place.translation
@@ -46,7 +46,7 @@ def alone(robot: str, x: float, y: float) -> float | None:
 
 
 def compared(robot: str, count: int, half: float, folder: Path) -> Iterator[str]:
-    """Yield a line for a robot, and a line for each false verdict."""
+    """Yield one line for the robot and one line for each false verdict."""
     axis = [-half + 2 * half * k / (count - 1) for k in range(count)]
     file = folder / f"{robot}.toml"
     file.write_text(

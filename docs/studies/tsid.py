@@ -1,4 +1,4 @@
-"""Processor time of a tick of the online controllers on one core, along a moving reference."""
+"""Processor time of a tick of the online controllers on one core, while they track a moving reference."""
 
 from __future__ import annotations
 
@@ -29,9 +29,10 @@ from impact_posture.tsid.tasks.joint_posture import JointPosture
 from tests.support.qpsolvers_solver import QpsolversSolver
 
 DT = 1e-3
-# Largest ratio of the tick of the impact-robust controller to the nominal tick.
+# Goal for the time of an impact-robust tick divided by the time of a nominal tick.
 RATIO = 1.05
-# The same for the mean of the controller with a reference flow, whose updates are spread over the ticks.
+# The same goal for the controller with a reference flow.  The mean is used, because updates of the flow are spread
+# over several ticks.
 FLOW_RATIO = 2.0
 _OTHERS = {"proxqp": {"eps_abs": 1e-9}, "quadprog": {}}
 _TICKS = (
@@ -39,7 +40,7 @@ _TICKS = (
 ).split("|")
 
 
-# The amplitude of the reference, m, and the most that a tick may take, µs: median, 99th percentile.
+# Amplitude of the reference, m, and goals for the time of a tick, µs: median, 99th percentile.
 GOALS = {
     "tilthex_arm": ((0.05, 0.02, 0.05), 120, 300),
     "solo8, four feet": ((0.01, 0.0, 0.01), 180, 450),
@@ -48,7 +49,7 @@ GOALS = {
 
 
 class Timed:
-    """Record the time of each solve, µs, and keep every tenth program."""
+    """QP solver that records the time of each solve, µs, and stores every tenth program."""
 
     def __init__(self, inner: DaqpSolver) -> None:
         self.inner, self.times, self.kept = inner, list[float](), list[tuple[QP, Solved | None]]()
@@ -68,7 +69,7 @@ class Timed:
 
 
 class Flight:
-    """A controller whose robot moves exactly as planned, along a sine with its velocity and acceleration."""
+    """Controller of a robot that moves exactly as planned and tracks a sine reference."""
 
     def __init__(self, amplitude: Sequence[float], robot: Robot, posture: JointPosture) -> None:
         aerial = robot.spec.kind == "aerial"
@@ -81,7 +82,7 @@ class Flight:
         target = self.task.target
         self.home = np.array(target.translation if isinstance(self.task, FramePose) else target)
         self.amplitude, self.rate = np.array(amplitude), 2 * np.pi * np.array([0.5, 0.4, 0.3])
-        # µs of the processor and of the wall.
+        # Processor time and wall time of each tick, µs.
         self.took, self.wall = list[float](), list[float]()
         self.relaxed = 0
         if isinstance(posture, ImpactRobustPosture | ReferenceFlowPosture):
@@ -105,13 +106,13 @@ class Flight:
 
     @property
     def usual(self) -> Vector:
-        """Median, and mean of the shorter 99 %, which leaves out interruptions by other programs."""
+        """Median of the times, and mean of the shortest 99 %, which leaves out interruptions by other programs."""
         took = np.sort(self.took)
         return np.array([np.median(took), took[: int(0.99 * took.size)].mean()])
 
 
 def lines(request: Request) -> Iterator[str]:
-    """Yield a row of ticks and a row of solvers for each robot."""
+    """Yield a row with times of ticks and a row with times of solvers for each robot."""
     yield from (machine("daqp"), "")
     yield (
         f"{request.count} ticks, one core; impact-robust controller, bracing. Processor time of a tick, "
@@ -145,7 +146,8 @@ def lines(request: Request) -> Iterator[str]:
 def _postures(
     robot: Robot, gradient: Gradient, every: int = 5
 ) -> tuple[JointPosture, ImpactRobustPosture, ReferenceFlowPosture]:
-    """Return the nominal, the impact-robust and the flowing posture task, with the same gains except for the term."""
+    """Return the nominal, the impact-robust and the reference-flow posture task, with equal gains except for the
+    term."""
     aerial = robot.spec.kind == "aerial"
     more = {} if aerial else {"kp": 20.0, "weight": 0.1, "base_weight": 0.0}
     return (
@@ -161,7 +163,7 @@ def _ticks(name: str, robot: Robot, gradient: Gradient, request: Request) -> lis
     nominal, robust, flow, often = flights = [Flight(amplitude, robot, posture) for posture in postures]
     gc.collect()
     for k in range(request.count):
-        # In turn, so that all meet the same disturbances of the machine.
+        # Run the controllers in turn, so that all are disturbed equally by other programs.
         for flight in flights:
             flight.tick(k)
     middle, late, ratio = robust.usual[0], np.percentile(robust.took, 99), robust.usual / nominal.usual
@@ -194,7 +196,7 @@ def _solvers(name: str, robot: Robot, gradient: Gradient, ticks: int) -> list[st
 
 
 def _other(solver: QpsolversSolver, programs: Sequence[tuple[QP, Solved | None]]) -> str:
-    """Write the median time of another solver on the same programs, with its largest difference from ours."""
+    """Return the median time of another solver for the same programs, and the largest difference between solutions."""
     times, apart = [], 0.0
     for qp, solved in programs:
         began = time.thread_time_ns()
