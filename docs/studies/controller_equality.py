@@ -50,7 +50,7 @@ class States:
     """Kind of states in which the controllers are compared.
 
     Attributes:
-        push: Acceleration of each joint by pushes during half of the time; each joint has a random factor.
+        push: Standard deviation of random joint accelerations by pushes, rad/s² or m/s²; pushes act half of the time.
         size: Size of random, unrelated states; 0 selects the states of a moving robot.
         follows: ``term`` or ``flow`` if this part of the controller follows the gradient of an impact, through all
             phases.

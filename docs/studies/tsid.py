@@ -196,7 +196,7 @@ def _solvers(name: str, robot: Robot, gradient: Gradient, ticks: int) -> list[st
 
 
 def _other(solver: QpsolversSolver, programs: Sequence[tuple[QP, Solved | None]]) -> str:
-    """Return the median time of another solver for the same programs, and the largest difference between solutions."""
+    """Return the median time of another solver for the same programs, and the largest difference of its solutions."""
     times, apart = [], 0.0
     for qp, solved in programs:
         began = time.thread_time_ns()

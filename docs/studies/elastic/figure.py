@@ -1,4 +1,4 @@
-"""The figure of the study: errors of the three models over x."""
+"""Figure of the study of elastic joints: errors of the three models as functions of x."""
 
 from __future__ import annotations
 
@@ -16,13 +16,13 @@ if TYPE_CHECKING:
     from docs.studies.elastic.study import Row
 
 PICTURE = ROOT / "docs" / "images" / "elastic.png"
-# Errors below this share are drawn at it.
+# Relative errors below this value are drawn at this value.
 _LEAST = 1e-4
 _MODELS = {"elastic": (BLUE, "o"), "link": (VERMILLION, "^"), "reflected": (GREEN, "s")}
 
 
 def figure(rows: Sequence[Row]) -> Figure:
-    """Draw a panel for the peak link velocity and a panel for the force: marks are impacts, lines are medians."""
+    """Draw one panel for the peak link velocity and one for the force.  Marks are impacts, lines are medians."""
     drawing = Figure(figsize=(WIDTH, 3.4), layout="constrained")
     FigureCanvasAgg(drawing)
     x = np.array([row.x for row in rows])
@@ -55,5 +55,5 @@ def figure(rows: Sequence[Row]) -> Figure:
 
 
 def draw(rows: Sequence[Row]) -> None:
-    """Write the figure for the documentation."""
+    """Write the figure into the images of the documentation."""
     figure(rows).savefig(PICTURE, dpi=150)

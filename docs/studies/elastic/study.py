@@ -1,4 +1,4 @@
-"""Inertia with which an arm with elastic joints meets a contact: predictions beside impacts in MuJoCo."""
+"""Effective inertia of an arm with elastic joints in an impact: predictions compared with impacts in MuJoCo."""
 
 from __future__ import annotations
 
@@ -25,21 +25,23 @@ from impact_posture.robot.robot_spec import JointTransmissionSpec, TransmissionS
 from tests.support.arms import TIP, seven_joints
 from tests.support.helpers import rng, unit
 
-SPEED = 0.5  # m/s
-# Contact stiffnesses of each posture: from x = 0.05 to 2 with the compression time of the links alone.
+SPEED = 0.5  # approach speed, m/s
+# Number of contact stiffnesses for each posture.  They span x = 0.05 to 2, with x for the compression time of the
+# links alone.
 STIFFNESSES = 10
 LEAST, LARGEST = 0.05, 2.0
-# A direction in which the contact point hardly moves with the joints is left out, m/rad.
+# Normals are left out if the joints move the contact point along the normal by less than this, m/rad.
 _REACH = 0.15
 EDGES = (0.05, 0.1, 0.2, 0.35, 0.5, 0.75, 1.0, 2.0)
 MODELS = ("elastic", "link", "reflected")
-# Joints 1 to 4 and 5 to 7 of an arm with strain wave gears, N m/rad; assumed, no stiffness is published for the two.
+# Assumed stiffness of joints 1 to 4 and 5 to 7 of an arm with strain wave gears, N m/rad.  No stiffness is published
+# for the two arms.
 ASSUMED = (14e3,) * 4 + (9e3,) * 3
 
 
 @dataclass(frozen=True)
 class Studied:
-    """A robot, its contact frame, its elastic joints, and words about their stiffness."""
+    """Robot, its contact frame, its elastic joints with their stiffness, and a description of the stiffness."""
 
     load: Callable[[], Robot]
     frame: str
@@ -49,7 +51,7 @@ class Studied:
 
     @cache  # noqa: B019 (kept as long as the program runs)
     def robot(self) -> Robot:
-        """Return the robot with only these springs."""
+        """Return the robot with springs at these joints and at no others."""
         loaded = self.load()
         springs = {
             name: JointTransmissionSpec("elastic", K) for name, K in zip(self.joints, self.stiffness, strict=True)
@@ -58,12 +60,12 @@ class Studied:
 
 
 def panda() -> Robot:
-    """The arm with its fingers rigid."""
+    """Return the arm with rigid fingers."""
     return load_robot("panda", lock=("panda_finger_joint*",))
 
 
 def talos_arm() -> Robot:
-    """The right arm, its pelvis fixed and all other joints rigid."""
+    """Return the right arm of TALOS, with a fixed pelvis and all other joints rigid."""
     return load_robot("talos", root="fixed", lock=("leg_*", "torso_*", "head_*", "arm_left_*", "gripper_*"))
 
 
@@ -85,19 +87,19 @@ STUDIED = {
 
 @dataclass(frozen=True)
 class Row:
-    """One impact: measurement and prediction of each model."""
+    """One impact: errors of the prediction of each model against the measurement."""
 
     robot: str
-    x: float  # with the time of the elastic response
-    x_links: float  # with the time of the links alone
-    y: float  # how far the springs turn the jump of the links within that time
-    error: dict[str, float]  # of the peak link velocity, relative, by model
+    x: float  # x for the compression time of the elastic response
+    x_links: float  # x for the compression time of the links alone
+    y: float  # rotation of the links' velocity jump by the springs within that time
+    error: dict[str, float]  # relative error of the peak link velocity, by model
     force_error: dict[str, float]
-    torque_error: float  # of the largest spring torque, elastic
+    torque_error: float  # relative error of the largest spring torque, elastic model
 
 
 def rows_of(name: str, count: int, seed: int) -> Iterator[Row]:
-    """Yield impacts of a robot: random postures within the limits, random normals, and stiffnesses over all x."""
+    """Yield impacts of a robot with random postures within the limits, random normals, and stiffnesses for all x."""
     studied = STUDIED[name]
     arm, generator = studied.robot(), rng(name, seed)
     low, high = (np.array(limit) for limit in (arm.model.lowerPositionLimit, arm.model.upperPositionLimit))
@@ -140,7 +142,7 @@ def rows_of(name: str, count: int, seed: int) -> Iterator[Row]:
 
 
 def lines(request: Request) -> Iterator[str]:
-    """Yield results and tables, and draw the figure where the page is written."""
+    """Yield results and tables, and draw the figure if the page is written."""
     import_mujoco()
     began = time.perf_counter()
     rows: list[Row] = []
@@ -171,7 +173,7 @@ def lines(request: Request) -> Iterator[str]:
 
 
 def _verdicts(rows: Sequence[Row], request: Request) -> Iterator[str]:
-    """Yield the goals, met or missed, and the range of the rules of thumb, with x of both times."""
+    """Yield whether goals are met, and the range in which the rules of thumb are valid, with x for both times."""
     for model, values, goal, where in (
         ("elastic", "error", 0.10, "peak link velocity"), ("elastic", "force_error", 0.15, "peak force"),
     ):  # fmt: skip
@@ -202,7 +204,7 @@ def _verdicts(rows: Sequence[Row], request: Request) -> Iterator[str]:
 
 
 def _errors(rows: Sequence[Row], which: str) -> Iterator[str]:
-    """Rows by x, columns by model."""
+    """Return a table of errors.  Rows are ranges of x, columns are models."""
     body = []
     for low, high in pairwise(EDGES):
         own = [getattr(row, which) for row in rows if low <= row.x < high]

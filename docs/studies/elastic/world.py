@@ -1,4 +1,7 @@
-"""An arm with elastic joints in MuJoCo: springs between the bodies of link and rotor, and a spring as the contact."""
+"""MuJoCo model of an arm with elastic joints.
+
+Springs connect the bodies of links and rotors; a spring is the contact.
+"""
 
 from __future__ import annotations
 
@@ -10,9 +13,10 @@ from docs.studies.core import Vector
 from impact_posture.dynamics.mjcf import build_mjcf, import_mujoco, pose
 from impact_posture.impact.elasticity.elastic_impact import ElasticImpact
 
-# Mass (kg) and moments (kg m²) of a rotor's body; the rotor's own inertia is the armature of its joint.
+# Mass (kg) and moments of inertia (kg m²) of the body of a rotor.  The inertia of the rotor is the armature of its
+# joint.
 _TINY = 1e-9
-# Steps of physics from touch to greatest compression.
+# Number of simulation steps from touch to greatest compression.
 STEPS = 4000
 
 
@@ -20,20 +24,20 @@ STEPS = 4000
 class Measured:
     """Measurements of one compression."""
 
-    duration: float  # from touch to greatest compression, s
-    force: float  # largest, N
-    jump: Vector  # change of the links' velocity since the touch, at the end, shape (nv,)
-    peak: float  # largest norm of this change during the compression
-    torque: Vector  # largest of each spring, N m, shape (nv,)
+    duration: float  # time from touch to greatest compression, s
+    force: float  # largest force, N
+    jump: Vector  # change of the links' velocity from touch to the end, shape (nv,)
+    peak: float  # largest norm of the links' velocity change during the compression
+    torque: Vector  # largest torque of each spring, N m, shape (nv,)
 
 
 class ElasticWorld:
-    """An arm on a fixed base whose joints turn about one axis each.
+    """Arm on a fixed base.  Each joint turns about one axis.
 
-    The body of the rotor turns about the same axis as the link, on the same parent.  A fixed tendon is the spring and
-    the damper between both joints.  So the rotor has inertia along its own axis alone, like an armature.
-    Gravity and joint limits are off.  The contact pushes with ``f = kδ`` along the normal at the contact point.
-    Depth and direction follow the moving arm, not a frozen one.
+    The body of a rotor has the same parent as the link, and turns about the same axis.  A fixed tendon acts as spring
+    and damper between both joints.  So the rotor has inertia only about its axis, like an armature.  Gravity and
+    joint limits are off.  The contact pushes with ``f = kδ`` along the normal at the contact point.  Depth and
+    direction of the contact are updated while the arm moves.
     """
 
     def __init__(self, impact: ElasticImpact) -> None:
@@ -63,15 +67,15 @@ class ElasticWorld:
         self._point = oracle.point.position
 
     def compress(self, q: Vector, stiffness: float, speed: float, duration: float) -> Measured:
-        """Approach with the least joint velocity that has this speed along the normal, and compress until δ̇ = 0.
+        """Approach with the smallest joint velocity that gives ``speed`` along the normal, and compress until δ̇ = 0.
 
         Rotors begin at the velocity of their links.
 
         Args:
             q: Configuration, shape (nq,).
-            stiffness: Of the contact, N/m.
+            stiffness: Stiffness of the contact, N/m.
             speed: Approach speed, m/s.
-            duration: Expected time, which sets the step, s.
+            duration: Expected duration of the compression, s, which determines the time step.
         """
         mujoco, model, data = self._mujoco, self._model, self._mujoco.MjData(self._model)
         oracle = self._impact.oracle.at(q)

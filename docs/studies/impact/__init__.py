@@ -1,1 +1,1 @@
-"""One impact in MuJoCo, measured and predicted by the objectives."""
+"""Study of single impacts: measurement in MuJoCo, and prediction by the objectives."""

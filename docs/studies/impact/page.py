@@ -1,4 +1,4 @@
-"""Page that compares the objectives with impacts: random postures meet a stiff surface in MuJoCo."""
+"""Page that compares the objectives with simulated impacts of random postures on a stiff surface in MuJoCo."""
 
 from __future__ import annotations
 
@@ -28,7 +28,7 @@ from docs.studies.impact.surface import Surface
 from impact_posture.dynamics.mjcf import import_mujoco
 from impact_posture.errors import ImpactPostureError, InputError
 
-# Postures of each robot for the table of variations.
+# Number of postures of each robot in the table of variations.
 _FEW = 10
 _RANKS = "robot|friction|postures|slid|e|size of the jumps|spread of √C|√H|√V|√S|√C|√E".split("|")
 _RANKS += ["jump per impulse with √H", "loss with E"]
@@ -39,7 +39,7 @@ _VARIED = "impact|lasts, ms|e|no friction: rank of √V|measured/predicted|stick
 
 
 def lines(request: Request) -> Iterator[str]:
-    """Yield all tables."""
+    """Yield all tables of the page."""
     import_mujoco()
     if request.count < 3:
         raise InputError(f"{request.count} postures", where="--count", hint="a rank correlation needs three")
@@ -80,7 +80,7 @@ def _rank_row(row: Row) -> list[str]:
 
 
 def _left_out(rows: Sequence[Row]) -> list[str]:
-    """Return a line for each robot and surface with a posture that is not counted."""
+    """Return a line for each robot and surface for which a posture was left out, with the reasons."""
     entries = [
         f"- {row.robot}, {_friction(row.surface)}: {count} left out, {reason}"
         for row in rows
@@ -90,7 +90,7 @@ def _left_out(rows: Sequence[Row]) -> list[str]:
 
 
 def _verdicts(rows: Sequence[Row]) -> Iterator[str]:
-    """Yield the targets, met or missed, for ``√C``, ``√V`` without friction and ``√S`` with friction."""
+    """Yield whether the targets are met for ``√C``, for ``√V`` without friction and for ``√S`` with friction."""
     frictions = dict.fromkeys(row.surface.friction for row in rows)
     wanted = [("coulomb", mu, 0.95) for mu in frictions]
     for objective, mu, least in [
@@ -113,7 +113,7 @@ def _verdicts(rows: Sequence[Row]) -> Iterator[str]:
 
 
 def _which_stick(dropped: Sequence[Dropped], rows: Sequence[Row]) -> Iterator[str]:
-    """Yield the postures that stick, by the angle of the sticking impulse, and the same with MuJoCo's friction."""
+    """Yield which postures stick, by the angle of the sticking impulse, for Coulomb friction and MuJoCo friction."""
     between = [row for row in rows if 0 < row.surface.friction < np.inf]
     yield from ("### Which postures stick", "")
     yield "A posture *should stick* if its sticking impulse needs at most the friction of the surface: the tangential"
@@ -149,7 +149,10 @@ def _convex_row(row: Row) -> list[str]:
 
 
 def _variations(dropped: Sequence[Dropped], postures: int) -> Iterator[str]:
-    """Vary speed, restitution and stiffness, without friction and sticking; the lightest robot has its own rows."""
+    """Vary speed, restitution and stiffness, for a frictionless and a sticking contact.
+
+    The lightest robot has separate rows.
+    """
     few = [replace(robot, scenes=robot.scenes[:_FEW]) for robot in dropped]
     body, gone = [], []
     parts = ("", [r for r in few if r.robot != LIGHTEST]), (f", {LIGHTEST}", [r for r in few if r.robot == LIGHTEST])
@@ -174,7 +177,7 @@ def _variations(dropped: Sequence[Dropped], postures: int) -> Iterator[str]:
 
 
 def _picks(robots: Sequence[str]) -> Iterator[str]:
-    """Yield the posture that each objective picks, and the impact there."""
+    """Yield the optimal posture of each objective, and the impact in this posture."""
     picks = {name: choices(name) for name in robots}
     smooth, sticks = FRICTIONS[0], FRICTIONS[-1]
     head = ["robot", "picked by", "H", "1/G, kg", "V", "S", "μ to stick"]

@@ -1,4 +1,4 @@
-"""Objectives against measured impacts: random postures of a task, and the optimum of each objective."""
+"""Compare objectives with measured impacts, in random postures of a task and in the optimum of each objective."""
 
 from __future__ import annotations
 
@@ -18,13 +18,13 @@ from impact_posture.posture.manifold.feasible_start import feasible_start
 from impact_posture.posture.search.multistart import solve
 
 OBJECTIVES = {"impulse": "H", "speed": "V", "sticking": "S", "coulomb": "C", "energy": "E"}
-# Friction for which ``coulomb`` picks a posture.
+# Friction coefficient for which the objective ``coulomb`` is optimized.
 PICKED_FOR = 0.3
-# The robot whose contact point weighs least.
+# Robot with the smallest effective mass at the contact point.
 LIGHTEST = "hextilt"
-# A contact point that leaves with more tangential speed than this share of v_n has slid.
+# A contact point has slid if its tangential speed after the impact is more than this share of v_n.
 SLID = 0.01
-# Cases by robot, with the contact pose that random postures keep, and words.
+# For each robot: the case, the contact pose that random postures keep, and a description.
 STUDIED: dict[str, tuple[Case, str, str]] = {
     CASES[name].robot: (CASES[name], pose, words)
     for name, pose, words in (
@@ -35,9 +35,9 @@ STUDIED: dict[str, tuple[Case, str, str]] = {
         ("hextilt, wall", "position", "flies as one body, the arm's end against a wall"),
     )
 }
-# Without friction, ice, two everyday surfaces, and one on which nothing slides.
+# Friction coefficients: no friction, ice, two ordinary surfaces, and a surface on which nothing slides.
 FRICTIONS = (0.0, 0.1, 0.3, 0.8, np.inf)
-# Other variations of an impact: words, and the surface without its friction.
+# Other variations of an impact: description, and surface; the friction is set later.
 VARIATIONS = (
     ("0.1 m/s", Surface(speed=0.1)),
     ("3 m/s", Surface(speed=3.0)),
@@ -49,7 +49,7 @@ VARIATIONS = (
 
 
 def needed_friction(predicted: ImpactQuantities) -> float:
-    """Return the least friction that makes the contact point stick: tangential over normal part of its impulse."""
+    """Return the smallest friction for which the contact point sticks: tangential over normal part of its impulse."""
     s, n = predicted.sticking_impulse, predicted.normal
     return float("nan") if s is None else float(np.linalg.norm(s - (n @ s) * n) / (n @ s))
 
@@ -61,16 +61,16 @@ class Outcome:
     predicted: ImpactQuantities
     measured: Measured
     speed: float
-    coulomb: Vector  # predicted jump per approach speed with the friction of the surface
+    coulomb: Vector  # predicted jump per unit approach speed with Coulomb friction of the surface
 
     def value(self, objective: str) -> float:
-        """The value of an objective."""
+        """Return the predicted value of an objective."""
         if objective == "coulomb":
             return float(self.coulomb @ self.coulomb)
         return float(getattr(self.predicted, OBJECTIVES[objective]))
 
     def deviation(self, objective: str) -> float:
-        """``‖Δν − predicted Δν‖`` over the predicted norm, for all objectives except ``impulse`` and ``energy``."""
+        """Return ``‖Δν − predicted Δν‖ / ‖predicted Δν‖``, for all objectives except ``impulse`` and ``energy``."""
         o, rebound = self.predicted, (1 + self.measured.restitution) * self.speed
         jumps = {"speed": o.jump / o.G, "sticking": o.sticking_jump, "coulomb": self.coulomb}
         predicted = rebound * np.asarray(jumps[objective])
@@ -78,13 +78,14 @@ class Outcome:
 
     @property
     def per_impulse(self) -> float:
-        """``‖Δν‖/λ``, which ``√H`` predicts."""
+        """Measured jump per impulse, ``‖Δν‖/λ``, which ``√H`` predicts."""
         return self.measured.size / self.measured.impulse
 
     def ratio(self, objective: str) -> float:
-        """Return measured over predicted jump, or for energy the loss.
+        """Return the measured jump divided by the predicted jump; for ``energy``, return the ratio of energy losses.
 
-        ``impulse`` uses the measured normal impulse; the others use approach speed and measured restitution.
+        The prediction for ``impulse`` uses the measured normal impulse.  The other predictions use the approach speed
+        and the measured restitution.
         """
         m, value, v = self.measured, self.value(objective), self.speed
         if objective == "impulse":
@@ -96,7 +97,7 @@ class Outcome:
 
 @dataclass(frozen=True)
 class Row:
-    """One robot on one surface: the counted postures, and the number of the others by reason."""
+    """One robot on one surface: outcomes of the postures, and the number of postures left out, by reason."""
 
     robot: str
     surface: Surface
@@ -104,25 +105,25 @@ class Row:
     left_out: Counter[str]
 
     def rank(self, objective: str, of: Callable[[Outcome], float] = lambda o: o.measured.size) -> float:
-        """Return Spearman's rank correlation of a measurement, by default the jump, with an objective."""
+        """Return Spearman's rank correlation of an objective with a measurement, by default the jump."""
         values = [o.value(objective) for o in self.outcomes]
         return float(scipy.stats.spearmanr([of(o) for o in self.outcomes], values).statistic)
 
     def ratios(self, objective: str) -> Vector:
-        """Measured over predicted, sorted."""
+        """Return the measured jumps divided by the predicted jumps, sorted."""
         return np.sort([o.ratio(objective) for o in self.outcomes])
 
     def measured(self, name: str) -> Vector:
-        """One measured quantity of all postures."""
+        """Return one measured quantity for all postures."""
         return np.array([getattr(o.measured, name) for o in self.outcomes])
 
     @property
     def slid(self) -> int:
-        """Postures whose contact point left with a tangential speed."""
+        """Number of postures whose contact point has slid."""
         return int((self.measured("slip") > SLID).sum())
 
     def split(self) -> tuple[Row, Row]:
-        """Return the postures that the friction of the surface should hold, and the others."""
+        """Return the postures in which the friction of the surface should prevent sliding, and the other postures."""
         holds = [needed_friction(o.predicted) <= self.surface.friction for o in self.outcomes]
         held, rest = (
             replace(self, outcomes=tuple(o for o, h in zip(self.outcomes, holds, strict=True) if h is wanted))
@@ -133,7 +134,7 @@ class Row:
 
 @dataclass(frozen=True, eq=False)
 class Dropped:
-    """The random postures of one robot, ready to meet surfaces."""
+    """Random postures of one robot, prepared for impacts on surfaces."""
 
     robot: str
     scenes: tuple[tuple[Scene, ImpactQuantities], ...]
@@ -141,7 +142,7 @@ class Dropped:
 
     @staticmethod
     def prepare(robot: str, count: int, seed: int) -> Dropped:
-        """Draw postures that keep the limits, the feet, and the place of the contact point."""
+        """Draw postures within the limits that keep the feet and the contact point in place."""
         case, pose, _ = STUDIED[robot]
         problem = case.problem(contact_pose=pose)
         left_out: Counter[str] = Counter()
@@ -160,7 +161,7 @@ class Dropped:
         return Dropped(robot, tuple(scenes), left_out)
 
     def on(self, surface: Surface) -> Row:
-        """Drop them all."""
+        """Simulate the impact of all postures on a surface."""
         left_out, outcomes = Counter(self.left_out), []
         for scene, predicted in self.scenes:
             try:
@@ -173,7 +174,7 @@ class Dropped:
 
 @dataclass(frozen=True)
 class Choice:
-    """Posture that an objective picks, or the start; measurements by friction, ``None`` without an impact."""
+    """Optimal posture of an objective, or the start.  Measurements by friction are ``None`` without an impact."""
 
     robot: str
     objective: str
@@ -182,7 +183,7 @@ class Choice:
 
 
 def choices(robot: str, starts: int = 16) -> list[Choice] | ImpactPostureError:
-    """Optimize each objective without collisions and loads, and simulate the impact in the optimal posture."""
+    """Optimize each objective without constraints on collisions and loads, and simulate the impact in the optimum."""
     picked: list[Choice] = []
     for objective in OBJECTIVES:
         problem = STUDIED[robot][0].problem(objective=objective, friction=PICKED_FOR)

@@ -1,4 +1,4 @@
-"""Measure the velocity jump of a robot that meets a plane in MuJoCo in one posture."""
+"""Measure the velocity jump of a robot that hits a plane in MuJoCo in one posture."""
 
 from __future__ import annotations
 
@@ -15,35 +15,38 @@ from impact_posture.impact.friction.coulomb_impact import coulomb_impact
 from impact_posture.impact.impact_contact import point_on
 from impact_posture.impact.worst_case_objective import WorstCaseObjective
 
-# Steps of physics in one time constant of the contact, and the constants after which a contact counts as endless.
+# Number of simulation steps in one time constant of the contact, and number of time constants after which the study
+# stops waiting for the end of the contact.
 _FINE, _PATIENCE = 50, 40
-# Rate at which friction and supports stop a velocity, over the rate of the contact; friction that prevents sliding.
+# Rate at which friction and supports stop a velocity, divided by the rate of the contact; friction coefficient that
+# prevents sliding.
 _GRIP, _STICKY = 10.0, 10.0
-# Friction that stands for any amount in a prediction.
+# Friction coefficient that replaces an infinite coefficient in a prediction.
 _STICKS = 1e6
-# Iterations on Coulomb's law within one step.
+# Number of iterations for Coulomb's law within one step.
 _INNER = 20
-# Steps without a force after which the contact is over.
+# Number of steps without a force after which the contact has ended.
 _QUIET = 5
-# Radius of the ball at the contact point (any: the ball touches at the point itself); height of the point above the
-# plane (all postures meet it in the same part of a step); meters.
+# Radius of the ball at the contact point, m; the value is arbitrary, because the ball touches at the contact point.
+# Height of this point above the plane, m, so that all postures touch in the same part of a step.
 _BALL, _GAP = 0.01, 1e-6
-# The stiffest constraint that MuJoCo takes, at any depth.
+# Parameters of the stiffest constraint that MuJoCo accepts, independent of the depth.
 _SOLIMP = (0.9999, 0.9999, 0.001, 0.5, 2.0)
 
 
 @dataclass(frozen=True)
 class Surface:
-    """Surface that the robot meets, and approach speed.
+    """Surface that the robot hits, and approach speed.
 
-    The contact is the spring and damper of MuJoCo, scaled by the mass that it feels: ``r'' = −2ζ r'/T − r/T²`` while
-    it pushes.  The friction of MuJoCo is convex and lifts a sliding contact off the surface like a rebound.  So this
-    study implements Coulomb's law unless ``convex``.  A sticking point has MuJoCo's friction, with coefficient 10.
+    The contact is the spring and damper of MuJoCo, scaled by the effective mass: ``r'' = −2ζ r'/T − r/T²`` while the
+    contact pushes.  The friction of MuJoCo is convex, and lifts a sliding contact off the surface like a rebound.
+    So this study implements Coulomb's law unless ``convex`` is true.  A sticking point has the friction of MuJoCo
+    with coefficient 10.
     """
 
-    friction: float = 0.0  # Coulomb coefficient; 0 for none at all, infinite for a contact point that sticks
+    friction: float = 0.0  # Coulomb coefficient; infinite for a contact point that sticks
     speed: float = 1.0  # approach speed v_n, m/s
-    damping: float = 2.0  # ζ: 2 rebounds with e = 0.05, 0.3 with 0.4, 0.1 with 0.7
+    damping: float = 2.0  # ζ; 2 gives the restitution e = 0.05, 0.3 gives 0.4, 0.1 gives 0.7
     time: float = 1e-4  # T, s; the contact lasts 1.5 T to 3 T
     convex: bool = False
 
@@ -53,28 +56,28 @@ class Measured:
     """Measurements of one impact."""
 
     jump: Vector  # Δν in Pinocchio's coordinates, shape (nv,)
-    restitution: float  # normal speed after over before
-    slip: float  # tangential speed of the contact point after over v_n (it is 0 before)
-    impulse: float  # what the surface gave along n, N s
+    restitution: float  # normal speed after the impact divided by the speed before
+    slip: float  # tangential speed of the contact point after the impact, divided by v_n
+    impulse: float  # impulse of the surface along n, N s
     loss: float  # kinetic energy lost, J
-    duration: float  # from touch to the last force, s
-    feet: float  # largest speed of a support after, over v_n
+    duration: float  # time from touch to the last force, s
+    feet: float  # largest speed of a support after the impact, divided by v_n
 
     @property
     def size(self) -> float:
-        """``‖Δν‖``."""
+        """Norm of the jump, ``‖Δν‖``."""
         return float(np.linalg.norm(self.jump))
 
 
 class NoImpact(Exception):
-    """The contact did not begin or did not end; the message says which."""
+    """The contact did not begin or did not end; the message states the reason."""
 
 
 class Scene:
-    """One posture of a robot, its contact point a hair above the plane.
+    """MuJoCo model of a robot in one posture, with the contact point slightly above the plane.
 
-    Gravity, motors and joint limits are off; armature is on.  Supports are equality constraints to the world, where
-    the feet are: ``connect`` for a point, ``weld`` for a surface.
+    Gravity, motors and joint limits are off; armature is on.  Each support is an equality constraint that fixes a
+    foot to the world: ``connect`` for a point, ``weld`` for a surface.
 
     Raises:
         NoImpact: The contact point cannot move along the normal alone.
@@ -83,7 +86,7 @@ class Scene:
     def __init__(self, objective: WorstCaseObjective, q: Vector) -> None:
         self._mujoco = import_mujoco()
         self._robot, self._q, self._objective = objective.robot, q, objective
-        # The oracle is shared, so copy its values at this posture.
+        # Copy the values of the oracle at this posture, because the oracle is reused for other postures.
         oracle = objective.oracle.at(q)
         self._M, self._J, self._Js, self._n = (np.array(x) for x in (oracle.M, oracle.J, oracle.Js, oracle.n))
         self._mobility = self._J @ oracle.solve(self._J.T)
@@ -95,9 +98,10 @@ class Scene:
         self.approach = self._approach()
 
     def _approach(self) -> Vector:
-        """``ν⁻`` per unit approach speed: ``Jν = −n``, ``J_sν = 0``.
+        """Return ``ν⁻`` per unit approach speed, with ``Jν = −n`` and ``J_sν = 0``.
 
-        A robot that flies moves as one body along ``−n``; others by the smallest velocity of base and joints.
+        A flying robot moves as one body along ``−n``.  Other robots move with the smallest velocity of base and
+        joints.
         """
         if self._robot.floating and not self._feet:
             velocity = np.zeros(self._robot.nv)
@@ -111,15 +115,15 @@ class Scene:
         return np.asarray(velocity)
 
     def with_friction(self, friction: float) -> Vector:
-        """Return the predicted jump per approach speed with friction, plastic, shape (nv,)."""
+        """Return the predicted jump per unit approach speed with friction, without rebound, shape (nv,)."""
         contact = replace(self._objective.contact, friction=min(friction, _STICKS))
         return coulomb_impact(replace(self._objective, contact=contact).oracle, self._q).jump
 
     def hit(self, surface: Surface) -> Measured:
-        """Fly into the surface and out again.
+        """Simulate the impact on the surface until the contact ends.
 
         Raises:
-            NoImpact: No contact, or no end of it.
+            NoImpact: The contact does not begin or does not end.
         """
         mujoco, model = self._mujoco, self._model
         self._set(surface)
@@ -148,11 +152,11 @@ class Scene:
         return total
 
     def _rub(self, data: Any, rubbing: Vector, friction: float) -> Vector:
-        """Apply Coulomb's friction for the next step, at most ``μ f_n`` against the sliding, and return it.
+        """Apply Coulomb friction for the next step, at most ``μ f_n`` against the sliding, and return its force.
 
-        Iterate ``f ← P(f − r v)``, where P projects on the disc of radius ``μ f_n`` and v is the sliding velocity at
-        the end of the step.  At rest, f keeps the point in place.  In motion, it points against v.  While f changes,
-        the spring and damper of the contact hold the normal acceleration.
+        Iterate ``f ← P(f − r v)``, where P projects onto the disc of radius ``μ f_n`` and v is the sliding velocity
+        at the end of the step.  At rest, f keeps the point in place.  In motion, f points against v.  While f
+        changes, the spring and damper of the contact keep the normal acceleration constant.
         """
         self._mujoco.mj_forward(self._model, data)
         step, center, n = self._model.opt.timestep, data.geom("ball").xpos, self._n
@@ -174,7 +178,7 @@ class Scene:
     def _set(self, surface: Surface) -> None:
         model, T = self._model, surface.time
         model.opt.timestep = T / _FINE
-        # Negative numbers: stiffness and damping themselves.
+        # MuJoCo reads negative numbers as stiffness and damping, not as a time constant and a damping ratio.
         model.pair_solref[:] = -1 / T**2, -2 * surface.damping / T
         model.pair_solreffriction[:] = -1 / T**2, -_GRIP / T
         model.eq_solref[:] = -((_GRIP / 2 / T) ** 2), -_GRIP / T
@@ -199,7 +203,7 @@ class Scene:
 
 
 def _with_surface(written: Mjcf, objective: WorstCaseObjective, q: Vector) -> Mjcf:
-    """Add a ball at the contact point, the plane below it, and a tie to the world for each support, at ``q``."""
+    """Add, at ``q``, a ball at the contact point, a plane below the ball, and a constraint for each support."""
     robot, oracle = objective.robot, objective.oracle.at(q)
     numeric, n = Numeric(robot.model).at(q), oracle.n.copy()
     mujoco, spec = import_mujoco(), written.spec
@@ -212,7 +216,7 @@ def _with_surface(written: Mjcf, objective: WorstCaseObjective, q: Vector) -> Mj
 
     contact = point_on(robot, objective.contact.frame, objective.contact.offset)
     position = numeric.placement(contact).translation
-    # The ball's lowest point is the contact point.
+    # The lowest point of the ball is the contact point.
     center = numeric.data.oMi[contact.joint].actInv(position + _BALL * n)
     written.add_geom(contact.joint, "ball", "sphere", (_BALL,), pin.SE3(np.eye(3), center))
     written.add_plane("surface", position - _GAP * n, n)

@@ -1,4 +1,4 @@
-"""Operations of H with ∇H, counted on CasADi's instructions and on the graph behind our C."""
+"""Count the operations of H with ∇H in instructions of CasADi, and in the graph that becomes our C code."""
 
 from __future__ import annotations
 
@@ -11,7 +11,7 @@ from impact_posture.codegen.export_library import NamedObjective, export_library
 from impact_posture.codegen.expression_graph import ARITHMETIC, COSINE, SINE, Graph
 from impact_posture.impact.worst_case_objective import WorstCaseObjective
 
-# How often: "add" (and subtract), "mul", "div", "trig" (sines and cosines), "neg" (sign changes).
+# Number of operations by kind: "add" (and subtract), "mul", "div", "trig" (sines and cosines), "neg" (sign changes).
 Operations = Counter[str]
 _INSTRUCTIONS = {
     ca.OP_ADD: "add", ca.OP_SUB: "add", ca.OP_MUL: "mul", ca.OP_SQ: "mul", ca.OP_TWICE: "mul", ca.OP_DIV: "div",
@@ -21,22 +21,22 @@ _NODES = {"+": "add", "-": "add", "*": "mul", "inv": "div", "neg": "neg", SINE: 
 
 
 def total(operations: Operations) -> int:
-    """Count all operations except sign changes, which compilers fold."""
+    """Count all operations except sign changes, which compilers merge into other operations."""
     return operations.total() - operations["neg"]
 
 
 def of_function(function: ca.Function) -> Operations:
-    """Count the operations in CasADi's C of a function."""
+    """Count the operations in the C code that CasADi generates for a function."""
     kinds = (_INSTRUCTIONS.get(function.instruction_id(k)) for k in range(function.n_instructions()))
     return Counter(kind for kind in kinds if kind)
 
 
 def of_export(objective: WorstCaseObjective) -> tuple[Operations, int | None]:
-    """Count the operations of one call of ``eval`` of the export, on single numbers and with vectors.
+    """Count the operations of one call of the exported ``eval``, without and with vector instructions.
 
-    A call runs only the blocks that its outputs need, so the reachable part of the graph gives the count.  The second
-    number counts an operation on all repeated limbs once, and sines and cosines singly.  It is ``None`` without
-    repeated limbs.  The order of sums in the C is ignored, which changes the count by at most 1 %.
+    A call runs only the blocks that its outputs need, so only the reachable part of the graph is counted.  The second
+    number counts an operation on all repeated limbs once, but each sine and cosine.  This number is ``None`` if there
+    are no repeated limbs.  The order of sums in the C code is ignored, which changes the count by at most 1 %.
     """
     exported = export_library([NamedObjective(objective, "kernel")])
     outputs = next(f.outputs for f in exported.functions if f.name == "eval")

@@ -1,9 +1,10 @@
-"""Operations of an ideal articulated-body factorization, two solves and the gradient, counted joint by joint.
+"""Count, for each joint, the operations of an ideal articulated-body factorization, two solves and the gradient.
 
 The count follows patterns of zeros, not values.  In the axes of its link, each joint is a rotation in a coordinate
-plane.  To rotate a pair of numbers takes 4 multiplications and 2 additions (4m 2a), a symmetric 2×2 matrix 4m 5a, and
-a general 2×2 matrix 4m 10a with the double angle (3m 2a for each joint).  A constant rotation that only permutes axes
-is free, and any other costs one more plane.  Translations are cross products with the nonzero numbers.  Per joint:
+plane.  Rotating a pair of numbers requires 4 multiplications and 2 additions (4m 2a).  A symmetric 2×2 matrix
+requires 4m 5a, and a general 2×2 matrix 4m 10a with the double angle (3m 2a for each joint).  A constant rotation
+that only permutes axes requires no operation; any other is counted as one more plane rotation.  Translations are
+cross products with the nonzero numbers.  Each joint requires:
 
 - factorization: ``U = I^A S`` is a column, one reciprocal, ``U/D``, one triangle of ``I^a = I^A − U Uᵀ/D`` (its axis
   row is zero without armature), ``I^a`` rotated, moved (``p̂A``, then ``p̂B`` and its partner on a triangle), added;
@@ -11,7 +12,7 @@ is free, and any other costs one more plane.  Translations are cross products wi
 - gradient: the rows of ``f = I^a v⁻ + p^a`` that the axis row of ``v⁻ ×* f`` meets, for a and for b, and that row.
 
 The base adds ``Rᵀn``, an LDLᵀ of a symmetric 6×6 and two solves with it.  The count ignores symmetric values, equal
-entries and constants that fold, so a program can need fewer operations on particular robots.
+entries and constants that can be combined.  So a program can need fewer operations for some robots.
 """
 
 from __future__ import annotations
@@ -28,7 +29,7 @@ _TINY = 1e-9
 
 
 class _Count:
-    """A running total, and the steps that add to it; patterns go in and come out."""
+    """Counter of operations.  Each method takes and returns patterns of nonzero entries, and adds its operations."""
 
     total = 0
 
@@ -36,20 +37,20 @@ class _Count:
         self.total += sum(counts)
 
     def plus(self, x: Pattern, y: Pattern) -> Pattern:
-        """Sum of two arrays; of symmetric matrices one triangle."""
+        """Add two arrays; for symmetric matrices, only one triangle."""
         both = x & y
         self.ops(int(np.triu(both).sum() if both.ndim == 2 else both.sum()))
         return x | y
 
     def times(self, x: Pattern, y: Pattern, triangle: bool = False) -> Pattern:
-        """Matrix product, or one triangle of it."""
+        """Multiply two matrices; with ``triangle``, compute only one triangle of the product."""
         terms = x.astype(int) @ y.astype(int)
         wanted = np.triu(terms) if triangle else terms
         self.ops(int(wanted.sum()), int(np.maximum(wanted - 1, 0).sum()))
         return np.asarray(terms > 0)
 
     def turn(self, v: Pattern, axis: int) -> Pattern:
-        """A plane rotation of a 3-vector."""
+        """Rotate a 3-vector in a coordinate plane."""
         i, j = (axis + 1) % 3, (axis + 2) % 3
         both = int(v[i]) + int(v[j])
         self.ops(2 * both, 2 * (both == 2))
@@ -58,7 +59,7 @@ class _Count:
         return v
 
     def turn_matrix(self, M: Pattern, axis: int, symmetric: bool) -> Pattern:
-        """A plane rotation of a 3×3 matrix from both sides."""
+        """Rotate a 3×3 matrix in a coordinate plane, from both sides."""
         i, j, k = (axis + 1) % 3, (axis + 2) % 3, axis
         M = M.copy()
         if M[np.ix_([i, j], [i, j])].any():
@@ -70,7 +71,7 @@ class _Count:
 
 
 class _Joint:
-    """Transforms between the link of a joint and the parent link."""
+    """Transformations between the link of a joint and the parent link."""
 
     def __init__(self, model: pin.Model, i: int) -> None:
         name = model.joints[i].shortname().replace("JointModel", "")
@@ -87,11 +88,11 @@ class _Joint:
 
     @property
     def row(self) -> int:
-        """Index of the entry of a spatial vector along the axis."""
+        """Index of the entry of a spatial vector that belongs to the joint axis."""
         return self.axis + (3 if self.revolute else 0)
 
     def vector(self, count: _Count, v: Pattern, inward: bool) -> Pattern:
-        """A 3-vector's rotation."""
+        """Rotate a 3-vector to the parent link or from it."""
         if inward and self.revolute:
             v = count.turn(v, self.axis)
         if self.permutes:
@@ -102,19 +103,19 @@ class _Joint:
         return count.turn(v, self.axis) if self.revolute and not inward else v
 
     def force(self, count: _Count, f: Pattern) -> Pattern:
-        """A force to the parent."""
+        """Transform a spatial force to the parent link."""
         linear, angular = self.vector(count, f[:3], True), self.vector(count, f[3:], True)
         moment = count.times(self.cross, linear[:, None])[:, 0]
         return np.concatenate([linear, count.plus(angular, moment)])
 
     def motion(self, count: _Count, v: Pattern) -> Pattern:
-        """A motion from the parent."""
+        """Transform a spatial motion from the parent link."""
         swept = count.times(self.cross, v[3:, None])[:, 0]
         linear = count.plus(v[:3], swept)
         return np.concatenate([self.vector(count, linear, False), self.vector(count, v[3:], False)])
 
     def inertia(self, count: _Count, I: Pattern) -> Pattern:  # noqa: E741
-        """A symmetric 6×6 to the parent."""
+        """Transform a symmetric 6×6 inertia to the parent link."""
         A, B, D = I[:3, :3], I[:3, 3:], I[3:, 3:]
         if self.revolute:
             count.ops(3, 2)
@@ -133,7 +134,7 @@ class _Joint:
 
 
 def floor(robot: Robot, contact: int) -> int:
-    """Operations of H and ∇H of one robot with the contact on joint ``contact``'s link.
+    """Return the number of operations of H and ∇H for a robot with the contact on the link of joint ``contact``.
 
     Every joint has one degree of freedom, except a free-flyer at the root.
     """
@@ -157,7 +158,8 @@ def floor(robot: Robot, contact: int) -> int:
             f = count.times(reduced[i][rows], before[i][:, None])[:, 0]
             count.plus(f, forces.get(i, np.zeros(6, dtype=bool))[rows])
             count.ops(2 * int(sum(before[i][r] for r in rows)))
-    # The normal outward along the chain and the turning couple inward, its row added; scale; H; the contact's arms.
+    # Rotate the normal outward and the couple inward along the chain, and add the row of the couple.  The last count
+    # is for scaling, H, and the lever arms of the contact.
     for i in sorted(chain & set(joints)):
         for inward in (False, True):
             joints[i].vector(count, np.ones(3, dtype=bool), inward)
@@ -188,7 +190,7 @@ def _factorize(count: _Count, model: pin.Model, joints: dict[int, _Joint]) -> di
 
 
 def _inward(count: _Count, joints: dict[int, _Joint], active: set[int], loaded: set[int]) -> dict[int, Pattern]:
-    """Biases from the leaves; ``active`` joints take part, on ``loaded`` links an outer force (no moment) acts."""
+    """Pass biases from the leaves inward over the ``active`` joints; an external force acts on ``loaded`` links."""
     bias = {i: np.zeros(6, dtype=bool) for i in joints}
     for i in loaded & set(joints):
         bias[i][:] = True
@@ -210,7 +212,7 @@ def _inward(count: _Count, joints: dict[int, _Joint], active: set[int], loaded: 
 
 
 def _outward(count: _Count, model: pin.Model, joints: dict[int, _Joint], based: list[int]) -> dict[int, Pattern]:
-    """Velocities from the base: ``v⁻`` of every joint with a parent."""
+    """Pass velocities from the base outward; return ``v⁻`` of every joint that has a parent."""
     after = {i: np.ones(6, dtype=bool) for i in based}
     before = {}
     for i, joint in joints.items():

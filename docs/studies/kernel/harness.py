@@ -1,4 +1,4 @@
-"""Compare kernels with Pinocchio at random configurations, then time them in turns with C loops."""
+"""Compare kernels with Pinocchio at random configurations, then measure their times with C loops that take turns."""
 
 from __future__ import annotations
 
@@ -25,27 +25,28 @@ from impact_posture.robot.robot import Robot
 from impact_posture.system.toolchain import find_compiler
 
 COUNT = 256
-# Differences call H many times, so a few configurations are enough.
+# Number of configurations for finite differences.  Few are enough, because each needs many calls of H.
 FEW = 16
 STEP = 1e-5
-# First rounds do not count.  A pass before each pass restores the caches after other kernels.
+# Number of first rounds that are not timed.  Before each timed pass, an untimed pass restores the caches, which other
+# kernels have changed.
 _UNCOUNTED = 2
 Kind = Literal["eval", "value", "batch", "differences"]
 
 
 class Absent(Exception):
-    """A peer cannot run here; the message has the reason."""
+    """A peer cannot run on this machine; the message states the reason."""
 
 
 class Disagreement(Exception):
-    """A kernel computes other numbers or fails, so that its time means nothing."""
+    """A kernel computes different numbers or fails, so that its time has no meaning."""
 
 
 def c_compiler() -> list[str]:
     """Return the C compiler of the user.
 
     Raises:
-        CompilerError: There is none.
+        CompilerError: There is no C compiler.
     """
     compiler = find_compiler()
     if compiler is None:
@@ -55,7 +56,7 @@ def c_compiler() -> list[str]:
 
 @dataclass(frozen=True)
 class Samples:
-    """A robot free of supports, its contact frame, and a configuration and a normal for each call."""
+    """Robot without supports, its contact frame, and a configuration and a normal for each call."""
 
     robot: Robot
     frame: str
@@ -64,7 +65,7 @@ class Samples:
     def drawn(self) -> tuple[Vector, Vector]:
         """Configurations, shape (COUNT, nq), and world unit normals, shape (COUNT, 3); the same on every run."""
         rng, robot = np.random.default_rng(0), self.robot
-        # The base anywhere in any attitude, the joints some way around the default posture.
+        # The base has random positions and orientations; the joints are within 1 of the default posture.
         width = np.full(robot.nv, 1.0)
         width[: 6 if robot.floating else 0] = np.pi / 2
         start = robot.posture()
@@ -74,14 +75,14 @@ class Samples:
 
     @cached_property
     def moved(self) -> Vector:
-        """``q``, and ``q ⊕ ±h e_i`` of the first configurations, shape (FEW, 1 + 2 nv, nq)."""
+        """For the first configurations: ``q`` and ``q ⊕ ±h e_i``, shape (FEW, 1 + 2 nv, nq)."""
         nv, model = self.robot.nv, self.robot.model
         steps = np.concatenate([np.zeros((1, nv)), *[STEP * np.stack([e, -e]) for e in np.eye(nv)]])
         return np.array([[pin.integrate(model, q, step) for step in steps] for q in self.drawn[0][:FEW]])
 
     @cached_property
     def objective(self) -> WorstCaseObjective:
-        """Objective that is exported, with W = I."""
+        """Objective for the export, with W = I."""
         return WorstCaseObjective(self.robot, ImpactContact(self.frame, (0.0, 0.0, 1.0)))
 
     @cached_property
@@ -95,7 +96,7 @@ class Samples:
 
     @property
     def point(self) -> PointOnLink:
-        """The contact point in its link."""
+        """Contact point, relative to its link."""
         return point_on(self.robot, self.frame)
 
     @property
@@ -107,18 +108,18 @@ class Samples:
 
 @dataclass(frozen=True)
 class Kernel:
-    """An implementation of H and ∇H.
+    """Implementation of H and ∇H.
 
-    Addresses by kind: ``eval`` is ``int f(q, n, H, grad)``, ``value`` and ``differences`` are ``int f(q, n, H)``,
-    ``batch`` is ``int f(q, n, count, H, grad)``.
+    ``functions`` contains the address of a C function for each kind.  ``eval`` is ``int f(q, n, H, grad)``, ``value``
+    and ``differences`` are ``int f(q, n, H)``, ``batch`` is ``int f(q, n, count, H, grad)``.
     """
 
     name: str
     group: str
     built: Built
     functions: dict[Kind, ctypes.c_void_p]
-    operations: Operations | None = None  # of H with ∇H; None: a library of templates
-    packed: int | None = None  # operations if a vector instruction counts once; None: no vectors
+    operations: Operations | None = None  # operations for H and ∇H; None for a template library
+    packed: int | None = None  # same, each vector instruction counted once; None without vectors
     source_kb: float | None = None
 
 
@@ -130,11 +131,13 @@ class Harness:
         text = Path(__file__).with_name("harness.c").read_text(encoding="utf-8")
         self._loop = build({"harness.c": text}, c_compiler(), ["-std=c99", "-O2"]).library.time_pass
         self._loop.restype = ctypes.c_double
-        # H and ∇H.
+        # Buffers for H and ∇H.
         self._results = np.zeros(COUNT), np.zeros((COUNT, samples.robot.nv))
 
     def pass_s(self, kind: Kind, function: ctypes.c_void_p) -> float:
-        """Return processor seconds for each configuration of a pass, after a pass that does not count.
+        """Return the processor time of a pass divided by the number of configurations, s.
+
+        An untimed pass runs first.
 
         Raises:
             Disagreement: A call returned an error code.
@@ -154,7 +157,8 @@ class Harness:
         """Return the largest relative difference of H and ∇H (over its largest entry) from the oracle.
 
         Raises:
-            Disagreement: Above 1e-6, or 1e-5 for finite differences; or a call that returned an error code.
+            Disagreement: The difference is above 1e-6 (1e-5 for finite differences), or a call returned an error
+                code.
         """
         worst = 0.0
         for kind, function in kernel.functions.items():
@@ -169,15 +173,15 @@ class Harness:
             if kind != "value":
                 scale = np.maximum(np.abs(gradient).max(axis=1), 1e-3 * np.abs(H))
                 errors.append((np.abs(own - gradient).max(axis=1) / scale).max())
-            # np.max keeps a NaN, which max() may drop.
+            # np.max returns NaN if an entry is NaN, but max() may ignore it.
             worst = float(np.max(errors))
-        # Not ">": that is false for a NaN.
+        # The condition is not written with ">", which is false for NaN.
         if not worst <= (1e-5 if kernel.group == "differences" else 1e-6):
             raise Disagreement(f"its numbers differ from Pinocchio's by {worst:.1e}, relative")
         return worst
 
     def times(self, kernels: Sequence[Kernel], rounds: int) -> list[dict[Kind, float]]:
-        """Return medians over rounds in which the kernels take turns, µs for each configuration."""
+        """Return the time for each configuration, µs: medians over rounds in which the kernels take turns."""
         passes: list[dict[Kind, list[float]]] = [{kind: [] for kind in kernel.functions} for kernel in kernels]
         with one_core():
             for _ in range(rounds + _UNCOUNTED):

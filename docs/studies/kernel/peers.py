@@ -1,4 +1,7 @@
-"""Our export and other implementations: each group is a function that returns kernels for the samples."""
+"""Kernels of our export and of other implementations.
+
+Each group is a function that returns kernels for the samples.
+"""
 
 from __future__ import annotations
 
@@ -47,7 +50,7 @@ int kernel_eval(const double *q, const double *n, double *H, double *grad)
 
 
 def exported(objective: WorstCaseObjective, prefix: str) -> tuple[Iterator[tuple[str, Built]], float]:
-    """Build the C export with each set of flags; return builds by name, and the size of the source, kB."""
+    """Build the C export with each set of flags.  Return the builds by name, and the size of the source, kB."""
     with tempfile.TemporaryDirectory() as folder:
         export(objective, Path(folder), prefix=prefix, check=False)
         sources = {name: (Path(folder) / name).read_text(encoding="utf-8") for name in (f"{prefix}.c", f"{prefix}.h")}
@@ -58,7 +61,7 @@ def exported(objective: WorstCaseObjective, prefix: str) -> tuple[Iterator[tuple
 
 
 def ours(samples: Samples) -> list[Kernel]:
-    """Return the export, and ∇H by central differences of its H."""
+    """Return kernels of the export, and kernels that compute ∇H by central differences of the exported H."""
     builds, size = exported(samples.objective, "kernel")
     count, packed = of_export(samples.objective)
     kernels = []
@@ -74,7 +77,7 @@ def ours(samples: Samples) -> list[Kernel]:
 
 
 def same_graph(samples: Samples) -> list[Kernel]:
-    """Return the expressions behind our export, printed by CasADi and compiled with the same flags."""
+    """Return kernels for the expressions of our export, but with C code of CasADi, compiled with the same flags."""
     exported = export_library([NamedObjective(samples.objective, "kernel")])
     q, n, _ = exported.function.sx_in()
     values = exported.function.call([q, n, ca.DM(exported.constants)])
@@ -86,13 +89,13 @@ def same_graph(samples: Samples) -> list[Kernel]:
 
 
 def dense(samples: Samples) -> list[Kernel]:
-    """Return the textbook method in CasADi: composite rigid bodies, LDLᵀ, reverse mode."""
+    """Return kernels for the textbook method in CasADi: composite rigid bodies, LDLᵀ, reverse mode."""
     robot = samples.robot
     q, n, step = ca.SX.sym("q", robot.nq), ca.SX.sym("n", 3), ca.SX.sym("step", robot.nv)
-    # To first order in the step this is q ⊕ step.
+    # To first order in step, this vector is q ⊕ step.
     at, direction = q + tangent_map(Chart(robot.model), q) @ step, n
     if robot.floating:
-        # M does not depend on the pose of the base, so keep the base fixed and turn the normal into its axes.
+        # M does not depend on the pose of the base, so keep the base fixed and express the normal in its axes.
         at = ca.vertcat(ca.DM([0, 0, 0, 0, 0, 0, 1]), at[7:])
         rest = quaternion_matrix(q[3:7]).T @ n
         direction = rest - ca.cross(step[3:6], rest)
@@ -103,17 +106,17 @@ def dense(samples: Samples) -> list[Kernel]:
 
 
 def adam(samples: Samples) -> list[Kernel]:
-    """Return ADAM's mass matrix and Jacobian with LDLᵀ and reverse mode.
+    """Return kernels for the mass matrix and the Jacobian of ADAM, with LDLᵀ and reverse mode.
 
-    ADAM takes the homogeneous transform of the base and the joint positions.  Here the transform of ``q`` is
-    multiplied by the rotation ``1 + ε̂``, so reverse mode with respect to (ε, joints) at ε = 0 gives the
-    tangent gradient in the axes of the base.  The position of the base does not enter H.  In the representation
-    BODY_FIXED, M agrees with Pinocchio, and the Jacobian is in the axes of the frame, so the normal is turned into
+    The inputs of ADAM are the homogeneous transform of the base and the joint positions.  Here the transform of ``q``
+    is multiplied by the rotation ``1 + ε̂``, so reverse mode with respect to (ε, joints) at ε = 0 gives the tangent
+    gradient in the axes of the base.  H does not depend on the position of the base.  In the representation
+    BODY_FIXED, M agrees with Pinocchio, and the Jacobian is in the axes of the frame, so the normal is expressed in
     these axes.  Armature, which ADAM does not have, is added to the diagonal.  For a fixed base, the rows and columns
     of the base are left out.
 
     Raises:
-        Absent: ADAM is not installed, or cannot do this robot.
+        Absent: ADAM is not installed, or does not support this robot.
     """
     try:
         from adam import Representations
@@ -124,13 +127,13 @@ def adam(samples: Samples) -> list[Kernel]:
         raise Absent("has no joints of several coordinates")
     robot, quiet = samples.robot, io.StringIO()
     try:
-        # The URDF reader of ADAM prints unknown elements.
+        # Redirect the output, because the URDF reader of ADAM prints unknown elements.
         with contextlib.redirect_stderr(quiet), contextlib.redirect_stdout(quiet), _prismatic_joints_repaired():
             kinematics = KinDynComputations(_urdf(samples), list(robot.joint_names))
             kinematics.set_frame_velocity_representation(Representations.BODY_FIXED_REPRESENTATION)
             functions = [kinematics.mass_matrix_fun(), kinematics.jacobian_fun(samples.frame)]
             functions.append(kinematics.forward_kinematics_fun(samples.frame))
-    except Exception as failed:  # whatever its URDF reader raises
+    except Exception as failed:  # The URDF reader of ADAM raises various errors.
         raise Absent(f"cannot read this robot ({type(failed).__name__}: {failed})") from None
     q, n, step = ca.SX.sym("q", robot.nq), ca.SX.sym("n", 3), ca.SX.sym("step", robot.nv)
     floating = robot.floating
@@ -154,12 +157,12 @@ def _by_reverse_mode(label: str, group: str, q: ca.SX, n: ca.SX, step: ca.SX, H:
     general = ca.Function("general", [q, n, step], [H, ca.densify(ca.gradient(H, step))])
     values = general.call([q, n, ca.DM.zeros(step.shape)])
     function = ca.Function("eval", [q, n], values, ["q", "n"], ["H", "grad"], {"cse": True})
-    # GNU C, the usual dialect for CasADi's code.
+    # Compile as GNU C, the usual dialect for C code of CasADi.
     return _printed(label, group, function, {"-O2": ["-O2"], "-O3 native": ["-O3", "-march=native"]})
 
 
 def _printed(label: str, group: str, function: ca.Function, ways: dict[str, Sequence[str]]) -> list[Kernel]:
-    """Compile CasADi's C of ``(q, n) → H, ∇H``."""
+    """Compile the C code that CasADi generates for ``(q, n) → H, ∇H``."""
     with tempfile.TemporaryDirectory() as folder:
         generator = ca.CodeGenerator("peer.c", {"with_header": False})
         generator.add(function)
@@ -189,7 +192,7 @@ def _urdf(samples: Samples) -> str:
 
 @contextlib.contextmanager
 def _prismatic_joints_repaired() -> Iterator[None]:
-    """Keep six rows of the motion subspace of prismatic joints.  ADAM 0.5 has twelve, and its mass matrix fails."""
+    """Correct an error of ADAM 0.5: reduce the motion subspace of prismatic joints from twelve rows to six."""
     from adam.model.std_factories.std_joint import StdJoint
 
     original = StdJoint.motion_subspace

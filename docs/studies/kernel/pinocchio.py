@@ -1,4 +1,4 @@
-"""Pinocchio C++ from the headers of its wheel: builds ``pinocchio_peer.cpp`` and hands it the model."""
+"""Build ``pinocchio_peer.cpp`` with the headers of the Pinocchio wheel, and pass the robot model to it."""
 
 from __future__ import annotations
 
@@ -14,16 +14,18 @@ from docs.studies.core import Vector, say
 from docs.studies.kernel.harness import Absent, Kernel, Samples
 from tests.support.tools import cxx_compiler, eigen_headers
 
-# Boost.MPL's preprocessed headers stop below the number of Pinocchio's joint types.
+# The preprocessed headers of Boost.MPL support fewer types than Pinocchio has joint types.
 DEFINITIONS = (
     "BOOST_MPL_LIMIT_LIST_SIZE=30", "BOOST_MPL_LIMIT_VECTOR_SIZE=30", "BOOST_MPL_CFG_NO_PREPROCESSED_HEADERS",
     "BOOST_FUSION_INVOKE_MAX_ARITY=12", "FUSION_MAX_VECTOR_SIZE=12", "NDEBUG",
 )  # fmt: skip
-# With GCC's default budget, inlining in one row depends on the other rows, which changes its time by up to a fifth.
+# With the default limits of GCC, the inlining of one formulation depends on the others, which changes its time by up
+# to a fifth.
 _INLINE = ("inline-unit-growth=400", "large-function-growth=2000", "large-stack-frame-growth=10000")
 _PARAMETERS = [*[f"--param={p}" for p in _INLINE], *[f"-D{d}" for d in DEFINITIONS]]
 _FLAGS = ("-std=c++17", "-O3", "-march=native", CONTRACT, *_PARAMETERS)
-# The first is Pinocchio's own derivative algorithms; the others are by hand in part or whole.  Row → H with ∇H, H.
+# The first formulation uses derivative algorithms of Pinocchio; the others are partly or fully handwritten.  Each
+# name maps to the functions for H with ∇H, and for H.
 DERIVATIVES = "Pinocchio derivatives"
 FORMULATIONS = {
     DERIVATIVES: ("rnea", "chol"),
@@ -35,10 +37,10 @@ _FREE_FLYER = 8
 
 
 def kernels(samples: Samples) -> list[Kernel]:
-    """Build every formulation.  They share one library and one loaded model, so time one robot at a time.
+    """Build every formulation.  All share one library and one loaded model, so time one robot at a time.
 
     Raises:
-        Absent: No C++ compiler or headers, or a model that the peer does not support.
+        Absent: The C++ compiler or headers are missing, or the peer does not support the model.
     """
     arrays = model_arrays(samples.robot.model)
     compiler, eigen = cxx_compiler(), eigen_headers()
@@ -63,7 +65,7 @@ def model_arrays(model: pin.Model) -> list[np.ndarray]:
     """Return parents, joints, axes, placements, inertias and armature for ``peer_load``.
 
     Raises:
-        Absent: A joint that the peer does not have, or armature on the free-flyer.
+        Absent: The peer does not support a joint of the model, or the free-flyer has armature.
     """
     links = range(1, model.njoints)
     kinds, axes = zip(*[_kind(model.joints[i]) for i in links], strict=True)

@@ -1,7 +1,8 @@
-"""Compare implementations of H and ∇H: time, operations, size of the source, time of the compiler.
+"""Compare implementations of H and ∇H by time, operations, source size and compile time.
 
-All implementations get the same configurations and normals, W = I, and the robot without supports.  After a check of
-their numbers, C loops call them in turns on one core.  Lines below the table name implementations that cannot run.
+All implementations use the same configurations and normals, W = I, and the robot without supports.  After a check of
+their numbers, C loops call the implementations in turns on one core.  Lines below the table name implementations that
+cannot run.
 """
 
 from __future__ import annotations
@@ -20,7 +21,8 @@ from impact_posture.robot.robot_loader import load_robot
 
 ROBOTS = ("solo8", "tilthex_arm", "panda", "talos")
 PEERS = {"same graph": same_graph, "pinocchio": kernels, "adam": adam, "casadi": dense}
-# Our fastest row is compared with the fastest row whose name starts so, except one.
+# Our fastest row is compared with the fastest row whose name starts with the first text and differs from the second
+# text.
 _AGAINST = {
     "Pinocchio's own derivative algorithms": (DERIVATIVES, ""),
     "the fastest by hand on Pinocchio's types": ("Pinocchio", DERIVATIVES),
@@ -34,19 +36,19 @@ _HEAD = "implementation|H, ∇H µs|ratio|H µs|∇/H|batch µs|operations|packe
 
 @dataclass(frozen=True)
 class Report:
-    """Rows of one robot, ours first, with times in µs, and reasons for missing rows."""
+    """Rows of the table of one robot, with times in µs and our rows first, and the reasons for missing rows."""
 
     samples: Samples
     rows: Sequence[tuple[Kernel, dict[Kind, float], float]]
     skipped: Sequence[str]
 
     def fastest(self, start: str, but: str = "") -> float | None:
-        """Return the shortest time of H with ∇H among the rows whose names start so."""
+        """Return the shortest time of H with ∇H among the rows whose names start with ``start``."""
         names = [k.name.startswith(start) and k.name != but for k, _, _ in self.rows]
         return min((_single(t) for (_, t, _), fits in zip(self.rows, names, strict=True) if fits), default=None)
 
     def compared(self, start: str, but: str) -> str:
-        """Write how many times faster our code is; in brackets for a configuration of a batch."""
+        """Return text: how many times faster our code is, and in brackets, how many times faster our batch is."""
         other, own = self.fastest(start, but), self.fastest("ours") or 1.0
         batch = min(times["batch"] for _, times, _ in self.rows if "batch" in times)
         return "–" if other is None else f"{other / own:.1f} ({other / batch:.1f})"
@@ -57,10 +59,10 @@ def _single(times: dict[Kind, float]) -> float:
 
 
 def measure(samples: Samples, rounds: int, peers: Sequence[str] = tuple(PEERS)) -> Report:
-    """Build and check the implementations, and time those with right numbers.
+    """Build and check the implementations, and measure the time of implementations with correct numbers.
 
     Raises:
-        CompilerError: No C compiler, or a build of ours is wrong.
+        CompilerError: There is no C compiler, or our export cannot be built or computes wrong numbers.
     """
     robot, skipped = samples.robot, []
     say(f"{robot.name}: the export")
@@ -81,14 +83,14 @@ def measure(samples: Samples, rounds: int, peers: Sequence[str] = tuple(PEERS)) 
     say(f"{robot.name}: {rounds} rounds")
     times = harness.times([kernel for kernel, _ in right], rounds)
     rows = [(kernel, timed, error) for (kernel, error), timed in zip(right, times, strict=True)]
-    # Keep only the fastest of our builds by differences.
+    # Of our builds with finite differences, keep only the fastest.
     differences = {kernel.name: t["differences"] for kernel, t, _ in rows if "differences" in t}
     slower = sorted(differences, key=lambda name: differences[name])[1:]
     return Report(samples, [row for row in rows if row[0].name not in slower], skipped)
 
 
 def lines(request: Request) -> Iterator[str]:
-    """Yield comparisons, a table for each robot, and the commands of the compilers."""
+    """Yield comparisons, a table for each robot, and the compiler commands."""
     reports = []
     for name in (name for name in ROBOTS if request.only in name):
         robot = load_robot(name)
