@@ -21,7 +21,7 @@ class ImpactCase:
         contact: Point and normal of the impact.
         metric: Weight ``W`` of the squared norm of the jump.
         supports: Feet that stay on the ground; empty for a robot that flies or is bolted down.
-        compliance: ε of the supports, 1/kg.  Zero stands for the
+        compliance: Compliance ε of the supports, 1/kg.  Zero selects the
             :func:`~impact_posture.impact.support_compliance.default_compliance`.
     """
 

@@ -15,9 +15,9 @@ from impact_posture.errors import ContactError
 from impact_posture.robot.robot import Robot
 from impact_posture.robot.robot_spec import Support as Support
 
-# A normal whose length differs from 1 by less is a unit vector up to rounding.
+# A normal is a unit vector up to rounding if its length differs from 1 by at most this.
 _UNIT = 1e-15
-# Largest impulse and speed.  Their squares times the quantities of a robot must stay within the range of doubles.
+# Largest impulse and speed.  The products of their squares and the quantities of a robot must not overflow a double.
 LARGEST = 1e100
 
 
@@ -27,11 +27,11 @@ class ImpactContact:
     """A point of the robot that will touch a surface.
 
     Attributes:
-        frame: The frame that carries the contact point.
-        normal: Direction out of the surface, towards the robot, shape (3,).  Any length is accepted, and the
+        frame: Name of the frame to which the contact point is fixed.
+        normal: Direction out of the surface, towards the robot, shape (3,).  The argument can have any length; the
             attribute is a unit vector.
-        offset: Contact point from the frame's origin, in the frame, meters.
-        normal_frame: Axes of ``normal``: the world, or the contact frame, with which the normal turns.
+        offset: Position of the contact point in the coordinates of ``frame``, shape (3,), m.
+        normal_frame: Axes in which ``normal`` is stated: ``world``, or ``contact`` for axes that turn with the frame.
         impulse: Largest impulse λ̄ along the normal, N·s.
         friction: Coulomb coefficient μ.
 
@@ -44,14 +44,14 @@ class ImpactContact:
     normal: Direction
     offset: FiniteVector = (0.0, 0.0, 0.0)
     normal_frame: NormalFrame = "world"
-    # The objective λ̄²H of a larger or smaller impulse is beyond double precision.
+    # For a larger or smaller impulse, the objective λ̄²H would be outside the range of doubles.
     impulse: Annotated[float, between(1 / LARGEST, LARGEST, "N·s")] = 1.0
     friction: Annotated[float, between(0, LARGEST)] = FRICTION
 
     def __post_init__(self) -> None:
         n = np.array(self.normal, dtype=float)
-        # Divide by the largest entry first, because squares of long vectors overflow.  A unit normal is not divided,
-        # so that the copy of a contact has exactly the same normal.
+        # Divide by the largest entry first, because the squares of large entries overflow.  A unit normal stays
+        # unchanged, so a copy of a contact has exactly the same normal.
         if abs(np.linalg.norm(n / np.abs(n).max()) * np.abs(n).max() - 1) > _UNIT:
             n = n / np.abs(n).max()
             n = n / np.linalg.norm(n)
@@ -72,10 +72,10 @@ class ImpactContact:
 
 
 def point_on(robot: Robot, frame: str, offset: Vector3 = (0.0, 0.0, 0.0)) -> PointOnLink:
-    """Resolve a frame and an offset in it to a point on a link.
+    """Return the point on a link at ``offset``, m, in the coordinates of ``frame``.
 
     Raises:
-        FrameNotFound: There is no such frame.
+        FrameNotFound: The robot has no such frame.
         ContactError: The frame is welded to the world.
     """
     carrier = robot.model.frames[robot.frame_id(frame)]

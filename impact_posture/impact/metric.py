@@ -27,11 +27,11 @@ class Metric:
     Attributes:
         kind: ``euclidean`` (W = I), ``kinetic`` (W = M) or ``weighted`` (diagonal).
         weights: Diagonal of the weighted metric, shape (nv,); else ``None``.
-        source: Origin of the weights.
+        source: Text that states where the weights come from.
 
     Raises:
         InputError: The kind is unknown, or a weight is not above zero.
-        MetricError: The weights do not belong to the kind.
+        MetricError: The kind is ``weighted`` and weights are missing, or another kind has weights.
     """
 
     kind: MetricKind = "euclidean"
@@ -43,22 +43,22 @@ class Metric:
             what = "needs weights" if self.weights is None else "takes no weights"
             raise MetricError(f"the {self.kind} metric {what}", where="metric", hint="see build_metric")
         if self.weights is not None:
-            # Equality and hash of the dataclass need a tuple, not an array.
+            # The dataclass can be compared and hashed only if the weights are a tuple, not an array.
             object.__setattr__(self, "weights", tuple(float(weight) for weight in self.weights))
 
     def diagonal(self, nv: int) -> Array:
-        """Return the diagonal of ``W``, shape (nv,), for a metric other than ``kinetic``."""
+        """Return the diagonal of ``W``, shape (nv,).  The kind must not be ``kinetic``."""
         return np.ones(nv) if self.weights is None else np.array(self.weights)
 
 
 def build_metric(robot: Robot, kind: MetricKind, weights: str | tuple[float, ...] | None = None) -> Metric:
-    """Build a metric.
+    """Build a metric of a given kind.
 
-    The weighted metric takes ``weights``: nv numbers, ``velocity-limits``, or a TOML file of joint = weight
-    (``base = [6 numbers]``).
+    The weighted metric needs ``weights``: nv numbers, the text ``velocity-limits``, or the path of a TOML file.  The
+    file has lines ``joint = weight``, and ``base = [6 numbers]`` for a floating base.
 
     Raises:
-        MetricError: Weights are missing, zero or negative.
+        MetricError: Weights are missing, wrong in number, not above zero, or given for another kind.
     """
     if kind != "weighted":
         if weights is not None and kind in get_args(MetricKind):
@@ -84,7 +84,7 @@ def build_metric(robot: Robot, kind: MetricKind, weights: str | tuple[float, ...
 
 
 def check_weights(robot: Robot, weights: Sequence[float] | None) -> None:
-    """Raise MetricError for weights that are not one number for each of the nv velocities."""
+    """Raise MetricError if ``weights`` does not have one number for each of the nv velocity entries."""
     if weights is not None and np.shape(weights) != (robot.nv,):
         hint = f"give {robot.nv} numbers above zero"
         raise MetricError(f"has {np.size(weights)} entries", where="weights", hint=hint)
@@ -93,7 +93,7 @@ def check_weights(robot: Robot, weights: Sequence[float] | None) -> None:
 def _from_limits(robot: Robot) -> Array:
     limits = robot.velocity_limits
     base = 6 if robot.floating else 0
-    # A floating base has no velocity limits.  Limits of 1 m/s and 1 rad/s keep its velocities in the norm.
+    # A floating base has no velocity limits.  With limits of 1 m/s and 1 rad/s, the norm includes its velocities.
     limits[:base] = 1.0
     for name, limit in zip(robot.tangent_names[base:], limits[base:], strict=True):
         if not limit < 1e6:

@@ -1,4 +1,4 @@
-"""The :class:`Objective` protocol and its parts, the only interface of an objective to the program and its solver."""
+"""The :class:`Objective` protocol, through which the program and its solver use an objective."""
 
 from __future__ import annotations
 
@@ -20,11 +20,11 @@ from impact_posture.system.arrays import Array
 
 @dataclass(frozen=True, eq=False)
 class Subgradients:
-    """Gradients whose convex hull is the subdifferential.
+    """Gradients whose convex hull is the subdifferential of an objective.
 
     Attributes:
-        gradients: Tangent gradients of the members of a maximum, shape (k, nv).
-        gaps: Objective minus the value of each member, ≥ 0, shape (k,).
+        gradients: Tangent gradients of the members of the maximum, one per row, shape (k, nv).
+        gaps: Value of the objective minus the value of each member, ≥ 0, shape (k,).
     """
 
     gradients: Array
@@ -37,14 +37,14 @@ class Subgradients:
 
 
 class Minimized(Protocol):
-    """A function of the posture with a numeric value, subgradients and a lifted form for the program."""
+    """A function of the posture that can be minimized: numeric value, subgradients, and lifted form."""
 
     @property
     def attempts(self) -> int:
-        """Number of different guesses of :meth:`guess`."""
+        """Number of different initial guesses that :meth:`guess` offers."""
 
     def guess(self, q: Array, scale: float, attempt: int = 0) -> Guess:
-        """Return the initial auxiliaries of the lifted form at ``q``, and their bounds."""
+        """Return initial values at ``q`` for the auxiliaries of the lifted form, and their bounds."""
 
     def value(self, q: Array) -> float:
         """Return the value at ``q``, > 0, computed with Pinocchio.
@@ -56,26 +56,29 @@ class Minimized(Protocol):
     def subgradients(self, q: Array, within: float = 0.0) -> Subgradients:
         """Return gradients that span the subdifferential at ``q``, computed with Pinocchio.
 
-        There is one gradient where the value is smooth.  A member of a maximum contributes its gradient if its value
-        is at most ``within`` below the maximum.  The leading member comes first.
+        If the value is smooth at ``q``, the result is one gradient.  If the value is a maximum, the result includes
+        the gradient of every member that is at most ``within`` below the maximum, the leading member first.
         """
 
     def lift(self, tree: Tree, parameters: ca.SX, scale: ca.SX) -> Lifted:
-        """Return the value in terms of auxiliaries and equations at ``tree.q``; ``scale`` is a typical value."""
+        """Return the value at ``tree.q`` as an expression of auxiliary unknowns, with the equations that define them.
+
+        ``scale`` is a typical size of the value.
+        """
 
 
 class WorstCase(Minimized, Protocol):
     """The largest value that an uncertain impact can have at one posture.
 
-    The parameters of :meth:`lift` are the normal.
+    The argument ``parameters`` of :meth:`lift` is the normal of the leading contact.
     """
 
     @property
     def oracle(self) -> ImpactOracle:
-        """The oracle of the leading contact, on the robot as modeled."""
+        """The oracle of the leading contact for the robot as modeled."""
 
     def expressions(self, k: ImpactKernel) -> tuple[ca.SX, ca.SX]:
-        """Return value and tangent gradient (nv) of the worst member in the symbols of a kernel of its contact."""
+        """Return value and tangent gradient (nv) of the worst member, in the symbols of the kernel ``k``."""
 
 
 class Objective(Minimized, Protocol):
@@ -99,14 +102,14 @@ class Objective(Minimized, Protocol):
 
     @property
     def structure(self) -> str:
-        """Text that identifies the expressions of a robot, as part of the key of the compile cache."""
+        """Text that, with the robot, identifies the expressions; it is part of the key of the compile cache."""
 
     @property
     def parameters(self) -> Array:
-        """Parameters of the lifted form, which may change without rebuilding the program, shape (k,)."""
+        """Parameters of the lifted form, shape (k,).  They can change without rebuilding the program."""
 
     def movable(self, q: Array) -> bool:
-        """Return whether the contact can move at ``q``; otherwise the value is a rounding error."""
+        """Return whether the contact can move at ``q``; if not, the value consists of rounding errors."""
 
     def blind_motions(self) -> Array:
         """Return base twists that do not change the value, world axes, linear first, shape (k, 6)."""

@@ -1,4 +1,4 @@
-"""Resolve settings to robot, contact, supports, metric and objective, for all commands and for Python."""
+"""Turn settings into robot, contacts, supports, metric and objective, for all commands and for Python."""
 
 from __future__ import annotations
 
@@ -27,12 +27,12 @@ FLOATS = "because its data name neither feet nor rotors"
 
 
 def resolve(settings: ImpactSettings, robot: Robot | None = None) -> ResolvedImpact:
-    """Load the robot, unless it is passed, and check all settings against it.
+    """Load the robot, unless ``robot`` is given, and check all settings for this robot.
 
-    A setting that is ``None`` takes its value from the robot.
+    If a setting is ``None``, the value in the robot's data is used.
 
     Raises:
-        ImpactPostureError: A setting is wrong.  The error names the first.
+        ImpactPostureError: A setting is wrong.  The error names the first wrong setting.
     """
     robot = with_joint_model(load_robot(settings.robot, settings) if robot is None else robot, settings.joint_model)
     q = read_posture(robot, settings.posture)
@@ -64,7 +64,7 @@ def resolve(settings: ImpactSettings, robot: Robot | None = None) -> ResolvedImp
 
 
 def _choose(settings: ImpactSettings, *, several: bool) -> tuple[ObjectiveKind, str]:
-    """Return the objective of the settings, and for ``auto`` the reason for the choice."""
+    """Return the kind of objective, and the reason for it if the setting is ``auto`` (otherwise empty)."""
     if settings.objective != "auto":
         return settings.objective, ""
     if several:
@@ -110,17 +110,17 @@ def _contact(
 
 @dataclass(frozen=True, eq=False)
 class ResolvedImpact:
-    """An impact whose settings fit its robot.
+    """An impact whose settings have been checked for its robot.
 
     Attributes:
         objective: Robot, contact, metric, kind, supports and compliance.
-        q: The posture of the settings, shape (nq,).
-        posture: Name or file of this posture.
+        q: The posture that the settings name, shape (nq,).
+        posture: Name or file of the posture ``q``.
         speed: Approach speed, m/s.
         restitution: Coefficient of restitution.
-        missing_support: Hint how to state the supports of a floating robot without any; else empty.
-        contact_stiffness: Elasticity of the contact; ``None`` if it is not known.
-        choice: Why ``auto`` chose this objective; empty if the settings name it.
+        missing_support: Hint how to state supports, for a floating robot for which none are stated; otherwise empty.
+        contact_stiffness: Elasticity of the contact; ``None`` if not known.
+        choice: Reason why ``auto`` chose this objective; empty if the settings name the objective.
     """
 
     objective: WorstCaseObjective
@@ -149,7 +149,7 @@ class ResolvedImpact:
 
     @property
     def metric(self) -> Metric:
-        """Metric of the velocity jump."""
+        """Metric that measures the velocity jump."""
         return self.objective.metric
 
     def evaluate(self, q: Array | None = None) -> Evaluation:
@@ -168,7 +168,7 @@ class ResolvedImpact:
     def to_dict(self, q: Array | None = None) -> dict[str, object]:
         """Return the blocks of ``result.json`` that state the impact: robot, contacts, supports, metric.
 
-        Normals are in world axes at ``q``, by default at :attr:`q`.
+        Normals are stated in world axes for the posture ``q``; by default, for :attr:`q`.
         """
         q = self.q if q is None else q
         return {
@@ -198,7 +198,7 @@ def robot_block(robot: Robot) -> dict[str, object]:
 
 
 def missing_support(robot: Robot) -> str:
-    """Return a hint how to state the supports of a floating robot whose data name neither feet nor rotors."""
+    """Return a hint how to state supports if a floating robot has data for neither feet nor rotors; else empty."""
     spec = robot.spec
     known = spec.propulsion is not None or spec.kind == "aerial" or spec.constraints.level_base
     if not robot.floating or known:

@@ -1,4 +1,4 @@
-"""The compliance ε of supports: its default and limits, and the inertia by which held feet enter the dynamics."""
+"""The compliance ε of supports: default, limits, and the inertia that represents supports in the dynamics."""
 
 from __future__ import annotations
 
@@ -11,26 +11,26 @@ from impact_posture.robot.robot import Robot
 from impact_posture.robot.robot_spec import Support
 from impact_posture.system.arrays import Array
 
-# Compliance times the mass of the robot: the default, and the least value that leaves enough digits.
+# Compliance times the mass of the robot: default, and least value for which rounding errors remain acceptable.
 _DEFAULT_COMPLIANCE, _LEAST_COMPLIANCE = 1e-4, 1e-6
 
 
 def default_compliance(robot: Robot) -> float:
-    """Return the default support compliance ε in 1/kg: a foot is held as if it weighed 10⁴ robots.
+    """Return the default support compliance ε, 1/kg, for which a foot acts as if it had the mass of 10⁴ robots.
 
-    The solution of ``M a − J_sᵀ f = Jᵀ n, J_s a + ε f = 0`` is smooth in ``q`` for any ε > 0.  The feet change the
-    jump by a share of at most ``ε/(σ + ε)`` less than rigid feet do, with σ the least eigenvalue of ``J_sM⁻¹J_sᵀ``
-    above zero.  This share is 1e-4 where the feet bear the mass of the robot, and larger where ``J_s`` nearly loses
-    rank.
+    The solution of ``M a − J_sᵀ f = Jᵀ n, J_s a + ε f = 0`` is smooth in ``q`` for any ε > 0.  Compared with rigid
+    feet, the effect of the feet on the jump is smaller by a share of at most ``ε/(σ + ε)``, where σ is the least
+    eigenvalue of ``J_sM⁻¹J_sᵀ`` above zero.  If the effective mass at the feet is the mass of the robot, this share
+    is 1e-4.  If ``J_s`` nearly loses rank, the share is larger.
     """
     return _DEFAULT_COMPLIANCE / robot.mass
 
 
 def least_compliance(robot: Robot) -> float:
-    """Return the least compliance ε that the symbolic kernel and the C export allow, 1/kg.
+    """Return the least compliance ε, 1/kg, that the symbolic kernel and the C export allow.
 
-    Both add ``1/ε`` to the inertia of the feet and subtract it again on the path to the base.  The difference loses
-    as many digits as ``ε`` has zeros.  About eight digits are left at this limit.
+    Both add ``1/ε`` to the inertia of the feet, and subtract it again on the path to the base.  The difference has a
+    rounding error proportional to ``1/ε``.  At this limit, about eight digits are correct.
     """
     return _LEAST_COMPLIANCE / robot.mass
 
@@ -44,12 +44,15 @@ def check_compliance(robot: Robot, compliance: float) -> None:
 
 
 def heavy_feet_rounding(robot: Robot, compliance: float) -> float:
-    """Return the rounding error of ``M + J_sᵀJ_s/ε`` relative to its error with the default compliance, ≥ 1."""
+    """Return how many times larger the rounding error of ``M + J_sᵀJ_s/ε`` is than with the default ε, at least 1."""
     return max(1.0, default_compliance(robot) / compliance)
 
 
 def support_inertia(robot: Robot, supports: tuple[Support, ...], compliance: float) -> dict[int, Array]:
-    """Return ``J_sᵀJ_s/ε`` by link, as 6×6 inertias: a point mass ``1/ε``, for a surface also moments ``1/ε``."""
+    """Return the inertias, shape (6, 6), by joint index, that represent the supports: their sum is ``J_sᵀJ_s/ε``.
+
+    Each support is a point mass ``1/ε``.  A surface support also has the rotational inertia ``1/ε``.
+    """
     extra: dict[int, Array] = {}
     for support in supports:
         point = point_on(robot, support.frame, support.offset)

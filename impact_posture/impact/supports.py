@@ -1,4 +1,4 @@
-"""Supports by name, and checks that an impact and its supports fit together."""
+"""Read supports from their names, and check that an impact is possible with these supports."""
 
 from __future__ import annotations
 
@@ -16,12 +16,13 @@ from impact_posture.robot.robot_spec import Support
 
 
 def resolve_supports(robot: Robot, texts: Sequence[str] | None) -> tuple[Support, ...]:
-    """Turn ``FRAME[:point|surface]`` into supports; ``None`` gives the supports of ``robot.toml``.
+    """Turn texts ``FRAME[:point|surface]`` into supports; for ``None``, return the supports in ``robot.toml``.
 
-    A frame listed in ``robot.toml`` has the offset and size stated there, and the kind unless ``texts`` states it.
+    If ``robot.toml`` lists the frame, its offset and size there are used.  The kind there is used unless the text
+    states a kind.
 
     Raises:
-        FrameNotFound: There is no such frame; the error lists the nearest names.
+        FrameNotFound: The robot has no such frame; the error lists the nearest names.
         InputError: A frame is given twice.
     """
     known = {support.frame: support for support in robot.spec.supports}
@@ -46,7 +47,7 @@ def _support(robot: Robot, text: str, known: Mapping[str, Support]) -> Support:
 
 
 def refuse_held(robot: Robot, contact: ImpactContact, supports: Sequence[Support]) -> None:
-    """Raise ContactError if a support holds the contact point, so that its compliance alone would matter."""
+    """Raise ContactError if a support keeps the contact point in place; only its compliance would yield then."""
     point = point_on(robot, contact.frame, contact.offset)
     for support in supports:
         foot = point_on(robot, support.frame, support.offset)
@@ -60,7 +61,7 @@ def refuse_held(robot: Robot, contact: ImpactContact, supports: Sequence[Support
 
 
 def refuse_rigid(robot: Robot, supports: Sequence[Support]) -> None:
-    """Raise InputError if all joints of a standing robot are locked, so that only the supports would yield."""
+    """Raise InputError if all joints of a standing robot are locked; only its supports would yield then."""
     if supports and np.isinf(robot.model.armature[6:]).all():
         what = f"all joints of {robot.name} are locked and its feet stay, so nothing moves in an impact"
         hint = "choose reflected or link, or no `support` for a robot off the ground"

@@ -1,4 +1,4 @@
-"""The objective of an impact in its worst case, over normals, impulses or robot models."""
+"""The objective of an impact: the worst case over normals, impulses or robot models."""
 
 from __future__ import annotations
 
@@ -34,22 +34,25 @@ from impact_posture.system.arrays import Array
 @checked
 @dataclass(frozen=True)
 class WorstCaseObjective:
-    """Impulse ``λ̄²H``, speed ``V``, sticking ``S``, coulomb ``C`` or energy ``E`` of an impact, in its worst case.
+    """The worst case of impulse ``λ̄²H``, speed ``V``, sticking ``S``, coulomb ``C`` or energy ``E`` of an impact.
 
-    It implements the :class:`~impact_posture.impact.objective.Objective` protocol for every combination of a kind
-    (:mod:`impact_posture.impact.kinds.kinds_by_name`), a metric, supports, contacts, a cone of normals and model
+    The class implements the :class:`~impact_posture.impact.objective.Objective` protocol for every combination of a
+    kind (:mod:`impact_posture.impact.kinds.kinds_by_name`), a metric, supports, contacts, a cone of normals and model
     variants.  Each type of maximum is a class in :mod:`impact_posture.impact.worst_case`.
 
     Attributes:
-        contact: Point and normal of the impact.
-        metric: Weight of the jump.
+        robot: The robot.
+        contact: Point and normal of the leading contact.
+        metric: Weight ``W`` of the squared norm of the jump.
         kind: ``impulse``, ``speed``, ``sticking``, ``coulomb`` or ``energy``.
         supports: Feet that stay on the ground.
-        compliance: ε of the supports, 1/kg.
-        normal_cone_deg: Half angle of the cone of possible normals, degrees; 0 for the contact's normal alone.
-        others: Further contacts at the same time, each with a bound on its impulse.
+        compliance: Compliance ε of the supports, 1/kg; zero selects the default.
+        normal_cone_deg: Half angle of the cone of possible normals, degrees; 0 if only the normal of the contact is
+            possible.
+        others: Contacts that are hit at the same time as the leading contact, each with a bound on its impulse.
         bilateral: Whether several contacts can pull as well as push.
-        model_variants: Possible robot models, the robot as modeled first; empty for the robot as modeled alone.
+        model_variants: Possible robot models, the robot as modeled first.  If empty, only the robot as modeled is
+            considered.
     """
 
     robot: Robot
@@ -72,7 +75,7 @@ class WorstCaseObjective:
 
     @cached_property
     def impact_kind(self) -> ImpactKind:
-        """Formulas of the kind for the leading contact, on the robot as modeled."""
+        """Formulas of the kind for the leading contact and the robot as modeled."""
         return KINDS[self.kind](self.oracle)
 
     @property
@@ -82,7 +85,7 @@ class WorstCaseObjective:
 
     @property
     def units(self) -> str:
-        """Units in words."""
+        """Units of the value as text."""
         return self.impact_kind.units
 
     @property
@@ -92,7 +95,7 @@ class WorstCaseObjective:
 
     @property
     def structure(self) -> str:
-        """See :class:`Objective`; the normal of the leading contact is a parameter."""
+        """Text that identifies the expressions; the normal of the leading contact is a parameter, so not included."""
         contact = self.contact
         return repr(
             (
@@ -111,10 +114,10 @@ class WorstCaseObjective:
 
     @property
     def warnings(self) -> tuple[str, ...]:
-        """Messages about degenerate combinations."""
+        """Warnings about combinations of metric and kind with a degenerate meaning."""
         if self.metric.kind != "kinetic":
             return ()
-        # With the impulse f of supports, aᵀMa = G − ε‖f‖².
+        # With supports, aᵀMa = G − ε‖f‖² for their impulses f.  Without supports, aᵀMa = G.
         rest = ", up to the compliance of the feet" if self.supports else ""
         meanings = {
             "speed": f"is 1/G{rest}: the exact opposite of 'impulse' (G) and twice 'energy'",
@@ -129,12 +132,12 @@ class WorstCaseObjective:
 
     @cached_property
     def case(self) -> ImpactCase:
-        """The impact at the leading contact, on the robot as modeled."""
+        """The impact at the leading contact for the robot as modeled."""
         return ImpactCase(self.robot, self.contact, self.metric, self.supports, self.compliance)
 
     @cached_property
     def singles(self) -> tuple[WorstCaseObjective, ...]:
-        """The objective of each contact alone, on the robot as modeled."""
+        """A separate objective for each contact, for the robot as modeled."""
         if not self.others and not self.model_variants:
             return (self,)
         return tuple(
@@ -143,14 +146,14 @@ class WorstCaseObjective:
 
     @cached_property
     def by_variant(self) -> tuple[WorstCaseObjective, ...]:
-        """The objective on the robot of each model variant, or the objective itself without variants."""
+        """A separate objective for each model variant; if there are no variants, only this objective."""
         if not self.model_variants:
             return (self,)
         return tuple(replace(self, robot=variant.robot, model_variants=()) for variant in self.model_variants)
 
     @cached_property
     def worst_case(self) -> WorstCase:
-        """The maximum over normals, impulses or models."""
+        """The maximum over models, impulses or normals that this objective computes."""
         if self.model_variants:
             return ModelSet(tuple(member.worst_case for member in self.by_variant))
         if self.others:
@@ -159,7 +162,7 @@ class WorstCaseObjective:
 
     @cached_property
     def normal_cone(self) -> NormalCone | None:
-        """The cone around the normal of the leading contact, on the robot as modeled; ``None`` without a cone."""
+        """Worst case over the cone around the normal of the leading contact; ``None`` if there is no cone."""
         kind = self.impact_kind
         if not self.normal_cone_deg or not isinstance(kind, QuadraticKind):
             return None
@@ -167,7 +170,7 @@ class WorstCaseObjective:
 
     @property
     def is_multiple_of_H(self) -> bool:
-        """Whether the objective is ``λ̄²H`` of the leading contact."""
+        """Whether the objective equals ``λ̄²H`` of the leading contact, without a maximum."""
         return self.impact_kind.symbol == "H" and isinstance(self.worst_case, ImpactKind)
 
     @cached_property
@@ -176,15 +179,16 @@ class WorstCaseObjective:
         return ImpactKernel(self.case, ca.SX.sym("q", self.robot.nq), ca.SX.sym("n", 3))
 
     def value_fun(self) -> ca.Function:
-        """Return ``(q, n) → value``, with ``n`` as in :meth:`gradient_fun`."""
+        """Return the function ``(q, n) → value``, with ``n`` as in :meth:`gradient_fun`."""
         general = self.gradient_fun()
         q, n = general.sx_in()
         return ca.Function("value", [q, n], [general(q, n)[0]], ["q", "n"], ["value"], {"cse": True})
 
     def gradient_fun(self) -> ca.Function:
-        """Return ``(q, n) → value, gradient`` (nv), with ``n`` in the normal frame of the leading contact.
+        """Return the function ``(q, n) → value, gradient`` with a tangent gradient, shape (nv,).
 
-        With a cone of normals, ``n`` is its axis.  The gradient is a subgradient where members of the maximum tie.
+        ``n`` is the normal of the leading contact in its ``normal_frame``; with a cone of normals, it is the axis of
+        the cone.  If members of the maximum tie, the gradient is a subgradient.
         """
         k = self.kernel
         value, gradient = self.worst_case.expressions(k)
@@ -192,21 +196,21 @@ class WorstCaseObjective:
         return ca.Function("gradient", [k.q, k.n], [value, gradient], *names, {"cse": True})
 
     def lift(self, tree: Tree, parameters: ca.SX, scale: ca.SX) -> Lifted:
-        """Return the objective with its linear solves as equations of the program."""
+        """Return the objective in lifted form: its linear systems are equations of the program."""
         return self.worst_case.lift(tree, parameters, scale)
 
     @property
     def attempts(self) -> int:
-        """Number of guesses: one where the equations are linear in the auxiliaries."""
+        """Number of different initial guesses; one if the equations are linear in the auxiliaries."""
         return self.worst_case.attempts
 
     def guess(self, q: Array, scale: float, attempt: int = 0) -> Guess:
-        """Return the auxiliaries of :meth:`lift` that solve its equations at ``q``."""
+        """Return values of the auxiliaries that solve the equations of :meth:`lift` at ``q``."""
         return self.worst_case.guess(q, scale, attempt)
 
     @cached_property
     def oracle(self) -> ImpactOracle:
-        """The oracle of the leading contact, on the robot as modeled."""
+        """The oracle of the leading contact for the robot as modeled."""
         return ImpactOracle(self.case)
 
     def value(self, q: Array) -> float:
@@ -222,11 +226,11 @@ class WorstCaseObjective:
         return self.subgradients(q).first
 
     def subgradients(self, q: Array, within: float = 0.0) -> Subgradients:
-        """Return the gradients of all members of the maximum that tie or lie at most ``within`` below it."""
+        """Return the gradients of all members of the maximum whose value ties or is at most ``within`` below it."""
         return self.worst_case.subgradients(q, within)
 
     def movable(self, q: Array) -> bool:
-        """Return whether a contact can move at ``q`` along its normal, or along another normal of its cone."""
+        """Return whether at least one contact can move at ``q`` along its normal or a normal of its cone."""
         if self.normal_cone_deg:
             return True
         return not all(single.oracle.quantities(q).blocked for single in self.singles)
@@ -234,9 +238,9 @@ class WorstCaseObjective:
     def blind_motions(self) -> Array:
         """Return base twists that do not change the value, world axes, linear first, shape (k, 6).
 
-        The pose of the base enters through ``R_bᵀn`` alone.  So all translations are blind, and so is the rotation
-        about the normal.  All rotations are blind if the normal turns with the robot, and none is if contacts have
-        different normals.
+        The value depends on the pose of the base only through ``R_bᵀn``.  Therefore translations and the rotation
+        about the normal do not change it.  If the normal turns with the robot, no rotation changes the value.  If
+        contacts have different normals, every rotation may change it.
         """
         n = np.array(self.contact.normal)
         turns = n[None, :]

@@ -1,1 +1,1 @@
-"""Elastic joints, and the compression of the contact."""
+"""Impacts of robots with elastic joints, and compression of an elastic contact."""

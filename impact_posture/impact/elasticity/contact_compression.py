@@ -1,16 +1,16 @@
-"""Compression time and peak force of a contact, and the inertia at the joints that responds to it.
+"""Compression time and peak force of a contact, and the joint inertia (links, or links and rotors) that responds.
 
-An effective mass ``m = 1/G`` that meets a contact at the speed v comes to rest after the time T.  The compression δ
-and the force are largest at T, with the peak force F:
+An effective mass ``m = 1/G`` that meets a contact at the speed v comes to rest after the time T.  At T, the
+compression δ and the force reach their maxima; the largest force is F:
 
 - linear contact, ``f = kδ``: ``T = (π/2)√(m/k)``, ``F = v√(km)``;
 - Hertzian contact, ``f = κδ^{3/2}`` (Johnson, Contact Mechanics, 1985, §11.4): ``δ = (5mv²/4κ)^{2/5}``,
   ``F = κδ^{3/2}``, ``T = 1.472 δ/v``;
-- contact of known T: the linear contact with this T, ``F = (π/2) mv/T``.
+- contact of known T: treated as the linear contact with this T, ``F = (π/2) mv/T``.
 
-The ratio ``x = T √(G/C)`` decides whether the rotors behind elastic transmissions take part.  It is T in units of the
-time in which the springs respond, with ``G = jM⁻¹jᵀ`` of the links alone, ``C = jK⁻¹jᵀ`` of the joint springs, and
-``j = nᵀJ``.
+The ratio ``x = T √(G/C)`` determines whether the rotors behind elastic transmissions respond to the impact.  It
+compares T with the response time of the joint springs.  Here ``G = jM⁻¹jᵀ`` with the mass matrix of the links alone,
+``C = jK⁻¹jᵀ`` with the stiffness of the joint springs, and ``j = nᵀJ``.
 """
 
 from __future__ import annotations
@@ -29,23 +29,23 @@ from impact_posture.impact.worst_case_objective import WorstCaseObjective
 from impact_posture.robot.joint_model import with_joint_model
 from impact_posture.system.arrays import Array
 
-# ∫₀¹ dz/√(1 − z^{5/2}): the time T in units of δ/v for the force κδ^{3/2}.
+# The integral ∫₀¹ dz/√(1 − z^{5/2}) is the ratio of T to δ/v for the force κδ^{3/2}.
 HERTZ_TIME = sqrt(pi) * gamma(7 / 5) / gamma(9 / 10)
-# Radius of the steel tip that touches a material, m.
+# Radius of the steel tip on the robot, m; a contact given by a material assumes this tip.
 TIP_RADIUS = 0.01
-# Up to the first x only the links respond, from the second x also the rotors (docs: which inertia).
+# For x up to SHORT, only the links respond.  For x from LONG, the rotors respond too (docs: which inertia).
 SHORT, LONG = 0.2, 0.75
 
 
 @dataclass(frozen=True)
 class ContactStiffness:
-    """The elasticity of a contact, by exactly one of three numbers.
+    """The elasticity of a contact, given by exactly one of ``linear``, ``hertz`` and ``duration``.
 
     Attributes:
-        linear: k, N/m.
-        hertz: κ, N/m^{3/2}.
-        duration: T, the time from touch to greatest compression, s.
-        material: Name of the material with this κ, or empty.
+        linear: Stiffness k of a linear contact, N/m, or ``None``.
+        hertz: Stiffness κ of a Hertzian contact, N/m^{3/2}, or ``None``.
+        duration: Time T from touch to greatest compression, s, or ``None``.
+        material: Name of the material from which κ was computed; empty for other contacts.
     """
 
     linear: float | None = None
@@ -55,10 +55,12 @@ class ContactStiffness:
 
     @staticmethod
     def of(stiffness: float | str | None, duration: float | None) -> ContactStiffness | None:
-        """Return the contact of the settings ``contact_stiffness`` and ``contact_duration``; ``None`` without both.
+        """Return the contact that the two settings describe; ``None`` if both are ``None``.
+
+        ``stiffness`` is the setting ``contact_stiffness``, and ``duration`` the setting ``contact_duration``.
 
         Raises:
-            InputError: Both are given.
+            InputError: Both settings are given.
         """
         if stiffness is not None and duration is not None:
             raise InputError("follows from `contact_stiffness`", where="contact_duration", hint="give one of the two")
@@ -69,7 +71,7 @@ class ContactStiffness:
         return None if stiffness is None else ContactStiffness(linear=stiffness)
 
     def compression_time(self, G: float, speed: float) -> float:
-        """Return T, s, of a contact with ``G = 1/m`` (1/kg) at the approach speed (m/s)."""
+        """Return the compression time T, s, for ``G = 1/m`` (1/kg) and the approach speed (m/s)."""
         if self.duration is not None:
             return self.duration
         if self.linear is not None:
@@ -77,7 +79,7 @@ class ContactStiffness:
         return HERTZ_TIME * self._depth(G, speed) / speed if speed > 0 else float("inf")
 
     def peak_force(self, G: float, speed: float) -> float:
-        """Return the force at greatest compression, N."""
+        """Return the contact force at greatest compression, N; arguments as in :meth:`compression_time`."""
         if self.duration is not None:
             return pi / 2 * speed / (G * self.duration)
         if self.linear is not None:
@@ -89,18 +91,18 @@ class ContactStiffness:
         return float((5 * speed**2 / (4 * (self.hertz or 0.0) * G)) ** 0.4)
 
     def linear_stiffness(self, G: float, speed: float) -> float:
-        """Return k, N/m, of the linear contact with the same compression time."""
+        """Return the stiffness k, N/m, of the linear contact that has the same compression time."""
         return self.linear or (pi / 2 / self.compression_time(G, speed)) ** 2 / G
 
     def least_mobility(self, force: float, speed: float) -> float:
-        """Return the least G, 1/kg, with which the peak force stays at most ``force``."""
+        """Return the least G, 1/kg, for which the peak force does not exceed ``force``, N."""
         # The peak force is proportional to G^(−power).
         power = 1.0 if self.duration is not None else 0.5 if self.linear is not None else 0.6
         return float((self.peak_force(1.0, speed) / force) ** (1 / power))
 
     @property
     def words(self) -> str:
-        """The contact as text."""
+        """Description of the contact for users."""
         if self.duration is not None:
             return f"compressed within {1e3 * self.duration:.3g} ms"
         if self.linear is not None:
@@ -114,21 +116,21 @@ class ContactStiffness:
 
 
 def hertz_stiffness(material: str) -> float:
-    """Return ``κ = (4/3) E* √R`` of a steel tip on a material, N/m^{3/2} (Johnson 1985, §4.2)."""
+    """Return ``κ = (4/3) E* √R``, N/m^{3/2}, for a steel tip that touches a material (Johnson 1985, §4.2)."""
     inverse = sum((1 - nu**2) / E for E, nu in (MATERIALS["steel"], MATERIALS[material]))
     return 4 / 3 / inverse * sqrt(TIP_RADIUS)
 
 
 @dataclass(frozen=True)
 class Compression:
-    """Effects of the elasticity of contact and joints.
+    """Compression of an elastic contact, and the ratio x that compares it with the joint springs.
 
     Attributes:
-        contact: The contact; ``None`` if its elasticity is not known.
-        time: T with the inertia of the objective's joint model, s; ``None`` without a contact.
-        peak_force: Peak force F with this inertia, N; ``None`` without a contact.
-        x: ``T √(G/C)`` with T and G of the links alone; ``None`` without a contact or without known springs.
-        by_material: x of each material in the table, if springs are known and the contact is not; else empty.
+        contact: Elasticity of the contact; ``None`` if not known.
+        time: Compression time T, s, with the inertia of the objective's joint model; ``None`` if not known.
+        peak_force: Peak force F, N, with the same inertia; ``None`` if not known.
+        x: Ratio ``T √(G/C)``, with T and G of the links alone; ``None`` if the contact or the springs are unknown.
+        by_material: Material → x for this material.  Empty unless the springs are known and the contact is not.
         joint_model: The joint model of the objective.
     """
 
@@ -141,14 +143,17 @@ class Compression:
 
     @property
     def fitting(self) -> JointModel | None:
-        """The joint model that fits x; ``None`` between the two, or where x is not known."""
+        """Joint model that is accurate for x: ``link`` for small x, ``reflected`` for large x.
+
+        ``None`` if x is between :data:`SHORT` and :data:`LONG`, or if x is not known.
+        """
         if self.x is None or SHORT < self.x < LONG:
             return None
         return "link" if self.x <= SHORT else "reflected"
 
     @property
     def line(self) -> str:
-        """The meaning of x as text; empty where x is not known."""
+        """Explanation of x for users; empty if x is not known."""
         if self.x is None:
             if not self.by_material:
                 return ""
@@ -180,9 +185,10 @@ class Compression:
 def compression(
     objective: WorstCaseObjective, q: Array, speed: float, contact: ContactStiffness | None
 ) -> Compression | None:
-    """Return T, peak force and x of the impact at the leading contact; ``None`` if all of them are unknown.
+    """Return compression time, peak force and x of the impact at the leading contact; ``None`` if all are unknown.
 
-    ``q`` has shape (nq,), and ``speed`` is the approach speed, m/s.  Without a ``contact``, x is for each material.
+    ``q`` has shape (nq,), and ``speed`` is the approach speed, m/s.  If ``contact`` is ``None``, x is computed for
+    every material in :data:`MATERIALS`.
     """
     springs = springs_along(objective.case, q)
     quantities = objective.oracle.quantities(q)
@@ -206,9 +212,9 @@ def compression(
 
 
 def springs_along(case: ImpactCase, q: Array) -> tuple[float, float] | None:
-    """Return ``G = jM⁻¹jᵀ`` of the links alone, 1/kg, and ``C = jK⁻¹jᵀ`` of the joint springs, m/N.
+    """Return ``G = jM⁻¹jᵀ`` with the inertia of the links alone, 1/kg, and ``C = jK⁻¹jᵀ`` of the joint springs, m/N.
 
-    ``None`` if no spring of known stiffness yields to the contact.
+    Return ``None`` if a force at the contact deflects no spring of known stiffness.
     """
     try:
         compliance = ElasticImpact(case).compliance(q)
@@ -219,6 +225,6 @@ def springs_along(case: ImpactCase, q: Array) -> tuple[float, float] | None:
 
 
 def both_models(objective: WorstCaseObjective) -> dict[JointModel, WorstCaseObjective]:
-    """Return the same objective for the links alone and for links with rotors."""
+    """Return the objective with the joint model ``link`` and with the joint model ``reflected``."""
     names: tuple[JointModel, ...] = ("link", "reflected")
     return {name: replace(objective, robot=with_joint_model(objective.robot, name)) for name in names}

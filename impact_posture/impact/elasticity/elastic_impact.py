@@ -1,22 +1,25 @@
-"""Velocity jump of a robot with rotors on springs, in a contact of known stiffness.
+"""Velocity jump of a robot whose rotors drive the links through springs, in a contact of known stiffness.
 
-In a short contact only the links respond, in a long contact the rotors move with them.  Between the two, links ``x``,
-rotors ``y`` and contact are a linear system about the configuration ``q``, in increments over free flight:
+In a short contact only the links respond; in a long contact the rotors move with the links.  For any duration, links
+``x``, rotors ``y`` and contact form a linear system about the configuration ``q``.  All variables are changes
+relative to the motion without contact:
 
     M ẍ = jᵀf − Eᵀτ,   B ÿ = τ,   s = Ex − y,   τ = K s + D ṡ,
     δ̇ = v − jẋ,   f = k δ,   j = nᵀJ,
 
-with the elastic joints in the rows of ``E`` (m×nv) and their rotors in ``B`` (m×m, diagonal).  ``M`` (nv×nv) holds
-the links, and the rotors of all joints without a spring of known stiffness.  Supports enter as ``M + J_sᵀJ_s/ε``, and
-locked joints do not move.  The compression ends at the first time ``T`` with ``δ̇ = 0`` (plastic impact, e = 0).
+where ``E`` (m×nv) selects the elastic joints, and ``B`` (m×m, diagonal) contains the inertias of their rotors.  ``M``
+(nv×nv) contains the inertia of the links, and of the rotors of all joints without a spring of known stiffness.  With
+supports, ``M + J_sᵀJ_s/ε`` replaces ``M``.  Locked joints do not move.  The compression ends at the first time ``T``
+with ``δ̇ = 0`` (plastic impact, e = 0).
 
-The springs and the contact determine the system.  With ``c = (s, δ)``, ``C = [E; −j]``, ``κ = (K, k)``, ``d = (D,
-0)``,
+The deflections of springs and contact, ``c = (s, δ)``, obey a separate equation.  With ``C = [E; −j]``, ``κ = (K,
+k)``, ``d = (D, 0)``,
 
     c̈ = −A (κc + dċ),   A = C M⁻¹ Cᵀ + diag(B⁻¹, 0),   c(0) = 0,   ċ(0) = (0, v),
 
-and the impulses ``I = ∫(τ, f)dt = A⁻¹(ċ(0) − ċ)`` move the links by ``ẋ = −M⁻¹CᵀI``.  The state ``(κ^½c, L⁻¹ċ)`` with
-``A = LLᵀ`` has the total energy as its squared norm, so its generator is skew-symmetric apart from the dampers.
+and the impulses ``I = ∫(τ, f)dt = A⁻¹(ċ(0) − ċ)`` change the velocity of the links by ``ẋ = −M⁻¹CᵀI``.  The squared
+norm of the state ``(κ^½c, L⁻¹ċ)``, with ``A = LLᵀ``, is twice the total energy.  Only the dampers change this norm.
+Therefore the generator (the matrix of this linear system) is skew-symmetric except for the terms of the dampers.
 """
 
 from __future__ import annotations
@@ -38,35 +41,38 @@ from impact_posture.system.arrays import Array
 
 # Range of contact stiffness, N/m: from softer than foam to stiffer than steel on steel.
 _SOFTEST, _STIFFEST = 1.0, 1e12
-# Largest phase of the fastest oscillation during a contact, rad.  Seven digits are left at this phase.
+# Largest phase of the fastest oscillation during a contact, rad.  At this phase the result has seven correct digits.
 _LONGEST = 1e8
-# Stiffness of held feet, relative to the stiffest spring.
+# Stiffness that replaces rigid feet in the compliance, relative to the stiffest spring.
 _HELD = 1e8
-# Phase step of the samples for the peaks, rad of the fastest oscillation, and limits of the number of samples.
+# Phase step between the samples for the peaks, rad of the fastest oscillation; fewest and most samples.
 _SAMPLE, _FEWEST, _MOST = 0.1, 100, 20_000
 
 
 @dataclass(frozen=True, eq=False)
 class ElasticResponse:
-    """Response of links, rotors and springs to a contact, until the greatest compression at the time ``T``.
+    """Response of links, rotors and springs to a contact, from touch to the greatest compression at the time ``T``.
 
-    All quantities are proportional to ``speed``, except ``duration``, ``compliance_ratio`` and ``value``.
+    All quantities are proportional to ``speed``, except ``stiffness``, ``duration``, ``compliance_ratio`` and
+    ``value``.
 
     Attributes:
-        stiffness: ``k`` of the contact, N/m.
+        stiffness: Stiffness ``k`` of the contact, N/m.
         speed: Approach speed ``v``, m/s.
-        duration: ``T``, s.
-        compliance_ratio: ``T√(G/C)`` with ``G = jM⁻¹jᵀ`` and the compliance ``C = jK⁻¹jᵀ`` of the contact point on
-            the springs.  Only the links respond if it is small, links and rotors if it is large.  Infinite if no
-            spring yields to the contact.
-        force: ``kδ(T)``, the largest force of the contact, N.
-        impulse: ``∫f`` until ``T``, N·s.
-        jump: ``ẋ(T)``, velocity jump of base and links, shape (nv,), with ``jump_norm`` ``‖ẋ(T)‖_W``.
-        value: ``‖ẋ(T)‖²_W/v²``, which is V where the joints are rigid.
-        peak_jump_norm: The largest ``‖ẋ(t)‖_W`` until ``T``.
-        rotor_jump: ``ẏ(T)``, shape (nv,); for a joint without a spring equal to ``jump``.
-        torque: ``τ(T)`` of the springs and dampers, N·m (N if prismatic), shape (nv,); zero without a spring.
-        peak_torque: The largest ``|τ(t)|`` until ``T``, shape (nv,).
+        duration: Time ``T`` from touch to the greatest compression, s.
+        compliance_ratio: Ratio ``T√(G/C)`` with ``G = jM⁻¹jᵀ`` and the compliance ``C = jK⁻¹jᵀ`` of the springs at
+            the contact point.  If the ratio is small, only the links respond; if it is large, links and rotors
+            respond.  Infinite if a force at the contact deflects no spring.
+        force: Largest contact force ``kδ(T)``, N.
+        impulse: Impulse ``∫f dt`` from touch to ``T``, N·s.
+        jump: Velocity jump ``ẋ(T)`` of base and links, shape (nv,).
+        jump_norm: Norm ``‖ẋ(T)‖_W`` of the jump.
+        value: ``‖ẋ(T)‖²_W/v²``; equal to V for rigid joints.
+        peak_jump_norm: Largest ``‖ẋ(t)‖_W`` from touch to ``T``.
+        rotor_jump: Velocity jump ``ẏ(T)`` of the rotors, shape (nv,); equal to ``jump`` for joints without a spring.
+        torque: Torque ``τ(T)`` of springs and dampers, shape (nv,), N·m (N for prismatic joints).  Zero for joints
+            without a spring.
+        peak_torque: Largest ``|τ(t)|`` of each joint from touch to ``T``, shape (nv,).
     """
 
     stiffness: float
@@ -90,14 +96,14 @@ class ElasticResponse:
 
 
 class ElasticImpact:
-    """Response to a contact of known stiffness, and its tangent gradient, by the matrix exponential.
+    """Compute the response to a contact of known stiffness, and its tangent gradient, with the matrix exponential.
 
-    The rotors have the armature stated for the robot, whatever its joint model, and the springs of ``[transmission]``
-    in robot.toml.  The metric W = M weighs the links, and the rotors of joints without a spring.
+    The rotor inertias are the armature of the robot, for every joint model.  The springs are read from
+    ``[transmission]`` in robot.toml.  The metric W = M includes the links, and the rotors of joints without a spring.
 
     Raises:
         InputError: No joint has a rotor on a spring of known stiffness.
-        InertiaError: The mass matrix is singular without the rotors on springs.
+        InertiaError: Without the rotors that have springs, the mass matrix is singular.
     """
 
     def __init__(self, case: ImpactCase) -> None:
@@ -111,7 +117,8 @@ class ElasticImpact:
         """Return the response at ``q``, shape (nq,), to a contact of ``stiffness`` in N/m at ``speed`` in m/s.
 
         Raises:
-            InputError: Stiffness (1 to 1e12 N/m) or speed is out of range, or springs are too stiff for the contact.
+            InputError: The stiffness (1 to 1e12 N/m) or the speed is out of range, or the joint springs are too stiff
+                for a contact this soft.
             ContactError: The contact cannot move along its normal.
         """
         if not 0 < speed <= LARGEST:
@@ -141,7 +148,7 @@ class ElasticImpact:
         )
 
     def value(self, q: Array, stiffness: float) -> float:
-        """Return ``‖ẋ(T)‖²_W/v²``."""
+        """Return ``‖ẋ(T)‖²_W/v²`` at ``q``, shape (nq,), for a contact of ``stiffness`` in N/m."""
         c = self._compression(q, stiffness)
         x = c.columns.a @ c.impulse(c.state)
         return float(x @ self.oracle.weigh(x))
@@ -149,9 +156,10 @@ class ElasticImpact:
     def gradient(self, q: Array, stiffness: float) -> Array:
         """Return the tangent gradient of :meth:`value`, shape (nv,).
 
-        ``T`` depends on ``q`` by ``δ̇(T) = 0``.  The gradient does not exist where ``δ̇`` touches zero without changing
-        sign, because ``T`` jumps there.  With ``P = −M⁻¹Cᵀ`` and the adjoint ``X`` of ``A``, it is the gradient of
-        ``⟨X, A⟩ + 2 bᵀ(jᵀI_f − Mẋ)`` with ``b = M⁻¹Wẋ``, where only ``M`` and ``j`` depend on ``q``.
+        ``T`` depends on ``q`` through ``δ̇(T) = 0``.  If ``δ̇`` touches zero without changing sign, ``T`` is
+        discontinuous and the gradient does not exist.  With the adjoint ``X`` of ``A``, the gradient of the value
+        equals the gradient of ``⟨X, A⟩ + 2 bᵀ(jᵀI_f − Mẋ)`` with ``b = M⁻¹Wẋ``, in which only ``M`` and ``j`` are
+        differentiated.
         """
         c = self._compression(q, stiffness)
         oracle, P, impulse = self.oracle, c.columns, c.impulse(c.state)
@@ -168,7 +176,7 @@ class ElasticImpact:
         return np.asarray(gradient + oracle.metric_gradient(x.a))
 
     def _compression(self, q: Array, stiffness: float) -> _Compression:
-        """Check the stiffness, and compute the compression at unit approach speed."""
+        """Check the contact stiffness, then compute the compression at an approach speed of 1 m/s."""
         if not _SOFTEST <= stiffness <= _STIFFEST:
             hint = f"give {_SOFTEST:g} to {_STIFFEST:g} N/m"
             raise InputError(f"is {stiffness:g} N/m", where="contact_stiffness", hint=hint)
@@ -183,7 +191,10 @@ class ElasticImpact:
         return _Compression((A + A.T) / 2, columns, kappa, d, oracle)
 
     def compliance(self, q: Array) -> float:
-        """Return ``C`` at ``q``, m/N, for fixed rotors and feet, and without feet also for a fixed base."""
+        """Return the compliance ``C`` of the springs at ``q``, m/N.
+
+        Rotors and feet are fixed.  For a robot without feet, the base is fixed too.
+        """
         oracle = self.oracle.at(q)
         feet = oracle.Js
         moving = np.append(np.arange(6 if len(feet) else 0), self.joints)
@@ -194,9 +205,9 @@ class ElasticImpact:
 
 
 class _Compression:
-    """Springs and contact from touch to greatest compression, at unit approach speed.
+    """Motion of springs and contact from touch to greatest compression, at an approach speed of 1 m/s.
 
-    ``mobility`` is ``A``, and ``columns`` is ``P = −M⁻¹Cᵀ``, shape (nv, m+1), with its support impulses.
+    ``mobility`` is the matrix ``A``.  ``columns`` contains ``P = −M⁻¹Cᵀ``, shape (nv, m+1), and the support impulses.
     """
 
     def __init__(
@@ -211,27 +222,27 @@ class _Compression:
         R = np.sqrt(kappa)[:, None] * self._L
         self._generator = np.block([[np.zeros_like(R), R], [-R.T, -(self._L.T * d) @ self._L]])
         self._fastest = float(np.linalg.norm(self._generator, 2))
-        # At touch only δ has a rate, which is the last row of L times the state.
+        # At touch, only δ changes.  Its rate is the last row of L times the velocity part of the state.
         self._row, self._start = np.append(np.zeros(len(R)), self._L[-1]), np.zeros(2 * len(R))
         self._start[-1] = 1 / self._L[-1, -1]
         self.duration, self.state = self._greatest_compression()
 
     def impulse(self, states: Array) -> Array:
-        """Return ``I`` of one state or of columns, springs first, shape (m+1, …)."""
+        """Return the impulses ``I``, springs first, shape (m+1, …), for one state or for states as columns."""
         moved = (self._start - states.T).T[len(self.kappa) :]
         return np.asarray(scipy.linalg.solve_triangular(self._L, moved, trans=1, lower=True))
 
     def force(self, states: Array) -> Array:
-        """Return ``κc + dċ`` of one state or of columns, springs first."""
+        """Return the forces ``κc + dċ``, springs first, for one state or for states as columns."""
         r = len(self.kappa)
         return np.asarray((np.sqrt(self.kappa) * states[:r].T + self.d * (self._L @ states[r:]).T).T)
 
     def _greatest_compression(self) -> tuple[float, Array]:
-        """Return the first root ``T`` of ``p = δ̇/v``, and the state there.
+        """Return the first root ``T`` of ``p = δ̇/v``, and the state at ``T``.
 
-        ``|p̈| ≤ kG``, because the energy of the second derivative of ``c`` starts at ``k²v²G/2`` and never grows.  So
-        ``p(t+h) ≥ p + ṗh − kGh²/2``.  Steps to the root of this bound cannot overshoot the first root of ``p``, and
-        converge quadratically.
+        The energy of the second derivative of ``c`` is ``k²v²G/2`` at touch and never increases, so ``|p̈| ≤ kG`` and
+        ``p(t+h) ≥ p + ṗh − kGh²/2``.  Each step goes to the root of this lower bound.  The steps cannot overshoot the
+        first root of ``p``, and converge quadratically.
         """
         bound = float(self.kappa[-1] * self.mobility[-1, -1])
         row, t, state = self._row, 0.0, self._start
@@ -249,7 +260,10 @@ class _Compression:
         return t, state
 
     def peaks(self) -> tuple[float, Array]:
-        """Return the largest ``‖ẋ‖²_W`` and the largest ``|τ|`` of each spring, by cubics through exact samples."""
+        """Return the largest ``‖ẋ‖²_W`` and the largest ``|τ|`` of each spring.
+
+        Values and slopes are exact at the samples; cubic polynomials interpolate between them.
+        """
         count = int(np.clip(self.duration * self._fastest / _SAMPLE, _FEWEST, _MOST))
         step, states = scipy.linalg.expm(self.duration / count * self._generator), [self._start]
         for _ in range(count - 1):
@@ -262,21 +276,21 @@ class _Compression:
         return _peak(times, np.sum(x * weighed, axis=0), slope), np.array(largest)
 
     def adjoint(self, g: Array) -> Array:
-        """Return the symmetric ``X`` with ``⟨X, dA⟩ = gᵀdI(T)``, shape (m+1, m+1), where ``T`` depends on ``A``."""
+        """Return the symmetric ``X`` with ``⟨X, dA⟩ = gᵀdI(T)``, shape (m+1, m+1), including the change of ``T``."""
         r, L, T = len(self.kappa), self._L, self.duration
         weighed, rate = scipy.linalg.cho_solve((L, True), g), self._generator @ self.state
         seed = np.append(np.zeros(r), -L.T @ weighed)
         seed = seed - self._row * (seed @ rate) / (self._row @ rate)
         moved = T * scipy.linalg.expm_frechet(T * self._generator.T, np.outer(seed, self._start), compute_expm=False)
-        # In fixed coordinates, A enters the generator by the rows −L⁻¹A [κ^½, d L].
+        # With L fixed, A appears only in the lower rows of the generator, −L⁻¹A [κ^½, d L].
         inner = moved[r:, :r] * np.sqrt(self.kappa) + (moved[r:, r:] @ L.T) * self.d
         X = scipy.linalg.solve_triangular(L, inner, trans=1, lower=True) + np.outer(weighed, self.impulse(self.state))
         return np.asarray(-(X + X.T) / 2)
 
 
 def _peak(times: Array, values: Array, slopes: Array) -> float:
-    """Return the largest absolute value of the piecewise cubic through values and slopes."""
-    # Imported here, because the import takes a quarter of a second and few robots have elastic joints.
+    """Return the largest absolute value of the piecewise cubic with these values and slopes at ``times``."""
+    # This import takes a quarter of a second, and few robots have elastic joints, so it is not at the top.
     from scipy.interpolate import CubicHermiteSpline
 
     cubic = CubicHermiteSpline(times, values, slopes)

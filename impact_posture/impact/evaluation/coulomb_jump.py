@@ -1,8 +1,9 @@
-"""Velocity jumps with Coulomb friction, at one contact and at several contacts at once.
+"""Velocity jumps with Coulomb friction, at one contact or at several contacts at once.
 
-Each of several contacts obeys ``0 ≤ p_n ⊥ u_n ≥ 0``, ``‖p_t‖ ≤ μ p_n``, ``u_t = −κ p_t`` and ``0 ≤ κ ⊥ μ p_n − ‖p_t‖
-≥ 0``, with the impulses ``p`` and the velocities ``u = u⁻ + Bp`` after the impact.  Block Gauss–Seidel iterates the
-fixed point ``p_i = P(p_i − ρ(u_i + μ‖u_t‖n_i))``, with ``P`` the projection onto the friction cone.
+If several contacts are hit at once, each obeys ``0 ≤ p_n ⊥ u_n ≥ 0``, ``‖p_t‖ ≤ μ p_n``, ``u_t = −κ p_t`` and ``0 ≤ κ
+⊥ μ p_n − ‖p_t‖ ≥ 0``, with the impulses ``p`` and the velocities ``u = u⁻ + Bp`` after the impact.  A block
+Gauss–Seidel method solves the fixed-point equations ``p_i = P(p_i − ρ(u_i + μ‖u_t‖n_i))``, where ``P`` projects onto
+the friction cone.
 """
 
 from __future__ import annotations
@@ -17,9 +18,9 @@ from impact_posture.impact.friction.coulomb_impact import coulomb_impact
 from impact_posture.impact.worst_case_objective import WorstCaseObjective
 from impact_posture.system.arrays import Array
 
-# Limit of sweeps over the contacts, steps at one contact in a sweep, and the relative change of impulses that ends.
+# Most sweeps over the contacts; steps per contact in each sweep; relative change of impulses that ends the iteration.
 _SWEEPS, _STEPS, _TOLERANCE = 5000, 20, 1e-11
-# Slip below this share of the approach speed is zero up to rounding.
+# A slip velocity below this share of the approach speed is a rounding error, so the point sticks.
 _SLIP = 1e-9
 
 
@@ -28,9 +29,9 @@ class CoulombJump(Jump):
     """A predicted velocity jump with friction.
 
     Attributes:
-        friction: Coulomb coefficient.
+        friction: Coulomb friction coefficient of the contact.
         sticks: Whether the contact point sticks.
-        slip_direction: Direction of the slip, world, unit, shape (3,); ``None`` if the contact point sticks.
+        slip_direction: Unit vector along the slip velocity, world axes, shape (3,); ``None`` if the point sticks.
     """
 
     friction: float
@@ -39,7 +40,7 @@ class CoulombJump(Jump):
 
     @staticmethod
     def of(jump: Jump, impulse: Array, friction: float, slip: Array) -> CoulombJump:
-        """Return a jump with the impulse and the slip (per approach speed) of a contact, both of shape (3,)."""
+        """Extend ``jump`` by the impulse and the slip velocity (per approach speed) of one contact, shapes (3,)."""
         size = float(np.linalg.norm(slip))
         direction = None if size <= _SLIP else slip / size
         return CoulombJump(
@@ -48,7 +49,10 @@ class CoulombJump(Jump):
 
 
 def coulomb_jump(objective: WorstCaseObjective, q: Array, rebound: float) -> CoulombJump | None:
-    """Return the jump of the leading contact with friction for ``rebound = (1 + e) v_n``, m/s; ``None`` without S."""
+    """Return the jump with friction at the leading contact for ``rebound = (1 + e) v_n``, m/s.
+
+    Return ``None`` if the point would stick in a posture where S does not exist.
+    """
     try:
         impact = coulomb_impact(objective.oracle, q)
     except MetricError:
@@ -59,10 +63,11 @@ def coulomb_jump(objective: WorstCaseObjective, q: Array, rebound: float) -> Cou
 
 
 def coulomb_jumps(objective: WorstCaseObjective, q: Array, speed: float) -> tuple[CoulombJump, ...] | None:
-    """Return the jump of the plastic impact of several contacts at once, with the impulse and slip of each contact.
+    """Return the jump of a plastic impact of all contacts at once, as one entry per contact.
 
-    Every contact point approaches along its normal at ``speed``, m/s.  All entries have the same velocity and norm.
-    ``None`` if contacts can pull, or if the iteration does not converge.
+    Every contact point approaches along its normal at ``speed``, m/s.  The entries differ only in impulse, friction
+    and slip; all have the same velocity jump.  Return ``None`` if the contacts can pull, or if the iteration does not
+    converge.
     """
     if objective.bilateral:
         return None
@@ -82,9 +87,9 @@ def coulomb_jumps(objective: WorstCaseObjective, q: Array, speed: float) -> tupl
 
 
 def contact_impulses(B: Array, normals: Array, friction: Array) -> Array | None:
-    """Return the impulses per unit approach speed, world, shape (m, 3); ``None`` if they do not converge.
+    """Return the impulses per unit approach speed, world axes, shape (m, 3); ``None`` if they do not converge.
 
-    ``B`` has shape (3m, 3m), the world unit ``normals`` have shape (m, 3), and the coefficients shape (m,).
+    ``B`` has shape (3m, 3m), the unit ``normals`` in world axes have shape (m, 3), and ``friction`` has shape (m,).
     """
     count = len(normals)
     blocks, p = B.reshape(count, 3, count, 3), np.zeros((count, 3))
@@ -103,7 +108,7 @@ def contact_impulses(B: Array, normals: Array, friction: Array) -> Array | None:
 
 
 def _on_cone(p: Array, n: Array, mu: float) -> Array:
-    """Return the nearest impulse with ``‖p_t‖ ≤ μ p_n``."""
+    """Project an impulse onto the friction cone ``‖p_t‖ ≤ μ p_n`` about the normal ``n``."""
     along = float(n @ p)
     across = p - along * n
     size = float(np.linalg.norm(across))

@@ -1,4 +1,4 @@
-"""The share of each joint in ``H``."""
+"""Share of each joint in the squared velocity jump ``H``."""
 
 from __future__ import annotations
 
@@ -17,9 +17,9 @@ class Dominance:
 
     Attributes:
         joint: The joint with the largest share.
-        share: Its share of ``H = Σ a_i (Wa)_i``.
-        base: Share of the floating base; zero for a fixed base.
-        line: The result as text.
+        share: Share of this joint in ``H = Σ a_i (Wa)_i``, 0 to 1.
+        base: Share of the floating base in ``H``; zero for a fixed base.
+        line: Explanation for users.
     """
 
     joint: str
@@ -29,7 +29,7 @@ class Dominance:
 
     @property
     def dominates(self) -> bool:
-        """Whether the share is above one half."""
+        """Whether the largest share is above one half."""
         return self.share > 0.5
 
     def to_dict(self) -> dict[str, object]:
@@ -38,7 +38,7 @@ class Dominance:
 
 
 def find_dominance(objective: WorstCaseObjective, quantities: ImpactQuantities) -> Dominance:
-    """Return the joint with the largest share ``Σ a_i (Wa)_i / H`` over its velocity entries."""
+    """Return the joint with the largest share in ``H``, ``Σ a_i (Wa)_i / H`` summed over its velocity entries."""
     robot, oracle = objective.robot, objective.oracle
     parts = quantities.jump * oracle.weigh(quantities.jump)
     width = 6 if robot.floating else 0

@@ -1,4 +1,4 @@
-"""All quantities of one impact at one posture, as ``evaluate`` and ``result.json`` show them."""
+"""All quantities of one impact at one posture, which the command ``evaluate`` and ``result.json`` show."""
 
 from __future__ import annotations
 
@@ -40,43 +40,46 @@ from impact_posture.impact.worst_case.worst_normal import WorstNormal
 from impact_posture.impact.worst_case_objective import WorstCaseObjective
 from impact_posture.system.arrays import Array
 
-# A relative change of H above this share, with supports ten times as stiff, gets a warning.
+# If supports that are ten times as stiff change H by more than this share, a warning is shown.
 _SOFT = 0.01
 
 
 @dataclass(frozen=True, eq=False)
 class Evaluation:
-    """One impact at one posture.
+    """All quantities of one impact at one posture.
 
     Attributes:
         q: Configuration, shape (nq,).
-        scalars: H, G, V, S, E, contact-consistent if there are supports; also attributes of the evaluation itself.
-        objective: The objective's value, λ̄² included; ``None`` where it does not exist.
+        scalars: H, G, V, S and E, computed with the supports.  Also available as attributes of the evaluation.
+        objective: Value of the objective, with the factor λ̄²; ``None`` if it does not exist at ``q``.
         gradient: Tangent gradient of H, shape (nv,).
-        objective_gradient: Tangent gradient of the objective, shape (nv,); ``None`` where it does not exist.
-        normal: World unit normal of H, G, V, S, E and the jumps, shape (3,).
-        worst_normal: World unit normal of the objective: ``normal``, or the worst normal of the cone around it.
-        cone: The worst normal of the cone, world; ``None`` without a cone, or where the objective does not exist.
+        objective_gradient: Tangent gradient of the objective, shape (nv,); ``None`` if it does not exist at ``q``.
+        normal: Unit normal for which H, G, V, S, E and the jumps are computed, world axes, shape (3,).
+        worst_normal: Unit normal for which the objective is computed, world axes, shape (3,).  With a cone of
+            normals, the worst normal of the cone; otherwise equal to ``normal``.
+        cone: Worst case over the cone of normals, world axes; ``None`` if there is no cone or no objective value.
         ellipsoid: Dynamic impact ellipsoid ``Λ_c``.
         pose: World placement of the contact frame.
         speed: Approach speed of the predicted jumps, m/s.
         restitution: Coefficient of restitution of the predicted jumps.
-        frictionless: Jump without friction; ``None`` if the contact is blocked along the normal.
-        sticking: Jump of a contact point that sticks; ``None`` where it does not exist.
-        coulomb: Jump with the friction of the contact, sticking or sliding; ``None`` where it does not exist.
-        together: Jump with friction of the plastic impact of several contacts at once, with the impulse and slip of
-            each contact; ``None`` for one contact, for contacts that can pull, or without convergence.
-        energy_loss: Energy that the frictionless impact dissipates, J; ``None`` if the contact is blocked.
+        frictionless: Jump without friction; ``None`` if the contact cannot move along the normal.
+        sticking: Jump if the contact point sticks; ``None`` if S does not exist at ``q``.
+        coulomb: Jump with the friction of the contact, which sticks or slides; ``None`` if there is no such jump.
+        together: Jump of a plastic impact of all contacts at once with friction, one entry per contact.  ``None`` for
+            one contact, for contacts that can pull, or if the iteration does not converge.
+        energy_loss: Energy that the frictionless impact dissipates, J; ``None`` if the contact cannot move along the
+            normal.
         compression: Compression time, peak force and the ratio x; ``None`` if all of them are unknown.
-        elastic: Response of links, rotors and springs to the contact; only with the joint model ``elastic``.
-        dominance: Whether one light joint makes up most of H.
+        elastic: Response of links, rotors and springs to the contact; ``None`` unless the joint model is ``elastic``.
+        dominance: Share of the joint that contributes most to H.
         without_supports: H, G, V, S, E of the robot without its supports; ``None`` for a robot without supports.
-        compliance_effect: Relative change of H with a tenth of the compliance; ``None`` without supports.
-        contact_stability: Whether the feet stay on the ground in the impact; ``None`` without supports.
-        contacts: Evaluation of each of several contacts alone, the leading contact first; empty for one contact.
-        impulses: The worst impulses of several contacts; ``None`` for one contact.
-        model_variants: Objective and scalars for each model variant; may be empty.
-        warnings: Limits of validity, one line each.
+        compliance_effect: Relative change of H if the supports have a tenth of the compliance; ``None`` for a robot
+            without supports.
+        contact_stability: Whether the feet stay on the ground in the impact; ``None`` for a robot without supports.
+        contacts: Separate evaluation of each contact, the leading contact first; empty if there is only one contact.
+        impulses: Worst impulses of several contacts; ``None`` if there is only one contact.
+        model_variants: Objective and scalars for each model variant; empty if there are no variants.
+        warnings: Limits of the validity of these quantities, one line each.
     """
 
     q: Array
@@ -143,7 +146,7 @@ class Evaluation:
 
 
 _JUMP = ("speed", "restitution", "frictionless", "sticking", "coulomb", "energy_loss")
-# Keys of one contact among several.  Posture and objective belong to all contacts together.
+# Keys of the block of each single contact.  Posture and objective are not included: they concern all contacts.
 _CONTACT = ("H", "G", "V", "S", "E", "effective_mass", "gradient", "ellipsoid", "pose", "free", "footing")
 
 
@@ -235,7 +238,7 @@ def _elastic(
 
 
 def _joint_model_warning(objective: WorstCaseObjective, q: Array, squeezed: Compression | None) -> tuple[str, ...]:
-    """Return a warning with the objective of both joint models where the joint model does not fit x."""
+    """If the joint model is not accurate for x, return a warning with the objective of both rigid joint models."""
     if squeezed is None or squeezed.x is None:
         return ()
     if objective.robot.joint_model in (squeezed.fitting, "locked", "elastic"):

@@ -1,4 +1,4 @@
-"""Value and gradient of an objective where they exist, and its value on each model variant."""
+"""Value and gradient of an objective, or ``None`` if they do not exist, and its value for each model variant."""
 
 from __future__ import annotations
 
@@ -16,11 +16,12 @@ from impact_posture.system.arrays import Array
 
 @dataclass(frozen=True)
 class VariantValue:
-    """The impact on one model variant.
+    """Quantities of the impact for one model variant.
 
     Attributes:
-        objective: The objective on this variant; ``None`` where it does not exist.
-        scalars: H, G, V, S, E of the leading contact on this variant.
+        name: Name of the variant.
+        objective: Objective for this variant; ``None`` if it does not exist at the posture.
+        scalars: H, G, V, S, E of the leading contact for this variant.
     """
 
     name: str
@@ -33,7 +34,7 @@ class VariantValue:
 
 
 def variant_values(objective: WorstCaseObjective, q: Array) -> tuple[VariantValue, ...]:
-    """Return the objective and its parts on each model variant; empty without variants."""
+    """Return the objective and the scalars H, G, V, S, E for each model variant; empty if there are no variants."""
     pairs = zip(objective.model_variants, objective.by_variant, strict=True) if objective.model_variants else ()
     return tuple(
         VariantValue(variant.name, objective_value(member, q), Scalars.of(member.oracle.quantities(q)))
@@ -42,7 +43,7 @@ def variant_values(objective: WorstCaseObjective, q: Array) -> tuple[VariantValu
 
 
 def worst_variant(variants: tuple[VariantValue, ...]) -> int:
-    """Return the index of the worst model variant.  A variant without a value is worse than all others."""
+    """Return the index of the worst model variant.  A variant whose objective is ``None`` is the worst."""
     return int(np.argmax([np.inf if variant.objective is None else variant.objective for variant in variants]))
 
 
@@ -63,9 +64,10 @@ def objective_value(objective: WorstCaseObjective, q: Array) -> float | None:
 
 
 def objective_gradient(objective: WorstCaseObjective, q: Array, value: float | None) -> Array | None:
-    """Return the tangent gradient, shape (nv,), a subgradient at a tie; ``None`` where it does not exist.
+    """Return the tangent gradient of the objective, shape (nv,); ``None`` if it does not exist at ``q``.
 
-    ``value`` is the objective at ``q`` from :func:`objective_value`.
+    If members of a maximum tie, the result is a subgradient.  ``value`` is the objective at ``q`` from
+    :func:`objective_value`.
     """
     values = np.linalg.eigvalsh(objective.oracle.quantities(q).mobility)
     singular = objective.kind == "sticking" and values[0] <= SINGULAR * values[-1]

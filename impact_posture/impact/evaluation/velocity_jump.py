@@ -19,10 +19,10 @@ class Jump:
     """A predicted velocity jump.
 
     Attributes:
-        velocity: ``Δν``, shape (nv,), m/s and rad/s.
-        norm: ``‖Δν‖_W``.
-        impulse: Impulse of the surface on the robot, world, shape (3,), N·s.
-        largest: ``(name, value, unit)`` of the largest entries in descending order.
+        velocity: Velocity jump ``Δν``, shape (nv,), m/s and rad/s.
+        norm: Norm ``‖Δν‖_W``.
+        impulse: Impulse of the surface on the robot, world axes, shape (3,), N·s.
+        largest: Largest entries of ``Δν`` as ``(name, value, unit)``, in descending order.
     """
 
     velocity: Array
@@ -32,7 +32,7 @@ class Jump:
 
     @property
     def impulse_size(self) -> float:
-        """Size of the impulse, N·s."""
+        """Magnitude of the impulse, N·s."""
         return float(np.linalg.norm(self.impulse))
 
     def to_dict(self) -> dict[str, object]:
@@ -51,13 +51,16 @@ def tangent_units(robot: Robot) -> tuple[str, ...]:
 
 
 def largest_entries(robot: Robot, values: Array) -> tuple[tuple[str, float, str], ...]:
-    """Return ``(name, value, unit)`` of the five largest entries of a tangent vector above 0.1 % of the largest."""
+    """Return up to five entries of a tangent vector as ``(name, value, unit)``, the largest first.
+
+    Entries below 0.1 % of the largest entry are omitted.
+    """
     units = tangent_units(robot)
     return tuple((robot.tangent_names[k], float(values[k]), units[k]) for k in _largest(np.abs(values), 5))
 
 
 def _largest(sizes: Array, count: int) -> list[int]:
-    """Return the indices of the largest sizes above 0.1 % of the largest, in descending order."""
+    """Return the indices of up to ``count`` largest sizes, in descending order, without sizes below 0.1 %."""
     order = np.argsort(-sizes, kind="stable")[:count]
     return [int(k) for k in order if sizes[k] > 1e-3 * sizes[order[0]]]
 
@@ -65,7 +68,10 @@ def _largest(sizes: Array, count: int) -> list[int]:
 def merged_entries(
     robot: Robot, *jumps: Jump | None, count: int = 6
 ) -> list[tuple[str, str, tuple[float | None, ...]]]:
-    """Return ``(name, unit, values)`` of the entries that are largest in any jump; value ``None`` for no jump."""
+    """Return ``(name, unit, values)`` of the velocity entries that are largest in any of the jumps.
+
+    ``values`` has one value per jump; the value is ``None`` for a jump that is ``None``.
+    """
     units, names = tangent_units(robot), robot.tangent_names
     sizes = np.max([np.zeros(robot.nv), *(np.abs(j.velocity) for j in jumps if j is not None)], axis=0)
     return [
@@ -75,9 +81,10 @@ def merged_entries(
 
 
 def frictionless_jump(objective: WorstCaseObjective, quantities: ImpactQuantities, rebound: float) -> Jump | None:
-    """Return ``Δν = (1+e) v_n a/G`` with the impulse ``(1+e) v_n/G`` along n; ``None`` if the contact is blocked.
+    """Return the jump ``Δν = (1+e) v_n a/G``, whose impulse along n is ``(1+e) v_n/G``.
 
-    ``rebound`` is ``(1+e) v_n`` with the coefficient of restitution e and the approach speed v_n, m/s.
+    ``rebound`` is ``(1+e) v_n`` with the coefficient of restitution e and the approach speed v_n, m/s.  Return
+    ``None`` if the contact cannot move along the normal.
     """
     if quantities.blocked:
         return None
@@ -86,13 +93,16 @@ def frictionless_jump(objective: WorstCaseObjective, quantities: ImpactQuantitie
 
 
 def sticking_jump(objective: WorstCaseObjective, quantities: ImpactQuantities, rebound: float) -> Jump | None:
-    """Return ``Δν = (1+e) v_n M⁻¹Jᵀ(JM⁻¹Jᵀ)⁻¹ n``, arguments as :func:`frictionless_jump`; ``None`` without S."""
+    """Return the jump ``Δν = (1+e) v_n M⁻¹Jᵀ(JM⁻¹Jᵀ)⁻¹ n``; ``None`` if S does not exist.
+
+    The arguments are as in :func:`frictionless_jump`.
+    """
     if quantities.sticking_jump is None or quantities.sticking_impulse is None:
         return None
     return weighed_jump(objective, quantities.sticking_jump * rebound, quantities.sticking_impulse * rebound)
 
 
 def weighed_jump(objective: WorstCaseObjective, velocity: Array, impulse: Array) -> Jump:
-    """Return the jump ``velocity``, shape (nv,), with its norm at the last posture of the oracle."""
+    """Return a :class:`Jump` from ``velocity``, shape (nv,), with its norm at the last posture of the oracle."""
     norm = float(np.sqrt(max(float(velocity @ objective.oracle.weigh(velocity)), 0.0)))
     return Jump(velocity, norm, impulse, largest_entries(objective.robot, velocity))

@@ -1,8 +1,8 @@
-"""Check whether support impulses within the friction cones can hold the feet during an impact.
+"""Check whether support impulses within the friction cones can keep the feet in place during an impact.
 
-The metric holds the feet by any impulse, even a pull.  The impulses are not unique where ``J_s`` lacks rank.  They
-are the set ``f + N z``, where ``N`` is a basis of ``{f: J_sᵀ f = 0}``, impulses by which feet press against each
-other.  Weight has no effect, because the duration of an impact is zero.
+The metric assumes that the feet stay in place, even if the ground would have to pull.  If ``J_s`` does not have full
+row rank, the support impulses are not unique.  All solutions are ``f + N z``, where ``N`` is a basis of ``{f: J_sᵀ f
+= 0}``, the impulses with which feet press against each other.  Weight has no effect, because an impact takes no time.
 """
 
 from __future__ import annotations
@@ -18,11 +18,11 @@ from impact_posture.impact.quantities.impact_oracle import ImpactOracle
 from impact_posture.robot.robot_spec import Support
 from impact_posture.system.arrays import Array
 
-# A singular value of J_s below this share of the largest one is zero up to rounding.
+# A singular value of J_s below this share of the largest one is a rounding error.
 _RANK = 1e-9
-# An impulse below this share of the largest one is zero.
+# An impulse below this share of the largest impulse is regarded as zero.
 _NONE = 1e-6
-# Sides of the pyramid, inside the friction cone, that replaces the cone.
+# Number of sides of the pyramid that approximates the friction cone from inside.
 _SIDES = 16
 _MOST_FRICTION = 10.0
 
@@ -33,9 +33,9 @@ class FootImpulse:
 
     Attributes:
         frame: Frame of the foot.
-        impulse: World axes, shape (3,); positive z pushes the robot up.
-        moment: Moment about its contact point, world axes, shape (3,); zero for a point.
-        lifts: Whether the ground would have to pull.
+        impulse: Impulse of the ground on the foot, world axes, shape (3,); positive z pushes the robot up.
+        moment: Angular impulse about the contact point of the foot, world axes, shape (3,); zero for a point foot.
+        lifts: Whether the foot lifts, because the ground would have to pull it.
     """
 
     frame: str
@@ -53,10 +53,11 @@ class ContactStability:
     """Whether the feet can stay on the ground in an impact.
 
     Attributes:
-        friction: Least friction coefficient with which all feet stay; infinite above ten; ``None`` if a foot lifts or
-            a sole tips at any friction.
-        feet: Impulse on each foot, within the cones if possible, else with the least pull.
-        freedom: Dimension of the set of impulses; zero if they are unique.
+        friction: Least friction coefficient for which all feet stay in place.  Infinite if it exceeds ten; ``None``
+            if a foot lifts or a sole tips for every friction coefficient.
+        feet: Impulse on each foot.  The impulses are within the friction cones if possible; otherwise, they have the
+            least pull.
+        freedom: Dimension of the set of possible impulses; zero if they are unique.
     """
 
     friction: float | None
@@ -65,7 +66,7 @@ class ContactStability:
 
     @property
     def line(self) -> str:
-        """The verdict as text."""
+        """The result as text for users."""
         lifting = [foot.frame for foot in self.feet if foot.lifts]
         if lifting:
             return f"the impact lifts {', '.join(lifting)}, although the metric assumes that all feet stay"
@@ -83,9 +84,10 @@ class ContactStability:
 
 
 def contact_stability(oracle: ImpactOracle, supports: tuple[Support, ...], q: Array) -> ContactStability:
-    """Compute impulses within the friction cones at ``q``, shape (nq,), or impulses with the least pull.
+    """Compute support impulses within the friction cones at ``q``, shape (nq,); if none exist, with the least pull.
 
-    The ground is level, so the axis of the cones is world z.  A sole with a ``size`` bears moments up to its edges.
+    The ground is level, so the axis of every cone is world z.  A sole with a ``size`` transmits moments until its
+    center of pressure reaches an edge.
     """
     particular = oracle.quantities(q).support_impulse
     values, vectors = np.linalg.eigh(oracle.Js @ oracle.Js.T)
@@ -101,7 +103,7 @@ def contact_stability(oracle: ImpactOracle, supports: tuple[Support, ...], q: Ar
         return verdict(None, lifting)
     held = cones.within(particular, basis, _MOST_FRICTION)
     if held is None:
-        # Nothing slides at a friction coefficient of 1e6, so an infeasible system means that a sole tips.
+        # With a friction coefficient of 1e6, nothing slides.  If there is still no solution, a sole tips.
         tips = cones.within(particular, basis, 1e6) is None
         return verdict(None if tips else float("inf"), lifting)
     low, high = 0.0, _MOST_FRICTION
@@ -115,7 +117,7 @@ def contact_stability(oracle: ImpactOracle, supports: tuple[Support, ...], q: Ar
 class FrictionCones:
     """The friction cones as inequalities ``A f ≤ 0`` on the stacked impulses.
 
-    ``axes`` holds the world axes of the frame of each foot, shape (3, 3), along which a sole has its size.
+    ``axes`` contains the world axes of the frame of each foot, shape (3, 3).  The size of a sole is along these axes.
     """
 
     def __init__(self, supports: tuple[Support, ...], axes: Sequence[Array]) -> None:
@@ -126,8 +128,8 @@ class FrictionCones:
     def matrix(self, friction: float) -> tuple[Array, list[str]]:
         """Return ``A``, shape (rows, impulses), for a friction coefficient, and the name of each row.
 
-        The rows are ``−f_z ≤ 0``, for soles ``|τ_x| ≤ Y f_z`` and ``|τ_y| ≤ X f_z`` in the axes of the foot, then
-        ``|f_t| ≤ μ f_z``, and for soles ``|τ_z| ≤ μ (X+Y)/2 f_z``.
+        Rows of each foot are ``−f_z ≤ 0`` and ``|f_t| ≤ μ f_z``.  Rows of each sole are also ``|τ_x| ≤ Y f_z`` and
+        ``|τ_y| ≤ X f_z`` in the axes of the foot, and ``|τ_z| ≤ μ (X+Y)/2 f_z``.
         """
         names, rows = [f"{s.frame} lifts" for _, s, _ in self._feet], [*self._lifts()]
 
@@ -157,11 +159,11 @@ class FrictionCones:
         return rows
 
     def pull(self, impulse: Array) -> float:
-        """Return the largest pull of the ground on a foot; zero if it pushes all feet."""
+        """Return the largest pull of the ground on any foot; zero if the ground pushes all feet."""
         return float(np.max(self._lifts() @ impulse, initial=0.0))
 
     def least_pull(self, particular: Array, basis: Array) -> Array:
-        """Return the impulses whose largest pull is least."""
+        """Return the possible impulses ``particular + basis z`` whose largest pull is as small as possible."""
         up, count = self._lifts(), basis.shape[1]
         if not count:
             return particular
@@ -173,7 +175,7 @@ class FrictionCones:
         return particular if solution.status != 0 else particular + basis @ solution.x[:-1]
 
     def within(self, particular: Array, basis: Array, friction: float) -> Array | None:
-        """Return the impulses within the cones whose largest entry is least, or ``None``."""
+        """Return the possible impulses within the cones whose largest entry is least; ``None`` if there are none."""
         A, _ = self.matrix(friction)
         slack = 1e-9 * max(float(np.abs(particular).max(initial=0.0)), 1e-300)
         if not basis.shape[1]:
@@ -187,7 +189,7 @@ class FrictionCones:
         return particular + basis @ solution.x[:-1] if solution.status == 0 else None
 
     def feet(self, impulse: Array, none: float) -> tuple[FootImpulse, ...]:
-        """Return the impulse on each foot; a pull above ``none`` lifts it."""
+        """Return the impulse on each foot.  A foot lifts if its pull is above ``none``."""
         feet = []
         for start, support, _ in self._feet:
             foot_impulse = impulse[start : start + support.rows]

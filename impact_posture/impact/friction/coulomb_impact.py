@@ -1,8 +1,9 @@
 """Stick or slip: the impulse of one contact with Coulomb friction, in numbers and as CasADi expressions.
 
-The contact point approaches along ``−n`` without tangential velocity.  While the normal impulse grows, the contact
-point sticks, or it slides along one fixed direction (:ref:`theory <coulomb>`).  ``B = JM⁻¹Jᵀ`` has the tangential
-part ``B_tt``, and ``Bn`` the tangential part ``g``.  The impulse is a multiple of ``n − w`` with
+The contact point approaches along ``−n`` without tangential velocity.  While the normal impulse increases, the
+contact point either sticks or slides along one fixed direction (:ref:`theory <coulomb>`).  Let ``B = JM⁻¹Jᵀ``;
+``B_tt`` is the tangential part of ``B``, and ``g`` the tangential part of ``Bn``.  The impulse is a
+multiple of ``n − w`` with
 
     ``(B_tt + σI) w = g``,  ``σ ≥ 0``,  ``‖w‖ ≤ μ``,  ``σ(μ − ‖w‖) = 0``.
 """
@@ -20,14 +21,14 @@ from impact_posture.impact.quantities.impact_oracle import ImpactOracle
 from impact_posture.impact.quantities.sticking_point import no_sticking
 from impact_posture.system.arrays import Array
 
-# An eigenvalue of B_tt below this share of the trace of B is zero.
+# An eigenvalue of B_tt below this share of the trace of B is regarded as zero.
 _RANK = 1e-9
-# Steps of Newton's method on 1/‖w‖ = 1/μ, which converges from below.  Of 10⁵ random B with conditions up to 10⁶, one
-# took ten steps, and all others fewer.
+# Number of Newton steps for 1/‖w‖ = 1/μ, which converge from below.  In a test with 10⁵ random B of condition up to
+# 10⁶, one B needed ten steps, and all others fewer.
 _STEPS = 10
-# Limit of the steps in numbers, and the relative step that ends them.
+# The numeric iteration ends after this many steps, or at a step of this relative size.
 _MOST_STEPS, _ROUNDING = 60, 1e-15
-# A smaller friction coefficient is zero up to rounding.
+# A friction coefficient below this value is regarded as zero.
 NO_FRICTION = 1e-15
 
 
@@ -39,8 +40,8 @@ class CoulombImpact:
         sticks: Whether the contact point sticks.
         jump: Velocity jump, shape (nv,).
         impulse: Impulse of the surface on the robot, world, shape (3,).
-        slip: Velocity of the contact point after the impact, world, shape (3,); zero if it sticks.
-        sigma: ``σ``, 1/kg; zero if it sticks, infinite without friction.
+        slip: Velocity of the contact point after the impact, world axes, shape (3,); zero if the point sticks.
+        sigma: Multiplier ``σ``, 1/kg; zero if the point sticks, infinite if there is no friction.
     """
 
     sticks: bool
@@ -53,11 +54,11 @@ class CoulombImpact:
 def coulomb_impact(oracle: ImpactOracle, q: Array, *, other: bool = False) -> CoulombImpact:
     """Compute the impact with the friction of the contact at ``q``, with Pinocchio.
 
-    With ``other``, continue the other branch: sticking where the contact point slides, and sliding with ``σ < 0``
-    where it sticks.
+    If ``other``, compute the other branch: sticking if the contact point would slide, and sliding with ``σ < 0`` if
+    it would stick.
 
     Raises:
-        MetricError: The contact point has to stick and cannot, or the other branch does not exist at ``q``.
+        MetricError: The result requires sticking, which does not exist at ``q``; or the other branch does not exist.
     """
     quantities, friction = oracle.quantities(q), oracle.contact.friction
     n, B = quantities.normal, quantities.mobility
@@ -86,10 +87,11 @@ def coulomb_impact(oracle: ImpactOracle, q: Array, *, other: bool = False) -> Co
 
 
 def _multiplier(values: Array, g: Array, friction: float, sigma: float) -> float:
-    """Return the ``σ`` at which ``‖g/(values + σ)‖ = μ``, from a ``sigma`` at which the norm is larger.
+    """Return the ``σ`` for which ``‖g/(values + σ)‖ = μ``.  The norm must exceed ``μ`` for the initial ``sigma``.
 
-    The inverse of the norm is concave in ``σ``, so Newton's method on it converges from below without overshoot
-    (Moré and Sorensen, Computing a Trust Region Step, 1983).  The solvers of SciPy would take 0.3 s to import.
+    The inverse of the norm is concave in ``σ``.  Newton's method for the inverse therefore converges from below
+    without overshoot (Moré and Sorensen, Computing a Trust Region Step, 1983).  Importing a solver of SciPy would
+    take 0.3 s.
     """
     for _ in range(_MOST_STEPS):
         w = g / (values + sigma)
@@ -104,8 +106,8 @@ def _multiplier(values: Array, g: Array, friction: float, sigma: float) -> float
 def coulomb_gradient(oracle: ImpactOracle, q: Array, impact: CoulombImpact) -> Array:
     """Return the tangent gradient of ``C = ‖Δν‖²_W`` at unit approach speed, shape (nv,), of an impact at ``q``.
 
-    With the impulse ``p`` and ``∂w = K ∂B (n − w)`` it is ``∂_q pᵀΛ_c p + 2 ∂_q rᵀBp`` for fixed ``p`` and
-    ``r = −(Cn + K(JM⁻¹Wa − C Bn))``, all in the axes of the normal.
+    Let ``p`` be the impulse and ``K`` the matrix with ``∂w = K ∂B (n − w)``.  The gradient is ``∂_q pᵀΛ_c p + 2 ∂_q
+    rᵀBp`` for fixed ``p`` and ``r = −(Cn + K(JM⁻¹Wa − C Bn))``, all in the axes in which the normal is stated.
     """
     if impact.sticks or not np.isfinite(impact.sigma):
         return oracle.gradient_S(q) if impact.sticks else oracle.gradient_V(q)
@@ -123,17 +125,17 @@ def coulomb_gradient(oracle: ImpactOracle, q: Array, impact: CoulombImpact) -> A
 def coulomb_direction(B: ca.SX, n: ca.SX, friction: float | ca.SX) -> tuple[ca.SX, ca.SX]:
     """Return ``n − w``, shape (3,), and ``K``, shape (3, 3), for ``B``, a unit normal, and friction above zero.
 
-    ``w = ((τ + σ)g − B_tt g)/(σ² + τσ + δ)`` with trace ``τ`` and determinant ``δ`` of ``B_tt``.  Where ``B_tt`` is
-    singular, as in planar robots, the direction in which the point cannot move gets the mobility ``τ``.  This does
-    not change ``w``, because ``g`` has no component in this direction.  Where sticking and sliding meet, ``K`` is the
-    matrix of sticking.
+    ``w = ((τ + σ)g − B_tt g)/(σ² + τσ + δ)`` with trace ``τ`` and determinant ``δ`` of ``B_tt``.  If ``B_tt`` is
+    singular, as for planar robots, the point cannot move in one tangential direction.  The mobility in this direction
+    is set to ``τ``; ``w`` does not change, because ``g`` has no component in this direction.  At the transition
+    between sticking and sliding, ``K`` is the matrix for sticking.
     """
     size, Bn, across = ca.trace(B), B @ n, ca.SX.eye(3) - n @ n.T
     g, trace = across @ Bn, size - ca.dot(n, Bn)
     Bg = across @ (B @ g)
     rows = [B[k, :].T for k in range(3)]
     determinant = ca.dot(n, ca.horzcat(*[cross(rows[k - 2], rows[k - 1]) for k in range(3)]) @ n)
-    # There is no friction on a point that can only move along the normal.
+    # A point that can only move along the normal has no friction force.
     fixed, flat = trace <= _RANK * size, determinant <= _RANK * size * trace
     determinant = ca.if_else(fixed, size**2, ca.if_else(flat, trace**2, determinant))
     trace = ca.if_else(fixed, 2 * size, ca.if_else(flat, 2 * trace, trace))

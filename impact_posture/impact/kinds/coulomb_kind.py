@@ -1,4 +1,4 @@
-"""The kind ``coulomb``: the squared jump at a given approach speed with friction, sticking or sliding."""
+"""The kind ``coulomb``: the squared jump at a given approach speed with friction; the contact sticks or slides."""
 
 from __future__ import annotations
 
@@ -21,15 +21,16 @@ from impact_posture.impact.quantities.impact_kernel import ImpactKernel
 from impact_posture.impact.quantities.lifted_form import Guess, Lifted, UnknownJump, impact_at, in_world, unknown_jump
 from impact_posture.system.arrays import Array
 
-# Bound of κo, which is zero in theory.  The interior-point method of the program needs a positive bound.
+# Upper bound of the product κo.  It should be zero, but the interior-point method needs a positive bound.
 _CORNER = 1e-10
 
 
 class CoulombKind(ImpactKind):
     """``C = ‖M⁻¹Jᵀp‖²_W/v²``: the squared jump at a given approach speed with the friction ``μ`` of the contact.
 
-    :mod:`impact_posture.impact.friction.coulomb_impact` computes the impulse ``p``.  ``C`` is ``S`` where the contact
-    point sticks, and ``V`` without friction.  It is continuous, with a kink where the contact point begins to slip.
+    :mod:`impact_posture.impact.friction.coulomb_impact` computes the impulse ``p``.  ``C`` equals ``S`` if the
+    contact point sticks, and equals ``V`` if there is no friction.  ``C`` is continuous in the posture.  At postures
+    where the contact point begins to slip, the gradient of ``C`` is discontinuous (a kink).
     """
 
     name, symbol = "coulomb", "C"
@@ -42,10 +43,11 @@ class CoulombKind(ImpactKind):
         return float(jump @ self.oracle.weigh(jump))
 
     def subgradients(self, q: Array, within: float = 0.0) -> Subgradients:
-        """Return the gradient, and the gradient of the other branch where it is at most ``within`` below the value.
+        """Return the gradient, and the gradient of the other branch (stick or slide) if its value is close.
 
-        At the kink the gradient of sticking comes first.  Where the value is the smaller of both branches, the kink
-        is not a minimum.
+        The other branch is included if its value is at most ``within`` below the value at ``q``.  At the kink, the
+        gradient of sticking is first.  If the other branch has the larger value, it is not included, because then the
+        kink cannot be a minimum.
         """
         oracle, sides = self.oracle, [coulomb_impact(self.oracle, q)]
         if within > 0:
@@ -57,7 +59,10 @@ class CoulombKind(ImpactKind):
         return Subgradients(np.array([coulomb_gradient(oracle, q, sides[k]) for k in near]), gaps[near])
 
     def expressions(self, k: ImpactKernel) -> tuple[ca.SX, ca.SX]:
-        """Return value and tangent gradient (nv) in the symbols of a kernel; at the kink for sticking."""
+        """Return value and tangent gradient (nv) in the symbols of a kernel.
+
+        At the kink, the gradient is the gradient of sticking.
+        """
         case, n = self.case, k.n
         if case.contact.friction <= NO_FRICTION:
             return k.V, k.grad_V
@@ -70,9 +75,10 @@ class CoulombKind(ImpactKind):
         return value, k.size_gradient(x, impact_at(case, r))
 
     def unknowns(self, tree: Tree, n: ca.SX, label: str = "") -> UnknownJump:
-        """Return the jump under ``λ(n − μd)``; the last unknowns are ``λ``, ``d``, ``κ`` (slip) and ``o = 1 − ‖d‖²``.
+        """Return the unknown jump under the impulse ``λ(n − μd)``, with the slip velocity ``κd``.
 
-        ``M a − J_sᵀf − λJᵀ(n − μd) = 0``, ``J_s a + εf = 0``, ``nᵀJa = 1``, ``(Ja)_t = κd``.
+        The last unknowns are ``λ``, ``d``, ``κ`` and ``o = 1 − ‖d‖²``.  The equations are ``M a − J_sᵀf − λJᵀ(n − μd)
+        = 0``, ``J_s a + εf = 0``, ``nᵀJa = 1``, ``(Ja)_t = κd``.
         """
         case, size, d = self.case, ca.SX.sym(f"lam{label}"), ca.SX.sym(f"d{label}", 3)
         slip, inside = ca.SX.sym(f"kappa{label}"), ca.SX.sym(f"o{label}")
@@ -85,13 +91,13 @@ class CoulombKind(ImpactKind):
         return jump.with_impulse(ca.vertcat(size, d, slip, inside), equations)
 
     def lift(self, tree: Tree, parameters: ca.SX, scale: ca.SX) -> Lifted:
-        """Return the value under the equations of :meth:`unknowns` and ``κ ≥ 0``, ``o ≥ 0``, ``κo = 0``."""
+        """Return the lifted form with the equations of :meth:`unknowns` and ``κ ≥ 0``, ``o ≥ 0``, ``κo = 0``."""
         jump = self.unknowns(tree, parameters)
         slip, inside = jump.variables[-2], jump.variables[-1]
         return Lifted.of([jump], self.lifted_value(jump), inequalities=[slip * inside - _CORNER])
 
     def jump(self, q: Array) -> tuple[Array, Array]:
-        """Return the jump with friction, and ``λ``, ``d``, ``κ`` and ``o``."""
+        """Return the jump with friction, and the values of ``λ``, ``d``, ``κ`` and ``o``."""
         oracle, friction = self.oracle, self.oracle.contact.friction
         impact = coulomb_impact(oracle, q)
         n, p = oracle.n, impact.impulse
@@ -100,7 +106,7 @@ class CoulombKind(ImpactKind):
         return impact.jump, np.array([size, *(oracle.axes.T @ d), slip, max(1 - float(d @ d), 0.0)])
 
     def guess(self, q: Array, scale: float, attempt: int = 0) -> Guess:
-        """Return the unknowns of :meth:`lift` that solve its equations at ``q``; ``κ`` and ``o`` are ≥ 0."""
+        """Return values that solve the equations of :meth:`lift` at ``q``; ``κ`` and ``o`` have the lower bound 0."""
         guess = super().guess(q, scale, attempt)
         guess.lower[-2:] = 0.0
         return guess

@@ -17,7 +17,8 @@ from impact_posture.system.arrays import Array
 class EnergyKind(FrictionlessKind, QuadraticKind):
     """``E = 1/(2G)``: the energy that the contact dissipates at a given approach speed.
 
-    The quadratic form of the normal is ``K = −JM⁻¹Jᵀ``, which is largest where ``G`` is least.
+    The quadratic form of the normal has the matrix ``K = −JM⁻¹Jᵀ``.  Its value is ``−G``, so it is largest for the
+    normal with the least ``G``.
     """
 
     name, symbol = "energy", "E"
@@ -37,7 +38,7 @@ class EnergyKind(FrictionlessKind, QuadraticKind):
         return -k.mobility
 
     def of_form(self, form: Array) -> Array:
-        """Return ``−1/(2K)``; infinite where the contact cannot move."""
+        """Return ``−1/(2K)``; infinite for a value of zero, for which the contact cannot move along the normal."""
         return np.asarray(np.where(form < 0, -1 / (2 * np.where(form < 0, form, -1.0)), np.inf))
 
     def of_form_slope(self, form: Array) -> Array:

@@ -1,4 +1,4 @@
-"""The abstract bases of the kinds of objective, each of which minimizes one scalar of an impact."""
+"""Abstract base classes of the kinds of objective; each kind minimizes one scalar of an impact."""
 
 from __future__ import annotations
 
@@ -31,17 +31,20 @@ from impact_posture.system.arrays import Array
 class ImpactKind(ABC):
     """A multiple of H, G, V, S or E of one impact along one normal.
 
-    It implements :class:`~impact_posture.impact.objective.WorstCase` without a maximum, because ``λ = λ̄``.  Value,
-    gradient and expressions follow from the attributes of the oracle and the kernel with the name :attr:`symbol`.  A
-    kind adds the equations of its lifted form.
+    A kind implements :class:`~impact_posture.impact.objective.WorstCase`.  No maximum is computed, because the worst
+    impulse is the bound ``λ̄``.  Value, gradient and expressions are read from the attributes of the oracle and the
+    kernel that :attr:`symbol` names.  Each kind adds the equations of its lifted form.
 
     Attributes:
         name: Name in options, files and outputs.
         symbol: Name of the scalar: H, G, V, S or E.
-        units: Units in words.
-        adds_up: Whether the impulses of several contacts at once are known, so that their jumps add up.
-        kink: Where the value has a kink, and which gradient it has there; empty for a smooth value.
-        no_cone: Reason why no exact worst case over a cone of normals exists.
+        units: Units as text.
+        adds_up: Whether the kind prescribes the impulse of each contact, so that the jumps of several contacts can be
+            added.
+        kink: Text that states where the gradient is discontinuous, and which gradient is returned there.  Empty for a
+            smooth value.
+        no_cone: Reason why the kind has no exact worst case over a cone of normals.
+        attempts: Number of different initial guesses that :meth:`guess` offers.
     """
 
     oracle: ImpactOracle
@@ -55,7 +58,7 @@ class ImpactKind(ABC):
 
     @property
     def case(self) -> ImpactCase:
-        """The impact."""
+        """Robot, contact, metric and supports of the impact."""
         return self.oracle.case
 
     @property
@@ -75,7 +78,7 @@ class ImpactKind(ABC):
         return self.factor * float(value)
 
     def subgradients(self, q: Array, within: float = 0.0) -> Subgradients:
-        """Return the tangent gradient, computed with Pinocchio, as the only member, because the value is smooth."""
+        """Return the tangent gradient, computed with Pinocchio; it is the only subgradient of a smooth value."""
         gradient = self.factor * getattr(self.oracle, f"gradient_{self.symbol}")(q)
         return Subgradients(gradient[None, :], np.zeros(1))
 
@@ -85,32 +88,35 @@ class ImpactKind(ABC):
 
     @abstractmethod
     def unknowns(self, tree: Tree, n: ca.SX, label: str = "") -> UnknownJump:
-        """Return the unknown jump at ``tree.q`` along the normal ``n``, with the equations that determine it."""
+        """Return the unknown jump for an impact at ``tree.q`` along the normal ``n``, with its equations."""
 
     @abstractmethod
     def jump(self, q: Array) -> tuple[Array, Array]:
-        """Return the jump (nv,) and the other unknowns that solve the equations of :meth:`unknowns` at ``q``."""
+        """Solve the equations of :meth:`unknowns` at ``q``; return the jump, shape (nv,), and the other unknowns."""
 
     def lifted_value(self, jump: UnknownJump) -> ca.SX:
-        """Return the value in terms of the unknown jump: ``aᵀWa`` times the factor."""
+        """Return the value as an expression of the unknown jump: ``aᵀWa`` times :attr:`factor`."""
         return self.factor * weighed(self.case.metric, jump, jump)
 
     def lift(self, tree: Tree, parameters: ca.SX, scale: ca.SX) -> Lifted:
-        """Return the lifted form at ``tree.q`` and the normal ``parameters``."""
+        """Return the lifted form at the posture ``tree.q``; ``parameters`` is the normal."""
         jump = self.unknowns(tree, parameters)
         return Lifted.of([jump], self.lifted_value(jump))
 
     def guess(self, q: Array, scale: float, attempt: int = 0) -> Guess:
-        """Return the unknowns of :meth:`lift` that solve its equations at ``q``."""
+        """Return the values of the unknowns that solve the equations of :meth:`lift` at ``q``."""
         a, others = self.jump(q)
         return Guess.unbounded(np.concatenate([self.oracle.with_support_impulses(a), others]))
 
 
 class FrictionlessKind(ImpactKind):
-    """A kind at unit approach speed without friction, with an unknown impulse ``λ``."""
+    """A kind for an approach speed of 1 m/s without friction; the impulse ``λ`` is an unknown."""
 
     def unknowns(self, tree: Tree, n: ca.SX, label: str = "") -> UnknownJump:
-        """Return ``M a − J_sᵀf − λJᵀn = 0``, ``J_s a + εf = 0``, ``nᵀJa = 1``; ``λ`` is the last unknown."""
+        """Return the jump with ``M a − J_sᵀf − λJᵀn = 0``, ``J_s a + εf = 0``, ``nᵀJa = 1``.
+
+        ``λ`` is the last unknown.
+        """
         impulse = ca.SX.sym(f"lam{label}")
         jump = unknown_jump(self.case, tree, impact_at(self.case, n * impulse), label)
         return jump.with_impulse(impulse, ca.dot(in_world(self.case, tree, n), jump.contact_velocity) - 1)
@@ -122,9 +128,9 @@ class FrictionlessKind(ImpactKind):
 
 
 class QuadraticKind(ImpactKind):
-    """A kind whose value rises with one quadratic form ``nᵀK(q)n`` of the normal.
+    """A kind whose value is an increasing function of one quadratic form ``nᵀK(q)n`` of the normal.
 
-    A quadratic form has an exact worst case over a cone of normals.  By default ``K = Λ_c``.
+    The largest value of a quadratic form over a cone of normals can be computed exactly.  By default ``K = Λ_c``.
 
     Attributes:
         unknown_impulse: Whether the unknowns of :meth:`lift_direction` include the impulse.
@@ -133,15 +139,20 @@ class QuadraticKind(ImpactKind):
     unknown_impulse: ClassVar[bool] = False
 
     def directions(self, mobility: Array, world: Array) -> Array:
-        """Return the impulses from whose jumps :meth:`form` follows along world directions (columns), shape (3, 3).
+        """Return the impulses whose jumps :meth:`form` needs, one column per world direction, shape (3, 3).
+
+        ``mobility`` is ``JM⁻¹Jᵀ``, shape (3, 3).
 
         Raises:
-            MetricError: They do not exist with this ``JM⁻¹Jᵀ``, shape (3, 3).
+            MetricError: The kind needs the inverse of ``mobility``, which is singular.
         """
         return world
 
     def form(self, mobility: Array, world: Array, jumps: Array) -> Array:
-        """Return ``K`` along world directions (columns) whose impulses cause ``jumps`` (columns), shape (3, 3)."""
+        """Return ``K`` in the axes ``world`` (columns), shape (3, 3).
+
+        ``jumps`` are the velocity jumps (columns) that the impulses of :meth:`directions` cause.
+        """
         return np.asarray(jumps.T @ self.oracle.weigh(jumps))
 
     @abstractmethod
@@ -153,25 +164,25 @@ class QuadraticKind(ImpactKind):
         """Return ``K`` in world axes, shape (3, 3)."""
 
     def of_form(self, form: Array) -> Array:
-        """Return the objective for values of the form."""
+        """Return the objective for each value of the quadratic form."""
         return self.factor * form
 
     def of_form_slope(self, form: Array) -> Array:
-        """Return the derivative of :meth:`of_form`."""
+        """Return the derivative of the objective with respect to the value of the form."""
         return np.full_like(form, self.factor)
 
     def of_form_expression(self, form: ca.SX) -> ca.SX:
-        """Return :meth:`of_form` as an expression."""
+        """Return the objective as an expression of the value of the form."""
         return self.factor * form
 
     def lift_direction(self, tree: Tree, n: ca.SX, label: str) -> UnknownJump:
-        """Return the unknown jump of a direction ``n`` of the form, in the axes of the normal, shape (3,)."""
+        """Return the unknown jump for a direction ``n``, shape (3,), in the axes in which the normal is stated."""
         return self.unknowns(tree, n, label)
 
     def lift_entry(self, world: ca.SX, first: UnknownJump, second: UnknownJump) -> ca.SX:
-        """Return an entry of ``K`` from the jumps of two directions; ``world`` is the first direction."""
+        """Return the entry of ``K`` for two directions from their jumps; ``world`` is the first direction."""
         return weighed(self.case.metric, first, second)
 
     def form_unit(self, value: Any) -> Any:
-        """Return the absolute value of the form where the objective has ``value``, a number or an expression."""
+        """Return the absolute value of the form for which the objective equals ``value`` (number or expression)."""
         return value / self.factor

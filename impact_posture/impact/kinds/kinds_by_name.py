@@ -1,4 +1,4 @@
-"""The kinds of objective by name."""
+"""Table of the kinds of objective: name → class."""
 
 from __future__ import annotations
 

@@ -1,7 +1,8 @@
-"""The impact quantities and their tangent gradients as expressions, by the adjoints of the theory page.
+"""The impact quantities and their tangent gradients as expressions; the theory page derives the adjoints.
 
-With feet held at compliance ε, every formula below holds with ``M + J_sᵀJ_s/ε`` in place of ``M``.  This is the mass
-matrix of a robot whose feet carry the point mass 1/ε.  So there is one code path with and without supports.
+If supports with compliance ε keep the feet in place, ``M + J_sᵀJ_s/ε`` replaces ``M`` in every formula below.  This
+is the mass matrix of a robot with an additional point mass 1/ε at each foot.  The same code therefore computes the
+quantities with and without supports.
 """
 
 from __future__ import annotations
@@ -22,15 +23,15 @@ from impact_posture.impact.support_compliance import support_inertia
 from impact_posture.robot.robot import Robot
 from impact_posture.system.arrays import Array, null_space
 
-# Singular values of stacked Jacobians below this share of the largest are zero up to rounding.
+# A singular value of the stacked Jacobians below this share of the largest one is a rounding error.
 _FROZEN = 1e-9
 
 
 class ImpactKernel:
     """Symbolic ``H, G, V, S, E, Λ_c`` and gradients of one impact.
 
-    The symbols ``q`` have shape (nq, 1), and ``n``, in the axes of the contact's normal, shape (3, 1).  The
-    expressions of repeated ``limbs`` take the same form.
+    The symbol ``q`` has shape (nq, 1).  The symbol ``n`` is the normal in the axes in which the contact states it,
+    shape (3, 1).  With ``limbs``, the expressions of repeated limbs differ only in parameters.
     """
 
     def __init__(self, case: ImpactCase, q: ca.SX, n: ca.SX, limbs: RepeatedLimbs | None = None) -> None:
@@ -42,7 +43,7 @@ class ImpactKernel:
 
     @cached_property
     def impact(self) -> Wrench:
-        """The unit impulse along the normal."""
+        """Unit impulse along the normal at the contact point."""
         return impact_at(self.case, self.n)
 
     @cached_property
@@ -52,11 +53,14 @@ class ImpactKernel:
 
     @cached_property
     def jump(self) -> Response:
-        """Response of the robot to the unit impulse, with ``a = M⁻¹Jᵀn``."""
+        """Response of the robot to the unit impulse along the normal, with ``a = M⁻¹Jᵀn``."""
         return self.respond([self.impact])
 
     def _on_all_limbs(self, wrench: Wrench) -> list[Wrench]:
-        """Return the wrench; for a repeated limb also wrenches on its counterparts, times a zero parameter."""
+        """Return the wrench, for a repeated limb as wrenches on all corresponding limbs.
+
+        A parameter is one for the limb of the wrench and zero for the others, so all limbs have the same operations.
+        """
         limbs, joint = self.tree.limbs, wrench.point.joint
         if limbs is None or joint not in limbs.places:
             return [wrench]
@@ -83,11 +87,11 @@ class ImpactKernel:
 
     @cached_property
     def grad_H(self) -> ca.SX:
-        """``2 ∂_q[nᵀJb − bᵀMa]`` with ``Mb = Wa`` (plus ``∂_q aᵀMa`` where W = M), shape (nv,)."""
+        """Tangent gradient of H, ``2 ∂_q[nᵀJb − bᵀMa]`` with ``Mb = Wa``, shape (nv,); plus ``∂_q aᵀMa`` if W = M."""
         return self.grad_G if self.metric.kind == "kinetic" and not self._supported else self.size_gradient(self.jump)
 
     def respond(self, impacts: Sequence[Wrench]) -> Response:
-        """Return the response of the robot to impulses at any points at once."""
+        """Return the response of the robot to simultaneous impulses at any points."""
         return self.tree.respond(wrenches=[part for impact in impacts for part in self._on_all_limbs(impact)])
 
     def product(self, first: Response, second: Response) -> ca.SX:
@@ -97,7 +101,8 @@ class ImpactKernel:
     def size_gradient(self, jump: Response, r: Wrench | None = None) -> ca.SX:
         """Return the tangent gradient of ``aᵀWa`` of a response, shape (nv,).
 
-        The impulses of the response are fixed.  With ``r`` there is one impulse ``p``, and ``∂pᵀJM⁻¹Wa = rᵀ∂B p``.
+        If ``r`` is ``None``, the impulses of the response do not depend on ``q``.  Otherwise the response has one
+        impulse ``p``, which depends on ``q`` such that ``∂pᵀJM⁻¹Wa = rᵀ∂B p`` with ``B = JM⁻¹Jᵀ``.
         """
         if self.metric.kind == "kinetic" and not self._supported and r is None:
             return self.tree.pair_gradient(jump, jump)
@@ -108,13 +113,13 @@ class ImpactKernel:
         return gradient
 
     def adjoint_velocity(self, x: Response) -> ca.SX:
-        """Return ``JM⁻¹Wa`` of a response, world, shape (3,)."""
+        """Return ``JM⁻¹Wa`` of a response, in world axes, shape (3,)."""
         free = self.tree.respond(tau=self._weigh(x.a, x.velocities))
         return self.tree.point_velocity(self.point, free.velocities)[:3]
 
     @cached_property
     def grad_G(self) -> ca.SX:
-        """``∂_q[2nᵀJa − aᵀMa]``, shape (nv,)."""
+        """Tangent gradient of G, ``∂_q[2nᵀJa − aᵀMa]``, shape (nv,)."""
         return self.tree.pair_gradient(self.jump, self.jump)
 
     @cached_property
@@ -139,7 +144,7 @@ class ImpactKernel:
 
     @cached_property
     def _axes(self) -> list[Response]:
-        """``M⁻¹Jᵀe_k`` for the three world directions."""
+        """Responses ``M⁻¹Jᵀe_k`` to unit impulses along the three world axes."""
         eye = np.eye(3)
         return [self.respond([self._force(ca.SX(eye[k]))]) for k in range(3)]
 
@@ -162,7 +167,7 @@ class ImpactKernel:
 
     @cached_property
     def sticking_form(self) -> ca.SX:
-        """``(JM⁻¹Jᵀ)⁻¹Λ_c(JM⁻¹Jᵀ)⁻¹``, shape (3, 3): ``S`` as a quadratic form of the world normal."""
+        """Matrix ``(JM⁻¹Jᵀ)⁻¹Λ_c(JM⁻¹Jᵀ)⁻¹``, shape (3, 3), whose quadratic form of the world normal is ``S``."""
         return self._mobility_inverse.T @ self.ellipsoid @ self._mobility_inverse
 
     @cached_property
@@ -177,7 +182,10 @@ class ImpactKernel:
 
     @cached_property
     def grad_S(self) -> ca.SX:
-        """``2 ∂_q[sᵀJb + rᵀJa − bᵀMa]`` (and ``−2rᵀn(q)`` for a normal that turns with the robot), shape (nv,)."""
+        """Tangent gradient of S, ``2 ∂_q[sᵀJb + rᵀJa − bᵀMa]``, shape (nv,).
+
+        If the normal turns with the robot, ``−2 ∂_q rᵀn(q)`` is added.
+        """
         x = self._sticking
         r = -self._mobility_inverse @ self.adjoint_velocity(x)
         gradient = self.size_gradient(x, self._force(r))
@@ -197,9 +205,10 @@ class ImpactKernel:
 
 
 def frozen_directions(robot: Robot, point: PointOnLink) -> Array:
-    """Return the projector on the world directions in which a point can never move, shape (3, 3).
+    """Return the projector onto the world directions in which a point cannot move at any posture, shape (3, 3).
 
-    It is zero except for planar robots.  The inverse of ``JM⁻¹Jᵀ`` plus this projector acts as the pseudo-inverse.
+    The projector is zero except for planar robots.  For impulses along the other directions, the inverse of
+    ``JM⁻¹Jᵀ + projector`` equals the pseudo-inverse of ``JM⁻¹Jᵀ``.
     """
     numeric, generator = Numeric(robot.model), np.random.default_rng(0)
     samples = [

@@ -1,7 +1,8 @@
 """The impact quantities by dense linear algebra on matrices from Pinocchio, independent of the symbolic kernel.
 
-Feet enter through the KKT system ``[M, −J_sᵀ; J_s, εI]``, not as the heavy feet of the symbolic kernel.  The support
-impulses ``f`` are unknowns of this system, because ``−J_s a/ε`` loses as many digits as ε has zeros.
+The symbolic kernel adds masses to the feet; this module instead solves the KKT system ``[M, −J_sᵀ; J_s, εI]``.  The
+support impulses ``f`` are unknowns of this system.  Computing them as ``−J_s a/ε`` would amplify rounding errors by
+1/ε.
 """
 
 from __future__ import annotations
@@ -18,13 +19,13 @@ from impact_posture.impact.quantities.impact_quantities import ImpactQuantities
 from impact_posture.impact.quantities.sticking_point import ImpulseResponse, StickingPoint, no_sticking
 from impact_posture.system.arrays import Array
 
-# Number of postures whose factorization is kept, because a search returns to its starts.
+# Number of postures whose matrices are kept, because a search evaluates its starts again.
 _KEPT = 32
 
 
 @dataclass(eq=False)
 class _Factorized:
-    """Matrices at one posture, and its quantities once they are computed."""
+    """Matrices at one posture, and the impact quantities after they have been computed."""
 
     M: Array
     J: Array
@@ -37,7 +38,7 @@ class _Factorized:
 class ImpactOracle:
     """Numeric ``H, G, V, S, E, Λ_c`` and tangent gradients of one impact.
 
-    Attributes ``M``, ``J``, ``Js`` and ``n`` (world normal) are at the posture of the last call of :meth:`at`.
+    The attributes ``M``, ``J``, ``Js`` and ``n`` (world normal) belong to the posture of the last call of :meth:`at`.
     """
 
     def __init__(self, case: ImpactCase) -> None:
@@ -51,11 +52,11 @@ class ImpactOracle:
         self._known: dict[bytes, _Factorized] = {}
 
     def at(self, q: Array) -> ImpactOracle:
-        """Move to ``q``.  The matrices of the last postures are kept."""
+        """Set the posture to ``q``.  The matrices of recent postures are kept and used again."""
         q = np.array(q, dtype=float)
         if (key := q.tobytes()) != self._key:
             self.numeric.at(q)
-            # The posture of the latest call is last, and the first is dropped.
+            # The dictionary is in the order of the calls, so its first entry is the oldest posture.
             self._known[key] = known = self._known.pop(key, None) or self._factorized()
             if len(self._known) > _KEPT:
                 del self._known[next(iter(self._known))]
@@ -74,7 +75,10 @@ class ImpactOracle:
         return _Factorized(M, J, Js, kkt, self._normals(None)[1])
 
     def respond(self, tau: Array, slip: Array | None = None) -> ImpulseResponse:
-        """Solve ``M a − J_sᵀf = τ, J_s a + εf = slip`` for vectors or columns; the slip is zero by default."""
+        """Solve ``M a − J_sᵀf = τ, J_s a + εf = slip`` for ``a`` and ``f``.
+
+        ``tau`` is a vector or a matrix whose columns are solved together.  ``slip`` is zero by default.
+        """
         rhs: Array = np.zeros((len(self._kkt), *tau.shape[1:]))
         rhs[: self._nv] = (tau.T * ~self.numeric.locked).T
         if slip is not None:
@@ -83,7 +87,7 @@ class ImpactOracle:
         return ImpulseResponse(solution[: self._nv], solution[self._nv :])
 
     def solve(self, tau: Array) -> Array:
-        """Return ``(M + J_sᵀJ_s/ε)⁻¹ τ`` for a vector or columns."""
+        """Return ``(M + J_sᵀJ_s/ε)⁻¹ τ`` for a vector ``tau`` or for each column of a matrix."""
         return self.respond(tau).a
 
     def weigh(self, a: Array) -> Array:
@@ -93,7 +97,7 @@ class ImpactOracle:
         return np.asarray((self.metric.diagonal(self._nv) * a.T).T)
 
     def quantities(self, q: Array) -> ImpactQuantities:
-        """Return all quantities at ``q``, computed once for each of the last postures."""
+        """Return all impact quantities at ``q``.  Recent postures are not computed again."""
         known = self.at(q)._known[self._key]
         if known.quantities is not None:
             return known.quantities
@@ -126,7 +130,7 @@ class ImpactOracle:
         return known.quantities
 
     def with_support_impulses(self, a: Array) -> Array:
-        """Return ``a`` followed by its support impulses ``−J_s a/ε``, in the axes of the feet at the last posture."""
+        """Return ``a``, followed by the support impulses ``−J_s a/ε`` in the axes of the feet at the last posture."""
         f = -self.Js @ a / self.compliance
         parts, start = [a], 0
         for foot in self.feet:
@@ -138,7 +142,7 @@ class ImpactOracle:
     def gradient_H(self, q: Array, normal: Array | None = None) -> Array:
         """Return the tangent gradient of H, shape (nv,).
 
-        ``normal`` replaces the contact's normal, in the same axes, shape (3,).
+        ``normal``, shape (3,), replaces the normal of the contact and is stated in the same axes.
         """
         self.at(q)
         normal, n = self._normals(normal)
@@ -157,11 +161,11 @@ class ImpactOracle:
     def gradient_S(self, q: Array, normal: Array | None = None) -> Array:
         """Return the tangent gradient of S, shape (nv,), with ``normal`` as in :meth:`gradient_H`.
 
-        Where ``JM⁻¹Jᵀ`` is singular, the point is held in its range.  This is correct if the directions in which the
-        contact can move are constant, as in a planar robot.
+        If ``JM⁻¹Jᵀ`` is singular, the contact point is constrained only in the directions in which it can move.  The
+        gradient is correct if these directions are constant, as in a planar robot.
 
         Raises:
-            MetricError: S does not exist here.
+            MetricError: S does not exist at ``q``.
         """
         self.at(q)
         _, n = self._normals(normal)
@@ -186,11 +190,11 @@ class ImpactOracle:
 
     @property
     def axes(self) -> Array:
-        """Axes of the contact's normal in the world at the last posture, as columns, shape (3, 3)."""
+        """Axes in which the contact states its normal, as columns in the world at the last posture, shape (3, 3)."""
         return np.asarray(self.numeric.placement(self.point).rotation) if self.case.in_contact_frame else np.eye(3)
 
     def _normals(self, normal: Array | None) -> tuple[Array, Array]:
-        """Return a normal, by default the contact's, in the axes of the contact's normal and in world axes."""
+        """Return ``normal`` (by default the normal of the contact) as stated, and the same normal in world axes."""
         normal = np.array(self.contact.normal) if normal is None else normal
         return normal, self.axes @ normal if self.case.in_contact_frame else normal
 
@@ -211,7 +215,7 @@ class ImpactOracle:
         return self._adjoint_rows(self.respond(np.eye(self._nv)))
 
     def _adjoint_rows(self, adjoints: ImpulseResponse) -> Array:
-        """Return ``pᵀ∂(Jᵀn + J_sᵀf − M a) + rᵀ∂(J_s a)`` for each adjoint ``p, r``, shape (k, nv)."""
+        """Return ``pᵀ∂(Jᵀn + J_sᵀf − M a) + rᵀ∂(J_s a)`` as one row per adjoint ``p, r``, shape (k, nv)."""
         normal, x = np.array(self.contact.normal), self.respond(self.J.T @ self.n)
         rows = [
             self.coupling(normal, p, self.case.in_contact_frame) - self.inertial(ImpulseResponse(p, r), x)
@@ -220,7 +224,10 @@ class ImpactOracle:
         return np.array(rows).reshape(-1, self._nv)
 
     def coupling(self, direction: Array, v: Array, in_frame: bool) -> Array:
-        """Return ``∂_q directionᵀJ v``, shape (nv,), for a direction in world axes or fixed in the frame."""
+        """Return ``∂_q directionᵀJ v``, shape (nv,).
+
+        The direction is constant in the contact frame if ``in_frame``, else in the world.
+        """
         wrench = np.concatenate([direction, np.zeros(3)])
         return self.numeric.coupling_gradient(self.point, wrench, v, in_frame=in_frame)
 
@@ -237,5 +244,5 @@ class ImpactOracle:
         return gradient
 
     def metric_gradient(self, a: Array) -> Array:
-        """Return ``∂_q aᵀWa`` with ``a`` held fixed, shape (nv,); zero unless W = M."""
+        """Return ``∂_q aᵀWa`` for a fixed ``a``, shape (nv,); zero unless W = M."""
         return self.numeric.inertial_gradient(a, a) if self.metric.kind == "kinetic" else np.zeros(self._nv)

@@ -8,7 +8,7 @@ import numpy as np
 
 from impact_posture.system.arrays import Array
 
-# A contact whose 1/m_eff along the normal is below this share of the largest mobility cannot move along it.
+# The contact cannot move along the normal if 1/m_eff is below this share of the largest mobility of any direction.
 _BLOCKED = 1e-12
 
 
@@ -20,15 +20,16 @@ class ImpactQuantities:
         H: ``nᵀΛ_c n``, squared jump per squared impulse.
         G: ``nᵀJM⁻¹Jᵀn = 1/m_eff``, 1/kg.
         V: ``H/G²``, squared jump per squared approach speed (frictionless, e = 0).
-        S: Squared jump per squared approach speed if the contact sticks; ``None`` where it does not exist.
-        E: ``1/(2G)``, energy dissipated per squared approach speed (e = 0), half the effective mass, kg.
-        jump: ``a = M⁻¹Jᵀn``, shape (nv,).
-        sticking_jump: Jump per unit approach speed of a contact that sticks, shape (nv,), or ``None``.
-        sticking_impulse: Impulse per unit approach speed of a contact that sticks, world, shape (3,), or ``None``.
-        ellipsoid: ``Λ_c``, shape (3, 3).
-        mobility: ``JM⁻¹Jᵀ``, shape (3, 3), 1/kg.
+        S: Squared jump per squared approach speed if the contact sticks; ``None`` if it cannot stick at this posture.
+        E: ``1/(2G)``, energy dissipated per squared approach speed (e = 0), which is half the effective mass, kg.
+        jump: Velocity jump per unit impulse, ``a = M⁻¹Jᵀn``, shape (nv,).
+        sticking_jump: Jump per unit approach speed if the contact sticks, shape (nv,); ``None`` if S is ``None``.
+        sticking_impulse: Impulse per unit approach speed if the contact sticks, world axes, shape (3,); ``None`` if S
+            is ``None``.
+        ellipsoid: Dynamic impact ellipsoid ``Λ_c``, world axes, shape (3, 3).
+        mobility: ``JM⁻¹Jᵀ``, world axes, shape (3, 3), 1/kg.
         normal: World unit normal, shape (3,).
-        support_impulse: ``f`` per unit impulse, stacked rows of the supports.
+        support_impulse: Support impulses ``f`` per unit impulse of the impact; the rows of all supports, stacked.
     """
 
     H: float
@@ -52,7 +53,7 @@ class ImpactQuantities:
 
 @dataclass(frozen=True)
 class Scalars:
-    """H, G, V, S and E as in :class:`ImpactQuantities`; ``None`` for a value that does not exist."""
+    """H, G, V, S and E as in :class:`ImpactQuantities`; a value is ``None`` if it does not exist at the posture."""
 
     H: float
     G: float
@@ -68,7 +69,7 @@ class Scalars:
 
     @property
     def effective_mass(self) -> float | None:
-        """``1/G``, kg; ``None`` where unbounded."""
+        """Effective mass ``1/G``, kg; ``None`` if it is unbounded (the contact cannot move along the normal)."""
         return None if self.E is None else 1 / self.G
 
     def to_dict(self) -> dict[str, float | None]:

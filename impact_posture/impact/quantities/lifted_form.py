@@ -1,4 +1,4 @@
-"""The lifted form of an objective, in which linear solves become unknowns and equations of the program."""
+"""The lifted form of an objective: solutions of linear systems become unknowns and equations of the program."""
 
 from __future__ import annotations
 
@@ -16,20 +16,21 @@ from impact_posture.impact.impact_contact import point_on
 from impact_posture.impact.metric import Metric
 from impact_posture.system.arrays import Array
 
-# Distance of the start of t above its bounds by attempt, in units of the scale.  A barrier needs a start inside.
+# Initial distance of t above its lower bounds in each attempt, in units of the scale.  The interior-point method
+# needs a start that satisfies the inequalities strictly.
 ABOVE = (0.01, 1.0, 0.1)
 
 
 @dataclass(frozen=True)
 class Lifted:
-    """An objective whose linear solves are equations of the program.
+    """An objective in lifted form: its linear systems are equations of the program.
 
     Attributes:
         variables: Auxiliary unknowns, shape (k, 1).
-        residual: Equations ``residual = 0`` that determine the unknowns, shape (r, 1).
-        value: The objective in terms of configuration and unknowns.
-        inequalities: Rows ``≤ 0`` that bound the value from below, shape (i, 1).
-        jumps: Unknown jumps whose derivatives are known in closed form.
+        residual: Left sides of the equations ``residual = 0`` that determine the unknowns, shape (r, 1).
+        value: The objective as an expression of the configuration and the unknowns.
+        inequalities: Expressions that must be ``≤ 0``; they bound the value from below, shape (i, 1).
+        jumps: Unknown jumps whose derivatives are available in closed form.
     """
 
     variables: ca.SX
@@ -47,7 +48,10 @@ class Lifted:
         equations: Sequence[ca.SX] = (),
         inequalities: Sequence[ca.SX] = (),
     ) -> Lifted:
-        """Return a form with the unknowns, equations and inequalities of all parts, followed by further ones."""
+        """Return a form with the unknowns, equations and inequalities of all parts.
+
+        ``others`` are further unknowns.  They and the further ``equations`` and ``inequalities`` come last.
+        """
         row, column, placed = 0, 0, list[PlacedJump]()
         for part in parts:
             placed += [PlacedJump(jump, row + below, column + right) for jump, below, right in part.jumps]
@@ -63,7 +67,7 @@ class Lifted:
 
     @property
     def rest(self) -> ca.SX:
-        """The residual without the terms whose derivatives are known, shape (r, 1)."""
+        """The residual without the terms whose derivatives are available in closed form, shape (r, 1)."""
         rest = ca.SX(self.residual)
         for jump, row, _ in self.jumps:
             rest[row : row + jump.rest.numel()] = jump.rest
@@ -75,9 +79,9 @@ class Guess:
     """Initial values and bounds of the unknowns of a lifted form.
 
     Attributes:
-        values: Values, shape (k,).
+        values: Initial values, shape (k,).
         lower: Lower bounds, shape (k,); minus infinity for an unbounded unknown.
-        upper: Upper bounds, shape (k,); ``None`` without upper bounds.
+        upper: Upper bounds, shape (k,); ``None`` if no unknown has an upper bound.
     """
 
     values: Array
@@ -86,35 +90,37 @@ class Guess:
 
     @staticmethod
     def unbounded(values: Array) -> Guess:
-        """Return a guess without lower bounds."""
+        """Return a guess with these values and without bounds."""
         return Guess(values, np.full(values.size, -np.inf))
 
     @property
     def above(self) -> Array:
-        """Upper bounds, infinite where there are none, shape (k,)."""
+        """Upper bounds, shape (k,); infinite for an unknown without an upper bound."""
         return np.full(self.values.size, np.inf) if self.upper is None else self.upper
 
     @staticmethod
     def joined(parts: Sequence[Guess]) -> Guess:
-        """Return the guesses of several parts, one after the other."""
+        """Return one guess with the unknowns of all parts, one part after the other."""
         keys = ("values", "lower", "above")
         return Guess(*(np.concatenate([np.zeros(0), *[getattr(part, key) for part in parts]]) for key in keys))
 
 
 @dataclass(frozen=True, eq=False)
 class UnknownJump:
-    """A jump ``a`` and the support impulses as unknowns.
+    """A velocity jump ``a`` and its support impulses, as unknowns of the program.
 
     Attributes:
         a: Unknown jump, shape (nv,).
-        f: Support impulses, in the axes of the feet.
-        variables: ``a``, the support impulses, and the impulse of the impact if it is unknown.
-        residual: ``M a − J_sᵀf − (the impact)`` and ``J_s a + εf``, and equations that determine the unknown impulse.
-        rest: The terms of the residual that :attr:`derivatives` do not cover: the impact and rows of locked joints.
-        derivatives: Closed derivatives of the other terms.
-        compliance: ε, 1/kg.
-        tree: The tree, whose locked joints have the equations ``a_k = 0``.
-        contact_velocity: ``J a``, world, shape (3,).
+        f: Unknown support impulses, in the axes of the feet.
+        variables: All unknowns: ``a``, ``f``, and the impulse of the impact if it is unknown.
+        residual: ``M a − J_sᵀf − (generalized impulse of the impact)``, then ``J_s a + εf``, then equations that
+            determine the impulse of the impact if it is unknown.
+        rest: The terms of the residual that :attr:`derivatives` do not include: the impulse of the impact, and the
+            rows of locked joints.
+        derivatives: Derivatives in closed form of the other terms.
+        compliance: Compliance ε of the supports, 1/kg.
+        tree: The kinematic tree.  Each locked joint k has the equation ``a_k = 0``.
+        contact_velocity: Velocity jump ``J a`` of the contact point, world axes, shape (3,).
     """
 
     a: ca.SX
@@ -129,16 +135,16 @@ class UnknownJump:
 
     @property
     def jumps(self) -> tuple[PlacedJump, ...]:
-        """The jump itself as a part of a :class:`Lifted`, if its closed derivatives exist."""
+        """This jump, placed first in a :class:`Lifted`; empty if it has no derivatives in closed form."""
         return (PlacedJump(self, 0, 0),) if self.derivatives.exist else ()
 
     def with_impulse(self, impulse: ca.SX, fixing: ca.SX) -> UnknownJump:
-        """Return the same jump with the impulse of the impact as an unknown, and equations that determine it."""
+        """Return this jump with the unknown ``impulse`` of the impact and the equations ``fixing = 0`` for it."""
         residual, rest = (ca.vertcat(rows, fixing) for rows in (self.residual, self.rest))
         return replace(self, variables=ca.vertcat(self.variables, impulse), residual=residual, rest=rest)
 
     def known_derivatives(self, multipliers: ca.SX) -> tuple[ca.SX, ca.SX]:
-        """Return Jacobian and Hessian of the residual less :attr:`rest`, over chart coordinates, ``a`` and ``f``."""
+        """Return Jacobian and Hessian of ``residual − rest`` with respect to chart coordinates, ``a`` and ``f``."""
         count, locked = self.a.numel(), list(self.tree.locked)
         moving = ca.SX.ones(count)
         moving[locked] = 0
@@ -149,7 +155,7 @@ class UnknownJump:
 
 
 class PlacedJump(NamedTuple):
-    """An unknown jump, with its first row and its first unknown in a lifted form."""
+    """An unknown jump, with the indices of its first row and its first unknown in a lifted form."""
 
     jump: UnknownJump
     row: int
@@ -157,7 +163,7 @@ class PlacedJump(NamedTuple):
 
 
 def unknown_jump(case: ImpactCase, tree: Tree, impact: Wrench, label: str = "") -> UnknownJump:
-    """Return unknowns and equations of the velocity jump under one impulse."""
+    """Return the unknowns and equations of the velocity jump that one impulse causes."""
     a = ca.SX.sym(f"a{label}", tree.nv)
     velocities = tree.velocities(a)
     feet = [Foot(point_on(case.robot, s.frame, s.offset), s.rows) for s in case.supports]
@@ -186,29 +192,33 @@ def unknown_jump(case: ImpactCase, tree: Tree, impact: Wrench, label: str = "") 
 
 
 def impact_at(case: ImpactCase, impulse: ca.SX) -> Wrench:
-    """Return an impulse at the contact point, in the axes of the contact's normal."""
+    """Return an impulse at the contact point; ``impulse`` is in the axes in which the contact states its normal."""
     return Wrench(case.point, impulse, ca.SX.zeros(3), in_frame=case.in_contact_frame)
 
 
 def in_world(case: ImpactCase, tree: Tree, directions: ca.SX) -> ca.SX:
-    """Turn directions (columns) from the axes of the contact's normal to world axes."""
+    """Turn directions (columns) from the axes in which the contact states its normal to world axes."""
     return tree.rotation(case.point) @ directions if case.in_contact_frame else directions
 
 
 def weighed(metric: Metric, first: UnknownJump, second: UnknownJump) -> ca.SX:
     """Return ``a₁ᵀWa₂``."""
     if metric.kind == "kinetic":
-        # Not sᵀJa − ε|f|², which is equal where the equations hold.  With stiff feet it loses digits by cancellation.
+        # At a solution of the equations, sᵀJa − ε|f|² has the same value.  With stiff feet, it loses digits by
+        # cancellation.
         return ca.dot(first.a, second.tree.mass_times(second.a))
     return ca.dot(first.a, ca.SX(metric.diagonal(first.a.numel())) * second.a)
 
 
 def worst_of(parts: Sequence[Lifted | UnknownJump], values: Sequence[ca.SX], scale: ca.SX) -> Lifted:
-    """Return the form of ``t · scale`` with ``values[k] ≤ t · scale`` and the unknowns and equations of all parts."""
+    """Return the form with the value ``t · scale`` and ``values[k] ≤ t · scale`` for all k.
+
+    The form has the unknowns and equations of all parts, and the unknown ``t``.
+    """
     t = ca.SX.sym("t")
     return Lifted.of(parts, t * scale, others=[t], inequalities=[v / scale - t for v in values])
 
 
 def worst_of_guesses(parts: Sequence[Guess], largest: float, attempt: int) -> Guess:
-    """Return the guess for :func:`worst_of`, with ``t`` above the ``largest`` value, in units of the scale."""
+    """Return the guess for :func:`worst_of`.  Its ``t`` is above ``largest``, the maximum in units of the scale."""
     return Guess.joined([*parts, Guess.unbounded(np.array([largest + ABOVE[attempt]]))])

@@ -10,16 +10,16 @@ from numpy.typing import NDArray
 from impact_posture.errors import MetricError
 from impact_posture.system.arrays import Array
 
-# Eigenvalues of JM⁻¹Jᵀ below this share of the largest are zero.
+# An eigenvalue of JM⁻¹Jᵀ below this share of the largest eigenvalue is regarded as zero.
 SINGULAR = 1e-9
 
 
 @dataclass(frozen=True, eq=False)
 class ImpulseResponse:
-    """Velocity jump under one generalized impulse, or under several (columns).
+    """Velocity jump and support impulses for one generalized impulse ``τ``, or for k of them as columns.
 
     Attributes:
-        a: ``(M + J_sᵀJ_s/ε)⁻¹ τ``, shape (nv,) or (nv, k).
+        a: Velocity jump ``(M + J_sᵀJ_s/ε)⁻¹ τ``, shape (nv,) or (nv, k).
         f: Support impulses ``−J_s a/ε``, shape (rows,) or (rows, k).
     """
 
@@ -29,10 +29,10 @@ class ImpulseResponse:
 
 @dataclass(frozen=True, eq=False)
 class StickingPoint:
-    """A contact point held like the feet, in the directions in which it can move.
+    """A contact point whose velocity is prescribed in the directions in which it can move.
 
-    The system ``M a − J_sᵀf − Jᵀs = τ, J_s a + εf = 0, J a = v`` is solved as a whole.  A solution by
-    ``(JM⁻¹Jᵀ)⁻¹`` would square the condition of this matrix in the adjoint of ∇S.
+    The system ``M a − J_sᵀf − Jᵀs = τ, J_s a + εf = 0, J a = v`` is solved as a whole.  A solution with
+    ``(JM⁻¹Jᵀ)⁻¹`` would be less accurate: in the adjoint of ∇S, the condition number of ``JM⁻¹Jᵀ`` would be squared.
     """
 
     system: Array
@@ -44,7 +44,7 @@ class StickingPoint:
     def of(kkt: Array, J: Array, mobility: Array, mobile: NDArray[np.bool_]) -> StickingPoint:
         """Build the system from ``kkt = [M, −J_sᵀ; J_s, εI]``, the world ``J``, and ``mobility = JM⁻¹Jᵀ``, 1/kg.
 
-        ``mobile`` marks the velocities whose joints are not locked, shape (nv,).
+        ``mobile`` is True for the velocity entries of joints that are not locked, shape (nv,).
         """
         values, vectors = np.linalg.eigh((mobility + mobility.T) / 2)
         kept = values > SINGULAR * max(float(values[-1]), 1e-300)
@@ -61,7 +61,10 @@ class StickingPoint:
         return bool(np.linalg.norm(self.outside.T @ n) <= np.sqrt(SINGULAR))
 
     def respond(self, *, tau: Array | None = None, velocity: Array | None = None) -> tuple[ImpulseResponse, Array]:
-        """Return the jump under ``τ`` with the velocity ``v`` of the point, and the impulse ``s`` on the point."""
+        """Return the jump and the impulse ``s`` on the point for the impulse ``tau`` and the point velocity ``v``.
+
+        Both ``tau`` and ``velocity`` are zero by default.
+        """
         right, nv = np.zeros(len(self.system)), len(self.mobile)
         size = len(right) - self.axes.shape[1]
         if tau is not None:
@@ -73,7 +76,7 @@ class StickingPoint:
 
 
 def no_sticking() -> MetricError:
-    """Build the error for a posture where S does not exist."""
+    """Build the error for a posture at which S does not exist."""
     return MetricError(
         "S does not exist here: the normal has a part along which the contact point cannot move",
         where="objective sticking",

@@ -1,9 +1,9 @@
-"""Several contacts at once: the largest jump under impulses within a box.
+"""Several contacts at once: the largest jump if each impulse is within its bounds, which form a box.
 
-``‖Σ λ_i a_i‖²_W`` with ``a_i = M⁻¹J_iᵀn_i`` is a convex quadratic ``λᵀKλ`` of the impulses, ``K_ij = a_iᵀWa_j``.  So
-its maximum over ``0 ≤ λ_i ≤ λ̄_i`` lies at one of the ``2^m − 1`` corners of the box other than the origin.  Where
-contacts can pull, ``|λ_i| ≤ λ̄_i``, and ``2^(m−1)`` corners differ by more than a sign.  The program is ``min t`` with
-``t ≥ λᵀKλ`` at every corner.
+The squared jump ``‖Σ λ_i a_i‖²_W`` with ``a_i = M⁻¹J_iᵀn_i`` is a convex quadratic function ``λᵀKλ`` of the impulses,
+``K_ij = a_iᵀWa_j``.  Its maximum over ``0 ≤ λ_i ≤ λ̄_i`` is therefore at a corner of the box.  The origin is not a
+candidate, so ``2^m − 1`` corners remain.  If contacts can pull, the bounds are ``|λ_i| ≤ λ̄_i``.  Opposite corners
+then have the same value, so ``2^(m−1)`` corners suffice.  The program is ``min t`` with ``t ≥ λᵀKλ`` at every corner.
 """
 
 from __future__ import annotations
@@ -36,7 +36,7 @@ from impact_posture.impact.quantities.lifted_form import (
 from impact_posture.impact.worst_case.model_set import finite_maximum, first_of_largest
 from impact_posture.system.arrays import Array
 
-# Six contacts have 63 corners.  Each additional contact doubles the rows of the program.
+# Six contacts have 63 corners.  Each additional contact doubles the number of inequalities in the program.
 MOST_CONTACTS = 6
 
 
@@ -45,10 +45,10 @@ class WorstImpulses:
     """The corner of the box of impulses with the largest jump.
 
     Attributes:
-        value: The objective, which is ``λᵀKλ`` at the corner.
-        impulses: λ of each contact, N·s, shape (m,).
-        tied: All corners with this value, shape (k, m); the first is ``impulses``.
-        jump: ``Δν`` at the corner, shape (nv,).
+        value: Value of the objective: ``λᵀKλ`` at the corner.
+        impulses: Impulse λ of each contact at the corner, N·s, shape (m,).
+        tied: All corners with the same value, as rows, N·s, shape (k, m); the first row is ``impulses``.
+        jump: Velocity jump ``Δν`` at the corner, shape (nv,).
     """
 
     value: float
@@ -67,11 +67,12 @@ class WorstImpulses:
 
 
 def check_contacts(contacts: Sequence[ImpactContact], kind: type[ImpactKind], *, bilateral: bool, cone: bool) -> None:
-    """Refuse contacts that have no worst case over a box of impulses.
+    """Check that the worst case of the contacts over a box of impulses exists.
 
     Raises:
-        ContactError: There are too many contacts, or two have the same point and normal.
-        MetricError: The kind is per approach speed, or there is a cone of normals.
+        ContactError: There are too many contacts, two contacts have the same point and normal, or a single contact is
+            bilateral.
+        MetricError: There are several contacts, and the kind is per approach speed or there is a cone of normals.
     """
     if len(contacts) == 1:
         if bilateral:
@@ -95,22 +96,24 @@ def check_contacts(contacts: Sequence[ImpactContact], kind: type[ImpactKind], *,
 def corners(count: int, bilateral: bool) -> Array:
     """Return the corners of the unit box as rows, shape (k, count).
 
-    The entries are 0 and 1, without the origin.  For bilateral contacts they are ±1, and the first is 1.
+    The entries are 0 or 1; the origin is omitted.  For bilateral contacts, the entries are ±1, and the first entry is
+    always 1.
     """
     if bilateral:
         return np.array([[1.0, *rest] for rest in product((1.0, -1.0), repeat=count - 1)])
-    # The corner of all contacts comes first, because a user expects this corner where corners tie.
+    # The corner with all impulses is first.  If corners tie, it is shown, as users expect.
     rows = sorted(product((1.0, 0.0), repeat=count), key=lambda corner: -sum(corner))
     return np.array(rows[:-1])
 
 
 @dataclass(frozen=True)
 class ImpulseBox:
-    """The worst corner of ``0 ≤ λ_i ≤ λ̄_i``, or of ``|λ_i| ≤ λ̄_i``.
+    """Worst case over the corners of the box ``0 ≤ λ_i ≤ λ̄_i``, or ``|λ_i| ≤ λ̄_i`` for bilateral contacts.
 
     Attributes:
         oracles: The oracle of each contact, the leading contact first.
         bilateral: Whether the contacts can pull as well as push.
+        attempts: Number of different initial guesses that :meth:`guess` offers.
     """
 
     oracles: tuple[ImpactOracle, ...]
@@ -123,7 +126,7 @@ class ImpulseBox:
 
     @cached_property
     def corners(self) -> Array:
-        """Impulses at the corners, N·s, shape (k, m)."""
+        """Impulses at the corners, one corner per row, N·s, shape (k, m)."""
         bounds = np.array([oracle.contact.impulse for oracle in self.oracles])
         return np.asarray(corners(len(bounds), self.bilateral) * bounds)
 
@@ -142,7 +145,7 @@ class ImpulseBox:
         return Subgradients(np.array([self._gradient(q, self.corners[k]) for k in tied]), gaps)
 
     def _jumps_and_values(self, q: Array) -> tuple[Array, Array]:
-        """Return ``a_i`` as columns, shape (nv, m), and ``λᵀKλ`` at every corner, shape (k,)."""
+        """Return the jumps ``a_i`` as columns, shape (nv, m), and ``λᵀKλ`` at every corner, shape (k,)."""
         jumps = np.stack([oracle.quantities(q).jump for oracle in self.oracles], axis=1)
         K = jumps.T @ self.oracle.at(q).weigh(jumps)
         return jumps, np.asarray(np.einsum("ki,ij,kj->k", self.corners, K, self.corners))
@@ -180,7 +183,7 @@ class ImpulseBox:
         return worst_of_guesses(parts, self.value(q) / scale, attempt)
 
     def _impacts(self, n: ca.SX) -> list[Wrench]:
-        """Return the unit impulses of all contacts, with ``n`` as the leading normal."""
+        """Return the unit impulses of all contacts; ``n`` is the normal of the leading contact."""
         leading, *others = [oracle.case for oracle in self.oracles]
         return [impact_at(leading, n), *[impact_at(c, ca.SX(np.array(c.contact.normal))) for c in others]]
 

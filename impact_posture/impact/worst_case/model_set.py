@@ -16,17 +16,18 @@ from impact_posture.impact.quantities.impact_oracle import ImpactOracle
 from impact_posture.impact.quantities.lifted_form import ABOVE, Guess, Lifted, worst_of, worst_of_guesses
 from impact_posture.system.arrays import Array
 
-# A member of a finite maximum is active if its value is within this share of the largest value.
+# A value is regarded as tied with the largest value if it is at most this share below it.
 ACTIVE = 1e-6
 
 
 @dataclass(frozen=True)
 class ModelSet:
-    """The maximum of one worst case over several robot models.
+    """The largest objective over several robot models.
 
-    ``min_q max_k f_k(q)``, where ``f_k`` is the objective on the k-th model, becomes ``min t`` with ``t ≥ f_k(q)``.
-    Models between the variants are not included.  :mod:`impact_posture.posture.analysis.robustness` samples them.
-    ``members`` holds the worst case on each model, the robot as modeled first.
+    Let ``f_k`` be the objective for the k-th model.  The problem ``min_q max_k f_k(q)`` becomes ``min t`` with ``t ≥
+    f_k(q)`` for all k.  Models between the variants are not included;
+    :mod:`impact_posture.posture.analysis.robustness` samples them.  ``members`` contains the worst case for each
+    model; the first member is for the robot as modeled.
     """
 
     members: tuple[WorstCase, ...]
@@ -40,7 +41,7 @@ class ModelSet:
         return max(len(ABOVE), *[member.attempts for member in self.members])
 
     def values(self, q: Array) -> Array:
-        """Return the value on each model, computed with Pinocchio, shape (k,)."""
+        """Return the objective for each model, computed with Pinocchio, shape (k,)."""
         return np.array([member.value(q) for member in self.members])
 
     def value(self, q: Array) -> float:
@@ -48,7 +49,7 @@ class ModelSet:
 
     def subgradients(self, q: Array, within: float = 0.0) -> Subgradients:
         tied, gaps = finite_maximum(self.values(q), within)
-        # The gap between a model and the worst model is a part of ``within``.
+        # A member is already ``gap`` below the maximum, so its own members may be ``within − gap`` lower.
         parts = [self.members[k].subgradients(q, max(within - gap, 0.0)) for k, gap in zip(tied, gaps, strict=True)]
         return Subgradients(
             np.vstack([part.gradients for part in parts]),
@@ -58,7 +59,8 @@ class ModelSet:
     def expressions(self, k: ImpactKernel) -> tuple[ca.SX, ca.SX]:
         pairs = []
         for member in self.members:
-            # The kernel's repeated limbs belong to its own model.  A payload on one limb makes limbs differ.
+            # A kernel is used only for the model it was built for: with a payload on one limb, other limbs are
+            # repeated.
             case = member.oracle.case
             pairs.append(member.expressions(k if case.robot is k.case.robot else ImpactKernel(case, k.q, k.n)))
         return first_of_largest([value for value, _ in pairs], [gradient for _, gradient in pairs])
@@ -76,20 +78,21 @@ class ModelSet:
 
 
 def finite_maximum(values: Array, within: float = 0.0) -> tuple[NDArray[np.int_], Array]:
-    """Return the indices of the values that tie with the largest value, the leading index first, and their gaps.
+    """Return the indices of the values that tie with the largest value, and their distances below it (gaps).
 
-    A value ties if it is at most a share :data:`ACTIVE`, or ``within``, below the largest value.
+    The leading index is first.  A value ties if it is at most ``within``, or the share :data:`ACTIVE`, below the
+    largest value.
     """
     largest = float(values.max())
     near = np.flatnonzero(values >= largest - max(ACTIVE * abs(largest), within))
-    # The leading index must not depend on rounding, so it is the first of the values that differ by rounding alone.
+    # Rounding errors must not determine the leading index, so it is the first of all values equal up to rounding.
     leading = int(np.flatnonzero(values >= largest - 1e-12 * abs(largest))[0])
     order = np.concatenate([[leading], near[near != leading]])
     return order, np.asarray(largest - values[order])
 
 
 def first_of_largest(values: Sequence[ca.SX], choices: Sequence[ca.SX]) -> tuple[ca.SX, ca.SX]:
-    """Return the largest expression and its choice; the first at a tie."""
+    """Return the largest of ``values`` and the entry of ``choices`` with the same index; at a tie, the first."""
     largest, choice = values[0], choices[0]
     for value, other in zip(values[1:], choices[1:], strict=True):
         larger = value > largest

@@ -1,17 +1,19 @@
 """The worst normal within a cone: value, gradients, expressions and lifted form.
 
-``impulse``, ``sticking`` and ``energy`` depend on the normal through one quadratic form ``nᵀK(q)n``
-(:class:`~impact_posture.impact.kinds.impact_kind.QuadraticKind`).  Its largest value over a cone is known exactly
-(:mod:`impact_posture.impact.worst_case.worst_normal`).  ``speed`` is not a quadratic form and has no such dual.
+The kinds ``impulse``, ``sticking`` and ``energy`` depend on the normal through one quadratic form ``nᵀK(q)n``
+(:class:`~impact_posture.impact.kinds.impact_kind.QuadraticKind`).  The largest value of this form over a cone can be
+computed exactly (:mod:`impact_posture.impact.worst_case.worst_normal`).  ``speed`` is not a quadratic form and has no
+such dual.
 
-In the program the dual replaces the inner maximum.  In the axes of the cone (half angle α), with the quadratic form
-``P(q) = [a, bᵀ; b, C]``, ``c = cos α``, ``s = sin α`` and everything divided by the first value of the form::
+In the program, the dual problem replaces the maximum over the normals.  In the axes of the cone (half angle α), let
+``P(q) = [a, bᵀ; b, C]`` be the matrix of the form, divided by the value of the form at the start.  With ``c = cos α``
+and ``s = sin α``, the program is::
 
     min t,   t = a + sτ,   Z = [τ − ρ, −bᵀ; −b, (st + ρc²) I − sC] = L²,   ρ ≥ 0
 
-``Z`` is ``D(tI − P − μ(n₀n₀ᵀ − c²I))D`` with ``D = diag(s^-½, s^½, s^½)`` and ``μ = ρ/s``, which stays bounded as α
-goes to zero.  At mirror-symmetric postures two eigenvalues of ``Z`` vanish together.  There the gradient of ``det Z``
-is zero, and the equations of the symmetric root ``L`` still have a gradient.
+``Z`` equals ``D(tI − P − μ(n₀n₀ᵀ − c²I))D`` with ``D = diag(s^-½, s^½, s^½)`` and ``μ = ρ/s``; its entries are
+bounded as α tends to zero.  At mirror-symmetric postures, two eigenvalues of ``Z`` are zero.  At these postures the
+gradient of ``det Z`` vanishes, but the gradient of the equations with the symmetric root ``L`` does not.
 """
 
 from __future__ import annotations
@@ -32,10 +34,10 @@ from impact_posture.impact.worst_case.worst_normal import WorstNormal, cone_axes
 from impact_posture.impact.worst_case.worst_normal_symbolic import cone_axes_symbolic, worst_normal_symbolic
 from impact_posture.system.arrays import Array
 
-# Normals whose value is within this share of the largest value contribute to the subdifferential.
+# The gradient at a normal belongs to the subdifferential if its value is at most this share below the largest value.
 _ACTIVE = 1e-7
-# Distance of the start of τ and ρ above their solution at the first posture, by attempt.  At a root with a zero
-# eigenvalue, on the boundary, Newton's method would meet a saddle point.
+# Initial values of τ and ρ minus their solution at the first posture, for each attempt.  Without this distance, L
+# would start with a zero eigenvalue, which is a saddle point for Newton's method.
 _INSIDE = ((0.03, 0.01), (0.3, 0.1), (0.003, 0.001))
 _UPPER = ((0, 0), (0, 1), (0, 2), (1, 1), (1, 2), (2, 2))
 
@@ -49,7 +51,7 @@ def check_cone(kind: type[ImpactKind], degrees: float) -> None:
 
 @dataclass(frozen=True)
 class NormalCone:
-    """The worst normal within ``degrees`` of the contact's normal."""
+    """Worst case over all normals within the angle ``degrees`` of the normal of the contact."""
 
     kind: QuadraticKind
     degrees: float
@@ -61,16 +63,16 @@ class NormalCone:
 
     @property
     def axis(self) -> Array:
-        """The contact's normal, shape (3,)."""
+        """Axis of the cone: the normal of the contact, shape (3,)."""
         return np.array(self.oracle.contact.normal)
 
     def worst(self, q: Array) -> WorstNormal:
-        """Return the worst normal at ``q``, in the axes of the contact's normal.
+        """Return the worst normal at ``q``, in the axes in which the contact states its normal.
 
-        Its ``value`` is the form ``nᵀKn``.  :meth:`value` returns the objective.
+        The attribute ``value`` of the result is the value of the form ``nᵀKn``, not the objective.
 
         Raises:
-            MetricError: The kind is ``sticking`` and the contact point cannot move in every direction.
+            MetricError: The kind is ``sticking``, and there is a direction in which the contact point cannot move.
         """
         return worst_normal(self._form(q)[0], self.axis, self.degrees)
 
@@ -82,10 +84,10 @@ class NormalCone:
         return float(self.kind.of_form(np.array(self.worst(q).value)))
 
     def subgradients(self, q: Array, within: float = 0.0) -> Subgradients:
-        """Return the gradients at all worst normals, each held fixed (Danskin), the leading normal first.
+        """Return one gradient for each worst normal, the leading normal first.
 
-        An arc or a circle of worst normals is sampled densely.  A normal contributes if its objective is at most
-        ``within`` below the maximum.
+        Each gradient is computed for a fixed normal (Danskin).  A normal is included if its objective is at most
+        ``within`` below the maximum.  If an arc or a circle of normals is included, it is sampled densely.
         """
         kind, axis = self.kind, self.axis
         form = self._form(q)[0]
@@ -102,14 +104,14 @@ class NormalCone:
         return Subgradients(slopes[:, None] * gradients, gaps)
 
     def expressions(self, k: ImpactKernel) -> tuple[ca.SX, ca.SX]:
-        """Return the expressions of a single impact along the worst normal, which is held fixed (Danskin)."""
+        """Return value and gradient for the worst normal.  The gradient is for a fixed normal (Danskin)."""
         R = in_world(k.case, k.tree, ca.SX.eye(3))
         K = R.T @ self.kind.form_expression(k) @ R
         n = worst_normal_symbolic((K + K.T) / 2, k.n, self.degrees)
         return self.kind.expressions(ImpactKernel(k.case, k.q, n, k.tree.limbs))
 
     def lift(self, tree: Tree, parameters: ca.SX, scale: ca.SX) -> Lifted:
-        """Return the dual over the cone, with three jumps, ``τ``, ``ρ`` and the six entries of ``L`` as unknowns."""
+        """Return the dual problem; its unknowns are three jumps, ``τ``, ``ρ`` and the six entries of ``L``."""
         kind, local = self.kind, cone_axes_symbolic(parameters)
         world = in_world(kind.case, tree, local)
         jumps = [kind.lift_direction(tree, local[:, k], str(k)) for k in range(3)]
@@ -133,7 +135,7 @@ class NormalCone:
         )
 
     def guess(self, q: Array, scale: float, attempt: int = 0) -> Guess:
-        """Return the unknowns of :meth:`lift` at ``q``, with a positive definite ``Z``."""
+        """Return initial values for the unknowns of :meth:`lift` at ``q``, for which ``Z`` is positive definite."""
         form, jumps, impulses = self._form(q, cone_axes(self.axis))
         form = form / self.kind.form_unit(scale)
         parts: list[Array] = []
@@ -161,10 +163,11 @@ class NormalCone:
         return float(np.cos(alpha)), float(np.sin(alpha))
 
     def _form(self, q: Array, directions: Array | None = None) -> tuple[Array, Array, Array]:
-        """Return ``K`` along three directions, shape (3, 3), their jumps, and the impulses that cause these.
+        """Return ``K`` in the axes of three directions, with the three jumps and the impulses that cause them.
 
-        The directions are columns in the axes of the normal, by default these axes.  The jumps are columns of shape
-        (nv, 3), and the impulses columns in world axes, shape (3, 3).
+        The directions are columns in the axes in which the normal is stated; by default, they are these axes.  ``K``
+        has shape (3, 3).  The jumps are columns, shape (nv, 3).  The impulses are columns in world axes, shape (3,
+        3).
         """
         world = self.oracle.at(q).axes
         if directions is not None:
@@ -177,10 +180,10 @@ class NormalCone:
         return (K + K.T) / 2, jumps, impulses
 
     def _form_tensor(self, q: Array) -> Array:
-        """Return ``∂K``, shape (3, 3, nv), from the gradients along six directions."""
+        """Return the tangent derivative of ``K``, shape (3, 3, nv), from the gradients for six directions."""
         axes = np.eye(3)
         tensor = np.zeros((3, 3, self.oracle.robot.nv))
-        # The diagonal comes first, because the other entries need it.
+        # Compute the diagonal entries first, because the other entries need them.
         for i, j in sorted(_UPPER, key=lambda entry: entry[0] != entry[1]):
             both = self.kind.form_gradient(q, axes[i] if i == j else axes[i] + axes[j])
             tensor[i, j] = tensor[j, i] = both if i == j else (both - tensor[i, i] - tensor[j, j]) / 2

@@ -1,8 +1,9 @@
-"""The exact worst normal of a cone, ``max nᵀAn`` over ``∠(n, n₀) ≤ α``, with the multiplier that proves it.
+"""The exact worst normal of a cone, ``max nᵀAn`` over ``∠(n, n₀) ≤ α``, with the multiplier that proves optimality.
 
-The maximum of a quadratic on a cap of the sphere is at an eigenvector inside the cap, or on the edge of the cap.  On
-the edge it is a trigonometric polynomial of degree two.  For every normal of the cone and any ``μ ≥ 0``,
-``bound = λ_max(A + μ(n₀n₀ᵀ − cos²α I)) ≥ nᵀAn``, with equality at the optimal ``μ`` (S-lemma).
+The unit normals of a cone form a cap of the sphere.  The maximum of a quadratic form on the cap is at an eigenvector
+inside the cap, or on the edge of the cap.  On the edge, the form is a trigonometric polynomial of degree two.  For
+every normal of the cone and any ``μ ≥ 0``, ``bound = λ_max(A + μ(n₀n₀ᵀ − cos²α I)) ≥ nᵀAn``.  Equality holds for the
+optimal ``μ`` and normal (S-lemma).
 """
 
 from __future__ import annotations
@@ -13,11 +14,11 @@ import numpy as np
 
 from impact_posture.system.arrays import Array
 
-# Values that differ by less, relative to the size of A times sin α (their possible range), are tied.
+# Two values tie if their difference is below this share of |A| sin α, the range of the values in the cone.
 TIED = 1e-6
-# Worst normals closer than this share of sin α are one normal.
+# Two worst normals are regarded as the same if their distance is below this share of sin α.
 _APART = 1e-2
-# Values that differ by less, relative to the size of A, are equal up to rounding.
+# Two values are equal up to rounding if their difference is below this share of |A|.
 _EQUAL = 1e-14
 _SMALL = float(np.finfo(float).tiny)
 _POLISH = 20
@@ -29,12 +30,12 @@ class WorstNormal:
     """The maximum of ``nᵀAn`` over a cone of normals.
 
     Attributes:
-        value: The maximum.
-        normal: Normal that attains the maximum, shape (3,); the first of ``normals``.
-        normals: All different tied normals, shape (k, 3); samples of an arc or a circle.
-        angle_deg: Angle of ``normal`` from the cone's axis, degrees.
-        multiplier: ``μ ≥ 0`` of the dual; zero if the edge of the cone is inactive.
-        bound: ``λ_max(A + μ(n₀n₀ᵀ − cos²α I))``, an upper bound over the cone.
+        value: The maximum of ``nᵀAn``.
+        normal: Normal that attains the maximum, shape (3,); the first row of ``normals``.
+        normals: All normals that attain the maximum, as rows, shape (k, 3); samples if they form an arc or a circle.
+        angle_deg: Angle between ``normal`` and the axis of the cone, degrees.
+        multiplier: Multiplier ``μ ≥ 0`` of the dual problem; zero if the maximum is inside the cone.
+        bound: ``λ_max(A + μ(n₀n₀ᵀ − cos²α I))``, an upper bound of ``nᵀAn`` over the cone.
     """
 
     value: float
@@ -46,11 +47,11 @@ class WorstNormal:
 
     @property
     def tied(self) -> bool:
-        """Whether another normal has the same value, so that the value has a kink and no gradient."""
+        """Whether several normals attain the maximum; the maximum then has subgradients but no gradient."""
         return len(self.normals) > 1
 
     def turned(self, R: Array) -> WorstNormal:
-        """Return the same maximum with its normals in other axes."""
+        """Return the same maximum with its normals multiplied by the rotation ``R``, shape (3, 3)."""
         return replace(self, normal=R @ self.normal, normals=self.normals @ R.T)
 
     def to_dict(self) -> dict[str, object]:
@@ -64,7 +65,7 @@ class WorstNormal:
 
 
 def cone_axes(n: Array) -> Array:
-    """Return orthonormal axes with ``n`` as first column, shape (3, 3); accurate for every ``n``."""
+    """Return orthonormal axes as columns, shape (3, 3), with ``n`` as first column; accurate for every unit ``n``."""
     x, y, z = (float(v) for v in n)
     side = 1.0 if z >= 0 else -1.0
     # Duff et al., "Building an orthonormal basis, revisited", JCGT 6 (2017).
@@ -86,7 +87,7 @@ def worst_normal(A: Array, axis: Array, cone_deg: float) -> WorstNormal:
     candidates = np.vstack([_inside(P, c, s * size), _on_edge(P, c, s, size)])
     values = np.einsum("ki,ij,kj->k", candidates, P, candidates)
     best = float(values.max())
-    # The leading normal must not depend on rounding, so coordinates decide at a tie.
+    # Rounding errors must not determine the leading normal.  Candidates with equal values are sorted by coordinates.
     near = [k for k in range(len(candidates)) if values[k] >= best - TIED * s * size]
     near.sort(key=lambda k: (round((best - values[k]) / (_EQUAL * size)), *(-candidates[k])))
     apart: list[Array] = []
@@ -107,10 +108,10 @@ def worst_normal(A: Array, axis: Array, cone_deg: float) -> WorstNormal:
 
 
 def tied_normals(A: Array, axis: Array, cone_deg: float, worst: WorstNormal, tolerance: float) -> Array:
-    """Return the normals whose value is within ``tolerance · |A|`` of the worst value, shape (k, 3).
+    """Return the normals whose value is at most ``tolerance · |A|`` below the largest value, shape (k, 3).
 
-    The worst normal is the first.  An arc, a circle or a cap of tied normals is sampled densely enough for its convex
-    hull.
+    The worst normal is the first.  If these normals form an arc, a circle or a cap, enough samples are returned to
+    represent its convex hull.
     """
     alpha = np.deg2rad(cone_deg)
     size = float(np.abs(A).max())
@@ -118,7 +119,8 @@ def tied_normals(A: Array, axis: Array, cone_deg: float, worst: WorstNormal, tol
     circle = np.stack([np.cos(_GRID), np.sin(_GRID)])
     values, vectors = np.linalg.eigh(A)
     top = vectors[:, values >= values[-1] - tolerance * size]
-    # A plane of top eigenvectors cuts the cap in an arc.  Where all eigenvectors are top, the whole cap is tied.
+    # If two eigenvalues are the largest, their plane cuts the cap in an arc of tied normals.  If all three are equal,
+    # all normals of the cap tie.
     tilts = alpha * (np.linspace(0, 1, 9) if top.shape[1] == 3 else np.ones(1))
     rings = [np.vstack([np.full_like(_GRID, np.cos(tilt)), np.sin(tilt) * circle]) for tilt in tilts]
     planes = [top[:, [i, j]] @ circle for i in range(top.shape[1]) for j in range(i)]
@@ -129,7 +131,7 @@ def tied_normals(A: Array, axis: Array, cone_deg: float, worst: WorstNormal, tol
 
 
 def _multiplier(P: Array, n: Array, c: float, s: float) -> float:
-    """Return ``μ`` of ``(P + μ diag(s², −c², −c²)) n = t n`` from its first row, without cancellation."""
+    """Return the ``μ`` for which ``(P + μ diag(s², −c², −c²)) n = t n``, in a form without cancellation."""
     if n[0] > c * (1 + 1e-12):
         return 0.0
     w = n[1:] / np.linalg.norm(n[1:])
@@ -137,7 +139,10 @@ def _multiplier(P: Array, n: Array, c: float, s: float) -> float:
 
 
 def _inside(P: Array, c: float, size: float) -> Array:
-    """Return the top eigenvectors within the cap, in its axes, and the top eigenvector nearest to the axis."""
+    """Return the unit eigenvectors of the largest eigenvalue within the cap, in the axes of the cap.
+
+    If there are several, the eigenvector nearest to the axis is included.
+    """
     values, vectors = np.linalg.eigh(P)
     top = vectors[:, values >= values[-1] - TIED * size]
     candidates = [*top.T]
@@ -149,16 +154,19 @@ def _inside(P: Array, c: float, size: float) -> Array:
 
 
 def _on_edge(P: Array, c: float, s: float, size: float) -> Array:
-    """Return the maxima on the edge ``n = (c, s cos φ, s sin φ)`` of the cap; three points for a constant value."""
-    # Divided by 2s, the value is Re(A z + B z²) plus a constant, with z = exp(iφ).
+    """Return the maxima of the form on the edge ``n = (c, s cos φ, s sin φ)`` of the cap, one per row.
+
+    If the form is constant on the edge, three points are added.
+    """
+    # The value divided by 2s is Re(A z + B z²) plus a constant, with z = exp(iφ).
     A, B = c * complex(P[0, 1], -P[0, 2]), s * complex(P[1, 1] - P[2, 2], -2 * P[1, 2]) / 4
 
     def height(x: Array, order: int = 0) -> Array:
-        """Return the value without its constant, or its derivative of an order."""
+        """Return Re(A z + B z²) at the angles ``x``, or its derivative of the given order."""
         z = np.exp(1j * x)
         return np.asarray((1j**order * (A * z + 2**order * B * z * z)).real)
 
-    # The zeros of the slope are roots z.  The angles of all roots are candidates.
+    # The slope is zero at the roots z of a polynomial.  Start from the angles of all roots.
     roots = np.roots([2 * B, A, 0, -A.conjugate(), -2 * B.conjugate()])
     phi = np.concatenate([np.angle(roots), _GRID[[int(height(_GRID).argmax())]]])
     swing = max(abs(A) + 2 * abs(B), _SMALL)
@@ -169,7 +177,8 @@ def _on_edge(P: Array, c: float, s: float, size: float) -> Array:
         if np.abs(step).max() < 1e-15:
             break
     kept = (height(phi, 2) < 0) & (np.abs(height(phi, 1)) <= 1e-10 * swing)
-    # A maximum that is flat to third order is not a simple root, so the highest candidate is kept as well.
+    # At a maximum whose second derivative is zero, the test above fails.  Therefore the highest candidate is kept
+    # too.
     heights = height(phi)
     highest = int(heights.argmax())
     kept[highest] |= not (heights[kept] >= heights[highest] - _EQUAL * swing / 2).any()

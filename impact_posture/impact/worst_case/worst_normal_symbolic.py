@@ -1,13 +1,13 @@
-"""The worst normal of a cone in closed form, as the expression that the C export evaluates.
+"""The worst normal of a cone as a CasADi expression, which the C export evaluates.
 
-In the axes of the cone, with the last two turned to principal axes, ``A`` is ``[a, bᵀ; b, diag(d₁, d₂)]`` with
-``d₁ ≥ d₂``.  The normal follows from the root of a function.  Newton's method converges to it from the left without
-overshoot:
+Choose the axes of the cone such that ``A = [a, bᵀ; b, diag(d₁, d₂)]`` with ``d₁ ≥ d₂``.  There are two cases.  In
+each case the normal follows from the root of a scalar function, to which Newton's method converges from the left
+without overshoot:
 
-- on the edge ``n = (c, s w)``, ``|w| = 1``: ``w_i = p_i/(ν − d_i)`` with ``p = b c/s`` (a trust-region problem in the
-  plane; Moré and Sorensen 1983), solved for ``1/|w| = 1``;
-- inside: ``n ∝ (1, b_i/(λ − d_i))`` with the secular equation ``λ − a = Σ b_i²/(λ − d_i)`` of the top eigenvalue,
-  which lies above ``ν`` exactly if its eigenvector is inside.
+- The normal is on the edge, ``n = (c, s w)``, ``|w| = 1``.  Then ``w_i = p_i/(ν − d_i)`` with ``p = b c/s``, and
+  ``ν`` is the root of ``1/|w| = 1`` (a trust-region problem in the plane; Moré and Sorensen 1983).
+- The normal is inside the cone, ``n ∝ (1, b_i/(λ − d_i))``.  Then ``λ`` is the largest eigenvalue, the root of
+  ``λ − a = Σ b_i²/(λ − d_i)``.  This is the case if and only if ``λ > ν``.
 """
 
 from __future__ import annotations
@@ -15,14 +15,15 @@ from __future__ import annotations
 import casadi as ca
 import numpy as np
 
-# These steps of Newton's method give full precision over 16 decades of p, gap and a, and up to 89.9°.
+# With these numbers of Newton steps, the normal has full precision for cones up to 89.9° and for values of p, gap and
+# a over 16 decades.
 _EDGE_STEPS, _INSIDE_STEPS = 8, 14
-# A divisor that replaces zero: smaller than all relevant values, in single precision as well.
+# Divisor that replaces zero.  It is smaller than all relevant values and can be represented in single precision.
 _TINY = 1e-30
 
 
 def cone_axes_symbolic(n: ca.SX) -> ca.SX:
-    """Return :func:`~impact_posture.impact.worst_case.worst_normal.cone_axes` of an expression."""
+    """Return :func:`~impact_posture.impact.worst_case.worst_normal.cone_axes` as an expression of ``n``."""
     x, y, z = n[0], n[1], n[2]
     side = ca.if_else(z >= 0, 1.0, -1.0)
     a = -1 / (side + z)
@@ -31,10 +32,10 @@ def cone_axes_symbolic(n: ca.SX) -> ca.SX:
 
 
 def worst_normal_symbolic(A: ca.SX, axis: ca.SX, cone_deg: float) -> ca.SX:
-    """Return the normal, shape (3,), that maximizes ``nᵀAn`` within ``cone_deg`` of ``axis``; one of them at a tie.
+    """Return the normal, shape (3,), that maximizes ``nᵀAn`` within ``cone_deg`` degrees of ``axis``.
 
-    The gradient of the maximum is the gradient of ``nᵀA(q)n`` with ``n`` held fixed (Danskin).  Do not differentiate
-    this expression.
+    If several normals attain the maximum, one of them is returned.  Do not differentiate this expression: the
+    gradient of the maximum is the gradient of ``nᵀA(q)n`` for a fixed ``n`` (Danskin).
     """
     alpha = np.deg2rad(cone_deg)
     c, s = float(np.cos(alpha)), float(np.sin(alpha))
@@ -48,7 +49,7 @@ def worst_normal_symbolic(A: ca.SX, axis: ca.SX, cone_deg: float) -> ca.SX:
     gap, above = 2 * radius, (P[1, 1] + P[2, 2]) / 2 + radius - P[0, 0]
     eta = _edge_root(b * (c / s), gap)
     w = _on_circle(b * (c / s), eta, gap)
-    # Above the root of the edge the secular function rises through zero only if the eigenvector is inside.
+    # The eigenvector is inside the cone only if the secular function has its root above the root of the edge.
     is_edge = _secular(eta, above, b, gap)[0] >= 0
     xi = eta
     for _ in range(_INSIDE_STEPS):
@@ -62,15 +63,15 @@ def worst_normal_symbolic(A: ca.SX, axis: ca.SX, cone_deg: float) -> ca.SX:
 
 
 def _edge_root(p: ca.SX, gap: ca.SX) -> ca.SX:
-    """Return ``η = ν − d₁ ≥ 0`` with ``p₁²/η² + p₂²/(η + gap)² = 1``; zero in the hard case."""
-    # Start at the largest lower bound.  The last bound is for p₁ near zero and |p₂| near the gap, where η ~ p₁^⅔.
+    """Return ``η = ν − d₁ ≥ 0`` with ``p₁²/η² + p₂²/(η + gap)² = 1``; zero if ``p₁ = 0`` and ``|p₂| < gap``."""
+    # Start at the largest lower bound.  The bound ``corner`` is for p₁ near zero and |p₂| near the gap: η ~ p₁^⅔.
     x, y = ca.fabs(p[0]), ca.fabs(p[1])
     corner = ca.fmin((x * x * gap / 4) ** (1 / 3), x * ca.sqrt(gap / (4 * ca.fmax(gap - y, 0) + _TINY)))
     eta = ca.fmax(ca.fmax(ca.fmax(x, y - gap), corner), _TINY)
     for _ in range(_EDGE_STEPS):
         x, y = p[0] / eta, p[1] / (eta + gap)
         square = x * x + y * y
-        # Newton's method on 1/|w| − 1, which is concave and rises, cannot overshoot the root from the left.
+        # The function 1/|w| − 1 is concave and increasing.  Newton's method from the left cannot overshoot its root.
         slope = x * x / eta + y * y / (eta + gap)
         step = square * (ca.sqrt(square) - 1) / ca.fmax(slope, _TINY)
         eta = eta + ca.fmax(step, 0)
@@ -78,15 +79,15 @@ def _edge_root(p: ca.SX, gap: ca.SX) -> ca.SX:
 
 
 def _on_circle(p: ca.SX, eta: ca.SX, gap: ca.SX) -> ca.SX:
-    """Return ``w`` of length one; in the hard case ``p₁ = 0`` both signs are right, and the sign is plus."""
+    """Return the unit vector ``w``.  If ``p₁ = 0``, both signs of its first entry are valid, and plus is used."""
     y = ca.fmin(ca.fmax(p[1] / ca.fmax(eta + gap, _TINY), -1), 1)
     rest = 1 - y * y
-    # Use the sine where it is large, and the quotient where a root would lose its digits.
+    # For a large first entry, use the square root.  For a small entry the square root loses digits; use the quotient.
     x = ca.if_else(rest > 1e-6, ca.if_else(p[0] >= 0, 1.0, -1.0) * ca.sqrt(rest), p[0] / eta)
     return ca.vertcat(x, y) / ca.hypot(x, y)
 
 
 def _secular(xi: ca.SX, above: ca.SX, b: ca.SX, gap: ca.SX) -> tuple[ca.SX, ca.SX]:
-    """Return ``λ − a − Σ b_i²/(λ − d_i)`` at ``λ = d₁ + ξ``, and its slope."""
+    """Return the secular function ``λ − a − Σ b_i²/(λ − d_i)`` at ``λ = d₁ + ξ``, and its derivative."""
     x, y = b[0] / ca.fmax(xi, _TINY), b[1] / ca.fmax(xi + gap, _TINY)
     return xi + above - b[0] * x - b[1] * y, 1 + x * x + y * y
