@@ -16,7 +16,8 @@ class CenterOfMassOverFeet(ExpressionConstraint):
     """The center of mass stays above the feet: ``A xy − b ≤ −margin``, meters.
 
     ``normals`` are ``A``, the outward unit normals of the edges of the support polygon, shape (k, 2), and ``offsets``
-    are ``b``.  ``loaded`` is another model, with its name, whose center of mass counts instead.
+    are ``b``.  If ``loaded`` is given (a model and its name), the center of mass of this model is used instead of the
+    robot's.
     """
 
     def __init__(

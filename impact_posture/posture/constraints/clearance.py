@@ -1,4 +1,4 @@
-"""The constraint that bodies stay apart: the links of the robot, the surface, the ground and obstacles."""
+"""The constraint of a least distance between bodies: the links, the surface, the ground and obstacles."""
 
 from __future__ import annotations
 
@@ -18,14 +18,16 @@ from impact_posture.posture.constraints.pair_distances import PairDistances
 from impact_posture.posture.constraints.separating_plane import EQUATIONS, Corners, SeparatingPlane
 from impact_posture.system.arrays import Array
 
-# Distances below this (m) beyond the clearance are exact; lower bounds are enough for other pairs.
+# Distances minus the clearance are exact below this value, m.  For larger distances, lower bounds are enough.
 _NEAR = 0.01
-# The certificate has rows of pairs closer than this (m) beyond their clearance.
+# The certificate contains the rows of a pair if its distance minus the clearance is below this value, m.
 _ROWS = 1e-3
-# The program lacks a pair that violates its clearance by more than this (m), half of what certifies.
+# A pair is added to the program if it violates its clearance by more than this, m; half the tolerance of the
+# certificate.
 _MISSING = 5e-9
-# Most pairs that one posture adds to the program, the deepest first: pairs of links, and pairs of a link and a plane.
-# Links behind a plane are mostly neighbors, and the deepest takes the others along.
+# Maximum number of pairs that one posture adds to the program, the deepest first: for pairs of links, and for pairs
+# of a link and a plane.  Links behind a plane are mostly neighbors, so moving the deepest one out also moves the
+# others.
 _MOST, _MOST_BEHIND = 6, 2
 
 _Lifted = WeakKeyDictionary[Tree, dict[int, tuple[Corners, LiftedRows]]]
@@ -37,9 +39,11 @@ class Clearance(Constraint):
     The program contains only active pairs.  :meth:`grown` adds pairs that a posture violates.
 
     Args:
-        active: Pairs in the program, by index, with the corners that have rows there.
-        lifted: Rows of pairs by tree and index with their corners, shared by all constraints that grow from this one.
-        distances: Distances of all pairs of the surroundings, and the indices of these pairs there.
+        active: Maps the index of each pair in the program to the corners that have rows in the program.
+        lifted: Cache of the rows of pairs and their corners, by tree and index of the pair; all constraints grown
+            from this one share it.
+        distances: Distances of all pairs of the surroundings, and the indices of the pairs of this constraint among
+            them.
     """
 
     projected = False
@@ -61,7 +65,7 @@ class Clearance(Constraint):
         self.lower, self.upper = np.zeros(len(pairs)), np.full(len(pairs), np.inf)
         self._distances, self._indices = distances or (PairDistances(pairs), range(len(pairs)))
         planes = {id(pair.b): pair.b.plane for pair in pairs if pair.known}
-        # Known planes are parameters, so programs with other planes are the same.
+        # The coefficients of known planes are parameters, so one program can be used for different planes.
         self.parameters = np.concatenate([np.zeros(0), *planes.values()])
         self._first_parameter = {body: 4 * index for index, body in enumerate(planes)}
 
@@ -77,7 +81,10 @@ class Clearance(Constraint):
         return self._pairs[row].name
 
     def evaluate(self, model: Numeric) -> tuple[Array, Array]:
-        """Return distances and their Jacobian; a distance beyond 1 cm may be a lower bound with a zero Jacobian."""
+        """Return distances minus the clearance, and their Jacobian.
+
+        A value above 1 cm may be a lower bound with a zero Jacobian.
+        """
         values = self._distances.within(model, _NEAR, self._indices)
         jacobian = np.zeros((self.rows, model.model.nv))
         for k in np.flatnonzero(values < _NEAR):
@@ -90,7 +97,7 @@ class Clearance(Constraint):
         return self._distances.within(model, 0.0, self._indices)
 
     def closest(self, model: Numeric) -> tuple[str, float]:
-        """Return the pair that is closest, and its distance less the clearance, m."""
+        """Return the name of the closest pair, and its distance minus the clearance, m."""
         bounds, closest = self._distances.bounds(model, self._indices), ("", np.inf)
         for k in np.argsort(bounds, kind="stable"):
             if bounds[k] >= closest[1]:
@@ -101,7 +108,10 @@ class Clearance(Constraint):
         return closest
 
     def grown(self, model: Numeric, auxiliaries: Array | None = None) -> Self:
-        """Add violated pairs, or their corners; slack that explains most of a violation needs no more corners."""
+        """Add violated pairs, or more corners of them.
+
+        If the slack of a pair is more than half of its violation, more corners are not needed.
+        """
         values, active = self.value(model), dict(self.active)
         unknowns = {} if auxiliaries is None else self._unknowns(auxiliaries)
         most, added = _MOST_BEHIND if self._pairs[0].known else _MOST, 0
@@ -111,8 +121,8 @@ class Clearance(Constraint):
             pair, old = self._pairs[k], active.get(k, Corners(frozenset(), frozenset()))
             if k in unknowns and pair.slack(unknowns[k]) > -values[k] / 2:
                 continue
-            # The plane of the program may differ from the plane between the closest points, and cut any corner
-            # without a row.
+            # The plane of the program may differ from the plane between the closest points.  It may then cut any
+            # corner without a row, so all corners are added if the closest ones already have rows.
             for new in (pair.corners(model), pair.every_corner):
                 if not (new.a <= old.a and new.b <= old.b):
                     active[k] = Corners(old.a | new.a, old.b | new.b)
@@ -128,7 +138,7 @@ class Clearance(Constraint):
         return max((self._pairs[k].slack(z) for k, z in self._unknowns(auxiliaries).items()), default=0.0)
 
     def _unknowns(self, auxiliaries: Array) -> dict[int, Array]:
-        """Split the auxiliaries by pair, without pairs that came in after the program was built."""
+        """Split the auxiliaries by pair; pairs that were added after the program was built are left out."""
         counts = [pair.count for _, pair, _ in self._program]
         parts = np.split(auxiliaries, np.cumsum(counts)[:-1]) if counts else []
         return {k: z for k, z in zip(self.active, parts, strict=True) if z.size}
@@ -138,12 +148,15 @@ class Clearance(Constraint):
         return [(k, self._pairs[k], corners) for k, corners in self.active.items()]
 
     def _plane_parameters(self, k: int) -> slice:
-        """Return where the known plane of pair k is among the parameters; empty if its plane is unknown."""
+        """Return the slice of the parameters with the known plane of pair k; empty if its plane is unknown."""
         first = self._first_parameter.get(id(self._pairs[k].b))
         return slice(0) if first is None else slice(first, first + 4)
 
     def lift(self, tree: Tree, parameters: ca.SX) -> LiftedRows:
-        """Lift the active pairs; the equations of a pair stay the same object while pairs and corners come in."""
+        """Lift the active pairs.
+
+        The expressions of the equations of a pair are reused while pairs and corners are added.
+        """
         lifted = self._lifted.setdefault(tree, {})
         for k, pair, corners in self._program:
             known, rows = lifted.get(k) or (
@@ -169,7 +182,7 @@ class Clearance(Constraint):
         return Guess.joined([pair.guess(model) for _, pair, _ in self._program])
 
     def linearize(self, model: Numeric, auxiliaries: Array) -> Linearization:
-        """Return the rows of all near pairs, whether the program has them or not."""
+        """Linearize the rows of all near pairs, including pairs that are not in the program."""
         near = np.flatnonzero(self._distances.within(model, _ROWS, self._indices) < _ROWS).tolist()
         unknowns = self._unknowns(auxiliaries) if near else {}
         parts = [self._pairs[k].linearize(model, unknowns.get(k)) for k in near]

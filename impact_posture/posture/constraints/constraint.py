@@ -1,8 +1,9 @@
-"""Base classes of the constraints on a posture, which CasADi sees as expressions and Pinocchio as numbers.
+"""Base classes of the constraints on a posture, with CasADi expressions and numeric values from Pinocchio.
 
-To add a constraint, derive from :class:`ExpressionConstraint` and implement ``symbolic`` and ``evaluate``.  If it has
-unknowns, derive from :class:`Constraint` and implement ``lift``, ``unknowns``, ``guess``, ``linearize`` and
-``evaluate``.  The program, the feasible starts, the certificate and the search for conflicts need nothing else.
+To add a constraint, derive from :class:`ExpressionConstraint` and implement ``symbolic`` and ``evaluate``.  If the
+constraint has unknowns, derive from :class:`Constraint` and implement ``lift``, ``unknowns``, ``guess``,
+``linearize`` and ``evaluate``.  The program, the feasible starts, the certificate and the search for conflicts need
+no other methods.
 """
 
 from __future__ import annotations
@@ -30,14 +31,14 @@ def digest(*parts: object) -> str:
 
 @dataclass(frozen=True, eq=False)
 class LiftedRows:
-    """A constraint in the unknowns of the program: ``lower ≤ g(q, z) ≤ upper`` with auxiliaries z.
+    """A constraint in the unknowns of the program: ``lower ≤ g(q, z) ≤ upper`` with the auxiliaries z.
 
     Attributes:
         rows: ``g(q, z)``, shape (m, 1).
         variables: ``z``, shape (k, 1).
-        slack: Sum of the auxiliaries that relax rows, meters; the program drives it to zero.
-        sides: More rows, which depend on ``z`` alone.
-        pieces: Pieces of a constraint that grows.  ``rows`` of a piece stays the same object.
+        slack: Sum of the auxiliaries that relax rows, m; the program minimizes this sum to zero.
+        sides: Further rows that depend on ``z`` only, not on ``q``.
+        pieces: Pieces of a constraint that can grow; the expression ``rows`` of a piece is reused while it grows.
     """
 
     rows: ca.SX
@@ -48,7 +49,7 @@ class LiftedRows:
 
     @staticmethod
     def joined(pieces: Sequence[LiftedRows]) -> LiftedRows:
-        """Join pieces: the rows of all, then the sides of all."""
+        """Join pieces: first the rows of all pieces, then the sides of all pieces."""
         rows, sides, variables = (
             ca.vertcat(ca.SX(0, 1), *[getattr(piece, key) for piece in pieces])
             for key in ("rows", "sides", "variables")
@@ -59,7 +60,7 @@ class LiftedRows:
 
 @dataclass(frozen=True, eq=False)
 class Linearization:
-    """Rows of a constraint near a posture, over the tangent space and the auxiliaries of the certificate.
+    """Linearized rows of a constraint near a posture, in the tangent space and the auxiliaries of the certificate.
 
     Attributes:
         names: Name of each row.
@@ -109,12 +110,13 @@ class Constraint(ABC):
 
     Attributes:
         name: Name in lists of active and of conflicting constraints.
-        parameters: Numbers that may change without rebuilding the program (targets, polygons).
+        parameters: Numbers that can change without rebuilding the program, for example targets and polygons.
         lower, upper: Bounds, shape (rows,).
-        projected: Whether starts are pulled onto the constraint; else the program alone satisfies it.
+        projected: Whether starts are projected onto the constraint; otherwise only the program enforces it.
         grows: Whether :meth:`grown` is likely to add parts to the program.
-        by_row: Whether conflicts name each row instead of the constraint.
-        price: Price of a violation where constraints conflict.  A cheap constraint gives way, and is named.
+        by_row: Whether a conflict is reported for each row instead of for the whole constraint.
+        price: Price of a violation in the search for conflicts.  If constraints conflict, the constraint with the
+            lowest price is violated and therefore reported.
     """
 
     name: str
@@ -138,7 +140,7 @@ class Constraint(ABC):
 
     @property
     def structure(self) -> str:
-        """Text that identifies the expressions, part of the key of the compile cache."""
+        """Text that identifies the expressions of the constraint; it is part of the key of the compile cache."""
         return f"{type(self).__name__}:{self.name}:{self.rows}"
 
     @abstractmethod
@@ -146,7 +148,7 @@ class Constraint(ABC):
         """Return ``c(q)``, shape (rows,), and its tangent Jacobian, shape (rows, nv), at ``model.q``."""
 
     def value(self, model: Numeric) -> Array:
-        """Return ``c(q)``, which needs to be exact only where it violates a bound."""
+        """Return ``c(q)``, shape (rows,); the value needs to be exact only in rows that violate a bound."""
         return self.evaluate(model)[0]
 
     # ---- lifted form, by default without auxiliaries ----------------------------------------------------------
@@ -166,17 +168,20 @@ class Constraint(ABC):
         return 0
 
     def guess(self, model: Numeric) -> Guess:
-        """Return the auxiliaries to start from at ``model.q``, with their bounds."""
+        """Return initial values and bounds of the auxiliaries at ``model.q``."""
         return Guess(np.zeros(0), np.zeros(0))
 
     def linearize(self, model: Numeric, auxiliaries: Array) -> Linearization:
-        """Return the rows at ``model.q`` and auxiliaries, shape (k,); rows far from their bounds may be left out."""
+        """Linearize the rows at ``model.q`` and ``auxiliaries``, shape (k,).
+
+        Rows far from their bounds may be left out.
+        """
         value, jacobian = self.evaluate(model)
         names = [self.row_name(row) for row in range(self.rows)]
         return Linearization(names, value, self.lower, self.upper, jacobian, np.zeros((self.rows, 0)))
 
     def grown(self, model: Numeric, auxiliaries: Array | None = None) -> Self:
-        """Return the constraint with the parts that its program lacks at ``model.q``, or itself if none are missing.
+        """Add the parts that the program lacks at ``model.q``; return the same constraint if no parts are missing.
 
         If the posture is the end of a run, ``auxiliaries`` are the values of the program there, shape (k,).
         """
@@ -191,7 +196,7 @@ class Constraint(ABC):
         return value - np.clip(value, self.lower, self.upper)
 
     def conflicts(self, excess: Array) -> dict[str, float]:
-        """Return the names of what is violated, with the size of each violation."""
+        """Return the name and the size of each violation."""
         if self.by_row:
             return {self.row_name(row): abs(float(excess[row])) for row in np.flatnonzero(excess).tolist()}
         return {self.name: float(np.linalg.norm(excess))}
@@ -205,12 +210,12 @@ class Constraint(ABC):
         return self.name if self.rows == 1 else f"{self.name}[{row}]"
 
     def pose_error(self, value: Array) -> tuple[float, float]:
-        """Return the position (m) and orientation error (rad) of a held pose where ``c(q)`` is ``value``."""
+        """Return the position (m) and orientation error (rad) of a held pose; ``value`` is ``c(q)``."""
         return 0.0, 0.0
 
 
 class ExpressionConstraint(Constraint):
-    """Abstract base class of constraints that are an expression of the posture alone."""
+    """Abstract base class of constraints that depend on the posture only, without auxiliaries."""
 
     @abstractmethod
     def symbolic(self, tree: Tree, parameters: ca.SX) -> ca.SX:

@@ -1,9 +1,9 @@
 """Bounds on the peak force of an impact and on the velocity jump of each joint.
 
-Without friction the jump is ``Δν = a (1+e) v/G`` with ``a = M⁻¹Jᵀn`` and ``G = nᵀJa``, and the peak force falls with
-G (:mod:`impact_posture.impact.elasticity.contact_compression`).  A joint controller with the velocity gain ``K_d``
-answers the jump with the torque ``K_d Δν``.  A bound on this torque is therefore a bound on the jump (Wang et al.
-2020, arXiv:2006.01987).
+Without friction the jump is ``Δν = a (1+e) v/G`` with ``a = M⁻¹Jᵀn`` and ``G = nᵀJa``, and the peak force decreases
+as G increases (:mod:`impact_posture.impact.elasticity.contact_compression`).  A joint controller with the velocity
+gain ``K_d`` responds to the jump with the torque ``K_d Δν``.  A bound on this torque is therefore a bound on the jump
+(Wang et al. 2020, arXiv:2006.01987).
 """
 
 from __future__ import annotations
@@ -23,13 +23,14 @@ from impact_posture.system.arrays import Array
 
 
 class ImpactBounds(ExpressionConstraint):
-    """``1/G(q) ≤ 1/G_min`` and ``|a_i(q)|/G(q) ≤ b`` at every joint, for the leading contact of the objective.
+    """Bounds ``1/G(q) ≤ 1/G_min`` and, at every joint, ``|a_i(q)|/G(q) ≤ b``, for the first contact of the objective.
 
-    Both limits are bounds of rows, so one program serves all values of them.
+    ``G_min`` and ``b`` are bounds of rows, so one program can be used for all their values.
 
     Args:
-        least_mobility: ``G_min``, 1/kg, the least G with which the peak force stays below its bound; 0 for no bound.
-        jump: ``b = Δν_max/((1+e) v)``, the largest jump of a joint per approach speed; infinite for no bound.
+        least_mobility: ``G_min``, 1/kg, the least G at which the peak force satisfies its bound; 0 for no bound.
+        jump: ``b = Δν_max/((1+e) v)``, the largest allowed velocity jump of a joint per approach speed; infinite for
+            no bound.
     """
 
     def __init__(self, objective: WorstCaseObjective, least_mobility: float, jump: float, variant: str = "") -> None:
@@ -41,7 +42,7 @@ class ImpactBounds(ExpressionConstraint):
         self._joints = np.flatnonzero(moving) if np.isfinite(jump) else np.zeros(0, dtype=int)
         self._least, self._jump = least_mobility, jump
         self.parameters = np.array(objective.contact.normal)
-        # The row of the force is 1/G, because a bound on G can be large beside any G.
+        # The peak force has the row 1/G instead of G, because G_min can be much larger than any G.
         mass = [1 / least_mobility] if least_mobility > 0 else []
         count = len(self._joints)
         self._names = [f"peak force{where}"] * len(mass)

@@ -1,4 +1,4 @@
-"""The constraint that the impact neither lifts nor slides a foot."""
+"""The constraint that no foot lifts off or slides during the impact."""
 
 from __future__ import annotations
 
@@ -19,12 +19,13 @@ from impact_posture.system.arrays import Array
 
 
 class KeptContacts(ExpressionConstraint):
-    """Support impulses ``f = −J_s a/ε`` stay in the friction cones: ``A f(q) ≤ 0`` per unit impulse.
+    """The support impulses ``f = −J_s a/ε`` per unit impulse stay in the friction cones: ``A f(q) ≤ 0``.
 
-    These impulses of feet with compliance ε are one member of the set of
-    :mod:`impact_posture.impact.friction.contact_stability`.  So the constraint is sufficient for the feet to stay,
-    and stricter than necessary where that set has several members.  ``A`` is scaled so that the largest impulse at
-    the given posture is 1.  The model at this posture (``numeric``) gives the axes of the soles, which are held.
+    The module :mod:`impact_posture.impact.friction.contact_stability` describes all impulses that can keep the feet
+    in place.  The impulses ``f`` of feet with compliance ε are one element of this set.  The constraint is therefore
+    sufficient for the feet to stay, but stricter than necessary if the set has several elements.  ``A`` is scaled so
+    that the largest impulse at the given posture is 1.  ``numeric`` is the model at this posture and gives the axes
+    of the soles, which do not change.
     """
 
     def __init__(self, objective: WorstCaseObjective, numeric: Numeric, friction: float, variant: str = "") -> None:

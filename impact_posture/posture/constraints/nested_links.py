@@ -1,4 +1,4 @@
-"""The constraint that two links stay where their shapes do not touch, although their hulls overlap."""
+"""The constraint that the shapes of two links do not touch, for links whose convex hulls overlap."""
 
 from __future__ import annotations
 
@@ -14,7 +14,10 @@ from impact_posture.system.arrays import Array
 
 
 class NestedLinks(ExpressionConstraint):
-    """``N θ ≤ b`` for the joints ``θ`` between two links (:class:`JointPlanes`), in shares of half their ranges."""
+    """``N θ ≤ b`` for the joints ``θ`` between two links (:class:`JointPlanes`).
+
+    A violation is a share of half the range of the joints.
+    """
 
     def __init__(self, robot: Robot, planes: JointPlanes) -> None:
         joints = [robot.joint_id(name) for name in planes.joints]

@@ -1,4 +1,4 @@
-"""Distances of many pairs of bodies: exact for near pairs, and cheap lower bounds for all others."""
+"""Distances of many pairs of bodies: exact for near pairs, and lower bounds, fast to compute, for others."""
 
 from __future__ import annotations
 
@@ -13,11 +13,11 @@ from impact_posture.system.arrays import Array
 
 
 class PairDistances:
-    """Distances less the clearance of pairs of bodies, at one posture after another.
+    """Distances minus the clearance of pairs of bodies, at one posture after another.
 
-    Three cheap lower bounds show that most pairs are apart: the distance of balls around the bodies, the last exact
-    distance less the motion of the bodies since, and the gap between the hulls along two directions.  The values at
-    the last posture are kept, because a search evaluates a posture several times.
+    Three lower bounds, fast to compute, show that most pairs do not touch: the distance of balls around the bodies,
+    the last exact distance minus the motion of the bodies since then, and the gap between the hulls along two
+    directions.  The values at the last posture are stored, because a search evaluates a posture several times.
     """
 
     def __init__(self, pairs: Sequence[SeparatingPlane]) -> None:
@@ -49,11 +49,13 @@ class PairDistances:
         self._planes = [(k, body) for k, body in enumerate(self._bodies) if body.normal is not None]
         self._offsets = np.array([body.offset for body in self._bodies])
         self._known = np.array([pair.known for pair in self._pairs], dtype=bool)
-        # The last exact distance of each pair of hulls, its normal, and the places of both bodies at that time.
+        # The last exact distance of each pair of hulls, its normal, and the placements of both bodies for which it
+        # was computed.
         self._latest = np.full(len(self._pairs), -np.inf)
         self._normals = np.zeros((len(self._pairs), 3))
         self._then = np.zeros((2, len(self._pairs), 12))
-        # The last posture, the bodies there, the normals of planes, and the distances or bounds.
+        # The last posture, and at this posture: axes and centers of the bodies, normals of planes, and distances or
+        # bounds.
         self._q = np.zeros(0)
         self._axes, self._centers = np.zeros((0, 3, 3)), np.zeros((0, 3))
         self._up = np.zeros((len(self._bodies), 3))
@@ -61,12 +63,12 @@ class PairDistances:
         self._exact = np.zeros(len(self._pairs), dtype=bool)
 
     def bounds(self, model: Numeric, pairs: range) -> Array:
-        """Return lower bounds on the distances of ``pairs`` by a ball around each body, m."""
+        """Return lower bounds, m, on the distances of ``pairs`` from a ball around each body."""
         self._move(model)
         return np.array(self._balls[pairs.start : pairs.stop])
 
     def within(self, model: Numeric, limit: float, pairs: range) -> Array:
-        """Return the distances of ``pairs``, m; values above ``limit`` (m) may be lower bounds."""
+        """Return distances minus clearance of ``pairs``, m; values above ``limit`` (m) may be lower bounds."""
         self._move(model)
         part = slice(pairs.start, pairs.stop)
         near = pairs.start + np.flatnonzero((self._values[part] < limit) & ~self._exact[part])
@@ -86,7 +88,7 @@ class PairDistances:
         return self._values[part].copy()
 
     def _move(self, model: Numeric) -> None:
-        """Place all bodies, unless they are at this posture already."""
+        """Compute the placements of all bodies, unless the posture is the last one."""
         if np.array_equal(self._q, model.q):
             return
         self._q = model.q
@@ -105,7 +107,7 @@ class PairDistances:
         self._values = self._balls.copy()
 
     def _places(self, bodies: Array) -> Array:
-        """Return the axes of bodies times their reach, and their centers, shape (k, 12)."""
+        """Return, for each body, the rotation matrix times the reach, and the center, shape (k, 12)."""
         axes = self._axes[bodies] * self._reach[bodies][:, None, None]
         return np.hstack([axes.reshape(-1, 9), self._centers[bodies]])
 
@@ -113,7 +115,7 @@ class PairDistances:
         """Return the gaps of pairs along the normal of the plane, or the larger gap along two directions, m."""
         first, second = self._first[pairs], self._second[pairs]
         apart = self._centers[first] - self._centers[second]
-        # The two directions: between the centers, and the normal when the pair was near last.
+        # The two directions are the line between the centers and the normal of the last exact distance.
         length = np.sqrt((apart * apart).sum(axis=1, keepdims=True))
         between = apart / np.maximum(length, np.finfo(float).tiny)
         along = np.stack(
@@ -122,13 +124,14 @@ class PairDistances:
         low = (self._corners[first] @ (self._axes[first].transpose(0, 2, 1) @ along)).min(axis=1)
         high = (self._corners[second] @ (self._axes[second].transpose(0, 2, 1) @ along)).max(axis=1)
         gaps = (apart[:, None] @ along)[:, 0] + low - high
-        # A pair that was never near has a normal of zeros, and the gap along it means nothing.
+        # If the distance of a pair was never computed exactly, its normal is zero, and the gap along this normal is
+        # not used.
         best = np.where(self._normals[pairs].any(axis=1), gaps.max(axis=1), gaps[:, 0])
         return np.asarray(best - self._gaps[pairs] - self._offsets[second])
 
 
 def _corners(body: ConvexBody) -> Array:
-    """Return the corners of a hull around its center in axes that turn with the body; the origin of a half-space."""
+    """Return the corners of a hull relative to its center in the turning axes; the origin for a half-space."""
     if body.hull is None:
         return np.zeros((1, 3))
     corners = body.hull.vertices - body.hull.center
@@ -136,6 +139,6 @@ def _corners(body: ConvexBody) -> Array:
 
 
 def _moved(now: Array, then: Array) -> Array:
-    """Return the largest motion ``|Δc| + |ΔR| r`` of a point of each body between :meth:`_places`, m, shape (k,)."""
+    """Bound how far each body moved between two results of ``_places``: ``|Δc| + |ΔR| r``, m, shape (k,)."""
     change = (now - then) ** 2
     return np.asarray(np.sqrt(change[:, 9:].sum(axis=1)) + np.sqrt(change[:, :9].sum(axis=1)))

@@ -33,7 +33,7 @@ class HeldPosition(ExpressionConstraint):
         return np.asarray(model.placement(self.point).translation - self.parameters)
 
     def pose_error(self, value: Array) -> tuple[float, float]:
-        """Return the distance from the target, or from the box around it."""
+        """Return the distance from the target, or from the box around the target, m, and a zero orientation error."""
         return float(np.linalg.norm(self.excess(value))), 0.0
 
 
@@ -53,12 +53,13 @@ class PositionBox(HeldPosition):
 
 
 class HeldOrientation(ExpressionConstraint):
-    """The frame keeps its world orientation ``target``, shape (3, 3), or the direction of one of its axes.
+    """The frame keeps its world orientation ``target``, shape (3, 3), or only the direction of one axis.
 
     The rows are ``2 vec(Q_left* ⊗ Q(q) ⊗ Q_right)``, the vector part of the error quaternion.  To first order this is
-    the rotation vector in radians.  It is zero at the target only and largest at 180°, where a skew-symmetric error
-    is zero again.  Its first two components alone hold the direction of ``axis``, a vector in the frame, about which
-    the frame may turn; ``None`` holds all three.
+    the rotation vector in radians.  The error is zero only at the target and largest at 180°, where a skew-symmetric
+    error is zero again.  If ``axis``, a vector in the frame, is given, only the first two components are rows.  The
+    direction of the axis is then constrained, and the frame may turn about it.  If ``axis`` is ``None``, all three
+    components are rows.
     """
 
     def __init__(self, name: str, point: PointOnLink, target: Array, axis: Array | None = None) -> None:
@@ -89,17 +90,18 @@ class HeldOrientation(ExpressionConstraint):
         """Return the rows and their tangent Jacobian from the rotation and angular Jacobian (3, nv) of the frame."""
         error = (self._left * pin.Quaternion(rotation) * self._right).coeffs()
         x, y, z, w = (error if error[3] >= 0 else -error).tolist()
-        # d(2 vec(Q)) = (w I + [v]×) ω in the axes that Q turns: the axes of the frame times `right`.
+        # d(2 vec(Q)) = (w I + [v]×) ω with ω in the axes that Q rotates, which are the axes of the frame times
+        # `right`.
         turn = np.array([[w, -z, y], [z, w, -x], [-y, x, w]])[: self.rows] @ (rotation @ self._axes).T
         return 2 * np.array([x, y, z])[: self.rows], turn @ jacobian
 
     def pose_error(self, value: Array) -> tuple[float, float]:
-        """Return the angle θ of a rotation or tilt, because the rows are ``2 sin(θ/2)`` along its axis."""
+        """Return a zero position error and the angle θ; the rows have the norm ``2 sin(θ/2)``."""
         return 0.0, 2 * float(np.arcsin(min(1.0, float(np.linalg.norm(value)) / 2)))
 
 
 class HeldPose(ExpressionConstraint):
-    """The frame keeps position and orientation: six rows, or five with a free spin."""
+    """The frame keeps its position and orientation, with six rows, or five if it may spin about ``axis``."""
 
     def __init__(self, name: str, point: PointOnLink, target: pin.SE3, axis: Array | None = None) -> None:
         self.name = name
@@ -132,7 +134,7 @@ class HeldPose(ExpressionConstraint):
 
 
 class AxisInCone(ExpressionConstraint):
-    """An axis of the frame stays within a cone, ``−dᵀR(q)c ≤ −cos α``, and the frame may turn about it.
+    """An axis of the frame stays within a cone, ``−dᵀR(q)c ≤ −cos α``, and the frame may turn about this axis.
 
     ``axis`` is the unit vector ``c`` in the frame, ``direction`` the axis ``d`` of the cone in the world, shape (3,)
     each, and ``degrees`` the half angle α of the cone.  ``point`` is a point on the link of the frame.
@@ -158,8 +160,8 @@ class AxisInCone(ExpressionConstraint):
 class HeldTurn(ExpressionConstraint):
     """The base does not turn about one of its axes: ``2 axis·vec(Q*⁻¹ ⊗ Q(q)) = 0``.
 
-    ``point`` is the origin of the base, ``target`` its orientation without a turn, shape (3, 3), and ``axis`` a unit
-    axis in the base, shape (3,).
+    ``point`` is the origin of the base, ``target`` the orientation ``Q*`` of the base before a turn, shape (3, 3),
+    and ``axis`` a unit vector in base axes, shape (3,).
     """
 
     def __init__(self, point: PointOnLink, target: Array, axis: Array, name: str) -> None:

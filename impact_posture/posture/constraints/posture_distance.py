@@ -1,4 +1,4 @@
-"""The distance between two postures, its tangent gradient, and a bound on it as a constraint."""
+"""The distance between two postures, its tangent gradient, and a constraint that bounds this distance."""
 
 from __future__ import annotations
 
@@ -16,10 +16,11 @@ from impact_posture.system.arrays import Array
 
 
 def distance_squared(chart: Chart, q: Any, reference: Any) -> Any:
-    """Return the squared distance of two configurations, ``SX`` or ``DM``: about ``‖q ⊖ reference‖²`` in rad and m.
+    """Return the squared distance of two configurations (``SX`` or ``DM``), about ``‖q ⊖ reference‖²`` in rad and m.
 
-    The distance is smooth everywhere.  A turn by Δ of a base, a ball joint or a continuous joint counts
-    ``4 sin²(Δ/2) = 4 (1 − (quaternion·quaternion)²) = 2 (1 − cos Δ)``.  Other joints and positions count Δ².
+    The distance is smooth everywhere.  A turn by Δ of a base, a ball joint or a continuous joint adds ``4 sin²(Δ/2) =
+    4 (1 − (quaternion·quaternion)²) = 2 (1 − cos Δ)``.  Each other joint or coordinate of a position that changes by
+    Δ adds Δ².
     """
     parts = []
     for slot in chart.slots:
@@ -27,13 +28,13 @@ def distance_squared(chart: Chart, q: Any, reference: Any) -> Any:
         if slot.kind.family in ("free-flyer", "spherical"):
             parts.append(4 * (1 - ca.dot(a[-4:], b[-4:]) ** 2))
             a, b = a[:-4], b[:-4]
-        # For a cosine and a sine this is 2 (1 − cos Δ).
+        # For the cosine and sine of a continuous joint, this sum of squares is 2 (1 − cos Δ).
         parts.append(ca.sumsqr(a - b))
     return ca.sum1(ca.vertcat(*parts))
 
 
 def distance(chart: Chart, q: Array, reference: Array) -> float:
-    """Return the root of :func:`distance_squared` of two configurations, shape (nq,)."""
+    """Return the square root of :func:`distance_squared` for two configurations, shape (nq,)."""
     return float(np.sqrt(max(float(distance_squared(chart, ca.DM(q), ca.DM(reference))), 0.0)))
 
 
@@ -62,9 +63,10 @@ def distance_gradient(chart: Chart, q: Array, reference: Array) -> Array:
 
 
 class WithinDistance(ExpressionConstraint):
-    """The posture stays in a ball: ``distance_squared(q, reference) ≤ radius²``, about ``‖q ⊖ reference‖ ≤ radius``.
+    """``distance_squared(q, reference) ≤ radius²``: the posture stays in a ball, about ``‖q ⊖ reference‖ ≤ radius``.
 
-    The radius (> 0) is a bound and the reference a parameter, so one program serves all radii.
+    The radius (> 0) is a bound and the reference a parameter, so one program can be used for all radii and
+    references.
     """
 
     def __init__(self, chart: Chart, reference: Array, radius: float) -> None:

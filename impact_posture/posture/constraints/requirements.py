@@ -1,4 +1,4 @@
-"""The demands of a task on the posture, which become constraints."""
+"""Requirements of a task on the posture, from which the constraints are built."""
 
 from __future__ import annotations
 
@@ -13,33 +13,39 @@ from impact_posture.config.problem_settings import CLEARANCE
 @checked
 @dataclass(frozen=True)
 class Requirements:
-    """Demands of the task on the posture.
+    """Requirements of the task on the posture.
 
     Attributes:
-        contact_pose: Held part of the pose of the leading contact frame, as in the setting ``contact_pose``.
-        other_poses: Held part of the pose of each other contact frame.
-        target_position: Position of the contact frame, world, meters; ``None`` for its initial position.
-        target_quaternion: Orientation of the contact frame, x y z w; ``None`` for its initial orientation.
-        box: Half extents of the box of ``contact_pose = box``, meters.
-        base: Freedom of the floating base: ``free``, ``level`` (tilt zero, yaw free), ``level:DEG`` (tilt from its
+        contact_pose: Part of the pose of the first contact frame that must not change; values of the setting
+            ``contact_pose``.
+        other_poses: Part of the pose that must not change, for each other contact frame.
+        target_position: Target position of the contact frame, world axes, m; ``None`` for its initial position.
+        target_quaternion: Target orientation of the contact frame, x y z w; ``None`` for its initial orientation.
+        box: Half extents of the box in which the contact frame must stay if ``contact_pose`` is ``box``, m.
+        base: How the floating base may move: ``free``, ``level`` (tilt zero, yaw free), ``level:DEG`` (tilt from its
             default posture at most DEG degrees, yaw free), ``fixed`` or ``box``.
-        base_box: Half extents of the box of ``base = box``, meters.
-        keep: Frames whose pose is held.
-        hold: Joints held at their initial value.
-        com_over_feet: Keep the center of mass above the support polygon.
-        com_asked: Whether the user set ``com_over_feet``.  If not, it is dropped where the feet span no area.
-        com_margin: Least distance of the center of mass from the edges of the polygon, meters.
-        keep_contacts: The impact must neither lift nor slide a foot.
-        holdable: Thrusts, torques and forces of the feet that hold the posture stay within their limits.
-        limit_share: Share of the limits of torques and thrusts that holding may take, about the middle of a range.
-        hold_force: Force with which each contact pushes back after the impact, N, which has to be held as well.
-        least_mobility: Least G of each contact, 1/kg, for the bound on the peak force; 0 for none.
-        largest_jump: Largest jump of a joint per approach speed; infinite for no bound.
-        approach_speed: Speed at which the joints have to bring the contact to the surface, m/s; 0 for no demand.
-        collision: Keep the links clear of each other, the surface, the ground and the obstacles.
-        clearance: Least distance between any two of these, m.
-        surface: ``plane``, ``none``, or the edge length of a square patch in m; ``None`` to choose by the robot.
-        limit_margin: Distance from the joint limits, rad or m.
+        base_box: Half extents of the box in which the base must stay if ``base`` is ``box``, m.
+        keep: Frames whose pose must not change.
+        hold: Joints whose position must not change.
+        com_over_feet: Whether the center of mass must stay above the support polygon.
+        com_asked: Whether the user set ``com_over_feet``.  If not, the requirement is dropped if the feet span no
+            area.
+        com_margin: Least horizontal distance of the center of mass from the edges of the support polygon, m.
+        keep_contacts: Whether the feet must neither lift off nor slide during the impact.
+        holdable: Whether thrusts, torques and foot forces within their limits must be able to hold the posture.
+        limit_share: Share of the torque and thrust ranges that may be used to hold the posture, around the middle of
+            each range.
+        hold_force: Force of the surface on each contact after the impact, N, which the robot must also be able to
+            hold.
+        least_mobility: Least allowed G of each contact, 1/kg, from the bound on the peak force; 0 for no bound.
+        largest_jump: Largest allowed velocity jump of a joint per approach speed; infinite for no bound.
+        approach_speed: Speed that the joints must be able to give the contact towards the surface, m/s; 0 for no
+            requirement.
+        collision: Whether the links must not touch each other, the surface, the ground or the obstacles.
+        clearance: Least distance between any two of these bodies, m.
+        surface: ``plane``, ``none``, or the edge length of a square patch in m; ``None`` for a choice that suits the
+            robot.
+        limit_margin: Least distance of the joint positions from their limits, rad or m.
         regularization: Weight of the squared distance from the initial posture, relative to the initial objective.
     """
 

@@ -1,4 +1,4 @@
-"""A plane between two bodies whose existence proves that they do not touch; its coefficients are unknowns.
+"""A plane that separates two bodies and so proves that they do not touch; its coefficients are unknowns.
 
 Two convex bodies do not touch if a plane separates them (S. Boyd and L. Vandenberghe, Convex Optimization, 2004,
 section 2.5).  With the plane ``{y: n·y = c}`` in the axes of body b, sweep radii r and the clearance δ, corners x of
@@ -8,8 +8,8 @@ a and y of b satisfy::
     m = Qᵀn,   d = n·t − c            (Q, t: placement of a in the axes of b)
 
 Every row of a corner is linear in the unknowns (n, c, m, d, s), and only four equations of a pair depend on the
-posture.  The slack s lets a solver start from bodies that penetrate each other.  A half-space has a known plane, so n
-and c are constants.  The program has rows of those corners only that a plane could meet.
+posture.  With the slack s, a solver can start from bodies that penetrate each other.  A half-space has a known plane,
+so n and c are constants.  The program has rows only for corners that a separating plane could touch.
 """
 
 from __future__ import annotations
@@ -28,34 +28,38 @@ from impact_posture.impact.quantities.lifted_form import Guess
 from impact_posture.posture.constraints.constraint import LiftedRows, Linearization
 from impact_posture.system.arrays import Array
 
-# Number of equations of a pair.
+# Number of equations that define m and d for each pair.
 EQUATIONS = 4
-# Least n·n.  Without it the normal could shrink to zero where bodies penetrate, and the solver would be stuck.
+# Lower bound on n·n.  Without this bound, the normal could shrink to zero if bodies penetrate, and the solver could
+# not continue.
 _SHORT = 0.8
-# The slack starts this much (m) above the penetration and the normal at this length, both inside their bounds.
+# Initially, the slack exceeds the penetration by the first value (m), and the normal has the second value as length.
+# Both are inside their bounds.
 _ABOVE, _LENGTH = 0.01, 0.98
-# Unit (m) of the slack among the unknowns.  With the usual price of a meter its multiplier is then one, IPOPT's first
-# guess, and a run takes a quarter fewer iterations than with meters.
+# Unit of the unknown slack, m.  In this unit and with the usual price of a meter, the multiplier of the slack is one,
+# the initial guess of IPOPT. A run then takes a quarter fewer iterations than in meters.
 _UNIT = 0.02
-# Corners get a row if the plane meets them first, also if it is tilted by this tangent to any of eight sides.
+# A corner gets a row if it is the first that the plane touches, either untilted or tilted towards one of eight sides.
+# This is the tangent of the tilt.
 _TILT = 0.5
 _AROUND = np.array([[0.0, 0.0], *[[np.cos(a), np.sin(a)] for a in np.arange(8) * np.pi / 4]])
-# A plane separates if it cuts off less than this (m) of a body, half of what certifies.
+# A plane separates two bodies if it cuts less than this (m) into a body. The value is half the tolerance of the
+# certificate.
 _KEPT = 5e-9
-# Rows of corners farther than this (m) from their plane have no multiplier.
+# If a corner is farther than this (m) from its plane, its row is inactive and left out.
 _NEAR = 1e-3
 
 
 @dataclass(frozen=True, eq=False)
 class ConvexBody:
-    """A swept hull or half-space that moves with a link, stands in the world, or follows a point without turning.
+    """A swept hull or half-space that moves with a link, is fixed in the world, or follows a point without turning.
 
     Attributes:
         hull: Corners and sweep radius in the axes of ``point``; ``None`` for the half-space behind a plane.
-        point: The point and axes that carry the body; joint 0 is the world.
+        point: The point and axes to which the body is fixed; joint 0 is the world.
         turns: Whether the body turns with the link; otherwise it keeps world axes.
         normal: Unit normal out of the half-space, in the axes of ``point``, shape (3,).
-        offset: Height of its plane ``{y: normal·y = offset}``, m.
+        offset: Offset of the boundary plane ``{y: normal·y = offset}`` of the half-space, m.
     """
 
     name: str
@@ -67,7 +71,7 @@ class ConvexBody:
 
     @staticmethod
     def of_link(hull: SweptHull) -> ConvexBody:
-        """Return a body of the robot, or of the world."""
+        """Return a swept hull as a body that is fixed to its link or to the world."""
         return ConvexBody(hull.name, hull, PointOnLink(hull.joint, np.zeros(3), np.eye(3)))
 
     @property
@@ -82,12 +86,18 @@ class ConvexBody:
 
     @property
     def center(self) -> Array:
-        """Middle of the body, or the origin of the plane, in the axes of the joint or of the world, shape (3,)."""
+        """Center of the hull, or origin of the half-space, shape (3,).
+
+        It is in the axes of the joint if the body turns with the link, and otherwise in world axes.
+        """
         center = np.zeros(3) if self.hull is None else self.hull.center
         return np.asarray(self.point.placement.act(center)) if self.turns else center
 
     def rates(self, model: Numeric, direction: Array, positions: Array) -> Array:
-        """Return the tangent gradients, shape (k, nv), of heights ``direction·x`` at world ``positions``, (k, 3)."""
+        """Return the tangent gradients, shape (k, nv), of ``direction·x`` for points x of the body.
+
+        ``positions`` are the world positions of these points, shape (k, 3).
+        """
         if self.point.joint == 0:
             return np.zeros((len(positions), model.model.nv))
         J = model.jacobian(self.point)
@@ -99,7 +109,7 @@ class ConvexBody:
 
 
 class Corners(NamedTuple):
-    """Corners of two bodies that have rows in the program, as indices."""
+    """Indices of the corners of bodies ``a`` and ``b`` that have rows in the program."""
 
     a: frozenset[int]
     b: frozenset[int]
@@ -117,7 +127,8 @@ class SeparatingPlane:
         self._x, self._y = a.hull.vertices, np.zeros((0, 3)) if b.hull is None else b.hull.vertices
         self.gap = a.hull.radius + (0.0 if b.hull is None else b.hull.radius) + margin
         self.margin = margin
-        # The last distance and the placements of both bodies there: a search evaluates a posture several times.
+        # Cache of the last distance with the placements of both bodies, because a search evaluates a posture several
+        # times.
         self._latest: tuple[pin.SE3, pin.SE3, tuple[float, Array, Array]] | None = None
 
     @property
@@ -126,22 +137,25 @@ class SeparatingPlane:
         return 5 if self.known else 9
 
     def slack(self, unknowns: Array) -> float:
-        """Return the slack in the unknowns of :meth:`lift`, m."""
+        """Return the slack, m, from the unknowns of :meth:`lift`."""
         return _UNIT * float(unknowns[-1])
 
     @property
     def known(self) -> bool:
-        """Whether the plane is known."""
+        """Whether the plane is known, because ``b`` is a half-space."""
         return self.b.normal is not None
 
     def bounds(self, corners: Corners) -> tuple[Array, Array]:
-        """Return the bounds of the :meth:`sides`; the :data:`EQUATIONS` of :meth:`lift` are zero."""
+        """Return the bounds of the rows of :meth:`sides`: the corners of ``a``, the corners of ``b``, and ``n·n``.
+
+        The rows of :meth:`lift` are equations with both bounds zero.
+        """
         of_a, of_b, normal = len(corners.a), len(corners.b), [] if self.known else [1.0]
         lower = np.array([*[self.gap] * of_a, *[-np.inf] * of_b, *[_SHORT] * len(normal)])
         return lower, np.array([*[np.inf] * of_a, *[0.0] * of_b, *normal])
 
     def content(self, corners: Corners) -> str:
-        """Return a text of all numbers in the rows except a known plane, which is a parameter."""
+        """Return a text with all numbers in the rows except a known plane, whose coefficients are parameters."""
         bodies = [(b.point.joint, b.point.position.tolist(), b.point.rotation.tolist()) for b in (self.a, self.b)]
         points = self._x[sorted(corners.a)].tolist(), self._y[sorted(corners.b)].tolist()
         return repr((bodies, self.b.turns, self.known, points))
@@ -149,8 +163,8 @@ class SeparatingPlane:
     def lift(self, tree: Tree, label: str, known: ca.SX) -> LiftedRows:
         """Return the equations, the unknowns ``n, c, m, d, s`` (``m, d, s`` for a half-space), and the slack.
 
-        The unknown ``s`` is in units of 2 cm.  ``label`` ends the names of the unknowns.  ``known`` is ``n, c`` of a
-        half-space, shape (4, 1); a swept hull does not use it.
+        The unknown ``s`` is in units of 2 cm.  ``label`` is the suffix of the names of the unknowns.  ``known``
+        contains ``n, c`` of a half-space, shape (4, 1); it is not used for a swept hull.
         """
         plane = ca.SX(0, 1) if self.known else ca.SX.sym(f"plane{label}", 4)
         m, d, s = ca.SX.sym(f"m{label}", 3), ca.SX.sym(f"d{label}"), ca.SX.sym(f"s{label}")
@@ -159,7 +173,7 @@ class SeparatingPlane:
         return LiftedRows(ca.vertcat(m - Q.T @ n, d - (ca.dot(n, t) - c)), ca.vertcat(plane, m, d, s), _UNIT * s)
 
     def sides(self, variables: ca.SX, corners: Corners) -> ca.SX:
-        """Return the rows of corners, over the unknowns of :meth:`lift`."""
+        """Return the rows of ``corners`` and of ``n·n`` as expressions of the unknowns of :meth:`lift`."""
         m, d, s = variables[-5:-2], variables[-2], variables[-1]
         rows = [ca.SX(self._x[sorted(corners.a)]) @ m + d + _UNIT * s]
         if not self.known:
@@ -168,7 +182,7 @@ class SeparatingPlane:
         return ca.vertcat(*rows)
 
     def corners(self, model: Numeric) -> Corners:
-        """Return the corners that a plane between the closest points meets first, also if it is tilted."""
+        """Return the corners closest to the separating plane, either untilted or tilted to one of eight sides."""
         normal = self.distance(model)[1]
         across = np.linalg.svd(normal[None])[2][1:]
         directions = normal + _TILT * _AROUND @ across
@@ -180,7 +194,7 @@ class SeparatingPlane:
 
     @property
     def every_corner(self) -> Corners:
-        """All corners of both bodies; none where the plane is known, because the closest corner then suffices."""
+        """All corners of both bodies; no corners if the plane is known, because the closest corner then suffices."""
         first, second = (0, 0) if self.known else (len(self._x), len(self._y))
         return Corners(frozenset(range(first)), frozenset(range(second)))
 
@@ -194,7 +208,7 @@ class SeparatingPlane:
         return R, p - tree.position(self.b.point)
 
     def distance(self, model: Numeric) -> tuple[float, Array, Array]:
-        """Return distance less clearance, normal from b to a, and closest points, shape (2, 3), in world axes."""
+        """Return the distance minus the clearance, the world normal from b to a, and the closest points, (2, 3)."""
         at_a, at_b = self.a.placement(model), self.b.placement(model)
         if self._latest is None or self._latest[0] != at_a or self._latest[1] != at_b:
             self._latest = at_a, at_b, self._distance(at_a, at_b)
@@ -212,7 +226,7 @@ class SeparatingPlane:
         return float(heights.min()) - self.gap, n, np.array([lowest, lowest - heights.min() * n])
 
     def guess(self, model: Numeric) -> Guess:
-        """Return the unknowns at the closest points, with their bounds."""
+        """Return initial values and bounds of the unknowns, for the plane between the closest points."""
         value, normal, _ = self.distance(model)
         at_b = self.b.placement(model)
         relative = at_b.actInv(self.a.placement(model))
@@ -226,7 +240,7 @@ class SeparatingPlane:
         return Guess(values, lower)
 
     def _plane(self, at_b: pin.SE3, relative: pin.SE3, normal: Array) -> tuple[Array, float]:
-        """Return ``n, c`` of the plane with a world normal in the middle between the bodies, in the axes of ``b``."""
+        """Return ``n, c``, in the axes of ``b``, of the plane midway between the bodies with this world normal."""
         if self.b.normal is not None:
             return self.b.normal, self.b.offset
         n = normal @ at_b.rotation
@@ -234,13 +248,15 @@ class SeparatingPlane:
         return n, float((points @ n).min() - self.gap + (self._y @ n).max()) / 2
 
     def linearize(self, model: Numeric, unknowns: Array | None) -> Linearization:
-        """Return the rows of corners near the plane over the tangent space and (n, c); see :class:`Constraint`.
+        """Linearize the rows of corners near the plane in the tangent space and (n, c); see :class:`Constraint`.
 
-        The plane is given by the unknowns of :meth:`lift`; ``None`` stands for the plane between the closest points.
+        The plane is given by the unknowns of :meth:`lift`.  If they are ``None``, the plane between the closest
+        points is used.
         """
         if unknowns is not None and not self.known:
             rows = self.linearize_at(model, unknowns[:3], float(unknowns[3]))
-            # The plane of the program may cut corners that have no row there, and then the pair is not active.
+            # The plane of the program may cut corners without rows in the program. The pair is then inactive, and the
+            # plane between the closest points is used.
             if rows.violation <= _KEPT:
                 return rows
         at_b = self.b.placement(model)
@@ -248,7 +264,7 @@ class SeparatingPlane:
         return self.linearize_at(model, *self._plane(at_b, relative, self.distance(model)[1]))
 
     def linearize_at(self, model: Numeric, n: Array, c: float) -> Linearization:
-        """Return the rows for the plane ``{y: n·y = c}`` in the axes of body b."""
+        """Linearize the rows for the plane ``{y: n·y = c}``, given in the axes of body b."""
         at_a, at_b, nv = self.a.placement(model), self.b.placement(model), model.model.nv
         corners = self._x @ at_a.rotation.T + at_a.translation
         in_b = (corners - at_b.translation) @ at_b.rotation

@@ -1,4 +1,4 @@
-"""The bodies that the robot must not touch: its own links, the struck surface, the ground and obstacles."""
+"""The bodies that the links of a robot must not touch: other links, the struck surface, the ground and obstacles."""
 
 from __future__ import annotations
 
@@ -26,27 +26,27 @@ from impact_posture.robot.robot import Robot
 from impact_posture.robot.robot_spec import Support
 from impact_posture.system.arrays import Array
 
-# A contact point this near (m) to a plane lies in the plane.
+# A contact point closer to a plane than this, m, is treated as lying in the plane.
 _BESIDE = 0.03
-# Least cosine between the normals of contacts at the same surface.
+# Two contacts can be at the same surface only if the cosine of the angle between their normals exceeds this value.
 _PARALLEL = 0.999
-# A fixed body farther (m) behind the plane of the surface shows that the surface ends before it.
+# If a fixed body lies farther than this, m, behind the plane of the surface, the surface must end before this body.
 _BEHIND = 1e-3
 
 
 @dataclass(frozen=True, eq=False)
 class _Wall:
-    """A plane or body that the links must stay clear of, except the links of the exempt joints."""
+    """A plane or body that links must not touch; only the links of the joints ``exempt`` may."""
 
     body: ConvexBody
     exempt: frozenset[int]
 
 
 class Surroundings:
-    """The bodies around a robot at a given posture, and the constraints that keep it clear of them.
+    """The bodies around a robot at a given posture, and the constraints that keep the links away from them.
 
-    ``numeric`` is the model at the given posture, ``held`` are joints that do not move, and ``clearance`` is the
-    least distance of all pairs, m.
+    ``numeric`` is the model at the given posture.  ``held`` are joints that do not move.  ``clearance`` is the least
+    allowed distance of all pairs, m.
     """
 
     def __init__(self, robot: Robot, numeric: Numeric, held: Sequence[str], clearance: float) -> None:
@@ -64,7 +64,7 @@ class Surroundings:
             self.notes.append(f"{len(touching)} {text}: {', '.join(pairs)}")
 
     def add_ground(self, supports: Sequence[Support], struck: Sequence[ImpactContact]) -> None:
-        """Put level ground under the lowest foot; the feet and the struck links may touch it."""
+        """Put level ground at the height of the lowest foot; the feet and the struck links may touch the ground."""
         if not supports:
             return
         feet = [point_on(self.robot, s.frame, s.offset) for s in supports]
@@ -84,13 +84,16 @@ class Surroundings:
     ) -> None:
         """Put the surface behind a contact: the whole plane, or a square patch of it.
 
-        The plane passes through the contact point, or behind the contact link and all links fixed to it, whichever
-        lies deeper at the given posture.  These links may touch the surface.  So may a link whose own contact lies in
-        the plane, such as a foot beside the struck one, or at the same surface, such as the other hand at a wall.  If
-        a foot or a fixed base lies behind the plane, the surface must end before it, and becomes a patch.
+        The plane passes through the contact point, unless the contact link or a link fixed to it extends behind this
+        plane at the given posture.  In this case, the plane is moved back until it touches the deepest point of these
+        links.  These links may touch the surface.  A link may also touch the surface if its own contact lies in the
+        plane, such as a foot next to the struck foot, or at the same surface, such as the other hand at a wall.  If a
+        foot or a fixed base lies behind the plane, the surface must end before this body, so a patch is used instead
+        of the plane.
 
-        ``width`` is the edge length of the patch, m; infinite for the plane, ``None`` to choose.  ``feet`` are the
-        contact points of the feet, and ``contacts`` act at the same time.
+        ``width`` is the edge length of the patch, m; infinite for the plane.  If ``None``, the plane is used unless a
+        fixed body lies behind it.  ``feet`` are the contact points of the feet.  ``contacts`` are the other contacts
+        of the same impact.
         """
         point = point_on(self.robot, contact.frame, contact.offset)
         turns = contact.normal_frame == "contact"
@@ -103,7 +106,8 @@ class Surroundings:
         plane = replace(through, offset=-depth)
         beside = [foot for foot in feet if abs(self._above(foot, plane)) < _BESIDE]
         for other in contacts:
-            # Links of the same kind reach equally far behind their contact points, where the surface is.
+            # Links of the same kind, such as two hands, extend equally far behind their contact points, so their
+            # surfaces coincide.  The plane through the contact point is therefore tested too.
             facing = self._world_normal(contact) @ self._world_normal(other) > _PARALLEL
             at = point_on(self.robot, other.frame, other.offset)
             if any(abs(self._above(at, face)) < _BESIDE for face in ((plane, through) if facing else (plane,))):
@@ -124,9 +128,9 @@ class Surroundings:
         self._walls.append(_Wall(ConvexBody(name, hull, point, turns), exempt))
 
     def add_obstacles(self, obstacles: Sequence[Obstacle]) -> None:
-        """Add bodies that stand in the world; links that cannot move may touch them.
+        """Add bodies that are fixed in the world; links that cannot move may touch these bodies.
 
-        Raise ``InputError`` if two bodies have the same name, so that messages could not tell them apart.
+        Raise ``InputError`` if two bodies have the same name, because messages identify bodies by name.
         """
         taken = {body.name for body in self._bodies} | {wall.body.name for wall in self._walls}
         for obstacle in obstacles:
@@ -137,17 +141,17 @@ class Surroundings:
             self._walls.append(_Wall(ConvexBody.of_link(obstacle_hull(obstacle)), self._rigid([0])))
 
     def depth(self, contact: ImpactContact) -> float:
-        """Return the distance of the surface behind the contact point, m; zero if a contact has no surface."""
+        """Return the distance from the contact point back to its surface, m; zero if the contact has no surface."""
         return self._depths.get(contact, 0.0)
 
     @cached_property
     def nested(self) -> list[NestedLinks]:
-        """Constraints of links whose hulls overlap (:class:`NestedLinks`)."""
+        """Constraints on pairs of links whose convex hulls overlap (:class:`NestedLinks`)."""
         return [NestedLinks(self.robot, planes) for planes in self.shapes.joint_planes if len(planes.bounds)]
 
     @cached_property
     def constraints(self) -> list[Clearance]:
-        """One constraint for the links among themselves, and one for each wall."""
+        """One constraint for the distances between links, and one for the distances of links from each wall."""
         near = f"at least {1e3 * self._clearance:g} mm apart"
         pairs = [SeparatingPlane(self._bodies[i], self._bodies[j], self._clearance) for i, j in self.shapes.pairs]
         groups = [("self-collision", pairs, f"links {near} ({len(pairs)} pairs)")]
@@ -155,7 +159,7 @@ class Surroundings:
             apart = [b for b in self._bodies if b.point.joint not in wall.exempt]
             pairs = [SeparatingPlane(body, wall.body, self._clearance) for body in apart]
             groups.append((wall.body.name, pairs, f"links and {wall.body.name} {near}"))
-        # A posture that needs the distances of one group needs all of them.
+        # The distances of all groups are computed together, because all are needed at the same postures.
         distances, first, constraints = PairDistances([pair for _, pairs, _ in groups for pair in pairs]), 0, []
         for name, pairs, text in groups:
             if pairs:
@@ -183,13 +187,13 @@ class Surroundings:
         }
 
     def collisions(self, q: Array) -> list[tuple[str, str]]:
-        """Return pairs of original shapes that touch at ``q``, with the surface, the ground and obstacles."""
+        """Return the pairs of original shapes, surface, ground and obstacles that touch at ``q``."""
         planes, solids = self.walls_at(q)
         return self._meshes.collisions(q, solids, planes)
 
     @cached_property
     def _moving(self) -> Numeric:
-        """A second model for other postures, because the first stays at the given posture."""
+        """A second model for evaluations at other postures, because ``_numeric`` must stay at the given posture."""
         return Numeric(self.robot.model)
 
     @cached_property
@@ -197,7 +201,10 @@ class Surroundings:
         return MeshCheck(self.robot, self.shapes)
 
     def walls_at(self, q: Array) -> tuple[list[HalfSpace], list[tuple[SweptHull, pin.SE3, frozenset[int]]]]:
-        """Return the planes, and the bodies with placements, around the robot at ``q``, with their exempt joints."""
+        """Return the planes, and the bodies with their placements, around the robot at ``q``.
+
+        Each has the joints whose links may touch it.
+        """
         numeric, planes, solids = self._moving.at(q), [], []
         for wall in self._walls:
             at = wall.body.placement(numeric)
@@ -209,7 +216,7 @@ class Surroundings:
         return planes, solids
 
     def _stands_behind(self, plane: ConvexBody, exempt: frozenset[int]) -> str:
-        """Return the name of a fixed body behind a plane, which may be a foot or the base; empty if there is none."""
+        """Return the name of a fixed body behind a plane, for example a foot or the base; empty if no body is."""
         still = self._still | self._rigid([0])
         for body in self._bodies:
             joint = body.point.joint
@@ -224,7 +231,7 @@ class Surroundings:
         return frozenset(k for k, group in enumerate(self._group) if group in groups)
 
     def _world_normal(self, contact: ImpactContact) -> Array:
-        """Return the normal of a contact at the given posture, world, shape (3,)."""
+        """Return the normal of a contact at the given posture in world axes, shape (3,)."""
         n = np.array(contact.normal)
         if contact.normal_frame == "world":
             return n
@@ -240,7 +247,7 @@ class Surroundings:
 
 
 def _rigid_groups(robot: Robot, held: Sequence[str]) -> list[int]:
-    """Return the group of each joint; links of a group do not move relative to each other."""
+    """Return the group number of each joint; links in the same group do not move relative to each other."""
     fixed = {robot.joint_id(joint) for joint in held}
     group = list(range(robot.model.njoints))
     for joint in range(1, robot.model.njoints):
@@ -250,7 +257,7 @@ def _rigid_groups(robot: Robot, held: Sequence[str]) -> list[int]:
 
 
 def _box_behind(n: Array, width: float) -> Array:
-    """Return the corners of a box behind the plane through the origin, with a face in the plane, shape (8, 3)."""
+    """Return the corners, shape (8, 3), of a box behind the plane through the origin; one face lies in the plane."""
     turn = pin.Quaternion.FromTwoVectors(np.array([0.0, 0.0, 1.0]), n).matrix()
     signs = np.array([[x, y, z] for x in (-1, 1) for y in (-1, 1) for z in (-2, 0)]) * width / 2
     return np.asarray(signs @ turn.T)

@@ -1,4 +1,4 @@
-"""Forces that hold a robot at rest with the least largest share of the limits of its actuators."""
+"""Forces that hold a robot at rest, chosen to minimize the largest share of an actuator limit."""
 
 from __future__ import annotations
 
@@ -12,11 +12,12 @@ from impact_posture.posture.loads.static_load import ForceSource, StaticLoad
 from impact_posture.posture.program.linear_program import solve_linear
 from impact_posture.system.arrays import Array
 
-# Shares closer to the largest share than this are equal to it.
+# A share that differs from the largest share by less than this is treated as equal to the largest share.
 _TIED = 1e-9
-# Most times that forces near even ones leave out feet that would have to pull.
+# Maximum number of iterations that leave out feet with pulling forces, when forces close to an even distribution are
+# computed.
 _TURNS = 4
-# Rate above which a load meets no limit.
+# A load factor λ above this value is reported as infinite.
 _MOST = 1e6
 
 
@@ -25,12 +26,12 @@ class Distribution:
     """Forces and torques that hold one posture.
 
     Attributes:
-        forces: ``z`` of rotors and feet, shape (k,).
+        forces: Vector ``z`` of the forces of rotors and feet, in units of the robot's weight, shape (k,).
         shares: Signed share of its limit that each actuator uses, 0 in the middle of its range, shape (actuators,).
-        unbalanced: Sum of the absolute entries of the unbalanced wrench on the base, in weights (moments over 1 m);
-            zero if the posture can be balanced.
-        jacobian: Tangent Jacobian of ``unbalanced`` and the absolute shares, shape (1 + actuators, nv).  If there are
-            forces to choose, only the rows of the largest share or of ``unbalanced`` are computed.
+        unbalanced: Sum of the absolute entries of the unbalanced wrench on the base, with forces in units of the
+            robot's weight and moments in units of weight times 1 m; zero if the base is balanced.
+        jacobian: Tangent Jacobian of ``unbalanced`` and the absolute shares, shape (1 + actuators, nv).  If the
+            forces can be chosen, only the rows of the largest share or of ``unbalanced`` are computed.
     """
 
     forces: Array
@@ -46,7 +47,7 @@ class Distribution:
 
 @dataclass(frozen=True, eq=False)
 class Thrusts:
-    """Thrusts of the rotors ``names``, which the wrench on the base determines, ``u = P τ_base``, and their limits.
+    """Thrusts ``u = P τ_base`` of the rotors ``names``, determined by the wrench on the base, and their limits.
 
     ``matrix`` is ``P`` in N per N and N·m, shape (k, 6).  The limits are in N, shape (k,).
     """
@@ -58,16 +59,17 @@ class Thrusts:
 
 
 class Equilibrium:
-    """A robot at rest: rows ``R τ(q, z) + r``, first the balance of the base (= 0), then shares of limits.
+    """Equations of a robot at rest: rows ``R τ(q, z) + r`` of the base balance (= 0), then of shares of limits.
 
     A share is 0 in the middle of the range of an actuator, and ±1 at its limits.
 
     Args:
-        model: The robot, with gravity.
-        sources: Wrenches of rotors and feet in weights, and of pushes on the robot, N.
+        model: Model of the robot, with gravity.
+        sources: Sources of wrenches: rotors and feet, with forces in units of the robot's weight, and pushes on the
+            robot, N.
         weight: The weight of the robot, N.
-        limits: Largest torques, infinite where unknown, shape (nv,).
-        balance: Combinations of the base wrench that the sources balance, shape (b, 6); none for a fixed base.
+        limits: Largest joint torques, infinite if unknown, shape (nv,).
+        balance: Combinations of the base wrench that the sources can balance, shape (b, 6); no rows for a fixed base.
         thrusts: Thrusts of rotors that are not among the sources.
         names: Names of the entries of ``ν``.
     """
@@ -101,7 +103,7 @@ class Equilibrium:
             (weight * self.load.lower[self._free], weight * self.load.upper[self._free]),
         ]
         self.lower, self.upper = (np.concatenate(parts) for parts in zip(*ends, strict=True))
-        # The last results, because a search evaluates a posture several times.
+        # Cache of the last results, because a search evaluates a posture several times.
         self._even: tuple[bytes, float] | None = None
         self._latest: tuple[bytes, Distribution] | None = None
 
@@ -116,9 +118,10 @@ class Equilibrium:
         return A, b, np.vstack([torques, thrusts]), np.append(c, -middle / half)
 
     def spares(self, q: Array, room: float) -> bool:
-        """Return whether nearly even forces balance the base and keep every share ``room`` below its limit.
+        """Return whether a nearly even distribution of forces balances the base with all shares below ``1 − room``.
 
-        If they do, the posture can be held, and no linear program is needed.  If not, other forces may hold it.
+        If it does, the posture can be held, and no linear program is needed.  Otherwise, other forces may still hold
+        the posture.
         """
         key = q.tobytes()
         if self._even is None or self._even[0] != key:
@@ -126,7 +129,7 @@ class Equilibrium:
         return self._even[1] <= 1 - room
 
     def _even_share(self, q: Array) -> float:
-        """Return the largest share of a limit at nearly even forces; infinite if they do not balance the base."""
+        """Return the largest share of a limit at nearly even forces; infinite if the base is not balanced."""
         still = self.load.torque(q, np.zeros(self.load.count), by_posture=False)
         A, b, S, c = self._affine(still.value, still.by_force)
         lower, upper = self.load.lower, self.load.upper
@@ -140,13 +143,13 @@ class Equilibrium:
             pulling = pushing & (z < 0)
             if not pulling.any():
                 break
-            # Feet that would have to pull do nothing, and the others carry the load.
+            # Feet that would have to pull get zero force in the next iteration, and the other feet support the load.
             used &= ~pulling
         balanced = np.abs(A @ z + b).max(initial=0.0) < _TIED and (z[pushing] >= 0).all()
         return float(np.abs(S @ z + c).max(initial=0.0)) if balanced else np.inf
 
     def distribute(self, q: Array) -> Distribution:
-        """Return the forces with the least largest share if the base can be balanced, or else the least imbalance."""
+        """Return the forces that minimize the largest share, or the imbalance if the base cannot be balanced."""
         key = q.tobytes()
         if self._latest is None or self._latest[0] != key:
             self._latest = key, self._distribute(q)
@@ -162,14 +165,15 @@ class Equilibrium:
             return Distribution(np.zeros(0), c, 0.0, jacobian)
         z, unbalanced, duals = self._least_share(A, b, S, c) or self._least_imbalance(A, b)
         shares = S @ z + c
-        # The derivative of the optimum is the derivative of R τ at fixed z, weighted by the multipliers of its rows.
+        # The derivative of the optimal value is the derivative of R τ at fixed z, multiplied by the multipliers of
+        # its rows.
         gradient = duals @ self.rows @ self.load.torque(q, z).by_posture
         worst = np.abs(shares) > np.abs(shares).max(initial=0.0) - _TIED
         jacobian[np.append(unbalanced > 0, worst & (unbalanced == 0))] = gradient
         return Distribution(z, shares, unbalanced, jacobian)
 
     def shares(self, q: Array, load: Array) -> Array | None:
-        """Return the signed shares, shape (actuators,), for a load other than gravity, such as ``M ν̇ + h``.
+        """Return the signed shares, shape (actuators,), for a load other than gravity alone, such as ``M ν̇ + h``.
 
         The largest share is as small as possible.  ``None`` if the feet cannot balance the load.
         """
@@ -180,9 +184,9 @@ class Equilibrium:
         return None if optimum is None else S @ optimum[0] + c
 
     def largest_rate(self, q: Array, rest: Array, dynamic: Array) -> float | None:
-        """Return the largest ``λ ≥ 0`` for which the limits allow the load ``rest + λ dynamic``.
+        """Return the largest ``λ ≥ 0`` at which the actuators can hold the load ``rest + λ dynamic``.
 
-        The result is infinite if the limits allow every λ, and ``None`` if they do not even allow ``rest``.
+        The result is infinite if they can hold it for every λ, and ``None`` if they cannot even hold ``rest``.
         """
         A, b, S, c = self._affine(rest, self._by_force(q))
         rate = self.rows @ dynamic
@@ -203,10 +207,10 @@ class Equilibrium:
         return self.load.torque(q, np.zeros(self.load.count)).by_force
 
     def _least_share(self, A: Array, b: Array, S: Array, c: Array) -> tuple[Array, float, Array] | None:
-        """Return z, 0, multipliers of ``min s`` with ``A z + b = 0``, ``|S z + c| ≤ s``; ``None`` if infeasible."""
+        """Solve ``min s`` with ``A z + b = 0``, ``|S z + c| ≤ s``; return z, 0, multipliers, or ``None``."""
         count, one, infinite = self.load.count, np.ones((len(S), 1)), np.full(2 * len(S), np.inf)
         low, high = np.append(self.load.lower, 0.0), np.append(self.load.upper, np.inf)
-        # A thrust beyond its limits shows as a share above one.
+        # Thrusts have no bounds in this program, because a thrust beyond its limits has a share above one.
         low[self._free], high[self._free] = -np.inf, np.inf
         optimum = solve_linear(
             np.append(np.zeros(count), 1.0),
@@ -223,7 +227,7 @@ class Equilibrium:
         return optimum.x[:count], 0.0, duals[: len(self.rows)]
 
     def _least_imbalance(self, A: Array, b: Array) -> tuple[Array, float, Array]:
-        """Return z, the value and multipliers of ``min Σ|A z + b|`` within the limits of thrusts and feet."""
+        """Solve ``min Σ|A z + b|`` within the limits of thrusts and feet; return z, the value and the multipliers."""
         unit, slacks = np.eye(len(A)), np.zeros(2 * len(A))
         optimum = solve_linear(
             np.concatenate([np.zeros(self.load.count), slacks + 1]),

@@ -1,4 +1,4 @@
-"""The constraint that a robot can hold its posture: thrusts, torques and contact forces within their limits."""
+"""The constraint that thrusts, torques and contact forces within their limits can hold the posture."""
 
 from __future__ import annotations
 
@@ -21,28 +21,31 @@ from impact_posture.posture.loads.equilibrium import Equilibrium
 from impact_posture.posture.loads.static_load import StaticLoad
 from impact_posture.system.arrays import Array
 
-# The program lacks the rows if a posture violates them by more than this, half of what the certificate allows.
+# The rows are added to the program if a posture violates them by more than this, half the tolerance of the
+# certificate.
 _KEPT = 5e-9
-# A share of a limit closer to 1 than this may have a multiplier.
+# If a share of a limit differs from 1 by less than this, its row may be active and have a multiplier.
 _NEAR = 1e-3
-# A share of a limit counts less than meters: where a pose cannot be held, the actuators are the reason.
+# Price of a share of a limit in the search for conflicts, lower than the price of a meter.  If a pose cannot be held,
+# the actuators are thus named as the conflict, not the pose.
 _PRICE = 1e-3
 
 
 class Holdable(Constraint):
-    """Forces z exist with ``R τ(q, z)`` within bounds: the base is balanced, and no actuator exceeds its limits.
+    """The constraint that forces z exist with which the base is balanced and no actuator exceeds its limits.
 
-    ``c(q)`` has a row for the unbalanced wrench of the base, and ``share − 1`` for each actuator at the forces with
-    the least largest share.
+    In the program, ``R τ(q, z)`` must be within bounds.  ``c(q)`` has one row for the unbalanced wrench on the base
+    and the row ``share − 1`` for each actuator, at the forces that minimize the largest share.
 
     Args:
-        name: The load in words, such as ``at rest``.
-        active: Whether the program has the rows.  Most optima keep the limits anyway, and a program without the rows
-            is faster, so :meth:`grown` adds them only where an optimum violates a limit.
+        name: Name of the load, such as ``at rest``.
+        active: Whether the program contains the rows.  Most optima satisfy the limits without the rows, and a program
+            without the rows is faster.  So :meth:`grown` adds the rows only if an optimum violates a limit.
     """
 
     price = _PRICE
-    # Most starts end within the limits anyway, and starts that are pulled onto this constraint are less diverse.
+    # Most starts end within the limits without a projection, and starts that are projected onto this constraint
+    # differ less.
     projected = False
     by_row = True
 
@@ -67,16 +70,16 @@ class Holdable(Constraint):
 
     def evaluate(self, model: Numeric) -> tuple[Array, Array]:
         forces = self._rest.distribute(model.q)
-        # Without a balance no torque is known.
+        # If the base is not balanced, the shares are not known, so their rows are reported as satisfied.
         shares = np.full(len(self._names), -1.0) if forces.unbalanced else np.abs(forces.shares) - 1
         return np.append(forces.unbalanced, shares), forces.jacobian
 
     def value(self, model: Numeric) -> Array:
-        """Return ``c(q)``, or zeros if even forces show that the posture can be held."""
+        """Return ``c(q)``, or zeros if nearly even forces already hold the posture."""
         return np.zeros(self.rows) if self._rest.spares(model.q, 0.0) else self.evaluate(model)[0]
 
     def grown(self, model: Numeric, auxiliaries: Array | None = None) -> Self:
-        """Add the rows where a posture violates them; this is rare, so a program without them is worth compiling."""
+        """Add the rows if the posture violates them."""
         if self.active or self.value(model).max() <= _KEPT:
             return self
         return type(self)(self._load, self._rest, self._description, active=True)
@@ -110,8 +113,8 @@ class Holdable(Constraint):
     def linearize(self, model: Numeric, auxiliaries: Array) -> Linearization:
         """Return the rows of :meth:`lift` and the bounds of the forces.
 
-        If the program lacks the rows, the forces have the least largest share.  No row is returned where even forces
-        stay away from all limits.
+        If the program lacks the rows, the forces that minimize the largest share are used.  If nearly even forces
+        stay away from all limits, no rows are returned.
         """
         rest, load, z = self._rest, self._rest.load, auxiliaries
         if not self.active:
@@ -132,10 +135,11 @@ class Holdable(Constraint):
 
 
 class ReachableWrench(ExpressionConstraint):
-    """The rotors can make the wrench on the base: ``R h(q) = 0`` for the combinations that they cannot make.
+    """The rotors can produce the wrench on the base: ``R h(q) = 0`` for all combinations that they cannot produce.
 
-    For example, rotors in one plane make no side force, so the robot has to be level to hold its weight.  ``rows``
-    are ``R`` on the base wrench in weights, shape (6 − rank of the allocation, 6).
+    For example, parallel rotors produce no side force, so the robot has to be level to hold its weight.  ``rows`` is
+    the matrix ``R``, which acts on the base wrench in units of the robot's weight, shape (6 − rank of the allocation,
+    6).
     """
 
     price = _PRICE

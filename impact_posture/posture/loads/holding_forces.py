@@ -1,4 +1,4 @@
-"""The forces that hold a posture: the torque or thrust of every actuator with its limits, and forces of the feet."""
+"""The forces that hold a posture: the torque or thrust of each actuator with its limits, and the foot forces."""
 
 from __future__ import annotations
 
@@ -9,15 +9,17 @@ import numpy as np
 from impact_posture.posture.loads.equilibrium import Equilibrium
 from impact_posture.system.arrays import Array
 
-# A share up to this above 1, and an unbalanced wrench up to this in weights, are rounding of the solver.
+# An excess of a share above 1, or an unbalanced wrench in units of the robot's weight, is a rounding error of the
+# solver up to this value.
 _ROUNDING = 1e-6
 
 
 @dataclass(frozen=True)
 class ActuatorLoad:
-    """Torque (N·m), force of a prismatic joint (N) or thrust (N) of an actuator between its limits.
+    """Torque (N·m), force of a prismatic joint (N) or thrust (N) of an actuator, with its limits.
 
-    ``share`` is the distance from the middle of the range divided by half the range, 1 at a limit.
+    ``share`` is the distance of ``value`` from the middle of the range, divided by half the range; it is 1 at a
+    limit.
     """
 
     value: float
@@ -28,15 +30,16 @@ class ActuatorLoad:
 
 @dataclass(frozen=True)
 class HoldingForces:
-    """Forces that hold a posture with the least largest share of a limit.
+    """Forces that hold a posture, chosen to minimize the largest share of an actuator limit.
 
     Attributes:
-        load: The load in words, such as ``at rest``.
-        feasible: Whether the robot can hold it.
-        unbalanced: Sum of the absolute entries of the unbalanced wrench on the base, in weights (moments over 1 m).
+        load: Name of the load, such as ``at rest``.
+        feasible: Whether the robot can hold the posture under this load.
+        unbalanced: Sum of the absolute entries of the unbalanced wrench on the base, with forces in units of the
+            robot's weight and moments in units of weight times 1 m.
         actuators: Load of each actuator with known limits.
-        contact_forces: Force on each foot, world axes, N.
-        other_loads: Holding forces under a force to hold and with payloads.
+        contact_forces: Force of the ground on each foot, world axes, N.
+        other_loads: Holding forces for the other load cases: with the force ``hold_force`` and with payloads.
     """
 
     load: str
@@ -49,7 +52,10 @@ class HoldingForces:
 
     @staticmethod
     def of(load: str, rest: Equilibrium, unreachable: Array, q: Array) -> HoldingForces:
-        """Distribute the forces at ``q``; rotors cannot make the base wrenches in ``unreachable``, shape (k, 6)."""
+        """Distribute the forces at ``q``.
+
+        The rows of ``unreachable``, shape (k, 6), are combinations of the base wrench that the rotors cannot produce.
+        """
         distribution = rest.distribute(q)
         z, shares = distribution.forces, distribution.shares
         unbalanced = distribution.unbalanced
@@ -72,7 +78,7 @@ class HoldingForces:
         )
 
     def violations(self) -> list[str]:
-        """Return why the robot cannot hold the posture under each load, one line each; empty if it can."""
+        """Return a line for each reason why the robot cannot hold the posture under a load; empty if it can."""
         lines = []
         if self.unbalanced > _ROUNDING:
             lines.append(f"{self.load}, nothing bears {self.unbalanced:.2g} weights of the wrench on its base")

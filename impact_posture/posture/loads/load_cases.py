@@ -1,4 +1,4 @@
-"""The loads under which a robot has to hold its posture: at rest before the impact, and pushing after it."""
+"""The loads under which a robot has to hold its posture: at rest before the impact, and pushing afterwards."""
 
 from __future__ import annotations
 
@@ -24,17 +24,19 @@ from impact_posture.system.arrays import Array
 
 # Number of edges of the pyramid inside a friction cone.
 _EDGES = 4
-# With more friction the pyramid would be so flat that its edges carry no weight.
+# Upper limit of the friction coefficient.  With more friction, the edges of the pyramid would be nearly horizontal
+# and could hardly support weight.
 _MOST_FRICTION = 10.0
-# Singular values of the map from forces to the base wrench below this share of the largest are rounding.
+# A singular value of the map from forces to the base wrench is treated as zero below this share of the largest one.
 _RANK = 1e-9
 
 
 @dataclass(frozen=True, eq=False)
 class LoadCase:
-    """One load that the robot has to hold, with its name in words, such as ``at rest``.
+    """One load that the robot has to hold; ``name`` is for example ``at rest``.
 
-    ``unreachable`` are combinations of the base wrench that the rotors cannot make, shape (6 − r, 6).
+    The rows of ``unreachable``, shape (6 − r, 6), are combinations of the base wrench that the rotors cannot produce.
+    Here r is the rank of the map from forces to the base wrench.
     """
 
     name: str
@@ -55,7 +57,7 @@ class LoadCase:
 class LoadCases:
     """The load cases of a problem, with notes for the user about missing data.
 
-    ``unknown`` says why there are no load cases; it is empty if there are any.
+    ``unknown`` is the reason why there are no load cases; it is empty if there are load cases.
     """
 
     cases: tuple[LoadCase, ...] = ()
@@ -63,7 +65,7 @@ class LoadCases:
     unknown: str = ""
 
     def holding(self, q: Array) -> HoldingForces | None:
-        """Return the forces that hold ``q`` at rest and in the other cases; ``None`` without cases."""
+        """Return the forces that hold ``q`` at rest and in the other cases; ``None`` if there are no cases."""
         if not self.cases:
             return None
         first, *others = [HoldingForces.of(case.name, case.equilibrium, case.unreachable, q) for case in self.cases]
@@ -71,10 +73,10 @@ class LoadCases:
 
 
 def load_cases(objective: Objective, q: Array, requirements: Requirements) -> LoadCases:
-    """Return the load cases for which the data of the robot are sufficient, at a posture with the feet in place.
+    """Return the load cases if the data of the robot are sufficient; ``q`` is a posture with the feet in place.
 
-    Before the impact the contact bears no force.  With a ``hold_force`` the robot must also hold this force along the
-    normal of every contact.  Each payload that the robot may carry adds these cases once more.
+    Before the impact, no force acts on the contact.  If ``hold_force`` is set, the robot must also hold this force
+    along the normal of every contact.  For each payload of the robot, these cases are added once more.
 
     Raises:
         InputError: A force has to be held, but the data of the robot are not sufficient.
@@ -102,7 +104,7 @@ def load_cases(objective: Objective, q: Array, requirements: Requirements) -> Lo
     what = " and ".join([", ".join(kinds[:-1]), kinds[-1]] if kinds[1:] else kinds)
     sources, balance, thrusts = [*rotors, *feet], reach[:rank], Thrusts()
     if rotors and not feet and rank == rotors[0].lower.size:
-        # The base wrench determines the thrusts of independent rotors, so these need no unknowns.
+        # The base wrench determines the thrusts of independent rotors, so these thrusts need no unknowns.
         limit = weight * rotors[0].lower, weight * rotors[0].upper
         thrusts = Thrusts(rotors[0].names, np.asarray(np.linalg.pinv(rotors[0].columns / weight)), *limit)
         sources, balance = [], balance[:0]
@@ -119,17 +121,17 @@ def load_cases(objective: Objective, q: Array, requirements: Requirements) -> Lo
 
 
 def _reach(load: StaticLoad, q: Array) -> tuple[Array, int]:
-    """Return orthonormal combinations of the base wrench, first the reachable ones, and the number of these."""
+    """Return orthonormal combinations of the base wrench, the reachable ones first, and how many are reachable."""
     vectors, values, _ = np.linalg.svd(load.torque(q, np.zeros(load.count)).by_force[:6])
     return vectors.T, int((values > _RANK * values.max(initial=0.0)).sum())
 
 
 def _models(objective: Objective) -> list[tuple[pin.Model, str]]:
-    """Return the model of the robot, and its models with payloads, each with a suffix for names."""
+    """Return the model of the robot and its models with payloads, each with a suffix for the names of load cases."""
     models = [(objective.robot.model, "")]
     if isinstance(objective, WorstCaseObjective):
         for variant in objective.model_variants[1:]:
-            # The armature does not change the weight.
+            # Variants that change the armature are skipped, because the armature does not change the weight.
             if variant.payload is not None and variant.armature_factor == 1:
                 models.append((variant.robot.model, f" ({variant.name})"))
     return models
@@ -148,7 +150,10 @@ def _rotors(robot: Robot, weight: float, share: float) -> list[ForceSource]:
 
 
 def _feet(objective: Objective, weight: float, friction: float) -> list[ForceSource]:
-    """Return the forces at contact points or corners of soles: edges of pyramids about world z, in weights."""
+    """Return the foot forces, at contact points or corners of soles, in units of the robot's weight.
+
+    Each force is a sum along the edges of a friction pyramid around the world z axis.
+    """
     angles = 2 * np.pi * np.arange(_EDGES) / _EDGES
     slope = min(friction, _MOST_FRICTION)
     edges = np.array([slope * np.cos(angles), slope * np.sin(angles), np.ones(_EDGES)])

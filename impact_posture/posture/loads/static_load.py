@@ -1,8 +1,8 @@
-"""Joint torques of a robot at rest, as an expression of CasADi and as numbers of Pinocchio.
+"""Joint torques of a robot at rest, as a CasADi expression and as numbers from Pinocchio.
 
 A robot at rest under gravity satisfies ``τ = h(q) − Σ J_kᵀ w_k``, with the generalized gravity ``h`` and the wrenches
 ``w_k = W_k z_k + p_k`` of rotors, feet and pushes on the robot.  ``τ`` is dual to ``ν``.  For a floating base its
-first six entries are the unbalanced wrench, which no actuator bears.
+first six entries are the unbalanced wrench on the base, which no actuator can produce.
 """
 
 from __future__ import annotations
@@ -21,14 +21,15 @@ from impact_posture.system.arrays import Array
 
 @dataclass(frozen=True, eq=False)
 class ForceSource:
-    """A wrench ``W z + p`` on a link, in world axes or in the axes of a frame.
+    """A wrench ``W z + p`` on a link, with unknowns z, in world axes or in the axes of a frame.
 
     Attributes:
-        point: Point of the link, with the axes of the frame.
+        point: Point on the link where the wrench acts, with the axes of the frame.
         columns: ``W``, force (N) above moment (N·m) about the point per unit z, shape (6, k).
         lower, upper: Bounds of z, shape (k,).
-        in_frame: Whether the wrench has the axes of the frame and turns with the link.
-        constant: ``p``, shape (6,).
+        in_frame: Whether the wrench is given in the axes of the frame, so that it turns with the link; otherwise in
+            world axes.
+        constant: Constant wrench ``p``, N and N·m, shape (6,).
     """
 
     point: PointOnLink
@@ -44,7 +45,7 @@ class ForceSource:
 class StaticTorque:
     """``τ(q, z)`` at one posture, shape (nv,), and its derivatives.
 
-    ``by_posture`` is the tangent Jacobian ``∂τ/∂q``, shape (nv, nv), zero if it was not asked for.  ``by_force`` is
+    ``by_posture`` is the tangent Jacobian ``∂τ/∂q``, shape (nv, nv), zero if it was not requested.  ``by_force`` is
     ``∂τ/∂z``, shape (nv, k).
     """
 
@@ -73,7 +74,7 @@ class StaticLoad:
 
     @property
     def content(self) -> list[object]:
-        """All numbers that enter the expressions."""
+        """All numbers on which the expressions depend."""
         parts = [self.model.gravity.linear, *(inertia.toDynamicParameters() for inertia in self.model.inertias)]
         for source in self.sources:
             point = source.point
@@ -85,7 +86,7 @@ class StaticLoad:
         return np.split(z, self._parts[1:-1]) if self.sources else []
 
     def symbolic(self, tree: Tree, z: ca.SX) -> ca.SX:
-        """Return ``τ(q, z)`` as an expression, shape (nv, 1); ``tree`` gives q and may be of another model."""
+        """Return ``τ(q, z)`` as an expression, shape (nv, 1), at ``tree.q``; ``tree`` may belong to another model."""
         tree = tree if tree.model is self.model else Tree(self.model, tree.q)
         wrenches = []
         for source, start, stop in zip(self.sources, self._parts, self._parts[1:], strict=False):
@@ -94,10 +95,10 @@ class StaticLoad:
         return -tree.generalized_force(wrenches, constant(self.model.gravity.linear))
 
     def torque(self, q: Array, z: Array, *, by_posture: bool = True) -> StaticTorque:
-        """Return ``τ`` and its derivatives at a posture; without ``∂τ/∂q`` it takes less time.
+        """Return ``τ`` and its derivatives at a posture; leaving out ``∂τ/∂q`` saves time.
 
-        Pinocchio keeps forces constant in the axes of the link.  In these axes a force with world axes becomes
-        ``f + f × δ`` if the link turns by δ.
+        Pinocchio computes derivatives for forces that are constant in the axes of the link.  In these axes, a force
+        that is constant in the world becomes ``f + f × δ`` if the link turns by δ.
         """
         model, data = self.model, self._data
         pin.computeJointJacobians(model, data, q)

@@ -1,7 +1,7 @@
 """The constraint manifold of a posture problem, evaluated at many postures at once.
 
-The functions of the program take one posture at a time.  Here CasADi evaluates a batch of postures, and NumPy solves
-the small linear systems of the batch together.  A posture of talos costs about 0.1 ms.
+The functions of the program evaluate one posture at a time.  Here, CasADi evaluates a batch of postures, and NumPy
+solves the small linear systems of the batch together.  A posture of talos takes about 0.1 ms.
 """
 
 from __future__ import annotations
@@ -29,18 +29,18 @@ _LONGEST_STEP = 0.5
 
 @dataclass(frozen=True)
 class Projected:
-    """Postures pulled onto the manifold, in chart coordinates, shape (N, nx), and whether each satisfies the rows."""
+    """Projected postures in chart coordinates, shape (N, nx), and whether each satisfies the equalities."""
 
     x: Array
     converged: NDArray[np.bool_]
 
 
 class ConstraintManifold:
-    """``{q : c(q) = 0}`` for the equalities of a problem with an impact objective.
+    """The set ``{q : c(q) = 0}`` for the equalities of a problem with an impact objective.
 
     Coordinates are chart coordinates ``x`` and tangent vectors ``v``.  Postures that differ by full turns of joints
-    are the same, so a joint with a range of a turn or more has no limit: its entries of ``lower`` and ``upper``,
-    shape (nx,), are infinite.
+    are the same.  A joint whose range is at least a full turn therefore has no limit, and its entries of ``lower``
+    and ``upper``, shape (nx,), are infinite.
     """
 
     def __init__(self, problem: ConstrainedProblem) -> None:
@@ -50,7 +50,7 @@ class ConstraintManifold:
         tree = Tree(model, self.chart.configuration(x), x)
         motion = _tangent_map(self.chart.slots, tree.q, self.chart.nx)
         held = held_rows(problem.robot, problem.requirements.hold)
-        # A constraint with auxiliaries has no expression in q alone, and counts as an inequality.
+        # A constraint with auxiliaries has no expression in q alone, so it is treated as an inequality.
         equalities = [
             c for c in problem.constraints if isinstance(c, ExpressionConstraint) and c.equality and c.projected
         ]
@@ -82,7 +82,7 @@ class ConstraintManifold:
         return value[:, 0, 0], gradient[:, :, 0]
 
     def distance_to_feasible(self, x: Array) -> Array:
-        """Return the first-order distance from limits and inequalities, shape (N,); zero where all hold."""
+        """Return the first-order distance to the set that satisfies limits and inequalities, shape (N,)."""
         outside = np.maximum(np.maximum(self.lower - x, x - self.upper), 0.0).max(axis=1, initial=0.0)
         numeric = Numeric(self.problem.robot.model)
         for k in range(len(x) if self._inequalities else 0):
@@ -98,15 +98,18 @@ class ConstraintManifold:
         return np.asarray(np.linalg.svd(self.equalities(x)[1])[2][:, self.chart.nv - dimension :])
 
     def move(self, x: Array, v: Array) -> Array:
-        """Return postures moved by tangent vectors, shape (N, nv), without full turns; to first order for a base."""
+        """Return postures moved by tangent vectors, shape (N, nv), without full turns of joints.
+
+        The motion of a floating base is accurate to first order.
+        """
         moved = _call(self._moved, x, v)[0][:, :, 0]
         turns = np.where(self._turning, np.floor((moved - self._middle + np.pi) / (2 * np.pi)), 0.0)
         return np.asarray(moved - 2 * np.pi * turns)
 
     def project(self, x: Array, steps: int = 20, *, within: bool = False) -> Projected:
-        """Pull postures, shape (N, nx), onto the equalities by Gauss–Newton steps of least norm.
+        """Project postures, shape (N, nx), onto the equalities by Gauss–Newton steps of least norm.
 
-        ``within`` also keeps them within the limits.
+        With ``within``, the postures also stay within the joint limits.
         """
         x, left = x.copy(), np.arange(len(x))
         converged = np.zeros(len(x), dtype=bool)
@@ -123,12 +126,12 @@ class ConstraintManifold:
         return Projected(x, converged)
 
     def embed(self, x: Array) -> Array:
-        """Return points, shape (N, k), whose Euclidean distances equal small distances of the postures."""
+        """Return points, shape (N, k); their Euclidean distances equal the distances of postures that are close."""
         parts = [np.zeros((len(x), 0))]
         for slot in self.chart.slots:
             piece = x[:, slot.x]
             if slot.kind.family in ("free-flyer", "spherical"):
-                # Two rotation matrices differ by √8 sin(angle/2).
+                # The Frobenius norm of the difference of two rotation matrices is √8 sin(angle/2).
                 parts += [piece[:, :-4], _rotations(piece[:, -4:]) / np.sqrt(2)]
             elif slot.kind.family in ("revolute", "continuous", "planar"):
                 parts += [piece[:, :-1], np.cos(piece[:, -1:]), np.sin(piece[:, -1:])]
@@ -162,7 +165,7 @@ def _least_norm(jacobian: Array, value: Array) -> Array:
     """Return the steps of least norm with ``J v = c``, shortened to the longest step, shape (N, nv)."""
     gram = jacobian @ jacobian.transpose(0, 2, 1)
     rows = np.arange(gram.shape[1])
-    # Rows may repeat others, and a planar arm has rows of zeros.
+    # The matrix may be singular: rows can be duplicates, and rows of a planar arm can be zero.
     gram[:, rows, rows] += _ROUNDING * np.maximum(1.0, np.trace(gram, axis1=1, axis2=2))[:, None]
     step = (jacobian.transpose(0, 2, 1) @ np.linalg.solve(gram, value[:, :, None]))[:, :, 0]
     length = np.linalg.norm(step, axis=1, keepdims=True)

@@ -1,4 +1,4 @@
-"""Feasible starts: random postures that are pulled onto the constraint manifold."""
+"""Feasible starts: random postures that are projected onto the constraint manifold."""
 
 from __future__ import annotations
 
@@ -13,14 +13,15 @@ from impact_posture.dynamics.numeric import Numeric
 from impact_posture.posture.program.constrained_problem import ConstrainedProblem, held_rows
 from impact_posture.system.arrays import Array
 
-# A constraint with a violation up to this (m, rad) is satisfied.
+# A constraint is satisfied if its violation is at most this (m, rad).
 FEASIBLE = 1e-8
-# Most random postures that one start pulls onto the constraints.
+# Maximum number of random postures that are projected onto the constraints for one start.
 ATTEMPTS = 20
 _STEPS = 80
-# The projection stops if the violation falls by less than a fifth in this many steps: it would hardly ever converge.
+# The projection stops if the violation decreases by less than a fifth in this many steps, because it would hardly
+# ever converge.
 _PATIENCE = 16
-# Most postures on the projected constraints that one start chooses from.
+# Maximum number of projected postures among which one start is chosen.
 CANDIDATES = 3
 # Share of the trace that is added to the diagonal of a matrix that may be singular.
 _ROUNDING = 1e-13
@@ -28,14 +29,14 @@ _ROUNDING = 1e-13
 
 @dataclass(frozen=True)
 class Projection:
-    """A posture pulled towards the constraints, and its largest violation (m, rad, or the unit of the constraint)."""
+    """A projected posture, and its largest remaining violation (m, rad, or the unit of the constraint)."""
 
     q: Array
     violation: float
 
 
 class Projector:
-    """Levenberg–Marquardt projection onto the projected constraints within the limits, without moving held joints."""
+    """Levenberg–Marquardt projection onto the constraints with ``projected``; held joints do not move."""
 
     def __init__(self, problem: ConstrainedProblem) -> None:
         self.problem = problem
@@ -56,7 +57,7 @@ class Projector:
         return np.minimum(np.maximum(self.chart.to_x(q), self.problem.lower), self.problem.upper)
 
     def residual(self, q: Array) -> tuple[Array, Array]:
-        """Return the violations of all rows at ``q``, zero where an inequality holds, and their Jacobian."""
+        """Return the violations of all rows at ``q`` and their Jacobian; both are zero for satisfied inequalities."""
         self.numeric.at(q)
         values, jacobians = [np.zeros(0)], [np.zeros((0, self.problem.robot.nv))]
         for constraint, equality in self._projected:
@@ -69,7 +70,10 @@ class Projector:
         return np.concatenate(values), np.concatenate(jacobians)
 
     def outside(self, q: Array, most: float = np.inf) -> float:
-        """Return the summed violation of all constraints that are not projected; above ``most`` it may be too low."""
+        """Return the sum of the violations of all constraints that are not projected.
+
+        If the sum exceeds ``most``, the result may be too low.
+        """
         self.numeric.at(q)
         total = 0.0
         for constraint in self._free:
@@ -79,7 +83,7 @@ class Projector:
         return total
 
     def project(self, q: Array, tolerance: float = 1e-9) -> Projection:
-        """Pull ``q`` onto the constraints; the result may still violate them."""
+        """Project ``q`` onto the constraints; the result may still violate the constraints."""
         x = self._clipped(q)
         q = self.chart.to_q(x)
         value, jacobian = self.residual(q)
@@ -97,7 +101,8 @@ class Projector:
                 gram = free @ free.T
                 diagonal = gram.reshape(-1)[:: len(gram) + 1]
                 plain = diagonal.copy()
-                # Rows may repeat others (two frames on one link), so the damping must stay above rounding.
+                # Rows can be duplicates, for example of two frames on one link, so the damping must exceed rounding
+                # errors.
                 least = _ROUNDING * max(1.0, float(plain.sum()))
             diagonal[:] = plain + (damping * min(1.0, size) + least)
             step = -free.T @ np.linalg.solve(gram, value)
@@ -115,7 +120,7 @@ class Projector:
         return Projection(q, float(np.abs(value).max(initial=0.0)))
 
     def _blocked(self, x: Array, direction: Array) -> NDArray[np.bool_]:
-        """Return which tangent entries are at a limit that the descent direction would violate, shape (nv,)."""
+        """Return a mask, shape (nv,), of the tangent entries at a limit that the descent direction would violate."""
         at, along = x[self._in_x], direction[self._in_v]
         at_low = (at <= self._low + 1e-12) & (along < 0)
         at_high = (at >= self._high - 1e-12) & (along > 0)
@@ -134,10 +139,10 @@ def feasible_start(
 ) -> Array | None:
     """Return the ``index``-th feasible start of a seed, or ``None`` if no attempt reached the constraints.
 
-    Start 0 is the given posture, pulled onto the constraints.  Odd starts lie near the posture ``around``, by default
-    the given one, and even starts anywhere within the limits.  Near starts reach the constraints more often, far
-    starts find other optima.  Among ``candidates`` postures on the projected constraints, the start violates the
-    other constraints least.  ``projector`` may belong to a problem that grew into this one.
+    Start 0 is the given posture, projected onto the constraints.  Odd starts lie near the posture ``around``, by
+    default the given one.  Even starts lie anywhere within the limits.  Near starts reach the constraints more often;
+    far starts lead to other optima.  Of ``candidates`` projected postures, the start is the one that violates the
+    other constraints least.  ``projector`` may belong to a problem from which this problem has grown.
     """
     if index == 0:
         projection = (projector or Projector(problem)).project(problem.given)
@@ -146,7 +151,7 @@ def feasible_start(
 
 
 class StartDraw:
-    """The random postures of one start, drawn only as needed; see :func:`feasible_start`."""
+    """The random postures of one start, drawn when they are needed; see :func:`feasible_start`."""
 
     def __init__(
         self,
@@ -165,7 +170,7 @@ class StartDraw:
         self._least = np.inf
 
     def choose(self, candidates: int) -> Array | None:
-        """Return the best of ``candidates`` postures on the projected constraints, counting earlier calls."""
+        """Return the best of ``candidates`` projected postures, including those of earlier calls."""
         while self._attempts < ATTEMPTS and self._tried < candidates and self._least > FEASIBLE:
             near = self._around if (self._index + self._attempts) % 2 else None
             self._attempts += 1

@@ -15,10 +15,10 @@ from impact_posture.system.arrays import Array
 
 @dataclass(frozen=True)
 class NullSpacePath:
-    """Postures that satisfy the constraints, shape (N, nq), and the impact along them.
+    """Postures ``q`` of a path along the constraints, shape (N, nq), and the impact quantities at each posture.
 
-    ``s`` is the path length, tangent norm, shape (N,).  The objective, H, G, V and S have the same shape.  S is NaN
-    where undefined.
+    ``s`` is the path length in the tangent norm, shape (N,).  The objective, H, G, V and S have the same shape.  S is
+    NaN at postures where it is undefined.
     """
 
     q: Array
@@ -31,7 +31,7 @@ class NullSpacePath:
 
 
 def null_space_path(problem: ConstrainedProblem, start: Array, end: Array, points: int = 61) -> NullSpacePath:
-    """Interpolate from ``start`` to ``end`` on the manifold and pull every point onto the constraints."""
+    """Interpolate from ``start`` to ``end`` and project every point onto the constraints."""
     projector, model = Projector(problem), problem.robot.model
     postures = [start]
     for t in np.linspace(0, 1, points)[1:-1]:

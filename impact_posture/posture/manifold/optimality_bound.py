@@ -3,7 +3,7 @@
 A patch is the part of the manifold within a radius r of its center.  With ``φ = ln f``, its gradient g along the
 manifold and a bound M on the curvature of φ, the patch has ``φ ≥ φ(center) − ‖g‖ r − M r²/2``.  M is estimated from
 the gradients at neighbors, so the result is an estimate as well.  It is therefore called *bounded* and not proved.
-The logarithm makes the bound relative, and keeps it useful near the poles of V and S.
+The logarithm makes the bound relative and useful even near the poles of V and S.
 """
 
 from __future__ import annotations
@@ -17,29 +17,32 @@ from impact_posture.posture.manifold.constraint_manifold import ConstraintManifo
 from impact_posture.posture.manifold.self_motion import SelfMotion
 from impact_posture.system.arrays import Array
 
-# Factor on the largest curvature between neighbors.
+# Safety factor on the largest curvature between neighbors.
 _SAFETY = 2.0
-# A posture is feasible if limits and inequalities hold up to this distance.
+# A posture is feasible if its distance from satisfying the limits and inequalities is at most this.
 _FEASIBLE = 1e-7
-# A patch is left out if the feasible set is farther from its center than this many radii, to first order.
+# A patch is discarded if the first-order distance of its center from the feasible set exceeds this many radii.
 _BEYOND = 1.5
 _MOST = 200_000
-# Seven discs of half the radius, one of them in the middle, cover a disc; two segments of half the length a segment.
+# A disc is covered by seven discs of half the radius, one of them in the middle.  A segment is covered by two
+# segments of half the length.
 _RING = [[np.sqrt(0.75) * np.cos(a), np.sqrt(0.75) * np.sin(a)] for a in np.pi / 3 * np.arange(6)]
 _PARTS = {1: np.array([[-0.5], [0.5]]), 2: np.array([[0.0, 0.0], *_RING])}
-# Parts overlap a little, because the manifold is curved.
+# Ratio of the radius of a part to the radius of its parent.  It exceeds 1/2 so that the parts overlap, because the
+# manifold is curved.
 _HALF = 0.52
 
 
 @dataclass(frozen=True, eq=False)
 class OptimalityBound:
-    """The best posture on the mapped components, and an estimated lower bound on the objective on all of them.
+    """The best posture on the mapped components, and an estimated lower bound of the objective on all components.
 
     Attributes:
         best: Least objective of a feasible posture.
-        x: Center of a patch with the objective ``best``, shape (nx,); ``None`` if the known posture is best.
+        x: Posture with the objective ``best``, the center of a patch, shape (nx,); ``None`` if the known posture is
+            best.
         patches: Number of evaluated patches.
-        finished: Whether every patch reached the wanted gap.
+        finished: Whether the bound of every patch is within the requested gap.
     """
 
     best: float
@@ -50,13 +53,13 @@ class OptimalityBound:
 
     @property
     def gap(self) -> float:
-        """``1 − lower/best``."""
+        """Relative gap between the bound and the best objective, ``1 − lower/best``."""
         return max(0.0, 1 - self.lower / self.best)
 
 
 @dataclass(frozen=True, eq=False)
 class _Patches:
-    """Patches: center (N, nx), radius (N,), φ (N,), gradient along the manifold (N, nv), curvature (N,)."""
+    """Center (N, nx), radius (N,), φ (N,), gradient along the manifold (N, nv) and curvature (N,) of patches."""
 
     x: Array
     radius: Array
@@ -66,7 +69,7 @@ class _Patches:
 
     @property
     def lower(self) -> Array:
-        """Bound on φ in each patch; −∞ where the center has no objective."""
+        """Lower bound of φ in each patch; −∞ if the objective is not defined at the center."""
         slope = np.linalg.norm(self.gradient, axis=1)
         bound = self.value - slope * self.radius - self.curvature * self.radius**2 / 2
         return np.where(np.isfinite(bound), bound, -np.inf)
@@ -76,9 +79,9 @@ class _Patches:
 
 
 def bound_objective(motion: SelfMotion, best: float, gap: float = 0.01) -> OptimalityBound:
-    """Split patches until none can contain a feasible posture with an objective below ``(1 − gap) best``.
+    """Split patches until no patch can contain a feasible posture with an objective below ``(1 − gap) best``.
 
-    ``best`` is the objective of a known feasible posture, or infinity.
+    ``best`` is the objective of a known feasible posture, or infinity if no feasible posture is known.
     """
     manifold, dimension = motion.manifold, motion.dimension
     x = np.concatenate([component.x for component in motion.components])
@@ -88,7 +91,7 @@ def bound_objective(motion: SelfMotion, best: float, gap: float = 0.01) -> Optim
     count, retired, best_x = len(x), np.inf, None
     while len(active.x):
         retired, active = _retire(active, retired, best * (1 - gap))
-        # The feasibility test takes longest, so it comes after the first bound.
+        # The feasibility test takes the most time, so patches that the bound excludes are removed first.
         distance = manifold.distance_to_feasible(active.x)
         values = np.where((distance <= _FEASIBLE) & np.isfinite(active.value), active.value, np.inf)
         if values.size and np.exp(values.min()) < best * (1 - 1e-9):
@@ -103,13 +106,13 @@ def bound_objective(motion: SelfMotion, best: float, gap: float = 0.01) -> Optim
 
 
 def _retire(active: _Patches, retired: float, threshold: float) -> tuple[float, _Patches]:
-    """Return the least bound on φ of all retired patches, and the patches that may lie below a threshold."""
+    """Retire patches whose bound exceeds ``threshold``; return the least bound of retired patches, and the rest."""
     below = active.lower < np.log(threshold)
     return min(retired, float(active.lower[~below].min(initial=np.inf))), active.where(below)
 
 
 def _curvature(manifold: ConstraintManifold, x: Array, gradient: Array) -> Array:
-    """Return a safe estimate of the curvature: twice the change of the gradient per distance to neighbors, (N,)."""
+    """Estimate the curvature from above, shape (N,): twice the change of the gradient per distance to neighbors."""
     from scipy.spatial import cKDTree
 
     points = manifold.embed(x)
@@ -121,7 +124,7 @@ def _curvature(manifold: ConstraintManifold, x: Array, gradient: Array) -> Array
 
 
 def _split(manifold: ConstraintManifold, dimension: int, parents: _Patches) -> _Patches:
-    """Return the parts of patches; the curvature of a part is at least half of its parent's."""
+    """Split each patch into parts; the curvature of a part is at least half the curvature of the patch."""
     parts = _PARTS[dimension]
     basis = manifold.tangents(parents.x, dimension)
     steps = np.einsum("n,pd,ndv->npv", parents.radius, parts, basis)

@@ -1,8 +1,10 @@
-"""The self-motion manifold of a problem with one or two degrees of freedom left, mapped by continuation.
+"""The self-motion manifold of a problem with one or two free degrees of freedom, mapped by continuation.
 
-A self-motion moves the robot while all equalities hold (J. W. Burdick, "On the inverse kinematics of redundant
-manipulators: characterization of the self-motion manifolds", ICRA 1989).  No motion within the joint limits leads
-from one component of the manifold to another.  One degree of freedom gives curves, two give surfaces.
+During a self-motion, the robot moves and all equalities stay satisfied (J. W. Burdick, "On the inverse kinematics of
+redundant
+manipulators: characterization of the self-motion manifolds", ICRA 1989).  The robot cannot move from one component of
+    the manifold to another within the joint limits.  With one degree of freedom, components are curves; with two,
+    surfaces.
 """
 
 from __future__ import annotations
@@ -17,19 +19,26 @@ from impact_posture.posture.manifold.constraint_manifold import ConstraintManifo
 from impact_posture.posture.manifold.feasible_start import random_posture
 from impact_posture.system.arrays import Array
 
-# Steps along a curve, rad or m: the first, the longest, and one so short that the curve is singular.
+# Steps along a curve, rad or m: the first step, the longest step, and the step below which the curve is treated as
+# singular.
 _FIRST, LONGEST_STEP, _SINGULAR = 0.02, 0.08, 1e-7
-# Least cosine of the turn of the tangent in a step, and the cosine above which steps grow.
+# Least cosine of the angle by which the tangent turns in one step, and the cosine above which the next step is
+# longer.
 _TURN, _STRAIGHT = 0.98, 0.995
-# A posture belongs to a node if it is off the tangent space of the node by at most this share of its distance.
+# A posture belongs to a node only if its distance from the tangent space of the node is at most this share of its
+# distance from the node.
 _FLAT = 0.2
-# Points of a curve are within this share of a step of a node: half of it, and a little more because the curve bends.
+# Each point of a curve is closer to a node than this share of a step.  The share is slightly more than half, because
+# the curve bends.
 _HALF = 0.52
-# Most nodes of a curve or surface.
+# Maximum number of nodes of a curve or surface.
 _NODES = 20_000
-# Step of a surface, least distance between nodes as a share of the step, and number of directions of a step.
+# For surfaces: length of a step, least distance between nodes as a share of the step, and number of directions of
+# steps.
 _STEP, _APART, _DIRECTIONS = 0.16, 0.7, 8
-# Each point at one step from a node is within half a direction of a tried point, which is near a node.
+# Radius that a node of a surface covers, as a share of the step.  A point one step away from a node differs by at
+# most half the angle between directions from a tried point, and the tried point is closer to a node than the least
+# distance between nodes.
 COVERED = _APART + 2 * np.sin(np.pi / _DIRECTIONS / 2)
 _BATCH = 100
 
@@ -39,11 +48,11 @@ class Component:
     """One connected piece of the self-motion manifold.
 
     Attributes:
-        x: Nodes in chart coordinates, along the curve for one degree of freedom, shape (N, nx).
+        x: Nodes in chart coordinates, shape (N, nx); the nodes of a curve are in their order along the curve.
         s: Path length to each node, rad mixed with m, shape (N,); zeros for a surface.
-        radius: Radius of the part that each node covers, shape (N,).
-        ends: ``closed`` alone, or for each of both ends of a curve ``limit``, ``singular`` or ``unfinished`` (too
-            long); empty for a surface.
+        radius: Radius of the neighborhood that each node covers, shape (N,).
+        ends: Only ``closed`` for a closed curve; otherwise ``limit``, ``singular`` or ``unfinished`` (too many nodes)
+            for each end of the curve; empty for a surface.
     """
 
     x: Array
@@ -53,16 +62,16 @@ class Component:
 
     @property
     def closed(self) -> bool:
-        """Whether the curve returns to its start."""
+        """Whether the component is a closed curve."""
         return self.ends == ("closed",)
 
 
 @dataclass(frozen=True, eq=False)
 class SelfMotion:
-    """The mapped self-motion manifold of one or two dimensions, and the components that starts reached.
+    """The mapped self-motion manifold of dimension one or two, with all components that a start reached.
 
     ``starts`` is the number of random postures that reached the manifold within the limits.  The last
-    ``unsuccessful`` starts were on no new component.
+    ``unsuccessful`` starts did not reach a new component.
     """
 
     manifold: ConstraintManifold
@@ -72,26 +81,27 @@ class SelfMotion:
     unsuccessful: int
 
     def component_of(self, x: Array) -> Array:
-        """Return the index of the component of each posture, shape (N,), or −1."""
+        """Return the index of the component that contains each posture, shape (N,); −1 if no component does."""
         return _component_of(self.manifold, self.dimension, self.components, x)
 
 
 def map_self_motion(
     manifold: ConstraintManifold, dimension: int, known: Array, *, patience: int = 1000, seed: int = 0
 ) -> SelfMotion:
-    """Map every component that random starts reach, until ``patience`` starts in a row reach no new component.
+    """Map each component that a random start reaches, until ``patience`` starts in a row reach no new one.
 
-    The components of the postures ``known``, shape (N, nx), come first.
+    The components that contain the postures ``known``, shape (N, nx), are mapped first.
 
     Raises:
-        InputError: There are not one or two degrees of freedom.
+        InputError: The number of free degrees of freedom is neither one nor two.
     """
     if dimension not in (1, 2):
         fault = f"{dimension} degrees of freedom are left"
         raise InputError(fault, where="search", hint="a map needs 1 or 2: add constraints")
     rng, components = np.random.default_rng(seed), _missing(manifold, dimension, (), known)
     starts = unsuccessful = idle = 0
-    # If less than a tenth of the postures reach the manifold, the limits leave almost nothing of it.
+    # Stop too if hardly any random posture reaches the manifold, because then almost no part of it is within the
+    # limits.
     while unsuccessful < patience and idle < 10 * patience:
         x = _random(manifold, rng)
         new = _missing(manifold, dimension, components, x)
@@ -103,12 +113,12 @@ def map_self_motion(
 
 
 def component_through(manifold: ConstraintManifold, x: Array) -> SelfMotion:
-    """Map the curve through one posture, shape (nx,), of a manifold with one degree of freedom."""
+    """Map the curve through the posture ``x``, shape (nx,), on a manifold with one degree of freedom."""
     return SelfMotion(manifold, 1, (_curve(manifold, x),), 0, 0)
 
 
 def _random(manifold: ConstraintManifold, rng: np.random.Generator) -> Array:
-    """Return random postures on the manifold within the limits; inequalities need not hold."""
+    """Return random postures on the manifold and within the limits; they may violate inequalities."""
     problem = manifold.problem
     drawn = [random_posture(problem, manifold.chart, rng, None if k % 4 else problem.given) for k in range(_BATCH)]
     projected = manifold.project(np.array([manifold.chart.to_x(q) for q in drawn]), within=True)
@@ -116,7 +126,7 @@ def _random(manifold: ConstraintManifold, rng: np.random.Generator) -> Array:
 
 
 def _missing(manifold: ConstraintManifold, dimension: int, known: Sequence[Component], x: Array) -> list[Component]:
-    """Return the new components that postures are on, in addition to the known components."""
+    """Map and return the components that contain one of the postures ``x`` and are not yet known."""
     new: list[Component] = []
     left = x[_component_of(manifold, dimension, known, x) < 0]
     while len(left):
@@ -127,7 +137,7 @@ def _missing(manifold: ConstraintManifold, dimension: int, known: Sequence[Compo
 
 
 def _component_of(manifold: ConstraintManifold, dimension: int, components: Sequence[Component], x: Array) -> Array:
-    """Return the index of the component that each posture is on, or −1, shape (N,)."""
+    """Return the index of the component that contains each posture, shape (N,); −1 if no component does."""
     from scipy.spatial import cKDTree
 
     owner = np.full(len(x), -1)
@@ -150,7 +160,7 @@ def _component_of(manifold: ConstraintManifold, dimension: int, components: Sequ
 
 
 def _embedded(manifold: ConstraintManifold, x: Array, basis: Array) -> Array:
-    """Return the unit directions in which the embedded points move along the vectors of a basis, shape (N, d, k)."""
+    """Map each tangent vector of a basis to the unit direction of the embedded point, shape (N, d, k)."""
     size = 1e-6
     here = manifold.embed(x)
     moved = [(manifold.embed(manifold.move(x, size * v)) - here) / size for v in basis.transpose(1, 0, 2)]
@@ -177,7 +187,7 @@ def _curve(manifold: ConstraintManifold, x: Array) -> Component:
 def _branch(manifold: ConstraintManifold, start: Array, tangent: Array) -> tuple[list[Array], list[float], str]:
     """Follow a curve in one direction by predictor and corrector.
 
-    Return the nodes from the start on, the lengths of the steps, and how the curve ends.
+    Return the nodes in order from ``start``, the lengths of the steps, and how the curve ends.
     """
     nodes, x, direction, step = [start], start, tangent, _FIRST
     lengths: list[float] = []
@@ -195,12 +205,12 @@ def _branch(manifold: ConstraintManifold, start: Array, tangent: Array) -> tuple
             continue
         beyond = np.maximum(manifold.lower - moved.x[0], moved.x[0] - manifold.upper).max(initial=-np.inf)
         if beyond > 1e-9:
-            # A limit lies within the step, and shorter steps find it.
+            # The step crosses a limit.  Halve the step until it ends close to the limit.
             if step < 10 * _SINGULAR:
                 return nodes, lengths, "limit"
             step /= 2
             continue
-        # The start lies between both nodes if it is ahead of the first and behind the second.
+        # The curve is closed if the start lies between the last two nodes, ahead of the first and behind the second.
         gap = home - point[0]
         if len(nodes) > 2 and np.linalg.norm(gap) <= 1.05 * length and ahead @ first > _TURN**2:
             behind = (point[1] - point[0]) @ (home - point[1]) <= 0
@@ -219,8 +229,9 @@ def _branch(manifold: ConstraintManifold, start: Array, tangent: Array) -> tuple
 def _surface(manifold: ConstraintManifold, x: Array) -> Component:
     """Cover the surface through a posture with nodes, by an advancing front.
 
-    Each node tries points one step away in all directions of its tangent plane.  A point that is far from all nodes
-    becomes a node.  Nodes beyond the limits by less than a step cover the rim, and the front stops there.
+    From each node, points one step away are tried in all directions of its tangent plane.  A point that is far from
+    all nodes becomes a node.  Nodes beyond the limits by less than a step are added to cover the rim of the surface.
+    The front does not continue from these nodes.
     """
     from scipy.spatial import cKDTree
 

@@ -1,4 +1,4 @@
-"""Check with Pinocchio, independently of the solver, whether a posture solves the problem."""
+"""Check with Pinocchio, independently of the solver, whether a posture is a solution of the problem."""
 
 from __future__ import annotations
 
@@ -17,16 +17,17 @@ from impact_posture.posture.constraints.posture_distance import distance_gradien
 from impact_posture.posture.program.constrained_problem import RANK_TOLERANCE, ConstrainedProblem, held_rows
 from impact_posture.system.arrays import Array, null_space
 
-# An inequality closer to its bound than this (m, rad) may have a multiplier.
+# Only an inequality closer to its bound than this (m, rad) can have a multiplier.
 _ACTIVE = 1e-3
-# Members of a maximum count if they are at most this share of f₀ below it.  The tolerance of the solver is a share of
-# f₀ as well, which is large if the objective fell by orders of magnitude.  Complementarity allows twice this gap.
+# A member of a maximum is included if its value is below the maximum by at most this share of f₀.  The tolerance of
+# the solver is also a share of f₀.  It is large relative to the objective if the objective decreased by orders of
+# magnitude.  The tolerance of complementarity is twice this gap.
 _TIED = 5e-8
-# Weight of complementarity beside stationarity: the ratio of their tolerances.
+# Weight of complementarity relative to stationarity; it equals the ratio of their tolerances.
 _COMPLEMENTARITY = 10.0
-# Above this violation (m, rad) no multipliers are computed, because no multiplier can certify the posture.
+# If the violation (m, rad) exceeds this value, no multipliers are computed, because the posture cannot be certified.
 _HOPELESS = 1e-4
-# A smaller multiplier is rounding.
+# A multiplier below this value is treated as a rounding error.
 _MULTIPLIER = 1e-6
 
 
@@ -34,7 +35,7 @@ _MULTIPLIER = 1e-6
 class Active:
     """An active inequality: a constraint, such as ``joint 'elbow'``, and its ``lower`` or ``upper`` side.
 
-    ``multiplier`` is the rise of the scaled objective per unit of the bound, ≥ 0.
+    ``multiplier`` (≥ 0) is the decrease of the scaled objective per unit by which the bound is relaxed.
     """
 
     constraint: str
@@ -44,18 +45,18 @@ class Active:
 
 @dataclass(frozen=True)
 class Certificate:
-    """First-order optimality and feasibility at one posture, recomputed.
+    """First-order optimality and feasibility at one posture, computed independently of the solver.
 
     Attributes:
-        stationarity: ``‖∇f/f₀ + Aᵀλ‖_∞`` over the tangent space, f₀ the initial objective, at the best multipliers
-            with the right signs (f the objective, A the Jacobian of constraints and limits).
+        stationarity: ``‖∇f/f₀ + Aᵀλ‖_∞`` in the tangent space, with the objective f, its initial value f₀, and the
+            Jacobian A of constraints and limits.  The multipliers λ have the right signs and make the residual least.
         primal: Largest violation of any constraint, limit or unit norm (m, rad).
-        complementarity: Largest ``|multiplier × distance from its bound|``.
-        pose_error_m: Largest position error of a held frame, meters.
-        pose_error_rad: Largest orientation error of a held frame, radians.
+        complementarity: Largest product of a multiplier and the distance of its row from the bound.
+        pose_error_m: Largest position error of a frame whose position is constrained, m.
+        pose_error_rad: Largest orientation error of a frame whose orientation is constrained, rad.
         limits: Largest violation of a joint limit, rad or m.
-        recomputed_with: Software that computed it.
-        active: Inequalities with a multiplier.
+        recomputed_with: Library and version with which the certificate was computed.
+        active: Inequalities with a positive multiplier.
     """
 
     stationarity: float
@@ -80,7 +81,7 @@ class Certificate:
 
     @property
     def feasible(self) -> bool:
-        """Whether the posture satisfies the constraints, optimal or not."""
+        """Whether the posture satisfies the constraints; it need not be optimal."""
         return replace(self, stationarity=0.0, complementarity=0.0).holds()
 
     def to_dict(self) -> dict[str, object]:
@@ -97,8 +98,9 @@ def certify(
 ) -> Certificate:
     """Certify the posture ``q``.
 
-    ``scale`` is the initial objective f₀.  ``auxiliaries`` are values for the constraints at ``q``, by default their
-    guesses.  A model ``numeric`` of the caller is moved to ``q``.
+    ``scale`` is the initial objective f₀.  ``auxiliaries`` are the values of the auxiliary unknowns of the
+    constraints at ``q``, by default their guesses.  If the caller passes a model ``numeric``, its state changes to
+    ``q``.
     """
     numeric = (numeric or Numeric(problem.robot.model)).at(q)
     gradients, gaps = objective_gradients(problem, q, scale)
@@ -108,7 +110,8 @@ def certify(
     errors = [c.pose_error(part.value) for c, part in zip(problem.constraints, parts, strict=True)]
     rows, limits = Linearization.joined(parts, problem.robot.nv), _limits(problem, q)
     near: list[_NearBound] = []
-    # To find the multipliers of a posture that violates its constraints would take long.
+    # Multipliers are computed only near the constraints, because otherwise the computation takes long and cannot
+    # help.
     if rows.violation <= _HOPELESS:
         near = _near_bounds(Linearization.joined([rows, limits], problem.robot.nv))
     jacobian = np.hstack([rows.posture, rows.auxiliary])
@@ -133,9 +136,10 @@ def certify(
 
 
 def objective_gradients(problem: ConstrainedProblem, q: Array, scale: float) -> tuple[Array, Array]:
-    """Return tangent gradients, shape (k, nv), and gaps of their values, shape (k,).
+    """Return tangent gradients of the objective, shape (k, nv), and the gaps of their members, shape (k,).
 
-    The gradients span the subdifferential of objective/scale plus the regularization; k = 1 where it is smooth.
+    The convex combinations of the gradients are the subdifferential of objective/scale plus regularization.  If this
+    sum is smooth, k = 1.  A gap is the distance of a member from the maximum, divided by the scale.
     """
     members = problem.objective.subgradients(q, _TIED * scale)
     gradients = members.gradients / scale
@@ -147,7 +151,7 @@ def objective_gradients(problem: ConstrainedProblem, q: Array, scale: float) -> 
 
 @dataclass(frozen=True, eq=False)
 class _NearBound:
-    """A bound of an inequality that is close, with its outward gradient and its distance."""
+    """A bound close to the value of its row, with the outward gradient of the row and the distance ``slack``."""
 
     name: str
     side: str
@@ -165,7 +169,10 @@ def _near_bounds(rows: Linearization) -> list[_NearBound]:
 
 
 def _active(near: Sequence[_NearBound], multipliers: Array) -> tuple[Active, ...]:
-    """Return the inequalities with a multiplier, summed by name; rows without a name belong to another row."""
+    """Return the inequalities with a multiplier; multipliers of rows with the same name are added.
+
+    Rows without a name are part of a named row and are left out.
+    """
     sums: dict[tuple[str, str], float] = {}
     for bound, multiplier in zip(near, multipliers, strict=True):
         if bound.name and multiplier > _MULTIPLIER:
@@ -174,7 +181,7 @@ def _active(near: Sequence[_NearBound], multipliers: Array) -> tuple[Active, ...
 
 
 def _limits(problem: ConstrainedProblem, q: Array) -> Linearization:
-    """Return the joint limits as rows."""
+    """Return the linearized rows of the joint limits."""
     chart = Chart.of(problem.robot.model)
     in_v, in_x = chart.bounded
     names = [next(f"joint '{s.name}'" for s in chart.slots if s.v.start <= k < s.v.stop) for k in in_v]
@@ -183,11 +190,11 @@ def _limits(problem: ConstrainedProblem, q: Array) -> Linearization:
 
 
 def _multipliers(gradients: Array, equalities: Array, near: Sequence[_NearBound]) -> tuple[Array, Array, Array]:
-    """Return weights of the gradients (≥ 0, sum 1), multipliers of the inequalities (≥ 0) and their least residual.
+    """Return weights of the gradients (≥ 0, sum 1), multipliers of the inequalities (≥ 0), and the least residual.
 
-    Multipliers of equalities have any sign, so all gradients are projected onto the null space of the equalities.
-    The product of a multiplier and its slack is a residual as well.  Otherwise a bound that is near and not active
-    could replace an active one.
+    Multipliers of equalities can have any sign, so all gradients are projected onto the null space of the equalities.
+    The products of multipliers and slacks are added to the residual.  Without these products, a bound that is near
+    but inactive could replace an active one.
     """
     count = len(gradients)
     free = null_space(equalities, RANK_TOLERANCE)
@@ -200,7 +207,8 @@ def _multipliers(gradients: Array, equalities: Array, near: Sequence[_NearBound]
         right = np.concatenate([-reduced[0], np.zeros(len(near))])
         multipliers = nonnegative_least_squares(np.vstack([bounds.T, slack]), right)
         return np.ones(1), multipliers, free @ (reduced[0] + bounds.T @ multipliers)
-    # A row with the sum 1 scales the solution, and does not turn the least residual.
+    # An additional row asks for the sum 1 of the weights.  It only scales the solution, so the weights are divided by
+    # their sum.
     left = np.vstack([reduced.T, np.zeros((len(near), count)), np.ones(count)])
     system = np.hstack([left, np.vstack([bounds.T, slack, np.zeros(len(near))])])
     solution = nonnegative_least_squares(system, np.eye(len(system))[-1])
@@ -209,21 +217,23 @@ def _multipliers(gradients: Array, equalities: Array, near: Sequence[_NearBound]
 
 
 def nonnegative_least_squares(matrix: Array, right: Array) -> Array:
-    """Return the ``x ≥ 0`` with the least ``‖A x − b‖`` (Lawson and Hanson 1974, algorithm NNLS).
+    """Return the ``x ≥ 0`` that minimizes ``‖A x − b‖`` (Lawson and Hanson 1974, algorithm NNLS).
 
-    ``scipy.optimize.nnls`` takes 0.35 s to import, and the optimization of a small robot 0.6 s in all (CPU times).
-    Over the 831 certificates of the tests the residuals of both differ by at most 6e-10; a certificate allows 1e-6.
+    This function replaces ``scipy.optimize.nnls``, whose import takes 0.35 s.  An optimization of a small robot takes
+    only 0.6 s in total (CPU times). For the 831 certificates of the tests, the residuals of both functions differ by
+    at most 6e-10; a certificate allows 1e-6.
     """
     x, passive = np.zeros(matrix.shape[1]), np.zeros(matrix.shape[1], dtype=bool)
     least = 10 * max(matrix.shape) * np.finfo(float).eps * float(np.abs(matrix).sum(axis=0).max(initial=0.0))
-    # The limit ends cycles of rounding errors, and three rounds for each unknown are plenty.
+    # Rounding errors can cause endless cycles, so the number of rounds is limited.  Three rounds per unknown are more
+    # than enough.
     for _ in range(3 * len(x)):
         slope = np.where(passive, -np.inf, matrix.T @ (right - matrix @ x))
         if passive.all() or slope.max() <= least:
             break
         passive[slope.argmax()] = True
         while (trial := _unbounded(matrix, right, passive))[passive].min(initial=np.inf) <= 0:
-            # Move towards the trial until the first entry is zero, which then stays there.
+            # Move towards the trial solution until the first entry becomes zero.  This entry then stays zero.
             falling = passive & (trial <= 0)
             step = (x[falling] / np.maximum(x[falling] - trial[falling], np.finfo(float).tiny)).min()
             x += step * (trial - x)

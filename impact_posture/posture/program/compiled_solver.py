@@ -1,8 +1,9 @@
-"""Compile the functions of the program to machine code where this pays, and keep the code in a cache by content.
+"""Compile the functions of the program to machine code if this saves time, and store the code in a cache.
 
-CasADi interprets an operation in a few nanoseconds.  Machine code needs a few tenths of a nanosecond, but compiling
-takes about 100 µs for each operation.  So one optimization of a small robot is interpreted, and a study of thousands
-of optimizations compiles once.
+The key of the cache is a hash of the content of the functions.  CasADi interprets an operation in a few nanoseconds.
+Machine code needs a few tenths of a nanosecond, but compiling takes about 100 µs for each operation.  So a single
+optimization of a small robot is interpreted.  For a study of thousands of optimizations, the functions are compiled
+once.
 """
 
 from __future__ import annotations
@@ -21,18 +22,19 @@ from impact_posture.system.toolchain import find_compiler, require_compiler, run
 
 CompileMode = Literal["auto", "always", "never"]
 
-# From docs/studies/solve.py for talos: 170,000 operations take about 20 s to compile, and a start of about
-# 25 iterations is then about 30 ms faster.  Orders of magnitude are enough to decide.
+# These numbers are from docs/studies/solve.py for talos: compiling 170,000 operations takes about 20 s, and a start
+# of about 25 iterations is then about 30 ms faster.  For the decision, orders of magnitude are enough.
 _COMPILE_S_PER_OPERATION = 1.2e-4
 _SAVED_S_PER_OPERATION = 6e-9
 _ITERATIONS = 35
-# Functions with more operations are compiled with -O0.  With -O1 the compiler takes three times as long for code that
-# is three times as fast, and evaluating that code no longer dominates the solve.
+# Functions with more operations are compiled with -O0.  With -O1, compiling takes three times as long, and the code
+# is three times as fast.  This is not worthwhile, because evaluating the code takes only a small part of the solve
+# time even with -O0.
 _OPTIMIZED = 100_000
 
 
 class BuiltSolver(NamedTuple):
-    """``nlpsol``, whether it runs as machine code, and why a compilation failed (empty if none failed)."""
+    """``nlpsol``, whether it runs as machine code, and the reason if a compilation failed (otherwise empty)."""
 
     solver: ca.Function
     compiled: bool
@@ -47,15 +49,16 @@ def compiled_solver(
     starts: int,
     derivatives: Mapping[str, ca.Function],
 ) -> BuiltSolver:
-    """Build ``nlpsol`` on the expressions ``x``, ``p``, ``f`` and ``g``, compiled or interpreted.
+    """Build ``nlpsol`` from the expressions ``x``, ``p``, ``f`` and ``g``, compiled or interpreted.
 
-    ``options`` are options of IPOPT, ``starts`` is the number of runs that share the cost of compiling, and
+    ``options`` are options of IPOPT, ``starts`` is the number of runs that use the same compiled code, and
     ``derivatives`` are options of ``nlpsol`` with known derivatives.
 
     Raises:
-        InputError: There is no such mode.
+        InputError: The mode is not one of ``auto``, ``always`` and ``never``.
         CompilerError: The mode is ``always``, and there is no compiler or it fails.
-        OutputError: The mode is ``always``, and the cache cannot be written or others can write to it.
+        OutputError: The mode is ``always``, and the cache folder cannot be written, or other users can write to the
+            folder.
     """
     if mode not in (modes := get_args(CompileMode)):
         raise InputError(f"no mode '{mode}'", where="compile", hint=f"choose from {', '.join(modes)}")
@@ -86,7 +89,7 @@ def _cached(problem: ConstrainedProblem, options: dict[str, Any]) -> ca.Function
     try:
         return ca.nlpsol("posture", "ipopt", str(library), options)
     except RuntimeError:
-        # Another machine that shares the folder built it.
+        # The library cannot be loaded; for example, another machine with the same cache folder built it.
         library.unlink(missing_ok=True)
         return None
 
@@ -97,12 +100,16 @@ def _pays(solver: ca.Function, starts: int) -> bool:
 
 
 def _key(problem: ConstrainedProblem) -> str:
-    """Return a hash of all numbers in the functions; targets, limits and the leading normal are parameters."""
+    """Return a hash of all numbers in the functions.
+
+    Targets, limits and the normal of the first contact are parameters, so they are not included.
+    """
     content = [
         ca.CasadiMeta.version(),
         f"{platform.system()} {platform.machine()}",
         problem.robot.impact_sha256,
-        # Placements of frames on links are not in the hash of the dynamics, but enter every expression of a point.
+        # The hash of the dynamics does not contain the placements of frames on links, but every expression of a point
+        # uses them.
         *[f"{f.name} {f.parentJoint} {f.placement.homogeneous.tolist()}" for f in problem.robot.model.frames],
         problem.objective.structure,
         problem.structure,
@@ -111,11 +118,11 @@ def _key(problem: ConstrainedProblem) -> str:
 
 
 def _compile(solver: ca.Function, compiler: list[str], name: str) -> None:
-    """Compile each function into a separate object file, with one compiler for each core, and link in the cache."""
+    """Compile each function into a separate object file, in parallel on all cores, and link them in the cache."""
     library = cache_folder() / name
     with building(library) as folder:
         functions = [solver.oracle(), *[_shared(solver.get_function(name)) for name in solver.get_function()]]
-        # The largest function is compiled first, so that nothing waits for it at the end.
+        # The compilation of the largest function starts first, because it takes longest.
         functions.sort(key=lambda function: -int(function.n_instructions()))
         commands = [_command(function, compiler, folder) for function in functions]
         run_compilers(commands, folder)
@@ -124,7 +131,7 @@ def _compile(solver: ca.Function, compiler: list[str], name: str) -> None:
 
 
 def _shared(function: ca.Function) -> ca.Function:
-    """Return the function with equal subexpressions computed once, because differentiation leaves many of them."""
+    """Return a function that computes equal subexpressions once; differentiation creates many of them."""
     inputs = function.sx_in()
     names = (function.name_in(), function.name_out())
     return ca.Function(function.name(), inputs, function.call(inputs), *names, {"cse": True})

@@ -1,4 +1,4 @@
-"""The posture problem: objective, constraints, limits and start, and the rank of its equalities."""
+"""The posture problem (objective, constraints, limits and given posture), and the rank of its equalities."""
 
 from __future__ import annotations
 
@@ -19,22 +19,23 @@ from impact_posture.posture.constraints.surroundings import Surroundings
 from impact_posture.robot.robot import Robot
 from impact_posture.system.arrays import Array
 
-# A constraint holds a direction of the tangent space if a unit step along it moves the constraint by more than this.
+# A constraint restricts a direction of the tangent space if a unit step along this direction changes the value of the
+# constraint by more than this.
 RANK_TOLERANCE = 1e-7
 
 
 @dataclass(frozen=True)
 class ConstrainedProblem:
-    """``min_q objective(q)`` under constraints, from a given posture.
+    """The problem ``min_q objective(q)`` subject to constraints, with the given posture.
 
     Attributes:
-        given: Posture of the user, shape (nq,).
+        given: Posture that the user specified, shape (nq,).
         constraints: All constraints except joint limits.
-        lower: Lower joint limits plus margin, chart coordinates, shape (nx,); the limits of a held joint are equal.
-        upper: Upper joint limits less margin, shape (nx,).
-        rows: Rows of each constraint that the program contains; empty for all rows.
-        notes: Decisions of the builder, one line each.
-        surroundings: The bodies that the robot stays clear of; ``None`` without collision constraints.
+        lower: Lower joint limits plus margin, chart coordinates, shape (nx,); both limits of a held joint are equal.
+        upper: Upper joint limits minus margin, chart coordinates, shape (nx,).
+        rows: For each constraint, the indices of its rows in the program; empty if the program contains all rows.
+        notes: Decisions made while the problem was built, one line each.
+        surroundings: The bodies that the robot must not touch; ``None`` if there are no collision constraints.
     """
 
     robot: Robot
@@ -50,14 +51,14 @@ class ConstrainedProblem:
 
     @property
     def impact(self) -> WorstCaseObjective:
-        """The objective as an impact objective; another objective raises ``InputError``."""
+        """The objective, if it is an impact objective; otherwise raise ``InputError``."""
         if not isinstance(self.objective, WorstCaseObjective):
             fault = f"is '{self.objective.name}', which is not an impact objective"
             raise InputError(fault, where="objective", hint="use a WorstCaseObjective for what needs H, G, V and S")
         return self.objective
 
     def carried(self, index: int) -> list[int]:
-        """Return the rows of constraint ``index`` that the program contains."""
+        """Return the indices of the rows of constraint ``index`` that the program contains."""
         return list(self.rows[index]) if self.rows else list(range(len(self.constraints[index].lifted_bounds[0])))
 
     @property
@@ -83,16 +84,16 @@ class ConstrainedProblem:
 
     @property
     def grows(self) -> bool:
-        """Whether the program may lack parts."""
+        """Whether the program may lack parts, which :meth:`grown` then adds."""
         return any(c.grows for c in self.constraints)
 
     def grown(
         self, postures: Sequence[Array], numeric: Numeric | None = None, auxiliaries: Sequence[Array] | None = None
     ) -> ConstrainedProblem:
-        """Return the problem with the parts that its program lacks at the postures, or itself if none are missing.
+        """Add the parts that the program lacks at the postures; return the same problem if no parts are missing.
 
-        If the postures are ends of runs, ``auxiliaries`` are the values of the program there, shape (k,) each.  A
-        model ``numeric`` of the caller is moved.
+        If the postures are ends of runs, ``auxiliaries`` are the values of the program there, shape (k,) each.  If
+        the caller passes a model ``numeric``, its state changes.
         """
         constraints, numeric = list(self.constraints), numeric or Numeric(self.robot.model)
         for index, q in enumerate(postures):
@@ -108,7 +109,7 @@ class ConstrainedProblem:
         return replace(self, constraints=tuple(constraints), rows=rows)
 
     def slack(self, auxiliaries: Array) -> float:
-        """Return the largest slack (m) of a constraint in the auxiliaries at the end of a run."""
+        """Return the largest slack of a constraint, m, from the auxiliaries at the end of a run."""
         ends = self.split(auxiliaries)
         return max((c.slack(end) for c, end in zip(self.constraints, ends, strict=True)), default=0.0)
 
@@ -126,7 +127,7 @@ class ConstrainedProblem:
 
 
 def rank(jacobian: Array) -> int:
-    """Return the rank of a constraint Jacobian with the tolerance of every redundancy count."""
+    """Return the rank of a constraint Jacobian, with the tolerance that all computations of the redundancy use."""
     return int(np.linalg.matrix_rank(jacobian, tol=RANK_TOLERANCE)) if jacobian.size else 0
 
 
@@ -138,7 +139,7 @@ def equality_jacobian(problem: ConstrainedProblem, numeric: Numeric) -> Array:
 
 
 def held_rows(robot: Robot, hold: Sequence[str]) -> Array:
-    """Return the unit rows of the tangent entries of held joints, shape (k, nv)."""
+    """Return a unit row for each tangent entry of a held joint, shape (k, nv)."""
     rows: list[int] = []
     for joint in hold:
         index = robot.joint_id(joint)

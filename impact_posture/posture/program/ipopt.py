@@ -1,4 +1,4 @@
-"""Call IPOPT with the right options, with one thread for linear algebra, and with a Ctrl-C that stops it.
+"""Call IPOPT with suitable options and one thread for linear algebra, so that Ctrl-C stops the solver.
 
 NumPy, SciPy and CasADi (for MUMPS in IPOPT) each bring a BLAS that uses all cores.  The systems here have about a
 hundred unknowns, so these threads only wait for each other and block the cores of parallel starts.
@@ -26,7 +26,7 @@ IPOPT_OPTIONS: dict[str, Any] = {
     "ipopt.constr_viol_tol": 1e-10,
     "ipopt.dual_inf_tol": 1e-7,
     "ipopt.compl_inf_tol": 1e-9,
-    # Bounds are limits of the robot, so the solver must not relax them.
+    # The bounds are limits of the robot, so the solver must not relax the bounds.
     "ipopt.bound_relax_factor": 0.0,
     "ipopt.honor_original_bounds": "yes",
     "ipopt.mu_strategy": "adaptive",
@@ -36,15 +36,16 @@ IPOPT_OPTIONS: dict[str, Any] = {
     "ipopt.max_iter": 300,
     "print_time": False,
     "calc_lam_p": False,
-    # Nothing uses sensitivities.
+    # The sensitivities of the solution are not used.
     "no_nlp_grad": True,
     "error_on_fail": False,
 }
-# For worst cases: the equations of the dual of a cone are quadratic, and violated equations let the bound ``t`` fall.
-# After a step that lowers the objective by a strong violation, IPOPT never returns to the equations.
+# Options for worst cases.  The dual of a cone has quadratic equations, and the bound ``t`` can decrease while they
+# are violated.  After a step that lowers the objective by a large violation, IPOPT does not return to the equations.
 WORST_OPTIONS = {"ipopt.theta_max_fact": 1.0}
 CONVERGED = ("Solve_Succeeded", "Solved_To_Acceptable_Level")
-# A warm start keeps unknowns on their bounds.  By default IPOPT moves them inside, and needs iterations to return.
+# With these options, unknowns that start on their bounds stay there.  By default, IPOPT moves these unknowns inside
+# and needs iterations to return them to the bounds.
 WARM_OPTIONS = {"ipopt.warm_start_init_point": "yes"} | {
     f"ipopt.warm_start_{name}": 1e-8
     for name in ("bound_push", "bound_frac", "slack_bound_push", "slack_bound_frac", "mult_bound_push")
@@ -52,7 +53,7 @@ WARM_OPTIONS = {"ipopt.warm_start_init_point": "yes"} | {
 
 
 class _CasadiOpenBLAS(threadpoolctl.OpenBLASController):  # type: ignore[misc]
-    """The OpenBLAS of the CasADi wheels, under its name there."""
+    """Controller for the OpenBLAS library in the CasADi wheels, which has a different file name."""
 
     internal_api = "casadi_openblas"
     filename_prefixes = ("libcasadi-tp-openblas",)
@@ -70,12 +71,15 @@ def one_blas_thread() -> Iterator[None]:
 
 @cache
 def _libraries() -> threadpoolctl.ThreadpoolController:
-    ca.has_nlpsol("ipopt")  # This loads IPOPT and its BLAS, because the controller finds loaded libraries only.
+    ca.has_nlpsol("ipopt")  # Load IPOPT and its BLAS: the controller sees only loaded libraries.
     return threadpoolctl.ThreadpoolController()
 
 
 def run_solver(solver: ca.Function, **arguments: Array) -> dict[str, ca.DM]:
-    """Call an ``nlpsol``, and raise a Ctrl-C after it, which IPOPT may take for a failed evaluation and ignore."""
+    """Call an ``nlpsol``; after a Ctrl-C, raise ``KeyboardInterrupt`` when the call returns.
+
+    IPOPT may treat the interrupt as a failed evaluation and ignore it.
+    """
     seen: list[int] = []
 
     def note(number: int, frame: object) -> None:

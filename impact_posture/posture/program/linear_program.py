@@ -1,4 +1,4 @@
-"""Linear programs, solved by the HiGHS of the CasADi wheels, because scipy.optimize takes 0.35 s to import."""
+"""Linear programs, solved by HiGHS from the CasADi wheels, because importing scipy.optimize takes 0.35 s."""
 
 from __future__ import annotations
 
@@ -11,7 +11,7 @@ import numpy as np
 
 from impact_posture.system.arrays import Array
 
-# A certificate needs tighter tolerances than the defaults of HiGHS, 1e-7.
+# The default tolerances of HiGHS, 1e-7, are too large for a certificate.
 _OPTIONS: dict[str, Any] = {
     "error_on_fail": False,
     "highs": {"output_flag": False, "primal_feasibility_tolerance": 1e-10, "dual_feasibility_tolerance": 1e-10},
@@ -22,7 +22,7 @@ _OPTIONS: dict[str, Any] = {
 class LinearOptimum:
     """Solution ``x`` of ``min cᵀx`` with ``lower ≤ A x ≤ upper`` and ``low ≤ x ≤ high``, and its value ``cᵀx``.
 
-    ``multipliers`` of the rows of ``A``, shape (m,), are positive at upper bounds.
+    ``multipliers`` are the multipliers of the rows of ``A``, shape (m,); they are positive at upper bounds.
     """
 
     x: Array

@@ -19,21 +19,22 @@ from impact_posture.posture.program.program import Program, parameters
 from impact_posture.posture.program.program_rows import ProgramRows
 from impact_posture.system.arrays import Array
 
-# Price of a meter of slack in units of the scale.  A meter of freedom must be worth less; with 2 slack was left.
+# Price of a meter of slack in units of the initial objective.  It must exceed the decrease of the objective per meter
+# of slack.  With the price 2, slack remained.
 SLACK_PRICE = 50.0
-# Numbers of the programs of this process.
+# Counter for the numbers of the programs in this process.
 _NUMBERS = count()
 
 
 @dataclass(frozen=True, eq=False)
 class WarmStart:
-    """End of a run, from which a run of the program with the same number and another target continues.
+    """Final values of a run; a run of the same program with another target can continue from these values.
 
     Attributes:
         x: All unknowns, shape (n,), between ``lower`` and ``upper``.
-        of_bounds: Multipliers of these bounds, shape (n,).
+        of_bounds: Multipliers of the bounds ``lower`` and ``upper``, shape (n,).
         of_rows: Multipliers of the rows, shape (m,).
-        scale: Divisor of the objective with these multipliers.
+        scale: Divisor of the objective in the run that gave these multipliers.
     """
 
     program: int
@@ -47,10 +48,10 @@ class WarmStart:
 
 @dataclass(frozen=True)
 class SolveRecord:
-    """Result of one run of the solver, with the return status and iterations of IPOPT and the wall time of the call.
+    """Result of one run of the solver: posture, status and iterations of IPOPT, and wall time of the call.
 
-    ``auxiliaries`` are final values for the constraints, shape (k,), ``minimized`` is the value that the solver
-    minimized, in units of the scale, and ``end`` has all values that a warm start needs.
+    ``auxiliaries`` are the final auxiliaries of the constraints, shape (k,).  ``minimized`` is the final value of the
+    function that the solver minimizes, in units of the scale.  ``end`` contains all values that a warm start needs.
     """
 
     q: Array
@@ -63,19 +64,19 @@ class SolveRecord:
 
     @property
     def converged(self) -> bool:
-        """Whether IPOPT reports convergence, which only the certificate proves."""
+        """Whether IPOPT reports convergence; only the certificate proves that the posture is optimal."""
         return self.status in CONVERGED
 
 
 @dataclass(frozen=True)
 class PostureNLP:
-    """A built program: its expressions, and ``nlpsol`` of CasADi.
+    """A built program: its expressions, and the CasADi solver ``nlpsol``.
 
     Attributes:
         build_time_s: Time to build and compile the program.
         compiled: Whether its functions run as machine code.
-        compiler_fault: Why a compilation failed; empty if none failed.
-        number: Number of the program, which is the same with another target.
+        compiler_fault: Reason why a compilation failed; empty if no compilation failed.
+        number: Number of the program; the program with another target has the same number.
     """
 
     problem: ConstrainedProblem
@@ -88,7 +89,7 @@ class PostureNLP:
 
     @property
     def chart(self) -> Chart:
-        """Coordinates of the robot."""
+        """Chart coordinates of the robot."""
         return self.program.chart
 
     def at(self, problem: ConstrainedProblem) -> PostureNLP:
@@ -104,7 +105,7 @@ class PostureNLP:
         return nlp
 
     def grown(self, problem: ConstrainedProblem, *, compile: CompileMode = "auto") -> PostureNLP:
-        """Build the program of a problem that this one grew into."""
+        """Build the program of ``problem``, which has grown from the problem of this program."""
         return build_nlp(problem, compile=compile, program=self.program)
 
     def solve(
@@ -118,9 +119,10 @@ class PostureNLP:
     ) -> SolveRecord:
         """Solve from the configuration ``start``, shape (nq,).
 
-        ``scale`` divides the objective, by default its value at ``start``.  ``attempt`` is the index of the guess of
-        the objective, and ``price`` the price of a meter of slack.  ``warm`` is the end of a run at ``start`` with
-        another target; it is ignored if it belongs to another program.
+        ``scale`` divides the objective, by default its value at ``start``.  ``attempt`` is the index of the initial
+        guess for the auxiliaries of the objective, and ``price`` the price of a meter of slack.  ``warm`` contains
+        the final values of a run that ended at ``start`` with another target.  If ``warm`` belongs to another
+        program, it is ignored.
         """
         scale = scale or self.problem.objective.value(start)
         if warm is None or warm.program != self.number:
@@ -134,10 +136,10 @@ class PostureNLP:
         return replace(again, iterations=record.iterations + again.iterations, time_s=record.time_s + again.time_s)
 
     def _cold(self, start: Array, scale: float, attempt: int) -> WarmStart:
-        """Return the start of a run without multipliers."""
+        """Return initial values for a run without multipliers."""
         problem, unclipped = self.problem, self.chart.to_x(start)
         x = np.clip(unclipped, problem.lower, problem.upper)
-        # The impact quantities at the start itself are usually known.
+        # Use ``start`` itself if possible, because its impact quantities are usually cached.
         q = start if np.array_equal(x, unclipped) else self.chart.to_q(x)
         impact, rows = problem.objective.guess(q, scale, attempt), problem.guess(self.program.numeric.at(q))
         return WarmStart(
@@ -172,7 +174,7 @@ class PostureNLP:
 
     @cached_property
     def _warm_solver(self) -> ca.Function:
-        """The solver that continues from unknowns and multipliers."""
+        """The solver that continues from given unknowns and multipliers."""
         names = {"grad_f": "nlp_grad_f", "jac_g": "nlp_jac_g", "hess_lag": "nlp_hess_l"}
         known = {option: self.solver.get_function(name) for option, name in names.items()}
         options = _options(self.problem) | WARM_OPTIONS | known
@@ -182,7 +184,8 @@ class PostureNLP:
     def _row_bounds(self) -> dict[str, Array]:
         norms = np.zeros(len(self.chart.quaternion_slices()))
         lower, upper = (np.concatenate([norms, bounds]) for bounds in self.problem.row_bounds)
-        # The other rows belong to the objective: first equations, then inequalities that bound it from below.
+        # The remaining rows belong to the objective: first equations, then inequalities that bound the objective from
+        # below.
         zeros = np.zeros(self.solver.size1_in("lbg") - len(lower))
         below = np.where(np.arange(zeros.size) < zeros.size - self.program.bounded, 0.0, -np.inf)
         return {"lbg": np.concatenate([lower, below]), "ubg": np.concatenate([upper, zeros])}
@@ -196,17 +199,19 @@ def build_nlp(
     program: Program | None = None,
     rows: ProgramRows | None = None,
 ) -> PostureNLP:
-    """Build the program for a number of runs, which decides whether compiling pays.
+    """Build the program for ``starts`` runs; this number decides whether compiling saves time.
 
-    ``program`` has the expressions of a problem that grew into this one, and ``rows`` the rows of its constraints.
+    ``program`` contains the expressions of a problem from which ``problem`` has grown.  ``rows`` are the rows of the
+    constraints, if they are already built.
 
     Raises:
-        CompilerError, OutputError: As :func:`impact_posture.posture.program.compiled_solver.compiled_solver`.
+        CompilerError, OutputError: For the same reasons as in
+            :func:`impact_posture.posture.program.compiled_solver.compiled_solver`.
     """
     began = time.perf_counter()
     program = program or Program(problem, rows)
     symbols, derivatives = program.symbols(problem)
-    # A program that grows is soon replaced, so it is compiled only if one run pays for it.
+    # A program that grows is soon replaced, so it is compiled only if compiling saves time for a single run.
     built = compiled_solver(problem, symbols, _options(problem), compile, 1 if problem.grows else starts, derivatives)
     took = time.perf_counter() - began
     return PostureNLP(problem, program, built.solver, took, built.compiled, built.fault)

@@ -1,13 +1,13 @@
 """The expressions of the nonlinear program.
 
-The lifted formulation leaves the linear solve of the impact to IPOPT::
+In the lifted formulation, IPOPT solves the linear equations of the impact::
 
     min over x, a, f, s   aᵀWa        (or λ/2)
     subject to            M(q)a − J_sᵀf − Jᵀs = 0,  J_s a + εf = 0,  equations of s and n,
                           c(q) within bounds,  |quaternions| = 1,  limits,
 
 Every function is then linear or quadratic in the auxiliaries, and the exact Hessian stays small
-(``docs/studies/formulations.py`` measures both forms).  An inner maximum adds unknowns and rows
+(``docs/studies/formulations.py`` compares both forms).  An inner maximum adds unknowns and rows
 (:mod:`impact_posture.impact.worst_case.model_set`).
 """
 
@@ -27,13 +27,13 @@ from impact_posture.system.arrays import Array
 
 
 class Program:
-    """The expressions of a program, most of which stay the same while the problem grows.
+    """The expressions of a program; most of them stay the same while the problem grows.
 
-    ``rows`` are the rows of its constraints, which programs of the same problem share.
+    ``rows`` are the rows of the constraints; all programs of the same problem share them.
 
     Attributes:
-        numeric: The model in Pinocchio, shared by all runs.
-        bounded: Number of inequalities ``≤ 0`` of the objective, which are the last rows.
+        numeric: The Pinocchio model, which all runs share.
+        bounded: Number of inequalities ``≤ 0`` of the objective; these are the last rows of ``g``.
     """
 
     def __init__(self, problem: ConstrainedProblem, rows: ProgramRows | None = None) -> None:
@@ -47,15 +47,16 @@ class Program:
         self.parameters = ca.vertcat(impact, scale, weight, self._price, rows.reference, *rows.parameters)
 
     def branch(self) -> Program:
-        """Return a copy that grows separately."""
+        """Return a copy that can grow without changing this program."""
         branch = copy(self)
         branch.rows = self.rows.branch()
         return branch
 
     def symbols(self, problem: ConstrainedProblem) -> tuple[dict[str, ca.SX], dict[str, ca.Function]]:
-        """Return the expressions of a problem, and for a problem that grows its derivatives as options of ``nlpsol``.
+        """Return the expressions of a problem and options of ``nlpsol``.
 
-        The expressions are ``x`` (unknowns), ``p`` (parameters), ``f`` and ``g``.
+        The expressions are ``x`` (unknowns), ``p`` (parameters), ``f`` and ``g``.  If the problem can grow, the
+        options contain its derivatives; otherwise they are empty.
         """
         rows, objective = self.rows.lift(problem), self.lifted
         x = ca.vertcat(self.rows.x, objective.variables, rows.variables)
@@ -64,15 +65,15 @@ class Program:
         if not problem.grows:
             return symbols, {}
         joint = joined(self.fixed, self.rows.derivatives(rows), self.chart.nx)
-        # Rows of ``joint``: the value, the norms, the rows of the objective, then of the constraints.  In ``g`` the
-        # constraints follow the norms.
+        # The rows of ``joint`` are the value, the norms, the rows of the objective, and the rows of the constraints.
+        # In ``g``, the rows of the constraints come directly after the norms.
         norms, count, fixed = self.rows.norms.numel(), rows.rows.numel(), self.fixed.multipliers.numel()
         order = [*range(1, 1 + norms), *range(fixed, fixed + count), *range(1 + norms, fixed)]
         return symbols, joint.reordered(order).options(x, self.parameters, joint.multipliers[0], g)
 
     @cached_property
     def fixed(self) -> Derivatives:
-        """Derivatives of the value, the norms and the rows of the objective, which do not grow."""
+        """Derivatives of the value, the norms and the rows of the objective, which never grow."""
         objective, nx, norms = self.lifted, self.chart.nx, self.rows.norms
         rows = ca.vertcat(self.value, norms, objective.rest, objective.inequalities)
         derivatives = Derivatives.of(rows, ca.vertcat(self.rows.x, objective.variables))

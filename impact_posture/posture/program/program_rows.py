@@ -1,7 +1,7 @@
-"""The rows of all constraints in a program that grows, whose derivatives are computed once for each piece.
+"""The rows of all constraints in a program that grows; each piece of the rows is differentiated only once.
 
-To build a program, first and second derivatives take most of the time.  When a program grows, most of its pieces and
-their derivatives stay the same.
+First and second derivatives take most of the time to build a program.  When a program grows, most of its pieces stay
+the same, so their derivatives are reused.
 """
 
 from __future__ import annotations
@@ -22,7 +22,7 @@ from impact_posture.posture.program.constrained_problem import ConstrainedProble
 
 @dataclass(frozen=True, eq=False)
 class Derivatives:
-    """Derivatives of rows ``g(x, z)`` and of ``λᵀg``, with the symbols ``λ``, shape (m, 1), as ``multipliers``.
+    """Jacobian of rows ``g(x, z)`` and Hessian of ``λᵀg``; ``multipliers`` are the symbols ``λ``, shape (m, 1).
 
     The Jacobian has the shape (m, nx + k), the Hessian (nx + k, nx + k).
     """
@@ -33,19 +33,19 @@ class Derivatives:
 
     @staticmethod
     def of(rows: ca.SX, unknowns: ca.SX) -> Derivatives:
-        """Differentiate rows."""
+        """Differentiate ``rows`` with respect to ``unknowns``."""
         multipliers = ca.SX.sym("multipliers", rows.numel())
         hessian = ca.hessian(ca.dot(multipliers, rows), unknowns)[0]
         return Derivatives(multipliers, ca.jacobian(rows, unknowns), hessian)
 
     def reordered(self, rows: list[int]) -> Derivatives:
-        """Return the derivatives with these rows; the Hessian keeps the multipliers of all."""
+        """Return the derivatives with these rows in this order; the Hessian still contains all multipliers."""
         return Derivatives(self.multipliers[rows], self.jacobian[rows, :], self.hessian)
 
     def options(self, x: ca.SX, p: ca.SX, price: ca.SX, g: ca.SX) -> dict[str, ca.Function]:
-        """Return the options of ``nlpsol`` for ``g`` with these derivatives; ``price`` is the multiplier of f.
+        """Return options of ``nlpsol`` that supply these derivatives of ``g``; ``price`` is the multiplier of f.
 
-        In a compiled library CasADi finds them by the names of functions, inputs and outputs.
+        In a compiled library, CasADi identifies the derivatives by the names of functions, inputs and outputs.
         """
         lagrangian, hessian = [x, p, price, self.multipliers], [ca.triu(self.hessian)]
         names = ["x", "p", "lam_f", "lam_g"]
@@ -56,13 +56,13 @@ class Derivatives:
 
 
 class ProgramRows:
-    """Lifted constraints of a problem, and of all problems that it grows into, shared by all programs of it.
+    """Lifted constraints of a problem and of all problems grown from it; all their programs share these rows.
 
     Attributes:
         x: Chart coordinates, shape (nx, 1).
-        norms: Squared norms of the quaternions less one.
+        norms: Squared norms of the quaternions minus one.
         reference: Symbols of the chart coordinates of the given posture, shape (nx, 1).
-        away: Squared distance from the given posture.
+        away: Expression of the squared distance from the given posture.
         parameters: Symbols of the parameters of each constraint.
     """
 
@@ -78,17 +78,17 @@ class ProgramRows:
         self._sides = WeakKeyDictionary[LiftedRows, Derivatives]()
 
     def branch(self) -> ProgramRows:
-        """Return a copy that grows separately."""
+        """Return a copy that can grow without changing these rows."""
         branch = copy(self)
         branch._lifted, branch._blocks = dict(self._lifted), list(self._blocks)
         return branch
 
     def lift(self, problem: ConstrainedProblem) -> LiftedRows:
-        """Return the rows in the program of a problem, by constraint."""
+        """Return the rows that each constraint of a problem has in the program."""
         pieces = []
         for index, constraint in enumerate(problem.constraints):
             carried = problem.carried(index)
-            # Constraints with another target have the same expressions.
+            # A constraint with another target has the same expressions, so they are reused.
             key = index, constraint.structure, tuple(carried)
             if key not in self._lifted:
                 lifted = constraint.lift(self.tree, self.parameters[index])
@@ -99,7 +99,7 @@ class ProgramRows:
         return LiftedRows.joined(pieces)
 
     def derivatives(self, lifted: LiftedRows) -> Derivatives:
-        """Return the derivatives of the rows of :meth:`lift` over ``(x, z)``."""
+        """Return the derivatives of the rows of :meth:`lift` with respect to ``(x, z)``."""
         nx, row, column = self.x.numel(), 0, 0
         rows, sides, columns = dict[int, range](), dict[int, range](), dict[int, range]()
         pieces: dict[int, LiftedRows] = {}
@@ -116,7 +116,7 @@ class ProgramRows:
                 columns[id(piece.rows)] = range(column, column + piece.variables.numel())
                 column += piece.variables.numel()
         self._differentiate(list(pieces.values()))
-        # Without any rows the derivatives over x are empty matrices.
+        # The first part makes the matrices have the right shape even if there are no rows.
         parts, order = [Derivatives(ca.SX(0, 1), ca.SX(0, nx), ca.SX(nx, nx))], list[int]()
         at = [k for _, block in self._blocks for piece in block for k in columns[id(piece.rows)]]
         for derivatives, block in self._blocks:
@@ -130,13 +130,13 @@ class ProgramRows:
         return Derivatives(multipliers[new_rows], J[new_rows, new_columns], H[new_columns, new_columns])
 
     def _of_sides(self, piece: LiftedRows) -> Derivatives:
-        """Differentiate the sides of a piece, which becomes another object when they change."""
+        """Return the cached derivatives of the sides of a piece; a piece with other sides is another object."""
         if piece not in self._sides:
             self._sides[piece] = Derivatives.of(piece.sides, piece.variables)
         return self._sides[piece]
 
     def _differentiate(self, pieces: list[LiftedRows]) -> None:
-        """Differentiate all new pieces together, because they share expressions."""
+        """Differentiate all new pieces together, because the pieces have common subexpressions."""
         known = {id(piece.rows) for _, block in self._blocks for piece in block}
         new = [piece for piece in pieces if id(piece.rows) not in known]
         if new:
@@ -145,7 +145,7 @@ class ProgramRows:
 
 
 def _with_sides(rows: Derivatives, sides: list[Derivatives], nx: int) -> Derivatives:
-    """Add sides, each of which depends on the auxiliaries of one piece alone."""
+    """Add the derivatives of sides; each side depends only on the auxiliaries of one piece."""
     jacobian = ca.diagcat(*[part.jacobian for part in sides])
     return Derivatives(
         ca.vertcat(rows.multipliers, *[part.multipliers for part in sides]),
@@ -155,7 +155,7 @@ def _with_sides(rows: Derivatives, sides: list[Derivatives], nx: int) -> Derivat
 
 
 def _stacked(parts: list[Derivatives], nx: int) -> tuple[ca.SX, ca.SX]:
-    """Return the Jacobian and the Hessian of parts that share x and no auxiliaries."""
+    """Return the Jacobian and the Hessian of parts that share the unknowns x but no auxiliaries."""
     J = ca.horzcat(ca.vertcat(*[p.jacobian[:, :nx] for p in parts]), ca.diagcat(*[p.jacobian[:, nx:] for p in parts]))
     both = ca.horzcat(*[p.hessian[:nx, nx:] for p in parts])
     H = ca.vertcat(
@@ -166,5 +166,5 @@ def _stacked(parts: list[Derivatives], nx: int) -> tuple[ca.SX, ca.SX]:
 
 
 def joined(first: Derivatives, second: Derivatives, nx: int) -> Derivatives:
-    """Join the derivatives of rows that share x alone."""
+    """Join the derivatives of two sets of rows that share the unknowns x but no auxiliaries."""
     return Derivatives(ca.vertcat(first.multipliers, second.multipliers), *_stacked([first, second], nx))

@@ -1,4 +1,4 @@
-"""Find the constraints that conflict in an infeasible problem, by relaxing each constraint at a price."""
+"""Find the constraints that conflict in an infeasible problem, by relaxing each one with slacks at a price."""
 
 from __future__ import annotations
 
@@ -20,26 +20,31 @@ from impact_posture.system.arrays import Array
 
 # A violation below this (m, rad) counts as satisfied.
 _KEPT = 1e-6
-# Price of a meter of slack, lower than the price 1 of a violated pose: a body in the way of a pose is the reason.
+# Price of a meter of slack. It is lower than the price 1 of a violated pose. If a body blocks a pose, the body is
+# thus named as the conflict, not the pose.
 _SLACK_PRICE = 0.03
 # Price of the squared distance from the given posture, which makes the solution unique.
 _AWAY_PRICE = 1e-6
-# Most starts, and most postures drawn for them: the clearest of many lead to a feasible posture where any 24 may not.
+# Maximum number of starts, and of random postures from which the starts are chosen. Starts far from all bodies often
+# lead to a feasible posture when 24 arbitrary ones do not.
 _TRIES, _DRAWN = 24, 200
-# Starts that confirm a conflict at a target nearby.  Panda before a wall needs two to find a way past a body.
+# Number of starts that confirm a conflict known from a nearby target. For panda in front of a wall, two starts are
+# needed to find a way around a body.
 _CONFIRMING = 4
-# Postures drawn first: few are usually enough, and drawing all takes longer than relaxing a small robot.
+# Number of random postures that are drawn first. They usually suffice, and drawing all takes longer than solving the
+# program of a small robot.
 _DRAW = 8
-# Most times that the program grows for one start.
+# Maximum number of times that the program grows for one start.
 _ROUNDS = 20
 
 
 @dataclass(frozen=True)
 class LeastViolation:
-    """The least violation that the search found, at ``q``, and the problem with all parts that its program needed.
+    """The posture ``q`` with the least violation, and the problem with all parts that its program needed.
 
-    ``conflicts`` is the violation of each violated constraint; it is empty if all are satisfied.  ``at_limits`` are
-    joints on a limit.  ``violation`` is the sum of the violations at the price of each constraint.
+    ``conflicts`` is the violation of each violated constraint; it is empty if all constraints are satisfied.
+    ``at_limits`` names the joints that are at a limit.  ``violation`` is the sum of all violations, each multiplied
+    by the price of its constraint.
     """
 
     q: Array
@@ -59,8 +64,8 @@ def find_conflicts(
     """Minimize the slack ``Σ (s⁺ + s⁻)`` with ``c(q) + s⁺ − s⁻`` within bounds, from ``guesses`` and other starts.
 
     ``program`` may belong to the same problem with another target, or to a problem that grew into this one.
-    ``beside`` is the least violation at a target nearby.  A few starts confirm it; the others run only if these leave
-    less than half of it.
+    ``beside`` is the least violation known from a nearby target.  If the first few starts reduce the violation below
+    half of ``beside``, the other starts run too; otherwise the search stops.
     """
     chart = Chart.of(problem.robot.model)
     program = program or ElasticProgram(problem)
@@ -80,7 +85,7 @@ def find_conflicts(
 
 
 def _starts(problem: ConstrainedProblem, chart: Chart, seed: int) -> Iterator[Array]:
-    """Yield the given posture, then random postures on the projected constraints, the clearest of each draw first."""
+    """Yield the given posture, then projected random postures, the farthest from all bodies first."""
     yield problem.given
     rng, projector = np.random.default_rng(seed), Projector(problem)
     near = [problem.given if k % 2 else None for k in range(1, _DRAWN)]
@@ -90,7 +95,7 @@ def _starts(problem: ConstrainedProblem, chart: Chart, seed: int) -> Iterator[Ar
 
 
 def _relax(problem: ConstrainedProblem, chart: Chart, program: ElasticProgram, start: Array) -> LeastViolation:
-    """Minimize the slack from one start; the problem of the result has grown if the program lacked parts."""
+    """Minimize the slack from one start; if the program lacked parts, the problem in the result contains them."""
     lower_rows, upper_rows = problem.row_bounds
     norms = np.zeros(len(chart.quaternion_slices()))
     x = np.clip(chart.to_x(start), problem.lower, problem.upper)
@@ -112,10 +117,11 @@ def _relax(problem: ConstrainedProblem, chart: Chart, program: ElasticProgram, s
 
 
 class ElasticProgram:
-    """The elastic program, most of whose expressions stay the same while the problem grows.
+    """The program that relaxes the constraints with slacks.
 
-    ``rows`` are the rows of its constraints, if another program of the problem has them.  ``problem`` is the problem
-    as far as it has grown, and ``time_s`` the wall time of the solver so far.
+    Most of its expressions stay the same while the problem grows.  ``rows`` are the rows of its constraints, if
+    another program of the problem has already built them.  ``problem`` is the latest grown problem, and ``time_s``
+    the total wall time of the solver.
     """
 
     def __init__(self, problem: ConstrainedProblem, rows: ProgramRows | None = None) -> None:
@@ -126,7 +132,7 @@ class ElasticProgram:
         self._fixed = Derivatives.of(ca.vertcat(self._away, rows.norms), rows.x)
 
     def solver(self, problem: ConstrainedProblem) -> ca.Function:
-        """Return ``nlpsol`` for the first problem, or for a problem with another target or that grew from it."""
+        """Return ``nlpsol`` for the first problem, also with another target or after it has grown."""
         self.problem, structure = problem, problem.structure
         if self._latest is None or self._latest[0] != structure:
             self._latest = structure, self._solver(problem)
@@ -135,7 +141,7 @@ class ElasticProgram:
     def _solver(self, problem: ConstrainedProblem) -> ca.Function:
         lifted = self._rows.lift(problem)
         z, nx = lifted.variables.numel(), self._rows.chart.nx
-        # Rows whose constraint has a slack, which is cheaper, need no other.
+        # If a constraint has its own slack, which has a lower price, its rows need no other slack.
         counts = [len(problem.carried(i)) for i in range(len(problem.constraints))]
         rigid = np.repeat(np.array([not piece.slack.nnz() for piece in lifted.pieces], dtype=bool), counts)
         price = np.repeat([c.price for c in problem.constraints], counts)[rigid]
@@ -147,7 +153,7 @@ class ElasticProgram:
         f = ca.dot(price, up + down) + _SLACK_PRICE * lifted.slack + self._away
         known = self._rows.derivatives(lifted)
         slacks = ca.horzcat(place, -place)
-        # The slacks, between x and the auxiliaries, enter the rows linearly.
+        # The slacks stand between x and the auxiliaries in the vector of unknowns. The rows are linear in the slacks.
         hessian, others = ca.SX(nx + 2 * k + z, nx + 2 * k + z), [*range(nx), *range(nx + 2 * k, nx + 2 * k + z)]
         hessian[others, others] = known.hessian
         jacobian = ca.horzcat(known.jacobian[:, :nx], slacks, known.jacobian[:, nx:])

@@ -1,9 +1,10 @@
 """Global search: a complete map for one or two degrees of freedom, and basin hopping for more.
 
-The map (:mod:`impact_posture.posture.manifold.self_motion`) shows how far the best posture can be from optimal.
-Basin hopping starts from the best posture with some joints drawn anew (D. J. Wales and J. P. K. Doye, "Global
-optimization by basin-hopping", J. Phys. Chem. A 1997), because many optima differ in a few joints only.  Starts are
-not chosen by their objective, which hardly predicts the objective at their ends (``make study-global``).
+The map (:mod:`impact_posture.posture.manifold.self_motion`) bounds how much lower than the best value the objective
+can be. Basin hopping gives random values to some joints of the best posture and solves from there (D. J. Wales and J.
+P. K. Doye, "Global optimization by basin-hopping", J. Phys. Chem. A 1997).  Many optima differ in a few joints only.
+The objective at a start hardly predicts the objective at its end (``make study-global``), so starts are not chosen by
+their objective.
 """
 
 from __future__ import annotations
@@ -28,13 +29,13 @@ from impact_posture.posture.search.growing_search import Progress
 from impact_posture.posture.search.multistart import PostureSolution, solve
 from impact_posture.system.arrays import Array
 
-# Number of rounds, each with as many hops as the multi-start search had starts.
+# Number of rounds of hops. In each round, the number of hops equals the number of starts of the multi-start search.
 HOPS_PER_START = 3
-# Shares of the joints that a hop draws anew.
+# Shares of the joints to which a hop gives random values.
 _REDRAWN = (0.1, 0.25, 0.5)
-# A value is better if it is lower by more than this share.
+# An objective is better than another if it is lower by more than this share.
 _BETTER = 1e-6
-# A start missed the best posture if its end is more than this share above it.
+# A start missed the best posture if the objective at its end is more than this share above the best objective.
 _MISSED = 1e-3
 _KEYS = ("redundancy", "improvement", "missed_rate", "unseen_share", "estimated_optima", "hops", "word", "line")
 # Attributes of a solution that describe the multi-start search.
@@ -45,14 +46,15 @@ _OF_THE_STARTS = (
 
 @dataclass(frozen=True, eq=False)
 class SelfMotionMap:
-    """The nodes of a mapped self-motion manifold for figures.
+    """Data for figures: the nodes of a mapped self-motion manifold.
 
     Attributes:
-        q: Nodes, component after component, along the curve for one degree of freedom, shape (N, nq).
+        q: Postures at the nodes, grouped by component, shape (N, nq); for one degree of freedom, in their order along
+            the curve.
         component: Index of the component of each node, shape (N,).
         s: Path length along the component, rad mixed with m, shape (N,); zeros for two degrees of freedom.
-        objective: The objective, shape (N,).
-        feasible: Whether limits and inequalities hold, shape (N,).
+        objective: Objective at each node, shape (N,).
+        feasible: Whether each node satisfies the joint limits and inequalities, shape (N,).
         start, optimum: Index of the node nearest to the initial and to the best posture, shape (1,).
         ends: Index of the node nearest to each optimum of the multi-start search, shape (M,).
     """
@@ -72,14 +74,14 @@ class GlobalSearch:
     """Result of the global search.
 
     Attributes:
-        redundancy: Degrees of freedom that the equalities leave.
-        improvement: Share by which the objective is below the best objective of the multi-start search.
-        missed_rate: Share of the certified starts that ended more than 0.1 % above the best posture.
+        redundancy: Number of degrees of freedom that remain under the equality constraints.
+        improvement: Relative decrease of the objective below the best objective of the multi-start search.
+        missed_rate: Share of the certified starts whose final objective is more than 0.1 % above the best objective.
         unseen_share: Estimated share of further starts that would end in an optimum not seen yet.
-        hops: Number of hops; 0 with a map.
-        motion: The map, or ``None``.
-        bound: The bound on the map, or ``None``.
-        map: The map for figures, or ``None``.
+        hops: Number of hops; 0 if the manifold was mapped.
+        motion: The mapped self-motion manifold; ``None`` after basin hopping.
+        bound: Lower bound of the objective on the mapped manifold; ``None`` after basin hopping.
+        map: Data of the mapped manifold for figures; ``None`` after basin hopping.
     """
 
     redundancy: int
@@ -94,7 +96,7 @@ class GlobalSearch:
 
     @property
     def line(self) -> str:
-        """The result in a sentence."""
+        """One sentence that describes the result."""
         missed = f"{100 * self.missed_rate:.0f} % of the starts"
         if self.motion is None or self.bound is None:
             return (
@@ -112,7 +114,7 @@ class GlobalSearch:
 
     @property
     def word(self) -> str | None:
-        """``bounded`` with a map, because the bound rests on estimates and is not proved; ``None`` without a map."""
+        """``bounded`` if the manifold was mapped (the bound uses estimates and is not proved); otherwise ``None``."""
         return None if self.bound is None else "bounded"
 
     def to_dict(self) -> dict[str, object]:
@@ -169,7 +171,7 @@ def search_globally(
     solves.
     """
     problem = solution.problem
-    # A singular posture has more freedom than the manifold, so the larger rank counts.
+    # The rank drops at a singular posture, so the larger of both ranks gives the dimension of the manifold.
     numeric = Numeric(problem.robot.model)
     ranks = [rank(equality_jacobian(problem, numeric.at(q))) for q in (solution.initial, solution.q)]
     redundancy = problem.robot.nv - max(ranks)
@@ -197,7 +199,7 @@ def _compared(before: PostureSolution, after: PostureSolution) -> tuple[float, f
 def _improved(
     before: PostureSolution, guesses: Sequence[Array | None], *, seed: int, jobs: int, compile: CompileMode
 ) -> PostureSolution:
-    """Solve from guesses, and return the better solution, with the multi-start statistics of ``before``."""
+    """Solve from ``guesses``; return the better of both solutions, with the multi-start statistics of ``before``."""
     known = [q for q in guesses if q is not None]
     try:
         count = 1 + len(known)
@@ -211,7 +213,7 @@ def _improved(
 
 
 def _redrawn(projector: Projector, q: Array, rng: np.random.Generator) -> Array | None:
-    """Draw some joints anew and pull the posture onto the constraints; ``None`` if it does not reach them."""
+    """Give random values to some joints and project the posture onto the constraints; ``None`` if that fails."""
     chart = projector.chart
     x, other = chart.to_x(q), chart.to_x(random_posture(projector.problem, chart, rng))
     share = rng.choice(_REDRAWN)
@@ -261,16 +263,16 @@ def _mapped(
 
 
 def unseen_share(hits: Sequence[int]) -> float:
-    """Return the share of further starts that would end in an optimum not seen yet, from the hits of each optimum.
+    """Estimate, from the hits of each optimum, the share of further starts that would end in an optimum not seen yet.
 
-    This is the Good–Turing estimate, the share of starts that ended in an optimum with one hit (I. J. Good, "The
+    The Good–Turing estimate is the share of starts that ended in an optimum with only one hit (I. J. Good, "The
     population frequencies of species and the estimation of population parameters", Biometrika 1953).
     """
     return sum(count == 1 for count in hits) / sum(hits)
 
 
 def estimated_optima(hits: Sequence[int]) -> float:
-    """Return an estimate of the number of optima, seen and unseen, that tends to be low, from the hits of each.
+    """Estimate the number of optima, seen and unseen, from the hits of each; the estimate tends to be too low.
 
     This is the bias-corrected Chao1 estimate ``n + f₁(f₁ − 1)/(2(f₂ + 1))`` with the numbers ``f_k`` of optima with k
     hits (A. Chao, "Nonparametric estimation of the number of classes in a population", Scand. J. Statist. 1984).

@@ -1,4 +1,4 @@
-"""Runs of the solver from all starts, with a program that grows by the parts that it lacks at their ends."""
+"""Runs of the solver from all starts; the program grows by the parts that are missing where a run ends."""
 
 from __future__ import annotations
 
@@ -25,22 +25,25 @@ from impact_posture.system.processes import fork_map
 
 Progress = Callable[[int, int], None]
 
-# Number of starts that run before all others if the program grows.
+# If the program can grow, this many starts run before all others.
 FIRST = 2
-# Most runs from one start, each with a program that has grown.
+# Maximum number of runs from one start; the program grows before each further run.
 _ROUNDS = 10
-# With at most this many unknowns of all starts together, every start is finished, because that takes no longer.
+# If all starts together have at most this many unknowns, every start is finished, because stopping some would save no
+# time.
 _SMALL = 1000
-# If only the best counts: unknowns of the starts that continue together, their least number, and the share above the
-# best objective from which a start is dominated.  With more starts, the program gets parts that the best do not need.
-# With fewer, it is built more often.  The share is large because a run that ended in a trap may end below its bound.
+# These numbers apply unless all starts are finished: the unknowns of all starts that continue together, the least
+# number of these starts, and the share above the best objective from which a start is dominated.  If more starts
+# continued together, the program would get parts that the best starts do not need. If fewer did, the program would be
+# built more often.  The share is large because a run after a trap may end below the bound of its start.
 _BATCH, _LEAST, _FAR = 600, 2, 0.05
-# A fork takes as long as runs with this many unknowns in all.
+# Starting processes takes as long as runs with this many unknowns in total.
 _FORK = 200
-# Starts that continue from postures this close (rad, m) share one run, because their runs would end equally.
+# Starts that continue from postures this close (rad, m) share one run, because their runs would end at the same
+# posture.
 _SAME = 1e-6
-# Price of a meter of slack after a trap, number of repetitions, and factor on the price in each.  Any fixed price
-# leaves slack where the objective falls steeply, as for a stretched ur10.
+# Price of a meter of slack after a trap, maximum number of repetitions, and factor by which each repetition raises
+# the price.  With a fixed price, slack remains if the objective decreases steeply, for example near a stretched ur10.
 HIGH_PRICE, _ANEW, _DEARER = 20 * SLACK_PRICE, 4, 10
 
 
@@ -50,15 +53,16 @@ class SolverRun:
 
     Attributes:
         start: The start, shape (nq,); ``None`` if no attempt reached the constraints.
-        record: Result of the solver; ``None`` if the objective does not exist at its end.
+        record: Result of the solver; ``None`` if the objective is not defined at the end of the run.
         objective: Objective at the end.
         minimized: Objective divided by the initial objective, plus the regularization.
-        certificate: Certificate of the end; ``None`` while the program lacks parts.
-        lacks: Whether the program lacks parts at the end.
-        dominated: Whether the start was stopped here because it could not become the best.
-        trapped: Whether the end violates a constraint although the program lacks nothing, or because slack pays.  The
-            run is repeated at a higher price.
-        time_s: Wall time of all runs from the start, s; runs for several starts count in equal shares.
+        certificate: Certificate of the final posture; ``None`` while the program lacks parts.
+        lacks: Whether the program lacks parts that the final posture needs.
+        dominated: Whether the start was stopped after this run because it could not become the best.
+        trapped: Whether the final posture violates a constraint although the program lacks no parts, or because slack
+            lowers the objective by more than its price.  The run is then repeated at a higher price.
+        time_s: Wall time of all runs from the start, s; the time of a run for several starts is divided equally among
+            them.
     """
 
     start: Array | None = None
@@ -73,7 +77,7 @@ class SolverRun:
 
     @property
     def good(self) -> bool:
-        """Whether the end is certified."""
+        """Whether the final posture is certified."""
         return self.certificate is not None and self.certificate.holds()
 
 
@@ -81,10 +85,10 @@ class SolverRun:
 def run_start(
     nlp: PostureNLP, start: Array, scale: float, price: float = SLACK_PRICE, first: SolveRecord | None = None
 ) -> tuple[SolveRecord, Certificate]:
-    """Solve from a feasible start and certify the end; if this fails, try the other guesses of the objective.
+    """Solve from a feasible start and certify the result; if that fails, try the other guesses of the objective.
 
     ``scale`` is the initial objective, ``price`` the price of a meter of slack, and ``first`` the result of the first
-    guess, if the caller has it.
+    guess, if the caller has already computed it.
     """
     record = first or nlp.solve(start, scale=scale, price=price)
     certificate = certify(nlp.problem, record.q, scale, record.auxiliaries, nlp.program.numeric)
@@ -99,10 +103,10 @@ def run_start(
 
 
 class GrowingSearch:
-    """Runs from all starts, repeated with a grown program until it lacks no part at any end.
+    """Runs from all starts; the program grows, and runs are repeated, until no final posture lacks a part.
 
     ``scale`` is the initial objective.  ``finish_all`` also finishes starts that cannot become the best; small
-    programs always finish them.  ``rows`` may come from another program of the problem.
+    programs always finish them.  ``rows`` may be shared with another program of the same problem.
     """
 
     def __init__(
@@ -122,21 +126,22 @@ class GrowingSearch:
         self.build_time_s = self.nlp.build_time_s
         # Ends of runs, from which the next runs continue with the grown program.
         self._ends: dict[int, Array] = {}
-        # Price of a meter of slack for starts that did not end in a trap.
+        # Price of a meter of slack for starts without a run that ended in a trap.
         self._price = SLACK_PRICE
-        # Number of traps of each start.
+        # Number of runs of each start that ended in a trap.
         self._trapped: Counter[int] = Counter()
 
     def run(self, jobs: int, progress: Progress | None) -> list[SolverRun]:
-        """Run all starts, and again from each end where the program lacked rows.
+        """Run all starts, and run again from each final posture at which the program lacked rows.
 
-        The objective at such an end is a lower bound for the start, because more rows raise the objective.  Starts
+        The objective at this posture is a lower bound for the start, because more rows raise the objective.  Starts
         with the lowest bounds continue first, and starts with bounds well above a certified end do not continue.
         """
         runs: dict[int, SolverRun] = {}
         starts, best = self._draws.count, np.inf
         waiting, counts = list(range(starts)), [0] * starts
-        # Ends where the program lacks rows, with the problem of their run; it gets the rows when the start continues.
+        # Results at which the program lacks rows, with the problem of their run. The program gets these rows when the
+        # start continues.
         owed: dict[int, tuple[SolveRecord, ConstrainedProblem]] = {}
         while waiting:
             batch = self._next(waiting, runs)
@@ -153,8 +158,8 @@ class GrowingSearch:
                 if run.good and run.minimized < best and self._clear(run):
                     best = run.minimized
             lacking = {k: r for k in batch if (r := runs[k].record) is not None and runs[k].lacks and k not in last}
-            # A run without all rows passes through bodies and may end between them.  With all rows and a higher
-            # price, it keeps the constraints that its start satisfies.
+            # A run with missing rows passes through bodies and may end between them.  With all rows and a higher
+            # price, a run stays within the constraints that its start satisfies.
             trapped = {k for k in batch if runs[k].trapped and k not in last}
             if len(runs) < starts and trapped == {*range(FIRST)}:
                 # For each of the first starts, passing through a body lowers the objective by more than the price.
@@ -171,8 +176,8 @@ class GrowingSearch:
         return [runs[index] for index in range(starts)]
 
     def _grow(self, owed: list[tuple[SolveRecord, ConstrainedProblem]]) -> None:
-        """Add the rows that the program lacks at ends of runs, each given with the problem of its run."""
-        # Auxiliaries are of use with the program of their run only.
+        """Add the rows that the program lacks at the results ``owed``, each given with the problem of its run."""
+        # Auxiliaries can be used only with the program of their run.
         now = [record for record, problem in owed if problem is self.problem]
         before = [record.q for record, problem in owed if problem is not self.problem]
         numeric = self.nlp.program.numeric
@@ -191,7 +196,7 @@ class GrowingSearch:
             # Most starts lack the same rows as the first starts.
             return waiting[:FIRST]
         if self._small and len(runs) == FIRST and waiting[0] < FIRST:
-            # In a small program more rows cost the other starts less than another run.
+            # In a small program, more rows take the other starts less time than another run.
             return [k for k in waiting if k < FIRST]
         if self._finish_all or not all(k in runs for k in waiting):
             return waiting
@@ -200,7 +205,7 @@ class GrowingSearch:
         return sorted(k for group in list(groups.values())[:count] for k in group)
 
     def _clear(self, run: SolverRun) -> bool:
-        """Return whether no original shapes touch at the end of a run."""
+        """Return whether no original shapes touch at the final posture of a run."""
         around = self.problem.surroundings
         return around is None or run.record is None or not around.collisions(run.record.q)
 
@@ -219,7 +224,8 @@ class GrowingSearch:
         jobs = jobs if len(waiting) * self._unknowns > _FORK else 1
         with fork_map(lambda k: self._timed(waiting[k], last=waiting[k] in last), len(waiting), jobs) as results:
             if around := self.problem.surroundings:
-                # Load the original shapes, which the final check needs, while this process would only wait.
+                # The final check needs the original shapes. Load them now, because this process only waits for the
+                # others.
                 _ = around.shapes.geometry
             for k, run in results:
                 yield waiting[k], run
@@ -230,7 +236,7 @@ class GrowingSearch:
 
     @one_blas_thread()
     def _run(self, index: int, *, last: bool) -> SolverRun:
-        """Run one start; if the program lacks parts at its end, certify the end in the last round only."""
+        """Run one start; if the program lacks parts at the result, certify the result in the last round only."""
         nlp, scale, problem = self.nlp, self._scale, self.problem
         numeric = nlp.program.numeric
         trapped, start = self._trapped[index], self._ends.get(index)
@@ -246,13 +252,13 @@ class GrowingSearch:
                 record, certificate = run_start(nlp, start, scale, price, record)
             objective = problem.objective.value(record.q)
         except MetricError:
-            # The objective does not exist at the end of this start.  The other starts continue.
+            # The objective is not defined at the final posture of this start.  The other starts continue.
             return SolverRun(start)
         minimized = objective / scale
         if problem.requirements.regularization:
             minimized += problem.requirements.regularization * distance(nlp.chart, record.q, problem.given) ** 2
         certified = certificate is not None and certificate.holds()
-        # More rows do not help where slack pays.
+        # If slack lowers the objective by more than its price, more rows do not help.
         pays = record.converged and problem.slack(record.auxiliaries) > FEASIBLE
         anew = record.converged and (pays or not lacks) and not certified and trapped < _ANEW
         anew = anew and not feasible(problem, record.q, numeric)
@@ -260,6 +266,6 @@ class GrowingSearch:
 
 
 def feasible(problem: ConstrainedProblem, q: Array, numeric: Numeric | None = None) -> bool:
-    """Return whether ``q``, shape (nq,), satisfies all constraints, also constraints that the program lacks."""
+    """Return whether ``q``, shape (nq,), satisfies all constraints, including those that the program lacks."""
     violations = problem.violations((numeric or Numeric(problem.robot.model)).at(q))
     return all(float(np.abs(excess).max(initial=0.0)) <= FEASIBLE for excess in violations)

@@ -6,12 +6,12 @@ from impact_posture.impact.objective import Objective
 from impact_posture.impact.worst_case_objective import WorstCaseObjective
 from impact_posture.system.arrays import Array
 
-# A contact counts as locked if its 1/mass falls below this share of the initial value.
+# A contact is reported as locked if its inverse effective mass falls below this share of its initial value.
 _LOCKED = 0.05
 
 
 def percent(share: float) -> str:
-    """Return a share in percent, with as many digits as a share below 100 % needs, and zero without a minus sign."""
+    """Return a share in percent, with enough digits that only exactly 100 % reads 100 %, and without "-0"."""
     for digits in range(1, 15):
         text = f"{100 * share:.{digits}f}"
         if abs(share) >= 1 or abs(float(text)) != 100:

@@ -15,19 +15,19 @@ from impact_posture.posture.search.conflicts import ElasticProgram, find_conflic
 from impact_posture.posture.search.growing_search import feasible
 from impact_posture.system.arrays import Array
 
-# Violation of a known conflict that lets :func:`find_conflicts` stop after a few starts.
+# With this value as ``beside``, :func:`find_conflicts` stops after a few starts if a conflict remains.
 _QUICK = 1e-9
 
 
 def initial_posture(problem: ConstrainedProblem, seed: int, rows: ProgramRows) -> tuple[ConstrainedProblem, Array]:
-    """Return the given posture moved onto the constraints, or the first other start that reaches them.
+    """Return the given posture moved onto the constraints, or else the first random start that reaches them.
 
-    If a start violates constraints without projection, the elastic program moves it.  The returned problem then has
-    all parts that this program needed.
+    If this start still violates constraints that the projection ignores, the elastic program moves it.  The returned
+    problem then has all parts that the elastic program needed.
 
     Raises:
         Infeasible: No posture satisfies the constraints; the error names the conflicting constraints.
-        SolverFailed: A posture was found near the constraints, but none on them.
+        SolverFailed: The search reached a posture near the constraints, but no posture that satisfies them.
     """
     starts = (feasible_start(problem, index, seed) for index in range(5))
     start = next((q for q in starts if q is not None), None)
@@ -52,7 +52,7 @@ def initial_posture(problem: ConstrainedProblem, seed: int, rows: ProgramRows) -
 
 
 def _turn_hint(problem: ConstrainedProblem, seed: int) -> str:
-    """Return a hint if the constraints do not conflict when the contact frame may turn, else an empty text."""
+    """Return a hint if the conflict vanishes when the contact frame may turn; otherwise an empty text."""
     if not problem.objective.contacts or problem.requirements.contact_pose in ("position", "box", "free"):
         return ""
     freed = replace(problem.requirements, contact_pose="position", target_quaternion=None)
@@ -65,12 +65,13 @@ def _turn_hint(problem: ConstrainedProblem, seed: int) -> str:
 
 
 def initial_objective(problem: ConstrainedProblem, initial: Array) -> float:
-    """Return the objective at the start, which scales the program.
+    """Return the objective at the initial posture; this value scales the program.
 
-    Raise ``ContactError`` if the contact point cannot move along the normal, because there is no objective then.
+    Raise ``ContactError`` if the contact point cannot move along the normal, because the objective is then not
+    defined.
     """
     objective = problem.objective
-    # If nothing can move along the normal, the value would be rounding.
+    # If the point cannot move along the normal, the computed value would only be a rounding error.
     value = objective.value(initial) if objective.movable(initial) else 0.0
     if not (np.isfinite(value) and value > 0):
         frames = ", ".join(f"'{contact.frame}'" for contact in objective.contacts)

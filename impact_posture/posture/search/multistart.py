@@ -23,11 +23,13 @@ from impact_posture.posture.search.initial_posture import initial_objective, ini
 from impact_posture.posture.search.start_draws import StartDraws
 from impact_posture.system.arrays import Array
 
-# Two ends are the same optimum if their postures (tangent norm) and objectives (relative) differ by less than this.
+# Two final postures are the same optimum if they (tangent norm) and their objectives (relative) differ by less than
+# this.
 SAME_POSTURE, _SAME_OBJECTIVE = 1e-2, 1e-4
-# A smaller reduction does not count: the jump, a square root, changes by less than 0.05 %.
+# A relative reduction below this value is not reported as better. The jump is a square root of the objective, so the
+# jump changes by less than 0.05 %.
 _NO_GAIN = 1e-3
-# With at least this many starts, a single hit of the best optimum gets a note.
+# If only one of at least this many starts ended at the best optimum, the solution gets a note.
 _MANY = 8
 
 
@@ -48,18 +50,18 @@ class PostureSolution:
         initial: The given posture, moved onto the constraints if it does not satisfy them, shape (nq,).
         moved: Length of this move, tangent norm.
         q: The best certified posture, shape (nq,).
-        redundancy: Degrees of freedom that the equalities leave at ``q``.
+        redundancy: Number of degrees of freedom at ``q`` that remain under the equality constraints.
         optima: Distinct optima, best first.
-        feasible_starts: Starts that reached the constraints.
-        certified_starts: Starts that ended at a certified posture where no original shapes touch.
-        colliding_starts: Starts that ended at a certified posture where original shapes touch.
-        dominated_starts: Starts that were stopped because they could not become the best.
+        feasible_starts: Number of starts that reached the constraints.
+        certified_starts: Number of starts that ended at a certified posture where no original shapes touch.
+        colliding_starts: Number of starts that ended at a certified posture where original shapes touch.
+        dominated_starts: Number of starts that were stopped because they could not become the best.
         status: Return status of IPOPT for the best run.
-        solve_time_s: Wall time of all runs together.
-        start_time_s: Median wall time of the runs from one start.
+        solve_time_s: Wall time of all runs together, s.
+        start_time_s: Median over the starts of the wall time of all runs from a start, s.
         compiled: Whether the program ran as machine code.
         notes: Notes for the user about the solution.
-        compiler_fault: Why a compilation failed; empty if none failed.
+        compiler_fault: Reason why a compilation failed; empty if no compilation failed.
     """
 
     problem: ConstrainedProblem
@@ -85,7 +87,7 @@ class PostureSolution:
 
     @property
     def reduction(self) -> float:
-        """``1 − objective(q)/objective(initial)``."""
+        """Relative reduction of the objective, ``1 − objective(q)/objective(initial)``."""
         objective = self.problem.objective
         return 1 - objective.value(self.q) / objective.value(self.initial)
 
@@ -104,8 +106,9 @@ def solve(
 ) -> PostureSolution:
     """Solve from the given posture, from feasible ``guesses``, shape (nq,) each, and from random feasible postures.
 
-    ``starts`` counts all starts, and ``seed`` is for the random postures.  ``progress`` is called with the numbers of
-    finished starts and of all starts.  ``finish_all`` also finishes starts that can no longer become the best.
+    ``starts`` is the number of all starts, and ``seed`` the seed of the random postures.  ``progress`` is called with
+    the numbers of finished starts and of all starts.  ``finish_all`` also finishes starts that can no longer become
+    the best.
 
     Raises:
         Infeasible: No posture satisfies the constraints; the error names the conflicting constraints.
@@ -127,7 +130,7 @@ def solve(
         fault = f"original shapes touch at all {len(certified)} certified postures: {touching}"
         hint = "try more `starts`, another `posture`, or a larger `clearance`"
         raise SolverFailed(fault, where="solver", hint=hint)
-    # The first of equally good runs counts, so that the solution does not depend on the speed of processes.
+    # Among equally good runs, take the first in the order of starts, so that the solution does not depend on timing.
     best = min(good, key=lambda r: round(r.minimized, 9))
     assert best.record is not None and best.certificate is not None  # noqa: S101 (narrows types)
     q, certificate, notes = best.record.q, best.certificate, []
@@ -174,7 +177,7 @@ def solve(
 
 
 def _without_collisions(problem: ConstrainedProblem, runs: list[SolverRun]) -> tuple[list[SolverRun], str]:
-    """Return the runs whose original shapes do not touch at the end, and the names of two shapes that touch."""
+    """Return the runs whose final postures have no collision, and the names of two shapes that collide in another."""
     if problem.surroundings is None:
         return runs, ""
     good: list[SolverRun] = []
@@ -182,7 +185,7 @@ def _without_collisions(problem: ConstrainedProblem, runs: list[SolverRun]) -> t
     for run in runs:
         assert run.record is not None  # noqa: S101 (narrows a type)
         q = run.record.q
-        # Equal ends are checked once.
+        # Check equal final postures only once.
         same = (pairs for other, pairs in checked if np.linalg.norm(wrapped_difference(problem, other, q)) < 1e-6)
         pairs = next(same, None)
         if pairs is None:
@@ -196,7 +199,7 @@ def _without_collisions(problem: ConstrainedProblem, runs: list[SolverRun]) -> t
 
 
 def distinct(problem: ConstrainedProblem, ends: list[tuple[Array, float]]) -> tuple[Optimum, ...]:
-    """Group ends (posture, objective) by optimum, best objective first."""
+    """Group final postures, given with their objectives, by optimum; the best objective comes first."""
     optima: list[Optimum] = []
     for q, objective in sorted(ends, key=lambda end: end[1]):
         for k, known in enumerate(optima):
@@ -210,13 +213,16 @@ def distinct(problem: ConstrainedProblem, ends: list[tuple[Array, float]]) -> tu
 
 
 def hits_of_best(optima: Sequence[Optimum]) -> int:
-    """Return how many starts reached the best objective at any posture, because ends on a flat optimum differ."""
+    """Return how many starts reached the best objective.
+
+    Their postures are not compared, because postures on a flat optimum differ.
+    """
     best = optima[0].objective
     return sum(o.hits for o in optima if o.objective - best <= _SAME_OBJECTIVE * abs(best))
 
 
 def wrapped_difference(problem: ConstrainedProblem, one: Array, other: Array) -> Array:
-    """Return ``other ⊖ one`` without full turns of revolute joints."""
+    """Return ``other ⊖ one``, shape (nv,), with the angles of revolute joints wrapped to ±π."""
     step = np.array(pin.difference(problem.robot.model, one, other))
     for slot in Chart.of(problem.robot.model).slots:
         if slot.kind.family == "revolute":

@@ -10,9 +10,9 @@ from impact_posture.system.arrays import Array
 class StartDraws:
     """Known starts, then random starts (:func:`impact_posture.posture.manifold.feasible_start.feasible_start`).
 
-    The process that runs a start draws it.  The constraints of the starts do not grow with the problem.  There is at
-    least one known start.  Odd random starts lie near the first, because the posture of the problem may be far from
-    all postures that satisfy the constraints.
+    Each start is drawn in the process that runs it.  The constraints on the starts do not grow with the problem.
+    There is at least one known start.  Every second random start lies near the first known start, because the posture
+    of the problem may be far from all postures that satisfy the constraints.
     """
 
     def __init__(self, problem: ConstrainedProblem, known: tuple[Array, ...], count: int, seed: int) -> None:
@@ -20,14 +20,14 @@ class StartDraws:
         self._problem, self._seed, self._projector = problem, seed, Projector(problem)
 
     def choose(self, index: int, trapped: int = 0) -> Array | None:
-        """Return a start; ``None`` if no attempt reached the constraints.
+        """Return the start with this index, shape (nq,); ``None`` if no attempt reached the constraints.
 
-        ``trapped`` is the number of runs from this start that ended in a trap.  After the first, the start is drawn
-        with more care, and after each further one, another start is drawn.
+        ``trapped`` is the number of runs from this start that ended in a trap.  After the first trap, the start is
+        chosen from more candidates.  After each further trap, another start is drawn.
         """
         if index < len(self._known) and trapped <= 1:
             return self._known[index]
         other = index + max(trapped - 1, 0) * self.count
         draw = StartDraw(self._problem, other, self._seed, self._known[0], self._projector)
-        # A run from a start between bodies may not get out.
+        # A run from a start between bodies may stay trapped there, so more candidates are drawn after a trap.
         return draw.choose(ATTEMPTS if trapped else CANDIDATES)
