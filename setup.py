@@ -1,8 +1,8 @@
-"""Find the packages: a folder that is added ships without being listed.  Everything else is in pyproject.toml."""
+"""Find the packages, so that a new folder is shipped without being listed.  Everything else is in pyproject.toml."""
 
 from setuptools import find_packages, setup
 
-# setuptools' own finder cannot rename a folder.
+# The automatic discovery of setuptools cannot rename a folder.
 FOLDERS = {"impact_posture": "impact_posture", "impact_posture_cli": "cli", "impact_posture_robots": "robots"}
 
 setup(

@@ -23,11 +23,11 @@ extensions = [
     "cli_reference",
     "package_structure",
 ]
-# MathJax from the wheel, so that equations show without a network; Sphinx's own default (a CDN) where it is missing.
+# Use MathJax from its wheel, so that equations show without a network.  If the wheel is missing, Sphinx uses a CDN.
 if importlib.util.find_spec("sphinx-mathjax-offline"):
     extensions.append("sphinx-mathjax-offline")
 
-# Two hyphens are an option, not a dash.
+# Two hyphens must stay hyphens, because they begin an option.
 smartquotes = False
 html_show_copyright = False
 html_theme = "furo"
@@ -44,7 +44,7 @@ autodoc_member_order = "bysource"
 suppress_warnings = ["ref.python"]
 autodoc_typehints = "signature"
 autodoc_default_options = {"members": True, "show-inheritance": True}
-# CasADi's and Pinocchio's own pages are not linked: the build needs no network.
+# The pages of CasADi and Pinocchio are not linked, because the build must work without a network.
 autodoc_class_signature = "mixed"
 napoleon_google_docstring = True
 napoleon_numpy_docstring = False

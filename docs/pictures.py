@@ -1,4 +1,4 @@
-"""Draw the pictures of README and pages into ``docs/images``.  Run: ``make pictures``."""
+"""Draw the pictures of README and pages into ``docs/images``.  Run with ``make pictures``."""
 
 from __future__ import annotations
 
@@ -11,7 +11,7 @@ from pathlib import Path
 from PIL import Image
 
 IMAGES = Path(__file__).parent / "images"
-# Commands, and the places of their figures.
+# Arguments of ``optimize``, and for each figure the name of its picture.
 PICTURES = [
     (
         "tilthex_arm --frame ee --normal 0 0 1",
@@ -24,7 +24,7 @@ PICTURES = [
 ]
 
 
-# A browser takes a picture of the report of the first command.
+# Command of the browser that takes a picture of the report of the first command.
 BROWSER = ("chromium", "--headless=new", "--no-sandbox", "--use-angle=swiftshader", "--enable-unsafe-swiftshader",
            "--hide-scrollbars", "--window-size=1280,1120", "--virtual-time-budget=8000")  # fmt: skip
 
@@ -41,7 +41,7 @@ def picture_report(page: Path) -> None:
 
 
 def main() -> None:
-    """Run each command and copy its figures."""
+    """Run each command, and copy its figures into the documentation."""
     program = Path(sys.executable).with_name("impact-posture")
     for arguments, figures in PICTURES:
         with tempfile.TemporaryDirectory() as folder:

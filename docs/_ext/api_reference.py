@@ -1,4 +1,4 @@
-"""``api-reference PACKAGE…``: one section for each module of the packages."""
+"""Directive ``api-reference PACKAGE…``, which writes a section for each module of the packages."""
 
 from __future__ import annotations
 
@@ -15,7 +15,7 @@ ROOT = "impact_posture"
 
 
 def modules(name: str) -> list[str]:
-    """Return a module, or the public modules of a package, with the package first if it exports names."""
+    """Return a module, or the public modules of a package.  A package that exports names comes first."""
     full = f"{ROOT}.{name}"
     package = import_module(full)
     if not hasattr(package, "__path__"):
@@ -34,7 +34,7 @@ def markdown(names: list[str]) -> str:
             "",
             "```{eval-rst}",
             f".. automodule:: {module}",
-            # matplotlib writes it into every class derived from its artists, in its own markup.
+            # Leave out the method that matplotlib adds, with its own markup, to every class derived from an artist.
             "   :exclude-members: set",
             "```",
             "",

@@ -1,6 +1,7 @@
-"""``cli-reference``: the command line as pages show it, read from the commands' own signatures.
+"""Directive ``cli-reference``, which describes the command line from the signatures of the commands.
 
-Typer's public ``OptionInfo`` is read, not the parser that it builds: that one differs from version to version.
+The directive reads the public ``OptionInfo`` of Typer.  The parser that Typer builds from it changes between
+versions.
 """
 
 from __future__ import annotations
@@ -23,7 +24,7 @@ _WORDS = {int: "INTEGER", float: "NUMBER", str: "TEXT"}
 
 @dataclass(frozen=True)
 class Parameter:
-    """An argument or option of a command: how to write it, its default and meaning, in Markdown."""
+    """Argument or option of a command: spelling, default and meaning, in Markdown."""
 
     names: tuple[str, ...]
     takes: str
@@ -34,7 +35,7 @@ class Parameter:
 
     @property
     def spelling(self) -> str:
-        """Every name, and what it takes."""
+        """All names of the parameter, and the placeholder of its value."""
         return f"{', '.join(self.names)} {self.takes}".strip()
 
 
@@ -59,7 +60,7 @@ def parameters(command: Callable[..., None]) -> list[Parameter]:
         info, value = infos[0], parameter.default
         inner = _plain(get_args(annotation)[0])
         argument = isinstance(info, ArgumentInfo)
-        # Inside Annotated, Typer keeps the first name where the default would stand.
+        # If a parameter uses Annotated, Typer stores the first name in the field for the default.
         first = (info.default,) if isinstance(info.default, str) else ()
         names = (*first, *(info.param_decls or ())) or (f"--{name.replace('_', '-')}",)
         takes = info.metavar or ("" if inner is bool else _choices(inner) or _WORDS.get(inner, "TEXT"))
@@ -78,7 +79,7 @@ def parameters(command: Callable[..., None]) -> list[Parameter]:
 
 
 def _plain(annotation: Any) -> Any:
-    """The type without ``| None`` and without the list around a repeatable option."""
+    """Return the type without ``| None`` and without the list of a repeatable option."""
     if get_origin(annotation) in (Union, types.UnionType):
         annotation = next(a for a in get_args(annotation) if a is not type(None))
     return get_args(annotation)[0] if get_origin(annotation) is list else annotation
@@ -92,7 +93,7 @@ def _choices(inner: Any) -> str:
 
 
 def _kinds(info: ArgumentInfo | OptionInfo, inner: Any) -> str:
-    """The choices, where a metavar hides them and the help does not name them all."""
+    """Return the choices if a metavar hides them and the help text does not name all of them."""
     choices = _choices(inner)
     if not (info.metavar and choices) or all(c in (info.help or "") for c in choices.split("|")):
         return ""
@@ -112,7 +113,7 @@ def _cell(text: str) -> str:
 
 
 def markdown() -> str:
-    """Write a section for each command: its purpose, its usage, and a table of its options."""
+    """Return a section for each command, with its purpose, its usage, and a table of its options."""
     from impact_posture_cli.app import COMMANDS
 
     parts = []

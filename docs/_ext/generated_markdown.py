@@ -10,12 +10,12 @@ if TYPE_CHECKING:
 
 
 def add_directive(app: Sphinx, name: str, markdown: Callable[[list[str]], str]) -> dict[str, Any]:
-    """Register a directive whose arguments become Markdown, and return the metadata of the extension."""
+    """Register a directive that inserts ``markdown(arguments)``, and return the metadata of the extension."""
     from docutils import nodes
     from sphinx.util.docutils import SphinxDirective
 
     class GeneratedMarkdown(SphinxDirective):
-        """Insert the Markdown."""
+        """Insert the Markdown text."""
 
         optional_arguments = 30
 

@@ -1,4 +1,4 @@
-"""Tables of the library that are counted or read when the pages are built.
+"""Tables about the structure of the library, which are computed when the pages are built.
 
 ``package-structure`` lists files, lines and imports of each folder, ``module-map`` the first sentence of each module.
 """
@@ -21,7 +21,7 @@ SUFFIXES = {".py", ".c", ".cpp", ".hpp"}
 
 
 def part_of(module: str) -> str:
-    """Folder or module of the library that a dotted name belongs to.  The command line is one part."""
+    """Return the folder or module of the library to which a dotted name belongs.  The command line is one part."""
     names = module.split(".")
     if names[0] == "impact_posture_cli":
         return "cli"
@@ -29,7 +29,7 @@ def part_of(module: str) -> str:
 
 
 def imports_of(path: Path) -> set[str]:
-    """Parts that a file imports when it is loaded or when its functions run, not for annotations alone."""
+    """Return the parts that a file imports at any time, without imports that only annotations need."""
     imported: set[str] = set()
     todo: list[ast.AST] = [ast.parse(path.read_text(encoding="utf-8"))]
     while todo:
@@ -37,7 +37,7 @@ def imports_of(path: Path) -> set[str]:
         if isinstance(node, ast.If) and ast.unparse(node.test) == "TYPE_CHECKING":
             continue
         if isinstance(node, ast.ImportFrom) and (node.module or "").split(".")[0] in PACKAGES:
-            # `from impact_posture import tsid` names a part, too.
+            # The statement `from impact_posture import tsid` also imports a part.
             names = [f"{node.module}.{alias.name}" for alias in node.names]
             imported |= {part_of(name) for name in ([node.module or ""] if "." in (node.module or "") else names)}
         todo += ast.iter_child_nodes(node)
@@ -45,7 +45,7 @@ def imports_of(path: Path) -> set[str]:
 
 
 def parts() -> dict[str, tuple[int, int, set[str]]]:
-    """Files, lines and imports of each part, the largest first."""
+    """Return number of files, number of lines, and imports of each part.  The largest part comes first."""
     counts: dict[str, tuple[int, int, set[str]]] = {}
     for package, folder in PACKAGES.items():
         for path in sorted(p for p in folder.rglob("*") if p.suffix in SUFFIXES):
@@ -60,7 +60,7 @@ def parts() -> dict[str, tuple[int, int, set[str]]]:
 
 
 def markdown() -> str:
-    """Write a row for each part, and the sum."""
+    """Return a table with a row for each part, and a row for the sum."""
     every = parts()
     rows = ["| part | files | lines | imports |", "|---|---|---|---|"]
     for name, (files, lines, imports) in every.items():
@@ -72,7 +72,7 @@ def markdown() -> str:
 
 
 def module_map() -> str:
-    """Write a table for each folder, with the first sentence of each module."""
+    """Return a table for each folder, with the first sentence of each module docstring."""
     folders: dict[Path, list[Path]] = {}
     for path in sorted(p for folder in PACKAGES.values() for p in folder.rglob("*.py") if p.name != "__init__.py"):
         folders.setdefault(path.parent, []).append(path)

@@ -1,7 +1,7 @@
-"""An aerial manipulator braces for an impact from below: nominal posture, impact-robust posture, and the difference.
+"""An aerial manipulator braces for an impact from below: from the nominal posture to the impact-robust posture.
 
 Run: python brace.py EXPORT
-EXPORT: what `impact-posture codegen tilthex_arm --frame ee --normal 0 0 1 --out EXPORT` wrote.
+EXPORT: folder that `impact-posture codegen tilthex_arm --frame ee --normal 0 0 1 --out EXPORT` wrote.
 """
 
 import sys
@@ -30,7 +30,7 @@ for k in range(4500):
     if k in events:
         events[k]()
     command = controller.tick(k * 1e-3, q, v)
-    # On a robot: send command.rotor_speed and command.torque.  Here the robot moves exactly as planned.
+    # On a robot, send command.rotor_speed and command.torque.  In this example, the robot moves exactly as planned.
     v = v + 1e-3 * command.acceleration
     q = pin.integrate(robot.model, q, 1e-3 * v)
 

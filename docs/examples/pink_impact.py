@@ -3,10 +3,10 @@
     pip install pin-pink
     python pink_impact.py
 
-``ImpactTask`` asks for the velocity ``v = −K ∇H(q)``.  It stands in the cost of pink's QP; what the robot must hold
-stands in pink's equality constraints, so that H falls in their null space alone.  The gradient comes from the
-compiled C export.  For each contact below, pink runs from the robot's posture until it rests; then the posture is put
-beside the optima that ``impact-posture optimize`` finds offline under the same constraints.
+``ImpactTask`` asks for the velocity ``v = −K ∇H(q)`` and is part of the cost of the QP in pink.  The tasks that the
+robot must keep are equality constraints in pink, so that H decreases only in their null space.  The gradient comes
+from the compiled C export.  For each contact below, pink runs from the default posture until the robot rests.  Then
+the posture is compared with the optima that ``impact-posture optimize`` computes offline under the same constraints.
 """
 
 from __future__ import annotations
@@ -28,13 +28,13 @@ from impact_posture.config.table_validation import validate
 from impact_posture.posture.formulation.problem_file import Prepared, prepare
 from impact_posture.posture.search.multistart import PostureSolution, solve
 
-DT, DURATION, AT_REST = 0.01, 60.0, 1e-6  # s, s, and a norm of v
+DT, DURATION, AT_REST = 0.01, 60.0, 1e-6  # time step, s; longest run, s; norm of v at rest
 
 
 class ImpactTask(Task):
-    """``Δq = −K ∇H(q) Δt``: error ``K ∇H Δt`` and Jacobian 1, both on the tangent space.
+    """Task ``Δq = −K ∇H(q) Δt``, with the error ``K ∇H Δt`` and the identity as Jacobian, both on the tangent space.
 
-    H scales with the robot: K is given as the norm of v at the first tick.
+    The size of H depends on the robot.  So the norm of v at the first tick is given instead of K.
     """
 
     def __init__(self, gradient: ImpactGradient, normal: tuple[float, ...], speed: float, q: np.ndarray) -> None:
@@ -54,7 +54,7 @@ class ImpactTask(Task):
 
 
 class PointTask(Task):
-    """Hold the origin of a frame and leave its orientation free; pink's FrameTask has all six rows."""
+    """Keep the position of a frame and leave its orientation free.  The FrameTask of pink has all six rows."""
 
     def __init__(self, frame: str, configuration: pink.Configuration) -> None:
         super().__init__(cost=1.0)
@@ -72,7 +72,7 @@ class PointTask(Task):
 
 
 class LevelTask(Task):
-    """Keep the z axis of the base vertical and its yaw free: ``e = (Rᵀ e_z)_xy``, with the rate ``−ω × Rᵀ e_z``."""
+    """Keep the z axis of the base vertical and the yaw free: ``e = (Rᵀ e_z)_xy``, with the rate ``−ω × Rᵀ e_z``."""
 
     def __init__(self, frame: str) -> None:
         super().__init__(cost=1.0)
@@ -90,20 +90,20 @@ class LevelTask(Task):
 
 
 def pose_and_level(frame: str, configuration: pink.Configuration) -> list[Task]:
-    """Return the tasks that the aerial manipulator holds."""
+    """Return the tasks that the aerial manipulator must keep."""
     pose = FrameTask(frame, position_cost=1.0, orientation_cost=1.0)
     pose.set_target_from_configuration(configuration)
     return [pose, LevelTask("base_link")]
 
 
 def point(frame: str, configuration: pink.Configuration) -> list[Task]:
-    """Return the task that an arm with a ball tip holds."""
+    """Return the task that an arm with a ball tip must keep."""
     return [PointTask(frame, configuration)]
 
 
 @dataclass(frozen=True)
 class Contact:
-    """A contact as options of ``optimize``, and the tasks that pink holds."""
+    """Contact as options of ``optimize``, and the tasks that pink must keep."""
 
     name: str
     settings: dict[str, object]
@@ -127,14 +127,14 @@ CONTACTS = (
 
 @dataclass(frozen=True)
 class Outcome:
-    """Posture in which pink rests, and the offline optimization of the same problem."""
+    """Posture in which the robot rests under pink, and the offline optimization of the same problem."""
 
     contact: Contact
     prepared: Prepared
-    offline: PostureSolution  # its optima, best first
+    offline: PostureSolution  # its optima are sorted, the best first
     q: np.ndarray
-    H: np.ndarray  # at the start and after each tick
-    errors: np.ndarray  # norm of what is held, after each tick
+    H: np.ndarray  # H at the start and after each tick
+    errors: np.ndarray  # norm of the errors of the kept tasks, after each tick
     speed: float  # norm of v at the last tick
 
     def distances(self) -> list[float]:
@@ -144,8 +144,8 @@ class Outcome:
 
 
 def follow(contact: Contact, speed: float = 5.0) -> Outcome:
-    """Run pink from the start posture until it rests."""
-    # pink knows neither collisions nor loads, so the offline problem leaves them out, too.
+    """Run pink from the start posture until the robot rests."""
+    # This use of pink includes neither collisions nor loads, so the offline problem leaves them out, too.
     settings = {"collision": False, "holdable": False, **contact.settings}
     prepared = prepare(validate(ProblemSettings, settings, "options"))
     impact, offline = prepared.impact, solve(prepared.problem)
@@ -170,7 +170,7 @@ def follow(contact: Contact, speed: float = 5.0) -> Outcome:
 
 
 def limited(prepared: Prepared) -> pin.Model:
-    """Return the model with the limit margin of ``optimize``, because pink reads limits from the model."""
+    """Return the model with the limit margin of ``optimize`` subtracted, because pink reads limits from the model."""
     model = prepared.impact.robot.model.copy()
     joints = slice(7 if prepared.impact.robot.floating else 0, None)
     lower, upper = model.lowerPositionLimit.copy(), model.upperPositionLimit.copy()
@@ -181,7 +181,7 @@ def limited(prepared: Prepared) -> pin.Model:
 
 
 def report(outcome: Outcome) -> None:
-    """Print an outcome."""
+    """Print the results of a run."""
     objective, H = outcome.prepared.impact.objective, outcome.H
     print(outcome.contact.name)
     print(f"  H {H[0]:.6g} → {H[-1]:.6g} ({100 * (H[-1] / H[0] - 1):+.1f} %) in {(len(H) - 1) * DT:.1f} s")
@@ -198,7 +198,7 @@ def report(outcome: Outcome) -> None:
 
 
 def main() -> list[Outcome]:
-    """Follow the term at all contacts."""
+    """Run pink with the impact-robust task for all contacts."""
     outcomes = []
     for contact in CONTACTS:
         outcomes.append(follow(contact))

@@ -3,10 +3,11 @@
     pip install --no-binary tsid tsid
     python tsid_impact.py
 
-TSID's posture task asks for ``ν̇* = K_p (q_ref − q) + K_d (ν_ref − ν) + a_ref``.  The term goes into its reference of
-acceleration: ``a_ref = −K ∇H(q)``, set anew at every tick.  A ur5 keeps its tip on one point, strictly, with a free
-orientation; K_p is zero, so that the posture comes to rest at an optimum of H and not where a spring holds it.  The
-accelerations that TSID answers with are integrated as they are: this shows the term, not a robot.
+The posture task of TSID asks for ``ν̇* = K_p (q_ref − q) + K_d (ν_ref − ν) + a_ref``.  The term is its reference
+acceleration ``a_ref = −K ∇H(q)``, which is updated at every tick.  A ur5 must keep its tip at one point, with a free
+orientation.  K_p is zero, so that the posture comes to rest at an optimum of H and not at the rest posture of a
+spring.  The accelerations of TSID are integrated without a simulation of the robot, because the example shows only
+the term.
 """
 
 from __future__ import annotations
@@ -28,21 +29,21 @@ from impact_posture.robot.robot_loader import load_robot
 DT, DURATION = 0.002, 20.0
 FRAME, NORMAL = "tool0", (0.0, 0.0, 1.0)
 KD = 20.0  # 1/s
-SPEED = 1.0  # norm of the velocity K/K_d ∇H at the first tick, because K alone depends on the robot
+SPEED = 1.0  # norm of the velocity K/K_d ∇H at the first tick, which gives K for any robot
 
 
 @dataclass(frozen=True)
 class Outcome:
-    """Record of a run."""
+    """Results of a run."""
 
     q: np.ndarray
     H: np.ndarray  # at each tick
-    tip_error: float  # largest, m
+    tip_error: float  # largest distance of the tip from its point, m
     speed: float  # norm of ν at the end
 
 
 def run() -> Outcome:
-    """Follow −K ∇H for ``DURATION`` in the null space of the tip's position."""
+    """Follow −K ∇H for ``DURATION`` seconds in the null space of the tip position."""
     robot = load_robot("ur5")
     model, q, v = robot.model, robot.posture().copy(), np.zeros(robot.nv)
     with tempfile.TemporaryDirectory() as folder:
@@ -51,7 +52,7 @@ def run() -> Outcome:
         gradient = ImpactGradient.load(folder, robot=robot)
     K = KD * SPEED / np.linalg.norm(gradient.value_and_gradient(q, NORMAL)[1])
 
-    # The model of the export, with armature, which a URDF does not have.
+    # Use the model of the export, which has armature.  A URDF contains no armature.
     wrapper = tsid.RobotWrapper(model, tsid.RootJointType.FIXED_BASE_SYSTEM, False)
     formulation = tsid.InverseDynamicsFormulationAccForce("impact", wrapper, False)
     formulation.computeProblemData(0.0, q, v)
@@ -63,7 +64,7 @@ def run() -> Outcome:
     tip.useLocalFrame(False)
     start = wrapper.framePosition(formulation.data(), model.getFrameId(FRAME))
     tip.setReference(tsid.TrajectorySE3Constant("tip", start).computeNext())
-    formulation.addMotionTask(tip, 1.0, 0, 0.0)  # level 0: a constraint
+    formulation.addMotionTask(tip, 1.0, 0, 0.0)  # level 0 makes the task a constraint
 
     posture = tsid.TaskJointPosture("posture", wrapper)
     posture.setKp(np.zeros(robot.nv))
@@ -76,7 +77,7 @@ def run() -> Outcome:
     H, error = [], 0.0
     for tick in range(round(DURATION / DT)):
         value, grad = gradient.value_and_gradient(q, NORMAL)
-        sample.second_derivative(-K * grad)  # the bridge: these two lines
+        sample.second_derivative(-K * grad)  # these two lines add the term to TSID
         posture.setReference(sample)
         solution = solver.solve(formulation.computeProblemData(tick * DT, q, v))
         a = formulation.getAccelerations(solution)
@@ -88,7 +89,7 @@ def run() -> Outcome:
 
 
 def main() -> Outcome:
-    """Run and print."""
+    """Run the example and print the results."""
     outcome = run()
     H = outcome.H
     print(f"H {H[0]:.6g} → {H[-1]:.6g} ({100 * (H[-1] / H[0] - 1):+.1f} %) in {DURATION:g} s")

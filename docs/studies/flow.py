@@ -1,5 +1,4 @@
-"""Postures at which the reference flow of ``robust-flow`` comes to rest, from random feasible starts; kinematics
-only."""
+"""Postures at which the reference flow of ``robust-flow`` rests, from random feasible starts; kinematics only."""
 
 from __future__ import annotations
 

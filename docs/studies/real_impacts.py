@@ -1,5 +1,4 @@
-"""Impacts of standing, fixed and flying robots: prediction of the rigid model, and simulated run, for each
-controller.
+"""Impacts of standing, fixed and flying robots: prediction of the rigid model and run of each controller.
 
 The prediction does not use the run.  The controller braces a robot that moves exactly as planned, and moves the end
 effector to the surface.  The inputs of the rigid model are the reached posture and the speed of the scenario.

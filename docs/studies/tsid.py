@@ -146,8 +146,7 @@ def lines(request: Request) -> Iterator[str]:
 def _postures(
     robot: Robot, gradient: Gradient, every: int = 5
 ) -> tuple[JointPosture, ImpactRobustPosture, ReferenceFlowPosture]:
-    """Return the nominal, the impact-robust and the reference-flow posture task, with equal gains except for the
-    term."""
+    """Return the nominal, the impact-robust and the reference-flow posture task, with equal gains apart from K."""
     aerial = robot.spec.kind == "aerial"
     more = {} if aerial else {"kp": 20.0, "weight": 0.1, "base_weight": 0.0}
     return (

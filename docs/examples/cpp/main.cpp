@@ -1,5 +1,5 @@
-// Reads q, v, q_des, n, Kp, Kd, K from standard input, again and again; prints the posture acceleration of each, or
-// the code where there is none.  In a controller the call in the loop is all.
+// Repeatedly reads q, v, q_des, n, Kp, Kd, K from standard input.  Prints the posture acceleration, or the error code
+// if it does not exist.  A controller needs only the call in the loop.
 #include "posture_acceleration.hpp"
 
 #include <cstdio>

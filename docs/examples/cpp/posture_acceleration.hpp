@@ -1,8 +1,8 @@
-// The impact-robust posture acceleration with Eigen and an export of `impact-posture codegen ... --prefix arm`:
+// Impact-robust posture acceleration with Eigen and an export of `impact-posture codegen ... --prefix arm`:
 //
 //   a* = Kp (q_des - q) - Kd v - K grad H(q)
 //
-// with the difference of the manifold, on the tangent space at q, as Pinocchio has it.
+// where the difference is the manifold difference on the tangent space at q, as in Pinocchio.
 #ifndef POSTURE_ACCELERATION_HPP
 #define POSTURE_ACCELERATION_HPP
 
@@ -32,14 +32,14 @@ struct Gains {
 };
 
 #if FLOATING_BASE
-// Rotation vector of a unit quaternion, the short way round.
+// Rotation vector of a unit quaternion, with an angle of at most pi.
 inline Vector3 log_rotation(Eigen::Quaternion<Real> r)
 {
   if (r.w() < 0) {
     r.coeffs() = -r.coeffs();
   }
   const Real sine = r.vec().norm();
-  // 2 atan(x) / x -> 2 where the rotation vanishes.
+  // 2 atan(x) / x tends to 2 if the rotation tends to zero.
   const Real ratio = sine < Real(1e-8) ? Real(2) : 2 * std::atan2(sine, r.w()) / sine;
   return ratio * r.vec();
 }
@@ -51,7 +51,7 @@ inline Eigen::Matrix<Real, 6, 1> base_difference(const Configuration &a, const C
   const Vector3 w = log_rotation(Ra.conjugate() * Rb);
   const Vector3 p = Ra.conjugate() * Vector3(b.template head<3>() - a.template head<3>());
   const Real square = w.squaredNorm(), half = std::sqrt(square) / 2;
-  // (1 - half / tan(half)) / square, by its series where that loses digits.
+  // (1 - half / tan(half)) / square, by its series if this expression loses digits.
   const Real c = half < Real(0.025) ? (1 + square / 60 + square * square / 2520) / 12
                                     : (1 - half / std::tan(half)) / square;
   Eigen::Matrix<Real, 6, 1> twist;
@@ -72,8 +72,8 @@ inline Tangent difference(const Configuration &a, const Configuration &b)
   return d;
 }
 
-// Returns arm_eval's code.  1 or 2 (q or n is broken): a is untouched, hold the command before.  3 (H does not exist
-// at this q): a is without the gradient.
+// Returns the code of arm_eval.  Codes 1 and 2 (q or n is not valid) leave a unchanged: repeat the last command.
+// With code 3 (H does not exist at this q), a is computed without the gradient.
 inline int posture_acceleration(const Configuration &q, const Tangent &v, const Configuration &q_des, const Vector3 &n,
   const Gains &gains, Tangent &a)
 {

@@ -1,4 +1,4 @@
-"""A controller of the experiments from another package: it bends the last joint before the impact."""
+"""Controller for the experiments, defined in a separate package, that bends the last joint before the impact."""
 
 from __future__ import annotations
 
@@ -19,7 +19,7 @@ Vector = NDArray[np.float64]
 
 
 class JointAngle(ip.tsid.Task):
-    """Move a joint with one number in ``q`` to an angle: ``e = target − q_j``."""
+    """Move a joint that has one coordinate in ``q`` to an angle: ``e = target − q_j``."""
 
     def __init__(self, robot: Robot, joint: str, target: float, kp: float, weight: float = 1.0) -> None:
         super().__init__(f"angle of {joint}", 1, kp=kp, weight=weight)

@@ -1,1 +1,1 @@
-"""Random variations of the shipped experiments, which show where each controller helps."""
+"""Study of random variations of the shipped experiments, which shows where each controller helps."""

@@ -1,4 +1,4 @@
-"""Points of the envelope of a shipped scenario, and their setups."""
+"""Points of the envelope of a shipped scenario (variations and random draws), and their setups."""
 
 from __future__ import annotations
 
@@ -23,15 +23,15 @@ from impact_posture.simulation.scenario_objective import scenario_objective
 from impact_posture.simulation.setup import Setup, set_up
 from impact_posture.simulation.world.world import build_world
 
-# To save time, every point has fewer contacts and shorter pauses (s) than the files of the scenarios, and a push
-# waits for at most PATIENCE seconds until the robot rests.
+# To save time, every point has fewer contacts and shorter pauses (s) than the scenario files.  A push waits at most
+# PATIENCE seconds for the robot to rest.
 COUNT, DWELL, PAUSE = 2, 0.4, 0.6
 PATIENCE = 5.0
-# A pyramid inside the cone with a margin of a tenth, as in the files of the scenarios.
+# Factor on friction for a pyramid inside the friction cone with a margin of 10 %, as in the scenario files.
 _TRUST = 0.9 / math.sqrt(2)
-# Least distance of the center of mass of a robot that stands from the edges of its support polygon, m.
+# Least distance of the center of mass of a standing robot from the edges of the support polygon, m.
 _COM_MARGIN = 0.02
-# Random changes of the base, as a share of the random changes of the joints.
+# Size of random changes of the base relative to random changes of the joints.
 _BASE = 0.2
 
 
@@ -40,12 +40,12 @@ class Draw:
     """One point of the envelope of a scenario.
 
     Attributes:
-        scenario: The scenario.
-        number: Number among the variations, then among the random draws.
-        attempt: Number of random draws before that were not admissible.
+        scenario: Name of the scenario.
+        number: Index of the point: first the variations are counted, then the random draws.
+        attempt: Number of earlier random draws for this point that were not admissible.
         seed: Seed of the study.
-        name: Name of the variation, empty for a random draw.
-        values: Values by the names of :data:`RANGES`; the rest is as shipped.
+        name: Name of the variation; empty for a random draw.
+        values: Changed values, by the names of :data:`RANGES`.  All other values are as shipped.
     """
 
     scenario: str
@@ -61,7 +61,7 @@ def _generator(scenario: str, number: int, attempt: int, seed: int, what: int = 
 
 
 def draw(scenario: str, number: int, attempt: int = 0, seed: int = 0) -> Draw:
-    """Return a point of the envelope, the same every time: first the variations, then random draws."""
+    """Return a point of the envelope: a variation, or else a random draw.  Equal arguments give equal points."""
     named = list(VARIATIONS[scenario].items())
     if number < len(named):
         name, values = named[number]
@@ -71,15 +71,15 @@ def draw(scenario: str, number: int, attempt: int = 0, seed: int = 0) -> Draw:
 
 
 def prepare(chosen: Draw) -> Setup:
-    """Build the setup of a point.
+    """Build the setup of the simulation for a point.
 
     Raises:
-        ImpactPostureError: The start is outside the limits, or not on the feet.
+        ImpactPostureError: The start is outside the limits, or the feet cannot keep their places.
     """
     scenario, v = read_scenario(chosen.scenario), chosen.values
     control = scenario.control
     robust = replace(control.robust, gain=v.get("gain", 1.0) * control.robust.gain)
-    # The stiffness of a contact goes with the inverse square of its time constant.
+    # The stiffness of a contact is proportional to the inverse square of its time constant.
     law = v.get("contact", 1.0) ** -0.5
     surfaces = tuple(
         replace(s, friction=v.get("friction", s.friction), solref=(law * s.solref[0], *s.solref[1:]))
@@ -102,7 +102,7 @@ def prepare(chosen: Draw) -> Setup:
 
 
 def _armature(scenario: Scenario, factor: float) -> dict[str, float]:
-    """Return the scaled armature by joint; joints without armature stay without."""
+    """Return the scaled armature by joint.  Joints without armature are left out."""
     model = load_robot(scenario.robot, scenario).model
     own = {str(name): float(model.armature[k]) for name, k in zip(model.names, model.idx_vs, strict=True) if k >= 0}
     return {name: factor * value for name, value in own.items() if value > 0}
@@ -112,7 +112,7 @@ def _contacts(scenario: Scenario, task: RepeatedContacts, v: Mapping[str, float]
     tilt, roll = math.radians(v.get("tilt", 0.0)), math.radians(v.get("roll", 0.0))
     joints = dict(scenario.joints)
     if "shoulder" in v:
-        # The tool looks at the wall, plus its tilt.
+        # The elbow compensates the shoulder, so that the tool points at the wall, apart from the tilt.
         joints |= {"shoulder_pitch": v["shoulder"], "elbow_pitch": tilt - math.pi / 2 - v["shoulder"]}
     elif "elbow" in v:
         elbow = v.get("fold", 1.0) * v["elbow"]
@@ -147,14 +147,14 @@ def _push(scenario: Scenario, task: SinglePush, v: Mapping[str, float]) -> Scena
 
 
 def _stiffer(gains: Gains, factor: float) -> Gains:
-    """Scale gains; the tasks of the shipped pushes have one stiffness each and critical damping."""
+    """Scale the gains.  Each task of the shipped pushes has one stiffness and critical damping."""
     if isinstance(gains.kp, tuple) or gains.kd is not None:
         raise InputError("a task with a damping of its own", where="robustness study", hint="scale it too")
     return replace(gains, kp=factor * gains.kp)
 
 
 def _start(setup: Setup, chosen: Draw) -> Vector:
-    """Return the posture of the scenario with random changes, pulled back onto its feet."""
+    """Change the posture of the scenario randomly, and project the result so that the feet keep their places."""
     robot = setup.robot
     rng = _generator(chosen.scenario, chosen.number, chosen.attempt, chosen.seed, what=1)
     hold = tuple(j for j in robot.spec.constraints.hold if j not in robot.locked)

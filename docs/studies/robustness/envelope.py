@@ -1,4 +1,4 @@
-"""Targets that each controller keeps over the envelope of a scenario, for the page of the reproduction."""
+"""Targets that each controller meets over the envelope of a scenario, for the page of the reproduction."""
 
 from __future__ import annotations
 
@@ -14,9 +14,9 @@ from impact_posture.experiment.reproduction import PAPER
 from impact_posture.simulation.controllers.controller_factory import MEANING
 
 Records = Mapping[str, Sequence[Record]]
-# A controller that keeps every target at fewer points than this share is not recommended.
+# A controller is recommended only if it meets every target at least at this share of the points.
 _OFTEN = 2 / 3
-# Number of variations in the sentence.
+# Number of variations that a sentence of the page lists.
 _TOLD = 7
 _NAMES = {
     "reduction": "reduction below the paper's", "recovery": "no reduction over the second",
@@ -25,7 +25,7 @@ _NAMES = {
     "saturation_outside": "more saturation outside", "stops": "on a stop", "rested": "not at rest",
     "completed": "failed",
 }  # fmt: skip
-# Differences of a scenario from the data of the robot, and the variation that shows their effect.
+# For each scenario: its differences from the data of the robot, and the variation that shows the effect of each.
 _DEVIATIONS = {
     "aerial-vertical": {"the arm is mounted under the base's center, 8 cm behind its own place": OWN_MOUNTING},
     "aerial-lateral": {
@@ -41,7 +41,7 @@ _HEAD = (
 
 
 def page(records: Records) -> Iterator[str]:
-    """Yield the page as lines of Markdown."""
+    """Yield the lines of the page as Markdown."""
     yield from ("### What to choose", "")
     yield from (choice(name, own) for name, own in records.items() if tried(own))
     yield from (_tuned(name, own) for name, own in records.items() if sum(bool(r.draw.name) for r in tried(own)) > 1)
@@ -57,18 +57,18 @@ def page(records: Records) -> Iterator[str]:
 
 
 def percent(value: float) -> str:
-    """Write a relative change; infinity stands for a failed run."""
+    """Write a relative change as text.  Infinity stands for a failed run."""
     return "fails" if value == math.inf else f"{100 * value:+.0f} %".replace("-", "−")
 
 
 def spread(values: Sequence[float]) -> str:
-    """Write median and quartiles of a relative change."""
+    """Write median and quartiles of a relative change as text."""
     low, middle, high = (percent(v) for v in values)
     return f"{middle} [{low}, {high}]"
 
 
 def choice(name: str, own: Sequence[Record]) -> str:
-    """Recommend the controller that keeps every target most often, and among equals the one with least motion."""
+    """Recommend the controller that meets every target most often.  Of equal controllers, choose the least motion."""
     summaries = [summarize(own, c) for c in COMPARED if c != NOMINAL]
     best = min(summaries, key=lambda s: (-s.kept, s.motion[1]))
     reliable = best.kept >= _OFTEN * best.count
@@ -87,12 +87,12 @@ def choice(name: str, own: Sequence[Record]) -> str:
 
 
 def _tuned(name: str, own: Sequence[Record]) -> str:
-    """Compare the term of the paper and the law without a gain, one variation at a time."""
+    """Compare, for single variations, the term of the paper with the control law without a gain."""
     parts = []
     for controller in ("robust", "robust-flow"):
         named = [(r.draw.name, change(r, controller)) for r in tried(own) if r.draw.name]
         (_, shipped), *others = named
-        # The variations of most interest come first; the table has all.
+        # List only the first variations, which are the most important.  The table has all variations.
         changes = ", ".join(f"{percent(value)} ({words})" for words, value in others[:_TOLD])
         changed = f"`{controller}` changes the motion by {percent(shipped)}"
         parts.append(f"{changed} as shipped, and otherwise by {changes}")
@@ -161,7 +161,7 @@ def _cells(record: Record, others: Sequence[str]) -> Iterator[str]:
 
 
 def _deviations(records: Records) -> Iterator[str]:
-    """List the choices of a scenario that differ from the data of the robot, with their effects."""
+    """List the values of a scenario that differ from the data of the robot, and their effects."""
     for name, deviations in _DEVIATIONS.items():
         known = {r.draw.name: r for r in records.get(name, ()) if r.draw.name}
         for words, variation in deviations.items():

@@ -1,4 +1,4 @@
-"""Outcomes of one point of the envelope: every controller runs through it, and a failure is an outcome too."""
+"""Run every controller at a point of the envelope, and record the outcomes.  A failure is also an outcome."""
 
 from __future__ import annotations
 
@@ -30,15 +30,17 @@ from impact_posture.simulation.setup import Setup
 
 SCHEMA = 3
 NOMINAL = "nominal"
-# Nominal first.
+# Compared controllers.  The nominal controller must be the first.
 COMPARED = (NOMINAL, "robust", "robust-flow", "posture", "stiff")
-# Share of a nominal run's ticks outside the windows that may be at a limit in a random draw.
+# Largest share of ticks at a limit, outside the impact windows, for which the nominal run of a random draw is
+# admissible.
 SATURATED = 0.05
-# Random draws of a point before it is given up.
+# Largest number of random draws for a point.
 ATTEMPTS = 40
-# Entries of a document that a record leaves out.
+# Entries of the document of a run that a record does not store.
 _LEFT_OUT = ("windows", "versions", "runs")
-# Offline postures that this process computed last, and how many it keeps: enough for some points of each scenario.
+# Largest number of offline postures in the cache of this process, enough for some points of each scenario; and the
+# cache.
 _KEPT = 16
 _OPTIMA: dict[str, OfflinePosture] = {}
 _Play = Callable[[Job, ControllerFactory], tuple[tuple[Run, ...], Document]]
@@ -49,11 +51,11 @@ class Record:
     """One point of the envelope.
 
     Attributes:
-        draw: The point.
-        rejected: Why each draw before was rejected, or why this variation cannot be tried.
-        q: Start posture, empty for a variation that cannot be tried.
-        documents: Documents of the runs, by label of the controller.  With ``offset``, the distance of the center of
-            mass from the line of the first impact, m.
+        draw: Values of the point.
+        rejected: Reason why each earlier draw was rejected, or why this variation cannot be simulated.
+        q: Start posture, shape (nq,); empty for a variation that cannot be simulated.
+        documents: Documents of the runs, by label of the controller.  The entry ``offset`` is the distance of the
+            center of mass from the line of the first impact, m.
     """
 
     draw: Draw
@@ -62,50 +64,50 @@ class Record:
     documents: Mapping[str, Document] = field(default_factory=dict)
 
     def row(self, controller: str) -> ControllerRow:
-        """Return the results of a controller against nominal at this point."""
+        """Return the results of a controller relative to the nominal controller at this point."""
         own, nominal = self.documents[controller], self.documents[NOMINAL]
         return row_of(self.draw.scenario, controller, [own], [nominal])
 
     def missed(self, controller: str) -> dict[str, str]:
-        """Return the targets that a controller misses here, ``completed`` among them."""
+        """Return the targets that a controller misses at this point.  ``completed`` is also a target."""
         missed = missed_targets(self.row(controller))
         return {"completed": "no completed run"} if missed is None else missed
 
     def failure(self, controller: str) -> str:
-        """Return the status of a run that did not complete, else nothing."""
+        """Return the status of a run if the run did not complete; else an empty text."""
         status = str(self.documents[controller]["status"])
         return "" if status == "completed" else status
 
     def to_json(self) -> str:
-        """Write the record as text."""
+        """Convert the record to JSON text."""
         return json.dumps({"key": key(self.draw.scenario), **asdict(self)}, indent=1)
 
     @classmethod
     def from_json(cls, text: str) -> Record | None:
-        """Read a record; return ``None`` if the study has changed since."""
+        """Read a record from JSON text; return ``None`` if the study has changed since the record was written."""
         stored = json.loads(text)
         chosen = Draw(**stored["draw"])
         same = chosen.scenario in RANGES and stored["key"] == key(chosen.scenario)
-        # A variation that was renumbered does not count.
+        # The record of a variation whose number has changed is not valid.
         if not same or (chosen.name and draw(chosen.scenario, chosen.number, seed=chosen.seed) != chosen):
             return None
         return cls(chosen, tuple(stored["rejected"]), tuple(stored["q"]), stored["documents"])
 
 
 def key(scenario: str) -> str:
-    """Return the settings that a kept record must share with this code."""
+    """Return the settings that must be equal in a stored record and in this code."""
     ranges = tuple((r.name, r.low, r.high, r.scale) for r in RANGES[scenario])
     return repr((SCHEMA, SHARE, SATURATED, ranges, COUNT, DWELL, PATIENCE, PAUSE))
 
 
 class NotAdmissible(Exception):
-    """The nominal controller itself fails at a point, so that it cannot be compared."""
+    """The nominal controller fails at a point, so that other controllers cannot be compared with it."""
 
 
 def point(scenario: str, number: int, seed: int, known: Record | None = None, play: _Play = execute) -> Record:
-    """Run the controllers that a point still lacks, and return its record.
+    """Run the controllers that are missing in the record of a point, and return the record.
 
-    A random draw is repeated until the nominal controller succeeds.  A variation is not repeated.
+    Random draws are repeated until the nominal controller succeeds.  Variations are not repeated.
 
     Raises:
         NotAdmissible: No draw was admissible.
@@ -136,27 +138,27 @@ def _complete(record: Record, factory: ControllerFactory, play: _Play) -> Record
 
 
 def is_complete(record: Record | None) -> bool:
-    """Whether a record has every controller, or belongs to a variation that cannot be tried."""
+    """Return whether a record has every controller, or belongs to a variation that cannot be simulated."""
     return record is not None and (not record.documents or set(COMPARED) <= set(record.documents))
 
 
 def is_held(setup: Setup, objective: WorstCaseObjective) -> bool:
-    """Whether at most :data:`SHARE` of the known limits holds the start of a scenario."""
+    """Return whether the motors can hold the start of a scenario with :data:`SHARE` of their known limits."""
     holding = load_cases(objective, setup.q, scenario_requirements(setup, objective)).holding(setup.q)
     return holding is None or holding.feasible
 
 
 def _factory(setup: Setup) -> ControllerFactory:
-    """Return controllers for runs without pictures."""
-    # Evaluating the gradient in Python costs less than compiling it for every armature and mounting.
+    """Return a factory of controllers for runs without pictures."""
+    # Evaluate the gradient in Python, which takes less time than compiling it for every armature and mounting.
     factory = ControllerFactory(setup, gradient_of=interpreted, offline_of=_offline)
-    # The metric over time is only drawn.
+    # Skip the metric over time, which is used only for pictures.
     factory.metric = lambda q: math.nan
     return factory
 
 
 def _offline(setup: Setup, objective: WorstCaseObjective, **options: Any) -> OfflinePosture:
-    """Optimize each problem once, because gains, pushes and contact laws do not change it."""
+    """Optimize each problem once, because gains, pushes and contact laws do not change the problem."""
     demands = scenario_requirements(setup, objective, at_contact=options["at_contact"])
     impact = objective.contact, objective.metric, objective.kind, objective.supports, objective.compliance
     key = repr((setup.robot.source, setup.robot.data_sha256, setup.q.tobytes(), impact, demands, options))
@@ -186,7 +188,7 @@ def _admit(chosen: Draw, play: _Play) -> tuple[ControllerFactory, Document]:
 
 
 def _document(factory: ControllerFactory, chosen: Draw, label: str, play: _Play) -> Document:
-    """Run a controller with the noise of seed 0.  An error that it raises is its outcome."""
+    """Run a controller with the noise of seed 0.  If the run raises an error, the error becomes the outcome."""
     name, mode, free = parse_controller(label)
     job = Job(chosen.scenario, name, 0, mode, free, compile="auto")
     try:
@@ -200,7 +202,7 @@ def _document(factory: ControllerFactory, chosen: Draw, label: str, play: _Play)
 
 
 def _offset(factory: ControllerFactory, run: Run) -> float | None:
-    """Return the distance of the center of mass from the line along which the first impact acts."""
+    """Return the distance of the center of mass from the line of action of the first impact, m."""
     if not run.of("impact"):
         return None
     robot, contact = factory.setup.robot, factory.objective().contact

@@ -1,4 +1,4 @@
-"""Page that says where controllers help, from the records: recommendations in sentences, then tables."""
+"""Page about where controllers help, computed from the records: recommendations in sentences, then tables."""
 
 from __future__ import annotations
 
@@ -29,11 +29,12 @@ from docs.studies.robustness.variations import RANGES
 from impact_posture.simulation.offline_posture import SHARE
 
 Records = Mapping[str, Sequence[Record]]
-# The page of the documentation includes the text before this mark and the text after it.
+# The documentation includes the text before this mark and the text after this mark in different places.
 MARK = "<!-- tables -->"
-# A shoulder that is less than this ahead of or behind the center of the base counts as under it, m.
+# A shoulder is treated as under the center of the base if its horizontal distance from the center is less than this,
+# m.
 _UNDER = 0.04
-# Drawn values whose rank correlation is shown.
+# Drawn values for which the page shows rank correlations.
 _RANKED = ("x", "z", "speed", "force", "stiffness", "armature", "gain", "contact", "friction")
 _OVERVIEW = (
     "scenario|controller|less motion|lower jump|motion: median [quartiles]|jump: median|saturated, s: inside + "
@@ -66,7 +67,7 @@ def _is_contact(name: str) -> bool:
 
 
 def _stiffness(records: Records) -> list[str]:
-    """Compare the stiffness of the term alone with the offline posture alone."""
+    """Compare the effect of the term's stiffness alone with the effect of the offline posture alone."""
     parts = []
     for name, own in records.items():
         term, stiff, posture = (summarize(own, c).motion[1] for c in ("robust", "stiff", "posture"))
@@ -97,7 +98,7 @@ def _failed(records: Records) -> list[str]:
 
 
 def _predictors(records: Records) -> list[str]:
-    """Say which of S, V and H predicts the jump of a contact best."""
+    """State which of S, V and H predicts the velocity jump of a contact best."""
     aerial = {name: own for name, own in records.items() if _is_contact(name)}
     if not aerial:
         return []
@@ -154,7 +155,7 @@ def _signed(value: float) -> str:
 
 
 def _ranks(records: Records) -> Iterator[str]:
-    """Yield rank correlations of the reduction by ``robust``."""
+    """Yield rank correlations of the reduction of motion by the controller ``robust``."""
     rows: dict[str, Callable[[Record], float | None]] = {
         **{f"fall of {key}": lambda r, key=key: fall(r, "robust", key) for key in ("H", "V", "S")},
         "fall of the offset": lambda r: fall(r, "robust", "offset"),
@@ -179,14 +180,15 @@ def _part(part: Split) -> str:
 
 
 def _splits(records: Records) -> Iterator[str]:
-    """Split the random draws by mounting, armature and K."""
+    """Compare results between random draws with small and large values of mounting, armature and gain K."""
     middle = {r.name: math.sqrt(r.low * r.high) for ranges in RANGES.values() for r in ranges if r.scale == "log"}
     words = {key: f"`{key}` below {middle[key]:.2g} × the scenario's" for key in ("armature", "gain")}
     body = []
     for name, own in records.items():
         drawn = [r for r in tried(own) if not r.draw.name]
         for key in ("x", *words) if name == "aerial-vertical" else words:
-            # The offline optimum does not depend on K.  In the impact against a wall, the height matters.
+            # The offline optimum does not depend on K, so leave out ``posture``.  Split by the horizontal mounting
+            # only for the vertical impact; for a wall, the height of the shoulder has more effect.
             for controller in ("robust",) if key == "gain" else ("robust", "posture"):
                 limit = middle.get(key, _UNDER)
                 so, otherwise = split(drawn, controller, lambda r, k=key, m=limit: abs(r.draw.values[k]) < m)
@@ -198,7 +200,7 @@ def _splits(records: Records) -> Iterator[str]:
 
 
 def _counterexamples(records: Records) -> Iterator[str]:
-    """Name counterexamples, with the command that runs them again."""
+    """List counterexamples, each with the command that repeats the run."""
     yield "These compare `robust` with `nominal`. `python -m docs.studies points --only NAME --number NUMBER`"
     yield from ("runs one of them again.", "")
     for name, every in records.items():
@@ -239,7 +241,7 @@ def _case(record: Record) -> str:
 
 
 def _drawn(records: Records, seed: int) -> Iterator[str]:
-    """Yield ranges, fixed values and rejected draws."""
+    """Yield the ranges of drawn values, the fixed values and the number of rejected draws."""
     yield f"The seed is {seed}. Distributions are uniform unless the table says otherwise."
     yield from ("", *range_table(list(records)), "")
     yield (

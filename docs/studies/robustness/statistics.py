@@ -1,4 +1,4 @@
-"""Statistics of a study: how often a controller helps, which targets it keeps, and correlations."""
+"""Statistics of the study of robustness: how often a controller helps, which targets it meets, and correlations."""
 
 from __future__ import annotations
 
@@ -13,8 +13,8 @@ from scipy.stats import spearmanr
 from docs.studies.robustness.outcomes import NOMINAL, Record
 from impact_posture.experiment.seed_statistics import value_of
 
-# Predictors of a jump, and their values in the prediction of a document.  The impulse of a contact is not known
-# before, so H counts as √H alone.
+# Predictors of a jump, and functions that read their values from the prediction in a document.  The impulse of a
+# contact is not known before, so the predictor H is √H without the impulse.
 PREDICTORS: dict[str, Callable[[Mapping[str, float | None]], float | None]] = {
     "H": lambda p: None if p["H"] is None else math.sqrt(p["H"]),
     "V": lambda p: p["frictionless"],
@@ -27,21 +27,22 @@ PREDICTORS: dict[str, Callable[[Mapping[str, float | None]], float | None]] = {
 class Summary:
     """Results of one controller at all points of a scenario.
 
-    A controller that failed (raised, lost a contact, fell …) does not help.  In medians and quartiles it ranks last.
+    A controller that failed (error, lost contact, fall …) does not help.  In medians and quartiles, its run ranks
+    last.
 
     Attributes:
-        controller: The controller.
+        controller: Label of the controller.
         count: Number of points.
-        helps: Points with less motion in the impact windows than nominal.
-        gentler: Points with a lower peak jump.
-        kept: Points at which it keeps every target.
-        missed: Number of points at which it misses a target, by target.
-        motion: Quartiles of the relative change of the motion in the windows, infinite for failed.
-        recovery: The same over the recovery.
+        helps: Number of points with less motion in the impact windows than with the nominal controller.
+        gentler: Number of points with a lower peak jump than with the nominal controller.
+        kept: Number of points at which the controller meets every target.
+        missed: For each target, number of points at which the controller misses this target.
+        motion: Quartiles of the relative change of the motion in the impact windows; infinite for failed runs.
+        recovery: Quartiles of the relative change of the motion during the recovery.
         jump: Median relative change of the peak jump.
         force: Median and largest peak force, divided by the nominal controller's.
-        saturation: Seconds at a limit of all runs that did not fail, inside and outside the windows.
-        failures: Number of points at which it failed, by status.
+        saturation: Time at a limit over all runs that did not fail, s, inside and outside the windows.
+        failures: For each status, number of points at which the controller failed with this status.
     """
 
     controller: str
@@ -59,12 +60,12 @@ class Summary:
 
 
 def tried(records: Sequence[Record]) -> list[Record]:
-    """Return the points at which the controllers ran."""
+    """Return the records of points at which the controllers ran."""
     return [record for record in records if record.documents]
 
 
 def change(record: Record, controller: str, metric: str = "q_total_impact") -> float:
-    """Return a relative change against nominal: −0.3 is 30 % less, and ``inf`` stands for a failure."""
+    """Return the relative change of a metric from nominal: −0.3 is 30 % less, ``inf`` stands for a failure."""
     if record.failure(controller):
         return math.inf
     own, before = (value_of(record.documents[c], metric) for c in (controller, NOMINAL))
@@ -107,7 +108,7 @@ def quartiles(values: Sequence[float]) -> tuple[float, ...]:
 
 
 def quantile(values: Sequence[float], p: float) -> float:
-    """Interpolate linearly between neighbors, of which the upper may be infinite."""
+    """Return a quantile by linear interpolation between neighbors.  The upper neighbor may be infinite."""
     ordered = sorted(values)
     place = p * (len(ordered) - 1)
     low = math.floor(place)
@@ -119,7 +120,7 @@ def quantile(values: Sequence[float], p: float) -> float:
 
 @dataclass(frozen=True)
 class Split:
-    """How often a controller helped at some points, and the median change of the motion."""
+    """Part of the points: their number, how often a controller helped, and the median change of the motion."""
 
     count: int
     helps: int
@@ -127,7 +128,7 @@ class Split:
 
 
 def split(records: Sequence[Record], controller: str, choose: Callable[[Record], bool]) -> tuple[Split, Split]:
-    """Split records into chosen and other records."""
+    """Split records into chosen and other records, and return the results of both parts."""
     parts = [[change(r, controller) for r in records if choose(r) is wanted] for wanted in (True, False)]
     chosen, others = (Split(len(m), sum(x < 0 for x in m), quantile(m, 0.5) if m else math.nan) for m in parts)
     return chosen, others
@@ -140,9 +141,9 @@ def predicted(record: Record, controller: str, name: str) -> float | None:
 
 
 def ranks_of_jumps(records: Sequence[Record], names: Sequence[str]) -> dict[str, float]:
-    """Return Spearman's correlation of the measured jumps of all runs with each predictor, and their number as ``n``.
+    """Return Spearman's correlation of the measured jumps with each predictor, and the number of runs as ``n``.
 
-    Only the runs for which every predictor is known count.
+    Only runs for which every predictor is known are included.
     """
     runs = [(r, c) for r in tried(records) for c in r.documents if not r.failure(c)]
     rows = [[value_of(r.documents[c], "peak_jump"), *(predicted(r, c, name) for name in names)] for r, c in runs]
@@ -156,7 +157,7 @@ def ranks_of_jumps(records: Sequence[Record], names: Sequence[str]) -> dict[str,
 
 
 def fall(record: Record, controller: str, name: str) -> float | None:
-    """Return the fall of a predictor (ln of the ratio) or of the offset (m) against nominal before the impact."""
+    """Return how far a predictor (ln of the ratio) or the offset (m) is below its nominal value before the impact."""
     if name == "offset":
         before, after = (record.documents[c]["offset"] for c in (NOMINAL, controller))
         return None if before is None or after is None else float(before - after)
@@ -165,7 +166,7 @@ def fall(record: Record, controller: str, name: str) -> float | None:
 
 
 def agreement(records: Sequence[Record], names: Sequence[str], of: str, metric: str) -> tuple[int, int]:
-    """Count the runs in which a metric changed in the same direction as a predictor, and all runs without failure."""
+    """Return the number of runs in which metric and predictor changed in the same direction, and of all runs."""
     same = [
         (fallen > 0) == (change(r, c, metric) < 0)
         for r in records
@@ -176,7 +177,7 @@ def agreement(records: Sequence[Record], names: Sequence[str], of: str, metric: 
 
 
 def rank(records: Sequence[Record], controller: str, of: Callable[[Record], float | None]) -> float:
-    """Return Spearman's correlation of a number with the *reduction* of the motion, without failed runs."""
+    """Return Spearman's correlation of a value with the *reduction* of the motion, without failed runs."""
     pairs = [(of(r), -change(r, controller)) for r in records if not r.failure(controller)]
     known = np.array([pair for pair in pairs if pair[0] is not None], dtype=float).reshape(-1, 2)
     if len(known) < 3 or np.ptp(known, axis=0).min() == 0:

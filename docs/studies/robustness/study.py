@@ -1,6 +1,6 @@
-"""Run every controller in variations of the shipped experiments, to see where each helps.
+"""Run every controller in variations of the shipped experiments, to measure where each controller helps.
 
-Finished points stay in build/robustness, so that an interrupted study can continue.
+Finished points are stored in build/robustness, so that an interrupted study can continue.
 """
 
 from __future__ import annotations
@@ -20,9 +20,10 @@ from impact_posture.system.processes import fork_map
 
 
 def points(request: Request) -> Iterator[str]:
-    """Run the points that are not kept yet, or run one point again."""
+    """Run the points that are not stored yet, or repeat one point."""
     import_mujoco()
-    # Every armature and mounting has other libraries, which must not fill the cache of the user.
+    # Use a separate cache.  Every armature and mounting needs new libraries, which must not fill the cache of the
+    # user.
     os.environ["IMPACT_POSTURE_CACHE"] = str(ROOT / "build" / "robustness" / "cache")
     scenarios = [name for name in RANGES if request.only in name]
     began = time.perf_counter()
@@ -40,12 +41,12 @@ def points(request: Request) -> Iterator[str]:
 
 
 def lines(request: Request) -> Iterator[str]:
-    """Yield the page that says where controllers help, from the kept points."""
+    """Yield the page about where controllers help, computed from the stored points."""
     yield from page.page(_store(request).complete([n for n in RANGES if request.only in n]), request.seed)
 
 
 def kept_targets(request: Request) -> Iterator[str]:
-    """Yield the page of the targets that controllers keep, from the kept points."""
+    """Yield the page about the targets that controllers meet, computed from the stored points."""
     yield from envelope.page(_store(request).complete([n for n in RANGES if request.only in n]))
 
 
@@ -61,10 +62,10 @@ def study(
     run: Callable[..., Record] = point,
     tell: Callable[[str], None] = say,
 ) -> None:
-    """Run the points that the store lacks.
+    """Run the points that are missing in the store.
 
-    The scenarios take turns, and every controller runs at a point before the next point.  So an interrupted study has
-    the same points of all controllers.
+    Points of the scenarios alternate, and all controllers run at a point before the next point begins.  So an
+    interrupted study has the same points for all controllers.
     """
     wanted = [(name, number) for number in range(max(points.values())) for name in points if number < points[name]]
     missing = [each for each in wanted if not is_complete(store.get(*each))]
@@ -72,7 +73,7 @@ def study(
     def one(index: int) -> str:
         name, number = missing[index]
         began = time.process_time()
-        # Each process stores its own records, so that an interruption loses only unfinished points.
+        # Each worker process stores its records itself, so that an interruption loses only unfinished points.
         with one_blas_thread():
             store.keep(run(name, number, seed, store.get(name, number)))
         return f"{name} {number}: {time.process_time() - began:.0f} s"
@@ -97,7 +98,7 @@ class Store:
         return Record.from_json(file.read_text(encoding="utf-8")) if file.is_file() else None
 
     def keep(self, record: Record) -> None:
-        """Write a record, whole or not at all."""
+        """Write a record to its file completely or not at all."""
         file = self._file(record.draw.scenario, record.draw.number)
         file.parent.mkdir(parents=True, exist_ok=True)
         beside = file.with_suffix(f".{os.getpid()}")
@@ -105,7 +106,7 @@ class Store:
         beside.replace(file)
 
     def complete(self, scenarios: Sequence[str]) -> dict[str, list[Record]]:
-        """Return the points of each scenario up to the first that is not complete."""
+        """Return the points of each scenario before the first incomplete point."""
         records: dict[str, list[Record]] = {}
         for name in scenarios:
             records[name] = []

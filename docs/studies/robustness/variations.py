@@ -1,4 +1,4 @@
-"""Ranges of the random draws, and variations of one value at a time."""
+"""Ranges of the random draws, and variations that change one value each."""
 
 from __future__ import annotations
 
@@ -9,7 +9,7 @@ import numpy as np
 
 @dataclass(frozen=True)
 class Range:
-    """Range of a drawn value from low to high: ``linear``, ``log``, or ``sign`` (one of the two ends)."""
+    """Range of a drawn value from low to high, with the scale ``linear``, ``log``, or ``sign`` (low or high)."""
 
     name: str
     low: float
@@ -18,7 +18,7 @@ class Range:
     scale: str = "linear"
 
     def draw(self, rng: np.random.Generator) -> float:
-        """Choose a value."""
+        """Draw a random value from the range."""
         if self.scale == "sign":
             return self.low if rng.random() < 0.5 else self.high
         if self.scale == "log":
@@ -26,7 +26,7 @@ class Range:
         return float(rng.uniform(self.low, self.high))
 
     def text(self) -> str:
-        """Write the range for the page."""
+        """Return the range as text for the page."""
         how = {"linear": "{} … {}", "log": "{} … {}, log-uniform", "sign": "{} or {}"}[self.scale]
         return how.format(f"{self.low:g}", f"{self.high:g}")
 
@@ -76,11 +76,11 @@ RANGES: dict[str, tuple[Range, ...]] = {
         _SLIP,
         *_COMMON,
     ),
-    # A quadruped stands in more ways than a humanoid.
+    # The posture of a quadruped can change more than the posture of a humanoid.
     "solo8-push": _pushed(0.3),
     "talos-push": _pushed(0.15),
 }
-# Where the URDF has the shoulder's pitch axis, m.
+# Position of the shoulder's pitch axis in the URDF, m.
 URDF_X, URDF_Z = 0.08, -0.06
 
 SHIPPED, OWN_MOUNTING, OWN_ARMATURE = "as shipped", "the robot's own mounting", "the robot's own armature (÷ 3)"
@@ -103,7 +103,7 @@ _PUSHED = {
     "gains × 0.5": {"stiffness": 0.5},
     "gains × 2": {"stiffness": 2.0},
 }
-# One value changes at a time, and the rest is as shipped.  The most interesting variations come first.
+# Each variation changes one value; all other values are as shipped.  The most important variations come first.
 VARIATIONS: dict[str, dict[str, dict[str, float]]] = {
     "aerial-vertical": {
         SHIPPED: {},

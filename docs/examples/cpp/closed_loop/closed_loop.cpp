@@ -27,7 +27,7 @@ struct Window {
   bool touched;
 };
 
-// One tick after the other, with a record of what the metrics need.
+// Runs ticks one after the other, and records the data for the metrics.
 class Loop {
 public:
   Loop(const Parameters &given, World &world, Controller &controller)
@@ -50,7 +50,7 @@ public:
     controller_.tick(t(), now.q.data(), now.v.data(), world_.feels() ? now.force.data() : nullptr);
     const double took = std::chrono::duration<double>(std::chrono::steady_clock::now() - begin).count();
     took_.push_back(took);
-    // A real loop would go on with the last command; here the clock of the simulation waits.
+    // A real loop would continue with the last command.  In this program, the clock of the simulation waits.
     missed_ += took > period_;
     relaxed_ += controller_.relaxed();
     held_ += controller_.held();
@@ -81,7 +81,7 @@ public:
     return std::numeric_limits<double>::quiet_NaN();
   }
 
-  // Print the metrics of the windows, of a push or of contacts.
+  // Print the metrics of the impact windows, for a push or for contacts.
   void print(const std::vector<Window> &windows, bool push)
   {
     double way = 0, jumps = 0, force = 0;
@@ -136,7 +136,7 @@ private:
   std::vector<Row> rows_;
 };
 
-// The reference of the end effector along its way in: distance, speed and acceleration.
+// Reference of the end effector during the approach: distance, speed and acceleration.
 std::array<double, 3> reference(const Parameters &given, double t)
 {
   const Vector &task = given.row("contacts", 6);

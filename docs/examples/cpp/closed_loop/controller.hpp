@@ -34,7 +34,7 @@ public:
 
   void tick(double t, const double *q, const double *v, const double *force)
   {
-    // The sensor feels a force; its moment about the tip is zero.
+    // The sensor measures a force; the moment of this force about the tip is zero.
     double wrench[6] = {};
     for (int i = 0; force && i < 3; ++i) {
       wrench[i] = force[i];
@@ -61,7 +61,7 @@ public:
   }
 
   const double *rotor_speed() const { return command_.rotor_speed; }
-  // Joint torques follow the thrusts of the rotors in u.
+  // In u, the joint torques come after the thrusts of the rotors.
   const double *torque() const { return command_.u + CONTROLLER_ROTORS; }
   bool relaxed() const { return command_.status == CONTROLLER_RELAXED; }
   bool held() const { return command_.status > CONTROLLER_RELAXED; }

@@ -20,7 +20,7 @@
 
 using Vector = std::vector<double>;
 
-// Parameters by key.  A key that stands on several lines has several rows.
+// Parameters by key.  If a key is on several lines, it has several rows.
 class Parameters {
 public:
   explicit Parameters(const std::string &path)
@@ -31,7 +31,7 @@ public:
       std::istringstream words(line);
       Vector row;
       words >> key;
-      // std::stod, because streams do not read "inf".
+      // Use std::stod, because streams do not read "inf".
       while (words >> number) {
         row.push_back(std::stod(number));
       }
@@ -79,7 +79,8 @@ public:
     if (!data_) {
       throw std::runtime_error(folder + "/world.mjb cannot be loaded: another version of MuJoCo wrote it?");
     }
-    // Nothing may be written into the working directory; a state that runs away shows in the numbers.
+    // Ignore warnings, because MuJoCo must not write a log file into the working directory.  The numbers show a
+    // diverged state.
     mju_user_warning = [](const char *) {};
     shape_of_.assign(std::size_t(model_->ngeom), -1);
     for (double geom : given_.row("shapes", 0)) {
@@ -93,7 +94,8 @@ public:
   double time() const { return double(steps_) * timestep(); }
   bool feels() const { return given_.has("force_shape"); }
 
-  // Largest force along the contact normals of a shape since the last look, and the time of its first touch (NaN).
+  // Largest force along the contact normals of a shape since the last call, and time of its first touch (NaN if
+  // none).
   double peak(std::size_t shape) const { return peak_[shape]; }
   double began(std::size_t shape) const { return began_[shape]; }
   bool touching(std::size_t shape) const { return normal_[shape] > 0; }
@@ -103,7 +105,7 @@ public:
     began_.assign(shapes_, std::numeric_limits<double>::quiet_NaN());
   }
 
-  // Begin at rest, with the propellers at given speeds.
+  // Start at rest, with the propellers at given speeds.
   void reset(const Vector &q, const double *speeds)
   {
     mj_resetData(model_.get(), data_.get());
@@ -128,7 +130,7 @@ public:
     sample();
   }
 
-  // Push a point of a body from now on.
+  // Apply a force to a point of a body from now on.
   void push(int body, std::array<double, 3> point, std::array<double, 3> force, double seconds)
   {
     push_body_ = body;
@@ -140,7 +142,7 @@ public:
   const Reading &measured() const { return past_.front(); }
   const Reading &truth() const { return past_.back(); }
 
-  // Take physics steps under one command.  Return whether the state is finite and has not run away.
+  // Simulate physics steps with one command.  Return whether the state is finite and has not diverged.
   bool step(const double *rotor_speed, const double *torque, int count)
   {
     const Vector &effort = given_.row("effort", 0);
