@@ -1,1 +1,1 @@
-"""Export of a whole controller as C code (``codegen --controller``)."""
+"""Export of a complete controller as C code (``codegen --controller``)."""

@@ -1,4 +1,7 @@
-"""Exported controller in Python, with the interface of ``tsid.Controller``.  This module needs no CasADi."""
+"""Run an exported C controller from Python, with the interface of ``tsid.Controller``.
+
+This module does not import CasADi.
+"""
 
 from __future__ import annotations
 
@@ -23,21 +26,21 @@ from impact_posture.system.libraries import library_path, load_library
 from impact_posture.tsid.controller import Command, Report
 
 _FUNCTIONS = ("init", "reset", "tick", "last_report", "move_to", "lead_posture", "brace", "contact", "release")
-# Number of doubles of a target: set, position, rotation, velocity, acceleration.
+# Number of doubles in a target: 1 (whether it is set), 3 (position), 9 (rotation), 6 (velocity), 6 (acceleration).
 TARGET = 25
 
 
 class CompiledController:
-    """Controller in a shared library: state in, commands out.
+    """Controller in a shared library, which computes a command from each measured state.
 
     Attributes:
         manifest: The content of ``<prefix>.json``.
-        parameters: Name → values, shape (size,), which the next :meth:`reset` reads.
-        targets: Name of a task → numbers of its target as C has them, shape (25,).
+        parameters: Parameter name → values, shape (size,).  The next :meth:`reset` reads these values.
+        targets: Task name → its target as stored in the memory of the C code, shape (25,).
     """
 
     def __init__(self, library: ctypes.CDLL, document: Mapping[str, Any], manifest: Manifest) -> None:
-        """Bind a loaded library; use :meth:`load`."""
+        """Connect to a loaded library.  Users call :meth:`load` instead."""
         self.manifest, self._checked = document, manifest
         sizes, bounds, prefix = manifest.sizes, len(manifest.bounds), manifest.prefix
 
@@ -56,7 +59,7 @@ class CompiledController:
         tasks = len(manifest.tasks)
         memory = memoryview(self._context)
         targets = np.frombuffer(memory, dtype=float, count=TARGET * tasks).reshape(tasks, TARGET)
-        # The level follows the targets.  C has no arrays of length zero.
+        # In memory, the level follows the targets.  C arrays cannot be empty, so there is at least one target.
         self._level = np.frombuffer(memory, dtype=float, count=1, offset=8 * TARGET * max(1, tasks))
         self.targets = {task.name: row for task, row in zip(manifest.tasks, targets, strict=True)}
         self._q, self._v, self._force = np.zeros(manifest.nq), np.zeros(manifest.nv), np.zeros(6)
@@ -69,17 +72,18 @@ class CompiledController:
     @classmethod
     @checked
     def load(cls, path: str | Path, *, robot: Robot | None = None) -> CompiledController:
-        """Load an exported controller.  **This runs its code**, so load only what you would run as a program.
+        """Load an exported controller.  **This runs its code**, so load only exports that you trust.
 
-        The method builds a missing ``lib<prefix>.so``.  The library must contain the identity of this manifest.
+        If ``lib<prefix>.so`` is missing, the method builds it.  The library must contain the identity of the manifest
+        in the folder.
 
         Args:
             path: The folder of the export, or its ``<prefix>.json``.
-            robot: The robot; the export must be of this model.
+            robot: The robot; the export must have been made for this model.  With ``None``, this is not checked.
 
         Raises:
             SpecError: The export is missing or broken.
-            ManifestMismatch: The export is of another robot, or the library belongs to another manifest.
+            ManifestMismatch: The export belongs to another robot, or the library belongs to another manifest.
             CompilerError: The library is missing and cannot be built.
         """
         document, manifest, folder = read_controller(Path(path))
@@ -96,13 +100,13 @@ class CompiledController:
             raise SpecError(f"lacks a function ({error})", where=str(target), hint="run codegen again") from None
 
     def reset(self, q: ArrayLike, v: ArrayLike) -> Command:
-        """Start again at ``(q, ν)`` with the present parameters.  Targets that are set stay.
+        """Start again at ``(q, ν)`` with the present parameters.  Targets that are already set stay the same.
 
         Raises:
-            InputError: A parameter is out of range; names it.
+            InputError: A parameter is out of range; the message names it.
             PostureError: ``q`` is not a configuration of the robot, or ``v`` is not a velocity.
-            ValueError: An array has another shape.
-            MetricError: The gradient of the posture task does not exist there, or vanishes.
+            ValueError: The shape of an array is wrong.
+            MetricError: At ``q``, the gradient of the posture task does not exist or is zero.
             ContactError: A sole stands on its edge.
         """
         self._measure(q, v)
@@ -129,11 +133,11 @@ class CompiledController:
         return self._commanded()
 
     def tick(self, t: float, q: ArrayLike, v: ArrayLike, force: ArrayLike | None = None) -> Command:
-        """Return the command at ``(q, ν)``; arguments as of ``tsid.Controller.tick``.
+        """Return the command at ``(q, ν)``.  The arguments are the same as in ``tsid.Controller.tick``.
 
         Raises:
             InputError: ``reset`` has not been called.
-            ValueError: An array has another shape.
+            ValueError: The shape of an array is wrong.
         """
         if not self._ready:
             raise InputError("has not been reset", where="controller", hint="call reset(q, v) first")
@@ -155,11 +159,11 @@ class CompiledController:
 
     @property
     def measured(self) -> tuple[Array, Array]:
-        """The state ``(q, ν)`` of the last tick."""
+        """The measured state ``(q, ν)`` of the last tick."""
         return self._q.copy(), self._v.copy()
 
     def addresses(self) -> dict[str, int]:
-        """Return the number of targets, and the addresses that a loop of ticks in C needs."""
+        """Return memory addresses by name, and the number of ``targets``, for a loop of ticks in C."""
         arrays = {"q": self._q, "v": self._v, "force": self._force, "level": self._level}
         arrays |= {"u": self._out["u"], "rotor_speed": self._out["rotor_speed"]}
         addresses = {name: int(array.ctypes.data) for name, array in arrays.items()}
@@ -178,7 +182,7 @@ class CompiledController:
     def set_target(
         self, task: str, target: pin.SE3 | ArrayLike, velocity: ArrayLike = 0.0, acceleration: ArrayLike = 0.0
     ) -> None:
-        """Set the target of a task by name, in the form of its class in ``tsid``, between ticks.
+        """Set the target of the task named ``task``, in the form that the task's class in ``tsid`` uses.
 
         Raises:
             InputError: The controller has no such task.
@@ -198,7 +202,7 @@ class CompiledController:
         row[0], row[13 : 13 + rows], row[19 : 19 + rows] = 1.0, velocity, acceleration
 
     def forget_target(self, task: str) -> None:
-        """Let the next :meth:`reset` take the present output as the target of a task.
+        """Clear the target of a task, so that the next :meth:`reset` sets it to the present output.
 
         Raises:
             InputError: The controller has no such task.
@@ -212,11 +216,11 @@ class CompiledController:
         return self.targets[task]
 
     def move_to(self, q: ArrayLike, over: float = 0.5) -> None:
-        """Fade the posture task to ``q``, shape (nq,), within ``over`` seconds.
+        """Fade the target of the posture task to ``q``, shape (nq,), within ``over`` seconds.
 
         Raises:
             InputError: The posture or the time is invalid, or ``reset`` has not been called.
-            ValueError: The posture has another shape.
+            ValueError: The shape of the posture is wrong.
         """
         q = _shaped(q, self._q.shape, "q")
         if self._call("move_to", _pointer(q), ctypes.c_double(over)):
@@ -228,7 +232,7 @@ class CompiledController:
 
         Raises:
             InputError: A number is invalid, or ``reset`` has not been called.
-            ValueError: An array has another shape.
+            ValueError: The shape of an array is wrong.
         """
         n, nv = self._q.shape, self._v.shape
         arrays = [_shaped(q, n, "q"), _shaped(v, nv, "v"), _shaped(a, nv, "a")]
@@ -243,20 +247,24 @@ class CompiledController:
 
     @property
     def flow_failures(self) -> int:
-        """Number of steps since the reset at which the solver of a reference flow failed.  The flow then rests."""
+        """Number of steps since the reset for which the solver of the reference flow failed.
+
+        After such a step, the flow rests.
+        """
         self._call("last_report", ctypes.byref(self._report))
         return int(self._report.flow_failures)
 
     def brace(self, t: float = -math.inf, *, t_impact: float | None = None) -> None:
-        """Switch the impact-robust term on, or start the reference flow, at the first tick at ``t``, s, or later.
+        """Switch the impact-robust term on, or start the reference flow, at the first tick from the time ``t`` on.
 
         Args:
-            t: Time on the clock of the ticks, s.
-            t_impact: Time from then until the impact, s, before which a reference flow rests.
+            t: Time of the switch, in the time of the ticks, s; by default, the next tick.
+            t_impact: Time from ``t`` to the impact, s, if it is known.  A reference flow then comes to rest before
+                the impact.
 
         Raises:
-            InputError: This phase does not follow the present phase, ``t`` is before the time of a waiting phase,
-                ``t_impact`` is not finite, or the controller has no flow.
+            InputError: This phase cannot follow the present phase, ``t`` is before the time of a waiting phase, or
+                ``t_impact`` is given but not finite, or given to a controller without a flow.
         """
         if t_impact is None:
             self._enter("brace", t)
@@ -266,16 +274,22 @@ class CompiledController:
             self._enter("brace_before", t, t_impact)
 
     def contact(self, t: float = -math.inf) -> None:
-        """Hold the reached posture during the impact, or keep the term on if it is live; as :meth:`brace`."""
+        """Make the reached posture the target during the impact, or keep the term on if it is live.
+
+        ``t`` has the same meaning as in :meth:`brace`.
+        """
         self._enter("contact", t)
 
     def release(self, t: float = -math.inf) -> None:
-        """Switch the impact-robust term or the flow off and hold the reached posture; as :meth:`brace`."""
+        """Switch the impact-robust term or the flow off, and make the reached posture the target.
+
+        ``t`` has the same meaning as in :meth:`brace`.
+        """
         self._enter("release", t)
 
     @property
     def level(self) -> float:
-        """Level of the impact-robust term, 0 to 1, or whether the flow may move."""
+        """Level of the impact-robust term, 0 to 1; for a reference flow, 1 if it may move and 0 if not."""
         return float(self._level[0])
 
     def _enter(self, function: str, *times: float) -> None:
@@ -306,7 +320,7 @@ def _pointer(array: Array) -> Any:
 
 
 def _structure(arrays: list[tuple[str, int]], integers: list[str]) -> tuple[Any, dict[str, Array]]:
-    """Return a C structure of arrays of doubles and integers, and views of its arrays."""
+    """Return a C structure with arrays of doubles, then single integers, and NumPy views of its arrays by name."""
     fields = [(name, ctypes.c_double * size) for name, size in arrays]
     kind = type("Block", (ctypes.Structure,), {"_fields_": [*fields, *((name, ctypes.c_int) for name in integers)]})
     block = kind()

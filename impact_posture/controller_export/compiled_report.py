@@ -1,4 +1,4 @@
-"""Report of a controller in C as a :class:`~impact_posture.tsid.controller.Report`."""
+"""Convert the report of a C controller to a :class:`~impact_posture.tsid.controller.Report`."""
 
 from __future__ import annotations
 
@@ -14,7 +14,7 @@ STATUSES = tuple(Status)
 
 
 def read_report(manifest: Manifest, status: Status, iterations: int, values: Mapping[str, Array]) -> Report:
-    """Return a report from the arrays of the structure in C, by their names."""
+    """Return the report of the last tick; ``values`` are the arrays of the C structure ``ip_report`` by name."""
     residuals: dict[str, Array] = {}
     active: list[tuple[str, str]] = []
     if status in (Status.SOLVED, Status.RELAXED):

@@ -1,4 +1,7 @@
-"""Manifest of an exported controller: reading, checks, and the build of its library.  This module needs no CasADi."""
+"""Read and check the manifest of an exported controller, and build its library.
+
+This module does not import CasADi.
+"""
 
 from __future__ import annotations
 
@@ -12,7 +15,7 @@ from impact_posture.codegen.manifest_reader import Loose, read_checked
 from impact_posture.system.libraries import build_parts, library_path
 
 SCHEMA = "impact-posture/controller/1"
-# Largest size in a manifest.  A larger size would only waste memory.
+# Largest size that a manifest may state.  A larger size would be an error and allocate too much memory.
 _MOST = 100_000
 
 Size = Annotated[int, Field(ge=-1, le=_MOST)]
@@ -25,7 +28,10 @@ class _Task(Loose):
 
 
 class Manifest(Loose):
-    """Keys that a loader needs.  The library identifies its manifest, hence all of them."""
+    """Keys of the manifest that the loader requires.
+
+    The library contains a hash of its manifest, so a library with other values of these keys is detected.
+    """
 
     prefix: Name
     real: Literal["double"]
@@ -46,10 +52,12 @@ class Manifest(Loose):
 
 
 def read_controller(path: Path) -> tuple[dict[str, Any], Manifest, Path]:
-    """Read the manifest in a folder, or at a path; return it, its checked keys, and the folder.
+    """Read the manifest at ``path``, which is a file or a folder.
+
+    Return the whole document, its checked keys, and the folder.
 
     Raises:
-        SpecError: There is not exactly one manifest, or it is broken.
+        SpecError: The folder does not contain exactly one manifest, or the manifest is broken.
     """
     document, checked, file = read_checked(path, SCHEMA, Manifest, "exported controller", "codegen --controller")
     return document, checked, file.parent
@@ -58,7 +66,7 @@ def read_controller(path: Path) -> tuple[dict[str, Any], Manifest, Path]:
 def build_controller(folder: Path, manifest: dict[str, Any], generated: Sequence[str] = ()) -> Path:
     """Build ``lib<prefix>.so`` in the folder of an exported controller.
 
-    ``generated`` are further flags of the compiler for the long sources without loops that come from the model.
+    ``generated`` are additional compiler flags for the long sources without loops that are generated from the model.
 
     Raises:
         CompilerError: The compiler failed or is missing.

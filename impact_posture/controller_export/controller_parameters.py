@@ -1,4 +1,4 @@
-"""Run-time parameters of an exported controller: their places in the C structure, rules, and values in Python."""
+"""Run-time parameters of an exported controller: order in the C structure, rules, and values of the formulation."""
 
 from __future__ import annotations
 
@@ -15,7 +15,7 @@ from impact_posture.tsid.limits.acceleration_bounds import LimitLaw
 from impact_posture.tsid.tasks.frame_tasks import FrameTask
 
 Rule = Literal["finite", "nonnegative", "positive", "limit", "amount", "share"]
-# Numbers of the rules in C: 1 finite, 2 not negative, 4 not zero, 8 at most one.
+# Code of each rule in C, as a sum: 1 for finite, 2 for not negative, 4 for not zero, 8 for at most one.
 RULES: dict[Rule, int] = {"finite": 1, "nonnegative": 3, "positive": 6, "limit": 0, "amount": 7, "share": 14}
 
 
@@ -24,9 +24,10 @@ class Field(NamedTuple):
 
     Attributes:
         name: Name in the C structure.
-        rule: What ``init`` accepts; ``limit`` and ``positive`` may be infinite, and a ``share`` is at most 1.
-        text: Meaning, with the unit.
-        value: Value in the exported formulation, flat.
+        rule: Rule for the values that ``init`` accepts.  ``limit`` and ``positive`` permit infinity, and a ``share``
+            is at most 1.
+        text: Meaning and unit, for the header.
+        value: Values in the exported formulation, as a flat array.
     """
 
     name: str
@@ -47,7 +48,7 @@ def parameters(s: Structure, period: float) -> Iterator[Field]:
 
     def field(name: str, rule: Rule, text: str, value: ArrayLike) -> Field:
         values = np.array(value, dtype=float).ravel()
-        # C has no arrays of length zero.
+        # C arrays cannot have the length zero.
         return Field(name, rule, text, values if values.size else np.ones(1))
 
     gains = (("kp", "stiffness, 1/s2"), ("kd", "damping, 1/s"), ("weight", "weight in the cost"))

@@ -1,4 +1,4 @@
-"""C text of a controller: generated dynamics, the tables of its structure, and the files of ``c/``."""
+"""Write the C text of a controller: generated dynamics, tables of its structure, and the files of ``c/``."""
 
 from __future__ import annotations
 
@@ -32,7 +32,7 @@ from impact_posture.system.arrays import Array
 from impact_posture.system.escape import c_comment
 from impact_posture.version import __version__
 
-# Files of c/ in the order of the source.
+# Files of the folder c/, in the order in which they are joined.
 _CORE = (
     "vector.c", "eigen.c", "algebra.c", "tasks.c", "contacts.c", "qp.c", "rank.c", "solve.c", "give_way.c",
     "reference_flow_space.c", "reference_flow_limits.c", "reference_flow_zmp.c", "reference_flow_direction.c",
@@ -42,24 +42,24 @@ _RELAXATION = (
     "relaxation_memory.c", "vector.c", "relaxation_rows.c", "relaxation_elimination.c", "relaxation_level.c",
     "relaxation_cost.c", "relaxation.c",
 )  # fmt: skip
-# Parameters that init compares with other parameters.
+# Parameters that ``init`` compares with other parameters, so their numbers are needed by name.
 _NAMED = ("control_upper", "joint_upper", "contact_normal", "law_rate", "posture_weight", "task_weight")
-# Bytes of variables, saved registers and return addresses of all functions in a tick, without the arrays.
+# Stack bytes of a tick apart from arrays: variables, saved registers and return addresses of all functions.
 _FRAMES = 4096
 
 
 @dataclass(frozen=True)
 class GeneratedCode:
-    """C code of the quantities in ``ip_model``, or of an objective.
+    """C code that computes the quantities in ``ip_model``, or an objective.
 
     Attributes:
-        constants: Tables of numbers.
-        blocks: Functions that compute parts.
-        angles: Entries of ``q`` with a sine and a cosine.
+        constants: C text of tables of numbers.
+        blocks: C functions that each compute a part of the quantities.
+        angles: Indices of the entries of ``q`` whose sine and cosine are used.
         work: Length of the work array.
-        outputs: Assignments after the blocks, target and value.
-        constant_outputs: Assignments that do not depend on the state.
-        stack_bytes: Upper bound on the stack.
+        outputs: Assignments after the blocks, as pairs of target and value.
+        constant_outputs: Assignments of values that do not depend on the state.
+        stack_bytes: Upper bound on the stack usage, bytes.
     """
 
     constants: str
@@ -75,9 +75,10 @@ class GeneratedCode:
 def dynamics_code(
     robot: Robot, points: tuple[tuple[str, Vector3, bool], ...], *, shared: bool = False
 ) -> GeneratedCode:
-    """Generate the dynamics of points of a robot, each with frame, offset, and whether it needs a rotation.
+    """Generate the dynamics of a robot and the kinematics of points.
 
-    ``shared`` code reads the numbers of :class:`~impact_posture.dynamics.model_parameters.ModelParameters`.
+    Each point is a frame, an offset, and whether the rotation of the frame is needed.  With ``shared``, the code
+    reads the numbers of :class:`~impact_posture.dynamics.model_parameters.ModelParameters` at run time.
     """
     q, v = ca.SX.sym("q", robot.nq), ca.SX.sym("v", robot.nv)
     numbers = ModelParameters(robot.model) if shared else None
@@ -94,14 +95,17 @@ def dynamics_code(
         quantities[f"velocity[{k}]"], quantities[f"drift[{k}]"] = velocity[:rows], drift[:rows]
         if rows == 6:
             quantities[f"rotation[{k}]"], quantities[f"spatial[{k}]"] = tree.rotation(on), spatial
-    # Transposed, because C stores matrices by rows, and CasADi by columns.
+    # Transpose the matrices, because the C code stores them row by row, and CasADi column by column.
     targets = {f"d->{name}[{{}}]": x.T for name, x in quantities.items()}
     return _generated({"q": q, "v": v} | ({} if numbers is None else {"numbers": numbers.symbol}), targets)
 
 
 @lru_cache(maxsize=2)
 def objective_code(objective: WorstCaseObjective) -> GeneratedCode:
-    """Generate an objective and its gradient, with numbers as in the shared :func:`dynamics_code`."""
+    """Generate an objective and its gradient.
+
+    Like the shared :func:`dynamics_code`, this code reads the numbers of the model at run time.
+    """
     q, numbers = ca.SX.sym("q", objective.robot.nq), ModelParameters(objective.robot.model)
     kernel = ImpactKernel(objective.case, q, ca.SX(ca.DM(objective.contact.normal)), numbers)
     targets = dict(zip(("value[{}]", "gradient[{}]"), objective.worst_case.expressions(kernel), strict=True))
@@ -140,9 +144,10 @@ def render(
 ) -> dict[str, str]:
     """Return file name → text of the header and the sources, whose C names begin with ``prefix``.
 
-    The library contains the ``identity`` of the manifest.  ``metric`` is the prefix of the gradient, if there is one.
-    The gradient is exported, or it is the :func:`objective_code` of an ``objective``.  With ``shared``, the last
-    parameter is ``numbers``, in which models with the same code differ.
+    The library contains the ``identity`` of the manifest.  ``metric`` is the prefix of the gradient's C names;
+    ``None`` means that there is no gradient.  If ``objective`` is given, its :func:`objective_code` is the gradient;
+    otherwise, the gradient is exported separately.  With ``shared``, the last parameter is ``numbers``, in which
+    robots with the same code may differ.
     """
     points, robot = tuple((p.frame, p.offset, p in s.turning) for p in s.points), s.robot
     code = dynamics_code(robot, points, shared=shared)
@@ -202,14 +207,14 @@ def _files(sizes: dict[str, int]) -> list[str]:
 
 
 def _relaxation_room(n: int, m: int, levels: int) -> int:
-    """Return a bound on the doubles in the memory of the relaxation, which ``init`` checks."""
+    """Return an upper bound on the number of doubles that the relaxation needs; ``init`` checks this bound."""
     entries, active = n + m, 2 * n + m + 2
     matrices = 2 * n * n + m * n + 3 * entries * n + active * (active + 1) // 2
     return matrices + 16 * n + 7 * active + (20 + levels) * entries + 64
 
 
 def relaxation() -> dict[str, str]:
-    """Return file name → text of the relaxation, with names without a prefix."""
+    """Return file name → text of the relaxation, whose C names have no prefix yet."""
     return {
         "relaxation.h": _core_text("relaxation.h"),
         "relaxation.c": "\n".join(_core_text(name) for name in _RELAXATION),
@@ -217,7 +222,7 @@ def relaxation() -> dict[str, str]:
 
 
 def named(text: str, prefix: str) -> str:
-    """Return C text with the prefix before all names."""
+    """Return C text in which all names of the package begin with ``prefix`` instead of ``ip``."""
     text = re.sub(r"\brelaxation_([a-z])", rf"{prefix}_relaxation_\1", text)
     return re.sub(r"\bip_", f"{prefix}_", re.sub(r"\bIP_", f"{prefix.upper()}_", text))
 
@@ -235,7 +240,7 @@ def _initializer(values: Array) -> str:
 
 
 def _table(values: Array) -> tuple[str, str, str]:
-    """Return C type, initializer with at least one number, and length."""
+    """Return the C type of a table, its length, and its initializer; an empty table gets one zero."""
     values = values.ravel() if values.size else np.zeros(1, dtype=values.dtype)
     if values.dtype == np.int64:
         return "int", str(values.size), _braced(str(x) for x in values.tolist())

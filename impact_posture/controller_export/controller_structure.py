@@ -1,4 +1,4 @@
-"""Structure of a controller that its C code contains: sizes, tasks, contacts and the order of the rows."""
+"""Structure of a controller that is fixed in its C code: sizes, tasks, contacts and the order of the rows."""
 
 from __future__ import annotations
 
@@ -24,22 +24,25 @@ from impact_posture.tsid.tasks.impact_robust import ImpactRobustPosture
 from impact_posture.tsid.tasks.joint_posture import JointPosture
 from impact_posture.tsid.tasks.task import Task
 
-# Kinds of tasks in the order of their numbers in C.
+# Task classes; the position in this tuple is the number of the class in C.
 _KINDS: tuple[type[Task], ...] = (Tilt, BaseOrientation, CenterOfMass, FramePosition, FramePose, FrameAligned)
 _POSTURES = (JointPosture, ImpactRobustPosture, ReferenceFlowPosture)
-# Families of joints in the order of their numbers in C.
+# Number in C of each family of joints.
 _FAMILIES = {"revolute": 0, "prismatic": 0, "continuous": 1, "free-flyer": 2, "spherical": 3}
 
 
 @dataclass(frozen=True, eq=False)
 class Structure:
-    """Formulation, with the numbers and tables that its C code needs.
+    """Formulation with the sizes and tables that its C code needs.
 
     Attributes:
+        robot: The robot.
+        formulation: Tasks, contacts and limits.
+        actuators: Rotors and motors.
         tasks: Tasks of the strict levels, then the weighted tasks.
-        points: Points whose kinematics a tick needs.
-        sizes: Name → number, of every size that the code fixes.
-        tables: Name → constant integers or doubles.
+        points: Points whose kinematics each tick computes.
+        sizes: Name → value of each size that is fixed in the code.
+        tables: Name → constant array of integers or doubles.
         levels: Names of the strict levels.
         bounds: Name of each bound, in the order of the multipliers in a report.
     """
@@ -56,19 +59,19 @@ class Structure:
 
     @property
     def robust(self) -> ImpactRobustPosture | None:
-        """The posture task, if it is impact-robust."""
+        """The posture task if it is impact-robust; otherwise ``None``."""
         posture = self.formulation.posture
         return posture if isinstance(posture, ImpactRobustPosture) else None
 
     @property
     def flow(self) -> ReferenceFlowPosture | None:
-        """The posture task, if it has a reference flow."""
+        """The posture task if it has a reference flow; otherwise ``None``."""
         posture = self.formulation.posture
         return posture if isinstance(posture, ReferenceFlowPosture) else None
 
     @property
     def turning(self) -> frozenset[Point]:
-        """Points whose rotation a task or a sole needs."""
+        """Points whose rotation is needed by a task, a sole or the measured force."""
         tasks = [t.point for t in self.tasks if isinstance(t, FramePose | FrameAligned)]
         soles = [c.point for c in self.formulation.contacts if c.kind == "surface"]
         pushed = [] if self.formulation.force_point is None else [self.formulation.force_point]
@@ -79,13 +82,13 @@ def structure_of(robot: Robot, formulation: TaskFormulation) -> Structure:
     """Return the structure of a formulation.
 
     Raises:
-        InputError: A task, a limit or a joint has no C code; names it.
+        InputError: A task, a limit or a joint has no C code; the message names it.
     """
     _check(robot, formulation)
     actuators = Actuators(robot)
     strict = tuple(task for level in formulation.levels for task in level)
     tasks, contacts, points = (*strict, *formulation.weighted), formulation.contacts, formulation.points
-    # Copies, because an assembly binds the targets of its tasks, and a controller may run with these tasks.
+    # Copy the tasks, because an assembly takes over their targets, and a controller may be running with these tasks.
     copied = tuple(tuple(map(copy, level)) for level in formulation.levels)
     copies = replace(formulation, levels=copied, weighted=tuple(map(copy, formulation.weighted)))
     assembly = Assembly(robot, copies, actuators)
@@ -151,14 +154,14 @@ def structure_of(robot: Robot, formulation: TaskFormulation) -> Structure:
         "inverse": actuators.inverse,
         "blind": actuators.blind if rotors else np.eye(actuators.base),
         "spare": actuators.spare,
-        # The axis of an alignment, and two directions across it.
+        # For an aligned frame: its axis and the two directions across the axis.
         "task_axis": [[t._axis, *t._across] if isinstance(t, FrameAligned) else np.zeros((3, 3)) for t in tasks],
     }
     if sizes["FLOW"] and robot.floating:
         doubles["upright"] = robot.upright
     arrays: dict[str, NDArray[Any]] = {name: np.array(v, dtype=np.int64) for name, v in tables.items()}
     arrays |= {name: np.array(values, dtype=float).ravel() for name, values in doubles.items()}
-    # Bounds on joints are either simple bounds, which come first, or the last rows.
+    # The bounds on joints are either simple bounds, which come first, or they are the last rows.
     bounded, rows = assembly.names[actuators.base : nv], assembly.names[assembly.qp.n :]
     names = (*(bounded if sizes["SIMPLE"] else ()), *rows, *(bounded if bounds else ()))
     levels = tuple(name for name, _ in assembly.levels)
@@ -170,8 +173,8 @@ def _add_flow(
 ) -> None:
     """Add sizes and tables of a reference flow.
 
-    ``HELD`` is the number of rows that the flow does not move: contacts, tasks and joints.  ``flow_led`` numbers the
-    tasks that it moves, from 1, and is zero for the other tasks.
+    ``HELD`` is the number of rows that the flow does not move: contacts, tasks and joints.  ``flow_led`` contains the
+    number, from 1, of each task that the flow moves, and zero for each other task.
     """
     posture = formulation.posture
     flow = posture if isinstance(posture, ReferenceFlowPosture) else None
@@ -181,7 +184,7 @@ def _add_flow(
     held = [task.size for task, leading in zip(tasks, leads, strict=True) if not leading]
     fixed = [robot.tangent_names.index(j) for j in robot.spec.constraints.hold if j in robot.tangent_names]
     edges = max(4, 4 * sizes["CONTACTS"]) if sizes["CONTACTS"] else 0
-    # The tilt of the base is one more row.
+    # The tilt of a floating base needs one additional row.
     placed = edges + int(robot.floating)
     size = int(flow is not None)
     if flow is not None:
@@ -200,7 +203,7 @@ def _add_flow(
 
 
 def _is_diagonal_in_momentum(robot: Robot, formulation: TaskFormulation) -> bool:
-    """Return whether center of mass, base orientation and the joints of a posture task make up the whole cost."""
+    """Return whether the cost consists only of center of mass, base orientation and the joints of a posture task."""
     tasks, posture = formulation.weighted, formulation.posture
     kinds = {type(task) for task in tasks}
     return (
@@ -214,7 +217,7 @@ def _is_diagonal_in_momentum(robot: Robot, formulation: TaskFormulation) -> bool
 
 
 def _check(robot: Robot, formulation: TaskFormulation) -> None:
-    """Refuse tasks, limits and joints without C code."""
+    """Raise :class:`InputError` if a task, a limit or a joint has no C code."""
 
     def refuse(what: str) -> InputError:
         return InputError(what, where="controller export", hint="run it in Python, or use tasks of this package")
@@ -224,7 +227,7 @@ def _check(robot: Robot, formulation: TaskFormulation) -> None:
         if type(task) not in known:
             raise refuse(f"task '{task.name}' ({type(task).__name__}) has no C code")
     if isinstance(formulation.posture, ReferenceFlowPosture) and formulation.contacts and not robot.floating:
-        # Python refuses them at a reset, too, so "run it in Python" is not a hint here.
+        # Such a flow raises an error in Python, too, so the hint "run it in Python" would be wrong.
         what = f"'{formulation.posture.name}' with contacts needs a floating base"
         raise InputError(what, where="controller export", hint="leave out `contacts`")
     if formulation.row_limits:

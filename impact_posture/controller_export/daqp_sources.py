@@ -1,6 +1,6 @@
-"""C sources of DAQP, the QP solver of an exported controller, in one version with a checked content.
+"""C sources of DAQP, the QP solver of an exported controller, in one version whose content is checked.
 
-They come from the source distribution, which pip downloads once and neither builds nor runs.
+The sources come from the source distribution on PyPI.  pip downloads it once, but neither builds nor runs it.
 """
 
 from __future__ import annotations
@@ -21,19 +21,19 @@ from impact_posture.system.libraries import building, cache_folder, is_cached
 VERSION = "0.11.0"
 SOURCES = ("auxiliary.c", "daqp.c", "factorization.c")
 _HEADERS = ("auxiliary.h", "constants.h", "daqp.h", "factorization.h", "types.h")
-# SHA-256 of the distribution, which pip compares, and of the contents of the needed files, in the order of FILES.
+# SHA-256 of the source distribution, which pip checks, and of the contents of the needed files in the order of FILES.
 _ARCHIVE_SHA256 = "2f27baf18d2acca14186498e651b34e0bed455627e777d3fd8ba655e7e40f920"
 _CONTENT_SHA256 = "7cce7844f7cf515e8c1fe9208e3996b0569c954ef641ad5b3478657ee23a6e9d"
-# Path of each file in the distribution.  An exported controller has all files in one folder.
+# Path of each file in the distribution.  In an exported controller, all files are in one folder.
 FILES = {
     **{name: f"csrc/src/{name}" for name in SOURCES},
     **{name: f"csrc/include/{name}" for name in _HEADERS},
     "LICENSE": "LICENSE",
 }
-# Largest size of a file, B.
+# Largest permitted size of a file, bytes.
 _LARGEST = 1 << 20
-# A build backend for pip, which always requires metadata.  With it, pip neither installs the real backend nor runs
-# the code of the distribution, which takes minutes.
+# Small build backend that gives pip the metadata that it always requires.  Otherwise, pip would install the real
+# backend and run the code of the distribution, which takes minutes.
 _BACKEND = f"""
 import pathlib
 def prepare_metadata_for_build_wheel(folder, settings=None):
@@ -46,15 +46,15 @@ _FOLDER_HINT = f"give the folder of DAQP {VERSION}'s sources with `daqp`"
 
 
 def daqp_sources(folder: Path | None = None) -> dict[str, bytes]:
-    """Return the content of each of :data:`FILES`.
+    """Return file name → content for the files in :data:`FILES`.
 
     Args:
-        folder: Unpacked source distribution, or a folder that directly contains the files; by default, the
-            distribution in the cache, which pip downloads if it is missing.
+        folder: Unpacked source distribution, or a folder that directly contains the files.  With ``None``, the
+            distribution in the cache is used; if it is missing, pip downloads it.
 
     Raises:
-        InputError: The sources are not available, or differ from :data:`VERSION`.
-        OutputError: The cache cannot be written, or other users may write it.
+        InputError: The sources are not available, or are not the sources of :data:`VERSION`.
+        OutputError: The cache cannot be written, or other users may write to it.
     """
     if folder is not None:
         return _checked(lambda name: _from_folder(folder, name), str(folder), _FOLDER_HINT)
@@ -70,9 +70,9 @@ def daqp_sources(folder: Path | None = None) -> dict[str, bytes]:
 
 
 def renamed(sources: dict[str, bytes], prefix: str) -> dict[str, str]:
-    """Return a header and a source that rename all functions of DAQP with a prefix.
+    """Return a header and a source file that add ``prefix`` to the names of all DAQP functions.
 
-    Two controllers in one program, and a DAQP of the program itself, then do not collide.
+    Without the prefix, names would collide if a program contains two controllers or its own DAQP.
     """
     headers = "".join(sources[name].decode() for name in _HEADERS)
     names = re.findall(r"^(?:void|int|c_float) (\w+)\(", headers, re.MULTILINE)
@@ -87,7 +87,7 @@ def renamed(sources: dict[str, bytes], prefix: str) -> dict[str, str]:
 
 
 def _checked(read: Callable[[str], bytes | None], where: str, hint: str) -> dict[str, bytes]:
-    """Read all files, and refuse contents that differ from the version."""
+    """Read all files; raise :class:`InputError` if a file is missing or the contents have the wrong hash."""
     sources, digest = dict[str, bytes](), hashlib.sha256()
     for name in FILES:
         content = read(name)
@@ -111,7 +111,10 @@ def _from_folder(folder: Path, name: str) -> bytes | None:
 
 
 def _from_archive(tar: tarfile.TarFile, name: str) -> bytes | None:
-    """Return a plain member without unpacking, so that no name or link in the archive reaches the disk."""
+    """Return the content of a regular file in the archive, or ``None`` if there is no such file.
+
+    The archive is not unpacked, so names and links in the archive cannot change other files.
+    """
     try:
         member = tar.getmember(f"daqp-{VERSION}/{FILES[name]}")
     except KeyError:

@@ -1,4 +1,4 @@
-"""Controllers with the default gains of this package, by kind of robot."""
+"""Formulations with the default gains of this package for each kind of robot."""
 
 from __future__ import annotations
 
@@ -32,21 +32,21 @@ _BUILD: dict[str, Callable[..., TaskFormulation]] = {"aerial": aerial_formulatio
 def default_formulation(
     robot: Robot, kind: ControllerKind, objective: WorstCaseObjective | None = None, *, flow: bool = False
 ) -> TaskFormulation:
-    """Return the formulation of a kind of robot with default gains.
+    """Return the formulation for a kind of robot, with default gains.
 
-    The task of the end effector (``aerial`` and ``arm``) holds the same rows as ``optimize`` by default, so that the
-    redundancy is the same.
+    For ``aerial`` and ``arm``, the task of the end effector constrains the same directions as ``optimize`` does by
+    default, so that the redundancy is the same.
 
     Args:
         robot: The robot.
         kind: ``aerial``, ``legged`` or ``arm``.
         objective: The objective whose gradient the posture task follows; ``None`` for a nominal posture task.
-        flow: Follow it by a reference flow instead of the impact-robust term.
+        flow: If true, a reference flow follows the gradient; otherwise, the impact-robust term follows it.
 
     Raises:
-        InputError: The robot is of another kind, or its data do not name an end effector.
+        InputError: The robot is not of this kind, or its data do not name an end effector.
     """
-    # The posture of a standing robot has little weight beside its center of mass and base (10 and 1).
+    # The posture weight of a standing robot is small compared with the weights of center of mass and base (10 and 1).
     kp, weight, base = (20.0, 0.1, 0.0) if kind == "legged" else (10.0, 1.0, None)
     if objective is None:
         posture = JointPosture(robot, kp=kp, weight=weight, base_weight=base)
@@ -63,11 +63,12 @@ def default_formulation(
 
 
 def _end_effector(robot: Robot, objective: WorstCaseObjective | None) -> EndEffector | None:
-    """Return the task of the impact's frame, or of the default contact frame; ``None`` without a frame.
+    """Return the task of the end effector, or ``None`` if no frame is known.
 
-    It has the rows of the frame's default pose mode.  ``aligned`` uses the normal at the default posture, or holds
-    the whole pose without an impact.  A frame with the pose mode ``free`` is pushed, so the task then holds the
-    default contact frame, as a whole pose if its mode is ``free``, too.
+    The end effector is the frame of the impact.  Without an impact, or if the pose mode of this frame is ``free``,
+    the end effector is the default contact frame.  The task constrains the directions of the frame's pose mode.
+    ``aligned`` uses the normal at the default posture.  The task constrains the whole pose for ``free``, and for
+    ``aligned`` without an impact.
     """
     frame, offset = robot.spec.contact.frame, robot.spec.contact.offset
     aligned = None
@@ -84,7 +85,7 @@ def _end_effector(robot: Robot, objective: WorstCaseObjective | None) -> EndEffe
 
 
 def _hint(robot: Robot, kind: ControllerKind, error: InputError) -> str:
-    """Return a hint: the kind of the robot, or the data that its kind needs."""
+    """Return a hint that names the kind of the robot, or the data that this kind requires."""
     if robot.floating and not robot.spec.supports and robot.spec.propulsion is None:
         return "name [propulsion] or [[supports]] in robot.toml"
     fits = "legged" if robot.spec.supports else "aerial" if robot.spec.propulsion else "arm"

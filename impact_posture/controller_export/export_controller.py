@@ -1,4 +1,4 @@
-"""Export of a controller as C into a folder: source, header, DAQP, the gradient, and a manifest."""
+"""Write a controller as C code to a folder: sources, header, DAQP, the gradient, and a manifest."""
 
 from __future__ import annotations
 
@@ -39,17 +39,17 @@ RUN_SCHEMA = "impact-posture/controller-run/1"
 
 @dataclass(frozen=True)
 class ControllerExport(WrittenCode):
-    """Exported C of a controller."""
+    """Folder and manifest of an exported C controller."""
 
     @property
     def verdict(self) -> str:
-        """Outcome in one line."""
+        """Result of the export in one line."""
         if self.library is not None:
             return f"{self.library.name}: built"
         return f"build: make -C {self.out} (or codegen --compile)"
 
     def to_dict(self) -> dict[str, Any]:
-        """Return the document of ``codegen --controller --json``."""
+        """Return the JSON document that ``codegen --controller --json`` prints."""
         return {
             "schema": RUN_SCHEMA,
             "out": str(self.out),
@@ -62,7 +62,7 @@ class ControllerExport(WrittenCode):
         }
 
     def load(self) -> CompiledController:
-        """Load the library, which runs its code; build it if it is missing."""
+        """Load the library, which runs its code.  If the library is missing, build it first."""
         return CompiledController.load(self.out, robot=self.robot)
 
 
@@ -81,28 +81,28 @@ def export_controller(
     generated: Sequence[str] = (),
     shared: bool = False,
 ) -> ControllerExport:
-    """Write the controller of a formulation as C99 into a folder, completely or not at all.
+    """Write the controller of a formulation as C99 code to a folder.  If this fails, the folder is not changed.
 
-    The code has the structure of the formulation.  Its gains, weights, limits and targets are the defaults of
-    parameters that a program can set.
+    The structure of the formulation is fixed in the code.  Gains, weights, limits and targets are parameters that a
+    program can set; their defaults are the values of the formulation.
 
     Args:
         robot: The robot.
         formulation: Tasks of this package, contacts and limits.
-        out: The folder; ``./<prefix>-c`` by default.
+        out: The folder; by default, ``./<prefix>-c``.
         objective: The objective whose gradient an impact-robust posture task or a reference flow follows.
-        prefix: Beginning of the C names; by default, the robot and ``controller``.
+        prefix: Beginning of all C names; by default, the name of the robot and ``controller``.
         period: Expected time between ticks, s.
-        daqp: Folder of the sources of DAQP, if they cannot be downloaded.
-        build: Leave ``lib<prefix>.so`` in the folder.
+        daqp: Folder with the sources of DAQP; with ``None``, they are downloaded.
+        build: Also build ``lib<prefix>.so`` in the folder, if there is a compiler.
         force: Replace an earlier export.
-        generated: Further flags of the compiler for the sources that come from the model.
-        shared: Make armature and joint placements a parameter, ``numbers``, so that robots that differ only in them
-            have the same code.  The gradient then is a part of this code.
+        generated: Additional compiler flags for the sources that are generated from the model.
+        shared: Make armature and joint placements a parameter, ``numbers``.  Robots that differ only in these numbers
+            then have the same code.  The gradient is then a part of this code.
 
     Raises:
         InputError: A task or joint has no C code, or the gradient or the sources of DAQP are missing.
-        OutputError: The folder exists without ``force``, is not an export, or cannot be written.
+        OutputError: The folder exists and ``force`` is false, is not an export, or cannot be written.
         CompilerError: The compiler failed.
     """
     prefix = c_identifier(robot.name, "controller") if prefix is None else check_prefix(prefix)
@@ -144,7 +144,7 @@ def export_controller(
 
 @lru_cache(maxsize=2)
 def _metric(objective: WorstCaseObjective, prefix: str) -> dict[str, str]:
-    """Return file name → text of the gradient, without the examples of an exported gradient."""
+    """Return file name → text of the exported gradient: source, header and manifest, without the examples."""
     with TemporaryDirectory() as folder:
         export_gradient(objective, Path(folder), prefix=prefix, check=False)
         names = [f"{prefix}.{ending}" for ending in ("c", "h", "json")]
@@ -152,7 +152,7 @@ def _metric(objective: WorstCaseObjective, prefix: str) -> dict[str, str]:
 
 
 def _manifest(s: Structure, fields: Sequence[Field], prefix: str) -> dict[str, Any]:
-    """Return the manifest: sizes of buffers and names of their entries."""
+    """Return the manifest, which contains the sizes of all buffers and the names of their entries."""
     robot = s.robot
     return {
         "schema": SCHEMA,

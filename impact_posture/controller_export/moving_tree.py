@@ -1,4 +1,4 @@
-"""Symbolic dynamics of a tick: ``M``, ``h``, and the kinematics of points with their drifts."""
+"""Symbolic dynamics for a tick: ``M``, ``h``, and the kinematics of points with their drifts."""
 
 from __future__ import annotations
 
@@ -21,7 +21,10 @@ from impact_posture.dynamics.tree import Tree
 
 
 class MovingTree(Tree):
-    """Tree of a ``pin.Model`` at ``(q, ν)``, shapes (nq, 1) and (nv, 1); ``numbers`` of the model are parameters."""
+    """Tree of a ``pin.Model`` at ``(q, ν)``, shapes (nq, 1) and (nv, 1).
+
+    With ``numbers``, armature and joint placements are parameters of the expressions.
+    """
 
     def __init__(self, model: object, q: ca.SX, v: ca.SX, numbers: ModelParameters | None = None) -> None:
         super().__init__(model, q, limbs=numbers)
@@ -29,7 +32,7 @@ class MovingTree(Tree):
         self._gravity = ca.SX(np.array(self.model.gravity.linear, dtype=float))
 
     def mass_matrix(self) -> ca.SX:
-        """Return ``M`` with armature, shape (nv, nv), by composite inertias (Featherstone 2008, table 6.2)."""
+        """Return ``M`` with armature, shape (nv, nv), from composite inertias (Featherstone 2008, table 6.2)."""
         composite = dict(self._inertia)
         M = ca.SX(self.nv, self.nv)
         for slot, i, parent in reversed(self._joints):
@@ -47,7 +50,7 @@ class MovingTree(Tree):
         return ca.triu2symm(ca.triu(M))
 
     def bias(self) -> ca.SX:
-        """Return ``h``, the generalized force at ``ν̇ = 0`` with gravity, shape (nv,)."""
+        """Return ``h``, the generalized force at ``ν̇ = 0`` including gravity, shape (nv,)."""
         forces: ByJoint = {}
         for i, acceleration in self._accelerations.items():
             momentum = self._inertia[i] @ self._moving[i]
@@ -67,7 +70,7 @@ class MovingTree(Tree):
         return J
 
     def velocity(self, point: PointOnLink) -> ca.SX:
-        """Return ``Jν`` of a point, shape (6,)."""
+        """Return the linear and angular velocity ``Jν`` of a point, world axes, shape (6,)."""
         return self.point_velocity(point, self._moving)
 
     def spatial_drift(self, point: PointOnLink) -> ca.SX:
@@ -82,11 +85,11 @@ class MovingTree(Tree):
             start = accelerations[parent] if parent else ca.vertcat(-self._gravity, ca.SX(3, 1))
             accelerations[i] = motion_to_child(self._R[i], self._p[i], start)
             if parent:
-                # For a joint on the world, v × S ν vanishes, because v is S ν.
+                # Joints on the world are left out, because their velocity v equals S ν, so v × S ν is zero.
                 accelerations[i] += _motion_cross(self._moving[i], self._S[i] @ self._v[slot.v])
         return accelerations
 
 
 def _motion_cross(a: ca.SX, b: ca.SX) -> ca.SX:
-    """Return ``a × b`` of motions (Featherstone 2008, eq. 2.31)."""
+    """Return the cross product ``a × b`` of two motion vectors (Featherstone 2008, eq. 2.31)."""
     return ca.vertcat(cross(a[3:], b[:3]) + cross(a[:3], b[3:]), cross(a[3:], b[3:]))

@@ -49,7 +49,10 @@ class Status(Enum):
     UNSOLVED = "unsolved"
     """The solver gave up, or its answer violates a control limit.  The previous command is repeated, with damping."""
     NON_FINITE = "non-finite"
-    """A measurement is not finite, exceeds 1e8, or is not a rotation.  The reaction is the same as for UNSOLVED."""
+    """A measurement is not finite, exceeds 1e8, or is not a rotation.
+
+    The previous command is repeated, with damping.
+    """
 
 
 @dataclass(frozen=True, slots=True, eq=False)

@@ -168,7 +168,7 @@ class ReferenceFlow:
     def rest_at(self, after: float) -> None:
         """Come to rest within ``after`` seconds from now, as far as the acceleration permits, and stay at rest.
 
-        The time limit :attr:`FlowOptions.duration` starts now.
+        The time limit ``options.duration`` starts now.
         """
         self._deadline, self._moved, self._remains = self._clock + after, 0.0, np.inf
 

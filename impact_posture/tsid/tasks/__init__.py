@@ -1,1 +1,1 @@
-"""Tasks of the controller."""
+"""Tasks whose accelerations the controller regulates."""

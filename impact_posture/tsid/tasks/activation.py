@@ -1,4 +1,4 @@
-"""Phases of an anticipated impact, and the activation of the impact-robust term in them."""
+"""Phases of an anticipated impact, and the activation level of the impact-robust term in each phase."""
 
 from __future__ import annotations
 
@@ -19,7 +19,7 @@ class Phase(Enum):
     RELEASE = "release"
 
 
-# Phases that may follow each phase.  A release ends in FREE without a call.
+# Phases that may follow each phase by a call of ``enter``.  RELEASE changes to FREE without a call.
 _FOLLOWS = {
     Phase.FREE: (Phase.BRACE,),
     Phase.BRACE: (Phase.CONTACT, Phase.RELEASE),
@@ -30,16 +30,17 @@ _FOLLOWS = {
 
 @checked
 class Activation:
-    """Level between 0 and 1 that moves along ``3x² − 2x³`` to the goal of the phase.
+    """Activation level between 0 and 1 that changes smoothly, along ``3x² − 2x³``, to the goal of the phase.
 
-    The goal is 0 in FREE, 1 in BRACE and 0 in RELEASE, which ends in FREE.  In CONTACT it is 1 if ``live``; otherwise
-    it is 0 and the robot holds the reached posture during the impact.  The level moves by at most ``1.5 dt/ramp``.
+    The goal is 0 in FREE, 1 in BRACE, and 0 in RELEASE.  RELEASE changes to FREE when the level is 0.  In CONTACT,
+    the goal is 1 if ``live`` is true.  Otherwise, the goal is 0, and the robot keeps the reached posture during the
+    impact.  Within ``dt`` seconds, the level changes by at most ``1.5 dt/ramp``.
 
     Attributes:
-        ramp: Seconds from 0 to 1 and back.
-        live: Whether the term stays on during the contact.
+        ramp: Time in which the level changes from 0 to 1, or from 1 to 0, s.
+        live: Whether the impact-robust term stays on during the contact.
         level: The present level α.
-        goal: The level to which the phase leads.
+        goal: Final level in the present phase.
     """
 
     def __init__(self, *, ramp: Positive = 0.3, live: bool = False) -> None:
@@ -47,14 +48,14 @@ class Activation:
         self.reset()
 
     def reset(self) -> None:
-        """Return to FREE with level zero."""
+        """Set the phase to FREE and the level to zero."""
         self.phase, self.level, self.goal, self._x = Phase.FREE, 0.0, 0.0, 0.0
 
     def enter(self, phase: Phase) -> None:
         """Go to the next phase.
 
         Raises:
-            InputError: The phase does not follow the present phase.
+            InputError: ``phase`` may not follow the present phase.
         """
         if phase not in _FOLLOWS[self.phase]:
             names = " or ".join(p.value for p in _FOLLOWS[self.phase])

@@ -15,7 +15,10 @@ from impact_posture.tsid.tasks.task import TargetTask
 
 
 class _BaseTurn(TargetTask[Array]):
-    """Base class of tasks that turn the base: ``J`` selects rows of ω from ν, in base axes, and ``J̇ν = 0``."""
+    """Base class of tasks that rotate the base.
+
+    ``J`` selects components of the base's angular velocity ω, in base axes, from ν.  Hence ``J̇ν = 0``.
+    """
 
     constant = True
 
@@ -24,13 +27,13 @@ class _BaseTurn(TargetTask[Array]):
 
 
 class Tilt(_BaseTurn):
-    """Regulate the direction of the base's z axis (reduced attitude); yaw stays free (2 × nv).
+    """Regulate the direction of the base's z axis (reduced attitude); the yaw angle stays free (2 × nv).
 
-    ``e`` has the x and y components, in base axes, of the shortest rotation from the base's z axis to ``target``
-    (Brescianini and D'Andrea 2018).  ``J`` selects ``ω_x, ω_y`` from ν, hence ``J̇ν = 0``.
+    ``e`` consists of the x and y components, in base axes, of the shortest rotation from the base's z axis to
+    ``target`` (Brescianini and D'Andrea 2018).  ``J`` selects ``ω_x`` and ``ω_y`` from ν, hence ``J̇ν = 0``.
 
     Attributes:
-        target: Direction of the base's z axis, unit vector in the world, shape (3,); up by default.
+        target: Desired direction of the base's z axis, unit vector in the world, shape (3,); upward by default.
     """
 
     title, rows = "tilt", 2
@@ -42,7 +45,7 @@ class Tilt(_BaseTurn):
         return state.base_rotation[:, 2].copy()
 
     def reset(self, state: State) -> None:
-        """Check the length of the target.
+        """Check that the target is a unit vector.
 
         Raises:
             InputError: The target is not a unit vector, or the base is fixed.
@@ -53,21 +56,25 @@ class Tilt(_BaseTurn):
             raise InputError("the target is not a unit vector", where=self.name, hint="normalize it")
 
     def error(self, state: State) -> Array:
-        """Return angle (rad) times axis."""
+        """Return the x and y components of the rotation vector (angle in rad times axis), shape (2,)."""
         x, y, z = (state.base_rotation.T @ self.required_target()).tolist()
         sine = math.hypot(x, y)
         if sine < 1e-12:
-            # Aligned or upside down.  Upside down, the rotations about all horizontal axes are equally short.
+            # The base is aligned or upside down.  Upside down, all horizontal rotation axes are equally good, so the
+            # code selects the x axis.
             return np.array([0.0 if z > 0 else math.pi, 0.0])
         scale = math.atan2(sine, z) / sine
         return np.array([-scale * y, scale * x])
 
 
 class BaseOrientation(_BaseTurn):
-    """Regulate the orientation of the base: ``e = log₃(RᵀR_des)`` in base axes, ``J`` selects ω from ν (3 × nv).
+    """Regulate the orientation of the base with the error ``e = log₃(RᵀR_des)`` in base axes.
+
+    ``J`` selects ω from ν (3 × nv).
 
     Attributes:
-        target: ``R_des``, world from base, shape (3, 3); by default, the orientation at ``reset``.
+        target: Desired orientation ``R_des``, world from base, shape (3, 3); by default, the orientation at
+            ``reset``.
     """
 
     title, rows = "base orientation", 3
@@ -83,7 +90,7 @@ class CenterOfMass(TargetTask[Array]):
     """Regulate the world position ``c`` of the center of mass of a floating robot: ``e = c_des − c`` (3 × nv).
 
     Attributes:
-        target: Meters, shape (3,); by default, the position at ``reset``.
+        target: Desired position ``c_des``, world, m, shape (3,); by default, the position at ``reset``.
     """
 
     title, rows = "center of mass", 3
@@ -102,17 +109,17 @@ class CenterOfMass(TargetTask[Array]):
 
 
 class BodyTaskLead:
-    """Target of center of mass and base orientation that moves along with a reference motion."""
+    """Moves the targets of center of mass and base orientation along a reference motion."""
 
     def __init__(self, model: pin.Model) -> None:
         self._model, self._data = model, model.createData()
         self._led: tuple[BaseOrientation | CenterOfMass, ...] = ()
-        # Views on the results of Pinocchio, because access to its attributes takes longer than its computation.
+        # Keep views on the results of Pinocchio, because reading its attributes takes longer than the computation.
         data = self._data
         self._com, self._rotation = (data.com[0], data.vcom[0], data.acom[0]), data.oMi[1].rotation
 
     def lead(self, tasks: Sequence[BaseOrientation | CenterOfMass], q: Array, v: Array, a: Array) -> None:
-        """Set the targets at ``q``, ``ν`` and ``ν̇``."""
+        """Set the targets of ``tasks`` to their outputs in the motion ``q``, ``ν``, ``ν̇``."""
         self._led = tuple(tasks)
         pin.centerOfMass(self._model, self._data, q, v, a, False)
         position, velocity, acceleration = self._com
@@ -125,7 +132,7 @@ class BodyTaskLead:
                 task.target_velocity, task.target_acceleration = v[3:6], a[3:6]
 
     def reset(self, state: State) -> None:
-        """Set the targets of the moved tasks to their present outputs, at rest."""
+        """Set the targets of the moved tasks to their present outputs, with zero velocity and acceleration."""
         for task in self._led:
             task.target, task.target_velocity, task.target_acceleration = None, 0.0, 0.0
             task.reset(state)

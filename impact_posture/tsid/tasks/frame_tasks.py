@@ -1,4 +1,4 @@
-"""Tasks of a frame: position, pose on SE(3), or position with the direction of an axis."""
+"""Tasks that regulate a frame: its position, its pose on SE(3), or its position and the direction of an axis."""
 
 from __future__ import annotations
 
@@ -23,31 +23,31 @@ from impact_posture.tsid.tasks.task import Target, TargetTask
 @checked
 @dataclass(frozen=True)
 class Impedance:
-    """Apparent inertia by which a measured force accelerates a frame: ``M_d⁻¹ F̂``.
+    """Apparent inertia of a frame: a measured force ``F̂`` adds ``M_d⁻¹ F̂`` to the desired acceleration.
 
-    Without this law, the controller compensates a measured force and pushes against the wall with a growing force.
+    Without an impedance, the controller compensates the measured force and pushes against a wall more and more.
 
     Attributes:
         mass: Apparent mass, kg.
-        inertia: Apparent rotational inertia, kg·m²; with ``None``, measured moments do not turn the frame.
+        inertia: Apparent rotational inertia, kg·m²; with ``None``, measured moments do not rotate the frame.
     """
 
     mass: Positive
     inertia: Positive | None = None
 
     def inverse(self) -> Array:
-        """Return the diagonal of ``M_d⁻¹`` for force and moment, shape (6,)."""
+        """Return the diagonal of ``M_d⁻¹``, first for the force, then for the moment, shape (6,)."""
         turn = 0.0 if self.inertia is None else 1.0 / self.inertia
         return np.array([1.0 / self.mass] * 3 + [turn] * 3)
 
 
 @checked
 class FrameTask(TargetTask[Target]):
-    """Base class of tasks of a point that moves with a frame.
+    """Base class of tasks that regulate a point of a frame.
 
     Attributes:
-        target: Target of the point, world; by default, its position or pose at ``reset``.
-        point: The point.
+        target: Desired position or pose of the point in the world; by default, the one at ``reset``.
+        point: The regulated point.
     """
 
     def __init__(
@@ -60,12 +60,12 @@ class FrameTask(TargetTask[Target]):
         weight: ArrayLike = 1.0,
         impedance: Impedance | None = None,
     ) -> None:
-        """Set the point, the gains of :class:`~impact_posture.tsid.tasks.task.Task`, and the law of an impedance.
+        """Set the point, the gains of :class:`~impact_posture.tsid.tasks.task.Task`, and the impedance.
 
-        Without an impedance, the task ignores a measured force.
+        If ``impedance`` is ``None``, the task ignores a measured force.
 
         Raises:
-            InputError: A gain or weight is negative, is not finite, or has another shape.
+            InputError: A gain or weight is negative, is not finite, or has the wrong shape.
         """
         super().__init__(name=name or f"{point.frame} {self.title}", kp=kp, kd=kd, weight=weight)
         self.point, self.points = point, (point,)
@@ -73,7 +73,10 @@ class FrameTask(TargetTask[Target]):
 
     @abstractmethod
     def select(self, here: PointState, six: Array) -> Array:
-        """Select the task's rows from a linear and an angular part in world axes, shape (6,) or (6, nv)."""
+        """Return the rows of ``six`` that the task regulates.
+
+        ``six`` has the shape (6,) or (6, nv): three linear rows, then three angular rows, in world axes.
+        """
 
     def jacobian(self, state: State) -> Array:
         here = state.at(self.point)
@@ -84,17 +87,17 @@ class FrameTask(TargetTask[Target]):
         return self.select(here, here.drift)
 
     def feedforward(self, state: State) -> Array | None:
-        """Return ``M_d⁻¹ F̂`` if there are an impedance and a measured force."""
+        """Return ``M_d⁻¹ F̂``; return ``None`` if there is no impedance or no measured force."""
         if self._soften is None or not state.pushed:
             return None
         return self.select(state.at(self.point), self._soften * state.force)
 
 
 class FramePosition(FrameTask[Array]):
-    """Regulate the world position of a point: ``e = p_des − p``, ``J`` is its linear Jacobian (3 × nv).
+    """Regulate the world position ``p`` of a point: ``e = p_des − p``; ``J`` is its linear Jacobian (3 × nv).
 
     Attributes:
-        target: ``p_des``, world, meters, shape (3,); by default, the position at ``reset``.
+        target: Desired position ``p_des``, world, m, shape (3,); by default, the position at ``reset``.
     """
 
     title, rows = "position", 3
@@ -110,13 +113,14 @@ class FramePosition(FrameTask[Array]):
 
 
 class FramePose(FrameTask[pin.SE3]):
-    """Regulate the pose of a frame at one of its points: ``e = log₆(T⁻¹ T_des)`` in world axes (6 × nv).
+    """Regulate the pose ``T`` of a frame at one of its points: ``e = log₆(T⁻¹ T_des)`` in world axes (6 × nv).
 
-    ``ẏ`` is the body twist of the frame at the point, expressed in world axes.  With an impedance, the law is
+    ``ẏ`` is the body twist of the frame at the point, expressed in world axes.  With an impedance, the closed loop is
     ``M_d(ÿ − ÿ_des) + … = F̂``.
 
     Attributes:
-        target: ``T_des``, world from frame, with its origin at the point; by default, the pose at ``reset``.
+        target: Desired pose ``T_des``, world from frame, with its origin at the point; by default, the pose at
+            ``reset``.
     """
 
     title, rows = "pose", 6
@@ -125,15 +129,15 @@ class FramePose(FrameTask[pin.SE3]):
         return placement(state.at(self.point))
 
     def error(self, state: State) -> Array:
-        """Return ``log₆(T⁻¹ T_des)``, linear part first, in world axes; a fresh array."""
+        """Return ``log₆(T⁻¹ T_des)`` in world axes, linear part first, in a new array of shape (6,)."""
         here, error = state.at(self.point), np.empty(6)
         local = pin.log6(placement(here).actInv(self.required_target()))
-        # One product turns both parts, which are the rows of a matrix.
+        # One matrix product rotates the linear and the angular part, which are the rows of a matrix.
         np.matmul(local.vector.reshape(2, 3), here.rotation.T, out=error.reshape(2, 3))
         return error
 
     def drift(self, state: State) -> Array:
-        """Return the spatial acceleration at the point at ``ν̇ = 0``: the classical acceleration minus ``ω × v``."""
+        """Return the spatial acceleration at ``ν̇ = 0``, which is the classical acceleration minus ``ω × v``."""
         return state.at(self.point).spatial_drift
 
     def select(self, here: PointState, six: Array) -> Array:
@@ -142,20 +146,21 @@ class FramePose(FrameTask[pin.SE3]):
 
 @checked
 class FrameAligned(FrameTask[pin.SE3]):
-    """Regulate the world position of a point and the direction of an axis; spin about the axis is free (5 × nv).
+    """Regulate the position of a point and the direction of an axis; rotation about the axis is free (5 × nv).
 
-    The first three rows are the rows of :class:`FramePosition`.  The other two are the shortest rotation from the
-    axis to its target direction, along two directions of the frame orthogonal to the axis.  ``J`` selects the same
-    two components of the frame's angular velocity.
+    The first three rows are the rows of :class:`FramePosition`.  The last two rows are components of the shortest
+    rotation from the axis to its desired direction.  The components are along two directions of the frame that are
+    orthogonal to the axis.  ``J`` selects the same two components of the frame's angular velocity.
 
     Attributes:
-        target: ``T_des``, world from frame, with its origin at the point; by default, the pose at ``reset``.
+        target: Desired pose ``T_des``, world from frame, with its origin at the point; by default, the pose at
+            ``reset``.
     """
 
     title, rows = "axis", 5
 
     def __init__(self, point: Point, axis: ArrayLike = (0.0, 0.0, 1.0), **gains: Any) -> None:
-        """Set the axis in the frame, of any length; ``gains`` are arguments of :class:`FrameTask`.
+        """Set the axis, a vector of any length in the frame; ``gains`` are arguments of :class:`FrameTask`.
 
         Raises:
             InputError: The axis has no direction, or a gain is invalid.
@@ -166,14 +171,14 @@ class FrameAligned(FrameTask[pin.SE3]):
         if self._axis.shape != (3,) or not 0 < length < math.inf:
             raise InputError("the axis has no direction", where=self.name, hint="give three numbers, not all zero")
         self._axis /= length
-        # The last two right singular vectors of a row vector are orthogonal to it.
+        # The last two right singular vectors of the axis, taken as a 1 × 3 matrix, are orthogonal to the axis.
         self._across = np.linalg.svd(self._axis[None])[2][1:]
 
     def present(self, state: State) -> pin.SE3:
         return placement(state.at(self.point))
 
     def error(self, state: State) -> Array:
-        """Return ``p_des − p``, then the two components of angle (rad) times axis of the shortest rotation."""
+        """Return ``p_des − p`` and two components of the shortest rotation (angle in rad times axis), shape (5,)."""
         here, target = state.at(self.point), self.required_target()
         wanted = here.rotation.T @ (target.rotation @ self._axis)
         turn = self._across @ np.cross(self._axis, wanted)
@@ -181,12 +186,16 @@ class FrameAligned(FrameTask[pin.SE3]):
         if sine >= 1e-12:
             turn *= math.atan2(sine, cosine) / sine
         elif cosine < 0:
-            # The axis points in the opposite direction, and rotations about all orthogonal axes are equally short.
+            # The axis points opposite to its target.  All orthogonal rotation axes are equally good, so the code
+            # selects the first.
             turn[0] = math.pi
         return np.concatenate([target.translation - here.position, turn])
 
     def select(self, here: PointState, six: Array) -> Array:
-        """Select the linear rows and the angular part across the axis; ``d(Rᵀω)/dt = Rᵀω̇``."""
+        """Return the linear rows and the two angular components across the axis.
+
+        This also holds for accelerations, because ``d(Rᵀω)/dt = Rᵀω̇``.
+        """
         return np.concatenate([six[:3], self._across @ (here.rotation.T @ six[3:])])
 
 
@@ -194,10 +203,10 @@ EndEffector = FramePose | FramePosition | FrameAligned
 
 
 def pose_task(point: Point, pose: str, axis: Array | None, **options: Any) -> EndEffector:
-    """Return the task that holds the rows of a pose mode at a point; ``box`` holds the position.
+    """Return the task that regulates a point as a pose mode requires.
 
-    ``aligned`` also holds the direction of ``axis``, a unit vector in the frame, shape (3,); without an axis, the
-    whole pose.
+    ``position`` and ``box`` regulate the position.  ``aligned`` also regulates the direction of ``axis``, a unit
+    vector in the frame, shape (3,).  All other modes, and ``aligned`` without an axis, regulate the whole pose.
     """
     if pose in ("position", "box"):
         return FramePosition(point, **options)
@@ -207,5 +216,5 @@ def pose_task(point: Point, pose: str, axis: Array | None, **options: Any) -> En
 
 
 def placement(point: PointState) -> pin.SE3:
-    """Return the world placement of a point with the rotation of its frame."""
+    """Return the pose, world from frame, with the origin at the point."""
     return pin.SE3(point.rotation, point.position)

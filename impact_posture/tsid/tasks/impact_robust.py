@@ -1,4 +1,4 @@
-"""Impact-robust posture task, which adds ``−K ∇H(q)`` to the posture task."""
+"""Impact-robust posture task, which adds the term ``−K ∇H(q)`` to the posture task."""
 
 from __future__ import annotations
 
@@ -27,18 +27,17 @@ Spring = Literal["keep", "release", "follow"]
 
 # Step of the central differences of the gradient, rad.
 _STEP = 1e-5
-# Least curvature that counts, per rad², as a share of H.
+# Lower bound on the curvature scale, per rad², as a share of H.
 _FLAT = 1e-3
 
 
 def gradient_of(export: ImpactGradient, normal: ArrayLike | None = None) -> Gradient:
-    """Return the gradient of a compiled export for the impact-robust term.
+    """Return the gradient function of a compiled export for the impact-robust term.
 
     Args:
-        export: Export of the robot.  Load it with ``free=True`` for the robot without its supports.
-        normal: Normal at which ``H`` is evaluated (function ``_eval`` of the export).  ``None`` evaluates the
-            objective of the exported problem at its normal (``_objective``): ``impulse``, ``speed``, ``sticking``,
-            ``energy``, ….
+        export: Export of the robot.  To ignore the robot's supports, load it with ``free=True``.
+        normal: Unit normal for ``H`` (function ``_eval`` of the export).  With ``None``, the function evaluates the
+            objective of the exported problem at its own normal (function ``_objective``).
 
     Raises:
         InputError: The normal is not a unit vector.
@@ -52,7 +51,11 @@ def gradient_of(export: ImpactGradient, normal: ArrayLike | None = None) -> Grad
 
 
 def fitting_gradient(robot: Robot, gradient: Gradient | ImpactGradient) -> Gradient:
-    """Return the gradient as a function; raise :class:`ManifestMismatch` for an export of another robot."""
+    """Return the gradient as a function.
+
+    Raises:
+        ManifestMismatch: The export belongs to another robot.
+    """
     if not isinstance(gradient, ImpactGradient):
         return gradient
     gradient.check_robot(robot)
@@ -68,33 +71,34 @@ _Fade = Annotated[
 class ImpactRobustPosture(JointPosture):
     """``ν̇* = K_p (q_des ⊖ q) − K_d ν − α K s(q) ∇H(q)/λ`` (Afifi et al. 2026, impact-robust posture).
 
-    - ``λ`` is the largest curvature of ``H`` along the redundancy at ``reset`` (:meth:`normalize`).  ``K`` is then a
-      stiffness like ``K_p``, in 1/s², on every robot, although ``H`` scales like 1/armature².  Near an optimum with
-      the curvature ``λ*``, the term is a spring ``K λ*/λ``.  This can be several times as stiff as ``K``, because
-      ``λ`` is the curvature at the start, where ``H`` may even be concave.
-    - ``K_d = 2√(K_p + K)`` by default, critical for both springs together where ``λ* = λ``.
-    - The length of the term is at most ``K·reach``, like a spring ``K`` stretched by ``reach``.  A bound below
-      ``K_p|q_des ⊖ q|`` would stop the robot short of the optimum.
-    - ``s(q)`` fades out the part of each joint that pushes into a position limit, from ``fade[1]`` rad before the
-      limit to ``fade[0]`` (at most a quarter and a sixteenth of the joint's range).  Without it, the robot would
-      brace on its stops.
+    - ``λ`` is the largest curvature of ``H`` along the redundancy at ``reset`` (:meth:`normalize`).  Because of
+      ``λ``, ``K`` is a stiffness in 1/s² like ``K_p`` on every robot, although ``H`` scales with 1/armature².  Near
+      an optimum with the curvature ``λ*``, the term is a spring with the stiffness ``K λ*/λ``.  This stiffness can be
+      several times ``K``, because ``λ`` is the curvature at the start, where ``H`` may even be concave.
+    - By default, ``K_d = 2√(K_p + K)``, which is critical damping for both springs together if ``λ* = λ``.
+    - The length of the term is at most ``K·reach``, the force of a spring ``K`` that is stretched by ``reach``.  If
+      this bound were below ``K_p|q_des ⊖ q|``, the robot would stop before the optimum.
+    - ``s(q)`` fades out the part of the term that pushes a joint into a position limit.  The fade begins
+      ``fade[1]`` rad before the limit and ends ``fade[0]`` rad before it.  These distances are at most a quarter and
+      a sixteenth of the joint's range.  Without ``s(q)``, the robot would move to its mechanical stops.
     - ``α`` is the level of :class:`~impact_posture.tsid.tasks.activation.Activation`.
 
-    ``spring`` says what happens to ``K_p`` while the term is on.  ``keep``: the robot rests where
-    ``K∇H/λ = K_p(q_des ⊖ q)``, short of the optimum.  ``release``: ``K_p`` is scaled by ``1 − α``, and the robot
-    reaches the optimum.  ``follow``: ``q_des`` follows ``q`` with the time constant ``follow`` (s), so that the
-    spring still resists fast motion.
+    ``spring`` determines ``K_p`` and ``q_des`` while the term is on.  With ``keep``, the robot comes to rest at
+    ``K∇H/λ = K_p(q_des ⊖ q)``, before it reaches the optimum.  With ``release``, ``K_p`` is scaled by ``1 − α``, and
+    the robot reaches the optimum.  With ``follow``, ``q_des`` follows ``q`` with the time constant ``follow`` (s), so
+    the spring still resists fast motion.
 
-    :meth:`contact` (unless the activation is ``live``) and :meth:`release` make the reached posture ``q_des``.  It
-    fades in while the term fades out.
+    After :meth:`release`, and after :meth:`contact` if the activation is not ``live``, the reached posture becomes
+    ``q_des``.  This target fades in while the term fades out.
 
     Attributes:
         K: Gain, 1/s².
         scale: ``λ``, in the objective's unit per rad².
-        activation: The state machine.
+        activation: Phase and level ``α`` of the term.
         value: ``H`` (or the objective) at the last evaluation.
-        term: ``−K s(q) ∇H/λ`` there, bounded, at full level, shape (nv,).
-        failed: Whether the last evaluation raised or was not finite.  The previous term then stays.
+        term: Bounded term ``−K s(q) ∇H/λ`` at the last evaluation, for ``α = 1``, shape (nv,).
+        failed: Whether the last evaluation raised an exception or was not finite.  If true, the previous term is
+            used.
     """
 
     def __init__(
@@ -114,26 +118,26 @@ class ImpactRobustPosture(JointPosture):
         activation: Activation | None = None,
         **gains: Any,
     ) -> None:
-        """Set gains and options; see the class.
+        """Set gains and options.
 
         Args:
             robot: The robot.
-            gradient: ``q → (H, ∇H)``, or a compiled export, whose exported objective is then used.
-            target: ``q_des``, shape (nq,); the posture at ``reset`` by default.
+            gradient: Function ``q → (H, ∇H)``, or a compiled export.  For an export, its objective is used.
+            target: Target posture ``q_des``, shape (nq,); by default, the posture at ``reset``.
             K: Gain, 1/s².
             name: Name in reports.
             spring: ``keep``, ``release`` or ``follow``.
             follow: Time constant of ``spring = "follow"``, s.
-            reach: Bound of the term divided by ``K``, rad.
-            fade: Distances from a position limit between which the term fades out, rad (m).
-            every: Ticks between evaluations of the gradient.
-            scale: ``λ``; measured at ``reset`` by default.
-            activation: The state machine.
+            reach: Largest length of the term, divided by ``K``, rad.
+            fade: Two distances from a position limit between which the term fades out, rad (m).
+            every: Number of ticks from one evaluation of the gradient to the next.
+            scale: Curvature scale ``λ``; by default, measured at ``reset``.
+            activation: Phase and level of the term; by default, a new :class:`Activation`.
             gains: Arguments of :class:`~impact_posture.tsid.tasks.joint_posture.JointPosture`.
 
         Raises:
             InputError: A number is out of range.
-            ManifestMismatch: The export is of another robot.
+            ManifestMismatch: The export belongs to another robot.
         """
         super().__init__(robot, target, name=name, **gains)
         self.K, self.scale = float(K), 1.0 if scale is None else float(scale)
@@ -146,7 +150,7 @@ class ImpactRobustPosture(JointPosture):
         ranges = JointRanges(robot)
         width = ranges.upper - ranges.lower
         near, self._farthest = np.minimum(fade[0], width / 16), fade[1]
-        # Lists, because few joints are near a limit, and access to one number is faster in a list than in an array.
+        # Use lists, because only a few joints are near a limit, and lists give single numbers faster than arrays do.
         self._near, self._band = near.tolist(), (np.minimum(fade[1], width / 4) - near).tolist()
         self._count, self._hold = 0, False
         self.value, self.term, self.failed = 0.0, np.zeros(robot.nv), False
@@ -155,16 +159,16 @@ class ImpactRobustPosture(JointPosture):
     # ---- phases of an impact ------------------------------------------------------------------------------------
 
     def brace(self) -> None:
-        """Switch the term on, because an impact is coming."""
+        """Switch the impact-robust term on, because an impact is coming."""
         self.activation.enter(Phase.BRACE)
 
     def contact(self) -> None:
-        """Hold the reached posture during the impact, or keep the term on if the activation is live."""
+        """Make the reached posture the target during the impact, or keep the term on if the activation is live."""
         self.activation.enter(Phase.CONTACT)
         self._hold = not self.activation.live
 
     def release(self) -> None:
-        """Switch the term off after the impact and hold the reached posture."""
+        """Switch the impact-robust term off after the impact, and make the reached posture the target."""
         was_on = self.activation.goal > 0
         self.activation.enter(Phase.RELEASE)
         self._hold = self._hold or was_on
@@ -177,27 +181,27 @@ class ImpactRobustPosture(JointPosture):
     # ---- the task -------------------------------------------------------------------------------------------------
 
     def reset(self, state: State) -> None:
-        """Return to FREE with the posture of the constructor, and evaluate the gradient."""
+        """Set the phase to FREE and the target to the constructor's posture, and evaluate the objective."""
         super().reset(state)
         self.activation.reset()
         self._count, self._hold, self.failed = 0, False, False
         self.value = self._function(state.q)[0]
 
     def normalize(self, state: State, redundancy: Array) -> None:
-        """Measure ``λ`` at ``state`` (:func:`curvature_scale`), unless the constructor got a ``scale``.
+        """Measure ``λ`` at ``state`` (:func:`curvature_scale`), unless the constructor was called with a ``scale``.
 
         Raises:
-            MetricError: The gradient does not exist there, or ``H`` and its curvature vanish.
+            MetricError: At this state, the gradient does not exist, or ``H`` and its curvature are zero.
         """
         if self._measure:
             self.scale = curvature_scale(self._function, self._model, state.q, redundancy, self.name)
 
     def advance(self, state: State, dt: float) -> None:
-        """Advance ramps, fades and a following ``q_des``; evaluate the gradient when it is due."""
+        """Advance ramps, fades and ``q_des`` by ``dt`` seconds; every ``every`` ticks, evaluate the gradient."""
         if self._hold:
             self._hold = False
-            # A released spring returns at the reached posture.  A kept spring moves there as slowly as the term
-            # fades.
+            # With "release", the spring comes back at the reached posture.  With "keep", the target moves to the
+            # reached posture as slowly as the term fades.
             self._fade_to(state.q, self.activation.ramp)
         super().advance(state, dt)
         level = self.activation.advance(dt)
@@ -213,7 +217,7 @@ class ImpactRobustPosture(JointPosture):
             self._evaluate(state)
 
     def pull(self, state: State) -> Array:
-        """Return ``K_p (q_des ⊖ q)``, with the option ``release`` scaled by ``1 − α``."""
+        """Return ``K_p (q_des ⊖ q)``, shape (nv,); the spring mode ``release`` scales the result by ``1 − α``."""
         pull = super().pull(state)
         if self.spring == "release" and self.activation.level > 0:
             pull *= 1.0 - self.activation.level
@@ -226,13 +230,13 @@ class ImpactRobustPosture(JointPosture):
         return self.term if level == 1 else level * self.term
 
     def _evaluate(self, state: State) -> None:
-        """Evaluate the term at ``state``; keep the previous one where the gradient does not exist."""
+        """Evaluate the term at ``state``; keep the previous term if the gradient does not exist."""
         term, bound = self._spare, self.K * self.reach
         try:
             value, gradient = self._function(state.q)
             np.multiply(gradient, -self.K / self.scale, out=term)
         except Exception:
-            # A user's function may raise anything, but the tick must go on.  `failed` reports it.
+            # A user's function may raise any exception, but the tick must not fail.  `failed` reports the problem.
             self.failed = True
             return
         square = term.dot(term)
@@ -249,7 +253,7 @@ class ImpactRobustPosture(JointPosture):
     def _fade(self, term: Array, rooms: Array) -> None:
         size = term.size
         for at in (rooms < self._farthest).nonzero()[0].tolist():
-            # The first half of the rooms belongs to the upper limits.
+            # The first half of ``rooms`` contains the distances from upper limits, the second half from lower limits.
             below, k = divmod(at, size)
             push = term.item(k)
             if (push < 0) if below else (push > 0):
@@ -260,7 +264,7 @@ class ImpactRobustPosture(JointPosture):
 
 def curvature(gradient: Gradient, model: pin.Model, q: Array, directions: Array) -> Array:
     """Return ``∇²H Z`` at ``q`` by central differences of the gradient, for directions ``Z`` of shape (nv, r)."""
-    # Copies, because a gradient may return the same buffer at each call.
+    # Copy each result, because a gradient function may return the same buffer at each call.
     ahead, behind = (
         np.column_stack([np.array(gradient(pin.integrate(model, q, step * z))[1]) for z in directions.T])
         for step in (_STEP, -_STEP)
@@ -271,14 +275,14 @@ def curvature(gradient: Gradient, model: pin.Model, q: Array, directions: Array)
 def curvature_scale(gradient: Gradient, model: pin.Model, q: Array, redundancy: Array, name: str) -> float:
     """Return ``λ`` at ``q``: the spectral norm of ``Zᵀ∇²H Z`` with ``Z`` = ``redundancy``, shape (nv, r).
 
-    It is at least a thousandth of ``H`` per rad², because a flat ``H`` cannot be improved.  Without redundancy, ``Z``
-    is the identity.
+    ``λ`` is at least a thousandth of ``H`` per rad², so that a flat ``H`` does not lead to a large term.  If there is
+    no redundancy, ``Z`` is the identity.
 
     Raises:
-        MetricError: The gradient does not exist there, or ``H`` and its curvature vanish.
+        MetricError: At ``q``, the gradient does not exist, or ``H`` and its curvature are zero.
     """
     Z = redundancy if redundancy.shape[1] else np.eye(model.nv)
-    # Along the axes, because the error of differences along a basis would depend on the choice of the basis.
+    # Take the differences along the axes.  Along a basis of the redundancy, their error would depend on the basis.
     change = curvature(gradient, model, q, np.eye(model.nv))
     scale = max(float(np.linalg.norm(Z.T @ change @ Z, 2)), _FLAT * abs(gradient(q)[0]))
     if not (np.isfinite(scale) and scale > 0):

@@ -19,15 +19,15 @@ from impact_posture.tsid.tasks.task import Task, gain
 class JointPosture(Task):
     """Regulate the posture by ``ν̇* = K_p (q_des ⊖ q) − K_d ν`` (Afifi et al. 2026, nominal posture).
 
-    ``⊖`` is the difference on the manifold, in the tangent space at ``q``, and includes the base.  If other tasks
-    control the base, set the weight of its six entries to zero (``base_weight = 0``).
+    ``⊖`` is the difference on the configuration manifold, in the tangent space at ``q``, and includes the base.  If
+    other tasks control the base, set the weight of its six entries to zero (``base_weight = 0``).
 
     :meth:`move_to` fades in a new ``q_des``, so that ``ν̇*`` does not jump.
 
     Attributes:
-        value: Objective at the last evaluation, if the task has one; else NaN.
-        stiffness: Matrix ``K_p`` of :meth:`stiffen`, 1/s², shape (nv, nv), or ``None``.
-        damping: Matrix ``K_d`` of :meth:`stiffen`, 1/s, shape (nv, nv), or ``None``.
+        value: Value of the task's objective at the last evaluation; NaN if the task has no objective.
+        stiffness: Stiffness matrix set by :meth:`stiffen`, 1/s², shape (nv, nv); ``None`` if it was not called.
+        damping: Damping matrix set by :meth:`stiffen`, 1/s, shape (nv, nv); ``None`` if it was not called.
     """
 
     constant = True
@@ -48,16 +48,16 @@ class JointPosture(Task):
 
         Args:
             robot: The robot.
-            target: ``q_des``, shape (nq,); the posture at ``reset`` by default.
+            target: Target posture ``q_des``, shape (nq,); by default, the posture at ``reset``.
             name: Name in reports.
-            kp: Stiffness, 1/s², one number or (nv,).
-            kd: Damping, 1/s; critical by default.
-            weight: Weight in the cost, one number or (nv,).
-            base_weight: Weight of the six base entries; ``weight`` by default.
+            kp: Stiffness, 1/s², one number or shape (nv,).
+            kd: Damping, 1/s, one number or shape (nv,); critical by default.
+            weight: Weight in the cost, one number or shape (nv,).
+            base_weight: Weight of the six base entries; by default, ``weight``.
 
         Raises:
             PostureError: The target is not a configuration of the robot.
-            InputError: A gain or weight is negative, is not finite, or has another shape.
+            InputError: A gain or weight is negative, is not finite, or has the wrong shape.
         """
         super().__init__(name, robot.nv, kp=kp, kd=kd, weight=weight)
         if base_weight is not None and robot.floating:
@@ -71,7 +71,7 @@ class JointPosture(Task):
         self.damping: Array | None = None
 
     def stiffen(self, added: Array) -> None:
-        """Use ``K = K_p + added`` and the critical ``D = 2 K^½`` as gains.
+        """Use the stiffness ``K = K_p + added`` and the critical damping ``D = 2 K^½`` from now on.
 
         ``added`` is a symmetric positive semidefinite stiffness, 1/s², shape (nv, nv).
         """
@@ -81,7 +81,7 @@ class JointPosture(Task):
 
     @property
     def target(self) -> Array:
-        """``q_des``, shape (nq,); during a fade, the new one.  Change it by :meth:`move_to`."""
+        """Target posture ``q_des``, shape (nq,); during a fade, the new target.  :meth:`move_to` changes it."""
         return self._next if self._blend < 1 else self._target
 
     @property
@@ -96,7 +96,7 @@ class JointPosture(Task):
     def move_to(self, target: ArrayLike, over: Positive = 0.5) -> None:
         """Fade ``q_des`` to another posture within ``over`` seconds.
 
-        A running fade stops where it is, and the new one starts there.
+        If a fade is running, the new fade starts at the posture that the running fade has reached.
 
         Raises:
             PostureError: The target is not a configuration of the robot.
@@ -105,9 +105,9 @@ class JointPosture(Task):
         self._fade_to(self._robot.check_posture(np.asarray(target), limits=False), over)
 
     def lead(self, q: Array, v: Array | float, a: Array | float) -> None:
-        """Set ``q_des`` with its velocity and acceleration in the tangent space, without checks.
+        """Set ``q_des``, its velocity and its acceleration in the tangent space, without checks.
 
-        They stay until the next call, :meth:`move_to` or ``reset``.
+        The values stay until the next call of this method, of :meth:`move_to` or of ``reset``.
         """
         self._target[:], self._blend = q, 1.0
         self._velocity[:], self._acceleration[:] = v, a
@@ -130,7 +130,7 @@ class JointPosture(Task):
         return self._eye
 
     def pull(self, state: State) -> Array:
-        """Return ``K_p (q_des ⊖ q)``, shape (nv,); a fresh array."""
+        """Return ``K_p (q_des ⊖ q)`` in a new array of shape (nv,)."""
         error = self.error(state)
         return np.asarray(self.kp * error if self.stiffness is None else self.stiffness @ error)
 
@@ -145,12 +145,12 @@ class JointPosture(Task):
         return wanted
 
     def _fade_to(self, target: Array, over: float) -> None:
-        """Fade to a valid configuration without checks, because a tick must not raise."""
+        """Fade to a valid configuration within ``over`` seconds, without checks, because a tick must not raise."""
         self.lead(self._reached(), 0.0, 0.0)
         self._next[:], self._blend, self._over = target, 0.0, over
 
     def _reached(self) -> Array:
-        """Return the present posture of a fade, or ``q_des``, shape (nq,)."""
+        """Return the posture that a fade has reached; if no fade is running, return ``q_des``, shape (nq,)."""
         if self._blend < 1:
             return np.asarray(pin.interpolate(self._model, self._target, self._next, smooth(self._blend)))
         return self._target

@@ -1,4 +1,4 @@
-"""Base classes of tasks.  A task defines an error and a Jacobian, and the base class derives the rest."""
+"""Base classes of tasks.  A task defines its error and Jacobian; the base class computes everything else."""
 
 from __future__ import annotations
 
@@ -18,7 +18,8 @@ from impact_posture.tsid.state import State
 
 Target = TypeVar("Target")
 
-# Time step of central differences along the motion, s.  Truncation and rounding stay far below a tick's tolerance.
+# Time step of central differences along the motion, s.  Truncation and rounding errors are far below the tolerance of
+# the QP solver.
 _STEP = 1e-4
 
 
@@ -32,7 +33,7 @@ class Task(ABC):
 
     Attributes:
         name: Name in reports.
-        size: Number of rows k.
+        size: Number k of rows.
         points: Points of the robot whose kinematics the task reads from the state.
         kp: Stiffness, 1/s², shape (k,).
         kd: Damping, 1/s, shape (k,).
@@ -41,17 +42,17 @@ class Task(ABC):
 
     points: Sequence[Point] = ()
     constant = False
-    """Whether ``J`` never changes and ``J̇ν`` is zero.  A stack then evaluates ``J`` only once."""
+    """Whether ``J`` is constant and ``J̇ν`` is zero.  If true, a stack evaluates ``J`` only at ``reset``."""
 
     def __init__(
         self, name: str, size: int, *, kp: ArrayLike = 0.0, kd: ArrayLike | None = None, weight: ArrayLike = 1.0
     ) -> None:
-        """Set gains and weight; each is one number, or one number per row.
+        """Set gains and weight.  Each of them is one number, or one number per row.
 
-        The damping ``kd`` is critical by default, ``2√kp``.
+        By default, the damping is critical: ``kd = 2√kp``.
 
         Raises:
-            InputError: A gain or weight is negative, is not finite, or has another shape.
+            InputError: A gain or weight is negative, is not finite, or has the wrong shape.
         """
         self.name, self.size = name, size
         self.kp = gain(kp, size, f"{name}: kp")
@@ -61,11 +62,11 @@ class Task(ABC):
 
     @abstractmethod
     def error(self, state: State) -> Array:
-        """Return ``e``, shape (k,), from ``y`` to its target, so that ``ė = ẏ_des − Jν`` to first order."""
+        """Return the error ``e`` from ``y`` to its target, shape (k,), with ``ė = ẏ_des − Jν`` to first order."""
 
     @abstractmethod
     def jacobian(self, state: State) -> Array:
-        """Return ``J`` with ``ẏ = Jν``, shape (k, nv)."""
+        """Return the Jacobian ``J`` with ``ẏ = Jν``, shape (k, nv)."""
 
     def drift(self, state: State) -> Array:
         """Return ``J̇ν``, shape (k,)."""
@@ -81,7 +82,7 @@ class Task(ABC):
 
     @property
     def target_velocity(self) -> Array:
-        """``ẏ_des``, shape (k,); zero unless set."""
+        """Desired velocity ``ẏ_des`` of the output, shape (k,); zero by default."""
         return self._velocity
 
     @target_velocity.setter
@@ -90,7 +91,7 @@ class Task(ABC):
 
     @property
     def target_acceleration(self) -> Array:
-        """``ÿ_des``, shape (k,); zero unless set."""
+        """Desired acceleration ``ÿ_des`` of the output, shape (k,); zero by default."""
         return self._acceleration
 
     @target_acceleration.setter
@@ -105,25 +106,25 @@ class Task(ABC):
         return wanted if more is None else wanted + more
 
     def reset(self, state: State) -> None:  # noqa: B027 - many tasks have nothing to reset
-        """Start again at ``state``.  A task without a target takes the present output as its target."""
+        """Start again at ``state``.  If the task has no target, the present output becomes its target."""
 
     def advance(self, state: State, dt: float) -> None:  # noqa: B027 - many tasks keep no memory
-        """Advance internal memory, such as ramps, by ``dt`` seconds; does nothing by default."""
+        """Advance the internal memory, such as ramps, by ``dt`` seconds.  By default, this method does nothing."""
 
     def bind(self, velocity: Array, acceleration: Array) -> None:
-        """Move the targets into the buffers of a stack, so that a tick copies nothing."""
+        """Store the desired velocity and acceleration in the buffers of a stack, so that no tick must copy them."""
         velocity[:], acceleration[:] = self._velocity, self._acceleration
         self._velocity, self._acceleration = velocity, acceleration
 
 
 @checked
 class TargetTask(Task, Generic[Target]):
-    """Base class of tasks that move an output to a target, by default the output at ``reset``.
+    """Base class of tasks that move an output to a target; by default, to the output at ``reset``.
 
-    A subclass defines its default name ``title`` and its size ``rows``.
+    A subclass defines its default name ``title`` and its number of rows ``rows``.
 
     Attributes:
-        target: Target of the output.
+        target: Target of the output; ``None`` until it is set.
     """
 
     title: str
@@ -141,13 +142,13 @@ class TargetTask(Task, Generic[Target]):
 
     @abstractmethod
     def present(self, state: State) -> Target:
-        """Return the output at ``state`` as a target that does not change with the state."""
+        """Return a copy of the output at ``state``, in the form of a target."""
 
     def reset(self, state: State) -> None:
-        """Take the present output as target, unless a target is set.
+        """If the target is not set, set it to the present output.
 
         Raises:
-            InputError: The task needs a floating base, and the base is fixed.
+            InputError: The task requires a floating base, but the base is fixed.
         """
         if self.target is None:
             self.target = self.present(state)
@@ -164,15 +165,15 @@ class TargetTask(Task, Generic[Target]):
 
 
 class TaskStack:
-    """Stack of tasks as ``J ν̇ = a`` with ``a = ÿ* − J̇ν``, updated once a tick.
+    """Stack of tasks in the form ``J ν̇ = a`` with ``a = ÿ* − J̇ν``, which each tick updates.
 
     Attributes:
-        tasks: Tasks from top to bottom.
+        tasks: Tasks in the order of their rows.
         rows: Rows of each task.
-        size: Number of all rows.
-        J: Shape (size, nv); may be a view on a larger matrix.
-        a: Shape (size,).
-        weight: Shape (size,).
+        size: Total number of rows.
+        J: Jacobian of all tasks, shape (size, nv); may be a view on a larger matrix.
+        a: Desired accelerations minus drifts, shape (size,).
+        weight: Weight of each row in the cost, shape (size,).
     """
 
     def __init__(self, tasks: Sequence[Task], nv: int, J: Array | None = None) -> None:
@@ -182,7 +183,7 @@ class TaskStack:
         self.a, self._e, self._drift, self._work, self._yd, self._ydd = np.zeros((6, self.size))
         for task, rows in zip(self.tasks, self.rows, strict=True):
             task.bind(self._yd[rows], self._ydd[rows])
-        # Views for the loop over the tasks, sliced only once.
+        # Store the views for the loop over the tasks, so that no tick must slice the arrays.
         self._parts = [
             (task, self.J[rows], self._e[rows], self._drift[rows], self.a[rows])
             for task, rows in zip(self.tasks, self.rows, strict=True)
@@ -190,7 +191,7 @@ class TaskStack:
         self.refresh()
 
     def refresh(self, state: State | None = None) -> None:
-        """Read gains and weights of the tasks, and evaluate the Jacobians at ``state`` unless it is ``None``."""
+        """Read the gains and weights of the tasks.  If ``state`` is not ``None``, evaluate the Jacobians there."""
         if state is not None:
             for task, J, *_ in self._parts:
                 J[:] = task.jacobian(state)
@@ -222,16 +223,16 @@ class TaskStack:
                 part += more
 
     def residuals(self, acceleration: Array) -> dict[str, Array]:
-        """Return ``ÿ − ÿ*`` of each task at ``ν̇``, by task name."""
+        """Return task name → ``ÿ − ÿ*`` at the acceleration ``ν̇``, shape (nv,)."""
         left = self.J @ acceleration - self.a
         return {task.name: left[rows] for task, rows in zip(self.tasks, self.rows, strict=True)}
 
 
 def gain(value: ArrayLike, size: int, where: str) -> Array:
-    """Return one number, or one number per row, as an array of ``size`` finite and non-negative numbers.
+    """Return ``value``, one number or one number per row, as an array of shape (size,).
 
     Raises:
-        InputError: The value has another shape, is negative, or is not finite.
+        InputError: The value has the wrong shape, is negative, or is not finite.
     """
     values = np.asarray(value, dtype=float)
     if values.shape not in ((), (size,)):
