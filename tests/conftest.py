@@ -9,14 +9,14 @@ from collections.abc import Iterator
 from pathlib import Path
 
 # If Python may not write bytecode next to the sources, every test process would compile all imports again, which
-# takes seconds.  A shared bytecode folder avoids this.
+# takes seconds.  A shared bytecode folder avoids the repeated compilation.
 if sys.dont_write_bytecode and not sys.pycache_prefix:
     sys.pycache_prefix = str(Path(__file__).parents[1] / "build" / "bytecode")
     sys.dont_write_bytecode = False
     os.environ["PYTHONPYCACHEPREFIX"] = sys.pycache_prefix
     os.environ.pop("PYTHONDONTWRITEBYTECODE", None)
 
-# Set this before importing numpy, because parallel test workers must not each start a thread on every core.
+# Limit the threads before numpy is imported, because parallel test workers would each start a thread per core.
 for name in ("OMP_NUM_THREADS", "MKL_NUM_THREADS"):
     os.environ.setdefault(name, "1")
 

@@ -149,7 +149,7 @@ def test_a_result_draws_and_exports_itself(result: ip.PostureResult, tmp_path: P
     value, slope = gradient.objective(result.q)
     assert value == pytest.approx(result.problem.problem.objective.value(result.q), rel=1e-9)
     for q, n in ((0.1, UP), ([0.1], UP), (result.q, 1.0), (result.q, [1.0]), (result.q[None], UP), (result.q, None)):
-        # A scalar must not be broadcast over all joints; it must raise an error.
+        # Scalar input must raise an error, instead of being broadcast over all joints.
         with pytest.raises((TypeError, ValueError)):
             gradient.value_and_gradient(q, n)
     robot = result.problem.problem.robot

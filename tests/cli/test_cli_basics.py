@@ -42,7 +42,7 @@ def document(*arguments: str) -> dict[str, Any]:
     return parsed
 
 
-# ---- what it shows ----------------------------------------------------------------------------------------------
+# ---- printed results --------------------------------------------------------------------------------------------
 
 
 def test_help_comes_at_once_and_names_the_commands() -> None:
@@ -232,7 +232,7 @@ def test_supports_by_option_without_and_by_default() -> None:
     assert two["evaluation"]["free"]["H"] == pytest.approx(bare["evaluation"]["H"], rel=1e-12)
 
 
-# ---- what it refuses --------------------------------------------------------------------------------------------
+# ---- rejected input ---------------------------------------------------------------------------------------------
 
 USAGE = [
     (("evaluate", "tilthex_arm", "--normal", "0", "0", "0"), "--normal"),
@@ -304,7 +304,7 @@ def test_a_package_folder_is_looked_for_where_the_user_is(tmp_path: Path) -> Non
     assert start(*INSPECT, "--package-dir", "meshes", cwd=tmp_path).returncode == 0
 
 
-# ---- the boundary alone -----------------------------------------------------------------------------------------
+# ---- error boundary ---------------------------------------------------------------------------------------------
 
 
 class Raises:

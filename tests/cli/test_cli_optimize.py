@@ -232,7 +232,7 @@ def test_failing_compiler_does_not_cost_the_posture(tmp_path: Path) -> None:
     assert list((tmp_path / "tilthex_arm-ee" / "c").glob("*.c"))
 
 
-# ---- the answer first ---------------------------------------------------------------------------------------------
+# ---- order of the output ------------------------------------------------------------------------------------------
 
 SMALL = ("ur5", "--frame", "tool0", "--normal", 0, 0, 1, "--starts", 2, "--jobs", 1)
 

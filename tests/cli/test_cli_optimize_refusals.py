@@ -151,7 +151,7 @@ def test_interrupt_in_mid_solve_leaves_nothing(jobs: int, tmp_path: Path) -> Non
     command = [str(COMMAND), *map(str, BASE), "--starts", "100000", "--jobs", str(jobs)]
     process = subprocess.Popen(
         command, cwd=tmp_path, stdout=subprocess.PIPE, stderr=subprocess.PIPE, text=True, start_new_session=True,
-        # A shell starts background programs with this signal ignored.
+        # A shell starts background programs so that they ignore SIGINT.
         preexec_fn=lambda: signal.signal(signal.SIGINT, signal.SIG_DFL),
     )  # fmt: skip
     assert process.stdout is not None

@@ -34,7 +34,7 @@ def call(capsys: pytest.CaptureFixture[str], *arguments: str) -> tuple[int, str,
     return code, *capsys.readouterr()
 
 
-# ---- what holds a floating robot up -----------------------------------------------------------------------------
+# ---- balance of floating robots ---------------------------------------------------------------------------------
 
 
 @pytest.mark.parametrize(
@@ -64,7 +64,7 @@ def test_a_stated_support_needs_no_hint(more: dict[str, Any]) -> None:
     settings = {"robot": B1_Z1, "root": "free-flyer", "frame": "link06", "normal": (0, 0, 1), **more}
     prepared = prepare(make_settings(settings))
     assert not any("floating freely" in line for line in prepared.impact.warnings)
-    # The problem file with resolved settings also names the support, so it can be prepared again.
+    # The resolved settings also name the support, so the resolved problem can be prepared again.
     prepare(resolved_settings(prepared))
 
 

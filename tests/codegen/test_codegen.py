@@ -99,8 +99,8 @@ def test_agrees_with_casadi(built: Built) -> None:
 
 
 def test_agrees_with_pinocchio(built: Built) -> None:
-    # The oracle solves a KKT system for feet with compliance 1e-4/m.  Its condition number costs at least four
-    # digits.
+    # The oracle solves a KKT system for feet with compliance 1e-4/m.  The condition number of this system reduces the
+    # accuracy by at least four digits.
     tolerance = 1e-8 if built.objective.supports else 1e-11
     assert largest_difference(built.library.gradient, built.objective, oracle_reference, 10) <= tolerance
 

@@ -108,7 +108,7 @@ def two(arm: WorstCaseObjective) -> tuple[WorstCaseObjective, WorstCaseObjective
     return arm, WorstCaseObjective(arm.robot, ImpactContact("base_link", (1, 0, 0)), arm.metric)
 
 
-# ---- other people's builds ----------------------------------------------------------------------------------------
+# ---- builds by users ----------------------------------------------------------------------------------------------
 
 
 @pytest.mark.parametrize("real", [DOUBLE, FLOAT], ids=lambda r: r.name)
@@ -137,8 +137,7 @@ def test_frames_must_differ_in_the_contact_alone(two: tuple[WorstCaseObjective, 
     assert not list(tmp_path.iterdir())
 
 
-# Flags for every lane width (also wider than this processor supports), with inlining and with all variables in
-# memory.
+# Compiler flags for every lane width, also widths that this processor lacks, with and without inlining.
 STACK_FLAGS = ("-O0", "-O3 -march=native", "-O3 -mavx2 -mfma", "-O3 -mavx512f -mfma", "-O0 -mavx512f")
 
 
@@ -185,8 +184,8 @@ def deepest_stack(folder: Path, prefix: str, tool: str, flags: str) -> int:
         size for name, size in sizes.items() if "_lanes" in name and "_block" not in name and "sincos" not in name
     ]
     entries = [size for name, size in sizes.items() if "_block" not in name and "_lanes" not in name]
-    # The outer functions are two nested entries, or an entry with the batch.  Blocks and sines follow.  Each call
-    # adds a return address.
+    # The outer functions are two nested entries, or an entry with the batch.  Blocks and sines follow.  Each nested
+    # call adds a return address to the stack.
     outer = max(sum(sorted(entries)[-2:]), max(entries) + max(lanes, default=0))
     return outer + max(inner) + 4 * 8
 

@@ -1,4 +1,4 @@
-"""The C export with various compilers and build tools, and the errors that it reports."""
+"""The C export with various compilers and build tools, and the errors that the export reports."""
 
 from __future__ import annotations
 
@@ -23,7 +23,7 @@ from tests.support.tools import STRICT, need, need_compiler
 
 OPTIMIZED = True
 
-# ---- quantities that do not exist ---------------------------------------------------------------------------------
+# ---- undefined quantities -----------------------------------------------------------------------------------------
 
 
 def test_code_for_a_quantity_that_does_not_exist(pendulum: str, tmp_path: Path) -> None:
@@ -73,7 +73,7 @@ def test_two_exports_in_one_program(pendulum: str, tmp_path: Path) -> None:
         "  int code = first_objective(first_posture, &a, g) + second_objective(second_posture, &b, g);\n"
         '  printf("%.17g %.17g\\n", a, b); return code; }\n'
     )
-    # Compile the files separately and link them, then compile them as one translation unit.
+    # Compile the C files separately and link them, then compile all files as one translation unit.
     (tmp_path / "unity.c").write_text('#include "first.c"\n#include "second.c"\n#include "both.c"\n')
     for sources in (["first.c", "second.c", "both.c"], ["unity.c"]):
         program = tmp_path / "program"

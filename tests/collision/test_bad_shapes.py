@@ -108,7 +108,7 @@ def test_a_bad_mesh_is_left_out_by_name(
     shapes = arm(tmp_path, mesh("bad.stl"), BOX)
     (line,) = shapes.warnings
     assert line.startswith("shape middle[0] is left out: ") and fault in line and "\n" not in line
-    # The other shapes are used, and nothing is printed.
+    # The valid shapes are used, and nothing is printed.
     assert {body.name for body in shapes.bodies} == {"base", "middle[1]", "tip"}
     assert capfd.readouterr() == ("", "")
 
@@ -134,7 +134,7 @@ def test_a_bad_description_is_left_out_by_name(tmp_path: Path, geometry: str, fa
     urdf = tmp_path / "arm.urdf"
     urdf.write_text(text)
     robot = load_robot(str(urdf), armature="none")
-    # Load the robot before the shape is added, because some versions of Pinocchio cannot read it.
+    # Add the invalid shape after the robot is loaded, because some Pinocchio versions cannot read such shapes.
     urdf.write_text(text.replace(link("middle", BOX), link("middle", geometry)))
     shapes, (line,) = read_urdf_shapes(robot)
     assert [shape.name for shape in shapes] == ["base"]

@@ -67,7 +67,7 @@ def test_the_check_sees_every_part_of_a_mesh(tmp_path: Path, monkeypatch: pytest
     q, seen = shapes.robot.posture(), []
     middle = np.array([0.0, 0.0, 0.3])
     for part in PARTS:
-        # This plate intersects only one part of the mesh.
+        # The plate intersects only one part of the mesh.
         plate = obstacle_hull(Obstacle(name="plate", box=(0.02, 0.2, 0.02), position=tuple((middle + part).tolist())))
         seen.append(bool(mesh_collisions(shapes.robot, shapes, q, obstacles=[(plate, pin.SE3.Identity(), ())])))
     assert seen == [True, right, right]

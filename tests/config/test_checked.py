@@ -67,7 +67,8 @@ GOOD: list[tuple[Callable[..., Any], dict[str, Any]]] = [
     ],
     (tsid.support_contacts, {"robot": ROBOT}),
 ]
-# Posture tasks create ReferenceFlow objects, and Task is a base class.  The other names are result types.
+# Posture tasks create ReferenceFlow objects, and Task is a base class.  The names that are not listed with arguments
+# are result types.
 OTHERS = {
     "Export", "ImpactPostureError", "PostureResult", "Robot", "__version__", "known_robots", "sweep", "tsid",
     "ImpactGradient", "CompiledController",

@@ -46,7 +46,7 @@ def assert_same_report(a: Report, b: Report, size: float) -> None:
 
 
 def both_at_rest(name: str) -> tuple[Controller, CompiledController, Array, Array]:
-    """Return the Python and C controllers after a reset at rest in the default posture, and this state."""
+    """Return the Python and C controllers, reset at rest in the default posture, and the state of the robot."""
     robot, formulation = formulation_of(name)
     python, c = Controller(robot, formulation), compiled(name)
     q, v = robot.posture(), np.zeros(robot.nv)
@@ -120,7 +120,7 @@ def test_a_relaxed_tick_misses_its_levels_as_in_python(name: str) -> None:
             continue
         relaxed += 1
         in_python, in_c = ({r.level: r.amount for r in x.report().relaxed} for x in (python, c))
-        # Compare only the first relaxed level, because lower levels depend on it and agree to fewer digits.
+        # Compare only the first relaxed level.  The lower levels depend on the first one and agree to fewer digits.
         first = next(iter(in_python))
         assert in_c.get(first, 0.0) <= in_python[first] * (1 + 1e-5) + 1e-6
         assert np.all(b.u <= python.actuators.upper * (1 + 1e-6))
@@ -270,7 +270,7 @@ def test_a_reset_forgets_a_led_posture() -> None:
     _, c, q, v = both_at_rest("panda")
     first = c.reset(q, v)
     c.lead_posture(q, v + 0.5, v + 2.0)
-    # A program in C resets the task in this way, without ip_init.
+    # Programs in C call the reset function like this, without ip_init.
     c._call("reset", *c._pointers[:2], ctypes.byref(c._command))
     np.testing.assert_allclose(c._commanded().u, first.u, rtol=0, atol=1e-9)
 

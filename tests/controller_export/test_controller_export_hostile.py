@@ -35,7 +35,7 @@ def compile_c(folder: Path, *flags: str) -> subprocess.CompletedProcess[str]:
 
 
 def abuse_with(sanitizers: str, folder: Path, program: Path, *more: str) -> None:
-    """Build the abuse program with the controller sources and sanitizers; skip the test if this is impossible."""
+    """Build the abuse program with the controller sources and sanitizers; skip the test if the build fails."""
     flags = [f"-fsanitize={sanitizers}", "-fno-sanitize-recover=all", "-O0", "-g0", f"-I{folder}", str(ABUSE)]
     sources = ["ctl.c", "ctl_defaults.c", "ctl_dynamics.c", "ctl_relaxation.c", "ctl_daqp.c", *more]
     built = compile_c(folder, *flags, *sources, "-o", str(program), "-lm", "-lpthread")

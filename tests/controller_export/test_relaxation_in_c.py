@@ -1,4 +1,4 @@
-"""The relaxations in C and in Python agree, and an independent certificate shows that they are lexicographic."""
+"""The relaxations in C and in Python agree, and a separate certificate shows that they are lexicographic optima."""
 
 from __future__ import annotations
 
@@ -95,7 +95,7 @@ def test_random_stacks(relaxation: Relaxation, seed: int) -> None:
     sizes = [int(g.integers(0, 4)), int(g.integers(0, 6)), *g.integers(1, 5, size=int(g.integers(1, 4)))]
     A = g.normal(size=(sum(sizes), n))
     level = np.concatenate([np.ones(n), np.repeat([0, *range(len(sizes) - 1)], sizes)]).astype(np.intc)
-    # Level 0 contains equations through a point, and inequalities that this point satisfies strictly.
+    # Level 0 contains equations that a random point satisfies, and inequalities that the point satisfies strictly.
     inside = g.normal(size=n)
     values = A @ inside
     lower, upper = (
@@ -170,7 +170,10 @@ def test_without_levels_or_rows(relaxation: Relaxation) -> None:
 
 
 def test_a_budget_is_kept(relaxation: Relaxation) -> None:
-    """If the iterations do not suffice, the result is an error code.  The next tick starts from these active rows."""
+    """If the iterations do not suffice, the result is an error code.
+
+    The next tick starts from the active rows of the stopped run.
+    """
     tick = ticks_of("talos", "legged")[-1]
     relaxation.forget()
     needed = relaxation.solve(tick).iterations

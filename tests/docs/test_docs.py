@@ -124,7 +124,7 @@ def test_claims_are_about_results_of_shown_commands() -> None:
 
 
 def test_commands_are_shown_at_all() -> None:
-    """Each tutorial shows commands, and some tutorial shows each command of the app."""
+    """Each tutorial shows commands, and each command of the app is shown in a tutorial."""
     tutorials = [p for p in PAGES if p.parent.name == "tutorials"]
     assert len(tutorials) >= 5
     assert all(shown_commands(p) for p in tutorials)

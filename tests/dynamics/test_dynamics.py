@@ -156,7 +156,7 @@ def compare(symbolic: Symbolic, q: Vector, generator: np.random.Generator) -> No
     assert_close(position, placement.act(OFFSET), TOLERANCE, "position in the chart")
 
 
-# ---- every robot known by name ----------------------------------------------------------------------------------
+# ---- all known robots -------------------------------------------------------------------------------------------
 
 
 @functools.cache
@@ -252,7 +252,7 @@ _AXIS = np.array([1.0, -2.0, 3.0]) / np.sqrt(14.0)
 
 @functools.cache
 def _continuous_about_an_odd_axis() -> pin.JointModel:
-    # Only the URDF parser can create this joint type; Python cannot.
+    # Only the URDF parser can create this joint type; Pinocchio's Python API cannot.
     joint = '<parent link="a"/><child link="b"/><axis xyz="1 -2 3"/>'
     xml = f'<link name="a"/>{_LINK.format("b", 1.0)}<joint name="j" type="continuous">{joint}</joint>'
     return pin.buildModelFromXML(f'<robot name="r">{xml}</robot>').joints[1]
@@ -320,7 +320,7 @@ def test_joints_that_no_urdf_makes_are_refused_by_name() -> None:
             joint_kind(joint, "odd")
 
 
-# ---- joints that only Pinocchio's URDF parser makes --------------------------------------------------------------
+# ---- joint types of the URDF parser ------------------------------------------------------------------------------
 
 
 def write_urdf(path: Path, joints: list[tuple[str, str]]) -> Path:

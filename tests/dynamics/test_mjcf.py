@@ -114,7 +114,7 @@ def test_indices_equal_the_compiled_model(name: str) -> None:
     assert {simulated.model.site(k).name for k in range(simulated.model.nsite)} == named
 
 
-# ---- every joint ------------------------------------------------------------------------------------------------
+# ---- all joint types --------------------------------------------------------------------------------------------
 
 
 def without_base_armature(model: pin.Model) -> pin.Model:
@@ -190,7 +190,7 @@ def test_urdf_joints_with_limits(tmp_path: Any) -> None:
     assert not limits["to_l2"][0] and not limits["to_l4.x"][0] and not limits["to_l4.turn"][0]
 
 
-# ---- bodies that MuJoCo's XML cannot hold ------------------------------------------------------------------------
+# ---- bodies that MuJoCo cannot represent -------------------------------------------------------------------------
 
 
 def test_moments_beyond_the_triangle_inequality_are_kept() -> None:

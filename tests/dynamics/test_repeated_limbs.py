@@ -234,7 +234,7 @@ def test_compiled_limbs(tmp_path: Path, count: int) -> None:
     objective = WorstCaseObjective(loaded, ImpactContact("b1_2", (0.3, -0.4, 0.9)), kind="sticking")
     export(objective, tmp_path, prefix="t", check=False)
     strict = ("-Wall", "-Wextra", "-pedantic", "-Werror")
-    # Native instructions are used only for five limbs; test_angles_near_and_far uses them for vectors of two.
+    # Only five limbs are compiled with native instructions; test_angles_near_and_far does so for two limbs.
     with built(tmp_path, "t", strict if count == 2 else (*strict, "-O3", "-march=native")) as compiled:
         assert largest_difference(compiled.gradient, objective, oracle_reference, 5) <= 1e-10
 

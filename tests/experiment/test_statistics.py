@@ -79,7 +79,7 @@ def test_failed_runs_are_reported_and_left_out() -> None:
     row = row_of("aerial-vertical", "robust", documents, NOMINAL)
     assert (row.status, row.completed, row.runs) == ("fell", 1, 2)
     assert row.failed == ("seed 1: fell: broke bound 1 at t = 2.50 s",) and row.metrics["peak_jump"].samples == 1
-    # If either robot fell, there is no comparison.
+    # If the robot fell with either controller, the text contains no comparison.
     assert row.reduction is None and row.recovery is None and not row.change and missed_targets(row) is None
     against = row_of("aerial-vertical", "robust", [document("robust", 0, 1.0)], [failed("nominal", 0, "fell")])
     assert against.status == "completed" and against.reduction is None

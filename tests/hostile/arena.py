@@ -24,7 +24,7 @@ CODES = {0, 1, 2, 3, 4, 130, 143}
 USAGE = ("Usage: ", "Try ", "Error: ")
 # Texts that only libraries and interpreters print.
 NOISE = ("Traceback", "internal error", "Warning:", "Exception ignored", "terminate called", "Segmentation", "DEBUG")
-# Permitted processor time of one attack, s, and time after which it is treated as hanging, s.
+# Permitted processor time of an attack (s), and the duration after which an attack is treated as hanging (s).
 BUSY, PATIENCE = 60, 120
 
 SMALL = """<robot name="small">
@@ -55,7 +55,7 @@ class Outcome:
 
     @property
     def complaints(self) -> list[str]:
-        """Return a list of the faults of this outcome."""
+        """Return a list of faults in the outcome of the command line."""
         lines = [line for line in self.err.splitlines() if line.strip() and not line.startswith("warning: ")]
         errors = [line for line in lines if line.startswith(("error: ", "Error: "))]
         complaints = [f"says {word!r}" for word in NOISE if word in self.err or word in self.out]

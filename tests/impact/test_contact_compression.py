@@ -69,7 +69,7 @@ def test_time_and_force_equal_an_integrated_contact(mass: float, speed: float, s
         time, force = touch(power, stiffness, mass, speed)
         assert contact.compression_time(1 / mass, speed) == pytest.approx(time, rel=1e-6)
         assert contact.peak_force(1 / mass, speed) == pytest.approx(force, rel=1e-6)
-        # A contact with these T and G transmits the impulse mv, whatever its force law.
+        # A contact with this compression time T and this G transmits the impulse mv for any force law.
         alike = ContactStiffness(duration=time)
         assert alike.peak_force(1 / mass, speed) == pytest.approx(np.pi / 2 * mass * speed / time)
         for one in (contact, alike):
@@ -293,7 +293,7 @@ def test_bounds_that_cannot_be_met_name_their_rows_and_units() -> None:
 
 
 def test_edges_of_speed_and_of_locked_joints(tmp_path: Path) -> None:
-    """At zero speed a material contact has no T.  If all joints are locked, there is no joint jump to bound."""
+    """At zero speed a material contact has no T.  If all joints are locked, no joint jump can be bounded."""
     still = ("evaluate", "panda", "--normal", 0, 0, 1, "--speed", 0, "--contact-stiffness", "steel", "--json")
     done = json.loads(run(*still).stdout)["evaluation"]["compression"]
     assert done["compression_time"] is None and done["peak_force"] == 0 and done["x"] is None

@@ -65,7 +65,7 @@ def test_an_impact_from_below_lifts(name: str) -> None:
 
 @pytest.mark.parametrize(("name", "normal"), [("solo12", (0.3, 0.2, -1.0)), ("talos", (1.0, 0.2, -0.4))])
 def test_impulses_equal_impulse_dynamics(name: str, normal: tuple[float, float, float]) -> None:
-    """If the foot impulses are unique, they equal the rigid impulse dynamics of Pinocchio."""
+    """If the foot impulses are unique, Pinocchio's rigid impulse dynamics gives the same impulses."""
     loaded, supports = standing(name)
     frame = "base_link"
     q = np.asarray(
@@ -89,7 +89,10 @@ def test_impulses_equal_impulse_dynamics(name: str, normal: tuple[float, float, 
 
 
 def test_the_set_matters_where_the_rank_drops() -> None:
-    """The planar legs of solo8 can press against each other.  The impulses with the smallest pull use this."""
+    """The planar legs of solo8 can press against each other.
+
+    The impulses with the smallest pull at the ground include such internal forces.
+    """
     loaded, supports = standing("solo8")
     q = loaded.posture()
     oracle = oracle_of("solo8", (0.0, 1.0, -0.6))
@@ -116,7 +119,7 @@ def test_soles_tip_over_their_edges() -> None:
     assert any(foot.lifts for foot in large.feet) or large.friction is not None
 
 
-# ---- as a constraint ----------------------------------------------------------------------------------------------
+# ---- use as a constraint ------------------------------------------------------------------------------------------
 
 
 @pytest.mark.parametrize(

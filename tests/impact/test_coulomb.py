@@ -103,7 +103,7 @@ def test_value_and_gradient_agree_three_ways(name: str) -> None:
         assert_coulomb(o.mobility, o.normal, friction, impact.impulse, 1e-8)
         assert_close(oracle.at(q).solve(oracle.J.T @ impact.impulse), impact.jump, 1e-8, where)
         limit = o.S if impact.sticks else o.V if friction == 0 else None
-        # Both methods solve with M, but in different orders.
+        # Both implementations solve linear systems with M, but in different orders, so rounding differs.
         rounding = 4 * np.finfo(float).eps * np.linalg.cond(oracle.M)
         assert limit is None or abs(value / limit - 1) < rounding, where
         differences = central_gradient(objective.value, loaded.model, q, STEP)
@@ -141,7 +141,7 @@ def test_planar_robots(friction: float) -> None:
 def test_a_point_on_a_line_slides_or_jams() -> None:
     """With one hinge, the tip moves along one direction, oblique to the normal.
 
-    Enough friction blocks this motion.
+    With enough friction, the tip cannot move.
     """
     loaded = arm([Y], [0.0], floating=False)
     q, normal = np.array([0.4]), (0.0, 0.0, 1.0)

@@ -97,7 +97,7 @@ def feet_of(friction: float) -> tuple[WorstCaseObjective, Vector]:
 def test_four_feet_land_in_mujoco(friction: float) -> None:
     """In MuJoCo a sliding foot also lifts, because its friction model is convex.
 
-    So the tolerance is tight for sticking feet only.
+    Therefore, only sticking feet are compared with a tight tolerance.
     """
     objective, q = feet_of(friction)
     jumps = coulomb_jumps(objective, q, 1.0)

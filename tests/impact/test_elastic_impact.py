@@ -47,7 +47,7 @@ def springs(stiffness: float, damping: float = 0.0, **joints: JointTransmissionS
 
 
 class Setup(NamedTuple):
-    """An impact with its posture and the stiffness of its contact."""
+    """Impact case with its posture and the stiffness of its contact."""
 
     case: ImpactCase
     q: Vector
@@ -180,8 +180,7 @@ def test_time_stepping_finds_the_same(name: str) -> None:
     assert (response.peak_torque >= np.abs(response.torque) * (1 - 1e-12)).all()
     assert response.peak_jump_norm >= response.jump_norm * (1 - 1e-12)
     assert response.value == pytest.approx((response.jump_norm / speed) ** 2, rel=1e-12)
-    # Without the contact, the motion would keep the approach speed, so the contact power is the force times this
-    # speed.
+    # Free flight would continue at the approach speed, so the contact power is the force times the approach speed.
     assert response.impulse * response.speed == pytest.approx(other.energy + other.loss, rel=1e-8)
     assert (other.loss > 0) == (name in ("mixed arm", "talos", "solo12"))
 
@@ -297,7 +296,7 @@ def test_armature_is_that_stated_whatever_the_joint_model() -> None:
     assert ElasticImpact(linked).response(q, stiffness).value == ElasticImpact(case).response(q, stiffness).value
 
 
-# ---- bad input --------------------------------------------------------------------------------------------------
+# ---- invalid input ----------------------------------------------------------------------------------------------
 
 
 @pytest.mark.parametrize("stiffness", [0.0, -1e5, float("nan"), float("inf"), 1e30, 0.5])

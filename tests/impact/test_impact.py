@@ -59,7 +59,7 @@ def supports_of(loaded: Robot) -> tuple[Support, ...]:
     return (Support(str(frame.name), "point", (0.02, 0.03, -0.01)),)
 
 
-# Robots that run all combinations, and robots that run three.  Together they cover continuous and sliding joints,
+# Robots that run all combinations, and robots that run three.  The robots cover continuous and prismatic joints,
 # branches and feet.  test_dynamics.py tests the dynamics of every known robot.
 WHOLE = ("solo8", "panda", "tilthex_arm")
 SOME = (*WHOLE, "kinova", "tiago", "talos", "anymal_kinova", "borinot", "bolt", "ur5")
@@ -178,8 +178,8 @@ def test_lifted_form(name: str) -> None:
 @pytest.mark.parametrize("name", WHOLE)
 def test_objective_functions_agree_with_its_own_numbers(name: str, kind: ObjectiveKind) -> None:
     all_of_them = list(combinations(name))
-    # These four cover all metrics, both frames, and cases with and without supports.  The other combinations are left
-    # out, because CasADi's search for common subexpressions is slow.
+    # Four combinations cover all metrics, both frames, and cases with and without supports.  The remaining
+    # combinations are left out, because CasADi's search for common subexpressions is slow.
     for result, contact, metric, supports in (all_of_them[k] for k in (0, 5, 7, 10)):
         objective = WorstCaseObjective(result, contact, metric, kind, supports)
         where = describe(contact, metric, supports)
@@ -202,7 +202,7 @@ def test_objective_functions_agree_with_its_own_numbers(name: str, kind: Objecti
 
 
 def test_an_oracle_that_returns_to_a_posture_has_the_same_numbers() -> None:
-    """There are more postures than the cache of the oracle can contain."""
+    """The test visits more postures than the cache of the oracle can contain."""
     talos = robot("talos")
     contact = ImpactContact("gripper_right_base_link", normal=(0, 0.6, 0.8))
     postures = random_configurations(talos.model, 36, "returns", spread=0.2)

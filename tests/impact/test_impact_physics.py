@@ -138,7 +138,10 @@ def test_feet_never_add_mobility(name: str) -> None:
 @pytest.mark.parametrize("metric", ["euclidean", "kinetic", "weighted"])
 @pytest.mark.parametrize("name", ["solo8", "panda", "tilthex_arm", "talos"])
 def test_root_h_is_the_ellipsoids_half_width(name: str, metric: str) -> None:
-    """The ellipsoid is the image of the unit ball under ``JM⁻¹W^½``.  Its largest extent along n is ``√H``."""
+    """The ellipsoid is the image of the unit ball under ``JM⁻¹W^½``.
+
+    The largest extent of the ellipsoid along n is ``√H``.
+    """
     loaded, generator = robot(name), rng(name, metric, "width")
     weights = generator.uniform(0.5, 2.0, loaded.nv)
     chosen = Metric("weighted", tuple(weights)) if metric == "weighted" else Metric(metric)  # type: ignore[arg-type]
@@ -251,7 +254,7 @@ def test_feet_are_heavier_links() -> None:
 
 @pytest.mark.parametrize("normal", [(1.0, 0.0, 0.0), (0.0, 0.0, 1.0), (0.0, 1.0, 0.0)])
 def test_solo8_on_its_feet_is_not_solo8_in_the_air(normal: tuple[float, float, float]) -> None:
-    """When solo8 crouches, ``H`` with feet and ``H`` without feet change in opposite directions."""
+    """When solo8 crouches, ``H`` computed with feet and ``H`` computed without feet change in opposite directions."""
     loaded = robot("solo8")
     contact, q = ImpactContact("base_link", normal), loaded.posture()
     free, standing = WorstCaseObjective(loaded, contact), WorstCaseObjective(loaded, contact, supports=feet(loaded))
@@ -280,7 +283,7 @@ def test_point_feet_lose_rank_and_stay_smooth() -> None:
     assert_close(objective.gradient(q), differences, 1e-6, "gradient", scale=objective.value(q))
 
 
-# ---- where S does not exist ---------------------------------------------------------------------------------------
+# ---- undefined S --------------------------------------------------------------------------------------------------
 
 
 @functools.cache

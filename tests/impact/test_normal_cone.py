@@ -85,7 +85,7 @@ def pinocchio_form(name: str, frame: str, q: np.ndarray, kind: ObjectiveKind) ->
     return np.asarray(stuck.T @ stuck)
 
 
-# ---- against samples ----------------------------------------------------------------------------------------------
+# ---- comparison with samples --------------------------------------------------------------------------------------
 
 
 @pytest.mark.parametrize("degrees", ANGLES)
@@ -125,7 +125,7 @@ def test_no_cone_is_the_plain_problem() -> None:
     assert 1 < narrow.value(q) / none.value(q) < 1 + 1e-3
 
 
-# ---- any matrix, ties included ------------------------------------------------------------------------------------
+# ---- random matrices, with ties -----------------------------------------------------------------------------------
 
 SYMBOLIC = {}
 
@@ -298,7 +298,10 @@ def test_starts_certify(name: str, kind: ObjectiveKind) -> None:
 
 
 def test_solved_from_and_at_mirror_symmetric_postures() -> None:
-    """solo8 starts and ends at a tie of two normals.  Neither gradient vanishes, but a convex combination does."""
+    """solo8 starts and ends at a tie of two normals.
+
+    Neither normal has a zero gradient, but a convex combination of both gradients is zero.
+    """
     settings = {"robot": "solo8", "frame": "base_link", "normal": (1, 0, 0), "normal_cone": 20.0}
     problem = prepare(make_settings(settings)).problem
     assert cone_of(problem.impact).worst(problem.given).tied
@@ -309,7 +312,7 @@ def test_solved_from_and_at_mirror_symmetric_postures() -> None:
     assert cone_of(problem.impact).worst(record.q).tied
 
 
-# ---- what is refused, and what comes out --------------------------------------------------------------------------
+# ---- rejected input and output ------------------------------------------------------------------------------------
 
 
 def test_speed_has_no_dual_and_no_cone_is_half_open() -> None:

@@ -90,7 +90,7 @@ def enumerated(objective: WorstCaseObjective, q: np.ndarray) -> tuple[np.ndarray
     return rows, np.einsum("ki,ij,kj->k", rows, jumps.T @ W @ jumps, rows)
 
 
-# ---- against enumeration, samples and finite differences ----------------------------------------------------------
+# ---- comparison with enumeration, samples, differences ------------------------------------------------------------
 
 
 @settings(max_examples=25)

@@ -99,7 +99,7 @@ def size(values: object) -> float:
     return float(np.abs(np.asarray(values, dtype=float)).max())
 
 
-# ---- what double precision keeps ----------------------------------------------------------------------------------
+# ---- accuracy in double precision ---------------------------------------------------------------------------------
 
 
 @pytest.mark.parametrize(("label", "rank"), SOLO8.items())
@@ -187,7 +187,7 @@ def _compiled(library: Exported, x: Bounded) -> None:
     heavy_feet(x, H, gradient, jump, G)
 
 
-# ---- what the compliance does -------------------------------------------------------------------------------------
+# ---- effect of the compliance -------------------------------------------------------------------------------------
 
 
 @pytest.mark.parametrize("relative_compliance", [1e-4, 1e-5, 1e-6])
@@ -197,8 +197,7 @@ def _compiled(library: Exported, x: Bounded) -> None:
 def test_the_effect_of_compliance_is_bounded(name: str, label: str, relative_compliance: float) -> None:
     """The effect of ε is at most ``ε/(σ+ε)`` of the effect of the feet; σ is the least nonzero eigenvalue."""
     x = bounded(name, label, relative_compliance)
-    # This compliance is so small that its bias is below double precision, but too large for rounding of J_s to
-    # matter.
+    # The reference compliance is so small that its bias is below double precision, but larger than rounding of J_s.
     rigid = ExactImpact(x.oracle, 1e-14 / x.oracle.robot.mass)
     M, Js = x.oracle.M, x.oracle.Js
     share = x.share
@@ -281,7 +280,7 @@ def test_decimal_elimination_by_its_residual() -> None:
     assert abs(residual).max() < Decimal("1e-40")
 
 
-# ---- the stiffest feet that may be asked for ----------------------------------------------------------------------
+# ---- largest permitted stiffness of feet --------------------------------------------------------------------------
 
 
 def test_the_stiffest_feet_pass_every_check(tmp_path: Path) -> None:

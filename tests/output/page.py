@@ -14,7 +14,7 @@ from mpl_toolkits.mplot3d import Axes3D
 
 from impact_posture.output.plot.style import lay_out
 
-# In their darkest color channel, lines are below this value; grids, walls and faint fills are above it.
+# Threshold for the darkest color channel: lines are darker; grids, walls and faint fills are lighter.
 _INK = 0.6
 _NUMBER = re.compile("[−0-9.e]+")
 

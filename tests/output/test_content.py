@@ -132,7 +132,8 @@ def test_cone_and_all_tied_worst_normals_are_drawn(solo8_cone: ResultView, solo8
     for axes, plane in zip(panels_of(figure), COORDINATE_PLANES, strict=True):
         limit = axes.get_xlim()[1]
         tips = [np.array(text.xy) for text in axes.texts if text.arrow_patch is not None]
-        # Each of the two equal postures has two arrows for worst normals.  There is one more arrow if n is visible.
+        # Each of the two equal postures has two arrows for worst normals.  If n is visible in the panel, the panel
+        # has one more arrow.
         assert len(tips) == 4 + plane.contains(solo8_cone.after.normal)
         for normal in worst.normals:
             assert sum(np.allclose(tip, 0.92 * limit * plane.axes @ normal, atol=1e-9) for tip in tips) >= 2

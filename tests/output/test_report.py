@@ -228,7 +228,7 @@ def test_texts_stay_texts(scene: ReportScene, text: str) -> None:
     assert "\u202e" not in page
 
 
-# ---- what moves ----------------------------------------------------------------------------------------------------
+# ---- measured motion -----------------------------------------------------------------------------------------------
 
 
 def test_the_viewer_gets_the_robot_where_it_is(folder: Path) -> None:
@@ -311,7 +311,7 @@ INERTIAL = '<inertial><mass value="1"/><inertia ixx="1" iyy="1" izz="1" ixy="0" 
 
 
 def user_robot(folder: Path, a: str, b: str) -> ip.Robot:
-    # The second last point is in a dent, so it is not a corner of the hull.
+    # The second last point lies in a dent, so the hull has one corner less.
     corners = [f"v {x} {y} {z}" for x, y, z in [*TETRAHEDRON, [0, 0, 0]]]
     faces = ["f 1 2 4", "f 2 3 4", "f 3 1 4", "f 1 5 2", "f 2 5 3", "f 3 5 1"]
     (folder / "dent.obj").write_text("\n".join([*corners, *faces]))
@@ -363,7 +363,7 @@ def test_primitives_and_robots_without_shapes(tmp_path: Path) -> None:
     assert 0.3 < np.ptp(sticks.solids[1].points[:, 0]) < 0.34
 
 
-# ---- in a browser --------------------------------------------------------------------------------------------------
+# ---- page in a browser ---------------------------------------------------------------------------------------------
 
 
 def different(a: np.ndarray, b: np.ndarray) -> float:

@@ -124,7 +124,7 @@ def test_windows_are_shaded_when_they_are(flying: RunView) -> None:
     whole, first = panels(metric_figure(flying))[:2]
     np.testing.assert_allclose(shaded(whole, "impact"), [(1.0, 1.3), (2.5, 2.8)])
     np.testing.assert_allclose(shaded(whole, "dwell"), [(1.0, 1.8), (2.5, 3.3)])
-    # The panel beside it shows milliseconds since the first touch.
+    # The right panel shows milliseconds since the first touch.
     np.testing.assert_allclose(shaded(first, "impact"), [(0.0, 300.0)], atol=1e-9)
     np.testing.assert_allclose(first.get_xlim(), (-60.0, 405.0))
     assert "ms" in panels(metric_figure(flying))[-1].get_xlabel()

@@ -92,7 +92,7 @@ def test_limits_hold_at_ten_times_the_resolution(dense: tuple[Robot, PosturePath
         )  # fmt: skip
         assert np.abs(fit.fun).max() < 1e-5 * loaded.mass * 9.81
     if not base:
-        # The motion is as fast as possible, because it reaches a limit.
+        # A timed path is as fast as possible if it reaches a limit at all times.
         assert max(largest, float((np.abs(path.v) / model.velocityLimit).max())) > 0.98
 
 

@@ -206,7 +206,7 @@ def chain(path: Path, axes: str, limits: Sequence[float]) -> str:
 @pytest.mark.parametrize(
     ("axes", "limits", "pose"),
     [
-        # Rows out of the plane of this arm are zero.
+        # For a planar arm, the constraint rows perpendicular to the plane are zero.
         ("yyyy", [2, 2, 2, 2], "full"),
         # The huge velocity limits act like no limit.
         ("zyzyzyz", [2, 2, 2, 2, 2, 2, 1e6], "full"),

@@ -140,7 +140,7 @@ def test_distances_and_their_gradient(name: str) -> None:
 
 
 def test_a_pair_that_stays_violated_has_rows_for_all_corners_in_the_end() -> None:
-    """Otherwise the program would report no solution where its plane only cuts corners that have no rows."""
+    """Without these rows, a separating plane could cut corners unnoticed, and the run would seem infeasible."""
     robot, rng = load_robot("tilthex_arm"), np.random.default_rng(5)
     constraint = Clearance("c", [_separator(robot, kind) for kind in KINDS], "words")
     numeric, seen = Numeric(robot.model), set[bool]()

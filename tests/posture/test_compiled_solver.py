@@ -99,7 +99,7 @@ def test_a_damaged_library_is_built_again(
     assert build_nlp(small, compile="always").compiled
     (library,) = tmp_path.glob("*.so")
     whole = library.stat().st_size
-    # This process has mapped the library, so it is renamed and a damaged copy takes its name.
+    # Replace the library by a damaged copy.  The test process has mapped the original, so only rename the original.
     library.write_bytes(library.rename(library.with_suffix(".old")).read_bytes()[: whole // 2])
     assert build_nlp(small, compile="always").compiled
     assert library.stat().st_size == whole and libraries.is_cached(library)

@@ -82,7 +82,7 @@ def test_a_distance_agrees_with_itself_on_joints_of_all_kinds() -> None:
 
 @pytest.mark.parametrize("angle", [1e-9, 1.0, np.pi - 1e-6, np.pi])
 def test_orientation_error_is_zero_at_the_target_only(angle: float) -> None:
-    """The skew-symmetric error also vanishes at 180°, but the tested error is largest there."""
+    """At a rotation of 180°, a skew-symmetric error would vanish, but the tested error is largest."""
     robot = load_robot("tilthex_arm")
     base = PointOnLink(1, np.zeros(3), np.eye(3))
     constraint = HeldOrientation("x", base, np.eye(3))

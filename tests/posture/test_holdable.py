@@ -81,7 +81,7 @@ def statics(posed: ConstrainedProblem, case: LoadCase, q: Vector, z: Vector) -> 
 @given(seed=SIZE)
 @settings(max_examples=3)
 def test_torques_agree_with_statics_the_expression_and_differences(name: str, seed: int) -> None:
-    """The statics here use other Pinocchio algorithms for gravity and forces than the code under test."""
+    """The reference computes gravity and forces with other Pinocchio algorithms than the code under test."""
     posed, generator = problem(name, **PUSHED.get(name, {})), np.random.default_rng(seed)
     case = cases(name, **PUSHED.get(name, {}))[-1]
     load, model, q = case.equilibrium.load, posed.robot.model, posture(posed, seed)
@@ -322,7 +322,7 @@ def test_a_force_beyond_the_robot_is_infeasible_and_names_the_limit(
     assert f"{named} while it pushes with {force:g} N" in conflicts
 
 
-# ---- which cases there are --------------------------------------------------------------------------------------
+# ---- load cases -------------------------------------------------------------------------------------------------
 
 
 def found(name: str, **more: object) -> LoadCases:

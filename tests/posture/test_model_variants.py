@@ -41,7 +41,7 @@ from tests.support.settings import make_settings
 FRAMES = {"tilthex_arm": "ee", "panda": "panda_hand_tcp", "bolt": "base_link", "talos": "gripper_right_base_link"}
 
 
-# ---- what a model variant is ------------------------------------------------------------------------------------
+# ---- model variants ---------------------------------------------------------------------------------------------
 
 
 @pytest.mark.parametrize("name", FRAMES)
@@ -127,7 +127,7 @@ def test_robots_between_the_model_variants() -> None:
     assert [one.model_sha256 for one in between(variants, 3, seed=1)] == [one.model_sha256 for one in drawn[:3]]
 
 
-# ---- the worst of them --------------------------------------------------------------------------------------------
+# ---- worst case ---------------------------------------------------------------------------------------------------
 
 MORE: dict[str, dict[str, object]] = {
     "plain": {},
@@ -327,7 +327,8 @@ def test_balance_and_feet_hold_in_every_model_variant() -> None:
         lambda x: centers[1].evaluate(Numeric(problem.robot.model).at(x))[0], problem.robot.model, solution.q, 1e-4
     )
     assert_close(jacobian, expected, 1e-7, "Jacobian of the loaded center of mass")
-    # The optimum without the payload tips over with it, so the constraint is necessary.
+    # With the payload, the robot would tip over in the optimum of the unloaded problem, so the constraint is
+    # necessary.
     plain = prepare(make_settings(task)).problem
     alone = solve(plain, starts=2, jobs=1, compile="never")
     assert centers[1].evaluate(Numeric(plain.robot.model).at(alone.q))[0].max() > -centers[1].margin

@@ -304,12 +304,15 @@ def test_settings_know_their_defaults() -> None:
     assert settings.base == "level" and settings.contact_pose == "full"
 
 
-# ---- starts and postures that are special by chance ---------------------------------------------------------------
+# ---- degenerate starts and postures -------------------------------------------------------------------------------
 
 
 @pytest.mark.parametrize("more", [{"target_position": (0.4, 0.2, 0.4), "contact_pose": "full"}, {}])
 def test_singular_start_drops_no_equation(more: dict) -> None:
-    """The rows of a straight UR5 are dependent only at this posture.  All rows are needed at other postures."""
+    """The constraint rows of UR5 are dependent only in its straight posture.
+
+    In other postures, all rows are needed.
+    """
     problem = problem_of("ur5", posture="neutral", **more)
     assert all(len(problem.carried(i)) == len(c.lifted_bounds[0]) for i, c in enumerate(problem.constraints))
     solution = solve(problem, starts=6, jobs=1)

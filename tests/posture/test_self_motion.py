@@ -101,7 +101,8 @@ def test_a_planar_arm_of_three_hinges_has_the_components_of_its_four_bar_linkage
     truth = scan(problem, rods, 2000).min()
     assert bound.finished and bound.gap <= 0.005 + 1e-9
     assert bound.lower <= truth * (1 + 1e-9)
-    # `bound.best` belongs to a posture, so it is not below the optimum.  The scan may miss this posture.
+    # The value `bound.best` belongs to a posture, so the value is not below the optimum.  The scan on a grid may miss
+    # the posture of `bound.best`.
     assert bound.best <= truth * 1.0051
     at = motion.manifold.project(bound.x[None])
     assert at.converged[0]

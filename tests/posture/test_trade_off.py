@@ -49,7 +49,10 @@ def solved(case: str) -> tuple[PostureSolution, TradeOff]:
 
 
 def moved(problem: ConstrainedProblem, q: np.ndarray, start: np.ndarray) -> float:
-    """Return the distance by an independent formula.  For a joint given by cosine and sine, it is the chord."""
+    """Return the distance by an independent formula.
+
+    For a joint given by cosine and sine, the distance is the chord.
+    """
     step = np.array(q[-(problem.robot.nq - 7) :] - start[7:] if problem.robot.floating else q - start)
     base = 0.0
     if problem.robot.floating:
@@ -189,7 +192,7 @@ def test_no_feasible_neighbor_within_the_distance_is_better() -> None:
 
 
 def test_parts_that_are_not_convex_are_there() -> None:
-    """A penalty on the distance would skip these points, because the curve is not convex there."""
+    """A penalty on the distance would skip the non-convex parts of the curve."""
     _, curve = solved("fixed")
     y = np.array([p.objective for p in curve.points])
     bulge = y[1:-1] - (y[:-2] + y[2:]) / 2
@@ -258,7 +261,7 @@ def test_points_that_do_not_certify_are_kept_and_named(monkeypatch: pytest.Monke
 
 
 def test_a_better_posture_than_the_optimum_is_said() -> None:
-    """Replace the optimum by a worse posture beyond it, as if the starts had ended there."""
+    """Replace the optimum by a farther and worse posture, as if the starts had ended at the latter."""
     solution, curve = solved("floating")
     beyond = next(
         q for q in walk(solution.problem, solution.q, 0.02, 40) + walk(solution.problem, solution.q, -0.02, 40)

@@ -221,7 +221,7 @@ def test_feet_under_locked_joints() -> None:
     assert all(np.isfinite(foot.impulse).all() for foot in stability.feet)
 
 
-# ---- refusals and the command -----------------------------------------------------------------------------------
+# ---- rejected input and command ---------------------------------------------------------------------------------
 
 
 def test_transmissions_by_joint() -> None:

@@ -1,1 +1,1 @@
-"""Controllers, runs and metrics of the experiments."""
+"""Tests of controllers, runs and metrics of the experiments."""

@@ -44,7 +44,7 @@ def controller_factory(setup: Setup, free: bool = False) -> ControllerFactory:
 
 
 def near(name: str, **changes: Any) -> Setup:
-    """Set up a short variant of a shipped scenario, with surfaces 5 cm nearer."""
+    """Set up a short variant of a shipped scenario whose surfaces are 5 cm nearer."""
     setup = shortened(name, **changes)
     if name in PUSHES:
         return setup

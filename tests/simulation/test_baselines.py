@@ -79,7 +79,7 @@ def test_the_offline_posture_of_S_is_reached_at_the_surface() -> None:
     optimum, sticking = factory.offline("posture-sticking"), factory.objective("sticking").value
     assert optimum is not None and factory.offline("nominal") is None
     there = resting_posture(factory.driver("posture-sticking"), 3.0, ahead=setup.gap)
-    # If the foot stays at its start, the robot cannot reach this posture.
+    # If the foot does not move, the robot cannot reach the target posture.
     here = resting_posture(factory.driver("posture-sticking"), 3.0)
     away = [np.linalg.norm(pin.difference(setup.robot.model, q, optimum.q)) for q in (there, here)]
     assert away[0] < 0.01 < away[1]
@@ -254,9 +254,9 @@ def test_the_correction_removes_velocities_of_impulses_only(name: str) -> None:
     for _ in range(5):
         impact = change @ generator.normal(size=3)
         correction = driver._correction(Reading(quiet.t, quiet.q, impact, None))
-        # The corrected velocity is zero.
+        # The corrected velocity is zero, as the limits demand.
         np.testing.assert_allclose(impact + correction, 0, atol=1e-6 * np.abs(impact).max())
-    # No impulse improves this motion, because the task errors are orthogonal to the effect of impulses.
+    # If the task errors are orthogonal to the effect of impulses, no impulse improves the motion.
     state = driver._state.update(quiet.q, quiet.v)
     J = np.vstack([task.jacobian(state) for task in leading(driver)])
     v = generator.normal(size=quiet.v.size)

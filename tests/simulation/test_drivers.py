@@ -231,7 +231,7 @@ def test_the_posture_driver_reaches_its_goal(name: str) -> None:
         np.testing.assert_allclose(center.target, pin.centerOfMass(robot.model, data, goal), atol=1e-12)
 
 
-# ---- bad input ----------------------------------------------------------------------------------------------------
+# ---- invalid input ------------------------------------------------------------------------------------------------
 
 
 @pytest.mark.parametrize(

@@ -69,8 +69,8 @@ def test_links_without_shapes_behind_a_surface_are_a_warning() -> None:
     for depth, reported in ((0.01, False), (0.05, True)):
         q = np.tile(setup.q, (1000, 1))
         q[600:700, :3] -= (elbow + depth) * n
-        # Move the elbow behind the surface.  Its shape touches the surface there, and the joints above are still in
-        # front.
+        # Move the elbow behind the surface.  The surface stops the shape at the elbow, and the joints above the elbow
+        # are still in front of the surface.
         assert links_behind(setup, [Run(by_hand(setup, 1000, q=q), ())]) == ()
         q[600:700, :3] = setup.q[:3] - ((setup.q[:3] - point) @ n + depth) * n
         warnings = links_behind(setup, [Run(by_hand(setup, 1000, q=q), ())])
@@ -181,7 +181,7 @@ def test_a_hextilt_flies_and_touches_the_floor(controller: str) -> None:
     assert np.abs(record.series.q[:, :3] - factory.setup.q[:3]).max() < 0.2
 
 
-# ---- nothing holds it ---------------------------------------------------------------------------------------------
+# ---- unsupported robots -------------------------------------------------------------------------------------------
 
 
 @pytest.mark.parametrize(

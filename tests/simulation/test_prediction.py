@@ -111,7 +111,7 @@ def test_a_sticking_impact_jumps_as_predicted() -> None:
     e = restitution(setup, run, 0.5)
     assert prediction.S is not None and prediction.sticking == pytest.approx(0.5 * np.sqrt(prediction.S))
     assert prediction.coulomb == pytest.approx(prediction.sticking)
-    # The frictionless prediction is far from the measurement.
+    # The frictionless prediction differs strongly from the measurement.
     assert prediction.measured == pytest.approx((1 + e) * 0.5 * np.sqrt(prediction.S), rel=0.05)
     assert abs(prediction.measured / ((1 + e) * prediction.frictionless) - 1) > 0.2
 

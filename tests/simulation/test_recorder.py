@@ -105,7 +105,7 @@ def test_the_metric_is_evaluated_every_tenth_tick_and_may_be_undefined() -> None
     def sometimes(q: Any) -> float:
         calls.append(1)
         if len(calls) == 2:
-            raise MetricError("does not exist there", where="S", hint="move")
+            raise MetricError("is undefined at this posture", where="S", hint="move")
         return 2.0
 
     recorder, world = recording("aerial-vertical", sometimes)

@@ -31,7 +31,7 @@ from tests.simulation.factories import (
     shortened,
 )
 
-# In scenarios without an approach, these controllers equal the nominal controller.
+# In scenarios without an approach, `reference-spreading` and `impact-aware` equal the nominal controller.
 APPROACH = ("reference-spreading", "impact-aware")
 # The controller `path` has separate tests.
 ALL = [("aerial-vertical", name, "live") for name in CONTROLLERS if name != "path"]
@@ -130,7 +130,7 @@ def test_windows_begin_at_the_first_touch(name: str) -> None:
         impact, dwell, recovery = record.windows
         series = record.series
         assert (impact.kind, dwell.kind, recovery.kind, impact.touched) == ("impact", "dwell", "recovery", True)
-        # The recovery lasts one second, or ends with the reference if this is earlier.
+        # The recovery lasts one second, or less if the reference ends earlier.
         assert recovery.begin == impact.begin
         assert recovery.end == pytest.approx(min(impact.begin + 1, reference.total))
         first = int(np.argmax(series.touching > 0))
@@ -193,7 +193,7 @@ def test_tight_limits_relax_the_tasks() -> None:
         assert name == "objective" or np.isfinite(column).all(), name
 
 
-# ---- bad input ----------------------------------------------------------------------------------------------------
+# ---- invalid input ------------------------------------------------------------------------------------------------
 
 
 @pytest.mark.parametrize(

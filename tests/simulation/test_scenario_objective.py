@@ -116,7 +116,7 @@ def test_an_undefined_objective_is_an_error() -> None:
     assert "\n" not in caught.value.line
 
 
-# ---- of a scenario ------------------------------------------------------------------------------------------------
+# ---- objective of a scenario --------------------------------------------------------------------------------------
 
 
 def test_the_contact_is_the_shape_or_the_pushed_frame() -> None:

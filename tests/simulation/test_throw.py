@@ -76,7 +76,7 @@ def test_a_ball_obeys_mechanics(name: str, direction: tuple[float, float, float]
     data = robot.model.createData()
     truth = world.truth()
     momentum = pin.computeCentroidalMomentum(robot.model, data, truth.q, truth.v)
-    # The armature of the motors has no momentum in this balance.
+    # The momentum balance does not include the armature of the motors.
     np.testing.assert_allclose(momentum.linear, impulse, rtol=2e-3, atol=1e-3 * np.linalg.norm(impulse))
     # The ball neither sticks to the shape nor passes through it.
     assert 0 < depth < 0.5 * throw.speed * throw.solref[0] * 2

@@ -76,8 +76,8 @@ def test_forces_agree_with_mujoco() -> None:
         mujoco.mj_copyData(copy, model, data)
         world.step(command)
         truth = world.truth()
-        # Use the contacts from the beginning of the step.  The step of the world has overwritten them, so compute
-        # them in a copy.
+        # Use the contacts from the beginning of the step.  Compute the contacts in a copy, because the step of the
+        # world has overwritten them.
         copy.ctrl[:] = truth.torques
         mujoco.mj_step2(model, copy)
         forces = np.zeros((len(shape_of), 3))

@@ -293,7 +293,7 @@ def test_a_push_acts_at_its_point_and_ends() -> None:
         world.step(idle(robot), 60)
 
 
-# ---- the same again ---------------------------------------------------------------------------------------------
+# ---- reproducibility --------------------------------------------------------------------------------------------
 
 
 def run(world: World, seed: int) -> list[Vector]:

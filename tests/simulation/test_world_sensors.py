@@ -144,8 +144,8 @@ def test_the_vibration_follows_from_the_forces_of_the_unbalance() -> None:
     ahead = vibration.twist(speeds, phases + 2 * np.pi * speeds * step)
     back = vibration.twist(speeds, phases - 2 * np.pi * speeds * step)
     wrench = inertia @ (ahead - back) / (2 * step)
-    # The imbalance force of a propeller is perpendicular to its axis and has magnitude U(2πω)².  The wrench is the
-    # sum of these forces.
+    # The imbalance force of a propeller is perpendicular to its axis and has magnitude U(2πω)².  The total wrench is
+    # the sum over all propellers.
     total = np.zeros(6)
     for k, rotor in enumerate(spec.rotors):
         turn = pin.Quaternion.FromTwoVectors(np.array([0.0, 0, 1]), np.array(rotor.direction)).matrix()
@@ -198,7 +198,7 @@ def test_contact_laws_faster_than_the_time_step_are_refused(solref: tuple[float,
     assert caught.value.where == "wall"
 
 
-# ---- what is refused --------------------------------------------------------------------------------------------
+# ---- rejected input ---------------------------------------------------------------------------------------------
 
 
 def one_line(error: ImpactPostureError) -> str:

@@ -63,7 +63,7 @@ def test_a_rebound_and_another_speed_scale_the_jump() -> None:
 
 
 def test_the_sticking_impulse_says_which_postures_slide() -> None:
-    """Coulomb's law, written out in the study, sticks inside the friction cone and agrees with MuJoCo there."""
+    """The study's Coulomb law predicts sticking inside the friction cone; MuJoCo agrees for sticking contacts."""
     friction = 0.8
     row = dropped(FLYING).on(Surface(friction))
     held = [needed_friction(o.predicted) <= friction for o in row.outcomes]
@@ -77,7 +77,7 @@ def test_the_sticking_impulse_says_which_postures_slide() -> None:
 
 
 def test_the_page_says_only_what_the_bench_printed() -> None:
-    """Every decimal number of the page is in the generated tables, and targets reported as met are met there."""
+    """Every decimal number on the page is also in the generated tables, and the tables confirm the targets met."""
     tables = page_of("impacts").read_text(encoding="utf-8")
     prose = (DOCS / "objectives.md").read_text(encoding="utf-8")
     printed = set(re.findall(r"\d+\.\d+", tables))

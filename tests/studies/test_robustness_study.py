@@ -176,7 +176,7 @@ def test_a_failure_is_an_outcome(monkeypatch: pytest.MonkeyPatch) -> None:
     assert "control lost 1" in text
     assert "nominal control lost: 1" in text
     assert f"- `robust` fails in `{AERIAL}` number {number}" in text
-    # If the record of one controller is missing, only this controller runs.
+    # If a record lacks one controller, the study runs only the missing controller.
     tried.clear()
     known = replace(record, documents={c: d for c, d in record.documents.items() if c != "stiff"})
     assert not is_complete(known)
@@ -268,7 +268,8 @@ def test_correlations_and_splits_by_hand() -> None:
     chosen, others = statistics.split(records, "robust", lambda r: r.draw.number < first + 2)
     assert (chosen.count, chosen.helps, chosen.median) == (2, 2, pytest.approx(-0.4))
     assert (others.count, others.helps, others.median) == (3, 0, pytest.approx(0.5))
-    # H decreased in the first three records and increased in the fourth.  One motion and one jump disagree with H.
+    # H decreased in the first three records and increased in the fourth.  In one record, the motion disagrees with H;
+    # in another record, the jump disagrees.
     for metric in ("q_total_impact", "peak_jump"):
         assert statistics.agreement(records, ["robust"], "H", metric) == (3, 4)
     # S correlates perfectly with the jump of `robust`.
@@ -277,7 +278,7 @@ def test_correlations_and_splits_by_hand() -> None:
         {"n": 4, "H": 0.2, "V": math.nan, "S": 1.0}, nan_ok=True
     )
     assert statistics.worst(records, "robust") is records[3]
-    # H decreased in three records.  In the first of these records, the jump increased.
+    # H decreased in three records.  In one of the three, the jump increased.
     assert statistics.misled(records, "robust") is records[0]
     text = "\n".join(page({AERIAL: records}, 0))
     assert f"`robust` moves the robot most, compared with nominal, in `{AERIAL}` number {first + 3}" in text

@@ -70,7 +70,7 @@ def groups(report: Report) -> set[str]:
     return {kernel.group for kernel, _, _ in report.rows}
 
 
-# ---- numbers before times ---------------------------------------------------------------------------------------
+# ---- numerical checks before timing -----------------------------------------------------------------------------
 
 
 def test_implementations_are_checked_before_they_are_timed(folder: Path) -> None:

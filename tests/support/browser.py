@@ -114,7 +114,7 @@ def browser(folder: Path) -> Iterator[Tab]:
     (theirs_in, ours_out), (ours_in, theirs_out) = os.pipe(), os.pipe()
 
     def channels() -> None:
-        # Chromium reads the protocol from file descriptor 3 and writes it to 4.
+        # Chromium reads protocol messages from file descriptor 3 and writes messages to file descriptor 4.
         read, write = os.dup(theirs_in), os.dup(theirs_out)
         os.dup2(read, 3)
         os.dup2(write, 4)

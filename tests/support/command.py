@@ -26,7 +26,7 @@ import rich.table
 import typer.rich_utils
 from matplotlib.figure import Figure
 
-# The commands import these modules when they run.  Import the modules once here.
+# The commands import these modules when they run.  Importing all modules once, before the forks, saves time.
 import impact_posture.codegen.export
 import impact_posture.experiment.experiment_folders
 import impact_posture.experiment.jobs
@@ -73,7 +73,7 @@ def run(
     """Run ``impact-posture`` with arguments, as its entry point does; ``env`` extends the environment variables.
 
     Only the figures named in ``pictures`` are drawn; all others are blank.  Drawing takes most of the time for a
-    small robot.  The timeout only ends commands that hang.  It does not test the duration of a command.
+    small robot.  The timeout only ends commands that hang.  No test fails because a command is slow.
     """
     with tempfile.TemporaryFile() as out, tempfile.TemporaryFile() as errors:
         child = start(arguments, out.fileno(), errors.fileno(), cwd, env, prepare, pictures)
@@ -148,7 +148,7 @@ def _command(
     pictures: Collection[str],
 ) -> None:
     """Run the command with the streams, folder, signal handlers and warnings that a new program would have."""
-    # Without `gc.freeze`, the garbage collector would write to the memory shared with the test, and so copy it.
+    # Without `gc.freeze`, the garbage collector would write to memory shared with the test, which copies the memory.
     gc.freeze()
     # A new program starts without cached controllers.
     impact_posture.experiment.jobs.controller_factory.cache_clear()

@@ -166,7 +166,7 @@ class ExactImpact:
 
     @cached_property
     def dM(self) -> Vector:
-        """``∂M_ij/∂q_k``, shape (nv, nv, nv)."""
+        """Derivative ``∂M_ij/∂q_k``, shape (nv, nv, nv)."""
         eye, numeric = np.eye(self.nv), self.oracle.numeric
         return np.array([[numeric.inertial_gradient(i, j) for j in eye] for i in eye])
 
@@ -186,29 +186,29 @@ class ExactImpact:
 
     @cached_property
     def grad_H(self) -> Exact:
-        """``2 ∂_q[nᵀJb + fᵀJ_s b + gᵀJ_s a − bᵀMa]``."""
+        """Gradient ``2 ∂_q[nᵀJb + fᵀJ_s b + gᵀJ_s a − bᵀMa]``, shape (nv,)."""
         (b, g), a, f = self.second, self.jump, self.impulse
         feet = bracket(self.dJs, f, b) + bracket(self.dJs, g, a)
         return 2 * (bracket(self.dJ, self.n, b) + feet - bracket(self.dM, b, a))
 
     @cached_property
     def grad_G(self) -> Exact:
-        """``∂_q[2nᵀJa + 2fᵀJ_s a − aᵀMa]``."""
+        """Gradient ``∂_q[2nᵀJa + 2fᵀJ_s a − aᵀMa]``, shape (nv,)."""
         a, f = self.jump, self.impulse
         return 2 * (bracket(self.dJ, self.n, a) + bracket(self.dJs, f, a)) - bracket(self.dM, a, a)
 
     @cached_property
     def grad_S(self) -> Exact:
-        """``2 ∂_q[sᵀJb + rᵀJa + fᵀJ_s b + gᵀJ_s a − bᵀMa]``."""
+        """Gradient ``2 ∂_q[sᵀJb + rᵀJa + fᵀJ_s b + gᵀJ_s a − bᵀMa]``, shape (nv,)."""
         s, a, f = self.sticking
         r, b, g = self._held(np.concatenate([a, exact(np.zeros(len(self.K_held) - self.nv))]))
         feet = bracket(self.dJs, f, b) + bracket(self.dJs, g, a)
         return 2 * (bracket(self.dJ, s, b) + bracket(self.dJ, r, a) + feet - bracket(self.dM, b, a))
 
-    # ---- derivatives of the answers ---------------------------------------------------------------------------
+    # ---- derivatives of the results ---------------------------------------------------------------------------
 
     def _moved(self, a: Exact, f: Exact, force: Exact) -> Exact:
-        """``∂_k a`` where ``M a − J_sᵀf = τ, J_s a + εf = 0`` and ``∂_k τ`` is ``force``, shape (nv, nv)."""
+        """Return ``∂_k a`` for ``M a − J_sᵀf = τ, J_s a + εf = 0``; ``force`` is ``∂_k τ``, shape (nv, nv)."""
         first = force - np.tensordot(a, exact(self.dM), (0, 0)) + np.tensordot(f, exact(self.dJs), (0, 0))
         slip = -np.tensordot(exact(self.dJs), a, (1, 0))
         return self.inverse[: self.nv] @ np.concatenate([first, slip])
@@ -225,7 +225,7 @@ class ExactImpact:
 
 
 def bracket(rates: Any, left: Any, right: Any) -> Any:
-    """``Σ_ij l_i r_j ∂_k T_ij``, shape (nv,)."""
+    """Return ``Σ_ij l_i r_j ∂_k T_ij``, shape (nv,)."""
     if left.dtype == object and rates.dtype != object:
         rates = exact(rates)
     return np.tensordot(right, np.tensordot(left, rates, (0, 0)), (0, 0))

@@ -9,9 +9,9 @@ to sixty digits:
   ``d_i² = M̃_ii`` (theorem 10.4).  A factorization with 1/ε added to the feet, such as the articulated bodies of the
   kernel, cannot guarantee a smaller error.
 
-Each bound multiplies the size of such a change of the matrix by the condition number of the quantity.  If a quantity
-needs several solves, the sum of their bounds would be far too large.  Its bound is therefore the change of the exact
-quantity when its input doubles are rounded once more.
+An error bound is the size of the matrix change ``ΔK`` or ``ΔM̃`` times the condition number of the quantity.  If a
+quantity needs several solves, the sum of their bounds would be far too large.  For such a quantity, the bound is the
+change of the exact value when its input doubles are rounded once more.
 """
 
 from __future__ import annotations
@@ -29,7 +29,7 @@ _UNIT = 2.0**-53
 
 
 def gamma(count: int) -> float:
-    """Higham's ``γ_n = nu/(1 − nu)``."""
+    """Return ``γ_n = nu/(1 − nu)`` (Higham), where u is the unit roundoff."""
     return count * _UNIT / (1 - count * _UNIT)
 
 

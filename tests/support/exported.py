@@ -1,4 +1,4 @@
-"""Call the C functions of a built export and return their codes, for tests."""
+"""Call the C functions of a built export and return their return codes, for tests."""
 
 from __future__ import annotations
 

@@ -1,4 +1,7 @@
-"""Exported controllers for tests.  Each is built once per run, without compiler optimization to save time."""
+"""Exported controllers for tests.
+
+Each controller is built once per run, without compiler optimization to save time.
+"""
 
 from __future__ import annotations
 
@@ -88,7 +91,7 @@ def compiled(name: str, objective: WorstCaseObjective | None = None) -> Compiled
 
 
 def gradient_beside(name: str, objective: WorstCaseObjective) -> ImpactGradient:
-    """Return the gradient in the library of a controller."""
+    """Return the gradient that the controller library contains."""
     folder = exported(name, objective)
     return ImpactGradient(load_library(library_path(folder, "ctl")), read_manifest(folder / "ctl_metric.json")[0])
 

@@ -1,4 +1,5 @@
-"""Helpers of the mathematical tests: robots, random configurations, errors, finite differences, raw Pinocchio.
+"""Helpers of the mathematical tests: robots, random configurations, errors, finite differences, direct calls of
+Pinocchio.
 
 The helpers do not call the code under test except to load a robot.
 """
@@ -95,7 +96,7 @@ def frame_jacobian(model: pin.Model, q: Vector, frame: int, offset: ArrayLike = 
 
 
 def frame_placement(model: pin.Model, q: Vector, frame: int) -> pin.SE3:
-    """Return the world placement of a frame."""
+    """Return the placement of a frame in the world."""
     data = model.createData()
     pin.framesForwardKinematics(model, data, q)
     return pin.SE3(data.oMf[frame])

@@ -53,7 +53,7 @@ starts = 1
 
 
 class Failed(Exception):
-    """Failed check, with a message that names it."""
+    """Exception for a failed check; the message names the check."""
 
 
 def run(command: list[str], folder: Path, fine: tuple[int, ...] = (0,)) -> subprocess.CompletedProcess[str]:
@@ -132,7 +132,7 @@ def build(work: Path) -> Path:
 
 
 def install(work: Path, wheel: Path, extras: str, lowest: bool) -> None:
-    """Install the wheel with these extras, and no other dependency."""
+    """Install the wheel with only the given extras."""
     python = str(work / "env" / "bin" / "python")
     pip = [python, "-m", "pip", "install", "--quiet", "--no-compile", "--disable-pip-version-check"]
     if lowest:
@@ -152,7 +152,7 @@ def commands(work: Path, programs: Path) -> None:
     ask = "import typer, impact_posture_cli.app as m; print(m.__file__, *typer.main.get_command(m.app).commands)"
     where, *names = run([str(programs / "python"), "-c", ask], work).stdout.split()
     if not Path(where).is_relative_to(programs.parent):
-        raise Failed(f"the command line that ran is {where}")
+        raise Failed(f"the command ran from {where}, not from the installed wheel")
     listed = {line.split()[0] for row in COMMANDS for line in row}
     if listed != set(names):
         raise Failed(f"COMMANDS and the commands of the app differ: {sorted(listed ^ set(names))}")
@@ -195,7 +195,7 @@ def types(work: Path, programs: Path) -> None:
 
 
 def suite(work: Path, programs: Path, arguments: list[str]) -> None:
-    """Run tests from a copy of the checkout without the two packages, so that they import the installed packages."""
+    """Run tests in a copy of the checkout without the two packages, so that tests import the installed packages."""
     folder = copy([n for n in tracked() if n.split("/")[0] not in PACKAGES], work / "tests")
     done = subprocess.run([str(programs / "python"), "-m", "pytest", "-q", *arguments], cwd=folder, check=False)
     if done.returncode:
@@ -204,7 +204,7 @@ def suite(work: Path, programs: Path, arguments: list[str]) -> None:
 
 @contextmanager
 def step(what: str) -> Iterator[None]:
-    """Print a step and its duration."""
+    """Print the name of a step and its duration."""
     print(f"{what} …", flush=True)
     start = time.monotonic()
     yield

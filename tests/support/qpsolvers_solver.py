@@ -1,4 +1,4 @@
-"""Solvers of the qpsolvers package, to compare DAQP with them on the programs of the online controllers."""
+"""Solvers of the qpsolvers package, compared with DAQP on the programs of the online controllers."""
 
 from __future__ import annotations
 

@@ -155,7 +155,7 @@ def stationarity(tick: RelaxedTick, z: np.ndarray) -> list[float]:
 
 
 def _complement(rows: np.ndarray) -> np.ndarray:
-    """Return an orthonormal basis, as rows, of the space orthogonal to the rows."""
+    """Return an orthonormal basis of the space orthogonal to the rows; each basis vector is a row."""
     if not rows.size:
         return np.eye(rows.shape[1])
     return scipy.linalg.null_space(rows, rcond=1e-9).T

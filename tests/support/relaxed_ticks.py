@@ -57,7 +57,7 @@ class RelaxedTick:
 
 
 def problem_of(assembly: Assembly, z: np.ndarray | None) -> RelaxedTick:
-    """Return the program that the relaxation of an assembly solves."""
+    """Return the optimization program that the relaxation of an assembly solves."""
     qp = assembly.rank.qp.copy()
     level = np.zeros(qp.n + qp.m, dtype=np.intc)
     level[assembly.limits] = 1

@@ -19,7 +19,7 @@ from impact_posture.simulation.world.world import World, build_world
 _RADIUS = 0.02
 # The test assumes that a contact never ends if it lasts longer than this number of time constants of the law.
 _PATIENCE = 200
-# Fractions of a time step at which the first touch occurs, because restitution depends slightly on this moment.
+# Fractions of a time step at which the first touch occurs; restitution depends slightly on this fraction.
 _PHASES = (0.1, 0.3, 0.5, 0.7, 0.9)
 
 
@@ -29,7 +29,7 @@ class Bounce:
 
     Attributes:
         restitution: Normal speed after the impact, divided by the normal speed before.
-        spread: Largest minus smallest restitution over these moments.
+        spread: Largest minus smallest restitution over the tested moments of touch.
         duration: Duration of the contact force, s.
         depth: Largest penetration of the ball, m.
         peak: Peak force times duration, divided by the impulse; 1 if the force is constant.
@@ -45,8 +45,8 @@ class Bounce:
 def ideal_restitution(damping: float) -> float:
     """Return the restitution of ``r'' = −2ζω r' − ω² r`` for any ω; the contact ends when its force vanishes.
 
-    ``exp(−2ζ arccos ζ/√(1 − ζ²))`` below ζ = 1, ``e⁻²`` there, ``exp(−2ζ arcosh ζ/√(ζ² − 1))`` above.  A
-    :class:`ContactLaw` approaches this value if its share d is near 1 and its time constant is many time steps.
+    The value is ``exp(−2ζ arccos ζ/√(1 − ζ²))`` for ζ < 1, ``e⁻²`` for ζ = 1, ``exp(−2ζ arcosh ζ/√(ζ² − 1))`` for ζ >
+    1.  A :class:`ContactLaw` approaches this value if its share d is near 1 and its time constant is many time steps.
 
     Args:
         damping: Damping ratio ζ, at least zero.
@@ -76,8 +76,8 @@ def measure_restitution(
         law: Contact law of the surface.
         speed: Approach speed, m/s.
         timestep: Time step of the physics, s.
-        mass: Mass of the ball, kg.  The result does not depend on it, because MuJoCo scales the law by the mass
-            at the contact.
+        mass: Mass of the ball, kg.  The mass does not change the result, because MuJoCo scales the law by the
+            mass at the contact.
 
     Raises:
         InputError: The ball stays on the surface, or the time step is too long for the law.
@@ -120,7 +120,9 @@ def _follow(world: World, surface: Surface, speed: float) -> Bounce:
         if ended:
             break
     if not ended:
-        raise InputError(f"the ball stays on it (solref {surface.solref})", where="contact law", hint="damp it less")
+        raise InputError(
+            f"the ball does not leave the surface (solref {surface.solref})", where="contact law", hint="damp it less"
+        )
     pushed = np.flatnonzero(forces)
     duration, impulse = (pushed[-1] - pushed[0] + 1) * world.timestep, sum(forces) * world.timestep
     after = float(world.truth().v[2])

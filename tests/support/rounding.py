@@ -1,8 +1,9 @@
 """Linear algebra with the rounding errors of another processor.
 
 OpenBLAS has a kernel for each family of processors, and each kernel rounds differently.  Each result is the exact
-solution for a matrix that differs in the last digits.  A random change of these digits before a factorization
-therefore represents all kernels.  A test that passes on one processor only by luck fails with this change.
+solution for a matrix that differs in the last digits.  Therefore, random changes in the last digits of a matrix
+before its factorization represent all kernels.  A test that passes on one processor only by luck fails after such a
+change.
 """
 
 from __future__ import annotations

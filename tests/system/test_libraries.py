@@ -27,7 +27,7 @@ from impact_posture.system.libraries import build_library, build_parts
 from tests.output.views import PENDULUM
 from tests.support.tools import need, need_compiler
 
-# This program loads each export folder and prints the result.  After a crash, its last line names the folder.
+# Program that loads each export folder and prints the result.  After a crash, the last printed line names the folder.
 LOADER = """
 import sys
 from impact_posture.codegen.impact_gradient import ImpactGradient
@@ -157,7 +157,7 @@ def test_a_library_of_another_export_is_refused(built: Path, tmp_path: Path) -> 
     export(objective, other, prefix="arm", check=False, portable=True)
     for name in ("libarm.so", "libarm.so.sha256"):
         shutil.copy(mine / name, other / name)
-    # This library does not contain the hash of a manifest.
+    # Use a library that does not contain the hash of a manifest.
     strange = shutil.copytree(built, tmp_path / "strange")
     (strange / "x.c").write_text("int arm_eval(void) { return 0; }\n")
     build_library(strange, "x", strange / "libarm.so")

@@ -260,7 +260,7 @@ def test_the_next_run_removes_only_the_folder_of_a_killed_run(tmp_path: Path) ->
     assert all((tmp_path / name / file).read_text() == text for name in others for file, text in others[name].items())
 
 
-# ---- names that no file can have -----------------------------------------------------------------------------------
+# ---- impossible file names -----------------------------------------------------------------------------------------
 
 
 @pytest.mark.parametrize("name", ["a\0b", "x" * 300, "a\ud800"])

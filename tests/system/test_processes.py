@@ -208,7 +208,7 @@ def test_no_process_outlives_a_killed_parent(what: str, count: int, tmp_path: Pa
                 os.kill(pid, signal.SIGKILL)
 
 
-# ---- ending early --------------------------------------------------------------------------------------------------
+# ---- early end of a run --------------------------------------------------------------------------------------------
 
 
 @pytest.fixture
@@ -241,7 +241,7 @@ def test_nothing_ends_the_process_while_signals_are_held(ended: list[str]) -> No
     assert ended == ["left"]
 
 
-# ---- a copy of this process ----------------------------------------------------------------------------------------
+# ---- fork of this process ------------------------------------------------------------------------------------------
 
 
 def test_a_copy_has_the_same_state() -> None:

@@ -47,7 +47,7 @@ def test_the_jump_is_the_least_change_of_energy(name: str) -> None:
     expected = np.linalg.solve(root, np.linalg.lstsq(rows @ np.linalg.inv(root), wanted, rcond=1e-7)[0])
     jump, impulse = limits.jump(state)
     np.testing.assert_allclose(jump @ v, expected, atol=1e-5 * np.abs(expected).max())
-    # The impulses of the contact and of the feet cause exactly this jump.
+    # The impulses of the contact and of the feet cause exactly the computed jump.
     rest = M @ (jump @ v) - impulse @ v
     if contacts:
         rest -= np.vstack(feet).T @ np.linalg.lstsq(np.vstack(feet).T, rest, rcond=1e-9)[0]

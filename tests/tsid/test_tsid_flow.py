@@ -144,7 +144,7 @@ def valley(r: Robot, key: object) -> Well:
 def test_it_does_not_climb_where_it_turns_or_brakes(
     key: int, epsilon: float, climb: float, least: float, rested: float
 ) -> None:
-    """In the first case the flow turns in the bend of the valley, in the second case it rests there.
+    """In the first case the flow turns in the bend of the valley; in the second case the flow rests in the bend.
 
     If the flow ignored the slope at its stopping point, the objective would increase by 2e-2 and by 1e-1.
     """
@@ -449,7 +449,7 @@ def test_a_gradient_that_fails_stops_the_flow_until_it_is_back() -> None:
 
     def function(q: Vector) -> tuple[float, Vector]:
         if fails[0]:
-            raise MetricError("does not exist there", where="H", hint="start elsewhere")
+            raise MetricError("is undefined at this posture", where="H", hint="start elsewhere")
         return arm_well()(q)
 
     controller, posture, q, v = flying(function)
@@ -458,7 +458,7 @@ def test_a_gradient_that_fails_stops_the_flow_until_it_is_back() -> None:
         fails[0] = 300 <= k < 800
         assert controller.tick(k * DT, q, v).status is Status.SOLVED
         if k == 750:
-            # It brakes evenly.
+            # The flow brakes evenly.
             assert posture.flow.failed and not np.abs(posture.flow.velocity).max() > 1e-4
     assert not posture.flow.failed and np.abs(posture.flow.velocity).max() > 0.01
 

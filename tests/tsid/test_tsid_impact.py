@@ -293,7 +293,7 @@ def test_a_standing_robot_braces_on_its_feet() -> None:
 
 
 def test_an_export_of_another_robot_is_refused(exported: dict[str, ImpactGradient]) -> None:
-    """The other robot has the same joints, so only this check can detect the difference."""
+    """The other robot has the same joints, so only the check of the manifest can detect the difference."""
     other = load_robot(ARM, armature={joint: 0.5 for joint in robot(ARM).joint_names})
     for make in (ImpactRobustPosture, ReferenceFlowPosture):
         with pytest.raises(ManifestMismatch, match="armature"):

@@ -174,7 +174,7 @@ def test_torques_equal_a_dense_program_over_all_variables(name: str) -> None:
         q, v = displaced(name, amount), 3 * amount * rng(name, k).normal(size=r.nv)
         command = controller.tick(k * DT, q, v)
         assert command.status is Status.SOLVED
-        # The dense formulation omits joint limits, so no joint limit may be active here.
+        # The dense formulation omits joint limits, so no joint limit may be active in the compared ticks.
         assert not [name for name, _ in controller.report().active if name in r.tangent_names[6:]]
         difference = dense_torques(controller, q, v) - command.torque
         assert np.abs(difference).max() <= 1e-6 * np.abs(command.torque).max()

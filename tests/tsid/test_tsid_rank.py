@@ -33,7 +33,7 @@ Vector = np.ndarray[Any, Any]
 
 
 def borinot() -> Robot:
-    """Return borinot with the rotors of another robot, because the data of its rotors are not published."""
+    """Return borinot with the rotors of another robot, because the rotor data of borinot are not published."""
     r, rotors = robot("borinot"), robot("tilthex_arm").spec.propulsion
     assert rotors is not None
     return replace(r, spec=replace(r.spec, propulsion=replace(rotors, frame="borinot__base_link")))
@@ -108,7 +108,7 @@ def rotation(r: Robot) -> Vector:
     return np.array(State(r, [point := Point(TIP)]).update(r.posture(), np.zeros(r.nv)).at(point).rotation)
 
 
-# ---- any stack on any arm ---------------------------------------------------------------------------------------
+# ---- random stacks on random arms -------------------------------------------------------------------------------
 
 
 class Scaled(Task):
@@ -144,7 +144,7 @@ def task_of(kind: str, link: int, name: str) -> Task:
 
 
 def turn_away(task: Task, by: Vector) -> None:
-    """Move the target of a task."""
+    """Move the target of the given task."""
     task = task.inner if isinstance(task, Scaled) else task
     if isinstance(task, FramePosition):
         task.target = task.target + by[:3]
@@ -272,7 +272,7 @@ def test_any_stack_is_answered_within_limits(drawn: tuple[Controller, Vector, Ve
     x, Zs, misses = command.acceleration, np.eye(n), reached(controller, command)
     for k, (J, b) in enumerate(levels_of(controller)):
         A = J @ Zs
-        # No step in the free directions may reduce the residual of this level.
+        # No step in the free directions may reduce the residual of the level.
         step = quadprog.solve_qp(
             A.T @ A + 1e-9 * np.eye(A.shape[1]), A.T @ (b - J @ x), (C @ Zs).T, d - C @ x - 1e-7 * (1 + np.abs(d))
         )[0]

@@ -138,7 +138,7 @@ def test_a_push_at_a_standing_robot_enters_its_dynamics() -> None:
     assert_dynamics(controller, command, force)
 
 
-# ---- the course of an impact -------------------------------------------------------------------------------------
+# ---- phases of an impact -----------------------------------------------------------------------------------------
 
 
 @pytest.mark.parametrize(

@@ -56,7 +56,7 @@ def rows_of(report: VerificationReport, source: str) -> list[VerificationRow]:
 
 
 def assert_all_there(report: VerificationReport) -> None:
-    """Check that every available source computed all its quantities and passed."""
+    """Check that every available source of values computed all its quantities and passed."""
     available = {CASADI: QUANTITIES, DIFFERENCES: ["∇H"]}
     if find_compiler() is not None:
         available[COMPILED] = QUANTITIES
