@@ -71,7 +71,7 @@ def rounding_of_this_run(request: pytest.FixtureRequest) -> Iterator[None]:
         yield
 
 
-# A link that rotates about z.  If the link points along x, its tip cannot move along x.
+# Robot with one link that rotates about z.  If the link points along x, its tip cannot move along x.
 PENDULUM = """<robot name="pendulum">
   <link name="base"/>
   <link name="arm"><inertial><origin xyz="0.5 0 0"/><mass value="2"/>

@@ -115,11 +115,11 @@ def test_another_objective_with_another_constraint(name: str) -> None:
 
 @pytest.fixture
 def setback(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> ModuleType:
-    """The package docs/examples/setback as if installed: a module, and metadata with its entry points."""
+    """Provide the package docs/examples/setback as if it were installed: module, and metadata with entry points."""
     shutil.copy(EXAMPLE / "setback.py", tmp_path)
     project = tomllib.loads((EXAMPLE / "pyproject.toml").read_text(encoding="utf-8"))["project"]
     added = [f"{name} = {value}" for name, value in project["entry-points"][GROUP].items()]
-    # Further entry points of other packages: `gone` cannot be imported, `number` and `odd` do not create drivers.
+    # Add entry points with faults: `gone` cannot be imported, `number` and `odd` do not create a controller driver.
     added += ["gone = setback_gone:make", "number = setback:len", "odd = setback:Vector"]
     metadata = tmp_path / "setback-1.0.dist-info"
     metadata.mkdir()
@@ -161,7 +161,7 @@ def test_another_controller_lives_through_a_scenario(setback: ModuleType) -> Non
 
 
 def test_the_installed_command_runs_a_registered_controller(setback: ModuleType, tmp_path: Path) -> None:
-    """Two faults of the other package and a misspelled name give a one-line error each."""
+    """Each of these gives a one-line error: two faults in the extension package, and a misspelled controller name."""
     needs_mujoco()
     scenario = tmp_path / "aerial.toml"
     scenario.write_text(cut("aerial-vertical", count=1, settle=0.1, dwell=0.2, pause=0.05), encoding="utf-8")

@@ -1,4 +1,4 @@
-"""``import impact_posture as ip``: the main task from Python, with the defaults of the command line."""
+"""Optimize a posture with ``import impact_posture as ip``; the defaults equal the defaults of the command line."""
 
 from __future__ import annotations
 
@@ -117,7 +117,7 @@ def test_evaluation_has_its_numbers() -> None:
 def test_a_result_saves_what_the_command_line_writes(
     result: ip.PostureResult, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
-    # Replace the figures by blank ones, as the test of the command does.
+    # Replace all figures by blank figures to save time.
     for name in ALL_PICTURES:
         monkeypatch.setitem(plot.FIGURES, name, blank)
     written = result.save(tmp_path / "python", codegen=False, report=False, jobs=1)
@@ -132,7 +132,7 @@ def test_a_result_saves_what_the_command_line_writes(
             document["solver"].pop(key)
     assert python == cli
     toml = [(folder / "problem.toml").read_text().splitlines() for folder in (written.out, theirs)]
-    # In Python, the number of starts does not belong to the problem.
+    # The settings in Python do not include the number of starts, unlike the command line.
     assert [a for a, b in zip(*toml, strict=True) if a != b] == ["starts = 16"]
     assert run("optimize", written.out / "problem.toml", "--out", "again", "--starts", 2, "--no-codegen",
                cwd=tmp_path).returncode == 0  # fmt: skip
@@ -219,7 +219,7 @@ def test_an_objective_from_outside_is_optimized_and_cannot_be_saved(tmp_path: Pa
 def test_the_shown_lines_run(page: str, tmp_path: Path) -> None:
     text = (Path(__file__).parents[2] / page).read_text(encoding="utf-8")
     blocks = re.findall(r"^```python\n(.*?)^```", text, re.MULTILINE | re.DOTALL)
-    # Draw only one figure, because other tests cover the others.
+    # Draw only one figure, because other tests cover the remaining figures.
     code = "import impact_posture.output.plot as p; p.drawable = lambda view: ['jump']\n" + "\n".join(blocks)
     done = subprocess.run([sys.executable, "-c", code], cwd=tmp_path, capture_output=True, text=True, check=False)
     assert done.returncode == 0, done.stderr

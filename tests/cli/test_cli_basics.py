@@ -51,14 +51,14 @@ def test_help_comes_at_once_and_names_the_commands() -> None:
         before = resource.getrusage(resource.RUSAGE_CHILDREN)
         done = subprocess.run([str(COMMAND), "--help"], capture_output=True, text=True, timeout=60)
         after = resource.getrusage(resource.RUSAGE_CHILDREN)
-        # Measure processor time, because programs wait on a loaded machine.
+        # Measure processor time instead of elapsed time, because the machine may be busy.
         times.append(after.ru_utime - before.ru_utime + after.ru_stime - before.ru_stime)
         assert done.returncode == 0
         if times[-1] < 1.0:
             break
     for name in ("robots", "inspect", "evaluate", "optimize", "plot"):
         assert f" {name} " in done.stdout
-    # The limit is 0.3 s plus a margin for slow processors.
+    # The help must appear within 0.3 s plus a margin for slow processors.
     assert min(times) < 1.0
 
 
@@ -308,7 +308,7 @@ def test_a_package_folder_is_looked_for_where_the_user_is(tmp_path: Path) -> Non
 
 
 class Raises:
-    """Replacement for a command, which raises an error."""
+    """Command for this test that raises an error."""
 
     def __init__(self, error: BaseException) -> None:
         self.error = error
@@ -355,5 +355,5 @@ def test_a_long_wait_is_estimated_from_the_pace_so_far() -> None:
     from impact_posture_cli.progress_line import _time_left
 
     assert _time_left(30.0, 10, 20) == ", 0:01:00 left"
-    # The time left is unknown without a first duration, and not shown if nothing is left.
+    # No remaining time is shown before the first item is finished, or after the last item.
     assert [_time_left(1.0, 10, 20), _time_left(30.0, 0, 20), _time_left(30.0, 30, 0)] == ["", "", ""]

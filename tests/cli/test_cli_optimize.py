@@ -173,7 +173,7 @@ def test_no_redundancy_is_said(tmp_path: Path) -> None:
 
 
 def test_aerial_robot_that_cannot_hover_is_warned_about(tmp_path: Path) -> None:
-    """Rotors limited to half of their speed cannot carry the weight, and the warning says so despite an optimum."""
+    """Rotors limited to half of their speed cannot carry the weight; the result contains a warning about this."""
     from impact_posture_robots import DATA
 
     spec = (DATA / "tilthex_arm" / "robot.toml").read_text().replace("speed_max = 100.0", "speed_max = 50.0")
@@ -245,7 +245,7 @@ def test_progress_is_shown_on_a_terminal_only(tmp_path: Path) -> None:
     draw = ("plot", "ur5-tool0", "--figure", "jump")
     for other in ("--quiet", "--json"):
         assert on_terminal(*draw, other, cwd=tmp_path) == ""
-    # Repeat the check for the program started from a shell.
+    # Repeat the check with the installed program in a separate process.
     ours, theirs = os.openpty()
     with subprocess.Popen([COMMAND, *draw], cwd=tmp_path, stdout=subprocess.DEVNULL, stderr=theirs) as process:
         os.close(theirs)
@@ -254,7 +254,10 @@ def test_progress_is_shown_on_a_terminal_only(tmp_path: Path) -> None:
 
 
 def test_the_answer_stands_before_pictures_and_c_code(tmp_path: Path) -> None:
-    """The compiler waits for a file.  The result is printed before the compiler ends, its error afterwards."""
+    """The compiler waits for a file.
+
+    The result is printed before the compiler ends, and the compiler's error afterwards.
+    """
     compiler = tmp_path / "cc"
     compiler.write_text(
         '#!/bin/sh\nwhile [ ! -e go ] && [ ! -e "$GO" ]; do sleep 0.05; done\necho "error: no" >&2\nexit 1\n'
@@ -311,7 +314,7 @@ def test_what_holds_the_posture_is_told(tmp_path: Path) -> None:
             assert max(shares) == load["largest_share"] <= 1
             assert all(one["low"] <= one["value"] <= one["high"] for one in load["actuators"].values())
         thrusts = [sum(v["value"] for k, v in one["actuators"].items() if "rotor" in k) for one in (block, pushing)]
-        # The surface supports the force with which the tool pushes, so the thrust is smaller.
+        # The surface pushes back against the tool, so the rotors need less thrust.
         assert thrusts[1] < thrusts[0]
     again = run("optimize", tmp_path / "tilthex_arm-ee" / "problem.toml", "--out", "again", "--json", cwd=tmp_path)
     assert json.loads(again.stdout)["optimal"]["holding"]["other_loads"][0]["load"] == "while it pushes with 3 N"

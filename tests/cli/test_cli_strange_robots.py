@@ -29,7 +29,7 @@ UP = ("--normal", "0", "0", "1")
 
 
 def call(capsys: pytest.CaptureFixture[str], *arguments: str) -> tuple[int, str, str]:
-    """Run the command line in this process; return exit code, standard output and standard error."""
+    """Run the command line without a new process; return exit code, standard output and standard error."""
     code = run(typer.main.get_command(app), put_right(arguments))
     return code, *capsys.readouterr()
 

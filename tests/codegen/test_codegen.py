@@ -154,7 +154,7 @@ def test_codes(built: Built) -> None:
         broken[-1] = bad
         code, H, gradient = library.eval(broken, UNIT)
         assert code == library.objective(broken)[0] == library.value(broken, UNIT)[0] == 1
-        assert np.isnan(H) and np.isnan(gradient).all()  # outputs are still the NaN of the caller
+        assert np.isnan(H) and np.isnan(gradient).all()  # the function has not written its outputs
         assert library.eval(q, np.array([bad, 0, 0]))[0] == library.value(q, np.array([0, bad, 0]))[0] == 1
 
 
@@ -221,7 +221,7 @@ def test_posture_is_a_constant(built: Built) -> None:
     np.testing.assert_array_equal(built.export.manifest["posture"], np.array(array))
 
 
-# Robots whose code contains vectors and comparisons, and a robot without both.
+# Two of the robots have code with SIMD vectors and comparisons; one robot has neither.
 @pytest.mark.parametrize("built", ["solo12-standing", "hextilt"], indirect=True)
 def test_compiles_as_cpp(built: Built, tmp_path: Path) -> None:
     compiler = need("g++")

@@ -37,7 +37,7 @@ JOINTS = [
 
 
 def chain(joints: list[tuple[str, str]] = JOINTS) -> str:
-    """Return a robot with every joint type of a URDF, or with the given ones."""
+    """Return a robot with every joint type of the URDF format, or with the given joint types."""
     inertial = (
         '<inertial><origin xyz="0.05 0.02 -0.03" rpy="0.1 0.2 0.3"/><mass value="{m}"/>'
         '<inertia ixx="0.02" ixy="0.001" ixz="0" iyy="0.03" iyz="-0.002" izz="0.025"/></inertial>'
@@ -59,7 +59,7 @@ def run(command: list[str], folder: Path) -> str:
     return done.stdout + done.stderr
 
 
-# Every objective, metric, joint type, base and number type occurs in some combination.
+# Every objective, metric, joint type, base type and number type occurs in at least one combination.
 GRID = [
     ("euclidean", "impulse", "fixed", DOUBLE, JOINTS),
     ("weighted", "speed", "free-flyer", DOUBLE, JOINTS),
@@ -176,7 +176,7 @@ def deepest_stack(folder: Path, prefix: str, tool: str, flags: str) -> int:
     (usage,) = folder.glob("*.su")
     rows = [line.split("\t") for line in usage.read_text().splitlines()]
     usage.unlink()
-    # "dynamic,bounded" marks an aligned stack frame; "dynamic" alone would mark an alloca.
+    # In the compiler report, "dynamic,bounded" is an aligned stack frame, but "dynamic" alone would be an alloca.
     assert {row[2] for row in rows} <= {"static", "dynamic,bounded"}
     sizes = {row[0].split(":")[-1]: int(row[1]) for row in rows}
     inner = [size for name, size in sizes.items() if "_block" in name or "sincos" in name]
@@ -184,8 +184,8 @@ def deepest_stack(folder: Path, prefix: str, tool: str, flags: str) -> int:
         size for name, size in sizes.items() if "_lanes" in name and "_block" not in name and "sincos" not in name
     ]
     entries = [size for name, size in sizes.items() if "_block" not in name and "_lanes" not in name]
-    # The outer functions are two nested entries, or an entry with the batch.  Blocks and sines follow.  Each nested
-    # call adds a return address to the stack.
+    # The deepest call consists of two nested entry functions (or one and the batch function) and one block or sine
+    # function.  Each nested call adds a return address to the stack.
     outer = max(sum(sorted(entries)[-2:]), max(entries) + max(lanes, default=0))
     return outer + max(inner) + 4 * 8
 
@@ -270,7 +270,7 @@ def test_example_under_sanitizers(plain_export: Path, tmp_path: Path) -> None:
 def test_folder_is_replaced_only_if_it_is_an_export(arm: WorstCaseObjective, tmp_path: Path) -> None:
     out = tmp_path / "project"
     out.mkdir()
-    # A file with the name of a manifest does not make its folder an export.
+    # A folder with a file named like a manifest is not yet an export.
     (out / "arm.json").write_text('{"name": "mine"}')
     for force in (False, True):
         with pytest.raises(OutputError):

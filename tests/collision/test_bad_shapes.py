@@ -218,7 +218,7 @@ def test_a_robot_without_shapes_says_so(tmp_path: Path) -> None:
 
 
 def test_a_hundred_thousand_faces_take_less_than_five_seconds(tmp_path: Path) -> None:
-    """The mesh is the surface of a ball with waves."""
+    """The mesh is a ball with a wavy surface."""
     count = 224
     polar, around = np.meshgrid(np.linspace(0, np.pi, count), np.linspace(0, 2 * np.pi, count), indexing="ij")
     radius = 0.1 * (1 + 0.1 * np.sin(5 * polar) * np.cos(4 * around))
@@ -232,7 +232,7 @@ def test_a_hundred_thousand_faces_take_less_than_five_seconds(tmp_path: Path) ->
     assert time.process_time() - start < 5
     body = next(body for body in shapes.bodies if body.link == "middle")
     assert len(body.vertices) <= 40 and body.radius < 0.02
-    # A second robot with the same content reuses the shapes.
+    # If a second robot has the same files, the cached shapes are reused.
     assert arm(tmp_path, mesh("fine.stl")) is shapes
 
 

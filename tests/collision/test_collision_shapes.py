@@ -90,12 +90,12 @@ def test_pairs_leave_out_neighbors_and_links_that_the_srdf_allows_to_touch(name:
     if robot.spec.model.srdf:
         path = resolve_path(robot.spec.model.srdf, robots_data() / name)
         pin.removeCollisionPairs(robot.model, srdf, str(path), False)
-    # Pinocchio does not remove any further pair.
+    # The SRDF file does not disable any of the remaining pairs.
     assert len(srdf.collisionPairs) == len(shapes.geometry.collisionPairs)
     for i, j in shapes.pairs:
         a, b = shapes.bodies[i].joint, shapes.bodies[j].joint
         assert a != b and parents[a] != b and parents[b] != a
-    # Each pair of shapes that must not touch belongs to a pair of bodies, and there are no other pairs of bodies.
+    # The pairs of bodies correspond exactly to the pairs of shapes that must not touch.
     joints = {(shapes.bodies[i].joint, shapes.bodies[j].joint) for i, j in shapes.pairs}
     named = {body.name: body.joint for body in shapes.bodies}
     nested = (*shapes.hulls_touching, *(planes.bodies for planes in shapes.joint_planes))
@@ -232,7 +232,7 @@ def test_overlaps_by_design_are_reported_by_name() -> None:
     assert shapes.always_touching == (("flying_arm_5__link_2", "flying_arm_5__link_4"),)
     pairs = {(shapes.bodies[i].name, shapes.bodies[j].name) for i, j in shapes.pairs}
     assert not pairs & {*shapes.always_touching, *shapes.hulls_touching}
-    # The shapes of nested bodies are checked as well.
+    # The check of meshes includes the shapes of nested bodies.
     objects = shapes.geometry.geometryObjects
     checked = {(objects[p.first].name, objects[p.second].name) for p in shapes.geometry.collisionPairs}
     nested = {planes.bodies for planes in shapes.joint_planes}

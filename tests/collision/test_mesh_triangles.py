@@ -71,7 +71,7 @@ def test_the_check_sees_every_part_of_a_mesh(tmp_path: Path, monkeypatch: pytest
         plate = obstacle_hull(Obstacle(name="plate", box=(0.02, 0.2, 0.02), position=tuple((middle + part).tolist())))
         seen.append(bool(mesh_collisions(shapes.robot, shapes, q, obstacles=[(plate, pin.SE3.Identity(), ())])))
     assert seen == [True, right, right]
-    # The correct triangles extend to the farthest corners.
+    # With correct triangles, the mesh extends to its farthest corners.
     reach = mesh_points(solid)[mesh_triangles(solid)][..., 0].max()
     assert bool(np.isclose(reach, PARTS[-1][0] + 0.05)) is right
     assert not shapes.warnings

@@ -90,7 +90,7 @@ def test_fit_contains_all_points(seed: int, count: int, form: str) -> None:
 
 
 def test_fit_stops_at_the_tolerance() -> None:
-    """A box with edges rounded by 3 mm needs hardly more vertices than the 8 corners."""
+    """The hull of a box with edges rounded by 3 mm needs hardly more than 8 vertices."""
     random = np.random.default_rng(0)
     box = np.array(np.meshgrid(*[[-0.1, 0.1]] * 3)).reshape(3, -1).T
     edges = random.normal(size=(3000, 3))
@@ -102,7 +102,7 @@ def test_fit_stops_at_the_tolerance() -> None:
 
 @pytest.mark.parametrize("kind", ["Box", "Sphere", "Cylinder", "Capsule"])
 def test_points_contain_a_primitive_shape(kind: str) -> None:
-    """In many directions, the points extend as far as the shape, or up to 3 % farther."""
+    """In random directions, the points extend at least as far as the shape and at most 3 % farther."""
     import coal
 
     sizes = {"Box": (0.2, 0.3, 0.4), "Sphere": (0.2,), "Cylinder": (0.1, 0.6), "Capsule": (0.1, 0.6)}[kind]

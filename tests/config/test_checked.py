@@ -67,8 +67,7 @@ GOOD: list[tuple[Callable[..., Any], dict[str, Any]]] = [
     ],
     (tsid.support_contacts, {"robot": ROBOT}),
 ]
-# Posture tasks create ReferenceFlow objects, and Task is a base class.  The names that are not listed with arguments
-# are result types.
+# Posture tasks create ReferenceFlow objects, and Task is a base class.  The remaining names are result types.
 OTHERS = {
     "Export", "ImpactPostureError", "PostureResult", "Robot", "__version__", "known_robots", "sweep", "tsid",
     "ImpactGradient", "CompiledController",

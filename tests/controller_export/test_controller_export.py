@@ -95,7 +95,7 @@ def test_commands_in_long_saturation_are_optimal() -> None:
 
 
 def test_the_iterations_of_a_tick_are_bounded_and_suffice() -> None:
-    """Far, unrelated states need more iterations than a run, but at most half of the maximum in the header."""
+    """Random far states need more iterations than states of a run, but at most half of the limit in the header."""
     robot, rng = formulation_of("talos")[0], np.random.default_rng(3)
     c = compiled("talos")
     c.reset(robot.posture(), np.zeros(robot.nv))
@@ -153,7 +153,8 @@ def test_the_impact_robust_term_agrees_with_python_in_all_phases(name: str, fram
     c.reset(q, v)
     levels = set()
     phases = (("brace", 3), ("contact", 40), ("release", 75))
-    # In Python, a phase begins at the call.  In C, the phase has a time, and the call may come earlier.
+    # In Python, a phase begins when its method is called.  In C, each phase has a start time, and the call may come
+    # before this time.
     for phase, at in phases[:2]:
         getattr(c, phase)(1e-3 * at)
     for wrong, at in (("brace", 0.08), ("contact", 0.08), ("release", 0.03), ("release", np.nan)):

@@ -38,7 +38,7 @@ IMPACTS = {"tilthex_arm": ("ee", (0.0, 0.0, 1.0)), "panda": ("panda_hand_tcp", (
            "talos": ("gripper_right_base_link", (-1.0, 0.0, 0.0))}  # fmt: skip
 # The arm of panda turns about the line from shoulder to wrist.
 ELBOW = (0.3, -0.7, 0.3, -2.3, 0.1, 1.6, 0.9, 0.035, 0.035)
-# A pitch angle of solo8 and joint angles that differ from leg to leg.
+# Pitch of the base of solo8, and joint angles that differ from leg to leg.
 LEANING = np.array([0, 0, 0, 0, 0.05, 0, 0.3, -0.15, -0.3, 0.1, 0.15, 0.3, -0.06, 0.12])
 DT = 2e-3
 
@@ -87,7 +87,7 @@ def test_the_reference_moves_as_in_python(
     posture.options = replace(posture.options, **options)
     for option, value in options.items():
         c.parameters[f"flow_{option}"][:] = value
-    # In its level default posture, solo8 has no reason to tilt.
+    # In the default posture with a level base, the flow of solo8 does not tilt the base.
     tilt = options.get("tilt", 0.8)
     start = np.array(pin.integrate(r.model, r.posture(), LEANING)) if tilt < 0.5 else r.posture()
     for controller in (python, c):
@@ -98,7 +98,7 @@ def test_the_reference_moves_as_in_python(
         for phase, at in (("brace", 0), ("contact", ticks // 2), ("brace", ticks // 2 + 20), ("release", ticks - 10)):
             if k == at:
                 for target in (posture, c):
-                    # The second `brace` prepares for an impact at a known time.
+                    # The second call of `brace` prepares for an impact whose time is known.
                     getattr(target, phase)(**({"t_impact": posture.settle + 0.1} if phase == "brace" and k else {}))
         for i, controller in enumerate((python, c)):
             q, v = states[i]

@@ -19,7 +19,7 @@ from tests.support.daqp import sources_or_skip
 
 @pytest.fixture
 def cache(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> Path:
-    """Use an empty cache and no network."""
+    """Provide an empty cache and block the network."""
     monkeypatch.setenv("IMPACT_POSTURE_CACHE", str(tmp_path / "cache"))
     monkeypatch.setenv("PIP_NO_INDEX", "1")
     monkeypatch.setenv("PIP_FIND_LINKS", str(tmp_path / "nothing"))
@@ -27,7 +27,7 @@ def cache(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> Path:
 
 
 def archive(path: Path, **members: tarfile.TarInfo | bytes) -> None:
-    """Write a distribution whose listed members contain one byte; in a name, _ stands for the dot."""
+    """Write a source distribution in which each given member contains only one byte; an _ in a name means a dot."""
     with tarfile.open(path, "w:gz") as tar:
         for name, place in FILES.items():
             entry = members.get(name.replace(".", "_"), b"?")

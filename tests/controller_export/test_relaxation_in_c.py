@@ -161,7 +161,7 @@ def test_the_cost_decides_in_the_free_directions(relaxation: Relaxation) -> None
 
 
 def test_without_levels_or_rows(relaxation: Relaxation) -> None:
-    """The minimum of z²/2 subject to z ≥ 1 is 1, whichever level contains the bound."""
+    """The minimizer of z²/2 subject to z ≥ 1 is z = 1 for both possible levels of the bound."""
     for level in (0, 1):
         one = np.ones(1)
         tick = RelaxedTick(np.eye(1), 0 * one, np.zeros((0, 1)), one, np.inf * one, np.array([level]), one, one)

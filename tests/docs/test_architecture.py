@@ -1,7 +1,7 @@
 """Rules for files that linters do not check.
 
-Files are short and have unique names, and folders contain few files.  No line contains a path of one machine.  Errors
-of the library do not mention command line options.
+Files are short and have unique names, and folders contain few files.  No line contains an absolute path that exists
+on one machine only.  Errors of the library do not mention command line options.
 """
 
 from __future__ import annotations
@@ -38,7 +38,7 @@ def test_files_are_short() -> None:
 
 def test_a_name_says_which_file_or_class_is_meant() -> None:
     files = Counter(path.name for path in modules() if path.name != "__init__.py")
-    # Names like ``ip.ImpactObjective`` also have only one definition.
+    # Public names such as ``ip.ImpactObjective`` also have only one definition.
     classes = Counter(
         node.name
         for path in modules()
@@ -83,7 +83,10 @@ def test_the_pattern_of_machine_paths() -> None:
 
 
 def test_errors_of_the_library_name_parameters_and_no_options() -> None:
-    """The command line translates parameter names into options (``as_options``).  Python users have no options."""
+    """The command line translates parameter names into options (``as_options``).
+
+    The Python interface has no command line options.
+    """
     messages = [
         f"{path.name}:{text.lineno}: {text.value}"
         for path in Path(impact_posture.__path__[0]).rglob("*.py")

@@ -31,7 +31,7 @@ EXAMPLES = DOCS / "examples"
 
 
 def shown_output() -> dict[str, list[str]]:
-    """Return the lines of pink's output that the page shows, by contact."""
+    """Return the output lines that the page shows for pink, with the contact as key."""
     page = (DOCS / "bridges.md").read_text(encoding="utf-8")
     lines: dict[str, list[str]] = {}
     for line in re.findall(r"^```text\n(.*?)^```", page, re.MULTILINE | re.DOTALL)[0].splitlines():

@@ -70,7 +70,7 @@ def squeezed(text: str) -> str:
 
 @dataclass(frozen=True)
 class Ran:
-    """A command of a page with its exit code and output."""
+    """A command shown on a page, with its actual exit code and output."""
 
     shown: Shown
     code: int
@@ -107,11 +107,11 @@ def test_shown_commands_run(page: Path, tmp_path: Path) -> None:
         assert all(change[k] > 1.01 for k in rises), f"{page.name}: {result} {change}"
 
 
-# What the tutorials say about results: result folder, quantities that decrease, quantities that increase.
+# Claims of the tutorials: result folder, quantities that decrease, quantities that increase.
 CLAIMS: dict[str, list[tuple[str, str, str]]] = {
     "aerial": [("floor", "HVS", "G"), ("wall", "HV", "S"), ("wall-sticking", "S", "")],
     "arm": [("box", "HGV", "S")],
-    # Rounding decides which optimum of the hand is reached, so V varies too.
+    # For the hand, rounding decides which optimum the search reaches, so V varies.
     "humanoid": [("hand", "H", "S")],
 }
 
@@ -133,7 +133,7 @@ def test_commands_are_shown_at_all() -> None:
 
 
 def test_no_command_escapes_the_convention() -> None:
-    """Commands in other blocks or after other prompts would not be tested."""
+    """Commands outside ``console`` blocks, or after other prompts, would not be tested."""
     fence = re.compile(r"^```(\{?[\w-]*\}?)[^\n]*\n(.*?)^```", re.MULTILINE | re.DOTALL)
     for page in PAGES:
         for kind, body in fence.findall(page.read_text(encoding="utf-8")):

@@ -75,7 +75,7 @@ def shown_default(value: object) -> str:
 def test_every_key_has_its_row(page: str, table: type) -> None:
     expected = keys(table)
     assert {"schema", "name"} <= set(expected) and any(key.count(".") == 2 for key in expected)
-    # Other tables have rows for names of poses.
+    # Rows of other tables contain names of poses instead of keys.
     shown = {key: cells for key, cells in rows(DOCS / "reference" / page).items() if key not in get_args(ContactPose)}
     assert set(shown) == set(expected)
     for key, value in expected.items():

@@ -47,7 +47,7 @@ def point_at(model: pin.Model, frame: int, offset: Vector = OFFSET) -> PointOnLi
 
 @dataclass(frozen=True)
 class Symbolic:
-    """All expressions of a tree as two functions, of (q, v, tau, wrench) and of chart coordinates."""
+    """CasADi functions of all expressions of a tree: one of (q, v, tau, wrench), one of chart coordinates."""
 
     model: pin.Model
     frame: int
@@ -276,7 +276,8 @@ def random_tree(kinds: list[str], climbs: list[int], seed: int, armature: bool) 
     generator = np.random.default_rng(seed)
     model, path = pin.Model(), [0]
     for k, kind in enumerate(kinds):
-        # Choose parents on the path from the root, so that numbers are depth-first, as Pinocchio's CRBA requires.
+        # Choose each parent on the path to the last joint, so that joint numbers are depth-first, as Pinocchio's CRBA
+        # requires.
         del path[max(1, len(path) - climbs[k]) :]
         joint = model.addJoint(path[-1], JOINTS[kind](), pin.SE3.Random(), f"{k} {kind}")
         body = pin.Inertia.Random()

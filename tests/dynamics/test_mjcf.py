@@ -53,7 +53,10 @@ def in_mujoco(name: str) -> InMujoco:
 
 
 def qacc(layout: MjcfLayout, q: Vector, v: Vector, a: Vector) -> Vector:
-    """Return ``qacc = T a + Ṫ v``, shape (nv,).  ``Ṫ`` occurs because linear velocities are in rotating body axes."""
+    """Return the acceleration in MuJoCo's coordinates, ``qacc = T a + Ṫ v``, shape (nv,).
+
+    The term with ``Ṫ`` occurs because Pinocchio's linear velocities are in rotating body axes.
+    """
     turning = np.zeros(layout.nv)
     for slot in layout.slots:
         piece = v[slot.joint.v]
@@ -118,10 +121,11 @@ def test_indices_equal_the_compiled_model(name: str) -> None:
 
 
 def without_base_armature(model: pin.Model) -> pin.Model:
-    """Remove armature that MuJoCo and Pinocchio interpret differently: of base joints, and partly of ball joints.
+    """Remove the armature of base and ball joints that MuJoCo and Pinocchio interpret differently.
 
-    With such armature the mass matrices still agree (below), but the accelerations differ.  In one program its
-    momentum is constant in body axes, in the other in world axes.  MuJoCo accepts one armature value per ball joint.
+    With such armature the mass matrices still agree (below), but the accelerations differ.  In Pinocchio and MuJoCo,
+    the momentum of an armature is fixed in different axes: body axes or world axes.  MuJoCo accepts only one armature
+    value per ball joint.
     """
     armature = np.array(model.armature)
     for joint in list(model.joints)[1:]:

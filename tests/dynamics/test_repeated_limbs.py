@@ -98,7 +98,7 @@ def values_of(graph: Graph, inputs: dict[str, np.ndarray]) -> dict[str, np.ndarr
 
 
 def shares(graph: Graph) -> dict[int, int]:
-    """Return how many operations an output needs, with the vector width as key."""
+    """Return the number of operations that an output needs, for each vector width."""
     needed: set[int] = set()
     waiting = [k for nodes in graph.outputs.values() for k in nodes]
     while waiting:
@@ -267,7 +267,7 @@ def test_angles_near_and_far(tmp_path: Path, flags: tuple[str, ...]) -> None:
             expected = ImpactOracle(ImpactCase(loaded, objective.contact, objective.metric)).quantities(reduced)
             code, H, _ = compiled.eval(q, n)
             assert code == 0
-            # The rounding of a large angle limits the attainable accuracy.
+            # For a large angle, the rounding of the angle itself limits the accuracy.
             assert pytest.approx(expected.H, rel=1e-11) == H, angle
 
 
@@ -283,7 +283,7 @@ def test_a_limb_with_another_axis_is_not_repeated() -> None:
 def test_two_exports_in_one_unit(tmp_path: Path) -> None:
     """In a unity build, both C files form one translation unit.
 
-    Macros of the first file must not affect the second.
+    Macros of the first C file must not affect the second C file.
     """
     compiler = need_compiler()
     for name, frame in (("solo8", "base_link"), ("panda", "panda_hand_tcp")):
@@ -296,7 +296,7 @@ def test_two_exports_in_one_unit(tmp_path: Path) -> None:
 
 
 def test_the_prefix_costs_no_room(tmp_path: Path) -> None:
-    """Names in thousands of operations remain short for any prefix."""
+    """Variable names in the C code remain short for any prefix, even with thousands of operations."""
     objective = WorstCaseObjective(robot("talos"), ImpactContact("gripper_right_base_link", (0.0, 0.6, 0.8)))
     export(objective, tmp_path, check=False)
     (source,) = tmp_path.glob("talos*.c")

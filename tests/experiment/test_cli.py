@@ -80,7 +80,7 @@ def test_simulate_prints_a_summary(push: Path, tmp_path: Path) -> None:
 
 @pytest.fixture(scope="session")
 def falls(push: Path, tmp_path_factory: pytest.TempPathFactory) -> Path:
-    """A push that makes every controller's robot fall."""
+    """Scenario with a push so strong that the robot falls with every controller."""
     path = tmp_path_factory.mktemp("scenarios") / "falls.toml"
     text, count = re.subn(r"(?m)^force = \[6.5, 0, 0\]", "force = [60, 0, 0]", push.read_text(encoding="utf-8"))
     assert count == 1
@@ -114,7 +114,7 @@ def test_compare_robots_that_fall(falls: Path, tmp_path: Path) -> None:
     for row in json.loads((tmp_path / "both" / "comparison.json").read_text())["rows"]:
         assert (row["status"], row["runs"], row["completed"]) == ("fell", 1, 0)
         assert row["metrics"] == {} and row["reduction"] is None and len(row["failed"]) == 1
-    # The report can be written afterwards.
+    # The command `report` can write the report later.
     assert not (tmp_path / "both" / "report.html").exists()
     done = start("report", "both", "--quiet", cwd=tmp_path)
     assert (done.returncode, done.stderr) == (0, "") and "(fell)" in (tmp_path / "both" / "report.html").read_text()

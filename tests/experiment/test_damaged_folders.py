@@ -119,8 +119,8 @@ def picture(width: int, height: int) -> bytes:
     return b"\x89PNG\r\n\x1a\n" + part(b"IHDR", head) + part(b"IDAT", zlib.compress(bytes(99))) + part(b"IEND", b"")
 
 
-# A bitmap instead of a PNG.  Other formats must be rejected, because Pillow starts external programs for some of
-# them.
+# Bitmap file with the name of a PNG file.  Formats other than PNG must be rejected, because Pillow starts external
+# programs for some formats.
 BITMAP = b"BM" + struct.pack("<IIIIiiHHIIIIII", 58, 0, 54, 40, 1, 1, 1, 24, 0, 4, 0, 0, 0, 0) + bytes(4)
 
 

@@ -105,7 +105,7 @@ def test_the_gravest_event_of_two_pushes_is_reported() -> None:
     [
         ({}, ()),
         ({"q": 1.1}, ("reduction",)),
-        # Motion that a controller delays during the window reappears in the recovery.
+        # If a controller delays motion during the impact window, the motion follows in the recovery.
         ({"q_total_recovery": 4.7}, ("recovery",)),
         ({"q_total_recovery": 4.2}, ()),
         ({"peak_recovery": 3.1}, ("peak_recovery",)),
@@ -132,7 +132,8 @@ def rows() -> list[Any]:
 def test_the_best_row_meets_the_targets_or_else_moves_least() -> None:
     best = best_of(rows())
     assert best is not None and best.controller == "posture"
-    # Without `posture`, no row meets all targets.  `walker` moves least, but did not come to rest.
+    # Without the controller `posture`, no controller meets all targets.  The controller `walker` moves least, but did
+    # not come to rest.
     best = best_of([row for row in rows() if row.controller != "posture"])
     assert best is not None and best.controller == "robust"
     assert best_of(rows()[:1]) is None

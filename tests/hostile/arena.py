@@ -20,9 +20,9 @@ from impact_posture_cli.error_boundary import run
 from tests.support.command import PARSER
 
 CODES = {0, 1, 2, 3, 4, 130, 143}
-# First words of the lines of a usage error.
+# Lines of a usage error begin with these words.
 USAGE = ("Usage: ", "Try ", "Error: ")
-# Texts that only libraries and interpreters print.
+# Texts that appear only in the output of libraries and interpreters.
 NOISE = ("Traceback", "internal error", "Warning:", "Exception ignored", "terminate called", "Segmentation", "DEBUG")
 # Permitted processor time of an attack (s), and the duration after which an attack is treated as hanging (s).
 BUSY, PATIENCE = 60, 120

@@ -1,4 +1,4 @@
-"""Folder for attacks, with a small robot and a file that no command may change."""
+"""Return a folder for attacks, with a small robot and a file that no command may change."""
 
 from __future__ import annotations
 

@@ -64,7 +64,7 @@ def times(count: int) -> list[tuple[str, int, signal.Signals]]:
 
 def send(name: str, k: int, number: signal.Signals, folder: Path) -> None:
     arguments, whole = COMMANDS[name]
-    # The time of the signal is processor time, because the speed of machines differs.
+    # The signal is sent after a given processor time, because elapsed times differ between machines.
     moment = random.Random(f"{name} {k}").uniform(0.0, whole)
     work, temporary = folder / "work", folder / "temporary"
     for place in (work, temporary):
@@ -73,7 +73,7 @@ def send(name: str, k: int, number: signal.Signals, folder: Path) -> None:
     process = subprocess.Popen(
         [str(COMMAND), *arguments], cwd=work, stdout=subprocess.PIPE, stderr=subprocess.PIPE, text=True,
         start_new_session=True, env=os.environ | cache | {"TMPDIR": str(temporary)},
-        # If a shell runs the tests in the background, the child would ignore SIGINT.
+        # Restore the SIGINT handler, because background processes of a shell ignore SIGINT.
         preexec_fn=lambda: signal.signal(signal.SIGINT, signal.default_int_handler),
     )  # fmt: skip
     try:
@@ -123,7 +123,7 @@ def test_many_signals(tmp_path: Path, hostile_full: bool) -> None:
 
 
 def test_a_signal_during_an_import_ends_the_process() -> None:
-    """During its own import, the module that cleans up exists without its functions."""
+    """While the cleanup module is imported, the module exists but its functions are still missing."""
     code = (
         "import os, signal, sys, types\n"
         "from impact_posture_cli.process import prepare\n"

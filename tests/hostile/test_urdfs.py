@@ -54,7 +54,7 @@ def with_attributes(root: ET.Element, rng: random.Random) -> ET.Element:
 
 
 def printable(texts: tuple[str, ...]) -> list[str]:
-    """Return short texts that XML can represent."""
+    """Return short random texts that can be part of an XML file."""
     return [
         text for text in texts if len(text) < 1000 and all(c >= " " and not "\ud800" <= c <= "\udfff" for c in text)
     ]
@@ -123,7 +123,7 @@ def test_spoiled_urdfs(argv: tuple[str, ...], arena: Path, hostile_full: bool) -
     assert outcomes[0].code == 0
     refused = [outcome for outcome in outcomes if outcome.code]
     assert len(refused) > COUNT / 4
-    # Other error lines name a missing frame or joint.
+    # The remaining error lines name a missing frame or joint.
     assert sum("bad.urdf" in outcome.err for outcome in refused) > len(refused) / 2
 
 

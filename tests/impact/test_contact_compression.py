@@ -43,7 +43,7 @@ masses, speeds = st.floats(0.05, 500.0), st.floats(0.01, 20.0)
 
 def touch(power: float, stiffness: float, mass: float, speed: float) -> tuple[float, float]:
     """Integrate ``m δ̈ = −k δ^p`` from touch to rest; return the compression time T and the force at T."""
-    # Depth is in units of the greatest compression, time in units of this compression divided by the speed.
+    # Scale depth by the greatest compression, and time by the greatest compression divided by the speed.
     depth = ((power + 1) * mass * speed**2 / (2 * stiffness)) ** (1 / (power + 1))
     ratio = stiffness * depth**power * depth / (mass * speed**2)
 
@@ -125,7 +125,7 @@ def test_x_of_a_standing_robot_equals_the_elastic_response() -> None:
         squeezed = compression(objective, q, 1.0, ContactStiffness(linear=1e9))
         response = ElasticImpact(objective.case).response(q, 1e9)
         assert squeezed is not None and squeezed.x is not None and G > 0
-        # The contact is so stiff that T depends only on the links.
+        # The contact is so stiff that the compression time T depends only on the links, not on the rotors.
         assert squeezed.x == pytest.approx(response.compliance_ratio, rel=0.02)
 
 
@@ -293,7 +293,10 @@ def test_bounds_that_cannot_be_met_name_their_rows_and_units() -> None:
 
 
 def test_edges_of_speed_and_of_locked_joints(tmp_path: Path) -> None:
-    """At zero speed a material contact has no T.  If all joints are locked, no joint jump can be bounded."""
+    """At zero speed, a contact given by its material has no compression time T.
+
+    If all joints are locked, no joint jump can be bounded.
+    """
     still = ("evaluate", "panda", "--normal", 0, 0, 1, "--speed", 0, "--contact-stiffness", "steel", "--json")
     done = json.loads(run(*still).stdout)["evaluation"]["compression"]
     assert done["compression_time"] is None and done["peak_force"] == 0 and done["x"] is None

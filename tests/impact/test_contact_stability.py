@@ -41,7 +41,7 @@ def oracle_of(name: str, normal: tuple[float, float, float], frame: str = "base_
 
 @pytest.mark.parametrize("name", ["solo8", "solo12"])
 def test_an_impact_from_above_presses_all_feet(name: str) -> None:
-    """Every foot pushes up, but the total is less than the impact, because knees without motor stiffness yield."""
+    """Every foot impulse points up, but their sum is less than the impact: knees without stiff motors yield."""
     loaded, supports = standing(name)
     q = loaded.posture()
     result = contact_stability(oracle_of(name, (0.0, 0.0, -1.0)), supports, q)
@@ -91,7 +91,7 @@ def test_impulses_equal_impulse_dynamics(name: str, normal: tuple[float, float, 
 def test_the_set_matters_where_the_rank_drops() -> None:
     """The planar legs of solo8 can press against each other.
 
-    The impulses with the smallest pull at the ground include such internal forces.
+    The computed impulses with the smallest pull at the ground include internal forces between legs.
     """
     loaded, supports = standing("solo8")
     q = loaded.posture()

@@ -95,7 +95,7 @@ def feet_of(friction: float) -> tuple[WorstCaseObjective, Vector]:
 
 @pytest.mark.parametrize("friction", (0.0, 0.15, 0.4, 2.0))
 def test_four_feet_land_in_mujoco(friction: float) -> None:
-    """In MuJoCo a sliding foot also lifts, because its friction model is convex.
+    """In MuJoCo a sliding foot also lifts, because the friction model of MuJoCo is convex.
 
     Therefore, only sticking feet are compared with a tight tolerance.
     """

@@ -88,7 +88,7 @@ CASES = ("panda", "arm", "mixed arm", "talos", "tilthex_arm", "solo12")
 
 
 class Stepped(NamedTuple):
-    """Results of time stepping at the end of the compression, and the largest values until then."""
+    """State of the time stepping at the end of the compression, and the largest values until this time."""
 
     duration: float
     x: Vector
@@ -180,7 +180,7 @@ def test_time_stepping_finds_the_same(name: str) -> None:
     assert (response.peak_torque >= np.abs(response.torque) * (1 - 1e-12)).all()
     assert response.peak_jump_norm >= response.jump_norm * (1 - 1e-12)
     assert response.value == pytest.approx((response.jump_norm / speed) ** 2, rel=1e-12)
-    # Free flight would continue at the approach speed, so the contact power is the force times the approach speed.
+    # The supplied energy is the impulse times the approach speed, because free flight would continue at this speed.
     assert response.impulse * response.speed == pytest.approx(other.energy + other.loss, rel=1e-8)
     assert (other.loss > 0) == (name in ("mixed arm", "talos", "solo12"))
 
@@ -197,7 +197,10 @@ def test_gradient_equals_differences(name: str) -> None:
 
 @pytest.mark.parametrize("name", ["panda", "arm", "tilthex_arm"])
 def test_limits_are_the_joint_models(name: str) -> None:
-    """A stiff contact feels only the links.  A soft contact with stiff springs feels links and rotors."""
+    """A stiff contact ends before the joint springs move the rotors.
+
+    During a soft contact, stiff joint springs couple the links with the rotors.
+    """
     case, q, _ = case_of(name)
     case = replace(case, metric=Metric(), robot=on_springs(case.robot, springs(5e3 if name == "panda" else 150.0)))
     elastic, stiff = ElasticImpact(case), {}
@@ -223,7 +226,10 @@ def test_dampers_hold_rotors_to_links() -> None:
 
 
 def test_first_greatest_compression_of_many() -> None:
-    """With soft wrists, the compression rises, stops and rises again.  The impact phase ends at the first stop."""
+    """With soft wrists, the compression of the contact rises, stops and rises again.
+
+    The impact phase ends when the compression stops rising for the first time.
+    """
     generator, close = rng("first root"), 0
     case, _, _ = case_of("arm")
     case = replace(case, metric=Metric())

@@ -93,7 +93,7 @@ def test_numbers_against_dense_algebra(name: str, frame: str, metric: str) -> No
     evaluation = evaluate(impact.objective, impact.q, 0.7, 0.3)
     W = mass_matrix(loaded.model, impact.q) if metric == "kinetic" else None
     expected = dense(loaded, frame, impact.q, n, W, impact.supports)
-    # The sum of 1/ε and the link masses in the inverse reduces the accuracy.
+    # Adding 1/ε to the link masses before inversion reduces the accuracy.
     tolerance = 1e-6 if impact.supports else 1e-10
     for key in ("H", "G", "V", "S", "E"):
         assert_close(evaluation.to_dict()[key], expected[key], tolerance, key)  # type: ignore[arg-type]
@@ -126,7 +126,7 @@ def test_free_values_stand_beside_the_supported_ones() -> None:
     assert evaluation.to_dict()["free"] == evaluation.without_supports.to_dict()
     assert evaluation.contact_stability is not None
     assert evaluation.to_dict()["footing"] == evaluation.contact_stability.to_dict()
-    # Two flat feet have full rank, so their compliance has little effect.
+    # The Jacobian of two flat feet has full rank, so their compliance has little effect.
     assert evaluation.compliance_effect is not None and 0 < evaluation.compliance_effect < 1e-2
     without = resolve(ImpactSettings(robot="talos", frame="torso_2_link", normal=(-1.0, 0.0, 0.0), support=()))
     alone = evaluate(without.objective, without.q)

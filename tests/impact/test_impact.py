@@ -39,7 +39,7 @@ from tests.support.helpers import (
 KINDS: tuple[ObjectiveKind, ...] = ("impulse", "speed", "sticking", "energy")
 OFFSET = (0.01, -0.02, 0.03)
 VALUE, GRADIENT = 1e-9, 1e-6
-# Best finite-difference step for a value that is accurate to 1e-11 (stiff feet): relative error 1e-9.
+# Best finite-difference step for values accurate to 1e-11 (stiff feet); the derivative's relative error is 1e-9.
 STEP = 2e-4
 
 
@@ -59,8 +59,8 @@ def supports_of(loaded: Robot) -> tuple[Support, ...]:
     return (Support(str(frame.name), "point", (0.02, 0.03, -0.01)),)
 
 
-# Robots that run all combinations, and robots that run three.  The robots cover continuous and prismatic joints,
-# branches and feet.  test_dynamics.py tests the dynamics of every known robot.
+# Robots tested with all combinations, and robots tested with three combinations.  The robots cover continuous and
+# prismatic joints, branches and feet.  test_dynamics.py tests the dynamics of every known robot.
 WHOLE = ("solo8", "panda", "tilthex_arm")
 SOME = (*WHOLE, "kinova", "tiago", "talos", "anymal_kinova", "borinot", "bolt", "ur5")
 
@@ -141,7 +141,7 @@ def test_oracle_by_its_definition(name: str) -> None:
         s = np.linalg.solve(mobility, n)
         G = n @ mobility @ n
         o = ImpactOracle(ImpactCase(loaded, contact, metric, supports, epsilon)).quantities(q)
-        # The sum M + JᵀJ/ε loses digits that the KKT system of the oracle preserves.
+        # Computing M + JᵀJ/ε loses digits that the KKT system of the oracle preserves.
         tolerance = 1e-8 if supports else 1e-10
         assert o.S is not None
         for what, value, expected in (
@@ -156,7 +156,7 @@ def test_oracle_by_its_definition(name: str) -> None:
 def test_lifted_form(name: str) -> None:
     """The guess satisfies the equations and has the oracle's value; the equations determine the unknowns."""
     for k, (loaded, contact, metric, supports) in enumerate(combinations(name)):
-        # Robots in WHOLE run every combination with every kind, other robots with three kinds.
+        # Robots in WHOLE are tested with every combination and objective kind, other robots with fewer kinds.
         for kind in KINDS if name in WHOLE else [KINDS[(NAMES.index(name) + k) % len(KINDS)]]:
             objective = WorstCaseObjective(loaded, contact, metric, kind, supports)
             q, n = ca.SX.sym("q", loaded.nq), ca.SX.sym("n", 3)
@@ -178,8 +178,8 @@ def test_lifted_form(name: str) -> None:
 @pytest.mark.parametrize("name", WHOLE)
 def test_objective_functions_agree_with_its_own_numbers(name: str, kind: ObjectiveKind) -> None:
     all_of_them = list(combinations(name))
-    # Four combinations cover all metrics, both frames, and cases with and without supports.  The remaining
-    # combinations are left out, because CasADi's search for common subexpressions is slow.
+    # Four of the twelve combinations cover all metrics, both frames, and cases with and without supports.  The
+    # remaining combinations are left out, because CasADi's search for common subexpressions is slow.
     for result, contact, metric, supports in (all_of_them[k] for k in (0, 5, 7, 10)):
         objective = WorstCaseObjective(result, contact, metric, kind, supports)
         where = describe(contact, metric, supports)

@@ -259,7 +259,7 @@ def test_solo8_on_its_feet_is_not_solo8_in_the_air(normal: tuple[float, float, f
     contact, q = ImpactContact("base_link", normal), loaded.posture()
     free, standing = WorstCaseObjective(loaded, contact), WorstCaseObjective(loaded, contact, supports=feet(loaded))
     assert relative(standing.value(q), free.value(q)) > 0.1
-    # Motion that the feet allow and that lowers the base without any other base motion.
+    # The motion ``crouch`` lowers the base without any other base motion, and the feet do not move.
     _, _, J_s = jacobians(loaded, q, feet(loaded))
     allowed = np.linalg.svd(J_s)[2][np.linalg.matrix_rank(J_s, tol=1e-9) :].T
     crouch = allowed @ np.linalg.lstsq(allowed[:6], np.array([0, 0, -1.0, 0, 0, 0]), rcond=None)[0]
@@ -325,7 +325,7 @@ def test_s_in_the_plane_by_the_pseudo_inverse() -> None:
         n /= np.linalg.norm(n)
         o = quantities(loaded, q, n, frame="link2")
         M = mass_matrix(loaded.model, q)
-        # Two joints move the tip in two directions, so J alone determines the jump.
+        # Two joints move the tip in two directions, so the Jacobian J alone determines the sticking jump.
         jump = np.linalg.pinv(J) @ n
         assert o.S is not None
         assert o.S == pytest.approx(float(jump @ jump), rel=1e-8)

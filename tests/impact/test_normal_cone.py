@@ -64,7 +64,7 @@ def cone_samples(axis: np.ndarray, degrees: float, count: int = 100_000) -> np.n
     turn = np.concatenate([2 * np.pi * np.arange(edge) / edge, np.pi * (3 - np.sqrt(5)) * k])
     radius = np.sqrt(1 - height**2)
     local = np.stack([height, radius * np.cos(turn), radius * np.sin(turn)])
-    # Compute the axes independently of the code under test.
+    # Compute the axes of the cone independently of the code under test.
     side = np.cross(axis, np.eye(3)[np.abs(axis).argmin()])
     side /= np.linalg.norm(side)
     return np.asarray((np.stack([axis, side, np.cross(axis, side)], axis=1) @ local).T)
@@ -120,7 +120,7 @@ def test_no_cone_is_the_plain_problem() -> None:
         and "cone" not in evaluation.to_dict()
         and np.array_equal(evaluation.worst_normal, evaluation.normal)
     )
-    # The value converges to the single-normal value as the cone angle vanishes.
+    # As the cone angle vanishes, the value converges to the value for a single normal.
     narrow = WorstCaseObjective(robot("tilthex_arm"), contact, normal_cone_deg=1e-3)
     assert 1 < narrow.value(q) / none.value(q) < 1 + 1e-3
 
@@ -215,7 +215,7 @@ def test_gradient_where_the_worst_normal_is_unique(name: str, kind: ObjectiveKin
 
 
 def test_subgradients_at_a_mirror_symmetric_posture() -> None:
-    """In every direction, the slope of the objective is its largest gradient component: no gradient is missing."""
+    """In every direction, the slope of the objective is the largest slope of the subgradients: none is missing."""
     loaded = robot("solo8")
     objective = WorstCaseObjective(loaded, ImpactContact("base_link", (1.0, 0.0, 0.0)), normal_cone_deg=20.0)
     q = loaded.posture()
@@ -298,7 +298,7 @@ def test_starts_certify(name: str, kind: ObjectiveKind) -> None:
 
 
 def test_solved_from_and_at_mirror_symmetric_postures() -> None:
-    """solo8 starts and ends at a tie of two normals.
+    """For solo8, two normals are equally bad at the start and at the optimum.
 
     Neither normal has a zero gradient, but a convex combination of both gradients is zero.
     """

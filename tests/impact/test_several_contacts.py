@@ -136,7 +136,7 @@ def test_every_box(floating: bool, count: int, feet: int, metric: str, axes: str
     assert_close(worst.impulses @ jumps.T @ W @ jumps @ worst.impulses, value, 1e-9, "attained there")
     assert_close(worst.jump, jumps @ worst.impulses, 1e-8, "its jump")
 
-    # With bilateral impulses every corner ties with its opposite corner, so compare with the third largest value.
+    # With bilateral impulses, opposite corners have equal values, so compare with the third largest value.
     best = np.sort(values)[::-1]
     if best[2 if bilateral else 1] < value * (1 - 1e-3):
         gradient = objective.gradient(q)
@@ -151,7 +151,7 @@ def test_every_box(floating: bool, count: int, feet: int, metric: str, axes: str
 @pytest.mark.parametrize(("name", "frames"), [("solo12", ("FL_SHOULDER", "FR_SHOULDER")),
                                               ("solo8", ("FL_UPPER_LEG", "FR_UPPER_LEG"))])  # fmt: skip
 def test_subgradients_at_a_mirror_symmetric_posture(name: str, frames: tuple[str, str]) -> None:
-    """Equal impacts from both sides tie, so the objective rises like the larger of both values."""
+    """Impacts from both sides are equally bad, so the objective increases like the larger of both values."""
     loaded = robot(name)
     one, other = (ImpactContact(f, (0.0, side, 0.0)) for f, side in zip(frames, (1.0, -1.0), strict=True))
     objective = WorstCaseObjective(loaded, one, others=(other,))
@@ -269,7 +269,7 @@ def test_optima_far_below_their_start_certify() -> None:
 
 
 class _Frozen:
-    """Objective that reports only its first subgradient."""
+    """Objective for a test that reports only its first subgradient."""
 
     def __init__(self, objective: WorstCaseObjective) -> None:
         self._objective = objective
@@ -288,7 +288,7 @@ def test_pulling_is_never_milder() -> None:
 
 
 def test_two_frames_of_one_link_are_held_once() -> None:
-    """The constraints of the two poses repeat each other, both in the search for starts and in the program."""
+    """The two contact poses have dependent constraint rows, both in the search for starts and in the program."""
     problem = problem_of({"robot": "ur5", "contact": ("tool0:1,0,0", "wrist_3_link-tool0_fixed_joint:0,1,0")})
     assert problem.rows, "rows that repeat others are left out"
     assert sum(feasible_start(problem, k, seed=0) is not None for k in range(12)) == 12

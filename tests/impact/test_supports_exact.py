@@ -33,7 +33,7 @@ from tests.support.helpers import Vector, central_gradient, random_configuration
 from tests.support.rigid import Rigid
 from tests.support.rounding import other_rounding
 
-# Compliance times the robot's mass: the default, and values for stiffer feet.
+# Values of compliance times robot mass: the default, and values for stiffer feet.
 STIFFNESS = (1e-4, 1e-6, 1e-9)
 ENDS = STIFFNESS[::2]
 # Postures in which the four feet of solo8 (at their centers) have different ranks: straight legs, equal knees,
@@ -127,7 +127,7 @@ def test_the_oracle_solves_what_it_is_given(
     lost_V = float(x.V) * (x.H_by_elimination / float(x.H) + 2 * x.G_by_elimination / float(x.G))
     within(result.V, x.V, 1.01 * lost_V, "V")
     within(gradient, x.grad_H, x.gradient_by_elimination, "∇H")
-    # The error of the jump depends on the condition of the motion, not on 1/ε; between ranks, at most on its root.
+    # The accuracy of the jump depends on the condition number of the motion, not on 1/ε.
     assert size(distance(result.jump, x.jump)) <= 1e-9 * size(x.jump)
 
 
@@ -146,7 +146,7 @@ def test_the_oracles_sticking_impact(name: str, label: str, seed: int | None) ->
 
 
 def heavy_feet(x: Bounded, H: object, gradient: object, jump: object, G: object) -> None:
-    """Check the bounds of a factorization with heavy feet; at the default compliance, nine digits are correct."""
+    """Check the error bounds of a factorization with 1/ε at the feet; by default, nine digits are correct."""
     within(jump, x.jump, x.jump_by_heavy_feet, "jump")
     within(H, x.H, x.H_by_heavy_feet, "H")
     within(G, x.G, x.G_by_heavy_feet, "G")
@@ -195,7 +195,7 @@ def _compiled(library: Exported, x: Bounded) -> None:
     ("name", "label"), [("solo8", "straight"), ("solo8", "equal knees"), ("solo12", "random"), ("talos", "random")]
 )
 def test_the_effect_of_compliance_is_bounded(name: str, label: str, relative_compliance: float) -> None:
-    """The effect of ε is at most ``ε/(σ+ε)`` of the effect of the feet; σ is the least nonzero eigenvalue."""
+    """The compliance ε changes the effect of the feet by at most ``ε/(σ+ε)``; σ is the least nonzero eigenvalue."""
     x = bounded(name, label, relative_compliance)
     # The reference compliance is so small that its bias is below double precision, but larger than rounding of J_s.
     rigid = ExactImpact(x.oracle, 1e-14 / x.oracle.robot.mass)
@@ -209,7 +209,7 @@ def test_the_effect_of_compliance_is_bounded(name: str, label: str, relative_com
     assert 0 <= float(x.G - rigid.G) <= share * (G_free - float(rigid.G)) * (1 + 1e-6)
     least = np.sqrt(np.linalg.eigvalsh(M)[0])
     assert abs(np.sqrt(float(x.H)) - np.sqrt(float(rigid.H))) <= kinetic / least * (1 + 1e-6)
-    # Along motions that the feet allow, the momentum equals the impulse for any compliance.
+    # Along motions that the feet allow, the momentum change equals the impulse for any compliance.
     allowed = np.linalg.svd(Js)[2][np.linalg.matrix_rank(Js, tol=1e-9) :]
     assert np.abs(allowed @ M @ off).max() <= 1e-9 * np.abs(M @ off).max()
 
@@ -251,8 +251,8 @@ def test_full_rank_feet_tend_to_impulse_dynamics(name: str, count: int) -> None:
     share = base.compliance / (held + base.compliance)
     assert share < 0.02
     assert 0 < np.sqrt(off @ M @ off) <= share * np.sqrt(done @ M @ done) * (1 + 1e-9)
-    # The extrapolation removes the first two powers of ε/σ.  The third power remains and is amplified by each
-    # inverse.
+    # The extrapolation removes the errors of first and second order in ε/σ.  The error of third order remains, and
+    # each matrix inverse increases the error.
     tolerance = 20 * share**3 + 1e-10
     expected = rigid.quantities(q)
     for what in ("H", "G", "V", "S", "jump", "support_impulse", "ellipsoid"):

@@ -55,7 +55,7 @@ def defects(figure: Figure) -> list[str]:
     """List defects: texts that overlap texts or lines or leave the page, axes without units, several legends."""
     figure.set_dpi(100)
     canvas = FigureCanvasAgg(figure)
-    # The layout also draws the figure, which determines the positions of its texts.
+    # Computing the layout also draws the figure, which determines the positions of all texts.
     lay_out(figure)
     texts = [t for t in figure.findobj(Text) if t.get_visible() and t.get_text().strip() and _shown(t, figure)]
     words = [Words.of(text) for text in texts]
@@ -66,7 +66,7 @@ def defects(figure: Figure) -> list[str]:
         and other.holds(one.points).any()
     ]
     for text in texts:
-        # Hide the texts together with their background, which would hide lines below them.
+        # Hide the texts and their background boxes, because a background box would hide lines below a text.
         text.set_visible(False)
     canvas.draw()
     image = np.asarray(canvas.buffer_rgba())[::-1, :, :3].min(axis=2) / 255
@@ -106,7 +106,7 @@ def check_page(figure: Figure) -> None:
 
 
 def _shown(text: Text, figure: Figure) -> bool:
-    """Whether a text is visible; ticks beyond the end of an axis are not."""
+    """Whether a text is visible; labels of ticks beyond the end of an axis are invisible."""
     for axes in figure.axes:
         for axis in _axes(axes):
             every = [t.label1 for t in axis.majorTicks + axis.minorTicks] + [t.label2 for t in axis.majorTicks]

@@ -108,7 +108,7 @@ def test_oblique_normal_gets_its_own_plane() -> None:
 def test_free_ellipsoid_stands_beside_the_consistent_one(solo8: ResultView, tilthex: ResultView) -> None:
     assert tilthex.free == () and "free" not in text_of(ellipsoid_figure(tilthex))
     assert len(solo8.free) == 2
-    # Expected ellipsoid without feet, from M alone.
+    # The expected ellipsoid without feet follows from M and J alone.
     J, M = solo8.jacobian(solo8.q_optimal), solo8.objective.oracle.at(solo8.q_optimal).M
     expected = np.linalg.solve(M, J.T).T @ np.linalg.solve(M, J.T)
     np.testing.assert_allclose(solo8.free[1].ellipsoid, expected, rtol=1e-9, atol=1e-12 * expected.max())
@@ -283,7 +283,7 @@ def test_a_surface_is_drawn_at_its_depth(tilthex: ResultView, solo8: ResultView)
 def test_each_contact_has_its_planes(
     tilthex: ResultView, turned: ResultView, two_hands: ResultView, solo8: ResultView
 ) -> None:
-    # If the contact moves along n, or n turns, the figure shows two surfaces per contact.
+    # If the contact point moves along n, or if n rotates, the figure shows two surfaces per contact.
     assert [s.name for s in surfaces(tilthex)] == ["n₀", "n₁"] == [s.name for s in surfaces(turned)]
     assert [s.name for s in surfaces(two_hands)] == ["n₀ A", "n₁ A", "n₀ B", "n₁ B"]
     for view in (tilthex, turned, two_hands):
@@ -324,9 +324,10 @@ def test_a_base_with_legs_is_a_body(name: str) -> None:
     np.testing.assert_allclose(corners.min(axis=0)[:2], hips.min(axis=0)[:2], atol=1e-12)
     np.testing.assert_allclose(corners.max(axis=0)[:2], hips.max(axis=0)[:2], atol=1e-12)
     assert np.ptp(corners[:, 2]) > 0.3 * np.ptp(hips, axis=0)[:2].min()
-    # The box replaces the sticks from the base to the hips.
+    # The box of the body replaces the lines from the base to the hips.
     assert not any(np.allclose(end, base.translation) for bone in seen.bones for end in bone)
-    # Collision shapes replace the box of the body.  A robot without shapes keeps the box.
+    # If a robot has collision shapes, the figure shows these instead of the box of the body.  For a robot without
+    # shapes, the figure shows the box of the body.
     assert "body" not in text_of(postures_figure(view)).split(" | ")
     assert "body" in text_of(postures_figure(without_shapes(view))).split(" | ")
 

@@ -174,7 +174,7 @@ def test_every_contact_is_shown(tmp_path: Path, monkeypatch: pytest.MonkeyPatch)
     problem = ip.PostureProblem(objective, contact_pose="position", collision=False)
     result = ip.optimize(problem, starts=1, jobs=1, compile="never")
     result.save(tmp_path / "out", codegen=False, report=False, jobs=1)
-    # The jump of the impact takes 15 ms.
+    # In the recorded run, the velocity jump of the impact takes 15 ms.
     monkeypatch.setattr(
         "impact_posture.output.report.result_report._frames", lambda view: (np.arange(2.0), "", view.path.q[:2])
     )
@@ -251,7 +251,7 @@ def test_the_viewer_gets_the_robot_where_it_is(folder: Path) -> None:
             assert np.allclose(placed[j].homogeneous, data.oMi[j].homogeneous, atol=2e-4)
             tip = data.oMi[j].act(model.inertias[j].lever) + packed["scale"]["jump"] * jumps[k, j]
             assert np.linalg.norm(tip - packed["center"]) < packed["radius"] + 1e-3
-    # The arrow of a link shows the velocity of its center of mass, from differences along the predicted jump.
+    # The arrow of a link is the velocity of its center of mass, computed by a finite difference along the jump.
     jump, centers = coulomb_jump(view.objective, view.q_optimal, 1.0), []
     assert jump is not None
     for sign in (-1, 1):
@@ -276,7 +276,7 @@ def test_a_run_is_thinned_where_nothing_happens() -> None:
     inside = (thinned.t >= 1.0) & (thinned.t <= 1.3)
     assert np.allclose(np.diff(thinned.t[inside]), 0.001) and inside.sum() >= 300
     assert np.diff(thinned.t).max() <= 0.0251 and len(thinned.t) < 450 and thinned.t[-1] == columns["t"][3499]
-    # The thinned frames still contain the largest peak.
+    # After thinning, the frames still contain the largest force peak.
     assert thinned.peak.max() == columns["peak"][:3500].max()
     sizes = np.linalg.norm(columns["force"][:3500], axis=1)
     assert np.linalg.norm(thinned.force, axis=1).max() == sizes.max()
@@ -294,7 +294,7 @@ def test_known_robots_come_with_meshes_and_their_license(name: str, largest: flo
     drawn = draw_robot(robot)
     assert [one.license for one in drawn.licenses] == [license] and drawn.licenses[0].upstream.startswith("https://")
     size = sum(4 / 3 * (solid.corners.nbytes + 2 * solid.faces.size) for solid in drawn.solids)
-    # Estimate the size after compression, which reduces every mesh by at least half.
+    # The page contains compressed meshes, and compression reduces every mesh by at least half.
     assert 0.5 * size < largest and sum(len(solid.faces) for solid in drawn.solids) <= 150_000
     assert robot.settings is not None
     links = parse_urdf(locate(name, robot.settings).urdf).findall("link")
@@ -330,7 +330,7 @@ def test_own_meshes_go_in_only_if_asked(tmp_path: Path) -> None:
     hulls, meshes = draw_robot(robot), draw_robot(robot, True)
     assert [len(one.solids[0].corners) for one in (hulls, meshes)] == [4, 5] and hulls.licenses == ()
     assert "hulls" in hulls.notes[0] and not meshes.notes
-    # Equal files with different scales are two meshes.
+    # A mesh file that is used with two scales gives two meshes.
     extents = [np.ptp(solid.points, axis=0) for solid in meshes.solids]
     assert np.allclose(extents, [[0.1, 0.2, 0.3], [0.2, 0.4, 0.6]], atol=1e-5)
     assert meshes.parts[0][3] == (0.5, 0.6, 0.7, 1.0)
@@ -386,7 +386,7 @@ def test_a_browser_draws_it_offline(folder: Path, scene: ReportScene, tmp_path: 
     with browser(tmp_path / "profile") as tab:
         tab.open(folder / "report.html")
         before = tab.picture("#view")
-        # The picture shows surface and robot, because hiding them changes the picture.
+        # If the surface or the robot is hidden, the picture changes, so both are visible.
         hide(tab, "surface")
         without_surface = tab.picture("#view")
         assert different(before, without_surface) > 0.05

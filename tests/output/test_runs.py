@@ -113,7 +113,7 @@ def shaded(axes: Axes, kind: str) -> np.ndarray:
 
 
 def limits(axes: Axes) -> list[float]:
-    """Return the heights of the dashed lines."""
+    """Return the y values of the dashed lines."""
     lines = [
         line for line in axes.lines if line.get_linestyle() == "--" and line.get_linewidth() == LIMIT["linewidth"]
     ]
@@ -355,7 +355,7 @@ def test_files_in_all_formats_and_the_same_each_time(flying: RunView, fixed: Run
 
 
 def test_long_curves_are_simplified_and_keep_their_peaks(tmp_path: Path) -> None:
-    """When drawing, Matplotlib removes invisible points, also in files."""
+    """When a figure is drawn or saved, Matplotlib removes invisible points of a curve."""
     t = np.arange(30_000) * 1e-3
     values = np.sin(t)
     values[12_345], values[23_456] = 7.0, -9.0

@@ -41,7 +41,7 @@ def sphere(count: int) -> np.ndarray:
 
 
 def sampled(matrix: np.ndarray, count: int = 200_000) -> np.ndarray:
-    """Return points on the ellipsoid by a matrix root that is not symmetric, shape (3, count)."""
+    """Return points on the ellipsoid, shape (3, count), computed with a non-symmetric matrix root."""
     values, vectors = np.linalg.eigh(matrix)
     return (vectors * np.sqrt(np.maximum(values, 0))) @ sphere(count)
 

@@ -67,7 +67,7 @@ def make_view(
 
 
 def map_of(objective: WorstCaseObjective, postures: list[np.ndarray]) -> SelfMotionMap:
-    """Return a map with two components, the path forward and backward; the end of the second is infeasible."""
+    """Return a map with two components: the path, and the reversed path, whose end is infeasible."""
     path = sample_path(objective, postures)
     count = len(postures)
     return SelfMotionMap(

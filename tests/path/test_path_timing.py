@@ -97,7 +97,7 @@ def test_limits_hold_at_ten_times_the_resolution(dense: tuple[Robot, PosturePath
 
 
 def forces(loaded: Robot, q: Array) -> tuple[Array, Array, Array]:
-    """Return the generalized forces of rotors, or of friction cone rays at the feet, and their bounds."""
+    """Return generalized forces of unit thrusts or friction cone rays as columns, and bounds of their magnitudes."""
     if loaded.spec.propulsion is not None:
         matrix = np.vstack([allocation_matrix(loaded.model, loaded.spec.propulsion), np.zeros((loaded.nv - 6, 6))])
         low, high = thrust_limits(loaded.spec.propulsion)
@@ -183,7 +183,7 @@ def test_without_a_torque_limit_only_velocities_count() -> None:
 
 
 def test_the_known_torque_limits_count_beside_an_unknown_limit() -> None:
-    """Only the first of two vertical hinges has a known torque limit; the duration equals its bang-bang control."""
+    """Only the first of two vertical hinges has a torque limit, so its bang-bang control determines the duration."""
     loaded = arm([Z, Z], [0.0, 0.0], floating=False, rods=[(0.5, 0, 0)] * 2, effort=0.5)
     loaded.model.effortLimit = np.array([0.5, 0.0])
     objective = WorstCaseObjective(loaded, ImpactContact(TIP, (0, 1, 0)))

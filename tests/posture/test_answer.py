@@ -208,7 +208,7 @@ def test_starts_that_share_a_run_end_where_their_own_runs_would(
 def test_a_start_that_is_left_would_not_have_been_the_best(
     robot: str, normal: tuple[float, float, float], starts: int, monkeypatch: pytest.MonkeyPatch
 ) -> None:
-    # Set the thresholds as if a program of a few starts were a large program.
+    # Lower the size thresholds, so that a small program is treated like a large program.
     monkeypatch.setattr(search_module, "_SMALL", 0)
     monkeypatch.setattr(search_module, "_BATCH", 500)
     problem = prepare(ProblemSettings(robot=robot, normal=normal)).problem

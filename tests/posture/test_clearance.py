@@ -98,7 +98,7 @@ def test_guess_satisfies_the_rows_where_bodies_are_apart(name: str) -> None:
         value = np.array(rows(chart.to_x(q), guess)).ravel()
         lower, upper = (np.append(np.zeros(EQUATIONS), side) for side in separator.bounds(corners))
         outside = np.maximum(lower - value, value - upper)
-        # The initial guess shortens the normal by 2 %, so a gap of a few millimeters may be reported as none.
+        # The guessed normal is 2 % too short, so the rows may report a violation for gaps of a few millimeters.
         if abs(distance) > 0.03:
             assert (outside.max() < 1e-9) == (distance > 0)
             apart, touching = apart + (distance > 0), touching + (distance < 0)
@@ -133,7 +133,7 @@ def test_distances_and_their_gradient(name: str) -> None:
         q = _random(robot, rng)
         jacobian = constraint.evaluate(numeric.at(q))[1]
         slopes = central_gradient(lambda p: constraint.evaluate(numeric.at(p))[0], robot.model, q, 1e-6)
-        # Distances are differentiable at most postures, for example between two edges that are not parallel.
+        # At most postures distances are differentiable, for example the distance of two edges that are not parallel.
         for row in np.flatnonzero(np.abs(jacobian).max(axis=1) > 0):
             smooth += bool(np.allclose(slopes[row], jacobian[row], atol=1e-5))
     assert smooth > 10
@@ -161,7 +161,7 @@ def test_a_pair_that_stays_violated_has_rows_for_all_corners_in_the_end() -> Non
 def test_a_pair_that_slack_lets_off_gets_no_more_corners() -> None:
     """With slack, more rows cannot separate bodies that the objective pushes together.
 
-    Without slack, rows are missing.
+    Without slack, the program still lacks rows.
     """
     robot, rng = load_robot("tilthex_arm"), np.random.default_rng(5)
     constraint = Clearance("c", [_separator(robot, kind) for kind in KINDS], "words")
@@ -170,7 +170,8 @@ def test_a_pair_that_slack_lets_off_gets_no_more_corners() -> None:
         q = _random(robot, rng)
         first = constraint.grown(numeric.at(q))
         numeric.at(pin.integrate(robot.model, q, 0.3 * rng.normal(size=robot.nv)))
-        # The guess sets the slack of each pair to its violation, as a run does if penetration improves the objective.
+        # Each slack in the guess equals the violation of its pair, as after a run in which penetration improves the
+        # objective.
         let_off = first.guess(numeric).values
         strict = let_off.copy()
         strict[[int(own[-1]) for own in first._unknowns(np.arange(strict.size)).values()]] = 0.0
@@ -272,7 +273,10 @@ def test_an_obstacle_at_the_contact_is_named() -> None:
     ("pose", "position"), [("full", None), ("full", (3.0, 0.0, 0.0)), ("position", (3.0, 0.0, 0.0))]
 )
 def test_a_turn_that_solves_a_conflict_is_the_hint(pose: str, position: tuple[float, ...] | None) -> None:
-    """The wrist of z1 is inside the floor that the hand faces.  For a target out of reach, no turn helps."""
+    """The wrist of z1 is inside the floor that the hand faces.
+
+    If the target is out of reach, the hint does not suggest to free the orientation.
+    """
     settings = {"robot": "z1", "normal": (0.0, 0.0, 1.0), "contact_pose": pose, "target_position": position}
     problem = prepare(validate(ProblemSettings, settings, "options")).problem
     with pytest.raises(Infeasible) as caught:
@@ -356,7 +360,7 @@ def test_derivatives_of_a_grown_program_agree_with_casadi(name: str) -> None:
 
 
 def test_starts_lie_near_a_posture_that_is_clear() -> None:
-    # The given posture reaches far through the wall, and most starts near it end with bodies on both sides.
+    # In the given posture, the robot reaches far through the wall; most starts near this posture end in collisions.
     posed = prepare(ProblemSettings(robot="xarm7", normal=(-1, 0, 0), holdable=False)).problem
     found = solve(posed, starts=16, jobs=1, compile="never", finish_all=True)
     assert found.certified_starts == 16
@@ -364,7 +368,7 @@ def test_starts_lie_near_a_posture_that_is_clear() -> None:
 
 @pytest.mark.parametrize("seed", [1, 9, 33])
 def test_the_way_past_a_wall_is_found_from_every_seed(seed: int) -> None:
-    # Few random postures lead to the part that is free of collisions.
+    # From few random postures, a run reaches the collision-free part.
     posed = prepare(ProblemSettings(robot="xarm7", normal=(-1, 0, 0))).problem
     assert not find_conflicts(posed, seed).conflicts
 

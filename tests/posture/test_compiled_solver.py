@@ -1,4 +1,4 @@
-"""Compiled programs: the same answers as the interpreter, the cache, and one thread for linear algebra."""
+"""Compiled programs: the same results as interpreted programs, the cache, and one thread for linear algebra."""
 
 from __future__ import annotations
 
@@ -63,7 +63,7 @@ def test_the_same_answer_from_machine_code(
 def test_the_same_answer_from_machine_code_of_a_program_that_grows(
     tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
-    """The default problem of the command line avoids collisions, and its derivatives are assembled from parts."""
+    """Solve the default problem of the command line: it avoids collisions and assembles derivatives from parts."""
     need_compiler()
     monkeypatch.setenv("IMPACT_POSTURE_CACHE", str(tmp_path))
     problem = prepare(ProblemSettings(robot="tilthex_arm", normal=(-1.0, 0.0, 0.0))).problem
@@ -195,7 +195,10 @@ def test_one_thread_within_and_as_before_after() -> None:
 
 
 def test_compilers_run_beside_each_other_and_none_stays(tmp_path: Path) -> None:
-    """The first failure is reported.  Compilers that still run are killed, together with their child processes."""
+    """The error of the first compiler that fails is reported.
+
+    Compilers that still run are killed, together with their child processes.
+    """
     marks = [tmp_path / name for name in ("child", "never")]
     slow = ["sh", "-c", f"(sleep 3; touch {marks[0]}) & sleep 3; touch {marks[1]}", "-o", "slow.o"]
     began = time.perf_counter()

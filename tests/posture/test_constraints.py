@@ -110,7 +110,7 @@ def test_level_base_leaves_yaw_free_and_nothing_else() -> None:
 def test_a_base_tilts_from_its_default_posture() -> None:
     robot = load_robot("solo8")
     q = robot.posture()
-    # Use a base link whose z axis is horizontal.
+    # Rotate the base link so that its z axis is horizontal.
     q[3:7] = pin.Quaternion(pin.exp3(np.array([np.pi / 2, 0.0, 0.3]))).coeffs()
     lying = replace(robot, postures={**robot.postures, robot.default_posture: q})
     objective = WorstCaseObjective(lying, ImpactContact("base_link", (1.0, 0.0, 0.0)))

@@ -34,7 +34,8 @@ def test_a_map_finds_the_component_that_few_starts_miss() -> None:
     document = result.document["global"]
     assert document["method"] == "self-motion"
     assert search.redundancy == 1 and len(document["components"]) == 8
-    # The two starts end far above the optimum.  The map reaches the result of many starts or a better one.
+    # The two starts end at objectives far above the optimum.  The self-motion map reaches the objective of many
+    # starts or a better objective.
     many = solve(result.problem.problem, starts=24, jobs=1, compile="never")
     assert many.problem.objective.value(result.q) <= many.optima[0].objective * (1 + 1e-6)
     assert search.missed_rate == 1 and search.improvement > 0.1

@@ -173,7 +173,7 @@ def least_share(posed: ConstrainedProblem, q: Vector) -> float:
 @given(seed=SIZE)
 @settings(max_examples=4)
 def test_least_largest_share_agrees_with_another_program(name: str, seed: int) -> None:
-    """Both programs report lost balance at random postures of legged robots; lateral rotor forces are excluded."""
+    """Both programs detect loss of balance at random postures of legged robots; lateral rotor forces are excluded."""
     posed, (case,) = problem(name), cases(name)
     q = posture(posed, seed) if name != "borinot" else posed.given
     distribution = case.equilibrium.distribute(q)
@@ -267,7 +267,7 @@ def test_a_program_without_the_rows_is_certified_by_the_best_forces() -> None:
     constraint, numeric = Holdable("at rest", case.equilibrium, ""), Numeric(problem("solo12").robot.model)
     assert constraint.grown(numeric.at(q)) is constraint
     assert not constraint.linearize(numeric.at(q), np.zeros(0)).names
-    # Lean the robot until all feet are behind its center of mass.
+    # Pitch the base so far that the center of mass is outside the polygon of the feet.
     leaning = pin.integrate(posed.robot.model, q, np.eye(posed.robot.nv)[4] * 0.9)
     found = constraint.linearize(numeric.at(leaning), np.zeros(0))
     outside = np.maximum(found.lower - found.value, found.value - found.upper)

@@ -162,7 +162,7 @@ def few(objective: WorstCaseObjective) -> ModelSet:
     return objective.worst_case
 
 
-# All variants on the smallest robot; on the other robots only variants that depend on feet or a fixed base.
+# The smallest robot is tested with all kinds of variants, other robots only with the kinds that feet or bases affect.
 EACH = [("tilthex_arm", False, kind) for kind in MORE]
 EACH += [(name, name == "bolt", kind) for name in ("panda", "bolt") for kind in ("plain", "pulling")]
 EACH += [("bolt", True, "cone")]
@@ -220,8 +220,7 @@ def test_subgradients_where_two_payloads_are_as_bad() -> None:
         there = np.array(pin.integrate(found.model, q, step * direction))
         rise = (tied.value(there) - tied.value(q)) / step
         slopes = points.gradients @ direction
-        # The slope lies within the hull of the gradients and equals its far end, as for a maximum of smooth
-        # functions.
+        # The slope equals the largest slope of the gradients, as for a maximum of smooth functions.
         assert rise == pytest.approx(slopes.max(), rel=1e-3, abs=1e-4 * tied.value(q))
         assert rise > slopes.min() - 1e-3 * tied.value(q)
 

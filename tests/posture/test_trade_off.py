@@ -261,7 +261,7 @@ def test_points_that_do_not_certify_are_kept_and_named(monkeypatch: pytest.Monke
 
 
 def test_a_better_posture_than_the_optimum_is_said() -> None:
-    """Replace the optimum by a farther and worse posture, as if the starts had ended at the latter."""
+    """Replace the optimum by a farther and worse posture, as if all starts had ended at this posture."""
     solution, curve = solved("floating")
     beyond = next(
         q for q in walk(solution.problem, solution.q, 0.02, 40) + walk(solution.problem, solution.q, -0.02, 40)

@@ -164,7 +164,7 @@ def test_another_objective_is_advised_only_if_it_minimizes_the_jump(
 ) -> None:
     prepared = prepare(make_settings({"robot": "panda", **NORMAL, "objective": kind, **more}))
     evaluation = prepared.impact.evaluate()
-    # The given posture cannot be better than itself.
+    # For the given posture itself, the verdict is not an improvement.
     told = verdict(prepared.impact, evaluation, evaluation)
     assert told.outcome == "no better"
     advised = [line for line in told.advice if "minimizes this jump" in line]

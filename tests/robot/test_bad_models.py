@@ -205,7 +205,7 @@ def test_a_joint_that_moves_no_mass(load: Load) -> None:
     with pytest.raises(InertiaError) as caught:
         load(*elements)
     one_line(caught.value, "joint 'b_c' moves no mass", "`lock_massless`")
-    # An armature gives the joint an inertia; locking removes the joint.
+    # The error disappears if the joint has an armature or is locked.
     load(*elements, armature={"b_c": 0.01})
     load(*elements, lock=("b_c",))
 

@@ -61,7 +61,7 @@ def test_feet_and_tips_by_names_and_geometry(path: str, expected: tuple[str, ...
     assert feet(loaded) == expected
     ordered = tips(loaded, feet(loaded))
     assert ordered[0] == tip
-    # The order includes every moving frame.
+    # The returned order includes every moving frame.
     assert set(ordered) == {str(f.name) for f in loaded.model.frames if f.parentJoint > 0} - {"root_joint"}
 
 
@@ -82,7 +82,7 @@ def test_a_sole_is_read_from_balls_and_boxes(path: str, foot: str, kind: str, si
     assert spec.size == pytest.approx(size, abs=1e-3)
     assert any(spec.offset) == ("go2" not in path)
     if kind == "point" and any(spec.offset):
-        # The lowest point of a ball is one radius below its center.
+        # The lowest point of a ball-shaped foot is one radius below its center.
         data = loaded.model.createData()
         pin.framesForwardKinematics(loaded.model, data, loaded.posture())
         down = data.oMf[loaded.frame_id(foot)].rotation @ np.array(spec.offset)

@@ -29,7 +29,7 @@ def test_a_joint_moves_with_its_subtree(name: str, joint: str) -> None:
     index = plain.model.getJointId(joint)
     data = plain.model.createData()
     pin.forwardKinematics(plain.model, data, q)
-    # The vector is in the axes of the preceding joint.
+    # The mounting vector is in the axes of the preceding joint.
     shift = data.oMi[plain.model.parents[index]].rotation @ np.array(MOVED)
     behind = set(plain.model.subtrees[index])
     assert len(behind) > 1

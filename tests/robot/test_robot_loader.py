@@ -321,7 +321,7 @@ def test_locked_joints_stay_where_the_default_posture_has_them(arm: Path) -> Non
 
 
 def test_armature_order(arm: Path) -> None:
-    """The option has priority over robot.toml, then follow the rotors of the SRDF, then zero with a warning."""
+    """Sources of the armature by priority: the option, robot.toml, rotors in the SRDF, and zero with a warning."""
     (arm.parent / "two.srdf").write_text(SRDF, encoding="utf-8")
 
     def load(text: str, option: dict[str, float] | str | None = None) -> tuple[list[float], str, bool]:

@@ -66,7 +66,7 @@ def test_stiff_has_the_spring_of_robust_at_rest(name: str) -> None:
     assert posture.damping is not None
     spring = spring_of_term(setup.robot, factory.gradient(), reached, control.robust.gain / robust.posture.scale)
     np.testing.assert_allclose(posture.stiffness, np.diag(posture.kp) + spring, rtol=1e-9, atol=1e-9)
-    # The damping is critical in every direction: (s + K^½)² = s² + D s + K.
+    # Each direction is critically damped: (s + K^½)² = s² + D s + K.
     np.testing.assert_allclose(posture.damping @ posture.damping / 4, posture.stiffness, rtol=1e-9, atol=1e-9)
 
 
@@ -172,7 +172,7 @@ def test_the_flow_is_free_of_other_tasks_and_lowers_the_metric(name: str) -> Non
     if rank == state.nv:
         # If the weighted tasks leave no free motion, only contacts and strict levels constrain the flow.
         rows = np.vstack([assembly.contacts.J, assembly.strict.J])
-    # The tolerance allows for a projector that is updated only every fifth tick.
+    # The tolerance is loose, because the projector is updated only every fifth tick.
     assert np.linalg.norm(rows @ flow) < 0.02 * np.linalg.norm(rows, 2) * np.linalg.norm(flow)
     objective = factory.objective()
     assert objective.gradient(state.q) @ flow < 0

@@ -69,7 +69,7 @@ def test_a_lasting_touch_is_reported_once() -> None:
         world.add(1e-3 * (k + 1), began=began, touching=touching)
         recorder.take(command(), 0.0, 0.0)
         if k == 4:
-            # The border between two recorded blocks of ticks does not change the time of the first touch.
+            # The time of the first touch does not depend on how ticks are divided into recorded blocks.
             assert recorder.first_touch(0.0, 1.0) == 0.0025
     assert recorder.first_touch(0.0, 1.0) == 0.0025
     # A touch that began before the interval is ignored.

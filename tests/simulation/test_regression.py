@@ -33,7 +33,7 @@ def test_robust_against_nominal(
     name: str, settle: float, changes: dict[str, Any], nominal: Band, reduction: Band, lowered: Band
 ) -> None:
     metrics, before = [], []
-    # The settling time in which the robust controller reaches its posture (q and H as after 6 s, within 8 %).
+    # After the time `settle`, q and H of the robust controller equal the values after 6 s within 8 %.
     for controller, seconds in (("nominal", 0.5), ("robust", settle)):
         factory = controller_factory(shortened(name, settle=seconds, **changes))
         record = driven(factory, controller)

@@ -163,7 +163,7 @@ def test_the_window_of_a_push_begins_after_rest(name: str) -> None:
 
 def test_the_window_of_a_missed_contact_begins_at_the_expected_time(monkeypatch: pytest.MonkeyPatch) -> None:
     factory = controller_factory(shortened("aerial-vertical", beyond=0.0, window=0.1))
-    # The reference motion ends before the surface.
+    # The reference motion ends in front of the surface.
     for key in factory.setup.world.built.gaps:
         monkeypatch.setitem(factory.setup.world.built.gaps, key, 0.14)  # type: ignore[arg-type]
     record = driven(factory, "nominal")

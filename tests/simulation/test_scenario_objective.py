@@ -88,7 +88,7 @@ def test_a_gradient_outlives_its_objective() -> None:
     points = [near(objective, "kept", k) for k in range(8)]
     expected = [objective.gradient(q) for q in points]
     del objective
-    # The new arrays overwrite freed memory.
+    # Allocate new arrays, which overwrite freed memory.
     for _ in range(3):
         gc.collect()
         rubbish = [np.full(n, 7.7) for n in (1, 3, 9, 12) for _ in range(500)]
@@ -222,7 +222,7 @@ def test_a_gradient_that_cannot_be_compiled_is_interpreted(
         write: Callable[..., Any] = module.write_export
 
         def elsewhere(objectives: Any, folder: Path, **options: Any) -> Any:
-            """Build like another machine: the library is complete, but this machine cannot load it."""
+            """Make builds return a library of another machine: the library is complete, but cannot be loaded."""
             written = write(objectives, folder, **options)
             written.library.unlink()
             written.library.write_text("of another machine")

@@ -260,7 +260,8 @@ def test_statistics_by_hand() -> None:
 
 def test_correlations_and_splits_by_hand() -> None:
     records = five()
-    # The motion decreases as H decreases more.  A constant has no rank correlation.
+    # In the records, the motion decreases as the decrease of H grows.  The rank correlation with a constant is
+    # undefined.
     assert rank(records, "robust", lambda r: -(r.documents["robust"]["prediction"]["H"])) == pytest.approx(1)
     assert rank(records, "robust", lambda r: float(r.draw.number)) == pytest.approx(-1)
     assert math.isnan(rank(records, "robust", lambda r: 1.0))
@@ -268,8 +269,8 @@ def test_correlations_and_splits_by_hand() -> None:
     chosen, others = statistics.split(records, "robust", lambda r: r.draw.number < first + 2)
     assert (chosen.count, chosen.helps, chosen.median) == (2, 2, pytest.approx(-0.4))
     assert (others.count, others.helps, others.median) == (3, 0, pytest.approx(0.5))
-    # H decreased in the first three records and increased in the fourth.  In one record, the motion disagrees with H;
-    # in another record, the jump disagrees.
+    # H decreased in the first three records and increased in the fourth.  The signs of the changes of motion and H
+    # differ in one record, and so do the signs of jump and H.
     for metric in ("q_total_impact", "peak_jump"):
         assert statistics.agreement(records, ["robust"], "H", metric) == (3, 4)
     # S correlates perfectly with the jump of `robust`.
@@ -278,7 +279,7 @@ def test_correlations_and_splits_by_hand() -> None:
         {"n": 4, "H": 0.2, "V": math.nan, "S": 1.0}, nan_ok=True
     )
     assert statistics.worst(records, "robust") is records[3]
-    # H decreased in three records.  In one of the three, the jump increased.
+    # In three records, H decreased.  In one of three records with lower H, the jump increased.
     assert statistics.misled(records, "robust") is records[0]
     text = "\n".join(page({AERIAL: records}, 0))
     assert f"`robust` moves the robot most, compared with nominal, in `{AERIAL}` number {first + 3}" in text
@@ -347,7 +348,7 @@ def test_the_page_has_every_range_and_controller_and_the_prose_no_numbers() -> N
             assert f"| `{scenario}` | `{controller}` |" in written
     targets = page_of("envelope").read_text(encoding="utf-8")
     assert targets.startswith(STUDIES["envelope"].head)
-    # The study may have been stopped before the last variations.
+    # Only the first variations are required, because the study may have been stopped early.
     for scenario, variations in VARIATIONS.items():
         rows = targets.partition(f"`{scenario}`:\n")[2].partition("\n\n`")[0]
         for name in list(variations)[:3]:

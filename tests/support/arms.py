@@ -61,7 +61,7 @@ def arm(
 
 
 def yaw_and_pitches() -> Robot:
-    """Build yaw, pitch, pitch, pitch below a hexarotor, so that only the base can roll the tip."""
+    """Build a hexarotor with an arm (yaw, pitch, pitch, pitch), so that only the base can roll the tip."""
     return arm([Z, Y, Y, Y], [0.3, -0.8, 1.2, -0.5], floating=True)
 
 

@@ -20,7 +20,7 @@ def check_expression(
 ) -> None:
     """Check value and Jacobian of ``c(q)``.
 
-    All rows in ``turns`` may change sign together, because quaternions may.
+    The rows in ``turns`` may all change sign together, because q and −q are the same orientation.
     """
     chart, numeric = Chart(model), Numeric(model)
     x, p = ca.SX.sym("x", chart.nx), ca.SX.sym("p", constraint.parameters.size)

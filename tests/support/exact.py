@@ -215,12 +215,12 @@ class ExactImpact:
 
     @cached_property
     def jump_rates(self) -> Exact:
-        """Derivative ``∂_k a`` in column k."""
+        """Derivatives of the jump ``a``; column k is ``∂_k a``."""
         return self._moved(self.jump, self.impulse, np.tensordot(self.n, exact(self.dJ), (0, 0)))
 
     @cached_property
     def second_rates(self) -> Exact:
-        """Derivative ``∂_k b`` in column k."""
+        """Derivatives of ``b``; column k is ``∂_k b``."""
         return self._moved(*self.second, self.jump_rates)
 
 

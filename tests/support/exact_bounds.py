@@ -40,7 +40,7 @@ def eliminated(matrix: Exact) -> Vector:
 
 
 class RoundedOnce(ExactImpact):
-    """Exact impact after a random change by one rounding of ``|L||U|`` in the system with the fixed contact."""
+    """Exact impact of a system matrix with random errors of one rounding of ``|L||U|`` (fixed contact point)."""
 
     def __init__(self, oracle: ImpactOracle, compliance: float, seed: int) -> None:
         super().__init__(oracle, compliance)
@@ -68,7 +68,10 @@ class Bounded(ExactImpact):
 
     @cached_property
     def lost_by_elimination(self) -> Vector:
-        """Largest error of each entry of ``a`` and ``f``.  The three columns of ``Jᵀ`` are solved and combined."""
+        """Largest error of each entry of ``a`` and ``f``.
+
+        The system is solved for the three columns of ``Jᵀ``, and the solutions are combined along n.
+        """
         x = np.abs(rounded(self.inverse[:, : self.nv] @ self.J.T))
         return (np.abs(rounded(self.inverse)) @ self._backward @ x + gamma(3) * x) @ np.abs(self.oracle.n)
 
@@ -142,7 +145,10 @@ class Bounded(ExactImpact):
 
     @cached_property
     def gradient_by_heavy_feet(self) -> Vector:
-        """Largest error of ∇H, ``2 ∂_k(bᵀΔM̃ a)``, shape (nv,).  A unit rotation changes ``ΔM̃`` by its own size."""
+        """Largest error of ∇H, ``2 ∂_k(bᵀΔM̃ a)``, shape (nv,).
+
+        A rotation by 1 rad changes ``ΔM̃`` by as much as ``ΔM̃`` itself.
+        """
         a, b = self._size(self.jump), self._size(self.second[0])
         rates = self._size(self.jump_rates) * b + a * self._size(self.second_rates)
         return np.asarray(2 * gamma(3 * self.nv + 1) * (rates + a * b))

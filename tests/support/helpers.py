@@ -51,7 +51,7 @@ def unit(generator: np.random.Generator, size: int = 3) -> Vector:
 def relative(actual: ArrayLike, expected: ArrayLike, scale: float = 0.0) -> float:
     """Return the largest deviation, divided by the largest expected entry or by ``scale``, whichever is larger.
 
-    Use a scale for values that may vanish: for a gradient, use the function value.
+    For values that may be zero, pass a scale; for a gradient, the scale is the function value.
     """
     x, y = np.array(actual, dtype=float), np.array(expected, dtype=float)
     assert x.size == y.size, (x.shape, y.shape)

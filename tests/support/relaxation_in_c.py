@@ -73,7 +73,7 @@ class Relaxation:
         self._work = dict[tuple[int, ...], np.ndarray]()
 
     def forget(self) -> None:
-        """Make the next problem start without active rows."""
+        """Delete the stored active rows, so that the next problem starts without active rows."""
         self._work.clear()
 
     def solve(self, tick: RelaxedTick, budget: int = 2000, repeats: int = 1) -> Answer:
@@ -103,7 +103,7 @@ COUNTS = 1e-7
 
 
 def violations(tick: RelaxedTick, z: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
-    """Return the signed violation of each entry of ``[z; A z]``, and its smallest significant value."""
+    """Return the signed violation of each entry of ``[z; A z]``, and the smallest violation that is significant."""
     values = np.concatenate([z, tick.A @ z])
     rows = np.vstack([np.diag(tick.unit), tick.A * tick.unit])
     size, lengths = max(1.0, float(np.max(np.abs(z) / tick.unit))), np.linalg.norm(rows, axis=1)

@@ -7,10 +7,10 @@ from impact_posture.config.table_validation import validate
 
 
 def make_settings(values: dict[str, object]) -> ProblemSettings:
-    """Validate values like options.  Collisions and motor loads are ignored unless the values request them.
+    """Return checked settings, without collisions and motor loads unless the values request them.
 
-    Such tests examine the impact and the optimization program.  With shapes and motors, some normals would be
-    infeasible, for example because of a wall through the robot.  ``test_clearance.py``, ``test_holdable.py`` and the
-    tests of the commands cover shapes and motors.
+    Tests with these settings only examine the impact and the optimization program.  With shapes and motors, some
+    normals would be infeasible, for example because of a wall through the robot.  ``test_clearance.py``,
+    ``test_holdable.py`` and the tests of the commands cover shapes and motors.
     """
     return validate(ProblemSettings, {"collision": False, "holdable": False, **values}, "options")

@@ -284,7 +284,7 @@ def test_an_interrupted_sweep_continues_in_either_pass(tmp_path: Path, whole: di
 
 
 def test_neighboring_shards_share_their_optima(tmp_path: Path) -> None:
-    """In the first pass, each point ends in its own optimum."""
+    """In the first pass, the points of the sweep end in different optima."""
     sweep = read_sweep(write(SWITCHING.format(starts=2, shard=1), tmp_path))
     run_sweep(sweep, tmp_path / "out")
     rows = ip.sweep.open(tmp_path / "out").to_table().sort_by("point").to_pylist()

@@ -138,7 +138,7 @@ def test_a_damaged_library_is_refused(built: Path, tmp_path: Path, with_hash: bo
     contents = [data[:size] for size in (0, 1, 16, 63, 64, 500, 4096, len(data) // 2, len(data) - 1)]
     contents += [b"text", data[:4] + b"\xff\xff" + data[6:], Path(sys.executable).read_bytes()]
     if with_hash:
-        # Only the hash reveals the changed byte.
+        # The size of the file is unchanged, so only the hash reveals the changed byte.
         contents += [data[:place] + bytes([data[place] ^ 1]) + data[place + 1 :] for place in (100, 9000, 12_000)]
     for k, content in enumerate(contents):
         folder = shutil.copytree(built, tmp_path / f"c{k}")

@@ -90,7 +90,7 @@ def test_a_controller_approaches_only_as_fast_as_the_limits_allow() -> None:
         speeds[active] = -float(state.at(point).jacobian[2] @ v)
         limits.active = True
         _, lower, upper = limits.rows(state)
-        # Largest violation of the limits if the impact occurred now, relative to the limits.
+        # Return the largest violation by an impact in the present state, relative to the limits.
         over = np.maximum(lower, -upper).max() / np.abs(upper).max()
         assert (over > 1e-3) if not active else (over < 1e-3), over
     assert speeds[False] == pytest.approx(1.0, abs=0.05)

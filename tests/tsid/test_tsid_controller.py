@@ -53,7 +53,7 @@ def far_posture(r: Robot) -> np.ndarray:
 
 
 def assert_dynamics(controller: Controller, command: Command, force: np.ndarray | None = None) -> None:
-    """Compare with the recursive Newton-Euler algorithm of Pinocchio under the forces of the command."""
+    """Compare the command with the recursive Newton-Euler algorithm of Pinocchio for the same forces."""
     state, r = controller.state, controller.robot
     load = pin.rnea(r.model, r.model.createData(), state.q, state.v, command.acceleration)
     applied = controller.actuators.G @ command.u
@@ -287,7 +287,7 @@ def test_mistakes_are_refused(wrong: str) -> None:
             controller.tick(0.0, r.posture(), np.zeros(r.nv))
         if wrong == "report":
             controller.report()
-        # At such a velocity, the computed torques are not finite.
+        # At this extreme velocity, the computed torques are not finite.
         controller.reset(r.posture(), np.full(r.nv, 1e200 if wrong == "size" else 0.0))
         controller.reset(r.posture(), np.full(r.nv, np.nan if wrong == "velocity" else 0.0))
         controller.reset(r.posture(), np.zeros(3 if wrong == "shape" else r.nv))

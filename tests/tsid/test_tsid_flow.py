@@ -65,7 +65,7 @@ def flow_of(r: Robot, function: Well, weaker: float = 1.0, **options: float) -> 
 
 @dataclass(frozen=True)
 class Course:
-    """Last posture of a flow, ``H/H₀`` at each update, time of rest (s), and largest contact and task errors."""
+    """Result of a flow: last posture, ``H/H₀`` at each update, time of rest (s), largest contact and task errors."""
 
     q: Vector
     values: Vector
@@ -414,7 +414,7 @@ def test_a_flow_goes_on_from_a_moved_posture() -> None:
     posture.move_to(other)
     for k in range(4000):
         if k in (200, 3000):
-            # The first call comes in the middle of the fade, the second call at its end.
+            # The first call of `brace` is in the middle of the fade, the second call at the end of the fade.
             posture.brace()
         if k == 400:
             posture.contact()
@@ -426,7 +426,7 @@ def test_a_flow_goes_on_from_a_moved_posture() -> None:
         if k == 2999:
             np.testing.assert_allclose(q, other, atol=0.02)
         q, v = integrate(r, q, v, command)
-    # The flow begins a few ticks after the phase.
+    # The flow begins a few ticks after the phase begins.
     assert max(steps[200], steps[3000]) < 0.1
 
 

@@ -128,7 +128,7 @@ def test_online_meets_offline(exported: dict[str, ImpactGradient], objective: st
         assert command.status is Status.SOLVED
         v = v + dt * command.acceleration
         q = np.array(pin.integrate(r.model, q, dt * v))
-        # A robot that is slow for a hundred ticks rests; for fewer ticks, it may only turn around.
+        # A robot rests if it is slow for a hundred ticks; for a shorter time, the motion may only reverse.
         slow = slow + 1 if np.abs(v).max() < 2e-4 else 0
         if slow > 100:
             break
@@ -242,7 +242,7 @@ def test_the_term_fades_out_before_a_limit_and_is_bounded() -> None:
         posture.advance(state, 0.0)
         assert posture.term[6] == pytest.approx(3.0 * share, abs=1e-12)
         assert posture.term[7] == pytest.approx(3.0)
-    # A push away from the limit is not faded.
+    # If the impact term pushes away from the joint limit, the term is not faded.
     push[6] = 1.0
     posture.advance(state, 0.0)
     assert posture.term[6] == pytest.approx(-3.0)

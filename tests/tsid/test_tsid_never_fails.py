@@ -155,7 +155,7 @@ def test_nearly_unit_numbers_are_normalized() -> None:
         controller.reset(q, v)
         posture.brace()
         assert np.allclose(controller.tick(0.0, off, v).u, exact.u, rtol=0, atol=1e-9)
-        # The reached posture becomes the target without further checks.
+        # At the call of `contact`, the reached posture becomes the target without further checks.
         posture.contact()
         assert controller.tick(DT, off, v).status is Status.SOLVED
 
@@ -255,7 +255,7 @@ def test_levels_against_one_quadratic_program_after_the_other(refined: bool, mon
         for A, b in ((first, wanted[0]), (second, wanted[1])):
             x = quadprog.solve_qp(A.T @ A + 1e-9 * np.eye(n), A.T @ b, rows.T, least)[0]
             assert np.linalg.norm(A @ z - b) == pytest.approx(np.linalg.norm(A @ x - b), rel=1e-4, abs=1e-4)
-            # The reached values become bounds, with a tolerance for rounding.
+            # The values reached at a level become bounds for lower levels, with a tolerance for rounding.
             rows = np.vstack([rows, A, -A])
             least = np.concatenate([least, A @ x - 1e-7, -A @ x - 1e-7])
 

@@ -303,9 +303,9 @@ def wrist() -> tuple[Robot, TaskFormulation]:
 
 
 def flying() -> tuple[Robot, TaskFormulation]:
-    """The second hinge rolls the tip.
+    """If the first link is not vertical, the second hinge rolls the tip.
 
-    If the first link hangs straight down, the hinge yaws the tip like the base.
+    If the first link is vertical, the second hinge yaws the tip, as the base does.
     """
     r = arm([Y, Z, Y], [0.3, 0.4, -0.2], floating=True)
     return r, aerial_formulation(r, JointPosture(r), law=None)
@@ -399,7 +399,7 @@ def test_a_relaxed_answer_is_damped_alike(name: str, torque: float) -> None:
 
 @pytest.mark.parametrize("name", SWEEPS)
 def test_there_is_no_hysteresis(name: str) -> None:
-    """The same states in another order give the same commands, so the controller has no memory of them."""
+    """The same states in another order give the same commands, so earlier states have no influence."""
     count = 201
     forth, _, _ = swept(name, count)
     order = rng(name, "order").permutation(count)

@@ -163,8 +163,8 @@ def test_events_at_odd_moments_make_no_step(name: str, kind: str, spring: Spring
             # A phase that cannot follow the present phase raises an error.
             with suppress(InputError):
                 getattr(posture, generator.choice(["brace", "contact", "release"]))()
-        # The call itself does not change the acceleration (for a floating base only approximately: its orientation is
-        # blended by logarithm).
+        # The call of a phase does not change the acceleration of the joints.  The base is excluded, because the
+        # blending of its orientation by logarithms is not exact.
         assert np.abs(posture.desired(state) - before)[base:].max() <= 1e-9
         dt = float(generator.choice([0.0, DT, DT, 4 * DT, 1.0]))
         t += dt
@@ -217,8 +217,8 @@ def test_ticks_leave_no_memory_behind() -> None:
 
     tracemalloc.start()
     try:
-        # Storing one number per tick would take 7,200 bytes per round.  The first rounds fill NumPy's cache for small
-        # arrays; its content depends on earlier tests.
+        # Storing one number per tick would take 7,200 bytes per round.  The first rounds may allocate more, because
+        # NumPy fills its cache for small arrays.
         assert any(after - before < 3_000 for before, after in pairwise(fly(300) for _ in range(9)))
     finally:
         tracemalloc.stop()
@@ -261,7 +261,7 @@ def test_energy_never_grows(name: str) -> None:
         v = v + dt * command.acceleration
         q = np.array(pin.integrate(r.model, q, dt * v))
     assert np.diff(energy).max() <= 1e-6 * energy[0] and energy[-1] < energy[0]
-    # Motion that is possible within the end effector task and the joint limits.
+    # Directions of motion that the end effector task and the joint limits leave free.
     stopped = np.eye(r.nv)[controller.state.room.min(axis=0) < 1e-2]
     rows = np.vstack([controller.assembly.strict.J, stopped])
     Z = np.linalg.svd(rows)[2][np.linalg.matrix_rank(rows, tol=1e-6) :].T
