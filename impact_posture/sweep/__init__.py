@@ -1,4 +1,4 @@
-"""Sweeps of many posture problems on any executor, with one table of results in Parquet files."""
+"""Solve many posture problems on any executor, and store the results as one table of Parquet files."""
 
 from impact_posture.sweep.atlas import open_atlas as open
 

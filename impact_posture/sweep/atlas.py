@@ -1,4 +1,4 @@
-"""Folder of a sweep: a manifest, and a Parquet file for each shard, written as a whole."""
+"""Folder of a sweep: a manifest and one Parquet file per shard.  Each file is written as a whole."""
 
 from __future__ import annotations
 
@@ -28,19 +28,22 @@ if TYPE_CHECKING:
 
 SCHEMA = "impact-posture/sweep-folder/1"
 MANIFEST, _DATA = "manifest.json", "data"
-# Folder of shards after their first pass, which neighbors still need after the second pass has replaced them.
+# Folder with shard files from the first pass.  Neighboring shards need them even after the second pass has replaced
+# the main file.
 _FIRST_PASS = "first-pass"
-# Number of shards whose postures are kept in memory, because successive shards have common neighbors.
+# Number of shards whose postures stay in memory, because successive shards have common neighbors.
 _KEPT = 16
-# Packages whose code determines the numbers.
+# Packages whose code affects the results.
 _PACKAGES = ("robot", "dynamics", "collision", "impact", "posture", "sweep")
 
 
 def sweep_key(sweep: Sweep) -> str:
-    """Return a hash of everything that the results of a sweep depend on.  This loads the robot of every case.
+    """Return a hash of everything that the results of a sweep depend on.
+
+    To compute the hash, the robot of every case is loaded.
 
     Raises:
-        ImpactPostureError: A setting does not fit its robot.
+        ImpactPostureError: A setting is invalid for its robot.
     """
     content = [repr((sweep.outer, sweep.grid, sweep.shard))]
     for case in sweep.cases:
@@ -51,7 +54,7 @@ def sweep_key(sweep: Sweep) -> str:
 
 
 class Atlas:
-    """Folder that a sweep writes."""
+    """Folder into which a sweep writes its results."""
 
     def __init__(self, folder: Path, sweep: Sweep, key: str) -> None:
         self.folder, self._sweep, self._key = folder, sweep, key
@@ -59,14 +62,15 @@ class Atlas:
 
     @contextmanager
     def opened(self) -> Iterator[None]:
-        """Make or continue the folder, and lock it against other processes within the block.
+        """Create the folder or continue in it, and lock it against other processes during the ``with`` block.
 
         Raises:
-            OutputError: The folder has other content, another sweep or version, or another process uses it.
+            OutputError: The folder contains other files, or results of another sweep or version, or another process
+                uses it.
         """
         manifest = self.folder / MANIFEST
         if not os.path.isfile(manifest):
-            # A run that was killed before it wrote the manifest left a record without results.
+            # If a run was killed before it wrote the manifest, the folder contains a record but no results.
             if not is_ours(self.folder, "sweep") or (self.folder / _DATA).exists():
                 check_output(self.folder, force=False, kind="sweep")
             try:
@@ -104,7 +108,10 @@ class Atlas:
         return [shard for shard in sorted(needed) if self._first(shard) is None], missing
 
     def solved(self, shard: int) -> tuple[bytes, dict[int, list[float]]]:
-        """Return the file of a shard after its first pass, and the postures next to it in other shards."""
+        """Return the file content of a shard after its first pass, and postures of neighboring points.
+
+        The postures are from the points of other shards that are neighbors of points of this shard.
+        """
         beside: dict[int, list[float]] = {}
         for other, points in self._sweep.beside(shard).items():
             known = self._postures(other)
@@ -115,12 +122,12 @@ class Atlas:
         """Write the file of a shard as a whole."""
         before = self._passes(self._path(shard), shard)
         if before == 1 < passes:
-            # The neighbors still need the first pass.
+            # Keep the file from the first pass, because neighboring shards still need it.
             self._write(self._path(shard, _FIRST_PASS), self._content(shard))
         self._write(self._path(shard, _FIRST_PASS if before > passes else _DATA), content)
 
     def finish(self) -> None:
-        """Delete the shards after their first pass."""
+        """Delete the shard files from the first pass."""
         places = [self._path(shard, _FIRST_PASS) for shard in range(self._sweep.shards)]
         with suppress(OSError):
             for path in places:
@@ -144,7 +151,7 @@ class Atlas:
         return passes_of(path, self._key, len(self._sweep.span(shard)[1]))
 
     def _first(self, shard: int) -> Path | None:
-        """Return the file of a shard after its first pass, or ``None``."""
+        """Return the path of the shard file from the first pass; ``None`` if the file does not exist."""
         paths = self._path(shard), self._path(shard, _FIRST_PASS)
         return next((path for path in paths if self._passes(path, shard) == 1), None)
 
@@ -155,7 +162,7 @@ class Atlas:
         return path.read_bytes()
 
     def _read_postures(self, shard: int) -> dict[int, list[float] | None]:
-        """Return the postures of a shard after its first pass by point."""
+        """Return a map from the points of a shard to their postures after the first pass."""
         return dict(zip(self._sweep.span(shard)[1], read_postures(self._content(shard)), strict=True))
 
     def _manifest(self) -> dict[str, Any]:
@@ -176,7 +183,7 @@ def read_manifest(folder: Path) -> dict[str, Any]:
     """Return the manifest of a sweep folder.
 
     Raises:
-        SpecError: The manifest is missing, or cannot be read.
+        SpecError: The manifest is missing or cannot be read.
     """
     path = folder / MANIFEST
     try:
@@ -213,7 +220,7 @@ def open_atlas(folder: str | Path) -> Dataset:
 
 
 def check_package(name: str, extra: str) -> None:
-    """Raise an InputError if the package of an extra is not installed."""
+    """Raise an InputError if a package is not installed.  The hint names the ``extra`` that installs the package."""
     if find_spec(name) is None:
         what = f"needs the package {name}"
         raise InputError(what, where="sweep", hint=f"pip install 'impact-posture[{extra}]'")

@@ -1,4 +1,4 @@
-"""Robot, problems and programs of a case, which a process builds once."""
+"""Robot, problems and programs of a case, built once in each process."""
 
 from __future__ import annotations
 
@@ -23,18 +23,18 @@ from impact_posture.sweep.point_search import Place, Timer, Walk
 from impact_posture.sweep.sweep_file import OFFSETS, Case, Grid
 from impact_posture.system.arrays import Array
 
-# Problems and programs that a process keeps, and most problems if the speed varies.  Each takes about a MB.  Points
-# with another normal come later, and their problems are not needed before.
+# Number of problems and programs that stay in memory, and maximum number of problems if the speed varies.  Each needs
+# about 1 MB.  The normal varies slowest, so problems of other normals are not needed at the same time.
 _KEPT, _MOST_SPEEDS = 4, 64
 
 _Value = TypeVar("_Value")
 
 
 class CaseSolver:
-    """Robot, problems and programs of a case, which a process keeps from shard to shard.
+    """Robot, problems and programs of a case, which stay in memory for the next shards.
 
     Raises:
-        ImpactPostureError: A setting is wrong.
+        ImpactPostureError: A setting of the case is invalid.
     """
 
     def __init__(self, case: Case, speeds: int = 1) -> None:
@@ -49,33 +49,33 @@ class CaseSolver:
 
     @property
     def content(self) -> str:
-        """Text with all content of the files of the robot and the problem."""
+        """Text that changes whenever the content of a file of the robot or the problem changes."""
         prepared = self.template(*self.normal_and_speed({}))
         around, weights = prepared.problem.surroundings, prepared.impact.objective.metric.weights
         bodies = [] if around is None else [(b.name, b.radius, b.vertices.tolist()) for b in around.shapes.bodies]
         return repr((self.robot.data_sha256, prepared.impact.q.tolist(), weights, bodies))
 
     def normal_and_speed(self, values: Mapping[str, Any]) -> tuple[Any, float]:
-        """Return the normal and the speed at values of the grid, which choose the template."""
+        """Return normal and speed for ``values`` of the grid.  Together they determine the template."""
         settings = self._case.settings
         return values.get("normal", settings.normal), values.get("speed", settings.speed)
 
     def _template(self, normal: Any, speed: float) -> Prepared:
-        """Return the problem with a normal and a speed, at the target of the case."""
+        """Return the problem for a normal and a speed, with the target of the case."""
         settings = replace(self._case.settings, normal=normal, speed=speed)
         prepared = prepare(settings, resolve(settings, self._loaded))
-        # Most problems do not depend on the speed, so all speeds share a problem and its solutions.
+        # Most problems do not depend on the speed.  Then all speeds use the same problem object and its solutions.
         objective = prepared.impact.objective
         key = objective.structure, tuple(objective.parameters), prepared.problem.requirements
         return replace(kept(self._known, key, lambda: prepared, self._templates), impact=prepared.impact)
 
     def _attainable(self, normal: Any, speed: float) -> AttainableSpeed:
-        """Return the fastest approach of the problem with a normal and a speed."""
+        """Return the computation of the largest approach speed, for a normal and a speed."""
         prepared = self.template(normal, speed)
         return AttainableSpeed(self.robot, prepared.impact.objective, prepared.problem.requirements)
 
     def target(self, values: Mapping[str, Any]) -> Place:
-        """Return the position and orientation of the contact frame at values of the grid."""
+        """Return the target position and orientation of the contact frame for ``values`` of the grid."""
         position = values.get("target_position", self._case.settings.target_position)
         quaternion = values.get("target_quaternion", self._case.settings.target_quaternion)
         if any(name in values for name in OFFSETS):
@@ -90,10 +90,11 @@ class CaseSolver:
         return np.array(Numeric(self.robot.model).at(impact.q).placement(frame).translation)
 
     def check(self, grid: Grid) -> None:
-        """Check that the targets and speeds of the grid fit the problem.
+        """Check that the targets and speeds of the grid are valid for the problem.
 
         Raises:
-            InputError: The contact takes no target, a quaternion is not a unit quaternion, or a speed does not fit.
+            InputError: The problem does not allow a target, a quaternion is not a unit quaternion, or a speed is
+                invalid.
         """
         for axis in grid.axes:
             for value in axis.values if axis.name.startswith(("target", "speed")) else axis.values[:1]:
@@ -101,10 +102,10 @@ class CaseSolver:
                 retarget(prepared.problem, *self.target({axis.name: value}))
 
     def walk(self, template: ConstrainedProblem) -> Walk:
-        """Return the walk of a template through a shard.
+        """Return the :class:`Walk` that solves the points of a shard with a template.
 
-        A program is built only for new expressions.  Each walk has its own branch of the program, so rounding depends
-        on the template and the points of the shard only.
+        A program is built only if its expressions are new.  Each walk has its own branch of the program, so rounding
+        errors depend only on the template and the points of the shard.
         """
         key = f"{template.objective.structure}\n{template.structure}"
         built = kept(self._programs, key, lambda: build_nlp(template, compile="never"), _KEPT)
@@ -113,7 +114,10 @@ class CaseSolver:
 
 
 def kept(cache: OrderedDict[Any, _Value], key: Any, make: Callable[[], _Value], most: int) -> _Value:
-    """Return a value of a cache that drops the least recently used value."""
+    """Return the value of ``key`` in a cache, and create a missing value with ``make``.
+
+    If the cache has more than ``most`` values, the least recently used value is removed.
+    """
     if key not in cache:
         cache[key] = make()
         if len(cache) > most:

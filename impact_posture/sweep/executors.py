@@ -1,4 +1,4 @@
-"""Executors of shards: processes of this machine, a Dask cluster, MPI ranks, and Slurm jobs."""
+"""Executors that solve shards: local processes, a Dask cluster, MPI ranks, and Slurm jobs."""
 
 from __future__ import annotations
 
@@ -19,13 +19,13 @@ from impact_posture.system.processes import depend, signals_held
 
 @contextmanager
 def process_pool(workers: int) -> Iterator[Executor]:
-    """Yield a pool of processes on this machine, which end with the block."""
-    # A fork imports nothing again, and leaves no semaphores behind after a signal.
+    """Yield a pool of processes on this machine.  The processes end at the end of the ``with`` block."""
+    # Workers are forked: a forked process imports no modules again, and leaves no semaphores behind after a signal.
     pool = ProcessPoolExecutor(workers, multiprocessing.get_context("fork"), depend, (os.getpid(),))
     others = set(multiprocessing.active_children())
     try:
-        # All workers are forked here, before a thread starts.  A signal reaches every process of the terminal, but
-        # workers must ignore it.
+        # The first submit forks all workers, before a thread starts.  On Ctrl-C, the terminal sends the signal to
+        # every process, but workers must ignore it.
         with signals_held():
             pool.submit(os.getpid)
         yield pool
@@ -37,10 +37,10 @@ def process_pool(workers: int) -> Iterator[Executor]:
 
 @contextmanager
 def dask_cluster(address: str) -> Iterator[Executor]:
-    """Yield the executor of the Dask cluster with a scheduler at an address, such as ``tcp://host:8786``.
+    """Yield the executor of a Dask cluster.  ``address`` is the address of its scheduler, such as ``tcp://host:8786``.
 
     Raises:
-        InputError: The package is missing, or no scheduler answers at the address.
+        InputError: The package ``distributed`` is not installed, or no scheduler answers at the address.
     """
     check_package("distributed", "dask")
     from distributed import Client
@@ -56,10 +56,12 @@ def dask_cluster(address: str) -> Iterator[Executor]:
 
 @contextmanager
 def mpi_ranks() -> Iterator[Executor]:
-    """Yield the executor over the ranks of ``mpiexec -n N python -m mpi4py.futures $(which impact-posture) …``.
+    """Yield the executor that uses the MPI ranks of this program.
+
+    Start the program with ``mpiexec -n N python -m mpi4py.futures $(which impact-posture) …``.
 
     Raises:
-        InputError: The package or an MPI library is missing.
+        InputError: The package ``mpi4py`` or an MPI library is not installed.
     """
     check_package("mpi4py", "mpi")
     try:
@@ -71,18 +73,19 @@ def mpi_ranks() -> Iterator[Executor]:
 
 
 class SlurmJobs(Executor):
-    """Executor of shards as elements of Slurm job arrays, by submitit.
+    """Executor that submits each shard as an element of a Slurm job array, with the package submitit.
 
     Args:
-        folder: Folder of the logs, which every node sees.
+        folder: Folder of the logs, which all nodes must be able to access.
         options: Parameters of ``submitit.AutoExecutor``, such as ``timeout_min`` or ``slurm_partition``.
-        cluster: Cluster of submitit: ``slurm``, ``local`` for processes of this machine, or ``None`` for detection.
+        cluster: Cluster for submitit: ``slurm``, or ``local`` for processes of this machine; ``None`` to let submitit
+            detect the cluster.
     """
 
     def __init__(self, folder: Path, options: dict[str, Any], cluster: str | None = None) -> None:
         check_package("submitit", "slurm")
         self._folder, self._options, self._cluster = folder, options, cluster
-        # submitit creates its folder at once, so try the options in a temporary folder.
+        # submitit immediately creates its folder, so check the options with a temporary folder.
         with TemporaryDirectory() as trial:
             try:
                 self._executor(Path(trial))
@@ -112,12 +115,12 @@ class SlurmJobs(Executor):
         return [self._waiting.submit(job.result) for job in jobs]
 
     def shutdown(self, wait: bool = True, *, cancel_futures: bool = False) -> None:
-        """See ``Executor``."""
+        """Stop waiting for the jobs, as :meth:`concurrent.futures.Executor.shutdown`."""
         self._waiting.shutdown(wait=wait, cancel_futures=cancel_futures)
 
 
 def parse_options(texts: Sequence[str]) -> dict[str, Any]:
-    """Return ``KEY=VALUE`` texts as options.  Decimal values become integers.
+    """Parse texts of the form ``KEY=VALUE``.  Values of decimal digits become integers.
 
     Raises:
         InputError: A text has no key or no value.

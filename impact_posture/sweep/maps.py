@@ -1,4 +1,4 @@
-"""Maps of a sweep: objective over two axes, points without posture, and switches of the best posture."""
+"""Maps of a sweep: objective over two axes, points without posture, and borders between different optima."""
 
 from __future__ import annotations
 
@@ -29,26 +29,27 @@ from impact_posture.sweep.sweep_file import Axis, Grid
 from impact_posture.system.arrays import Array
 from impact_posture.system.escape import plot_label
 
-# The best posture switches between neighbors whose difference (tangent norm, without the position of the base)
-# exceeds SWITCH, and this multiple of the lower quartile of all differences.  The quartile is the usual difference
-# as long as at most half of the pairs of neighbors are on two sides of a switch.
+# Two neighboring points have different optima if the difference of their postures (tangent norm, without the position
+# of the base) exceeds SWITCH and also this multiple of the lower quartile of all differences.  The lower quartile is
+# a typical difference within one optimum, if at most half of the pairs of neighbors have different optima.
 _UNUSUAL = 4.0
-# Use a logarithmic color scale above this ratio of the largest to the least objective.
+# The color scale is logarithmic if the ratio of the largest to the smallest objective exceeds this value.
 _WIDE = 20.0
 _HATCH = {"infeasible": "////", "uncertified": "....", "undefined": "xxxx"}
-# Most labels of values along an axis.
+# Maximum number of labels along an axis.
 _TICKS = 9
 
 
 @dataclass(frozen=True)
 class Shown:
-    """Content of the maps of a sweep.
+    """Summary of the maps of a sweep.
 
     Attributes:
         points: Number of problems of the sweep.
         counts: Number of solved points of each status.
-        switches: Number of pairs of neighbors in the maps between which the best posture switches.
-        best: Values and objective of the best point of each case.
+        switches: Number of pairs of neighboring points in the maps that have different optima.
+        best: Axis values and objective of the best point of each case.
+        files: Paths of the written figures.
     """
 
     points: int
@@ -64,14 +65,14 @@ class Shown:
 
 
 def draw_maps(folder: Path, out: Path, axes: Sequence[str] | None = None, formats: Sequence[str] = ("png",)) -> Shown:
-    """Draw a map of each case of a finished or unfinished sweep folder into ``out``.
+    """Draw a map for each case of a sweep folder and write it into ``out``.  The sweep may be unfinished.
 
-    ``axes`` names the horizontal and the vertical axis, by default the two axes with the most values.  Other axes are
-    at their middle values.
+    ``axes`` contains the names of the horizontal and the vertical axis, by default the two axes with the most values.
+    The map shows the points at which the other axes have their middle values.
 
     Raises:
         InputError: An axis is unknown.
-        SpecError: The folder is not a sweep folder.
+        SpecError: The folder is not a sweep folder, or is damaged.
     """
     from pyarrow import compute
 
@@ -102,7 +103,7 @@ def _hashable(value: Any) -> Any:
 
 
 def _chosen(grid: Grid, axes: Sequence[str] | None) -> tuple[int, int | None]:
-    """Return the indices of the horizontal and the vertical axis; ``None`` for a single axis."""
+    """Return the indices of the horizontal and the vertical axis; the latter is ``None`` for a map over one axis."""
     names = [axis.name for axis in grid.axes]
     if axes is None:
         longest = sorted(range(len(names)), key=lambda k: (-grid.shape[k], k))[:2]
@@ -120,7 +121,7 @@ def _chosen(grid: Grid, axes: Sequence[str] | None) -> tuple[int, int | None]:
 
 
 def _plane(grid: Grid, across: int, upwards: int | None) -> NDArray[np.int64]:
-    """Return the points of a map, shape (rows, columns), with other axes at their middle values."""
+    """Return the points of a map, shape (rows, columns); the other axes have their middle values."""
     place: list[Any] = [count // 2 for count in grid.shape]
     place[across] = np.arange(grid.shape[across])
     if upwards is not None:
@@ -129,9 +130,12 @@ def _plane(grid: Grid, across: int, upwards: int | None) -> NDArray[np.int64]:
 
 
 class _Slice:
-    """Points of one map: status (empty if unsolved) and objective (NaN without posture), shape (rows, columns).
+    """Points of one map.
 
-    The best posture switches between the neighbors ``(row, column), (row, column)`` in ``switches``.
+    Attributes:
+        status: Status of each point, empty if the point is not solved, shape (rows, columns).
+        value: Objective of each point, NaN if the point has no posture, shape (rows, columns).
+        switches: Pairs of neighbors ``(row, column), (row, column)`` that have different optima.
     """
 
     def __init__(self, data: Any, points: NDArray[np.int64], problem: ConstrainedProblem) -> None:
@@ -150,7 +154,7 @@ class _Slice:
 
 def _switches(postures: Sequence[Sequence[Array | None]], problem: ConstrainedProblem) -> list[tuple[Any, Any]]:
     steps = []
-    # The base of a floating robot follows the target, so its position does not count.
+    # The base of a floating robot moves with the target, so the position of the base is not compared.
     first = 3 if problem.robot.floating else 0
     for row, line in enumerate(postures):
         for column, q in enumerate(line):
@@ -165,7 +169,7 @@ def _switches(postures: Sequence[Sequence[Array | None]], problem: ConstrainedPr
 
 
 def _best(data: Any, grid: Grid, number: int, values: dict[str, Any]) -> list[dict[str, Any]]:
-    """Return the point with the least objective of a case; empty if it has none."""
+    """Return a list with the point of a case that has the smallest objective; empty if no point is certified."""
     from pyarrow import compute
 
     least = (np.inf, -1)
@@ -238,7 +242,7 @@ def _draw(
 
 
 def _edge(cell: tuple[int, int], other: tuple[int, int]) -> list[tuple[float, float]]:
-    """Return the border between two cells."""
+    """Return the two end points of the border between two neighboring cells."""
     row, column = (np.array(cell) + np.array(other)) / 2
     if cell[0] == other[0]:
         return [(column, row - 0.5), (column, row + 0.5)]
@@ -248,7 +252,7 @@ def _edge(cell: tuple[int, int], other: tuple[int, int]) -> list[tuple[float, fl
 def _label(axis: Any, grid_axis: Axis) -> None:
     count = len(grid_axis.values)
     shown = np.unique(np.linspace(0, count - 1, min(count, _TICKS)).round().astype(int))
-    # On the horizontal axis, long labels would overlap, so the entries of a vector are one below the other.
+    # On the horizontal axis, long labels would overlap, so the entries of a vector are written below each other.
     space = "\n" if axis.axis_name == "x" and isinstance(grid_axis.values[0], tuple) else " "
     axis.set_ticks(shown, [plot_label(_short(grid_axis.values[k])).replace(" ", space) for k in shown])
     axis.set_label_text(plot_label(grid_axis.name + (" offset, m" if grid_axis.name in "xyz" else "")))

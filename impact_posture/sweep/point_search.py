@@ -1,4 +1,7 @@
-"""Solution of one point of a sweep: warm starts, random starts where they disagree, and a certificate or a reason."""
+"""Solve one point of a sweep from warm starts, and from random starts if the warm starts lead to different optima.
+
+The result has a certificate, or the reason why there is no certified posture.
+"""
 
 from __future__ import annotations
 
@@ -20,19 +23,20 @@ from impact_posture.posture.search.growing_search import HIGH_PRICE
 from impact_posture.posture.search.multistart import distinct, solve
 from impact_posture.system.arrays import Array
 
-# Most rounds in which the program of a point grows, and most rounds before the point is known to be feasible.
+# Maximum number of rounds in which the program of a point grows.  The second number applies as long as it is unknown
+# whether the point is feasible.
 _ROUNDS, _UNSURE = 8, 3
 # Postures whose joints differ by more than this (rad, m) may belong to different optima.
 SWITCH = 0.2
-# An optimum is better than another one if its objective is lower by this share.
+# An optimum replaces another one only if its objective is smaller by at least this share.
 _BETTER = 1e-4
 
-# Position and orientation of the contact frame; ``None`` keeps the value at the given posture.
+# Target position and orientation of the contact frame; ``None`` to keep the value at the given posture.
 Place = tuple[Any, Any]
 
 
 class Start(NamedTuple):
-    """Start posture, shape (nq,), with the end of the solver run that led to it, if known."""
+    """Start posture ``q``, shape (nq,), and the ``end`` of the solver run that computed it; ``None`` if unknown."""
 
     q: Array
     end: WarmStart | None = None
@@ -42,9 +46,10 @@ class PointResult(NamedTuple):
     """Result of one point.
 
     Attributes:
-        row: Columns of the point in the table.
-        start: Posture of the point, as a start for other points; ``None`` without a posture.
-        violation: Least known violation, weighted by the prices of the constraints, if the point is infeasible.
+        row: Column name → value of the point in the table.
+        start: Posture of the point, from which other points can start; ``None`` if the point has no posture.
+        violation: If the point is infeasible, the smallest known violation of its constraints, weighted by their
+            prices; otherwise 0.
     """
 
     row: dict[str, Any]
@@ -53,38 +58,44 @@ class PointResult(NamedTuple):
 
     @property
     def q(self) -> Array | None:
-        """Posture of the point, shape (nq,), or ``None``."""
+        """Posture of the point, shape (nq,); ``None`` if the point has no posture."""
         return self.start and self.start.q
 
 
 @dataclass
 class Timer:
-    """Wall time within IPOPT and the functions that it calls, s."""
+    """Wall time in IPOPT, which includes the functions that IPOPT calls, s."""
 
     solver_s: float = 0.0
 
 
 class Walk:
-    """Problem and program of a template, which grow from point to point of a shard."""
+    """Problem and program for the points of a shard with the same template.
+
+    Both grow if a point needs more parts, and the next points use the grown program.
+    """
 
     def __init__(
         self, template: ConstrainedProblem, settings: ProblemSettings, nlp: PostureNLP, timer: Timer
     ) -> None:
-        # Keep the template alive, because a shard identifies it by its ``id``.
+        # Keep a reference to the template, because a shard identifies the template by its ``id``.
         self._template, self.settings, self.timer = template, settings, timer
         self.problem, self.nlp = template, nlp
         self._relaxed: ElasticProgram | None = None
 
     def grow(self, problem: ConstrainedProblem) -> None:
-        """Continue with a problem that has more parts."""
+        """Use a problem with more parts from now on."""
         self.problem, self.nlp = problem, self.nlp.grown(problem, compile="never")
 
     def at(self, problem: ConstrainedProblem, place: Place) -> ConstrainedProblem:
-        """Return a problem with another target."""
+        """Return the problem with the target ``place``."""
         return retarget(problem, *place, self.nlp.program.numeric)
 
     def relax(self, place: Place, guesses: Sequence[Array] = (), beside: float = 0.0) -> LeastViolation:
-        """Relax the constraints at a target, in a program that has grown at earlier targets."""
+        """Minimize the violation of the constraints at a target.
+
+        The program contains the parts that earlier targets needed.  ``beside`` is the violation at neighbors.
+        """
         program = self._relaxed = self._relaxed or ElasticProgram(self.problem, self.nlp.program.rows.branch())
         before = program.time_s
         violation = find_conflicts(self.at(program.problem, place), self.settings.seed, program, guesses, beside)
@@ -93,16 +104,16 @@ class Walk:
 
 
 def search(walk: Walk, place: Place, guesses: Sequence[Start], beside: float = 0.0) -> PointResult:
-    """Solve one point from optima of neighbors and the given posture, and from many starts where they disagree.
+    """Solve one point from the optima of its neighbors and from the given posture.
 
-    ``beside`` is the least violation at infeasible neighbors, if no neighbor has an optimum.  This point is then
-    likely infeasible.
+    If these starts lead to different optima, random starts are added.  If no neighbor has an optimum, ``beside`` is
+    the smallest violation at infeasible neighbors.  In this case, the point is likely to be infeasible.
     """
     attempt = _Attempt(walk, place, walk.settings.starts - 1)
     try:
         if not beside and (result := attempt.certified(guesses, rounds=_UNSURE)) is not None:
             return result
-        # The relaxed problem has either conflicting constraints or a posture to start from.
+        # The result of the relaxed problem is either a set of conflicting constraints, or a start posture.
         relaxed = walk.relax(place, [guess.q for guess in guesses], beside)
         if relaxed.conflicts:
             return attempt.failure("infeasible", Infeasible(relaxed.conflicts).what, relaxed.violation)
@@ -113,8 +124,8 @@ def search(walk: Walk, place: Place, guesses: Sequence[Start], beside: float = 0
 
 
 def improve(walk: Walk, place: Place, known: PointResult, guess: Start) -> PointResult:
-    """Return the better of a known result and the optimum from the posture of a neighbor."""
-    # The base of a floating robot follows the target, so its position does not distinguish optima.
+    """Solve a point from the posture of a neighbor.  Return the better of this result and the known result."""
+    # The base of a floating robot moves with the target, so the position of the base does not distinguish optima.
     first = 3 if walk.problem.robot.floating else 0
     if known.q is not None and np.abs(known.q - guess.q)[first:].max() < SWITCH:
         return known
@@ -130,7 +141,7 @@ def improve(walk: Walk, place: Place, known: PointResult, guess: Start) -> Point
 
 
 class _Attempt:
-    """Solver runs at one point, with the number of random starts where the first starts disagree."""
+    """Solver runs at one point.  ``others`` random starts are added if the first starts lead to different optima."""
 
     def __init__(self, walk: Walk, place: Place, others: int) -> None:
         self.problem, self.runs, self.fault = walk.at(walk.problem, place), 0, "no run converged"
@@ -139,9 +150,11 @@ class _Attempt:
     def certified(
         self, guesses: Sequence[Start], *, alone: bool = False, rounds: int = _ROUNDS
     ) -> PointResult | None:
-        """Return the best certified result from the guesses and, if they are not ``alone``, from other starts.
+        """Return the best certified result, or ``None``.
 
-        The program grows by the parts that the ends of the runs need, in at most ``rounds`` rounds.
+        With ``alone``, the runs start only from ``guesses``.  Otherwise, they also start from the given posture, and
+        from random starts if the results differ.  After each of at most ``rounds`` rounds, the program grows by the
+        parts that are needed at the ends of the runs.
         """
         price = SLACK_PRICE
         for _ in range(rounds):
@@ -166,14 +179,15 @@ class _Attempt:
             if self.problem is not problem:
                 self._walk.grow(self.problem)
             elif price == SLACK_PRICE:
-                # No part is missing, but a constraint is violated: the run is trapped.
+                # No part is missing, but a constraint is still violated: the solver is in a local minimum of the
+                # violation.  Try again with a higher price of violations.
                 price = HIGH_PRICE
             else:
                 return None
         return None
 
     def searched(self, guess: Array) -> PointResult | None:
-        """Return the result of ``optimize``, which starts again where a run ends between bodies."""
+        """Return the result of the multistart search of ``optimize``, which also restarts from ends in collision."""
         settings = self._walk.settings
         try:
             solution = solve(
@@ -186,7 +200,7 @@ class _Attempt:
         return self._answer(Start(solution.q), solution.certificate, len(solution.optima))
 
     def _random_starts(self) -> Iterator[Start]:
-        """Yield random postures whose projection satisfies the constraints."""
+        """Yield projections of random postures onto the constraints, if the projection succeeds."""
         projector = Projector(self.problem)
         for k in range(1, self._others + 1):
             rng = np.random.default_rng([self._walk.settings.seed, k])
@@ -222,13 +236,13 @@ class _Attempt:
         return PointResult(row, start)
 
     def failure(self, status: str, reason: str, violation: float = 0.0) -> PointResult:
-        """Return the result of a point without posture."""
+        """Return the result of a point for which no posture was found."""
         row = {"status": status, "reason": reason, "optima": 0, "runs": self.runs}
         return PointResult(row, violation=violation)
 
 
 class _End(NamedTuple):
-    """End of a solver run.  The value is the minimized objective, or infinite if the run did not converge."""
+    """End of a solver run.  ``value`` is the minimized objective, or infinite if the run did not converge."""
 
     q: Array
     value: float
@@ -237,7 +251,7 @@ class _End(NamedTuple):
 
 
 def _optima(problem: ConstrainedProblem, ends: Sequence[_End]) -> list[_End]:
-    """Return an end for each distinct optimum, the best first."""
+    """Return one solver end for each distinct optimum, sorted from the best to the worst."""
     by_posture = {id(end.q): end for end in ends}
     return [
         by_posture[id(optimum.q)]
@@ -246,7 +260,7 @@ def _optima(problem: ConstrainedProblem, ends: Sequence[_End]) -> list[_End]:
 
 
 def _agree(problem: ConstrainedProblem, ends: Sequence[_End], home: _End) -> bool:
-    """Whether all neighbors lead to one optimum, and the given posture does not lead to a better one."""
+    """Return whether all neighbors lead to the same optimum, and the given posture does not lead to a better one."""
     if not ends or not all(np.isfinite(end.value) for end in ends):
         return False
     return len(_optima(problem, ends)) == 1 and home.value > (1 - _BETTER) * min(end.value for end in ends)

@@ -1,4 +1,4 @@
-"""Solution of a shard in two passes.  Workers return the shard as a Parquet file."""
+"""Solve a shard in two passes.  A worker returns the shard as the content of a Parquet file."""
 
 from __future__ import annotations
 
@@ -19,9 +19,9 @@ from impact_posture.sweep.shard_table import STATUS, read_shard, write_shard
 from impact_posture.sweep.sweep_file import Sweep
 from impact_posture.system.arrays import Array
 
-# MUMPS, within IPOPT, is not thread-safe, so a worker with several threads solves one shard at a time.
+# MUMPS, the linear solver in IPOPT, is not thread-safe.  So a worker with several threads solves one shard at a time.
 _ALONE = threading.Lock()
-# Cases whose robots and programs a worker keeps.
+# Number of cases whose robots and programs stay in the memory of a worker.
 _KEPT = 4
 _KEPT_WALKS = 64
 _SOLVERS: OrderedDict[tuple[str, int], CaseSolver] = OrderedDict()
@@ -29,7 +29,15 @@ _SOLVERS: OrderedDict[tuple[str, int], CaseSolver] = OrderedDict()
 
 @dataclass(frozen=True)
 class ShardResult:
-    """Parquet file of a shard after a pass, points of each status, and wall times within IPOPT and in all, s."""
+    """Result of one pass over a shard.
+
+    Attributes:
+        index: Number of the shard.
+        content: Content of the Parquet file.
+        counts: Number of points of each status.
+        solver_s: Wall time in IPOPT, s.
+        total_s: Wall time of the whole pass, s.
+    """
 
     index: int
     content: bytes
@@ -39,16 +47,20 @@ class ShardResult:
 
 
 def solve_shard(sweep: Sweep, key: str, index: int) -> ShardResult:
-    """Solve all points of shard ``index``, each from its neighbors before it.  ``key`` identifies the sweep."""
+    """First pass: solve all points of shard ``index``, starting each point from the postures of earlier neighbors.
+
+    ``key`` is the hash that identifies the sweep (:func:`sweep_key`).
+    """
     return _passed(sweep, key, index, 1, [], _Shard.solve)
 
 
 def revise_shard(
     sweep: Sweep, key: str, index: int, content: bytes, beside: Mapping[int, list[float]]
 ) -> ShardResult:
-    """Improve the points of a shard after its first pass (``content``) from postures of neighboring points.
+    """Second pass: improve the points of a shard, starting from the postures of neighboring points.
 
-    ``beside`` has the postures of the neighboring points in other shards after the first pass.
+    ``content`` is the file of the shard after the first pass.  ``beside`` maps the neighboring points in other shards
+    to their postures after the first pass.
     """
     return _passed(sweep, key, index, 2, read_shard(content), lambda shard: shard.revise(beside))
 
@@ -70,14 +82,14 @@ def _passed(
 
 
 class _Shard:
-    """Points of a shard, with the results of the first ones so far."""
+    """Points of a shard.  ``results`` contains the results of the points that are already solved."""
 
     def __init__(self, sweep: Sweep, solver: CaseSolver, points: range, results: list[PointResult]) -> None:
         self._grid, self._solver, self._points, self.results = sweep.grid, solver, points, results
         self._walks: OrderedDict[int, Walk] = OrderedDict()
 
     def solve(self) -> None:
-        """Solve each point from the neighbors before it, then improve it from the neighbors after it."""
+        """Solve each point from its earlier neighbors, then improve it from its later neighbors."""
         grid, first = self._grid, self._points.start
         for point, is_new in self._problems():
             if not is_new:
@@ -88,7 +100,7 @@ class _Shard:
             violations = [result.violation for result in before if result.violation]
             beside = 0.0 if guesses else min(violations, default=0.0)
             self.results.append(search(*self._at(point), guesses, beside))
-        # A later optimum may be better at earlier points too.
+        # The optimum of a later point may lead to a better optimum at earlier points.
         for point in reversed(self._points):
             start = self.results[point - first].start
             if start is not None:
@@ -97,7 +109,7 @@ class _Shard:
         self._share()
 
     def revise(self, beside: Mapping[int, list[float]]) -> None:
-        """Improve border points from postures of other shards, and other points from improved points."""
+        """Improve points at the border from postures in other shards, then other points from improved points."""
         improved = set[int]()
 
         def improve_from_neighbors(points: Iterable[int], starts: Callable[[int], Start | None]) -> None:
@@ -121,7 +133,7 @@ class _Shard:
         self._share()
 
     def predicted(self, values: Mapping[str, Any], q: Array, row: Mapping[str, Any]) -> dict[str, float | None]:
-        """Return the predicted impulse, jump and attainable speed at a point."""
+        """Return the predicted impulse, predicted jump and attainable speed of a point."""
         choice = self._solver.normal_and_speed(values)
         impact = self._solver.template(*choice).impact
         approach = (1 + impact.restitution) * impact.speed
@@ -138,7 +150,7 @@ class _Shard:
         return walk, self._solver.target(values)
 
     def _problems(self) -> Iterator[tuple[int, bool]]:
-        """Yield each point, and whether its problem differs from the problem of the point before it.
+        """Yield each point, and whether its problem differs from the problem of the previous point.
 
         Points that differ only in the speed have the same problem, unless a requirement depends on the speed.
         """
@@ -149,7 +161,7 @@ class _Shard:
             last = walk, place
 
     def _improve(self, point: int, start: Start) -> bool:
-        """Improve a point from the posture of a neighbor.  Return whether it improved."""
+        """Try to improve a point from the posture of a neighbor.  Return whether the point improved."""
         index = point - self._points.start
         known = self.results[index]
         self.results[index] = improve(*self._at(point), known, start)
@@ -157,7 +169,7 @@ class _Shard:
 
     def _share(self) -> None:
         """Copy the result of a point to the points after it with the same problem."""
-        # The first speed has the most neighbors.
+        # The results are computed at the first speed, because this point has the most neighbors.
         for point, is_new in self._problems():
             if not is_new:
                 index = point - self._points.start

@@ -1,4 +1,4 @@
-"""Table of a shard: a Parquet file with a row for each point."""
+"""Table of a shard: a Parquet file with one row per point."""
 
 from __future__ import annotations
 
@@ -26,9 +26,9 @@ def write_shard(
     results: Sequence[PointResult],
     predicted: Callable[[Mapping[str, Any], Array, Mapping[str, Any]], dict[str, float | None]],
 ) -> bytes:
-    """Return the file of a shard after a number of passes.
+    """Return the content of the Parquet file of a shard after ``passes`` passes.
 
-    ``predicted`` returns the predicted columns of a point from its values, its posture and its other columns.
+    ``predicted`` computes the columns :data:`PREDICTED` of a point from its grid values, posture and other columns.
     """
     import pyarrow as pa
     from pyarrow import parquet
@@ -42,7 +42,7 @@ def write_shard(
     rows = []
     for point, result in zip(points, results, strict=True):
         values = {**sweep.grid.values(point), **sweep.cases[case].values}
-        # Values without a plain Arrow type are stored as JSON.
+        # Values that have no simple Arrow type are stored as JSON text.
         odd = {name: json.dumps(v) for name, v in values.items() if kinds[name] == text and not isinstance(v, str)}
         rows.append({"point": case * sweep.grid.size + point, **values, **odd, **result.row})
         if result.q is not None:
@@ -54,7 +54,7 @@ def write_shard(
 
 
 def read_shard(content: bytes) -> list[PointResult]:
-    """Return the results in the file of a shard."""
+    """Return the results of all points, read from the content of a shard file."""
     import pyarrow as pa
     from pyarrow import parquet
 
@@ -67,7 +67,7 @@ def read_shard(content: bytes) -> list[PointResult]:
 
 
 def read_postures(content: bytes) -> list[list[float] | None]:
-    """Return the postures in the file of a shard."""
+    """Return the posture of each point, read from the content of a shard file; ``None`` without posture."""
     import pyarrow as pa
     from pyarrow import parquet
 
@@ -76,7 +76,10 @@ def read_postures(content: bytes) -> list[list[float] | None]:
 
 
 def passes_of(path: Path, key: str, points: int) -> int:
-    """Return the number of passes over the shard in a file; 0 if it is not a complete file of the sweep."""
+    """Return the number of passes after which a shard file was written.
+
+    Return 0 if ``path`` is not a complete shard file of the sweep with this key.
+    """
     from pyarrow import ArrowException, parquet
 
     try:
@@ -89,7 +92,7 @@ def passes_of(path: Path, key: str, points: int) -> int:
 
 
 def _kind(axis: Axis) -> Any:
-    """Return the Arrow type of the column of an axis."""
+    """Return the Arrow type of the column with the values of an axis."""
     import pyarrow as pa
 
     if all(isinstance(value, bool) for value in axis.values):

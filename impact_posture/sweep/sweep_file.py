@@ -1,4 +1,4 @@
-"""Content of ``SWEEP.toml``: one posture problem, and the values that vary over a grid."""
+"""Content of ``SWEEP.toml``: one posture problem, and the settings that vary over a grid."""
 
 from __future__ import annotations
 
@@ -19,24 +19,28 @@ from impact_posture.errors import SpecError, nearest, printable
 from impact_posture.impact.impact_contact import LARGEST
 from impact_posture.robot.robot_loader import from_folder
 
-# Axes that share one program, from the slowest to the fastest.  ``x``, ``y`` and ``z`` are offsets of the target.
+# Axes along which one program can be used, from the slowest to the fastest.  ``x``, ``y`` and ``z`` are offsets of
+# the target.
 OFFSETS = ("x", "y", "z")
 _INNER = ("normal", "target_quaternion", "target_position", *OFFSETS, "speed")
-# Settings of the search or the output, which cannot vary.
+# Settings that cannot be an axis, because they concern the search or the output.
 _NO_AXIS = ("schema", "q", "starts", "seed", "tradeoff", "tradeoff_against", "path", "search", "finish_all",
             "contact")  # fmt: skip
 _FILES = ("srdf", "config", "weights", "armature", "posture")
-# Most points of a grid, so that every index is a 64-bit integer.
+# Maximum number of points of a grid, so that every index is a 64-bit integer.
 _MOST = 10**15
-# Most combinations of values that need separate programs, because the settings of all of them are in memory.
+# Maximum number of combinations of values that need separate programs.  The settings of all of them are in memory.
 _MOST_CASES = 10**5
-# Number of neighbors, along the fastest axes, from which a point is warm started.
+# Number of neighbors from which a point is warm started, chosen along the fastest axes.
 _NEIGHBORS = 2
 
 
 @dataclass(frozen=True)
 class Axis:
-    """Values of ``x``, ``y`` or ``z`` (offset of the target, world, m) or of a setting, in the order of the file."""
+    """Axis of a grid: values of a setting, or of ``x``, ``y`` or ``z`` (offset of the target, world, m).
+
+    The values have the same order as in the file.
+    """
 
     name: str
     values: tuple[Any, ...]
@@ -55,7 +59,7 @@ class Grid:
 
     @property
     def size(self) -> int:
-        """Number of points."""
+        """Number of points of the grid."""
         return prod(self.shape)
 
     def place(self, point: int) -> tuple[int, ...]:
@@ -67,14 +71,17 @@ class Grid:
         return {axis.name: axis.values[k] for axis, k in zip(self.axes, self.place(point), strict=True)}
 
     def neighbors(self, point: int, first: int) -> list[int]:
-        """Return the nearest neighbors before ``point`` along the fastest axes, not before ``first``.
+        """Return the neighbors of ``point`` with smaller indices, but at least ``first``, along the fastest axes.
 
-        They depend on the grid and the shard only, so the bytes of the shard are reproducible.
+        The neighbors depend only on the grid and the shard, so the bytes of the shard are reproducible.
         """
         return [other for other in self.around(point) if first <= other < point][:_NEIGHBORS]
 
     def around(self, point: int) -> list[int]:
-        """Return the neighbors along all axes, before and after ``point``, the fastest axis first."""
+        """Return the neighbors of ``point`` on both sides along every axis.
+
+        The neighbors along the axis that varies fastest come first.
+        """
         neighbors: list[int] = []
         stride = 1
         for count, k in zip(reversed(self.shape), reversed(self.place(point)), strict=True):
@@ -89,9 +96,9 @@ class SweepSettings(StrictTable):
 
     Attributes:
         problem: Table with the keys of a ``problem.toml``, or the path of a ``problem.toml``.
-        grid: Values of each axis.
-        shard: Points of a shard, which is solved and written as a unit.
-        schema: Name of this format.
+        grid: Axis name → values, as a list or as a table with ``from``, ``to`` and ``count``.
+        shard: Number of points of a shard.  A shard is solved and written as a unit.
+        schema: Name of this file format.
     """
 
     problem: str | dict[str, Any]
@@ -102,7 +109,12 @@ class SweepSettings(StrictTable):
 
 @dataclass(frozen=True)
 class Case:
-    """Values of the outer axes, which need a separate program, and the problem at the first point of the grid."""
+    """Combination of values of the outer axes, which needs a separate program.
+
+    Attributes:
+        settings: Settings of the problem at the first point of the grid.
+        values: Values of the outer axes, by name.
+    """
 
     settings: ProblemSettings
     values: Mapping[str, Any]
@@ -114,9 +126,9 @@ class Sweep:
 
     Attributes:
         cases: Combinations of robot parameters, objectives and other settings.
-        outer: Axes of these settings.
-        grid: Targets, normals and speeds, equal for every case.
-        shard: Points of a shard.
+        outer: Axes along which the cases vary.
+        grid: Grid of targets, normals and speeds, the same for every case.
+        shard: Number of points of a shard.
     """
 
     cases: tuple[Case, ...]
@@ -126,12 +138,12 @@ class Sweep:
 
     @property
     def points(self) -> int:
-        """Number of problems."""
+        """Number of problems of the sweep."""
         return len(self.cases) * self.grid.size
 
     @property
     def shards(self) -> int:
-        """Number of shards.  A shard has points of one case only."""
+        """Number of shards of the sweep.  All points of a shard belong to the same case."""
         return len(self.cases) * self.shards_of_case
 
     @property
@@ -145,13 +157,13 @@ class Sweep:
         return 1 if self.shards_of_case == 1 else 2
 
     def span(self, shard: int) -> tuple[int, range]:
-        """Return the case of a shard, and its points as indices of the grid."""
+        """Return the number of the case of a shard, and the points of the shard as indices into the grid."""
         case, part = divmod(shard, self.shards_of_case)
         first = part * self.shard
         return case, range(first, min(first + self.shard, self.grid.size))
 
     def beside(self, shard: int) -> dict[int, list[int]]:
-        """Return the neighbors of the points of a shard in other shards, by shard."""
+        """Return other shards with points that are neighbors of points of this shard, each with these points."""
         case, points = self.span(shard)
         neighbors: dict[int, list[int]] = {}
         for other in sorted({other for point in points for other in self.grid.around(point)}.difference(points)):
@@ -160,10 +172,10 @@ class Sweep:
 
 
 def read_sweep(path: Path) -> Sweep:
-    """Read a ``SWEEP.toml``.  Its paths are relative to its folder.
+    """Read a ``SWEEP.toml``.  Paths in the file are relative to its folder.
 
     Raises:
-        SpecError: A key is unknown or missing, or a value does not fit.
+        SpecError: A key is unknown or missing, or a value is invalid.
     """
     settings, folder = validate(SweepSettings, read_toml(path), str(path)), path.resolve().parent
     if isinstance(settings.problem, str):
@@ -213,13 +225,13 @@ def _size(axis: Any, where: str) -> int:
 
 
 def _values(name: str, axis: Any) -> tuple[Any, ...]:
-    """Return the values of an axis after the check of :func:`_size`."""
+    """Return the values of an axis that :func:`_size` has checked."""
     if isinstance(axis, dict):
         low, high, count = axis["from"], axis["to"], axis["count"]
-        # Round, so that a tenth is a tenth and zero is zero.
+        # Round, so that values such as 0.1 and 0 are exact.
         even = [low + (high - low) * k / (count - 1) for k in range(count)]
         return tuple(0.0 if abs(v) < 1e-12 * abs(high - low) else float(f"{v:.12g}") for v in even)
-    # A larger integer may overflow as a float.  The demand of the setting refuses it later.
+    # Keep larger integers, because they may overflow as a float.  The check of the setting rejects them later.
     return tuple(float(v) if name in _INNER and type(v) is int and abs(v) <= LARGEST else v for v in axis)
 
 
@@ -234,7 +246,7 @@ def _check_names(names: Sequence[str], where: str) -> None:
 
 
 def _checked(name: str, values: Sequence[Any], problem: dict[str, Any], where: str) -> tuple[Any, ...]:
-    # An offset must be valid as an entry of a position.
+    # Check an offset as an entry of ``target_position``.
     key, wrap = ("target_position", lambda v: [v, 0.0, 0.0]) if name in OFFSETS else (name, lambda v: v)
     checked = []
     for k, value in enumerate(values):

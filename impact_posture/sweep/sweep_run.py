@@ -1,4 +1,4 @@
-"""Run of a sweep on an executor, which writes each shard when it is solved."""
+"""Run a sweep on an executor, and write each shard as soon as it is solved."""
 
 from __future__ import annotations
 
@@ -15,20 +15,21 @@ from impact_posture.sweep.shard_table import STATUS
 from impact_posture.sweep.sweep_file import Sweep
 
 Progress = Callable[[int, int], None]
-# Shards that are submitted and not yet written.  More shards need memory, fewer leave workers idle.
+# Maximum number of shards that are submitted and not yet written.  A larger number needs more memory; with a smaller
+# number, workers could wait.
 IN_HAND = 64
 
 
 @dataclass(frozen=True)
 class SweepRun:
-    """Result of a run of a sweep.
+    """Summary of a run of a sweep.
 
     Attributes:
-        folder: The sweep folder.
+        folder: Folder of the sweep.
         points: Number of problems of the sweep.
         counts: Number of points of each status in the shards that this run finished.
         shards: Number of shards that this run finished.
-        solver_s: Sum of the wall times of the workers within IPOPT, s.
+        solver_s: Sum of the wall times that the workers spent in IPOPT, s.
         total_s: Sum of the wall times of all shards, s.
     """
 
@@ -50,20 +51,21 @@ def run_sweep(
 ) -> SweepRun:
     """Solve all shards that are missing in the folder, and write them.
 
-    The bytes of a shard depend on the sweep only, not on the executor.
+    The bytes of a shard do not depend on the executor.
 
     Args:
-        sweep: The sweep.
-        folder: The folder.  An unfinished folder of the same sweep is continued.
-        executor: A ``concurrent.futures.Executor``; ``None`` for this process.
-        progress: Callback with the number of solved points and of points to solve.  With several shards in a case,
-            every point counts twice.
-        in_hand: Most shards that are submitted at once.
+        sweep: Sweep to run.
+        folder: Folder of the results.  If the folder contains an unfinished run of the same sweep, this run continues
+            it.
+        executor: A ``concurrent.futures.Executor``; ``None`` to solve in this process.
+        progress: Callback with the number of solved points and the number of all points to solve.  If a case has
+            several shards, each point is included twice, because each shard has two passes.
+        in_hand: Maximum number of shards that are submitted at the same time.
 
     Raises:
-        InputError: pyarrow is not installed, or a setting does not fit the robot.
-        OutputError: The folder has other content, or cannot be written.
-        WorkerDied: A worker of a pool was killed.  Another run continues the sweep.
+        InputError: pyarrow is not installed, or a setting is invalid for the robot.
+        OutputError: The folder contains something else, or cannot be written.
+        WorkerDied: A worker process was killed.  Run the sweep again to continue it.
     """
     check_package("pyarrow", "sweep")
     key = sweep_key(sweep)
@@ -95,7 +97,7 @@ def run_sweep(
 
 
 def _results(tasks: Iterable[tuple[Any, ...]], executor: Executor | None, in_hand: int) -> Iterator[ShardResult]:
-    """Yield the shards in the order in which they finish.  A task is a function with its arguments."""
+    """Yield results of shards in the order in which they finish.  A task is a tuple ``(function, *arguments)``."""
     if executor is None:
         yield from (function(*values) for function, *values in tasks)
         return

@@ -1,4 +1,4 @@
-"""Controllers for comparison with the impact-robust term: stiffer springs, and the gradient flow of Walker 1994."""
+"""Controllers for comparison with the impact-robust term: additional stiffness, and the flow of Walker 1994."""
 
 from __future__ import annotations
 
@@ -22,10 +22,11 @@ from impact_posture.tsid.tasks.impact_robust import ImpactRobustPosture, curvatu
 def spring_of_term(robot: Robot, gradient: Gradient, q: Array, strength: float) -> Array:
     """Return ``[K ∇²H(q)/λ]₊``, the stiffness of the impact-robust term at ``q``, 1/s², shape (nv, nv).
 
-    ``gradient`` is ``q → (H, ∇H)``, ``strength`` is ``K/λ``, and the term rests at ``q``, shape (nq,).
-    A posture task with this added stiffness has the spring of the term without its posture.  The difference between
-    the two controllers is the effect of the posture.  ``∇²H`` is symmetrized.  The base of a floating robot is left
-    out, because other tasks control it.  Negative curvature is left out, because it is not a stiffness.
+    ``gradient`` is ``q → (H, ∇H)``, ``strength`` is ``K/λ``, and ``q``, shape (nq,), is the resting posture with the
+    term.  A posture task with this additional stiffness is as stiff as the term, but does not change the posture.  So
+    the difference between the two controllers is the effect of the posture.  ``∇²H`` is symmetrized.  The entries of
+    a floating base are zero, because other tasks control the base.  Negative eigenvalues are set to zero, because
+    they would destabilize the robot.
     """
     added = strength * curvature(gradient, robot.model, q, np.eye(robot.nv))
     if robot.floating:
@@ -38,9 +39,10 @@ def spring_of_term(robot: Robot, gradient: Gradient, q: Array, strength: float) 
 def resting_posture(driver: Driver, seconds: float, *, ahead: float = 0.0) -> Array:
     """Return the posture in which a driver comes to rest after :meth:`Driver.brace`, shape (nq,).
 
-    The robot executes the planned acceleration exactly, without physics engine, sensors and motors.  It rests once
-    ``‖ν‖`` has been below 1e-3 at the full level of the driver for 0.2 s, or after ``seconds``.  Then the end
-    effector moves ``ahead`` (m) towards the surface, and the robot comes to rest again.
+    The robot executes the commanded acceleration exactly, without physics engine, sensors and motors.  The motion
+    ends when the level of the driver is 1 and ``‖ν‖`` has been below 1e-3 for 0.2 s, or after ``seconds``.  If
+    ``ahead`` is not zero, the end effector then moves ``ahead`` (m) towards the surface, and the robot comes to rest
+    again.
     """
     setup, period = driver.setup, driver.controller.period
     q, v, t = setup.q.copy(), np.zeros(setup.robot.nv), 0.0
@@ -62,13 +64,13 @@ def resting_posture(driver: Driver, seconds: float, *, ahead: float = 0.0) -> Ar
 class FlowPosture(ImpactRobustPosture):
     """Projected gradient flow of Walker 1994 as the reference of a posture task.
 
-    ``ν_ref = −α k Z Zᵀ ∇H/λ``.  The columns of ``Z`` span the motions that the other tasks leave free.  ``q_des`` is
-    the integral of ``ν_ref``, and ``ν_ref`` is the velocity reference.  They replace the impact-robust term.
-    ``k = K/K_d`` makes the flow as fast as this term.  The flow has the bound and the fade of the term near joint
-    limits.
+    The velocity reference is ``ν_ref = −α k Z Zᵀ ∇H/λ``, and the posture reference ``q_des`` is its integral.  They
+    replace the impact-robust term.  The columns of ``Z`` span the motions that the other tasks leave free.
+    ``k = K/K_d`` makes the flow as fast as the impact-robust term.  The flow is bounded like this term, and it fades
+    out near joint limits like this term.
 
     Attributes:
-        basis: ``Z``, shape (nv, r).  Without it, the posture does not flow.
+        basis: ``Z``, shape (nv, r); ``None`` to stop the flow.
     """
 
     def reset(self, state: State) -> None:
@@ -77,7 +79,7 @@ class FlowPosture(ImpactRobustPosture):
         self._flow = np.zeros(state.nv)
 
     def contact(self) -> None:
-        """Let the flow fade.  :class:`WalkerDriver` then moves the reference back to the robot."""
+        """Fade the flow out.  :class:`WalkerDriver` then moves the reference back to the robot's posture."""
         self.activation.enter(Phase.CONTACT)
 
     def advance(self, state: State, dt: float) -> None:
@@ -94,7 +96,7 @@ class FlowPosture(ImpactRobustPosture):
 
 
 class WalkerDriver(RobustDriver):
-    """Nominal controller whose posture reference flows down the gradient."""
+    """Nominal controller whose posture reference follows the negative gradient of H (:class:`FlowPosture`)."""
 
     posture: FlowPosture
 
@@ -105,7 +107,7 @@ class WalkerDriver(RobustDriver):
         return command
 
     def tick(self, reading: Reading, reference: ReferencePoint | None = None) -> Command:
-        """Return the command, and compute the redundancy as often as the gradient."""
+        """Return the command.  Update the basis ``Z`` as often as the gradient."""
         if self.level > 0:
             if self._ticks % self.posture.every == 0:
                 self.posture.basis = self.controller.assembly.redundancy(self.controller.state)
@@ -115,17 +117,18 @@ class WalkerDriver(RobustDriver):
     def hold(self) -> None:
         """Stop the flow and hold the present posture, center of mass and base orientation."""
         super().hold()
-        # The reference is ahead of the robot where other tasks have kept the robot back.
+        # If other tasks have slowed the robot, the reference is ahead, so move the reference to the robot's posture.
         self.posture.move_to(self.controller.state.q, self.posture.activation.ramp)
 
 
 class ReleaseDriver(RobustDriver):
-    """Impact-robust term without the nominal spring, until ``H`` stops falling.
+    """Impact-robust term without the nominal stiffness ``K_p``, until ``H`` no longer decreases.
 
-    Without ``K_p``, the posture flows to the optimum instead of coming to rest before it.  The scale of the term is
-    the larger curvature of the start and the offline optimum, so its stiffness hardly exceeds ``K`` between them.
-    The reached posture is held when ``H`` falls by a share of less than :attr:`LEAST` within :attr:`PATIENCE` (s).
-    The term has ``spring="release"`` and an activation that is not live.
+    Without ``K_p``, the posture moves to the optimum.  With ``K_p``, it would come to rest before.  The scale of the
+    term is the larger one of the curvatures at the start and at the offline optimum, so the stiffness of the term
+    hardly exceeds ``K`` between these postures.  If ``H`` decreases by a share of less than :attr:`LEAST` within
+    :attr:`PATIENCE` (s), the reached posture is held.  The term must have ``spring="release"`` and an activation that
+    is not live.
     """
 
     PATIENCE, LEAST = 0.5, 0.01
@@ -151,7 +154,7 @@ class ReleaseDriver(RobustDriver):
         self._braced = True
 
     def tick(self, reading: Reading, reference: ReferencePoint | None = None) -> Command:
-        """Return the command, and check periodically whether ``H`` still falls."""
+        """Return the command, and check periodically whether ``H`` still decreases."""
         if self._braced and self.level == 1:
             self._ticks += 1
             if self._ticks * self.controller.period >= self.PATIENCE:

@@ -1,4 +1,4 @@
-"""Controller of a driver as machine code, built once for each formulation."""
+"""Controller of a driver as machine code, which is built once for each formulation."""
 
 from __future__ import annotations
 
@@ -26,13 +26,13 @@ from impact_posture.tsid.controller import Command, Controller
 from impact_posture.tsid.tasks.task import TargetTask
 
 _PREFIX = "controller"
-# Optimizing the generated code takes long.  For a humanoid, -O1 costs 2 s and makes ticks 10 % faster.  Robots that
-# differ only in armature and mounting share the library.
+# Compiler options for the generated code.  Higher optimization takes long.  For a humanoid, -O1 needs 2 s and makes
+# ticks 10 % faster.
 _QUICK = ("-O1",)
 
 
 class CompiledTick:
-    """Controller in C (``library``) that follows the targets of the tasks in Python."""
+    """Controller in C (``library``) that gets its targets from the tasks in Python."""
 
     def __init__(self, controller: Controller, structure: Structure, library: CompiledController) -> None:
         self.library, self._controller, self._structure = library, controller, structure
@@ -41,26 +41,27 @@ class CompiledTick:
         self._numbers = ModelParameters(structure.robot.model).values
 
     def reset(self, q: Array, v: Array) -> Command:
-        """Start at the state of the controller in Python after its reset, with its gains and targets."""
+        """Start in the same state as the Python controller after its reset, with the same gains and targets."""
         for field in parameters(self._structure, self._controller.period):
             self.library.parameters[field.name][:] = field.value
         self.library.parameters["numbers"][:] = self._numbers
         if self._structure.robust is not None:
-            # Python has measured the scale, so that both controllers have the same digits.
+            # Copy the scale that Python has computed, so that both controllers use exactly the same value.
             self.library.parameters["robust_scale"][:] = self._structure.robust.scale
         self._sent.clear()
         self._lead()
         return self.library.reset(q, v)
 
     def tick(self, reading: Reading) -> Command:
-        """Send the moved targets and return the command at a reading."""
+        """Send the changed targets to C and return the command for a reading."""
         self._lead()
         return self.library.tick(reading.t, reading.q, reading.v, reading.force)
 
     def plan(self, times: Sequence[float], lead: Callable[[float], None]) -> tuple[Array, Array]:
-        """Return whether ``lead`` moves each target before the ticks at n times, and the numbers of the target.
+        """Call ``lead`` for ticks at n times, and record how it changes the targets.
 
-        The shapes are (n, targets) and (n, targets, 25).
+        Return flags, shape (n, targets), which are 1 if a target changes before a tick, and the changed targets,
+        shape (n, targets, 25).
         """
         targets = self.library.targets
         before = {name: row.copy() for name, row in targets.items()}
@@ -75,14 +76,15 @@ class CompiledTick:
         return led, leads
 
     def catch_up(self) -> None:
-        """Set the state of the controller in Python to the state of the last tick."""
+        """Set the state of the Python controller to the measured state of the last tick."""
         self._controller.state.update(*self.library.measured)
 
     def _lead(self) -> list[str]:
-        """Send the moved targets.  Return the names of their tasks."""
+        """Send the changed targets to C.  Return the names of their tasks."""
         moved = []
         for task in self._tasks:
-            # Python replaces a moved target as a whole.  Targets that C moves stay unchanged here.
+            # Python changes a target by assigning a new object, so identity shows a change.  Targets that C changes
+            # stay the same object here.
             rates = task.target_velocity, task.target_acceleration
             now = (task.target, rates[0].tobytes(), rates[1].tobytes())
             sent = self._sent.get(task.name)
@@ -98,8 +100,8 @@ def compiled_tick(controller: Controller, structure: Structure, objective: Worst
 
     Raises:
         InputError: The sources of DAQP are missing.
-        CompilerError: There is no compiler, or it failed.
-        OutputError: The cache cannot be written, or other users can write it.
+        CompilerError: There is no compiler, or the compiler failed.
+        OutputError: The cache folder cannot be written, or other users can write to it.
     """
     folder = cache_folder("controllers") / _key(structure, objective)
     with locked(folder.with_suffix(".lock")):
@@ -110,15 +112,18 @@ def compiled_tick(controller: Controller, structure: Structure, objective: Worst
             options |= {"generated": _QUICK, "shared": True}
             if export_controller(controller.robot, controller.formulation, folder, **options).library is None:
                 raise CompilerError("left no library", where=str(folder), hint="set CC to another compiler")
-    # The manifest may name another robot with the same code.
+    # Use the given structure, because the manifest can name another robot that has the same code.
     return CompiledTick(controller, structure, CompiledController.load(folder))
 
 
 def _key(structure: Structure, objective: WorstCaseObjective | None) -> str:
-    """Return a hash of everything that is compiled.  Gains, limits, targets and some numbers are parameters."""
+    """Return a hash of everything that the compiled code depends on.
+
+    Gains, limits, targets, armature and mounting are parameters of the code and not part of the hash.
+    """
     robot = without_parameters(structure.robot)
     if objective is not None:
-        # Only the kind ``coulomb`` depends on the friction of the impact.
+        # The friction of the impact affects only the objective ``coulomb``.
         friction = objective.contact.friction if objective.kind == "coulomb" else 0.0
         objective = replace(objective, robot=robot, contact=replace(objective.contact, friction=friction))
     points = [(robot.model.frames[robot.frame_id(point.frame)], point) for point in structure.points]

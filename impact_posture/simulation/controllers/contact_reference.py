@@ -1,4 +1,4 @@
-"""Reference of the end effector over time, for repeated contacts."""
+"""Reference trajectory of the end effector for repeated contacts."""
 
 from __future__ import annotations
 
@@ -13,7 +13,7 @@ from impact_posture.simulation.scenario_file import RepeatedContacts
 
 
 class ReferencePoint(NamedTuple):
-    """Distance (m), speed (m/s) and acceleration (m/s²) along the approach, relative to the start of the shape."""
+    """Distance from the start position (m), speed (m/s) and acceleration (m/s²) along the approach."""
 
     distance: float
     speed: float
@@ -21,17 +21,19 @@ class ReferencePoint(NamedTuple):
 
 
 class Reference:
-    """Reference of :class:`RepeatedContacts` along ``−n``, into the surface.
+    """Reference trajectory of :class:`RepeatedContacts` along ``−n``, into the surface.
 
-    The approach accelerates from rest with ``acceleration`` to ``speed``, keeps this speed until the surface, and
-    brakes evenly to rest ``beyond`` the surface.  After ``dwell``, the return goes from rest to rest with the same
-    acceleration and at most the same speed.  A pause follows.
+    In the approach, the reference accelerates from rest with ``acceleration`` to ``speed`` and keeps this speed until
+    it reaches the surface.  It then brakes uniformly to rest at the distance ``beyond`` behind the surface.  After
+    the time ``dwell``, it returns to the start with the same acceleration and at most the same speed.  Then it
+    pauses.
 
     Attributes:
         inward: Duration of the approach, s.
-        cycle: Time from one approach to the next, s.
+        cycle: Time from the begin of an approach to the begin of the next one, s.
         total: Duration of the run, s.
-        legs: Duration, acceleration, and initial distance and speed of each leg of constant acceleration.
+        legs: Segments of constant acceleration, each with duration (s), acceleration (m/s²), initial distance (m) and
+            initial speed (m/s).
 
     Raises:
         InputError: The gap is too short to reach the speed.
@@ -39,7 +41,7 @@ class Reference:
 
     def __init__(self, task: RepeatedContacts, gap: float) -> None:
         v, a = task.speed, task.acceleration
-        # A product overflows to infinity, but a power raises OverflowError.
+        # Use ``v * v``: if it overflows, the result is infinite, but ``v**2`` raises OverflowError.
         run_up = v * v / (2 * a)
         if not run_up <= gap:
             what = f"{v:g} m/s at {a:g} m/s² takes {run_up:.3g} m, the gap is {gap:.3g} m"
@@ -62,11 +64,11 @@ class Reference:
         self.total = task.settle + task.count * self.cycle
 
     def start(self, contact: int) -> float:
-        """Return the begin of the approach of a contact, s."""
+        """Return the time at which the approach of a contact begins, s."""
         return float(self.task.settle + contact * self.cycle)
 
     def at(self, t: float) -> ReferencePoint:
-        """Return the reference at a time, s."""
+        """Return the reference at time ``t``, s."""
         contact = min(max(int((t - self.task.settle) // self.cycle), 0), self.task.count - 1)
         since = t - self.start(contact)
         k = bisect_right(self._ends, since)

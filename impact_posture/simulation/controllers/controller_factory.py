@@ -1,4 +1,4 @@
-"""Controllers by name, and the factory that builds their drivers."""
+"""Names of the controllers, and the factory that builds their drivers."""
 
 from __future__ import annotations
 
@@ -43,7 +43,7 @@ from impact_posture.tsid.tasks.impact_robust import ImpactRobustPosture
 from impact_posture.tsid.tasks.joint_posture import JointPosture
 
 Mode = Literal["live", "held"]
-# Descriptions for tables and help.
+# Controller name → description in tables and help.
 MEANING: dict[str, str] = {
     "nominal": "TSID with the start posture",
     "robust": "its posture task with -K grad H, the paper's",
@@ -63,7 +63,8 @@ MEANING: dict[str, str] = {
     "walker": "the gradient's flow as reference of the posture task",
 }
 CONTROLLERS = tuple(MEANING)
-# This suffix adds the stiffness that the impact-robust term has in the posture of the controller.
+# With this suffix, a controller gets additional stiffness, equal to the stiffness of the impact-robust term at the
+# controller's resting posture.
 _STIFF = "-stiff"
 _PLAIN = {
     "nominal": Driver,
@@ -86,7 +87,7 @@ GROUP = "impact_posture.controllers"
 
 
 def check_gain(name: str, gain: float | None) -> None:
-    """Raise an InputError for a gain of a controller of this package that has none."""
+    """Raise an InputError if a gain is given for a controller of this package that has no gain."""
     has = name.startswith(("robust", "walker", "stiff")) and not name.startswith("robust-flow")
     if gain is not None and name in CONTROLLERS and not (has or name.endswith(_STIFF)):
         hint = "robust, its variants, walker and stiff have one"
@@ -95,17 +96,19 @@ def check_gain(name: str, gain: float | None) -> None:
 
 @dataclass(eq=False)
 class ControllerFactory:
-    """Builds the controllers of a scenario.  Shared parts are built at their first use.
+    """Factory of the controllers of a scenario.  Parts that several controllers need are built once, at first use.
 
     Attributes:
-        free: Whether gradients and the offline optimum ignore the feet.
+        setup: Scenario that is ready to run.
+        free: If true, gradients and the offline optimum ignore the contacts at the feet.
         gradient_of: Function that builds the gradient of an objective, compiled or interpreted.
-        offline_of: Function with the arguments and result of
+        offline_of: Function that computes the offline posture, with the same arguments and result as
             :func:`~impact_posture.simulation.offline_posture.offline_posture`.
-        compile: Whether controllers run as machine code: ``auto`` where they can, always, or never.
+        compile: When controllers run as machine code: ``always``, ``never``, or ``auto`` for controllers that can be
+            compiled.
         starts: Number of starts of the optimizer for offline postures.
-        in_c: Whether the last driver runs as machine code.
-        warnings: Parts of the last driver that could not be compiled, with reasons.
+        in_c: True if the last built driver runs as machine code.
+        warnings: Parts of the last built driver that could not be compiled, with reasons.
     """
 
     setup: Setup
@@ -122,18 +125,21 @@ class ControllerFactory:
     _offline: dict[tuple[ObjectiveKind, bool], OfflinePosture] = field(default_factory=dict)
 
     def objective(self, kind: ObjectiveKind = "impulse") -> WorstCaseObjective:
-        """Return an objective for the impact of the scenario."""
+        """Return the objective of a kind for the impact of the scenario."""
         if kind not in self._objectives:
             self._objectives[kind] = scenario_objective(self.setup, kind, free=self.free)
         return self._objectives[kind]
 
     def gradient(self, kind: ObjectiveKind = "impulse") -> Gradient:
-        """Return the gradient of an objective.  It is interpreted, with a warning, if it cannot be compiled."""
+        """Return the gradient of the objective of a kind.
+
+        If the gradient cannot be compiled, it is interpreted, and a warning is added.
+        """
         if kind not in self._gradients:
             try:
                 self._gradients[kind] = self.gradient_of(self.objective(kind)), ()
             except InputError as error:
-                # An error of the objective itself is raised again here.
+                # If the error comes from the objective and not from compiling, the next statement raises it again.
                 warning = f"the gradient is interpreted, not compiled, which is slower: {error.line}"
                 self._gradients[kind] = interpreted(self.objective(kind)), (warning,)
         gradient, warnings = self._gradients[kind]
@@ -142,7 +148,7 @@ class ControllerFactory:
 
     @cached_property
     def metric(self) -> Callable[[Array], float]:
-        """``q → H``, the objective in the CasADi interpreter, which is ready at once."""
+        """Function ``q → H``, evaluated by the CasADi interpreter because this needs no compilation."""
         tell("building the expressions")
         function, normal = self.objective().value_fun(), np.array(self.objective().contact.normal, dtype=float)
         return lambda q: float(function(q, normal))
@@ -153,7 +159,7 @@ class ControllerFactory:
         return self._optimum(name) if name in _OFFLINE else None
 
     def _optimum(self, name: str) -> OfflinePosture:
-        # Along a path, the end effector stays at its start.
+        # For the controller ``path``, the end effector stays at its start, so the optimum is another one.
         kind, at_contact = _KINDS.get(name, "impulse"), name != "path"
         if (kind, at_contact) not in self._offline:
             self._offline[kind, at_contact] = self.offline_of(
@@ -163,22 +169,23 @@ class ControllerFactory:
 
     @cached_property
     def path(self) -> PosturePath:
-        """Path of the ``path`` controller."""
+        """Path that the controller ``path`` follows."""
         check_package()
         solution = self._optimum("path").solution
         tell("looking for a path to the offline posture")
         return posture_path(solution)
 
     def driver(self, name: str, mode: Mode = "live", gain: float | None = None) -> Driver:
-        """Build a controller.
+        """Build the driver of a controller.
 
-        A name of another package is looked up among the entry points :data:`GROUP` of the installed packages.  The
-        entry point is a function of this factory, the mode and the gain that returns the driver.  For the arguments
-        see :func:`impact_posture.simulation.run.run`.
+        Other installed packages can add controllers by entry points of the group :data:`GROUP`.  Such an entry point
+        is a function that gets this factory, the mode and the gain, and returns the driver.  For the arguments see
+        :func:`impact_posture.simulation.run.run`.
 
         Raises:
             ControllerNotFound: The controller is unknown.
-            InputError: The mode is unknown, the controller has no term to hold, or another package fails.
+            InputError: The mode is unknown, the mode is ``held`` and the controller has no impact-robust term, or the
+                code of another package fails.
         """
         self.warnings.clear()
         self.in_c = False
@@ -221,9 +228,9 @@ class ControllerFactory:
         return driver(setup, task(robot, gradient, K=K, fade=term.fade, activation=activation, **options))
 
     def _compiled(self, driver: Driver, name: str) -> CompiledTick | None:
-        """Return the controller of a driver as machine code, or ``None`` where Python runs it.
+        """Return the controller of a driver as machine code, or ``None`` if it must run in Python.
 
-        Only the drivers of :data:`_IN_C` can run in C, because the others read the state of their controller.
+        Only the drivers in :data:`_IN_C` can use machine code.  Other drivers read the state of their controller.
         """
         always, controller = self.compile == "always", driver.controller
         if not always and (self.compile == "never" or self._fault or find_compiler() is None):
@@ -243,13 +250,17 @@ class ControllerFactory:
         except InputError as error:
             if always:
                 raise
-            # A failed build or download is not tried again for each run.
+            # Remember the failure of a build or download, so that the next runs do not try again.
             self._fault = f"the controller runs in Python, not in C, which is slower: {error.line}"
             self.warnings.append(self._fault)
             return None
 
     def _stiffened(self, name: str, at: str, gain: float | None) -> Driver:
-        """Build controller ``name`` with the stiffness of the term of ``robust`` in the resting posture of ``at``."""
+        """Build controller ``name`` with additional stiffness.
+
+        The additional stiffness is equal to the stiffness of the impact-robust term at the resting posture of
+        controller ``at``.
+        """
         robust = self.driver("robust", gain=gain)
         assert isinstance(robust, RobustDriver)  # noqa: S101 (the name says it)
         seconds = self.setup.scenario.task.settle
@@ -271,7 +282,7 @@ class ControllerFactory:
         except ImpactPostureError:
             raise
         except Exception as error:
-            # The code of another package may raise anything.
+            # The code of another package can raise any exception.
             what = f"cannot be made: {type(error).__name__}: {error}"
             raise InputError(what, where=where, hint="correct or remove the package that adds it") from error
         if not isinstance(driver, Driver):

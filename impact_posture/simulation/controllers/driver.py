@@ -1,4 +1,4 @@
-"""Controller of a scenario: references, preparation for the impact, and the posture that it holds."""
+"""Drivers of controllers in a scenario: they set references and prepare the controller for the impact."""
 
 from __future__ import annotations
 
@@ -21,7 +21,7 @@ from impact_posture.tsid.tasks.body_tasks import BaseOrientation, BodyTaskLead, 
 from impact_posture.tsid.tasks.impact_robust import ImpactRobustPosture
 from impact_posture.tsid.tasks.joint_posture import JointPosture
 
-# Time in which references move to a new posture, s.
+# Duration of the motion of references to a new posture, s.
 MOVE = 1.0
 
 
@@ -30,7 +30,8 @@ class Driver:
 
     Attributes:
         controller: The controller in Python.
-        compiled: The same controller as machine code.  If it is set, it gives the commands.
+        compiled: The same controller as machine code, which then computes the commands; ``None`` if the controller
+            runs in Python.
     """
 
     compiled: CompiledTick | None = None
@@ -47,7 +48,7 @@ class Driver:
         self._followed: ReferencePoint | None = None
 
     def reset(self, q: Array) -> Command:
-        """Begin at rest.  All tasks hold the present state, and targets of an earlier run are forgotten."""
+        """Start at rest at ``q``.  The targets of all tasks are reset to the present state."""
         end_effector, self._followed = self._end_effector, None
         for task in (*([] if end_effector is None else [end_effector]), *self._body_tasks):
             task.target, task.target_velocity, task.target_acceleration = None, 0.0, 0.0
@@ -57,14 +58,14 @@ class Driver:
         return command if self.compiled is None else self.compiled.reset(q, at_rest)
 
     def tick(self, reading: Reading, reference: ReferencePoint | None = None) -> Command:
-        """Return the command.  ``reference`` is the target of the end effector along its approach."""
+        """Return the command for a reading.  ``reference`` is the target of the end effector along its approach."""
         self.lead(reading.t, reference)
         if self.compiled is not None:
             return self.compiled.tick(reading)
         return self.controller.tick(reading.t, reading.q, reading.v, reading.force)
 
     def lead(self, t: float, reference: ReferencePoint | None = None) -> None:
-        """Move the targets of the tasks for a tick at time ``t``, s."""
+        """Set the targets of the tasks for a tick at time ``t``, s."""
         if reference != self._followed and reference is not None:
             self._follow(reference)
             self._followed = reference
@@ -84,7 +85,7 @@ class Driver:
         return self.posture.level if self.compiled is None else self.compiled.library.level
 
     def _call_posture(self, method: str, *arguments: Any, **named: Any) -> None:
-        """Call a method of the posture task in Python or in C, whichever is in use."""
+        """Call a method of the posture task, in C if the controller runs in C, otherwise in Python."""
         getattr(self.posture if self.compiled is None else self.compiled.library, method)(*arguments, **named)
 
     def _follow(self, reference: ReferencePoint) -> None:
@@ -98,7 +99,7 @@ class Driver:
 
 
 class RobustDriver(Driver):
-    """Impact-robust controller.  Its posture task has the impact-robust term from :meth:`brace` on."""
+    """Impact-robust controller.  After :meth:`brace`, its posture task contains the impact-robust term."""
 
     posture: ImpactRobustPosture
 
@@ -116,7 +117,7 @@ class RobustDriver(Driver):
 
 
 class FlowDriver(Driver):
-    """Controller whose posture flows to a smaller impact from :meth:`brace` on."""
+    """Controller whose reference posture flows towards a smaller impact after :meth:`brace`."""
 
     posture: ReferenceFlowPosture
     _now = 0.0
@@ -132,19 +133,19 @@ class FlowDriver(Driver):
         self._call_posture("contact")
 
     def expect(self, t: float) -> None:
-        """Come to rest before an impact at time ``t``, s."""
+        """Stop the flow before an impact at time ``t``, s, so that the posture is at rest at the impact."""
         if self.level > 0:
             self._call_posture("brace", t_impact=t - self._now)
 
 
 class PostureDriver(Driver):
-    """Nominal controller that moves to an offline posture, ``target`` of shape (nq,), from :meth:`brace` on."""
+    """Nominal controller that moves to an offline posture, ``target`` of shape (nq,), after :meth:`brace`."""
 
     def __init__(self, setup: Setup, posture: JointPosture, target: Array) -> None:
         super().__init__(setup, posture)
         self._goal = target
         self._since: float | None = None
-        # Body tasks with their first and last targets.
+        # Tuples (body task, target at the start of the motion, target at its end).
         self._moves: list[tuple[CenterOfMass | BaseOrientation, Any, Any]] = []
 
     def reset(self, q: Array) -> Command:
@@ -156,7 +157,7 @@ class PostureDriver(Driver):
         self._call_posture("move_to", self._goal, MOVE)
         model = self.setup.robot.model
         for task in self._body_tasks:
-            # The goal was computed with the feet in place, so they do not move.
+            # The feet have the same positions in the goal posture and now, so this motion does not move the feet.
             if isinstance(task, CenterOfMass):
                 end = np.array(pin.centerOfMass(model, model.createData(), self._goal))
             else:
@@ -181,13 +182,13 @@ class PostureDriver(Driver):
 
 
 class PathDriver(Driver):
-    """Nominal controller whose posture follows a timed path from :meth:`brace` on.
+    """Nominal controller whose posture follows a timed path after :meth:`brace`.
 
-    Between two points of the path, the posture is interpolated on the manifold, and velocity and acceleration
-    linearly.  Center of mass and base orientation follow the posture.
+    Between two points of the path, the posture is interpolated on the manifold.  Velocity and acceleration are
+    interpolated linearly.  The targets of center of mass and base orientation are computed from the posture.
 
     Attributes:
-        path: Path that begins at the start posture, or at the nearest posture that satisfies the constraints.
+        path: Path from the start posture (or the nearest posture that satisfies the constraints) to the optimum.
     """
 
     def __init__(self, setup: Setup, posture: JointPosture, path: PosturePath) -> None:

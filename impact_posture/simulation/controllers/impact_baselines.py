@@ -1,4 +1,4 @@
-"""Published controllers for impacts: invariant feedback, reference spreading, and impact-aware limits."""
+"""Published controllers for impacts: impact-invariant feedback, reference spreading, and impact-aware limits."""
 
 from __future__ import annotations
 
@@ -22,11 +22,12 @@ from impact_posture.tsid.tasks.joint_posture import JointPosture
 class ImpactFeedbackDriver(Driver):
     """Nominal controller whose velocity feedback depends on the time of the impact.
 
-    The impact is at the expected time, or when a force sensor feels more than ``FELT`` (N) in an approach.
+    The time of the impact is the expected time, or the time at which a force sensor measures more than ``FELT`` (N)
+    during an approach.
     """
 
     FELT = 5.0
-    # A force earlier than this before the expected time belongs to the previous impact, s.
+    # If a force acts earlier than this before the expected time, it belongs to the previous impact, s.
     EARLY = 0.2
 
     def __init__(self, setup: Setup, posture: JointPosture) -> None:
@@ -45,14 +46,14 @@ class ImpactFeedbackDriver(Driver):
         self._at, self._felt = t, False
 
     def _feel(self, reading: Reading) -> bool:
-        """Set the time of an impact that the force sensor feels.  Return whether the impact acts now."""
+        """Set the time of an impact that the force sensor measures.  Return whether a contact force acts now."""
         acts = reading.force is not None and float(np.linalg.norm(reading.force)) > self.FELT
         if acts and not self._felt and reading.t > self._at - self.EARLY:
             self._at, self._felt = reading.t, True
         return acts
 
     def _lead(self, reference: ReferencePoint | None) -> None:
-        """Set the targets of the end effector, and the target velocities of all tasks."""
+        """Set the end effector's targets to ``reference``, and the target velocities of other tasks to zero."""
         for task in self.controller.formulation.tasks:
             task.target_velocity = np.zeros(task.size)
         if reference is not None:
@@ -69,15 +70,17 @@ class ImpactFeedbackDriver(Driver):
 class InvariantDriver(ImpactFeedbackDriver):
     """Feedback on the impact-invariant subspace around an impact (Yang and Posa 2021).
 
-    An impulse at the contact does not change the component of ν in the null space of ``J M⁻¹``.  Around the impact,
-    the velocity feedback of every task uses ``ν + α M⁻¹Jᵀ λ*`` instead of ν.  So it does not oppose a velocity that
-    an impulse may have caused.  ``λ*`` minimizes ``‖ẏ_des − J_y (ν + M⁻¹Jᵀ λ)‖``.  Within ``T`` = ``WINDOW`` (s) of
-    the impact at ``t*``, ``α = 1 − exp(−(T − |t − t*|)/τ)`` with ``τ`` = ``FADE`` (s).
+    An impulse at the contact changes ν only in the range of ``M⁻¹Jᵀ``.  Around the impact, the velocity feedback of
+    every task uses ``ν + α M⁻¹Jᵀ λ*`` instead of ν.  So the feedback does not oppose a velocity that an impulse can
+    have caused.  ``λ*`` minimizes ``‖ẏ_des − J_y (ν + M⁻¹Jᵀ λ)‖``.  If the time ``t`` is within ``T`` = ``WINDOW``
+    (s) of the impact at ``t*``, then ``α = 1 − exp(−(T − |t − t*|)/τ)`` with ``τ`` = ``FADE`` (s); otherwise, α is 0.
 
-    Differences from the paper: a force sensor moves ``t*``, instead of a schedule.  The posture task does not count
-    for ``λ*`` if there are other tasks, because its target is at rest while they move.  The paper has no redundant
-    posture.  Standing feet react to the impulse (``M⁻¹`` is contact-consistent).  In the paper, their impulses are
-    free.  Here, free impulses could explain every velocity of center of mass and base, and would leave no feedback.
+    There are three differences from the paper.  First, ``t*`` does not follow a schedule, because a force sensor
+    corrects it.  Second, if there are other tasks, the posture task does not affect ``λ*``, because its target is at
+    rest while the other tasks move.  In the paper, there is no redundant posture.  Third, the impulses at standing
+    feet follow from the impulse at the contact (``M⁻¹`` is contact-consistent).  In the paper, the impulses at the
+    feet are free variables.  Here, free impulses could explain every velocity of center of mass and base, so no
+    feedback would remain.
     """
 
     WINDOW, FADE = 0.05, 0.0025
@@ -89,12 +92,12 @@ class InvariantDriver(ImpactFeedbackDriver):
         return self._command(reading, share * self._correction(reading) if share > 0 else None)
 
     def share(self, t: float) -> float:
-        """Return ``α`` at time ``t``, s."""
+        """Return the weight ``α`` at time ``t``, s."""
         left = self.WINDOW - abs(t - self._at)
         return float(-np.expm1(-left / self.FADE)) if left > 0 else 0.0
 
     def _correction(self, reading: Reading) -> Array:
-        """Return ``M⁻¹Jᵀ λ*``, shape (nv,)."""
+        """Return the velocity correction ``M⁻¹Jᵀ λ*``, shape (nv,)."""
         state, formulation = self._state.update(reading.q, reading.v), self.controller.formulation
         change = supported_inverse(state, formulation.contacts) @ state.at(self._point).jacobian[:3].T
         leading = [task for task in formulation.tasks if task is not self.posture] or [self.posture]
@@ -107,28 +110,32 @@ class InvariantDriver(ImpactFeedbackDriver):
 class ReferenceSpreadingDriver(ImpactFeedbackDriver):
     """Time-invariant reference spreading with an interim mode (van Steen et al. 2024).
 
-    The end effector has three references along its distance ``s`` into the surface:
+    The end effector has three references for its distance ``s`` along the approach:
 
-    - Before the impact, the speed is a function of the position, ``√(2 a s)`` up to the speed of the scenario.  It
-      continues behind the surface, so a late impact meets the same reference.  There is no position error along the
-      approach.
-    - The interim mode lasts from the first touch until the contact has lasted for ``SUSTAINED`` (s), at most
-      ``INTERIM`` (s).  No task has velocity feedback.  The position follows the integral of the speed before the
-      impact, which completes the contact.
-    - After the impact, the position fades to the rest position of the scenario with the time constant ``SETTLE`` (s).
-      The velocity targets of all tasks begin at ``J_y ν⁺`` and fade likewise.  ``ν⁺ = ν⁻ + Δν`` follows from a rigid,
-      inelastic impact at the velocity before the touch.
+    - Before the impact, the target speed is a function of the position: ``√(2 a s)``, at most the speed of the
+      scenario.  This reference continues behind the surface, so it is also valid if the impact is late.  The position
+      feedback along the approach is zero.
+    - The interim mode starts at the first touch.  It ends when the contact has lasted for ``SUSTAINED`` (s), or after
+      ``INTERIM`` (s).  In this mode, no task has velocity feedback.  The position target continues with the speed
+      before the impact, which establishes the contact.
+    - After the impact, the position target moves exponentially, with the time constant ``SETTLE`` (s), to the rest
+      position of the scenario.  The velocity targets of all tasks start at ``J_y ν⁺`` and decay with the same time
+      constant.  ``ν⁺ = ν⁻ + Δν`` is the velocity after a rigid, inelastic impact at the velocity ``ν⁻`` before the
+      touch.
 
-    Differences from the paper: there is one contact instead of several simultaneous contacts.  A rebound counts as a
-    partial contact.  ``ν⁻`` is measured, because the tasks leave a redundancy without a reference.  The return
-    follows the scenario in time.  Without contacts, this is the nominal controller.  Longer modes let the robot move
-    more, because this controller avoids feedback and not motion.
+    There are four differences from the paper.  First, there is one contact instead of several simultaneous contacts,
+    and a rebound is treated as a partial contact.  Second, ``ν⁻`` is measured, because the tasks leave redundant
+    motions without a reference.  Third, the return follows the scenario in time.  Fourth, in a scenario without
+    contacts, this controller is the nominal controller.  With longer modes, the robot moves more, because this
+    controller reduces feedback and not motion.
     """
 
     SUSTAINED, INTERIM, SETTLE = 0.005, 0.05, 0.03
-    # Least distance for the speed before the impact, m.  At zero, the robot would never start.
+    # The target speed before the impact is computed with at least this distance, m.  With zero, the robot would never
+    # start.
     BEGIN = 2e-3
-    # Distance of the touch, which the interim mode advances; duration of the contact; end of the interim mode.
+    # Distance at the touch, which increases in the interim mode (m); duration of the contact (s); time at which the
+    # interim mode ended (s), ``None`` before.
     _touch: float
     _lasted: float
     _done: float | None
@@ -186,16 +193,16 @@ class ReferenceSpreadingDriver(ImpactFeedbackDriver):
 
 
 class ImpactAwareDriver(Driver):
-    """Nominal controller with limits of post-impact rates and impulsive torques (Wang et al. 2020).
+    """Nominal controller with limits on joint velocities and impulsive torques after an impact (Wang et al. 2020).
 
-    From the begin of an approach until the return, each tick obeys
-    :class:`~impact_posture.tsid.limits.impact_limits.ImpactLimits`, as if the impact came at the next tick.  So the
-    approach is only as fast as the limits of the robot allow.  If they allow the speed of the scenario, this is the
-    nominal controller.
+    From the begin of an approach until the return, each tick satisfies
+    :class:`~impact_posture.tsid.limits.impact_limits.ImpactLimits`, as if the impact happened in the next tick.  So
+    the approach is at most as fast as the limits of the robot allow.  If the limits allow the speed of the scenario,
+    the commands are the same as from the nominal controller.
 
-    Differences from the paper: limits that the present state violates give way, like limits of the joints.  The paper
-    does not treat this case.  It also keeps the zero-moment point and the friction of standing feet through the
-    impact.  Here, the feet react without limits.
+    There are two differences from the paper.  First, if the present state violates limits, these limits are relaxed,
+    like joint limits.  The paper does not treat this case.  Second, the forces at the feet during the impact are not
+    limited.  In the paper, standing feet also satisfy zero-moment point and friction constraints during the impact.
     """
 
     def __init__(self, setup: Setup, posture: JointPosture) -> None:

@@ -1,4 +1,4 @@
-"""Tasks of a controller from the gains of a scenario.  Controllers differ in the posture task only."""
+"""Build the tasks of a controller from the gains of a scenario.  Controllers differ only in the posture task."""
 
 from __future__ import annotations
 
@@ -22,10 +22,10 @@ from impact_posture.tsid.tasks.task import Task
 
 
 def end_effector_task(setup: Setup) -> EndEffector | None:
-    """Return the task of the end effector, if the scenario has contacts.
+    """Return the task of the end effector; ``None`` if the scenario has no contacts.
 
     Raises:
-        SpecError: A push has gains for an end effector, or contacts have none.
+        SpecError: The scenario has a push or throw and gains for an end effector, or contacts and no such gains.
     """
     scenario, gains = setup.scenario, setup.scenario.control.end_effector
     if scenario.contacts is None and gains is not None:
@@ -45,14 +45,14 @@ def end_effector_task(setup: Setup) -> EndEffector | None:
 
 
 def build_formulation(setup: Setup, posture: JointPosture, end_effector: EndEffector | None) -> TaskFormulation:
-    """Build the tasks of a scenario around a posture task.
+    """Build the task formulation of a scenario with a given posture task.
 
-    For a robot with ``[control.footing]``, contacts and friction are constraints, and center of mass, base
-    orientation, end effector and posture are weighted.  Another robot has strict levels: level base, end effector,
-    and the posture in the cost.
+    For a scenario with ``[control.footing]``, contacts and friction are constraints.  Center of mass, base
+    orientation, end effector and posture are weighted tasks.  For other scenarios, the level base and the end
+    effector are strict levels, and the posture is in the cost.
 
     Raises:
-        SpecError: A task with gains does not exist for this robot.
+        SpecError: The scenario has gains for a task that is not available for this robot.
     """
     control, scenario = setup.scenario.control, setup.scenario
     _check_gains(setup)
@@ -71,9 +71,9 @@ def build_formulation(setup: Setup, posture: JointPosture, end_effector: EndEffe
 
 
 def posture_options(setup: Setup) -> dict[str, Any]:
-    """Return the options of the posture task, which all controllers share.
+    """Return the options of the posture task, which are the same for all controllers.
 
-    The base of a floating robot has no weight, because other tasks control it.
+    The weight of a floating base is zero, because other tasks control the base.
     """
     gains, base = setup.scenario.control.posture, 0.0 if setup.robot.floating else None
     kd = 2 * np.sqrt(gains.kp) if gains.kd is None else gains.kd
