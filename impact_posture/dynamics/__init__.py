@@ -1,1 +1,1 @@
-"""Dynamics of a ``pin.Model`` as CasADi expressions, computed with Pinocchio, and in MuJoCo."""
+"""Dynamics of a ``pin.Model``: as CasADi expressions, computed with Pinocchio, and computed with MuJoCo."""

@@ -1,4 +1,4 @@
-"""Coordinates of the configuration space for an optimizer."""
+"""Coordinates of the configuration space that an optimizer uses."""
 
 from __future__ import annotations
 
@@ -13,15 +13,15 @@ from impact_posture.dynamics.joints import JointKind, joint_kind
 from impact_posture.robot.model_joints import ENDLESS
 from impact_posture.system.arrays import Array
 
-# Joints whose last coordinate is an angle; their q has its cosine and sine.
+# Joint families whose last chart coordinate is an angle; q contains the cosine and sine of this angle.
 _ANGLES = ("continuous", "planar")
-# Joints whose coordinates may have limits.
+# Joint families whose coordinates can have limits.
 BOUNDED = ("revolute", "prismatic", "translation")
 
 
 @dataclass(frozen=True)
 class JointSlot:
-    """Entries of one joint in ``q``, ``v`` and the chart ``x``."""
+    """One joint, and its entries in ``q``, ``v`` and the chart coordinates ``x``."""
 
     index: int
     name: str
@@ -32,15 +32,16 @@ class JointSlot:
 
 
 class Chart:
-    """Chart ``x`` of the configuration space: ``q`` with an angle in place of each cosine and sine.
+    """Chart ``x`` of the configuration space: like ``q``, but an angle replaces each pair of cosine and sine.
 
-    A quaternion remains four numbers, and :meth:`norms` has the equation of its unit norm.  So ``q(x)`` is smooth and
-    has no singular point.
+    A quaternion stays four numbers; :meth:`norms` contains the equation for its unit norm.  The function ``q(x)`` is
+    therefore smooth and has no singular point.
     """
 
     def __init__(self, model: pin.Model) -> None:
         self.slots: list[JointSlot] = []
-        # Indices in q and x of equal numbers, and of each cosine (before its sine) in q and its angle in x.
+        # Pairs of indices in q and x: of numbers that are equal, and of each cosine in q (followed by its sine) and
+        # its angle in x.
         copied: list[tuple[int, int]] = []
         angles: list[tuple[int, int]] = []
         start = 0
@@ -63,12 +64,15 @@ class Chart:
     @staticmethod
     @lru_cache(maxsize=16)
     def of(model: pin.Model) -> Chart:
-        """Return the chart of a model.  The charts of the last models are kept."""
+        """Return the chart of a model.  The charts of recent models are cached."""
         return Chart(model)
 
     @cached_property
     def bounded(self) -> tuple[list[int], list[int]]:
-        """Indices in ``v`` and in ``x`` of the coordinates that may have limits; their rate is the entry of ``v``."""
+        """Indices in ``v`` and in ``x`` of the coordinates that can have limits.
+
+        The entry of ``v`` is the time derivative of the coordinate.
+        """
         slots = [slot for slot in self.slots if slot.kind.family in BOUNDED]
         in_v = [k for slot in slots for k in range(slot.v.start, slot.v.stop)]
         return in_v, [k for slot in slots for k in range(slot.x.start, slot.x.stop)]
@@ -87,7 +91,7 @@ class Chart:
         return [slice(s.x.stop - 4, s.x.stop) for s in self.slots if s.kind.family in ("free-flyer", "spherical")]
 
     def norms(self, x: ca.SX) -> ca.SX:
-        """Return ``|quaternion|² − 1`` for each quaternion in ``x``."""
+        """Return ``|quaternion|² − 1``, which must be zero, for each quaternion in ``x``."""
         return ca.vertcat(ca.SX(0, 1), *[ca.sumsqr(x[s]) - 1 for s in self.quaternion_slices()])
 
     def to_x(self, q: Array) -> Array:
@@ -99,7 +103,7 @@ class Chart:
         return x
 
     def to_q(self, x: Array) -> Array:
-        """Return the configuration of chart coordinates, shape (nq,), with normalized quaternions."""
+        """Return the configuration for chart coordinates, shape (nq,), with normalized quaternions."""
         q = np.zeros(self.nq)
         q[self._q] = x[self._x]
         if self._angle.size:
@@ -107,7 +111,7 @@ class Chart:
         return np.asarray(pin.normalize(self._model, q))
 
     def bounds(self) -> tuple[Array, Array]:
-        """Return the position limits in chart coordinates, infinite where there are none."""
+        """Return lower and upper limits of the chart coordinates; infinite for a coordinate without a limit."""
         lower, upper = np.full(self.nx, -np.inf), np.full(self.nx, np.inf)
         for slot in self.slots:
             if slot.kind.family in BOUNDED:

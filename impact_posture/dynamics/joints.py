@@ -1,4 +1,4 @@
-"""The joint types of Pinocchio's URDF parser: transform, orientation and motion subspace as expressions."""
+"""Joint types of the URDF parser of Pinocchio: transform, orientation and motion subspace as expressions."""
 
 from __future__ import annotations
 
@@ -12,14 +12,14 @@ from numpy.typing import NDArray
 from impact_posture.dynamics.spatial import Spin, constant, quaternion_matrix, skew, template
 from impact_posture.errors import UnsupportedJoint
 
-# Short name of a joint model without "JointModel" → its family.
+# Short name of a Pinocchio joint model, without "JointModel" → family of the joint.
 _FAMILIES = {
     **dict.fromkeys(("RX", "RY", "RZ", "RevoluteUnaligned"), "revolute"),
     **dict.fromkeys(("RUBX", "RUBY", "RUBZ", "RevoluteUnboundedUnaligned"), "continuous"),
     **dict.fromkeys(("PX", "PY", "PZ", "PrismaticUnaligned"), "prismatic"),
     **{"FreeFlyer": "free-flyer", "Planar": "planar", "Spherical": "spherical", "Translation": "translation"},
 }
-# Families that rotate by an angle about an axis, and families whose configuration ends in a quaternion.
+# Families that rotate by an angle about an axis; families whose configuration ends with a quaternion.
 _TURNING, _QUATERNION = ("revolute", "continuous", "planar"), ("free-flyer", "spherical")
 
 
@@ -30,9 +30,9 @@ class JointKind:
     Attributes:
         family: ``revolute``, ``continuous``, ``prismatic``, ``free-flyer``, ``planar``, ``spherical`` or
             ``translation``.
-        axis: Unit axis in the joint frame, shape (3,); zeros for a family without an axis.
-        subspace: Motion subspace ``S`` in the joint frame, shape (6, nv), constant for all families.
-        nq: Length of the configuration.
+        axis: Unit axis in the joint frame, shape (3,); zero for a family without an axis.
+        subspace: Motion subspace ``S`` in the joint frame, shape (6, nv); constant for all families.
+        nq: Number of entries in ``q``.
     """
 
     family: str
@@ -42,7 +42,7 @@ class JointKind:
 
     @property
     def nv(self) -> int:
-        """Degrees of freedom."""
+        """Number of degrees of freedom."""
         return int(self.subspace.shape[1])
 
 
@@ -50,14 +50,14 @@ def joint_kind(joint: pin.JointModel, name: str) -> JointKind:
     """Classify a Pinocchio joint.
 
     Raises:
-        UnsupportedJoint: The joint type is not possible in a URDF (composite, universal, helical, ...).
+        UnsupportedJoint: The joint type cannot occur in a URDF (composite, universal, helical, ...).
     """
     short = joint.shortname().removeprefix("JointModel")
     family = _FAMILIES.get(short)
     if family is None:
         hint = "lock it (`lock`) or model it by revolute and prismatic joints"
         raise UnsupportedJoint(f"joint '{name}' is of type {short}", where="symbolic dynamics", hint=hint)
-    # S does not depend on the configuration.
+    # S does not depend on the configuration, so any configuration can be used here.
     data = joint.createData()
     joint.calc(data, np.full(joint.idx_q + joint.nq, 0.5))
     subspace = np.array(data.S, dtype=float).reshape(6, -1)
@@ -67,7 +67,7 @@ def joint_kind(joint: pin.JointModel, name: str) -> JointKind:
 
 
 def joint_transform(kind: JointKind, q: ca.SX) -> tuple[ca.SX, ca.SX]:
-    """Return rotation (3, 3) and translation (3,) of the joint at ``q``, in its rest frame."""
+    """Return rotation (3, 3) and translation (3,) of the joint frame relative to its rest frame at ``q``."""
     rotation, translation = ca.SX.eye(3), ca.SX(3, 1)
     if kind.family in _TURNING:
         rotation = axis_rotation(*_cosine_sine(kind, q), axis=tuple(kind.axis.tolist()))
@@ -80,7 +80,7 @@ def joint_transform(kind: JointKind, q: ca.SX) -> tuple[ca.SX, ca.SX]:
 
 
 def joint_spin(kind: JointKind, q: ca.SX) -> Spin | None:
-    """Return the rotation of a joint about a coordinate axis; ``None`` for another joint."""
+    """Return the rotation of a joint if it rotates about a coordinate axis; ``None`` for other joints."""
     axis = int(np.argmax(np.abs(kind.axis)))
     if kind.family not in ("revolute", "continuous") or abs(kind.axis[axis]) < 1 - 1e-15:
         return None
@@ -95,16 +95,16 @@ def _cosine_sine(kind: JointKind, q: ca.SX) -> tuple[ca.SX, ca.SX]:
 
 @template
 def axis_rotation(cosine: ca.SX, sine: ca.SX, *, axis: tuple[float, ...]) -> ca.SX:
-    """Return the rotation ``aaᵀ + cos (I − aaᵀ) + sin [a]×`` (Rodrigues)."""
+    """Return the rotation about the unit ``axis`` a, ``aaᵀ + cos (I − aaᵀ) + sin [a]×`` (Rodrigues)."""
     outer = np.outer(axis, axis)
     return ca.sparsify(constant(outer) + cosine * constant(np.eye(3) - outer) + sine * skew(constant(axis)))
 
 
 def joint_quaternion(kind: JointKind, x: ca.SX) -> ca.SX:
-    """Return the unit quaternion ``x y z w`` of a joint's rotation as a smooth function of its chart coordinates.
+    """Return the unit quaternion ``x y z w`` of a joint rotation as a smooth function of the chart coordinates.
 
-    A half angle is not a smooth function of a cosine and a sine.  So a chart has the angle of a continuous or planar
-    joint (:class:`~impact_posture.dynamics.chart.Chart`).
+    The quaternion needs the half angle, which is not a smooth function of cosine and sine.  For this reason, the
+    chart coordinate of a continuous or planar joint is the angle (:class:`~impact_posture.dynamics.chart.Chart`).
     """
     if kind.family in _TURNING:
         half = x[-1] / 2

@@ -1,17 +1,18 @@
 """First and second derivatives of the equations of a velocity jump, in closed form.
 
 The equations of a jump ``a`` with impulses ``f`` on the feet, in the axes of the feet, are ``M a − J_sᵀf`` and ``J_s
-a + εf``.  Their sum with multipliers ``b`` and ``l`` is ``φ = bᵀM a − bᵀJ_sᵀf + lᵀJ_s a + ε lᵀf``.  All vectors here
-are in the axes of a root link, so that the inertia of a subtree is a sum.  A motion of joint j turns all links beyond
-it by ``S_j ×``.  Relative to these links, the velocities under ``a`` change by ``U_j(a) = −S_j × V_p(a)``, where p is
-the parent.  So ::
+a + εf``.  Their sum with multipliers ``b`` and ``l`` is ``φ = bᵀM a − bᵀJ_sᵀf + lᵀJ_s a + ε lᵀf``.  All vectors in
+this module are in the axes of a root link (a link whose parent is the world).  The inertia of a subtree is then the
+sum of the inertias of its links.  A motion of joint j turns all links after this joint by ``S_j ×``.  Relative to
+these links, their velocities for ``a`` change by ``U_j(a) = −S_j × V_p(a)``, where p is the parent of j.  The
+derivatives are::
 
     ∂φ/∂q_j       = U_j(b)ᵀF_j(a) + U_j(a)ᵀF_j(b)
-    ∂²φ/∂q_j∂q_k  = U_j(b)ᵀA_k(a) + U_j(a)ᵀA_k(b),   A_k = S_k ×* F_k + I_k U_k,   for k = j or beyond j
+    ∂²φ/∂q_j∂q_k  = U_j(b)ᵀA_k(a) + U_j(a)ᵀA_k(b),   A_k = S_k ×* F_k + I_k U_k,   for k in the subtree of j
 
-``I_k`` is the inertia of the subtree of k.  ``F_k(a)`` is its momentum under a minus the impulses ``f`` on its feet,
-and ``F_k(b)`` its momentum under b plus ``l``.  For standing robots, automatic differentiation takes about twice as
-many operations.
+``I_k`` is the inertia of the subtree of k.  ``F_k(a)`` is the momentum of this subtree for the velocity a, minus the
+impulses ``f`` on its feet.  ``F_k(b)`` is its momentum for the velocity b, plus ``l``.  For standing robots,
+automatic differentiation needs about twice as many operations.
 """
 
 from __future__ import annotations
@@ -27,17 +28,17 @@ from impact_posture.dynamics.kinematics import ByJoint, Kinematics, PointOnLink
 from impact_posture.dynamics.spatial import constant, cross, motion_cross_force, skew, symmetric, template
 from impact_posture.system.arrays import Array
 
-# Families with one degree of freedom, whose velocity is the rate of their chart coordinate.
+# Joint families with one degree of freedom.  Their velocity is the time derivative of their chart coordinate.
 _ONE_AXIS = ("revolute", "continuous", "prismatic")
 
 
 @dataclass(frozen=True, eq=False)
 class Foot:
-    """A point of a link that is held in place.
+    """A point of a link that stays in place.
 
     Attributes:
         point: The point.  Its velocity and its impulse are in the axes of its frame.
-        rows: Number of velocity entries that are held: 3 linear, or 6 with the angular ones.
+        rows: Number of velocity entries that stay zero: 3 (linear), or 6 (linear and angular).
     """
 
     point: PointOnLink
@@ -46,34 +47,38 @@ class Foot:
 
 @dataclass(frozen=True, eq=False)
 class _Motion:
-    """``U_j`` (``turned``) and ``A_j`` (``changed``) of one velocity for every joint beyond a root, (6, joints)."""
+    """Matrices with the columns ``U_j`` (``turned``) and ``A_j`` (``changed``) for one velocity, shape (6, joints).
+
+    There is one column for every joint that is not a root.
+    """
 
     turned: ca.SX
     changed: ca.SX
 
 
 class JumpDerivatives:
-    """Derivatives of the equations of jumps at the configuration of a tree without extra inertias."""
+    """Derivatives of the equations of velocity jumps at the configuration of a tree without extra inertias."""
 
     def __init__(self, tree: Kinematics, feet: Sequence[Foot]) -> None:
         self._tree, self._feet = tree, tuple(feet)
         self._parents = [int(parent) for parent in tree.model.parents]
         slots = tree.chart.slots
         self._beyond = [slot for slot in slots if self._parents[slot.index]]
-        # The joint of each degree of freedom, and of each column of a motion.
+        # Joint index of each degree of freedom, and of each column of a _Motion.
         self._of_v = [slot.index for slot in slots for _ in range(slot.kind.nv)]
         self._of_u = [slot.index for slot in self._beyond]
 
     @property
     def exist(self) -> bool:
-        """Whether all joints beyond the roots have one degree of freedom."""
+        """Whether the closed form applies: all joints except the roots have one degree of freedom."""
         return all(slot.kind.family in _ONE_AXIS for slot in self._beyond)
 
     def of(self, a: ca.SX, f: ca.SX, b: ca.SX, multipliers: ca.SX, compliance: float) -> tuple[ca.SX, ca.SX]:
-        """Return the Jacobian of the equations and the Hessian of ``φ`` over chart coordinates, ``a`` and ``f``.
+        """Return the Jacobian of the equations and the Hessian of ``φ``.
 
-        ``f`` stacks the impulses in the axes of each foot.  ``b`` are the multipliers of ``M a − J_sᵀf``, and
-        ``multipliers`` the multipliers ``l`` of ``J_s a + εf``, with ``compliance`` ε in 1/kg.
+        Both are with respect to chart coordinates, ``a`` and ``f``, in this order.  ``f`` contains the impulses of
+        all feet, each in the axes of its foot.  ``b`` are the multipliers of ``M a − J_sᵀf``, and ``multipliers`` the
+        multipliers ``l`` of ``J_s a + εf``.  ``compliance`` is ε, 1/kg.
         """
         under_a, under_b = self._motion(a, -f), self._motion(b, multipliers)
         nx, others = self._tree.chart.nx, a.numel() + f.numel()
@@ -91,25 +96,28 @@ class JumpDerivatives:
         )
 
     def _lies_on(self, ends: Sequence[int], joints: Sequence[int], *, itself: bool = True) -> Array:
-        """Return whether each of the ``joints`` (columns) is on the path from a root to each of the ends (rows)."""
+        """Return an array that is True if a joint (column) is on the path from its root to an end (row).
+
+        The end itself is on the path if ``itself``.
+        """
         paths = {end: {int(i) for i in self._tree.model.supports[end]} - (set() if itself else {end}) for end in ends}
         return np.array([[joint in paths[end] for joint in joints] for end in ends], dtype=bool)
 
     @cached_property
     def _mass(self) -> ca.SX:
-        """``M``, shape (nv, nv)."""
+        """Mass matrix ``M``, shape (nv, nv)."""
         products = self._momenta.T @ self._subspaces
         below = _kept(products, self._lies_on(self._of_v, self._of_v) & np.tri(len(self._of_v), dtype=bool))
         return ca.tril2symm(below) + ca.diag(self._tree.armature)
 
     def _of_momentum(self, motion: _Motion) -> ca.SX:
-        """Return the derivative of ``M x`` with the impulses on the feet, shape (nv, joints)."""
+        """Return the derivative of ``M x``, including the impulses on the feet, shape (nv, joints)."""
         below = _kept(self._momenta.T @ motion.turned, self._lies_on(self._of_v, self._of_u))
         above = _kept(motion.changed.T @ self._subspaces, self._lies_on(self._of_u, self._of_v, itself=False))
         return below + above.T
 
     def _at_feet(self, motions: ca.SX, joints: Sequence[int]) -> ca.SX:
-        """Return the held velocities of the feet under ``motions`` of the links beyond each joint."""
+        """Return the velocities of the feet if the links after each joint have the velocities ``motions``."""
         rows = [ca.SX(0, len(joints))]
         for foot, X in zip(self._feet, self._foot_motions, strict=True):
             rows.append(_kept(X @ motions, np.tile(self._lies_on([foot.point.joint], joints), (foot.rows, 1))))
@@ -122,7 +130,7 @@ class JumpDerivatives:
 
     @cached_property
     def _subspaces(self) -> ca.SX:
-        """Motion subspaces of all joints, shape (6, nv)."""
+        """Motion subspaces of all joints in the axes of their root links, shape (6, nv)."""
         columns = []
         for slot in self._tree.chart.slots:
             place, S = self._places[slot.index], constant(slot.kind.subspace)
@@ -131,7 +139,7 @@ class JumpDerivatives:
 
     @cached_property
     def _inertias(self) -> ByJoint:
-        """Mass, first moment and rotational inertia about the root of every link, in one matrix of shape (4, 4)."""
+        """Mass, first moment and rotational inertia of every link about the origin of its root link, shape (4, 4)."""
         inertias: ByJoint = {}
         for i, (R, p) in self._places.items():
             body = self._tree.model.inertias[i]
@@ -141,7 +149,7 @@ class JumpDerivatives:
 
     @cached_property
     def _subtrees(self) -> ByJoint:
-        """The sum of these matrices over the subtree of every joint."""
+        """Sum of the inertias of all links in the subtree of every joint, shape (4, 4)."""
         return self._gathered(self._inertias)
 
     def _gathered(self, of_links: ByJoint) -> ByJoint:
@@ -153,12 +161,12 @@ class JumpDerivatives:
 
     @cached_property
     def _momenta(self) -> ca.SX:
-        """``I_k S_k``, shape (6, nv)."""
+        """Momenta ``I_k S_k`` of the subtrees, shape (6, nv)."""
         return ca.horzcat(*[_momentum(self._subtrees[i], self._subspaces[:, k]) for k, i in enumerate(self._of_v)])
 
     @cached_property
     def _foot_motions(self) -> list[ca.SX]:
-        """The matrix from the motion of a foot's link to the held velocities of the foot, shape (rows, 6)."""
+        """Matrix of each foot that maps the velocity of its link to the velocity of the foot, shape (rows, 6)."""
         motions = []
         for foot in self._feet:
             R, p = self._places[foot.point.joint]
@@ -168,7 +176,7 @@ class JumpDerivatives:
         return motions
 
     def _motion(self, x: ca.SX, impulses: ca.SX) -> _Motion:
-        """Return ``U`` and ``A`` under the velocity ``x``, with ``impulses`` on the feet added to the momentum."""
+        """Return ``U`` and ``A`` for the generalized velocity ``x``; ``impulses`` on the feet add to the momenta."""
         velocities: ByJoint = {}
         forces: ByJoint = {}
         turned: ByJoint = {}
@@ -193,20 +201,23 @@ class JumpDerivatives:
 
 
 def _kept(matrix: ca.SX, pattern: Array) -> ca.SX:
-    """Return a matrix without the entries outside a pattern."""
+    """Remove the entries of a matrix for which the pattern is False."""
     return matrix * ca.sparsify(ca.SX(pattern.astype(float)))
 
 
 @template
 def _motion_of_link(R: ca.SX, p: ca.SX, motion: ca.SX) -> ca.SX:
-    """Express the motion of a link in the axes of its root."""
+    """Express the motion of a link in the axes of its root link."""
     angular = R @ motion[3:]
     return ca.vertcat(R @ motion[:3] + cross(p, angular), angular)
 
 
 @template
 def _inertia_of_link(R: ca.SX, p: ca.SX, mass: ca.SX, lever: ca.SX, inertia: ca.SX) -> ca.SX:
-    """Return ``[I h; hᵀ m]`` with ``h = m c`` and ``I`` about the root, from the inertia about the center of mass."""
+    """Return ``[I h; hᵀ m]`` with ``h = m c`` and ``I`` about the origin of the root link.
+
+    The argument ``inertia`` is about the center of mass.
+    """
     c = p + R @ lever
     h = mass * c
     about_root = symmetric(R @ symmetric(inertia) @ R.T + ca.dot(h, c) * ca.SX.eye(3) - h @ c.T)
@@ -215,7 +226,7 @@ def _inertia_of_link(R: ca.SX, p: ca.SX, mass: ca.SX, lever: ca.SX, inertia: ca.
 
 @template
 def _momentum(inertia: ca.SX, motion: ca.SX) -> ca.SX:
-    """Return the momentum about the root, ``[m v − h × w; h × v + I w]``."""
+    """Return the momentum about the origin of the root link, ``[m v − h × w; h × v + I w]``."""
     h, v, w = inertia[:3, 3], motion[:3], motion[3:]
     return ca.vertcat(inertia[3, 3] * v - cross(h, w), cross(h, v) + inertia[:3, :3] @ w)
 

@@ -1,4 +1,4 @@
-"""The kinematic tree at one symbolic configuration: placements of links, points and frames."""
+"""Kinematics of the tree at one symbolic configuration: placements of links, points and frames."""
 
 from __future__ import annotations
 
@@ -17,18 +17,18 @@ from impact_posture.dynamics.repeated_limbs import RepeatedLimbs
 from impact_posture.dynamics.spatial import constant, quaternion_product, transposed_times
 from impact_posture.robot.model_joints import finite_armature
 
-# Spatial inertias, forces or motions by joint index.
+# Joint index → spatial inertia, force or motion of its link.
 ByJoint = dict[int, ca.SX]
 
 
 @dataclass(frozen=True)
 class PointOnLink:
-    """A point with axes, fixed to a link.
+    """A point, with the axes of a frame, that is fixed to a link.
 
     Attributes:
         joint: Index of the joint that moves the link.
-        position: The point in link coordinates, meters, shape (3,).
-        rotation: The axes of the frame in link coordinates, shape (3, 3).
+        position: Position of the point in link coordinates, m, shape (3,).
+        rotation: Axes of the frame as columns, in link coordinates, shape (3, 3).
     """
 
     joint: int
@@ -37,18 +37,19 @@ class PointOnLink:
 
     @cached_property
     def placement(self) -> pin.SE3:
-        """Placement of the point and its axes in the link."""
+        """Placement of the point and its axes in link coordinates."""
         return pin.SE3(self.rotation, self.position)
 
 
 class Kinematics:
-    """A ``pin.Model`` at the configuration ``q``, shape (nq, 1), with joints of all types of Pinocchio's URDF parser.
+    """Kinematics of a ``pin.Model`` at the configuration ``q``, shape (nq, 1).
 
-    An infinite armature locks a joint: it does not move in an impact.  ``locked`` has the velocity entries of locked
-    joints.  ``extra_inertia`` has constant 6×6 matrices in link coordinates, which add to the inertias of the model.
-    A foot held with compliance ε is a foot with the point mass 1/ε.  The constants of repeated ``limbs`` become
-    parameters, so that their expressions have the same form.  Only :attr:`quaternions` needs ``chart_x``, the chart
-    coordinates of ``q``.
+    The model can have all joint types that the URDF parser of Pinocchio creates.  A joint with infinite armature is
+    locked and does not move in an impact; ``locked`` contains the velocity entries of locked joints.
+    ``extra_inertia`` contains constant 6×6 inertias by joint index, in link coordinates, which are added to the
+    inertias of the model.  For example, a foot on a support with compliance ε has the extra point mass 1/ε.  With
+    ``limbs``, parameters replace the constants in which repeated limbs differ.  ``chart_x`` are the chart coordinates
+    of ``q``; only :attr:`quaternions` needs them.
     """
 
     def __init__(
@@ -87,11 +88,11 @@ class Kinematics:
         self.locked = tuple(int(k) for k in np.flatnonzero(locked))
 
     def _constant(self, joint: int, tag: str, of: Callable[[int], ArrayLike]) -> ca.SX:
-        """Return a constant of a joint as numbers, or as parameters where the numbers of its counterparts differ."""
+        """Return a constant of a joint; parameters replace the numbers in which repeated limbs differ."""
         return constant(of(joint)) if self.limbs is None else self.limbs.constant(joint, tag, of)
 
     def by_joint(self, tag: str, values: NDArray[np.float64]) -> ca.SX:
-        """Return constants of the degrees of freedom, shape (nv,), as an expression."""
+        """Return one constant per degree of freedom, shape (nv,), as an expression; ``tag`` names the constant."""
         slots = self.chart.slots
         parts = [self._constant(s.index, tag, lambda j: values[slots[j - 1].v]) for s in slots]
         return ca.densify(ca.vertcat(*parts))
@@ -115,7 +116,7 @@ class Kinematics:
 
     @cached_property
     def quaternions(self) -> ByJoint:
-        """World orientation of every link as a quaternion x y z w, polynomial in half angles."""
+        """World orientation of every link as a quaternion x y z w."""
         if self._x is None:
             raise ValueError("quaternions need chart_x")
         quaternions: ByJoint = {0: ca.SX([0, 0, 0, 1])}
@@ -128,7 +129,7 @@ class Kinematics:
     def relative(self, base: int, joint: int) -> tuple[ca.SX, ca.SX]:
         """Return rotation (3, 3) and origin (3,) of a link in the coordinates of the link ``base``.
 
-        The expressions contain only the joints between the two links, unlike differences of world placements.
+        The expressions depend only on the joints between the two links.
         """
         meeting = max({*self.model.supports[base]} & {*self.model.supports[joint]})
         (R_base, p_base), (R, p) = (self._below(meeting, i) for i in (base, joint))
@@ -148,7 +149,7 @@ class Kinematics:
         return self.origins[point.joint] + self.rotations[point.joint] @ ca.SX(point.position)
 
     def rotation(self, point: PointOnLink) -> ca.SX:
-        """Return the world axes of the frame of a point, shape (3, 3)."""
+        """Return the axes of the frame of a point as columns in world axes, shape (3, 3)."""
         return self.rotations[point.joint] @ constant(point.rotation)
 
     def quaternion(self, point: PointOnLink) -> ca.SX:
@@ -166,7 +167,7 @@ class Kinematics:
         return ca.densify(moments[0] / masses[0])
 
     def to_link(self, joint: int, direction: ca.SX) -> ca.SX:
-        """Rotate a world direction into link coordinates, down the chain from the root."""
+        """Rotate a world direction into link coordinates, joint by joint from the root to the link."""
         for i in list(self.model.supports[joint])[1:]:
             direction = transposed_times(self._R[i], direction)
         return direction

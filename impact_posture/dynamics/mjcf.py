@@ -1,7 +1,8 @@
 """Build a MuJoCo model from a ``pin.Model``, with the same bodies, joints, inertias and armature.
 
-MuJoCo's own URDF reader loses package paths, the floating base and the armature, and changes the order of joints.
-The model has no geometry.  A simulation adds it with :meth:`Mjcf.add_geom` and :meth:`Mjcf.add_plane`.
+The URDF reader of MuJoCo is not used, because it loses package paths, the floating base and the armature, and
+changes the order of joints.  The model has no geometry.  A simulation adds shapes with :meth:`Mjcf.add_geom` and
+:meth:`Mjcf.add_plane`.
 """
 
 from __future__ import annotations
@@ -25,9 +26,9 @@ Geom = Literal["sphere", "box", "plane"]
 
 # Joint index of the world.
 WORLD = 0
-# MuJoCo refuses a moving body with less mass (kg) or moment (kg m²) than this.
+# MuJoCo rejects a moving body whose mass (kg) or moment of inertia (kg m²) is smaller.
 _LEAST = 1e-15
-# With these options MuJoCo keeps every inertia and every body as stated.
+# With these options MuJoCo does not change inertias and does not merge bodies.
 _COMPILER = {
     "degree": False,
     "autolimits": True,
@@ -47,11 +48,12 @@ class Mjcf:
     Attributes:
         spec: The ``mujoco.MjSpec``, which :meth:`compile` compiles.
         layout: Conversions of coordinates.
-        bodies: Name of the body that each Pinocchio joint moves, by joint index.
-        joints: Names of the MuJoCo joints that make up each Pinocchio joint, by joint index.
-        sites: Name of the site of each frame, by frame index.  Of frames with the same name, only the first has one.
-        moments: Principal moments, kg·m², shape (3,), by body, that violate the triangle inequality.  MuJoCo refuses
-            them, so the spec has the nearest valid moments, and :meth:`compile` sets the exact ones.
+        bodies: Index of a Pinocchio joint → name of the body that the joint moves.
+        joints: Index of a Pinocchio joint → names of the MuJoCo joints that represent it.
+        sites: Index of a frame → name of its site.  If several frames have the same name, only one has a site.
+        moments: Body name → principal moments of inertia, kg·m², shape (3,), that violate the triangle inequality.
+            MuJoCo rejects such moments.  The spec therefore has the nearest valid moments, and :meth:`compile`
+            replaces them by the exact moments.
     """
 
     spec: Any
@@ -62,15 +64,15 @@ class Mjcf:
     moments: dict[str, Array]
 
     def body(self, joint: int) -> Any:
-        """Return the ``MjsBody`` that a Pinocchio joint moves, or the world for :data:`WORLD`."""
+        """Return the ``MjsBody`` that a Pinocchio joint moves; for :data:`WORLD`, the body of the world."""
         return self.spec.worldbody if joint == WORLD else self.spec.body(self.bodies[joint])
 
     def add_geom(self, joint: int, name: str, kind: Geom, size: Sequence[float], placement: pin.SE3) -> None:
-        """Add a massless shape, which collides only in contact pairs.
+        """Add a shape without mass, which collides only in explicit contact pairs.
 
-        ``joint`` is the index of the Pinocchio joint that moves it, or :data:`WORLD`, and ``placement`` its pose in
-        the frame of the joint.  ``size`` is its radius, or three half extents, m.  A plane is endless, normal to its
-        z axis.
+        ``joint`` is the index of the Pinocchio joint that moves the shape, or :data:`WORLD`.  ``placement`` is the
+        pose of the shape in the frame of this joint.  ``size`` is the radius, or three half extents, m.  A plane is
+        infinite and normal to its z axis.
         """
         type_ = getattr(import_mujoco().mjtGeom, f"mjGEOM_{kind.upper()}")
         size = (*size, 0.0, 0.0)[:3]
@@ -79,12 +81,12 @@ class Mjcf:
         )
 
     def add_plane(self, name: str, point: Array, normal: Array) -> None:
-        """Add an endless plane through a point to the world, with a unit normal, each world, shape (3,)."""
+        """Add an infinite plane to the world; ``point`` and unit ``normal`` are in world axes, shape (3,)."""
         upright = pin.Quaternion.FromTwoVectors(np.array([0.0, 0.0, 1.0]), np.array(normal)).matrix()
         self.add_geom(WORLD, name, "plane", (1.0, 1.0, 1.0), pin.SE3(upright, np.array(point)))
 
     def compile(self) -> Any:
-        """Return the ``mujoco.MjModel``, or raise InputError if MuJoCo refuses the model."""
+        """Return the ``mujoco.MjModel``; raise InputError if MuJoCo rejects the model."""
         mujoco = import_mujoco()
         try:
             model = self.spec.compile()
@@ -98,7 +100,7 @@ class Mjcf:
 
 
 def import_mujoco() -> Any:
-    """Return the ``mujoco`` module, or raise InputError if it is not installed."""
+    """Return the module ``mujoco``; raise InputError if MuJoCo is not installed."""
     try:
         import mujoco
     except ImportError:
@@ -108,7 +110,7 @@ def import_mujoco() -> Any:
 
 
 def pose(placement: pin.SE3) -> dict[str, Array]:
-    """Return ``pos`` (m) and ``quat`` (w x y z, unit) of a placement."""
+    """Return a placement as MuJoCo arguments: ``pos`` (m) and ``quat`` (unit, w x y z)."""
     quaternion = pin.Quaternion(np.array(placement.rotation)).normalized()
     return {"pos": np.array(placement.translation), "quat": np.array(quaternion.coeffs()[[3, 0, 1, 2]])}
 
@@ -116,15 +118,16 @@ def pose(placement: pin.SE3) -> dict[str, Array]:
 def build_mjcf(model: pin.Model, name: str = "robot") -> Mjcf:
     """Build the MuJoCo model of a Pinocchio model.
 
-    Each body has the name of the link at its origin, or else of its joint.  Every frame becomes a site with its name.
-    Where a link and a joint have the same name, it is the frame of the link.  A free-flyer on the world becomes a
-    free joint, and any other free-flyer three slides and a ball.  A planar joint becomes two slides and a hinge, and
-    a translation three slides.  A massless body gets the least mass and moments that MuJoCo accepts, 1e-15.  The
-    model has no friction, damping or effort limits, because the dynamics of Pinocchio have none.
+    Each body is named after the link at its origin; if there is none, after its joint.  Every frame becomes a site
+    with the name of the frame.  If a link and a joint have the same name, the site is at the frame of the link.  A
+    free-flyer whose parent is the world becomes a free joint, and any other free-flyer becomes three slides and a
+    ball.  A planar joint becomes two slides and a hinge, and a translation becomes three slides.  A body without mass
+    gets the least mass and moments of inertia that MuJoCo accepts, 1e-15.  The model has no friction, damping or
+    effort limits, because the dynamics of Pinocchio do not include them.
 
     Raises:
-        UnsupportedJoint: The joint type is not possible in a URDF.
-        InputError: MuJoCo is not installed, or the armature differs between axes that have one value in MuJoCo.
+        UnsupportedJoint: The joint type cannot occur in a URDF.
+        InputError: MuJoCo is not installed, or axes with different armatures would be one MuJoCo joint.
     """
     order = _depth_first(model)
     slots = Chart(model).slots
@@ -149,7 +152,7 @@ def build_mjcf(model: pin.Model, name: str = "robot") -> Mjcf:
 
 
 def _depth_first(model: pin.Model) -> list[int]:
-    """Return the joint indices in the order in which MuJoCo numbers bodies."""
+    """Return the joint indices in depth-first order, in which MuJoCo numbers bodies."""
     order, waiting = [], [WORLD]
     while waiting:
         order.append(waiting.pop())
@@ -158,14 +161,17 @@ def _depth_first(model: pin.Model) -> list[int]:
 
 
 def _is_free(model: pin.Model, slot: JointSlot) -> bool:
-    """Return whether a joint can be a free joint, which moves in the world and has one armature for all six axes."""
+    """Return whether a joint can become a MuJoCo free joint.
+
+    Its parent must be the world, and all six axes must have the same armature.
+    """
     if slot.kind.family != "free-flyer" or model.parents[slot.index] != 0:
         return False
     return bool(np.ptp(np.asarray(model.armature)[slot.v]) == 0)
 
 
 def _link_name(model: pin.Model, joint: int) -> str:
-    """Return the name of the link whose frame coincides with the joint's, or else the name of the joint."""
+    """Return the name of the link whose frame equals the joint frame; if there is none, the name of the joint."""
     for frame in model.frames:
         if frame.parentJoint == joint and frame.type == pin.FrameType.BODY and frame.placement.isIdentity(1e-12):
             return str(frame.name)
@@ -183,9 +189,9 @@ def _unique(name: str, taken: set[str]) -> str:
 
 
 def _add_joints(body: Any, model: pin.Model, slot: JointSlot, free: bool, taken: set[str]) -> tuple[str, ...]:
-    """Add the MuJoCo joints of a Pinocchio joint to its body and return their names.
+    """Add the MuJoCo joints that represent a Pinocchio joint to its body, and return their names.
 
-    A column of the motion subspace becomes a slide or a hinge, and three columns of rotation become a ball.
+    Each column of the motion subspace becomes a slide or a hinge, but three rotation columns become one ball.
     """
     subspace, armature, types = slot.kind.subspace, np.asarray(model.armature)[slot.v], import_mujoco().mjtJoint
     names: list[str] = []
@@ -221,19 +227,25 @@ def _add_joints(body: Any, model: pin.Model, slot: JointSlot, free: bool, taken:
 
 
 def _alike(armature: Array, slot: JointSlot) -> None:
-    """Refuse different armatures of the axes of a ball, or of slides that a rotation turns."""
+    """Raise InputError if axes that need the same armature in MuJoCo have different armatures.
+
+    The axes of a ball need the same armature, and so do slides whose directions turn with a rotation.
+    """
     if armature.size and np.ptp(armature) > 0:
         what = f"the armature of joint '{slot.name}' differs between its axes"
         raise InputError(what, where="MJCF", hint="give it one value")
 
 
 def _inertia(inertia: pin.Inertia) -> tuple[dict[str, Any], Array | None]:
-    """Return the arguments of ``add_body`` for an inertia, and its exact moments where MuJoCo refuses them."""
+    """Return the arguments of ``add_body`` for an inertia.
+
+    Also return the exact principal moments if MuJoCo rejects them; otherwise ``None``.
+    """
     moments, axes = np.linalg.eigh(np.array(inertia.inertia))
     if np.linalg.det(axes) < 0:
         axes[:, 0] = -axes[:, 0]
     accepted = np.maximum(moments, _LEAST)
-    # MuJoCo refuses a largest moment above the sum of the others.
+    # MuJoCo rejects a body if its largest moment exceeds the sum of the other two.
     accepted[2] = max(min(accepted[2], accepted[0] + accepted[1]), accepted[1])
     principal = {f"i{key}": value for key, value in pose(pin.SE3(axes, np.array(inertia.lever))).items()}
     mass = max(float(inertia.mass), _LEAST)
@@ -256,7 +268,7 @@ def _add_sites(elements: dict[int, Any], model: pin.Model) -> dict[int, str]:
 
 @contextmanager
 def unwarned() -> Iterator[None]:
-    """Keep MuJoCo from writing warnings to a log file in the working directory.  The state shows the problem."""
+    """Prevent MuJoCo from writing warnings to a log file in the working directory; the state shows the problem."""
     mujoco = import_mujoco()
     before = mujoco.get_mju_user_warning()
     mujoco.set_mju_user_warning(lambda message: None)

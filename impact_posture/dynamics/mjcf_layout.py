@@ -1,12 +1,13 @@
-"""Conversions between ``q, v`` of Pinocchio and ``qpos, qvel`` of MuJoCo, for the same tree.
+"""Conversions between ``q, v`` of Pinocchio and ``qpos, qvel`` of MuJoCo for the same kinematic tree.
 
-The two differ in these points:
+Pinocchio and MuJoCo differ in these points:
 
-- A quaternion is x y z w in Pinocchio and w x y z in MuJoCo.
-- A continuous joint is a cosine and a sine in Pinocchio and an angle in MuJoCo.
-- A linear velocity is in body axes in Pinocchio, and in the axes of the world or of the rest frame in MuJoCo.
-- The pose of a base is relative to the rest frame of its joint in Pinocchio and to the world in MuJoCo.
-- MuJoCo numbers joints depth first, Pinocchio may not.
+- A quaternion is stored as x y z w in Pinocchio, and as w x y z in MuJoCo.
+- The position of a continuous joint is a cosine and a sine in Pinocchio, and an angle in MuJoCo.
+- The linear velocity of a base is in body axes in Pinocchio, and in the axes of the world or of the rest frame in
+  MuJoCo.
+- The pose of a base is relative to the rest frame of its joint in Pinocchio, and relative to the world in MuJoCo.
+- MuJoCo numbers joints in depth-first order; Pinocchio can have another order.
 """
 
 from __future__ import annotations
@@ -28,9 +29,11 @@ class MjcfSlot:
 
     Attributes:
         joint: Type of the joint, and its entries in the Pinocchio vectors.
-        placement: Rest frame of the joint in its parent.
-        moved: Whether it is a MuJoCo free joint with a rest frame other than the world.  MuJoCo has the pose and the
-            linear velocity of a free joint in world axes, but of three slides and a ball in the rest frame.
+        qpos: Entries of the joint in ``qpos``.
+        qvel: Entries of the joint in ``qvel``.
+        placement: Placement of the rest frame of the joint in its parent.
+        moved: Whether the joint is a MuJoCo free joint whose rest frame is not the world frame.  MuJoCo states pose
+            and linear velocity of a free joint in world axes, but of slides and a ball in the rest frame.
     """
 
     joint: JointSlot
@@ -43,16 +46,17 @@ class MjcfSlot:
 class MjcfLayout:
     """Conversions between Pinocchio and MuJoCo coordinates of one model.
 
-    The map ``T(q)`` of velocities, ``qvel = T v``, is orthogonal, because it rotates linear parts and permutes
-    entries.  ``order`` has the joint indices in the (depth-first) order of the MuJoCo bodies.  ``free`` has the
-    indices of the joints that are free joints in MuJoCo.
+    The matrix ``T(q)`` with ``qvel = T v`` is orthogonal, because it only rotates linear velocities and permutes
+    entries.  ``order`` contains the joint indices in the (depth-first) order of the MuJoCo bodies.  ``free`` contains
+    the indices of the joints that are free joints in MuJoCo.
     """
 
     def __init__(self, model: pin.Model, order: Sequence[int], free: frozenset[int]) -> None:
         self._chart = chart = Chart(model)
         self.nqpos, self.nv, self.nq = chart.nx, chart.nv, chart.nq
         self.slots: list[MjcfSlot] = []
-        # The index in the chart of each entry of qpos, which has the same value, and the index in v of each of qvel.
+        # For each entry of qpos, the index of the chart coordinate with the same value.  For each entry of qvel, the
+        # index in v.
         places: list[int] = []
         rates: list[int] = []
         for i in order:
@@ -66,8 +70,8 @@ class MjcfLayout:
             self.slots.append(MjcfSlot(joint, *ends, place, moved))
             places += x
             rates += v
-        # A simulation converts in every tick.  So all joints are converted at once, except poses in another frame and
-        # linear velocities.
+        # A simulation converts the state in every tick.  To be fast, all joints are converted by one permutation;
+        # only poses in another frame and linear velocities are converted separately.
         self._places, self._permutation = np.array(places, dtype=int), np.eye(self.nv)[rates]
         self._rates = np.argsort(rates)
         self._moved = [slot for slot in self.slots if slot.moved]
@@ -75,27 +79,28 @@ class MjcfLayout:
 
     @property
     def places(self) -> tuple[NDArray[np.int_], NDArray[np.int_]] | None:
-        """Return the indices of ``q`` in ``qpos`` and of ``v`` in ``qvel`` where these define the conversion.
+        """Return the index in ``qpos`` of each entry of ``q``, and the index in ``qvel`` of each entry of ``v``.
 
-        This holds for hinges and slides, and a floating base before them.  The quaternion of the base is then
-        normalized and its linear velocity turned.  Return ``None`` for a model with other joints.
+        These indices define the conversion if the model has only hinges and slides, with or without a floating base.
+        In addition, the quaternion of the base must be normalized, and its linear velocity rotated.  Return ``None``
+        for a model with other joints.
         """
         base = len(self._turning)
-        # Chart coordinates are equal to q apart from cosines and sines.
+        # If no joint has a cosine and a sine in q, the chart coordinates equal q.
         plain = not self._moved and base <= 1 and self.nq == self.nqpos and self.slots[:base] == self._turning
         if not plain or any(slot.joint.kind.nv != 1 for slot in self.slots[base:]):
             return None
         return np.argsort(self._places), self._rates
 
     def qpos(self, q: Array) -> Array:
-        """Return ``qpos``, shape (nqpos,), of a configuration, shape (nq,)."""
+        """Convert a configuration, shape (nq,), to ``qpos``, shape (nqpos,)."""
         for slot in self._moved:
             q = q.copy()
             q[slot.joint.q] = pin.SE3ToXYZQUAT(slot.placement * pin.XYZQUATToSE3(q[slot.joint.q]))
         return np.asarray(self._chart.to_x(q)[self._places])
 
     def q(self, qpos: Array) -> Array:
-        """Return the configuration, shape (nq,), of a ``qpos``, shape (nqpos,), with quaternions normalized."""
+        """Convert ``qpos``, shape (nqpos,), to a configuration, shape (nq,), with normalized quaternions."""
         x = np.zeros(self.nqpos)
         x[self._places] = qpos
         q = self._chart.to_q(x)
@@ -105,9 +110,9 @@ class MjcfLayout:
         return q
 
     def velocity_map(self, q: Array) -> Array:
-        """Return ``T(q)`` of ``qvel = T v``, orthogonal, shape (nv, nv).
+        """Return the orthogonal matrix ``T(q)`` with ``qvel = T v``, shape (nv, nv).
 
-        It follows that ``M = Tᵀ M_mj T``, ``J = J_mj T`` and ``τ = Tᵀ τ_mj``.
+        Therefore ``M = Tᵀ M_mj T``, ``J = J_mj T`` and ``τ = Tᵀ τ_mj``, with the MuJoCo quantities ``…_mj``.
         """
         T = self._permutation.copy()
         for slot in self._turning:
@@ -117,12 +122,12 @@ class MjcfLayout:
         return T
 
     def qvel(self, q: Array, v: Array) -> Array:
-        """Return ``qvel`` of a velocity, shape (nv,)."""
+        """Convert a velocity ``v``, shape (nv,), at ``q`` to ``qvel``."""
         return np.asarray(self.velocity_map(q) @ v)
 
     def state(self, qpos: Array, qvel: Array) -> tuple[Array, Array]:
-        """Return the Pinocchio configuration, shape (nq,), and velocity, shape (nv,)."""
-        # This is faster than the whole map, for a simulation that calls it in every tick.
+        """Convert ``qpos`` and ``qvel`` to the Pinocchio configuration, shape (nq,), and velocity, shape (nv,)."""
+        # A simulation calls this method in every tick.  It is faster without the matrix T.
         q, v = self.q(qpos), qvel[self._rates]
         for slot in self._turning:
             turn = _turn(slot, q[slot.joint.q])
@@ -132,7 +137,10 @@ class MjcfLayout:
 
 
 def _turn(slot: MjcfSlot, piece: Array) -> Array:
-    """Return the rotation of the linear velocity of a free-flyer or planar joint."""
+    """Return the rotation of the linear velocity of a free-flyer or planar joint from Pinocchio to MuJoCo axes.
+
+    ``piece`` contains the entries of the joint in ``q``.
+    """
     if slot.joint.kind.family == "planar":
         return np.array([[piece[2], -piece[3]], [piece[3], piece[2]]])
     R = pin.Quaternion(np.array(piece[3:])).matrix()

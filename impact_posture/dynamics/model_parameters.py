@@ -1,4 +1,4 @@
-"""Constants of a model as parameters of expressions, so that models with other constants have the same code."""
+"""Replace constants of a model by parameters in expressions, so models that differ in these constants share code."""
 
 from __future__ import annotations
 
@@ -18,11 +18,11 @@ from impact_posture.system.arrays import Array
 
 
 class ModelParameters(RepeatedLimbs):
-    """The nonzero armatures and joint positions of a model as parameters, without repeated limbs.
+    """Parameters for the nonzero armatures and joint positions of a model; repeated limbs are not used.
 
     Attributes:
-        symbol: The parameters, shape (n, 1) with n of at least one.
-        values: Their values, shape (n,).
+        symbol: Symbol of all parameters, shape (n, 1), with n ≥ 1.
+        values: Values of the parameters, shape (n,).
     """
 
     def __init__(self, model: pin.Model) -> None:
@@ -40,13 +40,13 @@ class ModelParameters(RepeatedLimbs):
                 count += 1
 
     def constant(self, joint: int, tag: str, of: Callable[[int], ArrayLike]) -> ca.SX:
-        """Return a constant of a joint, with parameters for its armature and its position."""
+        """Return a constant of a joint as an expression; parameters replace its armature and its position."""
         parameters = self._parameters.get((joint, tag))
         return constant(of(joint)) if parameters is None else parameters
 
 
 def without_parameters(robot: Robot) -> Robot:
-    """Return the robot with ones in place of its parameters, so that robots with the same code are equal."""
+    """Return the robot with all nonzero parameters set to one.  Robots that share code are then equal."""
     model, armature = robot.model.copy(), np.array(robot.model.armature)
     finite = np.isfinite(armature)
     armature[finite] = rounded(armature[finite]) != 0.0
@@ -57,7 +57,7 @@ def without_parameters(robot: Robot) -> Robot:
 
 
 def _numbers(model: pin.Model) -> dict[tuple[int, str], Array]:
-    """Return the constants that become parameters, by joint and kind of constant."""
+    """Return the constants that become parameters: (joint index, kind of constant) → values."""
     armature, numbers = finite_armature(model)[0], dict[tuple[int, str], Array]()
     for joint in range(1, model.njoints):
         numbers[joint, "translation"] = rounded(model.jointPlacements[joint].translation)

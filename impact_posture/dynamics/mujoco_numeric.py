@@ -1,4 +1,4 @@
-"""Mass matrix and Jacobians of MuJoCo in Pinocchio coordinates, as an independent check of Pinocchio."""
+"""Mass matrix and Jacobians that MuJoCo computes, in Pinocchio coordinates, as an independent check of Pinocchio."""
 
 from __future__ import annotations
 
@@ -11,10 +11,10 @@ from impact_posture.system.arrays import Array
 
 
 class MujocoNumeric:
-    """A ``pin.Model`` in MuJoCo, at one configuration at a time.
+    """Compute dynamics of a ``pin.Model`` with MuJoCo at one configuration.
 
-    Call :meth:`at` first, because the other methods use its configuration.  All vectors and matrices are in the order
-    and tangent space of Pinocchio.
+    Call :meth:`at` first; the other methods use the configuration that was passed to it.  All vectors and matrices
+    are in the order and tangent space of Pinocchio.
 
     Raises:
         InputError: MuJoCo is not installed.
@@ -28,14 +28,14 @@ class MujocoNumeric:
         self._map = np.eye(model.nv)
 
     def at(self, q: Array) -> MujocoNumeric:
-        """Move to ``q``, shape (nq,)."""
+        """Set the configuration to ``q``, shape (nq,)."""
         self.data.qpos[:] = self.mjcf.layout.qpos(q)
         self._mujoco.mj_fwdPosition(self.model, self.data)
         self._map = self.mjcf.layout.velocity_map(q)
         return self
 
     def mass_matrix(self) -> Array:
-        """Return ``M(q)``, shape (nv, nv), including armature."""
+        """Return the mass matrix ``M(q)``, shape (nv, nv), including armature."""
         M = np.zeros((self.model.nv, self.model.nv))
         self._mujoco.mj_fullM(self.model, self.data, M)
         return np.asarray(self._map.T @ M @ self._map)
@@ -45,9 +45,9 @@ class MujocoNumeric:
         return np.array(self.data.site(site).xmat).reshape(3, 3)
 
     def jacobian(self, site: str, offset: ArrayLike = (0.0, 0.0, 0.0)) -> Array:
-        """Return ``J``, shape (6, nv), of the linear and angular velocity of a point in world axes.
+        """Return the Jacobian of the linear and angular velocity of a point, in world axes, shape (6, nv).
 
-        The point is at ``offset`` from the origin of the frame ``site``, in its axes, m, shape (3,).
+        ``offset`` is the position of the point in the coordinates of the frame ``site``, m, shape (3,).
         """
         linear, angular = np.zeros((3, self.model.nv)), np.zeros((3, self.model.nv))
         point = np.array(self.data.site(site).xpos) + self.rotation(site) @ np.asarray(offset, dtype=float)

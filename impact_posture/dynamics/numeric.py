@@ -1,4 +1,4 @@
-"""Kinematics and dynamics computed with Pinocchio, the reference for the symbolic results."""
+"""Kinematics and dynamics computed with Pinocchio, used as the reference for the symbolic results."""
 
 from __future__ import annotations
 
@@ -14,16 +14,16 @@ from impact_posture.system.arrays import Array
 
 
 class Numeric:
-    """Kinematics, mass matrix and their tangent derivatives at one configuration at a time.
+    """Compute kinematics, mass matrix and their tangent derivatives at one configuration.
 
-    Call :meth:`at` first, because the other methods use its configuration.
+    Call :meth:`at` first; the other methods use the configuration that was passed to it.
 
     Attributes:
-        locked: Velocity entries of joints that an infinite armature locks, shape (nv,).
+        locked: True for the velocity entries of joints that an infinite armature locks, shape (nv,).
     """
 
     def __init__(self, model: pin.Model) -> None:
-        # Gravity has no effect in an impact.  Without gravity, RNEA is exactly M(q) a.
+        # Gravity has no effect in an impact.  Without gravity, RNEA at zero velocity returns exactly M(q) a.
         self.model = model.copy()
         self.model.gravity = pin.Motion.Zero()
         self.model.armature, self.locked = finite_armature(model)
@@ -32,13 +32,13 @@ class Numeric:
         self._zero, self._below = np.zeros(model.nv), _below_diagonal(model.nv)
 
     def at(self, q: Array) -> Numeric:
-        """Move to ``q``, shape (nq,)."""
+        """Set the configuration to ``q``, shape (nq,)."""
         self.q = np.array(q, dtype=float)
         pin.computeJointJacobians(self.model, self.data, self.q)
         return self
 
     def mass_matrix(self) -> Array:
-        """Return ``M(q)`` with armature, shape (nv, nv).  Locked joints move in it."""
+        """Return ``M(q)`` with armature, shape (nv, nv).  Locked joints are treated as if they could move."""
         M = np.array(pin.crba(self.model, self.data, self.q)).reshape(2 * (self.model.nv,))
         M[self._below] = M.T[self._below]
         return M
@@ -48,27 +48,28 @@ class Numeric:
         return self.data.oMi[point.joint] * point.placement
 
     def jacobian(self, point: PointOnLink) -> Array:
-        """Return ``J``, shape (6, nv), of the world linear and angular velocity (LOCAL_WORLD_ALIGNED)."""
+        """Return the Jacobian of linear and angular velocity in world axes (LOCAL_WORLD_ALIGNED), shape (6, nv)."""
         J = pin.getFrameJacobian(self.model, self.data, point.joint, point.placement, pin.LOCAL_WORLD_ALIGNED)
         return np.asarray(J).reshape(6, -1)
 
     def center_of_mass(self) -> tuple[Array, Array]:
-        """Return the world center of mass, shape (3,), and its Jacobian, shape (3, nv)."""
+        """Return the world position of the center of mass, shape (3,), and its Jacobian, shape (3, nv)."""
         J = np.array(pin.jacobianCenterOfMass(self.model, self.data, self.q)).reshape(3, -1)
         return np.array(self.data.com[0]), J
 
     def inertial_gradient(self, left: Array, right: Array) -> Array:
-        """Return the tangent gradient of ``leftᵀ M(q) right``, shape (nv,), by derivatives of RNEA."""
+        """Return the tangent gradient of ``leftᵀ M(q) right``, shape (nv,), from the derivatives of RNEA."""
         dtau_dq = pin.computeRNEADerivatives(self.model, self.data, self.q, self._zero, right)[0]
         gradient = np.asarray(dtau_dq).reshape(self.model.nv, -1).T @ left
-        self.at(self.q)  # the derivatives have changed data
+        self.at(self.q)  # restore the data, which the computation of derivatives has changed
         return np.asarray(gradient)
 
     def coupling_gradient(self, point: PointOnLink, wrench: Array, v: Array, *, in_frame: bool = False) -> Array:
-        """Return the tangent gradient of ``wᵀ J(q) v``, shape (nv,), with ``w`` constant in the world or the frame.
+        """Return the tangent gradient of ``wᵀ J(q) v``, shape (nv,).
 
-        Pinocchio's LOCAL_WORLD_ALIGNED derivatives omit the rotation of the frame.  So this method rotates its LOCAL
-        derivatives, which are complete.
+        ``w`` is constant in the frame if ``in_frame``, else in the world.  The LOCAL_WORLD_ALIGNED derivatives of
+        Pinocchio omit the rotation of the frame.  This method therefore uses the LOCAL derivatives, which are
+        complete, and adds the rotation.
         """
         pin.computeForwardKinematicsDerivatives(self.model, self.data, self.q, v, self._zero)
         frame = self.model, self.data, point.joint, point.placement, pin.LOCAL
@@ -84,14 +85,17 @@ class Numeric:
         return np.asarray(dv_dq.T @ np.concatenate([force, moment]) + angular.T @ turning)
 
     def turning_gradient(self, point: PointOnLink, direction: Array, covector: Array) -> Array:
-        """Return the tangent gradient of ``cᵀ d(q)``, shape (nv,), of a world direction that turns with the link."""
+        """Return the tangent gradient of ``cᵀ d(q)``, shape (nv,), for a direction ``d`` that turns with the link.
+
+        ``d`` and the fixed ``covector`` c are in world axes.
+        """
         return np.asarray(self.jacobian(point)[3:].T @ _cross(direction, covector))
 
 
 def hold_locked(locked: NDArray[np.bool_], M: Array, *jacobians: Array) -> tuple[Array, ...]:
-    """Return ``M`` and Jacobians with zero rows and columns at the locked entries.
+    """Return ``M`` and the Jacobians with zero rows and columns at the locked entries.
 
-    The diagonal of ``M`` is one there, so that ``M`` remains regular.
+    The diagonal of ``M`` is set to one at the locked entries, so ``M`` can still be inverted.
     """
     if not locked.any():
         return M, *jacobians
@@ -101,10 +105,10 @@ def hold_locked(locked: NDArray[np.bool_], M: Array, *jacobians: Array) -> tuple
 
 @cache
 def _below_diagonal(size: int) -> tuple[NDArray[np.intp], NDArray[np.intp]]:
-    """Return the indices below the diagonal of a square matrix, which NumPy computes slowly."""
+    """Return the indices below the diagonal of a square matrix; cached, because NumPy computes them slowly."""
     return np.tril_indices(size, -1)
 
 
 def _cross(a: Array, b: Array) -> Array:
-    """Return ``a × b`` of 3-vectors, twenty times as fast as ``numpy.cross``."""
+    """Return ``a × b`` for 3-vectors; twenty times as fast as ``numpy.cross``."""
     return np.array([a[1] * b[2] - a[2] * b[1], a[2] * b[0] - a[0] * b[2], a[0] * b[1] - a[1] * b[0]])

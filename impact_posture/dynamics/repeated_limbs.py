@@ -1,7 +1,7 @@
-"""Repeated limbs of a robot, which have the same joints: the two legs of a humanoid, the four legs of a quadruped.
+"""Repeated limbs: limbs of a robot with the same joints, for example the two legs of a humanoid.
 
-Their expressions differ in constants only.  With parameters for these constants, all limbs have the same
-instructions, which a processor executes at once in its SIMD lanes.
+The expressions of repeated limbs differ only in constants.  If parameters replace these constants, all limbs have the
+same instructions.  A processor can then compute several limbs at once, one per SIMD lane.
 """
 
 from __future__ import annotations
@@ -18,19 +18,19 @@ from impact_posture.dynamics.joints import joint_kind
 from impact_posture.dynamics.spatial import constant, rounded
 from impact_posture.robot.model_joints import finite_armature
 
-# A limb also computes with zeros where its counterpart has nonzero constants.  This is the largest ratio of such
-# work.
+# If a constant is zero in one limb but not in another, both limbs compute with it.  Limbs are repeated only if this
+# increases the number of constants at most by this factor.
 _FILL = 1.25
 _WIDTHS = (4, 2)
 
 
 @dataclass(frozen=True)
 class Place:
-    """Position of a joint in repeated limbs.
+    """Position of a joint in repeated limbs.  All numbers start at zero.
 
     Attributes:
-        group: Number of the group of limbs.
-        lane: Number of the limb in the group.
+        group: Number of the group of limbs that repeat each other.
+        lane: Number of the limb in the group, which is its SIMD lane.
         position: Number of the joint in the limb.
     """
 
@@ -43,9 +43,9 @@ class RepeatedLimbs:
     """The repeated limbs of a model, and parameters for the constants in which they differ.
 
     Attributes:
-        groups: For each group its limbs, and for each limb its joints, in the same order.
-        places: Joint index → its place; without joints outside repeated limbs.
-        parameters: Symbol and value of each parameter, by group, lane, and a name common to all lanes.
+        groups: Groups of limbs; each limb is a tuple of joint indices, in the same order for all limbs of a group.
+        places: Joint index → its place.  Joints outside repeated limbs have no entry.
+        parameters: (group, lane, name) → symbol and value of a parameter.  The name is the same for all lanes.
     """
 
     def __init__(self, model: pin.Model) -> None:
@@ -59,14 +59,18 @@ class RepeatedLimbs:
         self.parameters: dict[tuple[int, int, str], tuple[ca.SX, float]] = {}
 
     def counterparts(self, joint: int) -> list[int]:
-        """Return the joints at the same position of all limbs, by lane; outside repeated limbs the joint alone."""
+        """Return the joints that correspond to this joint in all repeated limbs, one per lane.
+
+        If the joint is in no repeated limb, return only the joint.
+        """
         place = self.places.get(joint)
         return [joint] if place is None else [limb[place.position] for limb in self.groups[place.group]]
 
     def constant(self, joint: int, tag: str, of: Callable[[int], ArrayLike]) -> ca.SX:
-        """Return ``of(joint)`` as an expression, with parameters where the counterparts of the joint differ.
+        """Return ``of(joint)`` as an expression.
 
-        ``of`` returns a vector or a matrix, whose symmetry is kept.  ``tag`` names the kind of constant.
+        An entry becomes a parameter if the corresponding joints of other limbs have another value.  ``of`` returns a
+        vector or a matrix; a symmetric matrix stays symmetric.  ``tag`` is a name for the kind of constant.
         """
         place = self.places.get(joint)
         if place is None:
@@ -79,7 +83,7 @@ class RepeatedLimbs:
             entries = [d[i, j] for d in dense]
             if len(set(entries)) > 1:
                 row, column = (min(i, j), max(i, j)) if symmetric else (i, j)
-                # The values are a part of the name, because another kernel may have other values of this kind.
+                # The name includes the values, because another kernel may use the same tag for other values.
                 name = f"{place.position}.{tag}.{row}.{column}.{entries}"
                 expression[i, j] = self._parameter(place, name, float(numbers[i, j]))
             elif entries[0] != 0.0:
@@ -87,7 +91,7 @@ class RepeatedLimbs:
         return expression
 
     def indicator(self, joint: int, of: int) -> ca.SX:
-        """Return a parameter that is one for the joint ``of`` and zero for its counterparts."""
+        """Return a parameter that is one if ``joint`` is ``of``, and zero for the corresponding joints."""
         place = self.places[of]
         return self._parameter(self.places[joint], f"{place.position}.on.{place.lane}", float(joint == of))
 
@@ -99,7 +103,7 @@ class RepeatedLimbs:
 
 
 def _groups(model: pin.Model) -> tuple[tuple[tuple[int, ...], ...], ...]:
-    """Return the outermost repeated limbs.  A limb is a whole subtree."""
+    """Return the groups of repeated limbs.  A limb is a whole subtree; it is not searched for smaller limbs."""
     groups: list[tuple[tuple[int, ...], ...]] = []
     waiting = [0]
     while waiting:
@@ -121,12 +125,15 @@ def _groups(model: pin.Model) -> tuple[tuple[tuple[int, ...], ...], ...]:
 
 
 def _limb(model: pin.Model, root: int) -> tuple[int, ...]:
-    """Return the joints of a subtree, depth first."""
+    """Return the indices of the joints of a subtree in depth-first order."""
     return (root, *[joint for child in model.children[root] for joint in _limb(model, int(child))])
 
 
 def _alike(model: pin.Model, first: tuple[int, ...], second: tuple[int, ...]) -> bool:
-    """Return whether two limbs have the same joints in the same order, and nearly the same zeros."""
+    """Return whether two limbs can be computed together.
+
+    They must have the same joints in the same order, and nearly the same zero entries in placements and inertias.
+    """
     if _joints(model, first) != _joints(model, second):
         return False
     pairs = [[_numbers(model, k) != 0.0 for k in pair] for pair in zip(first, second, strict=True)]
@@ -134,7 +141,7 @@ def _alike(model: pin.Model, first: tuple[int, ...], second: tuple[int, ...]) ->
 
 
 def _joints(model: pin.Model, limb: tuple[int, ...]) -> list[tuple[object, ...]]:
-    """Return family, axis, whether it is locked, and place of the parent in the limb, for each joint of a limb."""
+    """Return for each joint of a limb: family, axis, whether the joint is locked, and position of its parent."""
     kinds, locked = [joint_kind(model.joints[k], str(model.names[k])) for k in limb], finite_armature(model)[1]
     parents = [-1, *[limb.index(int(model.parents[k])) for k in limb[1:]]]
     return [

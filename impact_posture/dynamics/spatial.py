@@ -1,7 +1,7 @@
 """Spatial algebra on CasADi expressions, with the linear part first as in Pinocchio.
 
-A motion ``[v; w]`` and a force ``[f; m]`` are 6-vectors of ``SX``.  ``R`` and ``p`` place a child frame in its
-parent by ``x_parent = R x_child + p``.  Structural zeros are kept, so that CasADi never multiplies by zero.
+A motion ``[v; w]`` and a force ``[f; m]`` are 6-vectors of type ``SX``.  ``R`` and ``p`` are the placement of a child
+frame in its parent: ``x_parent = R x_child + p``.  Zeros stay structural zeros, so CasADi never multiplies by zero.
 """
 
 from __future__ import annotations
@@ -20,11 +20,12 @@ Result = TypeVar("Result", ca.SX, tuple[ca.SX, ...])
 
 
 def template(operation: Callable[P, Result]) -> Callable[P, Result]:
-    """Decorate an operation: its expressions are built once for each size of arguments, and then reused.
+    """Decorate an operation so that its expressions are built only once for each size of arguments.
 
-    A tree applies a few operations to every joint, and calls from Python would take most of the time.  CasADi inserts
-    the arguments into the expressions, and simplifies products with their zeros and ones.  ``operation`` takes ``SX``
-    matrices, with options as keyword arguments, and returns a matrix or a tuple.
+    A tree applies a few operations to every joint, and building their expressions from Python would take most of the
+    time.  On later calls, CasADi inserts the arguments into the stored expressions, and simplifies products with
+    zeros and ones.  The arguments of ``operation`` are ``SX`` matrices, and keyword arguments for options.  It
+    returns a matrix or a tuple of matrices.
     """
     functions: dict[tuple[object, ...], ca.Function] = {}
 
@@ -42,7 +43,7 @@ def template(operation: Callable[P, Result]) -> Callable[P, Result]:
 
 
 def rounded(value: ArrayLike) -> NDArray[np.float64]:
-    """Return numbers in which values within 1e-15 of −1, 0 or 1 become exact."""
+    """Return a copy of numbers in which values within 1e-15 of −1, 0 or 1 are rounded to −1, 0 or 1."""
     array = np.array(value, dtype=float)
     nice = np.rint(array)
     near = (np.abs(array - nice) < 1e-15) & (np.abs(nice) <= 1)
@@ -51,12 +52,12 @@ def rounded(value: ArrayLike) -> NDArray[np.float64]:
 
 
 def constant(value: ArrayLike) -> ca.SX:
-    """Turn :func:`rounded` numbers into ``SX`` with exact zeros as structural zeros."""
+    """Turn numbers into ``SX`` after :func:`rounded`; exact zeros become structural zeros."""
     return ca.sparsify(ca.SX(rounded(value)))
 
 
 def skew(p: ca.SX) -> ca.SX:
-    """Return ``[p]×``, shape (3, 3)."""
+    """Return the cross-product matrix ``[p]×``, shape (3, 3)."""
     return ca.sparsify(ca.skew(ca.densify(p)))
 
 
@@ -68,7 +69,7 @@ def cross(a: ca.SX, b: ca.SX) -> ca.SX:
 
 @template
 def transposed_times(A: ca.SX, b: ca.SX) -> ca.SX:
-    """Return ``Aᵀ b``."""
+    """Return the product ``Aᵀ b``."""
     return A.T @ b
 
 
@@ -95,9 +96,10 @@ def motion_cross_force(motion: ca.SX, force: ca.SX) -> ca.SX:
 
 @dataclass(frozen=True)
 class Spin:
-    """Rotation about the coordinate ``axis`` 0, 1 or 2, with the cosine and sine of its angle.
+    """Rotation about a coordinate axis, stated by the cosine and sine of its angle.
 
-    ``sense`` is −1 if the axis of the joint has the opposite direction.  The sine includes this sign.
+    ``axis`` is 0, 1 or 2.  ``sense`` is −1 if the joint axis points opposite to the coordinate axis, else 1; ``sine``
+    already includes this sign.
     """
 
     axis: int
@@ -107,9 +109,12 @@ class Spin:
 
 
 def _turned(M: ca.SX, k: int, cosine: ca.SX, sine: ca.SX) -> ca.SX:
-    """Return ``R M Rᵀ`` of a 3×3 matrix by plane rotations, with 16 products, or 12 if ``M`` is symmetric."""
+    """Return ``R M Rᵀ`` for a rotation ``R`` about axis ``k`` and a 3×3 matrix ``M``.
+
+    This takes 16 products, or 12 if ``M`` is symmetric.
+    """
     i, j = (k + 1) % 3, (k + 2) % 3
-    # A symmetric matrix turns by twice the angle.
+    # The symmetric part of the 2×2 block transforms with twice the angle.
     c2, s2 = (cosine - sine) * (cosine + sine), 2 * sine * cosine
     mean, half = (M[i, i] + M[j, j]) / 2, (M[i, i] - M[j, j]) / 2
     even, odd = (M[i, j] + M[j, i]) / 2, (M[i, j] - M[j, i]) / 2
@@ -124,9 +129,9 @@ def _turned(M: ca.SX, k: int, cosine: ca.SX, sine: ca.SX) -> ca.SX:
 
 @template
 def spin_power(inertia: ca.SX, x: ca.SX, y: ca.SX, *, axis: int, sense: float) -> ca.SX:
-    """Return ``yᵀ K x`` with the symmetric ``K = (S×)ᵀ I + I (S×)`` of a 6×6 inertia ``I`` and a motion ``S``.
+    """Return ``yᵀ K x`` with the symmetric ``K = (S×)ᵀ I + I (S×)`` for a 6×6 inertia ``I`` and a motion ``S``.
 
-    ``S`` rotates about the coordinate ``axis``, in the opposite direction if ``sense`` is −1.
+    ``S`` is the unit rotation about the coordinate ``axis``, in the negative direction if ``sense`` is −1.
     """
     turn = skew(constant(sense * np.eye(3)[axis]))
     S = ca.diagcat(turn, turn)
@@ -137,7 +142,8 @@ def spin_power(inertia: ca.SX, x: ca.SX, y: ca.SX, *, axis: int, sense: float) -
 def inertia_to_parent(inertia: ca.SX, R: ca.SX, p: ca.SX, *spin: ca.SX, axis: int | None = None) -> ca.SX:
     """Return a symmetric 6×6 inertia of a child in the coordinates of its parent.
 
-    ``spin`` is cosine and sine of a rotation about the coordinate ``axis`` 0, 1 or 2, which is applied before ``R``.
+    ``spin`` contains the cosine and sine of a rotation about the coordinate ``axis`` 0, 1 or 2; this rotation is
+    applied before ``R``.
     """
     blocks = [symmetric(inertia[:3, :3]), inertia[:3, 3:], symmetric(inertia[3:, 3:])]
     if axis is not None:
@@ -150,7 +156,7 @@ def inertia_to_parent(inertia: ca.SX, R: ca.SX, p: ca.SX, *spin: ca.SX, axis: in
 
 
 def symmetric(matrix: ca.SX) -> ca.SX:
-    """Copy the upper triangle to the lower one, so that equal expressions are computed once."""
+    """Copy the upper triangle to the lower triangle, so that equal entries are the same expression."""
     return ca.triu2symm(ca.triu(matrix))
 
 
@@ -162,7 +168,7 @@ def quaternion_product(a: ca.SX, b: ca.SX) -> ca.SX:
 
 
 def quaternion_matrix(q: ca.SX) -> ca.SX:
-    """Return the rotation matrix of a unit quaternion in ``x y z w`` order, quadratic in its entries."""
+    """Return the rotation matrix of a unit quaternion in ``x y z w`` order."""
     x, y, z, w = q[0], q[1], q[2], q[3]
     return ca.blockcat(
         [

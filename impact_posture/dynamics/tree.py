@@ -1,8 +1,8 @@
-"""Dynamics of the kinematic tree at one symbolic configuration: sweeps and an O(n) articulated-body factorization.
+"""Dynamics of the kinematic tree at one symbolic configuration, by an articulated-body factorization in O(n).
 
-All quantities are in link coordinates.  ``M`` does not depend on the pose of the base, which only rotates world
-directions to link coordinates.  Notation and signs follow Featherstone, *Rigid Body Dynamics Algorithms* (2008), with
-the linear part first as in Pinocchio.
+All quantities are in link coordinates.  ``M`` does not depend on the pose of the base.  The pose is only needed to
+rotate world directions to link coordinates.  Notation and signs follow Featherstone, *Rigid Body Dynamics Algorithms*
+(2008), but the linear part is first, as in Pinocchio.
 """
 
 from __future__ import annotations
@@ -33,12 +33,14 @@ _ZERO = ca.SX(6, 1)
 
 @dataclass(frozen=True)
 class Wrench:
-    """A force and a moment at a point of a link, constant in the world or in the frame.
+    """A force and a moment at a point of a link.
 
     Attributes:
-        force: The force, shape (3,), in world axes; in the axes of the frame if ``in_frame``.
-        moment: The moment about the point, shape (3,), in the same axes.
-        in_frame: Whether the wrench turns with the link.
+        point: The point, with the axes of its frame.
+        force: The force, shape (3,), in the axes of the frame if ``in_frame``, else in world axes.
+        moment: The moment about the point, shape (3,), in the same axes as the force.
+        in_frame: Whether the wrench is constant in the frame and turns with the link; otherwise constant in the
+            world.
     """
 
     point: PointOnLink
@@ -52,11 +54,12 @@ class Response:
     """The response of the robot to a generalized force and wrenches.
 
     Attributes:
-        a: ``M⁻¹(τ + Σ Jᵀ w)``, shape (nv,).
-        velocities: Spatial velocity of every link under ``a``, in link coordinates.
-        before: Spatial velocity of every link without the motion of its joint, ``v⁻``.
-        forces: Spatial force through every joint, on its link.
-        passed: The part of this force that does not depend on the motion of the parent.
+        a: Generalized response ``M⁻¹(τ + Σ Jᵀ w)``, shape (nv,).
+        velocities: Spatial velocity of every link for the generalized velocity ``a``, in link coordinates.
+        before: Spatial velocity ``v⁻`` of every link without the motion of its own joint, in link coordinates.
+        forces: Spatial force that acts through every joint on its link, in link coordinates.
+        passed: The part of ``forces`` that does not depend on the motion of the parent link.
+        wrenches: The wrenches that act on the robot.
     """
 
     a: ca.SX
@@ -68,7 +71,7 @@ class Response:
 
 
 class Tree(Kinematics):
-    """Dynamics of a model, with the arguments of :class:`~impact_posture.dynamics.kinematics.Kinematics`."""
+    """Dynamics of a model; the arguments are as for :class:`~impact_posture.dynamics.kinematics.Kinematics`."""
 
     def velocities(self, v: ca.SX) -> ByJoint:
         """Return the spatial velocity of every link, in link coordinates, for the generalized velocity ``v``."""
@@ -89,9 +92,10 @@ class Tree(Kinematics):
     def mass_times(
         self, v: ca.SX, velocities: ByJoint | None = None, *, extra: bool = True, less: Sequence[Wrench] = ()
     ) -> ca.SX:
-        """Return ``M(q) v − Σ Jᵀ w`` in O(n), armature included, shape (nv,), for the wrenches ``less``.
+        """Return ``M(q) v − Σ Jᵀ w`` in O(n), shape (nv,), where ``w`` are the wrenches ``less``.
 
-        ``velocities`` are the known results of :meth:`velocities`.  ``extra`` includes the extra inertias.
+        ``M`` includes the armature, and the extra inertias if ``extra``.  Pass ``velocities`` if the result of
+        :meth:`velocities` for ``v`` is already available.
         """
         velocities = self.velocities(v) if velocities is None else velocities
         inertia = self._inertia if extra else self._own_inertia
@@ -114,9 +118,9 @@ class Tree(Kinematics):
         return ca.vertcat(force, moment + cross(position, force))
 
     def generalized_force(self, wrenches: Sequence[Wrench], gravity: ca.SX | None = None) -> ca.SX:
-        """Return ``Σ Jᵀ [force; moment]`` of the wrenches, and of the weights under ``gravity``, shape (nv,).
+        """Return the generalized force ``Σ Jᵀ [force; moment]`` of the wrenches and of gravity, shape (nv,).
 
-        ``gravity`` is an acceleration in world axes, shape (3,).
+        ``gravity`` is the gravitational acceleration in world axes, shape (3,); ``None`` for no gravity.
         """
         forces: ByJoint = dict.fromkeys(self._R, _ZERO)
         if gravity is not None:
@@ -136,7 +140,7 @@ class Tree(Kinematics):
         return ca.vertcat(R @ local[:3], R @ local[3:])
 
     def own_velocity(self, point: PointOnLink, velocities: ByJoint) -> ca.SX:
-        """Return the linear and angular velocity of a point in the axes of the point, shape (6,)."""
+        """Return the linear and angular velocity of a point in the axes of its frame, shape (6,)."""
         motion, axes = velocities[point.joint], constant(point.rotation).T
         return ca.vertcat(axes @ (motion[:3] + cross(motion[3:], ca.SX(point.position))), axes @ motion[3:])
 
@@ -149,15 +153,16 @@ class Tree(Kinematics):
 
     @cached_property
     def _factor(self) -> dict[int, tuple[ca.SX, ...]]:
-        """``(pivot, D⁻¹Uᵀ, I^a = I^A − U D⁻¹ Uᵀ)`` of every joint, with ``U = I^A S`` and ``D = SᵀU + armature``.
+        """Factors of every joint: ``(pivot, D⁻¹Uᵀ, I^a = I^A − U D⁻¹ Uᵀ)``, ``U = I^A S``, ``D = SᵀU + armature``.
 
-        The pivot is ``D``, ``1/D`` for a joint with one axis, and zero for a locked joint, which has ``D⁻¹ = 0``.
+        The pivot is ``1/D`` for a joint with one axis, and ``D`` for a joint with several.  For a locked joint, ``D``
+        is infinite, and the pivot is ``D⁻¹ = 0``.
         """
         articulated = dict(self._inertia)
         factors: dict[int, tuple[ca.SX, ...]] = {}
         for slot, i, parent in reversed(self._joints):
             D = step.pivot(articulated[i], self._S[i], self.armature[slot.v])
-            # Outside a template, so that a constant 1/D is a factor and not a divisor.
+            # Not part of a template: so a constant D becomes the constant factor 1/D instead of a division.
             pivot = ca.SX(0) if slot.v.start in self.locked else 1 / D if slot.kind.nv == 1 else D
             factors[i] = pivot, *step.reduce(articulated[i], self._S[i], pivot)
             if parent:
@@ -165,9 +170,9 @@ class Tree(Kinematics):
         return factors
 
     def respond(self, tau: ca.SX | None = None, wrenches: Sequence[Wrench] = ()) -> Response:
-        """Solve ``M a = τ + Σ Jᵀ w`` by the articulated-body factorization, in O(n) and without forming ``M``.
+        """Solve ``M a = τ + Σ Jᵀ w`` by the articulated-body factorization in O(n), without computing ``M``.
 
-        The force through joint i is ``f_i = I^a_i v_i⁻ + p^a_i``, without a sweep over the momenta of the subtree.
+        The force through joint i is ``f_i = I^a_i v_i⁻ + p^a_i``, so no additional sweep over the tree is needed.
         """
         bias: ByJoint = dict.fromkeys(self._R, _ZERO)
         for wrench in wrenches:
@@ -193,9 +198,10 @@ class Tree(Kinematics):
     def pair_gradient(self, x: Response, y: Response) -> ca.SX:
         """Return the tangent gradient of ``w_xᵀJ y + w_yᵀJ x − yᵀM x`` for fixed x, y, w_x and w_y, shape (nv,).
 
-        It is ``Sᵀ(v_y⁻ ×* f_x + v_x⁻ ×* f_y)`` plus the rotation of wrenches that are constant in the world.  With
-        ``f = I^a v⁻ + p^a`` and a joint about a coordinate axis, the two terms of ``I^a`` are the one product
-        ``v_y⁻ᵀ K v_x⁻``, where ``K`` is the rate of ``I^a`` as the joint rotates.
+        The gradient is ``Sᵀ(v_y⁻ ×* f_x + v_x⁻ ×* f_y)``, plus a term for wrenches that are constant in the world,
+        since they rotate relative to the links.  Insert ``f = I^a v⁻ + p^a``.  For a joint about a coordinate axis,
+        the two terms with ``I^a`` equal one product ``v_y⁻ᵀ K v_x⁻``, where ``K`` is the derivative of ``I^a`` with
+        respect to the joint angle.
         """
         turning: ByJoint = {}
         for pushed, moved in ((x, y), (y, x)):
@@ -214,12 +220,12 @@ class Tree(Kinematics):
     def energy_gradient(self, velocities: ByJoint) -> ca.SX:
         """Return the tangent gradient of ``vᵀM(q)v`` for fixed ``v``, without extra inertias, shape (nv,).
 
-        A motion ``S_j δ`` of joint j turns every velocity beyond it by ``−S_j δ ×``.  With ``F_j`` the momentum of
-        the subtree of j, this changes the value by ``−2 S_jᵀ (v_j⁻ ×* F_j)``, where ``v_j⁻`` is the velocity of the
-        link without the motion of joint j.
+        A motion ``S_j δ`` of joint j changes the velocities of all links after this joint by ``−S_j δ ×``.  The value
+        changes by ``−2 S_jᵀ (v_j⁻ ×* F_j)``.  Here ``F_j`` is the momentum of the subtree of j, and ``v_j⁻`` the
+        velocity of its first link without the motion of joint j.
         """
         forces = {i: -2 * (self._own_inertia[i] @ velocity) for i, velocity in velocities.items()}
-        # A joint with one axis keeps its motion, because Sᵀ(S ×* F) is zero.
+        # For a joint with one axis, v⁻ can include the motion of the joint, because Sᵀ(S ×* F) is zero.
         before = {
             i: velocities[i] if slot.kind.nv == 1 else motion_to_child(self._R[i], self._p[i], velocities[parent])
             for slot, i, parent in self._joints
@@ -228,10 +234,10 @@ class Tree(Kinematics):
         return self._gather([(before, self._accumulate(forces))], {})
 
     def _turn(self, turning: ByJoint, wrench: Wrench, velocities: ByJoint) -> None:
-        """Add ``f × u + m × ω`` of a wrench that is constant in the world while its link moves with ``(u, ω)``.
+        """Add ``f × u + m × ω`` to ``turning`` for a wrench ``(f, m)`` that is constant in the world.
 
-        The wrench turns back relative to the link, which adds ``−ω_jᵀ (f × u + m × ω)`` for every joint j on the path
-        to the link.
+        ``(u, ω)`` is the velocity of the point of the wrench.  When a joint j on the path to the link turns, the
+        wrench rotates relative to the link.  This contributes ``−ω_jᵀ (f × u + m × ω)`` to the gradient.
         """
         joint = wrench.point.joint
         if wrench.in_frame:
@@ -244,7 +250,10 @@ class Tree(Kinematics):
     def _gather(
         self, pairs: Sequence[tuple[ByJoint, ByJoint]], turning: ByJoint, known: ByJoint | None = None
     ) -> ca.SX:
-        """Return ``Σ S_jᵀ(v_j⁻ ×* F_j) − ω_jᵀ turning`` for pairs ``(v⁻, F)``, plus the ``known`` rows of joints."""
+        """Return ``Σ S_jᵀ(v_j⁻ ×* F_j) − ω_jᵀ turning`` for all pairs ``(v⁻, F)``, shape (nv,).
+
+        ``known`` contains terms that are added to the rows of joints.
+        """
         turning = {i: turning.get(i, ca.SX(3, 1)) for i in self._R}
         rows: ByJoint = {}
         for slot, i, parent in reversed(self._joints):
@@ -256,7 +265,10 @@ class Tree(Kinematics):
         return ca.densify(ca.vertcat(*[rows[i] for i in self._R]))
 
     def turning_gradient(self, point: PointOnLink, direction: ca.SX, covector: ca.SX) -> ca.SX:
-        """Return the tangent gradient of ``cᵀ d(q)``, shape (nv,), of a world direction that turns with the link."""
+        """Return the tangent gradient of ``cᵀ d(q)``, shape (nv,), for a direction ``d`` that turns with the link.
+
+        ``d`` and the fixed ``covector`` c are in world axes.
+        """
         turning = {point.joint: -self.to_link(point.joint, cross(direction, covector))}
         return self._gather([], turning)
 

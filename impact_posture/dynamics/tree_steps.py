@@ -1,7 +1,7 @@
-"""The steps of sweeps over the tree at one joint, as templates.
+"""Operations at one joint in a sweep over the tree, as templates.
 
-Notation follows Featherstone (2008).  ``S`` is the motion subspace, shape (6, nv), ``I`` the articulated inertia
-of the link, and ``pivot`` is ``D = SᵀIS + armature``, or ``1/D`` for a joint with one axis.
+Notation follows Featherstone (2008).  ``S`` is the motion subspace of the joint, shape (6, nv), and ``I`` the
+articulated inertia of its link.  ``pivot`` is ``D = SᵀIS + armature``, or ``1/D`` for a joint with one axis.
 """
 
 from __future__ import annotations
@@ -27,7 +27,7 @@ def reduce(inertia: ca.SX, S: ca.SX, pivot: ca.SX) -> tuple[ca.SX, ...]:
 
 @template
 def drive(S: ca.SX, tau: ca.SX, bias: ca.SX, gain: ca.SX) -> tuple[ca.SX, ...]:
-    """Return the drive of a joint, ``τ − Sᵀp``, shape (nv,), and the bias force on its parent, shape (6,)."""
+    """Return the driving force of a joint, ``τ − Sᵀp``, shape (nv,), and the bias force on its parent, shape (6,)."""
     driving = tau - S.T @ bias
     return driving, bias + gain.T @ driving
 
@@ -36,7 +36,7 @@ def drive(S: ca.SX, tau: ca.SX, bias: ca.SX, gain: ca.SX) -> tuple[ca.SX, ...]:
 def respond(
     before: ca.SX, S: ca.SX, drive: ca.SX, passed: ca.SX, pivot: ca.SX, gain: ca.SX, reduced: ca.SX
 ) -> tuple[ca.SX, ...]:
-    """Return the rates of a joint, the velocity of its link and the force through it.
+    """Return the joint rates, the velocity of the link after the joint, and the force through the joint.
 
     ``before`` is the velocity of the link without the motion of the joint.  The other arguments are results of
     :func:`drive` and :func:`reduce`.
@@ -47,7 +47,7 @@ def respond(
 
 @template
 def gradient(S: ca.SX, turning: ca.SX, known: ca.SX, *pairs: ca.SX) -> ca.SX:
-    """Return ``known − S_ωᵀ turning + Σ Sᵀ(v ×* F)`` for ``pairs`` of ``v`` and ``F`` in turn, shape (nv,)."""
+    """Return ``known − S_ωᵀ turning + Σ Sᵀ(v ×* F)``, shape (nv,); ``pairs`` is ``v₁, F₁, v₂, F₂, …``."""
     row = known - S[3:, :].T @ turning
     for velocity, force in zip(pairs[::2], pairs[1::2], strict=True):
         row = row + S.T @ motion_cross_force(velocity, force)
@@ -55,7 +55,7 @@ def gradient(S: ca.SX, turning: ca.SX, known: ca.SX, *pairs: ca.SX) -> ca.SX:
 
 
 def _solve(pivot: ca.SX, rhs: ca.SX) -> ca.SX:
-    """Return ``D⁻¹ rhs``, for several axes by ``LDLᵀ`` without pivoting."""
+    """Return ``D⁻¹ rhs``; for a joint with several axes, by an ``LDLᵀ`` factorization without pivoting."""
     if pivot.is_scalar():
         return pivot * rhs
     D, LT, order = ca.ldl(pivot, False)
