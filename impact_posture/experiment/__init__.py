@@ -1,1 +1,1 @@
-"""Runs of scenarios from end to end: one, several side by side, and the paper's table and figures."""
+"""Run scenarios and write their results: single runs, comparisons, and the tables and figures of the paper."""

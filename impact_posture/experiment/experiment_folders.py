@@ -1,4 +1,4 @@
-"""Output folders of runs, comparisons and reproductions.  Each is written as a whole or not at all."""
+"""Output folders of runs, comparisons and reproductions.  Each folder is written completely or not at all."""
 
 from __future__ import annotations
 
@@ -25,12 +25,14 @@ FORMATS = ("png",)
 
 @dataclass(frozen=True)
 class Output:
-    """Output folder, and what it contains besides the numbers.
+    """Output folder, and options for its figures and its report.
 
     Attributes:
-        force: Whether an earlier result there may be replaced.
-        report: Whether ``report.html`` is written.
-        meshes: Whether the report shows the meshes of the robot.
+        folder: Path of the folder.
+        force: If true, an earlier result in the folder may be replaced.
+        formats: File formats of the figures.
+        report: If true, ``report.html`` is written.
+        meshes: If true, the report shows the meshes of the robot.
     """
 
     folder: Path
@@ -43,10 +45,11 @@ class Output:
 def write_simulation(output: Output, job: Job, runs: Sequence[Run], document: Document) -> str:
     """Write ``run.json``, ``series.npz`` (``series-minus.npz`` for a push with sign -1), figures and ``report.html``.
 
-    Return the reason why the report is missing, empty if it was written or not requested.
+    Return the reason why the report is missing.  The text is empty if the report was written or not requested.
 
     Raises:
-        OutputError: The folder exists without ``force``, has foreign files, or cannot be written.
+        OutputError: The folder exists and ``force`` is false, or the folder contains files that are not from this
+            command, or it cannot be written.
     """
     with whole_folder(output.folder, force=output.force, kind="run") as folder:
         write_json(folder / SIMULATION, document)
@@ -57,12 +60,13 @@ def write_simulation(output: Output, job: Job, runs: Sequence[Run], document: Do
 
 
 def write_comparison(output: Output, comparison: Reproduction, store: JobStore) -> str:
-    """Write ``comparison.json``, figures, ``runs/`` and ``report.html`` of the first seed, and remove the store.
+    """Write ``comparison.json``, figures, ``runs/`` and ``report.html``, and remove the store.
 
-    Return the reason why the report is missing, empty if it was written or not requested.
+    Figures, ``runs/`` and the report show the first seed.  Return the reason why the report is missing.  The text is
+    empty if the report was written or not requested.
 
     Raises:
-        OutputError: As :func:`write_simulation`.
+        OutputError: As in :func:`write_simulation`.
     """
     with whole_folder(output.folder, force=output.force, kind="comparison") as folder:
         write_json(folder / COMPARISON, comparison.comparison())
@@ -75,10 +79,12 @@ def write_comparison(output: Output, comparison: Reproduction, store: JobStore) 
 
 
 def write_reproduction(output: Output, reproduction: Reproduction, store: JobStore) -> Document:
-    """Write ``SUMMARY.md``, ``runs/``, figures and ``reproduction.json``, return the latter, and remove the store.
+    """Write ``SUMMARY.md``, ``runs/``, figures and ``reproduction.json``, and remove the store.
+
+    Return the content of ``reproduction.json``.
 
     Raises:
-        OutputError: As :func:`write_simulation`.
+        OutputError: As in :func:`write_simulation`.
     """
     document = {**reproduction.to_dict(), "summary": summary(reproduction)}
     with whole_folder(output.folder, force=output.force, kind="reproduction") as folder:
@@ -93,16 +99,16 @@ def write_reproduction(output: Output, reproduction: Reproduction, store: JobSto
 
 
 def store_beside(out: Path) -> AbstractContextManager[JobStore]:
-    """Lock the store that keeps finished runs until the output folder is written.
+    """Lock and yield the store that keeps finished runs until the output folder ``out`` is written.
 
     Raises:
-        OutputError: As :meth:`JobStore.locked`.
+        OutputError: As in :meth:`JobStore.locked`.
     """
     return JobStore(out.absolute().parent / f".{out.name}.runs").locked()
 
 
 def draw_runs(job: Job, runs: Sequence[Run], document: Document, folder: Path, formats: Sequence[str]) -> None:
-    """Draw the figures of a job; figures of the second sign of a push are in ``minus/``."""
+    """Draw the figures of a job.  For the second sign of a push, the figures are written into ``minus/``."""
     for run, part in zip(runs, document["runs"], strict=True):
         tell("drawing")
         subfolder = folder if run is runs[0] else folder / "minus"
@@ -110,7 +116,7 @@ def draw_runs(job: Job, runs: Sequence[Run], document: Document, folder: Path, f
 
 
 def draw_side_by_side(jobs: Sequence[Job], store: JobStore, folder: Path, formats: Sequence[str]) -> None:
-    """Draw several controllers in one scenario, with the first sign of a push."""
+    """Draw figures that compare several controllers in one scenario.  Pushes are drawn with their first sign."""
     tell("drawing")
     views = []
     for job in jobs:
@@ -122,12 +128,15 @@ def draw_side_by_side(jobs: Sequence[Job], store: JobStore, folder: Path, format
 
 
 def draw_reproduction(reproduction: Reproduction, store: JobStore, folder: Path, formats: Sequence[str]) -> None:
-    """Draw ``bars``, and for each scenario a folder with nominal, robust and the best controller side by side."""
+    """Draw the figure ``bars`` and, in a folder per scenario, figures that compare three controllers.
+
+    The three controllers are nominal, robust and the best controller.
+    """
     bars = []
     for row in reproduction.rows:
         paper, total = PAPER.get(row.scenario), row.metrics.get("q_total_impact")
         mean, half = (np.nan, 0.0) if total is None else (total.mean, total.shown or 0.0)
-        # The paper has values for the nominal and the robust controller only.
+        # The paper gives values only for the nominal and the robust controller.
         bars.append(Bar(row.scenario, row.controller, mean, half, getattr(paper, row.controller, None)))
     save(bars_figure(bars), folder, "bars", formats)
     for scenario in reproduction.scenarios:

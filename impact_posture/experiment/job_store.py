@@ -1,4 +1,4 @@
-"""Store of finished jobs, so that an interrupted comparison continues instead of starting again."""
+"""Store of finished jobs.  With it, an interrupted comparison can continue instead of starting again."""
 
 from __future__ import annotations
 
@@ -28,7 +28,7 @@ from impact_posture.system.processes import fork_map, undone
 from impact_posture.system.text_files import read_text
 
 Progress = Callable[[int, int], None]
-# Names of stored files, and of the incomplete files that a killed process leaves.
+# Pattern of the names of stored files, and of incomplete files that a killed process leaves.
 _STORED = re.compile(r"\.?[0-9a-f]{64}(\.minus)?\.(json|npz)(\.\d+\.part)?")
 
 
@@ -36,7 +36,7 @@ class JobStore:
     """Folder with the documents and time series of finished jobs.
 
     The name of a file is a hash of everything that its job depends on (:func:`key_of`).  A document begins with its
-    checksum and has the checksums of its time series, so a damaged file is noticed and its job runs again.
+    checksum and contains the checksums of its time series.  So a damaged file is detected, and its job runs again.
     """
 
     def __init__(self, folder: Path) -> None:
@@ -44,10 +44,10 @@ class JobStore:
 
     @contextmanager
     def locked(self) -> Iterator[JobStore]:
-        """Make the folder and lock it against other commands.  Remove it at the end if it is empty.
+        """Create the folder and lock it against other commands.  Remove the folder at the end if it is empty.
 
         Raises:
-            OutputError: The folder cannot be made or read, or another command uses it.
+            OutputError: The folder cannot be created or read, or another command uses it.
         """
         with parents_of(self.folder):
             lock = self._lock()
@@ -58,7 +58,7 @@ class JobStore:
                 os.close(lock)
 
     def _lock(self) -> int:
-        """Return a descriptor of the folder.  The folder is locked while the descriptor is open."""
+        """Lock the folder and return its file descriptor.  The folder is locked while the descriptor is open."""
         self._make_folder()
         lock = os.open(self.folder, os.O_RDONLY)
         try:
@@ -84,7 +84,7 @@ class JobStore:
             self.folder.rmdir()
 
     def remove(self) -> None:
-        """Remove the stored files, and the folder unless it holds other files."""
+        """Remove the stored files.  Also remove the folder if it then is empty."""
         with suppress(OSError):
             for path in self.folder.iterdir():
                 if _STORED.fullmatch(path.name):
@@ -110,7 +110,7 @@ class JobStore:
         """Return the document of a job that :func:`run_batch` has finished.
 
         Raises:
-            OutputError: A file was removed or changed since.
+            OutputError: A stored file was removed or changed after the job finished.
         """
         document = self.find(job)
         if document is None:
@@ -125,7 +125,7 @@ class JobStore:
     def keep(self, job: Job, document: Document, runs: Sequence[Run] = ()) -> None:
         """Write a document and the time series of its runs.
 
-        The document is written last, so an interrupted call stores nothing that :meth:`find` returns.
+        The document is written last.  So :meth:`find` returns ``None`` if the call was interrupted.
 
         Raises:
             OutputError: The files cannot be written.
@@ -159,7 +159,7 @@ def _scenario(scenario: str) -> str:
     """Return the text of a scenario file, and hashes of the files that the scenario names."""
     setup = controller_factory(scenario, False).setup
     shapes = ""
-    # A mesh that cannot be read has no influence.
+    # A mesh that cannot be read has no effect on the results, so it is not part of the hash.
     with suppress(OSError):
         shapes = geometry_key(setup.robot, read_urdf_shapes(setup.robot)[0])
     text = scenario_path(scenario).read_text(encoding="utf-8")
@@ -171,19 +171,20 @@ def run_batch(
 ) -> list[Document]:
     """Run the jobs that are not stored yet, and return all documents in the order of the jobs.
 
-    A job that fails (for example where a metric is undefined) has a document without runs and with the status
-    ``control lost``.  The store also keeps the time series of the jobs that figures and reports show.  ``progress``
-    is called with (done, all).
+    The document of a job that fails, for example because a metric is undefined, has no runs and the status
+    ``control lost``.  For jobs that figures and reports show, time series are stored too.  ``progress`` is called
+    with the number of finished jobs and the number of all jobs.
 
     Raises:
         ImpactPostureError: A scenario cannot be set up, or a controller does not exist.
     """
     done: dict[int, Document] = {}
     for k, job in enumerate(jobs):
-        # This refuses every wrong scenario or controller before hours of runs.
+        # Setting up every scenario and controller first reveals mistakes before hours of runs.
         factory = controller_factory(job.scenario, job.free)
         if job.controller not in CONTROLLERS:
-            # The key of a stored job does not cover the code of another package, so the job runs again.
+            # The controller is from another package.  The key of a job does not contain the code of other packages,
+            # so the job always runs again.
             factory.driver(job.controller)
         elif store is not None:
             document = store.find(job)
@@ -210,7 +211,7 @@ def _run(job: Job, store: JobStore | None) -> Document:
         runs, document = execute(job)
     except ImpactPostureError as error:
         if isinstance(error, InputError) and not isinstance(error, MetricError):
-            # A user's mistake fails with every seed, so it ends the batch.
+            # A wrong input fails with every seed, so raise its error and end the batch.
             raise
         document = lost_control(job, error)
     if store is not None:

@@ -1,4 +1,4 @@
-"""Jobs of an experiment, and the documents with their results."""
+"""Jobs of an experiment, and the JSON documents with their results."""
 
 from __future__ import annotations
 
@@ -25,24 +25,25 @@ from impact_posture.system.escape import file_name
 Document = dict[str, Any]
 
 SCHEMA = "impact-posture/simulation/4"
-# Number of runs from which compiling pays.  The library of a humanoid takes about 6 s and saves 4 s of each run.  An
-# existing library in the cache does not count, because the rounding of a run must not depend on earlier runs.
+# From this number of runs on, compiling the controller saves time.  For a humanoid, compiling needs about 6 s and
+# saves 4 s in each run.  It does not matter whether the cache already contains the library, because the rounding
+# errors of a run must not depend on earlier runs.
 _PAYS = 2
 
 
 @dataclass(frozen=True)
 class Job:
-    """Runs of one controller in one scenario: one run, or one for each sign of a push or throw.
+    """Runs of one controller in one scenario: one run for contacts, or one run for each sign of a push or throw.
 
     Attributes:
         scenario: Name or file of the scenario.
         controller: Name of the controller.
         seed: Seed of the sensor noise.
-        mode: ``live`` or ``held``.
-        free: Whether gradients and the offline optimum ignore the feet.
-        gain: K in place of the value in the scenario, 1/s².
-        sign: Sign to run; both by default.
-        compile: Whether the controller runs as machine code: ``auto`` where it can, always, or never.
+        mode: ``live`` or ``held`` (:func:`impact_posture.simulation.run.run`).
+        free: If true, gradients and the offline optimum ignore the contacts at the feet.
+        gain: K of the impact-robust term, 1/s²; ``None`` for the value in the scenario.
+        sign: Sign of the push or throw; ``None`` for every sign of the scenario.
+        compile: When the controller runs as machine code: ``always``, ``never``, or ``auto`` if it can be compiled.
     """
 
     scenario: str
@@ -61,17 +62,17 @@ class Job:
 
     @property
     def shown(self) -> bool:
-        """Whether figures and reports show this job, so that its time series are stored (first seed only)."""
+        """True for the first seed.  Figures and reports show only this seed, so only its time series are stored."""
         return self.seed == 0
 
     @property
     def name(self) -> str:
-        """Name of the files of this job."""
+        """Name of the files of this job, without extension."""
         return f"{file_name(self.scenario)}-{file_name(self.label.replace(':', '-'))}-{self.seed}"
 
 
 def worth_compiling(compile: CompileMode, runs: int) -> CompileMode:
-    """Return :attr:`Job.compile` for a number of runs of each controller; ``auto`` compiles from two runs on."""
+    """Return :attr:`Job.compile` for ``runs`` runs of each controller.  ``auto`` compiles from two runs on."""
     return "never" if compile == "auto" and runs < _PAYS else compile
 
 
@@ -90,7 +91,7 @@ def parse_controller(text: str) -> tuple[str, Mode, bool]:
 
 @lru_cache(maxsize=8)
 def controller_factory(scenario: str, free: bool = False) -> ControllerFactory:
-    """Return the controllers of a scenario, and keep them for the next job.
+    """Return the controller factory of a scenario.  A cache returns the same factory to the next job.
 
     Raises:
         ImpactPostureError: The scenario cannot be read or set up.
@@ -99,10 +100,12 @@ def controller_factory(scenario: str, free: bool = False) -> ControllerFactory:
 
 
 def execute(job: Job, factory: ControllerFactory | None = None) -> tuple[tuple[Run, ...], Document]:
-    """Run a job, by default with the controllers of its scenario.  Return the runs and the document.
+    """Run a job.  Return its runs and its document.
+
+    By default, ``factory`` is :func:`controller_factory` of the scenario.
 
     Raises:
-        ImpactPostureError: As :func:`impact_posture.simulation.run.run`, or the scenario cannot be set up.
+        ImpactPostureError: The scenario cannot be set up, or :func:`impact_posture.simulation.run.run` fails.
     """
     if factory is None:
         factory = controller_factory(job.scenario, job.free)
@@ -142,12 +145,12 @@ def execute(job: Job, factory: ControllerFactory | None = None) -> tuple[tuple[R
 
 
 def software() -> dict[str, str]:
-    """Return the versions of all software that a run depends on."""
+    """Return the versions of all software that affects a run."""
     return versions() | {"mujoco": str(import_mujoco().__version__)}
 
 
 def lost_control(job: Job, error: Exception) -> Document:
-    """Return the document of a failed job: status ``control lost``, without runs."""
+    """Return the document of a failed job.  It has the status ``control lost`` and no runs."""
     event = {"status": "control lost", "time": getattr(error, "time", None), "what": str(error), "sign": None}
     return {"schema": SCHEMA, "scenario": job.scenario, "controller": job.controller, "mode": job.mode,
             "free": job.free, "seed": job.seed, "status": "control lost", "events": [event], "metrics": None,
@@ -155,12 +158,16 @@ def lost_control(job: Job, error: Exception) -> Document:
 
 
 def jsonable(content: object) -> Any:
-    """Return JSON content: dataclasses as objects, arrays as lists, and non-finite numbers as ``None``."""
+    """Convert content to JSON: dataclasses to objects, arrays to lists, and non-finite numbers to ``None``."""
     return to_jsonable_python(content, inf_nan_mode="null", fallback=lambda array: array.tolist())
 
 
 def combined(metrics: list[Metrics]) -> Metrics:
-    """Combine the metrics of several runs: sums of counts, largest peaks, all stops, and means of the others."""
+    """Combine the metrics of several runs.
+
+    Counts are added, and stops are collected.  ``peak_jump_max`` and ``peak_force`` are the largest values,
+    ``rested`` is true if it is true for all runs, and all other metrics are means.
+    """
     first = metrics[0]
     if len(metrics) == 1:
         return first
@@ -188,7 +195,7 @@ def _run_document(factory: ControllerFactory, record: Run, metrics: Metrics) -> 
 
 
 def _mean_prediction(impacts: list[Document]) -> Document:
-    """Return means over the impacts; a mean is ``None`` if the value of an impact is undefined."""
+    """Return the mean of each predicted quantity over the impacts; ``None`` if it is undefined for an impact."""
     means: Document = {"impacts": len(impacts)}
     for key in ("H", "G", "V", "S", "approach", "frictionless", "sticking", "coulomb", "measured", "ratio"):
         values = [impact[key] for impact in impacts]

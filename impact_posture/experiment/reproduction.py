@@ -1,4 +1,7 @@
-"""Controllers in scenarios over many seeds, Table I of Afifi et al. 2026, and the targets of a better controller."""
+"""Run controllers in scenarios with many seeds, and compare them with Table I of Afifi et al. 2026.
+
+A controller is better than nominal only if it meets several targets, which are also defined here.
+"""
 
 from __future__ import annotations
 
@@ -13,23 +16,30 @@ from impact_posture.posture.program.compiled_solver import CompileMode
 from impact_posture.simulation.controllers.controller_factory import CONTROLLERS
 
 SCHEMA, COMPARISON_SCHEMA = "impact-posture/reproduction/3", "impact-posture/comparison/3"
-# ``held`` shows the effect of the posture that a term reaches, ``free`` the effect of the metric without the feet.
+# The variant ``held`` shows the effect of the posture alone.  The variant ``free`` shows the effect of a metric that
+# ignores the contacts at the feet.
 HELD, FREE = ("robust:held", "walker:held"), "robust:free"
-# Labels of controllers (:func:`parse_controller`) by name or file of the scenario.
+# Name or file of a scenario → labels of its controllers (:func:`parse_controller`).
 Plan = Mapping[str, Sequence[str]]
 
 
 @dataclass(frozen=True)
 class PaperRow:
-    """Row of Table I: ``q_total_impact`` of both TSID controllers, and the reduction in the text of the paper."""
+    """Row of Table I of the paper.
+
+    Attributes:
+        nominal: ``q_total_impact`` of the nominal TSID controller.
+        robust: ``q_total_impact`` of the impact-robust TSID controller.
+        reduction: Reduction that the text of the paper gives, as a share.
+    """
 
     nominal: float
     robust: float
     reduction: float
 
 
-# Compare reductions, not values.  The shipped scenarios have other robots, gains and contact models, and the windows
-# of the paper end with the contact.
+# Compare reductions with the paper, not values: the shipped scenarios have other robots, gains and contact models,
+# and the windows of the paper end with the contact.
 PAPER: dict[str, PaperRow] = {
     "aerial-vertical": PaperRow(10.4, 5.1, 0.51),
     "aerial-lateral": PaperRow(9.2, 5.5, 0.402),
@@ -37,7 +47,8 @@ PAPER: dict[str, PaperRow] = {
     "talos-push": PaperRow(0.305, 0.166, 0.456),
 }
 
-# The controller that meets its targets most often in the envelope (docs: reproduction), or comes nearest to them.
+# Scenario → the controller that meets its targets at most points of the envelope (docs: reproduction).  If no
+# controller meets them, it is the controller with the smallest misses.
 RECOMMENDED: dict[str, str] = {
     "aerial-vertical": "posture",
     "aerial-lateral": "robust-flow",
@@ -45,9 +56,9 @@ RECOMMENDED: dict[str, str] = {
     "talos-push": "robust-flow",
 }
 
-# Targets of a better controller: whether the means of a row miss a target, given the reduction of the paper, and what
-# the row has instead.  A motion that only comes later, in the recovery, is not a reduction.  Saturations are
-# multiples of a tick, so a difference in the last digits is rounding.
+# Target → function and text.  The function returns whether a row misses the target, for the reduction of the paper.
+# The text describes what the row has if it misses the target.  The target ``recovery`` excludes motion that is only
+# delayed.  Saturation times are multiples of a tick, so a difference below 1e-9 s is a rounding error.
 _TARGETS: dict[str, tuple[Callable[[ControllerRow, float], bool], str]] = {
     "reduction": (lambda row, paper: _mean(row.reduction) < paper, "less than the paper's reduction"),
     "recovery": (lambda row, _: _mean(row.recovery) <= 0, "no less motion than nominal over the recovery"),
@@ -73,9 +84,9 @@ def _mean(value: Interval | None) -> float:
 
 
 def missed_targets(row: ControllerRow) -> dict[str, str] | None:
-    """Return the targets that a row misses, each with what the row has instead.
+    """Return the names of the targets that a row misses, each with a text that describes the miss.
 
-    The nominal controller and a row without reduction have ``None``.
+    Return ``None`` for the nominal controller and for a row without reduction, because they have no targets.
     """
     if row.reduction is None or row.recovery is None or row.controller == "nominal":
         return None
@@ -84,9 +95,10 @@ def missed_targets(row: ControllerRow) -> dict[str, str] | None:
 
 
 def best_of(rows: Sequence[ControllerRow]) -> ControllerRow | None:
-    """Return the row with the largest reduction among the rows that meet every target, or else among all rows.
+    """Return the row with the largest reduction among the rows that meet every target.
 
-    The reduction of a row is the smaller one of ``reduction`` and ``recovery``.
+    If no row meets every target, choose among all rows.  Rows of robots that were not at rest are left out.  The
+    reduction of a row is the smaller one of ``reduction`` and ``recovery``.
     """
     missed = [(row, targets) for row in rows if (targets := missed_targets(row)) is not None and row.rested]
     candidates = [row for row, targets in missed if not targets] or [row for row, _ in missed]
@@ -94,14 +106,17 @@ def best_of(rows: Sequence[ControllerRow]) -> ControllerRow | None:
 
 
 def controllers_of(scenario: str, everything: bool) -> tuple[str, ...]:
-    """Return the labels of the controllers of a reproduction, nominal first."""
+    """Return the labels of the controllers in a reproduction, with nominal as the first one.
+
+    With ``everything``, the reproduction contains all controllers.
+    """
     if everything:
         return (*CONTROLLERS, *HELD, *([FREE] if scenario.endswith("-push") else []))
     return tuple(dict.fromkeys(("nominal", "robust", "robust-flow", RECOMMENDED[scenario])))
 
 
 def jobs_of(plan: Plan, seeds: int, compile: CompileMode = "auto") -> list[Job]:
-    """Return all jobs of a plan, scenario by scenario, controller by controller, seed by seed."""
+    """Return all jobs of a plan, sorted by scenario, then by controller, then by seed."""
     jobs, compile = [], worth_compiling(compile, seeds)
     for scenario, labels in plan.items():
         for label in labels:
@@ -111,7 +126,7 @@ def jobs_of(plan: Plan, seeds: int, compile: CompileMode = "auto") -> list[Job]:
 
 
 def gather(scenario: str, labels: Sequence[str], documents: Sequence[Document]) -> list[ControllerRow]:
-    """Return the rows of a scenario from the documents of its jobs, in the order of :func:`jobs_of`."""
+    """Return the rows of a scenario, computed from the documents of its jobs in the order of :func:`jobs_of`."""
     count = len(documents) // len(labels)
     parts = {label: documents[k * count : (k + 1) * count] for k, label in enumerate(labels)}
     name = next((d["scenario"] for d in documents if d["runs"]), scenario)
@@ -120,7 +135,13 @@ def gather(scenario: str, labels: Sequence[str], documents: Sequence[Document]) 
 
 @dataclass(frozen=True, eq=False)
 class Reproduction:
-    """Results of all controllers in all scenarios: rows, scenario by scenario, nominal first, and their jobs."""
+    """Results of all controllers in all scenarios.
+
+    Attributes:
+        seeds: Number of seeds.
+        rows: One row per scenario and controller, sorted by scenario, with nominal as the first controller.
+        jobs: Jobs of all rows.
+    """
 
     seeds: int
     rows: tuple[ControllerRow, ...]
@@ -128,7 +149,7 @@ class Reproduction:
 
     @property
     def shown(self) -> list[Job]:
-        """The jobs whose time series are kept."""
+        """Jobs whose time series are stored (:attr:`Job.shown`)."""
         return [job for job in self.jobs if job.shown]
 
     @property
@@ -145,11 +166,11 @@ class Reproduction:
         return next((row for row in self.of(scenario) if row.controller == controller), None)
 
     def best(self, scenario: str) -> ControllerRow | None:
-        """Return the best row of a scenario (:func:`best_of`)."""
+        """Return the best row of a scenario, which :func:`best_of` determines."""
         return best_of(self.of(scenario))
 
     def comparison(self) -> dict[str, Any]:
-        """Return the content of ``comparison.json``, for one scenario."""
+        """Return the content of ``comparison.json``, if there is only one scenario."""
         head = {"schema": COMPARISON_SCHEMA, "scenario": self.rows[0].scenario, "seeds": list(range(self.seeds))}
         return head | {"rows": jsonable(self.rows)}
 
@@ -174,13 +195,14 @@ def reproduce(
     progress: Progress | None = None,
     compile: CompileMode = "auto",
 ) -> Reproduction:
-    """Run the controllers of a plan in their scenarios with every seed, from 0.
+    """Run the controllers of a plan in their scenarios, with the seeds 0 to ``seeds`` − 1.
 
-    The store keeps finished runs, with the time series of the first seed.  ``progress`` is called with (done, all).
-    Controllers run as machine code where that pays (``auto``), always or never.
+    The store keeps the documents of finished jobs, and the time series of the first seed.  ``progress`` is called
+    with the number of finished jobs and the number of all jobs.  Controllers run as machine code ``always``,
+    ``never``, or if this saves time (``auto``).
 
     Raises:
-        ImpactPostureError: A scenario cannot be set up, there is no such controller, MuJoCo is not installed, or the
+        ImpactPostureError: A scenario cannot be set up, a controller does not exist, MuJoCo is not installed, or the
             store cannot be written.
     """
     jobs = jobs_of(plan, seeds, compile)

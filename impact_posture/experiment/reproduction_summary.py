@@ -1,4 +1,4 @@
-"""Sentences and Markdown tables about a reproduction."""
+"""Sentences and Markdown tables that summarize a reproduction."""
 
 from __future__ import annotations
 
@@ -11,9 +11,9 @@ from impact_posture.experiment.seed_statistics import FEWEST, ControllerRow, Int
 from impact_posture.simulation.controllers.controller_factory import MEANING
 from impact_posture.system.escape import markdown
 
-# Most decimals of a number that is nearly zero.
+# Maximum number of decimals, which limits the decimals of a number near zero.
 _DECIMALS = 4
-# Metrics in the table of a scenario, with their significant digits.
+# Metric in the table of a scenario → number of its significant digits.
 _COLUMNS = {
     "peak_jump": 3, "peak_recovery": 3, "saturation_inside": 2, "saturation_outside": 2, "relaxed_ticks": 2,
     "peak_force": 3,
@@ -26,7 +26,10 @@ LEGEND = (
 
 
 def table_one(results: Reproduction) -> str:
-    """Return Table I of the paper beside ours: ``q_total_impact`` of nominal, robust and the best controller."""
+    """Return a table of ``q_total_impact``: values of Table I of the paper, and our values in the same row.
+
+    Our values are for nominal, robust and the best controller.
+    """
     head = "scenario|paper: nominal|robust|reduction|ours: nominal|robust|reduction|best|reduction"
     lines = []
     for scenario in results.scenarios:
@@ -68,7 +71,7 @@ def scenario_table(rows: Sequence[ControllerRow]) -> str:
 
 
 def _table(head: str, rows: Sequence[Sequence[str]]) -> str:
-    """Return a Markdown table.  Cells that are missing at the end of a row are empty."""
+    """Return a Markdown table.  Rows that are too short are filled with empty cells."""
     columns = head.split("|")
     lines = [f"| {' | '.join([*cells, *[''] * (len(columns) - len(cells))])} |" for cells in (columns, *rows)]
     return "\n".join([lines[0], "|---" * len(columns) + "|", *lines[1:]])
@@ -97,9 +100,9 @@ def summary(results: Reproduction) -> str:
 
 
 def advice(results: Reproduction, others: Reproduction | None = None) -> list[str]:
-    """Return one line for each scenario: the best controller of ``results``, its reduction, and its disadvantages.
+    """Return one line for each scenario: the best controller in ``results``, its reduction and its disadvantages.
 
-    ``others`` may contain the held variant of the best controller, if ``results`` does not.
+    If ``results`` does not contain the held variant of the best controller, ``others`` can contain it.
     """
     lines = []
     for scenario in results.scenarios:
@@ -123,7 +126,7 @@ def advice(results: Reproduction, others: Reproduction | None = None) -> list[st
 
 
 def _force(best: ControllerRow, nominal: ControllerRow | None) -> str:
-    """Return a sentence if the contact has to bear more than 10 % more force."""
+    """Return a sentence about the contact force if it is more than 10 % larger than with nominal."""
     if nominal is None:
         return ""
     before, after = (row.metrics["peak_force"].mean for row in (nominal, best))
@@ -131,7 +134,7 @@ def _force(best: ControllerRow, nominal: ControllerRow | None) -> str:
 
 
 def _held(best: ControllerRow, held: ControllerRow | None) -> str:
-    """Return a warning if most of the reduction does not come from the posture."""
+    """Return a warning if the posture causes less than half of the reduction."""
     share = _share(held, best)
     if share is None or share > 0.5:
         return ""
@@ -142,14 +145,17 @@ def _held(best: ControllerRow, held: ControllerRow | None) -> str:
 
 
 def _share(part: ControllerRow | None, whole: ControllerRow | None) -> float | None:
-    """Return the ratio of two reductions: 0 if ``whole`` is not positive, ``None`` if a reduction is missing."""
+    """Return the reduction of ``part`` divided by the reduction of ``whole``.
+
+    Return 0 if the reduction of ``whole`` is not positive, and ``None`` if a reduction is missing.
+    """
     if part is None or whole is None or part.reduction is None or whole.reduction is None:
         return None
     return part.reduction.mean / whole.reduction.mean if whole.reduction.mean > 0 else 0.0
 
 
 def remarks(results: Reproduction, scenario: str) -> list[str]:
-    """Return notes for the reader of the table of a scenario."""
+    """Return notes that explain the table of a scenario."""
     lines = []
     for name in ("robust", "walker"):
         held, whole = results.row(scenario, f"{name}:held"), results.row(scenario, name)
@@ -177,13 +183,16 @@ def remarks(results: Reproduction, scenario: str) -> list[str]:
 
 
 def interval_text(value: Interval, digits: int = 3) -> str:
-    """Return ``mean ± half width`` with significant digits of the mean; the half width only where people see it."""
+    """Return ``mean ± half width``, or the mean alone if :attr:`Interval.shown` is ``None``.
+
+    ``digits`` is the number of significant digits of the mean.
+    """
     decimals = max(0, digits - 1 - int(np.floor(np.log10(abs(value.mean))))) if value.mean else 0
     return _plus_minus(value, min(decimals, _DECIMALS))
 
 
 def percent(value: Interval | None, unit: str = " %") -> str:
-    """Return a share in percent."""
+    """Return a share as text in percent."""
     return "–" if value is None else _plus_minus(value, 1, 100) + unit
 
 
@@ -194,12 +203,12 @@ def _plus_minus(value: Interval, decimals: int, factor: int = 1) -> str:
 
 
 def reduction_text(row: ControllerRow | None) -> str:
-    """Return the reduction of a row in percent."""
+    """Return the reduction of a row as text in percent; ``–`` for nominal or without a reduction."""
     return percent(None if row is None or row.controller == "nominal" else row.reduction)
 
 
 def targets_text(row: ControllerRow) -> str:
-    """Return ``met``, or the names of the missed targets."""
+    """Return ``met``, or the names of the missed targets; empty if the row has no targets."""
     missed = missed_targets(row)
     if missed is None:
         return ""
@@ -207,7 +216,7 @@ def targets_text(row: ControllerRow) -> str:
 
 
 def _missed(row: ControllerRow) -> str:
-    """Return what a row has instead of its missed targets."""
+    """Return a text that describes by how the row misses its targets, such as "a joint on its stop"."""
     return ", ".join((missed_targets(row) or {}).values())
 
 

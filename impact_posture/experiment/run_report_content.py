@@ -1,4 +1,4 @@
-"""Texts and tables of the reports of runs and comparisons."""
+"""Texts and tables in the reports of runs and comparisons."""
 
 from __future__ import annotations
 
@@ -14,7 +14,7 @@ from impact_posture.output.plot.run_view import RunView, run_header
 from impact_posture.output.report.report_page import Content, Table
 from impact_posture.system.output_folder import typed_command
 
-# Metrics of a table: key, unit and meaning.
+# Metrics in the table of a report: key, unit and meaning.
 _METRICS = (
     ("q_total_impact", "m, rad", "way of the robot in the impact windows, ∫‖ν‖dt"),
     ("q_total_recovery", "m, rad", "the same until 1 s after each impact began"),
@@ -24,7 +24,7 @@ _METRICS = (
     ("peak_force", "N", "largest normal force in the impact windows"),
     ("slip", "m", "way that the contact slid in the impact windows"),
 )
-# Meanings of the same metrics for pushes.
+# Key → meaning of the metrics that have another meaning for pushes.
 _PUSH_MEANINGS = {
     "peak_jump": "largest ‖ν‖ from a push on until its window ends, mean of the pushes",
     "peak_jump_max": "the largest of the pushes",
@@ -40,7 +40,7 @@ _MOVES = (
 
 
 def run_content(folder: Path, document: Document, view: RunView, job: Job) -> Content:
-    """Return the texts and the table of a page about one run."""
+    """Return the texts and the table of the report about one run."""
     scenario = controller_factory(job.scenario, job.free).setup.scenario
     options = ["simulate", job.scenario, "--controller", job.controller, "--seed", str(job.seed)]
     options += ["--mode", "held"] * (job.mode == "held") + ["--free"] * job.free
@@ -67,7 +67,7 @@ def run_content(folder: Path, document: Document, view: RunView, job: Job) -> Co
 
 
 def table_metrics(view: RunView) -> list[tuple[str, str, str]]:
-    """Return key, unit and meaning of the metrics of a table."""
+    """Return key, unit and meaning of each metric in the table of a report."""
     meanings = _PUSH_MEANINGS if view.pushed else {}
     return [(key, unit, meanings.get(key, meaning)) for key, unit, meaning in _METRICS]
 
@@ -78,7 +78,7 @@ def _summary(metrics: Mapping[str, Any]) -> str:
 
 
 def comparison_content(folder: Path, document: Document, view: RunView) -> Content:
-    """Return the texts and the table of a page about a comparison.  ``view`` is any of its runs."""
+    """Return the texts and the table of the report about a comparison.  ``view`` is any run of the comparison."""
     rows = document["rows"]
     labels = [str(row["controller"]) for row in rows]
     table = [("status", *(str(row["status"]) for row in rows), "", "")]
@@ -110,7 +110,7 @@ def comparison_content(folder: Path, document: Document, view: RunView) -> Conte
 
 
 def _mean(interval: Mapping[str, Any] | None) -> str:
-    """Return a mean, with the half width of its interval where people see it."""
+    """Return a mean as text, with the half width of its interval if :attr:`Interval.shown` is not ``None``."""
     if interval is None:
         return "–"
     half = Interval(**interval).shown

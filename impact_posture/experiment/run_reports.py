@@ -1,4 +1,4 @@
-"""Reports of runs and comparisons, which are written from the files in their folders."""
+"""Write reports of runs and comparisons from the files in their folders."""
 
 from __future__ import annotations
 
@@ -31,19 +31,19 @@ from impact_posture.system.output_folder import write_json
 from impact_posture.system.text_files import read_text
 
 SIMULATION, COMPARISON, RUNS = "run.json", "comparison.json", "runs"
-# Time between shown ticks, in impact windows and elsewhere, s.
+# Time between two ticks that a report shows, within impact windows and outside them, s.
 _FINE, _COARSE = 0.001, 0.025
-# A larger position means that the state has diverged, m or rad.
+# If a position exceeds this value, the state has diverged, m or rad.
 _AWAY = 1e3
-# Columns of the time series that figures show.
+# Names of the columns of the time series that figures use.
 _COLUMNS = {field.name for field in fields(RunView)} & {field.name for field in fields(Series)}
 _BROKEN = (LookupError, ArithmeticError, ValueError, TypeError, AttributeError, OSError, RecursionError)
 
 
 def keep_runs(folder: Path, jobs: Sequence[Job], store: JobStore) -> None:
-    """Write the document and the shown ticks of each stored job into ``runs/`` of a comparison.
+    """Write the document and the ticks for the report of each stored job into ``runs/`` of a comparison.
 
-    A run whose state diverges at once is left out.
+    A run is left out if its state diverges within two ticks.
     """
     (folder / RUNS).mkdir()
     for job in jobs:
@@ -56,7 +56,7 @@ def keep_runs(folder: Path, jobs: Sequence[Job], store: JobStore) -> None:
 
 
 def stored_run(job: Job, store: JobStore) -> tuple[Document, Series] | None:
-    """Return the document of a stored job and the series of its first run; ``None`` if it has no runs."""
+    """Return the document of a stored job and the time series of its first run; ``None`` if the job has no runs."""
     document = store.finished(job)
     if not document["runs"]:
         return None
@@ -64,7 +64,7 @@ def stored_run(job: Job, store: JobStore) -> tuple[Document, Series] | None:
 
 
 def run_view(job: Job, part: Document, series: Series) -> RunView:
-    """Return the view of a run from its document.  The label has the status of an incomplete run."""
+    """Return the data of a run for figures.  If the run did not complete, the label contains its status."""
     factory = controller_factory(job.scenario, job.free)
     setup, scenario, objective = factory.setup, factory.setup.scenario, factory.objective()
     return RunView(
@@ -82,7 +82,7 @@ def run_view(job: Job, part: Document, series: Series) -> RunView:
 
 
 def try_report(folder: Path, scenario: str, *, meshes: bool) -> str:
-    """Write the report of a folder.  Return the reason if that fails, because the runs are kept without it."""
+    """Write the report of a folder.  If that fails, return the reason instead of raising, so the runs are kept."""
     try:
         write_run_report(folder, scenario, meshes=meshes)
     except Exception as error:
@@ -94,13 +94,13 @@ def write_run_report(folder: Path, scenario: str = "", *, meshes: bool = False) 
     """Write ``report.html`` of a run or comparison into its folder.  Return the path of the report.
 
     Args:
-        folder: A folder that ``simulate`` or ``compare`` wrote.
-        scenario: Name or file of the scenario; from the folder by default.
-        meshes: Include the meshes of the user's URDF.
+        folder: Folder that ``simulate`` or ``compare`` has written.
+        scenario: Name or file of the scenario; by default, the scenario that the folder names.
+        meshes: If true, the report contains the meshes of the user's URDF.
 
     Raises:
-        SpecError: The folder holds neither a run nor a comparison, or its files do not fit together.
-        ImpactPostureError: The scenario cannot be set up any more.
+        SpecError: The folder contains neither a run nor a comparison, or its files are inconsistent.
+        ImpactPostureError: The scenario cannot be set up.
         OutputError: The report cannot be written.
     """
     try:
@@ -110,7 +110,7 @@ def write_run_report(folder: Path, scenario: str = "", *, meshes: bool = False) 
             content = run_content(folder, document, runs[0][0], _job(document, scenario))
         else:
             document, runs = _read(folder / COMPARISON, COMPARISON_SCHEMA), []
-            # Rows with the same name share one file.
+            # Controllers whose names give the same file name have one common file.
             for stem in dict.fromkeys(_stem(row["controller"]) for row in document["rows"]):
                 if (path := folder / RUNS / f"{stem}.json").is_file():
                     runs += _runs(_read(path, SIMULATION_SCHEMA), folder / RUNS / stem, scenario, 1)
@@ -124,9 +124,10 @@ def write_run_report(folder: Path, scenario: str = "", *, meshes: bool = False) 
 
 
 def thin(series: Series, windows: Iterable[Window]) -> Series:
-    """Return the ticks of a run that a report shows.  A force is the largest one since the previous shown tick.
+    """Return a selection of the ticks of a run for the report.
 
-    The ticks end where the state diverges, and are denser within windows of kind ``impact``.
+    The ticks are denser within impact windows, and end when the state diverges.  The force and the peak at a selected
+    tick are the largest values since the previous selected tick.
 
     Raises:
         InputError: The state diverges within two ticks.
@@ -140,7 +141,7 @@ def thin(series: Series, windows: Iterable[Window]) -> Series:
     for window in windows:
         if window.kind == "impact":
             inside |= (t >= window.begin - _FINE) & (t <= window.end)
-    # Strides count ticks, because a sum of times is not exact.
+    # Select by the number of ticks and not by time, because sums of time steps have rounding errors.
     stride = np.where(inside, max(round(_FINE / step), 1), max(round(_COARSE / step), 1))
     kept = np.flatnonzero((np.arange(len(t)) % stride == 0) | (np.arange(len(t)) == len(t) - 1))
     size = np.linalg.norm(series.force[: len(t)], axis=1)
@@ -152,7 +153,10 @@ def thin(series: Series, windows: Iterable[Window]) -> Series:
 
 
 def run_scene(runs: Sequence[tuple[RunView, WorstCaseObjective]], *, meshes: bool = False) -> ReportScene:
-    """Return the scene of runs of one scenario, each a view with the ticks of :func:`thin` and its objective."""
+    """Return the 3D scene of the report for runs of one scenario.
+
+    Each run is a view with the ticks that :func:`thin` selects, and its objective.
+    """
     first, objective = runs[0]
     planes = []
     if first.surface is not None:
@@ -198,7 +202,7 @@ def _series(stem: Path, sign: int) -> Path:
 
 
 def _job(document: Document, scenario: str) -> Job:
-    """Return the job of a document.  A shipped scenario is named, another one is given by its path."""
+    """Return the job of a document.  A shipped scenario is given by its name, any other scenario by its path."""
     name, source = str(document["scenario"]), str(document["source"])
     shipped = name in known_scenarios() and Path(source) == scenario_path(name)
     scenario = scenario or (name if shipped else source)
@@ -206,7 +210,7 @@ def _job(document: Document, scenario: str) -> Job:
 
 
 def _runs(document: Document, stem: Path, scenario: str, count: int) -> list[tuple[RunView, WorstCaseObjective]]:
-    """Return views of the first runs of a document, each with its objective."""
+    """Return views of the first ``count`` runs of a document, each with its objective."""
     job, runs = _job(document, scenario), []
     factory = controller_factory(job.scenario, job.free)
     if document["model_sha256"] != factory.setup.robot.model_sha256:

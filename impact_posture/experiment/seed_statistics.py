@@ -1,4 +1,7 @@
-"""Means over seeds with confidence intervals, and reductions against the nominal controller with the same seed."""
+"""Means over seeds with confidence intervals, and reductions relative to the nominal controller.
+
+A reduction compares two runs with the same seed.
+"""
 
 from __future__ import annotations
 
@@ -12,13 +15,13 @@ from impact_posture.experiment.jobs import Document
 from impact_posture.simulation.metrics import Metrics
 from impact_posture.simulation.outcome import Outcome, gravest
 
-# The metrics that have a mean and an interval.
+# Metrics for which a mean and a confidence interval are computed.
 QUANTITIES = tuple(f.name for f in fields(Metrics) if f.name not in ("stops", "contacts", "contacts_asked", "rested"))
 
-# Fewest samples whose interval is shown.  For two samples, the quantile of Student's t is 12.7, so an interval says
-# nothing.
+# An interval is shown only for at least this number of samples.  For two samples, the quantile of Student's t is
+# 12.7, so the interval is too wide to be useful.
 FEWEST = 3
-# Samples with a smaller relative half width differ only by rounding, because the scenario has no noise.
+# If the relative half width is smaller than this, the samples differ only by rounding: the scenario has no noise.
 _SAME = 1e-12
 
 
@@ -27,7 +30,9 @@ class Interval:
     """Mean with its 95 % confidence interval (Student's t).
 
     Attributes:
-        half_width: Half width of the interval, ``None`` for one sample.
+        mean: Mean of the samples.
+        half_width: Half width of the interval; ``None`` for one sample.
+        samples: Number of samples.
     """
 
     mean: float
@@ -36,24 +41,27 @@ class Interval:
 
     @property
     def shown(self) -> float | None:
-        """Half width that people see; ``None`` for fewer than :data:`FEWEST` samples or equal ones."""
+        """Half width for tables and figures; ``None`` for fewer than :data:`FEWEST` samples or equal samples."""
         return None if self.samples < FEWEST or self.alike else self.half_width
 
     @property
     def alike(self) -> bool:
-        """Whether several samples differ only by rounding."""
+        """True if there are several samples that differ only by rounding."""
         return self.half_width is not None and self.half_width <= _SAME * abs(self.mean)
 
     @staticmethod
     def of(values: Sequence[float]) -> Interval:
-        """Return the interval of at least one sample."""
+        """Return the mean and interval of one or more samples."""
         n = len(values)
         half_width = float(stdtrit(n - 1, 0.975) * np.std(values, ddof=1) / np.sqrt(n)) if n > 1 else None
         return Interval(float(np.mean(values)), half_width, n)
 
 
 def without_noise(intervals: Iterable[Interval]) -> bool:
-    """Return whether there are intervals, and the samples of each are alike because the scenario has no noise."""
+    """Return whether the scenario has no noise, that is, whether the samples of each interval are equal.
+
+    Return false if there are no intervals.
+    """
     alike = [interval.alike for interval in intervals]
     return bool(alike) and all(alike)
 
@@ -63,20 +71,22 @@ class ControllerRow:
     """Results of a controller in a scenario, over all seeds.
 
     Attributes:
+        scenario: Name of the scenario.
         controller: Label of the controller.
-        status: ``completed`` if all runs completed, else the gravest status.
+        status: ``completed`` if all runs completed, otherwise the worst status of a run.
+        runs: Number of runs.
         completed: Number of runs that completed.
-        failed: Reason why a run did not complete, one line each.
-        metrics: Means of the completed runs, by name of :data:`QUANTITIES`.  Empty if no run completed.
-        reduction: Reduction of ``q_total_impact`` against nominal with the same seed, a share.  ``None`` without
-            nominal runs, or if a run of either controller did not complete.
-        recovery: Reduction of ``q_total_recovery``.
-        change: Differences of all quantities from nominal; empty where ``reduction`` is ``None``.
+        failed: Seed and reason of each run that did not complete, one line per run.
+        metrics: Name in :data:`QUANTITIES` → mean over the completed runs; empty if no run completed.
+        reduction: Reduction of ``q_total_impact`` relative to nominal with the same seed, as a share.  ``None`` if
+            there are no nominal runs, or if a run of either controller did not complete.
+        recovery: Like ``reduction``, but for ``q_total_recovery``.
+        change: Name in :data:`QUANTITIES` → difference from nominal; empty if ``reduction`` is ``None``.
         stops: Joints that reached a position limit within an impact window of any run.
-        rested: Whether the robot was at rest before every push.
+        rested: True if the robot was at rest before every push.
         H: Mean of H just before the impacts.
-        ratio: Mean of the measured jump over the jump of the rigid model with the friction of the surface.
-        force: ``peak_force`` over the nominal value with the same seed; ``None`` where ``reduction`` is ``None``.
+        ratio: Mean of the measured jump divided by the jump that the rigid-body model predicts with friction.
+        force: ``peak_force`` divided by its nominal value with the same seed; ``None`` if ``reduction`` is ``None``.
     """
 
     scenario: str
@@ -97,7 +107,7 @@ class ControllerRow:
 
 
 def value_of(document: Document, quantity: str) -> float:
-    """Return a quantity of the document of a run."""
+    """Return the value of a metric in the document of a job."""
     metrics = document["metrics"]
     if quantity.startswith("saturation_"):
         return float(metrics["saturation_s"][quantity.removeprefix("saturation_")])
@@ -105,7 +115,7 @@ def value_of(document: Document, quantity: str) -> float:
 
 
 def fate(document: Document) -> str:
-    """Return the first event of the gravest kind in an incomplete run, with its time."""
+    """Describe why a job did not complete: the first event with its worst status, and the time of this event."""
     status = str(document["status"])
     first = next(event for event in document["events"] if event["status"] == status)
     sign = f" (push {first['sign']:+d})" if len(document["runs"]) > 1 else ""
@@ -116,11 +126,11 @@ def fate(document: Document) -> str:
 def row_of(
     scenario: str, controller: str, documents: Sequence[Document], nominal: Sequence[Document]
 ) -> ControllerRow:
-    """Summarize the runs of a controller, compared to runs of the nominal controller with the same seeds, if any."""
+    """Summarize the runs of a controller, and compare them with nominal runs that have the same seeds, if any."""
     good = [d for d in documents if d["status"] == "completed"]
     base = {d["seed"]: d for d in nominal}
     pairs = [(d, base[d["seed"]]) for d in documents if d["seed"] in base]
-    # If some runs failed, the seeds of the others are not a fair sample.
+    # If some runs failed, do not compare the others, because they are not a representative sample.
     fair = bool(pairs) and len(good) == len(documents) and all(n["status"] == "completed" for _, n in pairs)
 
     def paired(name: str, compare: Callable[[float, float], float]) -> Interval:

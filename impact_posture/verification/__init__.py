@@ -1,1 +1,1 @@
-"""Comparison of several computations of the quantities of an impact."""
+"""Verify the quantities of an impact: compute them by different means and compare the results."""

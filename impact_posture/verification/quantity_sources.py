@@ -1,4 +1,4 @@
-"""Sources that compute the quantities of an impact by different means, and random samples for them."""
+"""Sources that compute the quantities of an impact by different means, and random samples for the comparison."""
 
 from __future__ import annotations
 
@@ -22,27 +22,27 @@ from impact_posture.system.arrays import Array
 from impact_posture.system.libraries import build_library, load_library
 from impact_posture.system.scratch_folder import scratch_folder
 
-# First step of the finite differences, and their number, each half of the one before.
+# First step of the finite differences, and number of steps.  Each step is half of the previous one.
 _FIRST_STEP, _LEVELS = 0.02, 7
-# H, G and ∇H vanish where the contact cannot move along n.  So the scale of their errors is at least this share of
-# their largest value over all normals.
+# H, G and ∇H are zero if the contact cannot move along n.  So their errors are relative to at least this share of the
+# largest value over all normals.
 _FLOOR = 1e-3
 
 
 @dataclass(frozen=True, eq=False)
 class PostureSample:
-    """Configuration, shape (nq,), and unit normal, shape (3,), in the normal frame of the contact."""
+    """Configuration ``q``, shape (nq,), and unit ``normal``, shape (3,), in the normal frame of the contact."""
 
     q: Array
     normal: Array
 
 
 def random_samples(robot: Robot, count: int, seed: int, normal: Array | None = None) -> tuple[PostureSample, ...]:
-    """Return random postures with random normals, which depend on the seed only.  ``normal`` replaces the first one.
+    """Return random postures with random normals, which depend only on the seed.
 
-    Joints are uniform within their limits.  Without limits, angles are within ±π and lengths within 1 m of the
-    default posture, and orientations are uniform.  A limit that is missing on one side is at this distance from the
-    default posture.
+    If ``normal`` is given, it replaces the first random normal.  Joint positions are distributed uniformly within
+    their limits.  A missing limit is replaced by a limit at a distance of π (angles) or 1 m (lengths) from the
+    default posture.  Orientations are distributed uniformly.
     """
     generator, chart = np.random.default_rng(seed), Chart(robot.model)
     start = chart.to_x(robot.posture())
@@ -71,11 +71,12 @@ def _direction(generator: np.random.Generator, size: int) -> Array:
 
 @dataclass(frozen=True, eq=False)
 class Numbers:
-    """Quantities of one source at one sample: ``H``, ``G``, ``Λ_c``, ``∇H``, ``M``, ``J``.
+    """Quantities that one source computes at one sample: some of ``H``, ``G``, ``Λ_c``, ``∇H``, ``M`` and ``J``.
 
     Attributes:
-        values: Array of each quantity that the source computes.
-        scales: Least scale of the relative error of each quantity.  The largest entry replaces a smaller scale.
+        values: Name of the quantity → its value.
+        scales: Name of the quantity → minimum scale of its relative error.  The scale is the largest entry of the
+            quantity if this entry is larger.
     """
 
     values: dict[str, Array]
@@ -86,7 +87,7 @@ Source = Callable[[PostureSample], Numbers]
 
 
 def pinocchio_numbers(objective: WorstCaseObjective, sample: PostureSample) -> Numbers:
-    """Return the reference from ``M``, ``J`` and derivatives of Pinocchio by dense linear algebra."""
+    """Return the reference values, computed by dense linear algebra from ``M``, ``J`` and Pinocchio derivatives."""
     oracle = oracle_along(objective, sample.normal)
     quantities = oracle.quantities(sample.q)
     values = {
@@ -102,7 +103,7 @@ def pinocchio_numbers(objective: WorstCaseObjective, sample: PostureSample) -> N
 
 
 def pinocchio_differences(objective: WorstCaseObjective, sample: PostureSample) -> Numbers:
-    """Return ``∇H`` from finite differences of ``H`` from Pinocchio."""
+    """Return ``∇H``, computed by finite differences of the ``H`` that :func:`pinocchio_numbers` computes."""
     oracle = oracle_along(objective, sample.normal)
 
     def value(q: Array) -> float:
@@ -114,17 +115,17 @@ def pinocchio_differences(objective: WorstCaseObjective, sample: PostureSample) 
 
 
 def casadi_source(objective: WorstCaseObjective) -> Source:
-    """Return the source of the symbolic expressions, interpreted by CasADi."""
+    """Return the source that evaluates the symbolic expressions with the CasADi interpreter."""
     reference = casadi_reference(_impulse(objective))
     return lambda sample: _named(reference(sample.q, sample.normal))
 
 
 @contextmanager
 def compiled_source(objective: WorstCaseObjective) -> Iterator[Source]:
-    """Yield the source of the C export, built in a temporary folder.
+    """Yield the source that calls the C export, which is built in a temporary folder.
 
     Raises:
-        CompilerError: There is no compiler, or it failed.
+        CompilerError: There is no compiler, or the compiler failed.
     """
     with scratch_folder() as folder:
         made = export(_impulse(objective), folder, prefix="verified", check=False)
@@ -144,7 +145,7 @@ def compiled_source(objective: WorstCaseObjective) -> Iterator[Source]:
 
 
 def _impulse(objective: WorstCaseObjective) -> WorstCaseObjective:
-    """Return the objective ``impulse``, which is defined everywhere and has the same ``H`` and ``∇H``."""
+    """Return the objective of kind ``impulse``.  It is defined everywhere and has the same ``H`` and ``∇H``."""
     return replace(objective, kind="impulse")
 
 
@@ -155,7 +156,7 @@ def _named(values: dict[str, Array]) -> Numbers:
 
 
 class MujocoSource:
-    """Source of ``M`` and ``J`` from MuJoCo.  The other quantities follow from one dense solve."""
+    """Source that gets ``M`` and ``J`` from MuJoCo and computes the other quantities by one dense linear solve."""
 
     def __init__(self, objective: WorstCaseObjective) -> None:
         self._objective = objective
@@ -164,7 +165,7 @@ class MujocoSource:
         self._numeric = MujocoNumeric(model)
 
     def __call__(self, sample: PostureSample) -> Numbers:
-        """Return the numbers at one sample, with ``∇H`` from finite differences of ``H``."""
+        """Return the quantities at one sample.  ``∇H`` is computed by finite differences of ``H``."""
 
         def value(q: Array) -> float:
             return float(self._values(q, sample.normal)["H"][0])
@@ -173,7 +174,7 @@ class MujocoSource:
         return Numbers({**self._values(sample.q, sample.normal), "∇H": gradient})
 
     def _values(self, q: Array, normal: Array) -> dict[str, Array]:
-        """``[M, −J_sᵀ; J_s, εI] [A; f] = [Jᵀ; 0]``, ``Λ_c = AᵀWA``, ``H = nᵀΛ_c n``, ``G = nᵀJA n``."""
+        """Solve ``[M, −J_sᵀ; J_s, εI] [A; f] = [Jᵀ; 0]``; return ``Λ_c = AᵀWA``, ``H = nᵀΛ_c n``, ``G = nᵀJA n``."""
         objective, numeric = self._objective, self._numeric.at(q)
         contact, metric = objective.contact, objective.metric
         M, J = numeric.mass_matrix(), numeric.jacobian(contact.frame, contact.offset)[:3]
@@ -191,9 +192,9 @@ class MujocoSource:
 def difference_gradient(value: Callable[[Array], float], model: pin.Model, q: Array) -> Array:
     """Return ``d/dε value(q ⊕ ε e_i)``, shape (nv,), by Ridders' extrapolation of central differences.
 
-    Each entry is the extrapolation of its tableau that differs least from its neighbors.  So stiff supports and flat
-    directions need no tuned steps (Ridders 1982, "Accurate computation of F'(x) and F'(x)F''(x)").  ``model`` defines
-    ``⊕``.
+    For each entry, the result is the extrapolated value that differs least from its neighbors in the tableau.  So the
+    step needs no tuning for stiff supports or flat directions (Ridders 1982, "Accurate computation of F'(x) and
+    F'(x)F''(x)").  ``model`` defines ``⊕``.
     """
     directions = np.eye(model.nv)
 

@@ -1,4 +1,4 @@
-"""Compare every source of the quantities of an impact with the numbers of Pinocchio."""
+"""Compare the quantities of an impact from every source with the reference values from Pinocchio."""
 
 from __future__ import annotations
 
@@ -36,26 +36,28 @@ REFERENCE = "Pinocchio"
 CASADI, COMPILED, DIFFERENCES, MUJOCO = "CasADi", "compiled C", "finite differences", "MuJoCo"
 NO_COMPILER = f"no C compiler: {GET_ONE}"
 
-# Largest relative errors that pass: M and J from MuJoCo; H, G, Λ_c and gradients by adjoints; and gradients by finite
-# differences.
+# Largest relative errors that pass, in this order: for M and J from MuJoCo; for H, G, Λ_c and for gradients from
+# CasADi and C; for gradients by finite differences.
 _MODEL, _VALUES, _DIFFERENCES = 1e-9, 1e-9, 1e-8
-# The last two for robots on feet, because the compliance ε gives a system with the condition number 1/ε.
+# Values for standing robots that replace _VALUES and _DIFFERENCES.  They are larger, because the compliance ε leads
+# to a linear system with the condition number 1/ε.
 _ON_FEET = 1e-7, 1e-6
 
 
 @dataclass(frozen=True)
 class VerificationRow:
-    """Comparison of a quantity of a source with Pinocchio.
+    """Comparison of one quantity from one source with Pinocchio.
 
     Attributes:
         source: Name of the source.
-        quantity: ``H``, ``G``, ``Λ_c``, ``∇H``, ``M`` or ``J``.
-        verdict: ``skipped`` if this machine lacks the source.
-        error: Largest relative error over all samples; ``None`` if it is unknown or not finite.
-        tolerance: Largest relative error that passes.
-        sample: Number of the sample with that error, from 0.
-        entry: Entry of the quantity with that error; empty for a scalar.
-        note: Reason of a skip or failure.
+        quantity: Name of the quantity: ``H``, ``G``, ``Λ_c``, ``∇H``, ``M`` or ``J``; empty if the whole source is
+            skipped or fails.
+        verdict: ``pass``, ``fail``, or ``skipped`` if the source is not available on this machine.
+        error: Largest relative error over all samples; ``None`` if the error is unknown or not finite.
+        tolerance: Largest relative error that passes; ``None`` if there is no comparison.
+        sample: Number of the sample with the largest error, starting at 0; ``None`` if there is no comparison.
+        entry: Entry of the quantity with the largest error; empty for a scalar.
+        note: Reason why the source is skipped or fails.
     """
 
     source: str
@@ -70,7 +72,13 @@ class VerificationRow:
 
 @dataclass(frozen=True, eq=False)
 class VerificationReport:
-    """Comparison of all sources, in their order, at samples that depend on the seed."""
+    """Comparison of all sources with Pinocchio.
+
+    Attributes:
+        rows: Comparisons, sorted by source.
+        samples: Random samples at which the sources were compared.
+        seed: Seed of the samples.
+    """
 
     rows: tuple[VerificationRow, ...]
     samples: tuple[PostureSample, ...]
@@ -78,11 +86,11 @@ class VerificationReport:
 
     @property
     def passed(self) -> bool:
-        """Whether all rows passed; skipped rows do not count."""
+        """True if no row fails.  Skipped rows are ignored."""
         return all(row.verdict != "fail" for row in self.rows)
 
     def to_dict(self) -> dict[str, object]:
-        """Return the JSON content: verdict, rows, and the samples that the rows name."""
+        """Return the JSON content: verdict, rows, and the samples with the largest errors."""
         named = sorted({row.sample for row in self.rows if row.sample is not None})
         return {
             "passed": self.passed,
@@ -104,25 +112,26 @@ def verify(
     seed: ZeroOrMore = 0,
     progress: Callable[[int, int], None] | None = None,
 ) -> VerificationReport:
-    """Compare ``H``, ``G``, ``Λ_c`` and ``∇H`` from every source with the numbers of Pinocchio.
+    """Compare ``H``, ``G``, ``Λ_c`` and ``∇H`` from every source with the reference values from Pinocchio.
 
-    The sources are the interpreter of CasADi, the C export if there is a compiler, finite differences of ``H`` from
-    Pinocchio for ``∇H``, and MuJoCo if it is installed.  MuJoCo gives ``M`` and ``J`` of a model of the same
-    ``pin.Model``.  ``H`` follows from them, and ``∇H`` from finite differences of this ``H``.
+    The sources are the CasADi interpreter, the C export if there is a compiler, finite differences, and MuJoCo if it
+    is installed.  The finite differences approximate ``∇H`` from the ``H`` of Pinocchio.  MuJoCo computes ``M`` and
+    ``J`` with a MuJoCo model that is built from the same ``pin.Model``.  From ``M`` and ``J``, this function computes
+    ``H``, and ``∇H`` by finite differences.
 
-    The error of a quantity is relative to its largest entry.  ``H``, ``G`` and ``∇H`` vanish where the contact cannot
-    move along the normal.  So their scale is at least a thousandth of the largest entry of ``Λ_c`` (``JM⁻¹Jᵀ`` for
-    ``G``).
+    The error of a quantity is relative to its largest entry.  ``H``, ``G`` and ``∇H`` are zero if the contact cannot
+    move along the normal.  So their errors are relative to at least a thousandth of the largest entry of ``Λ_c``
+    (``JM⁻¹Jᵀ`` for ``G``).
 
     Args:
-        objective: Robot, contact, metric and supports.
+        objective: Objective that defines robot, contact, metric and supports.
         samples: Number of random postures and normals.  The first normal is the normal of the contact.
         seed: Seed of the samples.
-        progress: Callback with (done, all) comparisons.
+        progress: Callback with the number of finished comparisons and the number of all comparisons.
 
     Raises:
-        InputError: ``samples`` is below one, or the seed is negative.
-        CompilerError: The compiler failed.  The error has its output and the command.
+        InputError: ``samples`` is smaller than one, or the seed is negative.
+        CompilerError: The compiler failed.  The error contains the command and its output.
     """
     drawn = random_samples(objective.robot, samples, seed, np.array(objective.contact.normal))
     expected = [pinocchio_numbers(objective, sample) for sample in drawn]
@@ -158,7 +167,7 @@ def verify(
 
 
 def _mujoco(objective: WorstCaseObjective) -> Source | VerificationRow:
-    """Return the source of MuJoCo, or a row with the reason why it is missing."""
+    """Return the MuJoCo source, or a row with the reason why this source is not available."""
     try:
         import_mujoco()
     except InputError as error:
@@ -166,14 +175,14 @@ def _mujoco(objective: WorstCaseObjective) -> Source | VerificationRow:
     try:
         return MujocoSource(objective)
     except InputError as error:
-        # The other sources remain.
+        # Report the failure as a row, so that the other sources are still compared.
         return VerificationRow(MUJOCO, "", "fail", note=error.line)
 
 
 def _row(
     robot: Robot, name: str, quantity: str, tolerance: float, numbers: Sequence[Numbers], expected: Sequence[Numbers]
 ) -> VerificationRow:
-    """Return the row of the worst sample of one quantity."""
+    """Compare one quantity at all samples.  Return the row for the sample with the largest error."""
     deviations = [
         deviation(actual.values[quantity], reference.values[quantity], reference.scales.get(quantity, 0.0))
         for actual, reference in zip(numbers, expected, strict=True)
