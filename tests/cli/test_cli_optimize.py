@@ -254,10 +254,7 @@ def test_progress_is_shown_on_a_terminal_only(tmp_path: Path) -> None:
 
 
 def test_the_answer_stands_before_pictures_and_c_code(tmp_path: Path) -> None:
-    """The compiler waits for a file.
-
-    The result is printed before the compiler ends, and the compiler's error afterwards.
-    """
+    """While the compiler waits for a file, the result is printed; the compiler's error is printed at the end."""
     compiler = tmp_path / "cc"
     compiler.write_text(
         '#!/bin/sh\nwhile [ ! -e go ] && [ ! -e "$GO" ]; do sleep 0.05; done\necho "error: no" >&2\nexit 1\n'

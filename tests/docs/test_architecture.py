@@ -83,10 +83,7 @@ def test_the_pattern_of_machine_paths() -> None:
 
 
 def test_errors_of_the_library_name_parameters_and_no_options() -> None:
-    """The command line translates parameter names into options (``as_options``).
-
-    The Python interface has no command line options.
-    """
+    """Only the command line translates parameter names into options (``as_options``)."""
     messages = [
         f"{path.name}:{text.lineno}: {text.value}"
         for path in Path(impact_posture.__path__[0]).rglob("*.py")

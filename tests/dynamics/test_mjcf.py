@@ -55,7 +55,7 @@ def in_mujoco(name: str) -> InMujoco:
 def qacc(layout: MjcfLayout, q: Vector, v: Vector, a: Vector) -> Vector:
     """Return the acceleration in MuJoCo's coordinates, ``qacc = T a + Ṫ v``, shape (nv,).
 
-    The term with ``Ṫ`` occurs because Pinocchio's linear velocities are in rotating body axes.
+    The term ``Ṫ v`` is due to Pinocchio's rotating body axes.
     """
     turning = np.zeros(layout.nv)
     for slot in layout.slots:

@@ -281,10 +281,7 @@ def test_a_limb_with_another_axis_is_not_repeated() -> None:
 
 
 def test_two_exports_in_one_unit(tmp_path: Path) -> None:
-    """In a unity build, both C files form one translation unit.
-
-    Macros of the first C file must not affect the second C file.
-    """
+    """Two C files form one translation unit; macros of the first file must not affect the second file."""
     compiler = need_compiler()
     for name, frame in (("solo8", "base_link"), ("panda", "panda_hand_tcp")):
         (tmp_path / name).mkdir()

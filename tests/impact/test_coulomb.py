@@ -139,10 +139,7 @@ def test_planar_robots(friction: float) -> None:
 
 
 def test_a_point_on_a_line_slides_or_jams() -> None:
-    """With one hinge, the tip moves along one direction, oblique to the normal.
-
-    With enough friction, the tip cannot move.
-    """
+    """With one hinge, the tip moves in one direction, oblique to the normal; enough friction prevents the motion."""
     loaded = arm([Y], [0.0], floating=False)
     q, normal = np.array([0.4]), (0.0, 0.0, 1.0)
     slides, jams = hung(loaded, normal, 0.1), hung(loaded, normal, 5.0)

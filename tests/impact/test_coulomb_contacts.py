@@ -95,10 +95,7 @@ def feet_of(friction: float) -> tuple[WorstCaseObjective, Vector]:
 
 @pytest.mark.parametrize("friction", (0.0, 0.15, 0.4, 2.0))
 def test_four_feet_land_in_mujoco(friction: float) -> None:
-    """In MuJoCo a sliding foot also lifts, because the friction model of MuJoCo is convex.
-
-    Therefore, only sticking feet are compared with a tight tolerance.
-    """
+    """Only sticking feet get a tight tolerance, because MuJoCo's convex friction model lifts sliding feet."""
     objective, q = feet_of(friction)
     jumps = coulomb_jumps(objective, q, 1.0)
     assert jumps is not None

@@ -197,10 +197,7 @@ def test_gradient_equals_differences(name: str) -> None:
 
 @pytest.mark.parametrize("name", ["panda", "arm", "tilthex_arm"])
 def test_limits_are_the_joint_models(name: str) -> None:
-    """A stiff contact ends before the joint springs move the rotors.
-
-    During a soft contact, stiff joint springs couple the links with the rotors.
-    """
+    """A stiff contact moves only the links; a soft contact with stiff joint springs moves links and rotors."""
     case, q, _ = case_of(name)
     case = replace(case, metric=Metric(), robot=on_springs(case.robot, springs(5e3 if name == "panda" else 150.0)))
     elastic, stiff = ElasticImpact(case), {}
@@ -226,10 +223,7 @@ def test_dampers_hold_rotors_to_links() -> None:
 
 
 def test_first_greatest_compression_of_many() -> None:
-    """With soft wrists, the compression of the contact rises, stops and rises again.
-
-    The impact phase ends when the compression stops rising for the first time.
-    """
+    """With soft wrists, the compression rises, stops and rises again; the impact phase ends at the first stop."""
     generator, close = rng("first root"), 0
     case, _, _ = case_of("arm")
     case = replace(case, metric=Metric())

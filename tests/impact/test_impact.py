@@ -44,10 +44,7 @@ STEP = 2e-4
 
 
 def supports_of(loaded: Robot) -> tuple[Support, ...]:
-    """Return the robot's feet.
-
-    A robot without feet gets a point support a third of the way along its kinematic chain.
-    """
+    """Return the robot's feet, or a point support in the kinematic chain of a robot without feet."""
     if loaded.spec.supports:
         return loaded.spec.supports
     assert loaded.spec.contact.frame is not None

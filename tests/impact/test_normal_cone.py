@@ -298,10 +298,7 @@ def test_starts_certify(name: str, kind: ObjectiveKind) -> None:
 
 
 def test_solved_from_and_at_mirror_symmetric_postures() -> None:
-    """For solo8, two normals are equally bad at the start and at the optimum.
-
-    Neither normal has a zero gradient, but a convex combination of both gradients is zero.
-    """
+    """At the optimum of solo8, two normals are equally bad; only a convex combination of their gradients is zero."""
     settings = {"robot": "solo8", "frame": "base_link", "normal": (1, 0, 0), "normal_cone": 20.0}
     problem = prepare(make_settings(settings)).problem
     assert cone_of(problem.impact).worst(problem.given).tied

@@ -159,10 +159,7 @@ def test_a_pair_that_stays_violated_has_rows_for_all_corners_in_the_end() -> Non
 
 
 def test_a_pair_that_slack_lets_off_gets_no_more_corners() -> None:
-    """With slack, more rows cannot separate bodies that the objective pushes together.
-
-    Without slack, the program still lacks rows.
-    """
+    """If slack permits a penetration, more rows do not help; without slack, the program still lacks rows."""
     robot, rng = load_robot("tilthex_arm"), np.random.default_rng(5)
     constraint = Clearance("c", [_separator(robot, kind) for kind in KINDS], "words")
     numeric, seen = Numeric(robot.model), 0
@@ -273,10 +270,7 @@ def test_an_obstacle_at_the_contact_is_named() -> None:
     ("pose", "position"), [("full", None), ("full", (3.0, 0.0, 0.0)), ("position", (3.0, 0.0, 0.0))]
 )
 def test_a_turn_that_solves_a_conflict_is_the_hint(pose: str, position: tuple[float, ...] | None) -> None:
-    """The wrist of z1 is inside the floor that the hand faces.
-
-    If the target is out of reach, the hint does not suggest to free the orientation.
-    """
+    """Freeing the orientation moves the wrist of z1 out of the floor, but does not help if the target is too far."""
     settings = {"robot": "z1", "normal": (0.0, 0.0, 1.0), "contact_pose": pose, "target_position": position}
     problem = prepare(validate(ProblemSettings, settings, "options")).problem
     with pytest.raises(Infeasible) as caught:

@@ -195,10 +195,7 @@ def test_one_thread_within_and_as_before_after() -> None:
 
 
 def test_compilers_run_beside_each_other_and_none_stays(tmp_path: Path) -> None:
-    """The error of the first compiler that fails is reported.
-
-    Compilers that still run are killed, together with their child processes.
-    """
+    """The first failure is reported; compilers that still run are killed, together with their child processes."""
     marks = [tmp_path / name for name in ("child", "never")]
     slow = ["sh", "-c", f"(sleep 3; touch {marks[0]}) & sleep 3; touch {marks[1]}", "-o", "slow.o"]
     began = time.perf_counter()

@@ -79,10 +79,7 @@ def test_its_ends_are_the_solutions_of_speed_and_of_sticking() -> None:
 
 
 def test_an_optimum_on_the_verge_of_slipping_is_certified_by_both_sides() -> None:
-    """On the table of the test, ur5 sticks in some postures and slips in others.
-
-    The best posture is at the kink between sticking and slipping.
-    """
+    """The best posture of ur5 on this table is at the kink between sticking and slipping."""
     problem = problem_of("ur5", (0.0, 0.6, 0.8), 0.4, contact_pose="position")
     assert isinstance(problem.objective, WorstCaseObjective)
     nlp = build_nlp(problem, compile="never")

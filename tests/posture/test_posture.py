@@ -309,10 +309,7 @@ def test_settings_know_their_defaults() -> None:
 
 @pytest.mark.parametrize("more", [{"target_position": (0.4, 0.2, 0.4), "contact_pose": "full"}, {}])
 def test_singular_start_drops_no_equation(more: dict) -> None:
-    """The constraint rows of UR5 are dependent only in its straight posture.
-
-    In other postures, all rows are needed.
-    """
+    """The constraint rows of UR5 are dependent only in its straight posture, so no row may be dropped."""
     problem = problem_of("ur5", posture="neutral", **more)
     assert all(len(problem.carried(i)) == len(c.lifted_bounds[0]) for i, c in enumerate(problem.constraints))
     solution = solve(problem, starts=6, jobs=1)

@@ -49,10 +49,7 @@ def solved(case: str) -> tuple[PostureSolution, TradeOff]:
 
 
 def moved(problem: ConstrainedProblem, q: np.ndarray, start: np.ndarray) -> float:
-    """Return the distance by an independent formula.
-
-    For a joint given by cosine and sine, the distance is the chord.
-    """
+    """Return the distance by an independent formula; for a joint given by cosine and sine, use the chord."""
     step = np.array(q[-(problem.robot.nq - 7) :] - start[7:] if problem.robot.floating else q - start)
     base = 0.0
     if problem.robot.floating:

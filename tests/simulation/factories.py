@@ -67,10 +67,7 @@ def driven(factory: ControllerFactory, controller: str, *, mode: Mode = "live", 
 
 @functools.cache
 def lived(name: str, controller: str, mode: Mode, settle: float | None) -> Run:
-    """Return a cached run of :func:`shared_factory`.
-
-    The arguments have no defaults, so that equal calls share a cache entry.
-    """
+    """Return a cached run of :func:`shared_factory`; without default arguments, equal calls share a cache entry."""
     return driven(shared_factory(name, settle), controller, mode=mode)
 
 

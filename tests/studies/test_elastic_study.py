@@ -1,4 +1,4 @@
-"""The study of elastic joints in short: MuJoCo's compression compared with the elastic response, and its page."""
+"""Short run of the study of elastic joints: MuJoCo's compression, the elastic response, and the page."""
 
 from __future__ import annotations
 
@@ -24,10 +24,7 @@ pytest.importorskip("mujoco")
 @pytest.mark.parametrize("name", list(STUDIED))
 @pytest.mark.parametrize("stiffness", [1e4, 1e6])
 def test_mujoco_finds_the_same(name: str, stiffness: float) -> None:
-    """The impact is slow, so that the arm hardly moves.
-
-    The joints include dampers, a rigid joint and a stiffer spring.
-    """
+    """Compare slow impacts, in which the arm hardly moves, with dampers, a rigid joint and a stiffer spring."""
     studied, generator = STUDIED[name], rng(name, "MuJoCo")
     plain = studied.robot()
     first, *others = studied.joints

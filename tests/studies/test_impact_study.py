@@ -1,4 +1,4 @@
-"""The study of impacts in short: few postures per robot, MuJoCo's jump compared with predictions, and its page."""
+"""Short run of the impact study: few postures per robot, MuJoCo's jump compared with predictions, and its page."""
 
 from __future__ import annotations
 

@@ -1,4 +1,4 @@
-"""The robustness study in short: random draws, failures, interruption, statistics, and its page."""
+"""Short runs of the robustness study: random draws, failures, interruption, statistics, and its page."""
 
 from __future__ import annotations
 

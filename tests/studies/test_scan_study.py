@@ -1,4 +1,4 @@
-"""The scan along the redundancy in short: its postures, caption and figure."""
+"""Short run of the study that scans the redundancy: postures, caption and figure."""
 
 from __future__ import annotations
 

@@ -1,7 +1,7 @@
 """Measure the branch coverage of both packages by the whole test suite, and write the coverage page.
 
-Run this module as ``python -m tests.support.coverage_report`` (``make coverage``).  The measurement takes about twice
-as long as the test suite alone.
+Run this module as ``python -m tests.support.coverage_report`` (``make coverage``).  The measurement takes twice as
+long as the suite.
 """
 
 from __future__ import annotations

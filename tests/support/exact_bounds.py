@@ -68,10 +68,7 @@ class Bounded(ExactImpact):
 
     @cached_property
     def lost_by_elimination(self) -> Vector:
-        """Largest error of each entry of ``a`` and ``f``.
-
-        The system is solved for the three columns of ``Jᵀ``, and the solutions are combined along n.
-        """
+        """Largest error of each entry of ``a`` and ``f``, combined from solutions for the three columns of ``Jᵀ``."""
         x = np.abs(rounded(self.inverse[:, : self.nv] @ self.J.T))
         return (np.abs(rounded(self.inverse)) @ self._backward @ x + gamma(3) * x) @ np.abs(self.oracle.n)
 
@@ -145,10 +142,7 @@ class Bounded(ExactImpact):
 
     @cached_property
     def gradient_by_heavy_feet(self) -> Vector:
-        """Largest error of ∇H, ``2 ∂_k(bᵀΔM̃ a)``, shape (nv,).
-
-        A rotation by 1 rad changes ``ΔM̃`` by as much as ``ΔM̃`` itself.
-        """
+        """Largest error of ∇H, ``2 ∂_k(bᵀΔM̃ a)``, shape (nv,), if a rotation by 1 rad changes ``ΔM̃`` by 100 %."""
         a, b = self._size(self.jump), self._size(self.second[0])
         rates = self._size(self.jump_rates) * b + a * self._size(self.second_rates)
         return np.asarray(2 * gamma(3 * self.nv + 1) * (rates + a * b))

@@ -1,7 +1,4 @@
-"""Exported controllers for tests.
-
-Each controller is built once per run, without compiler optimization to save time.
-"""
+"""Exported controllers for tests, each built once per run, without compiler optimization to save time."""
 
 from __future__ import annotations
 

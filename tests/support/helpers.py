@@ -1,5 +1,4 @@
-"""Helpers of the mathematical tests: robots, random configurations, errors, finite differences, direct calls of
-Pinocchio.
+"""Helpers of the mathematical tests: robots, random configurations, errors, finite differences, Pinocchio calls.
 
 The helpers do not call the code under test except to load a robot.
 """

@@ -1,7 +1,4 @@
-"""Ticks in which the controller needs the relaxation, with the Python solution.
-
-The ticks come from simulated robots and random states.
-"""
+"""Ticks of simulated robots and random states that need the relaxation, with the Python solution."""
 
 from __future__ import annotations
 
@@ -95,8 +92,7 @@ def pushed(name: str) -> tuple[list[RelaxedTick], int]:
     """Push a simulated robot with its nominal controller.
 
     Returns:
-        The relaxed ticks, and how many of them precede the fall.  The robot falls when its base is a third lower
-        than at the start.
+        The relaxed ticks, and how many of them precede the fall (base a third lower than at the start).
     """
     scenario, frame, force, seconds = RUNS[name]
     setup = set_up(read_scenario(scenario))

@@ -76,8 +76,7 @@ def measure_restitution(
         law: Contact law of the surface.
         speed: Approach speed, m/s.
         timestep: Time step of the physics, s.
-        mass: Mass of the ball, kg.  The mass does not change the result, because MuJoCo scales the law by the
-            mass at the contact.
+        mass: Mass of the ball, kg.  The result does not depend on the mass, because MuJoCo scales the law.
 
     Raises:
         InputError: The ball stays on the surface, or the time step is too long for the law.

@@ -21,8 +21,7 @@ def level_bound(activation: Activation, dt: float) -> float:
 def step_bound(posture: ip.tsid.JointPosture, state: State, dt: float) -> float:
     """Return the largest change of an entry of ``ν̇*`` within ``dt`` that ramps and fades cause (``q``, ν, ∇H fixed).
 
-    The level contributes ``1.5 dt/ramp·(K·reach + K_p|q_des ⊖ q|)``; the fade of the target posture adds its own
-    part.
+    The level contributes ``1.5 dt/ramp·(K·reach + K_p|q_des ⊖ q|)``, in addition to the fade of the target posture.
     """
     bound, model = 0.0, posture._model
     if posture._blend < 1:

@@ -88,10 +88,7 @@ def test_rows_that_agree_hold_exactly_and_others_are_reported(name: str) -> None
 
 @pytest.mark.parametrize(("kind", "rows"), [(FramePosition, 3), (FrameAligned, 5)])
 def test_a_task_with_fewer_rows_is_not_deficient(kind: type[EndEffector], rows: int) -> None:
-    """The tool points forward.
-
-    The task does not constrain the spin about the tool axis, which the arm cannot produce.
-    """
+    """The task does not constrain the spin about the tool axis, which this arm cannot produce."""
     r = arm([Z, Y, Y, Y], [0.3, -0.8, 0.3, -0.5], floating=True)
     axis: Any = {} if kind is FramePosition else {"axis": rotation(r).T @ np.array([np.cos(0.3), np.sin(0.3), 0.0])}
     task = kind(Point(TIP), kp=60.0, **axis)
@@ -303,10 +300,7 @@ def wrist() -> tuple[Robot, TaskFormulation]:
 
 
 def flying() -> tuple[Robot, TaskFormulation]:
-    """If the first link is not vertical, the second hinge rolls the tip.
-
-    If the first link is vertical, the second hinge yaws the tip, as the base does.
-    """
+    """The second hinge rolls the tip; if the first link is vertical, the hinge yaws the tip, as the base does."""
     r = arm([Y, Z, Y], [0.3, 0.4, -0.2], floating=True)
     return r, aerial_formulation(r, JointPosture(r), law=None)
 

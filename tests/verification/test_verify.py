@@ -274,8 +274,8 @@ def test_differences_of_a_known_function() -> None:
 
     np.testing.assert_allclose(difference_gradient(value, model, q), weights, rtol=1e-10, atol=1e-10)
     assert np.isnan(difference_gradient(lambda _: float("nan"), model, q)).all()
-    # The function varies on a scale of 0.01, less than the first step.  Standing robots near singular postures are
-    # similar.
+    # The function varies on a scale of 0.01, less than the first step.  Objectives of standing robots near singular
+    # postures behave like this function.
     stiff = difference_gradient(lambda at: float(np.tanh(100 * weights @ pin.difference(model, q, at))), model, q)
     np.testing.assert_allclose(stiff, 100 * weights, rtol=1e-7)
 
