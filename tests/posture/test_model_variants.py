@@ -297,13 +297,13 @@ def test_words_of_every_finding() -> None:
         return Robustness((variant,), 4.0, worst_nominal, broken, 3.0, 60).line
 
     assert found(1.0, 5.0) == (
-        "the optimum moves by 0.5 rad (m); the worst case is 20.0% lower than at the optimum of the model as it "
-        "stands; the model as it stands is 100.0% above its own optimum"
+        "the optimum moves by 0.5 rad (m); the worst case is 20.0% lower than at the optimum of the nominal "
+        "model; the objective of the nominal model is 100.0% above its optimum"
     )
     assert "25.0% higher than at the optimum" in found(1.0, 3.2) and "more `starts`" in found(1.0, 3.2)
-    assert "breaks feet that stay (x)" in found(1.0, None, ("feet that stay (x)",))
-    assert "no certified optimum of its own" in found(None, None)
-    assert "50.0% below its own optimum" in found(4.0, 5.0)
+    assert "violates feet that stay (x)" in found(1.0, None, ("feet that stay (x)",))
+    assert "no certified optimum to compare with" in found(None, None)
+    assert "50.0% below its optimum" in found(4.0, 5.0)
 
 
 def test_balance_and_feet_hold_in_every_model_variant() -> None:

@@ -4,14 +4,16 @@
 
     f(d) = min over q  objective(q)    subject to the constraints of the problem and price(q) ≤ d
 
-for a series of bounds d from the least price to the price of the optimum.  The price is the distance ‖q ⊖ q₀‖ of
-:func:`~impact_posture.posture.constraints.posture_distance.distance_squared`, or the peak force of the impact.  It is
-a bound and not a penalty, because the minimizers of ``objective + w·price`` reach the convex hull of the curve only.
+with bounds d from the least price to the price of the optimum.  The price is the distance ‖q ⊖ q₀‖ of
+:func:`~impact_posture.posture.constraints.posture_distance.distance_squared`, or the peak force of the impact.  The
+price is bounded and not penalized, because minimizers of ``objective + w·price`` give only points on the convex hull
+of the curve.
 
 One program, with d as the bound of a row, is solved along two paths: outward from the posture with the least price
-and inward from the optimum.  Each solve starts at the end of the previous solve, with its multipliers if this end is
-within the bound.  The best certified end within each bound counts.  If the best end at a neighboring bound is on
-another path, this path is tried here as well.  So the curve is the lower envelope of the paths.
+and inward from the optimum.  Each solve starts at the result of the previous solve, with its multipliers if this
+result is within the bound.  For each bound, the best certified result is kept.  If the best result for a neighboring
+bound is on another path, a solve starts from this result as well.  The curve is therefore the lower envelope of the
+paths.
 """
 
 from __future__ import annotations
@@ -36,17 +38,18 @@ from impact_posture.posture.search.growing_search import Progress, run_start
 from impact_posture.posture.search.multistart import PostureSolution, solve
 from impact_posture.system.arrays import Array
 
-# Prices that differ by less than this (relative, and rad or m) are equal.
+# Two prices are equal if they differ by less than this, relative to the price or in rad or m.
 _STILL = 1e-6
-# A posture is better if it gains more than this share of the initial objective.
+# A posture is better if its objective is lower by more than this share of the initial objective.
 _EQUAL = 1e-9
-# A rise of the curve by more than this share of the initial objective is reported.
+# If the objective increases along the curve by more than this share of the initial objective, the result gets a note.
 _RISE = 1e-6
-# Number of other optima from which a path starts, and rounds of trying the paths of neighbors.
+# Maximum number of other optima from which a path starts, and of rounds in which results of neighboring bounds are
+# tried.
 _PATHS, _ROUNDS = 3, 3
-# Most times that the program of one point grows.
+# Maximum number of times that the program grows for one point.
 _GROWTH = 8
-# Starts of the search for the posture with the least force.
+# Number of starts of the search for the posture with the least force.
 _FORCE_STARTS = 8
 
 
@@ -59,14 +62,14 @@ def pareto_front(
     compile: CompileMode = "auto",
     progress: Progress | None = None,
 ) -> TradeOff:
-    """Follow the curve in ``points`` equal steps from the least price to the price of the optimum.
+    """Compute the curve in ``points`` equal steps from the least price to the price of the optimum.
 
-    The regularization is left out, because the bound on the distance replaces it.  ``force`` is the contact and the
-    approach speed (m/s) whose peak force is the price; ``None`` for the distance.  ``progress`` is called with the
-    numbers of finished and planned solves.
+    The regularization is left out, because the bound on the distance replaces it.  ``force`` contains the contact and
+    the approach speed (m/s) that determine the peak force as the price; if it is ``None``, the price is the distance.
+    ``progress`` is called with the numbers of finished and planned solves.
 
     Raises:
-        InputError: The number of points is below 1, or there are several contacts whose forces would compete.
+        InputError: The number of points is below 1, or the price is the force and there are several contacts.
     """
     problem = solution.problem
     price = _price(solution, force, compile)
@@ -91,16 +94,16 @@ def _price(
         return DistancePrice(problem.robot.model, solution.initial)
     objective, (contact, speed) = problem.impact, force
     if objective.others:
-        fault = "is of one contact, and there are several"
+        fault = "bounds the force of one contact, but there are several contacts"
         raise InputError(fault, where="tradeoff_against", hint="give one `contact`")
-    # The least E = 1/(2G) has the least force, which falls as G rises.
+    # The force decreases as G increases, so the posture with the least E = 1/(2G) has the least force.
     energy = replace(objective, kind="energy", normal_cone_deg=0.0, model_variants=())
     least = solve(replace(problem, objective=energy), starts=_FORCE_STARTS, compile=compile, guesses=[solution.q])
     return ForcePrice(objective, contact, speed, least.q)
 
 
 def _bounded(problem: ConstrainedProblem, price: TradeOffPrice) -> ConstrainedProblem:
-    """Return the problem with the bound as its last constraint and without regularization."""
+    """Return the problem with the bound on the price as its last constraint, and without regularization."""
     return replace(
         problem,
         requirements=replace(problem.requirements, regularization=0.0),
@@ -111,7 +114,7 @@ def _bounded(problem: ConstrainedProblem, price: TradeOffPrice) -> ConstrainedPr
 
 @dataclass(frozen=True, eq=False)
 class _End:
-    """The end of a solve: the name of its path, and the point."""
+    """The result of a solve: the name of its path, and the point."""
 
     path: str
     point: TradePoint
@@ -123,7 +126,7 @@ class _End:
 
 
 class _Curve:
-    """The curve during the search."""
+    """The curve with the best results so far, while it is computed."""
 
     def __init__(
         self,
@@ -137,13 +140,13 @@ class _Curve:
         self._scale = problem.objective.value(price.nearest)
         self._best: list[_End | None] = [None] * len(levels)
         self._tried: set[tuple[int, bytes]] = set()
-        # Ends of solves by their postures.
+        # Values for a warm start from the result of each solve, by the bytes of its posture.
         self._ends: dict[bytes, WarmStart] = {}
         self.solves = 0
         self._take(0, "outward", price.nearest)
 
     def follow(self, solution: PostureSolution, progress: Progress | None) -> None:
-        """Solve outward from the least price, and inward from the optimum and from cheaper optima."""
+        """Solve outward from the least price, and inward from the optimum and from optima with lower prices."""
         last = len(self._levels) - 1
         planned = 2 * last
         self._take(last, "inward", solution.q)
@@ -173,7 +176,7 @@ class _Curve:
                 break
 
     def _try_neighbors(self, order: range, neighbor: int) -> bool:
-        """Try the path of each neighbor if it differs or does better; return whether a point improved."""
+        """Solve from the result of a neighbor if it is on another path or better; return whether a point improved."""
         better = False
         for k in order:
             best, other = self._best[k], self._best[k + neighbor]
@@ -186,7 +189,7 @@ class _Curve:
         return better
 
     def _solve(self, k: int, path: str, start: Array) -> Array:
-        """Solve within bound ``k`` from ``start``, or from a posture near it that is within the bound."""
+        """Solve with bound ``k`` from ``start``, or from a posture near ``start`` that satisfies the bound."""
         level = self._levels[k]
         key = (k, start.tobytes())
         if self._nlp is None or key in self._tried:
@@ -206,7 +209,7 @@ class _Curve:
                 start = record.q
             self._take(k, path, record.q, certificate)
         except MetricError:
-            # The objective does not exist at the end of this path.
+            # The objective is not defined at the result of this solve.
             return start
         finally:
             self.solves += 1
@@ -217,7 +220,7 @@ class _Curve:
         return replace(self._problem, constraints=(*self._problem.constraints[:-1], bound))
 
     def _take(self, k: int, path: str, q: Array, certificate: Certificate | None = None) -> None:
-        """Keep a posture if it satisfies the constraints and is the best within bound ``k``."""
+        """Keep the posture ``q`` if it satisfies the constraints and is the best within bound ``k``."""
         end, best = _End(path, self._point(k, q, certificate)), self._best[k]
         uncertified, objective = end.rank
         if end.point.certificate.feasible and (
@@ -242,10 +245,10 @@ class _Curve:
         )
 
     def finish(self, solution: PostureSolution, solve: float, build: float, notes: list[str]) -> TradeOff:
-        """Return the curve with notes."""
+        """Return the finished curve with notes."""
         points: list[TradePoint] = []
         for k, end in enumerate(self._best):
-            # If no solve ended on the constraints, the posture of the previous bound satisfies them.
+            # If no result satisfies the constraints, use the posture of the previous bound, which satisfies them.
             before = points[-1].q if points else self._price.nearest
             points.append(self._point(k, before) if end is None else end.point)
         best = solution.problem.objective.value(solution.q)
@@ -256,14 +259,14 @@ class _Curve:
         risen = [b for a, b in pairwise(points) if b.objective > a.objective + _RISE * self._scale]
         if risen:
             notes.append(
-                f"trade-off: within {', '.join(f'{p.within:.3g}' for p in risen)} a worse posture was found than "
-                "within less: it is not the best there"
+                f"trade-off: within {', '.join(f'{p.within:.3g}' for p in risen)} the posture is worse than "
+                "within a smaller bound, so it is not the best there"
             )
         lowest = min(p.objective for p in points)
         if lowest < best - _RISE * self._scale and not solution.problem.requirements.regularization:
             notes.append(
-                f"trade-off: it found a better posture ({lowest:.4g}) than the starts did ({best:.4g}); "
-                "more `starts` may find it, too"
+                f"trade-off: the curve found a better posture ({lowest:.4g}) than the search ({best:.4g}); "
+                "with more `starts`, the search may find it too"
             )
         knee = find_knee(np.array([p.distance for p in points]), np.array([p.objective for p in points]))
         return TradeOff(tuple(points), knee, self.solves, solve, build, tuple(notes), self._price.against)

@@ -1,4 +1,4 @@
-"""Warnings about an optimal posture: it cannot be held or reached at speed, or joints are behind a surface."""
+"""Warnings about an optimal posture that cannot be held, cannot be reached at speed, or crosses a surface."""
 
 from __future__ import annotations
 
@@ -8,19 +8,20 @@ from impact_posture.posture.formulation.problem_file import Prepared
 from impact_posture.posture.loads.holding_forces import HoldingForces
 from impact_posture.system.arrays import Array
 
-# An attainable speed below the approach speed by less than this share gets no warning, as three digits hide it.
+# If the attainable speed is below the approach speed by less than this share, there is no warning, because both
+# speeds are equal in the three digits of the message.
 _REACHED = 5e-3
-# A joint farther than this (m) behind a surface or below the ground gets a warning.
+# Joints farther than this (m) behind a surface or below the ground are reported.
 _BEHIND = 0.01
 
 
 def posture_warnings(
     prepared: Prepared, initial: Array, q: Array, holding: HoldingForces | None, attainable: float | None
 ) -> list[str]:
-    """Return warnings about holding, approach, surface and ground, for the initial and the optimal posture.
+    """Return warnings about holding forces, approach speed, surface and ground for the optimal posture.
 
-    ``holding`` are the forces that hold the optimal posture, and ``attainable`` is the speed at which the joints can
-    arrive there, m/s.  Either is ``None`` if it is unknown.
+    ``holding`` are the forces that hold the optimal posture, and ``attainable`` is the highest contact speed that the
+    joints can reach in this posture, m/s.  Each of the two is ``None`` if it is unknown.
     """
     verb = "hold" if prepared.impact.robot.spec.propulsion is None else "hover in"
     loads = holding.violations() if holding else []
@@ -29,7 +30,7 @@ def posture_warnings(
     if attainable is not None and attainable < (1 - _REACHED) * prepared.impact.speed and not demanded:
         held.append(
             f"the joints can bring the contact to the surface at no more than {attainable:.3g} m/s in the optimal "
-            f"posture, not at {prepared.impact.speed:g} m/s: add `approach`, or give the `speed` that is meant"
+            f"posture, not at {prepared.impact.speed:g} m/s: add `approach`, or correct the `speed`"
         )
     around = prepared.problem.surroundings
     if around is not None and around.shapes.bodies:
@@ -38,8 +39,8 @@ def posture_warnings(
 
 
 def _surface_warnings(prepared: Prepared, initial: Array, q: Array) -> list[str]:
-    """Return warnings about joints behind the plane of the contact, where no constraint keeps them in front of it."""
-    # A push (a free contact pose) has no surface.
+    """Warn about joints that lie behind the contact plane; no constraint keeps them in front of it."""
+    # With a free contact pose, an object pushes the robot, so there is no surface.
     if prepared.problem.requirements.contact_pose == "free":
         return []
     before, after = (_joints_behind(prepared, posture) for posture in (initial, q))
@@ -52,14 +53,14 @@ def _surface_warnings(prepared: Prepared, initial: Array, q: Array) -> list[str]
     new = [name for name in after if name not in before]
     if new:
         lines.append(
-            f"the optimal posture brings {_named(new)} behind the plane of the surface: it is not kept out of it; "
+            f"the optimal posture brings {_named(new)} behind the plane of the surface: no constraint prevents this; "
             "bound the base or the joints if the surface reaches that far"
         )
     return lines
 
 
 def _joints_behind(prepared: Prepared, q: Array) -> list[str]:
-    """Return the joints whose origin lies behind the plane of the contact, except the joint of the contact link."""
+    """Return the joints whose origins lie behind the contact plane, except the joint of the contact link."""
     oracle = prepared.impact.objective.oracle.at(q)
     contact = oracle.numeric.placement(oracle.point).translation
     n, touching = oracle.n.copy(), oracle.point.joint
@@ -71,7 +72,7 @@ def _joints_behind(prepared: Prepared, q: Array) -> list[str]:
 
 
 def _ground_warnings(prepared: Prepared, q: Array) -> list[str]:
-    """Return a warning about joints below the lowest foot, where no constraint keeps them above level ground."""
+    """Warn about joints that lie below the lowest foot; no constraint keeps them above flat ground."""
     robot, supports = prepared.impact.robot, prepared.impact.supports
     if not supports:
         return []
@@ -79,8 +80,8 @@ def _ground_warnings(prepared: Prepared, q: Array) -> list[str]:
     ground = min(numeric.placement(point_on(robot, s.frame, s.offset)).translation[2] for s in supports)
     below = [name for _, name, origin in _origins(prepared, numeric) if origin[2] < ground - _BEHIND]
     text = (
-        f"the optimal posture has {_named(below)} below the lowest foot: nothing keeps them above the ground; narrow "
-        "their limits (robot.toml [limits.position]) or stay nearer with `regularization`"
+        f"the optimal posture has {_named(below)} below the lowest foot: no constraint keeps them above the ground; "
+        "narrow their limits (robot.toml [limits.position]) or stay nearer with `regularization`"
     )
     return [text] if below else []
 

@@ -42,7 +42,7 @@ def result_document(
     path: dict[str, object] | None = None,
     global_search: GlobalSearch | None = None,
 ) -> dict[str, object]:
-    """Return the content of ``result.json``, with a block for each of the last four arguments that is given."""
+    """Return the content of ``result.json``, with a block for each of the last four arguments except ``None``."""
     impact, around = prepared.impact, prepared.problem.surroundings
     initial, optimal = impact.evaluate(solution.initial), impact.evaluate(solution.q)
     loads = load_cases(impact.objective, solution.initial, prepared.problem.requirements)
@@ -96,7 +96,7 @@ def versions() -> dict[str, str]:
 
 @cache
 def _version_of(package: str) -> str | None:
-    """Return the version of an installed package, which takes milliseconds to find."""
+    """Return the version of an installed package; the result is cached because a look-up takes milliseconds."""
     try:
         return metadata.version(package)
     except metadata.PackageNotFoundError:

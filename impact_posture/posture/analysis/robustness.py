@@ -1,4 +1,4 @@
-"""Robustness against model variants: how far the optimum moves, what it costs and what it gains."""
+"""Robustness against model variants: how far the optimum moves, and how the objective changes."""
 
 from __future__ import annotations
 
@@ -21,18 +21,20 @@ from impact_posture.posture.search.multistart import SAME_POSTURE, PostureSoluti
 from impact_posture.robot.model_variant import between
 from impact_posture.system.arrays import Array
 
-# Number of models drawn between the variants to check whether any is worse than all variants.
+# Number of random models between the variants, to check whether any model is worse than all variants.
 _BETWEEN = 60
-# A smaller share is an error of the solver, and a smaller violation (m, rad) counts as satisfied.
+# A smaller relative change is a rounding error of the solver, and a constraint with a smaller violation (m, rad) is
+# satisfied.
 _NOISE = 1e-6
 
 
 @dataclass(frozen=True, eq=False)
 class VariantOptimum:
-    """A model variant and its own optimum, the best posture for this variant alone.
+    """A model variant and its own optimum, which is the best posture for this variant alone.
 
-    ``at_robust`` is the objective of the variant at the robust optimum, and ``own`` at its own optimum ``q``, shape
-    (nq,).  ``moved`` is the tangent distance between both.  The last three are ``None`` if no start certified.
+    ``at_robust`` is the objective of the variant at the robust optimum.  ``own`` is its objective at its own optimum
+    ``q``, shape (nq,).  ``moved`` is the tangent distance between both optima.  ``own``, ``q`` and ``moved`` are
+    ``None`` if no start ended at a certified posture.
     """
 
     name: str
@@ -49,15 +51,15 @@ class VariantOptimum:
 
 @dataclass(frozen=True, eq=False)
 class Robustness:
-    """Comparison of the robust optimum with the optimum of the model as it stands.
+    """Comparison of the robust optimum with the optimum of the nominal model (stated armature, no payload).
 
     Attributes:
-        model_variants: All model variants, the model as it stands first.
-        worst_robust: Worst objective over the model variants at the robust optimum.
-        worst_nominal: Worst objective at the optimum of the model as it stands; ``None`` if this optimum does not
-            exist, or violates a constraint for another model variant.
-        broken: Names of the violated constraints.
-        between: Largest objective at the robust optimum among models drawn between the model variants.
+        model_variants: All model variants; the nominal model is the first.
+        worst_robust: Worst objective of all model variants at the robust optimum.
+        worst_nominal: Worst objective of all model variants at the optimum of the nominal model; ``None`` if this
+            optimum does not exist, or violates a constraint for another model variant.
+        broken: Names of the constraints of the robust problem that the optimum of the nominal model violates.
+        between: Largest objective at the robust optimum for the random models between the model variants.
     """
 
     model_variants: tuple[VariantOptimum, ...]
@@ -69,41 +71,41 @@ class Robustness:
 
     @property
     def moved(self) -> float | None:
-        """Tangent distance of the robust optimum from the optimum of the model as it stands."""
+        """Tangent distance of the robust optimum from the optimum of the nominal model."""
         return self.model_variants[0].moved
 
     @property
     def price(self) -> float | None:
-        """Share by which the objective of the model as it stands is above the objective at its own optimum."""
+        """Relative increase of the nominal model's objective from its own optimum to the robust optimum."""
         own = self.model_variants[0].own
         return None if own is None else self.model_variants[0].at_robust / own - 1
 
     @property
     def gain(self) -> float | None:
-        """Share by which the worst case is below the worst case at the optimum of the model as it stands."""
+        """Relative decrease of the worst case from the optimum of the nominal model to the robust optimum."""
         return None if self.worst_nominal is None else 1 - self.worst_robust / self.worst_nominal
 
     @property
     def line(self) -> str:
-        """The comparison in a sentence."""
+        """One sentence that describes the comparison."""
         if self.moved is None or self.price is None:
-            return "the model as it stands has no certified optimum of its own to compare with"
+            return "the nominal model has no certified optimum to compare with"
         parts = [f"the optimum moves by {self.moved:.3g} rad (m)"]
-        here = "at the optimum of the model as it stands"
+        here = "at the optimum of the nominal model"
         if self.gain is None:
-            parts.append(f"the optimum of the model as it stands breaks {', '.join(self.broken)}")
+            parts.append(f"the optimum of the nominal model violates {', '.join(self.broken)}")
         elif self.gain < -_NOISE:
             parts.append(
                 f"the worst case is {percent(-self.gain)} higher than {here}: more `starts` will find a better one"
             )
         else:
             parts.append(f"the worst case is {percent(max(self.gain, 0.0))} lower than {here}")
-        lower = self.price < -_NOISE
-        parts.append(
-            f"the model as it stands is {percent(abs(self.price))} {'below' if lower else 'above'} its own optimum"
-        )
+        side = "below" if self.price < -_NOISE else "above"
+        parts.append(f"the objective of the nominal model is {percent(abs(self.price))} {side} its optimum")
         if self.between > self.worst_robust * (1 + _NOISE):
-            parts.append(f"between the model variants it reaches {self.between:.4g}, above the worst of them")
+            parts.append(
+                f"for models between the variants, the objective reaches {self.between:.4g}, above the worst variant"
+            )
         return "; ".join(parts)
 
     def to_dict(self) -> dict[str, object]:
@@ -118,7 +120,7 @@ class Robustness:
 
 @dataclass(frozen=True, eq=False)
 class RobustSolution:
-    """A solution, and its robustness; ``None`` without model variants."""
+    """A solution and its robustness; the robustness is ``None`` if there are no model variants."""
 
     solution: PostureSolution
     robustness: Robustness | None
@@ -134,9 +136,9 @@ def solve_robustly(
     progress: Progress | None = None,
     finish_all: bool = False,
 ) -> RobustSolution:
-    """Solve a problem with model variants, after each variant alone; without variants solve it once.
+    """Solve the problem for each model variant alone, then for all; if there are no variants, solve it once.
 
-    The optima of the variants are starts of the robust problem in addition to ``starts`` other starts.
+    The search for the robust optimum starts from the optima of the variants and from ``starts`` other postures.
 
     Raises:
         Infeasible, SolverFailed: See :func:`~impact_posture.posture.search.multistart.solve`.
@@ -147,7 +149,7 @@ def solve_robustly(
             problem, starts=starts, seed=seed, jobs=jobs, compile=compile, progress=progress, finish_all=finish_all
         )
         return RobustSolution(solution, None)
-    # Each problem is built anew, because support impulses and the center of mass depend on the model.
+    # A problem is built for each variant, because support impulses and the center of mass depend on the model.
     alone = [
         build_problem(variant.robot, member, given, wanted)
         for variant, member in zip(problem.impact.model_variants, problem.impact.by_variant, strict=True)
@@ -169,14 +171,15 @@ def solve_robustly(
     feasible = [q for q in optima if q is not None and not _broken(problem, q)]
     solution = run(problem, _apart(problem, feasible), len(alone))
     for k, (member, q) in enumerate(zip(alone, optima, strict=True)):
-        # If the robust optimum is better for a variant than its own optimum, the starts missed a better one.
+        # If the robust optimum is better for a variant than its own optimum, the search for its own optimum missed a
+        # better posture.  Search again, also from the robust optimum.
         if q is None or member.objective.value(solution.q) < member.objective.value(q) * (1 - _NOISE):
             optima[k] = _optimum(partial(run, member, (solution.q,), len(alone)))
     return RobustSolution(solution, compare_variants(solution, optima, seed))
 
 
 def compare_variants(solution: PostureSolution, optima: Sequence[Array | None], seed: int = 0) -> Robustness:
-    """Compare the robust optimum with the optima of the variants, and with models drawn between the variants."""
+    """Compare the robust optimum with the optima of the variants, and evaluate random models between the variants."""
     problem, objective = solution.problem, solution.problem.impact
     variants: list[VariantOptimum] = []
     for variant, q in zip(objective.model_variants, optima, strict=True):
@@ -199,7 +202,7 @@ def compare_variants(solution: PostureSolution, optima: Sequence[Array | None], 
 
 
 def _apart(problem: ConstrainedProblem, postures: Sequence[Array]) -> list[Array]:
-    """Return the postures that are not nearly equal to an earlier posture."""
+    """Return the postures without those that nearly equal an earlier posture."""
     kept: list[Array] = []
     for q in postures:
         if all(np.linalg.norm(wrapped_difference(problem, other, q)) > SAME_POSTURE for other in kept):

@@ -1,4 +1,4 @@
-"""The trade-off of objective against distance from the initial posture, or against force: its points and its knee."""
+"""The points and the knee of the trade-off of objective against distance from the initial posture or force."""
 
 from __future__ import annotations
 
@@ -11,21 +11,22 @@ from impact_posture.config.problem_settings import Against
 from impact_posture.posture.program.certificate import Certificate
 from impact_posture.system.arrays import Array
 
-# Least excess of the share of the gain over the share of the distance at a knee.  A parabola, the shape around every
-# smooth optimum, reaches 1/4.
+# A point is a knee only if its share of the gain exceeds its share of the distance by at least this.  For a parabola,
+# which every smooth optimum resembles, this excess is at most 1/4, so a parabola has no knee.
 KNEE = 1 / 3
 
 
 @dataclass(frozen=True, eq=False)
 class TradePoint:
-    """The best posture within one bound, with H, G, V and S (``None`` where undefined) of its impact.
+    """The best posture within one bound, with H, G, V and S of its impact; S is ``None`` if undefined.
 
     Attributes:
         within: The bound on the distance from the initial posture (rad mixed with m), or on the peak force (N).
-        distance: Distance or force of the posture, below ``within`` if the objective gains nothing there.
+        distance: Distance or force of the posture; it is below ``within`` if using the whole bound does not improve
+            the objective.
         q: Posture, shape (nq,).
-        certificate: Certificate of the problem with the bound; its stationarity has no meaning at the first point.
-        first: Whether this is the only posture at the least distance or force.
+        certificate: Certificate of the problem with the bound; at the first point, its stationarity has no meaning.
+        first: Whether this is the first point, the only posture at the least distance or force.
     """
 
     within: float
@@ -41,7 +42,7 @@ class TradePoint:
 
     @property
     def certified(self) -> bool:
-        """Whether the certificate holds; at the first point, whether the posture satisfies the constraints."""
+        """Whether the posture is certified; at the first point, whether it satisfies the constraints."""
         return self.certificate.feasible if self.first else self.certificate.holds()
 
     def to_dict(self) -> dict[str, object]:
@@ -53,10 +54,10 @@ class TradePoint:
 
 @dataclass(frozen=True, eq=False)
 class TradeOff:
-    """The best objective within each distance from the initial posture, or (``against``) within each peak force.
+    """The best objective within each distance from the initial posture or, depending on ``against``, peak force.
 
     ``points`` are in the order of distance or force.  ``knee`` is the index of the point at the knee
-    (:func:`find_knee`), or ``None``.  The solver ran ``solves`` times.
+    (:func:`find_knee`); ``None`` if there is no knee.  ``solves`` is the number of runs of the solver.
     """
 
     points: tuple[TradePoint, ...]
@@ -79,9 +80,9 @@ class TradeOff:
 
 
 def find_knee(distances: Array, objectives: Array) -> int | None:
-    """Return the index of the point whose share of the gain most exceeds its share of the distance, or ``None``.
+    """Return the index of the point at which the share of the gain most exceeds the share of the distance.
 
-    There is no such point if the excess is below :data:`KNEE`, or without a gain.
+    Return ``None`` if the excess is below :data:`KNEE`, or if the objective does not improve along the curve.
     """
     far, gain = distances[-1] - distances[0], objectives[0] - objectives[-1]
     if not (far > 0 and gain > 0):

@@ -1,4 +1,4 @@
-"""The price that a trade-off bounds: the distance from the initial posture, or the peak force of the impact."""
+"""The prices that a trade-off can bound: the distance from the initial posture, and the peak force."""
 
 from __future__ import annotations
 
@@ -21,8 +21,8 @@ from impact_posture.system.arrays import Array
 class DistancePrice:
     """The distance from the initial posture, rad mixed with m.
 
-    ``nearest`` is the posture at the least price, shape (nq,), ``against`` the name of the price in options and
-    files, and ``nothing`` the message if the optimum has the least price.
+    ``nearest`` is the posture with the least price, shape (nq,).  ``against`` is the name of the price in options and
+    files.  ``nothing`` is the message for the case that the optimum already has the least price.
     """
 
     model: pin.Model
@@ -35,18 +35,18 @@ class DistancePrice:
         return distance(Chart(self.model), q, self.nearest)
 
     def bound(self, level: float) -> Constraint:
-        """Return the constraint that the price is at most ``level``; one program serves all levels."""
+        """Return the constraint that the price is at most ``level``; one program can be used for all levels."""
         return WithinDistance(Chart(self.model), self.nearest, level)
 
     def within(self, q: Array, level: float) -> Array:
-        """Return a start for the program with this bound, from a posture that may exceed it."""
+        """Return a start within the bound ``level``, near the posture ``q``, which may exceed the bound."""
         away = self.measure(q)
         return q if away <= level else np.array(pin.interpolate(self.model, self.nearest, q, level / away))
 
 
 @dataclass(frozen=True, eq=False)
 class ForcePrice:
-    """The peak force of the impact without friction, N, which falls as G rises."""
+    """The peak force of the impact without friction, N; it decreases as G increases."""
 
     objective: WorstCaseObjective
     contact: ContactStiffness

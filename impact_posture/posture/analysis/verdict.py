@@ -1,4 +1,4 @@
-"""The verdict on an optimal posture: how jump, impulse and force change at the stated approach speed."""
+"""The verdict on an optimal posture: how jump, impulse and force change at the given approach speed."""
 
 from __future__ import annotations
 
@@ -18,18 +18,19 @@ Outcome = Literal[
     "better", "better at the price of force", "better at the price of impulse", "no better", "worse", "unknown"
 ]
 
-# A change below this share does not count.
+# A relative change below this value is treated as no change.
 _SAME = 0.01
 
 
 @dataclass(frozen=True)
 class PredictedImpact:
-    """The impact at the stated approach speed in one posture, with the jump ``‖Δν‖_W``.
+    """The predicted impact in one posture at the given approach speed; ``jump`` is ``‖Δν‖_W``.
 
     Attributes:
-        impulse: Size of the impulse of the first contact, N·s.
-        peak_force: Peak force without friction, N; ``None`` without a stated contact or with several contacts.
-        sticks: Whether the first contact point sticks; ``None`` for a jump without friction.
+        impulse: Magnitude of the impulse at the first contact, N·s.
+        peak_force: Peak force without friction, N; ``None`` if no contact stiffness is given, or for several
+            contacts.
+        sticks: Whether the first contact point sticks; ``None`` if the jump was computed without friction.
     """
 
     jump: float
@@ -44,16 +45,16 @@ class PredictedImpact:
 
 @dataclass(frozen=True)
 class Verdict:
-    """Changes by the optimal posture at the stated approach speed, with the stated friction.
+    """Changes from the initial to the optimal posture, at the given approach speed and friction.
 
     Attributes:
         outcome: The verdict in a few words.
-        line: The verdict in a sentence.
+        line: One sentence that describes the verdict.
         jump: Relative change of ``‖Δν‖_W``; ``None`` if it is unknown.
-        impulse: Relative change of the size of the impulse.
-        peak_force: Relative change of the peak force without friction.
-        advice: The jump without friction, a better objective, or a joint model that fits, one line each.
-        before, after: The impact in the initial and in the optimal posture; ``None`` if it is unknown.
+        impulse: Relative change of the magnitude of the impulse.
+        peak_force: Relative change of the peak force without friction; ``None`` if it is unknown.
+        advice: Advice, one line each: the jump without friction, a better objective, or a more accurate joint model.
+        before, after: The predicted impact in the initial and in the optimal posture; ``None`` if it is unknown.
         assumptions: Assumptions behind the numbers, one line each.
     """
 
@@ -75,9 +76,9 @@ class Verdict:
 def verdict(impact: ResolvedImpact, before: Evaluation, after: Evaluation) -> Verdict:
     """Compare the predicted jumps of the initial and the optimal posture.
 
-    Jumps include the friction of the contact.  Peak forces are for the stated contact, or for a linear contact of any
-    stiffness, ``F ∝ √m``.  Several contacts act at once; if this jump is unknown at one of the postures, the first
-    contact alone is compared.
+    Jumps include the friction of the contact.  Peak forces are for the given contact stiffness, or for a linear
+    contact of any stiffness, ``F ∝ √m``.  Several contacts are struck at the same time.  If the jump of this impact
+    is unknown at one of the postures, only the first contact is compared.
     """
     together = bool(before.together and after.together)
     pair = _jump(before, together), _jump(after, together)
@@ -115,7 +116,7 @@ def verdict(impact: ResolvedImpact, before: Evaluation, after: Evaluation) -> Ve
 
 
 def _predicted(evaluation: Evaluation, jump: Jump) -> PredictedImpact:
-    # The forces of several contacts at once are unknown.
+    # If several contacts are struck at the same time, their forces are unknown.
     compression = None if evaluation.contacts else evaluation.compression
     peak = None if compression is None else compression.peak_force
     return PredictedImpact(jump.norm, jump.impulse_size, peak, jump.sticks if isinstance(jump, CoulombJump) else None)
@@ -123,7 +124,7 @@ def _predicted(evaluation: Evaluation, jump: Jump) -> PredictedImpact:
 
 def _assumptions(impact: ResolvedImpact, jump: Jump, together: bool, force: float | None) -> tuple[str, ...]:
     friction = f"friction {impact.contact.friction:g}" if isinstance(jump, CoulombJump) else "no friction"
-    # Impacts at several contacts at once are plastic.
+    # Impacts at several contacts at the same time are treated as plastic.
     restitution = 0.0 if together else impact.restitution
     stated = "the stated contact" if impact.contact_stiffness else "a linear contact, the same before and after"
     return (
@@ -172,7 +173,7 @@ def _newtons(before: Evaluation, after: Evaluation) -> str:
 
 
 def _without_friction(before: Evaluation, after: Evaluation, jump: float) -> Iterator[str]:
-    """Yield the change of the jump without friction if it has the opposite sign."""
+    """Yield the change of the jump without friction if its sign differs from the change with friction."""
     if before.frictionless is None or after.frictionless is None or before.contacts:
         return
     change = _change(before.frictionless.norm, after.frictionless.norm)
@@ -184,7 +185,8 @@ def _better_objective(impact: ResolvedImpact, outcome: Outcome, jumps: tuple[Jum
     objective = impact.objective
     if outcome in ("worse", "no better") and objective.kind != "coulomb" and not objective.others:
         kind = "sticking" if objective.normal_cone_deg else "coulomb"
-        # The jump with friction is the jump of S if the contact sticks at both postures, and of V at friction 0.
+        # If the contact sticks at both postures, the jump with friction is the jump that S measures.  At friction 0,
+        # it is the jump that V measures.  These objectives then need no other objective.
         slides = impact.contact.friction == 0
         sticks = all(isinstance(jump, CoulombJump) and jump.sticks for jump in jumps)
         same = (kind, "speed" if slides else "", "sticking" if sticks else "")
@@ -195,7 +197,7 @@ def _better_objective(impact: ResolvedImpact, outcome: Outcome, jumps: tuple[Jum
 
 
 def _other_joint_model(impact: ResolvedImpact, before: Evaluation, after: Evaluation) -> Iterator[str]:
-    """Yield the change of the jump with each joint model that fits x better than the chosen model."""
+    """Yield the change of the jump with each joint model that is more accurate at x than the chosen one."""
     chosen, compression = impact.robot.joint_model, after.compression
     if compression is None or compression.x is None or chosen in (compression.fitting, "locked", "elastic"):
         return

@@ -13,28 +13,29 @@ from impact_posture.posture.approach.attainable_speed import FASTEST, Attainable
 from impact_posture.posture.constraints.constraint import Constraint, LiftedRows, Linearization, digest
 from impact_posture.system.arrays import Array
 
-# A missing speed counts less than meters: where a pose cannot be held, the pose is the reason.
+# Price of a missing m/s in the search for conflicts, lower than the price of a meter.
 _PRICE = 1e-3
 
 
 class ApproachSpeed(Constraint):
     """``s − σ(q) ≤ 0``: the joints can bring the contact to the surface at the speed s, m/s.
 
-    In the program the velocities are unknowns, in shares of their limits.
+    In the program, the joint velocities are unknowns, each in units of its limit.
 
     Raises:
-        InputError: The joints are too few to move the contact along the normal.
+        InputError: There are too few joints to move the contact along the normal.
     """
 
     price = _PRICE
-    # Starts that are pulled onto this constraint are less diverse.
+    # Starts that are projected onto this constraint differ less from each other.
     projected = False
 
     def __init__(self, attainable: AttainableSpeed, speed: float) -> None:
         self.name = f"approach at {speed:g} m/s"
         self._attainable, self._speed, self._kept = attainable, speed, attainable.independent
         if len(self._kept) > len(attainable.free):
-            what = f"{len(attainable.free)} joints cannot move {' and '.join(p.name for p in attainable.points)} so"
+            points = " and ".join(point.name for point in attainable.points)
+            what = f"{len(attainable.free)} joints cannot move {points} as required"
             raise InputError(what, where="approach", hint="leave it out, or hold fewer joints and frames")
         self._coming = [point for point in attainable.points if point.comes]
         self.parameters = np.concatenate([[speed], *[point.axes.ravel() for point in self._coming]])
@@ -54,7 +55,7 @@ class ApproachSpeed(Constraint):
 
     def evaluate(self, model: Numeric) -> tuple[Array, Array]:
         attained = self._attainable.at(model)
-        # An unbounded speed counts as twice the wanted speed.
+        # An unbounded speed is replaced by twice the required speed, so that the row stays finite.
         speed = attained.speed if np.isfinite(attained.speed) else 2 * self._speed
         return np.array([self._speed - speed]), -attained.gradient[None, :]
 
@@ -82,13 +83,13 @@ class ApproachSpeed(Constraint):
         return len(self._attainable.free)
 
     def guess(self, model: Numeric) -> Guess:
-        """Return the fastest approach, slowed down to the wanted speed."""
+        """Return the velocities of the fastest approach, scaled down to the required speed."""
         attained, upper = self._attainable.at(model), self._attainable.upper
         slower = min(1.0, self._speed / min(attained.speed, FASTEST)) if attained.speed > 0 else 1.0
         return Guess(slower * attained.velocities, -upper, upper)
 
     def linearize(self, model: Numeric, auxiliaries: Array) -> Linearization:
-        """Return the rows of :meth:`lift` and the velocity limits."""
+        """Linearize the rows of :meth:`lift` and the velocity limits."""
         attainable = self._attainable
         names = [f"motion of {moved.name} in the {self.name}" for moved in attainable.points for _ in moved.rows]
         by_posture = [attainable.by_posture(model, auxiliaries, row) for row in np.eye(len(names))]

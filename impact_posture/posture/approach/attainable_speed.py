@@ -1,7 +1,8 @@
 """The highest speed at which the joints can bring the contact to the surface.
 
-An impact-robust arm is often stretched along the normal, and a stretched arm cannot move in this direction.  Such a
-posture takes the impact well, but no joint motion can arrive in it at speed.
+An impact-robust arm is often stretched along the normal, and a stretched arm cannot move in this direction.  In a
+stretched posture, the impact changes the joint velocities little, but the joints cannot bring the contact to the
+surface at speed.
 """
 
 from __future__ import annotations
@@ -24,19 +25,20 @@ from impact_posture.posture.program.linear_program import solve_linear
 from impact_posture.robot.robot import Robot
 from impact_posture.system.arrays import Array, independent_rows
 
-# A contact speed (m/s) or velocity limit (rad/s or m/s) from here on counts as unbounded.
+# A contact speed (m/s) or velocity limit (rad/s or m/s) of at least this value is treated as unbounded.
 FASTEST = 1e3
 
 
 @dataclass(frozen=True, eq=False)
 class MovingPoint:
-    """Demands on the motion of a point during the approach: rows of ``D v`` and ``D ω`` equal ``−σ d``.
+    """Requirements on the motion of a point during the approach: rows of ``D v`` and ``D ω`` equal ``−σ d``.
 
     Attributes:
-        axes: ``D``, shape (3, 3): the normal and two tangents, or the axes of the world.
-        rows: Constrained rows of ``(D v, D ω)``.
-        comes: Whether the first row is the approach, ``nᵀv = −σ``; otherwise it is zero like the other rows.
-        in_frame: Whether the axes turn with the frame.
+        axes: Matrix ``D``, shape (3, 3), whose rows are the normal and two tangents, or the axes of the world.
+        rows: Indices of the constrained rows of ``(D v, D ω)``.
+        comes: Whether the point moves towards the surface, so that the first row is ``nᵀv = −σ``; otherwise all rows
+            are zero.
+        in_frame: Whether the axes turn with the frame of the point; otherwise they are fixed in the world.
     """
 
     name: str
@@ -48,23 +50,23 @@ class MovingPoint:
 
     @property
     def arrives(self) -> Array:
-        """``d`` of the rows, shape (k,)."""
+        """Vector ``d`` for the constrained rows, shape (k,): 1 for the approach, 0 for other rows."""
         return np.array([float(self.comes and row == 0) for row in self.rows])
 
     def wrench(self, weights: Array) -> Array:
-        """Return the force and moment whose power is the weighted sum of the rows, shape (6,)."""
+        """Return the wrench, force above moment, whose power is the weighted sum of the rows, shape (6,)."""
         wrench = np.zeros(6)
         wrench[list(self.rows)] = weights
         return np.concatenate([self.axes.T @ wrench[:3], self.axes.T @ wrench[3:]])
 
     def jacobian(self, model: Numeric) -> Array:
-        """Return the rows over the generalized velocity, shape (k, nv)."""
+        """Return the matrix that maps the generalized velocity to the rows, shape (k, nv)."""
         J = model.jacobian(self.point)
         D = self.axes @ model.placement(self.point).rotation.T if self.in_frame else self.axes
         return np.vstack([D @ J[:3], D @ J[3:]])[list(self.rows)]
 
     def symbolic(self, tree: Tree, velocities: dict[int, ca.SX], axes: ca.SX) -> ca.SX:
-        """Return the rows as an expression, shape (k, 1)."""
+        """Return the rows as an expression of the link velocities, shape (k, 1)."""
         twist = tree.point_velocity(self.point, velocities)
         if self.in_frame:
             R = tree.rotations[self.point.joint] @ ca.SX(self.point.rotation)
@@ -74,10 +76,10 @@ class MovingPoint:
 
 @dataclass(frozen=True, eq=False)
 class Attained:
-    """The fastest approach ``σ`` at a posture, m/s; infinite where no limit bounds it.
+    """The fastest approach at a posture; ``speed`` is ``σ``, m/s, infinite if no velocity limit bounds it.
 
-    ``velocities`` are the free entries of the velocity at ``min(σ, FASTEST)``, in units of their scales, shape (k,).
-    ``gradient`` is the tangent gradient of the speed, shape (nv,).
+    ``velocities`` are the free entries of the generalized velocity at ``min(σ, FASTEST)``, divided by their scales,
+    shape (k,). ``gradient`` is the tangent gradient of the speed, shape (nv,).
     """
 
     speed: float
@@ -86,17 +88,20 @@ class Attained:
 
 
 class AttainableSpeed:
-    """``σ(q) = max σ`` such that a generalized velocity ``|ν_i| ≤ ν̄_i`` brings the contact in at ``nᵀJν = −σ``.
+    """The largest σ(q) with ``nᵀJν = −σ`` for a generalized velocity within its limits, ``|ν_i| ≤ ν̄_i``.
 
-    The contact point moves along the normal only, and kept frames do not move.  The contact frame turns only where
-    its pose is free, or where the joints are too few to hold it.  Several contacts all arrive at ``σ`` and may slide.
-    The base and feet of a standing robot do not move; the base of a robot without feet moves at any speed.  At a
-    contact with a free pose something hits the robot, at any speed.
+    The contact point moves only along the normal, and frames in ``keep`` do not move.  The contact frame turns only
+    if its pose allows this, or if there are too few joints to prevent a turn.  Several contacts all approach at the
+    speed ``σ`` and may also move tangentially.  The base and feet of a standing robot do not move.  The base of a
+    robot without feet can move at any speed.  A contact with a free pose is left out, because an object hits the
+    robot there.
 
     Attributes:
-        unknown: Why the speed is undefined; empty if it is defined, although infinite at some postures.
+        unknown: Reason why the speed is not computed; empty if it is computed.  A computed speed can be infinite at
+            some postures.
         scale: Unit of each free entry of the velocity, rad/s or m/s, shape (k,).
-        upper: Velocity limit of each free entry by the URDF, in its unit, or infinity, shape (k,).
+        upper: Velocity limit of each free entry from the URDF, divided by its scale, shape (k,); infinite if there is
+            no limit.
     """
 
     def __init__(self, robot: Robot, objective: Objective, requirements: Requirements) -> None:
@@ -115,14 +120,14 @@ class AttainableSpeed:
         self.names = [robot.tangent_names[k] for k in self.free]
         self.unknown = ""
         if robot.floating and not flies and self.points and ((bringing & standing).any() or not bringing.any()):
-            self.unknown = "the legs move the contact, and how fast they do is not computed"
+            self.unknown = "the legs move the contact, and the speed of such a motion is not computed"
         elif not self.points or flies or (free.any() and not stated.any()):
-            self.unknown = "nothing bounds it: no joint velocity with a limit decides it"
+            self.unknown = "nothing bounds it: no joint with a velocity limit determines this speed"
         if len(self.independent) > len(self.free):
             self.points = [replace(moved, rows=moved.rows[:3]) if moved.comes else moved for moved in self.points]
 
     def _chain(self, points: Sequence[PointOnLink]) -> NDArray[np.bool_]:
-        """Return which entries of the velocity move any of the points, shape (nv,)."""
+        """Return a mask, shape (nv,), of the entries of the generalized velocity that move any of the points."""
         moves, model = np.zeros(self._model.nv, dtype=bool), self._model
         for point in points:
             for joint in model.supports[point.joint].tolist()[1:]:
@@ -131,7 +136,10 @@ class AttainableSpeed:
 
     @property
     def independent(self) -> list[int]:
-        """Independent rows: for example, a planar robot cannot leave its plane, so its rows out of it are zero."""
+        """Indices of independent rows.
+
+        For example, a planar robot cannot leave its plane, so its rows for motion out of the plane are zero.
+        """
         if not self.points:
             return []
         rng, model, blocks = np.random.default_rng(0), Numeric(self._model), []
@@ -146,12 +154,12 @@ class AttainableSpeed:
         return np.concatenate([point.arrives for point in self.points])
 
     def jacobian(self, model: Numeric) -> Array:
-        """Return the rows over the free velocities in their units, shape (m, k)."""
+        """Return the matrix that maps the scaled free velocities to the rows, shape (m, k)."""
         rows = np.vstack([point.jacobian(model) for point in self.points])
         return np.asarray(rows[:, self.free] * self.scale)
 
     def by_posture(self, model: Numeric, velocities: Array, weights: Array) -> Array:
-        """Return the tangent gradient, shape (nv,), of the rows summed with ``weights``, shape (m,)."""
+        """Return the tangent gradient, shape (nv,), of the sum of the rows weighted by ``weights``, shape (m,)."""
         v = np.zeros(model.model.nv)
         v[self.free] = self.scale * velocities
         gradient = np.zeros(len(v))
@@ -175,7 +183,7 @@ class AttainableSpeed:
         return Attained(max(0.0, -optimum.value), optimum.x[:-1], gradient)
 
     def reached(self, q: Array) -> float | None:
-        """Return the speed at ``q``, shape (nq,), in m/s; ``None`` where it is unknown or unbounded."""
+        """Return the speed at ``q``, shape (nq,), in m/s; ``None`` if it is not computed or is unbounded."""
         speed = float("inf") if self.unknown else self.at(Numeric(self._model).at(q)).speed
         return speed if np.isfinite(speed) else None
 
@@ -185,7 +193,7 @@ def _moving_points(robot: Robot, objective: Objective, requirements: Requirement
     poses = (requirements.contact_pose, *requirements.other_poses)
     alone = len(objective.contacts) == 1
     for contact, pose in zip(objective.contacts, poses, strict=False):
-        # At a contact with a free pose something else hits the robot, at its own speed.
+        # At a contact with a free pose, an object hits the robot at its own speed, so the joints need no speed.
         if pose == "free":
             continue
         turning = {"full": (3, 4, 5), "aligned": (4, 5)}.get(pose, ())

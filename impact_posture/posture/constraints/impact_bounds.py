@@ -54,7 +54,7 @@ class ImpactBounds(ExpressionConstraint):
     def describe(self) -> str:
         parts = [f"effective mass at most {1 / self._least:.4g} kg (peak force)"] if self._least > 0 else []
         if len(self._joints):
-            parts.append(f"joints jump at most {self._jump:.4g} per m/s of approach")
+            parts.append(f"joint velocities jump by at most {self._jump:.4g} per m/s of approach")
         return f"{self.name}: {', '.join(parts)}"
 
     @property

@@ -41,7 +41,7 @@ class KeptContacts(ExpressionConstraint):
         self.lower, self.upper = np.full(len(matrix), -np.inf), np.zeros(len(matrix))
 
     def describe(self) -> str:
-        return f"{self.name}: the impact neither lifts nor slides one"
+        return f"{self.name}: no foot lifts off or slides during the impact"
 
     @property
     def structure(self) -> str:

@@ -1,4 +1,4 @@
-"""Turn the requirements of a task into the constraints of a posture problem."""
+"""Build the constraints of a posture problem from the requirements of a task."""
 
 from __future__ import annotations
 
@@ -42,18 +42,18 @@ from impact_posture.system.arrays import Array
 
 
 def build_problem(robot: Robot, objective: Objective, given: Array, requirements: Requirements) -> ConstrainedProblem:
-    """Turn requirements into constraints without solving anything.
+    """Build the posture problem from its requirements without solving it.
 
-    Raise ``InputError`` if the requirements contradict each other or the robot.
+    Raise ``InputError`` if the requirements contradict each other or do not suit the robot.
     """
     _check(robot, requirements)
     numeric = Numeric(robot.model).at(given)
     constraints: list[Constraint] = [_held_support(robot, numeric, support) for support in objective.supports]
     held = {s.frame for s in objective.supports}
     poses = (requirements.contact_pose, *requirements.other_poses)
-    # A frame that is struck along several normals is held once.
+    # If a frame is struck along several normals, its pose is constrained only once.
     struck: dict[str, tuple[ImpactContact, str]] = {}
-    # An objective without contacts leaves the contact pose unused.
+    # If the objective has no contacts, the contact pose is not used.
     for contact, mode in zip(objective.contacts, poses, strict=bool(objective.contacts)):
         struck.setdefault(contact.frame, (contact, mode))
     for contact, mode in struck.values():
@@ -70,13 +70,13 @@ def build_problem(robot: Robot, objective: Objective, given: Array, requirements
         except InputError:
             if requirements.com_asked:
                 raise
-            decided.append("center of mass left free: the feet span no area to keep it above")
+            decided.append("the center of mass is not constrained, because the feet span no area")
     if isinstance(objective, WorstCaseObjective):
         constraints += impact_constraints(objective, numeric, requirements, constraints)
     if requirements.approach_speed > 0:
         attainable = AttainableSpeed(robot, objective, requirements)
         if attainable.unknown:
-            decided.append(f"the speed of the approach is not demanded: {attainable.unknown}")
+            decided.append(f"the speed of the approach is not required: {attainable.unknown}")
         else:
             constraints.append(ApproachSpeed(attainable, requirements.approach_speed))
     lower, upper = _bounds(Chart(robot.model), given, requirements)
@@ -102,13 +102,13 @@ def retarget(
     quaternion: tuple[float, float, float, float] | None,
     numeric: Numeric | None = None,
 ) -> ConstrainedProblem:
-    """Return the problem with another target of its only contact frame, which can use the same program.
+    """Return the problem with another target of its only contact frame; the program stays the same.
 
-    The target is a position, world, meters, and a quaternion x y z w; ``None`` for the initial pose.  A model
-    ``numeric`` of the caller is moved to the given posture.
+    The target is a position in world axes, m, and a quaternion x y z w.  Each is ``None`` to keep its initial value.
+    If the caller passes a model ``numeric``, its state changes to the given posture.
 
     Raises:
-        InputError: The contact pose takes no target, or the quaternion does not have unit length.
+        InputError: The contact pose is free and cannot have a target, or the quaternion does not have unit length.
     """
     requirements = replace(problem.requirements, target_position=position, target_quaternion=quaternion)
     _check_target(requirements)
@@ -116,7 +116,7 @@ def retarget(
     numeric = (numeric or Numeric(problem.robot.model)).at(problem.given)
     contact_pose = _contact_constraints(problem.robot, contact, numeric, requirements, requirements.contact_pose)
     constraints, first = list(problem.constraints), len(problem.objective.supports)
-    # The first constraints are of the feet, and the next of the contact.
+    # The constraints of the feet come first, followed by the constraints of the contact.
     constraints[first : first + len(contact_pose)] = contact_pose
     return replace(problem, requirements=requirements, constraints=tuple(constraints))
 
@@ -124,7 +124,10 @@ def retarget(
 def _surroundings(
     objective: Objective, numeric: Numeric, requirements: Requirements, struck: Sequence[tuple[ImpactContact, str]]
 ) -> Surroundings:
-    """Return the bodies to stay clear of; a contact with a free pose is a push and has no surface."""
+    """Return the bodies that the links must not touch.
+
+    A contact with a free pose has no surface, because an object pushes the robot there.
+    """
     around = Surroundings(objective.robot, numeric, requirements.hold, requirements.clearance)
     touching = [contact for contact, mode in struck if mode != "free"]
     around.add_ground(objective.supports, touching)
@@ -143,7 +146,7 @@ def _check(robot: Robot, requirements: Requirements) -> None:
     if requirements.keep_contacts and not requirements.friction > 0:
         raise InputError(f"is {requirements.friction:g}", where="friction", hint="give a coefficient above zero")
     if requirements.hold_force and not requirements.holdable:
-        raise InputError("does nothing without `holdable`", where="hold_force", hint="leave out one of them")
+        raise InputError("has no effect without `holdable`", where="hold_force", hint="leave out one of them")
     for joint in requirements.hold:
         robot.joint_id(joint)
     _check_target(requirements)
@@ -235,7 +238,7 @@ def _com_constraint(
 
 
 def _bounds(chart: Chart, given: Array, requirements: Requirements) -> tuple[Array, Array]:
-    """Return the joint limits less the margin, chart coordinates, shape (nx,); held joints get equal limits."""
+    """Return the joint limits reduced by the margin, chart coordinates, shape (nx,); held joints get equal limits."""
     lower, upper = chart.bounds()
     x = chart.to_x(given)
     margin = requirements.limit_margin
@@ -244,6 +247,6 @@ def _bounds(chart: Chart, given: Array, requirements: Requirements) -> tuple[Arr
         if slot.name in requirements.hold:
             lower[slot.x] = upper[slot.x] = x[slot.x]
         elif (lower[slot.x] > upper[slot.x]).any():
-            fault = f"a margin of {margin:g} leaves joint '{slot.name}' no room"
+            fault = f"a margin of {margin:g} leaves joint '{slot.name}' no room to move"
             raise InputError(fault, where="limit_margin", hint="give a smaller one")
     return lower, upper

@@ -1,4 +1,4 @@
-"""The constraints on an impact and on the feet under it, for every contact and model variant."""
+"""The constraints on the impact and on the feet during the impact, for each contact and model variant."""
 
 from __future__ import annotations
 
@@ -17,23 +17,24 @@ from impact_posture.posture.constraints.requirements import Requirements
 def impact_constraints(
     objective: WorstCaseObjective, numeric: Numeric, requirements: Requirements, constraints: Sequence[Constraint]
 ) -> list[Constraint]:
-    """Return the bounds on the impact and the constraints of the feet, which depend on the model.
+    """Return the bounds on the impact and the constraints on the feet for all model variants.
 
-    Cones are convex, so feet that stay under the impact at each contact stay under all impacts at once.  A payload
-    moves the center of mass, so its constraint (among ``constraints``) gets a copy for each model with a payload.
+    Friction cones are convex.  If the feet stay in place for an impact at each single contact, they therefore stay
+    for impacts at all contacts at the same time.  A payload moves the center of mass, so its constraint (among
+    ``constraints``) is repeated for each model with a payload.
 
     Raises:
-        InputError: Feet should stay under contacts that also pull.
+        InputError: The feet must stay in place, but the contacts can also pull.
     """
     if requirements.keep_contacts and objective.bilateral:
-        fault = "contacts that pull as well as push would have to leave the feet without any impulse"
+        fault = "contacts that pull as well as push would be allowed only if the feet get no impulse"
         raise InputError(fault, where="keep_contacts", hint="leave out `bilateral` or `keep_contacts`")
     added: list[Constraint] = []
     centers = [constraint for constraint in constraints if isinstance(constraint, CenterOfMassOverFeet)]
     for k, member in enumerate((objective, *objective.by_variant[1:])):
         variant = objective.model_variants[k] if k else None
         name = variant.name if variant else ""
-        # The armature does not move the center of mass.
+        # Variants that change the armature are skipped, because the armature does not move the center of mass.
         if variant and variant.payload is not None and variant.armature_factor == 1:
             loaded = variant.robot.model, name
             added += [CenterOfMassOverFeet(c.normals, c.offsets, c.margin, loaded) for c in centers]
@@ -41,6 +42,6 @@ def impact_constraints(
             added += [KeptContacts(single, numeric, requirements.friction, name) for single in member.singles]
         limits = requirements.least_mobility, requirements.largest_jump
         bounds = [ImpactBounds(single, *limits, name) for single in member.singles]
-        # Without limits, or if all joints are locked, there is nothing to bound.
+        # A bound has no rows if there are no limits, or if all joints are locked.
         added += [bound for bound in bounds if bound.rows]
     return added

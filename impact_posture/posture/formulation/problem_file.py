@@ -1,4 +1,4 @@
-"""Read, prepare and write ``problem.toml``, whose keys are the command-line options with ``_`` for ``-``."""
+"""Read, prepare and write ``problem.toml``, whose keys are the command-line options, with ``_`` instead of ``-``."""
 
 from __future__ import annotations
 
@@ -26,7 +26,7 @@ from impact_posture.robot.urdf import EXAMPLE_PREFIX
 from impact_posture.system.escape import toml
 
 _FILES = ("srdf", "config")
-# Keys of the file that an option replaces in addition to its own key.
+# For each option, the keys of the file that it replaces in addition to its own key.
 _REPLACED_BY = {
     "frame": ("contact",),
     "normal": ("contact",),
@@ -35,13 +35,13 @@ _REPLACED_BY = {
     "contact_stiffness": ("contact_duration",),
     "posture": ("q",),
 }
-# Requirements that depend on the robot as well as on the setting of the same name.
+# Requirements that depend on the robot and on the setting with the same name.
 _WORKED_OUT = {"contact_pose", "base", "hold", "com_margin", "limit_margin"}
 
 
 @dataclass(frozen=True)
 class Prepared:
-    """A problem ready to be solved: the merged settings of file and command line, their impact, and the problem."""
+    """A problem that is ready to be solved, with the merged settings of file and command line, and their impact."""
 
     settings: ProblemSettings
     impact: ResolvedImpact
@@ -52,7 +52,7 @@ def read_settings(path: Path, over: dict[str, object] | None = None) -> ProblemS
     """Read a ``problem.toml`` with paths relative to its folder; options in ``over`` replace its keys."""
     data = from_folder(read_toml(path), path.resolve().parent, (*_FILES, "weights", "armature", "posture"))
     over = over or {}
-    # An option also replaces keys that state the same thing in another form.
+    # An option also replaces keys that describe the same quantity in another form.
     replaced = [key for option in over for key in _REPLACED_BY.get(option, ())]
     if over.get("metric", "weighted") != "weighted" and "weights" not in over:
         replaced.append("weights")
@@ -61,15 +61,15 @@ def read_settings(path: Path, over: dict[str, object] | None = None) -> ProblemS
 
 
 def prepare(settings: ProblemSettings, impact: ResolvedImpact | None = None) -> Prepared:
-    """Resolve all defaults (and the impact, if the caller has none) and build the problem without solving it.
+    """Resolve all defaults, also the impact if it is ``None``, and build the problem without solving it.
 
     Raises:
-        ImpactPostureError: A setting is wrong; the error names the first fault in one line.
+        ImpactPostureError: A setting is wrong; the error describes the first wrong setting in one line.
     """
     impact = resolve(settings) if impact is None else impact
     if impact.robot.joint_model == "elastic":
-        fault = "elastic predicts the impact at one posture"
-        hint = "optimize with link or reflected, as the number x says, and evaluate the optimum with elastic"
+        fault = "the joint model elastic only predicts the impact at one given posture"
+        hint = "optimize with link or reflected, depending on the number x, and evaluate the optimum with elastic"
         raise InputError(fault, where="joint_model", hint=hint)
     if settings.q is not None:
         impact = replace(impact, q=impact.robot.check_posture(np.array(settings.q), where="q"))
@@ -91,16 +91,16 @@ def _held_by_default(robot: Robot) -> tuple[str, ...]:
 
 
 def requirements(settings: ProblemSettings, objective: Objective) -> Requirements:
-    """Return the requirements of the settings; settings that are ``None`` get the values of the robot.
+    """Return the requirements of the settings; if a setting is ``None``, the value of the robot is used.
 
-    Without supports, settings about feet raise ``InputError``.
+    Raise ``InputError`` if a setting concerns feet and there are no supports.
     """
     robot, spec = objective.robot, objective.robot.spec.constraints
     poses = [settings.contact_pose or robot.contact_pose(contact.frame) for contact in objective.contacts]
     base = "level" if spec.level_base and robot.floating else "free"
     com = spec.com_over_feet and bool(objective.supports) if settings.com is None else settings.com
     if settings.obstacles and not settings.collision:
-        raise InputError("do nothing without `collision`", where="obstacles", hint="leave one of them out")
+        raise InputError("have no effect without `collision`", where="obstacles", hint="leave one of them out")
     if com and not objective.supports:
         fault = "there are no feet to keep the center of mass over"
         raise InputError(fault, where="com", hint="add `support`, or choose no `com`")
@@ -127,7 +127,7 @@ def requirements(settings: ProblemSettings, objective: Objective) -> Requirement
 
 
 def _least_mobility(settings: ProblemSettings) -> float:
-    """Return the least G, 1/kg, with which the peak force stays within ``max_force``; 0 without a bound."""
+    """Return the least G, 1/kg, at which the peak force is at most ``max_force``; 0 if there is no bound."""
     for name, asked in (
         ("max_force", settings.max_force is not None),
         ("tradeoff_against", settings.tradeoff > 0 and settings.tradeoff_against == "force"),
@@ -145,7 +145,7 @@ def _least_mobility(settings: ProblemSettings) -> float:
 
 
 def _largest_jump(settings: ProblemSettings) -> float:
-    """Return the largest jump of a joint per approach speed, from ``max_joint_jump`` and ``max_torque``."""
+    """Return the largest allowed jump of a joint per approach speed, from ``max_joint_jump`` and ``max_torque``."""
     if (settings.max_torque is None) != (settings.velocity_gain is None):
         fault = "bounds the velocity gain times the jump of a joint, so each of the two needs the other"
         hint = "give `max_torque` and `velocity_gain`, or none of them"
@@ -158,7 +158,7 @@ def _largest_jump(settings: ProblemSettings) -> float:
 
 
 def resolved_settings(prepared: Prepared) -> ProblemSettings:
-    """Return the settings with all defaults written out, which reproduce the result."""
+    """Return the settings with all defaults written out; these settings reproduce the result."""
     settings, impact, wanted = prepared.settings, prepared.impact, prepared.problem.requirements
     robot = settings.robot
     if names_a_path(robot, Path()):
@@ -170,7 +170,7 @@ def resolved_settings(prepared: Prepared) -> ProblemSettings:
         **_resolved_contacts(impact),
         "posture": None,
         "q": tuple(float(v) for v in impact.q),
-        # One key holds for all contacts, so several contacts keep the key as it was given.
+        # This key applies to all contacts.  If there are several contacts, its value stays as the user gave it.
         "contact_pose": settings.contact_pose if wanted.other_poses else wanted.contact_pose,
         "support": tuple(f"{s.frame}:{s.kind}" for s in impact.supports),
         "support_compliance": impact.objective.compliance if impact.supports else None,
@@ -206,8 +206,8 @@ def _resolved_contacts(impact: ResolvedImpact) -> dict[str, object]:
 
 
 def _resolved_variants(variants: Sequence[ModelVariant]) -> dict[str, object]:
-    """Return the settings that give these model variants."""
-    # The robot as modeled is always a variant.
+    """Return the settings from which these model variants result."""
+    # The nominal robot is always one of the variants.
     factors = {variant.armature_factor for variant in variants} - {1.0}
     if len(factors) == 1:
         factors.add(1.0)
@@ -226,9 +226,9 @@ def _armature_by_joint(impact: ResolvedImpact) -> str | dict[str, float]:
 
 
 def dump_settings(settings: ProblemSettings) -> str:
-    """Write settings as TOML in the order of the fields, without ``None``; a path must be UTF-8 (``SpecError``)."""
+    """Write settings as TOML in the order of the fields, without ``None``; raise ``SpecError`` if not UTF-8."""
     lines = [f"schema = {toml(settings.schema)}"]
-    # Readers look for the robot first.
+    # Write the robot first, because readers look for it first.
     for key in sorted((field.name for field in fields(ProblemSettings)), key=lambda name: name != "robot"):
         value = getattr(settings, key)
         if key != "schema" and value is not None and value != {}:

@@ -1,4 +1,4 @@
-"""Make a problem well-posed: fix undetermined motions, omit repeated equalities, hold turns of first order only."""
+"""Make a problem well-posed: fix undetermined motions, omit redundant equalities, block first-order turns."""
 
 from __future__ import annotations
 
@@ -24,7 +24,8 @@ from impact_posture.posture.program.constrained_problem import (
 from impact_posture.robot.robot import Robot
 from impact_posture.system.arrays import Array, independent_rows, null_space
 
-# Size of a trial turn (rad), and the share of it that must remain if the turn is possible.
+# Angle of a trial turn (rad), and the share of this angle that must remain after a projection if the turn is
+# possible.
 _TRIAL, _SURVIVES = 0.05, 0.1
 # Number of random feasible postures at which ranks are compared.
 _SAMPLES = 4
@@ -37,11 +38,11 @@ def fix_undetermined_motions(
     requirements: Requirements,
     constraints: Sequence[Constraint],
 ) -> tuple[list[Constraint], list[str]]:
-    """Return constraints that fix the base where nothing else determines it, and notes for the user.
+    """Return constraints on motions of the base that nothing else determines, and notes for the user.
 
-    Some motions of the whole robot do not change the objective, such as translations.  If the constraints allow such
-    a motion, it is fixed at its initial value.  With a free contact pose and without feet, yaw is fixed as well,
-    because a turn of the whole robot relative to the impact does not change the posture.
+    Some motions of the whole robot, such as translations, do not change the objective.  If the constraints allow a
+    motion of this kind, the base is fixed in its direction.  If the contact pose is free and the robot has no feet,
+    yaw is fixed as well, because a turn of the whole robot relative to the impact does not change the posture.
     """
     if not robot.floating:
         return [], []
@@ -65,7 +66,7 @@ def fix_undetermined_motions(
         allowed = null_space(np.vstack(rows), RANK_TOLERANCE)
         return np.asarray(numeric.jacobian(base) @ motions @ allowed)
 
-    # A turn about another point moves the base as well, so turns are fixed before positions.
+    # A turn about a point other than the base origin also moves the base, so turns are fixed before positions.
     candidates = [("yaw", np.array([0.0, 0.0, 1.0]))]
     if len(turns) == 1:
         candidates.append(("turn about the normal", placement.rotation.T @ turns[0]))
@@ -82,17 +83,18 @@ def fix_undetermined_motions(
 
 
 def make_well_posed(problem: ConstrainedProblem) -> ConstrainedProblem:
-    """Choose independent equality rows for the program, and hold turns that exist to first order only.
+    """Choose independent equality rows for the program, and constrain turns that are possible only to first order.
 
-    Four point feet on planar legs (solo8) give 12 equations of rank 10.  Two equations repeat others, and the base
-    may roll to first order although any finite roll would spread the feet.  The solver can handle neither.  So the
-    program omits the repeated rows, which the certificate still checks, and a constraint holds the turn.
+    Four point feet on planar legs (solo8) give 12 equations of rank 10.  Two equations are redundant.  To first
+    order, the base can roll, although any finite roll would spread the feet.  The solver cannot solve the program in
+    either case.  So the program omits the redundant rows, which the certificate still checks, and a constraint blocks
+    the turn.
     """
     numeric = Numeric(problem.robot.model)
     jacobian = equality_jacobian(problem, numeric.at(problem.given))
     if rank(jacobian) == len(jacobian):
         return problem
-    # The given posture pulled onto the constraints, and a few random feasible postures.
+    # Ranks are compared at the projected given posture and at a few random feasible postures.
     postures = [Projector(problem).project(problem.given).q]
     postures += [q for k in range(1, _SAMPLES + 1) if (q := feasible_start(problem, k, seed=0)) is not None]
     added, notes = [], []
@@ -104,7 +106,7 @@ def make_well_posed(problem: ConstrainedProblem) -> ConstrainedProblem:
                 added.append(turn)
                 notes.append(f"{turn.name} held: the feet block it, although their linearization allows it")
     problem = replace(problem, constraints=(*problem.constraints, *added), notes=(*problem.notes, *notes))
-    # A posture may be singular by chance (a straight arm), so the posture with the highest rank decides.
+    # A posture may happen to be singular, for example with a straight arm, so use the posture with the highest rank.
     generic = max(postures, key=lambda q: rank(equality_jacobian(problem, numeric.at(q))))
     jacobian = equality_jacobian(problem, numeric.at(generic))
     if rank(jacobian) == len(jacobian):
@@ -113,7 +115,7 @@ def make_well_posed(problem: ConstrainedProblem) -> ConstrainedProblem:
 
 
 def _only_to_first_order(problem: ConstrainedProblem, numeric: Numeric, turn: HeldTurn, q: Array) -> bool:
-    """Return whether the linearized equalities at ``q`` allow a turn that the nonlinear equalities undo."""
+    """Return whether the linearized equalities at ``q`` allow a turn that the nonlinear equalities prevent."""
     model = problem.robot.model
     jacobian = equality_jacobian(problem, numeric.at(q))
     free = null_space(jacobian, RANK_TOLERANCE)
@@ -137,11 +139,11 @@ def _only_to_first_order(problem: ConstrainedProblem, numeric: Numeric, turn: He
 
 
 def _independent_rows(problem: ConstrainedProblem, numeric: Numeric) -> tuple[tuple[int, ...], ...]:
-    """Return the rows of each constraint for the program: all inequalities, and independent equalities."""
+    """Return the row indices of each constraint for the program: all inequalities and independent equalities."""
     held = held_rows(problem.robot, problem.requirements.hold).sum(axis=0) > 0
     equalities = [(index, c) for index, c in enumerate(problem.constraints) if c.equality]
     labels = [(index, row) for index, c in equalities for row in range(c.rows)]
-    # Among rows that repeat each other, rows of cheap constraints are omitted.
+    # The factor ``price`` makes rows of constraints with a low price the first to be omitted among redundant rows.
     stacked = np.vstack([c.price * c.evaluate(numeric)[1] for _, c in equalities])
     stacked[:, held] = 0.0
     chosen = {labels[k] for k in independent_rows(stacked, RANK_TOLERANCE)}

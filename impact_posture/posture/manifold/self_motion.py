@@ -97,7 +97,7 @@ def map_self_motion(
     """
     if dimension not in (1, 2):
         fault = f"{dimension} degrees of freedom are left"
-        raise InputError(fault, where="search", hint="a map needs 1 or 2: add constraints")
+        raise InputError(fault, where="search", hint="a map needs 1 or 2; add constraints to reduce the number")
     rng, components = np.random.default_rng(seed), _missing(manifold, dimension, (), known)
     starts = unsuccessful = idle = 0
     # Stop too if hardly any random posture reaches the manifold, because then almost no part of it is within the

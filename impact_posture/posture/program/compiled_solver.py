@@ -72,7 +72,9 @@ def compiled_solver(
             return BuiltSolver(interpreted, False)
         _compile(interpreted, compiler, f"{_key(problem)}.so")
         if (solver := _cached(problem, options)) is None:
-            raise CompilerError("what was built cannot be loaded", where="compile", hint="set CC to another compiler")
+            raise CompilerError(
+                "the compiled library cannot be loaded", where="compile", hint="set CC to another compiler"
+            )
         return BuiltSolver(solver, True)
     except (CompilerError, OutputError) as error:
         if mode == "always":

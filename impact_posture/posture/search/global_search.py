@@ -151,8 +151,8 @@ def check_searchable(problem: ConstrainedProblem) -> None:
     """Raise ``InputError`` unless the objective is an impact objective without a regularization."""
     _ = problem.impact
     if problem.requirements.regularization:
-        fault = "bounds the objective alone, but `regularization` adds the distance from the start"
-        hint = "leave `regularization` away, or use the search multistart"
+        fault = "can bound only the objective, but `regularization` adds the distance from the initial posture"
+        hint = "leave out `regularization`, or use the search multistart"
         raise InputError(fault, where="search global", hint=hint)
 
 

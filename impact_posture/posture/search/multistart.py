@@ -139,7 +139,7 @@ def solve(
     if redundancy == 0 and best.objective > scale * (1 - 1e-6):
         notes.append("no redundancy left: the constraints alone determine the posture, there is nothing to optimize")
     elif redundancy == 0:
-        notes.append("no redundancy left: this is the best of separate postures that the constraints allow")
+        notes.append("no redundancy left: this is the best of the isolated postures that satisfy the constraints")
     elif best.objective > scale * (1 - _NO_GAIN):
         note = "no better posture found: the initial one is already optimal for this impact, or nearly so"
         other = np.linalg.norm(wrapped_difference(problem, initial, q)) > SAME_POSTURE
