@@ -1,19 +1,20 @@
-/* Ticks of a simulated world under a controller in C.  They are those of World in world.py, with the sensors of
- * sensor_noise.py, the propellers of rotors.py and the contacts of contact_forces.py, which explain the words. */
+/* Ticks of a simulated world with a controller in C.  The code computes the same as the class World in world.py, with
+ * the sensors of sensor_noise.py, the propellers of rotors.py and the contacts of contact_forces.py.  These Python
+ * files explain the terms. */
 #include <math.h>
 #include <string.h>
 
 #include <mujoco/mujoco.h>
 
 #define PI 3.14159265358979323846
-/* Most propellers. */
+/* Maximum number of propellers. */
 #define ROTORS 64
-/* Numbers of a target of the controller. */
+/* Number of values in a target of the controller. */
 #define TARGET 25
-/* Squares of angles below which series replace sines. */
+/* If the square of an angle is below this value, power series replace sine and cosine. */
 #define SMALL 1e-8
 
-/* compiled_world.py reads this text and fills it in. */
+/* compiled_world.py parses this declaration, and fills in the members. */
 typedef struct {
   const mjModel *model;
   mjData *data;
@@ -22,42 +23,42 @@ typedef struct {
   void (*apply)(const mjModel *, mjData *, const double *, const double *, const double *, int, double *);
   int (*tick)(void *, double, const double *, const double *, const double *, void *);
 
-  /* The controller: what it is given, what it answers, and its targets. */
+  /* The controller: its inputs, its outputs, and its targets. */
   void *context, *command;
   double *q, *v, *force, *u, *rotor_speed, *level, *target;
   int *status, targets;
 
-  /* The robot: places of q and v in qpos and qvel, the true state. */
+  /* The robot: indices of q and v in qpos and qvel, and the true state. */
   int nq, nv, nqpos, floating, joints, *q_at, *v_at;
   double *true_q, *true_v, *effort, *torque, runaway;
-  /* Whether the last command was refused, as World.checked does. */
+  /* 1 if the last command was invalid, with the same check as CommandLimits.within. */
   int refused;
 
-  /* Time: physics steps in all and in a tick, s. */
+  /* Time: number of physics steps since the reset, number of physics steps in a tick, and time step in s. */
   int steps, count;
   double timestep;
 
-  /* The propellers: speeds and angles, the ways that a speed goes in the steps of a tick, vibration. */
+  /* The propellers: speeds and angles, relative changes of a speed in the steps of a tick, limits, and vibration. */
   int rotors, vibrates;
   double *speeds, *phases, *up, *down, lowest, highest, thrust, *along, *across, *inverse;
 
-  /* The sensors: what has noise, and the low-pass filter of the force on a shape. */
+  /* The sensors: flags for the readings with noise, and the low-pass filter of the force on a shape. */
   int noises, noisy_q, noisy_v, noisy_force, felt;
   double resolution, share, *filtered;
 
-  /* The shapes: the shape of each geom, forces of the last step, and what accumulates. */
+  /* The shapes: the shape of each geom, forces of the last step, and accumulated quantities. */
   int shapes, *shape_of;
   double *now, *normal, *impulse, *peak, *began;
 
-  /* Pushes: points in the axes of their bodies and forces, and their last steps. */
+  /* Pushes: bodies, last steps, and for each push the point (coordinates of its body) and the force. */
   int pushes, *push_body, *push_end;
   double *push;
 
-  /* For each tick: whether and where Python moves each target, and the noise. */
+  /* For each tick: flags of the targets that Python changes, the changed targets, and the noise. */
   int *led;
   double *lead, *noise;
 
-  /* Of each tick. */
+  /* Recorded results, one row per tick. */
   int *row_status;
   double *row_t, *row_q, *row_v, *row_qpos, *row_rotor_speeds, *row_torques, *row_command, *row_level;
   double *row_touching, *row_force, *row_impulse, *row_peak, *row_began, *row_slip;
@@ -81,7 +82,7 @@ static void cross(const double *a, const double *b, double *out)
   }
 }
 
-/* R of a unit quaternion x y z w, row by row. */
+/* Rotation matrix R of a unit quaternion x y z w, stored row by row. */
 static void rotation(const double *x, double *R)
 {
   int i, j;
@@ -96,7 +97,7 @@ static void rotation(const double *x, double *R)
   }
 }
 
-/* The coordinates of Pinocchio. */
+/* Compute the state in the coordinates of Pinocchio. */
 static void state(const world *w, double *q, double *v)
 {
   const double *qvel = w->data->qvel;
@@ -123,7 +124,7 @@ static void state(const world *w, double *q, double *v)
   }
 }
 
-/* Move the pose of a base, xyz and quaternion, by a twist d in its own axes for a unit of time. */
+/* Move the pose of a base (xyz and quaternion) with the constant twist d, in base axes, for a unit of time. */
 static void move_base(double *q, const double *d)
 {
   const double *p = d, *r = d + 3;
@@ -154,7 +155,7 @@ static void move_base(double *q, const double *d)
   }
 }
 
-/* The twist that unbalanced propellers add to that of the base. */
+/* Add the vibration of unbalanced propellers to the measured twist of the base. */
 static void vibrate(const world *w, double *v)
 {
   double force[6] = {0}, rate;
@@ -171,7 +172,7 @@ static void vibrate(const world *w, double *v)
   }
 }
 
-/* What the sensors measure of the true state, with the noise of a reading. */
+/* Compute the sensor readings from the true state and the noise of one reading. */
 static void measure(const world *w, const double *noise)
 {
   double *q = w->q, *v = w->v;
@@ -185,7 +186,7 @@ static void measure(const world *w, const double *noise)
     if (w->floating) {
       move_base(q, noise);
     }
-    /* A joint has one number, and behind a base one less of v than of q. */
+    /* Each joint has one value.  A base has 7 values in q and 6 in v, so the indices of joints differ by one. */
     for (k = 6 * w->floating; k < w->nv; ++k) {
       q[k + w->floating] += noise[k];
     }
@@ -226,7 +227,7 @@ static void push(const world *w)
   }
 }
 
-/* Forces of the surfaces on the shapes in a step, and what accumulates from them. */
+/* Compute the forces of the surfaces on the shapes in a step, and update the accumulated quantities. */
 static void contacts(const world *w)
 {
   const double step = w->timestep, began = w->data->time - step;
@@ -260,7 +261,7 @@ static void contacts(const world *w)
   }
 }
 
-/* The largest tangential speed of the contact points of each shape that a surface pushes. */
+/* Compute the largest tangential speed of the contact points of each shape that a surface pushes. */
 static void slips(const world *w, double *slip)
 {
   double arm[3], velocity[3], normal;
@@ -288,7 +289,7 @@ static void slips(const world *w, double *slip)
   }
 }
 
-/* Take the physics steps of a tick under the present command. */
+/* Take the physics steps of a tick with the present command. */
 static void advance(world *w)
 {
   double *control = w->data->ctrl, away[ROTORS], begin[ROTORS], angle[ROTORS], whole[ROTORS] = {0};
@@ -318,7 +319,7 @@ static void advance(world *w)
   }
 }
 
-/* Whether the command is not finite, or has an endless torque within the effort limits. */
+/* Return 1 if the command is not finite, or if a torque after clipping to the effort limits is too large. */
 static int refuses(const world *w)
 {
   int k;
@@ -339,7 +340,7 @@ static int refuses(const world *w)
   return 0;
 }
 
-/* Take ticks.  Return how many were taken before the state ran away or a command was refused. */
+/* Run ticks.  Return the number of ticks before the state diverged or a command was invalid. */
 int world_ticks(world *w, int ticks)
 {
   const int targets = w->targets;
