@@ -178,7 +178,7 @@ def test_an_open_mesh_is_closed_by_its_hull(tmp_path: Path) -> None:
 
 
 def test_a_corner_with_hundreds_of_edges(tmp_path: Path) -> None:
-    """A fine cone next to a box: coal supports 255 edges per corner, but the tip of the cone has 400."""
+    """Check a fine cone: coal supports 255 edges per corner, but the tip of the cone has 400 edges."""
     angles = np.linspace(0, 2 * np.pi, 401)
     rim = 0.08 * np.stack([np.cos(angles), np.sin(angles), 0 * angles], axis=1)
     tip = np.broadcast_to([0.0, 0.0, 0.2], (400, 3))

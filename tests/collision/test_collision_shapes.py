@@ -60,7 +60,7 @@ def surface(shape: pin.GeometryObject, random: np.random.Generator, count: int) 
 
 
 def outside(body: SweptHull, points: Array) -> Array:
-    """Return the distances by which points are outside a swept hull, m."""
+    """Return the distances from a swept hull (m) of all points outside the hull without its sweep."""
     if len(body.vertices) > 3:
         planes = ConvexHull(body.vertices).equations
         points = points[np.max(points @ planes[:, :3].T + planes[:, 3], axis=1) > 0]

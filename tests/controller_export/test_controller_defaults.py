@@ -1,4 +1,4 @@
-"""With default gains, the end effector task leaves free the same motions as `optimize`."""
+"""With default gains, the end effector task and `optimize` leave the same degrees of freedom redundant."""
 
 from __future__ import annotations
 
@@ -46,7 +46,7 @@ def test_the_task_has_the_rows_of_the_contact_pose(
     objective = WorstCaseObjective(robot, ImpactContact(frame, (0, 0, 1)))
     assert type(tip(default_formulation(robot, kind, objective))) is kept
     assert tip(default_formulation(robot, kind, objective)).point.frame == frame
-    # Without an impact, an aligned end effector has no normal.
+    # Without an impact, the task `aligned` has no normal to which the end effector could be aligned.
     assert type(tip(default_formulation(robot, kind))) is (FramePose if kept is FrameAligned else kept)
 
 

@@ -244,7 +244,7 @@ def test_targets_are_set_by_the_name_of_their_task() -> None:
     c.move_to(goal, 0.01)
     for k in range(4):
         assert difference(python.tick(0.004 * k, q, v), c.tick(0.004 * k, q, v)) < 1e-9
-    # Without a target, the task holds the pose of the next reset.
+    # If the target is deleted, the task holds the pose that the end effector has at the next reset.
     c.forget_target(name)
     fresh = compiled("panda")
     for controller in (c, fresh):

@@ -118,7 +118,7 @@ def test_the_reference_moves_as_in_python(
     assert tilt > 0.5 or 0.0515 < most < tilt
     assert path or posture.value < 0.95 * first
     assert np.abs(posture.flow.velocity).max() < 0.02
-    # The zero moment point of talos reaches two edges at once, in the same order in Python and C.
+    # For talos, the zero moment point reaches two polygon edges at once; Python and C list both in the same order.
     assert (max(edges) > 1) == (name == "talos")
 
 

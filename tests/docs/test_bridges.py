@@ -57,7 +57,7 @@ def example() -> ModuleType:
     spec = importlib.util.spec_from_file_location("pink_impact", EXAMPLES / "pink_impact.py")
     assert spec is not None and spec.loader is not None
     module = importlib.util.module_from_spec(spec)
-    # Dataclasses look up their module in ``sys.modules``.
+    # The decorator of dataclasses requires that their module is in ``sys.modules``.
     sys.modules[spec.name] = module
     spec.loader.exec_module(module)
     return module

@@ -53,10 +53,7 @@ def in_mujoco(name: str) -> InMujoco:
 
 
 def qacc(layout: MjcfLayout, q: Vector, v: Vector, a: Vector) -> Vector:
-    """Return the acceleration in MuJoCo's coordinates, ``qacc = T a + Ṫ v``, shape (nv,).
-
-    The term ``Ṫ v`` is due to Pinocchio's rotating body axes.
-    """
+    """Return MuJoCo's acceleration ``qacc = T a + Ṫ v``, shape (nv,); Pinocchio uses rotating body axes."""
     turning = np.zeros(layout.nv)
     for slot in layout.slots:
         piece = v[slot.joint.v]
@@ -111,7 +108,7 @@ def test_indices_equal_the_compiled_model(name: str) -> None:
         first = int(body.jntadr[0])
         assert simulated.model.jnt_qposadr[first] == slot.qpos.start
         assert simulated.model.jnt_dofadr[first] == slot.qvel.start
-    # Point masses get 1e-15 kg m² of rotational inertia; all other inertias are unchanged.
+    # The rotational inertia of point masses becomes 1e-15 kg m²; all other inertias are unchanged.
     assert simulated.model.body_mass.sum() == pytest.approx(pin.computeTotalMass(model), rel=1e-12)
     named = {f.name for f in model.frames} - {"universe"}
     assert {simulated.model.site(k).name for k in range(simulated.model.nsite)} == named

@@ -225,7 +225,7 @@ def test_limbs_are_outermost_and_disjoint() -> None:
                 assert model.joints[i].shortname() == model.joints[j].shortname()
 
 
-# Five limbs give a vector of four lanes and one single limb.
+# Five equal limbs are compiled to one vector of four lanes and one single limb.
 @pytest.mark.parametrize("count", [2, 5])
 def test_compiled_limbs(tmp_path: Path, count: int) -> None:
     need_compiler()

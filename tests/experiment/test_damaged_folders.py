@@ -77,7 +77,7 @@ def archive(**entries: bytes) -> bytes:
 
 
 def array(shape: tuple[int, ...]) -> bytes:
-    """Return an NPY file with 10 numbers whose header claims another shape."""
+    """Return an NPY file with 10 numbers whose header states another shape."""
     header = io.BytesIO()
     np.lib.format.write_array_header_1_0(header, {"descr": "<f8", "fortran_order": False, "shape": shape})
     return header.getvalue() + bytes(80)
@@ -110,7 +110,7 @@ def test_arrays_larger_than_any_run_are_refused(both: Path, monkeypatch: pytest.
 
 
 def picture(width: int, height: int) -> bytes:
-    """Return a PNG file that claims a size but has no pixels."""
+    """Return a PNG file whose header states a size, but which contains no pixels."""
 
     def part(kind: bytes, data: bytes) -> bytes:
         return struct.pack(">I", len(data)) + kind + data + struct.pack(">I", zlib.crc32(kind + data))

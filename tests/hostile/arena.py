@@ -22,7 +22,7 @@ from tests.support.command import PARSER
 CODES = {0, 1, 2, 3, 4, 130, 143}
 # Lines of a usage error begin with these words.
 USAGE = ("Usage: ", "Try ", "Error: ")
-# Texts that appear only in the output of libraries and interpreters.
+# Texts that the program itself never prints, but libraries and interpreters do.
 NOISE = ("Traceback", "internal error", "Warning:", "Exception ignored", "terminate called", "Segmentation", "DEBUG")
 # Permitted processor time of an attack (s), and the duration after which an attack is treated as hanging (s).
 BUSY, PATIENCE = 60, 120

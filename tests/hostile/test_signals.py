@@ -97,7 +97,7 @@ def send(name: str, k: int, number: signal.Signals, folder: Path) -> None:
         assert process.returncode == 128 + number, about
         assert len(lines) == 1 and lines[0].startswith("error: "), about
     assert "Traceback" not in errors and "ignored" not in errors, about
-    # A process that ends before the signal has written its complete output folder.
+    # If a process ends before the signal, its output folder must be complete.
     names = {path.name for path in work.iterdir()}
     assert names <= {"out", "deep"}, about
     if "deep" in names:

@@ -161,7 +161,7 @@ def test_files_made_to_break_parsers(name: str, arena: Path) -> None:
 
 
 def test_shapes_of_which_no_two_can_meet(arena: Path) -> None:
-    """Only two adjacent links have shapes, so the result has no distance to report."""
+    """Only two adjacent links have shapes, and adjacent links are not checked, so the result reports no distance."""
     box = '<collision><geometry><box size="0.1 0.1 0.5"/></geometry></collision>'
     (arena / "boxes.urdf").write_text(SMALL.replace("</inertial>", f"</inertial>{box}"))
     push = ("--frame", "tip", "--normal", "1", "0", "0", "--contact-pose", "free")

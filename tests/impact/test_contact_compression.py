@@ -252,7 +252,7 @@ def test_the_front_of_jump_and_force_equals_searches_with_a_bound() -> None:
     middle = curve.points[2]
     bounded = prepare(make_settings({**settings_, "max_force": middle.within}))
     again = solve(bounded.problem, starts=4, compile="never")
-    # A second search does not reach a better posture.
+    # A second search with the force bound does not reach a better posture.
     assert middle.objective <= bounded.problem.objective.value(again.q) * (1 + 1e-6)
 
 

@@ -151,7 +151,7 @@ def test_oracle_by_its_definition(name: str) -> None:
 
 @pytest.mark.parametrize("name", SOME)
 def test_lifted_form(name: str) -> None:
-    """The guess satisfies the equations and has the oracle's value; the equations determine the unknowns."""
+    """The initial guess satisfies the equations, gives the oracle's value, and is the only solution near it."""
     for k, (loaded, contact, metric, supports) in enumerate(combinations(name)):
         # Robots in WHOLE are tested with every combination and objective kind, other robots with fewer kinds.
         for kind in KINDS if name in WHOLE else [KINDS[(NAMES.index(name) + k) % len(KINDS)]]:

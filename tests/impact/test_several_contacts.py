@@ -307,7 +307,7 @@ def test_struck_feet_that_are_balls_are_held_in_place_only() -> None:
     ("normals", "stops"),
     [
         (((-1, 0, 0), (-1, 0, 0)), False),
-        # The left hand meets another surface, and must not touch the surface of the right hand.
+        # The two hands contact different surfaces, and the left hand must not touch the surface of the right hand.
         (((-1, 0, 0), (0, 1, 0)), True),
     ],
 )

@@ -123,7 +123,7 @@ def test_cone_shadow_is_the_projection_of_the_cone(degrees: float, plane: Plane)
     np.testing.assert_allclose(axis @ rim, 2.0 * np.cos(np.radians(degrees)), rtol=1e-12)
     outline = cone_shadow(axis, degrees, 2.0, plane.axes)
     np.testing.assert_array_equal(outline[:, 0], outline[:, -1])
-    # The outline has the same support function as the apex together with the rim.
+    # The outline of a cone has the same support function as its apex and rim together.
     angle = np.linspace(0, 2 * np.pi, 73)
     directions = np.array([np.cos(angle), np.sin(angle)]).T
     seen = np.maximum((directions @ plane.axes @ rim).max(axis=1), 0.0)

@@ -130,7 +130,7 @@ def test_no_frame_moves_more_than_the_check_distance_between_two_checks() -> Non
         objective = WorstCaseObjective(loaded, ImpactContact(frame, (0, 0, 1)))
         requirements = Requirements(contact_pose="free", com_over_feet=False)
         problem = build_problem(loaded, objective, loaded.posture(), requirements)
-        # Distances of frames are checked only if the problem has an inequality, so add one.
+        # Distances of frames are checked only if the problem has an inequality, so add a disc constraint.
         space = PathSpace(with_disc(problem, frame, np.full(2, 9.0), 0.1))
         data = loaded.model.createData()
         for seed in range(5):

@@ -58,7 +58,7 @@ def test_the_polygon_of_the_feet_is_the_convex_hull(corners: list[tuple[float, f
     assert edges is not None
     normals, offsets = edges
     np.testing.assert_allclose(np.linalg.norm(normals, axis=1), 1, atol=1e-9)
-    # The polygon has as many edges as the hull has corners, and the same half-planes.
+    # The polygon has one edge per corner of the convex hull, and the same half-planes as the hull.
     expected = np.unique(np.round(hull.equations, 7), axis=0)
     assert len(normals) == len(expected)
     for *n, b in hull.equations:

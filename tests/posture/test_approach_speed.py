@@ -79,7 +79,7 @@ def fastest(posed: Prepared, q: Vector) -> float:
         if wanted.contact_pose == "full":
             rows, arrives = [*rows, *J[3:]], [*arrives, 0.0, 0.0, 0.0]
         elif wanted.contact_pose.startswith("aligned"):
-            # Two of the three rows are independent, because the rotation about the normal is free.
+            # Only two of the three rows are independent, because the rotation about the normal is not constrained.
             rows, arrives = [*rows, *((np.eye(3) - np.outer(n, n)) @ J[3:])], [*arrives, 0.0, 0.0, 0.0]
     for frame in wanted.keep:
         J = pin.getFrameJacobian(model, data, model.getFrameId(frame), pin.ReferenceFrame.LOCAL_WORLD_ALIGNED)

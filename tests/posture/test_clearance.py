@@ -354,7 +354,7 @@ def test_derivatives_of_a_grown_program_agree_with_casadi(name: str) -> None:
 
 
 def test_starts_lie_near_a_posture_that_is_clear() -> None:
-    # In the given posture, the robot reaches far through the wall; most starts near this posture end in collisions.
+    # In the given posture, the robot is far inside the wall; most starts near this posture end in collisions.
     posed = prepare(ProblemSettings(robot="xarm7", normal=(-1, 0, 0), holdable=False)).problem
     found = solve(posed, starts=16, jobs=1, compile="never", finish_all=True)
     assert found.certified_starts == 16
@@ -362,7 +362,7 @@ def test_starts_lie_near_a_posture_that_is_clear() -> None:
 
 @pytest.mark.parametrize("seed", [1, 9, 33])
 def test_the_way_past_a_wall_is_found_from_every_seed(seed: int) -> None:
-    # From few random postures, a run reaches the collision-free part.
+    # Only from few random postures does a run reach collision-free postures.
     posed = prepare(ProblemSettings(robot="xarm7", normal=(-1, 0, 0))).problem
     assert not find_conflicts(posed, seed).conflicts
 

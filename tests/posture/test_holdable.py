@@ -242,7 +242,7 @@ def test_lifted_rows_agree_with_pinocchio_and_with_differences(name: str) -> Non
 
 
 def test_an_optimum_beyond_the_limits_moves_to_them_and_certifies() -> None:
-    """From this start, an arm on four legs ends beyond the torque limits of the legs, so the program adds rows."""
+    """The run from the given start ends beyond the torque limits of the legs, so the program needs more rows."""
     posed = problem("anymal_kinova", normal=(1.0, 0.0, 0.0))
     begin, scale = feasible_start(posed, 1, seed=0), posed.objective.value(posed.given)
     assert begin is not None

@@ -39,7 +39,7 @@ def test_export_has_the_worst_model_variant(tmp_path: Path, kind: str, real: Rea
         assert_close(value, objective.value(q), tolerance, "value")
         assert_close(gradient, objective.gradient(q), 10 * tolerance, "gradient", scale=value)
         H, _ = loaded.value_and_gradient(q, objective.contact.normal)
-        assert_close(H, objective.oracle.quantities(q).H, tolerance, "H stays that of the robot as modeled")
+        assert_close(H, objective.oracle.quantities(q).H, tolerance, "H of the robot without variants")
 
 
 # ---- the command line ---------------------------------------------------------------------------------------------

@@ -185,7 +185,7 @@ def test_a_joint_without_a_range_stays_where_it_is() -> None:
 
     planes = planes_where(touches, ranges={WAIST[0]: (0.0, 0.0)})
     assert planes is not None and planes.joints == WAIST[1:]
-    # On a grid over many turns, adjacent points are too far apart.
+    # If a joint range covers many turns, adjacent points of the grid are too far apart.
     assert planes_where(touches, ranges={WAIST[0]: (-75.4, 75.4)}) is None
 
 

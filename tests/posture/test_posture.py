@@ -317,7 +317,7 @@ def test_singular_start_drops_no_equation(more: dict) -> None:
 
 
 def test_turns_that_change_nothing_are_fixed() -> None:
-    """Rotating the whole robot about n changes nothing.  With an offset, the held point is not the pivot."""
+    """Rotating the robot about n changes nothing, also if the contact point has an offset from the pivot."""
     offset = problem_of("tilthex_arm", contact_pose="position", offset=(0.05, 0, 0))
     assert "base yaw" in [c.name for c in offset.constraints]
     sideways = problem_of("hextilt", (1, 0, 0), base="free", contact_pose="free")

@@ -198,7 +198,7 @@ def test_parts_that_are_not_convex_are_there() -> None:
 
 
 def test_separate_postures_make_steps() -> None:
-    """Without redundancy, the robot has only a few postures: between them, more distance does not help."""
+    """Without redundancy, only a few postures are feasible, so a little more distance often does not help."""
     solution, curve = solved("separate")
     assert solution.redundancy == 0
     idle = [p for p in curve.points if p.distance < 0.9 * p.within]

@@ -31,7 +31,7 @@ Solved = tuple[PostureNLP, SolveRecord, float]
 
 @pytest.fixture(scope="module", params=CASES)
 def solved(request: pytest.FixtureRequest) -> Solved:
-    """Return the program of a solved problem, grown for its optimum, and the run that starts from this optimum."""
+    """Return the program of a solved problem, with all rows that its optimum needs, and a run from this optimum."""
     settings = ProblemSettings(**{"robot": request.param, **CASES[request.param]})
     solution = solve(prepare(settings).problem, starts=2, jobs=1, finish_all=True)
     scale = solution.problem.objective.value(solution.q)

@@ -126,7 +126,7 @@ def test_hovers_level_in_every_named_posture(posture: str, model: pin.Model, pro
     assert result.thrust_margin > 0.25
     assert result.torque_margin > 0.75
     np.testing.assert_allclose(propulsion.thrust_coefficient * result.speeds**2, result.thrusts)
-    # Independent check: for these inputs, inverse and forward dynamics give zero acceleration.
+    # Check with inverse and forward dynamics that the computed thrusts and torques give zero acceleration.
     inputs = np.r_[result.thrusts, result.joint_torques]
     forces = actuation_matrix(model, propulsion) @ inputs
     zero = np.zeros(model.nv)

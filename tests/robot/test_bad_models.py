@@ -247,7 +247,7 @@ def test_a_joint_through_a_point_mass(load: Load) -> None:
     with pytest.raises(InertiaError) as caught:
         load(link("a", GOOD), link("b", OFF_AXIS), link("c", on_axis), joint("a", "b"), joint("b", "c"))
     one_line(caught.value, "b_c moves no inertia")
-    # A point mass that is off the axis has inertia.
+    # A point mass has inertia about an axis that does not pass through it.
     load(link("a", GOOD), link("b", OFF_AXIS), link("c", on_axis), joint("a", "b"), joint("b", "c", "1 0 0"))
 
 

@@ -28,7 +28,7 @@ from tests.support.helpers import Vector, central_gradient, frame_jacobian, mass
 
 
 def moving(factory: ControllerFactory, *key: object) -> Reading:
-    """Return a state near the start that has a velocity."""
+    """Return a state near the start with non-zero velocity."""
     generator, robot = rng(*key), factory.setup.robot
     q = np.array(pin.integrate(robot.model, factory.setup.q, 0.02 * generator.normal(size=robot.nv)))
     return Reading(0.5, q, 0.3 * generator.normal(size=robot.nv), None)
@@ -196,7 +196,7 @@ def test_the_flow_is_the_projected_gradient() -> None:
     Z = np.linalg.svd(J)[2][8:].T
     assert Z.shape == (9, 1)
     term = -control.robust.gain / driver.posture.scale * factory.objective().gradient(q)
-    # The impact term is bounded by K times its reach.
+    # The impact term is at most K times the option `reach`.
     bound = control.robust.gain * driver.posture.reach
     term *= min(1.0, bound / np.linalg.norm(term))
     expected = Z @ (Z.T @ term) / control.posture.kd

@@ -139,7 +139,7 @@ def test_held_freezes_posture_center_of_mass_and_base(name: str, controller: str
     assert driver.level == 0
     target = driver.posture.target
     moved = pin.difference(play.factory.setup.robot.model, reached, target)[6:]
-    # The held posture is the posture measured one tick earlier.
+    # The driver holds the posture that was measured one tick earlier.
     assert np.abs(moved).max() < 0.01
     wanted = [np.array(t.target) for t in driver.controller.formulation.weighted]  # type: ignore[attr-defined]
     last = play.go(1.8 if name in AERIAL else 0.8).q

@@ -41,7 +41,7 @@ def test_before_the_impact_the_reference_is_a_function_of_the_position() -> None
     for deeper in (0.01, 0.03, 0.4):
         led = driver._end_effector
         assert led is not None
-        # The reference depends on the distance, not on time.
+        # The reference velocity depends on the distance to the surface, not on time.
         for late in (0.0, 0.05):
             driver.tick(reading(t + late, deeper, np.zeros(9)), reference.at(t + late))
             expected = min(np.sqrt(2 * task.acceleration * deeper), task.speed)
@@ -91,7 +91,7 @@ def test_after_the_impact_the_targets_begin_at_the_rigid_impact() -> None:
 def test_reference_spreading_makes_its_contact() -> None:
     run = lived(NAME, "reference-spreading", "live", None)
     assert [window.touched for window in run.of("impact")] == [True]
-    # The reference of the contact always has the speed of the scenario.
+    # For a contact, the reference always moves at the contact speed of the scenario.
     k = before(run.series, run.of("impact")[0])
     assert run.series.v[k, 2] == pytest.approx(-0.5, abs=0.06)
 

@@ -145,7 +145,8 @@ def test_relaxed_and_failed_ticks_stops_and_contacts() -> None:
     status[10:13] = STATUSES.index(Status.RELAXED)
     status[500] = STATUSES.index(Status.UNSOLVED)
     status[501] = STATUSES.index(Status.NON_FINITE)
-    # Three joints reach a stop: one at the start, one outside the window, and one inside.  Only the last is reported.
+    # Three joints reach a stop: at the start, outside the time window, and inside the time window.  Only the joint
+    # inside the time window is reported.
     at_stop[:, 6], at_stop[700, 7], at_stop[300, 8] = True, True, True
     metrics = measured({"status": status, "at_stop": at_stop}, touch(0.2))
     assert (metrics.relaxed_ticks, metrics.failed_ticks) == (3, 2)

@@ -29,7 +29,7 @@ class SyntheticWorld:
     def add(
         self, t: float, *, began: float | None = None, touching: bool = False, stop: str = "", slip: float = 0.1
     ) -> None:
-        """Add a state in which all shapes have the same contact, but the slip increases from shape to shape."""
+        """Add a state in which all shapes have equal contacts, except that the slip increases from shape to shape."""
         robot, shapes = self._setup.robot, len(self._setup.scenario.shapes)
         rotors = 0 if robot.spec.propulsion is None else len(robot.spec.propulsion.rotors)
         ones = np.ones(shapes)

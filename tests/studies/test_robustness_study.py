@@ -260,7 +260,7 @@ def test_statistics_by_hand() -> None:
 
 def test_correlations_and_splits_by_hand() -> None:
     records = five()
-    # In the records, the motion decreases as the decrease of H grows.  The rank correlation with a constant is
+    # In the records, a larger decrease of H comes with a smaller motion.  The rank correlation with a constant is
     # undefined.
     assert rank(records, "robust", lambda r: -(r.documents["robust"]["prediction"]["H"])) == pytest.approx(1)
     assert rank(records, "robust", lambda r: float(r.draw.number)) == pytest.approx(-1)

@@ -1,6 +1,6 @@
 /* Run an exported controller at states that are impossible for a robot.  Each command must be finite and within its
- * limits, also where these permit almost nothing.  A copied context and contexts in threads must give the same answers.
- * Prints the growth of memory, and the statuses.  Built with sanitizers, run by valgrind.
+ * limits, even if the limits permit almost nothing.  Copied contexts and contexts in threads must give equal commands.
+ * The program prints the growth of memory and the statuses.  Tests build it with sanitizers or run it in valgrind.
  * Arguments: number of ticks, number of threads. */
 #include <math.h>
 #include <pthread.h>
@@ -70,7 +70,7 @@ static int start_narrow(run *r, const double *still, ctl_command *out)
   return ctl_init(&r->c, &r->p) || ctl_reset(&r->c, r->p.posture_target, still, out);
 }
 
-/* Return 0, or a number that says what went wrong. */
+/* Return 0, or the number of the failed check. */
 static int abuse(run *r)
 {
   static const double absurd[] = {0.0, 1e200, -1e200, 1e-300, 1e7, 9e7};

@@ -79,7 +79,7 @@ def central_gradient(f: Callable[[Vector], ArrayLike], model: pin.Model, q: Vect
 
 
 def mass_matrix(model: pin.Model, q: Vector) -> Vector:
-    """Return the mass matrix of Pinocchio, with the lower triangle that CRBA leaves empty."""
+    """Return the full mass matrix of Pinocchio; CRBA fills only the upper triangle."""
     upper = np.triu(pin.crba(model, model.createData(), q))
     return np.asarray(upper + np.triu(upper, 1).T)
 

@@ -316,7 +316,7 @@ def test_the_key_depends_on_files_of_the_robot_and_the_posture(pendulum: str, tm
 
 @pytest.mark.parametrize("y", [[0.1], [0.0, 0.1]], ids=["alone", "beside optima"])
 def test_points_out_of_reach_are_infeasible_and_others_avoid_the_wall(tmp_path: Path, y: list[float]) -> None:
-    """The first point is out of reach; for other points, most postures have a link in the wall or lead into it."""
+    """The first point is out of reach; for the other points, most starts end with a link in the wall."""
     problem = '[problem]\nrobot = "xarm7"\nnormal = [-1, 0, 0]\nholdable = false\nstarts = 4\n'
     solve(f"{problem}[grid]\nx = [2.0, 0.0]\ny = {y}", tmp_path)
     rows = ip.sweep.open(tmp_path / "out").to_table().sort_by("point").to_pylist()

@@ -1,4 +1,4 @@
-"""Limits on the effects of an impact: the jump is a rigid impact, and a controller keeps within the limits."""
+"""Limits on the effects of an impact: the jump obeys a rigid impact model, and a controller obeys the limits."""
 
 from __future__ import annotations
 

@@ -92,7 +92,7 @@ def test_a_conflicting_posture_moves_neither_tilt_nor_end_effector() -> None:
 
 
 def pushed(r: Robot, meters: float) -> Controller:
-    """Return a controller whose end effector target is too far to the side to be held by level rotors."""
+    """Return a controller whose end effector target is far to the side, so that a level base lacks the thrust."""
     ee = FramePose(Point("ee"), kp=60.0)
     controller = Controller(r, aerial_formulation(r, JointPosture(r), end_effector=ee))
     controller.reset(r.posture(), np.zeros(r.nv))
@@ -165,12 +165,12 @@ def test_a_solver_that_gives_up_holds_the_last_command(monkeypatch: pytest.Monke
     controller.reset(r.posture(), np.zeros(r.nv))
     before = controller.tick(0.0, r.posture(), np.zeros(r.nv))
     working = controller._solver
-    # The relaxation solves the tick although the usual solver fails ...
+    # If the solver of the ticks fails, the relaxation solves the tick ...
     controller._solver = Refusing()
     monkeypatch.setattr(relaxation, "DaqpSolver", lambda n, m, **options: Refusing())
     command = controller.tick(0.001, r.posture(), np.zeros(r.nv))
     assert command.status is Status.SOLVED and np.allclose(command.u, before.u, rtol=0, atol=1e-6)
-    # ... the solution of the levels is used if the program with the cost fails ...
+    # ... if the program with the cost fails, the solution of the levels without the cost is used ...
     monkeypatch.setattr(relaxation.daqp, "solve", _without_cost(relaxation.daqp.solve))
     bare = controller.tick(0.001, r.posture(), 0.05 * rng("bare").normal(size=r.nv))
     assert bare.status is Status.SOLVED

@@ -62,8 +62,8 @@ def test_feet_stay_where_they_are(name: str) -> None:
 def dense_torques(controller: Controller, q: np.ndarray, v: np.ndarray) -> np.ndarray:
     """Return the torques of the same tick over (ν̇, f, τ), from raw Pinocchio calls.
 
-    Each sole is modeled by forces at its four corners.  The cost of the wrench applies to the total wrench of these
-    forces, so that the optimum is the same. The solver is qpOASES of CasADi, as in the paper.
+    Each sole is modeled by forces at its four corners.  The cost applies to the total wrench of the corner forces, so
+    that the optimum is the same. The solver is qpOASES of CasADi, as in the paper.
     """
     r, formulation = controller.robot, controller.formulation
     model, nv, nj = r.model, r.nv, r.nv - 6
@@ -129,7 +129,7 @@ def dense_torques(controller: Controller, q: np.ndarray, v: np.ndarray) -> np.nd
     for W in wrenches:
         scale = 1e-6 * np.array([1.0, 1, 1, 100, 100, 100][: W.shape[0]])
         at = slice(start, start + W.shape[1])
-        # A small weight selects one of the many corner forces with the same wrench.
+        # Many corner forces have the same wrench, so a small weight selects one set of forces.
         H[at, at] = W.T * scale @ W + 1e-12 * np.eye(W.shape[1])
         start += W.shape[1]
     S = np.vstack([np.zeros((6, nj)), np.eye(nj)])

@@ -51,7 +51,7 @@ def test_gentle_flight_is_solved_at_every_tick(name: str, noise: float) -> None:
     """The arm cannot roll the end effector, so base tilt and end effector pose share a row."""
     r = FLYING_ARMS[name]()
     controller, generator = Controller(r, aerial_formulation(r, JointPosture(r))), rng(name, noise)
-    # With a small velocity, the two requirements on the shared row differ in the seventh digit.
+    # At a small velocity, the two tasks demand accelerations along the shared row that differ in the seventh digit.
     q, v = r.posture(), 1e-7 * generator.normal(size=r.nv)
     assert controller.reset(q, v).status is Status.SOLVED
     for k in range(300):
@@ -312,7 +312,7 @@ def two_levels() -> tuple[Robot, TaskFormulation]:
     return r, TaskFormulation(((tip,), (elbow,)), (), JointPosture(r), law=None)
 
 
-# Distance of the targets from a swept state, m (rad), so small that no limit becomes active.
+# Distance of the targets from the states of a sweep (m or rad), so small that no limit becomes active.
 AHEAD = {"flying": 1e-3}
 SWEEPS: dict[str, tuple[Callable[[], tuple[Robot, TaskFormulation]], list[float], list[float]]] = {
     "planar": (planar, [0.3, 0.0, 0.0], [0.0, 0.8, 0.5]),
@@ -329,7 +329,7 @@ def swept(
     torque: float = np.inf,
     look: Callable[[Controller, Command], None] = lambda controller, command: None,
 ) -> tuple[Vector, set[Status], Controller]:
-    """Return accelerations at ``count`` states through the singular posture, with all targets slightly ahead."""
+    """Return accelerations at ``count`` states on a line through the singular posture, for nearby targets."""
     make, through, along = SWEEPS[name]
     r, formulation = make()
     controller, state = Controller(r, formulation), State(r, formulation.points)
@@ -355,7 +355,7 @@ def swept(
 
 @pytest.mark.parametrize("name", SWEEPS)
 def test_a_slow_sweep_through_a_singular_posture_is_continuous(name: str) -> None:
-    """Half the step halves the change of the accelerations, so they do not jump, and they stay bounded."""
+    """A step of half the size halves the change of the accelerations, so accelerations are continuous and bounded."""
     coarse, seen, _ = swept(name, 401)
     fine, again, controller = swept(name, 801)
     assert seen == again == {Status.SOLVED}
@@ -368,7 +368,7 @@ def test_a_slow_sweep_through_a_singular_posture_is_continuous(name: str) -> Non
 
 @pytest.mark.parametrize(("name", "torque"), [("wrist", 1.0), ("two levels", 0.3)])
 def test_a_relaxed_answer_is_damped_alike(name: str, torque: float) -> None:
-    """At limits near a singularity, quadprog gets the same minimum of the damped cost."""
+    """If limits are active near a singularity, quadprog computes the same minimum of the damped cost."""
     quadprog, damped = pytest.importorskip("quadprog"), []
 
     def look(controller: Controller, command: Command) -> None:
