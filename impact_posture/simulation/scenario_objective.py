@@ -62,7 +62,7 @@ def compiled(objective: WorstCaseObjective) -> Gradient:
     """Return the function ``q → (objective, gradient)`` from the C export, which is built once and cached.
 
     Raises:
-        CompilerError: There is no compiler, the compiler failed, or the library computes other numbers than CasADi.
+        CompilerError: No compiler exists, the compiler failed, or the library computes other numbers than CasADi.
         OutputError: The cache folder cannot be written, or other users can write it.
         SpecError: The library cannot be loaded, for example because another machine built it.
     """

@@ -40,7 +40,7 @@ def build_library(folder: Path, prefix: str, library: Path | None = None, flags:
     ``$CFLAGS``, then ``flags``.
 
     Raises:
-        CompilerError: There is no compiler, or the compiler failed; the error contains the first error line and the
+        CompilerError: No compiler exists, or the compiler failed; the error contains the first error line and the
             command.
         OutputError: The library cannot be written.
     """
@@ -62,7 +62,7 @@ def build_parts(folder: Path, library: Path, parts: Mapping[str, Sequence[str]])
     share object files.
 
     Raises:
-        CompilerError: There is no compiler, or the compiler failed; the error contains the first error line and the
+        CompilerError: No compiler exists, or the compiler failed; the error contains the first error line and the
             command.
         OutputError: The library or the cache cannot be written.
     """

@@ -40,7 +40,7 @@ def require_compiler(where: str) -> list[str]:
     """Return the compiler from :func:`find_compiler`; ``where`` names, for errors, the work that needs a compiler.
 
     Raises:
-        CompilerError: There is no compiler, or ``$CC`` has an open quote.
+        CompilerError: No compiler is installed, or ``$CC`` has an open quote.
     """
     compiler = find_compiler()
     if compiler is None:

@@ -125,7 +125,7 @@ def compiled_source(objective: WorstCaseObjective) -> Iterator[Source]:
     """Yield the source that calls the C export, which is built in a temporary folder.
 
     Raises:
-        CompilerError: There is no compiler, or the compiler failed.
+        CompilerError: No compiler is installed, or the compiler failed.
     """
     with scratch_folder() as folder:
         made = export(_impulse(objective), folder, prefix="verified", check=False)

@@ -46,7 +46,7 @@ def c_compiler() -> list[str]:
     """Return the C compiler of the user.
 
     Raises:
-        CompilerError: There is no C compiler.
+        CompilerError: No C compiler is installed.
     """
     compiler = find_compiler()
     if compiler is None:

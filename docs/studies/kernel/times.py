@@ -62,7 +62,7 @@ def measure(samples: Samples, rounds: int, peers: Sequence[str] = tuple(PEERS)) 
     """Build and check the implementations, and measure the time of implementations with correct numbers.
 
     Raises:
-        CompilerError: There is no C compiler, or our export cannot be built or computes wrong numbers.
+        CompilerError: No C compiler is installed, or our export cannot be built or computes wrong numbers.
     """
     robot, skipped = samples.robot, []
     say(f"{robot.name}: the export")
