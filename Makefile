@@ -1,4 +1,4 @@
-# From a bare clone: `make demo`, `make test`.  Needs Python >= 3.11, make and a C compiler.
+# In a fresh clone, run `make demo` or `make test`.  Both need Python >= 3.11, make and a C compiler.
 PYTHON ?= python3
 VENV := .venv
 BIN := $(VENV)/bin
@@ -8,27 +8,27 @@ JOBS ?= 2
 .PHONY: pictures viewer clean
 
 help:
-	@echo "make demo        install into .venv, optimize a real robot, leave pictures and C code in demo/"
-	@echo "make test        install with the test extras and run the whole suite"
-	@echo "make lint types  ruff, import-linter; mypy"
-	@echo "make docs        the documentation site in docs/_build/html"
-	@echo "make wheel       build sdist and wheel, compare them with git, install, run every command, types"
-	@echo "make test-wheel  the same, then the whole suite against the installed wheel"
-	@echo "make lowest      the same with the lowest versions that pyproject.toml allows; PYTHON= tries another Python"
-	@echo "make bench       speed on this machine: solve times, ticks, the exported kernel and its peers"
-	@echo "make coverage    branch coverage of both packages by the suite, for the documentation"
-	@echo "make study-impacts  predictions of the objectives against impacts simulated in MuJoCo"
-	@echo "make study-elastic  inertia of arms with elastic joints in an impact, against MuJoCo"
-	@echo "make study-global   completeness of the global search, and basin hopping against multi-start"
-	@echo "make reproduction   the paper's experiments, many seeds, for the documentation (about ten minutes)"
-	@echo "make study-feasible  cost of collision constraints, limits at rest and approach speed"
-	@echo "make study-flow     rest of the reference flow, from 1,000 random starts of each of four seeds (three minutes)"
-	@echo "make study-real-impacts  balls, strikes, taps: rigid model against MuJoCo (some minutes)"
-	@echo "make study-robustness  where each controller helps and which targets it keeps (ten minutes; continues after an interruption)"
-	@echo "make study-scan     a scan along the redundancy of an arm and of a humanoid, as a picture"
-	@echo "make study-controller  the controller in C against Python: equal answers, growth, times (an hour; PART=equality, growth or times; times: 4 minutes on a quiet machine)"
-	@echo "make study-sweep    robustness (killed workers and parents, MPI, Slurm jobs) and cost of sweeps"
-	@echo "make calibration    restitution of the contact laws in the simulated world"
+	@echo "make demo        install into .venv, optimize a posture of a real robot, write pictures and C code into demo/"
+	@echo "make test        install with the test extras and run all tests"
+	@echo "make lint types  check the code with ruff and import-linter; check the types with mypy"
+	@echo "make docs        build the documentation site in docs/_build/html"
+	@echo "make wheel       build sdist and wheel, compare their files with git, install the wheel, run every command, check types"
+	@echo "make test-wheel  the steps of `make wheel`, then all tests with the installed wheel"
+	@echo "make lowest      the steps of `make test-wheel` with the lowest versions that pyproject.toml allows; PYTHON= selects the Python"
+	@echo "make bench       measure solve times, ticks, and the exported kernel against other implementations"
+	@echo "make coverage    measure the branch coverage of both packages by the tests, for the documentation"
+	@echo "make study-impacts  compare predictions of the objectives with impacts simulated in MuJoCo"
+	@echo "make study-elastic  compare the predicted inertia of arms with elastic joints with MuJoCo"
+	@echo "make study-global   measure how complete the global search is, and compare basin hopping with multi-start"
+	@echo "make reproduction   run the experiments of the paper with many seeds, for the documentation (about ten minutes)"
+	@echo "make study-feasible  measure the effect of collision constraints, limits at rest and approach speed"
+	@echo "make study-flow     run the reference flow from 1,000 random starts for each of four seeds (three minutes)"
+	@echo "make study-real-impacts  compare the rigid model with MuJoCo for throws, strikes and taps (some minutes)"
+	@echo "make study-robustness  measure where each controller helps and which targets it meets (ten minutes; can continue after an interruption)"
+	@echo "make study-scan     scan postures of an arm and of a humanoid, and draw the results"
+	@echo "make study-controller  compare the controllers in C and Python: equal answers, growth of memory, times (an hour; PART=equality, growth or times runs one part; times needs 4 minutes on a quiet machine)"
+	@echo "make study-sweep    measure the robustness (killed workers and parents, MPI, Slurm jobs) and the speed of sweeps"
+	@echo "make calibration    measure the restitution of the contact laws in the simulated world"
 	@echo "make regression  recompute the committed reference results"
 	@echo "make pictures    draw the pictures of the documentation"
 	@echo "make viewer      rebuild the script of report.html from its sources; needs npm"
@@ -59,7 +59,8 @@ demo: $(VENV)/.installed
 	@echo
 	@echo "Open demo/report.html in a browser, or: $(BIN)/impact-posture view demo"
 
-# Tests run some hundred commands.  Where Python may not write bytecode, each of them would compile the package again.
+# Compile the packages first.  Tests run some hundred commands, and if Python may not write bytecode, each command would
+# compile the packages again.
 test: $(VENV)/.installed-test
 	$(BIN)/python -m compileall -q impact_posture cli robots
 	$(BIN)/python -m pytest -n $(JOBS) --dist worksteal -q
@@ -78,8 +79,8 @@ lint: $(VENV)/.installed-test
 	$(BIN)/ruff format --check .
 	$(BIN)/lint-imports --no-logo
 
-# mypy does not see mapped packages in an editable install, so it checks what a wheel would install; from there, since it
-# would read the sources that lie in the folder where it starts.
+# In an editable install, mypy does not find packages whose folders are renamed.  So mypy checks the files that a wheel
+# installs.  It must start in their folder, because otherwise it reads the sources in the current folder.
 types: $(VENV)/.installed-test
 	rm -rf build/types build/lib
 	$(BIN)/python -m pip install --quiet --disable-pip-version-check --no-deps --target build/types .
@@ -139,7 +140,8 @@ calibration: $(VENV)/.installed-test
 regression: $(VENV)/.installed
 	$(BIN)/python -m tests.regression.make
 
-# The script of report.html from npm's packages by their lock file, in a folder of its own; VIEWER_OUT= writes elsewhere.
+# Build the script of report.html in a separate folder, from the npm packages of the lock file.  VIEWER_OUT= selects
+# the output file.
 VIEWER := impact_posture/output/report/viewer
 VIEWER_OUT ?= $(VIEWER)/viewer.min.js
 viewer:

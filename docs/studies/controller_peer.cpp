@@ -1,7 +1,7 @@
-// A tick as it is written by hand with Pinocchio and DAQP: the dynamics, Jacobians and drifts that the tasks need, then the
-// QP by DAQP from its last active set.  The QPs come from the controller in Python by a file, so that their
-// assembly takes no time here.
-// Arguments: model, ticks.  Prints nanoseconds, one a line; fails where an answer is not Python's.
+// A handwritten tick with Pinocchio and DAQP: the dynamics, Jacobians and drifts that the tasks need, then the QP,
+// which DAQP solves from its last active set.  The QPs are read from a file of the controller in Python, so that
+// their assembly is not timed.  Arguments: model, ticks.  Prints the nanoseconds of each tick on a line.  Fails if a
+// solution differs from the solution of Python.
 #include <chrono>
 #include <cmath>
 #include <cstdio>

@@ -1,7 +1,7 @@
-/* Time of each tick of an exported controller over recorded states: ticks.bin, NQ + NV numbers each.
- * Arguments: the file, and "cold" to flush the caches before each tick, or the ticks between evaluations of the gradient
- * of the impact-robust term, which is then on.  Prints nanoseconds, status, iterations and, with such a term, the
- * nanoseconds of its gradient alone, a line for each tick. */
+/* Measures each tick of an exported controller over the recorded states of a file (NQ + NV numbers each).
+ * Arguments: the file; then "cold" to flush the caches before each tick, or a number to switch on the impact-robust
+ * term, whose gradient is then evaluated every so many ticks.  Prints a line for each tick: nanoseconds, status,
+ * iterations and, with the term, the nanoseconds of its gradient. */
 #define _POSIX_C_SOURCE 199309L
 #include <stdio.h>
 #include <stdlib.h>

@@ -1,7 +1,7 @@
-/* Courses of the reference flow, for the end of the source of an exported controller with the prefix "course".  The robot
+/* Courses of the reference flow.  Append this file to the source of an exported controller with the prefix "course".  The robot
  * follows exactly, and no command is computed but the first. */
 
-/* Numbers of a row of course_run before the posture. */
+/* Number of values in a row of course_run, with the posture. */
 enum { COURSE_ROW = 4 + COURSE_NQ };
 
 static void course_row(const course_context *c, double *row)
@@ -20,8 +20,8 @@ static void course_row(const course_context *c, double *row)
   memcpy(row + 4, f->here, sizeof f->here);
 }
 
-/* Begin at rest at q, to visit the posture of the path first or not; the first row is in out.  Return 0, or what init
- * or reset return. */
+/* Start the flow at rest at q.  If `visit` is not 0, the flow visits the posture of the path first.  Write the first
+ * row to out.  Return 0, or the error code of init or reset. */
 int course_begin(course_context *c, const course_params *p, const double *q, int visit, double *out)
 {
   static const double still[COURSE_NV] = {0};
@@ -36,8 +36,8 @@ int course_begin(course_context *c, const course_params *p, const double *q, int
   return refused;
 }
 
-/* Let the flow go for at most so many updates, each of ticks of dt, s, a row of out each, or until it rests.  Return the
- * updates. */
+/* Run the flow until it rests, for at most `updates` updates with ticks of dt seconds.  Write a row of out for each
+ * update.  Return the number of updates. */
 int course_run(course_context *c, double dt, int updates, double *out)
 {
   int k, i;

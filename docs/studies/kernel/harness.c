@@ -1,7 +1,7 @@
-/* Times kernels of one signature without Python in the loop.
+/* Measure the time of kernels with equal signatures, without Python in the loop.
  *
  * A pass calls the kernel once at each of `count` configurations, one after the other in memory.  The clock is the
- * processor time of the thread: what other programs take of a busy machine does not count.
+ * processor time of the thread, which excludes the time of other programs.
  */
 #define _POSIX_C_SOURCE 199309L
 #include <time.h>
@@ -17,9 +17,9 @@ static double now(void)
   return (double)t.tv_sec + 1e-9 * (double)t.tv_nsec;
 }
 
-/* Seconds a configuration; calls that return no zero add up in *failed.  `kind` is the kind of f: e(val), v(alue),
- * b(atch), or d(ifferences): of a value, at each configuration a call at q and two for each direction, at
- * configurations that were moved by `step` before.
+/* Return the seconds for each configuration.  Count calls that do not return zero in *failed.  `kind` is the kind of
+ * f: e(val), v(alue), b(atch), or d(ifferences).  For differences, call a value function at each configuration q, and
+ * twice for each direction at configurations that were moved by `step` before.
  */
 double time_pass(char kind, void *f, const double *q, const double *n, int nq, int nv, int count, double step,
                  double *H, double *grad, int *failed)

@@ -1,12 +1,13 @@
-// H = aᵀa with M a = Jᵀn, and its tangent gradient, in Pinocchio C++: what a user who knows the library would write.
+// H = aᵀa with M a = Jᵀn, and its tangent gradient, in Pinocchio C++, as an experienced user would write them.
 //
-// Every formulation is ∇H = 2 ∂_q[nᵀJb − bᵀMa] with M b = a (the letters a, b held fixed); they differ in who does
-// the work:
+// Every formulation is ∇H = 2 ∂_q[nᵀJb − bᵀMa] with M b = a (the letters a, b held fixed); they differ in which
+// algorithms do the work:
 //   rnea   crba + cholesky + computeRNEADerivatives (its dτ/dq, transposed, times b), stock algorithms only
 //   chol   crba + cholesky, the gradient by two velocity sweeps and one backward sweep over Pinocchio's spatial types
 //   aba    aba() for a, its factorization kept for b, the gradient as in chol
 //   hand   no stock algorithm at all: articulated bodies in world axes over Pinocchio's joints and spatial types
-// The sweeps are in world axes, where the forces of subtrees only add up.  One model at a time; not re-entrant.
+// The sweeps use world axes, in which the forces of subtrees are summed without rotation.  The library supports one
+// model at a time and is not re-entrant.
 
 #include <algorithm>
 #include <cmath>
@@ -36,8 +37,8 @@ using Index = pin::JointIndex;
 template<typename T>
 using Links = std::vector<T, Eigen::aligned_allocator<T>>;
 
-// The one-dof joints that a URDF makes, a free-flyer, and what Pinocchio's own code names.  With all of Pinocchio's
-// joint types these few algorithms take g++ -O3 above ten minutes and 5 GB; the run-time dispatch is the same.
+// The joints of one degree of freedom that a URDF can define, a free-flyer, and types that the code of Pinocchio names.
+// With all joint types, g++ -O3 needs over ten minutes and 5 GB; the dispatch at run time is the same.
 template<typename S, int O>
 struct FewJointsTpl
 {
@@ -67,13 +68,13 @@ struct Peer
   std::vector<Index> support;  // joints between the world and the contact, the contact's first
   Vector q, zero, a, b;
   Eigen::MatrixXd dq, dv, da;
-  // World axes, per joint; only `local` is in the joint's own.
+  // In world axes, for each joint; only `local` is in the axes of the joint.
   Links<Motion> va, vb;
   Links<Force> local, bias, Fa, Fb;
   Links<Matrix6> Ia;
   Links<Vector6> S, U;
   std::vector<double> reciprocal, torque;
-  // A free-flyer is solved for its twist: its six rates are that twist in the base's axes.
+  // The solve gives the twist of a free-flyer.  Its six rates are this twist in the axes of the base.
   Eigen::LLT<Matrix6> base;
 
   Peer(const Model & m, Index contact, const Vector3 & position)
@@ -92,7 +93,7 @@ Peer * peer = nullptr;
 
 bool free_flyer(const Peer & p, Index i) { return p.model.nvs[i] == 6; }
 
-// World columns after an algorithm of Pinocchio has placed the links.
+// Computes the columns in world axes after an algorithm of Pinocchio has placed the links.
 void columns(Peer & p)
 {
   for (Index i = 1; i < p.links; ++i) {
@@ -102,7 +103,7 @@ void columns(Peer & p)
   }
 }
 
-// The unit impulse as a force at the world's origin.
+// The unit impulse as a spatial force at the origin of the world.
 Force impulse(const Peer & p, const Vector3 & n) { return Force(n, p.data.oMi[p.contact].act(p.position).cross(n)); }
 
 // Jᵀn.
@@ -132,14 +133,14 @@ void velocity(const Peer & p, Index i, const Vector & rates, Links<Motion> & v)
   }
 }
 
-// The contact's wrench stays in the world's axes while its link turns.
+// The wrench of the contact is constant in world axes while the link turns.
 Vector3 turning(const Peer & p, const Vector3 & n)
 {
   const Motion & v = p.vb[p.contact];
   return n.cross(v.linear() + v.angular().cross(p.data.oMi[p.contact].act(p.position)));
 }
 
-// Components along a joint of a force in world axes, times −2.
+// Component of a force (world axes) along a joint, times −2.
 template<typename Out>
 void project(const Peer & p, Index i, const Force & t, Out && write)
 {
@@ -153,7 +154,7 @@ void project(const Peer & p, Index i, const Force & t, Out && write)
   }
 }
 
-// ∇H from a, b, their link velocities, and inertias and columns in world axes.
+// Computes ∇H from a, b, their link velocities, and inertias and columns in world axes.
 void gradient(Peer & p, const Vector3 & n, double * grad)
 {
   for (Index i = 1; i < p.links; ++i) {
@@ -200,7 +201,7 @@ double eval_rnea(Peer & p, const Vector3 & n, double * grad)
   p.da.setZero();
   pin::computeRNEADerivatives(p.model, p.data, p.q, p.zero, p.a, p.dq, p.dv, p.da);
   Eigen::Map<Vector>(grad, p.model.nv).noalias() = -2.0 * (p.dq.transpose() * p.b);
-  // The contact direction's term: ∂_q nᵀJb along the contact's joints.
+  // Term of the contact direction: ∂_q nᵀJb along the joints of the contact.
   for (auto at = p.support.rbegin(); at != p.support.rend(); ++at) {
     velocity(p, *at, p.b, p.vb);
   }
@@ -248,8 +249,8 @@ void factor_hand(Peer & p)
   }
 }
 
-// A step over Pinocchio's joint models.  Placing: forward kinematics of one joint, its inertia and column in world axes;
-// else: what aba() leaves of its factorization.
+// A step over the joint models of Pinocchio.  With placing: forward kinematics of one joint, its inertia and column
+// in world axes.  Without: the factorization that aba() has computed.
 template<bool placing>
 struct Visit : pin::fusion::JointUnaryVisitorBase<Visit<placing>>
 {
@@ -283,7 +284,7 @@ struct Visit : pin::fusion::JointUnaryVisitorBase<Visit<placing>>
   }
 };
 
-// Forward half of a solve: rates and link velocities from the joints' torques and the base's bias.
+// Forward half of a solve: computes rates and link velocities from joint torques and the bias of the base.
 void outward(Peer & p, Vector & rates, Links<Motion> & v)
 {
   for (Index i = 1; i < p.links; ++i) {
@@ -326,7 +327,7 @@ double value_hand(Peer & p, const Vector3 & n)
     p.Ia[i] = p.data.oinertias[i].matrix();
   }
   factor_hand(p);
-  // M a = Jᵀn: only the contact's own joints carry a bias.
+  // M a = Jᵀn: only joints between the contact and the base have a bias.
   std::fill(p.torque.begin(), p.torque.end(), 0.0);
   Vector6 bias = -impulse(p, n).toVector();
   for (const Index i : p.support) {
@@ -395,9 +396,9 @@ Vector3 at(const double * q, const double * n)
 }  // namespace
 
 extern "C" {
-// Per joint (the world left out): parent; kind X Y Z as 0 1 2 (3 any other axis), 4 more if prismatic, 8 a free-flyer;
-// axis; placement as translation and rotation by columns; mass, center of mass, inertia about it by columns.
-// The free-flyer has no armature.
+// Arguments for each joint, without the world: parent; kind (0, 1, 2 for the axes X, Y, Z, 3 for another axis, plus 4
+// if prismatic; 8 for a free-flyer); axis; placement (translation, rotation by columns); mass, center of mass,
+// inertia about the center of mass by columns.  The free-flyer must not have armature.
 void peer_load(
   int count, const int * parents, const int * kinds, const double * axes, const double * placements,
   const double * inertias, const double * armature, int contact, const double * position)
