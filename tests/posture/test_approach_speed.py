@@ -169,7 +169,7 @@ def test_where_joints_with_limits_do_not_bring_the_contact_nothing_is_demanded(
 ) -> None:
     posed = prepare(make_settings({"normal": (0, 0, 1), "approach": True, **more}))
     assert not any(isinstance(c, ApproachSpeed) for c in posed.problem.constraints)
-    assert any("speed of the approach is not demanded" in note and words in note for note in posed.problem.notes)
+    assert any("speed of the approach is not required" in note and words in note for note in posed.problem.notes)
     assert AttainableSpeed(posed.problem.robot, posed.problem.objective, posed.problem.requirements).unknown
 
 

@@ -10,10 +10,10 @@ price is bounded and not penalized, because minimizers of ``objective + w·price
 of the curve.
 
 One program, with d as the bound of a row, is solved along two paths: outward from the posture with the least price
-and inward from the optimum.  Each solve starts at the result of the previous solve, with its multipliers if this
-result is within the bound.  For each bound, the best certified result is kept.  If the best result for a neighboring
-bound is on another path, a solve starts from this result as well.  The curve is therefore the lower envelope of the
-paths.
+and inward from the optimum.  Each solve starts at the result of the previous solve, and also uses its multipliers if
+this result satisfies the new bound.  For each bound, the best certified result is kept.  If the best result for a
+neighboring bound is on another path, a solve starts from this result as well.  The curve is therefore the lower
+envelope of the paths.
 """
 
 from __future__ import annotations
@@ -38,9 +38,9 @@ from impact_posture.posture.search.growing_search import Progress, run_start
 from impact_posture.posture.search.multistart import PostureSolution, solve
 from impact_posture.system.arrays import Array
 
-# Two prices are equal if they differ by less than this, relative to the price or in rad or m.
+# Tolerance below which two prices are treated as equal, relative or in rad or m.
 _STILL = 1e-6
-# A posture is better if its objective is lower by more than this share of the initial objective.
+# One posture is better than another if its objective is lower by more than this share of the initial objective.
 _EQUAL = 1e-9
 # If the objective increases along the curve by more than this share of the initial objective, the result gets a note.
 _RISE = 1e-6
@@ -62,7 +62,7 @@ def pareto_front(
     compile: CompileMode = "auto",
     progress: Progress | None = None,
 ) -> TradeOff:
-    """Compute the curve in ``points`` equal steps from the least price to the price of the optimum.
+    """Compute the trade-off curve in ``points`` equal steps from the least price to the price of the optimum.
 
     The regularization is left out, because the bound on the distance replaces it.  ``force`` contains the contact and
     the approach speed (m/s) that determine the peak force as the price; if it is ``None``, the price is the distance.
@@ -126,7 +126,7 @@ class _End:
 
 
 class _Curve:
-    """The curve with the best results so far, while it is computed."""
+    """A trade-off curve while it is computed, with the best result so far for each bound."""
 
     def __init__(
         self,
@@ -140,7 +140,7 @@ class _Curve:
         self._scale = problem.objective.value(price.nearest)
         self._best: list[_End | None] = [None] * len(levels)
         self._tried: set[tuple[int, bytes]] = set()
-        # Values for a warm start from the result of each solve, by the bytes of its posture.
+        # Maps the posture of each result (its bytes) to the values for a warm start from this result.
         self._ends: dict[bytes, WarmStart] = {}
         self.solves = 0
         self._take(0, "outward", price.nearest)
@@ -209,7 +209,7 @@ class _Curve:
                 start = record.q
             self._take(k, path, record.q, certificate)
         except MetricError:
-            # The objective is not defined at the result of this solve.
+            # The objective is not defined at the posture where the solver stopped, so the result is ignored.
             return start
         finally:
             self.solves += 1

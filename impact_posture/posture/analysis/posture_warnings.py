@@ -8,8 +8,8 @@ from impact_posture.posture.formulation.problem_file import Prepared
 from impact_posture.posture.loads.holding_forces import HoldingForces
 from impact_posture.system.arrays import Array
 
-# If the attainable speed is below the approach speed by less than this share, there is no warning, because both
-# speeds are equal in the three digits of the message.
+# There is no warning if the attainable speed is below the approach speed by less than this share.  Both speeds would
+# be equal in the three digits of the message.
 _REACHED = 5e-3
 # Joints farther than this (m) behind a surface or below the ground are reported.
 _BEHIND = 0.01
@@ -21,7 +21,7 @@ def posture_warnings(
     """Return warnings about holding forces, approach speed, surface and ground for the optimal posture.
 
     ``holding`` are the forces that hold the optimal posture, and ``attainable`` is the highest contact speed that the
-    joints can reach in this posture, m/s.  Each of the two is ``None`` if it is unknown.
+    joints can reach in this posture, m/s.  ``holding`` or ``attainable`` is ``None`` if unknown.
     """
     verb = "hold" if prepared.impact.robot.spec.propulsion is None else "hover in"
     loads = holding.violations() if holding else []

@@ -96,7 +96,7 @@ def versions() -> dict[str, str]:
 
 @cache
 def _version_of(package: str) -> str | None:
-    """Return the version of an installed package; the result is cached because a look-up takes milliseconds."""
+    """Return the version of an installed package; the result is cached, because finding it takes milliseconds."""
     try:
         return metadata.version(package)
     except metadata.PackageNotFoundError:

@@ -23,8 +23,8 @@ from impact_posture.system.arrays import Array
 
 # Number of random models between the variants, to check whether any model is worse than all variants.
 _BETWEEN = 60
-# A smaller relative change is a rounding error of the solver, and a constraint with a smaller violation (m, rad) is
-# satisfied.
+# Relative changes below this value are treated as errors of the solver.  Constraints with a violation below this
+# value (m, rad) are treated as satisfied.
 _NOISE = 1e-6
 
 
@@ -32,9 +32,9 @@ _NOISE = 1e-6
 class VariantOptimum:
     """A model variant and its own optimum, which is the best posture for this variant alone.
 
-    ``at_robust`` is the objective of the variant at the robust optimum.  ``own`` is its objective at its own optimum
-    ``q``, shape (nq,).  ``moved`` is the tangent distance between both optima.  ``own``, ``q`` and ``moved`` are
-    ``None`` if no start ended at a certified posture.
+    ``at_robust`` is the objective of the variant at the robust optimum.  ``own`` is the objective of the variant at
+    its own optimum ``q``, shape (nq,).  ``moved`` is the tangent distance between the robust optimum and ``q``.
+    ``own``, ``q`` and ``moved`` are ``None`` if no start ended at a certified posture.
     """
 
     name: str
@@ -172,7 +172,7 @@ def solve_robustly(
     solution = run(problem, _apart(problem, feasible), len(alone))
     for k, (member, q) in enumerate(zip(alone, optima, strict=True)):
         # If the robust optimum is better for a variant than its own optimum, the search for its own optimum missed a
-        # better posture.  Search again, also from the robust optimum.
+        # better posture.  Repeat the search for this variant, also from the robust optimum.
         if q is None or member.objective.value(solution.q) < member.objective.value(q) * (1 - _NOISE):
             optima[k] = _optimum(partial(run, member, (solution.q,), len(alone)))
     return RobustSolution(solution, compare_variants(solution, optima, seed))

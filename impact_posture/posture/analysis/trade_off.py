@@ -11,8 +11,8 @@ from impact_posture.config.problem_settings import Against
 from impact_posture.posture.program.certificate import Certificate
 from impact_posture.system.arrays import Array
 
-# A point is a knee only if its share of the gain exceeds its share of the distance by at least this.  For a parabola,
-# which every smooth optimum resembles, this excess is at most 1/4, so a parabola has no knee.
+# A point is a knee only if its share of the total gain exceeds its share of the total distance by at least this
+# value.  For a parabola, which every smooth optimum resembles, the excess is at most 1/4, so a parabola has no knee.
 KNEE = 1 / 3
 
 
@@ -22,8 +22,8 @@ class TradePoint:
 
     Attributes:
         within: The bound on the distance from the initial posture (rad mixed with m), or on the peak force (N).
-        distance: Distance or force of the posture; it is below ``within`` if using the whole bound does not improve
-            the objective.
+        distance: Distance or force of the posture; it is below ``within`` if a larger distance or force does not
+            improve the objective.
         q: Posture, shape (nq,).
         certificate: Certificate of the problem with the bound; at the first point, its stationarity has no meaning.
         first: Whether this is the first point, the only posture at the least distance or force.
@@ -56,8 +56,9 @@ class TradePoint:
 class TradeOff:
     """The best objective within each distance from the initial posture or, depending on ``against``, peak force.
 
-    ``points`` are in the order of distance or force.  ``knee`` is the index of the point at the knee
-    (:func:`find_knee`); ``None`` if there is no knee.  ``solves`` is the number of runs of the solver.
+    ``points`` are the points of the curve, in the order of increasing distance or force.  ``knee`` is the index of
+    the point at the knee (:func:`find_knee`); ``None`` if there is no knee.  ``solves`` is the number of times that
+    the solver ran.
     """
 
     points: tuple[TradePoint, ...]
@@ -82,7 +83,8 @@ class TradeOff:
 def find_knee(distances: Array, objectives: Array) -> int | None:
     """Return the index of the point at which the share of the gain most exceeds the share of the distance.
 
-    Return ``None`` if the excess is below :data:`KNEE`, or if the objective does not improve along the curve.
+    The gain is the decrease of the objective along the curve.  Return ``None`` if the excess is below :data:`KNEE`,
+    or if there is no gain.
     """
     far, gain = distances[-1] - distances[0], objectives[0] - objectives[-1]
     if not (far > 0 and gain > 0):

@@ -186,7 +186,8 @@ def _better_objective(impact: ResolvedImpact, outcome: Outcome, jumps: tuple[Jum
     if outcome in ("worse", "no better") and objective.kind != "coulomb" and not objective.others:
         kind = "sticking" if objective.normal_cone_deg else "coulomb"
         # If the contact sticks at both postures, the jump with friction is the jump that S measures.  At friction 0,
-        # it is the jump that V measures.  These objectives then need no other objective.
+        # the jump equals the jump that V measures.  If the objective is already S or V in these cases, another
+        # objective is not better.
         slides = impact.contact.friction == 0
         sticks = all(isinstance(jump, CoulombJump) and jump.sticks for jump in jumps)
         same = (kind, "speed" if slides else "", "sticking" if sticks else "")

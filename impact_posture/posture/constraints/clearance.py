@@ -18,16 +18,17 @@ from impact_posture.posture.constraints.pair_distances import PairDistances
 from impact_posture.posture.constraints.separating_plane import EQUATIONS, Corners, SeparatingPlane
 from impact_posture.system.arrays import Array
 
-# Distances minus the clearance are exact below this value, m.  For larger distances, lower bounds are enough.
+# Distances minus the clearance are computed exactly if they are below this value, m.  For larger distances, lower
+# bounds are enough.
 _NEAR = 0.01
 # The certificate contains the rows of a pair if its distance minus the clearance is below this value, m.
 _ROWS = 1e-3
-# A pair is added to the program if it violates its clearance by more than this, m; half the tolerance of the
-# certificate.
+# A pair is added to the program if it violates its clearance by more than this value, m.  The value is half the
+# tolerance of the certificate.
 _MISSING = 5e-9
-# Maximum number of pairs that one posture adds to the program, the deepest first: for pairs of links, and for pairs
-# of a link and a plane.  Links behind a plane are mostly neighbors, so moving the deepest one out also moves the
-# others.
+# Maximum number of pairs that one posture adds to the program, the pairs with the deepest penetration first.  The
+# first number is for pairs of links, the second for pairs of a link and a plane.  Links behind a plane are mostly
+# neighbors, so moving the deepest one out also moves the others.
 _MOST, _MOST_BEHIND = 6, 2
 
 _Lifted = WeakKeyDictionary[Tree, dict[int, tuple[Corners, LiftedRows]]]
@@ -121,8 +122,9 @@ class Clearance(Constraint):
             pair, old = self._pairs[k], active.get(k, Corners(frozenset(), frozenset()))
             if k in unknowns and pair.slack(unknowns[k]) > -values[k] / 2:
                 continue
-            # The plane of the program may differ from the plane between the closest points.  It may then cut any
-            # corner without a row, so all corners are added if the closest ones already have rows.
+            # The plane of the program may differ from the plane between the closest points.  The plane of the program
+            # may then cut any corner without a row.  So all corners are added if the closest corners already have
+            # rows.
             for new in (pair.corners(model), pair.every_corner):
                 if not (new.a <= old.a and new.b <= old.b):
                     active[k] = Corners(old.a | new.a, old.b | new.b)
@@ -153,7 +155,7 @@ class Clearance(Constraint):
         return slice(0) if first is None else slice(first, first + 4)
 
     def lift(self, tree: Tree, parameters: ca.SX) -> LiftedRows:
-        """Lift the active pairs.
+        """Return the equations and rows of the active pairs.
 
         The expressions of the equations of a pair are reused while pairs and corners are added.
         """

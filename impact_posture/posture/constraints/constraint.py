@@ -85,7 +85,7 @@ class Linearization:
     @staticmethod
     def joined(parts: Sequence[Linearization], nv: int) -> Linearization:
         """Join the rows of parts whose auxiliaries are separate."""
-        # Most parts are empty, because most postures are far from most bounds.
+        # Leave out empty parts.  Most parts are empty, because most postures are far from most bounds.
         parts = [part for part in parts if part.names or part.auxiliary.shape[1]]
         if len(parts) == 1:
             return parts[0]
@@ -109,7 +109,7 @@ class Constraint(ABC):
     A constraint is an equality if both bounds are equal.
 
     Attributes:
-        name: Name in lists of active and of conflicting constraints.
+        name: Name of the constraint in lists of active or conflicting constraints.
         parameters: Numbers that can change without rebuilding the program, for example targets and polygons.
         lower, upper: Bounds, shape (rows,).
         projected: Whether starts are projected onto the constraint; otherwise only the program enforces it.
@@ -174,7 +174,7 @@ class Constraint(ABC):
     def linearize(self, model: Numeric, auxiliaries: Array) -> Linearization:
         """Linearize the rows at ``model.q`` and ``auxiliaries``, shape (k,).
 
-        Rows far from their bounds may be left out.
+        Rows that are far from their bounds may be left out of the result.
         """
         value, jacobian = self.evaluate(model)
         names = [self.row_name(row) for row in range(self.rows)]
@@ -183,20 +183,21 @@ class Constraint(ABC):
     def grown(self, model: Numeric, auxiliaries: Array | None = None) -> Self:
         """Add the parts that the program lacks at ``model.q``; return the same constraint if no parts are missing.
 
-        If the posture is the end of a run, ``auxiliaries`` are the values of the program there, shape (k,).
+        If ``model.q`` is the final posture of a run, ``auxiliaries`` are the final auxiliaries of this run, shape
+        (k,).
         """
         return self
 
     def slack(self, auxiliaries: Array) -> float:
-        """Return the slack (m) in the auxiliaries of :meth:`lift`, shape (k,), at the end of a run."""
+        """Return the slack, m, from the final ``auxiliaries`` of a run, shape (k,)."""
         return 0.0
 
     def excess(self, value: Array) -> Array:
-        """Return how far ``c(q)`` lies outside its bounds, signed, shape (rows,)."""
+        """Return the signed distance of ``c(q)`` from its bounds, shape (rows,); zero within the bounds."""
         return value - np.clip(value, self.lower, self.upper)
 
     def conflicts(self, excess: Array) -> dict[str, float]:
-        """Return the name and the size of each violation."""
+        """Return the name of each violated row or constraint with the size of the violation."""
         if self.by_row:
             return {self.row_name(row): abs(float(excess[row])) for row in np.flatnonzero(excess).tolist()}
         return {self.name: float(np.linalg.norm(excess))}

@@ -2,8 +2,8 @@
 
 Without friction the jump is ``Δν = a (1+e) v/G`` with ``a = M⁻¹Jᵀn`` and ``G = nᵀJa``, and the peak force decreases
 as G increases (:mod:`impact_posture.impact.elasticity.contact_compression`).  A joint controller with the velocity
-gain ``K_d`` responds to the jump with the torque ``K_d Δν``.  A bound on this torque is therefore a bound on the jump
-(Wang et al. 2020, arXiv:2006.01987).
+gain ``K_d`` responds to the jump with the torque ``K_d Δν``.  A bound on the torque ``K_d Δν`` is therefore a bound
+on the jump (Wang et al. 2020, arXiv:2006.01987).
 """
 
 from __future__ import annotations
@@ -25,7 +25,7 @@ from impact_posture.system.arrays import Array
 class ImpactBounds(ExpressionConstraint):
     """Bounds ``1/G(q) ≤ 1/G_min`` and, at every joint, ``|a_i(q)|/G(q) ≤ b``, for the first contact of the objective.
 
-    ``G_min`` and ``b`` are bounds of rows, so one program can be used for all their values.
+    ``G_min`` and ``b`` are bounds of rows, so the same program can be used for all values of ``G_min`` and ``b``.
 
     Args:
         least_mobility: ``G_min``, 1/kg, the least G at which the peak force satisfies its bound; 0 for no bound.
@@ -42,7 +42,7 @@ class ImpactBounds(ExpressionConstraint):
         self._joints = np.flatnonzero(moving) if np.isfinite(jump) else np.zeros(0, dtype=int)
         self._least, self._jump = least_mobility, jump
         self.parameters = np.array(objective.contact.normal)
-        # The peak force has the row 1/G instead of G, because G_min can be much larger than any G.
+        # The row of the peak force is 1/G and not G, because G_min can be much larger than every attainable G.
         mass = [1 / least_mobility] if least_mobility > 0 else []
         count = len(self._joints)
         self._names = [f"peak force{where}"] * len(mass)

@@ -40,7 +40,8 @@ class PairDistances:
         margins = np.array([pair.margin for pair in self._pairs])
         self._ends = (0, self._first), (1, self._second)
         self._least = self._reach[self._first] + self._reach[self._second] + margins
-        # Corners of the hulls around their centers, in axes that turn with the body; the last corner is repeated.
+        # Corners of each hull relative to its center, in axes that turn with the body.  The last corner is repeated
+        # so that all hulls have the same number of corners.
         corners = [_corners(body) for body in self._bodies]
         most = max(map(len, corners), default=0)
         padded = [np.vstack([points, np.repeat(points[-1:], most - len(points), axis=0)]) for points in corners]
@@ -88,7 +89,7 @@ class PairDistances:
         return self._values[part].copy()
 
     def _move(self, model: Numeric) -> None:
-        """Compute the placements of all bodies, unless the posture is the last one."""
+        """Compute the placements of all bodies, unless the posture did not change since the last call."""
         if np.array_equal(self._q, model.q):
             return
         self._q = model.q

@@ -55,11 +55,11 @@ class PositionBox(HeldPosition):
 class HeldOrientation(ExpressionConstraint):
     """The frame keeps its world orientation ``target``, shape (3, 3), or only the direction of one axis.
 
-    The rows are ``2 vec(Q_left* ⊗ Q(q) ⊗ Q_right)``, the vector part of the error quaternion.  To first order this is
-    the rotation vector in radians.  The error is zero only at the target and largest at 180°, where a skew-symmetric
-    error is zero again.  If ``axis``, a vector in the frame, is given, only the first two components are rows.  The
-    direction of the axis is then constrained, and the frame may turn about it.  If ``axis`` is ``None``, all three
-    components are rows.
+    The rows are ``2 vec(Q_left* ⊗ Q(q) ⊗ Q_right)``, the vector part of the error quaternion.  To first order, the
+    rows are the rotation vector of the error, rad.  The error is zero only at the target and largest at 180°, where a
+    skew-symmetric error is zero again.  If ``axis``, a vector in the frame, is given, only the first two components
+    are rows.  The direction of ``axis`` is then constrained, and the frame may turn about ``axis``.  If ``axis`` is
+    ``None``, all three components are rows.
     """
 
     def __init__(self, name: str, point: PointOnLink, target: Array, axis: Array | None = None) -> None:
@@ -90,13 +90,12 @@ class HeldOrientation(ExpressionConstraint):
         """Return the rows and their tangent Jacobian from the rotation and angular Jacobian (3, nv) of the frame."""
         error = (self._left * pin.Quaternion(rotation) * self._right).coeffs()
         x, y, z, w = (error if error[3] >= 0 else -error).tolist()
-        # d(2 vec(Q)) = (w I + [v]×) ω with ω in the axes that Q rotates, which are the axes of the frame times
-        # `right`.
+        # d(2 vec(Q)) = (w I + [v]×) ω with ω in rotated axes: the rotation of the frame times the matrix of `right`.
         turn = np.array([[w, -z, y], [z, w, -x], [-y, x, w]])[: self.rows] @ (rotation @ self._axes).T
         return 2 * np.array([x, y, z])[: self.rows], turn @ jacobian
 
     def pose_error(self, value: Array) -> tuple[float, float]:
-        """Return a zero position error and the angle θ; the rows have the norm ``2 sin(θ/2)``."""
+        """Return a zero position error and the error angle θ, rad; the rows have the norm ``2 sin(θ/2)``."""
         return 0.0, 2 * float(np.arcsin(min(1.0, float(np.linalg.norm(value)) / 2)))
 
 
@@ -158,7 +157,7 @@ class AxisInCone(ExpressionConstraint):
 
 
 class HeldTurn(ExpressionConstraint):
-    """The base does not turn about one of its axes: ``2 axis·vec(Q*⁻¹ ⊗ Q(q)) = 0``.
+    """The base does not turn about ``axis``, one of its own axes: ``2 axis·vec(Q*⁻¹ ⊗ Q(q)) = 0``.
 
     ``point`` is the origin of the base, ``target`` the orientation ``Q*`` of the base before a turn, shape (3, 3),
     and ``axis`` a unit vector in base axes, shape (3,).

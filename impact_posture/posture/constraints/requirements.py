@@ -28,21 +28,21 @@ class Requirements:
         keep: Frames whose pose must not change.
         hold: Joints whose position must not change.
         com_over_feet: Whether the center of mass must stay above the support polygon.
-        com_asked: Whether the user set ``com_over_feet``.  If not, the requirement is dropped if the feet span no
-            area.
+        com_asked: Whether the user set ``com_over_feet``.  If the user did not set it, the requirement is dropped for
+            feet that span no area.
         com_margin: Least horizontal distance of the center of mass from the edges of the support polygon, m.
         keep_contacts: Whether the feet must neither lift off nor slide during the impact.
         holdable: Whether thrusts, torques and foot forces within their limits must be able to hold the posture.
         limit_share: Share of the torque and thrust ranges that may be used to hold the posture, around the middle of
             each range.
-        hold_force: Force of the surface on each contact after the impact, N, which the robot must also be able to
-            hold.
+        hold_force: Force of the surface on each contact after the impact, N; the robot must also be able to hold its
+            posture under this force.
         least_mobility: Least allowed G of each contact, 1/kg, from the bound on the peak force; 0 for no bound.
         largest_jump: Largest allowed velocity jump of a joint per approach speed; infinite for no bound.
         approach_speed: Speed that the joints must be able to give the contact towards the surface, m/s; 0 for no
             requirement.
         collision: Whether the links must not touch each other, the surface, the ground or the obstacles.
-        clearance: Least distance between any two of these bodies, m.
+        clearance: Least distance between links, surface, ground and obstacles if ``collision`` is set, m.
         surface: ``plane``, ``none``, or the edge length of a square patch in m; ``None`` for a choice that suits the
             robot.
         limit_margin: Least distance of the joint positions from their limits, rad or m.

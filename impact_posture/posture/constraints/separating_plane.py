@@ -30,23 +30,24 @@ from impact_posture.system.arrays import Array
 
 # Number of equations that define m and d for each pair.
 EQUATIONS = 4
-# Lower bound on n·n.  Without this bound, the normal could shrink to zero if bodies penetrate, and the solver could
-# not continue.
+# Lower bound on n·n.  Without this lower bound, the normal n could shrink to zero if bodies penetrate each other, and
+# the solver could not continue.
 _SHORT = 0.8
 # Initially, the slack exceeds the penetration by the first value (m), and the normal has the second value as length.
-# Both are inside their bounds.
+# Slack and normal then start inside their bounds.
 _ABOVE, _LENGTH = 0.01, 0.98
 # Unit of the unknown slack, m.  In this unit and with the usual price of a meter, the multiplier of the slack is one,
-# the initial guess of IPOPT. A run then takes a quarter fewer iterations than in meters.
+# the initial guess of IPOPT. With this unit, a run takes a quarter fewer iterations than with meters.
 _UNIT = 0.02
 # A corner gets a row if it is the first that the plane touches, either untilted or tilted towards one of eight sides.
-# This is the tangent of the tilt.
+# The tangent of the tilt angle is this value.
 _TILT = 0.5
 _AROUND = np.array([[0.0, 0.0], *[[np.cos(a), np.sin(a)] for a in np.arange(8) * np.pi / 4]])
-# A plane separates two bodies if it cuts less than this (m) into a body. The value is half the tolerance of the
+# A plane separates two bodies if it cuts less than this (m) into a body. This limit is half the tolerance of the
 # certificate.
 _KEPT = 5e-9
-# If a corner is farther than this (m) from its plane, its row is inactive and left out.
+# If a corner is farther than this, m, from the plane, its row is inactive and therefore left out of the
+# linearization.
 _NEAR = 1e-3
 
 
@@ -56,7 +57,7 @@ class ConvexBody:
 
     Attributes:
         hull: Corners and sweep radius in the axes of ``point``; ``None`` for the half-space behind a plane.
-        point: The point and axes to which the body is fixed; joint 0 is the world.
+        point: Point and axes to which the body is fixed; the joint with index 0 is the world.
         turns: Whether the body turns with the link; otherwise it keeps world axes.
         normal: Unit normal out of the half-space, in the axes of ``point``, shape (3,).
         offset: Offset of the boundary plane ``{y: normal·y = offset}`` of the half-space, m.
@@ -88,7 +89,7 @@ class ConvexBody:
     def center(self) -> Array:
         """Center of the hull, or origin of the half-space, shape (3,).
 
-        It is in the axes of the joint if the body turns with the link, and otherwise in world axes.
+        The axes are the joint axes if the body turns with the link, and the world axes otherwise.
         """
         center = np.zeros(3) if self.hull is None else self.hull.center
         return np.asarray(self.point.placement.act(center)) if self.turns else center
@@ -250,8 +251,8 @@ class SeparatingPlane:
     def linearize(self, model: Numeric, unknowns: Array | None) -> Linearization:
         """Linearize the rows of corners near the plane in the tangent space and (n, c); see :class:`Constraint`.
 
-        The plane is given by the unknowns of :meth:`lift`.  If they are ``None``, the plane between the closest
-        points is used.
+        The plane is given by the unknowns of :meth:`lift`.  If ``unknowns`` is ``None``, the plane between the
+        closest points is used.
         """
         if unknowns is not None and not self.known:
             rows = self.linearize_at(model, unknowns[:3], float(unknowns[3]))

@@ -36,7 +36,7 @@ _BEHIND = 1e-3
 
 @dataclass(frozen=True, eq=False)
 class _Wall:
-    """A plane or body that links must not touch; only the links of the joints ``exempt`` may."""
+    """A plane or body that no link may touch except the links of the joints in ``exempt``."""
 
     body: ConvexBody
     exempt: frozenset[int]
@@ -85,15 +85,15 @@ class Surroundings:
         """Put the surface behind a contact: the whole plane, or a square patch of it.
 
         The plane passes through the contact point, unless the contact link or a link fixed to it extends behind this
-        plane at the given posture.  In this case, the plane is moved back until it touches the deepest point of these
-        links.  These links may touch the surface.  A link may also touch the surface if its own contact lies in the
-        plane, such as a foot next to the struck foot, or at the same surface, such as the other hand at a wall.  If a
-        foot or a fixed base lies behind the plane, the surface must end before this body, so a patch is used instead
-        of the plane.
+        plane at the given posture.  If one extends behind it, the plane is moved back to the deepest point of these
+        links.  The contact link and the links fixed to it may touch the surface.  A link may also touch the surface
+        if its own contact lies in the plane, such as a foot next to the struck foot, or at the same surface, such as
+        the other hand at a wall.  If a foot or a fixed base lies behind the plane, the surface must end before this
+        body, so a patch is used instead of the plane.
 
-        ``width`` is the edge length of the patch, m; infinite for the plane.  If ``None``, the plane is used unless a
-        fixed body lies behind it.  ``feet`` are the contact points of the feet.  ``contacts`` are the other contacts
-        of the same impact.
+        ``width`` is the edge length of the patch, m; infinite for the plane.  If ``width`` is ``None``, the plane is
+        used unless a fixed body lies behind the plane.  ``feet`` are the contact points of the feet.  ``contacts``
+        are the other contacts of the same impact.
         """
         point = point_on(self.robot, contact.frame, contact.offset)
         turns = contact.normal_frame == "contact"
@@ -107,7 +107,7 @@ class Surroundings:
         beside = [foot for foot in feet if abs(self._above(foot, plane)) < _BESIDE]
         for other in contacts:
             # Links of the same kind, such as two hands, extend equally far behind their contact points, so their
-            # surfaces coincide.  The plane through the contact point is therefore tested too.
+            # surfaces coincide.  A contact is therefore also tested against the plane through the contact point.
             facing = self._world_normal(contact) @ self._world_normal(other) > _PARALLEL
             at = point_on(self.robot, other.frame, other.offset)
             if any(abs(self._above(at, face)) < _BESIDE for face in ((plane, through) if facing else (plane,))):
@@ -159,7 +159,7 @@ class Surroundings:
             apart = [b for b in self._bodies if b.point.joint not in wall.exempt]
             pairs = [SeparatingPlane(body, wall.body, self._clearance) for body in apart]
             groups.append((wall.body.name, pairs, f"links and {wall.body.name} {near}"))
-        # The distances of all groups are computed together, because all are needed at the same postures.
+        # The distances of all groups of pairs are computed together, because they are needed at the same postures.
         distances, first, constraints = PairDistances([pair for _, pairs, _ in groups for pair in pairs]), 0, []
         for name, pairs, text in groups:
             if pairs:
@@ -203,7 +203,7 @@ class Surroundings:
     def walls_at(self, q: Array) -> tuple[list[HalfSpace], list[tuple[SweptHull, pin.SE3, frozenset[int]]]]:
         """Return the planes, and the bodies with their placements, around the robot at ``q``.
 
-        Each has the joints whose links may touch it.
+        For each plane or body, the result contains the joints whose links may touch it.
         """
         numeric, planes, solids = self._moving.at(q), [], []
         for wall in self._walls:

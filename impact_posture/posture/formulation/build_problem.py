@@ -104,8 +104,9 @@ def retarget(
 ) -> ConstrainedProblem:
     """Return the problem with another target of its only contact frame; the program stays the same.
 
-    The target is a position in world axes, m, and a quaternion x y z w.  Each is ``None`` to keep its initial value.
-    If the caller passes a model ``numeric``, its state changes to the given posture.
+    The target is a position in world axes, m, and a quaternion x y z w.  If ``position`` or ``quaternion`` is
+    ``None``, its initial value is the target. If the caller passes a model ``numeric``, its state changes to the
+    given posture.
 
     Raises:
         InputError: The contact pose is free and cannot have a target, or the quaternion does not have unit length.

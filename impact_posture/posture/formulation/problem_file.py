@@ -170,7 +170,8 @@ def resolved_settings(prepared: Prepared) -> ProblemSettings:
         **_resolved_contacts(impact),
         "posture": None,
         "q": tuple(float(v) for v in impact.q),
-        # This key applies to all contacts.  If there are several contacts, its value stays as the user gave it.
+        # One key `contact_pose` applies to all contacts.  If there are several contacts, the key keeps the value that
+        # the user gave.
         "contact_pose": settings.contact_pose if wanted.other_poses else wanted.contact_pose,
         "support": tuple(f"{s.frame}:{s.kind}" for s in impact.supports),
         "support_compliance": impact.objective.compliance if impact.supports else None,

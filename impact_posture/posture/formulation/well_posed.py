@@ -41,8 +41,9 @@ def fix_undetermined_motions(
     """Return constraints on motions of the base that nothing else determines, and notes for the user.
 
     Some motions of the whole robot, such as translations, do not change the objective.  If the constraints allow a
-    motion of this kind, the base is fixed in its direction.  If the contact pose is free and the robot has no feet,
-    yaw is fixed as well, because a turn of the whole robot relative to the impact does not change the posture.
+    motion that does not change the objective, this motion of the base is fixed.  If the contact pose is free and the
+    robot has no feet, yaw is fixed as well, because a turn of the whole robot relative to the impact does not change
+    the posture.
     """
     if not robot.floating:
         return [], []
@@ -85,10 +86,10 @@ def fix_undetermined_motions(
 def make_well_posed(problem: ConstrainedProblem) -> ConstrainedProblem:
     """Choose independent equality rows for the program, and constrain turns that are possible only to first order.
 
-    Four point feet on planar legs (solo8) give 12 equations of rank 10.  Two equations are redundant.  To first
-    order, the base can roll, although any finite roll would spread the feet.  The solver cannot solve the program in
-    either case.  So the program omits the redundant rows, which the certificate still checks, and a constraint blocks
-    the turn.
+    Four point feet on planar legs (solo8) give 12 equations of rank 10.  Two of these equations are redundant.  To
+    first order, the base can roll, although any finite roll would spread the feet.  Both the redundant equations and
+    this roll prevent the solver from converging.  So the program omits the redundant rows, which the certificate
+    still checks, and a constraint blocks the turn.
     """
     numeric = Numeric(problem.robot.model)
     jacobian = equality_jacobian(problem, numeric.at(problem.given))

@@ -49,7 +49,8 @@ class Distribution:
 class Thrusts:
     """Thrusts ``u = P τ_base`` of the rotors ``names``, determined by the wrench on the base, and their limits.
 
-    ``matrix`` is ``P`` in N per N and N·m, shape (k, 6).  The limits are in N, shape (k,).
+    ``matrix`` is ``P`` in N per N and N·m, shape (k, 6).  ``lower`` and ``upper`` are the limits of the thrusts, N,
+    shape (k,).
     """
 
     names: tuple[str, ...] = ()
@@ -120,8 +121,8 @@ class Equilibrium:
     def spares(self, q: Array, room: float) -> bool:
         """Return whether a nearly even distribution of forces balances the base with all shares below ``1 − room``.
 
-        If it does, the posture can be held, and no linear program is needed.  Otherwise, other forces may still hold
-        the posture.
+        If nearly even forces suffice, the posture can be held, and no linear program is needed.  If they do not
+        suffice, other forces may still hold the posture.
         """
         key = q.tobytes()
         if self._even is None or self._even[0] != key:
@@ -175,7 +176,8 @@ class Equilibrium:
     def shares(self, q: Array, load: Array) -> Array | None:
         """Return the signed shares, shape (actuators,), for a load other than gravity alone, such as ``M ν̇ + h``.
 
-        The largest share is as small as possible.  ``None`` if the feet cannot balance the load.
+        The forces are chosen so that the largest share is as small as possible.  The result is ``None`` if the feet
+        cannot balance the load.
         """
         A, b, S, c = self._affine(load, self._by_force(q))
         if not self.load.count:
@@ -186,7 +188,8 @@ class Equilibrium:
     def largest_rate(self, q: Array, rest: Array, dynamic: Array) -> float | None:
         """Return the largest ``λ ≥ 0`` at which the actuators can hold the load ``rest + λ dynamic``.
 
-        The result is infinite if they can hold it for every λ, and ``None`` if they cannot even hold ``rest``.
+        The result is infinite if the actuators can hold the load for every λ, and ``None`` if they cannot even hold
+        ``rest``.
         """
         A, b, S, c = self._affine(rest, self._by_force(q))
         rate = self.rows @ dynamic

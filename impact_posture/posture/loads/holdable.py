@@ -21,8 +21,8 @@ from impact_posture.posture.loads.equilibrium import Equilibrium
 from impact_posture.posture.loads.static_load import StaticLoad
 from impact_posture.system.arrays import Array
 
-# The rows are added to the program if a posture violates them by more than this, half the tolerance of the
-# certificate.
+# The rows are added to the program if a posture violates them by more than this value, which is half the tolerance of
+# the certificate.
 _KEPT = 5e-9
 # If a share of a limit differs from 1 by less than this, its row may be active and have a multiplier.
 _NEAR = 1e-3
@@ -44,8 +44,8 @@ class Holdable(Constraint):
     """
 
     price = _PRICE
-    # Most starts end within the limits without a projection, and starts that are projected onto this constraint
-    # differ less.
+    # Starts are not projected onto this constraint.  Most starts end within the limits anyway, and projected starts
+    # would differ less from each other.
     projected = False
     by_row = True
 
@@ -79,7 +79,7 @@ class Holdable(Constraint):
         return np.zeros(self.rows) if self._rest.spares(model.q, 0.0) else self.evaluate(model)[0]
 
     def grown(self, model: Numeric, auxiliaries: Array | None = None) -> Self:
-        """Add the rows if the posture violates them."""
+        """Add the rows of the constraint to the program if the posture violates them."""
         if self.active or self.value(model).max() <= _KEPT:
             return self
         return type(self)(self._load, self._rest, self._description, active=True)

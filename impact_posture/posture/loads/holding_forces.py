@@ -9,8 +9,8 @@ import numpy as np
 from impact_posture.posture.loads.equilibrium import Equilibrium
 from impact_posture.system.arrays import Array
 
-# An excess of a share above 1, or an unbalanced wrench in units of the robot's weight, is a rounding error of the
-# solver up to this value.
+# Up to this value, an excess of a share above 1 is treated as a rounding error of the solver.  This also applies to
+# an unbalanced wrench in units of the robot's weight.
 _ROUNDING = 1e-6
 
 

@@ -24,8 +24,8 @@ from impact_posture.system.arrays import Array
 
 # Number of edges of the pyramid inside a friction cone.
 _EDGES = 4
-# Upper limit of the friction coefficient.  With more friction, the edges of the pyramid would be nearly horizontal
-# and could hardly support weight.
+# Upper limit of the friction coefficient.  With a larger coefficient, the edges of the friction pyramid would be
+# nearly horizontal and could hardly support weight.
 _MOST_FRICTION = 10.0
 # A singular value of the map from forces to the base wrench is treated as zero below this share of the largest one.
 _RANK = 1e-9
@@ -76,7 +76,8 @@ def load_cases(objective: Objective, q: Array, requirements: Requirements) -> Lo
     """Return the load cases if the data of the robot are sufficient; ``q`` is a posture with the feet in place.
 
     Before the impact, no force acts on the contact.  If ``hold_force`` is set, the robot must also hold this force
-    along the normal of every contact.  For each payload of the robot, these cases are added once more.
+    along the normal of every contact.  For each payload of the robot, the same load cases are added for the robot
+    with this payload.
 
     Raises:
         InputError: A force has to be held, but the data of the robot are not sufficient.

@@ -1,8 +1,8 @@
 """Joint torques of a robot at rest, as a CasADi expression and as numbers from Pinocchio.
 
 A robot at rest under gravity satisfies ``τ = h(q) − Σ J_kᵀ w_k``, with the generalized gravity ``h`` and the wrenches
-``w_k = W_k z_k + p_k`` of rotors, feet and pushes on the robot.  ``τ`` is dual to ``ν``.  For a floating base its
-first six entries are the unbalanced wrench on the base, which no actuator can produce.
+``w_k = W_k z_k + p_k`` of rotors, feet and pushes on the robot.  ``τ`` is dual to ``ν``.  For a floating base, the
+first six entries of ``τ`` are the unbalanced wrench on the base, which no actuator can produce.
 """
 
 from __future__ import annotations
@@ -97,8 +97,8 @@ class StaticLoad:
     def torque(self, q: Array, z: Array, *, by_posture: bool = True) -> StaticTorque:
         """Return ``τ`` and its derivatives at a posture; leaving out ``∂τ/∂q`` saves time.
 
-        Pinocchio computes derivatives for forces that are constant in the axes of the link.  In these axes, a force
-        that is constant in the world becomes ``f + f × δ`` if the link turns by δ.
+        Pinocchio computes derivatives for forces that are constant in the axes of the link.  In the axes of the link,
+        a force that is constant in the world becomes ``f + f × δ`` if the link turns by δ.
         """
         model, data = self.model, self._data
         pin.computeJointJacobians(model, data, q)

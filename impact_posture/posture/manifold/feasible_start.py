@@ -13,13 +13,13 @@ from impact_posture.dynamics.numeric import Numeric
 from impact_posture.posture.program.constrained_problem import ConstrainedProblem, held_rows
 from impact_posture.system.arrays import Array
 
-# A constraint is satisfied if its violation is at most this (m, rad).
+# A constraint is treated as satisfied if its violation is at most this value (m, rad).
 FEASIBLE = 1e-8
 # Maximum number of random postures that are projected onto the constraints for one start.
 ATTEMPTS = 20
 _STEPS = 80
-# The projection stops if the violation decreases by less than a fifth in this many steps, because it would hardly
-# ever converge.
+# If the violation decreases by less than a fifth in this many steps, the projection stops, because it would probably
+# not converge.
 _PATIENCE = 16
 # Maximum number of projected postures among which one start is chosen.
 CANDIDATES = 3
@@ -72,7 +72,7 @@ class Projector:
     def outside(self, q: Array, most: float = np.inf) -> float:
         """Return the sum of the violations of all constraints that are not projected.
 
-        If the sum exceeds ``most``, the result may be too low.
+        If the sum of the violations exceeds ``most``, the result may be too low.
         """
         self.numeric.at(q)
         total = 0.0

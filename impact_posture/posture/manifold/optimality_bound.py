@@ -2,8 +2,8 @@
 
 A patch is the part of the manifold within a radius r of its center.  With ``φ = ln f``, its gradient g along the
 manifold and a bound M on the curvature of φ, the patch has ``φ ≥ φ(center) − ‖g‖ r − M r²/2``.  M is estimated from
-the gradients at neighbors, so the result is an estimate as well.  It is therefore called *bounded* and not proved.
-The logarithm makes the bound relative and useful even near the poles of V and S.
+the gradients at neighbors, so the result is an estimate as well.  The objective is therefore called *bounded*, and
+the bound is not a proof. The logarithm makes the bound relative and useful even near the poles of V and S.
 """
 
 from __future__ import annotations
@@ -19,7 +19,7 @@ from impact_posture.system.arrays import Array
 
 # Safety factor on the largest curvature between neighbors.
 _SAFETY = 2.0
-# A posture is feasible if its distance from satisfying the limits and inequalities is at most this.
+# A posture is treated as feasible if its distance from the feasible set is at most this value.
 _FEASIBLE = 1e-7
 # A patch is discarded if the first-order distance of its center from the feasible set exceeds this many radii.
 _BEYOND = 1.5
@@ -28,8 +28,8 @@ _MOST = 200_000
 # segments of half the length.
 _RING = [[np.sqrt(0.75) * np.cos(a), np.sqrt(0.75) * np.sin(a)] for a in np.pi / 3 * np.arange(6)]
 _PARTS = {1: np.array([[-0.5], [0.5]]), 2: np.array([[0.0, 0.0], *_RING])}
-# Ratio of the radius of a part to the radius of its parent.  It exceeds 1/2 so that the parts overlap, because the
-# manifold is curved.
+# Ratio of the radius of a part to the radius of its parent.  The ratio exceeds 1/2 so that the parts overlap, because
+# the manifold is curved.
 _HALF = 0.52
 
 

@@ -28,17 +28,17 @@ _TURN, _STRAIGHT = 0.98, 0.995
 # A posture belongs to a node only if its distance from the tangent space of the node is at most this share of its
 # distance from the node.
 _FLAT = 0.2
-# Each point of a curve is closer to a node than this share of a step.  The share is slightly more than half, because
-# the curve bends.
+# Each point of a curve is closer to a node than this share of a step.  This share of a step is slightly more than
+# half, because the curve bends.
 _HALF = 0.52
 # Maximum number of nodes of a curve or surface.
 _NODES = 20_000
 # For surfaces: length of a step, least distance between nodes as a share of the step, and number of directions of
 # steps.
 _STEP, _APART, _DIRECTIONS = 0.16, 0.7, 8
-# Radius that a node of a surface covers, as a share of the step.  A point one step away from a node differs by at
-# most half the angle between directions from a tried point, and the tried point is closer to a node than the least
-# distance between nodes.
+# Radius that a node of a surface covers, as a share of the step.  Consider a point one step away from a node.  A
+# tried point lies within half the angle between directions, and a node lies within the least distance between nodes
+# from the tried point.
 COVERED = _APART + 2 * np.sin(np.pi / _DIRECTIONS / 2)
 _BATCH = 100
 
@@ -97,11 +97,11 @@ def map_self_motion(
     """
     if dimension not in (1, 2):
         fault = f"{dimension} degrees of freedom are left"
-        raise InputError(fault, where="search", hint="a map needs 1 or 2; add constraints to reduce the number")
+        raise InputError(fault, where="search", hint="add constraints until 1 or 2 degrees of freedom are left")
     rng, components = np.random.default_rng(seed), _missing(manifold, dimension, (), known)
     starts = unsuccessful = idle = 0
-    # Stop too if hardly any random posture reaches the manifold, because then almost no part of it is within the
-    # limits.
+    # Also stop if less than about a tenth of the random postures reach the manifold, because then almost no part of
+    # the manifold is within the limits.
     while unsuccessful < patience and idle < 10 * patience:
         x = _random(manifold, rng)
         new = _missing(manifold, dimension, components, x)
@@ -205,7 +205,7 @@ def _branch(manifold: ConstraintManifold, start: Array, tangent: Array) -> tuple
             continue
         beyond = np.maximum(manifold.lower - moved.x[0], moved.x[0] - manifold.upper).max(initial=-np.inf)
         if beyond > 1e-9:
-            # The step crosses a limit.  Halve the step until it ends close to the limit.
+            # If a step crosses a limit, halve the step until it ends close to the limit.
             if step < 10 * _SINGULAR:
                 return nodes, lengths, "limit"
             step /= 2
@@ -231,7 +231,7 @@ def _surface(manifold: ConstraintManifold, x: Array) -> Component:
 
     From each node, points one step away are tried in all directions of its tangent plane.  A point that is far from
     all nodes becomes a node.  Nodes beyond the limits by less than a step are added to cover the rim of the surface.
-    The front does not continue from these nodes.
+    The front does not continue from nodes beyond the limits.
     """
     from scipy.spatial import cKDTree
 

@@ -20,8 +20,8 @@ from impact_posture.system.arrays import Array, null_space
 # Only an inequality closer to its bound than this (m, rad) can have a multiplier.
 _ACTIVE = 1e-3
 # A member of a maximum is included if its value is below the maximum by at most this share of f₀.  The tolerance of
-# the solver is also a share of f₀.  It is large relative to the objective if the objective decreased by orders of
-# magnitude.  The tolerance of complementarity is twice this gap.
+# the solver is also a share of f₀.  This tolerance is large relative to the objective if the objective decreased by
+# orders of magnitude.  The tolerance of complementarity is twice this share.
 _TIED = 5e-8
 # Weight of complementarity relative to stationarity; it equals the ratio of their tolerances.
 _COMPLEMENTARITY = 10.0
@@ -35,7 +35,7 @@ _MULTIPLIER = 1e-6
 class Active:
     """An active inequality: a constraint, such as ``joint 'elbow'``, and its ``lower`` or ``upper`` side.
 
-    ``multiplier`` (≥ 0) is the decrease of the scaled objective per unit by which the bound is relaxed.
+    ``multiplier`` (≥ 0) is the rate at which the scaled objective decreases if the bound is relaxed, per m or rad.
     """
 
     constraint: str
@@ -49,9 +49,9 @@ class Certificate:
 
     Attributes:
         stationarity: ``‖∇f/f₀ + Aᵀλ‖_∞`` in the tangent space, with the objective f, its initial value f₀, and the
-            Jacobian A of constraints and limits.  The multipliers λ have the right signs and make the residual least.
-        primal: Largest violation of any constraint, limit or unit norm (m, rad).
-        complementarity: Largest product of a multiplier and the distance of its row from the bound.
+            Jacobian A of constraints and limits.  λ are the multipliers with the right signs that minimize this norm.
+        primal: Largest violation of a constraint or joint limit, or error of the norm of a quaternion (m, rad).
+        complementarity: Largest product of a multiplier and the distance of its constraint from the bound.
         pose_error_m: Largest position error of a frame whose position is constrained, m.
         pose_error_rad: Largest orientation error of a frame whose orientation is constrained, rad.
         limits: Largest violation of a joint limit, rad or m.
@@ -136,10 +136,10 @@ def certify(
 
 
 def objective_gradients(problem: ConstrainedProblem, q: Array, scale: float) -> tuple[Array, Array]:
-    """Return tangent gradients of the objective, shape (k, nv), and the gaps of their members, shape (k,).
+    """Return the tangent gradient and the gap of each member of a worst case, shapes (k, nv) and (k,).
 
-    The convex combinations of the gradients are the subdifferential of objective/scale plus regularization.  If this
-    sum is smooth, k = 1.  A gap is the distance of a member from the maximum, divided by the scale.
+    The convex combinations of the gradients are the subdifferential of objective/scale plus regularization.  If the
+    objective is smooth at ``q``, k = 1.  A gap is the distance of a member from the maximum, divided by the scale.
     """
     members = problem.objective.subgradients(q, _TIED * scale)
     gradients = members.gradients / scale
@@ -207,8 +207,8 @@ def _multipliers(gradients: Array, equalities: Array, near: Sequence[_NearBound]
         right = np.concatenate([-reduced[0], np.zeros(len(near))])
         multipliers = nonnegative_least_squares(np.vstack([bounds.T, slack]), right)
         return np.ones(1), multipliers, free @ (reduced[0] + bounds.T @ multipliers)
-    # An additional row asks for the sum 1 of the weights.  It only scales the solution, so the weights are divided by
-    # their sum.
+    # An additional row requires that the weights have the sum 1.  This row changes only the scale of the solution, so
+    # the solution is divided by the sum of the weights.
     left = np.vstack([reduced.T, np.zeros((len(near), count)), np.ones(count)])
     system = np.hstack([left, np.vstack([bounds.T, slack, np.zeros(len(near))])])
     solution = nonnegative_least_squares(system, np.eye(len(system))[-1])
@@ -233,7 +233,8 @@ def nonnegative_least_squares(matrix: Array, right: Array) -> Array:
             break
         passive[slope.argmax()] = True
         while (trial := _unbounded(matrix, right, passive))[passive].min(initial=np.inf) <= 0:
-            # Move towards the trial solution until the first entry becomes zero.  This entry then stays zero.
+            # Move towards the trial solution until the first entry becomes zero.  The entry that became zero stays
+            # zero.
             falling = passive & (trial <= 0)
             step = (x[falling] / np.maximum(x[falling] - trial[falling], np.finfo(float).tiny)).min()
             x += step * (trial - x)

@@ -22,14 +22,15 @@ from impact_posture.system.toolchain import find_compiler, require_compiler, run
 
 CompileMode = Literal["auto", "always", "never"]
 
-# These numbers are from docs/studies/solve.py for talos: compiling 170,000 operations takes about 20 s, and a start
-# of about 25 iterations is then about 30 ms faster.  For the decision, orders of magnitude are enough.
+# These times are measured with docs/studies/solve.py for talos: compiling 170,000 operations takes about 20 s, and a
+# start of about 25 iterations is then about 30 ms faster.  Whether compiling saves time depends only on their orders
+# of magnitude.
 _COMPILE_S_PER_OPERATION = 1.2e-4
 _SAVED_S_PER_OPERATION = 6e-9
 _ITERATIONS = 35
 # Functions with more operations are compiled with -O0.  With -O1, compiling takes three times as long, and the code
-# is three times as fast.  This is not worthwhile, because evaluating the code takes only a small part of the solve
-# time even with -O0.
+# is three times as fast.  For large functions, -O1 is not worthwhile, because evaluating them takes only a small part
+# of the solve time even with -O0.
 _OPTIMIZED = 100_000
 
 
@@ -56,7 +57,7 @@ def compiled_solver(
 
     Raises:
         InputError: The mode is not one of ``auto``, ``always`` and ``never``.
-        CompilerError: The mode is ``always``, and there is no compiler or it fails.
+        CompilerError: The mode is ``always``, and there is no compiler, or the compiler fails.
         OutputError: The mode is ``always``, and the cache folder cannot be written, or other users can write to the
             folder.
     """

@@ -19,8 +19,8 @@ from impact_posture.posture.constraints.surroundings import Surroundings
 from impact_posture.robot.robot import Robot
 from impact_posture.system.arrays import Array
 
-# A constraint restricts a direction of the tangent space if a unit step along this direction changes the value of the
-# constraint by more than this.
+# Tolerance of the rank: a constraint restricts a direction of the tangent space if a unit step along this direction
+# changes the constraint value by more than this.
 RANK_TOLERANCE = 1e-7
 
 
@@ -92,8 +92,8 @@ class ConstrainedProblem:
     ) -> ConstrainedProblem:
         """Add the parts that the program lacks at the postures; return the same problem if no parts are missing.
 
-        If the postures are ends of runs, ``auxiliaries`` are the values of the program there, shape (k,) each.  If
-        the caller passes a model ``numeric``, its state changes.
+        If the postures are final postures of runs, ``auxiliaries`` are the final auxiliaries of these runs, shape
+        (k,) each.  If the caller passes a model ``numeric``, its state changes to the last posture.
         """
         constraints, numeric = list(self.constraints), numeric or Numeric(self.robot.model)
         for index, q in enumerate(postures):

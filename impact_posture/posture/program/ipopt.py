@@ -36,16 +36,17 @@ IPOPT_OPTIONS: dict[str, Any] = {
     "ipopt.max_iter": 300,
     "print_time": False,
     "calc_lam_p": False,
-    # The sensitivities of the solution are not used.
+    # Do not compute sensitivities of the solution, because they are not used.
     "no_nlp_grad": True,
     "error_on_fail": False,
 }
 # Options for worst cases.  The dual of a cone has quadratic equations, and the bound ``t`` can decrease while they
-# are violated.  After a step that lowers the objective by a large violation, IPOPT does not return to the equations.
+# are violated.  If a step reduces the objective but violates the equations strongly, IPOPT does not return to a small
+# violation.
 WORST_OPTIONS = {"ipopt.theta_max_fact": 1.0}
 CONVERGED = ("Solve_Succeeded", "Solved_To_Acceptable_Level")
-# With these options, unknowns that start on their bounds stay there.  By default, IPOPT moves these unknowns inside
-# and needs iterations to return them to the bounds.
+# With these options, IPOPT starts from the given unknowns even if they lie on their bounds.  By default, IPOPT moves
+# unknowns away from their bounds and needs iterations to return them.
 WARM_OPTIONS = {"ipopt.warm_start_init_point": "yes"} | {
     f"ipopt.warm_start_{name}": 1e-8
     for name in ("bound_push", "bound_frac", "slack_bound_push", "slack_bound_frac", "mult_bound_push")

@@ -19,8 +19,8 @@ from impact_posture.posture.program.program import Program, parameters
 from impact_posture.posture.program.program_rows import ProgramRows
 from impact_posture.system.arrays import Array
 
-# Price of a meter of slack in units of the initial objective.  It must exceed the decrease of the objective per meter
-# of slack.  With the price 2, slack remained.
+# Price of a meter of slack in units of the initial objective.  The price must exceed the decrease of the objective
+# per meter of slack.  With the price 2, the solutions still had slack.
 SLACK_PRICE = 50.0
 # Counter for the numbers of the programs in this process.
 _NUMBERS = count()

@@ -6,7 +6,7 @@ In the lifted formulation, IPOPT solves the linear equations of the impact::
     subject to            M(q)a − J_sᵀf − Jᵀs = 0,  J_s a + εf = 0,  equations of s and n,
                           c(q) within bounds,  |quaternions| = 1,  limits,
 
-Every function is then linear or quadratic in the auxiliaries, and the exact Hessian stays small
+In this formulation, every function is linear or quadratic in the auxiliaries, and the exact Hessian stays small
 (``docs/studies/formulations.py`` compares both forms).  An inner maximum adds unknowns and rows
 (:mod:`impact_posture.impact.worst_case.model_set`).
 """

@@ -20,8 +20,8 @@ from impact_posture.system.arrays import Array
 
 # A violation below this (m, rad) counts as satisfied.
 _KEPT = 1e-6
-# Price of a meter of slack. It is lower than the price 1 of a violated pose. If a body blocks a pose, the body is
-# thus named as the conflict, not the pose.
+# Price of a meter of slack of bodies, lower than the price 1 of a violated pose.  If a body blocks a pose, the body
+# is therefore reported as the conflict, not the pose.
 _SLACK_PRICE = 0.03
 # Price of the squared distance from the given posture, which makes the solution unique.
 _AWAY_PRICE = 1e-6
@@ -31,8 +31,8 @@ _TRIES, _DRAWN = 24, 200
 # Number of starts that confirm a conflict known from a nearby target. For panda in front of a wall, two starts are
 # needed to find a way around a body.
 _CONFIRMING = 4
-# Number of random postures that are drawn first. They usually suffice, and drawing all takes longer than solving the
-# program of a small robot.
+# Number of random postures that are drawn first. This number usually suffices, and drawing all takes longer than
+# solving the program of a small robot.
 _DRAW = 8
 # Maximum number of times that the program grows for one start.
 _ROUNDS = 20
@@ -95,7 +95,7 @@ def _starts(problem: ConstrainedProblem, chart: Chart, seed: int) -> Iterator[Ar
 
 
 def _relax(problem: ConstrainedProblem, chart: Chart, program: ElasticProgram, start: Array) -> LeastViolation:
-    """Minimize the slack from one start; if the program lacked parts, the problem in the result contains them."""
+    """Minimize the slack from one start; the problem in the result contains parts that the program lacked."""
     lower_rows, upper_rows = problem.row_bounds
     norms = np.zeros(len(chart.quaternion_slices()))
     x = np.clip(chart.to_x(start), problem.lower, problem.upper)
@@ -119,8 +119,8 @@ def _relax(problem: ConstrainedProblem, chart: Chart, program: ElasticProgram, s
 class ElasticProgram:
     """The program that relaxes the constraints with slacks.
 
-    Most of its expressions stay the same while the problem grows.  ``rows`` are the rows of its constraints, if
-    another program of the problem has already built them.  ``problem`` is the latest grown problem, and ``time_s``
+    Most expressions of the program stay the same while the problem grows.  ``rows`` are the rows of its constraints,
+    if another program of the problem has already built them.  ``problem`` is the latest grown problem, and ``time_s``
     the total wall time of the solver.
     """
 

@@ -34,8 +34,9 @@ _ROUNDS = 10
 _SMALL = 1000
 # These numbers apply unless all starts are finished: the unknowns of all starts that continue together, the least
 # number of these starts, and the share above the best objective from which a start is dominated.  If more starts
-# continued together, the program would get parts that the best starts do not need. If fewer did, the program would be
-# built more often.  The share is large because a run after a trap may end below the bound of its start.
+# continued together, the program would get parts that the best starts do not need.  If fewer starts continued
+# together, the program would be built more often.  The share is large because a run after a trap may end below the
+# bound of its start.
 _BATCH, _LEAST, _FAR = 600, 2, 0.05
 # Starting processes takes as long as runs with this many unknowns in total.
 _FORK = 200
@@ -52,15 +53,15 @@ class SolverRun:
     """A run of the solver from one start.
 
     Attributes:
-        start: The start, shape (nq,); ``None`` if no attempt reached the constraints.
+        start: Posture from which the run starts, shape (nq,); ``None`` if no attempt reached the constraints.
         record: Result of the solver; ``None`` if the objective is not defined at the end of the run.
-        objective: Objective at the end.
+        objective: Objective at the final posture.
         minimized: Objective divided by the initial objective, plus the regularization.
         certificate: Certificate of the final posture; ``None`` while the program lacks parts.
         lacks: Whether the program lacks parts that the final posture needs.
         dominated: Whether the start was stopped after this run because it could not become the best.
         trapped: Whether the final posture violates a constraint although the program lacks no parts, or because slack
-            lowers the objective by more than its price.  The run is then repeated at a higher price.
+            lowers the objective by more than its price.  A trapped run is repeated at a higher price of slack.
         time_s: Wall time of all runs from the start, s; the time of a run for several starts is divided equally among
             them.
     """
@@ -124,7 +125,7 @@ class GrowingSearch:
         self._small = draws.count * self._unknowns <= _SMALL
         self._finish_all = finish_all or self._small
         self.build_time_s = self.nlp.build_time_s
-        # Ends of runs, from which the next runs continue with the grown program.
+        # Final postures of runs; the next runs continue from these postures with the grown program.
         self._ends: dict[int, Array] = {}
         # Price of a meter of slack for starts without a run that ended in a trap.
         self._price = SLACK_PRICE
@@ -132,16 +133,17 @@ class GrowingSearch:
         self._trapped: Counter[int] = Counter()
 
     def run(self, jobs: int, progress: Progress | None) -> list[SolverRun]:
-        """Run all starts, and run again from each final posture at which the program lacked rows.
+        """Run all starts; if the program lacks rows at a final posture, run again from this posture.
 
-        The objective at this posture is a lower bound for the start, because more rows raise the objective.  Starts
-        with the lowest bounds continue first, and starts with bounds well above a certified end do not continue.
+        The objective at such a final posture is a lower bound for the start, because additional rows raise the
+        objective.  Starts with the lowest bounds continue first, and starts with bounds well above a certified end do
+        not continue.
         """
         runs: dict[int, SolverRun] = {}
         starts, best = self._draws.count, np.inf
         waiting, counts = list(range(starts)), [0] * starts
-        # Results at which the program lacks rows, with the problem of their run. The program gets these rows when the
-        # start continues.
+        # Results at which the program lacks rows, with the problem of their run. When the start continues, the
+        # missing rows are added to the program.
         owed: dict[int, tuple[SolveRecord, ConstrainedProblem]] = {}
         while waiting:
             batch = self._next(waiting, runs)
@@ -159,7 +161,7 @@ class GrowingSearch:
                     best = run.minimized
             lacking = {k: r for k in batch if (r := runs[k].record) is not None and runs[k].lacks and k not in last}
             # A run with missing rows passes through bodies and may end between them.  With all rows and a higher
-            # price, a run stays within the constraints that its start satisfies.
+            # price of slack, a run stays within the constraints that its start satisfies.
             trapped = {k for k in batch if runs[k].trapped and k not in last}
             if len(runs) < starts and trapped == {*range(FIRST)}:
                 # For each of the first starts, passing through a body lowers the objective by more than the price.
@@ -191,12 +193,12 @@ class GrowingSearch:
         return int(self.nlp.solver.size1_in("x0"))
 
     def _next(self, waiting: list[int], runs: dict[int, SolverRun]) -> list[int]:
-        """Return the starts to run next."""
+        """Return the indices of the starts that run next."""
         if not runs and self.problem.grows:
             # Most starts lack the same rows as the first starts.
             return waiting[:FIRST]
         if self._small and len(runs) == FIRST and waiting[0] < FIRST:
-            # In a small program, more rows take the other starts less time than another run.
+            # In a small program, additional rows slow down the other starts by less than the time of another run.
             return [k for k in waiting if k < FIRST]
         if self._finish_all or not all(k in runs for k in waiting):
             return waiting
@@ -224,8 +226,8 @@ class GrowingSearch:
         jobs = jobs if len(waiting) * self._unknowns > _FORK else 1
         with fork_map(lambda k: self._timed(waiting[k], last=waiting[k] in last), len(waiting), jobs) as results:
             if around := self.problem.surroundings:
-                # The final check needs the original shapes. Load them now, because this process only waits for the
-                # others.
+                # The final check needs the original shapes. Load the shapes now, because this process only waits for
+                # the other processes.
                 _ = around.shapes.geometry
             for k, run in results:
                 yield waiting[k], run
@@ -252,7 +254,8 @@ class GrowingSearch:
                 record, certificate = run_start(nlp, start, scale, price, record)
             objective = problem.objective.value(record.q)
         except MetricError:
-            # The objective is not defined at the final posture of this start.  The other starts continue.
+            # The objective is not defined at the final posture of this start.  This start ends without a result, and
+            # the other starts continue.
             return SolverRun(start)
         minimized = objective / scale
         if problem.requirements.regularization:

@@ -20,7 +20,7 @@ def percent(share: float) -> str:
 
 
 def notes_on_impacts(objective: Objective, initial: Array, q: Array) -> list[str]:
-    """Return notes on contacts that lock."""
+    """Return notes on contacts that the optimal posture nearly locks along the normal."""
     notes: list[str] = []
     if not isinstance(objective, WorstCaseObjective):
         return notes

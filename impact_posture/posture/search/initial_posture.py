@@ -22,8 +22,8 @@ _QUICK = 1e-9
 def initial_posture(problem: ConstrainedProblem, seed: int, rows: ProgramRows) -> tuple[ConstrainedProblem, Array]:
     """Return the given posture moved onto the constraints, or else the first random start that reaches them.
 
-    If this start still violates constraints that the projection ignores, the elastic program moves it.  The returned
-    problem then has all parts that the elastic program needed.
+    If the start still violates constraints that the projection ignores, the elastic program moves the start.  The
+    returned problem then has all parts that the elastic program needed.
 
     Raises:
         Infeasible: No posture satisfies the constraints; the error names the conflicting constraints.
@@ -52,7 +52,7 @@ def initial_posture(problem: ConstrainedProblem, seed: int, rows: ProgramRows) -
 
 
 def _turn_hint(problem: ConstrainedProblem, seed: int) -> str:
-    """Return a hint if the conflict vanishes when the contact frame may turn; otherwise an empty text."""
+    """Return a hint if there is no conflict when the contact frame may turn; otherwise return an empty text."""
     if not problem.objective.contacts or problem.requirements.contact_pose in ("position", "box", "free"):
         return ""
     freed = replace(problem.requirements, contact_pose="position", target_quaternion=None)

@@ -23,11 +23,11 @@ from impact_posture.posture.search.initial_posture import initial_objective, ini
 from impact_posture.posture.search.start_draws import StartDraws
 from impact_posture.system.arrays import Array
 
-# Two final postures are the same optimum if they (tangent norm) and their objectives (relative) differ by less than
-# this.
+# Two final postures are the same optimum if their tangent distance and the relative difference of their objectives
+# are below these values.
 SAME_POSTURE, _SAME_OBJECTIVE = 1e-2, 1e-4
-# A relative reduction below this value is not reported as better. The jump is a square root of the objective, so the
-# jump changes by less than 0.05 %.
+# If the relative reduction of the objective is below this value, the result is not reported as better.  The jump is
+# the square root of the objective, so the jump then changes by less than 0.05 %.
 _NO_GAIN = 1e-3
 # If only one of at least this many starts ended at the best optimum, the solution gets a note.
 _MANY = 8
@@ -48,7 +48,7 @@ class PostureSolution:
 
     Attributes:
         initial: The given posture, moved onto the constraints if it does not satisfy them, shape (nq,).
-        moved: Length of this move, tangent norm.
+        moved: Tangent distance from the given posture to ``initial``.
         q: The best certified posture, shape (nq,).
         redundancy: Number of degrees of freedom at ``q`` that remain under the equality constraints.
         optima: Distinct optima, best first.
@@ -215,7 +215,7 @@ def distinct(problem: ConstrainedProblem, ends: list[tuple[Array, float]]) -> tu
 def hits_of_best(optima: Sequence[Optimum]) -> int:
     """Return how many starts reached the best objective.
 
-    Their postures are not compared, because postures on a flat optimum differ.
+    The postures of these starts are not compared, because postures on a flat optimum differ.
     """
     best = optima[0].objective
     return sum(o.hits for o in optima if o.objective - best <= _SAME_OBJECTIVE * abs(best))

@@ -8,7 +8,9 @@ from impact_posture.system.arrays import Array
 
 
 class StartDraws:
-    """Known starts, then random starts (:func:`impact_posture.posture.manifold.feasible_start.feasible_start`).
+    """Starts of a search: first the known starts, then random starts.
+
+    Random starts are drawn as in :func:`impact_posture.posture.manifold.feasible_start.feasible_start`.
 
     Each start is drawn in the process that runs it.  The constraints on the starts do not grow with the problem.
     There is at least one known start.  Every second random start lies near the first known start, because the posture
