@@ -1,1 +1,1 @@
-"""The C export of ``H``, its gradient and the objective, and the loader of a built export."""
+"""Export of ``H``, its gradient and the objective as C code, and a loader for the compiled code."""

@@ -1,4 +1,4 @@
-"""Divide a graph among C functions: each block computes a part, and the exported functions call blocks."""
+"""Divide a graph into blocks.  Each block becomes a C function, and the exported functions call the blocks."""
 
 from __future__ import annotations
 
@@ -9,7 +9,7 @@ from dataclasses import dataclass
 
 from impact_posture.codegen.expression_graph import ARITHMETIC, COSINE, SINE, Graph
 
-# Largest number of statements in a block.  The time of a compiler grows faster than the length of a function.
+# Largest number of statements in a block.  A compiler needs disproportionately more time for long functions.
 _BLOCK = 300
 # Largest number of operations in a statement.
 _STATEMENT = 12
@@ -21,7 +21,7 @@ class Block:
 
     Attributes:
         functions: Numbers of the exported functions that call the block.
-        nodes: The nodes that it computes, in order, by one statement each.
+        nodes: The nodes that the block computes, in order; one statement computes each node.
     """
 
     functions: frozenset[int]
@@ -30,15 +30,17 @@ class Block:
 
 @dataclass(frozen=True)
 class Layout:
-    """Blocks in the order of their calls, and the values that later blocks use.
+    """Blocks of a graph, and places for the values that later blocks use.
 
     Attributes:
-        inlined: Nodes that are computed within the statement of their only user.
-        slots: Node → its index in the work array of its width.
-        sizes: Width → length of the work array.
-        angles: Inputs whose sine and cosine are computed, in the order of the array of sines.
-        trig: Sine or cosine node → its first index in this array.
-        leaves: Nodes without a statement: constants, inputs, lanes, sines and cosines.
+        graph: The graph.
+        blocks: The blocks in the order in which they are called.
+        inlined: Nodes without a statement of their own, computed as part of the statement of their only user.
+        slots: Node that a later block uses → index of its value in the work array for its width.
+        sizes: Width → length of the work array for values of this width.
+        angles: Input nodes whose sine and cosine are computed, in the order of the arrays of sines and cosines.
+        trig: Sine or cosine node → index of its first value in the array of sines or cosines.
+        leaves: Nodes that need no statement: constants, inputs, lanes, and sines and cosines of inputs.
     """
 
     graph: Graph
@@ -52,12 +54,15 @@ class Layout:
 
 
 def lay_out(graph: Graph, functions: Sequence[Sequence[str]], block: int = _BLOCK) -> Layout:
-    """Divide a graph among exported ``functions`` (their outputs) and blocks of at most ``block`` statements."""
+    """Divide a graph into blocks of at most ``block`` statements.
+
+    ``functions`` contains the names of the outputs of each exported function.
+    """
     order = _depth_first(graph, [k for names in functions for name in names for k in graph.outputs[name]])
     angles, trig = _trig(graph, order)
     leaves = frozenset(k for k in order if graph.nodes[k].op in ("const", "in", "lane") or k in trig)
     needed = _needed(graph, functions, leaves)
-    # A node that only the array of sines uses has no statement.
+    # Drop nodes that are needed only for the arrays of sines and cosines; no statement computes them.
     order = [k for k in order if k in needed]
     users: dict[int, list[int]] = {}
     for k in order:
@@ -77,7 +82,7 @@ def lay_out(graph: Graph, functions: Sequence[Sequence[str]], block: int = _BLOC
     at = {k: number for number, part in enumerate(blocks) for k in part.nodes}
 
     def home(k: int) -> int:
-        """Return the block of the statement that computes node k."""
+        """Return the number of the block whose statement computes node ``k``."""
         while k in inlined:
             (k,) = users[k]
         return at[k]
@@ -90,7 +95,8 @@ def lay_out(graph: Graph, functions: Sequence[Sequence[str]], block: int = _BLOC
 def _slots(graph: Graph, blocks: Sequence[Block], last: Mapping[int, int]) -> tuple[dict[int, int], dict[int, int]]:
     """Return indices in the work arrays for values that later blocks use, and the lengths of the arrays.
 
-    Every function calls its blocks in one order.  So an index is free after the ``last`` block that uses its value.
+    All functions call blocks in the same order.  Therefore an index can be used again after the ``last`` block that
+    uses its value.
     """
     slots: dict[int, int] = {}
     sizes: dict[int, int] = {}
@@ -113,7 +119,7 @@ def _slots(graph: Graph, blocks: Sequence[Block], last: Mapping[int, int]) -> tu
 
 
 def _source(graph: Graph, k: int) -> int:
-    """Return the vector of a lane, and any other node itself."""
+    """Return the vector node if ``k`` is a lane of a vector; otherwise return ``k``."""
     return graph.nodes[k].args[0] if graph.nodes[k].op == "lane" else k
 
 
@@ -122,9 +128,10 @@ def _sources(graph: Graph, leaves: Set[int], k: int) -> list[int]:
 
 
 def _depth_first(graph: Graph, roots: Sequence[int]) -> list[int]:
-    """Return the nodes that the roots need, operands first, close to where they are used.
+    """Return the nodes that the roots need, in an order in which operands come shortly before their users.
 
-    The operand with the longest chain comes first, so that the other operands wait for less time.
+    Of several operands, the operand with the longest chain of operations is last in the order.  Its result is then
+    used immediately.
     """
     depth: list[int] = []
     for node in graph.nodes:
@@ -146,7 +153,10 @@ def _depth_first(graph: Graph, roots: Sequence[int]) -> list[int]:
 
 
 def _trig(graph: Graph, order: Sequence[int]) -> tuple[tuple[int, ...], dict[int, int]]:
-    """Return ``angles`` and ``trig`` of :class:`Layout`, vectors first, each at a multiple of its width."""
+    """Return ``angles`` and ``trig`` of :class:`Layout`.
+
+    Vectors come first, so that each vector starts at a multiple of its width.
+    """
     trigonometric = [k for k in order if graph.nodes[k].op in (SINE, COSINE)]
     starts: dict[int, int] = {}
     angles: list[int] = []
@@ -163,7 +173,7 @@ def _trig(graph: Graph, order: Sequence[int]) -> tuple[tuple[int, ...], dict[int
 
 
 def _needed(graph: Graph, functions: Sequence[Sequence[str]], leaves: Set[int]) -> dict[int, frozenset[int]]:
-    """Return node → numbers of the exported functions that need it."""
+    """Return node → numbers of the exported functions that need the node."""
     numbers: dict[int, set[int]] = {}
     for number, names in enumerate(functions):
         waiting = [_source(graph, k) for name in names for k in graph.outputs[name]]
@@ -182,7 +192,10 @@ def _inlined(
     outputs: set[int],
     needed: Mapping[int, frozenset[int]],
 ) -> set[int]:
-    """Return arithmetic that is used once, by another arithmetic operation of the same functions."""
+    """Return the nodes that can be part of the statement of another node.
+
+    These are arithmetic operations that are used only once, by another arithmetic operation of the same functions.
+    """
     size: dict[int, int] = {}
     inlined: set[int] = set()
     for k in order:

@@ -1,7 +1,8 @@
-"""C99 from a layout: blocks of straight-line code with local variables, and work arrays for values of later blocks.
+"""Write C99 code for a layout.
 
-Names are short because a humanoid has ten thousand operations.  Vectors are the extension of GCC and Clang, whose
-arithmetic has the same operators as numbers.
+A block is a function without branches.  Its values are local variables, or entries of work arrays if later blocks use
+them.  Names are short, because the code of a humanoid has ten thousand operations.  Vectors use an extension of GCC
+and Clang, in which arithmetic operators also apply to vectors.
 """
 
 from __future__ import annotations
@@ -14,27 +15,28 @@ from impact_posture.codegen.block_layout import Block, Layout
 from impact_posture.codegen.c_literals import Real
 from impact_posture.codegen.expression_graph import COSINE, Node
 
-# Length of a reference to a constant in a table, such as K[1234].  A shorter literal is written out.
+# Length of a reference to a constant in a table, such as K[1234].  A literal that is shorter is written instead.
 _PLACE = 7
 SHORT_NAMES = ("APART", "K", "K2", "K4", "V2", "V2u", "V4", "V4u", "VN")
-"""Macros of the emitted text, which the end of the text undefines."""
+"""Names of the macros that the generated C file defines, and undefines at its end."""
 
-# Arrays that a block may receive in addition to the inputs.
+# Arrays that can be parameters of a block in addition to the inputs: sines, cosines, and work arrays by width.
 _SHARED = ("s", "c", "w", "w2", "w4")
-# The compiler splits vectors that are wider than the processor's.  Without optimization it stores the parts and the
-# whole.
+# A compiler splits vectors that are wider than the vectors of the processor.  Without optimization, it stores both
+# the parts and the whole vector, which takes twice the stack.
 _HALVES = 2
 
 
 @dataclass(frozen=True)
 class BlockText:
-    """The C of a block.
+    """C code of a block.
 
     Attributes:
-        text: The function.
-        call: Its call with the caller's names: inputs, ``m.s``, ``m.w`` and so on.
-        local_bytes: Upper bound on the bytes of its variables.
-        wide_bytes: Upper bound on the bytes of the parts of vectors that are wider than the processor's.
+        text: Definition of the C function.
+        call: C statement that calls the function, with the names of arrays in the caller (inputs, ``m.s``, ``m.w``,
+            …).
+        local_bytes: Upper bound on the stack bytes of its local variables.
+        wide_bytes: Upper bound on the additional stack bytes for vectors wider than the vectors of the processor.
     """
 
     text: str
@@ -44,14 +46,14 @@ class BlockText:
 
 
 class Constants:
-    """Tables of the constants in the blocks of a library.  A reference is shorter than the digits of a number."""
+    """Tables of the constants in the blocks of a library; a reference to a table is shorter than the number."""
 
     def __init__(self, prefix: str, real: Real) -> None:
         self._prefix, self._real = prefix, real
         self._tables: dict[int, dict[tuple[float, ...], int]] = {}
 
     def place(self, node: Node) -> str:
-        """Return the C of a constant: a short literal, or a reference to a table."""
+        """Return the C expression of a constant: a short literal, or a reference to a table."""
         if node.width == 1:
             text = self._real.literal(node.value[0])
             if len(text) < _PLACE:
@@ -60,7 +62,7 @@ class Constants:
         return f"{_short(node.width)}[{known.setdefault(node.value, len(known))}]"
 
     def text(self, types: Mapping[int, str]) -> str:
-        """Return the C of the tables and of their short names.  ``types`` has the C type of each width."""
+        """Return the C definitions of the tables and of their short names.  ``types`` maps a width to its C type."""
         lines = []
         for width, known in sorted(self._tables.items()):
             rows = [", ".join(self._real.plain(v) for v in value) for value in known]
@@ -78,11 +80,11 @@ def _short(width: int) -> str:
 
 
 class Emitter:
-    """The C of one layout.
+    """C code of the blocks of one layout.
 
-    The names of blocks begin with ``prefix``.  ``types`` has the C type of each width, and ``size`` is the bytes of
-    width one if its type is not ``real``.  ``work`` names the structure with inputs and work arrays.  It is empty if
-    inputs are separate arguments.
+    The names of blocks begin with ``prefix``.  ``types`` maps a width to its C type.  ``size`` is the size in bytes
+    of the type of width one; by default, the size of ``real``.  ``work`` is the name of the C structure that contains
+    inputs and work arrays; empty if the inputs are separate arguments.
     """
 
     def __init__(
@@ -99,7 +101,7 @@ class Emitter:
         self._constants, self._size, self._work = constants, size or real.size, work
         self._graph = layout.graph
         at = {k: number for number, block in enumerate(layout.blocks) for k in block.nodes}
-        # Nodes that need a name, because another statement of the same block uses them.
+        # Nodes that need a local variable, because another statement of the same block uses them.
         self._reused: set[int] = set()
         for k, number in at.items():
             waiting = list(self._graph.nodes[k].operands)
@@ -113,7 +115,7 @@ class Emitter:
         self.blocks = [self._block(number, block) for number, block in enumerate(layout.blocks)]
 
     def output(self, k: int, work: str = "m.") -> str:
-        """Return the C of an output, valid after the calls of the blocks."""
+        """Return a C expression for the value of node ``k``, which is valid after the blocks have been called."""
         node = self._graph.nodes[k]
         if node.op == "const":
             return self._real.literal(node.value[0])
@@ -165,7 +167,7 @@ class Emitter:
         )
 
     def _vector_bytes(self, block: Block) -> int:
-        """Return the bytes of all vectors that a block computes, also within statements."""
+        """Return the total size, bytes, of all vectors that a block computes, including vectors within statements."""
         total, waiting = 0, list(block.nodes)
         while waiting:
             node = self._graph.nodes[waiting.pop()]
@@ -174,7 +176,11 @@ class Emitter:
         return total
 
     def _expression(self, k: int, number: int, names: dict[int, str], lines: list[str], *, top: bool = False) -> str:
-        """Return a variable, an array element, or the operation, in parentheses unless it is the whole statement."""
+        """Return a C expression for node ``k``: a variable, an array element, or the operation itself.
+
+        An operation is in parentheses unless ``top``, that is, unless the expression is the right side of a
+        statement.
+        """
         node = self._graph.nodes[k]
         if not top and k in names:
             return names[k]

@@ -1,4 +1,4 @@
-"""Numbers as C text: the number type of an export, its literals and initializers."""
+"""Write numbers as C text: the number type of an export, literals, and initializers of arrays."""
 
 from __future__ import annotations
 
@@ -16,12 +16,12 @@ _MATH = re.compile(r"\b(exp|log|pow|sqrt|a?sin|a?cos|a?tan|atan2|tanh|hypot|fabs
 
 @dataclass(frozen=True)
 class Real:
-    """The number type of an export.
+    """The floating-point type of the numbers in an export.
 
     Attributes:
-        name: ``double`` or ``float``.
-        size: Bytes of a number.
-        unit_tolerance: Largest deviation of the norm of a quaternion from one.
+        name: C name of the type, ``double`` or ``float``.
+        size: Size of a number, bytes.
+        unit_tolerance: Largest permitted difference between the norm of a quaternion (or cosine-sine pair) and one.
     """
 
     name: str
@@ -34,11 +34,11 @@ class Real:
         return np.dtype(np.float64 if self.name == "double" else np.float32)
 
     def rounded(self, values: ArrayLike) -> NDArray[np.float64]:
-        """Return numbers rounded to this type, as doubles."""
+        """Round numbers to this type, and return them as doubles."""
         return np.array(values, dtype=self.dtype).astype(np.float64)
 
     def literal(self, value: float) -> str:
-        """Return the literal of the nearest number of this type; a negative literal is in parentheses."""
+        """Return the C literal of ``value`` rounded to this type; a negative literal is in parentheses."""
         if self.name == "double" or not math.isfinite(value):
             return c_double(value)
         with np.errstate(over="ignore", under="ignore"):
@@ -49,15 +49,15 @@ class Real:
         return f"{text[:-1]}f)" if text.endswith(")") else f"{text}f"
 
     def plain(self, value: float) -> str:
-        """Return a literal without parentheses, for an initializer."""
+        """Return the C literal of ``value`` without parentheses, for use in an initializer."""
         return self.literal(float(value)).strip("()")
 
     def initializer(self, values: Sequence[float], indent: str = "") -> str:
-        """Return a brace initializer with four numbers a line."""
+        """Return the C initializer of an array in braces, with four numbers per line."""
         return brace_initializer([self.plain(v) for v in values], 4, indent)
 
     def spelled(self, operation: str) -> str:
-        """Translate the C of an operation on doubles to this type: ``sinf`` for ``sin``, ``1.0f`` for ``1.0``."""
+        """Translate a C expression for doubles to this type: for ``float``, ``sin(1.0)`` becomes ``sinf(1.0f)``."""
         if self.name == "double":
             return operation
         text = _MATH.sub(r"\1f(", operation).replace("(double)", "(float)")
@@ -70,7 +70,7 @@ REALS = {real.name: real for real in (DOUBLE, FLOAT)}
 
 
 def c_double(value: float) -> str:
-    """Return a double literal that reads back exactly; a negative literal is in parentheses."""
+    """Return a C literal with exactly this value as a double; a negative literal is in parentheses."""
     if math.isnan(value):
         return "NAN"
     text = "INFINITY" if math.isinf(value) else repr(abs(value))
@@ -78,6 +78,6 @@ def c_double(value: float) -> str:
 
 
 def brace_initializer(texts: Sequence[str], count: int, indent: str) -> str:
-    """Return a brace initializer with ``count`` entries a line."""
+    """Return the C initializer of an array in braces, with ``count`` entries per line."""
     rows = [", ".join(texts[k : k + count]) for k in range(0, len(texts), count)]
     return "{\n" + ",\n".join(f"{indent}  {row}" for row in rows) + f"\n{indent}}}"

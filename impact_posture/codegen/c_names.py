@@ -1,4 +1,4 @@
-"""C identifiers, and the files that builds of an export add."""
+"""C identifiers of an export, and names of the files that building an export creates."""
 
 from __future__ import annotations
 
@@ -8,7 +8,7 @@ from impact_posture.errors import InputError
 from impact_posture.system.escape import identifier
 
 _IDENTIFIER = re.compile(r"[A-Za-z][A-Za-z0-9_]*")
-# A file <prefix>.h with one of these names would hide the header of the C library.
+# Names of headers of the C library.  A file <prefix>.h with the same name would hide the header.
 _C_HEADERS = frozenset(
     "assert complex ctype errno fenv float inttypes iso646 limits locale math setjmp signal stdarg stdbool stddef"
     " stdint stdio stdlib string tgmath time wchar wctype".split()
@@ -16,22 +16,22 @@ _C_HEADERS = frozenset(
 
 
 def products(prefix: str) -> tuple[str, ...]:
-    """Return the files that the Makefile of an export, or a program that loads it, adds to the export."""
+    """Return the files that the Makefile of an export, or a program that loads the export, creates in its folder."""
     library = f"lib{prefix}.so"
     return ("example", "example_cpp", f"{prefix}.o", library, f"{library}.sha256")
 
 
 def c_identifier(robot: str, frame: str) -> str:
-    """Return robot and frame as one C identifier, with an underscore for every other character."""
+    """Return robot and frame name as one C identifier; underscores replace characters that C does not allow."""
     text = identifier(f"{robot}_{frame}")
     return text if _IDENTIFIER.fullmatch(text) else f"robot_{text}".rstrip("_")
 
 
 def check_prefix(prefix: str) -> str:
-    """Return the prefix if it is usable.
+    """Return the prefix if it can be used in C names and file names.
 
     Raises:
-        InputError: The prefix is not a C identifier, or is the name of the example or of a C header.
+        InputError: The prefix is not a C identifier, or it is ``example`` or the name of a C header.
     """
     what, hint = "", "choose another"
     if not _IDENTIFIER.fullmatch(prefix):

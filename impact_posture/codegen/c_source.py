@@ -1,4 +1,4 @@
-"""Content of ``templates/source.c.jinja``: the functions of an export, their blocks, and the batch."""
+"""Generate the C code that ``templates/source.c.jinja`` inserts: functions of an export, their blocks, and batches."""
 
 from __future__ import annotations
 
@@ -19,36 +19,40 @@ from impact_posture.config.cached_values import read_stored, write_stored
 from impact_posture.system.libraries import source_key
 
 LARGEST_VECTOR = 64
-"""Bytes of the widest vectors, and of the widest group of narrower vectors in a batch."""
+"""Size of the widest vectors, bytes.  Groups of narrower vectors in a batch have at most this size in total."""
 
-# Bytes for return addresses, saved registers, alignment and the variables of the small functions.  APART keeps
-# blocks from being joined, so the variables of one block at a time are on the stack.
+# Stack bytes for return addresses, saved registers, alignment and the variables of the small functions.  The macro
+# APART prevents the compiler from inlining blocks, so the stack contains the variables of only one block at a time.
 _FRAMES = 2048
-# With -march=native a compiler makes vectors of neighboring numbers, and may store a number in several vectors.
+# With -march=native, a compiler can combine neighboring numbers to vectors.  A number may then be stored in several
+# vectors, which takes up to this many times the stack.
 _SPILL = 2
 
-# Statements in a block of the batch.  A block of this length stays in the first cache from group to group.
+# Largest number of statements in a block of a batch.  A block of this length stays in the first-level cache while the
+# groups are computed one after the other.
 _BATCH_BLOCK = 60
 
 
 @dataclass(frozen=True)
 class CSource:
-    """Functions of an export.
+    """C code of all functions of an export.
 
     Attributes:
         portable: Whether the code is plain C99 without vectors.
-        constants: Tables of numbers.
-        blocks: Blocks that the functions share.
+        constants: C definitions of the tables of constants.
+        blocks: Blocks that the functions call.
         angles: Index in ``q`` of each angle whose sine and cosine are computed.
         room: Length of the arrays of sines and cosines.
         work: C type, name and length of each work array.
-        functions: For each function of one configuration its ``stem``, ``name``, constant ``normal`` (``None`` if it
-            is a parameter), ``calls`` of blocks, ``outputs`` (target, value, whether it is constant), and ``finite``,
-            the name and length of each result.
-        batches: For each objective its ``stem``, ``normal``, the literal ``scale`` of its ratio to ``H`` (empty if
-            it is not a multiple), and the ``blocks``, ``angles``, ``room``, ``work`` and ``outputs`` of its batch on
-            vectors.  Without blocks the batch is a loop.
-        stack_bytes: Upper bound on the stack of a call, without the functions of the C library.
+        functions: One entry for each function of a single configuration.  Keys: ``stem``, ``name``, ``normal`` (the
+            constant normal; ``None`` if the normal is a parameter), ``calls`` (statements that call the blocks),
+            ``outputs`` (target, value, whether the value is constant), and ``finite`` (name and length of each
+            result).
+        batches: One entry for each objective of one contact.  Keys: ``stem``, ``normal``, ``scale`` (C literal of the
+            ratio of the objective to ``H``; empty if the objective is not a multiple of ``H``), ``blocks``, and, if
+            there are blocks, ``angles``, ``room``, ``work`` and ``outputs``.  If ``blocks`` is empty, the batch is a
+            loop over single calls.
+        stack_bytes: Upper bound on the stack that a call uses, in bytes, without the functions of the C library.
     """
 
     portable: bool
@@ -63,9 +67,9 @@ class CSource:
 
 
 def build_c_source(exported: Sequence[NamedObjective], prefix: str, real: Real, *, portable: bool = False) -> CSource:
-    """Generate the functions of objectives of one robot, or read them from the user's cache.
+    """Generate the C code of the objectives of one robot, or read it from the cache of the user.
 
-    ``portable`` code has no vectors, for compilers without them.
+    ``portable`` code does not use vectors, so compilers other than GCC and Clang can compile it.
     """
     library = export_library(exported)
     models = [
@@ -88,11 +92,13 @@ def _generate(
     contacts = {v.stem: v.objective.contact for v in single}
     robot = single[0].objective.robot
     scalars = library.graph()
-    # A single call waits for results of operations.  A batch computes other lanes meanwhile, so its order stays.
+    # In a single call, the processor waits for the results of operations, so the order of sums matters.  In a batch,
+    # it computes other configurations meanwhile, so the batch uses the original order.
     graph = reorder_sums(scalars if portable else library.vector_graph())
     layout = lay_out(graph, [f.outputs for f in library.functions])
     constants = Constants(prefix, real)
-    # The names of types occur thousands of times, so they are short.  The source undefines them at its end.
+    # The names of types occur thousands of times, so they are short macros, which are undefined at the end of the
+    # file.
     types = {1: real.name, 2: "V2", 4: "V4"}
     emitter = Emitter(layout, prefix, real, types, constants)
     angles = _angles(layout)
@@ -106,7 +112,7 @@ def _generate(
         functions.append({
             "stem": function.stem,
             "name": function.name,
-            # The objective of several contacts at once takes the normal of the leading contact.
+            # The objective of several contacts at once has the normal of the leading contact.
             "normal": None if "n" in inputs else contacts.get(function.stem, single[0].objective.contact).normal,
             "calls": [text.call for block, text in blocks if number in block.functions],
             "outputs": [*_outputs(function, emitter, "m.")],
@@ -120,7 +126,8 @@ def _generate(
         scale = real.literal(v.objective.scale) if v.objective.is_multiple_of_H else ""
         batch = {"stem": v.stem, "normal": v.objective.contact.normal, "scale": scale, "blocks": ()}
         function = next(f for f in library.functions if (f.stem, f.name) == (v.stem, "eval"))
-        # A batch of the robot without supports would add a third to the source, so it is a loop.
+        # Vector code for the batch of the robot without supports would make the file a third longer, so this batch is
+        # a loop.
         if not portable and not v.free and (lanes := _lanes(function, scalars, real, constants)):
             held = 2 * lanes["room"] + lanes["work"] + robot.nq + 3 + 2 * (1 + robot.nv)
             frame = max((block.local_bytes for block in lanes["blocks"]), default=0)
@@ -136,7 +143,7 @@ def _generate(
 
 
 def _lanes(function: Exported, scalars: Graph, real: Real, constants: Constants) -> dict[str, Any]:
-    """Return the batch on vectors of configurations; empty if an operation has no vector form in C."""
+    """Return the keys of a batch that computes vectors of configurations; empty if an operation has no such form."""
     layout = lay_out(scalars, [function.outputs], _BATCH_BLOCK)
     computed = {k for block in layout.blocks for k in block.nodes} | layout.inlined
     if not all(k in layout.trig or scalars.nodes[k].op in ARITHMETIC for k in computed):
@@ -145,7 +152,7 @@ def _lanes(function: Exported, scalars: Graph, real: Real, constants: Constants)
     return {
         "blocks": emitter.blocks,
         "angles": _angles(layout),
-        # C has no arrays of length zero.
+        # An array in C cannot have the length zero.
         "room": max(1, len(layout.angles)),
         "work": layout.sizes.get(1, 1),
         "outputs": [*_outputs(function, emitter, "m->")],
@@ -153,12 +160,12 @@ def _lanes(function: Exported, scalars: Graph, real: Real, constants: Constants)
 
 
 def _angles(layout: Layout) -> tuple[int, ...]:
-    """Return the index in ``q`` of each angle."""
+    """Return the index in ``q`` of each angle of a layout."""
     return tuple(layout.graph.nodes[k].args[1] for k in layout.angles)
 
 
 def _outputs(function: Exported, emitter: Emitter, work: str) -> Iterator[dict[str, Any]]:
-    """Yield the assignments of a function's results from the structure ``work``."""
+    """Yield the assignments of the results of a function; ``work`` begins the names of the work arrays."""
     graph, arrays = emitter.layout.graph, lengths(0, 0)
     for name, output in zip(SIGNATURES[function.name][1], function.outputs, strict=True):
         for k, node in enumerate(graph.outputs[output]):

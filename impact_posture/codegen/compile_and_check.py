@@ -1,4 +1,4 @@
-"""Compile an export, and compare its numbers with CasADi and Pinocchio."""
+"""Compile an export, and compare the results of its functions with CasADi and Pinocchio."""
 
 from __future__ import annotations
 
@@ -37,14 +37,14 @@ from impact_posture.system.libraries import (
 from impact_posture.system.scratch_folder import scratch_folder
 from impact_posture.system.toolchain import find_compiler, words_of
 
-# Tolerance against the oracle, which factorizes another matrix.  Its condition with feet at compliance ε is about
-# 1/ε.
+# Relative tolerance for the comparison with the oracle.  The oracle factorizes another matrix, whose condition number
+# is about 1/ε if the robot has supports with compliance ε.
 _ORACLE_TOLERANCE = 1e-5
-# Number of random postures and normals in a comparison.
+# Number of random pairs of posture and normal in a comparison.
 _SAMPLES = 20
-# Number of libraries in the cache, which drops the oldest.
+# Largest number of libraries in the cache; if there are more, the oldest are deleted.
 _CACHED = 16
-# The error of a gradient is relative to its largest entry, or to a thousandth of the value if that is larger.
+# The error of a gradient is relative to its largest entry, or to the share _SHARE of the value if this is larger.
 _LEAST = {"grad": "H", "objective_grad": "objective"}
 _SHARE = 1e-3
 
@@ -52,24 +52,26 @@ _SHARE = 1e-3
 def compile_and_check(
     export_dir: Path, prefix: str, objectives: Sequence[WorstCaseObjective], *, keep: bool = False
 ) -> float:
-    """Build an export, compare it at random postures and normals, and return the largest relative difference.
+    """Build an export and compare its results at random postures and normals; return the largest relative difference.
 
-    There is one of the ``objectives`` for each frame.  With ``keep`` the library stays in the folder of the export,
-    even if it fails.
+    ``objectives`` contains one objective per frame.  If ``keep``, the library stays in the folder of the export, even
+    if its results are wrong.
 
     Raises:
-        CompilerError: There is no compiler, it failed, or the numbers of its code are wrong.
+        CompilerError: There is no compiler, the compiler failed, or the results of the compiled code are wrong.
     """
     manifest, _ = read_manifest(export_dir / f"{prefix}.json")
     real, worst = REALS[manifest["real"]], 0.0
-    # A killed process leaves its temporary files, which must go with the folder of the result.
+    # If the process is killed, its temporary files stay.  They are in the folder of the export, so they are deleted
+    # with it.
     with scratch_folder(export_dir) as folder:
         if keep or (built := _cached_library(export_dir, prefix)) is None:
             built = build_library(export_dir, prefix, library_path(export_dir if keep else folder, prefix))
         library = load_library(built)
         for v in named_objectives(objectives, prefix):
             objective = v.objective
-            # Without ``several``, ImpactGradient binds the objective of the frame alone.
+            # If ``several`` is set, ImpactGradient uses the objective of all contacts instead of the objective of the
+            # frame.
             block = manifest if v.joint else manifest | {"several": None}
             gradient = ImpactGradient(library, block, objective.contact.frame, free=v.free)
             tolerance = self_test_tolerance(objective, real)
@@ -87,9 +89,10 @@ def compile_and_check(
 
 
 def _cached_library(export_dir: Path, prefix: str) -> Path | None:
-    """Return the library of an export from the cache, built if it is missing; ``None`` if the cache is not writable.
+    """Return the library of an export from the cache; build it if it is missing.
 
-    A humanoid takes seconds to compile, and many exports differ in the constant posture alone.
+    Return ``None`` if the cache is not writable.  Compiling the code of a humanoid takes seconds, and many exports
+    differ only in the constant posture.
     """
     source = (export_dir / f"{prefix}.c").read_text(encoding="utf-8")
     content = [re.sub(rf"^const \w+ {prefix}_(posture|manifest)\[.*?;$", "", source, flags=re.DOTALL | re.MULTILINE)]
@@ -113,17 +116,17 @@ def largest_difference(
     build_reference: Callable[[WorstCaseObjective], Reference],
     samples: int,
 ) -> float:
-    """Return the largest relative difference of an export from a reference, at random postures and normals.
+    """Return the largest relative difference between an export and a reference at random postures and normals.
 
-    ``build_reference`` is :func:`~impact_posture.codegen.self_test.casadi_reference` or ``oracle_reference``.  The
-    difference is infinite if a call fails.
+    ``build_reference`` is :func:`~impact_posture.codegen.self_test.casadi_reference` or ``oracle_reference``.  If a C
+    function returns an error code, the difference is infinite.
     """
     reference = build_reference(objective)
     normals = np.random.default_rng(2).normal(size=(samples, 3))
     normals /= np.linalg.norm(normals, axis=1, keepdims=True)
     worst = 0.0
     for k, q in enumerate(sample_postures(objective.robot, samples, 1)):
-        # Rounded to the C type, so that reference and export have the same inputs.
+        # Round the inputs to the C type, so that reference and export have the same inputs.
         q, n = (np.array(v, dtype=gradient.dtype).astype(float) for v in (q, normals[k]))
         expected = reference(q, n)
         for name, quantities in RESULTS.items():
@@ -148,8 +151,8 @@ class Deviation:
     """The largest relative error of one quantity at one sample.
 
     Attributes:
-        error: Largest ``|value − expected|`` over the scale; infinite where a number is not finite.
-        index: Index of the entry with that error.
+        error: Largest ``|value − expected|`` divided by the scale; infinite if a value is not finite.
+        index: Index of the entry with the largest error.
     """
 
     error: float
@@ -157,7 +160,7 @@ class Deviation:
 
 
 def deviation(values: Array, expected: Array, scale: float = 0.0) -> Deviation:
-    """Return the largest error, relative to the largest expected entry or to ``scale`` if that is larger."""
+    """Return the largest error, relative to the largest expected entry, or to ``scale`` if ``scale`` is larger."""
     with np.errstate(invalid="ignore"):
         difference = np.abs(values - expected)
     difference[~np.isfinite(difference)] = np.inf

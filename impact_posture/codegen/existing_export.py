@@ -1,4 +1,4 @@
-"""An export of an objective that exists already in a folder."""
+"""Check whether a folder already contains the export of an objective."""
 
 from __future__ import annotations
 
@@ -15,18 +15,18 @@ from impact_posture.system.libraries import library_path
 from impact_posture.system.output_folder import own_files
 from impact_posture.system.toolchain import find_compiler
 
-# Keys of a manifest that depend on more than the objective.
+# Keys of a manifest whose values do not follow from the objective alone.
 _OTHERS = ("posture", "compression", "stack_bytes")
 
 
 def existing_export(objective: WorstCaseObjective, out: Path, *, build: bool) -> Export | None:
-    """Return the export of an objective in a folder such as ``c/`` of a result; ``None`` if there is none.
+    """Return the export of an objective that ``out``, such as ``c/`` of a result, contains; ``None`` if it has none.
 
-    The manifest may also state a posture and the compression of the impact.  Everything else must equal the output of
-    :func:`~impact_posture.codegen.export.export`.  With ``build``, the library is built and checked.
+    The manifest can state any posture and compression of the impact.  All other content must equal the manifest that
+    :func:`~impact_posture.codegen.export.export` would write.  If ``build``, the library is built and checked.
 
     Raises:
-        CompilerError: The compiler failed, or the numbers of its code are wrong.
+        CompilerError: The compiler failed, or the results of the compiled code are wrong.
     """
     prefix = default_prefix([objective])
     files = own_files(out, "export")
@@ -37,7 +37,8 @@ def existing_export(objective: WorstCaseObjective, out: Path, *, build: bool) ->
         content = _comparable(manifest)
     except (OSError, LookupError, ValueError, TypeError, AttributeError, RecursionError):
         return None
-    # A manifest read from a file has lists in place of tuples.
+    # Convert the new manifest to JSON and back: like the manifest from the file, it then has lists in place of
+    # tuples.
     if content != _comparable(json.loads(json.dumps(build_manifest([objective], prefix, None, None)))):
         return None
     existing = Export(out, objective.robot, tuple(out / name for name in files), manifest, requested=build)
@@ -48,6 +49,6 @@ def existing_export(objective: WorstCaseObjective, out: Path, *, build: bool) ->
 
 
 def _comparable(manifest: dict[str, Any]) -> dict[str, Any]:
-    """Return the keys that the objective alone determines."""
+    """Return the part of a manifest that the objective alone determines."""
     rest = {key: value for key, value in manifest.items() if key not in _OTHERS}
     return rest | {"symbols": {name: symbol for name, symbol in rest["symbols"].items() if name != "posture"}}

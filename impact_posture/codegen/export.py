@@ -1,4 +1,4 @@
-"""Export ``H``, ``∇H`` and the objective of a problem as C code for a controller."""
+"""Export ``H``, its gradient and the objective of a problem as C code for a controller."""
 
 from __future__ import annotations
 
@@ -34,12 +34,14 @@ SCHEMA = "impact-posture/codegen-run/1"
 
 @dataclass(frozen=True)
 class WrittenCode:
-    """Generated C in a folder.
+    """Generated C code in a folder.
 
     Attributes:
-        out: The folder of the files.
+        out: The folder that contains the files.
+        robot: The robot for which the code was generated.
+        files: Paths of the generated files.
         manifest: The content of ``<prefix>.json``.
-        library: The shared library, where one stays in the folder.
+        library: Path of the shared library; ``None`` if the folder has no library.
     """
 
     out: Path
@@ -50,17 +52,18 @@ class WrittenCode:
 
     @property
     def prefix(self) -> str:
-        """Beginning of the C names."""
+        """Text with which all C names of the export begin."""
         return str(self.manifest["prefix"])
 
 
 @dataclass(frozen=True)
 class Export(WrittenCode):
-    """A written export of an objective.
+    """The export of an objective in a folder.
 
     Attributes:
-        agreement: Largest relative difference of the built code from CasADi and Pinocchio; ``None`` without a build.
-        requested: Whether a library was requested.
+        agreement: Largest relative difference between the results of the compiled code and of CasADi or Pinocchio;
+            ``None`` if the code was not compiled.
+        requested: Whether the user requested a library.
     """
 
     agreement: float | None = None
@@ -68,11 +71,11 @@ class Export(WrittenCode):
 
     @property
     def compiled(self) -> bool:
-        """Whether a compiler built the code and the numbers agreed."""
+        """Whether the code was compiled and its results agreed with CasADi and Pinocchio."""
         return self.agreement is not None
 
     def load(self, **options: Any) -> ImpactGradient:
-        """Load the library, which runs its code, with the options of :meth:`ImpactGradient.load`."""
+        """Load the library with the options of :meth:`ImpactGradient.load`.  Loading runs code of the library."""
         return ImpactGradient.load(self.out, robot=self.robot, **options)
 
     @property
@@ -84,7 +87,7 @@ class Export(WrittenCode):
 
     @property
     def verdict(self) -> str:
-        """The outcome of the build as one line."""
+        """One line for users that states whether the library was built."""
         if self.library is not None:
             return f"{self.library.name}: built, agrees to {self.agreement:.0e}"
         if self.requested:
@@ -119,27 +122,28 @@ def export(
     force: bool = False,
     check: bool = True,
 ) -> Export:
-    """Write the C export of an objective into an existing folder, and check it if there is a compiler.
+    """Write the C export of an objective into an existing folder, and check the code if there is a compiler.
 
-    All texts are complete before the first file is written, and each file is written whole or not at all.
+    All texts are generated before the first file is written.  Each file is written completely or not at all.
 
     Args:
-        objective: The objective.  Several objectives of one robot at different frames make one library with functions
-            ``<prefix>_<frame>_eval`` and so on.
-        out: The folder.
-        prefix: Beginning of the C names, a C identifier; robot and frame by default.
-        posture: A configuration for a constant in the code, shape (nq,).
-        compression: Compression time, peak force and x of the impact, for the manifest and the header.
-        real: The number type.
-        portable: Write plain C99, for compilers without the vectors of GCC and Clang.
+        objective: The objective, or several objectives of one robot at different frames.  Several objectives become
+            one library with functions such as ``<prefix>_<frame>_eval``.
+        out: The existing folder.
+        prefix: Text with which all C names begin, a C identifier; by default, names of robot and frame.
+        posture: Configuration that the code contains as a constant, shape (nq,); ``None`` for no constant.
+        compression: Compression time, peak force and x of the impact, which are written to manifest and header.
+        real: Floating-point type of the code.
+        portable: Write plain C99 without vectors, for compilers other than GCC and Clang.
         force: Replace existing files.
-        check: Build and compare.
+        check: Compile the code, and compare its results with CasADi and Pinocchio.
 
     Raises:
-        InputError: The prefix is not a C identifier, or the objectives differ in more than the contact.
+        InputError: The prefix is not a C identifier, the objectives differ in more than the contact, or the joint
+            model is ``elastic``.
         PostureError: The posture has the wrong length or is not finite.
         OutputError: ``out`` is not a folder, already contains the files, or is not writable.
-        CompilerError: The compiler failed, or the numbers of its code are wrong.  The files remain.
+        CompilerError: The compiler failed, or the results of the compiled code are wrong.  The files stay.
     """
     objectives = _same_robot(objective)
     robot = objectives[0].robot
@@ -152,7 +156,8 @@ def export(
     if posture is not None:
         stated = np.array(posture, dtype=float)
         posture = robot.check_posture(stated, limits=False)
-        # Normalization changes the last digits of a normalized configuration.  Keep the digits of result.json.
+        # Normalization can change the last digits even if the posture is normalized.  In this case keep the given
+        # digits, so that the code contains the same numbers as result.json.
         posture = stated if np.allclose(stated, posture, rtol=0, atol=1e-9) else posture
     exported, code = cached_code(tuple(objectives), prefix, real, portable)
     manifest = build_manifest(objectives, prefix, posture, compression, real, code.stack_bytes, portable=portable)
@@ -173,7 +178,10 @@ def export(
 def cached_code(
     objectives: tuple[WorstCaseObjective, ...], prefix: str, real: Real, portable: bool
 ) -> tuple[tuple[NamedObjective, ...], CSource]:
-    """Return the functions of an export, which take most of the time of :func:`export` and depend on no posture."""
+    """Return the objectives and the C code of an export; they do not depend on the posture.
+
+    Generating the code takes most of the time of :func:`export`, so the last result is cached.
+    """
     exported = named_objectives(objectives, prefix)
     return exported, build_c_source(exported, prefix, real, portable=portable)
 
@@ -191,16 +199,16 @@ def write_export(
     build: bool = False,
     force: bool = False,
 ) -> Export:
-    """Write an export into a new folder, whole or not at all, and build its library there on request.
+    """Write an export into a new folder, completely or not at all, and build its library if ``build``.
 
-    The folder ``out`` is ``./<prefix>-c`` by default.  With ``single`` the code computes in ``float``.  ``build``
-    builds ``lib<prefix>.so`` in the folder.  Without a compiler there is neither a library nor an error.  ``force``
-    replaces an earlier export.  The other arguments are as in :func:`export`.
+    The folder ``out`` is ``./<prefix>-c`` by default.  If ``single``, the code computes in ``float``.  ``build``
+    creates ``lib<prefix>.so`` in the folder; if there is no compiler, the library is omitted without an error.
+    ``force`` replaces an earlier export.  The other arguments are as in :func:`export`.
 
     Raises:
-        OutputError: The folder exists without ``force``, is not an export, or is not writable.
-        CompilerError: The compiler failed, or the numbers of its code are wrong.  Nothing is written.
-        ImpactPostureError: As in :func:`export`.
+        OutputError: The folder exists and ``force`` is False, it is not an export, or it is not writable.
+        CompilerError: The compiler failed, or the results of the compiled code are wrong.  Nothing is written.
+        ImpactPostureError: An error that :func:`export` raises.
     """
     prefix = default_prefix(objectives) if prefix is None else check_prefix(prefix)
     out = Path(f"{prefix}-c") if out is None else out
@@ -223,14 +231,14 @@ def write_export(
 
 
 def default_prefix(objectives: Sequence[WorstCaseObjective]) -> str:
-    """Return robot and frame as a prefix; the robot alone where there are several frames."""
+    """Return the default prefix: names of robot and frame, or only the name of the robot for several frames."""
     first = objectives[0]
     alone = len(objectives) == 1 and not first.others
     return c_identifier(first.robot.name, first.contact.frame if alone else "")
 
 
 def _same_robot(objective: WorstCaseObjective | Sequence[WorstCaseObjective]) -> tuple[WorstCaseObjective, ...]:
-    """Return the objectives as a tuple, and refuse objectives that differ in more than the contact."""
+    """Return the objectives as a tuple; raise InputError if they differ in more than the contact."""
     objectives = (objective,) if isinstance(objective, WorstCaseObjective) else tuple(objective)
     if not objectives:
         raise InputError("no objective is given", where="codegen", hint="give one for each frame")

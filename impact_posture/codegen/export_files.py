@@ -1,7 +1,8 @@
-"""Files of an export, written from the templates in ``templates/``.
+"""Generate the files of an export from the templates in ``templates/``.
 
-A template escapes every inserted text for the language of its file, because the names of robots, joints and frames
-are data.  Text of type :class:`Verbatim` is inserted unchanged.  An undefined name is an error (``StrictUndefined``).
+Names of robots, joints and frames can contain any characters, so a template escapes every inserted text for the
+language of its file.  Only text of type :class:`Verbatim` is inserted unchanged.  A template that uses an undefined
+name raises an error (``StrictUndefined``).
 """
 
 from __future__ import annotations
@@ -28,7 +29,7 @@ _WIDTH = 112
 
 
 class Verbatim(str):
-    """Text that a template inserts without escapes."""
+    """Text that a template inserts unchanged, without escaping any character."""
 
     __slots__ = ()
 
@@ -36,13 +37,13 @@ class Verbatim(str):
 def render_files(
     exported: Sequence[NamedObjective], prefix: str, manifest: dict[str, Any], code: CSource, real: Real
 ) -> dict[str, str]:
-    """Return file name → text of every file except the manifest."""
+    """Return file name → text, for every file of the export except the manifest."""
     context = _context(exported, prefix, manifest, code, real)
     return {name: template.render(context) for name, template in load_templates(prefix).items()}
 
 
 def load_templates(prefix: str = "") -> dict[str, Template]:
-    """Return file name → template.  The first call takes long."""
+    """Return file name → template.  The first call is slow, because it compiles the templates."""
     names = {
         f"{prefix}.h": "header.h", f"{prefix}.c": "source.c",
         **{name: name for name in ("example.c", "example.cpp", "Makefile", "CMakeLists.txt", "README.md")},
@@ -54,7 +55,7 @@ def load_templates(prefix: str = "") -> dict[str, Template]:
 
 @cache
 def environment(package: str, escape: Callable[[str], str]) -> Environment:
-    """Return the templates of a package with the escapes of one language."""
+    """Return an environment for the templates of a package; ``escape`` escapes text for the language of the files."""
 
     def insert(value: object) -> str:
         return value if isinstance(value, Verbatim) else escape(str(value))
@@ -86,7 +87,7 @@ def _verbatim(function: Callable[..., str]) -> Callable[..., Verbatim]:
 
 
 def wrapped(words: Iterable[str], indent: str) -> str:
-    """Return comma-separated words on several lines of a comment."""
+    """Join words by commas, with line breaks so that the text fits into a comment."""
     lines, line = [], ""
     *first, last = words
     for piece in (*[f"{word}," for word in first], last):
@@ -176,7 +177,7 @@ def _frame(v: NamedObjective, test: dict[str, Any], alone: bool) -> dict[str, An
 
 
 def _worst_note(objective: WorstCaseObjective) -> str:
-    """Return the note of a header on model variants, on the gradient at a tie, and on friction."""
+    """Return a note for the header about model variants, the gradient if normals or models tie, and friction."""
     note = ""
     if objective.model_variants:
         note = "; the worst of " + "; ".join(model.name for model in objective.model_variants)
@@ -188,7 +189,7 @@ def _worst_note(objective: WorstCaseObjective) -> str:
 
 
 def _several(joint: NamedObjective, test: dict[str, Any]) -> dict[str, Any]:
-    """Return the variables of the objective of several contacts at once."""
+    """Return the template variables for the objective of several contacts at once."""
     objective = joint.objective
     names = [f"({model.name})" for model in objective.model_variants]
     return {

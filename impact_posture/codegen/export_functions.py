@@ -1,4 +1,4 @@
-"""The C functions of an export: names, parameters and results."""
+"""Names, parameters and results of the C functions of an export."""
 
 from __future__ import annotations
 
@@ -14,20 +14,22 @@ SIGNATURES: Mapping[str, tuple[tuple[str, ...], tuple[str, ...]]] = {
     "jump": (("q", "n"), ("a", "G", "V")),
     "ellipsoid": (("q",), ("L",)),
 }
-"""Name of each C function → its inputs and its results, in the order of its parameters; the batch is not included."""
+"""C function → its inputs and its results, in the order of the parameters.  The batch function is not included."""
 
 
 FUNCTIONS = (*SIGNATURES, "eval_batch")
-"""The functions of each frame; their C names are ``<stem>_<function>``."""
+"""Names of the functions that each frame has; the C names are ``<stem>_<function>``."""
 
 
 def lengths(nq: int, nv: int) -> dict[str, int]:
-    """Return the length of each parameter that is an array; the other parameters are single numbers."""
+    """Return parameter name → length, for parameters that are arrays.  All other parameters are single numbers."""
     return {"q": nq, "n": 3, "grad": nv, "a": nv, "L": 9}
 
 
 def stems(prefix: str, frames: Sequence[str]) -> tuple[str, ...]:
-    """Return the beginning of the function names of each frame: the prefix for one frame, else prefix and frame.
+    """Return for each frame the text with which its function names begin (stem).
+
+    For one frame, the stem is the prefix.  For several frames, the stem is prefix and frame name.
 
     Raises:
         InputError: A frame is given twice, or two frames have the same C identifier.

@@ -19,12 +19,13 @@ from impact_posture.impact.worst_case_objective import WorstCaseObjective
 
 @dataclass(frozen=True)
 class NamedObjective:
-    """An objective with the beginning of its C names.
+    """An objective with the text with which its C names begin.
 
     Attributes:
-        stem: Beginning of its C names.
-        free: Whether it is the objective without the supports of a standing robot.
-        joint: Whether it is the objective of several contacts at once, which has no ``H``.
+        objective: The objective.
+        stem: Text with which its C names begin.
+        free: Whether this objective is for a standing robot without its supports.
+        joint: Whether this objective is for several contacts at once; ``H`` is then not exported.
     """
 
     objective: WorstCaseObjective
@@ -34,18 +35,19 @@ class NamedObjective:
 
 
 def named_objectives(objectives: Sequence[WorstCaseObjective], prefix: str) -> tuple[NamedObjective, ...]:
-    """Return the objective of each contact, followed by ``<stem>_free`` without supports if it has supports.
+    """Return the objectives to export, with their stems.
 
-    A problem of several contacts has these for each contact, and last the objective of all contacts.
+    If the robot has supports, each objective is followed by ``<stem>_free``, the objective without supports.  An
+    objective of several contacts becomes one objective per contact; the objective of all contacts is last.
 
     Raises:
-        InputError: A problem of several contacts is not the only objective.
+        InputError: An objective of several contacts is exported together with other objectives.
     """
     several = [objective for objective in objectives if objective.others]
     if several and len(objectives) > 1:
         what = "a several-contact objective cannot be exported with others"
         raise InputError(what, where="codegen", hint="export them one by one")
-    # H takes the normal at run time, so a frame with two contacts has one H.
+    # The normal is a parameter of H, so a frame with two contacts needs only one H.
     singles: dict[str, WorstCaseObjective] = {}
     for single in (single for objective in several for single in objective.singles):
         singles.setdefault(single.contact.frame, single)
@@ -62,12 +64,12 @@ def named_objectives(objectives: Sequence[WorstCaseObjective], prefix: str) -> t
 
 @dataclass(frozen=True)
 class Exported:
-    """One function of the library.
+    """One C function of the library.
 
     Attributes:
-        stem: Beginning of its C name.
-        name: A name of :data:`~impact_posture.codegen.export_functions.SIGNATURES`.
-        outputs: Names of its results in :attr:`ExportLibrary.function`.
+        stem: Text with which its C name begins.
+        name: Name of the function in :data:`~impact_posture.codegen.export_functions.SIGNATURES`.
+        outputs: Names of its results among the outputs of :attr:`ExportLibrary.function`.
     """
 
     stem: str
@@ -77,12 +79,13 @@ class Exported:
 
 @dataclass(frozen=True)
 class ExportLibrary:
-    """All results of a library as one function, so that common expressions exist once.
+    """All results of a library as one CasADi function, so that common expressions are computed once.
 
     Attributes:
-        function: ``(q, n, constants)`` → all outputs.
-        constants: Values of the input ``constants``, in which repeated limbs differ.
-        seeds: Input name and index → its limb.
+        function: CasADi function ``(q, n, constants)`` → all outputs.
+        constants: Values of the input ``constants``: the constants in which repeated limbs differ.
+        seeds: (input name, index) → place of the input in repeated limbs.
+        functions: The C functions.
     """
 
     function: ca.Function
@@ -91,23 +94,24 @@ class ExportLibrary:
     functions: tuple[Exported, ...]
 
     def graph(self) -> Graph:
-        """Return the operations on single numbers, with values for the constants."""
+        """Return the graph of operations on single numbers, with numbers in place of the input ``constants``."""
         *inputs, _ = self.function.sx_in()
         values = self.function.call([*inputs, ca.DM(self.constants)])
         names = self.function.name_in()[:-1], self.function.name_out()
         return graph_of(ca.Function("numbers", inputs, values, *names, {"cse": True}))
 
     def vector_graph(self) -> Graph:
-        """Return the operations, with one vector operation for equal operations of repeated limbs."""
+        """Return the graph of operations, in which vector operations replace equal operations of repeated limbs."""
         if not self.seeds:
             return self.graph()
         return pack_lanes(graph_of(self.function), self.seeds, {"constants": self.constants})
 
 
 def export_library(exported: Sequence[NamedObjective]) -> ExportLibrary:
-    """Return the functions of objectives of one robot.
+    """Return the expressions of the objectives of one robot.
 
-    They omit ``V``, which the C code computes from ``H`` and ``G``, and an ``objective`` that is a multiple of ``H``.
+    The C code computes two results from others, so they have no expression here: ``V`` from ``H`` and ``G``, and an
+    ``objective`` that is a multiple of ``H``.
     """
     model = exported[0].objective.robot.model
     q, n, limbs = ca.SX.sym("q", model.nq), ca.SX.sym("n", 3), RepeatedLimbs(model)

@@ -11,13 +11,14 @@ import casadi as ca
 
 from impact_posture.errors import CompilerError
 
-# Operations with a vector form in C.  A division is a product with a reciprocal, which several divisions can share.
+# Operations that C can apply to vectors.  A division becomes a product with a reciprocal ("inv"), because several
+# divisions by the same number can share the reciprocal.
 ARITHMETIC = frozenset({"+", "-", "*", "neg", "inv"})
 _COMMUTE = frozenset({"+", "*"})
-# Functions with the same names in C and in CasADi, of one and of two arguments.
+# Functions that have the same name in C and in CasADi: with one argument, and with two arguments.
 _OF_ONE = ("exp", "log", "sqrt", "sin", "cos", "tan", "asin", "acos", "atan", "tanh", "fabs")
 _OF_TWO = ("pow", "atan2", "hypot", "fmin", "fmax")
-# The C of the other operations.  Operands are names or are in parentheses.
+# CasADi operation → C expression, for all other operations.  Every operand is a name or is in parentheses.
 CALLS = {
     **{getattr(ca, f"OP_{name.upper()}"): f"{name}({{0}})" for name in _OF_ONE},
     **{getattr(ca, f"OP_{name.upper()}"): f"{name}({{0}}, {{1}})" for name in _OF_TWO},
@@ -32,20 +33,22 @@ CALLS = {
     ca.OP_OR: "(double)({0} != 0.0 || {1} != 0.0)",
     ca.OP_IF_ELSE_ZERO: "({0} != 0.0 ? {1} : 0.0)",
 }
-# Sums and products.  A square and a double have their operand twice.
+# CasADi operation → binary operation.  A square x*x and a double x+x use the same operand twice.
 _PAIRS = {ca.OP_ADD: "+", ca.OP_SUB: "-", ca.OP_MUL: "*", ca.OP_SQ: "*", ca.OP_TWICE: "+"}
 _SINGLE = {ca.OP_NEG: "neg", ca.OP_INV: "inv"}
 SINE, COSINE = CALLS[ca.OP_SIN], CALLS[ca.OP_COS]
 
 
 class Node(NamedTuple):
-    """One operation.
+    """One operation of a graph.
 
     Attributes:
-        op: ``const``, ``in``, ``lane``, ``gather``, one of :data:`ARITHMETIC`, or a C expression of :data:`CALLS`.
-        args: Numbers of the operands.  ``in`` has the number of an input and an index, ``lane`` a node and an index.
-        width: 1, or the number of lanes of a vector.
-        value: The value of ``const``, one number for each lane.
+        op: ``const`` (constant), ``in`` (entry of an input), ``lane`` (entry of a vector), ``gather`` (vector from
+            single numbers), an operation of :data:`ARITHMETIC`, or a C expression of :data:`CALLS`.
+        args: Numbers of the nodes that are operands.  For ``in``: number of the input, and index in the input.  For
+            ``lane``: number of the vector node, and index in the vector.
+        width: Number of lanes of a vector; 1 for a single number.
+        value: For ``const``, one value per lane, or one value for all lanes.
     """
 
     op: str
@@ -55,17 +58,18 @@ class Node(NamedTuple):
 
     @property
     def operands(self) -> tuple[int, ...]:
-        """Numbers of the nodes among :attr:`args`."""
+        """The entries of :attr:`args` that are numbers of nodes."""
         return () if self.op in ("const", "in") else self.args[:1] if self.op == "lane" else self.args
 
 
 @dataclass
 class Graph:
-    """Operations, each after its operands.  Equal operations exist once.
+    """List of operations in which each operation comes after its operands, and no operation occurs twice.
 
     Attributes:
         inputs: Names of the inputs.
-        outputs: Output name → the nodes of its entries, column by column.
+        nodes: The operations.  The number of a node is its index in this list.
+        outputs: Output name → numbers of the nodes of its entries, column by column.
     """
 
     inputs: tuple[str, ...]
@@ -74,7 +78,10 @@ class Graph:
     _known: dict[Node, int] = field(default_factory=dict)
 
     def add(self, node: Node) -> int:
-        """Return the number of a node, which is added if it is new; arithmetic on constants becomes a constant."""
+        """Return the number of a node, and add the node if it is new.
+
+        If all operands of an arithmetic operation are constants, the result is a constant node instead.
+        """
         if node.op in ARITHMETIC and all(self.nodes[a].op == "const" for a in node.args):
             operands = [self.nodes[a] for a in node.args]
             width = max(o.width for o in operands)
@@ -88,12 +95,12 @@ class Graph:
         return number
 
     def constant(self, *value: float) -> int:
-        """Return the node of a number or of a vector; a vector of equal numbers is the number."""
+        """Return the number of a constant node; a vector of equal numbers becomes a single number."""
         same = len(set(value)) == 1
         return self.add(Node("const", (), 1 if same else len(value), value[:1] if same else value))
 
     def element(self, node: int, lane: int) -> int:
-        """Return the node of one number of a vector."""
+        """Return the number of the node for one lane of a vector."""
         vector = self.nodes[node]
         if vector.op == "const":
             return self.constant(vector.value[lane if vector.width > 1 else 0])
@@ -110,10 +117,10 @@ _COMPUTE: dict[str, Callable[..., float]] = {
 
 
 def graph_of(function: ca.Function) -> Graph:
-    """Return the operations of an SX function.  Sparse outputs become dense.
+    """Return the operations of an SX function as a graph.  Sparse outputs become dense.
 
     Raises:
-        CompilerError: An operation has no form in C.
+        CompilerError: An operation of the function cannot be written in C.
     """
     inputs = function.sx_in()
     outputs = [ca.densify(value) for value in function.call(inputs)]

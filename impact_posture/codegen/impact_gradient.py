@@ -1,4 +1,4 @@
-"""A built export as Python functions for a control loop, without CasADi and Pinocchio."""
+"""Call the functions of a compiled export from Python, for control loops; CasADi and Pinocchio are not needed."""
 
 from __future__ import annotations
 
@@ -23,46 +23,47 @@ if TYPE_CHECKING:
 Array = NDArray[Any]
 
 _TYPES: dict[str, Any] = {"double": ctypes.c_double, "float": ctypes.c_float}
-# Tolerance for the reference values of the manifest: rounding of the compiler.  In float, feet at compliance ε leave
-# few of the seven digits (condition about 1/ε).
+# Relative tolerance for the reference values of the manifest, which allows for rounding.  In float, few of the seven
+# digits are correct if the robot has supports with compliance ε (condition number about 1/ε).
 _SELF_TEST = {"double": 1e-7, "float": 0.1}
 
 
 class ImpactGradient:
-    """``H``, its tangent gradient and related quantities from a compiled export.
+    """Compute ``H``, its tangent gradient and related quantities with a compiled export.
 
     Every method copies its inputs into buffers that were allocated once.  **Array results are views of buffers, and
-    the next call of the same method overwrites them.**  Copy a result that must last.  An object serves one thread.
-    :meth:`copy` returns an object for another thread.  Calls release the global interpreter lock.
+    the next call of the same method overwrites them.**  Copy a result if you need it after the next call.  Use an
+    object in one thread only; :meth:`copy` returns an object for another thread.  Calls release the global
+    interpreter lock.
 
-    Methods for one configuration raise these errors:
+    The methods for a single configuration raise these errors:
 
     - ``InputError``: A number is not finite.
     - ``PostureError``: A quaternion or cosine-sine pair is not of unit norm.
-    - ``MetricError``: The result is not finite, because the quantity does not exist there.
+    - ``MetricError``: The result is not finite, because the quantity does not exist at this configuration.
     - ``ValueError``: An input has the wrong shape.
 
     Attributes:
         manifest: The content of ``<prefix>.json``.
-        frame: The contact frame of this object.
-        free: Whether this object ignores the supports.
+        frame: Name of the contact frame of this object.
+        free: Whether this object computes the robot without its supports.
         nq: Length of a configuration.
         nv: Length of a gradient.
-        dtype: The number type of the library.
+        dtype: NumPy type of the numbers in the library.
     """
 
     def __init__(
         self, library: ctypes.CDLL, manifest: Mapping[str, Any], frame: str | None = None, *, free: bool = False
     ) -> None:
-        """Bind a loaded library; use :meth:`load`."""
+        """Bind the functions of a loaded library.  To load an export, use :meth:`load` instead."""
         block = frame_block(manifest, frame)
         self.manifest, self.frame, self.free = manifest, str(block["frame"]), free
         self.nq, self.nv = int(manifest["nq"]), int(manifest["nv"])
-        # A robot without supports has no second set of functions.
+        # If the robot has no supports, the export has no separate functions without supports.
         block = (block.get("free") if free else None) or block
         symbols = dict(block["symbols"])
         if manifest.get("several") and not free:
-            # The problem has one objective, of all contacts together, at every frame.
+            # The objective is for all contacts together, so it is the same for every frame.
             symbols |= manifest["several"]["symbols"]
         self._library, self._reference = library, block["self_test"]
         real = _TYPES[manifest["real"]]
@@ -83,22 +84,23 @@ class ImpactGradient:
     def load(
         cls, path: str | Path, *, robot: Robot | None = None, frame: str | None = None, free: bool = False
     ) -> ImpactGradient:
-        """Load an export.  **This runs its code**, so load an export only if you trust its origin.
+        """Load an export.  **Loading runs the code of the export**, so load an export only if you trust its origin.
 
-        The library is ``lib<prefix>.so`` beside the manifest.  If it is missing, this method **builds it there** with
-        the user's compiler (``$CC``, cc, gcc or clang).  If there is a file with its SHA-256, the library must have
-        this hash.  It must also name this manifest and reproduce its reference values.
+        The library is ``lib<prefix>.so`` in the folder of the manifest.  If the library is missing, this method
+        **builds it in this folder** with the compiler of the user (``$CC``, cc, gcc or clang).  If the folder has a
+        file with the SHA-256 of the library, the hash must agree.  The library must also identify this manifest, and
+        reproduce the reference values of the manifest.
 
         Args:
             path: The folder of the export, or its ``<prefix>.json``.
-            robot: The robot, whose model the export must have.
-            frame: The contact frame; by default the first of the export.
-            free: Ignore the supports, if the export has some.
+            robot: If given, the export must be for this robot model.
+            frame: The contact frame; by default, the first frame of the export.
+            free: Compute the robot without its supports; no effect if the export has no supports.
 
         Raises:
             SpecError: The export does not exist or is damaged.
             ManifestMismatch: Robot, joint order or convention differ, or the library belongs to another manifest.
-                The error names the difference.
+                The error names the first difference.
             FrameNotFound: The export has no such frame.  The error lists its frames.
             CompilerError: The library is missing and cannot be built.
         """
@@ -120,17 +122,17 @@ class ImpactGradient:
         return gradient
 
     def copy(self) -> ImpactGradient:
-        """Return the same functions with new buffers, for another thread."""
+        """Return an object with the same functions and separate buffers, for use in another thread."""
         return ImpactGradient(self._library, self.manifest, self.frame, free=self.free)
 
     @checked
     def check_robot(self, robot: Robot) -> None:
-        """Refuse a robot that differs from the export in more than the joint model.
+        """Check that the export is for this robot; a different joint model is allowed.
 
         Raises:
             ManifestMismatch: The robot differs.  The error names the first difference.
         """
-        # Only this method needs Pinocchio.
+        # Import here, because only this method needs Pinocchio.
         from impact_posture.robot.joint_model import with_joint_model
 
         joints = self.manifest["joint_model"]
@@ -139,14 +141,15 @@ class ImpactGradient:
     def call(self, name: str, q: ArrayLike, n: ArrayLike | None = None) -> tuple[int, tuple[Array, ...]]:
         """Call a C function of :data:`~impact_posture.codegen.export_functions.SIGNATURES`.
 
-        ``q`` has shape (nq,).  ``n`` is the unit normal out of the surface, in the manifest's ``normal_frame``, shape
-        (3,).  Return the code of the function, and views of its results, also if the code is not zero.
+        ``q`` has shape (nq,).  ``n`` is the unit normal out of the surface, shape (3,), in the axes that the key
+        ``normal_frame`` of the manifest names.  Return the error code of the function, and views of its results.
+        Views are returned even if the code is not zero.
 
         Raises:
             ValueError: An input has the wrong shape.
         """
         function, results = self._functions[name]
-        # Assignment alone would broadcast one number to all joints.
+        # Check the length, because NumPy would broadcast an array with one number to all joints.
         if len(q) != self.nq:  # type: ignore[arg-type]
             raise ValueError(f"q has length {len(q)}, not {self.nq}")  # type: ignore[arg-type]
         self._q[:] = q
@@ -160,7 +163,7 @@ class ImpactGradient:
         return function(), results
 
     def _results(self, name: str, q: ArrayLike, n: ArrayLike | None = None) -> tuple[Array, ...]:
-        """Return the results of a C function whose code is zero."""
+        """Call a C function and return views of its results; raise an error if its code is not zero."""
         code, results = self.call(name, q, n)
         if code:
             raise _failure(code)
@@ -168,19 +171,19 @@ class ImpactGradient:
 
     def value_and_gradient(self, q: ArrayLike, n: ArrayLike) -> tuple[float, Array]:
         """Return ``H`` and its tangent gradient, a view of shape (nv,), with ``q`` and ``n`` as in :meth:`call`."""
-        # Without self._results, because control loops call this method in every tick.
+        # Control loops call this method in every tick.  It is faster without self._results.
         code, (H, gradient) = self.call("eval", q, n)
         if code:
             raise _failure(code)
         return H.item(), gradient
 
     def objective(self, q: ArrayLike) -> tuple[float, Array]:
-        """Return the exported objective at its normal, and its tangent gradient, a view of shape (nv,)."""
+        """Return the objective for the normal of the export, and its tangent gradient, a view of shape (nv,)."""
         value, gradient = self._results("objective", q)
         return value.item(), gradient
 
     def value(self, q: ArrayLike, n: ArrayLike) -> float:
-        """Return ``H`` alone."""
+        """Return ``H`` without its gradient."""
         return float(self._results("value", q, n)[0].item())
 
     def jump(self, q: ArrayLike, n: ArrayLike) -> tuple[Array, float, float]:
@@ -195,11 +198,11 @@ class ImpactGradient:
     def value_and_gradient_batch(
         self, q: ArrayLike, n: ArrayLike, out: tuple[Array, Array] | None = None
     ) -> tuple[Array, Array]:
-        """Return ``H``, shape (N,), and tangent gradients, shape (N, nv), of many configurations in new arrays.
+        """Return ``H``, shape (N,), and tangent gradients, shape (N, nv), for N configurations.
 
-        A row whose configuration would raise an error is NaN, and the other rows are valid.  ``q`` has shape (N, nq),
-        and ``n`` shape (N, 3), or (3,) for one normal.  ``out`` has contiguous arrays of the library's type for the
-        results.
+        ``q`` has shape (N, nq).  ``n`` has shape (N, 3), or (3,) if all configurations have the same normal.  ``out``
+        can provide two contiguous arrays of type :attr:`dtype` for the results; by default, new arrays are returned.
+        If a configuration is invalid, its rows are NaN; the rows of all other configurations are valid.
 
         Raises:
             InputError: A shape or a type is wrong.
@@ -226,7 +229,7 @@ class ImpactGradient:
         H, grad = self.value_and_gradient(test["q"], test["n"])
         values, expected = np.array([H, *grad]), np.array([test["H"], *test["grad"]])
         difference = float(np.abs(values - expected).max() / np.abs(expected).max())
-        # A comparison by ">" would accept a NaN.
+        # The condition "difference > tolerance" would be False for NaN, and accept it.
         if not difference <= _SELF_TEST[self.manifest["real"]]:
             hint = "delete the library, which is then built again"
             raise ManifestMismatch("reference value of H", test["H"], H, where=where, hint=hint)

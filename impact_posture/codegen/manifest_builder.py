@@ -1,4 +1,4 @@
-"""The manifest of an export: robot, frames, metric, objective and self-test."""
+"""Build the manifest of an export: robot, frames, metric, objective and self-test."""
 
 from __future__ import annotations
 
@@ -24,7 +24,7 @@ from impact_posture.version import __version__
 
 
 def configuration_names(robot: Robot) -> list[str]:
-    """Return a name with unit for each entry of ``q``."""
+    """Return a name for each entry of ``q``, with its unit."""
     parts = {
         "free-flyer": ("x (m)", "y (m)", "z (m)", "qx", "qy", "qz", "qw"),
         "spherical": ("qx", "qy", "qz", "qw"),
@@ -49,9 +49,10 @@ def build_manifest(
 ) -> dict[str, Any]:
     """Return the manifest of an export.
 
-    ``frames`` has an entry for each frame, and the top level repeats the first entry.  ``free`` of an entry has
-    symbols and self-test for the robot without its supports, or is null without supports.  ``several`` has symbols
-    and self-test of the objective of several contacts at once.
+    The key ``frames`` has one entry for each frame, and the top level repeats the first entry.  The key ``free`` of
+    an entry contains symbols and self-test for the robot without its supports; it is null if the robot has no
+    supports.  The key ``several`` contains contacts, symbols and self-test of the objective of several contacts at
+    once.
     """
     first = objectives[0]
     robot, metric = first.robot, first.metric

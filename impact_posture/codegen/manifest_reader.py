@@ -1,4 +1,4 @@
-"""Read the manifest of an export, and compare it with a robot and a library.  This module needs no CasADi."""
+"""Read the manifest of an export, and compare it with a robot and a library.  This module does not import CasADi."""
 
 from __future__ import annotations
 
@@ -25,7 +25,7 @@ Numbers = tuple[Annotated[float, Field(allow_inf_nan=False)], ...]
 
 
 class Loose(BaseModel):
-    """A block with required keys, which may have other keys."""
+    """A block of JSON with required keys; other keys are allowed and ignored."""
 
     model_config = ConfigDict(strict=True)
 
@@ -52,7 +52,7 @@ class _Several(Loose):
 
 
 class _Manifest(Loose):
-    """The keys that a loader needs.  :func:`check_library` compares the whole manifest with the library."""
+    """The manifest keys that loading needs.  :func:`check_library` compares the whole manifest with the library."""
 
     prefix: Annotated[str, Field(pattern=r"^[A-Za-z][A-Za-z0-9_]*$")]
     real: Literal["double", "float"]
@@ -67,10 +67,12 @@ class _Manifest(Loose):
 
 
 def read_manifest(path: Path) -> tuple[dict[str, Any], Path]:
-    """Read the manifest of an export at ``path``, the folder or the manifest; return it and the export's folder.
+    """Read the manifest of an export; return its content and the folder of the export.
+
+    ``path`` is the folder, or the manifest file.
 
     Raises:
-        SpecError: There is no manifest or more than one, or it is damaged.
+        SpecError: The folder has no manifest or several, or the manifest is damaged.
     """
     manifest, checked, file = read_checked(path, SCHEMA, _Manifest, "export", "codegen")
     sizes = [("armature", len(checked.armature), checked.nv)]
@@ -87,13 +89,13 @@ def read_manifest(path: Path) -> tuple[dict[str, Any], Path]:
 def read_checked(
     path: Path, schema: str, model: type[_Checked], what: str, command: str
 ) -> tuple[dict[str, Any], _Checked, Path]:
-    """Read and validate a manifest; return its content, the validated model, and its file.
+    """Read and validate a manifest; return its content, the validated ``model``, and the path of the file.
 
-    ``path`` is the folder or the manifest itself.  Messages name ``what`` is in the folder, and the ``command`` that
-    writes it.
+    ``path`` is the folder, or the manifest file.  In error messages, ``what`` is the name for the content of the
+    folder, and ``command`` is the command that writes the folder.
 
     Raises:
-        SpecError: There is no manifest or more than one, or it is damaged.
+        SpecError: The folder has no manifest or several, or the manifest is damaged.
     """
     files = [path] if not os.path.isdir(path) else sorted(p for p in path.glob("*.json") if _is_manifest(p, schema))
     if len(files) != 1:
@@ -125,18 +127,18 @@ def _incomplete(file: Path, why: str) -> SpecError:
 
 
 def identity(manifest: Mapping[str, Any]) -> str:
-    """Return the text by which a library names its manifest: sizes, number type and hash, as ``key=value``."""
+    """Return the text with which a library identifies its manifest: sizes, number type and hash, as ``key=value``."""
     content = json.dumps(manifest, sort_keys=True, separators=(",", ":"), allow_nan=False)
     digest = hashlib.sha256(content.encode()).hexdigest()
     return f"nq={manifest['nq']} nv={manifest['nv']} real={manifest['real']} sha256={digest}"
 
 
 def check_library(library: ctypes.CDLL, manifest: Mapping[str, Any], *, where: str) -> None:
-    """Refuse a library that belongs to another manifest, before any of its functions is called.
+    """Check that a library belongs to a manifest, before any function of the library is called.
 
     Raises:
-        SpecError: The library does not name a manifest.
-        ManifestMismatch: Sizes, number type or another part of the manifest differ.
+        SpecError: The library does not identify its manifest.
+        ManifestMismatch: The library was built for another manifest; the error names the first difference.
     """
     symbol = f"{manifest['prefix']}_manifest"
     try:
@@ -162,7 +164,7 @@ def _is_manifest(path: Path, schema: str) -> bool:
 
 
 def check_robot(manifest: Mapping[str, Any], robot: Robot, *, where: str = "manifest") -> None:
-    """Raise ManifestMismatch with the first difference if an export belongs to another robot."""
+    """Raise ManifestMismatch if an export was generated for another robot; the error names the first difference."""
     joints = list(manifest["joint_names"])
     if joints != list(robot.joint_names):
         pairs = zip([*joints, None], [*robot.joint_names, None], strict=False)
@@ -181,7 +183,11 @@ def check_robot(manifest: Mapping[str, Any], robot: Robot, *, where: str = "mani
 
 
 def frame_block(manifest: Mapping[str, Any], frame: str | None) -> Mapping[str, Any]:
-    """Return the block of a frame, by default of the first; raise FrameNotFound with the known frames."""
+    """Return the manifest block of a frame; for ``None``, of the first frame.
+
+    Raises:
+        FrameNotFound: The export has no such frame; the error lists its frames.
+    """
     blocks: dict[str, Mapping[str, Any]] = {str(block["frame"]): block for block in manifest["frames"]}
     if frame is None:
         return next(iter(blocks.values()))

@@ -1,4 +1,4 @@
-"""The self-test of a manifest: reference values for the code of an export, and its tolerance."""
+"""Self-test of an export: reference values in the manifest, and the tolerance for results of the C code."""
 
 from __future__ import annotations
 
@@ -21,16 +21,17 @@ from impact_posture.robot.robot import Robot
 from impact_posture.system.arrays import Array
 
 Reference = Callable[[Array, Array], dict[str, Array]]
-"""Function of a configuration ``q`` (nq,) and a normal ``n`` (3,) that returns quantities by name, as flat arrays."""
+"""Function of ``q``, shape (nq,), and ``n``, shape (3,), that returns a flat array for each name of a quantity."""
 
 
-# The manifest and the check of the same export need the same references.
+# Cached, because the manifest and the check of the same export need the same reference.
 @lru_cache(maxsize=8)
 def casadi_reference(objective: WorstCaseObjective) -> Reference:
-    """Return the quantities of an export, computed with CasADi.
+    """Return a function that computes the quantities of an export with CasADi.
 
-    The names are ``H``, ``grad`` (nv,), ``jump`` (nv,), ``G``, ``V = H/G²``, ``ellipsoid`` (9,).  ``objective`` and
-    ``objective_grad`` (nv,) are at the normal of the contact.  Several contacts at once have only these two.
+    The quantities are ``H``, ``grad`` (nv,), ``jump`` (nv,), ``G``, ``V = H/G²``, ``ellipsoid`` (9,), ``objective``
+    and ``objective_grad`` (nv,).  The last two are for the normal of the contact and do not depend on ``n``.  For an
+    objective of several contacts, only the last two exist.
     """
     k = objective.kernel
     value, gradient = objective.gradient_fun().call([k.q, ca.DM(objective.contact.normal)])
@@ -46,7 +47,7 @@ def casadi_reference(objective: WorstCaseObjective) -> Reference:
 
 
 def oracle_reference(objective: WorstCaseObjective) -> Reference:
-    """Return the same quantities, computed with Pinocchio."""
+    """Return a function that computes the quantities of :func:`casadi_reference` with Pinocchio."""
 
     def evaluate(q: Array, n: Array) -> dict[str, Array]:
         values: dict[str, ArrayLike] = {"objective": objective.value(q), "objective_grad": objective.gradient(q)}
@@ -61,30 +62,30 @@ def oracle_reference(objective: WorstCaseObjective) -> Reference:
 
 
 def oracle_along(objective: WorstCaseObjective, normal: Array) -> ImpactOracle:
-    """Return the oracle of the leading contact along another normal, shape (3,), in the same axes."""
+    """Return an oracle for the leading contact with another normal, shape (3,), stated in the same axes."""
     x, y, z = (float(v) for v in normal)
     return ImpactOracle(replace(objective.case, contact=replace(objective.contact, normal=(x, y, z))))
 
 
-# A unit vector that is not along an axis, so that no entry of a gradient vanishes.
+# A unit vector that is not parallel to an axis; with such a normal, entries of the gradient are not zero.
 _NORMAL = (0.48, -0.6, 0.64)
 _SCALARS = frozenset({"H", "objective", "G", "V"})
 
 
 def sample_postures(robot: Robot, count: int, seed: int) -> list[Array]:
-    """Return random configurations around the default posture, each of shape (nq,)."""
+    """Return ``count`` random configurations around the default posture, each of shape (nq,)."""
     rng = np.random.default_rng(seed)
     start = robot.posture()
     return [np.asarray(pin.integrate(robot.model, start, rng.uniform(-0.5, 0.5, robot.nv))) for _ in range(count)]
 
 
 def self_test(objective: WorstCaseObjective, real: Real = DOUBLE) -> dict[str, Any]:
-    """Return reference values at one posture and normal, computed with CasADi: ``q, n, H, grad, objective, …``.
+    """Return reference values for one posture and normal, computed with CasADi: ``q, n, H, grad, objective, …``.
 
-    Posture and normal are exact in the number type of the export.
+    Posture and normal are rounded to the number type of the export.
 
     Raises:
-        MetricError: The objective does not exist there.
+        MetricError: The objective does not exist at this posture.
     """
     q, n = real.rounded(sample_postures(objective.robot, 1, 0)[0]), real.rounded(_NORMAL)
     values = casadi_reference(objective)(q, n)
@@ -97,7 +98,7 @@ def self_test(objective: WorstCaseObjective, real: Real = DOUBLE) -> dict[str, A
     }
 
 
-# C function → names of its results in a reference.
+# C function → names of its results among the quantities of a reference.
 RESULTS = {
     "eval": ("H", "grad"),
     "objective": ("objective", "objective_grad"),
@@ -108,10 +109,10 @@ RESULTS = {
 
 
 def self_test_tolerance(objective: WorstCaseObjective, real: Real) -> float:
-    """Return the largest relative difference from CasADi that rounding errors can explain.
+    """Return the largest relative difference from CasADi that rounding errors can cause.
 
-    The C code multiplies by reciprocals, and a compiler may fuse sums with products.  In float the condition of the
-    model amplifies these errors.
+    The C code rounds differently: it multiplies by reciprocals, and a compiler may use fused multiply-adds.  In
+    float, ill-conditioned models amplify the rounding errors.
     """
     if real.name == "double":
         return 1e-9 * (heavy_feet_rounding(objective.robot, objective.compliance) if objective.supports else 1.0)

@@ -1,7 +1,8 @@
-"""Compute equal operations of repeated limbs as one vector operation, with one SIMD lane for each limb.
+"""Replace equal operations of repeated limbs by one vector operation, with one SIMD lane for each limb.
 
-The key of an operation consists of its kind and the keys of its operands.  The key of an angle or constant of a limb
-is its place in the limb.  Operations of all limbs of a group with the same key become one vector operation.
+Two operations are equal if they have the same key.  The key of an operation consists of its kind and the keys of its
+operands.  The key of an angle or constant of a limb is its place in the limb.  If all limbs of a group have an
+operation with the same key, these operations become one vector operation.
 """
 
 from __future__ import annotations
@@ -11,18 +12,18 @@ from dataclasses import dataclass
 
 from impact_posture.codegen.expression_graph import ARITHMETIC, COSINE, SINE, Graph, Node
 
-# Key of an operation.
+# Key by which equal operations of several limbs are identified.
 Key = tuple[object, ...]
 
 
 @dataclass(frozen=True)
 class LimbInput:
-    """An input of one of several repeated limbs.
+    """Place of an input (an angle or a constant) in repeated limbs.
 
     Attributes:
         group: Number of the group of limbs.
         lane: Number of the limb in the group.
-        name: Name of the input in all limbs.
+        name: Name of the input, equal for the corresponding inputs of all limbs of the group.
     """
 
     group: int
@@ -33,9 +34,10 @@ class LimbInput:
 def pack_lanes(
     graph: Graph, seeds: Mapping[tuple[str, int], LimbInput], values: Mapping[str, Sequence[float]]
 ) -> Graph:
-    """Return the same computation with vector operations for equal operations of repeated limbs.
+    """Return a graph with the same results, in which vector operations replace equal operations of repeated limbs.
 
-    ``seeds`` has the limb of each input name and index, and ``values`` the inputs that are constants, by name.
+    ``seeds`` maps (input name, index) to the place of the input in repeated limbs.  ``values`` maps the name of an
+    input to its values if these are constant.
     """
     widths: dict[int, int] = {}
     for seed in seeds.values():
@@ -50,7 +52,7 @@ def pack_lanes(
 
 
 def _levels(graph: Graph) -> list[list[int]]:
-    """Return the nodes by the length of the longest path to them from an input or a constant."""
+    """Return lists of nodes.  List k has the nodes whose longest path from an input or a constant has length k."""
     depth: list[int] = []
     levels: list[list[int]] = []
     for k, node in enumerate(graph.nodes):
@@ -64,14 +66,14 @@ def _levels(graph: Graph) -> list[list[int]]:
 def _bundles(
     graph: Graph, levels: list[list[int]], places: Mapping[int, LimbInput], widths: Mapping[int, int]
 ) -> dict[int, tuple[int, ...]]:
-    """Return node → all nodes in its vector.
+    """Return node → all nodes of the vector to which the node belongs.
 
-    Operations with the same key are in the same level, so each level is complete before the next uses it.  Where a
-    lane has no operation with a key, or two, these operations remain single.
+    Operations with the same key are in the same level, so the bundles of a level are complete before the next level
+    is processed.  If a limb has no operation with a key, or has several, the operations with this key stay single.
     """
     bundles: dict[int, tuple[int, ...]] = {}
     lanes: dict[int, tuple[int, int]] = {}
-    # In keys, a node stands for itself or for the first node of its bundle.
+    # Number that represents a node in keys: the first node of its bundle, or the node itself if it has no bundle.
     short = list(range(len(graph.nodes)))
     for level in levels:
         by_key: dict[Key, dict[int, list[int]]] = {}
@@ -94,7 +96,11 @@ def _bundles(
 def _place(
     graph: Graph, k: int, places: Mapping[int, LimbInput], lanes: Mapping[int, tuple[int, int]], short: list[int]
 ) -> tuple[Key, tuple[int, int]] | None:
-    """Return the key of a node with its group and lane; ``None`` if its operands are in no lane or in several."""
+    """Return the key of a node, and its group and lane.
+
+    Return ``None`` if the node cannot be in a vector: its operands are in no lane or in several lanes, or the
+    operation has no vector form.
+    """
     node = graph.nodes[k]
     if k in places:
         place = places[k]
@@ -114,13 +120,13 @@ def _merge(
     bundles: Mapping[int, tuple[int, ...]],
     values: Mapping[str, Sequence[float]],
 ) -> Graph:
-    """Return a graph with a vector for each bundle."""
+    """Return a graph in which one vector operation replaces the operations of each bundle."""
     merged = Graph(graph.inputs)
     singles: dict[int, int] = {}
     vectors: dict[tuple[int, ...], int] = {}
 
     def number(k: int) -> int:
-        """Return the new node for the single number k."""
+        """Return the number in the new graph of the node whose number in the old graph is ``k``."""
         if k not in singles:
             bundle = bundles[k]
             singles[k] = merged.element(vectors[bundle], bundle.index(k))
@@ -144,7 +150,7 @@ def _merge(
             if all(merged.nodes[p].op == "const" for p in parts):
                 return merged.constant(*[merged.nodes[p].value[0] for p in parts])
             return merged.add(Node("gather", tuple(parts), len(parts)))
-        # An operand is a single number that all lanes share, or a vector in the same order.
+        # An operand is either one number that all lanes share, or a vector with its lanes in the same order.
         slots = [list(operands) for operands in zip(*[node.operands for node in members], strict=True)]
         if members[0].op in "+*":
             _align(slots, bundles)
@@ -154,7 +160,7 @@ def _merge(
         ]
         return merged.add(Node(members[0].op, tuple(operands), max(merged.nodes[o].width for o in operands)))
 
-    # The nodes of a bundle are in one level, and their operands in earlier levels.
+    # All nodes of a bundle are in the same level, and all their operands are in earlier levels.
     for k in (k for level in levels for k in level):
         if k not in bundles:
             singles[k] = single(graph.nodes[k])
@@ -165,7 +171,7 @@ def _merge(
 
 
 def _align(slots: list[list[int]], bundles: Mapping[int, tuple[int, ...]]) -> None:
-    """Put the two operands of each lane's sum or product in the order of the first lane."""
+    """Exchange the operands of a sum or product in a lane if they are not in the order of the first lane."""
     first, second = slots
     for lane in range(1, len(first)):
         pairs = ((first[0], first[lane]), (second[0], second[lane]))

@@ -1,4 +1,4 @@
-"""Reorder sums: a sum adds the terms that are ready first, so that only its last term causes a delay."""
+"""Reorder sums so that the terms that are available first are added first; only the last term then causes a delay."""
 
 from __future__ import annotations
 
@@ -7,15 +7,16 @@ from collections.abc import Callable
 
 from impact_posture.codegen.expression_graph import Graph, Node
 
-# Approximate latency of operations on current processors, in cycles, and of a sine or cosine.
+# Approximate latency of operations on current processors, in cycles; _TRIG is for a sine, cosine or other function.
 _LATENCY = {"+": 4, "-": 4, "*": 4, "inv": 15, "neg": 1, "lane": 2, "const": 0, "in": 0, "gather": 1}
 _TRIG = 40
-# Least number of cycles that a separate sum of two terms must save.  No fused multiply-add can absorb its addition.
+# Two terms are added separately only if this saves at least this number of cycles.  A separate addition cannot be
+# part of a fused multiply-add, so it takes extra time.
 _WORTH = 8
 
 
 def reorder_sums(graph: Graph) -> Graph:
-    """Return the same computation with the terms of every sum in the order in which they are ready."""
+    """Return a graph with the same results, in which each sum first adds the terms that are available first."""
     reordered = Graph(graph.inputs)
     ready: list[int] = []
     new_of: dict[int, int] = {}
@@ -43,7 +44,7 @@ def reorder_sums(graph: Graph) -> Graph:
 
 
 def _inner(graph: Graph) -> set[int]:
-    """Return the sums that are used once, as a term of another sum of the same width."""
+    """Return the sums that are used only once, namely as a term of another sum of the same width."""
     users: dict[int, set[int]] = {}
     times: Counter[int] = Counter()
     for k, node in enumerate(graph.nodes):
@@ -63,7 +64,7 @@ def _inner(graph: Graph) -> set[int]:
 
 
 def _terms(graph: Graph, root: int, inner: set[int]) -> list[tuple[int, int]]:
-    """Return sign and node of each term of a sum."""
+    """Return the sign and the node number of each term of the sum at ``root``, with inner sums expanded."""
     terms: list[tuple[int, int]] = []
     waiting = [(1, root)]
     while waiting:
@@ -78,11 +79,11 @@ def _terms(graph: Graph, root: int, inner: set[int]) -> list[tuple[int, int]]:
 
 
 def _sum(graph: Graph, add: Callable[[Node], int], ready: list[int], terms: list[tuple[int, int]]) -> int:
-    """Return the node of the sum of signed nodes, which adds the latest term last."""
+    """Add the terms (pairs of sign and node number), the term that is available last at the end; return the node."""
     queue = sorted(terms, key=lambda term: (ready[term[1]], term[1]))
 
     def plus(first: tuple[int, int], second: tuple[int, int]) -> tuple[int, int]:
-        # Sums of single numbers remain single until a vector is added.
+        # The sum of two single numbers is a single number; if one term is a vector, the sum is a vector.
         width = max(graph.nodes[first[1]].width, graph.nodes[second[1]].width)
         if first[0] == second[0]:
             return first[0], add(Node("+", (first[1], second[1]), width))
@@ -93,7 +94,7 @@ def _sum(graph: Graph, add: Callable[[Node], int], ready: list[int], terms: list
     while queue:
         term = queue.pop(0)
         if queue and ready[total[1]] >= ready[queue[0][1]] + _WORTH:
-            # Two terms are ready before the sum.
+            # The next two terms are both available long before the sum so far: add them to each other first.
             term = plus(term, queue.pop(0))
         total = plus(total, term)
     return total[1] if total[0] > 0 else add(Node("neg", (total[1],), graph.nodes[total[1]].width))
