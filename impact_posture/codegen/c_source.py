@@ -1,4 +1,4 @@
-"""Generate the C code that ``templates/source.c.jinja`` inserts: functions of an export, their blocks, and batches."""
+"""Generate the C code that ``templates/source.c.jinja`` inserts: functions of an export, blocks, and batches."""
 
 from __future__ import annotations
 
