@@ -1,4 +1,4 @@
-"""The Sphinx site: ``sphinx-build -W -b html docs docs/_build/html``."""
+"""Configuration of the Sphinx site, which ``sphinx-build -W -b html docs docs/_build/html`` builds."""
 
 from __future__ import annotations
 

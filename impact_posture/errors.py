@@ -20,7 +20,8 @@ _LONGEST_PART = 10_000
 def printable(text: str, *, keep: str = "", longest: int = 0) -> str:
     r"""Return text without characters that control a terminal or change the writing direction.
 
-    Control and format characters, line separators and lone surrogates become escapes such as ``\x1b`` and ``\u202e``.
+    Control and format characters, line separators and lone surrogates are replaced by escapes such as ``\x1b`` and
+    ``\u202e``.
 
     Args:
         text: Any text.
@@ -105,8 +106,8 @@ class ImpactPostureError(Exception):
         return f"{text}; {self.hint}" if self.hint else text
 
     def __reduce__(self) -> tuple[object, ...]:
-        # Worker processes pickle errors.  Unpickling must not call the constructors, because subclasses have other
-        # arguments.
+        # Worker processes pickle errors.  Unpickling must not call the constructors, because constructors of
+        # subclasses have other arguments.
         return BaseException.__new__, (type(self), self.line), self.__dict__.copy()
 
 

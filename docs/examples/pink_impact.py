@@ -131,7 +131,7 @@ class Outcome:
 
     contact: Contact
     prepared: Prepared
-    offline: PostureSolution  # its optima are sorted, the best first
+    offline: PostureSolution  # optima of the solution are sorted, the best first
     q: np.ndarray
     H: np.ndarray  # H at the start and after each tick
     errors: np.ndarray  # norm of the errors of the kept tasks, after each tick

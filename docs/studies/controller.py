@@ -27,7 +27,7 @@ from impact_posture.tsid.controller import Controller
 from tests.support.exported_controller import KINDS, exported, formulation_of, impact_of
 
 HARNESS = Path(__file__).with_name("controller_times.c")
-# Number of repetitions of a tick.  Other programs interrupt some of them, so the shortest time is used.
+# Number of repetitions of a tick.  Other programs interrupt some repetitions, so the shortest time is used.
 REPETITIONS = 7
 # Number of timed ticks, and number of random ticks during which the memory must not grow.
 TIMED, RANDOM = 1000, 1_000_000
@@ -69,7 +69,10 @@ def flowing(name: str, ticks: int) -> tuple[Path, list[Vector]]:
 
 
 def times(folder: Path, recorded: list[Vector], flags: list[str], cold: bool) -> tuple[float, float]:
-    """Return median and 99th percentile of the times of ticks, µs.  Each time is the shortest of the repetitions."""
+    """Return median and 99th percentile of the times of ticks, µs.
+
+    The time of a tick is the shortest time of its repetitions.
+    """
     least = _least(folder, recorded, flags, [["cold"] if cold else []])[0][:, 0]
     return float(np.median(least)), float(np.percentile(least, 99))
 

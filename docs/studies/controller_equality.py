@@ -120,7 +120,7 @@ def objective_of(name: str) -> WorstCaseObjective:
 
 
 def pair(name: str, follows: str) -> tuple[Controller, CompiledController]:
-    """Return a robot's controllers in Python and in C.  A gradient, if any, is the same compiled function in both."""
+    """Return a robot's controllers in Python and in C.  Both controllers call the same compiled gradient."""
     objective = objective_of(name) if follows else None
     folder = exported(name, objective, "-O2", () if follows == "flow" else None)
     robot = load_robot(name) if objective is None else objective.robot

@@ -72,7 +72,10 @@ def _build(folder: Path, daqp: Path) -> Path:
 
 
 def times(program: Path, name: str, recorded: list[Vector]) -> tuple[float, float]:
-    """Return median and 99th percentile of the times of ticks, µs.  Each time is the shortest of the repetitions."""
+    """Return median and 99th percentile of the times of ticks, µs.
+
+    The time of a tick is the shortest time of its repetitions.
+    """
     robot, formulation = formulation_of(name)
     controller = Controller(robot, formulation)
     controller.reset(robot.posture(), np.zeros(robot.nv))

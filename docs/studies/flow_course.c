@@ -1,5 +1,5 @@
-/* Courses of the reference flow.  Append this file to the source of an exported controller with the prefix "course".  The robot
- * follows exactly, and no command is computed but the first. */
+/* Courses of the reference flow.  Append this file to the source of an exported controller with the prefix "course".
+ * The robot follows exactly, and no command except the first is computed. */
 
 /* Number of values in a row of course_run, with the posture. */
 enum { COURSE_ROW = 4 + COURSE_NQ };

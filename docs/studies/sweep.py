@@ -1,4 +1,4 @@
-"""Robustness and cost of sweeps: ``make study-sweep``.
+"""Robustness and computation time of sweeps.  Run with ``make study-sweep``.
 
 Four runs must write the same bytes as a process pool: a Dask cluster that loses a worker, MPI ranks, Slurm jobs on
 this machine, and a parent that is killed at random times.  The study then measures the speed, the memory of a long

@@ -31,8 +31,8 @@ from tests.support.qpsolvers_solver import QpsolversSolver
 DT = 1e-3
 # Goal for the time of an impact-robust tick divided by the time of a nominal tick.
 RATIO = 1.05
-# The same goal for the controller with a reference flow.  The mean is used, because updates of the flow are spread
-# over several ticks.
+# Goal for the mean time of a tick with a reference flow, divided by the time of a nominal tick.  The mean is used,
+# because updates of the flow are spread over several ticks.
 FLOW_RATIO = 2.0
 _OTHERS = {"proxqp": {"eps_abs": 1e-9}, "quadprog": {}}
 _TICKS = (

@@ -1,1 +1,1 @@
-"""The objective, the problem and the result behind ``import impact_posture as ip``."""
+"""Classes of objectives, problems and results, which ``import impact_posture as ip`` provides."""

@@ -27,7 +27,7 @@ class Demand:
     """Demand on a value, used as metadata of ``Annotated``.
 
     Attributes:
-        holds: Function that returns whether a value of the right type meets the demand.  It may raise a
+        holds: Function that returns whether a value of the right type meets the demand.  The function may raise a
             ``ValueError`` with a more exact message.
         words: Description of valid values for error messages.
     """

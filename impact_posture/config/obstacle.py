@@ -26,7 +26,7 @@ class Obstacle(StrictTable):
     """Box or ball that the robot must not touch.
 
     Attributes:
-        name: Name in messages.
+        name: Name of the obstacle in messages.
         box: Edge lengths of a box along its own axes, m.
         sphere: Radius of a ball, m.
         position: Center in the world, m.

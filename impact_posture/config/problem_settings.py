@@ -141,7 +141,10 @@ class ImpactSettings(RobotSettings):
     friction: NonNegative = setting(FRICTION, "Friction coefficient at the impact and at the feet.", CONTACT)
     metric: MetricKind = setting("euclidean", "Norm of the velocity jump.", METRIC)
     weights: str | tuple[float, ...] | None = setting(
-        None, "Weights of the weighted metric: TOML of joint = weight, or 1/limit².", METRIC, "FILE|velocity-limits"
+        None,
+        "Weights of the weighted metric: TOML file of joint = weight, or 1/limit².",
+        METRIC,
+        "FILE|velocity-limits",
     )
     objective: ObjectiveChoice = setting(
         "impulse", "Minimize H (impulse), V (speed), S (sticking), C (coulomb) or E (energy).", METRIC

@@ -44,7 +44,7 @@ def validate(cls: type[_Table], data: object, where: str) -> _Table:
         table: _Table = adapter(cls).validate_json(text)  # type: ignore[arg-type]
         return table
     except ValidationError as error:
-        # Report a misspelt key first, because the key that it should be is also missing.
+        # Report a misspelt key before missing keys, because the correct key is then missing as well.
         faults = error.errors()
         fault = next((f for f in faults if f["type"] in _UNKNOWN), faults[0])
     # Leave out the alternative of a union, which Pydantic adds to the location.

@@ -14,8 +14,8 @@ from impact_posture.errors import is_visible, printable
 
 # ASCII replacements for symbols in our texts, because some compilers reject other characters in C comments.
 _ASCII = str.maketrans({"·": " ", "²": "^2", "×": "x", "λ": "l", "ε": "eps", "⁻": "^-", "¹": "1"})
-# Largest numbers of characters.  Linkers and file systems accept more (255 bytes per file name), so suffixes can be
-# added.
+# Largest numbers of characters in an identifier, a file name and a label.  Linkers and file systems accept more (255
+# bytes per file name), so suffixes can be added.
 _LONGEST_IDENTIFIER, _LONGEST_FILE_NAME, _LONGEST_LABEL = 100, 120, 60
 
 

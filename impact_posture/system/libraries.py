@@ -187,7 +187,7 @@ def cache_path() -> Path:
 
 
 def cache_folder(*parts: str) -> Path:
-    """Return a folder of the cache; make it with mode 0700 if it is missing.
+    """Return a folder of the cache; if the folder is missing, make it with mode 0700.
 
     Raises:
         OutputError: The folder cannot be made, or another user owns the folder or may write to it.

@@ -1,7 +1,7 @@
 """Write each output folder completely or not at all, and never overwrite foreign files.
 
 Each output folder has a record, ``.impact-posture.json``, of the files that were written into it.  ``--force``
-replaces a folder only if the record names every file in it.
+replaces a folder only if the record lists every file in the folder.
 """
 
 from __future__ import annotations
@@ -225,7 +225,7 @@ def _replace(beside: Path, out: Path, force: bool, kind: Kind) -> None:
     """Replace ``out`` by ``beside``.  After an interruption at any time, the old or the new folder exists."""
     if not force or not out.exists():
         try:
-            # The rename is atomic.  It fails if another process has filled the folder in the meantime.
+            # The rename is atomic.  The rename fails if another process has filled the folder in the meantime.
             os.rename(beside, out)
         except OSError as error:
             if error.errno in (errno.ENOTEMPTY, errno.EEXIST):

@@ -40,7 +40,7 @@ _PR_SET_PDEATHSIG = 1
 def undone(undo: Callable[[], None]) -> Iterator[None]:
     """Call ``undo`` at the end of the block, also if a signal ends the process inside the block (:func:`end_early`).
 
-    A signal may come while ``undo`` runs, so a second call of ``undo`` must do no harm.
+    A signal may arrive while ``undo`` runs, so it must be safe to call ``undo`` twice.
     """
     entry = (os.getpid(), undo)
     _UNFINISHED.append(entry)
@@ -54,8 +54,8 @@ def undone(undo: Callable[[], None]) -> Iterator[None]:
 @contextmanager
 def signals_held() -> Iterator[None]:
     """Delay signals that would end the process until the end of the block."""
-    # Processes that are forked in the block inherit the signal mask.  This process also needs the count, because
-    # another of its threads may get the signal.
+    # Processes that are forked in the block inherit the signal mask.  This process also needs the number of blocks,
+    # because another of its threads may get the signal.
     before = signal.pthread_sigmask(signal.SIG_BLOCK, ENDING)
     _HELD[0] += 1
     try:
@@ -100,8 +100,8 @@ def fork_map(function: Callable[[int], _Result], count: int, jobs: int) -> Itera
     """Yield ``(index, function(index))`` for each index below ``count``, in the order in which they finish.
 
     The calls run in forked processes if ``jobs`` is more than one and the system can fork, else in this process, one
-    after the other.  All workers end with the block, also after Ctrl-C. On Linux, they also end if this process is
-    killed.
+    after the other.  All workers end with the block, also after Ctrl-C. On Linux, all workers also end if this
+    process is killed.
 
     Raises:
         WorkerDied: A worker was killed, for example for lack of memory.
@@ -137,7 +137,7 @@ def fork_call(function: Callable[[], _Result]) -> Iterator[Callable[[], _Result]
     """Start ``function()`` in a copy of this process and yield a function that waits for its result.
 
     The copy includes state that cannot be copied in another way (physics, solvers).  Exceptions of the copy are
-    raised here.  The copy ends with the block.
+    raised in this process.  The copy ends with the block.
 
     Raises:
         OSError: The system cannot fork.

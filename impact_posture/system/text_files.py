@@ -7,7 +7,7 @@ import os
 from pathlib import Path
 
 # Largest number of characters in a file.  The largest file of this package, the result of a long search, has about a
-# million.
+# million characters.
 MOST_CHARACTERS = 1 << 26
 
 

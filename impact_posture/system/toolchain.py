@@ -16,8 +16,8 @@ from impact_posture.system.processes import undone
 
 GET_ONE = "install gcc or clang, or set CC"
 
-# A compiler starts other processes.  The shell kills its whole process group when the pipe on standard input ends,
-# that is, when this process closes the pipe or is killed.
+# A compiler starts other processes.  The shell reads a pipe from standard input.  When this process closes the pipe
+# or is killed, the shell kills its whole process group.
 _GUARD = (
     "exec 3<&0 </dev/null; { read -r _ <&3; kill -KILL 0; } >/dev/null 2>&1 & "
     '"$@" 3<&-; code=$?; kill -KILL $!; exit $code'
@@ -101,8 +101,8 @@ def run_compilers(commands: Sequence[list[str]], folder: Path) -> None:
 
 def _start(command: list[str], folder: Path, guard: int) -> subprocess.Popen[str]:
     pipe = subprocess.PIPE
-    # Put temporary files into the folder of the result.  A killed compiler leaves them, but they are removed with
-    # this folder.
+    # Put temporary files into the folder of the result.  A killed compiler leaves its temporary files, but they are
+    # removed together with this folder.
     temporary = (folder / command[command.index("-o") + 1]).absolute().parent
     try:
         return subprocess.Popen(

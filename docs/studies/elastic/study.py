@@ -92,7 +92,7 @@ class Row:
     robot: str
     x: float  # x for the compression time of the elastic response
     x_links: float  # x for the compression time of the links alone
-    y: float  # rotation of the links' velocity jump by the springs within that time
+    y: float  # rotation of the links' velocity jump by the springs during the compression
     error: dict[str, float]  # relative error of the peak link velocity, by model
     force_error: dict[str, float]
     torque_error: float  # relative error of the largest spring torque, elastic model

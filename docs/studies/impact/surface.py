@@ -47,7 +47,7 @@ class Surface:
     friction: float = 0.0  # Coulomb coefficient; infinite for a contact point that sticks
     speed: float = 1.0  # approach speed v_n, m/s
     damping: float = 2.0  # ζ; 2 gives the restitution e = 0.05, 0.3 gives 0.4, 0.1 gives 0.7
-    time: float = 1e-4  # T, s; the contact lasts 1.5 T to 3 T
+    time: float = 1e-4  # time constant T, s; the contact lasts 1.5 T to 3 T
     convex: bool = False
 
 
@@ -55,7 +55,7 @@ class Surface:
 class Measured:
     """Measurements of one impact."""
 
-    jump: Vector  # Δν in Pinocchio's coordinates, shape (nv,)
+    jump: Vector  # velocity jump Δν in the coordinates of Pinocchio, shape (nv,)
     restitution: float  # normal speed after the impact divided by the speed before
     slip: float  # tangential speed of the contact point after the impact, divided by v_n
     impulse: float  # impulse of the surface along n, N s

@@ -1,10 +1,10 @@
 """Count, for each joint, the operations of an ideal articulated-body factorization, two solves and the gradient.
 
-The count follows patterns of zeros, not values.  In the axes of its link, each joint is a rotation in a coordinate
-plane.  Rotating a pair of numbers requires 4 multiplications and 2 additions (4m 2a).  A symmetric 2×2 matrix
-requires 4m 5a, and a general 2×2 matrix 4m 10a with the double angle (3m 2a for each joint).  A constant rotation
-that only permutes axes requires no operation; any other is counted as one more plane rotation.  Translations are
-cross products with the nonzero numbers.  Each joint requires:
+The count follows patterns of zeros, not values.  Each joint is a rotation in a coordinate plane of its link.
+Rotating a pair of numbers requires 4 multiplications and 2 additions (4m 2a).  A symmetric 2×2 matrix requires 4m 5a,
+and a general 2×2 matrix 4m 10a with the double angle (3m 2a for each joint).  A constant rotation that only permutes
+axes requires no operation; any other is counted as one more plane rotation.  Translations are cross products with the
+nonzero numbers.  Each joint requires:
 
 - factorization: ``U = I^A S`` is a column, one reciprocal, ``U/D``, one triangle of ``I^a = I^A − U Uᵀ/D`` (its axis
   row is zero without armature), ``I^a`` rotated, moved (``p̂A``, then ``p̂B`` and its partner on a triangle), added;
@@ -158,8 +158,8 @@ def floor(robot: Robot, contact: int) -> int:
             f = count.times(reduced[i][rows], before[i][:, None])[:, 0]
             count.plus(f, forces.get(i, np.zeros(6, dtype=bool))[rows])
             count.ops(2 * int(sum(before[i][r] for r in rows)))
-    # Rotate the normal outward and the couple inward along the chain, and add the row of the couple.  The last count
-    # is for scaling, H, and the lever arms of the contact.
+    # Rotate the normal outward and the couple inward along the chain, and add the row of the couple.  Then count the
+    # operations of scaling, of H, and of the lever arms of the contact.
     for i in sorted(chain & set(joints)):
         for inward in (False, True):
             joints[i].vector(count, np.ones(3, dtype=bool), inward)

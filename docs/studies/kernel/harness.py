@@ -25,7 +25,7 @@ from impact_posture.robot.robot import Robot
 from impact_posture.system.toolchain import find_compiler
 
 COUNT = 256
-# Number of configurations for finite differences.  Few are enough, because each needs many calls of H.
+# Number of configurations for finite differences.  Few configurations are enough, because each needs many calls of H.
 FEW = 16
 STEP = 1e-5
 # Number of first rounds that are not timed.  Before each timed pass, an untimed pass restores the caches, which other
@@ -118,7 +118,7 @@ class Kernel:
     group: str
     built: Built
     functions: dict[Kind, ctypes.c_void_p]
-    operations: Operations | None = None  # operations for H and ∇H; None for a template library
+    operations: Operations | None = None  # operations of H and ∇H; None if a template library computes them
     packed: int | None = None  # same, each vector instruction counted once; None without vectors
     source_kb: float | None = None
 

@@ -37,7 +37,7 @@ _FREE_FLYER = 8
 
 
 def kernels(samples: Samples) -> list[Kernel]:
-    """Build every formulation.  All share one library and one loaded model, so time one robot at a time.
+    """Build every formulation.  All formulations share one library and one loaded model, so time one robot at a time.
 
     Raises:
         Absent: The C++ compiler or headers are missing, or the peer does not support the model.

@@ -27,7 +27,7 @@ from impact_posture.simulation.world.world import build_world
 # PATIENCE seconds for the robot to rest.
 COUNT, DWELL, PAUSE = 2, 0.4, 0.6
 PATIENCE = 5.0
-# Factor on friction for a pyramid inside the friction cone with a margin of 10 %, as in the scenario files.
+# Factor from a friction coefficient to a pyramid inside the cone with a margin of 10 %, as in the scenario files.
 _TRUST = 0.9 / math.sqrt(2)
 # Least distance of the center of mass of a standing robot from the edges of the support polygon, m.
 _COM_MARGIN = 0.02
@@ -45,7 +45,8 @@ class Draw:
         attempt: Number of earlier random draws for this point that were not admissible.
         seed: Seed of the study.
         name: Name of the variation; empty for a random draw.
-        values: Changed values, by the names of :data:`RANGES`.  All other values are as shipped.
+        values: Changed values, by the names of :data:`RANGES`.  All other values are the values of the shipped
+            scenario.
     """
 
     scenario: str

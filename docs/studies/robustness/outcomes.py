@@ -39,8 +39,8 @@ SATURATED = 0.05
 ATTEMPTS = 40
 # Entries of the document of a run that a record does not store.
 _LEFT_OUT = ("windows", "versions", "runs")
-# Largest number of offline postures in the cache of this process, enough for some points of each scenario; and the
-# cache.
+# Largest number of offline postures in the cache of this process.  The number is enough for some points of each
+# scenario.
 _KEPT = 16
 _OPTIMA: dict[str, OfflinePosture] = {}
 _Play = Callable[[Job, ControllerFactory], tuple[tuple[Run, ...], Document]]

@@ -29,7 +29,7 @@ from docs.studies.robustness.variations import RANGES
 from impact_posture.simulation.offline_posture import SHARE
 
 Records = Mapping[str, Sequence[Record]]
-# The documentation includes the text before this mark and the text after this mark in different places.
+# The documentation includes the text before this mark in one place, and the text after this mark in another place.
 MARK = "<!-- tables -->"
 # A shoulder is treated as under the center of the base if its horizontal distance from the center is less than this,
 # m.

@@ -14,7 +14,7 @@ from docs.studies.robustness.outcomes import NOMINAL, Record
 from impact_posture.experiment.seed_statistics import value_of
 
 # Predictors of a jump, and functions that read their values from the prediction in a document.  The impulse of a
-# contact is not known before, so the predictor H is √H without the impulse.
+# contact is not known before the contact, so the predictor H is √H without the impulse.
 PREDICTORS: dict[str, Callable[[Mapping[str, float | None]], float | None]] = {
     "H": lambda p: None if p["H"] is None else math.sqrt(p["H"]),
     "V": lambda p: p["frictionless"],
@@ -27,7 +27,7 @@ PREDICTORS: dict[str, Callable[[Mapping[str, float | None]], float | None]] = {
 class Summary:
     """Results of one controller at all points of a scenario.
 
-    A controller that failed (error, lost contact, fall …) does not help.  In medians and quartiles, its run ranks
+    A controller that failed (error, lost contact, fall …) does not help.  In medians and quartiles, failed runs rank
     last.
 
     Attributes:
