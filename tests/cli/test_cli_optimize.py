@@ -137,7 +137,7 @@ def test_nothing_gained_is_said_where_a_mirrored_posture_is_shown() -> None:
     assert 0 <= result.reduction < 1e-3
     assert np.linalg.norm(result.q - result.initial) > 1
     (note,) = [note for note in result.solution.notes if "no better posture" in note]
-    assert note.endswith("another one of equal objective")
+    assert note.endswith("another posture with equal objective")
 
 
 def test_joints_that_robot_toml_holds_and_the_option_releases_are_named() -> None:

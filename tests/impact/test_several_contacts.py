@@ -355,8 +355,8 @@ def test_a_resolved_problem_gives_the_same_again(tmp_path: Path) -> None:
 @pytest.mark.parametrize(
     ("settings_", "kind", "words"),
     [
-        ({"target_position": (0.4, 0.0, 0.4)}, InputError, "one target for several contacts"),
-        ({"target_quaternion": (0.0, 0.0, 0.0, 1.0)}, InputError, "one target for several contacts"),
+        ({"target_position": (0.4, 0.0, 0.4)}, InputError, "single target, but there are several contacts"),
+        ({"target_quaternion": (0.0, 0.0, 0.0, 1.0)}, InputError, "single target, but there are several contacts"),
         ({"objective": "speed"}, MetricError, "approach speed of one contact"),
         ({"normal_cone": 5.0}, MetricError, "exact for one contact only"),
         ({"offset": (0.0, 0.0, 0.1)}, ContactError, "one offset for several contacts"),

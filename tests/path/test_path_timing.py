@@ -210,7 +210,7 @@ def test_a_floating_base_without_rotors_or_feet_has_no_limits() -> None:
     loose = replace(yaw_and_pitches(), spec=RobotSpec())
     objective = WorstCaseObjective(loose, ImpactContact(TIP, (0, 0, 1)))
     limits = ActuatorLimits(objective, loose.posture(), Requirements())
-    assert limits.missing == "there are neither rotors nor feet that could hold it up"
+    assert limits.missing == "there are neither rotors nor feet that could hold the robot up"
 
 
 @pytest.mark.parametrize("name", ["solo8", "go2", "anymal_c"])

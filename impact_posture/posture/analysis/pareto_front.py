@@ -47,7 +47,7 @@ _RISE = 1e-6
 # Maximum number of other optima from which a path starts, and of rounds in which results of neighboring bounds are
 # tried.
 _PATHS, _ROUNDS = 3, 3
-# Maximum number of times that the program grows for one point.
+# Maximum number of times that missing parts are added to the program for one point.
 _GROWTH = 8
 # Number of starts of the search for the posture with the least force.
 _FORCE_STARTS = 8

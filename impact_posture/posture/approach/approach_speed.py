@@ -36,7 +36,7 @@ class ApproachSpeed(Constraint):
         if len(self._kept) > len(attainable.free):
             points = " and ".join(point.name for point in attainable.points)
             what = f"{len(attainable.free)} joints cannot move {points} as required"
-            raise InputError(what, where="approach", hint="leave it out, or hold fewer joints and frames")
+            raise InputError(what, where="approach", hint="leave out `approach`, or hold fewer joints and frames")
         self._coming = [point for point in attainable.points if point.comes]
         self.parameters = np.concatenate([[speed], *[point.axes.ravel() for point in self._coming]])
         self.lower, self.upper = np.array([-np.inf]), np.zeros(1)

@@ -41,8 +41,8 @@ class Clearance(Constraint):
 
     Args:
         active: Maps the index of each pair in the program to the corners that have rows in the program.
-        lifted: Cache of the rows of pairs and their corners, by tree and index of the pair; all constraints grown
-            from this one share it.
+        lifted: Cache of the rows of pairs and their corners, by tree and index of the pair; shared with the
+            constraints that :meth:`grown` returns.
         distances: Distances of all pairs of the surroundings, and the indices of the pairs of this constraint among
             them.
     """

@@ -38,7 +38,8 @@ class LiftedRows:
         variables: ``z``, shape (k, 1).
         slack: Sum of the auxiliaries that relax rows, m; the program minimizes this sum to zero.
         sides: Further rows that depend on ``z`` only, not on ``q``.
-        pieces: Pieces of a constraint that can grow; the expression ``rows`` of a piece is reused while it grows.
+        pieces: Pieces of a constraint to which parts can be added; the expression ``rows`` of each piece is then
+            reused.
     """
 
     rows: ca.SX

@@ -21,11 +21,11 @@ from impact_posture.system.arrays import Array
 class KeptContacts(ExpressionConstraint):
     """The support impulses ``f = −J_s a/ε`` per unit impulse stay in the friction cones: ``A f(q) ≤ 0``.
 
-    The module :mod:`impact_posture.impact.friction.contact_stability` describes all impulses that can keep the feet
-    in place.  The impulses ``f`` of feet with compliance ε are one element of the set of these impulses.  The
-    constraint is therefore sufficient for the feet to stay, but stricter than necessary if the set has several
-    elements.  ``A`` is scaled so that the largest impulse at the given posture is 1.  ``numeric`` is the model at the
-    given posture.  It gives the axes of the soles, which do not change.
+    The support impulses of rigid feet are not always unique
+    (:mod:`impact_posture.impact.friction.contact_stability`).  The impulses ``f`` of feet with compliance ε are one
+    of the possible solutions.  The constraint is therefore sufficient for the feet to stay, but stricter than
+    necessary if there are several solutions.  ``A`` is scaled so that the largest impulse at the given posture is 1.
+    ``numeric`` is the model at the given posture.  It gives the axes of the soles, which do not change.
     """
 
     def __init__(self, objective: WorstCaseObjective, numeric: Numeric, friction: float, variant: str = "") -> None:

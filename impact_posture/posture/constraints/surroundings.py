@@ -60,7 +60,7 @@ class Surroundings:
         self.notes: list[str] = list(self.shapes.warnings)
         if touching := self.shapes.always_touching:
             pairs = [*(" / ".join(pair) for pair in touching[:3]), *["…"] * (len(touching) > 3)]
-            text = "pairs of shapes may touch, because they do so at most postures"
+            text = "pairs of shapes may touch, because they touch at most postures"
             self.notes.append(f"{len(touching)} {text}: {', '.join(pairs)}")
 
     def add_ground(self, supports: Sequence[Support], struck: Sequence[ImpactContact]) -> None:
@@ -136,7 +136,7 @@ class Surroundings:
         for obstacle in obstacles:
             if obstacle.name in taken:
                 fault = f"'{obstacle.name}' is the name of another body"
-                raise InputError(fault, where="obstacles", hint="give it another name")
+                raise InputError(fault, where="obstacles", hint="give the obstacle another name")
             taken.add(obstacle.name)
             self._walls.append(_Wall(ConvexBody.of_link(obstacle_hull(obstacle)), self._rigid([0])))
 

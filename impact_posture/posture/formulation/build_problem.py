@@ -142,12 +142,14 @@ def _surroundings(
 
 def _check(robot: Robot, requirements: Requirements) -> None:
     if not robot.floating and requirements.base != "free":
-        fault = f"base '{requirements.base}' does not fit a robot whose root is fixed"
-        raise InputError(fault, where="base", hint="leave it out or use `root` free-flyer")
+        fault = f"base '{requirements.base}' needs a floating base, but the root of the robot is fixed"
+        raise InputError(fault, where="base", hint="leave out `base` or use `root` free-flyer")
     if requirements.keep_contacts and not requirements.friction > 0:
         raise InputError(f"is {requirements.friction:g}", where="friction", hint="give a coefficient above zero")
     if requirements.hold_force and not requirements.holdable:
-        raise InputError("has no effect without `holdable`", where="hold_force", hint="leave out one of them")
+        raise InputError(
+            "has no effect without `holdable`", where="hold_force", hint="add `holdable` or leave this out"
+        )
     for joint in requirements.hold:
         robot.joint_id(joint)
     _check_target(requirements)
@@ -156,8 +158,8 @@ def _check(robot: Robot, requirements: Requirements) -> None:
 def _check_target(requirements: Requirements) -> None:
     quaternion = requirements.target_quaternion
     if requirements.other_poses and (quaternion is not None or requirements.target_position is not None):
-        fault = "is one target for several contacts"
-        hint = "leave it out and start from a `posture` that has the contacts in place"
+        fault = "is a single target, but there are several contacts"
+        hint = "leave out the target and start from a `posture` that has the contacts in place"
         raise InputError(fault, where="target_quaternion" if quaternion is not None else "target_position", hint=hint)
 
 
@@ -232,7 +234,7 @@ def _com_constraint(
             corners.append(placement.act(np.array([x, y, 0.0]))[:2])
     edges = polygon_edges(corners)
     if edges is None:
-        fault = "the feet span no area to keep the center of mass above"
+        fault = "the feet span no area above which the center of mass could stay"
         hint = "give three feet or soles with a size, set com_over_feet = false, or choose no `com`"
         raise InputError(fault, where="com_over_feet", hint=hint)
     return CenterOfMassOverFeet(*edges, margin)
@@ -249,5 +251,5 @@ def _bounds(chart: Chart, given: Array, requirements: Requirements) -> tuple[Arr
             lower[slot.x] = upper[slot.x] = x[slot.x]
         elif (lower[slot.x] > upper[slot.x]).any():
             fault = f"a margin of {margin:g} leaves joint '{slot.name}' no room to move"
-            raise InputError(fault, where="limit_margin", hint="give a smaller one")
+            raise InputError(fault, where="limit_margin", hint="give a smaller margin")
     return lower, upper

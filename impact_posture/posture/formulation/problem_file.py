@@ -100,12 +100,16 @@ def requirements(settings: ProblemSettings, objective: Objective) -> Requirement
     base = "level" if spec.level_base and robot.floating else "free"
     com = spec.com_over_feet and bool(objective.supports) if settings.com is None else settings.com
     if settings.obstacles and not settings.collision:
-        raise InputError("have no effect without `collision`", where="obstacles", hint="leave one of them out")
+        raise InputError(
+            "have no effect without `collision`", where="obstacles", hint="add `collision` or leave this out"
+        )
     if com and not objective.supports:
         fault = "there are no feet to keep the center of mass over"
         raise InputError(fault, where="com", hint="add `support`, or choose no `com`")
     if settings.keep_contacts and not objective.supports:
-        raise InputError("there are no feet to keep", where="keep_contacts", hint="add `support` or leave it out")
+        raise InputError(
+            "there are no feet to keep in place", where="keep_contacts", hint="add `support` or leave it out"
+        )
     if settings.approach and not 0 < settings.speed <= FASTEST:
         what = "needs an approach speed above zero"
         raise InputError(what, where="approach", hint=f"give `speed`, up to {FASTEST:g} m/s")
@@ -236,6 +240,6 @@ def dump_settings(settings: ProblemSettings) -> str:
             try:
                 lines.append(f"{key} = {toml(value)}")
             except UnicodeEncodeError:
-                fault = f"'{value}' is not UTF-8, as TOML has to be"
+                fault = f"'{value}' is not UTF-8, but TOML must be UTF-8"
                 raise SpecError(fault, where=key, hint="rename the file or folder") from None
     return "\n".join(lines) + "\n"

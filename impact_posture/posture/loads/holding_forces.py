@@ -81,7 +81,9 @@ class HoldingForces:
         """Return a line for each reason why the robot cannot hold the posture under a load; empty if it can."""
         lines = []
         if self.unbalanced > _ROUNDING:
-            lines.append(f"{self.load}, {self.unbalanced:.2g} weights of the wrench on its base are not balanced")
+            lines.append(
+                f"{self.load}, a wrench of {self.unbalanced:.2g} times its weight on its base is not balanced"
+            )
         for name, load in sorted(self.actuators.items(), key=lambda item: -item[1].share):
             if load.share > 1 + _ROUNDING and self.unbalanced <= _ROUNDING:
                 limits = f"[{load.low:.3g}, {load.high:.3g}]"

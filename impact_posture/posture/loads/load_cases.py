@@ -90,17 +90,19 @@ def load_cases(objective: Objective, q: Array, requirements: Requirements) -> Lo
     reach, rank = _reach(StaticLoad(robot.model, [*rotors, *feet]), q) if robot.floating else (np.zeros((0, 6)), 0)
     unknown = ""
     if robot.floating and not (rotors or feet):
-        unknown = "there are neither rotors nor feet that could hold it up"
+        unknown = "there are neither rotors nor feet that could hold the robot up"
     elif feet and rank < 6:
-        unknown = f"feet with friction {requirements.friction:g} at these points cannot balance it at rest"
+        unknown = f"feet with friction {requirements.friction:g} at these points cannot balance the robot at rest"
     elif not robot.floating and not np.isfinite(limits).any():
         unknown = "no effort limit of a joint is known"
     if unknown and force:
-        raise InputError(f"{force:g} N cannot be checked: {unknown}", where="hold_force", hint="leave it out")
+        raise InputError(
+            f"{force:g} N cannot be checked: {unknown}", where="hold_force", hint="leave out `hold_force`"
+        )
     if unknown:
         return LoadCases((), (f"whether the robot can hold the posture is not checked: {unknown}",), unknown)
     free = [s.frame for s in objective.supports if feet and s.kind == "surface" and not s.has_sole]
-    notes = [f"the moments that {', '.join(free)} can bear are not checked: the sole has no size"] if free else []
+    notes = [f"the moments that {', '.join(free)} can support are not checked: the sole has no size"] if free else []
     kinds = ["joint torques", *["rotor thrusts"] * bool(rotors), *["forces of the feet"] * bool(feet)]
     what = " and ".join([", ".join(kinds[:-1]), kinds[-1]] if kinds[1:] else kinds)
     sources, balance, thrusts = [*rotors, *feet], reach[:rank], Thrusts()

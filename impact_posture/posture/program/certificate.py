@@ -35,7 +35,8 @@ _MULTIPLIER = 1e-6
 class Active:
     """An active inequality: a constraint, such as ``joint 'elbow'``, and its ``lower`` or ``upper`` side.
 
-    ``multiplier`` (≥ 0) is the rate at which the scaled objective decreases if the bound is relaxed, per m or rad.
+    ``multiplier`` (≥ 0) is the rate at which the scaled objective decreases if the bound is relaxed, per unit of the
+    bound.
     """
 
     constraint: str
@@ -49,7 +50,8 @@ class Certificate:
 
     Attributes:
         stationarity: ``‖∇f/f₀ + Aᵀλ‖_∞`` in the tangent space, with the objective f, its initial value f₀, and the
-            Jacobian A of constraints and limits.  λ are the multipliers with the right signs that minimize this norm.
+            Jacobian A of constraints and limits.  The multipliers λ have the right signs and are computed by least
+            squares.
         primal: Largest violation of a constraint or joint limit, or error of the norm of a quaternion (m, rad).
         complementarity: Largest product of a multiplier and the distance of its constraint from the bound.
         pose_error_m: Largest position error of a frame whose position is constrained, m.

@@ -54,7 +54,7 @@ class ConstrainedProblem:
         """The objective, if it is an impact objective; otherwise raise ``InputError``."""
         if not isinstance(self.objective, WorstCaseObjective):
             fault = f"is '{self.objective.name}', which is not an impact objective"
-            raise InputError(fault, where="objective", hint="use a WorstCaseObjective for what needs H, G, V and S")
+            raise InputError(fault, where="objective", hint="use a WorstCaseObjective, which provides H, G, V and S")
         return self.objective
 
     def carried(self, index: int) -> list[int]:

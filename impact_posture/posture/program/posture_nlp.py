@@ -105,7 +105,7 @@ class PostureNLP:
         return nlp
 
     def grown(self, problem: ConstrainedProblem, *, compile: CompileMode = "auto") -> PostureNLP:
-        """Build the program of ``problem``, which has grown from the problem of this program."""
+        """Build the program of ``problem``, the problem of this program with additional parts."""
         return build_nlp(problem, compile=compile, program=self.program)
 
     def solve(
@@ -201,8 +201,8 @@ def build_nlp(
 ) -> PostureNLP:
     """Build the program for ``starts`` runs; this number decides whether compiling saves time.
 
-    ``program`` contains the expressions of a problem from which ``problem`` has grown.  ``rows`` are the rows of the
-    constraints, if they are already built.
+    ``program`` contains the expressions of the same problem with fewer parts; they are reused.  ``rows`` are the rows
+    of the constraints, if they are already built.
 
     Raises:
         CompilerError, OutputError: For the same reasons as in
@@ -211,7 +211,8 @@ def build_nlp(
     began = time.perf_counter()
     program = program or Program(problem, rows)
     symbols, derivatives = program.symbols(problem)
-    # A program that grows is soon replaced, so it is compiled only if compiling saves time for a single run.
+    # A program to which parts are added is soon replaced, so it is compiled only if compiling saves time for a single
+    # run.
     built = compiled_solver(problem, symbols, _options(problem), compile, 1 if problem.grows else starts, derivatives)
     took = time.perf_counter() - began
     return PostureNLP(problem, program, built.solver, took, built.compiled, built.fault)

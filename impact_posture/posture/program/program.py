@@ -27,7 +27,7 @@ from impact_posture.system.arrays import Array
 
 
 class Program:
-    """The expressions of a program; most of them stay the same while the problem grows.
+    """The expressions of a program; most of them stay the same when parts are added to the problem.
 
     ``rows`` are the rows of the constraints; all programs of the same problem share them.
 
@@ -47,7 +47,7 @@ class Program:
         self.parameters = ca.vertcat(impact, scale, weight, self._price, rows.reference, *rows.parameters)
 
     def branch(self) -> Program:
-        """Return a copy that can grow without changing this program."""
+        """Return a copy to which parts can be added without changing this program."""
         branch = copy(self)
         branch.rows = self.rows.branch()
         return branch
@@ -55,8 +55,8 @@ class Program:
     def symbols(self, problem: ConstrainedProblem) -> tuple[dict[str, ca.SX], dict[str, ca.Function]]:
         """Return the expressions of a problem and options of ``nlpsol``.
 
-        The expressions are ``x`` (unknowns), ``p`` (parameters), ``f`` and ``g``.  If the problem can grow, the
-        options contain its derivatives; otherwise they are empty.
+        The expressions are ``x`` (unknowns), ``p`` (parameters), ``f`` and ``g``.  If parts can be added to the
+        problem, the options contain its derivatives; otherwise they are empty.
         """
         rows, objective = self.rows.lift(problem), self.lifted
         x = ca.vertcat(self.rows.x, objective.variables, rows.variables)
@@ -73,7 +73,7 @@ class Program:
 
     @cached_property
     def fixed(self) -> Derivatives:
-        """Derivatives of the value, the norms and the rows of the objective, which never grow."""
+        """Derivatives of the value, the norms and the rows of the objective, which never change."""
         objective, nx, norms = self.lifted, self.chart.nx, self.rows.norms
         rows = ca.vertcat(self.value, norms, objective.rest, objective.inequalities)
         derivatives = Derivatives.of(rows, ca.vertcat(self.rows.x, objective.variables))

@@ -1,7 +1,7 @@
-"""The rows of all constraints in a program that grows; each piece of the rows is differentiated only once.
+"""The rows of all constraints of a program to which rows can be added; each piece is differentiated once.
 
-First and second derivatives take most of the time to build a program.  When a program grows, most of its pieces stay
-the same, so their derivatives are reused.
+First and second derivatives take most of the time to build a program.  When rows are added, most pieces stay the
+same, so their derivatives are reused.
 """
 
 from __future__ import annotations
@@ -56,7 +56,7 @@ class Derivatives:
 
 
 class ProgramRows:
-    """Lifted constraints of a problem and of all problems grown from it; all their programs share these rows.
+    """Lifted constraints of a problem, with all parts added so far; all programs of the problem share them.
 
     Attributes:
         x: Chart coordinates, shape (nx, 1).
@@ -78,7 +78,7 @@ class ProgramRows:
         self._sides = WeakKeyDictionary[LiftedRows, Derivatives]()
 
     def branch(self) -> ProgramRows:
-        """Return a copy that can grow without changing these rows."""
+        """Return a copy to which rows can be added without changing these rows."""
         branch = copy(self)
         branch._lifted, branch._blocks = dict(self._lifted), list(self._blocks)
         return branch

@@ -34,7 +34,7 @@ _CONFIRMING = 4
 # Number of random postures that are drawn first. This number usually suffices, and drawing all takes longer than
 # solving the program of a small robot.
 _DRAW = 8
-# Maximum number of times that the program grows for one start.
+# Maximum number of times that missing parts are added to the program for one start.
 _ROUNDS = 20
 
 
@@ -63,7 +63,7 @@ def find_conflicts(
 ) -> LeastViolation:
     """Minimize the slack ``Σ (s⁺ + s⁻)`` with ``c(q) + s⁺ − s⁻`` within bounds, from ``guesses`` and other starts.
 
-    ``program`` may belong to the same problem with another target, or to a problem that grew into this one.
+    ``program`` may belong to the same problem with another target or with fewer parts.
     ``beside`` is the least violation known from a nearby target.  If the first few starts reduce the violation below
     half of ``beside``, the other starts run too; otherwise the search stops.
     """
@@ -119,9 +119,9 @@ def _relax(problem: ConstrainedProblem, chart: Chart, program: ElasticProgram, s
 class ElasticProgram:
     """The program that relaxes the constraints with slacks.
 
-    Most expressions of the program stay the same while the problem grows.  ``rows`` are the rows of its constraints,
-    if another program of the problem has already built them.  ``problem`` is the latest grown problem, and ``time_s``
-    the total wall time of the solver.
+    Most expressions of the program stay the same when parts are added to the problem.  ``rows`` are the rows of its
+    constraints, if another program of the problem has already built them.  ``problem`` is the problem with all parts
+    added so far, and ``time_s`` the total wall time of the solver.
     """
 
     def __init__(self, problem: ConstrainedProblem, rows: ProgramRows | None = None) -> None:
@@ -132,7 +132,7 @@ class ElasticProgram:
         self._fixed = Derivatives.of(ca.vertcat(self._away, rows.norms), rows.x)
 
     def solver(self, problem: ConstrainedProblem) -> ca.Function:
-        """Return ``nlpsol`` for the first problem, also with another target or after it has grown."""
+        """Return ``nlpsol`` for the first problem, also with another target or with additional parts."""
         self.problem, structure = problem, problem.structure
         if self._latest is None or self._latest[0] != structure:
             self._latest = structure, self._solver(problem)

@@ -1,4 +1,4 @@
-"""Runs of the solver from all starts; the program grows by the parts that are missing where a run ends."""
+"""Runs of the solver from all starts; parts that a final posture needs are added to the program."""
 
 from __future__ import annotations
 
@@ -25,9 +25,9 @@ from impact_posture.system.processes import fork_map
 
 Progress = Callable[[int, int], None]
 
-# If the program can grow, this many starts run before all others.
+# If parts can be added to the program, this many starts run before all others.
 FIRST = 2
-# Maximum number of runs from one start; the program grows before each further run.
+# Maximum number of runs from one start; before each further run, missing parts are added to the program.
 _ROUNDS = 10
 # If all starts together have at most this many unknowns, every start is finished, because stopping some would save no
 # time.
@@ -104,7 +104,7 @@ def run_start(
 
 
 class GrowingSearch:
-    """Runs from all starts; the program grows, and runs are repeated, until no final posture lacks a part.
+    """Runs from all starts; parts are added to the program, and runs repeated, until no part is missing.
 
     ``scale`` is the initial objective.  ``finish_all`` also finishes starts that cannot become the best; small
     programs always finish them.  ``rows`` may be shared with another program of the same problem.
@@ -125,7 +125,7 @@ class GrowingSearch:
         self._small = draws.count * self._unknowns <= _SMALL
         self._finish_all = finish_all or self._small
         self.build_time_s = self.nlp.build_time_s
-        # Final postures of runs; the next runs continue from these postures with the grown program.
+        # Final postures of runs; the next runs continue from these postures with the extended program.
         self._ends: dict[int, Array] = {}
         # Price of a meter of slack for starts without a run that ended in a trap.
         self._price = SLACK_PRICE

@@ -46,7 +46,8 @@ def initial_posture(problem: ConstrainedProblem, seed: int, rows: ProgramRows) -
         )
     projection = Projector(problem).project(least.q)
     if projection.violation > FEASIBLE:
-        fault = f"a posture within {projection.violation:.1e} of the constraints was found, but none on them"
+        near = f"a posture within {projection.violation:.1e} of the constraints was found"
+        fault = f"{near}, but no posture that satisfies them"
         raise SolverFailed(fault, where="problem", hint="start from a `posture` nearer to the target")
     return replace(least.problem, given=given), projection.q
 
@@ -76,6 +77,6 @@ def initial_objective(problem: ConstrainedProblem, initial: Array) -> float:
     if not (np.isfinite(value) and value > 0):
         frames = ", ".join(f"'{contact.frame}'" for contact in objective.contacts)
         fault = f"the contact point at {frames} cannot move along the normal"
-        hint = "choose another frame, normal or posture: an impact along it moves nothing"
+        hint = "choose another frame, normal or posture: an impact along this normal moves nothing"
         raise ContactError(fault, where="normal", hint=hint)
     return value

@@ -141,9 +141,9 @@ def solve(
     elif redundancy == 0:
         notes.append("no redundancy left: this is the best of the isolated postures that satisfy the constraints")
     elif best.objective > scale * (1 - _NO_GAIN):
-        note = "no better posture found: the initial one is already optimal for this impact, or nearly so"
+        note = "no better posture found: the initial posture is already optimal for this impact, or nearly so"
         other = np.linalg.norm(wrapped_difference(problem, initial, q)) > SAME_POSTURE
-        notes.append(f"{note}; the posture shown is another one of equal objective" if other else note)
+        notes.append(f"{note}; the posture shown is another posture with equal objective" if other else note)
     optima = distinct(problem, [(r.record.q, r.objective) for r in good if r.record is not None])
     notes += notes_on_impacts(problem.objective, initial, q)
     if touching:
@@ -234,7 +234,9 @@ def _failure(runs: list[SolverRun]) -> SolverFailed:
     solved = [(r.record, r.certificate) for r in runs if r.record is not None and r.certificate is not None]
     if not solved:
         return SolverFailed(
-            "the objective does not exist where the starts ended", where="solver", hint="choose another `objective`"
+            "the objective is not defined at the postures where the starts ended",
+            where="solver",
+            hint="choose another `objective`",
         )
     statuses = sorted({record.status for record, _ in solved})
     nearest = min((certificate for _, certificate in solved), key=lambda c: c.stationarity)

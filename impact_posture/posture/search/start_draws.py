@@ -12,9 +12,9 @@ class StartDraws:
 
     Random starts are drawn as in :func:`impact_posture.posture.manifold.feasible_start.feasible_start`.
 
-    Each start is drawn in the process that runs it.  The constraints on the starts do not grow with the problem.
-    There is at least one known start.  Every second random start lies near the first known start, because the posture
-    of the problem may be far from all postures that satisfy the constraints.
+    Each start is drawn in the process that runs it.  The constraints on the starts stay the same when parts are added
+    to the problem. There is at least one known start.  Every second random start lies near the first known start,
+    because the posture of the problem may be far from all postures that satisfy the constraints.
     """
 
     def __init__(self, problem: ConstrainedProblem, known: tuple[Array, ...], count: int, seed: int) -> None:
