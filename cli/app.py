@@ -1,4 +1,4 @@
-"""The Typer app: the subcommands of ``impact-posture``, each imported when it is called."""
+"""Typer app with the subcommands of ``impact-posture``.  A call imports only the module of the called subcommand."""
 
 from __future__ import annotations
 
@@ -12,7 +12,7 @@ from impact_posture_cli.commands import COMMANDS
 
 
 def load(name: str) -> Any:
-    """Import the function behind a subcommand."""
+    """Import and return the function of a subcommand."""
     return getattr(import_module(f"impact_posture_cli.commands.{name}"), name)
 
 
@@ -26,7 +26,7 @@ def build(name: str) -> Any:
 class CommandGroup(TyperGroup):
     """Group of subcommands that builds the parser of the called subcommand only.
 
-    The help page needs no more than :data:`COMMANDS`.
+    The help page uses only the names and texts in :data:`COMMANDS`.
     """
 
     def __init__(self, **attributes: Any) -> None:
@@ -34,7 +34,7 @@ class CommandGroup(TyperGroup):
         self.commands = {name: TyperCommand(name, help=text) for name, text in COMMANDS.items()}
 
     def resolve_command(self, ctx: Any, args: list[str]) -> Any:
-        """Find the called subcommand and build its parser."""
+        """Return the name, the parser and the arguments of the called subcommand."""
         name, _, rest = super().resolve_command(ctx, args)
         return name, build(str(name)), rest
 
@@ -42,7 +42,7 @@ class CommandGroup(TyperGroup):
 app = typer.Typer(
     name="impact-posture",
     cls=CommandGroup,
-    help="Find the posture in which a redundant robot takes an impact best, see why, and hand it to the controller.",
+    help="Find the posture of a redundant robot with the lowest impact, see why, and export it to the controller.",
     epilog="Each command has its own --help. ROBOT: a name from 'impact-posture robots', or a path to a .urdf.",
     no_args_is_help=True,
     pretty_exceptions_enable=False,
@@ -63,4 +63,4 @@ def root(
         bool, typer.Option("--version", callback=_version, is_eager=True, help="Print the version and exit.")
     ] = False,
 ) -> None:
-    """Read the options that stand before a subcommand."""
+    """Read the options that are given before a subcommand."""

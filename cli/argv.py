@@ -1,4 +1,4 @@
-"""Rewrite arguments of the command line to the form that Typer reads."""
+"""Convert arguments of the command line to a form that Typer can read."""
 
 from __future__ import annotations
 
@@ -6,18 +6,19 @@ import re
 from collections.abc import Sequence
 from itertools import zip_longest
 
-# Options whose value may be left out, and the pattern of a value.
+# Options whose value may be missing, and the pattern that a value matches.
 _OPTIONAL = {
-    # Any number, because the option itself refuses a fraction.
+    # Match any number, because the option itself reports a fraction as an error.
     "--tradeoff": re.compile(r"[+-]?[0-9.]+$"),
     "--write-robot-toml": re.compile(r".*\.toml$"),
 }
 
 
 def put_right(arguments: Sequence[str]) -> list[str]:
-    """Write ``--payload FRAME MASS`` as ``--payload FRAME:MASS``, and give options of ``_OPTIONAL`` a missing value.
+    """Return the arguments with two changes that Typer requires.
 
-    Typer has neither repeatable options of two values nor options with an optional value.
+    ``--payload FRAME MASS`` becomes ``--payload FRAME:MASS``, because a repeatable option cannot have two values in
+    Typer.  Options in ``_OPTIONAL`` without a value get their default value, because Typer requires a value.
     """
     words, rest = [], list(arguments)
     while rest:
@@ -29,7 +30,7 @@ def put_right(arguments: Sequence[str]) -> list[str]:
     for word, following in zip_longest(words, words[1:], fillvalue=""):
         filled.append(word)
         if word in _OPTIONAL and not _OPTIONAL[word].match(following):
-            # Imported here, because --help does without.
+            # Imported here, because --help does not need this module.
             from impact_posture.config.problem_settings import TRADEOFF_POINTS
 
             filled.append(str(TRADEOFF_POINTS) if word == "--tradeoff" else "")

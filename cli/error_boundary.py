@@ -1,4 +1,4 @@
-"""Error boundary: turn each error into a line on standard error and an exit code."""
+"""Error boundary: convert each error to one line on standard error and an exit code."""
 
 from __future__ import annotations
 
@@ -23,41 +23,42 @@ from impact_posture_cli.output import as_options
 
 DEBUG_VARIABLE = "IMPACT_POSTURE_DEBUG"
 _INTERRUPTED = 130
-# Base class of all usage errors of the Click that this Typer carries.
+# Base class of all usage errors.  Typer may contain its own copy of Click, so the class is taken from Typer.
 UsageError: type[Exception] = typer.BadParameter.__mro__[1]
 
 
 def run(command: Any, arguments: Sequence[str]) -> int:
     """Run a Typer command and return its exit code.
 
-    0 done; 1 an error to act on; 2 a wrong command line; other codes as the error says; 130 interrupted.  One line on
-    standard error, and with ``--json`` the same as ``{"error": {code, kind, what, where, hint}}`` on standard output.
+    The exit code is 0 after success, 1 after an error, 2 for a wrong command line, and 130 after Ctrl-C.  Some errors
+    have their own exit code.  An error is written as one line to standard error.  With ``--json``, it is also written
+    as ``{"error": {code, kind, what, where, hint}}`` to standard output.
     """
-    # Matplotlib logs a warning where it cannot write a folder for its caches.
+    # Matplotlib logs a warning if it cannot write to the folder of its cache.  Users need not see this warning.
     logging.getLogger("matplotlib").setLevel(logging.ERROR)
     for stream in (sys.stdout, sys.stderr):
         if hasattr(stream, "reconfigure"):
-            # λ and × must not crash a terminal without these letters.
+            # Characters such as λ and × must not raise an error if the terminal cannot encode them.
             stream.reconfigure(errors="replace")
     wants_json = "--json" in arguments
     try:
         with warnings.catch_warnings():
             if not os.environ.get(DEBUG_VARIABLE):
-                # Libraries warn, for example NumPy of an overflow. Checks of the results say what is wrong.
+                # Ignore warnings of libraries, for example of an overflow in NumPy. The results are checked anyway.
                 warnings.simplefilter("ignore")
             code = command.main(args=list(arguments), prog_name="impact-posture", standalone_mode=False)
         sys.stdout.flush()
-        if code == _INTERRUPTED:  # newer Typers hand Ctrl-C back as a code
+        if code == _INTERRUPTED:  # newer versions of Typer return this code after Ctrl-C
             raise KeyboardInterrupt
         return code if isinstance(code, int) else 0
     except (KeyboardInterrupt, typer.Abort):
         return _report(_Fault(_INTERRUPTED, "Interrupted", "interrupted"), wants_json)
     except SystemExit as error:
-        # Rich leaves this way when its pipe closes.
+        # Rich raises SystemExit if the pipe of its output is closed.
         return error.code if isinstance(error.code, int) else 1
     except Exception as error:
         if isinstance(error, BrokenPipeError) or getattr(error, "errno", None) == errno.EPIPE:
-            # The reader has closed the pipe (``| head``), which is not a fault.
+            # The reader has closed the pipe, for example ``| head``. This is not reported as an error.
             _discard_output()
             return 1
         if os.environ.get(DEBUG_VARIABLE):
@@ -81,7 +82,7 @@ class _Fault:
 def _explain(error: Exception, arguments: Sequence[str]) -> _Fault:
     kind = type(error).__name__
     if isinstance(error, ImpactPostureError):
-        # A place that begins with an option of this command line is written as this option.
+        # If the place of the error is a parameter whose option is on the command line, write the option instead.
         option = f"--{error.where.partition(' ')[0].replace('_', '-')}"
         typed = any(word.partition("=")[0] == option for word in arguments)
         where = option + error.where[len(option) - 2 :] if typed else error.where
@@ -101,7 +102,7 @@ def _explain(error: Exception, arguments: Sequence[str]) -> _Fault:
 
 
 def _usage(error: Any, wants_json: bool) -> int:
-    """Print the message of Typer without colors: the usage and the error."""
+    """Print the usage error of Typer without colors, and return its exit code."""
     code = int(getattr(error, "exit_code", 2))
     _reword_choice(error)
     text = io.StringIO()
@@ -116,8 +117,8 @@ def _usage(error: Any, wants_json: bool) -> int:
 
 
 def _reword_choice(error: Any) -> None:
-    """Reword the message of an invalid choice as for a key of a file."""
-    # Typer has no hook for this. The wording differs between versions; all contain the value and the choices.
+    """Replace the message for an invalid choice by the message that keys of files have."""
+    # Typer offers no way to set this message. In all versions, the message contains the value and the choices.
     match = re.search(r"'(.*?)' is not one of ('.*)", str(getattr(error, "message", "")))
     if match:
         from impact_posture.errors import not_one_of
@@ -144,7 +145,7 @@ def _document(fault: _Fault) -> None:
 
 
 def _discard_output() -> None:
-    """Discard unwritten output, so that the last flush of the interpreter does not fail."""
+    """Discard unwritten output, so that the flush at the end of the interpreter does not fail."""
     for stream in (sys.stdout, sys.stderr):
         try:
             stream.flush()

@@ -23,15 +23,15 @@ ScenarioName = Annotated[
         "g1-strike, solo12-landing, panda-tap, hextilt-poke, or a path to a scenario.toml.",
     ),
 ]
-Seeds = Annotated[int, option("--seeds", RUN, "Seeds of each controller, from 0.", min=1)]
+Seeds = Annotated[int, option("--seeds", RUN, "Number of seeds per controller, counted from 0.", min=1)]
 Compile = Annotated[
-    CompileMode, option("--compile", RUN, "Compile controllers to machine code; auto from 2 seeds on.")
+    CompileMode, option("--compile", RUN, "Compile controllers to machine code; auto: if there are 2 or more seeds.")
 ]
 Processes = Annotated[int, option("--jobs", RUN, "Number of processes that run at the same time.", min=1)]
 
 
 def rows_table(page: Page, rows: tuple[ControllerRow, ...] | list[ControllerRow]) -> None:
-    """Write a table with a row for each controller of a scenario."""
+    """Write a table with one row per controller of a scenario."""
     from impact_posture.experiment.reproduction_summary import interval_text, percent
 
     lines = []

@@ -1,4 +1,4 @@
-"""Summary of an impact for every command: description, quantities and worst cases."""
+"""Tables and lines that describe an impact and its worst cases, for several commands."""
 
 from __future__ import annotations
 
@@ -13,7 +13,7 @@ if TYPE_CHECKING:
 
 
 def contact_names(contacts: Sequence[ImpactContact]) -> list[str]:
-    """Name each contact by its frame, and by its normal where several contacts share the frame."""
+    """Return a name for each contact: its frame, with its normal if several contacts have the same frame."""
     frames = [contact.frame for contact in contacts]
     return [
         f"{c.frame} ({', '.join(f'{v:.3g}' for v in c.normal)})" if frames.count(c.frame) > 1 else c.frame
@@ -22,7 +22,10 @@ def contact_names(contacts: Sequence[ImpactContact]) -> list[str]:
 
 
 def impact_rows(impact: ResolvedImpact, normals: Sequence[Iterable[Any]], axes: str) -> list[tuple[str, str]]:
-    """Describe an impact: normals in the frame that ``axes`` names, contact point, supports, metric, armature."""
+    """Return rows that describe an impact: normals, contact point, supports, metric, armature, joint model.
+
+    ``axes`` names the frame of the ``normals``, one per contact.
+    """
     objective, contact, metric = impact.objective, impact.contact, impact.metric
     rows = []
     for name, struck, normal in zip(contact_names(objective.contacts), objective.contacts, normals, strict=True):
@@ -43,9 +46,9 @@ def impact_rows(impact: ResolvedImpact, normals: Sequence[Iterable[Any]], axes: 
 
 
 def worst_tables(page: Page, frames: Sequence[str], blocks: Mapping[str, Mapping[str, Any]]) -> None:
-    """Show each of several contacts alone, and the objective of each model variant.
+    """Print the quantities of each contact alone, and the objective of each model variant.
 
-    ``blocks`` are evaluations by name, as in ``result.json``.  The last evaluation lists the contacts.
+    ``blocks`` maps a name to an evaluation as in ``result.json``.  The contacts are taken from the last evaluation.
     """
     last = list(blocks.values())[-1]
     if "by_contact" in last:
@@ -65,7 +68,7 @@ def worst_tables(page: Page, frames: Sequence[str], blocks: Mapping[str, Mapping
 
 
 def worst_lines(page: Page, frames: Sequence[str], blocks: Mapping[str, Mapping[str, Any]]) -> None:
-    """Print the worst normal, the worst impulses and whether the feet stay, for each evaluation by name."""
+    """Print the worst normal, the worst impulses and whether the feet stay, for each evaluation in ``blocks``."""
     named = {f" {name}" if len(blocks) > 1 else "": block for name, block in blocks.items()}
     for when, block in named.items():
         if "cone" in block:
@@ -87,6 +90,6 @@ def _impulses(frames: Sequence[str], worst: Mapping[str, Any]) -> str:
 
 
 def alone_line(page: Page, frames: Sequence[str], what: str) -> None:
-    """Name the contact whose numbers are shown, if there are several contacts."""
+    """If there are several contacts, print which contact the shown numbers belong to."""
     if len(frames) > 1:
         page.line(f"  ({what}: of an impact at {frames[0]} alone)", style="dim")

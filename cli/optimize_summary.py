@@ -1,4 +1,4 @@
-"""Print a problem and its result for ``optimize``."""
+"""Print the problem and the result of ``optimize``."""
 
 from __future__ import annotations
 
@@ -12,12 +12,12 @@ if TYPE_CHECKING:
     from impact_posture.posture.formulation.problem_file import Prepared
     from impact_posture.posture.search.multistart import PostureSolution
 
-# Number of actuators in the table of loads.
+# Number of actuators in the table of loads: the ones nearest to their limits.
 _TIGHTEST = 3
 
 
 def announce(page: Page, prepared: Prepared) -> None:
-    """Show the impact and the constraints before the solver starts."""
+    """Print the impact and the constraints, before the solver starts."""
     if page.quiet:
         return
     impact, problem = prepared.impact, prepared.problem
@@ -46,7 +46,7 @@ def announce(page: Page, prepared: Prepared) -> None:
 
 
 def summarize(page: Page, prepared: Prepared, solution: PostureSolution, document: dict[str, Any]) -> None:
-    """Show the result: verdict, table before and after, certificate, trade-off and path."""
+    """Print the result: verdict, table of values before and after, certificate, trade-off and path."""
     from impact_posture.output.quantity_table import quantity_rows
     from impact_posture.posture.search.impact_notes import percent
 
@@ -86,7 +86,7 @@ def summarize(page: Page, prepared: Prepared, solution: PostureSolution, documen
     if "collision" in document:
         at = document["collision"]["optimal"]
         page.line(f"no collision; closest: {at['closest']}, {1e3 * at['distance']:.3g} mm")
-    # Mirrored postures have the same value.
+    # Count optima by their printed value, because mirrored postures have equal values.
     hits = Counter[str]()
     for optimum in solution.optima:
         hits[number(optimum.objective)] += optimum.hits
@@ -109,7 +109,7 @@ def summarize(page: Page, prepared: Prepared, solution: PostureSolution, documen
 
 
 def _holding(page: Page, before: dict[str, Any] | None, after: dict[str, Any] | None) -> None:
-    """Show the actuators that come nearest to their limits, under each load."""
+    """Print, for each load, the actuators that are nearest to their limits."""
     if before is None or after is None:
         return
     rows = []

@@ -1,4 +1,4 @@
-"""Options that several commands share besides the settings of a problem."""
+"""Options of several commands, apart from the settings of a problem."""
 
 from __future__ import annotations
 
@@ -14,7 +14,7 @@ CompileMode = Literal["auto", "always", "never"]
 
 
 class PictureFormat(StrEnum):
-    """Formats of figures, an enumeration because Typer has no lists of literals."""
+    """Formats of figures.  This is an enumeration, because Typer does not support lists of literals."""
 
     png = "png"
     svg = "svg"
@@ -22,13 +22,13 @@ class PictureFormat(StrEnum):
 
 
 def option(names: str, panel: str, help: str, **more: Any) -> Any:
-    """Return an option with its spellings, its panel in ``--help``, and its help text."""
+    """Return a Typer option.  ``names`` are its spellings, and ``panel`` is its panel in ``--help``."""
     return typer.Option(*names.split(), help=help, rich_help_panel=panel, **more)
 
 
 def out_option(help: str, default: str = "") -> Any:
-    """Return the option of the folder to write."""
-    # A shell leaves the ~ of --out=~/result to the program.
+    """Return the option ``--out`` for the folder to write."""
+    # Shells do not expand the ~ in --out=~/result, so the program expands it.
     home = {"callback": lambda folder: folder and os.path.expanduser(folder)}
     return option("--out", OUTPUT, help, metavar="DIR", show_default=default or True, **home)
 
@@ -51,37 +51,40 @@ RobotOrResult = Annotated[
 ]
 FrameList = Annotated[
     list[str] | None,
-    option("--frame", CONTACT, "Contact frame of a library; repeatable.", metavar="F", show_default="the robot's"),
+    option("--frame", CONTACT, "Contact frame of a C library; repeatable.", metavar="F", show_default="the robot's"),
 ]
 Out = Annotated[str | None, out_option("Result folder.", "./ROBOT-FRAME")]
 Force = Annotated[bool, option("--force", OUTPUT, "Replace an existing result folder.")]
 Prefix = Annotated[
     str | None,
     option(
-        "--prefix", OUTPUT, "Beginning of all names in C.", metavar="NAME", show_default="ROBOT_FRAME",
+        "--prefix", OUTPUT, "Beginning of all C names.", metavar="NAME", show_default="ROBOT_FRAME",
         callback=_check_prefix,
     ),
 ]  # fmt: skip
 ExportOut = Annotated[str | None, out_option("Folder of the C code.", "./PREFIX-c")]
-Float = Annotated[bool, option("--float", OUTPUT, "Compute in float instead of double.")]
-Portable = Annotated[bool, option("--portable", OUTPUT, "C99 without vectors, for any compiler.")]
+Float = Annotated[bool, option("--float", OUTPUT, "Use float instead of double in the C code.")]
+Portable = Annotated[bool, option("--portable", OUTPUT, "Write C99 without vector types, for any compiler.")]
 CompileLibrary = Annotated[bool, option("--compile", OUTPUT, "Build the shared library and check its numbers.")]
 ControllerKind = Annotated[
     Literal["aerial", "legged", "arm"] | None,
     option("--controller", OUTPUT, "Export an online controller for this kind of robot.", show_default="none"),
 ]
-ControllerFlow = Annotated[bool, option("--flow", OUTPUT, "With --controller: follow the reference flow.")]
+ControllerFlow = Annotated[bool, option("--flow", OUTPUT, "With --controller: use the reference flow.")]
 ControllerScenario = Annotated[
-    str | None, option("--scenario", OUTPUT, "With --controller: tasks and gains of a scenario.", metavar="SCENARIO")
+    str | None,
+    option("--scenario", OUTPUT, "With --controller: use a scenario's tasks and gains.", metavar="SCENARIO"),
 ]
-Daqp = Annotated[str | None, option("--daqp", OUTPUT, "With --controller: folder of DAQP's sources.", metavar="DIR")]
-NoCodegen = Annotated[bool, option("--no-codegen", OUTPUT, "Leave the C export out.")]
-NoReport = Annotated[bool, option("--no-report", OUTPUT, "Leave report.html out.")]
+Daqp = Annotated[
+    str | None, option("--daqp", OUTPUT, "With --controller: folder of the DAQP sources.", metavar="DIR")
+]
+NoCodegen = Annotated[bool, option("--no-codegen", OUTPUT, "Do not export C code.")]
+NoReport = Annotated[bool, option("--no-report", OUTPUT, "Do not write report.html.")]
 Meshes = Annotated[bool, option("--meshes", OUTPUT, "Embed the meshes of your own URDF in report.html.")]
 Json = Annotated[bool, option("--json", OUTPUT, "Print one JSON document instead of tables.")]
-Quiet = Annotated[bool, option("--quiet -q", OUTPUT, "Print no warnings and no progress.")]
-Jobs = Annotated[int, option("--jobs", SEARCH, "Number of processes that search.", min=1)]
-Compile = Annotated[CompileMode, option("--compile", SEARCH, "Whether the solver runs compiled code.")]
+Quiet = Annotated[bool, option("--quiet -q", OUTPUT, "Do not print warnings or progress.")]
+Jobs = Annotated[int, option("--jobs", SEARCH, "Number of processes that search at the same time.", min=1)]
+Compile = Annotated[CompileMode, option("--compile", SEARCH, "Whether to compile the code that the solver runs.")]
 Formats = Annotated[
     list[PictureFormat] | None,
     option("--format", OUTPUT, "Format of the pictures: png, svg or pdf; repeatable.", show_default="png"),

@@ -15,22 +15,22 @@ if TYPE_CHECKING:
 
 
 def as_options(text: str) -> str:
-    """Write each parameter between backquotes as an option: ```out``` as ``--out``, no ```com``` as ``--no-com``."""
+    """Replace each parameter name in backquotes by its option, for example ```out``` by ``--out``."""
     return re.sub(r"(no )?`(\w+)`", lambda m: f"--{'no-' if m[1] else ''}{m[2].replace('_', '-')}", text)
 
 
 def print_json(document: object) -> None:
-    """Write a strictly valid JSON document to standard output. NaN and infinity raise ``ValueError``."""
+    """Write a valid JSON document to standard output.  Raise ``ValueError`` for NaN and infinity."""
     sys.stdout.write(json.dumps(document, indent=1, allow_nan=False) + "\n")
 
 
 def complain(line: str) -> None:
-    """Write a line to standard error."""
+    """Write one line to standard error."""
     sys.stderr.write(f"{one_line(line)}\n")
 
 
 class Page:
-    """Titled tables on standard output, and warnings on standard error."""
+    """Writes titles, lines and tables to standard output, and warnings to standard error."""
 
     def __init__(self, *, quiet: bool = False) -> None:
         from rich.console import Console
@@ -39,7 +39,7 @@ class Page:
         self.quiet = quiet
 
     def title(self, text: str, detail: str = "") -> None:
-        """Write a bold line."""
+        """Write a bold title, with a dim ``detail`` after it."""
         from rich.text import Text
 
         line = Text(printable(text), style="bold")
@@ -48,7 +48,7 @@ class Page:
         self.console.print(line)
 
     def line(self, text: str, *, style: str = "") -> None:
-        """Write a paragraph, wrapped at words."""
+        """Write a paragraph; long lines are wrapped between words."""
         from rich.text import Text
 
         self.console.print(Text(printable(as_options(text)), style=style))
@@ -58,7 +58,7 @@ class Page:
         self.console.print()
 
     def pairs(self, rows: Iterable[tuple[str, str]]) -> None:
-        """Write two columns: names and values."""
+        """Write a table with two columns: names and values."""
         self.table((), [(f"  {key}", value) for key, value in rows], dim=0)
 
     def table(
@@ -70,10 +70,10 @@ class Page:
         dim: int | None = None,
         fold: int = -1,
     ) -> None:
-        """Write a table of plain text, which Rich does not read as markup; empty ``headers`` leave the titles out.
+        """Write a table of plain text, without the markup of Rich.
 
-        The columns ``right`` are aligned to the right, and the column ``dim`` has dim letters. Only the column
-        ``fold`` wraps where the terminal is too narrow.
+        If ``headers`` is empty, the table has no header. The columns ``right`` are aligned to the right, and the
+        column ``dim`` is printed dim. If the terminal is too narrow, only the column ``fold`` is wrapped.
         """
         from rich.table import Table
         from rich.text import Text
@@ -95,14 +95,14 @@ class Page:
         self.console.print(table)
 
     def warnings(self, lines: Iterable[str]) -> None:
-        """Write each warning on a line of standard error, unless quiet."""
+        """Write each warning as a line to standard error, unless the page is quiet."""
         if not self.quiet:
             for line in lines:
                 complain(f"warning: {as_options(line)}")
 
 
 def number(value: float | None, unit: str = "", *, missing: str = "undefined") -> str:
-    """Format a number with four significant digits and a unit; return ``missing`` for ``None``."""
+    """Return a number as text with four significant digits and its unit; return ``missing`` for ``None``."""
     if value is None:
         return missing
     text = f"{value:.0f}" if 1e4 <= abs(value) < 1e6 else f"{value:.4g}"
@@ -110,13 +110,16 @@ def number(value: float | None, unit: str = "", *, missing: str = "undefined") -
 
 
 def vector(values: Iterable[Any]) -> str:
-    """Format a unit vector with numbers of equal width."""
-    # Adding zero turns -0.0 into 0.0.
+    """Return a unit vector as text with numbers of equal width."""
+    # Add zero, because -0.0 + 0.0 is 0.0.
     return " ".join(f"{round(float(v), 3) + 0.0:6.3f}" for v in values).strip()
 
 
 def worst_normal(block: dict[str, Any], normal: Iterable[Any]) -> str:
-    """Describe where in the cone the worst normal lies, from the ``cone`` block of an evaluation."""
+    """Return a text that describes the worst normal.
+
+    ``block`` is the ``cone`` block of an evaluation.
+    """
     others = len(block["normals"]) - 1
     tied = f", tied: {vector(block['normals'][1])} is as bad" if others else ""
     more = f", and {others - 1} more" if others > 1 else ""

@@ -8,9 +8,9 @@ from collections.abc import Callable, Iterator
 from contextlib import contextmanager
 from datetime import timedelta
 
-# Seconds between two drawings of the line.
+# Least time between two updates of the line, s.
 _REFRESH = 0.1
-# Seconds after which a pace is known.
+# Time after which the remaining time can be estimated, s.
 _PACE = 2.0
 
 
@@ -18,11 +18,12 @@ _PACE = 2.0
 def progress(
     doing: str, unit: str = "", *, shown: bool, first: str = ""
 ) -> Iterator[Callable[[int, int], None] | None]:
-    """Show what the program is doing while the block runs.
+    """Show a progress line while the block runs.
 
-    The line shows what the library tells (:func:`impact_posture.system.progress.tell`) and what the block counts.
-    Yield the function that takes ``(done, all)``; ``None`` where nothing is shown.  Without the ``unit`` of a count,
-    the line shows a bar and no numbers.  Until the first count, it shows ``first`` instead of ``doing``.
+    The line shows the messages of the library (:func:`impact_posture.system.progress.tell`) and the progress that the
+    block reports.  For these reports, the block receives a function with the arguments ``(done, all)``.  If no line
+    is shown, the block receives ``None``.  If ``unit`` is empty, the line shows a bar but no numbers.  Before the
+    first report, the line shows ``first`` instead of ``doing``.
     """
     from rich.console import Console
 
@@ -36,13 +37,14 @@ def progress(
     from impact_posture.system.processes import undone
     from impact_posture.system.progress import listening
 
-    # No thread redraws the line: worker processes are forked meanwhile, and long calls of C hold Python's lock.
+    # No thread updates the line, because worker processes are forked during the block, and long calls of C code keep
+    # the lock of the Python interpreter.
     words = TextColumn("{task.description}", markup=False)
     columns = (words, BarColumn(), TextColumn("{task.fields[count]}"), TimeElapsedColumn())
     line = Progress(*columns, console=console, transient=True, auto_refresh=False)
     task = line.add_task(f"{first or doing} …", total=None, count="")
     drawn, last = 0.0, ""
-    # When the first count came, and what was done by then: an earlier run may have done it.
+    # Time of the first report, and the work that was done before it, possibly by an earlier run.
     began: tuple[float, int] | None = None
 
     def show(text: str, share: float | None = None) -> None:
@@ -62,14 +64,14 @@ def progress(
             line.update(task, count=f"{done}/{total} {unit}{left}")
         show(doing, done / total)
 
-    # The line hides the cursor; a signal that ends the process must show it again.
+    # The line hides the cursor.  If a signal ends the process, line.stop shows the cursor again.
     with undone(line.stop), listening(show), line:
         line.refresh()
         yield advance
 
 
 def _time_left(took: float, done: int, left: int) -> str:
-    """Return an estimate of the time left, from the pace so far; nothing before there is a pace."""
+    """Return a text with the remaining time, estimated from the speed so far, or an empty text if it is too early."""
     if took < _PACE or not (done and left):
         return ""
     return f", {timedelta(seconds=math.ceil(took / done * left))} left"

@@ -1,4 +1,4 @@
-"""Make options of the fields of settings, and settings of the options."""
+"""Create command-line options from the fields of settings, and settings from the given options."""
 
 from __future__ import annotations
 
@@ -21,18 +21,23 @@ from impact_posture_cli.error_boundary import UsageError
 _PANELS = (CONTACT, METRIC, ROBOT, TASK, LIMITS, SEARCH)
 _Settings = TypeVar("_Settings", bound=RobotSettings)
 
-NoSupport = Annotated[bool, typer.Option("--no-support", rich_help_panel=ROBOT, help="Nothing stays on the ground.")]
+NoSupport = Annotated[bool, typer.Option("--no-support", rich_help_panel=ROBOT, help="No foot stays on the ground.")]
 
 
 @dataclass(frozen=True)
 class TypedSettings:
-    """Settings that stand on the command line, by name and without defaults."""
+    """Settings that are given on the command line, without defaults.
+
+    Attributes:
+        context: Typer context of the command.
+        values: Name of a setting → its value.
+    """
 
     context: typer.Context
     values: dict[str, Any]
 
     def fill(self, settings: type[_Settings], **more: Any) -> _Settings:
-        """Make settings of these values and of ``more``, which has priority."""
+        """Return settings from :attr:`values` and ``more``; if both contain a name, ``more`` has priority."""
         return validate(settings, self.values | more, "options")
 
     def check_contact(self) -> None:
@@ -40,15 +45,19 @@ class TypedSettings:
         if "contact" not in self.values and "normal" not in self.values:
             raise UsageError("Missing option '--normal X Y Z': the direction out of the surface, towards the robot.")
         if "contact" in self.values and ("frame" in self.values or "normal" in self.values):
-            raise UsageError("--contact stands instead of --frame and --normal: give one of the two.")
+            raise UsageError("--contact replaces --frame and --normal: give either --contact, or the other two.")
 
     def is_result(self, robot: str, free: Collection[str]) -> bool:
-        """Return whether ROBOT|RESULT_DIR is a result folder; with one, refuse all options but ``free``."""
+        """Return whether the argument ROBOT|RESULT_DIR is a result folder.
+
+        Raises:
+            UsageError: The argument is a result folder, and an option other than the ``free`` ones is given.
+        """
         if not os.path.isfile(Path(robot) / "result.json"):
             return False
         for name in self.context.params:
             if name not in {"robot", "json", "quiet", *free} and _on_command_line(self.context, name):
-                what = f"{_spelled(name)} contradicts RESULT_DIR, which says what the problem is"
+                what = f"{_spelled(name)} contradicts RESULT_DIR, which already contains the problem"
                 raise UsageError(f"{what}: leave it out.")
         return True
 
@@ -56,9 +65,10 @@ class TypedSettings:
 def with_settings(
     settings: type[RobotSettings], *, without: Collection[str] = (), **changed: Any
 ) -> Callable[[Callable[..., None]], Callable[..., None]]:
-    """Give a command the options of all settings, except ``without``. It receives ``typed`` and its own parameters.
+    """Return a decorator that adds an option for each setting to a command.
 
-    ``changed`` are annotations of the fields whose options differ in this command.
+    The settings ``without`` get no option. ``changed`` maps a setting to the annotation that its option has in this
+    command. The command is called with ``typed`` (:class:`TypedSettings`) and its own parameters.
     """
     options = _options(settings, without) | {name: (hint, None) for name, hint in changed.items()}
     if "support" in options:
@@ -83,7 +93,7 @@ def with_settings(
             *(inspect.Parameter(n, keyword, default=default, annotation=a) for n, (a, default) in options.items()),
             *(parameter for parameter in others if parameter.default is not parameter.empty),
         ]
-        # Typer reads the signature and, in some versions, the annotations.
+        # All versions of Typer read the signature; some versions also read the annotations.
         run.__signature__ = inspect.Signature(parameters)  # type: ignore[attr-defined]
         run.__annotations__ = {parameter.name: parameter.annotation for parameter in parameters}
         run.__name__, run.__doc__, run.__module__ = command.__name__, command.__doc__, command.__module__
@@ -93,12 +103,12 @@ def with_settings(
 
 
 def settings_of(settings: type[RobotSettings]) -> dict[str, Setting]:
-    """Return the description of each field that has an option."""
+    """Return name → description of each field that has an option."""
     return {f.name: f.metadata["setting"] for f in fields(settings) if "setting" in f.metadata}
 
 
 def _options(settings: type[RobotSettings], without: Collection[str]) -> dict[str, tuple[Any, Any]]:
-    """Return annotation and default of each option, panel by panel."""
+    """Return name → annotation and default of each option, in the order of the panels."""
     described, options = settings_of(settings), {}
     types, demands = get_type_hints(settings), get_type_hints(settings, include_extras=True)
     defaults: dict[str, Any] = {f.name: None if f.default is MISSING else f.default for f in fields(settings)}
@@ -128,7 +138,7 @@ def _option_type(kind: Any, setting: Setting, optional: bool) -> Any:
 
 
 def demanding(annotation: Any, setting: Setting | None = None) -> Callable[[Any], Any]:
-    """Return the callback that checks the value of an option against an annotation."""
+    """Return a callback that checks the value of an option against the demands of an annotation."""
 
     def check(value: Any) -> Any:
         if value is not None and value != []:

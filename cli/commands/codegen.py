@@ -1,6 +1,6 @@
 """``impact-posture codegen ROBOT --frame F --normal X Y Z`` or ``impact-posture codegen RESULT_DIR``.
 
-With ``--controller KIND`` it writes the whole online controller.
+With ``--controller KIND``, the command writes the complete online controller instead of the metric alone.
 """
 
 from __future__ import annotations
@@ -50,11 +50,12 @@ def codegen(
     from_result = typed.is_result(robot, {"prefix", "out", "float_", "portable", "compile", "force"})
     if controller is None:
         if flow or scenario is not None or daqp is not None:
-            raise UsageError("--flow, --scenario and --daqp belong to --controller: give aerial, legged or arm.")
+            what = "--flow, --scenario and --daqp belong to --controller"
+            raise UsageError(f"{what}: give --controller aerial, legged or arm.")
         if not from_result:
             _check_problem(typed, robot)
     elif float_ or portable:
-        raise UsageError("--controller is double and plain C99: leave --float and --portable out.")
+        raise UsageError("--controller always writes C99 with double: leave --float and --portable out.")
     warnings: tuple[str, ...] = ()
     written: ControllerExport | Export
     place = Path(out) if out else None
@@ -98,7 +99,10 @@ def codegen(
 
 
 def _check_problem(typed: TypedSettings, robot: str) -> None:
-    """Check that there is a contact. Without one, a folder or a path to one is meant as a result folder."""
+    """Check that a contact is given.
+
+    If no contact is given and ``robot`` is a folder, the user means a result folder. The error then names its fault.
+    """
     if not {"contact", "normal"} & typed.values.keys() and (os.path.isdir(robot) or robot.endswith(os.sep)):
         from impact_posture.output.result_reader import load_view
         from impact_posture.robot.robot_loader import known_robots
@@ -111,7 +115,7 @@ def _check_problem(typed: TypedSettings, robot: str) -> None:
 def _objectives(
     typed: TypedSettings, robot: str, from_result: bool
 ) -> tuple[list[WorstCaseObjective], Array | None, Compression | None, tuple[str, ...]]:
-    """Return objectives, the optimum of a result, the first known compression of a contact, and warnings."""
+    """Return the objectives, the optimum of a result, the first known contact compression, and warnings."""
     if from_result:
         from impact_posture.output.result_reader import load_view
 
@@ -129,7 +133,7 @@ def _objectives(
 def _controller_parts(
     typed: TypedSettings, robot: str, kind: ControllerKind, flow: bool, scenario: str | None
 ) -> tuple[Robot, TaskFormulation, WorstCaseObjective | None]:
-    """Return the robot, its tasks, and the objective that the posture task follows."""
+    """Return the robot, its task formulation, and the objective of the posture task (``None``: no objective)."""
     if scenario is not None:
         from impact_posture.simulation.controllers.controller_factory import ControllerFactory
         from impact_posture.simulation.scenario_file import read_scenario
@@ -137,11 +141,12 @@ def _controller_parts(
         from impact_posture.simulation.setup import set_up
 
         if typed.values:
-            raise UsageError(f"--{next(iter(typed.values))} contradicts --scenario, which has robot and impact.")
+            what = f"--{next(iter(typed.values))} contradicts --scenario, which sets robot and impact"
+            raise UsageError(f"{what}: leave it out.")
         setup = set_up(read_scenario(scenario))
         known = {setup.robot.name, setup.robot.source}
         if robot not in known and Path(robot).resolve() != Path(setup.robot.source).resolve():
-            raise UsageError(f"The scenario {scenario} is of {setup.robot.name}, not of {robot}.")
+            raise UsageError(f"The scenario {scenario} has another robot than {robot}: give {setup.robot.name}.")
         factory = ControllerFactory(setup, gradient_of=interpreted)
         driver = factory.driver("robust-flow" if flow else "robust")
         return setup.robot, driver.controller.formulation, factory.objective()
@@ -152,13 +157,13 @@ def _controller_parts(
 
         frames = typed.values.get("frame", (None,))
         if len(frames) > 1:
-            raise UsageError("--controller follows the gradient of one impact: give one --frame.")
+            raise UsageError("--controller can follow the gradient of only one impact: give one --frame.")
         objective = resolve(typed.fill(ImpactSettings, robot=robot, frame=frames[0])).objective
         return objective.robot, default_formulation(objective.robot, kind, objective, flow=flow), objective
     from impact_posture.robot.robot_loader import load_robot
 
     if flow:
-        raise UsageError("--flow lowers impacts: give --normal X Y Z, or --scenario.")
+        raise UsageError("--flow requires an impact: give --normal X Y Z, or --scenario.")
     known = {field.name for field in fields(LoadOptions)}
     for name in typed.values:
         if name not in known:

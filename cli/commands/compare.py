@@ -16,7 +16,7 @@ from impact_posture_cli.progress_line import progress
 Controllers = Annotated[
     str,
     options.option(
-        "--controllers", RUN, "Names as in simulate; robust:held has --mode held, and robust:free has --free.",
+        "--controllers", RUN, "Names as in simulate; append :held for --mode held, or :free for --free.",
         metavar="A,B,…",
     ),
 ]  # fmt: skip

@@ -19,7 +19,7 @@ if TYPE_CHECKING:
 WriteRobotToml = Annotated[
     str | None,
     options.option(
-        "--write-robot-toml", OUTPUT, "Draft a robot.toml; without FILE, beside the URDF, or here for a package.",
+        "--write-robot-toml", OUTPUT, "Write a draft of robot.toml to FILE, to the URDF's folder, or to this folder.",
         metavar="[FILE.toml]",
     ),
 ]  # fmt: skip
@@ -41,7 +41,7 @@ def inspect(
     load = typed.fill(RobotSettings, robot=robot)
     if write_robot_toml is not None:
         if load.config is not None:
-            raise UsageError("--config contradicts --write-robot-toml, which drafts one: leave it out.")
+            raise UsageError("--config contradicts --write-robot-toml, which writes a new robot.toml: leave it out.")
         _write(robot, load, write_robot_toml, force=force, json=json, quiet=quiet)
         return
     summary = summarize(load_robot(robot, load))
@@ -73,14 +73,14 @@ def _write(robot: str, load: LoadOptions, out: str, *, force: bool, json: bool, 
         page.line("Then optimize, without the options that this file answers:")
         beside = path.name == "robot.toml" and path.parent == Path(robot).parent
         config = "" if beside else f" --config {path}"
-        # This line is not wrapped, because users copy it.
+        # Do not wrap this line, because users copy it.
         page.console.print(f"  impact-posture optimize {robot}{config} --normal X Y Z", soft_wrap=True, markup=False)
 
 
 def _head(page: Page, summary: dict[str, Any]) -> None:
     contact, supports = summary["contact"], summary["supports"]
     page.title(summary["name"], summary["description"])
-    # The root link does not move then.  A forgotten `root = "free-flyer"` shows here.
+    # With a fixed root, the mass excludes links that cannot move.  This shows users a missing `root = "free-flyer"`.
     fixed = ", without what is fixed to the world" if summary["root"] == "fixed" else ""
     rows = [
         ("model", summary["source"]),

@@ -19,7 +19,7 @@ from impact_posture_cli.settings_options import TypedSettings, with_settings
 if TYPE_CHECKING:
     from impact_posture.output.result_folder import Written
 
-# Thresholds of the garbage collector.
+# High thresholds of the garbage collector, so that it rarely runs.
 _RARELY = 200_000, 50, 100
 
 RobotOrProblem = Annotated[
@@ -45,7 +45,7 @@ def optimize(
     json: options.Json = False,
     quiet: options.Quiet = False,
 ) -> None:
-    # Most objects live until the result is printed, so garbage collection only takes time.
+    # Most objects are used until the result is printed, so garbage collection would only need time.
     gc.set_threshold(*_RARELY)
     settings = _settings(robot, typed)
     _refuse_idle(typed, settings)
@@ -60,7 +60,7 @@ def optimize(
 
         check_package()
     page, shown = Page(quiet=quiet or json), not (quiet or json)
-    # The shapes of a large robot are fitted once, which can take some seconds.
+    # For a large robot, fitting the collision shapes can take some seconds the first time.
     with progress("preparing", "", shown=shown):
         prepared = prepare(settings)
     folder = Path(out) if out else default_out(prepared)
@@ -75,7 +75,7 @@ def optimize(
             compile=compile,
             search=settings.search,
             progress=advance,
-            # A path that does not reach the best optimum leads to the next.
+            # If no path reaches the best optimum, the next best optimum is used, so all starts must be finished.
             finish_all=settings.finish_all or settings.path,
         )
     if settings.tradeoff:
@@ -85,7 +85,7 @@ def optimize(
         with progress("planning", "paths", shown=shown, first="searching a path to the optimum"):
             result = result.path(seed=settings.seed)
     if not json:
-        # The result comes first, because figures and C code take longer.
+        # Print the result before the figures and the C code are written, because this takes longer.
         summarize(page, prepared, result.solution, result.document)
     with progress("drawing" if no_codegen else "drawing and compiling", "files", shown=shown) as advance:
         written = result.save(
@@ -115,7 +115,7 @@ def _settings(robot: str, typed: TypedSettings) -> ProblemSettings:
         from impact_posture.robot.robot_loader import known_robots
 
         if robot not in known_robots():
-            what = f"a result folder is not a robot; its problem is {problem}"
+            what = f"this is a result folder, not a robot; to solve its problem again, give {problem}"
             raise typer.BadParameter(what, param_hint="'ROBOT'")
     if not from_file or "contact" in typed.values:
         typed.check_contact()
@@ -127,7 +127,7 @@ def _settings(robot: str, typed: TypedSettings) -> ProblemSettings:
 
 
 def _refuse_idle(typed: TypedSettings, settings: ProblemSettings) -> None:
-    """Refuse options that have no effect without another option."""
+    """Raise an error for an option that has no effect because another option is missing."""
     for name, used, hint in (
         ("box", settings.contact_pose == "box", "--contact-pose box"),
         ("tradeoff_against", bool(settings.tradeoff), "--tradeoff"),

@@ -42,7 +42,7 @@ def plot(
     formats = format or FORMATS
     with progress("drawing", shown=not (quiet or json)):
         written = draw_all(load_view(folder), into, formats, figure)
-    # A result folder records these files as its own.
+    # A result folder keeps a list of its files, which must include the new files.
     add_to_record(into, written)
     if json:
         print_json({"schema": "impact-posture/plot/1", "files": [str(path) for path in written]})

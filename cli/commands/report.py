@@ -37,7 +37,7 @@ def report(
 
 
 def show_written(command: str, page: Path, *, json: bool, quiet: bool) -> None:
-    """Print the path of a page."""
+    """Print the path of a written page, as JSON or as text."""
     if json:
         print_json({"schema": f"impact-posture/{command}/1", "file": str(page)})
     elif not quiet:

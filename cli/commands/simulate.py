@@ -30,9 +30,10 @@ Controller = Annotated[
 ]  # fmt: skip
 RunSeed = Annotated[int, options.option("--seed", RUN, "Seed of the sensor noise.", min=0)]
 RunMode = Annotated[
-    Mode, options.option("--mode", RUN, "In the impact: keep the robust term on (live), or hold the posture (held).")
+    Mode,
+    options.option("--mode", RUN, "In the impact: keep the impact-robust term (live), or hold the posture (held)."),
 ]
-Free = Annotated[bool, options.option("--free", RUN, "Gradient and optimum as if the feet were in the air.")]
+Free = Annotated[bool, options.option("--free", RUN, "Compute gradient and optimum without the feet on the ground.")]
 Gain = Annotated[
     float | None,
     options.option(
@@ -44,7 +45,7 @@ Sign = Annotated[
     Literal["+1", "1", "-1"] | None, options.option("--sign", RUN, "Sign of the push.", show_default="both")
 ]
 ExportWorld = Annotated[
-    str | None, options.option("--export-world", RUN, "Write the world for C++ and run nothing.", metavar="DIR")
+    str | None, options.option("--export-world", RUN, "Only write the world for C++.", metavar="DIR")
 ]
 Out = Annotated[
     str | None, options.out_option("Folder for run.json, the time series and the figures.", "./SCENARIO-CONTROLLER")
@@ -71,7 +72,7 @@ def simulate(
 ) -> None:
     from impact_posture.simulation.scenario_file import read_scenario
 
-    # A name that is none is refused before all that takes long to import.
+    # Read the scenario before the slow imports, so that a wrong name is reported at once.
     experiment = read_scenario(scenario)
     from impact_posture.experiment.experiment_folders import FORMATS, Output, write_simulation
     from impact_posture.experiment.jobs import Job, execute, worth_compiling

@@ -20,17 +20,19 @@ if TYPE_CHECKING:
 RUN = "Where it runs"
 
 Target = Annotated[
-    str, typer.Argument(metavar="SWEEP.toml|show", help="File of the problems to solve, or the word show.")
+    str, typer.Argument(metavar="SWEEP.toml|show", help="File that describes the problems, or the word show.")
 ]
 Shown = Annotated[str | None, typer.Argument(metavar="DIR", help="With show: the folder that sweep wrote.")]
 Workers = Annotated[int, options.option("--workers", RUN, "Number of processes on this machine.", min=1)]
 Scheduler = Annotated[
     str | None, options.option("--scheduler", RUN, "Dask cluster, such as tcp://host:8786.", metavar="ADDRESS")
 ]
-Mpi = Annotated[bool, options.option("--mpi", RUN, "Use the ranks of mpiexec … -m mpi4py.futures.")]
+Mpi = Annotated[bool, options.option("--mpi", RUN, "Solve on the MPI ranks of mpiexec … -m mpi4py.futures.")]
 Slurm = Annotated[
     list[str] | None,
-    options.option("--slurm", RUN, "Use Slurm job arrays; option of submitit; repeatable.", metavar="KEY=VALUE"),
+    options.option(
+        "--slurm", RUN, "Use Slurm job arrays, with an option of submitit; repeatable.", metavar="KEY=VALUE"
+    ),
 ]
 Out = Annotated[
     str | None, options.out_option("Folder of the sweep; with show, of the maps.", "./SWEEP, or DIR/maps")
@@ -59,9 +61,9 @@ def sweep(
         _show(Path(folder), axes, out, format, json=json, quiet=quiet)
         return
     if folder is not None:
-        raise UsageError("DIR goes with show alone: give --out to name the folder.")
+        raise UsageError("DIR is only allowed after show: use --out for the folder of the sweep.")
     if sum((scheduler is not None, mpi, slurm is not None)) > 1:
-        raise UsageError("--scheduler, --mpi and --slurm exclude each other: give one of them.")
+        raise UsageError("--scheduler, --mpi and --slurm exclude each other: give only one of them.")
     from impact_posture.sweep.sweep_file import read_sweep
     from impact_posture.sweep.sweep_run import run_sweep
     from impact_posture.system.escape import file_name
@@ -118,7 +120,7 @@ def _executor(
 def _show(
     folder: Path, axes: str | None, out: str | None, format: list[Any] | None, *, json: bool, quiet: bool
 ) -> None:
-    """Draw the maps of a sweep folder, and print its best point and its switches."""
+    """Draw the maps of a sweep folder; print its best points and how often neighbors have different optima."""
     from impact_posture.sweep.maps import draw_maps
 
     wanted = tuple(name.strip() for name in axes.split(",")) if axes else None

@@ -80,7 +80,7 @@ def verify(
 
 
 def _of_result(folder: Path) -> ResolvedImpact:
-    """Return the impact of a result folder at the optimal posture."""
+    """Return the impact of a result folder, at its optimal posture."""
     from impact_posture.impact.resolved_impact import ResolvedImpact
     from impact_posture.output.result_reader import load_view
 
