@@ -240,7 +240,7 @@ USAGE = [
     (("evaluate", "tilthex_arm", "--normal", "0", "1"), "--normal"),
     (("evaluate", "tilthex_arm"), "Missing option '--normal"),
     (("evaluate", "tilthex_arm", "--contact", "ee:0,0,0"), "--contact"),
-    ((*PUSH, "--contact", "ee:0,0,1"), "instead of"),
+    ((*PUSH, "--contact", "ee:0,0,1"), "--contact replaces"),
     ((*PUSH, "--support", "ee", "--no-support"), "--no-support"),
     ((*PUSH, "--restitution", "1.5"), "--restitution"),
     ((*PUSH, "--impulse", "0"), "--impulse"),

@@ -174,9 +174,9 @@ def test_the_controller_of_another_robot_is_refused() -> None:
     ("arguments", "words"),
     [
         (["solo8", "--controller", "aerial"], "try legged"),
-        (["panda", "--controller", "arm", "--float"], "--controller is double"),
+        (["panda", "--controller", "arm", "--float"], "--controller always writes C99"),
         (["panda", "--daqp", "x", "--normal", "0", "0", "1"], "belong to --controller"),
-        (["panda", "--controller", "arm", "--scenario", "solo8-push"], "is of solo8"),
+        (["panda", "--controller", "arm", "--scenario", "solo8-push"], "has another robot than panda: give solo8"),
         (["panda", "--controller", "arm", "--daqp", "/nowhere"], "has no file"),
         (["panda", "--controller", "arm", "--frame", "panda_hand"], "belongs to an impact"),
     ],

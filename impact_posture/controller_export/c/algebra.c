@@ -1,9 +1,9 @@
 /* Rotations, the configuration manifold, and small dense factorizations.  Matrices are row-major. */
 
-/* Families of joints in ip_joint_family. */
+/* Families of joints, as in ip_joint_family. */
 enum { IP_DIRECT, IP_CONTINUOUS, IP_FREE_FLYER, IP_SPHERICAL };
 
-/* As fmin and fmax if b is not NaN, but without a call. */
+/* Like fmin and fmax if b is not NaN, but without a function call. */
 static double ip_least(double a, double b)
 {
   return a < b ? a : b;
@@ -14,7 +14,7 @@ static double ip_most(double a, double b)
   return a > b ? a : b;
 }
 
-/* Write the part of a heading across the unit vector n, and return its length. */
+/* Write the part of a heading that is orthogonal to the unit vector n, and return its length. */
 static double ip_across(const double *n, const double *heading, double *across)
 {
   memcpy(across, heading, sizeof(double) * 3);
@@ -38,7 +38,7 @@ static void ip_turn(const double *R, const double *x, int transposed, double *ou
   }
 }
 
-/* out = A'B of rotations. */
+/* out = A'B for rotation matrices. */
 static void ip_relative(const double *A, const double *B, double *out)
 {
   int i, j;
@@ -49,7 +49,7 @@ static void ip_relative(const double *A, const double *B, double *out)
   }
 }
 
-/* Quaternion x y z w of a rotation, by its largest component. */
+/* Compute the quaternion x y z w of a rotation, starting from its largest component. */
 static void ip_quaternion(const double *R, double *x)
 {
   const double trace = R[0] + R[4] + R[8];
@@ -73,7 +73,7 @@ static void ip_quaternion(const double *R, double *x)
   x[k] = (R[3 * k + i] + R[3 * i + k]) * 0.5 / root;
 }
 
-/* Angle times axis of a unit quaternion. */
+/* Compute angle times axis of a unit quaternion. */
 static void ip_log_quaternion(const double *x, double *w)
 {
   const double sine = sqrt(ip_dot(x, x, 3)), sign = x[3] < 0.0 ? -1.0 : 1.0;
@@ -88,7 +88,7 @@ static void ip_log3(const double *R, double *w)
   ip_log_quaternion(x, w);
 }
 
-/* Linear part of log6 for the rotation vector w and the translation p. */
+/* Compute the linear part of log6 for the rotation vector w and the translation p. */
 static void ip_log6_linear(const double *w, const double *p, double *out)
 {
   const double t2 = ip_dot(w, w, 3), t = sqrt(t2);
@@ -154,7 +154,7 @@ static void ip_difference(const double *a, const double *b, double *v)
   }
 }
 
-/* Unit quaternion of the rotation vector w. */
+/* Compute the unit quaternion of the rotation vector w. */
 static void ip_exponential(const double *w, double *x)
 {
   const double t2 = ip_dot(w, w, 3), t = sqrt(t2);
@@ -201,13 +201,13 @@ static void ip_integrate(const double *q, const double *v, double step, double *
   }
 }
 
-/* Upper R with A = R'R in place of the upper triangle of the n x n matrix A; 0 where A is not positive definite. */
+/* Replace the upper triangle of the n x n matrix A by R with A = R'R.  Return 0 if A is not positive definite. */
 static int ip_cholesky(double *A, int n)
 {
   int i, k;
   for (i = 0; i < n; ++i) {
     double *row = A + i * n, s;
-    /* Not "<=", which is false for a NaN. */
+    /* A test with "<=" would accept NaN. */
     if (!(row[i] > 0.0)) {
       return 0;
     }

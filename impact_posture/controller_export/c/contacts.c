@@ -1,16 +1,16 @@
 /* Contacts with the ground: desired accelerations, places, and friction cones. */
 
-/* Least length of a heading across a normal. */
+/* Least length of the part of a heading that is orthogonal to the normal. */
 #define IP_ACROSS 1e-6
 
-/* Row of the Jacobian of a contact that belongs to an entry of f. */
+/* Return the row of a contact Jacobian that belongs to an entry of f. */
 static const double *ip_contact_motion(const ip_context *c, int entry)
 {
   const int k = ip_force_contact[entry];
   return c->m.jacobian[ip_contact_point[k]] + (entry - ip_contact_row[k]) * IP_NV;
 }
 
-/* Right-hand sides of the contacts.  Their rows are the Jacobians of their points. */
+/* Compute the right-hand sides of the contacts.  The rows of a contact are the Jacobian of its point. */
 static void ip_contact_rows(ip_context *c)
 {
   int k, i;
@@ -30,7 +30,7 @@ static void ip_contact_rows(ip_context *c)
   }
 }
 
-/* Whether the heading of a sole points along the normal of its ground. */
+/* Return whether a sole stands on its edge: its heading is parallel to the normal of the ground. */
 static int ip_on_edge(const ip_context *c)
 {
   int k;
@@ -45,8 +45,8 @@ static int ip_on_edge(const ip_context *c)
   return 0;
 }
 
-/* Hold the contacts at their places, and write the rows of their friction cones in world axes (support_contact.py has the
- * formulas).  A row has entries at the forces of its contact only, so the other entries stay zero. */
+/* Make the present places of the contacts their targets, and write the rows of their friction cones in world axes.
+ * support_contact.py explains the formulas.  A row has nonzero entries only at the forces of its contact. */
 static void ip_hold_contacts(ip_context *c)
 {
   int k, i, j, b;
@@ -65,7 +65,7 @@ static void ip_hold_contacts(ip_context *c)
       if (!(length < IP_ACROSS)) {
         break;
       }
-      /* A point may have any heading.  Use the world axis that is least along the normal. */
+      /* A point contact may have any heading.  Use the world axis with the smallest component along the normal. */
       j = fabs(n[1]) < fabs(n[0]) ? 1 : 0;
       j = fabs(n[2]) < fabs(n[j]) ? 2 : j;
       for (i = 0; i < 3; ++i) {

@@ -1,13 +1,14 @@
-/* Eigenvalues of a symmetric matrix: Householder's tridiagonal form, then QR steps with Wilkinson's shift (Golub and Van
- * Loan, Matrix Computations, sections 8.3.1 and 8.3.3). */
+/* Eigenvalues of a symmetric matrix: Householder's tridiagonal form, then QR steps with Wilkinson's shift (Golub and
+ * Van Loan, Matrix Computations, sections 8.3.1 and 8.3.3). */
 
-/* Bring the symmetric n x n matrix A to V A V', tridiagonal on and above its diagonal. */
+/* Replace the symmetric n x n matrix A by V A V', which is tridiagonal; only the diagonal and the entries above are
+ * written. */
 static void ip_tridiagonal(double *A, double *V, int n)
 {
   double p[IP_LARGEST], beta[IP_LARGEST], e[IP_LARGEST];
   int i, k;
   for (k = 0; k + 1 < n; ++k) {
-    /* The reflection I - beta v v' of the entries from k + 1 on. */
+    /* Compute the reflection I - beta v v', which acts on the entries from k + 1 on. */
     double *v = A + k * n, size = sqrt(ip_dot(v + k + 1, v + k + 1, n - k - 1)), half = 0.0;
     beta[k] = 0.0;
     e[k] = v[k + 1];
@@ -40,7 +41,8 @@ static void ip_tridiagonal(double *A, double *V, int n)
   }
 }
 
-/* One QR step on the rows from low to high of the tridiagonal matrix with diagonal d and neighbors e. */
+/* Do one QR step on the rows low to high of the tridiagonal matrix with the diagonal d and the entries e beside it.
+ * */
 static void ip_qr_step(double *d, double *e, double *V, int n, int low, int high)
 {
   const double half = 0.5 * (d[high - 1] - d[high]), t = e[high - 1];
@@ -65,7 +67,8 @@ static void ip_qr_step(double *d, double *e, double *V, int n, int low, int high
   }
 }
 
-/* Bring a tridiagonal matrix closer to its eigenvalues on the diagonal, by at most about so many rotations. */
+/* Diagonalize a tridiagonal matrix by at most about `rotations` rotations; the diagonal approaches the eigenvalues.
+ * */
 static void ip_diagonalize(double *A, double *V, int n, int rotations)
 {
   double e[IP_LARGEST], d[IP_LARGEST];
@@ -94,8 +97,8 @@ static void ip_diagonalize(double *A, double *V, int n, int rotations)
   }
 }
 
-/* Write the eigenvalues of the symmetric n x n matrix A on its diagonal, and the eigenvectors in the rows of V.  Return the
- * largest eigenvalue, or 0 if all are negative. */
+/* Write the eigenvalues of the symmetric n x n matrix A on its diagonal, and the eigenvectors in the rows of V.
+ * Return the largest eigenvalue, or 0 if all are negative. */
 static double ip_eigen(double *A, double *V, int n)
 {
   double most = 0.0;

@@ -1,14 +1,14 @@
-/* Answer to a tick whose strict levels cannot hold (relaxation.h). */
+/* Relaxed answer for a tick whose strict levels cannot hold (relaxation.h). */
 
-/* Number of rows of the program without bounds on joints. */
+/* Number of rows of the program, without the bounds on joints. */
 #define IP_OTHERS (IP_GENERAL - (IP_DENSE ? IP_BOUNDED : 0))
-/* Least miss that counts, relative to the terms of a row. */
+/* A row whose error is below this share of its terms counts as satisfied. */
 #define IP_OFF 1e-6
-/* Force on one of the contacts that compares with an acceleration of 1, relative to the mass of the robot.  Of the values
- * from 0.03 to 10, pushed robots took the fewest iterations with this one. */
+/* Unit of the force on a contact, relative to the mass of the robot, if the unit of accelerations is 1.  Of the
+ * values from 0.03 to 10, this value led to the fewest iterations for pushed robots. */
 #define IP_FORCE_UNIT 0.1
 
-/* Write the largest violation of a bound on a joint, then the norm of the miss of each level. */
+/* Write the largest violation of a bound on a joint, then the norm of the error of each level. */
 static void ip_list_gave_way(ip_context *c, const double *lower, const double *upper)
 {
   double most = 0.0, size = 1.0;
@@ -20,7 +20,7 @@ static void ip_list_gave_way(ip_context *c, const double *lower, const double *u
   }
   c->gave[0] = most > IP_OFF * size ? most : 0.0;
   for (k = 0; k < IP_LEVELS; ++k) {
-    /* Rows that are equations, then rows that lack rank. */
+    /* First the rows that are equations, then the rows that lack rank. */
     double square[2] = {0}, worst[2] = {0}, sizes[2] = {1.0, 1.0};
     for (i = r; i < r + ip_level_rows[k]; ++i) {
       const int lacks = isinf(c->low[IP_SIMPLE + i]) ? 1 : 0;
@@ -39,7 +39,7 @@ static void ip_list_gave_way(ip_context *c, const double *lower, const double *u
   }
 }
 
-/* Write z.  Return whether there is an answer. */
+/* Compute the relaxed answer z.  Return whether there is an answer. */
 static int ip_relax(ip_context *c)
 {
   enum { N = IP_VARIABLES, M = IP_OTHERS };

@@ -1,6 +1,6 @@
 /* Posture task: fades of q_des, and the impact-robust term with its phases. */
 
-/* Set q_des to the present posture of a fade, at rest. */
+/* Set q_des to the posture that a fade has reached, with zero velocity and acceleration. */
 static void ip_stop_fade(ip_context *c)
 {
   double step[IP_NV];
@@ -22,7 +22,7 @@ static void ip_fade_to(ip_context *c, const double *q, double over)
 }
 
 #if IP_ROBUST
-/* Evaluate the term at q; keep the previous one where the gradient does not exist. */
+/* Evaluate the impact-robust term at q; if the gradient does not exist, keep the previous term. */
 static void ip_evaluate(ip_context *c)
 {
   double term[IP_NV], value, square;
@@ -52,7 +52,7 @@ static void ip_evaluate(ip_context *c)
   c->value = value;
 }
 
-/* Advance the level of the activation by dt seconds. */
+/* Advance the activation level by dt seconds. */
 static void ip_activate(ip_context *c, double dt)
 {
   const double step = dt / c->p.robust_ramp[0];
@@ -65,7 +65,7 @@ static void ip_activate(ip_context *c, double dt)
   }
 }
 
-/* C = A B, all n x n. */
+/* C = A B for n x n matrices. */
 static void ip_multiply(const double *A, const double *B, double *C, int n)
 {
   int i;
@@ -74,7 +74,7 @@ static void ip_multiply(const double *A, const double *B, double *C, int n)
   }
 }
 
-/* Measure lambda, the largest curvature of H along the redundancy.  Return 0 where it does not exist. */
+/* Measure lambda, the largest curvature of H along the redundancy.  Return 0 if lambda does not exist. */
 static int ip_normalize(ip_context *c)
 {
   enum { N = IP_NV };
@@ -84,7 +84,8 @@ static int ip_normalize(ip_context *c)
   if (c->scale > 0.0) {
     return 1;
   }
-  /* The redundancy beside all tasks, else beside contacts and strict levels, else all directions. */
+  /* Compute the directions that all tasks leave free.  If there are none, use the directions that contacts and strict
+   * levels leave free.  If there are none either, use all directions. */
   for (all = 1; all >= 0 && !redundant; --all) {
     double most;
     memset(A, 0, sizeof(double) * N * N);
@@ -107,7 +108,7 @@ static int ip_normalize(ip_context *c)
   for (i = 0; i < N && !redundant; ++i) {
     P[i * (N + 1)] = 1.0;
   }
-  /* Along the axes, because the error of differences along a basis would depend on the choice of the basis. */
+  /* Take the differences along the axes.  Along a basis of the redundancy, their error would depend on the basis. */
   for (k = 0; k < N; ++k) {
     double z[N] = {0};
     z[k] = 1.0;
@@ -121,7 +122,7 @@ static int ip_normalize(ip_context *c)
       A[i * N + k] = (g[0][i] - g[1][i]) / 2e-5;
     }
   }
-  /* The spectral norm of PAP, with the projection P on the redundancy. */
+  /* Compute the spectral norm of P A P, where P is the projection on the redundancy. */
   ip_multiply(A, P, V, N);
   memcpy(A, V, sizeof(double) * N * N);
   ip_multiply(P, A, V, N);
@@ -228,13 +229,13 @@ static void ip_posture_wanted(ip_context *c)
 #endif
 }
 
-/* Schedule a phase, which begins with the first tick at a time or later. */
+/* Schedule a phase, which begins with the first tick at the time t or later. */
 static int ip_announce(ip_context *c, int phase, double t)
 {
   const int before = c->waiting > 0 ? c->entering[c->waiting - 1] : c->phase;
   const int fits = phase == IP_BRACE ? before == IP_FREE || before == IP_RELEASE
                    : phase == IP_CONTACT ? before == IP_BRACE : before == IP_BRACE || before == IP_CONTACT;
-  /* A reference flow stops and starts in any order. */
+  /* For a reference flow, phases may follow each other in any order. */
   if (!c->ready || !(IP_FLOW || (IP_ROBUST && fits)) || isnan(t) || c->waiting == IP_WAITING
       || (c->waiting > 0 && t < c->since[c->waiting - 1])) {
     return 1;

@@ -1,4 +1,4 @@
-/* The QP of a tick in the form of DAQP: the least |u|^2 with lower <= M u <= upper, with rows of length one.
+/* The QP of a tick in the form of DAQP: minimize |u|^2 subject to lower <= M u <= upper; each row has the length one.
  *
  * The variables z = [v; w; f] are z = T (center + u), where T makes the cost |T^-1 z|^2/2:
  * - IP_DENSE: T is the inverse of a Cholesky factor.  The bounds on joints are the last rows.
@@ -7,11 +7,11 @@
  * - Otherwise T is diagonal.
  * In the last two cases, joints come first in u, and their bounds are bounds on u. */
 
-/* Length of a row that is zero for DAQP. */
+/* Rows with a smaller length are treated as zero, as in DAQP. */
 #define IP_NOTHING 1e-11
 #define IP_JOINTS_V (IP_NV - IP_BASE)
 
-/* Entry of v for an entry of u. */
+/* Return the index in v for an index in u. */
 static int ip_entry(int k)
 {
   return IP_DENSE ? k : k < IP_JOINTS_V ? k + IP_BASE : k - IP_JOINTS_V;
@@ -60,7 +60,7 @@ static void ip_finish(ip_context *c, int r, double lower, double upper)
   double *row = c->M[r], length = ip_dot(row, row, IP_VARIABLES), scale;
   const double shift = ip_dot(row, c->center, IP_NV);
   const int at = IP_SIMPLE + r;
-  /* The sum stays finite while all numbers are finite. */
+  /* The sum is finite as long as all numbers are finite. */
   c->sum += length + shift + (isnan(lower) || isnan(upper) ? NAN : 0.0);
   scale = length > IP_NOTHING * IP_NOTHING ? 1.0 / sqrt(length) : 1.0;
   ip_scaled(row, scale, row, IP_VARIABLES);
@@ -71,8 +71,8 @@ static void ip_finish(ip_context *c, int r, double lower, double upper)
   c->lower[at] = (lower - shift) * scale;
 }
 
-/* Add the cost of weighted tasks, soft contacts and the posture to the upper triangle of H, with rows of `stride` numbers,
- * and to g, where -g is its linear part. */
+/* Add the cost of weighted tasks, soft contacts and the posture to the upper triangle of H, with rows of `stride`
+ * numbers, and to g, where -g is its linear part. */
 static void ip_cost(const ip_context *c, double *H, int stride, double *g)
 {
   int i, r;
@@ -92,7 +92,7 @@ static void ip_cost(const ip_context *c, double *H, int stride, double *g)
   }
 }
 
-/* Compute T, and the center of the cost. */
+/* Compute T and the minimum of the cost, `center`. */
 static void ip_factorize(ip_context *c)
 {
   double g[IP_NV] = {0};
@@ -104,7 +104,7 @@ static void ip_factorize(ip_context *c)
   if (!ip_cholesky(R, IP_NV)) {
     c->sum = NAN;
   }
-  /* The inverse of the triangle, from the last row up. */
+  /* Invert the triangular matrix, from the last row to the first. */
   for (i = IP_NV - 1; i >= 0; --i) {
     const double pivot = 1.0 / R[i * (IP_NV + 1)];
     double *out = inverse + i * IP_NV;
@@ -161,7 +161,7 @@ static double ip_force_row(const ip_context *c, const double *s, int first, int 
   return bias;
 }
 
-/* Transform the row [v; w; f] into M. */
+/* Transform a row on [v; w; f] into a row of M. */
 static void ip_put(ip_context *c, int r, double lower, double upper)
 {
   const double *row = c->rows[r];
@@ -173,7 +173,7 @@ static void ip_put(ip_context *c, int r, double lower, double upper)
   ip_finish(c, r, lower, upper);
 }
 
-/* Fill M and the bounds. */
+/* Fill M and the bounds for this tick. */
 static void ip_assemble(ip_context *c)
 {
   double to[2], one = 1.0, bias;
@@ -210,7 +210,7 @@ static void ip_assemble(ip_context *c)
     c->known[i] = bias;
     ip_put(c, r++, c->p.control_lower[i] - bias, c->p.control_upper[i] - bias);
   }
-  /* The rows of the cones do not change between resets. */
+  /* The rows of the friction cones change only at a reset. */
   r += IP_CONES;
   for (i = 0; IP_LAW && i < IP_JOINTS_V; ++i) {
     ip_bounds(c, IP_BASE + i, to);
@@ -229,7 +229,7 @@ static void ip_assemble(ip_context *c)
   }
 }
 
-/* Reset the types of the bounds, so that only equations are active. */
+/* Reset the active set, so that only equations are active. */
 static void ip_cool(ip_context *c)
 {
   int i;
@@ -238,12 +238,12 @@ static void ip_cool(ip_context *c)
   }
 }
 
-/* Read the weights, and transform the rows of the cones. */
+/* Read the weights, and transform the rows of the friction cones. */
 static void ip_begin_qp(ip_context *c)
 {
   int i, k;
   for (i = 0; i < IP_NV; ++i) {
-    /* The cost always needs a minimum. */
+    /* A small weight on every acceleration ensures that the cost has a minimum. */
     c->added[i] = fmax(c->p.posture_weight[i], 1e-8);
   }
   for (i = 0; i < IP_NV; ++i) {
@@ -259,7 +259,7 @@ static void ip_begin_qp(ip_context *c)
   }
   for (i = 0; i < IP_FORCES; ++i) {
     const int row = i - ip_contact_row[ip_force_contact[i]];
-    /* A moment of 1 N m costs as much as a force of 10 N. */
+    /* A moment of 1 N m has the same cost as a force of 10 N. */
     c->ease[IP_NV + IP_SPARE + i] = 1.0 / sqrt(c->p.force_weight[0] * (row < 3 ? 1.0 : 100.0));
   }
   memset(c->center, 0, sizeof c->center);

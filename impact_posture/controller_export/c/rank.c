@@ -1,13 +1,13 @@
-/* Strict levels of any rank, as LevelRank has them: dependent rows leave the program, and nearly dependent rows are
- * damped. */
+/* Strict levels of any rank, as in LevelRank (level_rank.py): dependent rows are removed from the program, and nearly
+ * dependent rows are damped. */
 
-/* Least singular value, over the length of a level's longest row, without damping; the share of it below which a direction
- * is dropped; the least 1 - alpha. */
+/* Smallest singular value without damping, divided by the length of the level's longest row; share of this value
+ * below which a direction is removed; least 1 - alpha. */
 #define IP_SINGULAR 2e-2
 #define IP_DROPPED 1e-9
 #define IP_LEAST 1e-8
 
-/* Value of a variable that compares with an acceleration of 1. */
+/* Typical size of a variable if accelerations have the size 1. */
 static double ip_size(const ip_context *c, int k)
 {
   return k < IP_NV + IP_SPARE ? 1.0 : c->m.M[0];
@@ -22,8 +22,8 @@ static void ip_in_units(const ip_context *c, const double *row, const double *le
   }
 }
 
-/* Decide whether the equations are independent, as LevelRank does: all singular values of the scaled rows are above 0.02.
- * A singular value changes at most by the change of the matrix, so most ticks need no decomposition. */
+/* Decide whether the equations are independent, as LevelRank does: all singular values of the scaled rows must be
+ * above 0.02.  A singular value changes at most by the change of the matrix, so most ticks need no decomposition. */
 static void ip_measure_rank(ip_context *c)
 {
 #if IP_LEVELS
@@ -102,8 +102,9 @@ static void ip_begin_rank(ip_context *c)
 }
 
 #if IP_LEVELS
-/* Rotate the k rows of B, of n numbers, until they are orthogonal: B becomes U B with an orthogonal U.  The rows of U are the
- * left singular vectors, and the rows of B the right singular vectors times the singular values (Hestenes 1958). */
+/* Rotate the k rows of B, of n numbers each, until they are orthogonal (Hestenes 1958): B becomes U B with an
+ * orthogonal U. Then the rows of U are the left singular vectors, and the rows of B are the right singular vectors
+ * times the singular values. */
 static void ip_orthogonalize(double *B, double *U, int k, int n)
 {
   int i, j, sweep, turned = 1;
@@ -141,8 +142,8 @@ static void ip_remove(double *Z, const double *v, double s, double share, int n)
   }
 }
 
-/* Replace the rows of the levels by independent rows.  Rows that are not equations get open bounds, and damped rows are
- * added to the upper triangle of H and to g, where -g is the linear part. */
+/* Replace the rows of the levels by independent rows.  Rows that are not equations get infinite bounds.  Damped rows
+ * are added to the cost: to the upper triangle of H and to g, where -g is the linear part. */
 static void ip_reduce(ip_context *c, double *H, double *g)
 {
   enum { N = IP_VARIABLES };
@@ -172,7 +173,7 @@ static void ip_reduce(ip_context *c, double *H, double *g)
       wanted[i] = ip_dot(U + i * count, c->low + IP_SIMPLE + r, count);
       ip_combine(turned + i * N, N, U + i * count, 1, c->rows[r], N, count);
     }
-    /* The mean weight of the cost over the directions that are left. */
+    /* Compute the mean weight of the cost over the remaining directions. */
     for (i = 0; i < IP_NV; ++i) {
       for (j = i; j < IP_NV; ++j) {
         top += (i == j ? 1.0 : 2.0) * c->cost[i * IP_NV + j] * ip_dot(Z + i * N, Z + j * N, N);
@@ -201,7 +202,7 @@ static void ip_reduce(ip_context *c, double *H, double *g)
         }
       }
       if (x > IP_DROPPED) {
-        /* This leaves Z times the other rows, because they are orthogonal to this row. */
+        /* This does not change Z times the other rows, because they are orthogonal to this row. */
         ip_remove(Z, v, s, 1.0 - sqrt(1.0 - alpha), N);
       }
     }

@@ -1,23 +1,26 @@
-/* The reference flow: a posture q_r that descends along the gradient on contacts and tasks, limited in speed and
- * acceleration.  The posture task follows it.  The work of an update is spread over IP_FLOW_PHASES ticks, so that no tick
- * takes much longer.  The formulas are in impact_posture/tsid/flow/reference_flow.py. */
+/* The reference flow: a posture q_r that moves to lower impacts with limited speed and acceleration, while contacts
+ * and tasks hold.  The posture task follows q_r.  The work of an update is spread over IP_FLOW_PHASES ticks, so that
+ * no tick needs much more time.  The formulas are in impact_posture/tsid/flow/reference_flow.py. */
 
-/* Ticks of an update, tick of the first change of the motion, and ticks from the second change to the next look. */
+/* Number of ticks per update; tick of the first change of the motion; number of ticks from the second change to the
+ * next evaluation. */
 #define IP_FLOW_PHASES 14
 #define IP_FLOW_UNTIL 4
 #define IP_FLOW_SINCE 3
 
-/* Step of the differences, rad; step below which a posture of the path counts as reached, rad (m). */
+/* Step of the finite differences, rad; step towards a posture of the path below which the flow continues to the next
+ * posture, rad (m). */
 #define IP_PROBE 1e-4
 #define IP_REACHED 0.02
-/* Least displacement of the flow between looks from which it learns, rad (m). */
+/* Least displacement between two evaluations that is used to update the curvature estimates, rad (m). */
 #define IP_MOVED 1e-6
-/* A direction with a shorter new part is orthogonalized once more. */
+/* If the part of a direction that is orthogonal to earlier directions is shorter, it is orthogonalized twice. */
 #define IP_NEW 0.1
-/* Length of the velocity below which a probe at the stopping point tells nothing. */
+/* If the velocity vector is shorter, the flow does not probe its stopping point, which is then too near. */
 #define IP_SLOW 1e-3
 
-/* Model and rows of the constraints at a posture at rest, and their errors unless `error` is null. */
+/* Evaluate the model and the rows of the constraints at a posture with v = 0; unless `error` is null, write the
+ * errors. */
 static void ip_flow_place(ip_context *c, const double *q, double *error)
 {
   static const double still[IP_NV] = {0};
@@ -53,7 +56,8 @@ static void ip_flow_place(ip_context *c, const double *q, double *error)
   }
 }
 
-/* Return the objective at a posture, and its gradient over H0 in `slope`; NaN and zero where they do not exist. */
+/* Return the objective at a posture, and write its gradient divided by H0 to `slope`.  If the gradient does not
+ * exist, return NaN and write zeros. */
 static double ip_flow_evaluate(ip_flow *f, const double *q, double *slope)
 {
   double value;
@@ -65,7 +69,7 @@ static double ip_flow_evaluate(ip_flow *f, const double *q, double *slope)
   return f->failed ? NAN : value;
 }
 
-/* The gradient on the constraints, slope - J'multiplier, in place. */
+/* Replace the slope by its part on the constraints, slope - J'multiplier. */
 static void ip_flow_reduce(const ip_flow *f, double (*J)[IP_NV], double *slope)
 {
   int i;
@@ -74,7 +78,7 @@ static void ip_flow_reduce(const ip_flow *f, double (*J)[IP_NV], double *slope)
   }
 }
 
-/* Evaluate objective and constraints at the posture that q_r will have at the next change of the motion. */
+/* Evaluate objective and constraints at q_r as predicted for the next change of the motion. */
 static void ip_flow_look(ip_context *c)
 {
   ip_flow *f = &c->flow;
@@ -93,7 +97,7 @@ static void ip_flow_look(ip_context *c)
   ip_flow_shares(c, f->shares);
 }
 
-/* Compute the redundancy, and the gradient on it. */
+/* Compute the redundancy and the gradient on the redundancy. */
 static void ip_flow_split(ip_context *c)
 {
   ip_flow *f = &c->flow;
@@ -107,11 +111,12 @@ static void ip_flow_split(ip_context *c)
   ip_flow_reduce(f, f->J, f->reduced);
 }
 
-/* Learn from the displacement since the last look, set the limits, and prepare the return. */
+/* Update the curvature estimates from the displacement since the last evaluation, set the limits, and prepare the
+ * return to the constraints. */
 static void ip_flow_limit(ip_context *c)
 {
   ip_flow *f = &c->flow;
-  /* The slope is zero after a look at which the gradient failed. */
+  /* The stored slope is zero if the gradient failed at the last evaluation. */
   if (f->length > IP_MOVED && !f->failed && ip_dot(f->there, f->there, IP_NV) > 0.0) {
     ip_flow_reduce(f, f->before, f->there);
     ip_scaled(f->z, 1.0 / f->length, f->z, IP_NV);
@@ -122,8 +127,8 @@ static void ip_flow_limit(ip_context *c)
   ip_flow_still(f);
 }
 
-/* The part of the next fixed direction that is orthogonal to the last ones: a direction of the redundancy that does not
- * depend on its basis. */
+/* Compute the next probe direction: the part of a fixed direction that is on the redundancy and orthogonal to the
+ * earlier probes.  This direction does not depend on the basis of the redundancy. */
 static void ip_flow_aim(ip_flow *f)
 {
   double *z = f->seen[f->probed], *was = f->work, s;
@@ -132,7 +137,7 @@ static void ip_flow_aim(ip_flow *f)
     const uint32_t j = (uint32_t)(f->probed * IP_NV + i + 1);
     z[i] = (double)(uint32_t)(j * j * UINT32_C(2654435769)) / 4294967296.0 - 0.5;
   }
-  /* Where little of the direction is new, a second pass makes it exact. */
+  /* If the remaining part of the direction is short, a second pass makes it exact. */
   for (again = 0, s = 0.0; again < 2 && s < IP_NEW; ++again) {
     memcpy(was, z, sizeof(double) * IP_NV);
     for (k = 0; k < f->probed; ++k) {
@@ -144,7 +149,8 @@ static void ip_flow_aim(ip_flow *f)
   }
 }
 
-/* Evaluate the gradient where the flow would stop, in every other update, or beside the posture of the last look. */
+/* Evaluate the gradient near the last evaluated posture; in every second update, evaluate it where the flow would
+ * stop. */
 static void ip_flow_probe(ip_context *c)
 {
   ip_flow *f = &c->flow;
@@ -170,7 +176,7 @@ static void ip_flow_probe(ip_context *c)
   ip_flow_place(c, q, NULL);
 }
 
-/* Learn from the gradient on the constraints and the static controls at the probe. */
+/* Update the curvature estimates from the gradient on the constraints and the static controls at the probe. */
 static void ip_flow_compare(ip_context *c)
 {
   ip_flow *f = &c->flow;
@@ -186,7 +192,7 @@ static void ip_flow_compare(ip_context *c)
   }
 }
 
-/* Compute the step, and whether it is worth moving. */
+/* Compute the step, and decide whether the flow rests. */
 static void ip_flow_direct(ip_context *c)
 {
   ip_flow *f = &c->flow;
@@ -213,11 +219,11 @@ static void ip_flow_direct(ip_context *c)
   }
 #endif
   ip_flow_solve(f);
-  /* H must decrease: a gain of the pull or of the springs does not count. */
+  /* Only a decrease of H is a gain; a decrease in the pull or in the springs is not. */
   f->gain = fmin(f->gain * ip_flow_root(f), -ip_dot(f->slope, f->wanted, IP_NV));
   f->resting = f->gain < (f->resting ? 4.0 : 1.0) * c->p.flow_epsilon[0] || f->remains <= 0.0;
   if (f->resting) {
-    /* The governor then brakes downhill. */
+    /* With a zero step, the governor brakes the flow without raising H. */
     memset(f->wanted, 0, sizeof f->wanted);
   }
 }

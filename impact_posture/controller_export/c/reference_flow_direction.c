@@ -1,7 +1,7 @@
-/* Direction of the reference flow: a saddle-free Newton step on the constraints, as a QP with limits.  The formulas are
- * in impact_posture/tsid/flow/flow_direction.py. */
+/* Direction of the reference flow: a saddle-free Newton step on the constraints, solved as a QP with limits.  The
+ * formulas are in impact_posture/tsid/flow/flow_direction.py. */
 
-/* Least H/H0 under the root. */
+/* A smaller H/H0 is replaced by this value in the square root. */
 #define IP_LEAST_VALUE 1e-8
 
 /* Write the rows of a step along f->axes, an NV x left matrix, into f->work, and their bounds. */
@@ -25,7 +25,7 @@ static void ip_flow_rows(ip_flow *f)
     ip_scaled(row, f->scaling[r], row, n);
     f->upper[r] = (f->high[r] + shift) * f->scaling[r];
     f->lower[r] = (f->low[r] + shift) * f->scaling[r];
-    /* A row of zeros bounds nothing. */
+    /* A row of zeros does not limit the step. */
     f->sense[r] = length >= IP_NOTHING ? 0 : DAQP_IMMUTABLE;
   }
 }
@@ -52,7 +52,7 @@ APART static void ip_flow_solve(ip_flow *f)
   w.scaling = f->scaling;
   w.sense = f->sense;
   if (daqp_reactivate_constraints(&w) < 0 || daqp_ldp(&w) <= 0 || w.state & DAQP_STATE_NOISE_FLOOR) {
-    /* The noise floor means that the solver cycled and its answer violates bounds. */
+    /* With this flag, the solver cycled and its answer violates bounds. */
     ++f->failures;
     return;
   }
@@ -70,7 +70,7 @@ APART static void ip_flow_solve(ip_flow *f)
   }
 }
 
-/* The root of H/H0, or its least value that counts. */
+/* Return the square root of H/H0, or of the least permitted value if H/H0 is smaller. */
 static double ip_flow_root(const ip_flow *f)
 {
   return sqrt(fmax(fabs(f->value / f->start), IP_LEAST_VALUE));
@@ -99,7 +99,7 @@ static void ip_flow_bend(ip_context *c)
     }
   }
   for (i = 0; f->soft && i < IP_HELD; ++i) {
-    /* Nearly dependent constraints are springs. */
+    /* Nearly dependent constraints are replaced by springs. */
     for (k = 0; k < n; ++k) {
       f->steep[k] -= IP_SPRING * f->spring[i][k] * f->error[i];
       ip_add(C + k * n, IP_SPRING * f->spring[i][k], f->spring[i], n);
@@ -107,8 +107,8 @@ static void ip_flow_bend(ip_context *c)
   }
 }
 
-/* Make the variables of the Newton step from the eigenvectors of the curvature: f->axes, and the slope along them in
- * f->steep. */
+/* Compute the variables of the Newton step from the eigenvectors of the curvature: their axes in f->axes, and the
+ * slope along the axes in f->steep. */
 static void ip_flow_turn(ip_context *c)
 {
   enum { N = IP_NV };
@@ -122,7 +122,7 @@ static void ip_flow_turn(ip_context *c)
     ip_scaled(V + k * n, ease, V + k * n, n);
     f->steep[k] = ip_dot(V + k * n, slope, n);
   }
-  /* V' in place of C. */
+  /* V' overwrites C. */
   for (i = 0; i < n; ++i) {
     for (k = 0; k < n; ++k) {
       C[i * n + k] = V[k * n + i];
@@ -133,8 +133,8 @@ static void ip_flow_turn(ip_context *c)
   }
 }
 
-/* Learn the curvature and the slope of the static controls along f->z, from the reduced gradient and the static controls
- * at the distance f->length along it from the last look. */
+/* Update the estimates of the curvature and of the slope of the static controls along f->z, from the reduced gradient
+ * and the static controls at the distance f->length along f->z from the last evaluated posture. */
 static void ip_flow_learn(ip_flow *f, const double *slope, const double *shares)
 {
   const double *z = f->z, length = f->length;
@@ -154,7 +154,8 @@ static void ip_flow_learn(ip_flow *f, const double *slope, const double *shares)
   }
 }
 
-/* Take out of a change of the flow the part that raises H now or, with the displacement `stop`, where the flow stops. */
+/* Remove from a change of the flow the part that increases H now or at the displacement `stop`, where the flow stops.
+ * */
 static void ip_flow_downhill(const ip_flow *f, const double *stop, double *step)
 {
   double uphill[IP_NV], climb;
@@ -171,7 +172,8 @@ static void ip_flow_downhill(const ip_flow *f, const double *stop, double *step)
   }
 }
 
-/* Time in which the flow stops evenly.  Going on for this time is twice the braking distance. */
+/* Return the time in which the flow stops with constant deceleration.  At constant velocity, the motion in this time
+ * would be twice the braking distance. */
 static double ip_flow_stopping(const ip_flow *f, const ip_params *p)
 {
   return ip_largest(f->flow, 0) / p->flow_acceleration[0];

@@ -1,14 +1,15 @@
-/* Limits of the reference flow: their room, and changes of the flow that do not cross them.  The formulas are in
- * impact_posture/tsid/flow/flow_direction.py. */
+/* Limits of the reference flow: distances from the limits, and changes of the flow that do not cross them.  The
+ * formulas are in impact_posture/tsid/flow/flow_direction.py. */
 
-/* Largest violation at which the flow may still move along a limit.  With all of IP_NEAR, it would creep across. */
+/* Largest violation at which the flow may still move along a limit.  It is below IP_NEAR, because the flow would
+ * otherwise slowly cross the limit. */
 #define IP_SPENT 9.9e-4
-/* Distance that the flow keeps from the joint limits, rad (m), and from the limits of static controls, as a share. */
+/* Distances that the flow keeps: from the joint limits, rad (m); from the limits of static controls, as a share. */
 #define IP_AIM 2e-3
 #define IP_RESERVE 8e-3
-/* Least square of the length of a row on the constraints. */
+/* Squared length of a row, projected on the constraints, below which the row cannot be corrected. */
 #define IP_FLAT 1e-6
-/* Sine of the tilt below which the tilt has no slope. */
+/* If the sine of the tilt is smaller, the slope of the tilt is set to zero, because the tilt axis is undefined. */
 #define IP_LEVEL 1e-6
 
 /* The largest absolute value from the entry `first` on. */
@@ -22,8 +23,8 @@ static double ip_largest(const double *x, int first)
   return most;
 }
 
-/* Change of the value of a row in a displacement of the flow.  A turn of the base across the tilt raises the tilt to second
- * order. */
+/* Return the change of the value of a row for a displacement.  A rotation of the base across the tilt axis increases
+ * the tilt to second order. */
 static double ip_flow_ahead(const ip_flow *f, int r, const double *moved)
 {
   const double along = r < IP_JOINTS_V               ? moved[IP_BASE + r]
@@ -39,7 +40,8 @@ static double ip_flow_ahead(const ip_flow *f, int r, const double *moved)
   return along;
 }
 
-/* Bounds of the rows on the step, at the model of the flow, less the braking distance of the flow. */
+/* Compute the bounds of the rows on the step at the posture of the flow, tightened by the braking distance of the
+ * flow. */
 static void ip_flow_limits(ip_context *c)
 {
   ip_flow *f = &c->flow;
@@ -99,7 +101,7 @@ static void ip_flow_limits(ip_context *c)
   }
 }
 
-/* Displacement within a time of the flow after a change. */
+/* Displacement of the flow within a time after a change of its velocity. */
 static void ip_flow_after(const ip_flow *f, const double *step, double time, double *moved)
 {
   int i;
@@ -108,7 +110,7 @@ static void ip_flow_after(const ip_flow *f, const double *step, double time, dou
   }
 }
 
-/* Take out of a change of the flow the parts that cross limits within a time, row by row. */
+/* Remove from a change of the flow, row by row, the parts that cross limits within a time. */
 static void ip_flow_along_limits(const ip_flow *f, double time, double *step)
 {
   double moved[IP_NV], across[IP_NV], over, square;

@@ -1,20 +1,22 @@
-/* Motion of the reference flow: its governor, its start, and the tasks that it leads. */
+/* Motion of the reference flow: its governor, its start, and the tasks that follow the flow. */
 
-/* Time constant of the return to contacts and tasks, s; speed below which a flow that is off stands still, rad/s (m/s). */
+/* Time constant of the return to contacts and tasks, s; speed below which a flow that is off is set to rest, rad/s
+ * (m/s). */
 #define IP_RETURN 0.1
 #define IP_STILL 1e-5
-/* Violation of a limit that a braking flow may reach, rad (m), or as a share. */
+/* Largest violation of a limit during braking, rad (m) for joints, and a share of the range for static controls. */
 #define IP_NEAR 1e-3
-/* Number of attempts for a change: as it is, then twice without the part that crosses limits. */
+/* Number of attempts per candidate: first unchanged, then twice without the part that crosses limits. */
 #define IP_ATTEMPTS 3
-/* Least share of the acceleration that counts as available for braking.  A change can raise the share by this much. */
+/* Least share of the acceleration that is assumed to be available for braking.  Also the largest increase of this
+ * share by one change. */
 #define IP_ABLE 0.1
-/* Factor of the braking time, because the slopes of the limits change during braking. */
+/* Safety factor of the braking time, because the slopes of the limits change during braking. */
 #define IP_CAUTION 1.5
 /* Largest ratio of the speed of the flow to its step, 1/s. */
 #define IP_RATE 4.8
 
-/* Shorten x so that no entry exceeds a number. */
+/* Scale x down so that no absolute value of an entry exceeds a number. */
 static void ip_shorten(double *x, double most)
 {
   const double size = ip_largest(x, 0);
@@ -23,8 +25,8 @@ static void ip_shorten(double *x, double most)
   }
 }
 
-/* A motion that changes the constraints at a rate.  Of all such motions, it moves the base and spares the joints, by the
- * factor of ip_flow_still. */
+/* Compute a velocity that changes the constraints at a rate.  Of all such velocities, the result has the slowest
+ * joints, with the factor computed by ip_flow_still. */
 static void ip_flow_moving(const ip_flow *f, const double *rate, double *back)
 {
   int i;
@@ -46,7 +48,8 @@ static void ip_flow_moving(const ip_flow *f, const double *rate, double *back)
 #endif
 }
 
-/* The velocity back to contacts and tasks, within speed and acceleration, plus the velocity of moving tasks. */
+/* Compute the velocity of the return to contacts and tasks, with limited speed and acceleration, plus the velocity of
+ * moving tasks. */
 static void ip_flow_back(ip_context *c, double period, double *back)
 {
   ip_flow *f = &c->flow;
@@ -55,7 +58,7 @@ static void ip_flow_back(ip_context *c, double period, double *back)
   int i, k, row;
   ip_flow_moving(f, f->error, back);
   size = fmax(ip_largest(back, 0), IP_TINY);
-  /* Two fifths of the acceleration stop a speed of sqrt(4/5 a d) within the distance d. */
+  /* A deceleration of 2/5 a stops a motion with the speed sqrt(4/5 a d) within the distance d. */
   pace = fmin(fmin(1.0 / IP_RETURN, sqrt(0.8 * p->flow_acceleration[0] / size)), p->flow_speed[0] / size);
   for (i = 0; i < IP_NV; ++i) {
     change[i] = pace * back[i] - f->returning[i];
@@ -71,7 +74,8 @@ static void ip_flow_back(ip_context *c, double period, double *back)
   ip_add(back, 1.0, f->returning, IP_NV);
 }
 
-/* Time for which the flow goes on if it changes by a step and then brakes evenly, as hard as it lately could. */
+/* Return the time at constant velocity that equals the motion of one change and the braking after it.  The
+ * deceleration is the one that the actuators permitted lately. */
 static double ip_flow_braking(const ip_flow *f, const ip_params *p, const double *step, double period)
 {
   double after[IP_NV];
@@ -79,7 +83,7 @@ static double ip_flow_braking(const ip_flow *f, const ip_params *p, const double
   return IP_CAUTION * ip_largest(after, 0) / (2.0 * f->able * p->flow_acceleration[0]) + period;
 }
 
-/* Whether the flow stays within the limits in that time. */
+/* Return whether the flow stays within the limits during its braking time. */
 static int ip_flow_stops(const ip_flow *f, const ip_params *p, const double *step, double period)
 {
   const double time = ip_flow_braking(f, p, step, period);
@@ -95,8 +99,8 @@ static int ip_flow_stops(const ip_flow *f, const ip_params *p, const double *ste
   return 1;
 }
 
-/* Shorten the flow after a change to the largest speed.  A limit takes a part out of the change of all joints, which can
- * speed up one of them. */
+/* Scale the flow after a change down to the largest speed.  The removal of a part that crosses a limit can speed up
+ * other joints. */
 static void ip_flow_bound_speed(const ip_flow *f, const ip_params *p, double *step)
 {
   double after[IP_NV];
@@ -107,19 +111,20 @@ static void ip_flow_bound_speed(const ip_flow *f, const ip_params *p, double *st
   }
 }
 
-/* The change of the flow towards the wanted step, as FlowGovernor.change has it.  Return whether the flow only brakes. */
+/* Compute the change of the flow towards the wanted step, as in FlowGovernor.change.  Return whether the flow only
+ * brakes. */
 static int ip_flow_change(const ip_flow *f, const ip_params *p, double period, double fastest, double *step)
 {
   enum { N = IP_NV, FAST = 0, BRAKE = 2 };
   const double a = p->flow_acceleration[0], most = a * period, time = ip_flow_stopping(f, p);
-  /* Two fifths of the acceleration stop a speed of sqrt(4/5 a d) within the step d. */
+  /* A deceleration of 2/5 a stops a motion with the speed sqrt(4/5 a d) within the step d. */
   const double pace = fmin(sqrt(0.8 * a / fmax(ip_largest(f->wanted, 0), IP_TINY)), IP_RATE);
   const int descends = fastest > 0.0 && f->visited == IP_PATH;
   double wanted[N], stop[N];
   int i, k, attempt;
   for (i = 0; i < N; ++i) {
     wanted[i] = pace * f->wanted[i];
-    /* Twice the braking distance, because the curvature may grow on it. */
+    /* This is twice the braking distance, because the curvature may increase during braking. */
     stop[i] = time * f->flow[i];
   }
   ip_shorten(wanted, fastest);
@@ -154,7 +159,7 @@ static int ip_flow_change(const ip_flow *f, const ip_params *p, double period, d
   return 1;
 }
 
-/* Limit speed and acceleration, and return to contacts and tasks. */
+/* Set the acceleration of the flow: limited, and with the return to contacts and tasks. */
 static void ip_flow_govern(ip_context *c)
 {
   enum { N = IP_NV };
@@ -172,7 +177,8 @@ static void ip_flow_govern(ip_context *c)
   if (f->on && !f->resting && f->visited == IP_PATH) {
     f->moved += period;
   }
-  /* The speed holds after the next change, and the change after it stops the flow with 2/5 of the acceleration. */
+  /* The flow keeps this speed until the next change.  The change after that one must stop the flow in the remaining
+   * time with 2/5 of the acceleration. */
   f->remains = fmin(f->deadline - f->clock, p->flow_duration[0] - f->moved) - 2.0 * period;
   fastest = fmin(fastest, 0.4 * p->flow_acceleration[0] * fmax(f->remains, 0.0));
   fastest = f->on ? fastest : 0.0;
@@ -188,7 +194,7 @@ static void ip_flow_govern(ip_context *c)
   for (i = 0; i < N; ++i) {
     more[i] = step[i] / period;
   }
-  /* A stop within the limits matters more than room for the actuators. */
+  /* Braking before a limit may use more of the actuators' remaining range. */
   part = ip_flow_permitted(c, known, more, brakes ? (1.0 + p->flow_haste[0]) / 2.0 : p->flow_haste[0]);
   f->able = fmin(fmax(part, IP_ABLE), f->able + IP_ABLE);
   ip_add(f->flow, part, step, N);
@@ -196,7 +202,7 @@ static void ip_flow_govern(ip_context *c)
   memcpy(f->acceleration, known, sizeof known);
 }
 
-/* Time at rest before a known impact, s: four time constants of the slowest joint. */
+/* Time for which the flow rests before a known impact, s: four time constants of the slowest joint. */
 static double ip_flow_settle(const ip_params *p)
 {
   double slowest = INFINITY;
@@ -207,13 +213,13 @@ static double ip_flow_settle(const ip_params *p)
   return slowest > 0.0 && isfinite(slowest) ? 4.0 / sqrt(slowest) : 0.0;
 }
 
-/* Whether the flow moves, or has to stop. */
+/* Return whether the flow is on or still moves. */
 static int ip_flow_moves(const ip_flow *f)
 {
   return f->on || ip_largest(f->velocity, 0) > 0.0;
 }
 
-/* Go on at rest from a posture, where the next update begins. */
+/* Set the flow to a posture at rest, and begin a new update. */
 static void ip_flow_start_at(ip_flow *f, const double *q)
 {
   memcpy(f->q, q, sizeof f->q);
@@ -227,8 +233,8 @@ static void ip_flow_start_at(ip_flow *f, const double *q)
   f->phase = f->resting = 0;
 }
 
-/* Begin at rest at the present posture, and measure the curvature there.  Return 0 where the objective does not exist or
- * vanishes. */
+/* Begin at rest at the present posture, and measure the curvature at this posture.  Return 0 if the objective does
+ * not exist or is zero. */
 static int ip_flow_begin(ip_context *c)
 {
   ip_flow *f = &c->flow;
@@ -269,7 +275,8 @@ static int ip_flow_begin(ip_context *c)
   return 1;
 }
 
-/* A part of the eigenvalues of the curvature and, at the last tick, the variables of the Newton step. */
+/* Compute a part of the eigenvalues of the curvature; at the last tick, also compute the variables of the Newton
+ * step. */
 static void ip_flow_curve(ip_context *c)
 {
   enum { BEND = 7, TRIDIAGONAL = 8, LAST = 12 };
@@ -292,10 +299,10 @@ static void ip_flow_curve(ip_context *c)
   }
 }
 
-/* Advance the flow by dt seconds, and move the targets of the posture task and of the tasks that it leads. */
+/* Advance the flow by dt seconds, and move the targets of the posture task and of the tasks that follow the flow. */
 static void ip_flow_lead(ip_context *c, double dt)
 {
-  /* Python has the look, the changes, the probe and the step at the same ticks. */
+  /* Evaluation, changes, probe and step take place at the same ticks as in Python. */
   static void (*const parts[IP_FLOW_PHASES])(ip_context *) = {
     ip_flow_look,    ip_flow_decompose, ip_flow_split, ip_flow_limit, ip_flow_govern, ip_flow_probe, ip_flow_compare,
     ip_flow_curve,   ip_flow_curve,     ip_flow_curve, ip_flow_curve, ip_flow_govern, ip_flow_curve, ip_flow_direct,
@@ -326,10 +333,10 @@ static void ip_flow_lead(ip_context *c, double dt)
     if (!ip_flow_led[k]) {
       continue;
     }
-    /* A reset takes the present output. */
+    /* The next reset sets this target to the present output. */
     target->set = -1.0;
     if (ip_flow_led[k] == 1) {
-      /* Only for the first of them, because the others read the same model. */
+      /* Compute the model only for the first of these tasks, because the others read the same model. */
       ip_dynamics(f->q, f->velocity, &f->ahead);
     }
     if (ip_task_kind[k] == IP_MASS_CENTER) {

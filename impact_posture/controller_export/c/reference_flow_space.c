@@ -1,19 +1,20 @@
-/* Redundancy of the reference flow, and the controls that hold it at rest.  The formulas are in
+/* Redundancy of the reference flow, and the static controls that hold its posture.  The formulas are in
  * impact_posture/tsid/flow/redundancy.py and static_controls.py. */
 
-/* Constraints with a smaller singular value, relative to the largest, are springs; their stiffness relative to H0, 1/m2. */
+/* If the singular value of a direction is below this share of the largest, the direction gets a spring instead of a
+ * constraint.  Stiffness of the springs relative to H0, 1/m2. */
 #define IP_SLACK 2e-2
 #define IP_SPRING 3e4
-/* Weight of a moment (N m), relative to a force (N), and a share that keeps equations solvable. */
+/* Weight of a moment (N m), relative to a force (N); share of the trace that makes the equations solvable. */
 #define IP_MOMENT 100.0
 #define IP_TINY 1e-12
-/* Points nearer to a line than this lie on it, m. */
+/* A point with a smaller distance from a line, m, is treated as a point on the line. */
 #define IP_ON_LINE 1e-9
-/* Small weight of the base in a motion that the joints do not determine. */
+/* Small regularization for base motions that leave the joints at rest. */
 #define IP_IDLE 1e-9
-/* Least share of the half range of a control that counts as available. */
+/* Accelerations may always use at least this share of the half range of a control. */
 #define IP_LEFT 0.1
-/* Share of the weight that soles carry in equal parts. */
+/* Share of the weight of which each sole carries an equal part. */
 #define IP_EVEN 0.6
 
 #if IP_BASE
@@ -36,7 +37,8 @@ static void ip_solve_factor(const double *R, int n, double *b)
 }
 #endif
 
-/* Write eigenvectors and eigenvalues of JJ' into f->work.  A Gram matrix is exact enough for singular values above 2 %. */
+/* Write eigenvectors and eigenvalues of JJ' into f->work.  This is exact enough for singular values above 2 % of the
+ * largest. */
 static void ip_flow_decompose(ip_context *c)
 {
   enum { N = IP_NV, M = IP_HELD };
@@ -51,8 +53,8 @@ static void ip_flow_decompose(ip_context *c)
   f->most = ip_eigen(G, G + M * M, M);
 }
 
-/* With J = U S V' from these: the inverse of the directions that J holds, and an orthonormal basis of the others in the
- * rows of Z. */
+/* From the eigenvectors, J = U S V' is known.  Compute the pseudo-inverse on the constrained directions, and an
+ * orthonormal basis of the free directions in the rows of Z. */
 static void ip_flow_space(ip_flow *f)
 {
   enum { N = IP_NV, M = IP_HELD };
@@ -69,8 +71,9 @@ static void ip_flow_space(ip_flow *f)
   for (i = 0; i < N; ++i) {
     ip_combine(f->inverse + i * M, M, held + i, N, U, M, rank);
   }
-  /* The reflections that take these rows to the first entries take the other entries to Z.  Their product is I - V'RV with
-   * their vectors in the rows of V and an upper triangular R (Golub and Van Loan, section 5.1.7).  T is R'. */
+  /* Reflections that map the rows of constrained directions to the first unit vectors map Z to the other unit
+   * vectors. The product of the reflections is I - V'RV, where the rows of V are their vectors and R is upper
+   * triangular (Golub and Van Loan, section 5.1.7).  T is R'. */
   for (k = 0; k < rank; ++k) {
     double *v = held + k * N, size = sqrt(ip_dot(v + k, v + k, N - k));
     v[k] += v[k] < 0.0 ? -size : size;
@@ -104,7 +107,7 @@ static void ip_flow_space(ip_flow *f)
   }
 }
 
-/* Factor of the joints' part of Z, by which the return spares the joints. */
+/* Compute a factor of the joint part of Z, with which the return to the constraints moves the joints least. */
 static void ip_flow_still(ip_flow *f)
 {
 #if IP_BASE
@@ -133,7 +136,8 @@ static void ip_flow_project(const ip_flow *f, double *x)
   memcpy(x, out, sizeof out);
 }
 
-/* Forces on the contacts that carry the base with the least weighted norm: J' times them, by the base's entries. */
+/* Compute the contact forces with the least weighted norm that carry a wrench on the base.  Write J' times these
+ * forces, per unit of each entry of the wrench. */
 static void ip_flow_carry(ip_flow *f)
 {
 #if IP_CONTACTS
@@ -149,7 +153,7 @@ static void ip_flow_carry(ip_flow *f)
     trace += square[7 * i];
   }
   for (i = 0; i < 6; ++i) {
-    /* Feet on a line carry no moment about it. */
+    /* Feet on one line cannot carry a moment about this line, so the matrix would be singular. */
     square[7 * i] += IP_TINY * trace;
   }
   memset(f->carried, 0, sizeof f->carried);
@@ -169,14 +173,14 @@ static void ip_flow_carry(ip_flow *f)
 #endif
 }
 
-/* Half of a control's range that rest may use; 0 where the control has no limits. */
+/* Return half of the control range that static controls may use; return 0 if the control has no limits. */
 static double ip_flow_half(const ip_params *p, int i)
 {
   const double half = p->flow_share[0] * (p->control_upper[i] - p->control_lower[i]) / 2.0;
   return isfinite(half) ? half : 0.0;
 }
 
-/* Controls that produce a generalized force, in units of ip_flow_half. */
+/* Compute the controls that produce a generalized force, in units of ip_flow_half. */
 static void ip_flow_needed(const ip_context *c, const double *force, double *shares)
 {
   double rest[IP_NV];
@@ -191,7 +195,7 @@ static void ip_flow_needed(const ip_context *c, const double *force, double *sha
   }
 }
 
-/* Static controls at the model of the flow, from the middle of their range. */
+/* Compute the static controls at the posture of the flow, measured from the middle of their ranges. */
 static void ip_flow_shares(ip_context *c, double *shares)
 {
   int i;
@@ -203,7 +207,8 @@ static void ip_flow_shares(ip_context *c, double *shares)
   }
 }
 
-/* The share of `more`, 0 to 1, with which both accelerations use at most `haste` of the room beside the static controls. */
+/* Return the share of the acceleration `more`, 0 to 1, that the actuators permit.  Both accelerations together may
+ * use the share `haste` of the range that the static controls leave. */
 static double ip_flow_permitted(const ip_context *c, const double *known, const double *more, double haste)
 {
   const ip_flow *f = &c->flow;
@@ -226,8 +231,9 @@ static double ip_flow_permitted(const ip_context *c, const double *known, const 
 }
 
 #if IP_CONTACTS
-/* Outward normals n and offsets b of the polygon n c + b <= 0 of the feet on level ground, as support_edges has them.  Feet
- * that span no area allow no motion of the center of mass: the result is then four edges at an infinite distance. */
+/* Compute outward normals n and offsets b of the polygon n c + b <= 0 of the feet on level ground, as in
+ * support_edges.  If the feet do not span an area, the center of mass must not move, and the result is four edges
+ * with infinite b. */
 static void ip_flow_polygon(ip_context *c)
 {
   enum { COUNT = 4 * IP_CONTACTS };
@@ -241,7 +247,7 @@ static void ip_flow_polygon(ip_context *c)
     const int sole = ip_contact_row[i / 4 + 1] - ip_contact_row[i / 4] == 6;
     for (j = 0; j < 2; ++j) {
       x[i][j] = c->m.position[ip_contact_point[i / 4]][j];
-      /* Points have no rotation in the model. */
+      /* The model has no rotation of point contacts. */
       x[i][j] += sole ? (i & 1 ? 1.0 : -1.0) * half[0] * R[3 * j] + (i & 2 ? 1.0 : -1.0) * half[1] * R[3 * j + 1] : 0.0;
     }
     ip_add(mean[i % 4], 1.0 / IP_CONTACTS, x[i], 2);
@@ -251,7 +257,7 @@ static void ip_flow_polygon(ip_context *c)
     for (j = 0; j < 2; ++j) {
       x[i][j] += even * (mean[i % 4][j] - x[i][j]);
     }
-    /* The leftmost corner, not a point between two corners. */
+    /* Start at the leftmost corner, not at a point between two corners. */
     start = x[i][0] < x[start][0] - IP_ON_LINE || (x[i][0] <= x[start][0] + IP_ON_LINE && x[i][1] < x[start][1]) ? i
                                                                                                                 : start;
   }

@@ -1,11 +1,12 @@
-/* Bounds of the acceleration that keep the zero moment point of a standing robot within the polygon of its feet.  The
+/* Bounds on the acceleration that keep the zero moment point of a standing robot in the polygon of its feet.  The
  * formulas are in impact_posture/tsid/flow/zero_moment_point.py. */
 
-/* Share of the distance from the center of mass to an edge that accelerations may use, and the least distance, m. */
+/* Share of the distance from the center of mass to an edge that accelerations may use; least value of this distance,
+ * m. */
 #define IP_ZMP_SHARE 0.8
 #define IP_ZMP_LEAST 0.01
 
-/* Set the rows, and the room beside a known acceleration. */
+/* Set the rows and their bounds, from which the part of a known acceleration is subtracted. */
 static void ip_flow_limit_zmp(ip_flow *f, const double *known)
 {
 #if IP_CONTACTS
@@ -33,7 +34,7 @@ static void ip_flow_limit_zmp(ip_flow *f, const double *known)
 #endif
 }
 
-/* Take out of a change of the velocity in a period the parts that move the point beyond an edge. */
+/* Remove from a change of the velocity within a period the parts that move the zero moment point beyond an edge. */
 static void ip_flow_keep_zmp(const ip_flow *f, double period, double *step)
 {
   double across[IP_NV], over, square;

@@ -1,4 +1,4 @@
-/* Start at zero, with the bounds of the problem and the scaled variables as coordinates. */
+/* Start at z = 0 with the bounds of the problem.  The coordinates are the scaled variables. */
 static void begin(Relaxation *r, const relaxation_problem *p, char *work, int budget) {
     const int n = p->n;
     memset(r, 0, sizeof *r);

@@ -9,7 +9,7 @@ static int factorize(Relaxation *r, double share) {
     }
     ip_combine(r->wanted, free, gradient, 1, Z, n, n);
     for (int i = 0; i < free; i++) {
-        /* More than the lower triangle, because pairs are added at once. */
+        /* Compute more than the lower triangle, because two entries are added at once. */
         ip_combine(r->L + i * n, i + 4 < free ? i / 4 * 4 + 4 : free, Z + i, n, HZ, n, n);
         largest = fmax(largest, r->L[i * n + i]);
     }
@@ -33,7 +33,8 @@ static void unwhiten(const Relaxation *r, double *y) {
     }
 }
 
-/* Move to the exact minimum of the cost with the active rows of its program held, which a proximal term has missed. */
+/* Move to the exact minimum of the cost while the active rows keep their values.  The program with a proximal term
+ * does not reach this minimum. */
 static void finish_cost(Relaxation *r) {
     for (int k = 0; k < MOST_MOVES; k++) {
         hold_rows(r, 1);
@@ -49,8 +50,8 @@ static void finish_cost(Relaxation *r) {
     }
 }
 
-/* Minimize the cost in the coordinates that are left.  A program with a proximal term decides the active rows, because the
- * cost may be too flat.  Then the point moves to the minimum. */
+/* Minimize the cost in the remaining coordinates.  A program with a proximal term determines the active rows, because
+ * the cost may be too flat for a program without this term.  Then the point moves to the minimum. */
 static int solve_cost(Relaxation *r) {
     const int free = r->n - r->fixed;
     int flag = 0;

@@ -42,7 +42,8 @@ static void turn_row(const Relaxation *r, double *row) {
 
 static void clear_rows(Relaxation *r) { r->exact = r->near = r->rank = 0; }
 
-/* List a row that reaches its goal exactly.  Only the first `rank` reflected coordinates move the exact rows. */
+/* Add a row to the list of rows that reach their goals exactly.  These rows depend only on the first `rank` reflected
+ * coordinates. */
 static void add_exact(Relaxation *r, int entry) {
     const int n = r->n, rank = r->rank, free = n - r->fixed;
     double *b = r->B + r->exact * n, *v = r->v + rank * n;
@@ -57,7 +58,8 @@ static void add_exact(Relaxation *r, int entry) {
     r->rows[r->exact++] = entry;
 }
 
-/* List a row that comes close to its goal (least squares).  It overwrites a row of the last program in M. */
+/* Add a row to the list of rows that approach their goals by least squares.  It overwrites a row of the last program
+ * in M. */
 static void add_near(Relaxation *r, int entry) {
     double *b = r->M + r->near * r->n;
     memcpy(b, motion(r, entry), (size_t)(r->n - r->fixed) * sizeof *b);
@@ -73,8 +75,8 @@ static void swap(double *a, double *b, int count) {
     }
 }
 
-/* Set r->step to the step by which the listed rows reach, or come close to, their goals.  Return the number of reflected
- * coordinates that it uses.  The coordinates after r->rank belong to the first rows in r->close. */
+/* Compute the step r->step by which the listed rows reach or approach their goals.  Return the number of reflected
+ * coordinates that the step uses.  The coordinates after r->rank belong to the first rows in r->close. */
 static int find_step(Relaxation *r) {
     const int n = r->n, rank = r->rank, free = n - r->fixed, rest = free - rank;
     double *step = r->step, *C = r->L, *rhs = r->rhs, *square = r->column, longest = 0;
@@ -109,7 +111,7 @@ static int find_step(Relaxation *r) {
         for (int i = used; i < r->near; i++) {
             double *b = C + i * n + used;
             reflect(v, *tau, b, rest - used);
-            /* The difference has few digits where a row nearly depends on earlier rows. */
+            /* If a row nearly depends on earlier rows, the difference has few correct digits. */
             if (b[0] * b[0] < (1 - 1e-6) * square[i])
                 square[i] -= b[0] * b[0];
             else
@@ -131,7 +133,8 @@ static void hold_rows(Relaxation *r, int held) {
     for (int i = 0; i < r->near; i++) r->held[r->close[i]] = held;
 }
 
-/* Move by r->step until a row of the program stops it.  Return the entry of this row, or -1 after the whole step. */
+/* Move by r->step until a row of the program reaches its bound.  Return the entry of this row, or -1 after the whole
+ * step. */
 static int move(Relaxation *r) {
     double part = 1, end = 0;
     int stop = -1;
@@ -157,7 +160,7 @@ static int move(Relaxation *r) {
 static void eliminate(Relaxation *r, int rank) {
     const int n = r->n, free = n - r->fixed, rest = free - rank;
     if (rest < rank) {
-        /* Few coordinates are left, so compute Z times each of them. */
+        /* If few coordinates remain, it is faster to compute Z times each of them. */
         for (int c = 0; c < rest; c++) {
             double *e = r->B + c * n;
             memset(e, 0, (size_t)free * sizeof *e);

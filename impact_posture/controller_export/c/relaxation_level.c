@@ -1,7 +1,7 @@
 /* ---- least-distance programs ---------------------------------------------------------------------------------- */
 
-/* List the inequalities of the levels above `level` and, as soft rows, all rows of `level`.  With a factor L of the cost,
- * they are in whitened coordinates. */
+/* List the inequalities of the levels above `level` and, as soft rows, all rows of `level`.  If there is a factor L
+ * of the cost, the rows are in whitened coordinates. */
 static void list_rows(Relaxation *r, int level, const double *L) {
     const int free = r->n - r->fixed;
     const int *warm = r->warm + level * r->entries;
@@ -23,8 +23,8 @@ static void list_rows(Relaxation *r, int level, const double *L) {
         }
         r->size[count] = size;
         ip_scaled(row, 1 / size, row, free);
-        /* The tolerance of a row is relative to its length in the units of the problem.  The program of the cost has the
-         * tolerance of rounding, and its active rows become exact afterwards. */
+        /* The tolerance of a row is relative to its length in the units of the problem.  In the program of the cost,
+         * the tolerance is as small as rounding errors, and the active rows are corrected later. */
         r->daqp.scaling[count] = L ? 1 : r->length[i] / size;
         const double ratio = longest / r->length[i];
         r->daqp.rho_ls[count] = r->daqp.rho_us[count] = STEP_WEIGHT * ratio * ratio;
@@ -36,7 +36,7 @@ static void list_rows(Relaxation *r, int level, const double *L) {
     r->daqp.n = free;
 }
 
-/* Set the bounds around the present point, or around the minimum of the cost, and return their unit. */
+/* Set the bounds relative to the present point, or to the minimum of the cost, and return their unit. */
 static double set_bounds(Relaxation *r, const double *wanted) {
     const int free = r->n - r->fixed;
     double largest = 0, size = 1;
@@ -73,7 +73,7 @@ static int start(Relaxation *r) {
     return run(r);
 }
 
-/* Keep the active rows of a program for the next solution. */
+/* Store the active rows of a program for the next call. */
 static void keep_active(Relaxation *r, int level) {
     int *warm = r->warm + level * r->entries;
     memset(warm, 0, (size_t)r->entries * sizeof *warm);
@@ -91,8 +91,8 @@ static void list_active(Relaxation *r) {
     }
 }
 
-/* After a whole move, drop the rows that the answer does not need: exact rows whose multiplier is zero or has the wrong
- * sign, and inequalities that hold.  Return whether rows were dropped. */
+/* After a whole move, remove unnecessary rows from the lists: exact rows whose multiplier is zero or has the wrong
+ * sign, and inequalities that hold.  Return whether rows were removed. */
 static int drop_rows(Relaxation *r) {
     double *force = r->column, most = 0, square = 0;
     const int exact = r->exact, near = r->near;
@@ -117,13 +117,15 @@ static int drop_rows(Relaxation *r) {
         r->rhs[i] *= r->goal[row] == r->upper[row] ? 1 : -1;
         if (r->rhs[i] < r->rhs[worst]) worst = i;
     }
-    /* Without progress, where many bounds meet, drop only the worst row, because others would stop the move in its place. */
+    /* If many bounds meet and the last move brought no progress, remove only the worst row.  Otherwise, the other
+     * removed rows would stop the move. */
     const int all = square < (1 - PROGRESS) * r->square;
     for (int i = 0; i < exact; i++)
         if (most > 0 && (r->rhs[i] > COUNTS * most || (!all && i != worst))) r->rows[exacts++] = r->rows[i];
     for (int i = 0; i < near; i++)
         if (is_equation(r, r->close[i]) || violation(r, r->close[i]) > least(r, r->close[i])) r->close[nears++] = r->close[i];
-    /* Inequalities exactly at their bounds would be dropped and stop the move again, endlessly. */
+    /* Keep inequalities that are exactly at their bounds.  If removed, they would stop the move again, without an
+     * end. */
     if (exacts + nears == exact + near || (exacts == exact && !all)) return 0;
     r->square = square;
     clear_rows(r);
@@ -132,8 +134,8 @@ static int drop_rows(Relaxation *r) {
     return 1;
 }
 
-/* List the rows that determine the level's answer: the active rows of the levels above if the level is missed, then the
- * level's equations and violated rows. */
+/* List the rows that determine the answer of the level: its equations and violated rows.  If the level cannot hold,
+ * list the active rows of the levels above first. */
 static void list_held(Relaxation *r, int level, int missed) {
     clear_rows(r);
     if (missed) list_active(r);
@@ -144,7 +146,8 @@ static void list_held(Relaxation *r, int level, int missed) {
     }
 }
 
-/* Compute the exact answer of a level from approximate active rows, and return the number of coordinates that it uses. */
+/* Compute the exact answer of a level from approximate active rows, and return the number of coordinates that it
+ * uses. */
 static int finish_level(Relaxation *r, int level, int missed) {
     int last = -1;
     r->square = INFINITY;
@@ -163,14 +166,14 @@ static int finish_level(Relaxation *r, int level, int missed) {
         else
             add_near(r, stop);
     }
-    /* The point is good but not the best, and its rows keep their values. */
+    /* The point may not be optimal for this level, but it is accepted, and its rows keep their values. */
     list_held(r, level, missed);
     for (int i = 0; i < r->exact; i++) r->goal[r->rows[i]] = r->value[r->rows[i]];
     for (int i = 0; i < r->near; i++) r->goal[r->close[i]] = r->value[r->close[i]];
     return find_step(r);
 }
 
-/* Bring the point as close to a level as the levels above permit, then hold the level. */
+/* Minimize the error of a level as far as the levels above permit.  After that, the level keeps its error. */
 static int solve_level(Relaxation *r, int level) {
     int missed = 0, same = 0;
     list_rows(r, level, NULL);
@@ -180,7 +183,7 @@ static int solve_level(Relaxation *r, int level) {
         r->daqp.reuse_ind = 0;
         int flag = k ? run(r) : start(r);
         if (flag <= 0 && flag != DAQP_EXIT_ITERLIMIT && !k) {
-            /* A program with a larger weight is easier. */
+            /* The solver failed.  A program with a larger weight is easier to solve. */
             for (int j = 0; j < r->count; j++) r->daqp.rho_us[j] = r->daqp.rho_ls[j] *= 100;
             flag = start(r);
         }
@@ -195,12 +198,12 @@ static int solve_level(Relaxation *r, int level) {
         same = !missed || (k && left - r->left == 1);
     }
     const int rank = finish_level(r, level, missed);
-    /* A dependent row may still move by rounding, so an inequality stays an inequality. */
+    /* Rounding errors can still change a dependent row, so an inequality stays an inequality. */
     for (int i = 0; i < r->exact; i++) r->held[r->rows[i]] = is_equation(r, r->rows[i]);
     for (int i = 0; i < r->near; i++) r->held[r->close[i]] = is_equation(r, r->close[i]);
     for (int k = 0; k < rank; k++) r->held[k < r->rank ? r->rows[r->lead[k]] : r->close[k - r->rank]] = 1;
     eliminate(r, rank);
-    /* The point counts as a solution, so the bounds open by the rounding of its rows. */
+    /* The point is accepted as a solution, so the bounds are widened by the rounding errors of its rows. */
     for (int i = 0; i < r->entries; i++)
         if (r->p->level[i] <= level) {
             r->lower[i] = fmin(r->lower[i], r->value[i]);

@@ -5,14 +5,15 @@
 
 #include "daqp.h"
 
-/* DAQP approximates the active rows of a level in steps from the last answer, with this weight of the squared step against
- * the violation.  Moves with eliminated rows then lead to the exact answer.  A bound may stop a move.  For each row, a move
- * counts as MOVE_COST iterations, which take as long by measurement. */
+/* DAQP approximates the active rows of a level in steps from the last answer.  This is the weight of the squared step
+ * relative to the violation.  Moves with eliminated rows then lead to the exact answer; a bound may stop a move.  A
+ * move counts as MOVE_COST iterations per row, because it needs as much time as so many iterations. */
 #define STEP_WEIGHT 1e-5
 #define MOST_STEPS 4
 #define MOST_MOVES 60
 #define MOVE_COST 0.1
-/* Largest violation of a bound, and least violation that counts, relative to the numbers of the problem. */
+/* Largest violation of a bound by DAQP, and largest violation that is treated as zero, relative to the numbers of the
+ * problem. */
 #define EXACT 1e-9
 #define COUNTS 1e-7
 /* Least relative decrease of a sum of squares. */
@@ -21,7 +22,8 @@
 #define WRONG 1e-7
 /* Largest violation of a bound in the program of the cost, relative to its unit. */
 #define ROUNDING 1e-10
-/* Length of a row that cannot move any more, and least pivot of an elimination, relative to the length of the whole row. */
+/* Relative to the length of the whole row: the remaining length below which a row cannot change any more, and the
+ * least pivot of an elimination. */
 #define FLAT 1e-12
 #define PIVOT 1e-8
 /* Proximal terms of the reduced cost, relative to its largest entry, in the order of the attempts. */
@@ -29,27 +31,27 @@ static const double PROXIMAL[] = {1e-5, 1e-3};
 
 typedef struct {
     const relaxation_problem *p;
-    int n, entries, fixed, left; /* variables, entries of [z; A z], eliminated coordinates, iterations left */
-    double *Z, *T;               /* n x n: z moves by the columns from `fixed` on; A Z, row by row where it is known */
-    double *z, *value, *lower, *upper, *length; /* the point, [z; A z], opened bounds, lengths in `unit` */
+    int n, entries, fixed, left; /* numbers: variables, entries of [z; A z], eliminated coordinates, iterations left */
+    double *Z, *T;               /* Z, n x n: z can move along the columns from `fixed` on; T = A Z for known rows */
+    double *z, *value, *lower, *upper, *length; /* the point, [z; A z], widened bounds, lengths in `unit` */
     int *first, *last, *known;   /* range of a row's nonzero entries; `fixed` at the last computation of its motion */
-    int *held;                   /* whether an entry is eliminated */
+    int *held;                   /* whether each entry is eliminated */
     double *goal;                /* desired values of listed rows */
     double *B, *v, *tau, *rhs, *step, *column; /* work arrays of an elimination */
     double *motion_z;                 /* Z times a step */
-    int *rows, *lead, *close;    /* exact rows; exact row of the k-th reflection; rows of least squares */
-    int exact, near, rank;       /* their numbers, and the number of coordinates that the exact rows take */
+    int *rows, *lead, *close;    /* exact rows; exact row of the k-th reflection; least-squares rows */
+    int exact, near, rank;       /* numbers: exact rows, least-squares rows, coordinates that the exact rows use */
     double *L, *wanted;          /* factor of the reduced cost (1/L on the diagonal), its minimum in whitened coordinates */
     DAQPWorkspace daqp;
     DAQPSettings settings;
     double *M, *size;            /* normalized rows of a least-distance program, and their former lengths */
     int *entry, count;           /* entries of these rows */
-    int *warm;                   /* levels + 2 times entries: active rows of each program at the last solution */
-    double square;               /* sum of squares that a level missed after its last whole move */
+    int *warm;                   /* (levels + 2) x entries: active rows of each program in the last call */
+    double square;               /* sum of squared errors of a level after its last whole move */
     double tolerance, scale;     /* violation that DAQP may leave; size of the point, in `unit` */
 } Relaxation;
 
-/* Place an array after the others; without a base, only count its bytes. */
+/* Place an array after the earlier ones; if base is null, only count its bytes. */
 static void *take(char *base, size_t *used, size_t count, size_t size) {
     char *array = base ? base + *used : NULL;
     *used += (count * size + sizeof(double) - 1) / sizeof(double) * sizeof(double);
@@ -73,7 +75,7 @@ static size_t place(Relaxation *r, char *base, size_t n, size_t m, size_t levels
         {&r->lead, n}, {&r->close, e}, {&r->entry, e},
         {&r->daqp.sense, e}, {&r->daqp.WS, active}, {&r->daqp.prox_mask, n},
     };
-    /* The active rows come first, because they stay for the next solution. */
+    /* The active rows come first, because the next call uses them. */
     for (size_t k = 0; k < sizeof ints / sizeof *ints; k++)
         *ints[k].array = take(base, &used, ints[k].count, sizeof(int));
     for (size_t k = 0; k < sizeof doubles / sizeof *doubles; k++)

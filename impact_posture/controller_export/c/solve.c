@@ -1,6 +1,6 @@
-/* Solution of the QP by DAQP from the last active set. */
+/* Solve the QP by DAQP, starting from the last active set. */
 
-/* out = T x, added to out. */
+/* out += T x. */
 static void ip_add_turned(const ip_context *c, const double *x, double *out)
 {
   int i, j;
@@ -32,8 +32,8 @@ static void ip_add_turned(const ip_context *c, const double *x, double *out)
   }
 }
 
-/* Compute z = [v; w; f] from u, and correct it once so that the active rows hold to the last digits.  The large weights of
- * the cost lose digits in the variables of DAQP. */
+/* Compute z = [v; w; f] from u, and correct z once, so that the active rows hold to the last digit.  This is
+ * necessary, because large weights of the cost make the variables of DAQP less exact. */
 static void ip_decode(ip_context *c, DAQPWorkspace *w)
 {
   double x[IP_VARIABLES];
@@ -45,7 +45,7 @@ static void ip_decode(ip_context *c, DAQPWorkspace *w)
   ip_add_turned(c, x, c->z);
   memset(x, 0, sizeof x);
 #if IP_MOMENTUM
-  /* The diagonal cost does not contain the least weight of the base's acceleration. */
+  /* The diagonal cost does not contain the small weight that every acceleration of the base has. */
   double rest[IP_NV] = {0};
   for (i = 0; i < 3; ++i) {
     rest[i] = -c->added[i] * c->z[i];
@@ -83,7 +83,8 @@ typedef struct {
   DAQPSettings settings;
 } ip_memory;
 
-/* Prepare a program of n variables with m bounds and rows, of which `simple` are bounds.  The caller sets them. */
+/* Prepare a program with n variables and m bounds and rows, of which `simple` are bounds.  The caller sets bounds and
+ * rows. */
 static void ip_prepare(ip_memory *s, int n, int simple, int m, double *u, DAQPWorkspace *w)
 {
   memset(s->prox, 0, sizeof s->prox);
@@ -123,7 +124,7 @@ static int ip_solve_warm(ip_context *c)
   flag = flag < 0 ? flag : daqp_ldp(&w);
   c->iterations += w.iterations;
   if (w.state & DAQP_STATE_NOISE_FLOOR) {
-    /* It cycled and then took violated bounds for rounding. */
+    /* DAQP cycled and treated violated bounds as rounding errors. */
     flag = DAQP_EXIT_CYCLE;
   }
   memset(c->multipliers, 0, sizeof c->multipliers);

@@ -1,8 +1,8 @@
 /* Tasks and joint limits at the state in the context. */
 
-/* Kinds of tasks in ip_task_kind. */
+/* Kinds of tasks, as in ip_task_kind. */
 enum { IP_TILT, IP_BASE_TURN, IP_MASS_CENTER, IP_POSITION, IP_POSE, IP_ALIGNED };
-/* Phases in c->phase. */
+/* Values of c->phase. */
 enum { IP_FREE, IP_BRACE, IP_CONTACT, IP_RELEASE };
 
 static double ip_smooth(double x)
@@ -34,7 +34,7 @@ static void ip_read_state(ip_context *c, const double *q, const double *v)
   ip_dynamics(c->q, c->v, &c->m);
 }
 
-/* Position, Jacobian (rows of NV) and drift of the center of mass at q, from the rows of the base in M and h. */
+/* Compute position, Jacobian (rows of NV numbers) and drift of the center of mass from the base rows of M and h. */
 static void ip_center_of_mass(const ip_model *m, const double *q, double *position, double *J, double *drift)
 {
 #if IP_BASE == 6
@@ -57,12 +57,12 @@ static void ip_center_of_mass(const ip_model *m, const double *q, double *positi
 #endif
 }
 
-/* Components x and y of angle times axis of the shortest rotation from the z axis to a unit vector. */
+/* Compute the x and y components of the shortest rotation (angle times axis) from the z axis to a unit vector. */
 static void ip_shortest(const double *to, double *e)
 {
   const double sine = hypot(to[0], to[1]);
   if (sine < 1e-12) {
-    /* Upside down, all rotations about horizontal axes are equally short. */
+    /* Upside down, all horizontal rotation axes are equally good, so the code selects the x axis. */
     e[0] = to[2] > 0.0 ? 0.0 : IP_PI;
     e[1] = 0.0;
   } else {
@@ -72,7 +72,7 @@ static void ip_shortest(const double *to, double *e)
   }
 }
 
-/* Rows of tasks whose Jacobian is constant. */
+/* Write the rows of a task whose Jacobian is constant. */
 static void ip_constant_rows(int k, double *J)
 {
   int i;
@@ -81,7 +81,7 @@ static void ip_constant_rows(int k, double *J)
   }
 }
 
-/* Set a target to the present output. */
+/* Set a target to the present output of its task. */
 static void ip_present(const ip_context *c, int k, ip_target *target)
 {
   const int point = ip_task_point[k];
@@ -196,7 +196,8 @@ static void ip_task_rows(ip_context *c, int k)
   }
 }
 
-/* Bounds on a joint's acceleration, to[0] towards the upper and to[1] towards the lower limit (LimitLaw has the formulas). */
+/* Compute the bounds on the acceleration of a joint: to[0] towards the upper limit, to[1] towards the lower limit.
+ * LimitLaw explains the formulas. */
 static void ip_bounds(const ip_context *c, int i, double *to)
 {
   const ip_params *p = &c->p;

@@ -1,13 +1,13 @@
 /* Functions of the controller. */
 
-/* Longest time step of ramps, in periods. */
+/* Limit on the time step of ramps, in periods, for a tick after a long pause. */
 #define IP_LONGEST 10.0
 /* Largest sum of squares of a valid measurement (1e8 m, rad/s or N). */
 #define IP_ABSURD 1e16
-/* Largest difference of equal times, s, because sums of periods are not exact. */
+/* Times with a smaller difference, s, are equal, because sums of periods are not exact. */
 #define IP_SAME 1e-9
 
-/* Whether a quaternion, or a cosine with its sine, is far from unit length. */
+/* Return whether a quaternion, or a cosine with its sine, is far from unit length. */
 static int ip_turned_wrong(const double *q)
 {
   int k;
@@ -98,7 +98,7 @@ static void ip_answer(ip_context *c, ip_command *out)
     u[i] = ip_least(ip_most(exact, c->p.control_lower[i]), c->p.control_upper[i]);
     over += (exact - u[i]) * (exact - u[i]);
   }
-  /* Not ">", which is false for a NaN. */
+  /* A test with ">" would accept NaN. */
   if (!(over <= c->excess * c->excess)) {
     ip_hold(c, IP_UNSOLVED, c->v, out);
     return;
@@ -111,12 +111,12 @@ static void ip_answer(ip_context *c, ip_command *out)
   ip_write(c, u, relaxed ? IP_RELAXED : IP_SOLVED, out);
 }
 
-/* Whether a measurement can be used. */
+/* Return whether a measurement can be used. */
 static int ip_measured(const double *q, const double *v, const double *force)
 {
   double total = ip_dot(q, q, IP_NQ) + ip_dot(v, v, IP_NV);
   total += force ? ip_dot(force, force, 6) : 0.0;
-  /* A sum of squares is finite and below a bound only if each number is. */
+  /* If the sum of squares is finite and below the bound, every number is finite and bounded too. */
   return total < IP_ABSURD && !ip_turned_wrong(q);
 }
 
@@ -134,7 +134,7 @@ int ip_reset(ip_context *c, const double q[IP_NQ], const double v[IP_NV], ip_com
   for (k = 0; k < IP_TASKS; ++k) {
     ip_constant_rows(k, c->J[ip_task_row[k]]);
     if (c->target[k].set < 0.0) {
-      /* A flow has moved it. */
+      /* A reference flow has moved this target. */
       memset(&c->target[k], 0, sizeof c->target[k]);
     }
     if (c->target[k].set <= 0.0) {
@@ -161,7 +161,7 @@ int ip_reset(ip_context *c, const double q[IP_NQ], const double v[IP_NV], ip_com
   for (i = 0; i < IP_NV; ++i) {
     c->damping[i] = 10.0 * c->m.M[i * (IP_NV + 1)];
   }
-  /* The first held command balances gravity. */
+  /* If the first tick fails, it repeats a command that balances gravity. */
   for (i = 0; i < IP_CONTROLS; ++i) {
     const double *h = c->m.h;
     const double force = i < IP_ROTORS ? ip_dot(ip_inverse + i * IP_BASE, h, IP_BASE) : h[IP_BASE + i - IP_ROTORS];

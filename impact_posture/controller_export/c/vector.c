@@ -1,6 +1,7 @@
 /* Loops over vectors. */
 
-/* Two doubles that one instruction adds or multiplies, if the compiler supports them.  It may not reorder a sum itself. */
+/* A vector of two doubles, which one instruction adds or multiplies, if the compiler supports this.  The vectors are
+ * explicit, because a compiler may not reorder a sum. */
 #if defined(__GNUC__)
 typedef double ip_pair __attribute__((vector_size(16), aligned(8), may_alias));
 #define IP_PAIR(p) (*(const ip_pair *)(p))
@@ -12,7 +13,7 @@ static inline double ip_dot(const double *a, const double *b, int n)
   double sum = 0.0;
   int i = 0;
 #if defined(__GNUC__)
-  /* Independent sums do not wait for each other. */
+  /* Use several independent sums, because additions to one sum must wait for each other. */
   ip_pair s = {0.0, 0.0}, t = {0.0, 0.0};
   for (; i + 3 < n; i += 4) {
     s += IP_PAIR(a + i) * IP_PAIR(b + i);
@@ -50,7 +51,7 @@ static inline void ip_subtract(const double *a, const double *b, double *out, in
   }
 }
 
-/* x = c x + s y and y = c y - s x at once. */
+/* Replace x by c x + s y and y by c y - s x. */
 static inline void ip_rotate(double *restrict x, double *restrict y, double c, double s, int n)
 {
   int i = 0;
@@ -87,7 +88,7 @@ static inline void ip_combine(double *restrict out, int n, const double *a, int 
 {
   int i = 0, k;
 #if defined(__GNUC__)
-  /* Eight or four sums stay in registers. */
+  /* Compute eight or four sums at a time, which stay in registers. */
   for (; i + 7 < n; i += 8) {
     ip_pair s0 = {0.0, 0.0}, s1 = {0.0, 0.0}, s2 = {0.0, 0.0}, s3 = {0.0, 0.0};
     const double *c = a, *y = x + i;
