@@ -1,10 +1,9 @@
 """The self-motion manifold of a problem with one or two free degrees of freedom, mapped by continuation.
 
 During a self-motion, the robot moves and all equalities stay satisfied (J. W. Burdick, "On the inverse kinematics of
-redundant
-manipulators: characterization of the self-motion manifolds", ICRA 1989).  The robot cannot move from one component of
-    the manifold to another within the joint limits.  With one degree of freedom, components are curves; with two,
-    surfaces.
+redundant manipulators: characterization of the self-motion manifolds", ICRA 1989).  The robot cannot move from one
+component of the manifold to another within the joint limits.  With one degree of freedom, components are curves; with
+two, surfaces.
 """
 
 from __future__ import annotations
