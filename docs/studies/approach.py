@@ -19,10 +19,11 @@ _SHARE = 0.9
 
 def lines(request: Request) -> Iterator[str]:
     """Yield a row for each normal and each robot whose joints move the contact to the surface."""
-    yield f"The fastest approach at the start and at the best of {STARTS} starts, clear of collisions and held by"
-    yield f"the motors; then the optimum with {_SHARE:.0%} of the speed at the start demanded. *loss*: rise of the"
-    yield "objective. *a start*: median time of a start over the median without the demand. Robots that fly and"
-    yield "contacts on the trunk have no bound. Robots without a posture clear of collisions have no row."
+    yield f"Fastest approach speed at the start and in the best optimum of {STARTS} starts, with constraints on"
+    yield f"collisions and motor limits. Then the optimum if {_SHARE:.0%} of the speed at the start is required."
+    yield "*loss*: increase of the objective by this requirement. *a start*: median time of a start, divided by"
+    yield "the median without the requirement. Flying robots and contacts on the trunk have no speed limit."
+    yield "Robots without a collision-free posture have no row."
     yield machine()
     yield ""
     cases = [(robot, normal) for robot in known_robots() if request.only in robot for normal in (DOWN, BACK)]

@@ -30,10 +30,10 @@ _HEAD = "robot|n|rank of $J_s$|ε m|bound|$H$ moved|oracle: H|∇H|f|kernel: H|�
 def lines(request: Request) -> Iterator[str]:
     """Yield a row for each case and compliance."""
     yield (
-        f"The least digits over the default and {request.count} random postures; in brackets the "
-        "guarantee of backward "
-        "error\nanalysis. $H$ moved: largest change by the compliance, against feet held exactly. Bound:\n"
-        "$\\varepsilon/(\\sigma+\\varepsilon)$, relative to the effect of the feet on the jump."
+        f"Smallest number of correct digits over the default posture and {request.count} random postures. In\n"
+        "brackets: digits that backward error analysis guarantees. $H$ moved: largest relative change of $H$ by\n"
+        "the compliance, compared with rigid feet. Bound: $\\varepsilon/(\\sigma+\\varepsilon)$, relative to the\n"
+        "effect of the feet on the jump."
     )
     yield ""
     wanted = [CASES[name] for name in _CASES if request.only in name]

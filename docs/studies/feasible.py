@@ -46,24 +46,19 @@ class Cost(NamedTuple):
 
 def lines(request: Request) -> Iterator[str]:
     """Yield a row for each robot and normal."""
-    yield "Each robot of the catalogue at its own contact frame, striking a floor (*down*) and a wall (*ahead*),"
-    yield f"from {STARTS} starts: *free* of demands, *clear* of collisions, and with *all*, also held by the motors."
-    yield "*collide*: number of distinct optima of the free problem at which shapes touch each other, the surface"
-    yield (
-        "or the ground. *loss*: rise of the objective of the best posture. *left out*: certified ends that the check"
-    )
-    yield "on the original shapes refused. *ms*: median time of a start. *a start*: this median over the median of a"
-    yield (
-        "free search just before. *search*: the same for the time of the whole search, where some starts run several"
-    )
-    yield f"times. These two are medians over {request.count} seeds. *certified* is the least number over the seeds,"
-    yield (
-        "and *left out* the sum. All of these searches finish every start. The default drops starts "
-        "that can no longer"
-    )
-    yield "become the best: *left* is their number, *above* the rise of the best objective because of it,"
-    yield "and *time* the time of the default search over the time with all starts. A dash: no posture meets the"
-    yield "demands, and the last column names the conflict."
+    yield "Each robot of the catalogue hits a floor (*down*) and a wall (*ahead*) with its contact frame. Each"
+    yield f"search has {STARTS} starts. *free*: no constraints on collisions and motors. *clear*: no collisions."
+    yield "*all*: no collisions, and the motors can hold the posture. *collide*: number of distinct optima of"
+    yield "the free problem at which collision shapes touch each other, the surface or the ground. *loss*:"
+    yield "increase of the objective of the best posture. *left out*: number of certified solutions that the"
+    yield "check of the original shapes rejected. *ms*: median time of a start. *a start*: this median, divided"
+    yield "by the median of a free search just before. *search*: the same ratio for the time of the whole"
+    yield f"search, which repeats some starts. Both ratios are medians over {request.count} seeds. *certified* is"
+    yield "the smallest number over the seeds, *left out* is the sum. All of these searches finish every start."
+    yield "The default stops starts that can no longer become the best. *left*: number of stopped starts."
+    yield "*above*: increase of the best objective because of them. *time*: time of the default search, divided"
+    yield "by the time with all starts. A dash: no posture satisfies the constraints, and the last column names"
+    yield "the conflict."
     yield machine()
     yield ""
     ends, left = list[int](), list[int]()

@@ -102,21 +102,14 @@ def lines(request: Request) -> Iterator[str]:
     yield machine("daqp")
     yield ""
     starts = f"{each} random feasible starts for each robot and seed"
-    yield f"{starts}, all on the same contacts and tool pose. Starts that need"
-    yield "more than 80 % of the actuator limits are drawn again. The flow runs in the controller in C."
-    yield (
-        "The robot follows exactly (no physics). The optimum of a basin is the solution of the offline "
-        "program (IPOPT)"
-    )
-    yield (
-        "from the end of the flow under the same rows. If this solution lies elsewhere, or needs more torque or tilt,"
-    )
-    yield (
-        "the optimum is the end of a finer flow (ρ = 0, ε = 10⁻⁷, 5 s more). Another basin: the optimum "
-        "lies more than"
-    )
-    yield "1 % of H₀ above the best optimum of all starts. *Sent to the best*: these starts visit the best optimum"
-    yield "first; the number says how many end within 1 % of H₀ of it."
+    yield f"{starts}, with equal contacts and tool pose. Starts that need more than 80 % of the actuator limits"
+    yield "are drawn again. The flow runs in the exported controller in C. The robot moves exactly as planned"
+    yield "(no physics). The optimum of a basin is the solution of the offline program (IPOPT), started at the"
+    yield "end of the flow, under the same constraints. If this solution is far from the end of the flow, or"
+    yield "needs more torque or tilt, the optimum is the end of a finer flow (ρ = 0, ε = 10⁻⁷, 5 s more)."
+    yield "Another basin: H at the optimum is more than 1 % of H₀ above the best optimum of all starts. *Sent to"
+    yield "the best*: flows from these starts first visit the best optimum. The number counts the flows that end"
+    yield "within 1 % of H₀ of this optimum."
     yield ""
     seeds, chosen = range(request.seed, request.seed + 4), [case for case in CASES if request.only in case.name]
     rows = (_row(case, each, replace(request, seed=seed)) for case in chosen for seed in seeds)

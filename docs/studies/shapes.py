@@ -22,12 +22,11 @@ _HEAD = ("robot", "shapes", "hulls", "corners", "sweep, mm", "pairs of shapes", 
 
 def lines(request: Request) -> Iterator[str]:
     """Yield a row for each robot."""
-    yield "Corners: median of the hulls. Sweep: median and largest of the hulls, without balls and capsules. Fit:"
-    yield "processor time with the loading of meshes. At the default: shapes and hulls that collide in this posture."
-    yield (
-        "Nested: pairs kept apart by the joints between them, the rows that this takes, and pairs that "
-        "are not kept apart."
-    )
+    yield "Corners: median number of corners of the hulls. Sweep: median and largest radius of the hulls,"
+    yield "without balls and capsules. Fit: processor time, with the loading of meshes. At the default: number"
+    yield "of pairs of shapes and of pairs of hulls that collide in the default posture. Nested: number of pairs"
+    yield "whose contact is prevented by constraints on the joints between them, number of rows of these"
+    yield "constraints, and number of pairs whose contact is not prevented."
     yield machine("pin")
     yield ""
     yield from table(_HEAD, (_row(name) for name in known_robots() if request.only in name))

@@ -117,10 +117,9 @@ def lines(request: Request) -> Iterator[str]:
     yield (
         f"{request.count} ticks, one core; impact-robust controller, bracing. Processor time of a tick, "
         "µs. Wall time\n"
-        "includes other programs on the machine. Robust over nominal: ratio of medians, and of means of the shorter\n"
-        "99 %, with the gradient every fifth tick (in brackets: every tick). Flow: a reference flow "
-        "that moves; ratio\n"
-        "of means of the shorter 99 %, and the 99th percentile."
+        "includes other programs on the machine. Robust / nominal: ratio of medians, and of means of the shortest\n"
+        "99 %, with the gradient every fifth tick (in brackets: every tick). Flow: controller with a moving\n"
+        "reference flow; ratio of means of the shortest 99 %, and the 99th percentile."
     )
     yield ""
     solvers = []
