@@ -12,7 +12,7 @@ of the curve.
 One program, with d as the bound of a row, is solved along two paths: outward from the posture with the least price
 and inward from the optimum.  Each solve starts at the result of the previous solve, and also uses its multipliers if
 this result satisfies the new bound.  For each bound, the best certified result is kept.  If the best result for a
-neighboring bound is on another path, a solve starts from this result as well.  The curve is therefore the lower
+neighboring bound comes from another path, one more solve starts from this result.  The curve is therefore the lower
 envelope of the paths.
 """
 
@@ -44,8 +44,8 @@ _STILL = 1e-6
 _EQUAL = 1e-9
 # If the objective increases along the curve by more than this share of the initial objective, the result gets a note.
 _RISE = 1e-6
-# Maximum number of other optima from which a path starts, and of rounds in which results of neighboring bounds are
-# tried.
+# Maximum number of other optima from which a path starts, and maximum number of rounds that start from results of
+# neighboring bounds.
 _PATHS, _ROUNDS = 3, 3
 # Maximum number of times that missing parts are added to the program for one point.
 _GROWTH = 8

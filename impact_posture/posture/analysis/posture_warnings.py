@@ -8,8 +8,8 @@ from impact_posture.posture.formulation.problem_file import Prepared
 from impact_posture.posture.loads.holding_forces import HoldingForces
 from impact_posture.system.arrays import Array
 
-# There is no warning if the attainable speed is below the approach speed by less than this share.  Both speeds would
-# be equal in the three digits of the message.
+# If the attainable speed is below the approach speed by less than this share, there is no warning, because the
+# message shows only three digits of both speeds.
 _REACHED = 5e-3
 # Joints farther than this (m) behind a surface or below the ground are reported.
 _BEHIND = 0.01

@@ -1,4 +1,4 @@
-"""The result of an optimization as the content of ``result.json`` and ``result.npz``."""
+"""Convert the result of an optimization to the content of ``result.json`` and ``result.npz``."""
 
 from __future__ import annotations
 

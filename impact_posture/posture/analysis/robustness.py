@@ -76,13 +76,13 @@ class Robustness:
 
     @property
     def price(self) -> float | None:
-        """Relative increase of the nominal model's objective from its own optimum to the robust optimum."""
+        """Relative increase of the nominal model's objective compared with its own optimum."""
         own = self.model_variants[0].own
         return None if own is None else self.model_variants[0].at_robust / own - 1
 
     @property
     def gain(self) -> float | None:
-        """Relative decrease of the worst case from the optimum of the nominal model to the robust optimum."""
+        """Relative decrease of the worst objective compared with the optimum of the nominal model."""
         return None if self.worst_nominal is None else 1 - self.worst_robust / self.worst_nominal
 
     @property
@@ -202,7 +202,7 @@ def compare_variants(solution: PostureSolution, optima: Sequence[Array | None], 
 
 
 def _apart(problem: ConstrainedProblem, postures: Sequence[Array]) -> list[Array]:
-    """Return the postures without those that nearly equal an earlier posture."""
+    """Return the postures, leaving out each posture that nearly equals an earlier one."""
     kept: list[Array] = []
     for q in postures:
         if all(np.linalg.norm(wrapped_difference(problem, other, q)) > SAME_POSTURE for other in kept):

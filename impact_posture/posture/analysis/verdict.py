@@ -198,7 +198,7 @@ def _better_objective(impact: ResolvedImpact, outcome: Outcome, jumps: tuple[Jum
 
 
 def _other_joint_model(impact: ResolvedImpact, before: Evaluation, after: Evaluation) -> Iterator[str]:
-    """Yield the change of the jump with each joint model that is more accurate at x than the chosen one."""
+    """Yield the change of the jump for each joint model that is more accurate than the chosen joint model."""
     chosen, compression = impact.robot.joint_model, after.compression
     if compression is None or compression.x is None or chosen in (compression.fitting, "locked", "elastic"):
         return

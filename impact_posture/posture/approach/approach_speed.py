@@ -13,7 +13,7 @@ from impact_posture.posture.approach.attainable_speed import FASTEST, Attainable
 from impact_posture.posture.constraints.constraint import Constraint, LiftedRows, Linearization, digest
 from impact_posture.system.arrays import Array
 
-# Price of a missing m/s in the search for conflicts, lower than the price of a meter.
+# Price of 1 m/s of missing speed in the search for conflicts.  This price is lower than the price of a meter.
 _PRICE = 1e-3
 
 
@@ -55,7 +55,7 @@ class ApproachSpeed(Constraint):
 
     def evaluate(self, model: Numeric) -> tuple[Array, Array]:
         attained = self._attainable.at(model)
-        # An unbounded speed is replaced by twice the required speed, so that the row stays finite.
+        # If the attainable speed is unbounded, use twice the required speed, so that the row stays finite.
         speed = attained.speed if np.isfinite(attained.speed) else 2 * self._speed
         return np.array([self._speed - speed]), -attained.gradient[None, :]
 

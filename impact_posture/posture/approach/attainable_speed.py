@@ -150,7 +150,7 @@ class AttainableSpeed:
 
     @property
     def arrives(self) -> Array:
-        """1 for rows of the approach and 0 for other rows, shape (m,)."""
+        """Vector with 1 for rows of the approach and 0 for other rows, shape (m,)."""
         return np.concatenate([point.arrives for point in self.points])
 
     def jacobian(self, model: Numeric) -> Array:
@@ -159,7 +159,7 @@ class AttainableSpeed:
         return np.asarray(rows[:, self.free] * self.scale)
 
     def by_posture(self, model: Numeric, velocities: Array, weights: Array) -> Array:
-        """Return the tangent gradient, shape (nv,), of the sum of the rows weighted by ``weights``, shape (m,)."""
+        """Return the tangent gradient, shape (nv,), of the sum of all rows, weighted by ``weights``, shape (m,)."""
         v = np.zeros(model.model.nv)
         v[self.free] = self.scale * velocities
         gradient = np.zeros(len(v))

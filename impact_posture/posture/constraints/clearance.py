@@ -1,4 +1,4 @@
-"""The constraint of a least distance between bodies: the links, the surface, the ground and obstacles."""
+"""The constraint that the distances between links, surface, ground and obstacles exceed the clearance."""
 
 from __future__ import annotations
 
@@ -109,9 +109,9 @@ class Clearance(Constraint):
         return closest
 
     def grown(self, model: Numeric, auxiliaries: Array | None = None) -> Self:
-        """Add violated pairs, or more corners of them.
+        """Add violated pairs, or further corners of pairs that are already in the program.
 
-        If the slack of a pair is more than half of its violation, more corners are not needed.
+        If the slack of a pair exceeds half of the violation of the pair, no corners are added for this pair.
         """
         values, active = self.value(model), dict(self.active)
         unknowns = {} if auxiliaries is None else self._unknowns(auxiliaries)

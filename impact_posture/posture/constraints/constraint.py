@@ -34,10 +34,10 @@ class LiftedRows:
     """A constraint in the unknowns of the program: ``lower ≤ g(q, z) ≤ upper`` with the auxiliaries z.
 
     Attributes:
-        rows: ``g(q, z)``, shape (m, 1).
-        variables: ``z``, shape (k, 1).
+        rows: Expression ``g(q, z)``, shape (m, 1).
+        variables: Symbols of the auxiliaries ``z``, shape (k, 1).
         slack: Sum of the auxiliaries that relax rows, m; the program minimizes this sum to zero.
-        sides: Further rows that depend on ``z`` only, not on ``q``.
+        sides: Further rows that depend only on the auxiliaries ``z``, not on ``q``, shape (p, 1).
         pieces: Pieces of a constraint to which parts can be added; the expression ``rows`` of each piece is then
             reused.
     """
@@ -65,10 +65,10 @@ class Linearization:
 
     Attributes:
         names: Name of each row.
-        value: ``g(q, z)``, shape (m,).
-        lower, upper: Bounds, shape (m,).
+        value: Value of ``g(q, z)``, shape (m,).
+        lower, upper: Bounds of the rows, shape (m,).
         posture: Tangent Jacobian ``∂g/∂q``, shape (m, nv).
-        auxiliary: ``∂g/∂z``, shape (m, k).
+        auxiliary: Jacobian ``∂g/∂z`` with respect to the auxiliaries, shape (m, k).
     """
 
     names: list[str]
@@ -85,7 +85,7 @@ class Linearization:
 
     @staticmethod
     def joined(parts: Sequence[Linearization], nv: int) -> Linearization:
-        """Join the rows of parts whose auxiliaries are separate."""
+        """Join the rows of several linearizations, each with its own auxiliaries."""
         # Leave out empty parts.  Most parts are empty, because most postures are far from most bounds.
         parts = [part for part in parts if part.names or part.auxiliary.shape[1]]
         if len(parts) == 1:
@@ -116,8 +116,8 @@ class Constraint(ABC):
         projected: Whether starts are projected onto the constraint; otherwise only the program enforces it.
         grows: Whether :meth:`grown` is likely to add parts to the program.
         by_row: Whether a conflict is reported for each row instead of for the whole constraint.
-        price: Price of a violation in the search for conflicts.  If constraints conflict, the constraint with the
-            lowest price is violated and therefore reported.
+        price: Price per unit of violation in the search for conflicts.  If constraints conflict, the constraint with
+            the lowest price is violated and therefore reported.
     """
 
     name: str

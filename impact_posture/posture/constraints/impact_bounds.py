@@ -1,9 +1,9 @@
 """Bounds on the peak force of an impact and on the velocity jump of each joint.
 
-Without friction the jump is ``Δν = a (1+e) v/G`` with ``a = M⁻¹Jᵀn`` and ``G = nᵀJa``, and the peak force decreases
-as G increases (:mod:`impact_posture.impact.elasticity.contact_compression`).  A joint controller with the velocity
-gain ``K_d`` responds to the jump with the torque ``K_d Δν``.  A bound on the torque ``K_d Δν`` is therefore a bound
-on the jump (Wang et al. 2020, arXiv:2006.01987).
+Without friction, the velocity jump of the joints is ``Δν = a (1+e) v/G`` with ``a = M⁻¹Jᵀn`` and ``G = nᵀJa``, and
+the peak force decreases as G increases (:mod:`impact_posture.impact.elasticity.contact_compression`).  A joint
+controller with the velocity gain ``K_d`` responds to the jump with the torque ``K_d Δν``.  A bound on the torque
+``K_d Δν`` is therefore a bound on the jump (Wang et al. 2020, arXiv:2006.01987).
 """
 
 from __future__ import annotations

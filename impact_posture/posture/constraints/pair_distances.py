@@ -15,9 +15,10 @@ from impact_posture.system.arrays import Array
 class PairDistances:
     """Distances minus the clearance of pairs of bodies, at one posture after another.
 
-    Three lower bounds, fast to compute, show that most pairs do not touch: the distance of balls around the bodies,
-    the last exact distance minus the motion of the bodies since then, and the gap between the hulls along two
-    directions.  The values at the last posture are stored, because a search evaluates a posture several times.
+    Most pairs are far from each other, which three fast lower bounds show.  The first is the distance of balls around
+    the bodies.  The second is the last exact distance minus the motion of the bodies since then.  The third is the
+    gap between the hulls along two directions.  The values at the last posture are stored, because a search evaluates
+    a posture several times.
     """
 
     def __init__(self, pairs: Sequence[SeparatingPlane]) -> None:
@@ -132,7 +133,7 @@ class PairDistances:
 
 
 def _corners(body: ConvexBody) -> Array:
-    """Return the corners of a hull relative to its center in the turning axes; the origin for a half-space."""
+    """Return the corners of a hull relative to its center, or the origin for a half-space."""
     if body.hull is None:
         return np.zeros((1, 3))
     corners = body.hull.vertices - body.hull.center

@@ -19,8 +19,8 @@ def distance_squared(chart: Chart, q: Any, reference: Any) -> Any:
     """Return the squared distance of two configurations (``SX`` or ``DM``), about ``‖q ⊖ reference‖²`` in rad and m.
 
     The distance is smooth everywhere.  A turn by Δ of a base, a ball joint or a continuous joint adds ``4 sin²(Δ/2) =
-    4 (1 − (quaternion·quaternion)²) = 2 (1 − cos Δ)``.  Each other joint or coordinate of a position that changes by
-    Δ adds Δ².
+    4 (1 − (quaternion·quaternion)²) = 2 (1 − cos Δ)``.  For other joints and for position coordinates, a change by Δ
+    adds Δ².
     """
     parts = []
     for slot in chart.slots:

@@ -43,8 +43,8 @@ class Requirements:
             requirement.
         collision: Whether the links must not touch each other, the surface, the ground or the obstacles.
         clearance: Least distance between links, surface, ground and obstacles if ``collision`` is set, m.
-        surface: ``plane``, ``none``, or the edge length of a square patch in m; ``None`` for a choice that suits the
-            robot.
+        surface: Shape of the surface: ``plane``, ``none``, or the edge length of a square patch, m; if ``None``, the
+            plane or a patch is chosen for the robot.
         limit_margin: Least distance of the joint positions from their limits, rad or m.
         regularization: Weight of the squared distance from the initial posture, relative to the initial objective.
     """

@@ -43,8 +43,7 @@ _UNIT = 0.02
 # The tangent of the tilt angle is this value.
 _TILT = 0.5
 _AROUND = np.array([[0.0, 0.0], *[[np.cos(a), np.sin(a)] for a in np.arange(8) * np.pi / 4]])
-# A plane separates two bodies if it cuts less than this (m) into a body. This limit is half the tolerance of the
-# certificate.
+# A plane separates two bodies if it cuts less than this (m) into a body. The certificate accepts twice this value.
 _KEPT = 5e-9
 # If a corner is farther than this, m, from the plane, its row is inactive and therefore left out of the
 # linearization.
@@ -58,7 +57,7 @@ class ConvexBody:
     Attributes:
         hull: Corners and sweep radius in the axes of ``point``; ``None`` for the half-space behind a plane.
         point: Point and axes to which the body is fixed; the joint with index 0 is the world.
-        turns: Whether the body turns with the link; otherwise it keeps world axes.
+        turns: Whether the body turns with the link; otherwise its axes stay parallel to the world axes.
         normal: Unit normal out of the half-space, in the axes of ``point``, shape (3,).
         offset: Offset of the boundary plane ``{y: normal·y = offset}`` of the half-space, m.
     """
@@ -117,7 +116,7 @@ class Corners(NamedTuple):
 
 
 class SeparatingPlane:
-    """The rows and unknowns of the plane that keeps a swept hull ``a`` clear of a swept hull or half-space ``b``.
+    """The rows and unknowns of a plane that separates a swept hull ``a`` from a swept hull or half-space ``b``.
 
     ``margin`` is the clearance δ, m.
     """

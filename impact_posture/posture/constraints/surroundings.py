@@ -85,11 +85,12 @@ class Surroundings:
         """Put the surface behind a contact: the whole plane, or a square patch of it.
 
         The plane passes through the contact point, unless the contact link or a link fixed to it extends behind this
-        plane at the given posture.  If one extends behind it, the plane is moved back to the deepest point of these
-        links.  The contact link and the links fixed to it may touch the surface.  A link may also touch the surface
-        if its own contact lies in the plane, such as a foot next to the struck foot, or at the same surface, such as
-        the other hand at a wall.  If a foot or a fixed base lies behind the plane, the surface must end before this
-        body, so a patch is used instead of the plane.
+        plane at the given posture.  If a link extends behind the plane, the plane is moved back to the deepest point
+        of the contact link and the links fixed to it.  The contact link and the links fixed to it may touch the
+        surface.  Other links may touch the surface if their own contacts lie in the plane, for example a foot next to
+        the struck foot.  This also applies to contacts at the same surface, for example the other hand at a wall.  If
+        a foot or a fixed base lies behind the plane, the surface must end before this body, so a patch is used
+        instead of the plane.
 
         ``width`` is the edge length of the patch, m; infinite for the plane.  If ``width`` is ``None``, the plane is
         used unless a fixed body lies behind the plane.  ``feet`` are the contact points of the feet.  ``contacts``

@@ -20,8 +20,8 @@ def impact_constraints(
     """Return the bounds on the impact and the constraints on the feet for all model variants.
 
     Friction cones are convex.  If the feet stay in place for an impact at each single contact, they therefore stay
-    for impacts at all contacts at the same time.  A payload moves the center of mass, so its constraint (among
-    ``constraints``) is repeated for each model with a payload.
+    for impacts at all contacts at the same time.  A payload moves the center of mass.  The constraint on the center
+    of mass, if ``constraints`` contains it, is therefore repeated for each model with a payload.
 
     Raises:
         InputError: The feet must stay in place, but the contacts can also pull.

@@ -42,8 +42,8 @@ def fix_undetermined_motions(
 
     Some motions of the whole robot, such as translations, do not change the objective.  If the constraints allow a
     motion that does not change the objective, this motion of the base is fixed.  If the contact pose is free and the
-    robot has no feet, yaw is fixed as well, because a turn of the whole robot relative to the impact does not change
-    the posture.
+    robot has no feet, yaw is fixed as well.  A turn of the whole robot relative to the impact would not change the
+    posture.
     """
     if not robot.floating:
         return [], []
@@ -60,7 +60,7 @@ def fix_undetermined_motions(
     notes: list[str] = []
 
     def free() -> Array:
-        """Return base twists that are still allowed, world axes, shape (6, k)."""
+        """Return the base twists that the constraints still allow, in world axes, shape (6, k)."""
         rows = [c.evaluate(numeric)[1] @ motions for c in (*constraints, *added)]
         if not rows:
             return np.asarray(numeric.jacobian(base) @ motions)

@@ -28,8 +28,8 @@ class Distribution:
     Attributes:
         forces: Vector ``z`` of the forces of rotors and feet, in units of the robot's weight, shape (k,).
         shares: Signed share of its limit that each actuator uses, 0 in the middle of its range, shape (actuators,).
-        unbalanced: Sum of the absolute entries of the unbalanced wrench on the base, with forces in units of the
-            robot's weight and moments in units of weight times 1 m; zero if the base is balanced.
+        unbalanced: Sum of the absolute entries of the unbalanced wrench on the base; zero if the base is balanced.
+            Forces are in units of the robot's weight, moments in units of the weight times 1 m.
         jacobian: Tangent Jacobian of ``unbalanced`` and the absolute shares, shape (1 + actuators, nv).  If the
             forces can be chosen, only the rows of the largest share or of ``unbalanced`` are computed.
     """
@@ -60,7 +60,7 @@ class Thrusts:
 
 
 class Equilibrium:
-    """Equations of a robot at rest: rows ``R τ(q, z) + r`` of the base balance (= 0), then of shares of limits.
+    """Rows ``R τ(q, z) + r`` for a robot at rest: first the balance of the base (= 0), then shares of limits.
 
     A share is 0 in the middle of the range of an actuator, and ±1 at its limits.
 

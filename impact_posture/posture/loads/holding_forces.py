@@ -35,8 +35,8 @@ class HoldingForces:
     Attributes:
         load: Name of the load, such as ``at rest``.
         feasible: Whether the robot can hold the posture under this load.
-        unbalanced: Sum of the absolute entries of the unbalanced wrench on the base, with forces in units of the
-            robot's weight and moments in units of weight times 1 m.
+        unbalanced: Sum of the absolute entries of the unbalanced wrench on the base.  Forces are in units of the
+            robot's weight, moments in units of the weight times 1 m.
         actuators: Load of each actuator with known limits.
         contact_forces: Force of the ground on each foot, world axes, N.
         other_loads: Holding forces for the other load cases: with the force ``hold_force`` and with payloads.

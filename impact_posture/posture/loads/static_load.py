@@ -1,8 +1,9 @@
 """Joint torques of a robot at rest, as a CasADi expression and as numbers from Pinocchio.
 
 A robot at rest under gravity satisfies ``τ = h(q) − Σ J_kᵀ w_k``, with the generalized gravity ``h`` and the wrenches
-``w_k = W_k z_k + p_k`` of rotors, feet and pushes on the robot.  ``τ`` is dual to ``ν``.  For a floating base, the
-first six entries of ``τ`` are the unbalanced wrench on the base, which no actuator can produce.
+``w_k = W_k z_k + p_k`` of rotors, feet and pushes on the robot.  The generalized force ``τ`` is dual to the
+generalized velocity ``ν``.  For a floating base, the first six entries of ``τ`` are the unbalanced wrench on the
+base, which no actuator can produce.
 """
 
 from __future__ import annotations
@@ -69,7 +70,7 @@ class StaticLoad:
 
     @property
     def count(self) -> int:
-        """Number of entries of z."""
+        """Number of entries of the force vector ``z``."""
         return len(self.lower)
 
     @property
@@ -82,7 +83,7 @@ class StaticLoad:
         return parts
 
     def split(self, z: Array) -> list[Array]:
-        """Split z by source."""
+        """Split the vector ``z`` into one part for each source."""
         return np.split(z, self._parts[1:-1]) if self.sources else []
 
     def symbolic(self, tree: Tree, z: ca.SX) -> ca.SX:

@@ -36,7 +36,7 @@ class Projection:
 
 
 class Projector:
-    """Levenberg–Marquardt projection onto the constraints with ``projected``; held joints do not move."""
+    """Levenberg–Marquardt projection onto all constraints whose ``projected`` is true; held joints do not move."""
 
     def __init__(self, problem: ConstrainedProblem) -> None:
         self.problem = problem

@@ -20,8 +20,8 @@ from impact_posture.system.arrays import Array, null_space
 # Only an inequality closer to its bound than this (m, rad) can have a multiplier.
 _ACTIVE = 1e-3
 # A member of a maximum is included if its value is below the maximum by at most this share of f₀.  The tolerance of
-# the solver is also a share of f₀.  This tolerance is large relative to the objective if the objective decreased by
-# orders of magnitude.  The tolerance of complementarity is twice this share.
+# the solver is also relative to the initial objective f₀.  If the objective decreased by orders of magnitude, this
+# tolerance is large relative to the objective.  The tolerance of complementarity is twice this share.
 _TIED = 5e-8
 # Weight of complementarity relative to stationarity; it equals the ratio of their tolerances.
 _COMPLEMENTARITY = 10.0
@@ -49,9 +49,9 @@ class Certificate:
     """First-order optimality and feasibility at one posture, computed independently of the solver.
 
     Attributes:
-        stationarity: ``‖∇f/f₀ + Aᵀλ‖_∞`` in the tangent space, with the objective f, its initial value f₀, and the
-            Jacobian A of constraints and limits.  The multipliers λ have the right signs and are computed by least
-            squares.
+        stationarity: Residual ``‖∇f/f₀ + Aᵀλ‖_∞`` in the tangent space.  Here f is the objective, f₀ its initial
+            value, and A the Jacobian of constraints and limits.  The multipliers λ have the right signs and are
+            computed by least squares.
         primal: Largest violation of a constraint or joint limit, or error of the norm of a quaternion (m, rad).
         complementarity: Largest product of a multiplier and the distance of its constraint from the bound.
         pose_error_m: Largest position error of a frame whose position is constrained, m.
@@ -153,7 +153,7 @@ def objective_gradients(problem: ConstrainedProblem, q: Array, scale: float) -> 
 
 @dataclass(frozen=True, eq=False)
 class _NearBound:
-    """A bound close to the value of its row, with the outward gradient of the row and the distance ``slack``."""
+    """A bound of an inequality that is close to its bound: outward gradient and distance ``slack`` to the bound."""
 
     name: str
     side: str
@@ -209,8 +209,8 @@ def _multipliers(gradients: Array, equalities: Array, near: Sequence[_NearBound]
         right = np.concatenate([-reduced[0], np.zeros(len(near))])
         multipliers = nonnegative_least_squares(np.vstack([bounds.T, slack]), right)
         return np.ones(1), multipliers, free @ (reduced[0] + bounds.T @ multipliers)
-    # An additional row requires that the weights have the sum 1.  This row changes only the scale of the solution, so
-    # the solution is divided by the sum of the weights.
+    # An additional row requires that the sum of the weights is 1.  Least squares satisfies this row only
+    # approximately, so the solution is then divided by the sum of the weights.
     left = np.vstack([reduced.T, np.zeros((len(near), count)), np.ones(count)])
     system = np.hstack([left, np.vstack([bounds.T, slack, np.zeros(len(near))])])
     solution = nonnegative_least_squares(system, np.eye(len(system))[-1])
@@ -228,7 +228,7 @@ def nonnegative_least_squares(matrix: Array, right: Array) -> Array:
     x, passive = np.zeros(matrix.shape[1]), np.zeros(matrix.shape[1], dtype=bool)
     least = 10 * max(matrix.shape) * np.finfo(float).eps * float(np.abs(matrix).sum(axis=0).max(initial=0.0))
     # Rounding errors can cause endless cycles, so the number of rounds is limited.  Three rounds per unknown are more
-    # than enough.
+    # than the algorithm normally needs.
     for _ in range(3 * len(x)):
         slope = np.where(passive, -np.inf, matrix.T @ (right - matrix @ x))
         if passive.all() or slope.max() <= least:

@@ -19,8 +19,7 @@ from impact_posture.posture.constraints.surroundings import Surroundings
 from impact_posture.robot.robot import Robot
 from impact_posture.system.arrays import Array
 
-# Tolerance of the rank: a constraint restricts a direction of the tangent space if a unit step along this direction
-# changes the constraint value by more than this.
+# Singular values of the constraint Jacobian up to this value are treated as zero when its rank is computed.
 RANK_TOLERANCE = 1e-7
 
 
@@ -78,7 +77,7 @@ class ConstrainedProblem:
         return Guess.joined([c.guess(numeric) for c in self.constraints if c.unknowns])
 
     def split(self, auxiliaries: Array) -> list[Array]:
-        """Split auxiliaries by constraint."""
+        """Split the vector of all auxiliaries into one part for each constraint."""
         ends = list(accumulate((c.unknowns for c in self.constraints), initial=0))
         return [auxiliaries[start:stop] for start, stop in pairwise(ends)]
 

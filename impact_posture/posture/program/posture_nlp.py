@@ -50,8 +50,9 @@ class WarmStart:
 class SolveRecord:
     """Result of one run of the solver: posture, status and iterations of IPOPT, and wall time of the call.
 
-    ``auxiliaries`` are the final auxiliaries of the constraints, shape (k,).  ``minimized`` is the final value of the
-    function that the solver minimizes, in units of the scale.  ``end`` contains all values that a warm start needs.
+    ``auxiliaries`` are the final values of the auxiliary unknowns of the constraints, shape (k,).  ``minimized`` is
+    the final value of the function that the solver minimizes, in units of the scale.  ``end`` contains all values
+    that a warm start needs.
     """
 
     q: Array

@@ -65,15 +65,16 @@ class Program:
         if not problem.grows:
             return symbols, {}
         joint = joined(self.fixed, self.rows.derivatives(rows), self.chart.nx)
-        # The rows of ``joint`` are the value, the norms, the rows of the objective, and the rows of the constraints.
-        # In ``g``, the rows of the constraints come directly after the norms.
+        # The rows of ``joint`` are, in this order, the objective value, the quaternion norms, the rows of the
+        # objective, and the rows of the constraints. In ``g``, the rows of the constraints come directly after the
+        # norms.
         norms, count, fixed = self.rows.norms.numel(), rows.rows.numel(), self.fixed.multipliers.numel()
         order = [*range(1, 1 + norms), *range(fixed, fixed + count), *range(1 + norms, fixed)]
         return symbols, joint.reordered(order).options(x, self.parameters, joint.multipliers[0], g)
 
     @cached_property
     def fixed(self) -> Derivatives:
-        """Derivatives of the value, the norms and the rows of the objective, which never change."""
+        """Derivatives of the objective value, quaternion norms and rows of the objective, which never change."""
         objective, nx, norms = self.lifted, self.chart.nx, self.rows.norms
         rows = ca.vertcat(self.value, norms, objective.rest, objective.inequalities)
         derivatives = Derivatives.of(rows, ca.vertcat(self.rows.x, objective.variables))

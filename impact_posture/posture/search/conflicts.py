@@ -23,7 +23,7 @@ _KEPT = 1e-6
 # Price of a meter of slack of bodies, lower than the price 1 of a violated pose.  If a body blocks a pose, the body
 # is therefore reported as the conflict, not the pose.
 _SLACK_PRICE = 0.03
-# Price of the squared distance from the given posture, which makes the solution unique.
+# Price of the squared distance from the given posture.  This term makes the solution unique.
 _AWAY_PRICE = 1e-6
 # Maximum number of starts, and of random postures from which the starts are chosen. Starts far from all bodies often
 # lead to a feasible posture when 24 arbitrary ones do not.

@@ -32,11 +32,11 @@ _ROUNDS = 10
 # If all starts together have at most this many unknowns, every start is finished, because stopping some would save no
 # time.
 _SMALL = 1000
-# These numbers apply unless all starts are finished: the unknowns of all starts that continue together, the least
-# number of these starts, and the share above the best objective from which a start is dominated.  If more starts
-# continued together, the program would get parts that the best starts do not need.  If fewer starts continued
-# together, the program would be built more often.  The share is large because a run after a trap may end below the
-# bound of its start.
+# Used unless all starts are finished.  The first number limits the unknowns of all starts that continue together; the
+# second is the least number of these starts.  A start is dominated if its objective exceeds the best by the third
+# number, a share.  If more starts continued together, the program would get parts that the best starts do not need.
+# If fewer starts continued together, the program would be built more often.  The share is large because a run after a
+# trap may end below the bound of its start.
 _BATCH, _LEAST, _FAR = 600, 2, 0.05
 # Starting processes takes as long as runs with this many unknowns in total.
 _FORK = 200
@@ -54,13 +54,13 @@ class SolverRun:
 
     Attributes:
         start: Posture from which the run starts, shape (nq,); ``None`` if no attempt reached the constraints.
-        record: Result of the solver; ``None`` if the objective is not defined at the end of the run.
+        record: Result of the solver; ``None`` if the objective is not defined at the final posture.
         objective: Objective at the final posture.
         minimized: Objective divided by the initial objective, plus the regularization.
         certificate: Certificate of the final posture; ``None`` while the program lacks parts.
         lacks: Whether the program lacks parts that the final posture needs.
         dominated: Whether the start was stopped after this run because it could not become the best.
-        trapped: Whether the final posture violates a constraint although the program lacks no parts, or because slack
+        trapped: Whether the final posture violates a constraint although no parts are missing, or because slack
             lowers the objective by more than its price.  A trapped run is repeated at a higher price of slack.
         time_s: Wall time of all runs from the start, s; the time of a run for several starts is divided equally among
             them.
@@ -136,8 +136,8 @@ class GrowingSearch:
         """Run all starts; if the program lacks rows at a final posture, run again from this posture.
 
         The objective at such a final posture is a lower bound for the start, because additional rows raise the
-        objective.  Starts with the lowest bounds continue first, and starts with bounds well above a certified end do
-        not continue.
+        objective.  Starts with the lowest bounds continue first.  Starts whose bounds are well above the objective of
+        a certified posture do not continue.
         """
         runs: dict[int, SolverRun] = {}
         starts, best = self._draws.count, np.inf
@@ -195,7 +195,7 @@ class GrowingSearch:
     def _next(self, waiting: list[int], runs: dict[int, SolverRun]) -> list[int]:
         """Return the indices of the starts that run next."""
         if not runs and self.problem.grows:
-            # Most starts lack the same rows as the first starts.
+            # Run the first starts alone, because most other starts need the same additional rows.
             return waiting[:FIRST]
         if self._small and len(runs) == FIRST and waiting[0] < FIRST:
             # In a small program, additional rows slow down the other starts by less than the time of another run.
@@ -254,7 +254,7 @@ class GrowingSearch:
                 record, certificate = run_start(nlp, start, scale, price, record)
             objective = problem.objective.value(record.q)
         except MetricError:
-            # The objective is not defined at the final posture of this start.  This start ends without a result, and
+            # The objective is not defined at the final posture of the run.  This start ends without a result, and
             # the other starts continue.
             return SolverRun(start)
         minimized = objective / scale

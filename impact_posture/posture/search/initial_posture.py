@@ -15,7 +15,7 @@ from impact_posture.posture.search.conflicts import ElasticProgram, find_conflic
 from impact_posture.posture.search.growing_search import feasible
 from impact_posture.system.arrays import Array
 
-# With this value as ``beside``, :func:`find_conflicts` stops after a few starts if a conflict remains.
+# If ``beside`` has this small value, :func:`find_conflicts` stops after a few starts when a conflict remains.
 _QUICK = 1e-9
 
 
