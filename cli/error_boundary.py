@@ -31,10 +31,10 @@ def run(command: Any, arguments: Sequence[str]) -> int:
     """Run a Typer command and return its exit code.
 
     The exit code is 0 after success, 1 after an error, 2 for a wrong command line, and 130 after Ctrl-C.  Some errors
-    have their own exit code.  An error is written as one line to standard error.  With ``--json``, it is also written
-    as ``{"error": {code, kind, what, where, hint}}`` to standard output.
+    have their own exit code.  An error is written as one line to standard error.  With ``--json``, the error is also
+    written as ``{"error": {code, kind, what, where, hint}}`` to standard output.
     """
-    # Matplotlib logs a warning if it cannot write to the folder of its cache.  Users need not see this warning.
+    # Hide the warning that Matplotlib logs if it cannot write to the folder of its cache.
     logging.getLogger("matplotlib").setLevel(logging.ERROR)
     for stream in (sys.stdout, sys.stderr):
         if hasattr(stream, "reconfigure"):
@@ -44,7 +44,7 @@ def run(command: Any, arguments: Sequence[str]) -> int:
     try:
         with warnings.catch_warnings():
             if not os.environ.get(DEBUG_VARIABLE):
-                # Ignore warnings of libraries, for example of an overflow in NumPy. The results are checked anyway.
+                # Ignore warnings of libraries, for example of an overflow in NumPy, because all results are checked.
                 warnings.simplefilter("ignore")
             code = command.main(args=list(arguments), prog_name="impact-posture", standalone_mode=False)
         sys.stdout.flush()
@@ -58,7 +58,7 @@ def run(command: Any, arguments: Sequence[str]) -> int:
         return error.code if isinstance(error.code, int) else 1
     except Exception as error:
         if isinstance(error, BrokenPipeError) or getattr(error, "errno", None) == errno.EPIPE:
-            # The reader has closed the pipe, for example ``| head``. This is not reported as an error.
+            # If the reader has closed the pipe, for example ``| head``, end without an error message.
             _discard_output()
             return 1
         if os.environ.get(DEBUG_VARIABLE):

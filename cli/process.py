@@ -12,7 +12,7 @@ from typing import NoReturn
 
 _WORDS = {signal.SIGINT: "interrupted", signal.SIGTERM: "terminated", signal.SIGHUP: "the terminal was closed"}
 _SEEN: list[int] = []
-# Least limit on the address space, bytes.  With less, OpenBLAS may wait forever for memory while SciPy is imported.
+# Below this limit on the address space, bytes, OpenBLAS may wait forever for memory while SciPy is imported.
 _LEAST_MEMORY = 1 << 30
 
 

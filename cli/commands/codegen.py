@@ -101,7 +101,8 @@ def codegen(
 def _check_problem(typed: TypedSettings, robot: str) -> None:
     """Check that a contact is given.
 
-    If no contact is given and ``robot`` is a folder, the user means a result folder. The error then names its fault.
+    If no contact is given and ``robot`` is a folder, the user means a result folder. The error then says what is
+    wrong with this folder.
     """
     if not {"contact", "normal"} & typed.values.keys() and (os.path.isdir(robot) or robot.endswith(os.sep)):
         from impact_posture.output.result_reader import load_view

@@ -79,7 +79,7 @@ class CompiledController:
 
         Args:
             path: The folder of the export, or its ``<prefix>.json``.
-            robot: The robot; the export must have been made for this model.  With ``None``, this is not checked.
+            robot: The robot for which the export must have been made; ``None`` skips this check.
 
         Raises:
             SpecError: The export is missing or broken.
@@ -128,7 +128,8 @@ class CompiledController:
         if code == 3:
             raise ContactError("the sole stands on its edge", where="contact", hint="put the sole on the ground")
         if code:
-            raise MetricError("the objective vanishes with its curvature", where="reset", hint="start elsewhere")
+            what = "the objective and its curvature are zero or do not exist"
+            raise MetricError(what, where="reset", hint="start at another posture")
         self._ready = True
         return self._commanded()
 
@@ -258,18 +259,19 @@ class CompiledController:
         """Switch the impact-robust term on, or start the reference flow, at the first tick from the time ``t`` on.
 
         Args:
-            t: Time of the switch, in the time of the ticks, s; by default, the next tick.
-            t_impact: Time from ``t`` to the impact, s, if it is known.  A reference flow then comes to rest before
-                the impact.
+            t: Time of the switch, s, measured like the times of ticks; by default, the time of the next tick.
+            t_impact: Time from ``t`` to the impact, s, before which a reference flow comes to rest; ``None`` if the
+                time is unknown.
 
         Raises:
-            InputError: This phase cannot follow the present phase, ``t`` is before the time of a waiting phase, or
-                ``t_impact`` is given but not finite, or given to a controller without a flow.
+            InputError: This phase cannot follow the present phase, or ``t`` is before the time of a waiting phase.
+                Also raised if ``t_impact`` is given and is not finite, or if the controller has no flow.
         """
         if t_impact is None:
             self._enter("brace", t)
         elif not math.isfinite(t_impact) or "brace_before" not in self._functions:
-            raise InputError("no flow can rest before this time", where="brace", hint="give finite seconds")
+            what = "t_impact is not finite, or the controller has no reference flow"
+            raise InputError(what, where="brace", hint="give finite seconds, or leave out t_impact")
         else:
             self._enter("brace_before", t, t_impact)
 

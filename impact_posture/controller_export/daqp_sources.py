@@ -32,8 +32,8 @@ FILES = {
 }
 # Largest permitted size of a file, bytes.
 _LARGEST = 1 << 20
-# Small build backend that gives pip the metadata that it always requires.  Otherwise, pip would install the real
-# backend and run the code of the distribution, which takes minutes.
+# Small build backend that gives pip the metadata that pip always requires.  Without this backend, pip would install
+# the real backend and run the code of the distribution, which takes minutes.
 _BACKEND = f"""
 import pathlib
 def prepare_metadata_for_build_wheel(folder, settings=None):

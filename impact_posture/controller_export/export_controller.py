@@ -62,7 +62,7 @@ class ControllerExport(WrittenCode):
         }
 
     def load(self) -> CompiledController:
-        """Load the library, which runs its code.  If the library is missing, build it first."""
+        """Load the library, which runs its code.  If the library is missing, build the library first."""
         return CompiledController.load(self.out, robot=self.robot)
 
 

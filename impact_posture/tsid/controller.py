@@ -27,7 +27,7 @@ from impact_posture.tsid.tasks.task import Task
 
 # Limit on the time step of ramps, in periods, for a tick after a long pause.
 _LONGEST = 10
-# From this nv on, LAPACK transforms a dense cost (:class:`WhitenedSolver`).  On a quadruped, this saves no time.
+# From this nv on, LAPACK transforms a dense cost (:class:`WhitenedSolver`).  With smaller nv, LAPACK saves no time.
 _LARGE = 20
 # Largest sum of squares of a valid measurement (1e8 m, rad/s or N).
 _ABSURD = 1e16
@@ -57,7 +57,7 @@ class Status(Enum):
 
 @dataclass(frozen=True, slots=True, eq=False)
 class Command:
-    """Command for the motors.  The controller does not change its arrays later.
+    """Command for the motors, in arrays that the controller does not change later.
 
     Attributes:
         u: Rotor thrusts (N), then joint torques (N·m), shape (controls,).
@@ -121,7 +121,7 @@ class Controller:
     def __init__(self, robot: Robot, formulation: TaskFormulation, *, period: Positive = 1e-3) -> None:
         """Size all buffers.
 
-        ``period``, s, is the first time step.  Later time steps are limited to a multiple of it.
+        ``period``, s, is the first time step.  Later time steps are at most a fixed multiple of ``period``.
 
         Raises:
             FrameNotFound: The frame of a task does not exist.

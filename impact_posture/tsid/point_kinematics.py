@@ -12,7 +12,7 @@ from impact_posture.config.checked import checked
 from impact_posture.robot.robot import Robot
 from impact_posture.system.arrays import Array
 
-# p @ _SHIFT is a 6 x 6 matrix with -[p]x at the upper right.  It moves a body's velocity from the origin to p.
+# p @ _SHIFT has -[p]x at the upper right; this 6 x 6 matrix moves a body's velocity from the origin to p.
 _SHIFT = np.zeros((3, 6, 6))
 _SHIFT[[2, 0, 1], [0, 1, 2], [4, 5, 3]] = 1.0
 _SHIFT[[1, 2, 0], [0, 1, 2], [5, 3, 4]] = -1.0

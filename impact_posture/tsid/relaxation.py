@@ -15,7 +15,7 @@ from impact_posture.tsid.qp.quadratic_program import EQUALITY, QP, Solved
 
 # A row whose error is below this share of its terms counts as satisfied.
 _OFF = 1e-6
-# A row that misses its bounds by more than this keeps its value.  Unit: length of the row times size of the point.
+# A row keeps its value if it misses its bounds by more than this, relative to its length times the size of the point.
 _MISSES = 1e-9
 # Largest violation of a bound that a result may have, in the unit of ``_MISSES``.
 _ROUNDING = 1e-13
@@ -71,8 +71,8 @@ def solve(assembly: Assembly, solver: DaqpSolver) -> Outcome:
         solver.reset()
         solved = solver.solve(qp)
     if solved is None and qp.finite:
-        # DAQP can call nearly dependent rows infeasible, so proximal steps decide.  They would start from the last
-        # answer in their workspace, so this workspace is new.
+        # DAQP can call nearly dependent rows infeasible, so proximal steps decide.  Proximal steps would start from
+        # the last answer in the solver's workspace, so a new solver is used.
         solved = DaqpSolver(qp.n, qp.m, proximal=_FLAT).solve(qp)
     if solved is not None or not qp.finite:
         return Outcome(solved)
@@ -86,9 +86,9 @@ def solve(assembly: Assembly, solver: DaqpSolver) -> Outcome:
 def _cheapest(qp: QP, units: Array, nearest: Array) -> Solved:
     """Minimize the cost in the directions that the lexicographic answer ``nearest`` leaves free.
 
-    Equations, and rows that miss their bounds, keep their values.  The cost is therefore minimized in their null
-    space: ``z = nearest + W y``.  In the basis ``W``, the cost is a sum of squares.  All other bounds hold.  If the
-    free motion is within rounding errors, return ``nearest``.
+    Equations, and rows that miss their bounds, keep their values.  The cost is therefore minimized in the null space
+    of these rows: ``z = nearest + W y``.  In the basis ``W``, the cost is a sum of squares.  All other bounds hold.
+    If the free motion is within rounding errors, return ``nearest``.
     """
     values, rows = qp.values(nearest), np.vstack([np.eye(qp.n), qp.A]) * units
     size, lengths = max(1.0, float(np.max(np.abs(nearest / units)))), np.linalg.norm(rows, axis=1)

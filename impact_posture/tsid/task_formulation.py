@@ -36,7 +36,7 @@ class TaskFormulation:
         contacts: Contacts with the ground.
         force_point: Point where a measured contact force acts; with ``None``, the dynamics ignore measured forces.
         law: Law that stops joints at their limits; with ``None``, the accelerations are unlimited.
-        row_limits: Limits for expected impacts.  Like joint limits, they are relaxed if they cannot hold.
+        row_limits: Limits for expected impacts; like joint limits, these limits are relaxed if they cannot hold.
         force_weight: Weight of contact forces in the cost, 1/N².  The weight of moments is a hundred times as large,
             1/(N·m)².
         spare_weight: Weight of the thrusts in the null space of redundant rotors, 1/N².
@@ -88,7 +88,7 @@ def aerial_formulation(
     """Return the stack of Afifi et al. 2026 for an aerial manipulator: tilt, then end effector, then posture.
 
     Args:
-        robot: The robot.  Its default contact frame is the end effector.
+        robot: The robot, whose default contact frame is the end effector.
         posture: Nominal posture task (:class:`JointPosture`), or an impact-robust posture task.
         end_effector: Task of the end effector; by default, a pose task with ``kp = 60``.  A measured force acts at
             the point of this task.
@@ -146,7 +146,7 @@ def legged_formulation(
     The tasks, which the contacts constrain, are: center of mass, base orientation, posture.
 
     Args:
-        robot: The robot.  It stands on the supports of its ``robot.toml``.
+        robot: The robot, which stands on the supports of its ``robot.toml``.
         posture: Nominal or impact-robust posture task.
         kp: Stiffness of center of mass and base orientation, 1/s².
         friction: Coulomb coefficient of the ground.

@@ -302,5 +302,5 @@ def test_two_contexts_of_a_library_do_not_disturb_each_other() -> None:
     other.reset(q + 0.1, v + 0.1)
     other.tick(0.0, q - 0.1, v)
     assert np.array_equal(one.tick(0.0, q, v).u, first.u)
-    with pytest.raises(InputError, match="no flow"):
+    with pytest.raises(InputError, match="no reference flow"):
         one.brace(t_impact=1.0)

@@ -478,5 +478,5 @@ def test_a_brace_needs_a_finite_time_and_a_reset() -> None:
 
 @pytest.mark.parametrize(("value", "slope"), [(0.0, 0.0), (1.0, np.nan)])
 def test_a_flow_does_not_start_without_an_objective(value: float, slope: float) -> None:
-    with pytest.raises(MetricError, match="start elsewhere"):
+    with pytest.raises(MetricError, match="start at another posture"):
         flying(lambda q: (value, np.full(robot("tilthex_arm").nv, slope)))

@@ -40,7 +40,7 @@ _PositiveShare = Annotated[float, Demand(lambda value: 0 < value <= 1, "a number
 @checked
 @dataclass(frozen=True)
 class FlowOptions:
-    """Parameters of the reference flow.  The defaults suit every robot.
+    """Parameters of the reference flow, whose defaults suit every robot.
 
     Attributes:
         speed: Largest speed ``v`` of an entry of ``q_r``, rad/s (m/s).
@@ -90,7 +90,7 @@ class FlowDirection:
         B: Estimated curvature of ``H/H₀`` on the constraints, shape (nv, nv).
         T: Estimated slope of the static controls (:class:`StaticControls`), shape (controls, nv).
         gain: Predicted decrease of ``H/H₀`` by the last step; limited to the first-order prediction.
-        failures: Number of steps for which the solver failed.  These steps are zero.
+        failures: Number of steps for which the solver failed; each of these steps is zero.
     """
 
     def __init__(self, robot: Robot, edges: Array, controls: int, options: FlowOptions) -> None:

@@ -13,8 +13,8 @@ from impact_posture.tsid.flow.zero_moment_point import ZeroMomentPoint
 
 # Number of attempts per candidate: first unchanged, then twice without the part that crosses limits.
 _ATTEMPTS = 3
-# Least share of the acceleration that is assumed to be available for braking.  Also the largest increase of this
-# share by one change.
+# Least share of the acceleration that is assumed to be available for braking.  One change can increase the assumed
+# share by at most the same value.
 _ABLE = 0.1
 # Safety factor of the braking time, because the slopes of the limits change during braking.
 _CAUTION = 1.5
@@ -79,7 +79,7 @@ class FlowGovernor:
         # A deceleration of 2/5 a stops a motion with the speed √(4/5 a δ) within the step δ.
         pace = min(math.sqrt(0.8 * options.acceleration / max(np.abs(step).max(), _TINY)), _RATE)
         away = limited(pace * step, fastest) - flow
-        # This is twice the braking distance, because the curvature may increase during braking.
+        # The displacement ``stop`` is twice the braking distance, because the curvature may increase during braking.
         stop = flow * self.stopping(flow)
         fast = space.project(np.minimum(np.maximum(away, -most), most))
         for change, keeps in ((fast, True), (away, False)):

@@ -11,8 +11,8 @@ from impact_posture.tsid.flow.redundancy import Redundancy
 
 # Least squared length of a direction, which prevents a division by zero.
 _EMPTY = 1e-24
-# If the part of a direction that is orthogonal to the earlier ones is shorter, the direction is orthogonalized twice.
-# Rounding would otherwise leave it inexact.
+# If the part of a direction that is orthogonal to the earlier ones is shorter, the direction is orthogonalized twice,
+# because rounding would otherwise leave the direction inexact.
 _NEW = 0.1
 
 
@@ -21,7 +21,7 @@ class ProbeDirections:
 
     The vectors are projections of fixed directions, because the columns of the basis ``Z`` are not unique.  The
     entries of the fixed directions are the fractional parts of ``k² φ``, where φ is the golden ratio in 32 bits.
-    They are spread like random numbers and are equal, bit for bit, on every machine.
+    These entries are spread like random numbers and are equal, bit for bit, on every machine.
 
     Attributes:
         count: Number of directions in which the flow has measured.

@@ -58,7 +58,7 @@ class Redundancy:
     def back(self, rate: Array, base: int) -> Array:
         """Return a velocity, shape (nv,), that changes the constraints at ``rate``, shape (rows,).
 
-        Of all such velocities, the result has the slowest joints.  The first ``base`` entries are not joints.
+        Of all such velocities, the result has the slowest joints.  The first ``base`` entries belong to the base.
         """
         back, Z = self.inverse @ rate, self.basis
         if base:

@@ -33,8 +33,8 @@ from impact_posture.tsid.tasks.task import Task
 _STEP = 1e-4
 # Least displacement between two evaluations that is used to update the curvature estimates, rad (m).
 _MOVED = 1e-6
-# If the step towards a posture of the path is shorter, rad (m), the flow continues to the next posture.  The posture
-# is then reached, or the limits permit no closer posture.
+# If the step towards a posture of the path is shorter, rad (m), the flow continues to the next posture.  The flow has
+# then reached the posture, or the limits permit no closer posture.
 _REACHED = 0.02
 # Speed below which a flow that is off is set to rest, rad/s (m/s).
 _STILL = 1e-5
@@ -65,7 +65,7 @@ class ReferenceFlow:
         start: ``H₀``, the absolute value of ``H`` at the reset.
         on: Whether the flow may move.
         resting: Whether the flow rests, because the predicted decrease is below ε or its time is over.
-        failed: Whether the last evaluation raised an exception or was not finite.  The flow then brakes.
+        failed: Whether the last evaluation raised an exception or was not finite; the flow then brakes.
         led: Tasks that follow the flow.
         error: Errors of contacts and tasks at the last update, m and rad, then zeros for held joints.
         shares: Static controls at the last update; the actuators can hold the posture if all entries are within ±1
@@ -134,7 +134,8 @@ class ReferenceFlow:
         self.start = 1.0
         self.value, _ = self._evaluate(self.q)
         if not (np.isfinite(self.value) and self.value != 0):
-            raise MetricError("the objective vanishes or does not exist", where="reset", hint="start elsewhere")
+            what = "the objective is zero or does not exist"
+            raise MetricError(what, where="reset", hint="start at another posture")
         self.start = abs(self.value)
         self._look()
         self._probes.count = 0
@@ -272,8 +273,8 @@ class ReferenceFlow:
         fastest = options.speed * max(1.0 - error / options.tracking, 0.0)
         if self.on and not self.resting and self._visited == len(self._path):
             self._moved += period
-        # The flow keeps this speed until the next change.  The change after that one must stop the flow in the
-        # remaining time with 2/5 of the acceleration.
+        # The flow keeps this speed until the next change.  From there on, 2/5 of the acceleration must suffice to
+        # stop the flow in the remaining time.
         self._remains = min(self._deadline - self._clock, options.duration - self._moved) - 2 * period
         fastest = min(fastest, 0.4 * options.acceleration * max(self._remains, 0.0))
         if not self.on:
@@ -310,7 +311,7 @@ class ReferenceFlow:
             J[:] = task.jacobian(state)
 
     def _evaluate(self, q: Array) -> tuple[float, Array]:
-        """Return ``H`` and a copy of ``∇H/H₀``.  If the gradient does not exist, return NaN and zeros."""
+        """Return ``H`` and a copy of ``∇H/H₀``.  If the gradient does not exist, return NaN and a zero vector."""
         try:
             value, gradient = self._gradient(q)
             slope = np.array(gradient, dtype=float) / self.start

@@ -49,7 +49,7 @@ class ReferenceFlowPosture(JointPosture):
 
         Args:
             robot: The robot.
-            gradient: Function ``q → (H, ∇H)``, or a compiled export.  For an export, its objective is used.
+            gradient: Function ``q → (H, ∇H)``, or a compiled export, whose exported objective is used.
             options: Parameters of the flow.
             path: Posture, shape (nq,), or postures, shape (k, nq), that ``q_r`` visits first, for example an offline
                 optimum or the path to it.  From the last posture, the flow takes over.
@@ -78,15 +78,15 @@ class ReferenceFlowPosture(JointPosture):
             InputError: No controller with this task has been reset.
         """
         if self._flow is None:
-            raise InputError("has no posture to flow from", where=self.name, hint="reset the controller first")
+            raise InputError("the flow has no start posture yet", where=self.name, hint="reset the controller first")
         return self._flow
 
     def brace(self, t_impact: float | None = None) -> None:
         """Start the flow, because an impact is coming.
 
         ``t_impact`` is the time to the impact, s, or ``None`` if it is unknown.  The flow moves for at most
-        ``options.duration``.  It comes to rest :attr:`settle` seconds before a known impact, if its acceleration
-        permits this.
+        ``options.duration``.  The flow comes to rest :attr:`settle` seconds before a known impact, if its
+        acceleration permits this.
 
         Raises:
             InputError: The time is not finite, or no controller with this task has been reset.

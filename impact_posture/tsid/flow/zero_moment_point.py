@@ -41,7 +41,7 @@ class ZeroMomentPoint:
     def limit(self, state: State, known: Array) -> None:
         """Set the rows at a state with ``ν = 0``, and their bounds, N·m.
 
-        The acceleration ``known``, shape (nv,), cannot be changed, so its part is subtracted from the bounds.
+        The acceleration ``known``, shape (nv,), cannot be changed, so its effect is subtracted from the bounds.
         """
         if not self._offsets.size:
             return

@@ -33,8 +33,8 @@ class LimitLaw:
             its limit.
         deceleration: Deceleration available for braking, rad/s² (m/s²).
         acceleration: Largest acceleration of a joint, rad/s² (m/s²); infinite means no bound.
-        margin: Distance between a position limit and the place where joints stop, rad (m).  At most a quarter of the
-            joint's range is used.
+        margin: Distance from a position limit at which joints stop, rad (m); limited to a quarter of the joint's
+            range.
     """
 
     approach: Positive = 10.0

@@ -21,8 +21,8 @@ _RANK = 1e-6
 def supported_inverse(state: State, contacts: Sequence[SupportContact]) -> Array:
     """Return the inverse mass matrix of the robot on its contacts, shape (nv, nv).
 
-    Without contacts, the result is ``M⁻¹``.  Contacts with the Jacobian ``J_s`` change the result to
-    ``M⁻¹ − M⁻¹J_sᵀ(J_s M⁻¹J_sᵀ)⁺J_s M⁻¹``, because they do not move during the impact.
+    Without contacts, the result is ``M⁻¹``.  Contacts with the Jacobian ``J_s`` do not move during the impact, so the
+    result is ``M⁻¹ − M⁻¹J_sᵀ(J_s M⁻¹J_sᵀ)⁺J_s M⁻¹``.
     """
     inverse = np.linalg.inv(state.M)
     if not contacts:
@@ -46,7 +46,7 @@ class ImpactLimits:
     limit for this joint.
 
     Attributes:
-        active: Whether an impact is expected.  If false, the limits are off.
+        active: Whether an impact is expected; if false, the limits are off.
         restitution: Coefficient of restitution ``e``.
         duration: Duration ``δt`` of the impact, s.
         size: Number of rows.
@@ -54,7 +54,7 @@ class ImpactLimits:
 
     Args:
         robot: The robot.
-        point: The point that hits.
+        point: The point of the robot that hits the surface.
         normal: Unit normal out of the surface, world, shape (3,).
         contacts: Contacts that do not move during the impact.
         period: Time ``dt`` to the next tick, s.

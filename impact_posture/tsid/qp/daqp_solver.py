@@ -34,7 +34,7 @@ class DaqpSolver:
         self._flag = 1
         self._model = daqp.Model()
         self._model.settings = _SETTINGS if proximal is None else _SETTINGS | {"eps_prox": proximal}
-        # The first program only sets the dimensions.  Its bounds are so wide that they are never active.
+        # The first program only sets the dimensions, and its bounds are so wide that they are never active.
         blank, upper = QP.empty(n, m), np.full(n + m, 1e30)
         self._model.setup(blank.H, blank.g, blank.A, upper, -upper, blank.sense)
         self._cold = True
@@ -64,8 +64,9 @@ class DaqpSolver:
 class WhitenedSolver(DaqpSolver):
     """DAQP with the change of variables ``y = Rz``, where LAPACK factorizes ``H = RᵀR``.
 
-    DAQP itself computes this form by plain loops, which need most of its time for a humanoid.  LAPACK and one matrix
-    product need half of this time.  Bounds on the dense variables become rows.  The rest of ``H`` must be diagonal.
+    Without this class, DAQP factorizes ``H`` by plain loops, which need most of its time for a humanoid.  LAPACK and
+    one matrix product need half of the time of these loops.  Bounds on the dense variables become rows.  The rest of
+    ``H`` must be diagonal.
     """
 
     def __init__(self, n: int, m: int, dense: int) -> None:

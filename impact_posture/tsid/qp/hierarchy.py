@@ -52,7 +52,7 @@ def lexicographic(levels: Sequence[Level], units: Array | float = 1.0) -> Array 
     if missed:
         whole = _stacked(scaled[: missed + 1])
         if _holds(whole, _onto(whole, y)):
-            # DAQP violated a level that can hold.  Solve again, with this level as a part of the first.
+            # DAQP violated a level that can hold, so solve again with this level joined to the first level.
             return lexicographic([_stacked(levels[: missed + 1]), *levels[missed + 1 :]], units)
     return np.asarray(units * y)
 
@@ -80,9 +80,10 @@ def _lengths(level: Level) -> Array:
 
 
 def _refined(levels: Sequence[Level], y: Array, near: float) -> Array:
-    """Solve for the rows that are equations, missed or at a bound at ``y``, level by level.
+    """Return the exact solution near the approximate solution ``y``.
 
-    A bound that is met holds for the answers of all levels.
+    Level by level, the function solves for three kinds of rows: equations, violated rows, and rows at a bound.  A row
+    that is at its bound at ``y`` stays at this bound in all levels.
     """
     exact, targets, missed = list[Array](), list[Array](), list[tuple[Array, Array]]()
     for k, level in enumerate(levels):
@@ -127,10 +128,10 @@ def _onto(level: Level, y: Array) -> Array:
 
 
 def _nearest(levels: Sequence[Level]) -> Array | None:
-    """Return the answer of the hierarchical programs of DAQP, which exists for all bounds, to about six digits.
+    """Return the solution of the hierarchical programs of DAQP, with about six digits; ``None`` if DAQP gave up.
 
-    DAQP measures a violation in units of the row's length.  Therefore, a rotation (:func:`balanced`) gives all
-    equations of a level the same length, which does not change the sum of squares.
+    DAQP divides each violation by the length of its row.  Therefore, a rotation (:func:`balanced`) first gives all
+    equations of a level the same length.  The rotation does not change the sum of squares.
     """
     blocks = []
     for level in levels:

@@ -35,12 +35,12 @@ class LevelRank:
     - Otherwise, the row is damped: it becomes a term ``α/(1 − α) (q·ν̇ − c/s)² + x (q·ν̇)²`` of the cost, with
       ``α = x²(3 − 2x)``.  ``q`` is the row's direction of motion, and ``c`` is its right-hand side.  The term has the
       mean weight of the cost.  With decreasing ``x``, the row changes smoothly from an equation to nothing, so
-      accelerations are continuous through a singular posture.  They are at most ``3/s₀`` times ``c``.  The levels
-      below can use the direction with the factor ``√(1 − α)``.
+      accelerations are continuous through a singular posture.  The accelerations are at most ``3/s₀`` times ``c``.
+      The levels below can use the direction with the factor ``√(1 − α)``.
 
     The result depends only on the present rows and on their lengths at reset.  While all rows are independent, the QP
-    does not change.  A singular value changes at most by the change of the matrix (Weyl 1912), so most ticks can
-    decide this without a decomposition.
+    does not change.  A singular value changes at most by the change of the matrix (Weyl 1912), so most ticks detect
+    independent rows without a decomposition.
 
     Attributes:
         qp: The QP to solve.
@@ -52,8 +52,8 @@ class LevelRank:
     def __init__(self, qp: QP, always: int, levels: Sequence[slice], accelerations: int, units: Array) -> None:
         """Size the buffers.
 
-        ``qp`` is the QP with all rows.  Its first ``always`` rows are always equations; the rows of the ``levels``
-        follow.  The first ``accelerations`` variables are accelerations.
+        ``qp`` is the QP with all rows.  The first ``always`` rows of ``qp`` are always equations; the rows of the
+        ``levels`` follow.  The first ``accelerations`` variables are accelerations.
         """
         self._full, self._always, self._levels = qp, always, tuple(levels)
         self._accelerations, self.units = accelerations, units

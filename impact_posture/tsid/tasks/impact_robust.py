@@ -35,7 +35,7 @@ def gradient_of(export: ImpactGradient, normal: ArrayLike | None = None) -> Grad
     """Return the gradient function of a compiled export for the impact-robust term.
 
     Args:
-        export: Export of the robot.  To ignore the robot's supports, load it with ``free=True``.
+        export: Export of the robot.  To ignore the robot's supports, load the export with ``free=True``.
         normal: Unit normal for ``H`` (function ``_eval`` of the export).  With ``None``, the function evaluates the
             objective of the exported problem at its own normal (function ``_objective``).
 
@@ -79,8 +79,9 @@ class ImpactRobustPosture(JointPosture):
     - The length of the term is at most ``K·reach``, the force of a spring ``K`` that is stretched by ``reach``.  If
       this bound were below ``K_p|q_des ⊖ q|``, the robot would stop before the optimum.
     - ``s(q)`` fades out the part of the term that pushes a joint into a position limit.  The fade begins
-      ``fade[1]`` rad before the limit and ends ``fade[0]`` rad before it.  These distances are at most a quarter and
-      a sixteenth of the joint's range.  Without ``s(q)``, the robot would move to its mechanical stops.
+      ``fade[1]`` rad before the limit and ends ``fade[0]`` rad before the limit.  ``fade[1]`` is limited to a quarter
+      of the joint's range, and ``fade[0]`` to a sixteenth.  Without ``s(q)``, the robot would move to its mechanical
+      stops.
     - ``α`` is the level of :class:`~impact_posture.tsid.tasks.activation.Activation`.
 
     ``spring`` determines ``K_p`` and ``q_des`` while the term is on.  With ``keep``, the robot comes to rest at
@@ -97,8 +98,7 @@ class ImpactRobustPosture(JointPosture):
         activation: Phase and level ``α`` of the term.
         value: ``H`` (or the objective) at the last evaluation.
         term: Bounded term ``−K s(q) ∇H/λ`` at the last evaluation, for ``α = 1``, shape (nv,).
-        failed: Whether the last evaluation raised an exception or was not finite.  If true, the previous term is
-            used.
+        failed: Whether the last evaluation raised an exception or was not finite; the previous term is then used.
     """
 
     def __init__(
@@ -122,7 +122,7 @@ class ImpactRobustPosture(JointPosture):
 
         Args:
             robot: The robot.
-            gradient: Function ``q → (H, ∇H)``, or a compiled export.  For an export, its objective is used.
+            gradient: Function ``q → (H, ∇H)``, or a compiled export, whose exported objective is used.
             target: Target posture ``q_des``, shape (nq,); by default, the posture at ``reset``.
             K: Gain, 1/s².
             name: Name in reports.
@@ -286,6 +286,6 @@ def curvature_scale(gradient: Gradient, model: pin.Model, q: Array, redundancy: 
     change = curvature(gradient, model, q, np.eye(model.nv))
     scale = max(float(np.linalg.norm(Z.T @ change @ Z, 2)), _FLAT * abs(gradient(q)[0]))
     if not (np.isfinite(scale) and scale > 0):
-        what = "the objective vanishes with its curvature"
-        raise MetricError(what, where=name, hint="start elsewhere, or give `scale`")
+        what = "the objective and its curvature are zero or do not exist"
+        raise MetricError(what, where=name, hint="start at another posture, or give `scale`")
     return scale

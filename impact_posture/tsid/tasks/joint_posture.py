@@ -26,8 +26,8 @@ class JointPosture(Task):
 
     Attributes:
         value: Value of the task's objective at the last evaluation; NaN if the task has no objective.
-        stiffness: Stiffness matrix set by :meth:`stiffen`, 1/s², shape (nv, nv); ``None`` if it was not called.
-        damping: Damping matrix set by :meth:`stiffen`, 1/s, shape (nv, nv); ``None`` if it was not called.
+        stiffness: Stiffness matrix set by :meth:`stiffen`, 1/s², shape (nv, nv); ``None`` before the first call.
+        damping: Damping matrix set by :meth:`stiffen`, 1/s, shape (nv, nv); ``None`` before the first call.
     """
 
     constant = True
@@ -86,7 +86,7 @@ class JointPosture(Task):
 
     @property
     def level(self) -> float:
-        """Level of the preparation for an impact, 0 to 1; always 0 here."""
+        """Level of the preparation for an impact, 0 to 1; always 0 for a nominal posture task."""
         return 0.0
 
     def reset(self, state: State) -> None:

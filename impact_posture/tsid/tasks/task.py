@@ -29,7 +29,8 @@ class Task(ABC):
 
     A task defines two methods, :meth:`error` and :meth:`jacobian`.  By default, :meth:`drift` computes ``J̇ν`` by
     central differences of the Jacobian along the motion, which takes two more evaluations of the kinematics.
-    Override it to save time.  A controller reads gains and weights at ``reset``, and targets at each tick.
+    A subclass can override :meth:`drift` to save time.  A controller reads gains and weights at ``reset``, and
+    targets at each tick.
 
     Attributes:
         name: Name in reports.
@@ -47,7 +48,7 @@ class Task(ABC):
     def __init__(
         self, name: str, size: int, *, kp: ArrayLike = 0.0, kd: ArrayLike | None = None, weight: ArrayLike = 1.0
     ) -> None:
-        """Set gains and weight.  Each of them is one number, or one number per row.
+        """Set ``kp``, ``kd`` and ``weight``, each of which is one number or one number per row.
 
         By default, the damping is critical: ``kd = 2√kp``.
 
@@ -145,7 +146,7 @@ class TargetTask(Task, Generic[Target]):
         """Return a copy of the output at ``state``, in the form of a target."""
 
     def reset(self, state: State) -> None:
-        """If the target is not set, set it to the present output.
+        """Set the target to the present output if there is no target yet.
 
         Raises:
             InputError: The task requires a floating base, but the base is fixed.
