@@ -12,7 +12,7 @@ from numpy.typing import ArrayLike
 
 from impact_posture.config.checked import checked
 from impact_posture.config.demand import Factors, HalfAngle, NonNegative
-from impact_posture.config.problem_settings import JointModel, MetricKind, ObjectiveKind
+from impact_posture.config.problem_settings import RESTITUTION, SPEED, JointModel, MetricKind, ObjectiveKind
 from impact_posture.errors import InputError
 from impact_posture.impact.evaluation.evaluation import Evaluation, evaluate
 from impact_posture.impact.impact_contact import ImpactContact
@@ -102,7 +102,7 @@ class ImpactObjective(WorstCaseObjective):
         object.__setattr__(self, "_missing", missing_support(robot) if supports is None and not feet else "")
 
     @checked
-    def evaluate(self, q: ArrayLike, speed: float = 1.0, restitution: float = 0.0) -> Evaluation:
+    def evaluate(self, q: ArrayLike, speed: float = SPEED, restitution: float = RESTITUTION) -> Evaluation:
         """Compute H, G, V, S, E, the ellipsoid and the predicted jump at ``q``; see :func:`evaluate`."""
         return evaluate(self, self.robot.check_posture(np.asarray(q, dtype=float), limits=False), speed, restitution)
 

@@ -9,7 +9,7 @@ from typing import Any
 import numpy as np
 
 from impact_posture.config.checked import checked
-from impact_posture.config.problem_settings import ImpactSettings, ProblemSettings, RobotSettings
+from impact_posture.config.problem_settings import RESTITUTION, SPEED, ImpactSettings, ProblemSettings, RobotSettings
 from impact_posture.config.table_validation import validate
 from impact_posture.errors import InputError
 from impact_posture.impact.elasticity.contact_compression import ContactStiffness
@@ -53,8 +53,8 @@ class PostureProblem:
         objective: Objective,
         posture: str | Array | Sequence[float] | None = None,
         *,
-        speed: float = 1.0,
-        restitution: float = 0.0,
+        speed: float = SPEED,
+        restitution: float = RESTITUTION,
         **task: Any,
     ) -> None:
         robot = objective.robot

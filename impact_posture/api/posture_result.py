@@ -13,7 +13,7 @@ import numpy as np
 from impact_posture.api.posture_problem import PostureProblem
 from impact_posture.config.checked import checked
 from impact_posture.config.demand import OneOrMore, ZeroOrMore
-from impact_posture.config.problem_settings import Against, Search
+from impact_posture.config.problem_settings import STARTS, TRADEOFF_POINTS, Against, Search
 from impact_posture.errors import InputError
 from impact_posture.output.result_folder import FORMATS, Written, finish_result
 from impact_posture.output.result_reader import SolvedPostures, result_view
@@ -106,7 +106,7 @@ class PostureResult:
     @checked
     def trade_off(
         self,
-        points: OneOrMore = 16,
+        points: OneOrMore = TRADEOFF_POINTS,
         against: Against = "distance",
         *,
         compile: CompileMode = "auto",
@@ -223,7 +223,7 @@ class PostureResult:
 def optimize(
     problem: PostureProblem,
     *,
-    starts: OneOrMore = 16,
+    starts: OneOrMore = STARTS,
     seed: ZeroOrMore = 0,
     jobs: OneOrMore = 2,
     compile: CompileMode = "auto",

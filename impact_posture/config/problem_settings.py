@@ -59,8 +59,10 @@ MATERIALS = {"steel": (200e9, 0.28), "wood": (11.5e9, 0.3), "rubber": (0.03e9, 0
 CLEARANCE, PATCH = 0.001, 0.3
 # Default friction coefficient (Coulomb).
 FRICTION = 0.7
-# Number of distances if --tradeoff is given without a number.
-TRADEOFF_POINTS = 16
+# Default number of starts, and number of distances if --tradeoff is given without a number.
+STARTS, TRADEOFF_POINTS = 16, 16
+# Default approach speed (m/s) and coefficient of restitution of predicted jumps.
+SPEED, RESTITUTION = 1.0, 0.0
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -129,8 +131,8 @@ class ImpactSettings(RobotSettings):
     )  # fmt: skip
     bilateral: bool = setting(False, "Contacts can also pull, as in a grasp.", CONTACT)
     impulse: Positive = setting(1.0, "Bound on the impulse, N·s.", CONTACT)
-    speed: NonNegative = setting(1.0, "Approach speed, m/s.", CONTACT)
-    restitution: Share = setting(0.0, "Coefficient of restitution, 0 (plastic) to 1 (elastic).", CONTACT)
+    speed: NonNegative = setting(SPEED, "Approach speed, m/s.", CONTACT)
+    restitution: Share = setting(RESTITUTION, "Coefficient of restitution, 0 (plastic) to 1 (elastic).", CONTACT)
     contact_stiffness: Annotated[str | float, between(1.0, 1e12, "N/m", tuple(MATERIALS))] | None = setting(
         None, f"Stiffness of the contact, or the material of the surface: {', '.join(MATERIALS)}.", CONTACT,
         "N/M|MATERIAL", "not known", parse=parse_number_or_name,
@@ -249,7 +251,7 @@ class ProblemSettings(ImpactSettings):
     search: Search = setting(
         "multistart", "multistart; or global, which adds a map of self-motions or basin hopping.", SEARCH
     )
-    starts: OneOrMore = setting(16, "Number of starting points of the search.", SEARCH)
+    starts: OneOrMore = setting(STARTS, "Number of starting points of the search.", SEARCH)
     finish_all: bool = setting(
         False, "Also finish starts that can no longer become the best; lists all optima.", SEARCH
     )

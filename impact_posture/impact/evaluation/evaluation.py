@@ -12,6 +12,7 @@ import pinocchio as pin
 from impact_posture.config.checked import checked
 from impact_posture.config.demand import Share, between
 from impact_posture.config.json_block import json_block
+from impact_posture.config.problem_settings import RESTITUTION, SPEED
 from impact_posture.errors import InputError, MetricError
 from impact_posture.impact.elasticity.contact_compression import (
     Compression,
@@ -154,8 +155,8 @@ _CONTACT = ("H", "G", "V", "S", "E", "effective_mass", "gradient", "ellipsoid", 
 def evaluate(
     objective: WorstCaseObjective,
     q: Array,
-    speed: Annotated[float, between(0, LARGEST, "m/s")] = 1.0,
-    restitution: Share = 0.0,
+    speed: Annotated[float, between(0, LARGEST, "m/s")] = SPEED,
+    restitution: Share = RESTITUTION,
     contact_stiffness: ContactStiffness | None = None,
 ) -> Evaluation:
     """Compute all impact quantities at ``q`` with Pinocchio, and predict the velocity jump.

@@ -10,7 +10,7 @@ from typing import TYPE_CHECKING, TypeVar
 import numpy as np
 from numpy.typing import NDArray
 
-from impact_posture.config.problem_settings import Against
+from impact_posture.config.problem_settings import RESTITUTION, SPEED, Against
 from impact_posture.errors import InputError, MetricError
 from impact_posture.impact.evaluation.objective_value import objective_value
 from impact_posture.impact.evaluation.velocity_jump import tangent_units
@@ -85,8 +85,8 @@ class ResultView:
     objective: WorstCaseObjective
     q_initial: Array
     q_optimal: Array
-    speed: float = 1.0
-    restitution: float = 0.0
+    speed: float = SPEED
+    restitution: float = RESTITUTION
     path: NullSpacePath | None = None
     tradeoff: TradeOffData | None = None
     motion: PosturePath | None = None

@@ -26,6 +26,7 @@ import numpy as np
 
 from impact_posture.config.checked import checked
 from impact_posture.config.demand import OneOrMore
+from impact_posture.config.problem_settings import TRADEOFF_POINTS
 from impact_posture.errors import InputError, MetricError
 from impact_posture.impact.elasticity.contact_compression import ContactStiffness
 from impact_posture.posture.analysis.trade_off import TradeOff, TradePoint, find_knee
@@ -56,7 +57,7 @@ _FORCE_STARTS = 8
 @checked
 def pareto_front(
     solution: PostureSolution,
-    points: OneOrMore = 16,
+    points: OneOrMore = TRADEOFF_POINTS,
     *,
     force: tuple[ContactStiffness, float] | None = None,
     compile: CompileMode = "auto",

@@ -9,6 +9,7 @@ from functools import partial
 import numpy as np
 
 from impact_posture.config.json_block import json_block
+from impact_posture.config.problem_settings import STARTS
 from impact_posture.dynamics.numeric import Numeric
 from impact_posture.errors import Infeasible, SolverFailed
 from impact_posture.impact.worst_case_objective import WorstCaseObjective
@@ -129,7 +130,7 @@ class RobustSolution:
 def solve_robustly(
     problem: ConstrainedProblem,
     *,
-    starts: int = 16,
+    starts: int = STARTS,
     seed: int = 0,
     jobs: int = 2,
     compile: CompileMode = "auto",

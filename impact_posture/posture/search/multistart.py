@@ -9,6 +9,7 @@ from dataclasses import dataclass, replace
 import numpy as np
 import pinocchio as pin
 
+from impact_posture.config.problem_settings import STARTS
 from impact_posture.dynamics.chart import Chart
 from impact_posture.dynamics.numeric import Numeric
 from impact_posture.errors import SolverFailed
@@ -96,7 +97,7 @@ class PostureSolution:
 def solve(
     problem: ConstrainedProblem,
     *,
-    starts: int = 16,
+    starts: int = STARTS,
     seed: int = 0,
     jobs: int = 2,
     compile: CompileMode = "auto",
