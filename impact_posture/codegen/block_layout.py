@@ -130,8 +130,8 @@ def _sources(graph: Graph, leaves: Set[int], k: int) -> list[int]:
 def _depth_first(graph: Graph, roots: Sequence[int]) -> list[int]:
     """Return the nodes that the roots need, in an order in which operands come shortly before their users.
 
-    Of several operands, the operand with the longest chain of operations is last in the order.  Its result is then
-    used immediately.
+    The operand with the longest chain of operations is the last operand in this order, so that its result is used
+    immediately.
     """
     depth: list[int] = []
     for node in graph.nodes:
@@ -194,7 +194,8 @@ def _inlined(
 ) -> set[int]:
     """Return the nodes that can be part of the statement of another node.
 
-    These are arithmetic operations that are used only once, by another arithmetic operation of the same functions.
+    Such a node is an arithmetic operation that is used only once, by another arithmetic operation of the same
+    functions.
     """
     size: dict[int, int] = {}
     inlined: set[int] = set()

@@ -15,7 +15,7 @@ from impact_posture.codegen.block_layout import Block, Layout
 from impact_posture.codegen.c_literals import Real
 from impact_posture.codegen.expression_graph import COSINE, Node
 
-# Length of a reference to a constant in a table, such as K[1234].  A literal that is shorter is written instead.
+# Length of a reference to a constant in a table, such as K[1234].  Literals that are shorter are written directly.
 _PLACE = 7
 SHORT_NAMES = ("APART", "K", "K2", "K4", "V2", "V2u", "V4", "V4u", "VN")
 """Names of the macros that the generated C file defines, and undefines at its end."""

@@ -30,7 +30,7 @@ class Real:
 
     @property
     def dtype(self) -> np.dtype[np.floating[Any]]:
-        """The same type in NumPy."""
+        """NumPy type with the same size as the C type."""
         return np.dtype(np.float64 if self.name == "double" else np.float32)
 
     def rounded(self, values: ArrayLike) -> NDArray[np.float64]:

@@ -33,12 +33,12 @@ def check_prefix(prefix: str) -> str:
     Raises:
         InputError: The prefix is not a C identifier, or it is ``example`` or the name of a C header.
     """
-    what, hint = "", "choose another"
+    what, hint = "", "choose another prefix"
     if not _IDENTIFIER.fullmatch(prefix):
         what = f"the prefix '{prefix}' is not a C identifier"
-        hint = f"letters, digits and underscores, a letter first, such as {c_identifier(prefix, '')}"
+        hint = f"use letters, digits and underscores, a letter first, such as {c_identifier(prefix, '')}"
     elif prefix.lower() == "example":
-        what = "the prefix 'example' is taken by example.c"
+        what = "the prefix 'example' is reserved for example.c"
     elif prefix.lower() in _C_HEADERS:
         what = f"the prefix '{prefix}' is the name of the C header {prefix}.h"
     if what:

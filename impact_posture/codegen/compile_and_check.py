@@ -62,8 +62,8 @@ def compile_and_check(
     """
     manifest, _ = read_manifest(export_dir / f"{prefix}.json")
     real, worst = REALS[manifest["real"]], 0.0
-    # If the process is killed, its temporary files stay.  They are in the folder of the export, so they are deleted
-    # with it.
+    # A killed process cannot delete its temporary files.  The folder of the export contains them, so that they are
+    # deleted together with the export.
     with scratch_folder(export_dir) as folder:
         if keep or (built := _cached_library(export_dir, prefix)) is None:
             built = build_library(export_dir, prefix, library_path(export_dir if keep else folder, prefix))

@@ -148,8 +148,8 @@ def export(
     objectives = _same_robot(objective)
     robot = objectives[0].robot
     if robot.joint_model == "elastic":
-        what = "elastic predicts the impact at one posture, and C code is for all postures"
-        raise InputError(what, where="joint_model", hint="export link or reflected")
+        what = "the joint model elastic predicts an impact at one posture, but C code must work at all postures"
+        raise InputError(what, where="joint_model", hint="use the joint model link or reflected")
     prefix = default_prefix(objectives) if prefix is None else check_prefix(prefix)
     if not out.is_dir():
         raise OutputError("no such folder", where=str(out), hint="create it first")
@@ -165,7 +165,7 @@ def export(
     texts[f"{prefix}.json"] = json.dumps(manifest, indent=2, allow_nan=False) + "\n"
     there = [name for name in texts if (out / name).exists()]
     if there and not force:
-        raise OutputError(f"holds {there[0]} already", where=str(out), hint="give `force` to replace it")
+        raise OutputError(f"already contains {there[0]}", where=str(out), hint="give `force` to replace it")
     for name, text in texts.items():
         write_whole(out / name, text)
     written = Export(out, robot, tuple(out / name for name in texts), manifest)
@@ -223,7 +223,7 @@ def write_export(
             try:
                 agreement = compile_and_check(folder, prefix, objectives, keep=True)
             except CompilerError as error:
-                hint = f"{error.hint}; without compiling, the C code is written all the same"
+                hint = f"{error.hint}; if you do not request compilation, the C code is still written"
                 raise CompilerError(error.what, where=error.where, hint=hint) from None
     library = None if agreement is None else library_path(out, prefix)
     files = tuple(out / path.name for path in written.files)
@@ -241,12 +241,12 @@ def _same_robot(objective: WorstCaseObjective | Sequence[WorstCaseObjective]) ->
     """Return the objectives as a tuple; raise InputError if they differ in more than the contact."""
     objectives = (objective,) if isinstance(objective, WorstCaseObjective) else tuple(objective)
     if not objectives:
-        raise InputError("no objective is given", where="codegen", hint="give one for each frame")
+        raise InputError("no objective is given", where="codegen", hint="give one objective for each frame")
     first = objectives[0]
     for other in objectives[1:]:
         if _without_contact(other) != _without_contact(first):
             what = f"'{other.contact.frame}' and '{first.contact.frame}' differ in more than the contact"
-            raise InputError(what, where="codegen", hint="export them one by one")
+            raise InputError(what, where="codegen", hint="export each objective separately")
     return objectives
 
 

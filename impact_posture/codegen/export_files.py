@@ -140,14 +140,14 @@ def _context(
         if (compression := manifest["compression"]) and compression["line"]
         else "",
         "supports": (
-            f"{supports}; M stands for M + Js'Js/c with c = {objective.compliance:.6g} 1/kg"
+            f"{supports}; with supports, M means M + Js'Js/c with c = {objective.compliance:.6g} 1/kg"
             if supports
             else "none (the free robot)"
         ),
         "unit_rule": (
             f"a quaternion or a cosine-sine pair in q is not of unit norm (to {real.unit_tolerance:g})"
             if units
-            else "never (this robot's q holds no quaternion and no cosine-sine pair)"
+            else "never (q of this robot contains no quaternion and no cosine-sine pair)"
         ),
         "units": units,
         "unit_bounds": [real.literal(float(f"{(1 + sign * real.unit_tolerance) ** 2:.12f}")) for sign in (-1, 1)],
@@ -182,7 +182,7 @@ def _worst_note(objective: WorstCaseObjective) -> str:
     if objective.model_variants:
         note = "; the worst of " + "; ".join(model.name for model in objective.model_variants)
     if objective.normal_cone_deg or objective.model_variants:
-        note += ".  Where several tie, grad is the subgradient at one of them"
+        note += ".  If several normals or models have the largest value, grad is the gradient for one of them"
     if objective.kind == "coulomb":
         note += f", friction {objective.contact.friction:.9g}; {objective.impact_kind.kink}"
     return note

@@ -41,7 +41,7 @@ def stems(prefix: str, frames: Sequence[str]) -> tuple[str, ...]:
         stem = f"{prefix}_{identifier(frame)}"
         if stem in frame_of:
             other = frame_of[stem]
-            what = f"'{frame}' is given twice" if other == frame else f"'{other}' and '{frame}' are one name in C"
-            raise InputError(what, where="frame", hint="give each frame once, or export one by one")
+            what = f"'{frame}' is given twice" if other == frame else f"'{other}' and '{frame}' have the same C name"
+            raise InputError(what, where="frame", hint="give each frame once, or export each frame separately")
         frame_of[stem] = frame
     return tuple(frame_of)

@@ -19,11 +19,11 @@ from impact_posture.impact.worst_case_objective import WorstCaseObjective
 
 @dataclass(frozen=True)
 class NamedObjective:
-    """An objective with the text with which its C names begin.
+    """An objective to export, with its C names.
 
     Attributes:
         objective: The objective.
-        stem: Text with which its C names begin.
+        stem: Text with which the C names of the objective begin.
         free: Whether this objective is for a standing robot without its supports.
         joint: Whether this objective is for several contacts at once; ``H`` is then not exported.
     """
@@ -46,7 +46,7 @@ def named_objectives(objectives: Sequence[WorstCaseObjective], prefix: str) -> t
     several = [objective for objective in objectives if objective.others]
     if several and len(objectives) > 1:
         what = "a several-contact objective cannot be exported with others"
-        raise InputError(what, where="codegen", hint="export them one by one")
+        raise InputError(what, where="codegen", hint="export each objective separately")
     # The normal is a parameter of H, so a frame with two contacts needs only one H.
     singles: dict[str, WorstCaseObjective] = {}
     for single in (single for objective in several for single in objective.singles):
@@ -67,9 +67,9 @@ class Exported:
     """One C function of the library.
 
     Attributes:
-        stem: Text with which its C name begins.
+        stem: Text with which the C name of the function begins.
         name: Name of the function in :data:`~impact_posture.codegen.export_functions.SIGNATURES`.
-        outputs: Names of its results among the outputs of :attr:`ExportLibrary.function`.
+        outputs: Names of the results of the function among the outputs of :attr:`ExportLibrary.function`.
     """
 
     stem: str

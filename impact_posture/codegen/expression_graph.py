@@ -67,7 +67,7 @@ class Graph:
     """List of operations in which each operation comes after its operands, and no operation occurs twice.
 
     Attributes:
-        inputs: Names of the inputs.
+        inputs: Names of the inputs of the graph.
         nodes: The operations.  The number of a node is its index in this list.
         outputs: Output name → numbers of the nodes of its entries, column by column.
     """
@@ -156,4 +156,4 @@ def _operation(graph: Graph, operation: int, operands: list[int]) -> int:
         text = CALLS[operation]
         return graph.add(Node(text, (a, b) if "{1}" in text else (a,)))
     hint = "add it to codegen/expression_graph.py"
-    raise CompilerError(f"CasADi operation {operation} has no C form", where="codegen", hint=hint)
+    raise CompilerError(f"CasADi operation {operation} cannot be written in C", where="codegen", hint=hint)

@@ -130,7 +130,7 @@ class ImpactGradient:
         """Check that the export is for this robot; a different joint model is allowed.
 
         Raises:
-            ManifestMismatch: The robot differs.  The error names the first difference.
+            ManifestMismatch: The export is for another robot; the error names the first difference.
         """
         # Import here, because only this method needs Pinocchio.
         from impact_posture.robot.joint_model import with_joint_model
@@ -171,7 +171,7 @@ class ImpactGradient:
 
     def value_and_gradient(self, q: ArrayLike, n: ArrayLike) -> tuple[float, Array]:
         """Return ``H`` and its tangent gradient, a view of shape (nv,), with ``q`` and ``n`` as in :meth:`call`."""
-        # Control loops call this method in every tick.  It is faster without self._results.
+        # Control loops call this method in every tick, so it does not use the slower self._results.
         code, (H, gradient) = self.call("eval", q, n)
         if code:
             raise _failure(code)
@@ -231,7 +231,7 @@ class ImpactGradient:
         difference = float(np.abs(values - expected).max() / np.abs(expected).max())
         # The condition "difference > tolerance" would be False for NaN, and accept it.
         if not difference <= _SELF_TEST[self.manifest["real"]]:
-            hint = "delete the library, which is then built again"
+            hint = "delete the library, so that it is built again"
             raise ManifestMismatch("reference value of H", test["H"], H, where=where, hint=hint)
 
 

@@ -99,8 +99,8 @@ def read_checked(
     """
     files = [path] if not os.path.isdir(path) else sorted(p for p in path.glob("*.json") if _is_manifest(p, schema))
     if len(files) != 1:
-        count = f"holds no {what}" if not files else f"holds {len(files)} {what}s"
-        hint = f"name the folder that {command} wrote" if not files else f"name one, such as {files[0].name}"
+        count = f"contains no {what}" if not files else f"contains {len(files)} {what}s"
+        hint = f"name the folder that {command} wrote" if not files else f"name one file, such as {files[0].name}"
         raise SpecError(count, where=str(path), hint=hint)
     (file,) = files
     try:
@@ -144,14 +144,14 @@ def check_library(library: ctypes.CDLL, manifest: Mapping[str, Any], *, where: s
     try:
         address = ctypes.addressof(ctypes.c_char.in_dll(library, symbol))
     except ValueError:
-        hint = "delete the library, which is then built again, or run codegen again"
+        hint = "delete the library, so that it is built again, or run codegen again"
         raise SpecError(f"has no symbol {symbol}", where=where, hint=hint) from None
     inside = ctypes.string_at(address).decode("ascii", "replace")
     pairs = [dict(part.partition("=")[::2] for part in text.split()) for text in (identity(manifest), inside)]
     for key, value in pairs[0].items():
         if pairs[1].get(key) != value:
             name = "the manifest's hash" if key == "sha256" else key
-            hint = "delete the library, which is then built again, or run codegen"
+            hint = "delete the library, so that it is built again, or run codegen again"
             raise ManifestMismatch(name, value, pairs[1].get(key), where=where, hint=hint)
 
 

@@ -30,8 +30,8 @@ def casadi_reference(objective: WorstCaseObjective) -> Reference:
     """Return a function that computes the quantities of an export with CasADi.
 
     The quantities are ``H``, ``grad`` (nv,), ``jump`` (nv,), ``G``, ``V = H/G²``, ``ellipsoid`` (9,), ``objective``
-    and ``objective_grad`` (nv,).  The last two are for the normal of the contact and do not depend on ``n``.  For an
-    objective of several contacts, only the last two exist.
+    and ``objective_grad`` (nv,).  ``objective`` and ``objective_grad`` are for the normal of the contact and do not
+    depend on ``n``.  For several contacts, only ``objective`` and ``objective_grad`` exist.
     """
     k = objective.kernel
     value, gradient = objective.gradient_fun().call([k.q, ca.DM(objective.contact.normal)])

@@ -37,7 +37,7 @@ class Foot:
     """A point of a link that stays in place.
 
     Attributes:
-        point: The point.  Its velocity and its impulse are in the axes of its frame.
+        point: The point.  Velocity and impulse of the foot are in the axes of the frame of this point.
         rows: Number of velocity entries that stay zero: 3 (linear), or 6 (linear and angular).
     """
 
@@ -76,7 +76,7 @@ class JumpDerivatives:
     def of(self, a: ca.SX, f: ca.SX, b: ca.SX, multipliers: ca.SX, compliance: float) -> tuple[ca.SX, ca.SX]:
         """Return the Jacobian of the equations and the Hessian of ``φ``.
 
-        Both are with respect to chart coordinates, ``a`` and ``f``, in this order.  ``f`` contains the impulses of
+        The variables are chart coordinates, ``a`` and ``f``, in this order.  ``f`` contains the impulses of
         all feet, each in the axes of its foot.  ``b`` are the multipliers of ``M a − J_sᵀf``, and ``multipliers`` the
         multipliers ``l`` of ``J_s a + εf``.  ``compliance`` is ε, 1/kg.
         """
@@ -98,7 +98,7 @@ class JumpDerivatives:
     def _lies_on(self, ends: Sequence[int], joints: Sequence[int], *, itself: bool = True) -> Array:
         """Return an array that is True if a joint (column) is on the path from its root to an end (row).
 
-        The end itself is on the path if ``itself``.
+        An end is on its own path only if ``itself``.
         """
         paths = {end: {int(i) for i in self._tree.model.supports[end]} - (set() if itself else {end}) for end in ends}
         return np.array([[joint in paths[end] for joint in joints] for end in ends], dtype=bool)

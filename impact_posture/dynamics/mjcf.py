@@ -47,7 +47,7 @@ class Mjcf:
 
     Attributes:
         spec: The ``mujoco.MjSpec``, which :meth:`compile` compiles.
-        layout: Conversions of coordinates.
+        layout: Conversions between the coordinates of Pinocchio and MuJoCo.
         bodies: Index of a Pinocchio joint → name of the body that the joint moves.
         joints: Index of a Pinocchio joint → names of the MuJoCo joints that represent it.
         sites: Index of a frame → name of its site.  If several frames have the same name, only one has a site.
@@ -163,7 +163,7 @@ def _depth_first(model: pin.Model) -> list[int]:
 def _is_free(model: pin.Model, slot: JointSlot) -> bool:
     """Return whether a joint can become a MuJoCo free joint.
 
-    Its parent must be the world, and all six axes must have the same armature.
+    The parent of the joint must be the world, and all six axes must have the same armature.
     """
     if slot.kind.family != "free-flyer" or model.parents[slot.index] != 0:
         return False
@@ -233,7 +233,7 @@ def _alike(armature: Array, slot: JointSlot) -> None:
     """
     if armature.size and np.ptp(armature) > 0:
         what = f"the armature of joint '{slot.name}' differs between its axes"
-        raise InputError(what, where="MJCF", hint="give it one value")
+        raise InputError(what, where="MJCF", hint="give all axes of the joint the same armature")
 
 
 def _inertia(inertia: pin.Inertia) -> tuple[dict[str, Any], Array | None]:

@@ -127,7 +127,7 @@ class MjcfLayout:
 
     def state(self, qpos: Array, qvel: Array) -> tuple[Array, Array]:
         """Convert ``qpos`` and ``qvel`` to the Pinocchio configuration, shape (nq,), and velocity, shape (nv,)."""
-        # A simulation calls this method in every tick.  It is faster without the matrix T.
+        # A simulation calls this method in every tick.  To be fast, the method does not compute the matrix T.
         q, v = self.q(qpos), qvel[self._rates]
         for slot in self._turning:
             turn = _turn(slot, q[slot.joint.q])

@@ -46,7 +46,7 @@ class ModelParameters(RepeatedLimbs):
 
 
 def without_parameters(robot: Robot) -> Robot:
-    """Return the robot with all nonzero parameters set to one.  Robots that share code are then equal."""
+    """Return the robot with all nonzero parameters set to one, so that robots that share code are equal."""
     model, armature = robot.model.copy(), np.array(robot.model.armature)
     finite = np.isfinite(armature)
     armature[finite] = rounded(armature[finite]) != 0.0

@@ -68,8 +68,8 @@ class Numeric:
         """Return the tangent gradient of ``wᵀ J(q) v``, shape (nv,).
 
         ``w`` is constant in the frame if ``in_frame``, else in the world.  The LOCAL_WORLD_ALIGNED derivatives of
-        Pinocchio omit the rotation of the frame.  This method therefore uses the LOCAL derivatives, which are
-        complete, and adds the rotation.
+        Pinocchio omit the rotation of the frame.  Therefore the LOCAL derivatives, which are complete, are computed
+        and rotated to world axes.
         """
         pin.computeForwardKinematicsDerivatives(self.model, self.data, self.q, v, self._zero)
         frame = self.model, self.data, point.joint, point.placement, pin.LOCAL

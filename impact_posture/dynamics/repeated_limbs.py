@@ -132,7 +132,8 @@ def _limb(model: pin.Model, root: int) -> tuple[int, ...]:
 def _alike(model: pin.Model, first: tuple[int, ...], second: tuple[int, ...]) -> bool:
     """Return whether two limbs can be computed together.
 
-    They must have the same joints in the same order, and nearly the same zero entries in placements and inertias.
+    The limbs must have the same joints in the same order, and nearly the same zero entries in placements and
+    inertias.
     """
     if _joints(model, first) != _joints(model, second):
         return False

@@ -97,7 +97,7 @@ def _from_limits(robot: Robot) -> Array:
     limits[:base] = 1.0
     for name, limit in zip(robot.tangent_names[base:], limits[base:], strict=True):
         if not limit < 1e6:
-            hint = "add it to robot.toml [limits.velocity] or give a file"
+            hint = "add the limit to robot.toml [limits.velocity], or give a file with weights"
             raise MetricError(f"joint '{name}' has no velocity limit", where="weights", hint=hint)
     return np.asarray(1.0 / limits**2)
 
@@ -113,6 +113,6 @@ def _from_file(robot: Robot, path: Path) -> Array:
             else:
                 values[v_slice(robot.model, robot.joint_id(key))] = float(value)  # type: ignore[arg-type]
         except (TypeError, ValueError, OverflowError):
-            hint = "joint = weight; base = [6 numbers]"
-            raise MetricError(f"key '{key}' holds no number", where=str(path), hint=hint) from None
+            hint = "write joint = weight, or base = [6 numbers]"
+            raise MetricError(f"the value of key '{key}' is not a number", where=str(path), hint=hint) from None
     return values

@@ -68,7 +68,7 @@ def _choose(settings: ImpactSettings, *, several: bool) -> tuple[ObjectiveKind, 
     if settings.objective != "auto":
         return settings.objective, ""
     if several:
-        return "impulse", "objective impulse: of several contacts at once, only bounds on the impulses are given"
+        return "impulse", "objective impulse: for several contacts at once, only bounds on the impulses are known"
     if settings.speed == 0:
         return "impulse", "objective impulse: there is no approach speed"
     at = f"at {settings.speed:g} m/s with friction {settings.friction:g}"
@@ -87,9 +87,10 @@ def _contacts(settings: ImpactSettings, robot: Robot) -> list[ImpactContact]:
             raise ContactError("is missing", where="normal", hint="give the direction out of the surface")
         return [_contact(settings, robot, settings.frame or _default_frame(robot), settings.normal, None)]
     if settings.frame is not None or settings.normal is not None:
-        raise ContactError("stands instead of `frame` and `normal`", where="contact", hint="give one of the two")
+        what, hint = "is used instead of `frame` and `normal`", "give either `contact`, or `frame` and `normal`"
+        raise ContactError(what, where="contact", hint=hint)
     if len(texts) > 1 and settings.offset is not None:
-        hint = "leave it out, or add frames to the URDF"
+        hint = "omit the offset, or add frames to the URDF"
         raise ContactError("one offset for several contacts", where="offset", hint=hint)
     return [_contact(settings, robot, *parse_contact(text)) for text in texts]
 
@@ -163,7 +164,7 @@ class ResolvedImpact:
         warnings = (*self.robot.warnings, *self.objective.warnings)
         if not self.missing_support:
             return warnings
-        return (*warnings, f"{self.robot.name} is taken as floating freely, {FLOATS}; {self.missing_support}")
+        return (*warnings, f"{self.robot.name} is assumed to be floating freely, {FLOATS}; {self.missing_support}")
 
     def to_dict(self, q: Array | None = None) -> dict[str, object]:
         """Return the blocks of ``result.json`` that state the impact: robot, contacts, supports, metric.
@@ -213,5 +214,5 @@ def missing_support(robot: Robot) -> str:
 def _default_frame(robot: Robot) -> str:
     if robot.spec.contact.frame is not None:
         return robot.spec.contact.frame
-    hint = f"give one, for example {', '.join(tips(robot, feet(robot))[:3])}"
+    hint = f"give a frame, for example {', '.join(tips(robot, feet(robot))[:3])}"
     raise ContactError(f"{robot.name} has no default contact frame", where="frame", hint=hint)

@@ -29,8 +29,8 @@ def default_compliance(robot: Robot) -> float:
 def least_compliance(robot: Robot) -> float:
     """Return the least compliance ε, 1/kg, that the symbolic kernel and the C export allow.
 
-    Both add ``1/ε`` to the inertia of the feet, and subtract it again on the path to the base.  The difference has a
-    rounding error proportional to ``1/ε``.  At this limit, about eight digits are correct.
+    Kernel and C code add ``1/ε`` to the inertia of the feet, and subtract it again on the path to the base.  The
+    difference has a rounding error proportional to ``1/ε``.  At this limit, about eight digits are correct.
     """
     return _LEAST_COMPLIANCE / robot.mass
 

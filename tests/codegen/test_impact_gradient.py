@@ -230,7 +230,7 @@ def test_library_that_computes_other_numbers(loaded: Loaded, tmp_path: Path) -> 
 def test_folders_without_a_valid_export_are_refused(
     loaded: Loaded, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
-    with pytest.raises(SpecError, match="holds no export"):
+    with pytest.raises(SpecError, match="contains no export"):
         ImpactGradient.load(tmp_path)
     with pytest.raises(SpecError, match="cannot be read"):
         ImpactGradient.load(tmp_path / "absent.json")

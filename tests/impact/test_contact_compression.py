@@ -318,7 +318,7 @@ def test_the_commands(tmp_path: Path) -> None:
     assert (
         "peak force" in evaluation.stdout
         and "x = 0.06" in evaluation.stdout
-        and "--joint-model link fits" in evaluation.stderr
+        and "use --joint-model link" in evaluation.stderr
     )
     between = ("panda", "--normal", 0, 0, 1, "--config", config, "--joint-model", "elastic")
     shown = run("evaluate", *between, "--contact-stiffness", 1e6)

@@ -207,7 +207,7 @@ def test_one_joint_dominates_or_none_does(planar: str) -> None:
     )
     assert joint.joint == "j2" and joint.dominates
     assert joint.share == pytest.approx(a[1] ** 2 / (a @ a), rel=1e-10)
-    assert joint.line.startswith(f"joint 'j2' carries {100 * joint.share:.0f} % of H")
+    assert joint.line.startswith(f"joint 'j2' contributes {100 * joint.share:.0f} % of H")
     even = resolve(ImpactSettings(robot="talos", frame="torso_2_link", normal=(-1.0, 0.0, 0.0)))
     verdict = evaluate(even.objective, even.q).dominance
     assert not verdict.dominates and verdict.line.startswith("no single joint dominates H")
@@ -297,7 +297,9 @@ def test_an_impact_at_a_held_point_is_refused() -> None:
 
 
 def test_a_robot_without_a_default_frame_names_some(planar: str) -> None:
-    with pytest.raises(ContactError, match="frame: planar has no default contact frame; give one, for example tip"):
+    with pytest.raises(
+        ContactError, match="frame: planar has no default contact frame; give a frame, for example tip"
+    ):
         resolve(ImpactSettings(robot=planar, normal=(1.0, 0.0, 0.0)))
 
 

@@ -63,7 +63,8 @@ class ContactStiffness:
             InputError: Both settings are given.
         """
         if stiffness is not None and duration is not None:
-            raise InputError("follows from `contact_stiffness`", where="contact_duration", hint="give one of the two")
+            what = "cannot be combined with `contact_stiffness`"
+            raise InputError(what, where="contact_duration", hint="give only one of the two settings")
         if duration is not None:
             return ContactStiffness(duration=duration)
         if isinstance(stiffness, str):
@@ -158,15 +159,15 @@ class Compression:
             if not self.by_material:
                 return ""
             each = ", ".join(f"{float(f'{x:.2g}'):g} on {name}" for name, x in self.by_material.items())
-            return f"x = {each} (an impact meets the links alone up to {SHORT:g}, links and rotors from {LONG:g})"
+            return f"x = {each} (up to {SHORT:g} only the links respond, from {LONG:g} links and rotors)"
         if self.fitting == "link":
             meaning = "the contact is over before the rotors move: joint model 'link'"
         elif self.fitting == "reflected":
             meaning = "the rotors move with the links: joint model 'reflected'"
         else:
             used = self.joint_model == "elastic"
-            advice = "'elastic', as here, is" if used else "evaluate with `joint_model` elastic"
-            meaning = f"neither 'link' nor 'reflected' is right; {advice}"
+            advice = "'elastic', which is used here, is" if used else "evaluate with `joint_model` elastic"
+            meaning = f"neither 'link' nor 'reflected' is accurate; {advice}"
         return f"x = {self.x:.2g}: {meaning}"
 
     def to_dict(self) -> dict[str, object]:

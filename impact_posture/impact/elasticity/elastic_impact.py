@@ -122,7 +122,8 @@ class ElasticImpact:
             ContactError: The contact cannot move along its normal.
         """
         if not 0 < speed <= LARGEST:
-            raise InputError(f"is {speed:g}", where="approach speed", hint=f"give m/s above zero, to {LARGEST:g}")
+            hint = f"give a speed above zero and up to {LARGEST:g} m/s"
+            raise InputError(f"is {speed:g}", where="approach speed", hint=hint)
         c = self._compression(q, stiffness)
         oracle, m, nv = self.oracle, len(self.joints), len(c.columns.a)
         force, impulse = c.force(c.state), c.impulse(c.state)
@@ -255,7 +256,8 @@ class _Compression:
             t += step
             if t * self._fastest > _LONGEST:
                 what = "joints are too stiff or too damped for a contact as soft as this one"
-                raise InputError(what, where="contact_stiffness", hint="raise it, or state a rigid transmission")
+                hint = "give a larger contact stiffness, or state a rigid transmission"
+                raise InputError(what, where="contact_stiffness", hint=hint)
             state = scipy.linalg.expm(step * self._generator) @ state
         return t, state
 
@@ -290,7 +292,7 @@ class _Compression:
 
 def _peak(times: Array, values: Array, slopes: Array) -> float:
     """Return the largest absolute value of the piecewise cubic with these values and slopes at ``times``."""
-    # This import takes a quarter of a second, and few robots have elastic joints, so it is not at the top.
+    # Importing SciPy here and not at the top saves a quarter of a second for all robots without elastic joints.
     from scipy.interpolate import CubicHermiteSpline
 
     cubic = CubicHermiteSpline(times, values, slopes)

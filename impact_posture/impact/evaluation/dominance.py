@@ -43,7 +43,7 @@ def find_dominance(objective: WorstCaseObjective, quantities: ImpactQuantities) 
     parts = quantities.jump * oracle.weigh(quantities.jump)
     width = 6 if robot.floating else 0
     if quantities.H <= 0 or not robot.joint_names:
-        return Dominance("", 0.0, float(quantities.H > 0), "no joint takes part in H")
+        return Dominance("", 0.0, float(quantities.H > 0), "no joint contributes to H")
     base = float(parts[:width].sum() / quantities.H)
     slots = {name: v_slice(robot.model, robot.joint_id(name)) for name in robot.joint_names}
     shares = {name: float(parts[slot].sum() / quantities.H) for name, slot in slots.items()}
@@ -53,15 +53,14 @@ def find_dominance(objective: WorstCaseObjective, quantities: ImpactQuantities) 
     if share > 0.5:
         unit = "kg" if tangent_units(robot)[k] == "m/s" else "kg·m²"
         line = (
-            f"joint '{joint}' carries {percent} of H (armature {robot.model.armature[k]:.3g} of the "
-            f"{oracle.M[k, k]:.3g} {unit} it moves)"
+            f"joint '{joint}' contributes {percent} of H (armature {robot.model.armature[k]:.3g} of the "
+            f"{oracle.M[k, k]:.3g} {unit} that it moves)"
         )
         if objective.metric.kind != "kinetic":
-            line += ("; the rest of the robot hardly counts" if share > 0.9 else "") + ": compare `metric` kinetic"
+            rest = ", and the rest of the robot hardly affects H" if share > 0.9 else ""
+            line += f"{rest}; compare with `metric` kinetic"
     elif base > 0.5:
-        line = (
-            f"no single joint dominates H (the base carries {100 * base:.0f} %; largest joint: '{joint}', {percent})"
-        )
+        line = f"no single joint dominates H (base: {100 * base:.0f} %; largest joint: '{joint}', {percent})"
     else:
         line = f"no single joint dominates H (largest: '{joint}', {percent})"
     return Dominance(joint, share, base, line)

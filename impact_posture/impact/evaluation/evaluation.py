@@ -246,7 +246,7 @@ def _joint_model_warning(objective: WorstCaseObjective, q: Array, squeezed: Comp
         return ()
     values = {name: objective_value(other, q) for name, other in both_models(objective).items()}
     listed = ", ".join(f"{value:.4g} with '{name}'" for name, value in values.items() if value is not None)
-    advice = f"`joint_model` {squeezed.fitting} fits" if squeezed.fitting else "expect a value between the two"
+    advice = f"use `joint_model` {squeezed.fitting}" if squeezed.fitting else "expect a value between the two"
     return (f"{squeezed.line}; the objective is {listed}: {advice}",)
 
 
@@ -263,7 +263,7 @@ def _warnings(scalars: Scalars, effect: float | None) -> tuple[str, ...]:
         )
     if effect is not None and effect > _SOFT:
         lines.append(
-            f"H changes by {100 * effect:.2g} % when the supports' compliance is a tenth: along this normal the "
-            "supports hold by their compliance"
+            f"H changes by {100 * effect:.2g} % if the compliance of the supports is divided by ten: along this "
+            "normal, the result depends on the assumed compliance"
         )
     return tuple(lines)

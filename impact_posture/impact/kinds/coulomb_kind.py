@@ -21,7 +21,7 @@ from impact_posture.impact.quantities.impact_kernel import ImpactKernel
 from impact_posture.impact.quantities.lifted_form import Guess, Lifted, UnknownJump, impact_at, in_world, unknown_jump
 from impact_posture.system.arrays import Array
 
-# Upper bound of the product κo.  It should be zero, but the interior-point method needs a positive bound.
+# Upper bound of the product κo.  In theory the product is zero, but the interior-point method needs a positive bound.
 _CORNER = 1e-10
 
 

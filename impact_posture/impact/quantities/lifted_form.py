@@ -50,7 +50,7 @@ class Lifted:
     ) -> Lifted:
         """Return a form with the unknowns, equations and inequalities of all parts.
 
-        ``others`` are further unknowns.  They and the further ``equations`` and ``inequalities`` come last.
+        Further unknowns ``others``, and further ``equations`` and ``inequalities``, come after the parts.
         """
         row, column, placed = 0, 0, list[PlacedJump]()
         for part in parts:
@@ -135,7 +135,7 @@ class UnknownJump:
 
     @property
     def jumps(self) -> tuple[PlacedJump, ...]:
-        """This jump, placed first in a :class:`Lifted`; empty if it has no derivatives in closed form."""
+        """This jump as the first part of a :class:`Lifted`; empty if the jump has no derivatives in closed form."""
         return (PlacedJump(self, 0, 0),) if self.derivatives.exist else ()
 
     def with_impulse(self, impulse: ca.SX, fixing: ca.SX) -> UnknownJump:
@@ -220,5 +220,5 @@ def worst_of(parts: Sequence[Lifted | UnknownJump], values: Sequence[ca.SX], sca
 
 
 def worst_of_guesses(parts: Sequence[Guess], largest: float, attempt: int) -> Guess:
-    """Return the guess for :func:`worst_of`.  Its ``t`` is above ``largest``, the maximum in units of the scale."""
+    """Return the guess for :func:`worst_of`, with ``t`` above ``largest``, the maximum in units of the scale."""
     return Guess.joined([*parts, Guess.unbounded(np.array([largest + ABOVE[attempt]]))])

@@ -77,7 +77,7 @@ def check_contacts(contacts: Sequence[ImpactContact], kind: type[ImpactKind], *,
     if len(contacts) == 1:
         if bilateral:
             what = "there is one contact, for which pulling is as bad as pushing"
-            raise ContactError(what, where="bilateral", hint="leave it out")
+            raise ContactError(what, where="bilateral", hint="omit `bilateral`")
         return
     if len(contacts) > MOST_CONTACTS:
         raise ContactError(f"{len(contacts)} contacts", where="contact", hint=f"give up to {MOST_CONTACTS}")
@@ -87,10 +87,10 @@ def check_contacts(contacts: Sequence[ImpactContact], kind: type[ImpactKind], *,
             raise ContactError(f"'{place[0]}' is given twice", where="contact", hint="remove one")
     if not kind.adds_up:
         what = f"{kind.name} is per approach speed of one contact, which does not determine the impulses of several"
-        raise MetricError(what, where="objective", hint="choose impulse, whose bounds are given, or one `contact`")
+        raise MetricError(what, where="objective", hint="choose impulse, or give one `contact`")
     if cone:
         what = "the worst case over a cone of normals is exact for one contact only"
-        raise MetricError(what, where="normal_cone", hint="give one `contact`, or leave the cone out")
+        raise MetricError(what, where="normal_cone", hint="give one `contact`, or omit the cone")
 
 
 def corners(count: int, bilateral: bool) -> Array:
