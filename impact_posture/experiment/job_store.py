@@ -65,7 +65,7 @@ class JobStore:
             fcntl.flock(lock, fcntl.LOCK_EX | fcntl.LOCK_NB)
         except BlockingIOError:
             os.close(lock)
-            what, hint = "another command keeps its runs there", "wait for its end, or choose another `out`"
+            what, hint = "another command stores its runs there", "wait until it ends, or choose another `out`"
             raise OutputError(what, where=str(self.folder), hint=hint) from None
         except OSError:
             # The file system has no locks.
@@ -76,8 +76,8 @@ class JobStore:
         try:
             self.folder.mkdir(parents=True, exist_ok=True)
         except OSError as error:
-            hint = "runs are kept there until `out` is written: move it away, or choose another `out`"
-            raise OutputError(f"cannot be made ({error.strerror})", where=str(self.folder), hint=hint) from error
+            hint = "runs are stored there until `out` is written: remove the file, or choose another `out`"
+            raise OutputError(f"cannot be created ({error.strerror})", where=str(self.folder), hint=hint) from error
 
     def _remove_empty(self) -> None:
         with suppress(OSError):
@@ -114,7 +114,7 @@ class JobStore:
         """
         document = self.find(job)
         if document is None:
-            what = f"the run of {job.label} with seed {job.seed} is gone or was changed"
+            what = f"the run of {job.label} with seed {job.seed} was deleted or changed"
             raise OutputError(what, where=str(self.folder), hint="run the command again")
         return document
 

@@ -112,7 +112,7 @@ def execute(job: Job, factory: ControllerFactory | None = None) -> tuple[tuple[R
     factory.compile = job.compile
     scenario = factory.setup.scenario
     if job.sign is not None and job.sign not in scenario.signs:
-        raise InputError(f"is not pushed with sign {job.sign}", where=scenario.name, hint="leave `sign` out")
+        raise InputError(f"has no push with sign {job.sign}", where=scenario.name, hint="omit `sign`")
     runs = run(factory, job.controller, seed=job.seed, mode=job.mode, gain=job.gain, only=job.sign)
     metrics = [measure(factory.setup, record) for record in runs]
     parts = [_run_document(factory, *each) for each in zip(runs, metrics, strict=True)]

@@ -56,7 +56,8 @@ RECOMMENDED: dict[str, str] = {
     "talos-push": "robust-flow",
 }
 
-# Target → function and text.  The function returns whether a row misses the target, for the reduction of the paper.
+# Target → function and text.  The function returns true if a row misses the target; its second argument is the
+# reduction in the paper.
 # The text describes what the row has if it misses the target.  The target ``recovery`` excludes motion that is only
 # delayed.  Saturation times are multiples of a tick, so a difference below 1e-9 s is a rounding error.
 _TARGETS: dict[str, tuple[Callable[[ControllerRow, float], bool], str]] = {
@@ -170,7 +171,7 @@ class Reproduction:
         return best_of(self.of(scenario))
 
     def comparison(self) -> dict[str, Any]:
-        """Return the content of ``comparison.json``, if there is only one scenario."""
+        """Return the content of ``comparison.json``.  It is defined only for results of a single scenario."""
         head = {"schema": COMPARISON_SCHEMA, "scenario": self.rows[0].scenario, "seeds": list(range(self.seeds))}
         return head | {"rows": jsonable(self.rows)}
 

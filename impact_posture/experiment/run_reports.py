@@ -115,11 +115,13 @@ def write_run_report(folder: Path, scenario: str = "", *, meshes: bool = False) 
                 if (path := folder / RUNS / f"{stem}.json").is_file():
                     runs += _runs(_read(path, SIMULATION_SCHEMA), folder / RUNS / stem, scenario, 1)
             if not runs:
-                raise SpecError("holds no run to show", where=str(folder), hint="see the status in comparison.json")
+                raise SpecError(
+                    "contains no run that can be shown", where=str(folder), hint="see the status in comparison.json"
+                )
             content = comparison_content(folder, document, runs[0][0])
         return write_page(folder, content, run_scene(runs, meshes=meshes))
     except _BROKEN as error:
-        what = f"holds no whole run or comparison ({type(error).__name__}: {error})"
+        what = f"contains no complete run or comparison ({type(error).__name__}: {error})"
         raise SpecError(what, where=str(folder), hint="run simulate or compare again") from None
 
 
@@ -135,7 +137,7 @@ def thin(series: Series, windows: Iterable[Window]) -> Series:
     away = np.flatnonzero(~(np.abs(series.q).max(axis=1) < _AWAY))
     t = series.t[: away[0]] if len(away) else series.t
     if len(t) < 2:
-        raise InputError("runs away at once", where="report", hint="there is nothing to show")
+        raise InputError("the state diverges within two ticks", where="report", hint="the run has no report")
     step = float(t[1] - t[0])
     inside = np.zeros(len(t), dtype=bool)
     for window in windows:
@@ -214,7 +216,7 @@ def _runs(document: Document, stem: Path, scenario: str, count: int) -> list[tup
     job, runs = _job(document, scenario), []
     factory = controller_factory(job.scenario, job.free)
     if document["model_sha256"] != factory.setup.robot.model_sha256:
-        raise SpecError("was run with another robot model", where=str(stem.parent), hint="run it again")
+        raise SpecError("contains a run with another robot model", where=str(stem.parent), hint="run it again")
     for part in document["runs"][:count]:
         view = run_view(job, part, thin(Series.load(_series(stem, part["sign"])), _windows(part)))
         label = f"{view.label}, push {part['sign']:+d}" if count > 1 else view.label

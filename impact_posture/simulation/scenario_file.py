@@ -144,7 +144,7 @@ class ScenarioTable(Scene, RobotSettings):
         if len(tasks) != 1:
             both = "both " + " and ".join(f"[{key}]" for key in tasks)
             what = both if tasks else "neither [contacts], [push] nor [throw]"
-            raise InputError(f"has {what}", hint="have one of them")
+            raise InputError(f"has {what}", hint="give exactly one of them")
         (task, content), shapes = tasks.popitem(), [s.frame for s in self.shapes]
         names = [] if self.contacts is None else [("surface", self.contacts.surface, [s.name for s in self.surfaces])]
         for key, name, known in (*names, *([] if self.push else [("frame", content.frame, shapes)])):
@@ -155,7 +155,7 @@ class ScenarioTable(Scene, RobotSettings):
         for shape in self.shapes if self.throw else ():
             if shape.frame == content.frame and (shape.kind != "sphere" or shape.center is None):
                 what = f"a ball is thrown at the {shape.kind} at '{shape.frame}'"
-                raise InputError(what, hint="make it a sphere and give its center, at which the ball flies")
+                raise InputError(what, hint="use a sphere and give its center, which is the target of the ball")
 
 
 @checked
@@ -214,7 +214,7 @@ class Scenario(ScenarioTable):
 
     def _contacts(self, what: str) -> RepeatedContacts:
         if self.contacts is None:
-            raise InputError(f"there is no {what}", where=self.source, hint="ask only where there are contacts")
+            raise InputError(f"there is no {what}", where=self.source, hint="use a scenario with contacts")
         return self.contacts
 
 

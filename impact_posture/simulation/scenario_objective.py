@@ -52,7 +52,7 @@ def interpreted(objective: WorstCaseObjective) -> Gradient:
     def call(q: Array) -> tuple[float, Array]:
         value, gradient = function(q, normal)
         if not np.isfinite(float(value)):
-            raise MetricError("does not exist there", where=objective.name, hint="start elsewhere")
+            raise MetricError("is undefined at this posture", where=objective.name, hint="use another start posture")
         return float(value), np.asarray(gradient).ravel()
 
     return call

@@ -16,7 +16,7 @@ from impact_posture.simulation.world.world import World, build_world
 from impact_posture.system.arrays import Array
 from impact_posture.system.progress import tell
 
-# Keys of a scenario; an error may give one of them as its place.
+# Keys of a scenario.  The ``where`` of an error may be one of these keys.
 _KEYS = {field.name for field in fields(ScenarioTable)}
 
 

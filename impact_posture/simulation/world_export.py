@@ -80,13 +80,15 @@ def _joints(setup: Setup) -> Iterable[tuple[str, Iterable[float]]]:
             yield "joint", indices
         else:
             what = f"joint '{slot.joint.name}' is of the family {family}"
-            raise InputError(what, where="world export", hint="lock it (lock = [...] in the scenario)")
+            raise InputError(what, where="world export", hint="lock the joint (lock = [...] in the scenario)")
 
 
 def _task(setup: Setup, model: Any) -> Iterable[tuple[str, Iterable[float]]]:
     scenario, task = setup.scenario, setup.scenario.task
     if isinstance(task, Throw):
-        raise InputError("a thrown ball cannot be exported", where=scenario.source, hint="take contacts or a push")
+        raise InputError(
+            "a thrown ball cannot be exported", where=scenario.source, hint="use a scenario with contacts or a push"
+        )
     if isinstance(task, RepeatedContacts):
         reference = Reference(task, setup.gap)
         yield "touching", [[shape.frame for shape in scenario.shapes].index(task.frame)]

@@ -78,12 +78,14 @@ class Atlas:
                 write_record(self.folder, "sweep")
             except OSError as error:
                 words = f"cannot be written ({error.strerror or error})"
-                raise OutputError(words, where=str(self.folder), hint="free space or choose another `out`") from None
+                raise OutputError(
+                    words, where=str(self.folder), hint="free disk space or choose another `out`"
+                ) from None
             write_whole(manifest, json.dumps(self._manifest(), indent=1) + "\n")
         known = read_manifest(self.folder)
         if known["key"] != self._key:
             other = "another version" if known["version"] != __version__ else "another sweep, or other code or robots"
-            raise OutputError(f"holds results of {other}", where=str(self.folder), hint="choose another `out`")
+            raise OutputError(f"contains results of {other}", where=str(self.folder), hint="choose another `out`")
         with manifest.open("rb") as held:
             try:
                 fcntl.flock(held, fcntl.LOCK_EX | fcntl.LOCK_NB)
@@ -158,7 +160,9 @@ class Atlas:
     def _content(self, shard: int) -> bytes:
         path = self._first(shard)
         if path is None:
-            raise OutputError("lost a shard meanwhile", where=str(self.folder), hint="run sweep again, which goes on")
+            raise OutputError(
+                "a shard was deleted meanwhile", where=str(self.folder), hint="run sweep again to continue"
+            )
         return path.read_bytes()
 
     def _read_postures(self, shard: int) -> dict[int, list[float] | None]:
@@ -192,7 +196,9 @@ def read_manifest(folder: Path) -> dict[str, Any]:
             raise ValueError(f"schema {content['schema']}")
         return {**content, "key": str(content["key"]), "version": str(content["version"])}
     except FileNotFoundError:
-        raise SpecError("holds no manifest.json", where=str(folder), hint="name a folder that sweep wrote") from None
+        raise SpecError(
+            "contains no manifest.json", where=str(folder), hint="name a folder that sweep wrote"
+        ) from None
     except (OSError, ValueError, LookupError, TypeError, RecursionError) as error:
         what = f"is not a manifest of a sweep ({type(error).__name__}: {error})"
         raise SpecError(what, where=str(path), hint="name a folder that sweep wrote") from None
@@ -212,7 +218,7 @@ def open_atlas(folder: str | Path) -> Dataset:
     read_manifest(Path(folder))
     data = Path(folder) / _DATA
     if next(data.glob("case=*/*.parquet"), None) is None:
-        raise SpecError("has no finished shard", where=str(folder), hint="run sweep again, which goes on")
+        raise SpecError("has no finished shard", where=str(folder), hint="run sweep again to continue")
     try:
         return dataset.dataset(data, format="parquet", partitioning="hive")
     except (OSError, ArrowException) as error:

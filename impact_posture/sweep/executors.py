@@ -90,7 +90,7 @@ class SlurmJobs(Executor):
             try:
                 self._executor(Path(trial))
             except (NameError, TypeError, ValueError, AssertionError) as error:
-                raise InputError(str(error), where="slurm", hint="name parameters of submitit.AutoExecutor") from None
+                raise InputError(str(error), where="slurm", hint="give parameters of submitit.AutoExecutor") from None
         self._waiting = ThreadPoolExecutor(1 << 10)
 
     def _executor(self, folder: Path) -> Any:

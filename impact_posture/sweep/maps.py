@@ -116,7 +116,7 @@ def _chosen(grid: Grid, axes: Sequence[str] | None) -> tuple[int, int | None]:
             hint = f"did you mean {', '.join(nearest(name, names))}?"
             raise InputError(f"no axis '{name}'", where="axes", hint=hint)
     if not 1 <= len(set(axes)) == len(axes) <= 2:
-        raise InputError(f"names {len(axes)} axes", where="axes", hint="give one or two different ones")
+        raise InputError(f"names {len(axes)} axes", where="axes", hint="give one axis or two different axes")
     return names.index(axes[0]), names.index(axes[1]) if len(axes) > 1 else None
 
 

@@ -195,14 +195,18 @@ def read_sweep(path: Path) -> Sweep:
             raise SpecError(f"has {count} {words}", where=f"{path}: grid", hint=f"give at most {most:.0e}")
     values = {name: _values(name, table) for name, table in settings.grid.items()}
     if "contact" in problem:
-        raise SpecError("a sweep is of one contact", where=f"{where}.contact", hint="give `frame` and `normal`")
+        raise SpecError(
+            "a sweep supports only one contact", where=f"{where}.contact", hint="give `frame` and `normal`"
+        )
     first = {name: values[name][0] for name in inner if name not in OFFSETS}
     first_settings = validate(ProblemSettings, problem | first | {name: values[name][0] for name in outer}, where)
     axes = tuple(Axis(name, _checked(name, values[name], problem | first, f"{path}: grid")) for name in inner)
     for name in outer:
         _checked(name, values[name], problem | first, f"{path}: grid")
     if first_settings.tradeoff or first_settings.path or first_settings.search != "multistart":
-        raise SpecError("`tradeoff`, `path` and `search` are for one optimum", where=where, hint="leave them out")
+        raise SpecError(
+            "a sweep does not support `tradeoff`, `path` and `search`", where=where, hint="remove these keys"
+        )
     cases = []
     for combination in product(*(values[name] for name in outer)):
         case = dict(zip(outer, combination, strict=True))
@@ -257,5 +261,5 @@ def _checked(name: str, values: Sequence[Any], problem: dict[str, Any], where: s
             raise SpecError(what, where=f"{where}.{name}[{k}]", hint=error.hint) from None
         checked.append(setting[0] if name in OFFSETS else setting)
     if len(set(map(repr, checked))) < len(checked):
-        raise SpecError("has a value twice", where=f"{where}.{name}", hint="leave one of them out")
+        raise SpecError("has a value twice", where=f"{where}.{name}", hint="remove one of the equal values")
     return tuple(checked)

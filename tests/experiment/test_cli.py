@@ -48,7 +48,7 @@ def test_simulate(aerial: Path, tmp_path: Path) -> None:
     columns = vars(series) | {"t": np.zeros_like(series.t)}
     Series(**columns).save(tmp_path / "run" / "series.npz")
     refused = start("report", "run", cwd=tmp_path)
-    assert refused.returncode == 1 and "run: holds no whole run" in refused.stderr
+    assert refused.returncode == 1 and "run: contains no complete run" in refused.stderr
 
 
 def test_simulate_without_a_compiler(aerial: Path, tmp_path: Path) -> None:
@@ -121,7 +121,7 @@ def test_compare_robots_that_fall(falls: Path, tmp_path: Path) -> None:
     for path in (tmp_path / "both" / "runs").iterdir():
         path.unlink()
     done = start("report", "both", cwd=tmp_path)
-    assert done.returncode == 1 and "both: holds no run to show" in done.stderr
+    assert done.returncode == 1 and "both: contains no run that can be shown" in done.stderr
 
 
 def test_simulate_prints_made_and_expected_contacts(capsys: pytest.CaptureFixture[str]) -> None:
@@ -189,9 +189,9 @@ def test_reproduce(tmp_path: Path) -> None:
     [
         (("simulate", "aerial-vertcal"), 1, "did you mean aerial-vertical"),
         (("simulate", "solo8-push", "--controller", "robst"), 1, "did you mean robust"),
-        (("simulate", "solo8-push", "--controller", "nominal", "--mode", "held"), 1, "has no term to hold"),
+        (("simulate", "solo8-push", "--controller", "nominal", "--mode", "held"), 1, "has no mode held"),
         (("simulate", "solo8-push", "--controller", "robust-flow", "--gain", "5"), 1, "'robust-flow' has no gain"),
-        (("simulate", "aerial-lateral", "--sign", "-1"), 1, "leave --sign out"),
+        (("simulate", "aerial-lateral", "--sign", "-1"), 1, "omit --sign"),
         (("simulate", "solo8-push", "--gain", "-1"), 2, "above zero"),
         (("compare", "solo8-push", "--controllers", "nominal,robust:hold"), 1, "no variant 'hold'"),
         (("compare", "solo8-push", "--controllers", " , "), 2, "at least one"),

@@ -150,7 +150,7 @@ def test_a_job_with_a_damaged_file_runs_again(
             {"empty": b"", "half": content[: len(content) // 2], "bytes": b"\xff\xfe\x00",
              "changed": content.replace(b"completed", b"fell"), "series": store.series(job, 1).read_bytes()}[damaged]
         )  # fmt: skip
-    with pytest.raises(OutputError, match="the run of nominal with seed 0 is gone or was changed"):
+    with pytest.raises(OutputError, match="the run of nominal with seed 0 was deleted or changed"):
         store.finished(job)
     assert run_batch([job], store=store) == documents and len(calls) == 2
     assert path.read_bytes() == content
@@ -200,14 +200,14 @@ def test_unknown_names_are_refused_before_any_run(aerial: Path) -> None:
 def test_a_file_in_the_place_of_the_store_is_refused(tmp_path: Path) -> None:
     (tmp_path / ".both.runs").write_text("mine")
     done = start("compare", "aerial-lateral", "--out", "both", cwd=tmp_path)
-    refused(done, 1, ".both.runs: cannot be made", "choose another --out")
+    refused(done, 1, ".both.runs: cannot be created", "choose another --out")
     assert (tmp_path / ".both.runs").read_text() == "mine" and len(list(tmp_path.iterdir())) == 1
 
 
 def test_two_commands_cannot_share_a_store(tmp_path: Path) -> None:
     with store_beside(tmp_path / "both") as store:
         done = start("compare", "aerial-lateral", "--out", "both", cwd=tmp_path)
-        refused(done, 1, ".both.runs: another command keeps its runs there", "wait for its end")
+        refused(done, 1, ".both.runs: another command stores its runs there", "wait until it ends")
         assert store.folder.is_dir()
     assert not list(tmp_path.iterdir())
 
@@ -228,7 +228,7 @@ def test_a_store_without_runs_is_removed_and_one_with_runs_stays(aerial: Path, t
 
 def test_figures_are_not_drawn_without_a_finished_run(aerial: Path, tmp_path: Path) -> None:
     reproduction = Reproduction(1, (), (Job(str(aerial), "nominal"),))
-    with pytest.raises(OutputError, match="is gone or was changed"), store_beside(tmp_path / "both") as store:
+    with pytest.raises(OutputError, match="was deleted or changed"), store_beside(tmp_path / "both") as store:
         draw_side_by_side(reproduction.shown, store, tmp_path, ["png"])
     assert not list(tmp_path.iterdir())
 

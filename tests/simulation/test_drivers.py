@@ -237,7 +237,7 @@ def test_the_posture_driver_reaches_its_goal(name: str) -> None:
 @pytest.mark.parametrize(
     ("name", "change", "words"),
     [
-        ("aerial-vertical", {"end_effector": None}, r"nothing that leads the frame there.*\[control.end_effector\]"),
+        ("aerial-vertical", {"end_effector": None}, r"no gains for the end effector.*\[control.end_effector\]"),
         ("aerial-vertical", {"center_of_mass": Gains(10)}, r"has \[control.center_of_mass\], but no"),
         ("aerial-vertical", {"base": Gains(10)}, r"has \[control.base\], but no \[control.footing\]"),
         ("solo8-push", {"tilt": Gains(10)}, r"has \[control.tilt\], but feet"),

@@ -200,7 +200,7 @@ def test_tight_limits_relax_the_tasks() -> None:
     ("arguments", "error", "words"),
     [
         ({"controller": "robsut"}, ControllerNotFound, "did you mean robust"),
-        ({"controller": "nominal", "mode": "held"}, InputError, "has no term to hold"),
+        ({"controller": "nominal", "mode": "held"}, InputError, "has no mode held"),
         ({"controller": "robust", "mode": "frozen"}, InputError, "there is no mode 'frozen'"),
         ({"controller": "robust", "gain": -1.0}, InputError, "K: is -1.0"),
         ({"controller": "stiff", "gain": float("nan")}, InputError, "K: is nan"),

@@ -185,7 +185,7 @@ def test_a_wrong_file_is_refused_in_one_line(folder: Path, old: str, new: str, w
     [
         ("speed = 0.2", "speed = 0.2\ncount = 10000000000000", r"more than 1e\+07 ticks"),
         ("speed = 0.2", "speed = 0.2\ndwell = 1e308", r"more than 1e\+07 ticks"),
-        ("speed = 0.2", "speed = 1e308", r"takes inf m"),
+        ("speed = 0.2", "speed = 1e308", r"requires inf m"),
         ("[control.posture]", "[control]\nperiod = 1e2\n\n[control.posture]", r"more than 1e\+05 times the physics"),
         ("[control.posture]", "[control]\nperiod = 30.0\n\n[control.posture]", r"fewer than two ticks"),
         ("timestep = 0.0005", "timestep = 1e-12", r"more than 1e\+05 times the physics"),
@@ -286,7 +286,7 @@ def test_the_reference_hits_the_surface_at_its_speed_and_returns(acceleration: f
 
 
 def test_a_gap_that_is_too_short_for_the_speed_is_refused() -> None:
-    with pytest.raises(InputError, match=r"takes 0\.125 m, the gap is 0\.1 m"):
+    with pytest.raises(InputError, match=r"requires 0\.125 m, but the gap is 0\.1 m"):
         Reference(RepeatedContacts("ee", "wall", 0.5), 0.1)
 
 

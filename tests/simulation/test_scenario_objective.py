@@ -111,7 +111,7 @@ def test_results_are_not_shared() -> None:
 
 def test_an_undefined_objective_is_an_error() -> None:
     call = interpreted(objective_of("ur5", "tool0", "impulse", False))
-    with pytest.raises(MetricError, match="does not exist there") as caught:
+    with pytest.raises(MetricError, match="is undefined at this posture") as caught:
         call(np.full(6, np.nan))
     assert "\n" not in caught.value.line
 

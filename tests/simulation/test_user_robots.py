@@ -226,7 +226,7 @@ def test_a_pushed_arm_without_an_end_effector_task(folder: Path) -> None:
 @pytest.mark.parametrize(
     ("old", "new", "words"),
     [
-        ("[control.end_effector]\nkp = 100\n", "", r"nothing that leads the frame there"),
+        ("[control.end_effector]\nkp = 100\n", "", r"no gains for the end effector"),
         ("[control.posture]", "[control.footing]\n\n[control.posture]", r"\[control.footing\], but a base that is"),
         ("speed = 0.2", "speed = 0.9", r"the gap is 0.04 m"),
         ("[control.posture]\nkp = 10", "[control.posture]\nkp = [1, 2]", r"kp: has shape"),

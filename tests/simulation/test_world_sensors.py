@@ -221,7 +221,7 @@ def one_line(error: ImpactPostureError) -> str:
         (lambda: Sensors(joint_rate=-1.0), "joint_rate"),
         (lambda: Scene((Surface("s", (0, 0, 1)), Surface("s", (1, 0, 0)))), "two surfaces are called 's'"),
         (lambda: Scene(shapes=(Shape("ee", (0.1,)), Shape("ee", (0.1,)))), "two shapes are at 'ee'"),
-        (lambda: Scene(sensors=Sensors(force_frame="ee")), "carries no shape"),
+        (lambda: Scene(sensors=Sensors(force_frame="ee")), "there is no shape at force_frame"),
     ],
 )
 def test_wrong_scenes_are_refused(make: Any, words: str) -> None:
@@ -261,7 +261,7 @@ def test_wrong_use_is_refused() -> None:
     with pytest.raises(InputError, match="give 6 finite numbers"):
         world.reset(robot.posture(), rotor_speed=[50.0, 50.0])
     for push in (Push("ee", (1, 0, 0), 0.0), Push("ee", (np.inf, 0, 0), 1.0)):
-        with pytest.raises(InputError, match="no force or no duration"):
+        with pytest.raises(InputError, match="the force or the duration is invalid"):
             world.push(push)
     with pytest.raises(FrameNotFound, match="ee"):
         world.push(Push("e", (1, 0, 0), 1.0))

@@ -410,7 +410,7 @@ PROBLEM = '[problem]\nrobot = "tilthex_arm"\nnormal = [0, 0, 1]\n'
         (PROBLEM + '[grid]\nobjective = ["impulse", "sped"]', "did you mean speed"),
         (PROBLEM + "[grid]\nseed = [1]", "'seed' cannot vary"),
         (PROBLEM + "[grid]\ntarget_quaternion = [[0, 0, 0, 2]]", "norm 2"),
-        (PROBLEM + 'path = true\n[grid]\nx = [0]', "leave them out"),
+        (PROBLEM + 'path = true\n[grid]\nx = [0]', "remove these keys"),
         ("shard = 0\n" + PROBLEM + "[grid]\nx = [0]", "1 to 1e+06 points"),
         (PROBLEM + '[grid]\n"\\u001b[31m\\n" = [0]', "unknown axis"),
         (PROBLEM.replace("tilthex_arm", "a\\u001bb") + "[grid]\nx = [0]", "no robot"),
@@ -428,7 +428,7 @@ def test_a_wrong_file_is_refused_in_one_line(tmp_path: Path, text: str, words: s
 def test_the_command_refuses_wrong_arguments_in_one_line(tmp_path: Path, arm: Path) -> None:
     (tmp_path / "a.toml").write_text(PROBLEM + "[grid]\ny = [0, 0]")
     refused(run("sweep", "a.toml", cwd=tmp_path), 1, "has a value twice")
-    refused(run("sweep", "show", tmp_path), 1, "holds no manifest.json")
+    refused(run("sweep", "show", tmp_path), 1, "contains no manifest.json")
     refused(run("sweep", "show", arm, "--axes", "x,w"), 1, "no axis 'w'")
     for words in (("show",), ("a.toml", "b"), ("a.toml", "--mpi", "--scheduler", "tcp://a:1")):
         assert run("sweep", *words, cwd=tmp_path).returncode == 2
@@ -444,7 +444,7 @@ def test_refused_options_of_slurm_leave_no_files(tmp_path: Path) -> None:
 
 
 def test_another_folder_cannot_be_opened_as_a_sweep(tmp_path: Path) -> None:
-    with pytest.raises(SpecError, match="holds no"):
+    with pytest.raises(SpecError, match="contains no"):
         ip.sweep.open(tmp_path)
     (tmp_path / "manifest.json").write_text('{"schema": 3}')
     with pytest.raises(SpecError, match="not a manifest of a sweep"):

@@ -26,8 +26,8 @@ from impact_posture.tsid.controller import Command, Controller
 from impact_posture.tsid.tasks.task import TargetTask
 
 _PREFIX = "controller"
-# Compiler options for the generated code.  Higher optimization takes long.  For a humanoid, -O1 needs 2 s and makes
-# ticks 10 % faster.
+# Compiler options for the generated code.  For a humanoid, -O1 needs 2 s and makes ticks 10 % faster.  Higher levels
+# of optimization need much more time.
 _QUICK = ("-O1",)
 
 
@@ -111,7 +111,9 @@ def compiled_tick(controller: Controller, structure: Structure, objective: Worst
             options: dict[str, Any] = {"objective": objective, "prefix": _PREFIX, "build": True, "force": True}
             options |= {"generated": _QUICK, "shared": True}
             if export_controller(controller.robot, controller.formulation, folder, **options).library is None:
-                raise CompilerError("left no library", where=str(folder), hint="set CC to another compiler")
+                raise CompilerError(
+                    "the compiler wrote no library", where=str(folder), hint="set CC to another compiler"
+                )
     # Use the given structure, because the manifest can name another robot that has the same code.
     return CompiledTick(controller, structure, CompiledController.load(folder))
 

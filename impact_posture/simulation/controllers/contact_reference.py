@@ -44,8 +44,8 @@ class Reference:
         # Use ``v * v``: if it overflows, the result is infinite, but ``v**2`` raises OverflowError.
         run_up = v * v / (2 * a)
         if not run_up <= gap:
-            what = f"{v:g} m/s at {a:g} m/s² takes {run_up:.3g} m, the gap is {gap:.3g} m"
-            raise InputError(what, where="contacts", hint="widen the gap, slow down, or accelerate more")
+            what = f"{v:g} m/s at {a:g} m/s² requires {run_up:.3g} m, but the gap is {gap:.3g} m"
+            raise InputError(what, where="contacts", hint="increase the gap or the acceleration, or reduce the speed")
         depth, braking = gap + task.beyond, 2 * task.beyond / v
         top = min(v, float(np.sqrt(a * depth)))
         inward = [(v / a, a, 0.0, 0.0), ((gap - run_up) / v, 0.0, run_up, v)]

@@ -90,7 +90,7 @@ def check_gain(name: str, gain: float | None) -> None:
     """Raise an InputError if a gain is given for a controller of this package that has no gain."""
     has = name.startswith(("robust", "walker", "stiff")) and not name.startswith("robust-flow")
     if gain is not None and name in CONTROLLERS and not (has or name.endswith(_STIFF)):
-        hint = "robust, its variants, walker and stiff have one"
+        hint = "robust, its variants, walker and stiff have a gain"
         raise InputError(f"'{name}' has no gain", where="gain", hint=hint)
 
 
@@ -159,7 +159,7 @@ class ControllerFactory:
         return self._optimum(name) if name in _OFFLINE else None
 
     def _optimum(self, name: str) -> OfflinePosture:
-        # For the controller ``path``, the end effector stays at its start, so the optimum is another one.
+        # For the controller ``path``, the end effector must stay at its start, so a separate optimum is computed.
         kind, at_contact = _KINDS.get(name, "impulse"), name != "path"
         if (kind, at_contact) not in self._offline:
             self._offline[kind, at_contact] = self.offline_of(
@@ -197,7 +197,7 @@ class ControllerFactory:
         if name.removesuffix(_STIFF) not in CONTROLLERS:
             return self._driver_from_outside(name, mode, gain)
         if mode == "held" and not (name.startswith("robust") or name == "walker"):
-            raise InputError(f"'{name}' has no term to hold", where="mode", hint="only robust… and walker have one")
+            raise InputError(f"'{name}' has no mode held", where="mode", hint="use robust, its variants, or walker")
         driver = self._build(name, mode, gain)
         driver.compiled = self._compiled(driver, name)
         self.in_c = driver.compiled is not None
@@ -237,7 +237,7 @@ class ControllerFactory:
             return None
         try:
             if type(driver) not in _IN_C:
-                raise InputError(f"'{name}' has no C code", where="compile", hint="run it with auto or never")
+                raise InputError(f"'{name}' has no C code", where="compile", hint="give auto or never")
             structure = structure_of(controller.robot, controller.formulation)
         except InputError:
             if always:
@@ -283,8 +283,10 @@ class ControllerFactory:
             raise
         except Exception as error:
             # The code of another package can raise any exception.
-            what = f"cannot be made: {type(error).__name__}: {error}"
-            raise InputError(what, where=where, hint="correct or remove the package that adds it") from error
+            what = f"cannot be built: {type(error).__name__}: {error}"
+            raise InputError(what, where=where, hint="correct or uninstall the package that adds it") from error
         if not isinstance(driver, Driver):
-            raise InputError(f"makes a {type(driver).__name__}", where=where, hint="return a Driver")
+            raise InputError(
+                f"returns an object of type {type(driver).__name__}", where=where, hint="return a Driver"
+            )
         return driver

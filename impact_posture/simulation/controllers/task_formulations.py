@@ -34,7 +34,7 @@ def end_effector_task(setup: Setup) -> EndEffector | None:
     if scenario.contacts is None:
         return None
     if gains is None:
-        what = "has contacts, but nothing that leads the frame there"
+        what = "has contacts, but no gains for the end effector"
         raise SpecError(what, where=scenario.source, hint="add [control.end_effector]")
     mass, frame = scenario.control.apparent_mass, scenario.shape.frame
     impedance = None if mass is None else Impedance(mass)
@@ -106,5 +106,5 @@ def _contacts(setup: Setup, footing: StanceGains) -> tuple[SupportContact, ...]:
     contacts = tuple(c for c in contacts if c.point.frame not in footing.lifted)
     if not contacts:
         what = "has [control.footing], but the robot has no supports"
-        raise SpecError(what, where=setup.scenario.source, hint="name [[supports]] in robot.toml")
+        raise SpecError(what, where=setup.scenario.source, hint="add [[supports]] to robot.toml")
     return tuple(replace(contact, least=footing.least) for contact in contacts)

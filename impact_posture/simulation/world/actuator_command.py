@@ -61,10 +61,10 @@ class CommandLimits:
         with np.errstate(over="ignore"):
             usual = speed.dot(speed) + torque.dot(torque) < RUNAWAY**2
         if not usual and not (np.isfinite(speed).all() and np.isfinite(torque).all()):
-            raise InputError("is not finite", where="command", hint="hold the last one instead")
+            raise InputError("is not finite", where="command", hint="repeat the last command instead")
         torque = np.minimum(np.maximum(torque, -self.effort), self.effort)
         if not usual and not np.abs(torque).max(initial=0.0) < RUNAWAY:
-            raise InputError("has an endless torque", where="command", hint="give the joints effort limits")
+            raise InputError("a torque is too large", where="command", hint="give the joints effort limits")
         return speed if self._rotors is None else self._rotors.within(speed), torque
 
 
@@ -105,8 +105,8 @@ class ActivePushes:
         """Begin a push at ``point`` in the coordinates of ``body``; errors as in :meth:`World.push`."""
         count = round(push.duration / self._model.opt.timestep) if np.isfinite(push.duration) else 0
         if count < 1 or not np.isfinite(push.force).all():
-            raise InputError("has no force or no duration", where=f"push at '{push.frame}'",
-                             hint="give newtons, and seconds of at least a time step")  # fmt: skip
+            raise InputError("the force or the duration is invalid", where=f"push at '{push.frame}'",
+                             hint="give a finite force in N, and at least one time step in s")  # fmt: skip
         self.active.append((body, point, np.array(push.force, dtype=float), step + count))
 
     def apply(self, data: Any, step: int) -> None:

@@ -12,7 +12,7 @@ from impact_posture.system.arrays import Array
 _ROWS, _FIRST = np.arange(3), np.arange(3) == 0
 # Indices with which a cross product is computed: (a × b)ᵢ = a[_NEXT[i]] b[_LAST[i]] − a[_LAST[i]] b[_NEXT[i]].
 _NEXT, _LAST = [1, 2, 0], [2, 0, 1]
-# With this number of recorded steps, the steps are evaluated even if :meth:`ContactLog.look` is not called.
+# As soon as this number of steps is recorded, the steps are evaluated even without :meth:`ContactLog.look`.
 _MOST = 4096
 
 
@@ -61,7 +61,7 @@ class _Mark(NamedTuple):
 
 
 class ContactLog:
-    """Contacts of all steps since the last :meth:`look`, with accumulated impulses and peaks."""
+    """Contacts of all steps since the last call of :meth:`look`, with accumulated impulses and peaks."""
 
     def __init__(self, model: Any, geoms: tuple[str, ...]) -> None:
         self._count, self._step = len(geoms), float(model.opt.timestep)

@@ -39,7 +39,9 @@ class Rotors:
         """Set the speeds, shape (rotors,), after clipping to the limits.  The speeds must be finite."""
         speeds = np.asarray(speeds, dtype=float)
         if speeds.shape != self.speeds.shape or not np.isfinite(speeds).all():
-            raise InputError("no speeds of the rotors", where="reset", hint=f"give {self.speeds.size} finite numbers")
+            raise InputError(
+                "the rotor speeds are invalid", where="reset", hint=f"give {self.speeds.size} finite numbers"
+            )
         self.speeds = self.within(speeds)
 
     def within(self, command: Array) -> Array:

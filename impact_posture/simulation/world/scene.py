@@ -154,7 +154,7 @@ class Scene(StrictTable):
         ):
             twice = sorted({name for name in names if names.count(name) > 1})
             if twice:
-                raise InputError(f"two {words} '{twice[0]}'", where="scene", hint="have one of each")
+                raise InputError(f"two {words} '{twice[0]}'", where="scene", hint="rename or remove one of them")
         step = self.physics.timestep
         for name, (a, b) in self.laws:
             # MuJoCo silently enforces the first two of these limits (refsafe).  A spring with 1/√k below the time
@@ -163,8 +163,8 @@ class Scene(StrictTable):
             for words, value, least in slow if a > 0 else (("1/√k", (-a) ** -0.5, 1),):
                 if value < least * step * (1 - 1e-9):
                     what = f"solref {[a, b]}: {words} is {value:.3g} s, below {least} × the time step of {step:g} s"
-                    raise InputError(what, where=name, hint="raise it, or lower the time step")
+                    raise InputError(what, where=name, hint="increase it, or reduce the time step")
         frame, frames = self.sensors.force_frame, [s.frame for s in self.shapes]
         if frame is not None and frame not in frames:
             hint = f"one of: {', '.join(frames)}" if frames else "add a shape"
-            raise InputError(f"force_frame '{frame}' carries no shape", where="sensors", hint=hint)
+            raise InputError(f"there is no shape at force_frame '{frame}'", where="sensors", hint=hint)

@@ -88,8 +88,8 @@ class World:
                 at ``q``.
 
         Raises:
-            PostureError: The configuration or the velocity does not fit the robot.
-            InputError: The rotor speeds do not fit the robot.
+            PostureError: The configuration or the velocity has a wrong size or is not finite.
+            InputError: The rotor speeds have a wrong size or are not finite.
         """
         q = self.robot.check_posture(np.asarray(q, dtype=float), limits=False, where="reset")
         v = checked_velocity(self.robot, np.zeros(self.robot.nv) if v is None else v)
@@ -143,12 +143,12 @@ class World:
             InputError: The scenario has no ball.
         """
         if self.ball is None:
-            raise InputError("has no ball", where="world", hint="take a scenario with [throw]")
+            raise InputError("has no ball", where="world", hint="use a scenario with [throw]")
         self.ball.throw(self._data, sign)
         self._mujoco.mj_step1(self._model, self._data)
 
     def step(self, command: Command | ActuatorCommand, count: int = 1) -> None:
-        """Take ``count`` physics steps under one command, which is clipped to the limits.
+        """Take ``count`` physics steps with a constant command, which is clipped to the limits.
 
         Raises:
             InputError: :meth:`reset` was not called, or the command has a wrong size or is not finite.
@@ -162,7 +162,7 @@ class World:
         with unwarned():
             self._advance(speed, count)
         state = self._data.qpos, self._data.qvel
-        # If the sum of squares is below the bound, so is every number.  Only otherwise, check the numbers one by one.
+        # If the sum of squares is below the bound, every number is below it too.  Otherwise, check each number.
         usual = state[0].dot(state[0]) + state[1].dot(state[1]) < RUNAWAY**2
         if not usual and not all(np.abs(part).max() < RUNAWAY for part in state):
             raise SimulationDiverged(self.time, where=self.robot.name)

@@ -125,7 +125,7 @@ def _placement(robot: Robot, numeric: Numeric, shape: Shape, normal: Array | Non
     if shape.center is not None:
         return frame * pin.SE3(np.eye(3), np.array(shape.center, dtype=float))
     if normal is None:
-        what = "has no center and no surface to be put against"
+        what = "has no center, and no surface determines its center"
         raise InputError(what, where=f"shape at '{shape.frame}'", hint="give a center")
     up = (numeric.data.oMi[point.joint] * frame).rotation.T @ normal
     if shape.kind == "sphere":
@@ -141,7 +141,7 @@ def _point(surface: Surface, normal: Array, placed: list[tuple[Shape, pin.SE3]])
     if surface.point is not None:
         return np.array(surface.point, dtype=float)
     if not placed:
-        what = "there is no shape that it has a gap to"
+        what = "has no point, and there is no shape that determines the point"
         raise InputError(what, where=f"surface '{surface.name}'", hint="give a point, or a shape")
     lowest = min((_lowest(*each, normal) for each in placed), key=lambda point: float(normal @ point))
     return np.asarray(lowest - surface.gap * normal)
@@ -175,7 +175,9 @@ def _add_motors(mjcf: Mjcf, robot: Robot) -> None:
         if slot.kind.family not in _DRIVEN:
             what = f"no motor drives joint '{slot.name}' ({slot.kind.family})"
             raise UnsupportedJoint(
-                what, where="simulation", hint="lock it (`lock`), or model it as slides and hinges"
+                what,
+                where="simulation",
+                hint="lock the joint (`lock`), or replace it by revolute and prismatic joints",
             )
         targets = mjcf.joints[slot.index]
         motors = [(f"motor {name}", name, np.eye(3)[0]) for name in targets]
