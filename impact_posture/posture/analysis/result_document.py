@@ -42,7 +42,7 @@ def result_document(
     path: dict[str, object] | None = None,
     global_search: GlobalSearch | None = None,
 ) -> dict[str, object]:
-    """Return the content of ``result.json``, with a block for each of the last four arguments except ``None``."""
+    """Return the content of ``result.json``; the last four arguments add a block each if they are not ``None``."""
     impact, around = prepared.impact, prepared.problem.surroundings
     initial, optimal = impact.evaluate(solution.initial), impact.evaluate(solution.q)
     loads = load_cases(impact.objective, solution.initial, prepared.problem.requirements)

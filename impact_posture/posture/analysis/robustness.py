@@ -24,8 +24,8 @@ from impact_posture.system.arrays import Array
 
 # Number of random models between the variants, to check whether any model is worse than all variants.
 _BETWEEN = 60
-# Relative changes below this value are treated as errors of the solver.  Constraints with a violation below this
-# value (m, rad) are treated as satisfied.
+# Relative changes of the objective below this value are treated as errors of the solver.  Constraints with a
+# violation below this value (m, rad) are treated as satisfied.
 _NOISE = 1e-6
 
 

@@ -74,7 +74,7 @@ class TradeOff:
         return [{**point.to_dict(), "knee": k == self.knee} for k, point in enumerate(self.points)]
 
     def arrays(self) -> dict[str, Array]:
-        """Return entries of ``result.npz``: ``tradeoff_q`` (k, nq) and arrays (k,), with NaN for a missing S."""
+        """Return the trade-off arrays of ``result.npz``, one row or entry per point; an undefined S is NaN."""
         names = ("within", "distance", "objective", "H", "G", "V", "q", "certified")
         arrays = {f"tradeoff_{name}": np.array([getattr(p, name) for p in self.points]) for name in names}
         return arrays | {"tradeoff_S": np.array([np.nan if p.S is None else p.S for p in self.points])}

@@ -48,7 +48,7 @@ class Verdict:
     """Changes from the initial to the optimal posture, at the given approach speed and friction.
 
     Attributes:
-        outcome: The verdict in a few words.
+        outcome: Verdict in a few words, one of the values of ``Outcome``.
         line: One sentence that describes the verdict.
         jump: Relative change of ``‖Δν‖_W``; ``None`` if it is unknown.
         impulse: Relative change of the magnitude of the impulse.

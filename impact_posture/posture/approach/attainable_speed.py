@@ -31,7 +31,7 @@ FASTEST = 1e3
 
 @dataclass(frozen=True, eq=False)
 class MovingPoint:
-    """Requirements on the motion of a point during the approach: rows of ``D v`` and ``D ω`` equal ``−σ d``.
+    """Required motion of a point during the approach: chosen rows of ``D v`` and ``D ω`` equal ``−σ d``.
 
     Attributes:
         axes: Matrix ``D``, shape (3, 3), whose rows are the normal and two tangents, or the axes of the world.
@@ -97,8 +97,8 @@ class AttainableSpeed:
     robot there.
 
     Attributes:
-        unknown: Reason why the speed is not computed; empty if it is computed.  A computed speed can be infinite at
-            some postures.
+        unknown: Reason why the speed is not computed; empty if it is computed.  A computed speed can still be
+            infinite at some postures.
         scale: Unit of each free entry of the velocity, rad/s or m/s, shape (k,).
         upper: Velocity limit of each free entry from the URDF, divided by its scale, shape (k,); infinite if there is
             no limit.

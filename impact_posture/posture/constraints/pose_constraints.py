@@ -87,7 +87,10 @@ class HeldOrientation(ExpressionConstraint):
         return self.error(model.placement(self.point).rotation, model.jacobian(self.point)[3:])
 
     def error(self, rotation: Array, jacobian: Array) -> tuple[Array, Array]:
-        """Return the rows and their tangent Jacobian from the rotation and angular Jacobian (3, nv) of the frame."""
+        """Return the rows and their tangent Jacobian.
+
+        ``jacobian`` is the angular Jacobian of the frame, shape (3, nv).
+        """
         error = (self._left * pin.Quaternion(rotation) * self._right).coeffs()
         x, y, z, w = (error if error[3] >= 0 else -error).tolist()
         # d(2 vec(Q)) = (w I + [v]×) ω with ω in rotated axes: the rotation of the frame times the matrix of `right`.
@@ -179,7 +182,7 @@ class HeldTurn(ExpressionConstraint):
 
 
 def base_point() -> PointOnLink:
-    """Return the origin of the link of a floating base."""
+    """Return the point at the origin of the floating base, with the axes of the base."""
     return PointOnLink(1, np.zeros(3), np.eye(3))
 
 

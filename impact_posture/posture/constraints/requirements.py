@@ -16,7 +16,7 @@ class Requirements:
     """Requirements of the task on the posture.
 
     Attributes:
-        contact_pose: Part of the pose of the first contact frame that must not change; values of the setting
+        contact_pose: Part of the pose of the first contact frame that must not change; same values as the setting
             ``contact_pose``.
         other_poses: Part of the pose that must not change, for each other contact frame.
         target_position: Target position of the contact frame, world axes, m; ``None`` for its initial position.

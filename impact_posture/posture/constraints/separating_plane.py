@@ -80,7 +80,7 @@ class ConvexBody:
         return np.zeros(0) if self.normal is None else np.append(self.normal, self.offset)
 
     def placement(self, model: Numeric) -> pin.SE3:
-        """Return the placement of the axes of the body in the world."""
+        """Return the placement of the body axes in the world."""
         placement = model.placement(self.point)
         return placement if self.turns else pin.SE3(np.eye(3), placement.translation)
 
@@ -248,7 +248,7 @@ class SeparatingPlane:
         return n, float((points @ n).min() - self.gap + (self._y @ n).max()) / 2
 
     def linearize(self, model: Numeric, unknowns: Array | None) -> Linearization:
-        """Linearize the rows of corners near the plane in the tangent space and (n, c); see :class:`Constraint`.
+        """Linearize the rows of corners near the plane with respect to the posture and (n, c).
 
         The plane is given by the unknowns of :meth:`lift`.  If ``unknowns`` is ``None``, the plane between the
         closest points is used.

@@ -144,7 +144,8 @@ def _independent_rows(problem: ConstrainedProblem, numeric: Numeric) -> tuple[tu
     held = held_rows(problem.robot, problem.requirements.hold).sum(axis=0) > 0
     equalities = [(index, c) for index, c in enumerate(problem.constraints) if c.equality]
     labels = [(index, row) for index, c in equalities for row in range(c.rows)]
-    # The factor ``price`` makes rows of constraints with a low price the first to be omitted among redundant rows.
+    # The rows are multiplied by the price of their constraint.  Among redundant rows, rows with a low price are then
+    # omitted first.
     stacked = np.vstack([c.price * c.evaluate(numeric)[1] for _, c in equalities])
     stacked[:, held] = 0.0
     chosen = {labels[k] for k in independent_rows(stacked, RANK_TOLERANCE)}

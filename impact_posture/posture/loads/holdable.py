@@ -40,7 +40,8 @@ class Holdable(Constraint):
     Args:
         name: Name of the load, such as ``at rest``.
         active: Whether the program contains the rows.  Most optima satisfy the limits without the rows, and a program
-            without the rows is faster.  So :meth:`grown` adds the rows only if an optimum violates a limit.
+            without the rows is faster.  So :meth:`grown` adds the rows to the program only if an optimum violates a
+            limit.
     """
 
     price = _PRICE
@@ -113,8 +114,8 @@ class Holdable(Constraint):
     def linearize(self, model: Numeric, auxiliaries: Array) -> Linearization:
         """Return the rows of :meth:`lift` and the bounds of the forces.
 
-        If the program lacks the rows, the forces that minimize the largest share are used.  If nearly even forces
-        stay away from all limits, no rows are returned.
+        If the program lacks the rows of this constraint, the forces that minimize the largest share are used.  If
+        nearly even forces stay away from all limits, no rows are returned.
         """
         rest, load, z = self._rest, self._rest.load, auxiliaries
         if not self.active:

@@ -52,7 +52,7 @@ class HoldingForces:
 
     @staticmethod
     def of(load: str, rest: Equilibrium, unreachable: Array, q: Array) -> HoldingForces:
-        """Distribute the forces at ``q``.
+        """Compute the forces that hold the posture ``q`` under one load.
 
         The rows of ``unreachable``, shape (k, 6), are combinations of the base wrench that the rotors cannot produce.
         """

@@ -155,7 +155,7 @@ def _with_sides(rows: Derivatives, sides: list[Derivatives], nx: int) -> Derivat
 
 
 def _stacked(parts: list[Derivatives], nx: int) -> tuple[ca.SX, ca.SX]:
-    """Return the Jacobian and the Hessian of parts that share the unknowns x but no auxiliaries."""
+    """Return the joint Jacobian and Hessian of parts that share the unknowns x but no auxiliaries."""
     J = ca.horzcat(ca.vertcat(*[p.jacobian[:, :nx] for p in parts]), ca.diagcat(*[p.jacobian[:, nx:] for p in parts]))
     both = ca.horzcat(*[p.hessian[:nx, nx:] for p in parts])
     H = ca.vertcat(

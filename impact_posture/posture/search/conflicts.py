@@ -1,4 +1,4 @@
-"""Find the constraints that conflict in an infeasible problem, by relaxing each one with slacks at a price."""
+"""Find the conflicting constraints of an infeasible problem, by relaxing each constraint with priced slacks."""
 
 from __future__ import annotations
 

@@ -129,7 +129,7 @@ class GrowingSearch:
         self._ends: dict[int, Array] = {}
         # Price of a meter of slack for starts without a run that ended in a trap.
         self._price = SLACK_PRICE
-        # Number of runs of each start that ended in a trap.
+        # For each start, the number of runs that ended in a trap (:attr:`SolverRun.trapped`).
         self._trapped: Counter[int] = Counter()
 
     def run(self, jobs: int, progress: Progress | None) -> list[SolverRun]:
@@ -193,7 +193,7 @@ class GrowingSearch:
         return int(self.nlp.solver.size1_in("x0"))
 
     def _next(self, waiting: list[int], runs: dict[int, SolverRun]) -> list[int]:
-        """Return the indices of the starts that run next."""
+        """Return the indices of the starts to run next, in increasing order."""
         if not runs and self.problem.grows:
             # Run the first starts alone, because most other starts need the same additional rows.
             return waiting[:FIRST]

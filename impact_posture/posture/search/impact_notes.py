@@ -11,7 +11,7 @@ _LOCKED = 0.05
 
 
 def percent(share: float) -> str:
-    """Return a share in percent, with enough digits that only exactly 100 % reads 100 %, and without "-0"."""
+    """Format a share in percent, with enough digits that only exactly 100 % is printed as 100 %."""
     for digits in range(1, 15):
         text = f"{100 * share:.{digits}f}"
         if abs(share) >= 1 or abs(float(text)) != 100:

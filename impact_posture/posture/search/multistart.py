@@ -48,7 +48,7 @@ class PostureSolution:
     """The solution of a posture problem.
 
     Attributes:
-        initial: The given posture, moved onto the constraints if it does not satisfy them, shape (nq,).
+        initial: The given posture, projected onto the constraints if it violates them, shape (nq,).
         moved: Tangent distance from the given posture to ``initial``.
         q: The best certified posture, shape (nq,).
         redundancy: Number of degrees of freedom at ``q`` that remain under the equality constraints.

@@ -8,7 +8,7 @@ from impact_posture.system.arrays import Array
 
 
 class StartDraws:
-    """Starts of a search: first the known starts, then random starts.
+    """Starting postures of a search: first the known postures, then random postures.
 
     Random starts are drawn as in :func:`impact_posture.posture.manifold.feasible_start.feasible_start`.
 
@@ -25,7 +25,7 @@ class StartDraws:
         """Return the start with this index, shape (nq,); ``None`` if no attempt reached the constraints.
 
         ``trapped`` is the number of runs from this start that ended in a trap.  After the first trap, the start is
-        chosen from more candidates.  After each further trap, another start is drawn.
+        chosen from more candidates.  If further runs from the start end in a trap, another start is drawn.
         """
         if index < len(self._known) and trapped <= 1:
             return self._known[index]
