@@ -26,7 +26,7 @@ class Metric:
 
     Attributes:
         kind: ``euclidean`` (W = I), ``kinetic`` (W = M) or ``weighted`` (diagonal).
-        weights: Diagonal of the weighted metric, shape (nv,); else ``None``.
+        weights: Diagonal of ``W`` for the kind ``weighted``, shape (nv,); ``None`` for the other kinds.
         source: Text that states where the weights come from.
 
     Raises:
@@ -47,7 +47,7 @@ class Metric:
             object.__setattr__(self, "weights", tuple(float(weight) for weight in self.weights))
 
     def diagonal(self, nv: int) -> Array:
-        """Return the diagonal of ``W``, shape (nv,).  The kind must not be ``kinetic``."""
+        """Return the diagonal of ``W``, shape (nv,).  The metric must not be ``kinetic``."""
         return np.ones(nv) if self.weights is None else np.array(self.weights)
 
 
@@ -93,7 +93,7 @@ def check_weights(robot: Robot, weights: Sequence[float] | None) -> None:
 def _from_limits(robot: Robot) -> Array:
     limits = robot.velocity_limits
     base = 6 if robot.floating else 0
-    # A floating base has no velocity limits.  With limits of 1 m/s and 1 rad/s, the norm includes its velocities.
+    # A floating base has no velocity limits.  With limits of 1 m/s and 1 rad/s, the norm includes the base velocity.
     limits[:base] = 1.0
     for name, limit in zip(robot.tangent_names[base:], limits[base:], strict=True):
         if not limit < 1e6:

@@ -106,7 +106,7 @@ class Objective(Minimized, Protocol):
 
     @property
     def parameters(self) -> Array:
-        """Parameters of the lifted form, shape (k,).  They can change without rebuilding the program."""
+        """Parameters of the lifted form, shape (k,), which can change without rebuilding the program."""
 
     def movable(self, q: Array) -> bool:
         """Return whether the contact can move at ``q``; if not, the value consists of rounding errors."""

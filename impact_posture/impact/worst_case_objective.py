@@ -51,8 +51,8 @@ class WorstCaseObjective:
             possible.
         others: Contacts that are hit at the same time as the leading contact, each with a bound on its impulse.
         bilateral: Whether several contacts can pull as well as push.
-        model_variants: Possible robot models, the robot as modeled first.  If empty, only the robot as modeled is
-            considered.
+        model_variants: Possible robot models, the robot as modeled first; empty if only the robot as modeled is
+            possible.
     """
 
     robot: Robot

@@ -131,7 +131,8 @@ class Compression:
         time: Compression time T, s, with the inertia of the objective's joint model; ``None`` if not known.
         peak_force: Peak force F, N, with the same inertia; ``None`` if not known.
         x: Ratio ``T √(G/C)``, with T and G of the links alone; ``None`` if the contact or the springs are unknown.
-        by_material: Material → x for this material.  Empty unless the springs are known and the contact is not.
+        by_material: Name of a material → x for a contact with this material; empty unless the springs are known and
+            the contact is not.
         joint_model: The joint model of the objective.
     """
 

@@ -192,9 +192,9 @@ class ElasticImpact:
         return _Compression((A + A.T) / 2, columns, kappa, d, oracle)
 
     def compliance(self, q: Array) -> float:
-        """Return the compliance ``C`` of the springs at ``q``, m/N.
+        """Return the compliance ``C`` of the springs at the contact point at ``q``, m/N.
 
-        Rotors and feet are fixed.  For a robot without feet, the base is fixed too.
+        For this compliance, rotors and feet are fixed.  If the robot has no supports, the base is fixed too.
         """
         oracle = self.oracle.at(q)
         feet = oracle.Js

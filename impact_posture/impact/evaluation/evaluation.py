@@ -51,7 +51,7 @@ class Evaluation:
 
     Attributes:
         q: Configuration, shape (nq,).
-        scalars: H, G, V, S and E, computed with the supports.  Also available as attributes of the evaluation.
+        scalars: H, G, V, S and E, computed with the supports; also attributes of the evaluation.
         objective: Value of the objective, with the factor λ̄²; ``None`` if it does not exist at ``q``.
         gradient: Tangent gradient of H, shape (nv,).
         objective_gradient: Tangent gradient of the objective, shape (nv,); ``None`` if it does not exist at ``q``.

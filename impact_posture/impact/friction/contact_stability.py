@@ -103,7 +103,7 @@ def contact_stability(oracle: ImpactOracle, supports: tuple[Support, ...], q: Ar
         return verdict(None, lifting)
     held = cones.within(particular, basis, _MOST_FRICTION)
     if held is None:
-        # With a friction coefficient of 1e6, nothing slides.  If there is still no solution, a sole tips.
+        # With a friction coefficient of 1e6, no foot slides.  If no impulses exist even then, a sole tips.
         tips = cones.within(particular, basis, 1e6) is None
         return verdict(None if tips else float("inf"), lifting)
     low, high = 0.0, _MOST_FRICTION

@@ -41,8 +41,8 @@ class ImpactKind(ABC):
         units: Units as text.
         adds_up: Whether the kind prescribes the impulse of each contact, so that the jumps of several contacts can be
             added.
-        kink: Text that states where the gradient is discontinuous, and which gradient is returned there.  Empty for a
-            smooth value.
+        kink: Text that states where the gradient is discontinuous, and which gradient is returned there; empty if
+            the value is smooth.
         no_cone: Reason why the kind has no exact worst case over a cone of normals.
         attempts: Number of different initial guesses that :meth:`guess` offers.
     """
@@ -122,7 +122,7 @@ class FrictionlessKind(ImpactKind):
         return jump.with_impulse(impulse, ca.dot(in_world(self.case, tree, n), jump.contact_velocity) - 1)
 
     def jump(self, q: Array) -> tuple[Array, Array]:
-        """Return ``a/G`` and ``λ = 1/G``."""
+        """Return the frictionless jump ``a/G`` and the impulse ``λ = 1/G``."""
         quantities = self.oracle.quantities(q)
         return quantities.jump / quantities.G, np.array([1 / quantities.G])
 

@@ -77,12 +77,12 @@ class ImpactKernel:
 
     @cached_property
     def H(self) -> ca.SX:
-        """``aᵀWa``: squared jump per squared impulse."""
+        """H: squared jump per squared impulse, ``aᵀWa``."""
         return self.product(self.jump, self.jump)
 
     @cached_property
     def G(self) -> ca.SX:
-        """``nᵀJM⁻¹Jᵀn = 1/m_eff``, 1/kg."""
+        """G: inverse effective mass along the normal, ``nᵀJM⁻¹Jᵀn = 1/m_eff``, 1/kg."""
         return ca.dot(self.tree.link_force(self.impact), self.jump.velocities[self.point.joint])
 
     @cached_property
@@ -124,7 +124,7 @@ class ImpactKernel:
 
     @cached_property
     def V(self) -> ca.SX:
-        """``H/G²``: squared jump per squared approach speed."""
+        """V: squared jump per squared approach speed without friction, ``H/G²``."""
         return self.H / self.G**2
 
     @cached_property
@@ -134,7 +134,7 @@ class ImpactKernel:
 
     @cached_property
     def E(self) -> ca.SX:
-        """``1/(2G) = m_eff/2``, kg."""
+        """E: dissipated energy per squared approach speed, ``1/(2G) = m_eff/2``, kg."""
         return 1 / (2 * self.G)
 
     @cached_property
@@ -150,13 +150,13 @@ class ImpactKernel:
 
     @cached_property
     def ellipsoid(self) -> ca.SX:
-        """``Λ_c = J M⁻¹ W M⁻¹ Jᵀ``, shape (3, 3)."""
+        """Dynamic impact ellipsoid ``Λ_c = J M⁻¹ W M⁻¹ Jᵀ``, world axes, shape (3, 3)."""
         columns = [self._weigh(x.a, x.velocities) for x in self._axes]
         return ca.blockcat([[ca.dot(self._axes[i].a, columns[j]) for j in range(3)] for i in range(3)])
 
     @cached_property
     def mobility(self) -> ca.SX:
-        """``J M⁻¹ Jᵀ``, shape (3, 3), 1/kg."""
+        """Mobility of the contact point, ``J M⁻¹ Jᵀ``, world axes, shape (3, 3), 1/kg."""
         return ca.horzcat(*[self.tree.point_velocity(self.point, x.velocities)[:3] for x in self._axes])
 
     @cached_property

@@ -224,7 +224,7 @@ class ImpactOracle:
         return np.array(rows).reshape(-1, self._nv)
 
     def coupling(self, direction: Array, v: Array, in_frame: bool) -> Array:
-        """Return ``∂_q directionᵀJ v``, shape (nv,).
+        """Return the tangent gradient of ``directionᵀJ(q) v``, shape (nv,).
 
         The direction is constant in the contact frame if ``in_frame``, else in the world.
         """

@@ -18,7 +18,7 @@ class ImpactQuantities:
 
     Attributes:
         H: ``nᵀΛ_c n``, squared jump per squared impulse.
-        G: ``nᵀJM⁻¹Jᵀn = 1/m_eff``, 1/kg.
+        G: Inverse effective mass along the normal, ``nᵀJM⁻¹Jᵀn = 1/m_eff``, 1/kg.
         V: ``H/G²``, squared jump per squared approach speed (frictionless, e = 0).
         S: Squared jump per squared approach speed if the contact sticks; ``None`` if it cannot stick at this posture.
         E: ``1/(2G)``, energy dissipated per squared approach speed (e = 0), which is half the effective mass, kg.

@@ -204,8 +204,8 @@ def in_world(case: ImpactCase, tree: Tree, directions: ca.SX) -> ca.SX:
 def weighed(metric: Metric, first: UnknownJump, second: UnknownJump) -> ca.SX:
     """Return ``a₁ᵀWa₂``."""
     if metric.kind == "kinetic":
-        # At a solution of the equations, sᵀJa − ε|f|² has the same value.  With stiff feet, it loses digits by
-        # cancellation.
+        # At a solution of the equations, sᵀJa − ε|f|² has the same value, but with stiff feet, this difference loses
+        # digits by cancellation.
         return ca.dot(first.a, second.tree.mass_times(second.a))
     return ca.dot(first.a, ca.SX(metric.diagonal(first.a.numel())) * second.a)
 

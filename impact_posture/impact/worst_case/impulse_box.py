@@ -101,7 +101,7 @@ def corners(count: int, bilateral: bool) -> Array:
     """
     if bilateral:
         return np.array([[1.0, *rest] for rest in product((1.0, -1.0), repeat=count - 1)])
-    # The corner with all impulses is first.  If corners tie, it is shown, as users expect.
+    # The corner at which all contacts have their largest impulse is first, so that it is shown if corners tie.
     rows = sorted(product((1.0, 0.0), repeat=count), key=lambda corner: -sum(corner))
     return np.array(rows[:-1])
 

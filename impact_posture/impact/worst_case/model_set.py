@@ -80,8 +80,8 @@ class ModelSet:
 def finite_maximum(values: Array, within: float = 0.0) -> tuple[NDArray[np.int_], Array]:
     """Return the indices of the values that tie with the largest value, and their distances below it (gaps).
 
-    The leading index is first.  A value ties if it is at most ``within``, or the share :data:`ACTIVE`, below the
-    largest value.
+    The index of the leading value is first.  A value ties if it is at most ``within``, or the share :data:`ACTIVE`,
+    below the largest value.
     """
     largest = float(values.max())
     near = np.flatnonzero(values >= largest - max(ACTIVE * abs(largest), within))

@@ -104,7 +104,7 @@ class NormalCone:
         return Subgradients(slopes[:, None] * gradients, gaps)
 
     def expressions(self, k: ImpactKernel) -> tuple[ca.SX, ca.SX]:
-        """Return value and gradient for the worst normal.  The gradient is for a fixed normal (Danskin)."""
+        """Return value and gradient for the worst normal, which is fixed in the gradient (Danskin)."""
         R = in_world(k.case, k.tree, ca.SX.eye(3))
         K = R.T @ self.kind.form_expression(k) @ R
         n = worst_normal_symbolic((K + K.T) / 2, k.n, self.degrees)

@@ -166,7 +166,7 @@ def _on_edge(P: Array, c: float, s: float, size: float) -> Array:
         z = np.exp(1j * x)
         return np.asarray((1j**order * (A * z + 2**order * B * z * z)).real)
 
-    # The slope is zero at the roots z of a polynomial.  Start from the angles of all roots.
+    # The slope is zero at the roots z of a polynomial.  The angles of all roots are starts for Newton's method.
     roots = np.roots([2 * B, A, 0, -A.conjugate(), -2 * B.conjugate()])
     phi = np.concatenate([np.angle(roots), _GRID[[int(height(_GRID).argmax())]]])
     swing = max(abs(A) + 2 * abs(B), _SMALL)

@@ -7,7 +7,7 @@ without overshoot:
 - The normal is on the edge, ``n = (c, s w)``, ``|w| = 1``.  Then ``w_i = p_i/(ν − d_i)`` with ``p = b c/s``, and
   ``ν`` is the root of ``1/|w| = 1`` (a trust-region problem in the plane; Moré and Sorensen 1983).
 - The normal is inside the cone, ``n ∝ (1, b_i/(λ − d_i))``.  Then ``λ`` is the largest eigenvalue, the root of
-  ``λ − a = Σ b_i²/(λ − d_i)``.  This is the case if and only if ``λ > ν``.
+  ``λ − a = Σ b_i²/(λ − d_i)``.  The normal is inside if and only if ``λ > ν``.
 """
 
 from __future__ import annotations
