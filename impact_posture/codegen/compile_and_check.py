@@ -148,7 +148,7 @@ def largest_difference(
 
 @dataclass(frozen=True)
 class Deviation:
-    """The largest relative error of one quantity at one sample.
+    """Largest relative error among the entries of one quantity at one sample.
 
     Attributes:
         error: Largest ``|value − expected|`` divided by the scale; infinite if a value is not finite.

@@ -75,12 +75,12 @@ class Export(WrittenCode):
         return self.agreement is not None
 
     def load(self, **options: Any) -> ImpactGradient:
-        """Load the library with the options of :meth:`ImpactGradient.load`.  Loading runs code of the library."""
+        """Load the library, which runs its code; the options are as for :meth:`ImpactGradient.load`."""
         return ImpactGradient.load(self.out, robot=self.robot, **options)
 
     @property
     def functions(self) -> list[str]:
-        """Names of the C functions."""
+        """Names of all C functions of the export."""
         blocks = [block for frame in self.manifest["frames"] for block in (frame, frame["free"])]
         blocks.append(self.manifest["several"])
         return [name for block in blocks if block is not None for name in block["symbols"].values()]
@@ -208,7 +208,7 @@ def write_export(
     Raises:
         OutputError: The folder exists and ``force`` is False, it is not an export, or it is not writable.
         CompilerError: The compiler failed, or the results of the compiled code are wrong.  Nothing is written.
-        ImpactPostureError: An error that :func:`export` raises.
+        ImpactPostureError: :func:`export` raises an error.
     """
     prefix = default_prefix(objectives) if prefix is None else check_prefix(prefix)
     out = Path(f"{prefix}-c") if out is None else out

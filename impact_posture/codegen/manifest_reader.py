@@ -112,7 +112,7 @@ def read_checked(
         hint = f"name the folder that {command} wrote, or run codegen again"
         raise SpecError(f"is not a manifest of an {what}", where=str(file), hint=hint)
     try:
-        # Strict validation accepts a list for a tuple only from JSON text.
+        # In strict mode, pydantic accepts a list in place of a tuple only if it reads JSON text.
         return manifest, model.model_validate_json(json.dumps(manifest, allow_nan=False)), file
     except ValidationError as error:
         first = error.errors()[0]

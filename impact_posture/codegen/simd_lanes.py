@@ -21,8 +21,8 @@ class LimbInput:
     """Place of an input (an angle or a constant) in repeated limbs.
 
     Attributes:
-        group: Number of the group of limbs.
-        lane: Number of the limb in the group.
+        group: Number of the group of repeated limbs to which the input belongs.
+        lane: Number of the limb in its group, which is its SIMD lane.
         name: Name of the input, equal for the corresponding inputs of all limbs of the group.
     """
 

@@ -78,7 +78,7 @@ class Chart:
         return in_v, [k for slot in slots for k in range(slot.x.start, slot.x.stop)]
 
     def configuration(self, x: ca.SX) -> ca.SX:
-        """Return ``q(x)``, shape (nq, 1)."""
+        """Return the configuration ``q(x)`` for chart coordinates ``x``, shape (nq, 1)."""
         parts = [ca.SX(0)] * self.nq
         for k, place in zip(self._q, self._x, strict=True):
             parts[k] = x[int(place)]

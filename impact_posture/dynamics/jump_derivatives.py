@@ -11,8 +11,8 @@ derivatives are::
     ∂²φ/∂q_j∂q_k  = U_j(b)ᵀA_k(a) + U_j(a)ᵀA_k(b),   A_k = S_k ×* F_k + I_k U_k,   for k in the subtree of j
 
 ``I_k`` is the inertia of the subtree of k.  ``F_k(a)`` is the momentum of this subtree for the velocity a, minus the
-impulses ``f`` on its feet.  ``F_k(b)`` is its momentum for the velocity b, plus ``l``.  For standing robots,
-automatic differentiation needs about twice as many operations.
+impulses ``f`` on its feet.  ``F_k(b)`` is the momentum of the subtree for the velocity b, plus ``l``.  For standing
+robots, automatic differentiation needs about twice as many operations.
 """
 
 from __future__ import annotations
@@ -28,7 +28,7 @@ from impact_posture.dynamics.kinematics import ByJoint, Kinematics, PointOnLink
 from impact_posture.dynamics.spatial import constant, cross, motion_cross_force, skew, symmetric, template
 from impact_posture.system.arrays import Array
 
-# Joint families with one degree of freedom.  Their velocity is the time derivative of their chart coordinate.
+# Joint families with one degree of freedom, whose velocity is the time derivative of the chart coordinate.
 _ONE_AXIS = ("revolute", "continuous", "prismatic")
 
 

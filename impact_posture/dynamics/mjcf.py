@@ -52,8 +52,8 @@ class Mjcf:
         joints: Index of a Pinocchio joint → names of the MuJoCo joints that represent it.
         sites: Index of a frame → name of its site.  If several frames have the same name, only one has a site.
         moments: Body name → principal moments of inertia, kg·m², shape (3,), that violate the triangle inequality.
-            MuJoCo rejects such moments.  The spec therefore has the nearest valid moments, and :meth:`compile`
-            replaces them by the exact moments.
+            MuJoCo rejects moments that violate it, so the spec has the nearest valid moments, and :meth:`compile`
+            sets the exact moments.
     """
 
     spec: Any

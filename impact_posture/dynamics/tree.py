@@ -155,8 +155,8 @@ class Tree(Kinematics):
     def _factor(self) -> dict[int, tuple[ca.SX, ...]]:
         """Factors of every joint: ``(pivot, D⁻¹Uᵀ, I^a = I^A − U D⁻¹ Uᵀ)``, ``U = I^A S``, ``D = SᵀU + armature``.
 
-        The pivot is ``1/D`` for a joint with one axis, and ``D`` for a joint with several.  For a locked joint, ``D``
-        is infinite, and the pivot is ``D⁻¹ = 0``.
+        The pivot is ``1/D`` for a joint with one axis, and ``D`` for a joint with several axes.  For a locked joint,
+        ``D`` is infinite, and the pivot is ``D⁻¹ = 0``.
         """
         articulated = dict(self._inertia)
         factors: dict[int, tuple[ca.SX, ...]] = {}

@@ -53,8 +53,8 @@ class ContactStability:
     """Whether the feet can stay on the ground in an impact.
 
     Attributes:
-        friction: Least friction coefficient for which all feet stay in place.  Infinite if it exceeds ten; ``None``
-            if a foot lifts or a sole tips for every friction coefficient.
+        friction: Least friction coefficient for which all feet stay in place; infinite if above ten; ``None`` if a
+            foot lifts or a sole tips for every friction coefficient.
         feet: Impulse on each foot.  The impulses are within the friction cones if possible; otherwise, they have the
             least pull.
         freedom: Dimension of the set of possible impulses; zero if they are unique.

@@ -177,8 +177,7 @@ def _on_edge(P: Array, c: float, s: float, size: float) -> Array:
         if np.abs(step).max() < 1e-15:
             break
     kept = (height(phi, 2) < 0) & (np.abs(height(phi, 1)) <= 1e-10 * swing)
-    # At a maximum whose second derivative is zero, the test above fails.  Therefore the highest candidate is kept
-    # too.
+    # The test above misses a maximum whose second derivative is zero, so the highest candidate is always kept.
     heights = height(phi)
     highest = int(heights.argmax())
     kept[highest] |= not (heights[kept] >= heights[highest] - _EQUAL * swing / 2).any()
