@@ -115,7 +115,7 @@ def _counts(records: Records) -> Iterator[str]:
         f"The runs are shorter than the shipped scenarios: one seed of noise, {COUNT} contacts instead "
         f"of 5, {DWELL:g} s "
         f"behind the surface and {PAUSE:g} s between contacts; the pushes have both signs. So the motion back "
-        "from the surface is part of the second after an impact, for all controllers alike."
+        "from the surface is part of the second after an impact, for all controllers."
     )
 
 
@@ -132,7 +132,7 @@ def _overview(name: str, own: Sequence[Record], controller: str) -> list[str]:
 
 def _explained() -> Iterator[str]:
     yield "Change of the motion in the window / over the second, against nominal at the same point. **Bold**: all"
-    yield "targets are kept. *Nominal*: motion of the nominal controller in the window."
+    yield "targets are met. *Nominal*: motion of the nominal controller in the window."
 
 
 def _variations(own: Sequence[Record]) -> Iterator[str]:

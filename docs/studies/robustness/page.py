@@ -253,10 +253,10 @@ def _drawn(records: Records, seed: int) -> Iterator[str]:
         "the scenarios."
     )
     yield ""
-    yield f"A draw is taken if the motors hold its start with {100 * SHARE:.0f} % of their limits and the nominal"
-    yield "controller succeeds: it makes all contacts, or comes to rest before the push, does not fall, and is at"
-    yield f"a limit for at most {100 * SATURATED:.0f} % of the time outside the impact windows. Otherwise another"
-    yield "draw takes its place."
+    yield f"A draw is accepted if the motors can hold its start with {100 * SHARE:.0f} % of their limits and the"
+    yield "nominal controller succeeds: it makes all contacts, or comes to rest before the push, does not fall, and"
+    yield f"is at a limit for at most {100 * SATURATED:.0f} % of the time outside the impact windows. Otherwise"
+    yield "another draw replaces this draw."
     yield ""
     for name, own in records.items():
         drawn = [record for record in own if not record.draw.name]
