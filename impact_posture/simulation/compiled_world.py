@@ -109,8 +109,9 @@ class CompiledWorld:
 def compiled_world(world: World, tick: CompiledTick | None, count: int) -> CompiledWorld | None:
     """Return the C loop for a world after its reset, or ``None`` if Python must run the ticks.
 
-    Python runs the ticks if there is no C controller, if the MuJoCo headers are missing, if the loop cannot be
-    compiled, or if C cannot simulate the world (:meth:`World.in_c`, or more than 64 rotors).
+    Python runs the ticks if there is no C controller, or if the loop cannot be compiled, for example because the
+    MuJoCo headers are missing.  Python also runs worlds with more than 64 rotors and worlds that :meth:`World.in_c`
+    excludes.
     """
     contents = None if tick is None else world.in_c(count)
     if tick is None or contents is None or contents["rotors"] > _ROTORS:

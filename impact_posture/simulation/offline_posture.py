@@ -72,9 +72,9 @@ def offline_posture(
     surface or the ground.  Holding the posture needs at most :data:`SHARE` of the limits of motors and rotors.  The
     end effector is at the surface, in the directions that its task controls.  If ``at_contact`` is false, the end
     effector stays at its start.  The base of a flying robot stays level.  The feet of a standing robot stay in place,
-    its center of mass is above the feet, and the limit for the tilt of its base is the same as in the reference flow.
-    If no posture without collisions is found, the result is the best posture with collisions, and its ``note`` says
-    so.
+    and its center of mass is above the feet.  The limit for the tilt of its base is the same as in the reference
+    flow.  If no posture without collisions is found, the result is the best posture with collisions, and its ``note``
+    says so.
 
     Raises:
         Infeasible, SolverFailed: As in :func:`impact_posture.posture.search.multistart.solve`.

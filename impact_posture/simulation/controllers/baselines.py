@@ -124,11 +124,11 @@ class WalkerDriver(RobustDriver):
 class ReleaseDriver(RobustDriver):
     """Impact-robust term without the nominal stiffness ``K_p``, until ``H`` no longer decreases.
 
-    Without ``K_p``, the posture moves to the optimum.  With ``K_p``, it would come to rest before.  The scale of the
-    term is the larger one of the curvatures at the start and at the offline optimum, so the stiffness of the term
-    hardly exceeds ``K`` between these postures.  If ``H`` decreases by a share of less than :attr:`LEAST` within
-    :attr:`PATIENCE` (s), the reached posture is held.  The term must have ``spring="release"`` and an activation that
-    is not live.
+    Without ``K_p``, the posture moves to the optimum.  With ``K_p``, it would come to rest before the optimum.  The
+    scale of the term is the larger one of the curvatures at the start and at the offline optimum.  So the stiffness
+    of the term hardly exceeds ``K`` between these postures.  If ``H`` decreases by a share of less than :attr:`LEAST`
+    within :attr:`PATIENCE` (s), the reached posture is held.  The term must have ``spring="release"`` and an
+    activation that is not live.
     """
 
     PATIENCE, LEAST = 0.5, 0.01
