@@ -65,7 +65,7 @@ def parameters(s: Structure, period: float) -> Iterator[Field]:
         yield field("stiffness", "finite", "K_p of the posture task as a matrix, 1/s2", posture.stiffness)
         yield field("damping", "finite", "K_d of the posture task as a matrix, 1/s", posture.damping)
     target = None if posture is None else posture._given
-    text = "1: reset takes posture_target; 0: the present posture"
+    text = "1: reset sets q_des to posture_target; 0: to the present posture"
     yield field("posture_given", "nonnegative", text, target is not None)
     yield field("posture_target", "finite", "q_des at reset", s.robot.posture() if target is None else target)
     for name, rule, text in (
@@ -81,32 +81,32 @@ def parameters(s: Structure, period: float) -> Iterator[Field]:
     yield field("contact_weight", "positive", "weight in the cost of each contact that is not hard", weights)
     yield field("force_weight", "positive", "weight of contact forces, 1/N2", formulation.force_weight)
     spare = formulation.spare_weight
-    yield field("spare_weight", "positive", "weight of the choice of redundant rotors, 1/N2", spare)
+    yield field("spare_weight", "positive", "weight of the choice among redundant rotors, 1/N2", spare)
     for name in ("lower", "upper"):
-        yield field(f"control_{name}", "limit", "thrusts, N, and torques, N m", getattr(actuators, name))
+        yield field(f"control_{name}", "limit", "limits of thrusts, N, and torques, N m", getattr(actuators, name))
     for name in ("lower", "upper"):
-        yield field(f"joint_{name}", "limit", "position of each entry of v, rad or m", getattr(ranges, name))
+        yield field(f"joint_{name}", "limit", "position limit of each entry of v, rad or m", getattr(ranges, name))
     yield field("joint_velocity", "positive", "largest rate of each entry of v; may be infinite", ranges.velocity)
     propulsion = s.robot.spec.propulsion
     thrust = 1.0 if propulsion is None else propulsion.thrust_coefficient
     yield field("thrust_coefficient", "positive", "thrust per squared rotor speed", thrust)
     for name in ("approach", "rate", "deceleration", "acceleration"):
         yield field(f"law_{name}", "positive", f"{name} of the law of the joint limits", getattr(law, name))
-    yield field("law_margin", "nonnegative", "distance kept from the position limits", law.margin)
+    yield field("law_margin", "nonnegative", "distance from the position limits at which joints stop", law.margin)
     if s.flow is not None:
         for name, rule, text in (
             ("speed", "amount", "largest speed of an entry of q_r, rad/s or m/s"),
             ("acceleration", "amount", "largest acceleration, rad/s2 or m/s2"),
-            ("rho", "nonnegative", "pull of the joints towards the start, 1/rad2"),
-            ("mu", "amount", "least curvature, 1/rad2"),
+            ("rho", "nonnegative", "weight of the squared distance from the start, 1/rad2"),
+            ("mu", "amount", "lower bound on the curvature that is used, 1/rad2"),
             ("epsilon", "amount", "predicted decrease of H/H0 below which the flow rests"),
-            ("duration", "amount", "longest time that it moves after a brace, not counting a path and rest, s"),
+            ("duration", "amount", "longest time of motion after a brace, without a path and rest, s"),
             ("joint_margin", "nonnegative", "distance from the joint limits, rad or m"),
             ("com_margin", "nonnegative", "distance of the center of mass from the edges of the support polygon, m"),
             ("tilt", "amount", "largest tilt of the base from the default posture, rad"),
-            ("share", "share", "share of the limits of the actuators that rest may use"),
-            ("haste", "share", "share of the rest of them for acceleration; braking may use (1 + haste)/2"),
-            ("tracking", "amount", "error of the joints at which the flow waits, rad or m"),
+            ("share", "share", "share of the actuators' limits that static controls may use"),
+            ("haste", "share", "share of the remaining limits for acceleration; braking may use (1 + haste)/2"),
+            ("tracking", "amount", "joint error at which the motion stops and waits, rad or m"),
         ):
             yield field(f"flow_{name}", rule, f"{text}, of the flow", getattr(s.flow.options, name))  # type: ignore[arg-type]
         if s.flow._path:
@@ -116,14 +116,16 @@ def parameters(s: Structure, period: float) -> Iterator[Field]:
         yield field("robust_gain", "nonnegative", "K, 1/s2", robust.K)
         scale = 0 if robust._measure else robust.scale
         yield field("robust_scale", "nonnegative", "lambda; 0: measured at reset", scale)
-        yield field("robust_reach", "positive", "bound of the term over K, rad", robust.reach)
+        yield field("robust_reach", "positive", "largest length of the term, divided by K, rad", robust.reach)
         yield field(
             "robust_near", "nonnegative", "distance of each joint from a limit where the term vanishes", robust._near
         )
         yield field("robust_band", "positive", "width of the fade of each joint; may be infinite", robust._band)
-        yield field("robust_far", "positive", "distance from which joints are looked at, rad", robust._farthest)
-        yield field("robust_every", "positive", "ticks between evaluations of the gradient", robust.every)
+        yield field(
+            "robust_far", "positive", "distance from a limit at which a fade can begin, rad", robust._farthest
+        )
+        yield field("robust_every", "positive", "number of ticks per evaluation of the gradient", robust.every)
         yield field("robust_ramp", "positive", "time from level 0 to 1, s", robust.activation.ramp)
         yield field("robust_live", "nonnegative", "1: the term stays on during the contact", robust.activation.live)
-        yield field("robust_follow", "positive", "time constant of the spring 2, s", robust._follow)
-        yield field("robust_spring", "nonnegative", "0 keep, 1 release, 2 follow", springs.index(robust.spring))
+        yield field("robust_follow", "positive", "time constant of q_des if robust_spring is 2, s", robust._follow)
+        yield field("robust_spring", "nonnegative", "mode: 0 keep, 1 release, 2 follow", springs.index(robust.spring))

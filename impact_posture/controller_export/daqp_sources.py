@@ -140,6 +140,6 @@ def _download(folder: Path) -> None:
         errors="replace",
     )
     if run.returncode:
-        lines = [line for line in run.stderr.splitlines() if line.startswith("ERROR")] or ["ERROR: it said nothing"]
+        lines = [line for line in run.stderr.splitlines() if line.startswith("ERROR")] or ["ERROR: no message"]
         what = f"its sources cannot be downloaded ({lines[-1].removeprefix('ERROR: ')})"
         raise InputError(what, where=f"DAQP {VERSION}", hint=f"connect to the network once, or {_FOLDER_HINT}")
