@@ -170,7 +170,7 @@ class StartDraw:
         self._least = np.inf
 
     def choose(self, candidates: int) -> Array | None:
-        """Return the best of ``candidates`` projected postures, including those of earlier calls."""
+        """Return the best of ``candidates`` projected postures, including postures of earlier calls."""
         while self._attempts < ATTEMPTS and self._tried < candidates and self._least > FEASIBLE:
             near = self._around if (self._index + self._attempts) % 2 else None
             self._attempts += 1
