@@ -78,10 +78,10 @@ def thrown_jumps(oracle: ImpactOracle, q: Array, throw: Throw, speed: float) -> 
     """Return the robot's velocity jumps ``‖Δν‖`` without friction, for a sticking ball, and with the ball's friction.
 
     The mobility at the contact is ``B + D``.  ``B = J M⁻¹Jᵀ`` is the mobility of the robot.  The mobility ``D`` of
-    the ball is ``1/m`` along the normal and ``3.5/m`` in the tangent plane.  Without rebound, the impulse is ``v
-    n/(nᵀ(B + D)n)`` without friction and ``v (B + D)⁻¹n`` if the ball sticks.  If the ball slides, its friction force
-    is assumed to have the tangential direction of the sticking impulse.  ``v`` is the approach ``speed``, m/s.  ``n``
-    is the normal of the oracle, which is the direction of flight.
+    the ball is ``1/m`` along the normal and ``3.5/m`` in the tangent plane.  Without rebound, the impulse is
+    ``v n/(nᵀ(B + D)n)`` without friction and ``v (B + D)⁻¹n`` if the ball sticks.  If the ball slides, its friction
+    force is assumed to have the tangential direction of the sticking impulse.  ``v`` is the approach ``speed``, m/s.
+    ``n`` is the normal of the oracle, which is the direction of flight.
     """
     quantities = oracle.quantities(q)
     n, jump_per_impulse = quantities.normal, oracle.solve(oracle.J.T)
