@@ -122,7 +122,7 @@ class ElasticImpact:
             ContactError: The contact cannot move along its normal.
         """
         if not 0 < speed <= LARGEST:
-            hint = f"give a speed above zero and up to {LARGEST:g} m/s"
+            hint = f"give m/s above zero, up to {LARGEST:g}"
             raise InputError(f"is {speed:g}", where="approach speed", hint=hint)
         c = self._compression(q, stiffness)
         oracle, m, nv = self.oracle, len(self.joints), len(c.columns.a)
