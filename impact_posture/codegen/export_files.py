@@ -182,7 +182,7 @@ def _worst_note(objective: WorstCaseObjective) -> str:
     if objective.model_variants:
         note = "; the worst of " + "; ".join(model.name for model in objective.model_variants)
     if objective.normal_cone_deg or objective.model_variants:
-        note += ".  If several normals or models have the largest value, grad is the gradient for one of them"
+        note += ".  If several normals or models have the largest value, grad is the subgradient for one of them"
     if objective.kind == "coulomb":
         note += f", friction {objective.contact.friction:.9g}; {objective.impact_kind.kink}"
     return note
