@@ -121,8 +121,7 @@ OneOrMore = Annotated[int, Demand(lambda value: value >= 1, "a whole number, 1 o
 ZeroOrMore = Annotated[int, Demand(lambda value: value >= 0, "a whole number, zero or more")]
 FiniteVector = Annotated[Vector3, Demand(_finite, "three finite numbers")]
 Position = Annotated[
-    Vector3,
-    Demand(lambda vector: all(abs(v) <= _FARTHEST for v in vector), f"finite numbers, up to {_FARTHEST:g}"),
+    Vector3, Demand(lambda vector: all(abs(v) <= _FARTHEST for v in vector), f"finite numbers, up to {_FARTHEST:g}")
 ]
 Direction = Annotated[Vector3, Demand(_has_direction, "three finite numbers, not all zero")]
 Lengths = Annotated[Vector3, Demand(lambda vector: _finite(vector) and min(vector) > 0, "three numbers above zero")]
@@ -130,10 +129,7 @@ UnitQuaternion = Annotated[Quaternion, Demand(_is_unit, _UNIT_QUATERNION)]
 Contacts = Annotated[str | tuple[str, ...], Demand(_are_contacts, "FRAME:NX,NY,NZ")]
 Factors = Annotated[
     tuple[float, float],
-    Demand(
-        lambda pair: 0 < pair[0] <= pair[1] < _INFINITE,
-        "two factors above zero, the lower first, such as 0.5 2",
-    ),
+    Demand(lambda pair: 0 < pair[0] <= pair[1] < _INFINITE, "two factors above zero, the lower first, such as 0.5 2"),
 ]
 Payloads = Annotated[
     tuple[tuple[str, float], ...],

@@ -74,10 +74,9 @@ def time_optimal(space: PathSpace, curve: PathCurve, limits: ActuatorLimits) -> 
 def scaled(space: PathSpace, curve: PathCurve, limits: ActuatorLimits) -> TimedCurve:
     """Return the fastest motion of the form ``s(t) = 10 τ³ − 15 τ⁴ + 6 τ⁵``, ``τ = t/T``, within all known limits.
 
-    The load of a motion is the load of gravity plus ``1/T²`` times a load that does not depend on ``T``.  So a
-    linear program gives the smallest ``T`` at each instant, and the motion takes the largest of these.  The instants
-    are spread
-    evenly, plus those at the places of the curve, most of which are at corners.  If a curve has corners and
+    The load of a motion is the load of gravity plus ``1/T²`` times a load that does not depend on ``T``.  So a linear
+    program gives the smallest ``T`` at each instant, and the motion takes the largest of these.  The instants are
+    spread evenly, plus those at the places of the curve, most of which are at corners.  If a curve has corners and
     :func:`slowed` takes less time, the result is the slowed motion.
     """
     fine = np.linspace(0.0, 1.0, _INVERSE)

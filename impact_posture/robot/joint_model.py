@@ -2,9 +2,8 @@
 
 A short impact ends before a soft spring between rotor and link has turned the rotor.  In that case, only the link
 reacts (``M``).  With a stiff transmission, the rotor moves with the link (``M + B``, with the armature ``B``).  A
-joint that cannot
-be driven from its link does not move at all.  Each joint model sets the armature to the rotor inertia, zero, or
-infinity.
+joint that cannot be driven from its link does not move at all.  Each joint model sets the armature to the rotor
+inertia, zero, or infinity.
 """
 
 from __future__ import annotations

@@ -21,11 +21,10 @@ from impact_posture.tsid.state import State
 class LimitLaw:
     """Law that stops joints at their limits.
 
-    At distance ``x`` from a limit, a joint may move towards the limit with at most the speed
-    ``φ(x) = min(approach·x, √(2·deceleration·x), velocity limit)``.  Beyond the limit, the joint must return with the
-    speed ``φ``.  The bounds of the acceleration are
-    ``rate·(−φ(q − q_min) − q̇) ≤ q̈ ≤ rate·(φ(q_max − q) − q̇)``.  ``φ`` is odd and increasing, so the lower bound
-    never exceeds the upper bound, inside the limits or outside.
+    At distance ``x`` from a limit, a joint may move towards the limit with at most the speed ``φ(x) = min(approach·x,
+    √(2·deceleration·x), velocity limit)``.  Beyond the limit, the joint must return with the speed ``φ``.  The bounds
+    of the acceleration are ``rate·(−φ(q − q_min) − q̇) ≤ q̈ ≤ rate·(φ(q_max − q) − q̇)``.  ``φ`` is odd and
+    increasing, so the lower bound never exceeds the upper bound, inside the limits or outside.
 
     Attributes:
         approach: Permitted speed towards a limit, divided by the distance from the limit, 1/s.
