@@ -22,8 +22,6 @@ from impact_posture.system.scratch_folder import scratch_folder
 from impact_posture.system.toolchain import require_compiler, run_compiler, run_compilers, words_of
 from impact_posture.version import __version__
 
-# ---- building -----------------------------------------------------------------------------------------------------
-
 # In the strict mode -std=c99, GCC fuses multiplications and additions only with -ffp-contract=fast.
 _FLAGS = ("-std=c99", "-O2", "-ffp-contract=fast", "-fPIC")
 
@@ -132,9 +130,6 @@ def _sha256(path: Path) -> str:
         return hashlib.file_digest(file, "sha256").hexdigest()
 
 
-# ---- loading ------------------------------------------------------------------------------------------------------
-
-
 def load_library(library: Path) -> ctypes.CDLL:
     """Load a shared library.  Loading runs code of the library.
 
@@ -169,9 +164,6 @@ def _is_truncated(library: Path) -> bool:
     (offset,) = struct.unpack_from(f"{order}Q", header, 40)
     size, count = struct.unpack_from(f"{order}HH", header, 58)
     return bool(library.stat().st_size < offset + size * count)
-
-
-# ---- the cache ----------------------------------------------------------------------------------------------------
 
 
 def cache_path() -> Path:

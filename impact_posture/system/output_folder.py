@@ -174,9 +174,6 @@ def write_whole(path: Path, content: str | bytes) -> None:
         raise OutputError(f"cannot be written ({error.strerror})", where=str(path), hint=hint) from None
 
 
-# ---- ownership -----------------------------------------------------------------------------------------------------
-
-
 def _check_ours(out: Path, kind: Kind) -> None:
     content = _read_record(out)
     if content is not None and content["kind"] != kind:
@@ -216,9 +213,6 @@ def _read_record(folder: Path) -> dict[str, Any] | None:
     lists = [content.get("files"), content.get("products")]
     sound = all(isinstance(names, list) and all(isinstance(name, str) for name in names) for names in lists)
     return content if sound and isinstance(content.get("kind"), str) else None
-
-
-# ---- replacing a folder ------------------------------------------------------------------------------------------
 
 
 def _replace(beside: Path, out: Path, force: bool, kind: Kind) -> None:

@@ -33,9 +33,6 @@ _LATER: list[Callable[[], None]] = []
 _PR_SET_PDEATHSIG = 1
 
 
-# ---- ending early --------------------------------------------------------------------------------------------------
-
-
 @contextmanager
 def undone(undo: Callable[[], None]) -> Iterator[None]:
     """Call ``undo`` at the end of the block, also if a signal ends the process inside the block (:func:`end_early`).
@@ -86,9 +83,6 @@ def end_early(leave: Callable[[], None]) -> None:
             with suppress(Exception):
                 undo()
     leave()
-
-
-# ---- workers -------------------------------------------------------------------------------------------------------
 
 
 def _worker(index: int) -> tuple[int, Any]:

@@ -122,8 +122,6 @@ class Assembly:
         self.rank.update()
         return self.qp
 
-    # ---- reading a solution --------------------------------------------------------------------------------------
-
     def acceleration(self, z: Array) -> Array:
         """Return ``ν̇``, shape (nv,)."""
         return z[: self._nv]
@@ -157,8 +155,6 @@ class Assembly:
         rows = [self.contacts.J, self.strict.J, self.weighted.J]
         Z = null_space(np.vstack(rows), _REDUNDANT)
         return np.ascontiguousarray(Z if Z.shape[1] else null_space(np.vstack(rows[:2]), _REDUNDANT))
-
-    # ---- filling the QP -------------------------------------------------------------------------------------------
 
     def _at(self, rows: slice) -> slice:
         """Return the indices that rows of ``A`` have in the bounds."""

@@ -152,8 +152,6 @@ class Constraint(ABC):
         """Return ``c(q)``, shape (rows,); the value needs to be exact only in rows that violate a bound."""
         return self.evaluate(model)[0]
 
-    # ---- lifted form, by default without auxiliaries ----------------------------------------------------------
-
     @abstractmethod
     def lift(self, tree: Tree, parameters: ca.SX) -> LiftedRows:
         """Return the rows of the program with their auxiliaries; ``tree`` is built with ``chart_x``."""

@@ -167,9 +167,6 @@ def _embedded(manifold: ConstraintManifold, x: Array, basis: Array) -> Array:
     return np.asarray(directions / np.linalg.norm(directions, axis=2, keepdims=True))
 
 
-# ---- one degree of freedom -----------------------------------------------------------------------------------
-
-
 def _curve(manifold: ConstraintManifold, x: Array) -> Component:
     """Follow the curve through a posture in both directions."""
     tangent = manifold.tangents(x[None], 1)[0, 0]
@@ -220,9 +217,6 @@ def _branch(manifold: ConstraintManifold, start: Array, tangent: Array) -> tuple
         x, direction = moved.x[0], ahead
         step = min(step * (1.5 if turn > _STRAIGHT else 1.0), LONGEST_STEP)
     return nodes, lengths, "unfinished"
-
-
-# ---- two degrees of freedom ----------------------------------------------------------------------------------
 
 
 def _surface(manifold: ConstraintManifold, x: Array) -> Component:

@@ -178,8 +178,6 @@ class ReferenceFlow:
         """Whether the flow is on or still moves."""
         return self.on or bool(self.velocity.any())
 
-    # ---- steps of an update ---------------------------------------------------------------------------------------
-
     def _look(self) -> None:
         """Evaluate objective, constraints and limits at ``q_r`` as predicted for the next change of the motion.
 

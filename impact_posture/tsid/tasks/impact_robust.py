@@ -156,8 +156,6 @@ class ImpactRobustPosture(JointPosture):
         self.value, self.term, self.failed = 0.0, np.zeros(robot.nv), False
         self._spare = np.zeros(robot.nv)
 
-    # ---- phases of an impact ------------------------------------------------------------------------------------
-
     def brace(self) -> None:
         """Switch the impact-robust term on, because an impact is coming."""
         self.activation.enter(Phase.BRACE)
@@ -177,8 +175,6 @@ class ImpactRobustPosture(JointPosture):
     def level(self) -> float:
         """Level ``α`` of the activation, 0 to 1."""
         return self.activation.level
-
-    # ---- the task -------------------------------------------------------------------------------------------------
 
     def reset(self, state: State) -> None:
         """Set the phase to FREE and the target to the constructor's posture, and evaluate the objective."""
