@@ -123,7 +123,7 @@ def parse_options(texts: Sequence[str]) -> dict[str, Any]:
     """Parse texts of the form ``KEY=VALUE``.  Values of decimal digits become integers.
 
     Raises:
-        InputError: A text has no key or no value.
+        InputError: An option is not of the form ``KEY=VALUE``.
     """
     options: dict[str, Any] = {}
     for text in texts:

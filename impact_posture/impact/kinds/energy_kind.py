@@ -38,7 +38,7 @@ class EnergyKind(FrictionlessKind, QuadraticKind):
         return -k.mobility
 
     def of_form(self, form: Array) -> Array:
-        """Return ``−1/(2K)``; infinite for a value of zero, for which the contact cannot move along the normal."""
+        """Return ``−1/(2K)``; infinite if ``K`` is zero, because then the contact cannot move along the normal."""
         return np.asarray(np.where(form < 0, -1 / (2 * np.where(form < 0, form, -1.0)), np.inf))
 
     def of_form_slope(self, form: Array) -> Array:

@@ -84,7 +84,7 @@ class Panel:
     Attributes:
         label: Name of the upright axis.
         names: Names of the curves, or of the runs if they are overlaid; may be empty.
-        values: Curves of each run, shape (n, curves).
+        values: Samples of the curves of each run, shape (number of times, number of curves).
         limits: Lower and upper limit of the commands, drawn as dashed lines; empty for none.
         ranges: Lower and upper bound to shade between, for each run, shape (n, 2).
         stopped: Whether the joint of a curve was at its stop, for each run, shape (n, curves).

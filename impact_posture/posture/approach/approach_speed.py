@@ -13,7 +13,8 @@ from impact_posture.posture.approach.attainable_speed import FASTEST, Attainable
 from impact_posture.posture.constraints.constraint import Constraint, LiftedRows, Linearization, digest
 from impact_posture.system.arrays import Array
 
-# Price of 1 m/s of missing speed in the search for conflicts.  This price is lower than the price of a meter.
+# Price (:attr:`Constraint.price`) per m/s by which the attainable speed is too low.  This price is lower than the
+# price of a meter.
 _PRICE = 1e-3
 
 

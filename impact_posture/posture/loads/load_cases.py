@@ -155,7 +155,7 @@ def _rotors(robot: Robot, weight: float, share: float) -> list[ForceSource]:
 def _feet(objective: Objective, weight: float, friction: float) -> list[ForceSource]:
     """Return the foot forces, at contact points or corners of soles, in units of the robot's weight.
 
-    Each force is a sum along the edges of a friction pyramid around the world z axis.
+    Each force is a nonnegative combination of the edges of a friction pyramid around the world z axis.
     """
     angles = 2 * np.pi * np.arange(_EDGES) / _EDGES
     slope = min(friction, _MOST_FRICTION)

@@ -153,7 +153,8 @@ def objective_gradients(problem: ConstrainedProblem, q: Array, scale: float) -> 
 
 @dataclass(frozen=True, eq=False)
 class _NearBound:
-    """A bound of an inequality that is close to its bound: outward gradient and distance ``slack`` to the bound."""
+    """One side of an inequality that is active or nearly active: outward gradient, and distance ``slack`` to the
+    limit."""
 
     name: str
     side: str

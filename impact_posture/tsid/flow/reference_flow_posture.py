@@ -49,7 +49,7 @@ class ReferenceFlowPosture(JointPosture):
 
         Args:
             robot: The robot.
-            gradient: Function ``q → (H, ∇H)``, or a compiled export, whose exported objective is used.
+            gradient: Function ``q → (H, ∇H)``, or a compiled export, whose objective gives H and ∇H.
             options: Parameters of the flow.
             path: Posture, shape (nq,), or postures, shape (k, nq), that ``q_r`` visits first, for example an offline
                 optimum or the path to it.  From the last posture, the flow takes over.

@@ -17,7 +17,7 @@ from impact_posture.tsid.tasks.task import TargetTask
 class _BaseTurn(TargetTask[Array]):
     """Base class of tasks that rotate the base.
 
-    ``J`` selects components of the base's angular velocity ω, in base axes, from ν.  Hence ``J̇ν = 0``.
+    ``J`` selects, from ν, components of the base's angular velocity ω in base axes.  Hence ``J̇ν = 0``.
     """
 
     constant = True
