@@ -153,8 +153,7 @@ def objective_gradients(problem: ConstrainedProblem, q: Array, scale: float) -> 
 
 @dataclass(frozen=True, eq=False)
 class _NearBound:
-    """One side of an inequality that is active or nearly active: outward gradient, and distance ``slack`` to the
-    limit."""
+    """One side of an active or nearly active inequality: outward gradient, and distance ``slack`` to the limit."""
 
     name: str
     side: str
