@@ -125,7 +125,7 @@ def test_a_scenario_is_of_the_urdf_that_both_name(tmp_path: Path) -> None:
     (tmp_path / "other.urdf").write_text(BARE_ARM)
     asked = ["--controller", "arm", "--scenario", str(tmp_path / "mine.toml"), "--out", str(tmp_path / "out")]
     refused = run("codegen", str(tmp_path / "other.urdf"), *asked)
-    assert refused.returncode == 2 and "is of bare" in " ".join(refused.stderr.split())
+    assert refused.returncode == 2 and "give bare" in " ".join(refused.stderr.split())
     done = run("codegen", str(tmp_path / "bare.urdf"), *asked)
     assert done.returncode == 0, done.stderr
     assert (tmp_path / "out" / "bare_controller.h").is_file()

@@ -114,7 +114,7 @@ def test_bad_input(tmp_path: Path) -> None:
         (("--contact", "panda_hand:0,0"), 2, "is not a contact"),
         (("--contact", "panda_hand:0,0,0"), 2, "with a direction"),
         (("--contact", "panda_hand:0,0,1:-1"), 2, "impulse above zero"),
-        ((*BOTH, "--normal", 0, 0, 1), 2, "instead of --frame and --normal"),
+        ((*BOTH, "--normal", 0, 0, 1), 2, "replaces --frame and --normal"),
         ((*BOTH, "--objective", "speed"), 1, "approach speed of one contact"),
     ):
         done = run("evaluate", "panda", *arguments, cwd=tmp_path)

@@ -145,7 +145,7 @@ def test_impossible_impulses_and_offsets(impulse: float) -> None:
         ("panda_joint1 = 0.0", ("panda_joint1", "is 0", "above zero")),
         ("panda_joint1 = -2.0", ("panda_joint1", "is -2")),
         ("panda_joint1 = nan", ("panda_joint1", "is nan")),
-        ('panda_joint1 = "much"', ("panda_joint1", "no number")),
+        ('panda_joint1 = "much"', ("panda_joint1", "not a number")),
     ],
 )
 def test_bad_weights(tmp_path: Path, text: str, words: tuple[str, ...]) -> None:
