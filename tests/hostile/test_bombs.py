@@ -40,7 +40,10 @@ FILES = {
     "long key in TOML": ("r.toml", f'"{LONG}" = 1\n', CONFIG, "unknown key"),
     "null in a path": ("r.toml", '[model]\nsrdf = "a\\u0000b"\n', CONFIG, "is not a path"),
     "weight beyond all numbers": (
-        "w.toml", f"shoulder = {'1' * 400}\n", ("evaluate", *PUSH, "--metric", "weighted", "--weights"), "not a number",
+        "w.toml",
+        f"shoulder = {'1' * 400}\n",
+        ("evaluate", *PUSH, "--metric", "weighted", "--weights"),
+        "not a number",
     ),
     "armature without end": ("w.toml", f"shoulder = {'1' * 400}\n", ("evaluate", *PUSH, "--armature"), "table"),
 }  # fmt: skip
