@@ -48,8 +48,8 @@ def prepared(name: str, speed: float = 0.5, **more: object) -> Prepared:
 
 
 def constraint_of(posed: Prepared) -> ApproachSpeed:
-    (found,) = (c for c in posed.problem.constraints if isinstance(c, ApproachSpeed))
-    return found
+    (approach_constraint,) = (c for c in posed.problem.constraints if isinstance(c, ApproachSpeed))
+    return approach_constraint
 
 
 def posture(posed: Prepared, seed: int) -> Vector:
@@ -91,8 +91,8 @@ def fastest(posed: Prepared, q: Vector) -> float:
         limit[model.idx_vs[model.getJointId(joint)]] = 0.0
     A = np.column_stack([np.array(rows), arrives])
     bounds = [*((-v, v) if np.isfinite(v) else (None, None) for v in limit), (0, 1e3)]
-    found = linprog(np.append(np.zeros(nv), -1.0), A_eq=A, b_eq=np.zeros(len(A)), bounds=bounds)
-    return float(-found.fun)
+    optimum = linprog(np.append(np.zeros(nv), -1.0), A_eq=A, b_eq=np.zeros(len(A)), bounds=bounds)
+    return float(-optimum.fun)
 
 
 @pytest.mark.parametrize("name", PROBLEMS)
@@ -102,9 +102,9 @@ def test_the_fastest_approach_agrees_with_another_program(name: str, seed: int) 
     posed = prepared(name)
     attainable = AttainableSpeed(posed.problem.robot, posed.problem.objective, posed.problem.requirements)
     q = posture(posed, seed)
-    found = attainable.at(Numeric(posed.problem.robot.model).at(q))
-    assert found.speed == pytest.approx(fastest(posed, q), rel=1e-6, abs=1e-9)
-    assert (np.abs(found.velocities) <= attainable.upper + 1e-9).all()
+    attained = attainable.at(Numeric(posed.problem.robot.model).at(q))
+    assert attained.speed == pytest.approx(fastest(posed, q), rel=1e-6, abs=1e-9)
+    assert (np.abs(attained.velocities) <= attainable.upper + 1e-9).all()
 
 
 @pytest.mark.parametrize("name", PROBLEMS)
@@ -138,15 +138,15 @@ def test_an_optimum_that_is_too_slow_moves_to_a_fast_one(name: str, speed: float
     """Both optima certify.  Without the constraint on the speed, the optimum is better but approaches too slowly."""
     free, asked = (prepared(name, speed, approach=approach) for approach in (False, True))
     attainable = AttainableSpeed(asked.problem.robot, asked.problem.objective, asked.problem.requirements)
-    found = [solve(posed.problem, starts=4, jobs=1) for posed in (free, asked)]
-    slow, fast = (attainable.reached(one.q) for one in found)
+    solutions = [solve(posed.problem, starts=4, jobs=1) for posed in (free, asked)]
+    slow, fast = (attainable.reached(one.q) for one in solutions)
     assert slow is not None and fast is not None
     assert slow < 0.9 * speed <= speed * (1 - 1e-6) <= fast
-    assert found[1].optima[0].objective > found[0].optima[0].objective
-    documents = [result_document(posed, one) for posed, one in zip((free, asked), found, strict=True)]
+    assert solutions[1].optima[0].objective > solutions[0].optima[0].objective
+    documents = [result_document(posed, one) for posed, one in zip((free, asked), solutions, strict=True)]
     warned = [any("add `approach`" in line for line in document["warnings"]) for document in documents]
     assert warned == [True, False]
-    assert fastest(asked, found[1].q) == pytest.approx(documents[1]["optimal"]["attainable_speed"], rel=1e-6)
+    assert fastest(asked, solutions[1].q) == pytest.approx(documents[1]["optimal"]["attainable_speed"], rel=1e-6)
 
 
 def test_a_speed_beyond_the_joints_is_infeasible_and_named() -> None:
@@ -222,10 +222,10 @@ def test_unusual_arms_certify(tmp_path: Path, axes: str, limits: list[float], po
     q = tuple([0.3, 0.6, 0.5, 0.4, 0.3, 0.4, 0.2][: len(axes)])
     values = {"robot": path, "frame": "tip", "normal": (-1, 0, 0), "q": q, "contact_pose": pose}
     posed = prepare(make_settings({**values, "speed": 0.2, "approach": True}))
-    found = solve(posed.problem, starts=3, jobs=1)
-    assert found.certificate.holds() and found.certified_starts == 3
+    solution = solve(posed.problem, starts=3, jobs=1)
+    assert solution.certificate.holds() and solution.certified_starts == 3
     attainable = AttainableSpeed(posed.problem.robot, posed.problem.objective, posed.problem.requirements)
-    assert 0.2 - 1e-8 <= (attainable.reached(found.q) or np.inf)
+    assert 0.2 - 1e-8 <= (attainable.reached(solution.q) or np.inf)
 
 
 def test_joints_that_are_too_few_are_refused(tmp_path: Path) -> None:

@@ -70,11 +70,11 @@ def test_relative_placements_agree_with_pinocchio(name: str) -> None:
     function = ca.Function("relative", [q], expressions)
     posture = _random(robot, rng)
     numeric.at(posture)
-    found = function(posture)
+    placements = function(posture)
     for k, (base, joint) in enumerate(pairs):
         expected = numeric.data.oMi[int(base)].actInv(numeric.data.oMi[int(joint)])
-        assert np.allclose(np.array(found[2 * k]), expected.rotation, atol=1e-12)
-        assert np.allclose(np.array(found[2 * k + 1]).ravel(), expected.translation, atol=1e-12)
+        assert np.allclose(np.array(placements[2 * k]), expected.rotation, atol=1e-12)
+        assert np.allclose(np.array(placements[2 * k + 1]).ravel(), expected.translation, atol=1e-12)
 
 
 @pytest.mark.parametrize("name", ROBOTS)
@@ -211,9 +211,11 @@ def test_distances_do_not_depend_on_earlier_calls(seed: int) -> None:
         exact = np.array([one.distance(numeric.at(q))[0] for one in separators])
         assert (known.bounds(numeric, range(5)) <= exact + 1e-9).all()
         for limit, pairs in product(rng.permutation([-0.1, 0.0, 0.05, 1.0]), (range(2), range(2, 5), range(5))):
-            found, own = known.within(numeric, float(limit), pairs), exact[pairs.start : pairs.stop]
-            assert (found <= own + 1e-9).all() and np.allclose(found[own < limit], own[own < limit], atol=1e-9)
-            assert not (found[own >= limit] < limit - 1e-9).any()
+            bounds_within, own = known.within(numeric, float(limit), pairs), exact[pairs.start : pairs.stop]
+            assert (bounds_within <= own + 1e-9).all() and np.allclose(
+                bounds_within[own < limit], own[own < limit], atol=1e-9
+            )
+            assert not (bounds_within[own >= limit] < limit - 1e-9).any()
 
 
 def _problem(**changes: object) -> ProblemSettings:
@@ -230,13 +232,13 @@ def test_a_body_in_the_way_of_the_optimum() -> None:
     shoulder = tuple(float(v) for v in data.oMi[model.njoints - 2].translation)
     blocked = prepare(_problem(obstacles=(Obstacle(name="ball", sphere=0.05, position=shoulder),))).problem
     assert not feasible(blocked, free.q)
-    found = solve(blocked, starts=8, jobs=1, compile="never")
-    assert found.certificate.holds()
-    assert feasible(found.problem, found.q)
-    touched = [active for active in found.certificate.active if active.constraint.endswith("/ ball")]
+    solution = solve(blocked, starts=8, jobs=1, compile="never")
+    assert solution.certificate.holds()
+    assert feasible(solution.problem, solution.q)
+    touched = [active for active in solution.certificate.active if active.constraint.endswith("/ ball")]
     assert touched and all(active.multiplier > 0 for active in touched)
-    objective = found.problem.objective
-    assert objective.value(free.q) < objective.value(found.q)
+    objective = solution.problem.objective
+    assert objective.value(free.q) < objective.value(solution.q)
 
 
 @pytest.mark.parametrize("names", [("a", "a"), ("base_link[0]",), ("surface at ee",)])
@@ -356,8 +358,8 @@ def test_derivatives_of_a_grown_program_agree_with_casadi(name: str) -> None:
 def test_starts_lie_near_a_posture_that_is_clear() -> None:
     # In the given posture, the robot is far inside the wall; most starts near this posture end in collisions.
     posed = prepare(ProblemSettings(robot="xarm7", normal=(-1, 0, 0), holdable=False)).problem
-    found = solve(posed, starts=16, jobs=1, compile="never", finish_all=True)
-    assert found.certified_starts == 16
+    solution = solve(posed, starts=16, jobs=1, compile="never", finish_all=True)
+    assert solution.certified_starts == 16
 
 
 @pytest.mark.parametrize("seed", [1, 9, 33])
@@ -371,5 +373,5 @@ def test_no_slack_is_left_where_the_objective_falls_steeply() -> None:
     # With the initial penalty on the slack, every start would end 0.6 mm inside the clearance of the surface.
     urdf = "example-robot-data:ur_description/urdf/ur10_robot.urdf"
     posed = prepare(ProblemSettings(robot=urdf, frame="tool0", normal=(0, 0, 1))).problem
-    found = solve(posed, starts=4, jobs=1, compile="never", finish_all=True)
-    assert found.certified_starts == 4
+    solution = solve(posed, starts=4, jobs=1, compile="never", finish_all=True)
+    assert solution.certified_starts == 4

@@ -135,9 +135,9 @@ def test_exported_code_agrees_and_names_the_gradient_at_the_switch(tmp_path: Pat
 def test_evaluate_shows_the_jump_with_friction() -> None:
     for friction, sticks in (("0.2", False), ("0.9", True)):
         argv = ("evaluate", "panda", "--normal", "0", "0.6", "0.8", "--friction", friction, "--speed", "2")
-        found = json.loads(run(*argv, "--objective", "coulomb", "--json").stdout)
-        assert found["contacts"][0]["friction"] == float(friction)
-        evaluation = found["evaluation"]
+        document = json.loads(run(*argv, "--objective", "coulomb", "--json").stdout)
+        assert document["contacts"][0]["friction"] == float(friction)
+        evaluation = document["evaluation"]
         jump = evaluation["jump"]["coulomb"]
         assert jump["sticks"] is sticks and jump["friction"] == float(friction)
         assert jump["norm"] ** 2 == pytest.approx(4 * evaluation["objective"])
@@ -155,8 +155,8 @@ def test_evaluate_shows_the_jump_with_friction() -> None:
 
 def test_several_contacts_at_once_are_predicted_with_friction() -> None:
     hands = ("--contact", "gripper_left_base_link:-1,0,0", "--contact", "gripper_right_base_link:-1,0,0")
-    found = json.loads(run("evaluate", "talos", *hands, "--json").stdout)["evaluation"]
-    both = found["coulomb_together"]
+    quantities = json.loads(run("evaluate", "talos", *hands, "--json").stdout)["evaluation"]
+    both = quantities["coulomb_together"]
     assert len(both) == 2 and both[0]["velocity"] == both[1]["velocity"]
     assert "all at once, with friction: gripper_left_base_link" in run("evaluate", "talos", *hands).stdout
     pulled = json.loads(run("evaluate", "talos", *hands, "--bilateral", "--json").stdout)["evaluation"]

@@ -86,17 +86,19 @@ def test_torques_agree_with_statics_the_expression_and_differences(name: str, se
     case = cases(name, **PUSHED.get(name, {}))[-1]
     load, model, q = case.equilibrium.load, posed.robot.model, posture(posed, seed)
     z = generator.uniform(0, 1, load.count)
-    found = load.torque(q, z)
-    assert_close(found.value, statics(posed, case, q, z), 1e-10, "torque")
+    linear_torque = load.torque(q, z)
+    assert_close(linear_torque.value, statics(posed, case, q, z), 1e-10, "torque")
     chart = Chart(model)
     x, symbol = ca.SX.sym("x", chart.nx), ca.SX.sym("z", load.count)
     tree = Tree(model, chart.configuration(x), x)
     expression = ca.Function("tau", [x, symbol], [load.symbolic(tree, symbol)])
-    assert_close(np.array(expression(chart.to_x(q), z)).ravel(), found.value, 1e-10, "expression")
+    assert_close(np.array(expression(chart.to_x(q), z)).ravel(), linear_torque.value, 1e-10, "expression")
     numeric = central_gradient(lambda p: load.torque(p, z).value, model, q, 1e-3)
-    assert_close(found.by_posture, numeric, 1e-8, "by posture")
+    assert_close(linear_torque.by_posture, numeric, 1e-8, "by posture")
     step = generator.normal(size=load.count)
-    assert_close(found.by_force @ step, load.torque(q, z + step).value - found.value, 1e-9, "by force", 1e-9)
+    assert_close(
+        linear_torque.by_force @ step, load.torque(q, z + step).value - linear_torque.value, 1e-9, "by force", 1e-9
+    )
 
 
 @pytest.mark.parametrize("name", ["talos", "solo12"])
@@ -165,8 +167,8 @@ def least_share(posed: ConstrainedProblem, q: Vector) -> float:
             right.append(sign * (high + low) / 2)
     balance = np.column_stack([B[:base], np.zeros(base)]) if base else None
     cost = np.append(np.zeros(B.shape[1]), 1.0)
-    found = linprog(cost, rows, right, balance, h[:base] if base else None, bounds=(None, None), method="highs-ipm")
-    return float(found.fun) if found.status == 0 else float("nan")
+    optimum = linprog(cost, rows, right, balance, h[:base] if base else None, bounds=(None, None), method="highs-ipm")
+    return float(optimum.fun) if optimum.status == 0 else float("nan")
 
 
 @pytest.mark.parametrize("name", ROBOTS)
@@ -269,8 +271,8 @@ def test_a_program_without_the_rows_is_certified_by_the_best_forces() -> None:
     assert not constraint.linearize(numeric.at(q), np.zeros(0)).names
     # Pitch the base so far that the center of mass is outside the polygon of the feet.
     leaning = pin.integrate(posed.robot.model, q, np.eye(posed.robot.nv)[4] * 0.9)
-    found = constraint.linearize(numeric.at(leaning), np.zeros(0))
-    outside = np.maximum(found.lower - found.value, found.value - found.upper)
+    linearized = constraint.linearize(numeric.at(leaning), np.zeros(0))
+    outside = np.maximum(linearized.lower - linearized.value, linearized.value - linearized.upper)
     missing = constraint.evaluate(numeric)[0][0]
     assert missing > 0.01
     assert np.abs(outside[: case.equilibrium.balanced]).sum() == pytest.approx(missing)
@@ -282,8 +284,8 @@ def test_every_start_certifies_and_holds(name: str) -> None:
     posed = problem(name, normal=(1.0, 0.0, 0.0))
     solution = solve(posed, starts=4, jobs=1)
     assert solution.certified_starts == 4
-    found = load_cases(posed.objective, solution.q, posed.requirements).holding(solution.q)
-    assert found is not None and found.feasible and not found.violations()
+    holding_forces = load_cases(posed.objective, solution.q, posed.requirements).holding(solution.q)
+    assert holding_forces is not None and holding_forces.feasible and not holding_forces.violations()
 
 
 def test_a_tight_limit_is_kept_and_has_a_multiplier() -> None:
@@ -325,15 +327,15 @@ def test_a_force_beyond_the_robot_is_infeasible_and_names_the_limit(
 # ---- load cases -------------------------------------------------------------------------------------------------
 
 
-def found(name: str, **more: object) -> LoadCases:
+def cases_of(name: str, **more: object) -> LoadCases:
     posed = problem(name, holdable=False, **more)
     return load_cases(posed.objective, posed.given, posed.requirements)
 
 
 def test_data_that_say_nothing_leave_the_robot_alone() -> None:
-    assert "feet with friction" in found("bolt").notes[0]
-    assert not found("bolt").cases and found("bolt").holding(problem("bolt").given) is None
-    floating = found("talos", support=(), base="free")
+    assert "feet with friction" in cases_of("bolt").notes[0]
+    assert not cases_of("bolt").cases and cases_of("bolt").holding(problem("bolt").given) is None
+    floating = cases_of("talos", support=(), base="free")
     assert "neither rotors nor feet" in floating.notes[0]
     posed = problem("talos", holdable=False, support=(), base="free")
     with pytest.raises(InputError, match="neither rotors nor feet"):

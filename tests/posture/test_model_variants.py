@@ -46,26 +46,29 @@ FRAMES = {"tilthex_arm": "ee", "panda": "panda_hand_tcp", "bolt": "base_link", "
 
 @pytest.mark.parametrize("name", FRAMES)
 def test_a_payload_adds_its_mass_and_a_factor_scales_the_armature(name: str) -> None:
-    found = robot(name)
-    before, armature = found.model_sha256, found.armature.copy()
+    nominal_robot = robot(name)
+    before, armature = nominal_robot.model_sha256, nominal_robot.armature.copy()
     frame = FRAMES[name]
     payload = Payload(frame, 0.7)
-    variants = build_model_variants(found, (0.5, 3.0), [payload])
+    variants = build_model_variants(nominal_robot, (0.5, 3.0), [payload])
     assert [s.name for s in variants] == [
         "as modeled", "armature × 0.5", "armature × 3", f"0.7 kg at {frame}",
         f"armature × 0.5, 0.7 kg at {frame}", f"armature × 3, 0.7 kg at {frame}",
     ]  # fmt: skip
-    assert variants[0].robot is found and len({s.robot.model_sha256 for s in variants}) == len(variants)
-    for q in random_configurations(found.model, 3, name, "payload"):
-        M, J = mass_matrix(found.model, q), frame_jacobian(found.model, q, found.frame_id(frame))[:3]
+    assert variants[0].robot is nominal_robot and len({s.robot.model_sha256 for s in variants}) == len(variants)
+    for q in random_configurations(nominal_robot.model, 3, name, "payload"):
+        M, J = (
+            mass_matrix(nominal_robot.model, q),
+            frame_jacobian(nominal_robot.model, q, nominal_robot.frame_id(frame))[:3],
+        )
         for variant in variants:
             expected = M + (variant.armature_factor - 1) * np.diag(armature)
             if variant.payload is not None:
                 expected = expected + payload.mass * J.T @ J
             assert_close(mass_matrix(variant.robot.model, q), expected, 1e-12, variant.name)
             np.testing.assert_allclose(variant.robot.armature, variant.armature_factor * armature, rtol=1e-15)
-    del found.__dict__["model_sha256"]
-    assert found.model_sha256 == before, "the robot itself is as it was"
+    del nominal_robot.__dict__["model_sha256"]
+    assert nominal_robot.model_sha256 == before, "the robot itself is as it was"
     assert variants[4].to_dict() == {
         "name": f"armature × 0.5, 0.7 kg at {frame}",
         "armature_factor": 0.5,
@@ -111,18 +114,18 @@ def test_refusals(
 
 
 def test_robots_between_the_model_variants() -> None:
-    found = robot("talos")
+    nominal_robot = robot("talos")
     variants = build_model_variants(
-        found, (0.5, 4.0), [Payload("gripper_right_base_link", 2.0), Payload("base_link", 9.0)]
+        nominal_robot, (0.5, 4.0), [Payload("gripper_right_base_link", 2.0), Payload("base_link", 9.0)]
     )
     drawn = between(variants, 200, seed=1)
-    factors = np.array([(one.armature.sum() / found.armature.sum()) for one in drawn])
+    factors = np.array([(one.armature.sum() / nominal_robot.armature.sum()) for one in drawn])
     assert 0.5 <= factors.min() < 0.6 and 3.5 < factors.max() <= 4.0
     assert 0.3 < (factors < np.sqrt(0.5 * 4)).mean() < 0.7, "evenly in the logarithm"
-    more = np.array([one.mass - found.mass for one in drawn])
+    more = np.array([one.mass - nominal_robot.mass for one in drawn])
     assert more.min() >= -1e-9 and 8 < more.max() <= 9.0
-    hand = found.model.frames[found.frame_id("gripper_right_base_link")].parentJoint
-    at_hand = np.array([one.model.inertias[hand].mass - found.model.inertias[hand].mass for one in drawn])
+    hand = nominal_robot.model.frames[nominal_robot.frame_id("gripper_right_base_link")].parentJoint
+    at_hand = np.array([one.model.inertias[hand].mass - nominal_robot.model.inertias[hand].mass for one in drawn])
     assert at_hand.max() <= 2.0 and (at_hand > 0).any() and (at_hand == 0).any(), "one payload at a time"
     assert [one.model_sha256 for one in between(variants, 3, seed=1)] == [one.model_sha256 for one in drawn[:3]]
 
@@ -142,16 +145,16 @@ MORE: dict[str, dict[str, object]] = {
 
 
 def objective_of(name: str, more: dict[str, object], *, feet: bool = False) -> WorstCaseObjective:
-    found = robot(name)
+    nominal_robot = robot(name)
     others = {"tilthex_arm": "base_link", "panda": "panda_link4", "bolt": "FL_UPPER_LEG"}
     several = {"others": (ImpactContact(others[name], (1, 0, 0.3), impulse=2.0),)} if more.get("several") else {}
     rest = {key: value for key, value in more.items() if key != "several"}
     return WorstCaseObjective(
-        found,
+        nominal_robot,
         ImpactContact(FRAMES[name], (0.2, -0.4, 1.0), (0.02, 0.0, 0.01)),
-        supports=found.spec.supports if feet else (),
+        supports=nominal_robot.spec.supports if feet else (),
         compliance=1e-3,
-        model_variants=build_model_variants(found, (0.4, 2.0), [Payload(FRAMES[name], 0.8)]),
+        model_variants=build_model_variants(nominal_robot, (0.4, 2.0), [Payload(FRAMES[name], 0.8)]),
         **several,
         **rest,  # type: ignore[arg-type]
     )
@@ -188,23 +191,27 @@ def test_the_largest_of_separate_objectives(name: str, feet: bool, kind: str) ->
         assert_close(symbolic[1], gradient, 1e-6, "CasADi's gradient", scale=value)
         points = objective.subgradients(q)
         np.testing.assert_array_equal(points.first, gradient)
-        found = evaluate(objective, q)
-        assert [s.objective for s in found.model_variants] == values.tolist() and found.objective == value
-        block = found.to_dict()
+        evaluated = evaluate(objective, q)
+        assert [s.objective for s in evaluated.model_variants] == values.tolist() and evaluated.objective == value
+        block = evaluated.to_dict()
         assert block["worst_scenario"] == objective.model_variants[worst].name
     assert seen <= set(range(len(objective.model_variants)))
 
 
 def test_subgradients_where_two_payloads_are_as_bad() -> None:
     """A payload may hang on either side.  Bisection determines the mass at which both sides are equally bad."""
-    found = robot("solo12")
-    q = random_configurations(found.model, 1, "either side", spread=0.3)[0]
+    nominal_robot = robot("solo12")
+    q = random_configurations(nominal_robot.model, 1, "either side", spread=0.3)[0]
     contact = ImpactContact("base_link", (0.0, 0.3, 1.0))
 
     def objective(mass: float) -> WorstCaseObjective:
         payloads = [Payload("FL_SHOULDER", 1.0), Payload("FR_SHOULDER", mass)]
         return WorstCaseObjective(
-            found, contact, Metric("kinetic"), "energy", model_variants=build_model_variants(found, None, payloads)
+            nominal_robot,
+            contact,
+            Metric("kinetic"),
+            "energy",
+            model_variants=build_model_variants(nominal_robot, None, payloads),
         )
 
     def gap(mass: float) -> float:
@@ -216,8 +223,8 @@ def test_subgradients_where_two_payloads_are_as_bad() -> None:
     assert len(points.gradients) == 2 and relative(*points.gradients) > 0.1
     step = 1e-6
     for index in range(20):
-        direction = unit(rng("payloads", index), found.nv)
-        there = np.array(pin.integrate(found.model, q, step * direction))
+        direction = unit(rng("payloads", index), nominal_robot.nv)
+        there = np.array(pin.integrate(nominal_robot.model, q, step * direction))
         rise = (tied.value(there) - tied.value(q)) / step
         slopes = points.gradients @ direction
         # The slope equals the largest slope of the gradients, as for a maximum of smooth functions.
@@ -255,30 +262,33 @@ def test_how_far_the_optimum_moves() -> None:
     """Recompute every number of the comparison by hand."""
     problem = problem_of(TASKS["aerial"])
     both = solve_robustly(problem, starts=3, seed=4, jobs=1, compile="never")
-    found, q = both.robustness, both.solution.q
-    assert found is not None and both.solution.certificate.holds()
+    robustness, q = both.robustness, both.solution.q
+    assert robustness is not None and both.solution.certificate.holds()
     members = problem.impact.by_variant
     at_robust = [member.value(q) for member in members]
-    assert [s.name for s in found.model_variants] == [s.name for s in problem.impact.model_variants]
-    assert [s.at_robust for s in found.model_variants] == at_robust and found.worst_robust == max(at_robust)
-    for one, member in zip(found.model_variants, members, strict=True):
+    assert [s.name for s in robustness.model_variants] == [s.name for s in problem.impact.model_variants]
+    assert [s.at_robust for s in robustness.model_variants] == at_robust and robustness.worst_robust == max(at_robust)
+    for one, member in zip(robustness.model_variants, members, strict=True):
         assert one.q is not None and one.own is not None and one.own == member.value(one.q)
         assert one.own <= one.at_robust * (1 + 1e-7), "its own optimum is best for it"
         assert one.moved == pytest.approx(np.linalg.norm(pin.difference(problem.robot.model, q, one.q)), rel=1e-9)
-    first = found.model_variants[0]
+    first = robustness.model_variants[0]
     assert first.own is not None and first.q is not None
-    assert found.worst_nominal == problem.objective.value(first.q) and found.worst_nominal >= found.worst_robust
-    assert found.price == pytest.approx(at_robust[0] / first.own - 1) and found.moved == first.moved
-    assert found.gain == pytest.approx(1 - found.worst_robust / found.worst_nominal)
+    assert (
+        robustness.worst_nominal == problem.objective.value(first.q)
+        and robustness.worst_nominal >= robustness.worst_robust
+    )
+    assert robustness.price == pytest.approx(at_robust[0] / first.own - 1) and robustness.moved == first.moved
+    assert robustness.gain == pytest.approx(1 - robustness.worst_robust / robustness.worst_nominal)
     drawn = [
         replace(problem.objective, robot=one, model_variants=()).value(q)
-        for one in between(problem.impact.model_variants, found.drawn, 4)
+        for one in between(problem.impact.model_variants, robustness.drawn, 4)
     ]
-    assert found.between == max(drawn)
-    words = found.line
-    assert f"moves by {found.moved:.3g} rad" in words and f"{found.gain:.1%} lower" in words
-    assert ("between the model variants" in words) == (found.between > found.worst_robust)
-    assert json.loads(json.dumps(found.to_dict(), allow_nan=False))["worst_nominal"] == found.worst_nominal
+    assert robustness.between == max(drawn)
+    words = robustness.line
+    assert f"moves by {robustness.moved:.3g} rad" in words and f"{robustness.gain:.1%} lower" in words
+    assert ("between the model variants" in words) == (robustness.between > robustness.worst_robust)
+    assert json.loads(json.dumps(robustness.to_dict(), allow_nan=False))["worst_nominal"] == robustness.worst_nominal
 
 
 def test_where_nothing_is_uncertain_nothing_is_compared() -> None:
@@ -290,20 +300,20 @@ def test_where_nothing_is_uncertain_nothing_is_compared() -> None:
 
 
 def test_words_of_every_finding() -> None:
-    def found(own: float | None, worst_nominal: float | None, broken: tuple[str, ...] = ()) -> str:
+    def line_of(own: float | None, worst_nominal: float | None, broken: tuple[str, ...] = ()) -> str:
         variant = VariantOptimum(
             "as modeled", 2.0, own, None if own is None else np.zeros(1), None if own is None else 0.5
         )
         return Robustness((variant,), 4.0, worst_nominal, broken, 3.0, 60).line
 
-    assert found(1.0, 5.0) == (
+    assert line_of(1.0, 5.0) == (
         "the optimum moves by 0.5 rad (m); the worst case is 20.0% lower than at the optimum of the nominal "
         "model; the objective of the nominal model is 100.0% above its optimum"
     )
-    assert "25.0% higher than at the optimum" in found(1.0, 3.2) and "more `starts`" in found(1.0, 3.2)
-    assert "violates feet that stay (x)" in found(1.0, None, ("feet that stay (x)",))
-    assert "no certified optimum to compare with" in found(None, None)
-    assert "50.0% below its optimum" in found(4.0, 5.0)
+    assert "25.0% higher than at the optimum" in line_of(1.0, 3.2) and "more `starts`" in line_of(1.0, 3.2)
+    assert "violates feet that stay (x)" in line_of(1.0, None, ("feet that stay (x)",))
+    assert "no certified optimum to compare with" in line_of(None, None)
+    assert "50.0% below its optimum" in line_of(4.0, 5.0)
 
 
 def test_balance_and_feet_hold_in_every_model_variant() -> None:

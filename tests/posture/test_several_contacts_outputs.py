@@ -35,17 +35,17 @@ def test_exported_hands(tmp_path: Path, name: str, hands: tuple[str, str], real:
     need_compiler()
     # Legs and torso are locked: this halves the code to compile, and the hands do not move.
     legs = tuple(joint for joint in robot(name).joint_names if joint.startswith(("leg", "head", "gripper", "torso")))
-    found = load_robot(name, LoadOptions(lock=legs))
+    locked_robot = load_robot(name, LoadOptions(lock=legs))
     right, left = (ImpactContact(frame, (-1.0, 0.1, 0.0), impulse=i) for frame, i in zip(hands, (1, 3), strict=True))
-    objective = WorstCaseObjective(found, right, others=(left,))
+    objective = WorstCaseObjective(locked_robot, right, others=(left,))
     written = export(objective, tmp_path, prefix="hands", real=real, check=False)
     assert written.manifest["several"]["symbols"] == {"objective": "hands_objective"}
     assert [b["frame"] for b in written.manifest["several"]["contacts"]] == list(hands)
     build_library(tmp_path, "hands", library_path(tmp_path, "hands"), ("-O0",))
-    both = ImpactGradient.load(tmp_path, robot=found)
-    alone = ImpactGradient.load(tmp_path, robot=found, frame=hands[1])
+    both = ImpactGradient.load(tmp_path, robot=locked_robot)
+    alone = ImpactGradient.load(tmp_path, robot=locked_robot, frame=hands[1])
     tolerance = 1e-8 if real is DOUBLE else 1e-4
-    for q in sample_postures(found, 5, 1):
+    for q in sample_postures(locked_robot, 5, 1):
         value, gradient = both.objective(q)
         assert_close(value, objective.value(q), tolerance, "value")
         assert_close(gradient, objective.gradient(q), tolerance, "gradient", scale=value)
@@ -59,11 +59,11 @@ def test_exported_hands(tmp_path: Path, name: str, hands: tuple[str, str], real:
 def test_exported_frame_struck_along_two_normals(tmp_path: Path) -> None:
     make = need("make")
     need_compiler()
-    found = robot("bolt")
-    feet = found.spec.supports
+    biped = robot("bolt")
+    feet = biped.spec.supports
     contacts = [ImpactContact("base_link", n, impulse=i) for n, i in (((0, 0, 1), 1.0), ((1, 0, 0.2), 2.0))]
     objective = WorstCaseObjective(
-        found, contacts[0], Metric("kinetic"), supports=feet, others=(contacts[1],), bilateral=True
+        biped, contacts[0], Metric("kinetic"), supports=feet, others=(contacts[1],), bilateral=True
     )
     export(objective, tmp_path, prefix="corner", check=False)
     assert "|impulse| up to" in (tmp_path / "corner.h").read_text()
@@ -72,8 +72,8 @@ def test_exported_frame_struck_along_two_normals(tmp_path: Path) -> None:
     assert done.returncode == 0, done.stderr
     assert "agrees" in done.stdout
     build_library(tmp_path, "corner", library_path(tmp_path, "corner"), ("-O0",))
-    loaded = ImpactGradient.load(tmp_path, robot=found)
-    for q in sample_postures(found, 10, 2):
+    loaded = ImpactGradient.load(tmp_path, robot=biped)
+    for q in sample_postures(biped, 10, 2):
         value, gradient = loaded.objective(q)
         assert_close(value, objective.value(q), 1e-8, "value")
         assert_close(gradient, objective.gradient(q), 1e-7, "gradient", scale=value)

@@ -50,10 +50,10 @@ def test_the_changes_follow_from_the_predicted_jumps(name: str, friction: float)
         assert any("`objective` coulomb" in line for line in told.advice) == (expected in ("worse", "no better"))
         assert any("max_force" in line for line in told.advice) == (expected == "better at the price of force")
         assert told.before is not None and told.after is not None
-        for side, found in ((told.before, before), (told.after, after)):
-            assert found.coulomb is not None and found.compression is not None
-            assert (side.jump, side.impulse) == (found.coulomb.norm, found.coulomb.impulse_size)
-            assert (side.peak_force, side.sticks) == (found.compression.peak_force, found.coulomb.sticks)
+        for side, quantities in ((told.before, before), (told.after, after)):
+            assert quantities.coulomb is not None and quantities.compression is not None
+            assert (side.jump, side.impulse) == (quantities.coulomb.norm, quantities.coulomb.impulse_size)
+            assert (side.peak_force, side.sticks) == (quantities.compression.peak_force, quantities.coulomb.sticks)
         assert told.assumptions[0] == f"rigid impact at 0.6 m/s with restitution 0 and friction {friction:g}"
         assert ("the feet stay on the ground" in told.assumptions) == bool(impact.objective.supports)
         assert told.assumptions[-1] == "peak force of the stated contact, without friction"

@@ -64,14 +64,14 @@ def test_a_run_that_fails_begins_anew(solved: Solved) -> None:
     nlp, home, scale = solved
     there = nlp.at(moved(nlp.problem, 0.003))
     broken = replace(home.end, of_rows=np.full_like(home.end.of_rows, np.nan))
-    cold, found = (there.solve(home.q, scale=scale, warm=end) for end in (None, broken))
-    assert found.converged and found.iterations >= cold.iterations
-    np.testing.assert_array_equal(found.q, cold.q)
+    cold, warm_run = (there.solve(home.q, scale=scale, warm=end) for end in (None, broken))
+    assert warm_run.converged and warm_run.iterations >= cold.iterations
+    np.testing.assert_array_equal(warm_run.q, cold.q)
 
 
 def test_the_end_of_another_program_is_not_used(solved: Solved) -> None:
     nlp, home, scale = solved
     other = build_nlp(nlp.problem, compile="never", program=nlp.program)
-    cold, found = (other.solve(home.q, scale=scale, warm=end) for end in (None, home.end))
-    assert (found.iterations, found.minimized) == (cold.iterations, cold.minimized)
-    np.testing.assert_array_equal(found.q, cold.q)
+    cold, warm_run = (other.solve(home.q, scale=scale, warm=end) for end in (None, home.end))
+    assert (warm_run.iterations, warm_run.minimized) == (cold.iterations, cold.minimized)
+    np.testing.assert_array_equal(warm_run.q, cold.q)
