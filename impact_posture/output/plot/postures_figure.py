@@ -35,7 +35,7 @@ _NO_SHAPES = "They do not show the shapes of the links."
 _ENDS = "The last stick of a chain ends at the last frame of its link, or at the center of mass of the link."
 _NORMAL = "n points out of the surface, towards the robot."
 _PUSHED = "n is the direction of the impulse on the robot, which strikes no surface."
-_BEHIND = "The surface lies behind the link of the contact where that reaches behind the contact point."
+_BEHIND = "If the contact link reaches beyond the contact point, the surface is drawn behind the link."
 _BODY = "The body is the box between the hips, of no true height."
 HATCH = "/////"
 # 3-D axes always give areas a drawing order from 3 upwards.
