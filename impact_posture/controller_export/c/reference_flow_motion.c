@@ -302,7 +302,7 @@ static void ip_flow_curve(ip_context *c)
 /* Advance the flow by dt seconds, and move the targets of the posture task and of the tasks that follow the flow. */
 static void ip_flow_lead(ip_context *c, double dt)
 {
-  /* Evaluation, changes, probe and step take place at the same ticks as in Python. */
+  /* The ticks of ip_flow_look, ip_flow_govern and ip_flow_direct are the same as in Python. */
   static void (*const parts[IP_FLOW_PHASES])(ip_context *) = {
     ip_flow_look,    ip_flow_decompose, ip_flow_split, ip_flow_limit, ip_flow_govern, ip_flow_probe, ip_flow_compare,
     ip_flow_curve,   ip_flow_curve,     ip_flow_curve, ip_flow_curve, ip_flow_govern, ip_flow_curve, ip_flow_direct,

@@ -49,10 +49,13 @@ _UNTIL, _SINCE = 4, 3
 class ReferenceFlow:
     """Saddle-free Newton flow of a reference posture ``q_r`` in the null space of contacts and tasks.
 
-    ``H`` and ``∇H`` are evaluated at ``q_r`` and not at the measured posture, so noise, tracking errors and the
-    impact have no influence on them.  An update takes :data:`UPDATE_TICKS` ticks and changes the motion twice.  The
-    controller in C changes the motion at the same ticks and spreads the other work over the ticks between them.  Only
-    the basis of the redundancy changes its size; all other arrays keep their sizes.
+    ``H`` and ``∇H`` are evaluated at ``q_r`` and not at the measured posture.  Noise, tracking errors and the impact
+    therefore have no influence on them.
+
+    An update takes :data:`UPDATE_TICKS` ticks.  Four of these ticks (0, 4, 11 and 13) define the motion.  Tick 0
+    evaluates ``H``, ``∇H`` and the limits.  Ticks 4 and 11 change the acceleration.  Tick 13 computes the step from
+    ``q_r`` at this tick and decides whether the flow rests.  The C controller does the same at these ticks; only C
+    spreads work over the other ticks.
 
     Contacts stay at their places.  Strict and weighted tasks stay at their targets.  Only the ``led`` tasks (center
     of mass, base orientation) follow the flow.  Joints that ``robot.toml`` lists under ``hold`` do not move.
@@ -150,10 +153,11 @@ class ReferenceFlow:
         tick, self._tick = self._tick, (self._tick + 1) % UPDATE_TICKS
         if tick == 0:
             self._look()
-        elif tick in (_UNTIL, UPDATE_TICKS - _SINCE):
+        elif tick == _UNTIL:
             self._govern(measured)
-        elif tick == _UNTIL + 1:
             self._probe()
+        elif tick == UPDATE_TICKS - _SINCE:
+            self._govern(measured)
         elif tick == UPDATE_TICKS - 1:
             self._direct()
         self.velocity += dt * self.acceleration
