@@ -25,7 +25,7 @@ FORMATS = ("png",)
 
 @dataclass(frozen=True)
 class Output:
-    """Output folder, and options for its figures and its report.
+    """Output folder of an experiment, and options for the figures and the report in it.
 
     Attributes:
         folder: Path of the folder.
@@ -48,8 +48,8 @@ def write_simulation(output: Output, job: Job, runs: Sequence[Run], document: Do
     Return the reason why the report is missing.  The text is empty if the report was written or not requested.
 
     Raises:
-        OutputError: The folder exists and ``force`` is false, or the folder contains files that are not from this
-            command, or it cannot be written.
+        OutputError: The folder exists and ``force`` is false, or the folder contains files that this command did not
+            write, or the folder cannot be written.
     """
     with whole_folder(output.folder, force=output.force, kind="run") as folder:
         write_json(folder / SIMULATION, document)
@@ -60,10 +60,9 @@ def write_simulation(output: Output, job: Job, runs: Sequence[Run], document: Do
 
 
 def write_comparison(output: Output, comparison: Reproduction, store: JobStore) -> str:
-    """Write ``comparison.json``, figures, ``runs/`` and ``report.html``, and remove the store.
+    """Write ``comparison.json``, figures, ``runs/`` and ``report.html``, and remove the store of finished runs.
 
-    Figures, ``runs/`` and the report show the first seed.  Return the reason why the report is missing.  The text is
-    empty if the report was written or not requested.
+    Figures, ``runs/`` and the report show the first seed.  The return value is as in :func:`write_simulation`.
 
     Raises:
         OutputError: As in :func:`write_simulation`.
@@ -79,7 +78,7 @@ def write_comparison(output: Output, comparison: Reproduction, store: JobStore) 
 
 
 def write_reproduction(output: Output, reproduction: Reproduction, store: JobStore) -> Document:
-    """Write ``SUMMARY.md``, ``runs/``, figures and ``reproduction.json``, and remove the store.
+    """Write ``SUMMARY.md``, ``runs/``, figures and ``reproduction.json``, and remove the store of finished runs.
 
     Return the content of ``reproduction.json``.
 
@@ -99,7 +98,7 @@ def write_reproduction(output: Output, reproduction: Reproduction, store: JobSto
 
 
 def store_beside(out: Path) -> AbstractContextManager[JobStore]:
-    """Lock and yield the store that keeps finished runs until the output folder ``out`` is written.
+    """Lock and yield the :class:`JobStore` with finished runs for the output folder ``out``.
 
     Raises:
         OutputError: As in :meth:`JobStore.locked`.
@@ -108,7 +107,7 @@ def store_beside(out: Path) -> AbstractContextManager[JobStore]:
 
 
 def draw_runs(job: Job, runs: Sequence[Run], document: Document, folder: Path, formats: Sequence[str]) -> None:
-    """Draw the figures of a job.  For the second sign of a push, the figures are written into ``minus/``."""
+    """Draw the figures of the runs of a job.  Figures of a second run (sign -1 of a push) go to ``minus/``."""
     for run, part in zip(runs, document["runs"], strict=True):
         tell("drawing")
         subfolder = folder if run is runs[0] else folder / "minus"
@@ -116,7 +115,7 @@ def draw_runs(job: Job, runs: Sequence[Run], document: Document, folder: Path, f
 
 
 def draw_side_by_side(jobs: Sequence[Job], store: JobStore, folder: Path, formats: Sequence[str]) -> None:
-    """Draw figures that compare several controllers in one scenario.  Pushes are drawn with their first sign."""
+    """Draw figures that compare controllers in one scenario.  They show the first run of each job."""
     tell("drawing")
     views = []
     for job in jobs:
@@ -128,10 +127,7 @@ def draw_side_by_side(jobs: Sequence[Job], store: JobStore, folder: Path, format
 
 
 def draw_reproduction(reproduction: Reproduction, store: JobStore, folder: Path, formats: Sequence[str]) -> None:
-    """Draw the figure ``bars`` and, in a folder per scenario, figures that compare three controllers.
-
-    The three controllers are nominal, robust and the best controller.
-    """
+    """Draw the figure ``bars``, and figures per scenario that compare nominal, robust and the best controller."""
     bars = []
     for row in reproduction.rows:
         paper, total = PAPER.get(row.scenario), row.metrics.get("q_total_impact")

@@ -1,4 +1,4 @@
-"""Store of finished jobs.  With it, an interrupted comparison can continue instead of starting again."""
+"""Store of finished jobs, with which an interrupted comparison can continue."""
 
 from __future__ import annotations
 
@@ -35,8 +35,8 @@ _STORED = re.compile(r"\.?[0-9a-f]{64}(\.minus)?\.(json|npz)(\.\d+\.part)?")
 class JobStore:
     """Folder with the documents and time series of finished jobs.
 
-    The name of a file is a hash of everything that its job depends on (:func:`key_of`).  A document begins with its
-    checksum and contains the checksums of its time series.  So a damaged file is detected, and its job runs again.
+    The name of a file is a hash of the settings, robot files and software of its job (:func:`key_of`).  A document
+    begins with its checksum and contains the checksums of its time series.  If a file is damaged, its job runs again.
     """
 
     def __init__(self, folder: Path) -> None:
@@ -68,7 +68,7 @@ class JobStore:
             what, hint = "another command stores its runs there", "wait until it ends, or choose another `out`"
             raise OutputError(what, where=str(self.folder), hint=hint) from None
         except OSError:
-            # The file system has no locks.
+            # Some file systems do not support locks.  On them, the folder is not locked.
             pass
         return lock
 
@@ -84,7 +84,7 @@ class JobStore:
             self.folder.rmdir()
 
     def remove(self) -> None:
-        """Remove the stored files.  Also remove the folder if it then is empty."""
+        """Remove the stored files.  Then remove the folder if it is empty."""
         with suppress(OSError):
             for path in self.folder.iterdir():
                 if _STORED.fullmatch(path.name):
@@ -119,13 +119,13 @@ class JobStore:
         return document
 
     def series(self, job: Job, sign: int) -> Path:
-        """Return the path of the time series of a run."""
+        """Return the path of the time series of a job for this sign of its push."""
         return self._path(job).with_suffix(f"{'' if sign > 0 else '.minus'}.npz")
 
     def keep(self, job: Job, document: Document, runs: Sequence[Run] = ()) -> None:
-        """Write a document and the time series of its runs.
+        """Write the document of a job and the time series of its runs.
 
-        The document is written last.  So :meth:`find` returns ``None`` if the call was interrupted.
+        The document is written last, so :meth:`find` returns ``None`` after an interrupted call.
 
         Raises:
             OutputError: The files cannot be written.
@@ -149,7 +149,7 @@ def _checksum(content: bytes) -> str:
 
 
 def key_of(job: Job) -> str:
-    """Return a hash of everything that the result of a job depends on."""
+    """Return a hash of the settings, robot files and software on which the result of a job depends."""
     content = [source_key((), ""), repr(software()), repr(asdict(job)), _scenario(job.scenario)]
     return _checksum("\0".join(content).encode())
 
@@ -171,20 +171,20 @@ def run_batch(
 ) -> list[Document]:
     """Run the jobs that are not stored yet, and return all documents in the order of the jobs.
 
-    The document of a job that fails, for example because a metric is undefined, has no runs and the status
-    ``control lost``.  For jobs that figures and reports show, time series are stored too.  ``progress`` is called
-    with the number of finished jobs and the number of all jobs.
+    If a job fails, for example because a metric is undefined, its document has no runs and the status ``control
+    lost``.  Time series are stored for jobs with :attr:`Job.shown`.  ``progress`` is called with the number of
+    finished jobs and the number of all jobs.
 
     Raises:
         ImpactPostureError: A scenario cannot be set up, or a controller does not exist.
     """
     done: dict[int, Document] = {}
     for k, job in enumerate(jobs):
-        # Setting up every scenario and controller first reveals mistakes before hours of runs.
+        # Set up every scenario and controller before the first run, so that mistakes appear at once.
         factory = controller_factory(job.scenario, job.free)
         if job.controller not in CONTROLLERS:
-            # The controller is from another package.  The key of a job does not contain the code of other packages,
-            # so the job always runs again.
+            # The controller belongs to another package.  The key of a job does not contain the code of other
+            # packages, so the job always runs again.
             factory.driver(job.controller)
         elif store is not None:
             document = store.find(job)
@@ -211,7 +211,7 @@ def _run(job: Job, store: JobStore | None) -> Document:
         runs, document = execute(job)
     except ImpactPostureError as error:
         if isinstance(error, InputError) and not isinstance(error, MetricError):
-            # A wrong input fails with every seed, so raise its error and end the batch.
+            # A wrong input fails with every seed, so the error ends the batch.
             raise
         document = lost_control(job, error)
     if store is not None:

@@ -25,25 +25,25 @@ from impact_posture.system.escape import file_name
 Document = dict[str, Any]
 
 SCHEMA = "impact-posture/simulation/4"
-# From this number of runs on, compiling the controller saves time.  For a humanoid, compiling needs about 6 s and
-# saves 4 s in each run.  It does not matter whether the cache already contains the library, because the rounding
-# errors of a run must not depend on earlier runs.
+# From this number of runs on, compiling the controller saves time.  For a humanoid, compiling takes about 6 s and
+# saves 4 s in each run.  A library in the cache does not lower this number, because the rounding errors of a run must
+# not depend on earlier runs.
 _PAYS = 2
 
 
 @dataclass(frozen=True)
 class Job:
-    """Runs of one controller in one scenario: one run for contacts, or one run for each sign of a push or throw.
+    """Simulation of one controller in one scenario with one seed.  A push or throw has one run for each sign.
 
     Attributes:
         scenario: Name or file of the scenario.
         controller: Name of the controller.
         seed: Seed of the sensor noise.
-        mode: ``live`` or ``held`` (:func:`impact_posture.simulation.run.run`).
-        free: If true, gradients and the offline optimum ignore the contacts at the feet.
+        mode: ``live``, or ``held`` to hold the reached posture (:func:`impact_posture.simulation.run.run`).
+        free: If true, the impact model ignores the contacts at the feet.
         gain: K of the impact-robust term, 1/s²; ``None`` for the value in the scenario.
         sign: Sign of the push or throw; ``None`` for every sign of the scenario.
-        compile: When the controller runs as machine code: ``always``, ``never``, or ``auto`` if it can be compiled.
+        compile: Whether the controller is compiled: ``always``, ``never``, or ``auto`` (if a compiler is available).
     """
 
     scenario: str
@@ -57,7 +57,7 @@ class Job:
 
     @property
     def label(self) -> str:
-        """Name of the controller and its variant, such as ``robust:held``."""
+        """Name of the controller with its variants, such as ``robust:held``."""
         return self.controller + (":held" if self.mode == "held" else "") + (":free" if self.free else "")
 
     @property
@@ -72,7 +72,7 @@ class Job:
 
 
 def worth_compiling(compile: CompileMode, runs: int) -> CompileMode:
-    """Return :attr:`Job.compile` for ``runs`` runs of each controller.  ``auto`` compiles from two runs on."""
+    """Return :attr:`Job.compile` for ``runs`` runs of each controller.  For one run, ``auto`` means ``never``."""
     return "never" if compile == "auto" and runs < _PAYS else compile
 
 
@@ -91,7 +91,7 @@ def parse_controller(text: str) -> tuple[str, Mode, bool]:
 
 @lru_cache(maxsize=8)
 def controller_factory(scenario: str, free: bool = False) -> ControllerFactory:
-    """Return the controller factory of a scenario.  A cache returns the same factory to the next job.
+    """Return the controller factory of a scenario.  Jobs with the same arguments share a cached factory.
 
     Raises:
         ImpactPostureError: The scenario cannot be read or set up.
@@ -165,8 +165,8 @@ def jsonable(content: object) -> Any:
 def combined(metrics: list[Metrics]) -> Metrics:
     """Combine the metrics of several runs.
 
-    Counts are added, and stops are collected.  ``peak_jump_max`` and ``peak_force`` are the largest values,
-    ``rested`` is true if it is true for all runs, and all other metrics are means.
+    Counts are added, and ``stops`` contains the joints of all runs.  ``peak_jump_max`` and ``peak_force`` are the
+    largest values.  ``rested`` is true if it is true for all runs.  All other metrics are means.
     """
     first = metrics[0]
     if len(metrics) == 1:

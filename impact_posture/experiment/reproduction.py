@@ -1,7 +1,4 @@
-"""Run controllers in scenarios with many seeds, and compare them with Table I of Afifi et al. 2026.
-
-A controller is better than nominal only if it meets several targets, which are also defined here.
-"""
+"""Run controllers in scenarios with many seeds, and compare them with Table I of Afifi et al. 2026."""
 
 from __future__ import annotations
 
@@ -16,8 +13,8 @@ from impact_posture.posture.program.compiled_solver import CompileMode
 from impact_posture.simulation.controllers.controller_factory import CONTROLLERS
 
 SCHEMA, COMPARISON_SCHEMA = "impact-posture/reproduction/3", "impact-posture/comparison/3"
-# The variant ``held`` shows the effect of the posture alone.  The variant ``free`` shows the effect of a metric that
-# ignores the contacts at the feet.
+# ``held`` holds the reached posture and switches the impact-robust term off, so only the posture has an effect.
+# ``free`` uses a metric that ignores the contacts at the feet.
 HELD, FREE = ("robust:held", "walker:held"), "robust:free"
 # Name or file of a scenario → labels of its controllers (:func:`parse_controller`).
 Plan = Mapping[str, Sequence[str]]
@@ -25,12 +22,12 @@ Plan = Mapping[str, Sequence[str]]
 
 @dataclass(frozen=True)
 class PaperRow:
-    """Row of Table I of the paper.
+    """Row of Table I of Afifi et al. 2026.
 
     Attributes:
         nominal: ``q_total_impact`` of the nominal TSID controller.
         robust: ``q_total_impact`` of the impact-robust TSID controller.
-        reduction: Reduction that the text of the paper gives, as a share.
+        reduction: Reduction in the text of the paper, as a share of ``nominal``.
     """
 
     nominal: float
@@ -38,8 +35,8 @@ class PaperRow:
     reduction: float
 
 
-# Compare reductions with the paper, not values: the shipped scenarios have other robots, gains and contact models,
-# and the windows of the paper end with the contact.
+# Only reductions can be compared with the paper.  The shipped scenarios have other robots, gains and contact models,
+# and the measurement windows of the paper end with the contact.
 PAPER: dict[str, PaperRow] = {
     "aerial-vertical": PaperRow(10.4, 5.1, 0.51),
     "aerial-lateral": PaperRow(9.2, 5.5, 0.402),
@@ -47,8 +44,8 @@ PAPER: dict[str, PaperRow] = {
     "talos-push": PaperRow(0.305, 0.166, 0.456),
 }
 
-# Scenario → the controller that meets its targets at most points of the envelope (docs: reproduction).  If no
-# controller meets them, it is the controller with the smallest misses.
+# Scenario → controller that meets its targets in most variations of the scenario (docs/reproduction.md).  If no
+# controller meets the targets, the entry is the controller that misses them least.
 RECOMMENDED: dict[str, str] = {
     "aerial-vertical": "posture",
     "aerial-lateral": "robust-flow",
@@ -56,10 +53,9 @@ RECOMMENDED: dict[str, str] = {
     "talos-push": "robust-flow",
 }
 
-# Target → function and text.  The function returns true if a row misses the target; its second argument is the
-# reduction in the paper.
-# The text describes what the row has if it misses the target.  The target ``recovery`` excludes motion that is only
-# delayed.  Saturation times are multiples of a tick, so a difference below 1e-9 s is a rounding error.
+# Target → function and text.  The function returns true if a row misses the target.  Its second argument is the
+# reduction in the paper.  The text describes the miss.  The target ``recovery`` rejects controllers that only delay
+# the motion.  Saturation times are multiples of a tick, so a difference below 1e-9 s is a rounding error.
 _TARGETS: dict[str, tuple[Callable[[ControllerRow, float], bool], str]] = {
     "reduction": (lambda row, paper: _mean(row.reduction) < paper, "less than the paper's reduction"),
     "recovery": (lambda row, _: _mean(row.recovery) <= 0, "no less motion than nominal over the recovery"),
@@ -85,9 +81,9 @@ def _mean(value: Interval | None) -> float:
 
 
 def missed_targets(row: ControllerRow) -> dict[str, str] | None:
-    """Return the names of the targets that a row misses, each with a text that describes the miss.
+    """Return the targets that a row misses: name → description of the miss.
 
-    Return ``None`` for the nominal controller and for a row without reduction, because they have no targets.
+    Return ``None`` for the nominal controller and for a row without reduction, which have no targets.
     """
     if row.reduction is None or row.recovery is None or row.controller == "nominal":
         return None
@@ -98,8 +94,8 @@ def missed_targets(row: ControllerRow) -> dict[str, str] | None:
 def best_of(rows: Sequence[ControllerRow]) -> ControllerRow | None:
     """Return the row with the largest reduction among the rows that meet every target.
 
-    If no row meets every target, choose among all rows.  Rows of robots that were not at rest are left out.  The
-    reduction of a row is the smaller one of ``reduction`` and ``recovery``.
+    If no row meets every target, choose among all rows.  A row is ignored if its robot was not at rest.  The
+    compared reduction is the smaller value of ``reduction`` and ``recovery``.
     """
     missed = [(row, targets) for row in rows if (targets := missed_targets(row)) is not None and row.rested]
     candidates = [row for row, targets in missed if not targets] or [row for row, _ in missed]
@@ -107,10 +103,7 @@ def best_of(rows: Sequence[ControllerRow]) -> ControllerRow | None:
 
 
 def controllers_of(scenario: str, everything: bool) -> tuple[str, ...]:
-    """Return the labels of the controllers in a reproduction, with nominal as the first one.
-
-    With ``everything``, the reproduction contains all controllers.
-    """
+    """Return the labels of some controllers, with nominal as the first label, or of all with ``everything``."""
     if everything:
         return (*CONTROLLERS, *HELD, *([FREE] if scenario.endswith("-push") else []))
     return tuple(dict.fromkeys(("nominal", "robust", "robust-flow", RECOMMENDED[scenario])))
@@ -127,7 +120,7 @@ def jobs_of(plan: Plan, seeds: int, compile: CompileMode = "auto") -> list[Job]:
 
 
 def gather(scenario: str, labels: Sequence[str], documents: Sequence[Document]) -> list[ControllerRow]:
-    """Return the rows of a scenario, computed from the documents of its jobs in the order of :func:`jobs_of`."""
+    """Return one row for each controller in a scenario.  ``documents`` has the order of :func:`jobs_of`."""
     count = len(documents) // len(labels)
     parts = {label: documents[k * count : (k + 1) * count] for k, label in enumerate(labels)}
     name = next((d["scenario"] for d in documents if d["runs"]), scenario)
@@ -167,11 +160,11 @@ class Reproduction:
         return next((row for row in self.of(scenario) if row.controller == controller), None)
 
     def best(self, scenario: str) -> ControllerRow | None:
-        """Return the best row of a scenario, which :func:`best_of` determines."""
+        """Return the best row of a scenario (:func:`best_of`)."""
         return best_of(self.of(scenario))
 
     def comparison(self) -> dict[str, Any]:
-        """Return the content of ``comparison.json``.  It is defined only for results of a single scenario."""
+        """Return the content of ``comparison.json``, for results of a single scenario."""
         head = {"schema": COMPARISON_SCHEMA, "scenario": self.rows[0].scenario, "seeds": list(range(self.seeds))}
         return head | {"rows": jsonable(self.rows)}
 
@@ -199,8 +192,8 @@ def reproduce(
     """Run the controllers of a plan in their scenarios, with the seeds 0 to ``seeds`` − 1.
 
     The store keeps the documents of finished jobs, and the time series of the first seed.  ``progress`` is called
-    with the number of finished jobs and the number of all jobs.  Controllers run as machine code ``always``,
-    ``never``, or if this saves time (``auto``).
+    with the number of finished jobs and the number of all jobs.  Controllers are compiled ``always``, ``never``, or
+    if this saves time (``auto``).
 
     Raises:
         ImpactPostureError: A scenario cannot be set up, a controller does not exist, MuJoCo is not installed, or the

@@ -11,7 +11,7 @@ from impact_posture.experiment.seed_statistics import FEWEST, ControllerRow, Int
 from impact_posture.simulation.controllers.controller_factory import MEANING
 from impact_posture.system.escape import markdown
 
-# Maximum number of decimals, which limits the decimals of a number near zero.
+# Maximum number of decimals, so that numbers near zero stay short.
 _DECIMALS = 4
 # Metric in the table of a scenario → number of its significant digits.
 _COLUMNS = {
@@ -26,9 +26,9 @@ LEGEND = (
 
 
 def table_one(results: Reproduction) -> str:
-    """Return a table of ``q_total_impact``: values of Table I of the paper, and our values in the same row.
+    """Return a Markdown table of ``q_total_impact``, with one row per scenario.
 
-    Our values are for nominal, robust and the best controller.
+    A row contains the values of the paper (nominal, robust) and our values (nominal, robust, best controller).
     """
     head = "scenario|paper: nominal|robust|reduction|ours: nominal|robust|reduction|best|reduction"
     lines = []
@@ -45,7 +45,7 @@ def table_one(results: Reproduction) -> str:
 
 
 def scenario_table(rows: Sequence[ControllerRow]) -> str:
-    """Return the table of all controllers of a scenario."""
+    """Return a Markdown table with one row per controller of a scenario."""
     head = (
         "controller|status|q_total_impact|reduction|over the recovery|peak jump|in the recovery|saturated inside, s|"
         "outside, s|relaxed ticks|peak force, N|over nominal's|H before|measured / predicted jump|targets"
@@ -134,7 +134,7 @@ def _force(best: ControllerRow, nominal: ControllerRow | None) -> str:
 
 
 def _held(best: ControllerRow, held: ControllerRow | None) -> str:
-    """Return a warning if the posture causes less than half of the reduction."""
+    """Return a warning if ``held``, the effect of the posture alone, is at most half of the reduction."""
     share = _share(held, best)
     if share is None or share > 0.5:
         return ""
@@ -155,7 +155,7 @@ def _share(part: ControllerRow | None, whole: ControllerRow | None) -> float | N
 
 
 def remarks(results: Reproduction, scenario: str) -> list[str]:
-    """Return notes that explain the table of a scenario."""
+    """Return sentences for the text below the table of a scenario."""
     lines = []
     for name in ("robust", "walker"):
         held, whole = results.row(scenario, f"{name}:held"), results.row(scenario, name)
@@ -185,7 +185,7 @@ def remarks(results: Reproduction, scenario: str) -> list[str]:
 def interval_text(value: Interval, digits: int = 3) -> str:
     """Return ``mean ± half width``, or the mean alone if :attr:`Interval.shown` is ``None``.
 
-    ``digits`` is the number of significant digits of the mean.
+    The mean has ``digits`` significant digits.
     """
     decimals = max(0, digits - 1 - int(np.floor(np.log10(abs(value.mean))))) if value.mean else 0
     return _plus_minus(value, min(decimals, _DECIMALS))
@@ -203,7 +203,7 @@ def _plus_minus(value: Interval, decimals: int, factor: int = 1) -> str:
 
 
 def reduction_text(row: ControllerRow | None) -> str:
-    """Return the reduction of a row as text in percent; ``–`` for nominal or without a reduction."""
+    """Return the reduction of a row in percent; ``–`` for nominal or if the reduction is ``None``."""
     return percent(None if row is None or row.controller == "nominal" else row.reduction)
 
 
@@ -216,7 +216,7 @@ def targets_text(row: ControllerRow) -> str:
 
 
 def _missed(row: ControllerRow) -> str:
-    """Return a text that describes by how the row misses its targets, such as "a joint on its stop"."""
+    """Return descriptions of the targets that a row misses, such as "a joint on its stop"."""
     return ", ".join((missed_targets(row) or {}).values())
 
 

@@ -24,7 +24,7 @@ _METRICS = (
     ("peak_force", "N", "largest normal force in the impact windows"),
     ("slip", "m", "way that the contact slid in the impact windows"),
 )
-# Key → meaning of the metrics that have another meaning for pushes.
+# Metrics with another meaning in push scenarios: key → meaning.
 _PUSH_MEANINGS = {
     "peak_jump": "largest ‖ν‖ from a push on until its window ends, mean of the pushes",
     "peak_jump_max": "the largest of the pushes",
@@ -78,7 +78,7 @@ def _summary(metrics: Mapping[str, Any]) -> str:
 
 
 def comparison_content(folder: Path, document: Document, view: RunView) -> Content:
-    """Return the texts and the table of the report about a comparison.  ``view`` is any run of the comparison."""
+    """Return the texts and the table of the report about a comparison.  ``view`` may be any run of the comparison."""
     rows = document["rows"]
     labels = [str(row["controller"]) for row in rows]
     table = [("status", *(str(row["status"]) for row in rows), "", "")]

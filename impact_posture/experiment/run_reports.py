@@ -35,13 +35,13 @@ SIMULATION, COMPARISON, RUNS = "run.json", "comparison.json", "runs"
 _FINE, _COARSE = 0.001, 0.025
 # If a position exceeds this value, the state has diverged, m or rad.
 _AWAY = 1e3
-# Names of the columns of the time series that figures use.
+# Columns of :class:`Series` that figures use.
 _COLUMNS = {field.name for field in fields(RunView)} & {field.name for field in fields(Series)}
 _BROKEN = (LookupError, ArithmeticError, ValueError, TypeError, AttributeError, OSError, RecursionError)
 
 
 def keep_runs(folder: Path, jobs: Sequence[Job], store: JobStore) -> None:
-    """Write the document and the ticks for the report of each stored job into ``runs/`` of a comparison.
+    """Write the document and the thinned time series of each job into ``runs/`` in the folder of a comparison.
 
     A run is left out if its state diverges within two ticks.
     """
@@ -82,7 +82,7 @@ def run_view(job: Job, part: Document, series: Series) -> RunView:
 
 
 def try_report(folder: Path, scenario: str, *, meshes: bool) -> str:
-    """Write the report of a folder.  If that fails, return the reason instead of raising, so the runs are kept."""
+    """Write the report of a folder.  If that fails, return the reason.  An exception would discard the runs."""
     try:
         write_run_report(folder, scenario, meshes=meshes)
     except Exception as error:
@@ -110,7 +110,7 @@ def write_run_report(folder: Path, scenario: str = "", *, meshes: bool = False) 
             content = run_content(folder, document, runs[0][0], _job(document, scenario))
         else:
             document, runs = _read(folder / COMPARISON, COMPARISON_SCHEMA), []
-            # Controllers whose names give the same file name have one common file.
+            # Two controllers share a file if their names lead to the same file name.
             for stem in dict.fromkeys(_stem(row["controller"]) for row in document["rows"]):
                 if (path := folder / RUNS / f"{stem}.json").is_file():
                     runs += _runs(_read(path, SIMULATION_SCHEMA), folder / RUNS / stem, scenario, 1)
@@ -126,10 +126,10 @@ def write_run_report(folder: Path, scenario: str = "", *, meshes: bool = False) 
 
 
 def thin(series: Series, windows: Iterable[Window]) -> Series:
-    """Return a selection of the ticks of a run for the report.
+    """Return the time series of a run with fewer ticks, for the report.
 
-    The ticks are denser within impact windows, and end when the state diverges.  The force and the peak at a selected
-    tick are the largest values since the previous selected tick.
+    The ticks are denser within impact windows, and end when the state diverges.  Force and peak force at a remaining
+    tick are the largest values since the previous remaining tick.
 
     Raises:
         InputError: The state diverges within two ticks.
@@ -143,7 +143,7 @@ def thin(series: Series, windows: Iterable[Window]) -> Series:
     for window in windows:
         if window.kind == "impact":
             inside |= (t >= window.begin - _FINE) & (t <= window.end)
-    # Select by the number of ticks and not by time, because sums of time steps have rounding errors.
+    # Count ticks instead of comparing times, because sums of time steps have rounding errors.
     stride = np.where(inside, max(round(_FINE / step), 1), max(round(_COARSE / step), 1))
     kept = np.flatnonzero((np.arange(len(t)) % stride == 0) | (np.arange(len(t)) == len(t) - 1))
     size = np.linalg.norm(series.force[: len(t)], axis=1)
@@ -155,10 +155,7 @@ def thin(series: Series, windows: Iterable[Window]) -> Series:
 
 
 def run_scene(runs: Sequence[tuple[RunView, WorstCaseObjective]], *, meshes: bool = False) -> ReportScene:
-    """Return the 3D scene of the report for runs of one scenario.
-
-    Each run is a view with the ticks that :func:`thin` selects, and its objective.
-    """
+    """Return the 3D scene of the report for ``runs`` of one scenario, after :func:`thin`."""
     first, objective = runs[0]
     planes = []
     if first.surface is not None:
@@ -204,7 +201,7 @@ def _series(stem: Path, sign: int) -> Path:
 
 
 def _job(document: Document, scenario: str) -> Job:
-    """Return the job of a document.  A shipped scenario is given by its name, any other scenario by its path."""
+    """Return the job of a document.  Its scenario is the name of a shipped scenario, or the path of a file."""
     name, source = str(document["scenario"]), str(document["source"])
     shipped = name in known_scenarios() and Path(source) == scenario_path(name)
     scenario = scenario or (name if shipped else source)
@@ -212,7 +209,7 @@ def _job(document: Document, scenario: str) -> Job:
 
 
 def _runs(document: Document, stem: Path, scenario: str, count: int) -> list[tuple[RunView, WorstCaseObjective]]:
-    """Return views of the first ``count`` runs of a document, each with its objective."""
+    """Return view and objective of the first ``count`` runs of a document."""
     job, runs = _job(document, scenario), []
     factory = controller_factory(job.scenario, job.free)
     if document["model_sha256"] != factory.setup.robot.model_sha256:

@@ -1,7 +1,4 @@
-"""Means over seeds with confidence intervals, and reductions relative to the nominal controller.
-
-A reduction compares two runs with the same seed.
-"""
+"""Means over seeds with confidence intervals, and reductions relative to nominal runs with the same seed."""
 
 from __future__ import annotations
 
@@ -21,7 +18,7 @@ QUANTITIES = tuple(f.name for f in fields(Metrics) if f.name not in ("stops", "c
 # An interval is shown only for at least this number of samples.  For two samples, the quantile of Student's t is
 # 12.7, so the interval is too wide to be useful.
 FEWEST = 3
-# If the relative half width is smaller than this, the samples differ only by rounding: the scenario has no noise.
+# If the half width divided by the mean is smaller than this, the samples differ only by rounding.
 _SAME = 1e-12
 
 
@@ -58,10 +55,7 @@ class Interval:
 
 
 def without_noise(intervals: Iterable[Interval]) -> bool:
-    """Return whether the scenario has no noise, that is, whether the samples of each interval are equal.
-
-    Return false if there are no intervals.
-    """
+    """Return whether all intervals are ``alike``, so the scenario has no noise; false if there are no intervals."""
     alike = [interval.alike for interval in intervals]
     return bool(alike) and all(alike)
 
@@ -115,7 +109,7 @@ def value_of(document: Document, quantity: str) -> float:
 
 
 def fate(document: Document) -> str:
-    """Describe why a job did not complete: the first event with its worst status, and the time of this event."""
+    """Describe why a job did not complete: the first event that caused its status, with the time of this event."""
     status = str(document["status"])
     first = next(event for event in document["events"] if event["status"] == status)
     sign = f" (push {first['sign']:+d})" if len(document["runs"]) > 1 else ""
@@ -126,11 +120,11 @@ def fate(document: Document) -> str:
 def row_of(
     scenario: str, controller: str, documents: Sequence[Document], nominal: Sequence[Document]
 ) -> ControllerRow:
-    """Summarize the runs of a controller, and compare them with nominal runs that have the same seeds, if any."""
+    """Summarize the runs of a controller, and compare them with ``nominal`` runs that have the same seeds."""
     good = [d for d in documents if d["status"] == "completed"]
     base = {d["seed"]: d for d in nominal}
     pairs = [(d, base[d["seed"]]) for d in documents if d["seed"] in base]
-    # If some runs failed, do not compare the others, because they are not a representative sample.
+    # If a run failed, compare none, because the remaining runs are not a representative sample.
     fair = bool(pairs) and len(good) == len(documents) and all(n["status"] == "completed" for _, n in pairs)
 
     def paired(name: str, compare: Callable[[float, float], float]) -> Interval:

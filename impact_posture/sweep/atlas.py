@@ -1,4 +1,4 @@
-"""Folder of a sweep: a manifest and one Parquet file per shard.  Each file is written as a whole."""
+"""Folder of a sweep: a manifest, and one Parquet file per shard (block of grid points that a worker solves)."""
 
 from __future__ import annotations
 
@@ -28,22 +28,20 @@ if TYPE_CHECKING:
 
 SCHEMA = "impact-posture/sweep-folder/1"
 MANIFEST, _DATA = "manifest.json", "data"
-# Folder with shard files from the first pass.  Neighboring shards need them even after the second pass has replaced
-# the main file.
+# Folder for results of the first pass.  Neighboring shards start from these results even after the second pass has
+# replaced the file in _DATA.
 _FIRST_PASS = "first-pass"
 # Number of shards whose postures stay in memory, because successive shards have common neighbors.
 _KEPT = 16
-# Packages whose code affects the results.
+# Subpackages of impact_posture whose code affects the results.
 _PACKAGES = ("robot", "dynamics", "collision", "impact", "posture", "sweep")
 
 
 def sweep_key(sweep: Sweep) -> str:
-    """Return a hash of everything that the results of a sweep depend on.
-
-    To compute the hash, the robot of every case is loaded.
+    """Return a hash of the settings, robot files and code on which the results of a sweep depend.
 
     Raises:
-        ImpactPostureError: A setting is invalid for its robot.
+        ImpactPostureError: A robot cannot be loaded, or a setting is invalid for the robot.
     """
     content = [repr((sweep.outer, sweep.grid, sweep.shard))]
     for case in sweep.cases:
@@ -70,7 +68,7 @@ class Atlas:
         """
         manifest = self.folder / MANIFEST
         if not os.path.isfile(manifest):
-            # If a run was killed before it wrote the manifest, the folder contains a record but no results.
+            # A run that was killed before it wrote the manifest leaves a record file but no results.
             if not is_ours(self.folder, "sweep") or (self.folder / _DATA).exists():
                 check_output(self.folder, force=False, kind="sweep")
             try:
@@ -93,7 +91,7 @@ class Atlas:
                 hint = "wait for it, or choose another `out`"
                 raise OutputError("is in use by another process", where=str(self.folder), hint=hint) from None
             except OSError:
-                # The file system has no locks.
+                # Some file systems do not support locks.  On them, the sweep runs without a lock.
                 pass
             for part in self.folder.glob("*/case=*/.shard-*.parquet.*.part"):
                 with suppress(OSError):
@@ -110,9 +108,9 @@ class Atlas:
         return [shard for shard in sorted(needed) if self._first(shard) is None], missing
 
     def solved(self, shard: int) -> tuple[bytes, dict[int, list[float]]]:
-        """Return the file content of a shard after its first pass, and postures of neighboring points.
+        """Return the file content of a shard after the first pass, and the postures around the shard.
 
-        The postures are from the points of other shards that are neighbors of points of this shard.
+        The postures belong to grid points in other shards that are next to a point of this shard.
         """
         beside: dict[int, list[float]] = {}
         for other, points in self._sweep.beside(shard).items():
@@ -121,7 +119,7 @@ class Atlas:
         return self._content(shard), beside
 
     def write(self, shard: int, content: bytes, passes: int) -> None:
-        """Write the file of a shard as a whole."""
+        """Write the ``content`` of a shard file after the given number of ``passes``."""
         before = self._passes(self._path(shard), shard)
         if before == 1 < passes:
             # Keep the file from the first pass, because neighboring shards still need it.
@@ -161,12 +159,11 @@ class Atlas:
         path = self._first(shard)
         if path is None:
             raise OutputError(
-                "a shard was deleted meanwhile", where=str(self.folder), hint="run sweep again to continue"
+                "a file was deleted during the run", where=str(self.folder), hint="run sweep again to continue"
             )
         return path.read_bytes()
 
     def _read_postures(self, shard: int) -> dict[int, list[float] | None]:
-        """Return a map from the points of a shard to their postures after the first pass."""
         return dict(zip(self._sweep.span(shard)[1], read_postures(self._content(shard)), strict=True))
 
     def _manifest(self) -> dict[str, Any]:

@@ -1,4 +1,4 @@
-"""Robot, problems and programs of a case, built once in each process."""
+"""Robot, problems and nonlinear programs of one case of a sweep, which each worker process builds once."""
 
 from __future__ import annotations
 
@@ -23,15 +23,16 @@ from impact_posture.sweep.point_search import Place, Timer, Walk
 from impact_posture.sweep.sweep_file import OFFSETS, Case, Grid
 from impact_posture.system.arrays import Array
 
-# Number of problems and programs that stay in memory, and maximum number of problems if the speed varies.  Each needs
-# about 1 MB.  The normal varies slowest, so problems of other normals are not needed at the same time.
+# A worker keeps at least _KEPT problems and programs in memory, each about 1 MB.  If the speed varies, it keeps a
+# problem for each speed, but at most _MOST_SPEEDS.  Problems with other normals are removed first, because the normal
+# varies slowest.
 _KEPT, _MOST_SPEEDS = 4, 64
 
 _Value = TypeVar("_Value")
 
 
 class CaseSolver:
-    """Robot, problems and programs of a case, which stay in memory for the next shards.
+    """Robot, problems and nonlinear programs of a :class:`Case`, which stay in memory for all its shards.
 
     Raises:
         ImpactPostureError: A setting of the case is invalid.
@@ -49,19 +50,19 @@ class CaseSolver:
 
     @property
     def content(self) -> str:
-        """Text that changes whenever the content of a file of the robot or the problem changes."""
+        """Text that changes with the content of any file that the robot or the problem uses."""
         prepared = self.template(*self.normal_and_speed({}))
         around, weights = prepared.problem.surroundings, prepared.impact.objective.metric.weights
         bodies = [] if around is None else [(b.name, b.radius, b.vertices.tolist()) for b in around.shapes.bodies]
         return repr((self.robot.data_sha256, prepared.impact.q.tolist(), weights, bodies))
 
     def normal_and_speed(self, values: Mapping[str, Any]) -> tuple[Any, float]:
-        """Return normal and speed for ``values`` of the grid.  Together they determine the template."""
+        """Return normal and speed for ``values`` of the grid axes.  They determine the problem up to its target."""
         settings = self._case.settings
         return values.get("normal", settings.normal), values.get("speed", settings.speed)
 
     def _template(self, normal: Any, speed: float) -> Prepared:
-        """Return the problem for a normal and a speed, with the target of the case."""
+        """Return the problem for a normal and a speed.  :meth:`target` later replaces the target of this problem."""
         settings = replace(self._case.settings, normal=normal, speed=speed)
         prepared = prepare(settings, resolve(settings, self._loaded))
         # Most problems do not depend on the speed.  Then all speeds use the same problem object and its solutions.
@@ -70,12 +71,11 @@ class CaseSolver:
         return replace(kept(self._known, key, lambda: prepared, self._templates), impact=prepared.impact)
 
     def _attainable(self, normal: Any, speed: float) -> AttainableSpeed:
-        """Return the computation of the largest approach speed, for a normal and a speed."""
         prepared = self.template(normal, speed)
         return AttainableSpeed(self.robot, prepared.impact.objective, prepared.problem.requirements)
 
     def target(self, values: Mapping[str, Any]) -> Place:
-        """Return the target position and orientation of the contact frame for ``values`` of the grid."""
+        """Return the target position and orientation of the contact frame for ``values`` of the grid axes."""
         position = values.get("target_position", self._case.settings.target_position)
         quaternion = values.get("target_quaternion", self._case.settings.target_quaternion)
         if any(name in values for name in OFFSETS):
@@ -102,10 +102,10 @@ class CaseSolver:
                 retarget(prepared.problem, *self.target({axis.name: value}))
 
     def walk(self, template: ConstrainedProblem) -> Walk:
-        """Return the :class:`Walk` that solves the points of a shard with a template.
+        """Return the :class:`Walk` that solves points of a shard, starting from the problem ``template``.
 
-        A program is built only if its expressions are new.  Each walk has its own branch of the program, so rounding
-        errors depend only on the template and the points of the shard.
+        A nonlinear program with the same expressions is reused.  Each walk extends its own copy of the program, so
+        its rounding errors do not depend on shards that this process solved before.
         """
         key = f"{template.objective.structure}\n{template.structure}"
         built = kept(self._programs, key, lambda: build_nlp(template, compile="never"), _KEPT)

@@ -20,12 +20,13 @@ from impact_posture.system.processes import depend, signals_held
 @contextmanager
 def process_pool(workers: int) -> Iterator[Executor]:
     """Yield a pool of processes on this machine.  The processes end at the end of the ``with`` block."""
-    # Workers are forked: a forked process imports no modules again, and leaves no semaphores behind after a signal.
+    # Fork the workers.  Spawned workers would import all modules again, and would leave semaphores behind after a
+    # signal.
     pool = ProcessPoolExecutor(workers, multiprocessing.get_context("fork"), depend, (os.getpid(),))
     others = set(multiprocessing.active_children())
     try:
-        # The first submit forks all workers, before a thread starts.  On Ctrl-C, the terminal sends the signal to
-        # every process, but workers must ignore it.
+        # The first submit forks all workers, before the pool starts a thread.  The workers inherit blocked signals,
+        # because the terminal sends Ctrl-C to every process and only the main process should react.
         with signals_held():
             pool.submit(os.getpid)
         yield pool
@@ -37,7 +38,7 @@ def process_pool(workers: int) -> Iterator[Executor]:
 
 @contextmanager
 def dask_cluster(address: str) -> Iterator[Executor]:
-    """Yield the executor of a Dask cluster.  ``address`` is the address of its scheduler, such as ``tcp://host:8786``.
+    """Yield the executor of the Dask cluster whose scheduler has this ``address``, such as ``tcp://host:8786``.
 
     Raises:
         InputError: The package ``distributed`` is not installed, or no scheduler answers at the address.
@@ -48,7 +49,7 @@ def dask_cluster(address: str) -> Iterator[Executor]:
     try:
         client = Client(address, timeout="10s")
     except (OSError, ValueError) as error:
-        what, hint = f"no Dask scheduler answers ({error})", "start one, or correct the address"
+        what, hint = f"no Dask scheduler answers ({error})", "start a scheduler, or correct the address"
         raise InputError(what, where=f"scheduler {address}", hint=hint) from None
     with client:
         yield client.get_executor()
@@ -85,7 +86,7 @@ class SlurmJobs(Executor):
     def __init__(self, folder: Path, options: dict[str, Any], cluster: str | None = None) -> None:
         check_package("submitit", "slurm")
         self._folder, self._options, self._cluster = folder, options, cluster
-        # submitit immediately creates its folder, so check the options with a temporary folder.
+        # submitit creates its folder at once.  The check uses a temporary folder, so invalid options leave no folder.
         with TemporaryDirectory() as trial:
             try:
                 self._executor(Path(trial))
@@ -115,12 +116,12 @@ class SlurmJobs(Executor):
         return [self._waiting.submit(job.result) for job in jobs]
 
     def shutdown(self, wait: bool = True, *, cancel_futures: bool = False) -> None:
-        """Stop waiting for the jobs, as :meth:`concurrent.futures.Executor.shutdown`."""
+        """Stop the threads that wait for jobs, as :meth:`concurrent.futures.Executor.shutdown`.  Jobs continue."""
         self._waiting.shutdown(wait=wait, cancel_futures=cancel_futures)
 
 
 def parse_options(texts: Sequence[str]) -> dict[str, Any]:
-    """Parse texts of the form ``KEY=VALUE``.  Values of decimal digits become integers.
+    """Parse texts of the form ``KEY=VALUE``.  A value that consists of decimal digits becomes an integer.
 
     Raises:
         InputError: An option is not of the form ``KEY=VALUE``.

@@ -29,9 +29,9 @@ from impact_posture.sweep.sweep_file import Axis, Grid
 from impact_posture.system.arrays import Array
 from impact_posture.system.escape import plot_label
 
-# Two neighboring points have different optima if the difference of their postures (tangent norm, without the position
-# of the base) exceeds SWITCH and also this multiple of the lower quartile of all differences.  The lower quartile is
-# a typical difference within one optimum, if at most half of the pairs of neighbors have different optima.
+# Two neighboring points count as different optima if their postures differ by more than SWITCH and by more than this
+# multiple of the lower quartile of all differences.  The lower quartile estimates the difference between neighbors
+# with the same optimum.  A difference is a norm in the tangent space, without the position of the base.
 _UNUSUAL = 4.0
 # The color scale is logarithmic if the ratio of the largest to the smallest objective exceeds this value.
 _WIDE = 20.0

@@ -23,12 +23,12 @@ from impact_posture.posture.search.growing_search import HIGH_PRICE
 from impact_posture.posture.search.multistart import distinct, solve
 from impact_posture.system.arrays import Array
 
-# Maximum number of rounds in which the program of a point grows.  The second number applies as long as it is unknown
-# whether the point is feasible.
+# Maximum number of rounds that add missing body pairs to the nonlinear program of a point.  The second number applies
+# as long as it is unknown whether the point is feasible.
 _ROUNDS, _UNSURE = 8, 3
 # Postures whose joints differ by more than this (rad, m) may belong to different optima.
 SWITCH = 0.2
-# An optimum replaces another one only if its objective is smaller by at least this share.
+# A new optimum replaces the known optimum only if it lowers the objective by at least this share.
 _BETTER = 1e-4
 
 # Target position and orientation of the contact frame; ``None`` to keep the value at the given posture.
@@ -36,7 +36,7 @@ Place = tuple[Any, Any]
 
 
 class Start(NamedTuple):
-    """Start posture ``q``, shape (nq,), and the ``end`` of the solver run that computed it; ``None`` if unknown."""
+    """Start posture ``q``, shape (nq,), and the final solver state ``end`` at this posture; ``None`` if unknown."""
 
     q: Array
     end: WarmStart | None = None
@@ -48,8 +48,7 @@ class PointResult(NamedTuple):
     Attributes:
         row: Column name → value of the point in the table.
         start: Posture of the point, from which other points can start; ``None`` if the point has no posture.
-        violation: If the point is infeasible, the smallest known violation of its constraints, weighted by their
-            prices; otherwise 0.
+        violation: Smallest known weighted sum of all constraint violations; 0 if the point is not infeasible.
     """
 
     row: dict[str, Any]
@@ -64,27 +63,27 @@ class PointResult(NamedTuple):
 
 @dataclass
 class Timer:
-    """Wall time in IPOPT, which includes the functions that IPOPT calls, s."""
+    """Wall time in IPOPT and in the functions that IPOPT calls, s."""
 
     solver_s: float = 0.0
 
 
 class Walk:
-    """Problem and program for the points of a shard with the same template.
+    """Problem and nonlinear program for points of a shard that differ only in the target.
 
-    Both grow if a point needs more parts, and the next points use the grown program.
+    If a point needs more body pairs, both are extended, and the next points use the extended program.
     """
 
     def __init__(
         self, template: ConstrainedProblem, settings: ProblemSettings, nlp: PostureNLP, timer: Timer
     ) -> None:
-        # Keep a reference to the template, because a shard identifies the template by its ``id``.
+        # The caller identifies the template by its ``id``.  This reference prevents that the ``id`` is used again.
         self._template, self.settings, self.timer = template, settings, timer
         self.problem, self.nlp = template, nlp
         self._relaxed: ElasticProgram | None = None
 
     def grow(self, problem: ConstrainedProblem) -> None:
-        """Use a problem with more parts from now on."""
+        """Use ``problem``, which has additional body pairs, for this and the next points."""
         self.problem, self.nlp = problem, self.nlp.grown(problem, compile="never")
 
     def at(self, problem: ConstrainedProblem, place: Place) -> ConstrainedProblem:
@@ -94,7 +93,8 @@ class Walk:
     def relax(self, place: Place, guesses: Sequence[Array] = (), beside: float = 0.0) -> LeastViolation:
         """Minimize the violation of the constraints at a target.
 
-        The program contains the parts that earlier targets needed.  ``beside`` is the violation at neighbors.
+        ``beside`` is the smallest violation at neighboring points.  The program keeps body pairs that earlier targets
+        needed.
         """
         program = self._relaxed = self._relaxed or ElasticProgram(self.problem, self.nlp.program.rows.branch())
         before = program.time_s
@@ -106,8 +106,8 @@ class Walk:
 def search(walk: Walk, place: Place, guesses: Sequence[Start], beside: float = 0.0) -> PointResult:
     """Solve one point from the optima of its neighbors and from the given posture.
 
-    If these starts lead to different optima, random starts are added.  If no neighbor has an optimum, ``beside`` is
-    the smallest violation at infeasible neighbors.  In this case, the point is likely to be infeasible.
+    If these starts lead to different optima, random starts are added.  ``beside`` is the smallest violation at
+    infeasible neighbors, or 0 if a neighbor has an optimum.  If it is positive, the point is probably infeasible.
     """
     attempt = _Attempt(walk, place, walk.settings.starts - 1)
     try:
@@ -141,7 +141,7 @@ def improve(walk: Walk, place: Place, known: PointResult, guess: Start) -> Point
 
 
 class _Attempt:
-    """Solver runs at one point.  ``others`` random starts are added if the first starts lead to different optima."""
+    """Solver runs at one point.  If the first starts lead to different optima, ``others`` random starts are added."""
 
     def __init__(self, walk: Walk, place: Place, others: int) -> None:
         self.problem, self.runs, self.fault = walk.at(walk.problem, place), 0, "no run converged"
@@ -153,8 +153,8 @@ class _Attempt:
         """Return the best certified result, or ``None``.
 
         With ``alone``, the runs start only from ``guesses``.  Otherwise, they also start from the given posture, and
-        from random starts if the results differ.  After each of at most ``rounds`` rounds, the program grows by the
-        parts that are needed at the ends of the runs.
+        from random starts if the results differ.  After each of at most ``rounds`` rounds, the program gets the body
+        pairs that violate their clearance at the results.
         """
         price = SLACK_PRICE
         for _ in range(rounds):
@@ -179,15 +179,15 @@ class _Attempt:
             if self.problem is not problem:
                 self._walk.grow(self.problem)
             elif price == SLACK_PRICE:
-                # No part is missing, but a constraint is still violated: the solver is in a local minimum of the
-                # violation.  Try again with a higher price of violations.
+                # The program is complete, but a constraint is still violated: the solver is in a local minimum of the
+                # violation.  Try again with a higher penalty on violations.
                 price = HIGH_PRICE
             else:
                 return None
         return None
 
     def searched(self, guess: Array) -> PointResult | None:
-        """Return the result of the multistart search of ``optimize``, which also restarts from ends in collision."""
+        """Return the result of the multistart search of ``optimize``.  It also restarts from results in collision."""
         settings = self._walk.settings
         try:
             solution = solve(
@@ -236,7 +236,7 @@ class _Attempt:
         return PointResult(row, start)
 
     def failure(self, status: str, reason: str, violation: float = 0.0) -> PointResult:
-        """Return the result of a point for which no posture was found."""
+        """Return the result of a point without a certified posture."""
         row = {"status": status, "reason": reason, "optima": 0, "runs": self.runs}
         return PointResult(row, violation=violation)
 
@@ -260,7 +260,7 @@ def _optima(problem: ConstrainedProblem, ends: Sequence[_End]) -> list[_End]:
 
 
 def _agree(problem: ConstrainedProblem, ends: Sequence[_End], home: _End) -> bool:
-    """Return whether all neighbors lead to the same optimum, and the given posture does not lead to a better one."""
+    """Return whether the runs ``ends`` have the same optimum, and the run ``home`` has no better optimum."""
     if not ends or not all(np.isfinite(end.value) for end in ends):
         return False
     return len(_optima(problem, ends)) == 1 and home.value > (1 - _BETTER) * min(end.value for end in ends)

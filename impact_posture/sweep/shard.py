@@ -1,4 +1,4 @@
-"""Solve a shard in two passes.  A worker returns the shard as the content of a Parquet file."""
+"""Solve a shard, a block of grid points, in two passes.  Each pass returns the content of a Parquet file."""
 
 from __future__ import annotations
 
@@ -19,7 +19,8 @@ from impact_posture.sweep.shard_table import STATUS, read_shard, write_shard
 from impact_posture.sweep.sweep_file import Sweep
 from impact_posture.system.arrays import Array
 
-# MUMPS, the linear solver in IPOPT, is not thread-safe.  So a worker with several threads solves one shard at a time.
+# A worker process with several threads solves one shard at a time, because MUMPS, the linear solver in IPOPT, is not
+# thread-safe.
 _ALONE = threading.Lock()
 # Number of cases whose robots and programs stay in the memory of a worker.
 _KEPT = 4
@@ -109,7 +110,7 @@ class _Shard:
         self._share()
 
     def revise(self, beside: Mapping[int, list[float]]) -> None:
-        """Improve points at the border from postures in other shards, then other points from improved points."""
+        """Improve border points from postures of other shards, then interior points from improved neighbors."""
         improved = set[int]()
 
         def improve_from_neighbors(points: Iterable[int], starts: Callable[[int], Start | None]) -> None:
@@ -168,8 +169,8 @@ class _Shard:
         return self.results[index] is not known
 
     def _share(self) -> None:
-        """Copy the result of a point to the points after it with the same problem."""
-        # The results are computed at the first speed, because this point has the most neighbors.
+        """Copy the result of a point to the next points if they have the same problem."""
+        # Among points with the same problem, the first point was started from the most neighbors.
         for point, is_new in self._problems():
             if not is_new:
                 index = point - self._points.start

@@ -76,10 +76,7 @@ def read_postures(content: bytes) -> list[list[float] | None]:
 
 
 def passes_of(path: Path, key: str, points: int) -> int:
-    """Return the number of passes after which a shard file was written.
-
-    Return 0 if ``path`` is not a complete shard file of the sweep with this key.
-    """
+    """Return 1 or 2, the passes after which a shard file was written; 0 if it is incomplete or has another key."""
     from pyarrow import ArrowException, parquet
 
     try:

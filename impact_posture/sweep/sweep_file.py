@@ -19,8 +19,8 @@ from impact_posture.errors import SpecError, nearest, printable
 from impact_posture.impact.impact_contact import LARGEST
 from impact_posture.robot.robot_loader import from_folder
 
-# Axes along which one program can be used, from the slowest to the fastest.  ``x``, ``y`` and ``z`` are offsets of
-# the target.
+# Axes along which one nonlinear program is used for all values, from the slowest to the fastest.  ``x``, ``y`` and
+# ``z`` are offsets of the target.
 OFFSETS = ("x", "y", "z")
 _INNER = ("normal", "target_quaternion", "target_position", *OFFSETS, "speed")
 # Settings that cannot be an axis, because they concern the search or the output.
@@ -71,9 +71,9 @@ class Grid:
         return {axis.name: axis.values[k] for axis, k in zip(self.axes, self.place(point), strict=True)}
 
     def neighbors(self, point: int, first: int) -> list[int]:
-        """Return the neighbors of ``point`` with smaller indices, but at least ``first``, along the fastest axes.
+        """Return up to two neighbors of ``point`` with indices from ``first`` to ``point - 1``.
 
-        The neighbors depend only on the grid and the shard, so the bytes of the shard are reproducible.
+        Neighbors along the axis that varies fastest come first.
         """
         return [other for other in self.around(point) if first <= other < point][:_NEIGHBORS]
 
@@ -109,7 +109,7 @@ class SweepSettings(StrictTable):
 
 @dataclass(frozen=True)
 class Case:
-    """Combination of values of the outer axes, which needs a separate program.
+    """One combination of values of the outer axes.  Each combination needs its own nonlinear program.
 
     Attributes:
         settings: Settings of the problem at the first point of the grid.
@@ -163,7 +163,7 @@ class Sweep:
         return case, range(first, min(first + self.shard, self.grid.size))
 
     def beside(self, shard: int) -> dict[int, list[int]]:
-        """Return other shards with points that are neighbors of points of this shard, each with these points."""
+        """Return the grid points in other shards that are next to this shard: number of the shard → its points."""
         case, points = self.span(shard)
         neighbors: dict[int, list[int]] = {}
         for other in sorted({other for point in points for other in self.grid.around(point)}.difference(points)):
@@ -250,7 +250,7 @@ def _check_names(names: Sequence[str], where: str) -> None:
 
 
 def _checked(name: str, values: Sequence[Any], problem: dict[str, Any], where: str) -> tuple[Any, ...]:
-    # Check an offset as an entry of ``target_position``.
+    # An offset obeys the same rules as an entry of ``target_position``.
     key, wrap = ("target_position", lambda v: [v, 0.0, 0.0]) if name in OFFSETS else (name, lambda v: v)
     checked = []
     for k, value in enumerate(values):

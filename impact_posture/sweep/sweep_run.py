@@ -15,8 +15,8 @@ from impact_posture.sweep.shard_table import STATUS
 from impact_posture.sweep.sweep_file import Sweep
 
 Progress = Callable[[int, int], None]
-# Maximum number of shards that are submitted and not yet written.  A larger number needs more memory; with a smaller
-# number, workers could wait.
+# Maximum number of shards that are submitted and not yet written.  A larger number needs more memory.  With a smaller
+# number, workers may have to wait for the next shard.
 IN_HAND = 64
 
 

@@ -1,4 +1,4 @@
-"""Sources that compute the quantities of an impact by different means, and random samples for the comparison."""
+"""Compute H, G, Λ_c and ∇H from CasADi, compiled C, MuJoCo and finite differences, at random postures."""
 
 from __future__ import annotations
 
@@ -22,16 +22,16 @@ from impact_posture.system.arrays import Array
 from impact_posture.system.libraries import build_library, load_library
 from impact_posture.system.scratch_folder import scratch_folder
 
-# First step of the finite differences, and number of steps.  Each step is half of the previous one.
+# First step of the finite differences, and number of steps.  Each step is half as long as the previous step.
 _FIRST_STEP, _LEVELS = 0.02, 7
-# H, G and ∇H are zero if the contact cannot move along n.  So their errors are relative to at least this share of the
-# largest value over all normals.
+# H, G and ∇H are zero if the contact cannot move along n.  So the scale of their relative errors is at least this
+# share of the largest H or G over all normals.
 _FLOOR = 1e-3
 
 
 @dataclass(frozen=True, eq=False)
 class PostureSample:
-    """Configuration ``q``, shape (nq,), and unit ``normal``, shape (3,), in the normal frame of the contact."""
+    """Configuration ``q``, shape (nq,), and unit ``normal``, shape (3,), in :attr:`ImpactContact.normal_frame`."""
 
     q: Array
     normal: Array
@@ -75,8 +75,8 @@ class Numbers:
 
     Attributes:
         values: Name of the quantity → its value.
-        scales: Name of the quantity → minimum scale of its relative error.  The scale is the largest entry of the
-            quantity if this entry is larger.
+        scales: Name of the quantity → smallest denominator of its relative error.  A larger entry of the quantity
+            replaces this denominator.
     """
 
     values: dict[str, Array]
@@ -115,14 +115,14 @@ def pinocchio_differences(objective: WorstCaseObjective, sample: PostureSample) 
 
 
 def casadi_source(objective: WorstCaseObjective) -> Source:
-    """Return the source that evaluates the symbolic expressions with the CasADi interpreter."""
+    """Return the function that evaluates the symbolic expressions with the CasADi interpreter."""
     reference = casadi_reference(_impulse(objective))
     return lambda sample: _named(reference(sample.q, sample.normal))
 
 
 @contextmanager
 def compiled_source(objective: WorstCaseObjective) -> Iterator[Source]:
-    """Yield the source that calls the C export, which is built in a temporary folder.
+    """Yield a function that calls the C export of the objective.  The export is built in a temporary folder.
 
     Raises:
         CompilerError: No compiler is installed, or the compiler failed.
@@ -145,7 +145,7 @@ def compiled_source(objective: WorstCaseObjective) -> Iterator[Source]:
 
 
 def _impulse(objective: WorstCaseObjective) -> WorstCaseObjective:
-    """Return the objective of kind ``impulse``.  It is defined everywhere and has the same ``H`` and ``∇H``."""
+    """Return the objective with kind ``impulse``, which is defined everywhere.  ``H`` and ``∇H`` stay the same."""
     return replace(objective, kind="impulse")
 
 
@@ -156,7 +156,7 @@ def _named(values: dict[str, Array]) -> Numbers:
 
 
 class MujocoSource:
-    """Source that gets ``M`` and ``J`` from MuJoCo and computes the other quantities by one dense linear solve."""
+    """Get ``M`` and ``J`` from MuJoCo, and compute the other quantities by one dense linear solve."""
 
     def __init__(self, objective: WorstCaseObjective) -> None:
         self._objective = objective
@@ -192,9 +192,9 @@ class MujocoSource:
 def difference_gradient(value: Callable[[Array], float], model: pin.Model, q: Array) -> Array:
     """Return ``d/dε value(q ⊕ ε e_i)``, shape (nv,), by Ridders' extrapolation of central differences.
 
-    For each entry, the result is the extrapolated value that differs least from its neighbors in the tableau.  So the
-    step needs no tuning for stiff supports or flat directions (Ridders 1982, "Accurate computation of F'(x) and
-    F'(x)F''(x)").  ``model`` defines ``⊕``.
+    For each entry, the result is the extrapolated value that differs least from its neighbors in the extrapolation
+    table.  So the step needs no tuning (Ridders 1982, "Accurate computation of F'(x) and F'(x)F''(x)").  ``model``
+    defines ``⊕``.
     """
     directions = np.eye(model.nv)
 

@@ -36,24 +36,23 @@ REFERENCE = "Pinocchio"
 CASADI, COMPILED, DIFFERENCES, MUJOCO = "CasADi", "compiled C", "finite differences", "MuJoCo"
 NO_COMPILER = f"no C compiler: {GET_ONE}"
 
-# Largest relative errors that pass, in this order: for M and J from MuJoCo; for H, G, Λ_c and for gradients from
-# CasADi and C; for gradients by finite differences.
+# Largest relative errors that pass: for M and J; for H, G, Λ_c and analytic gradients; for finite differences.
 _MODEL, _VALUES, _DIFFERENCES = 1e-9, 1e-9, 1e-8
-# Values for standing robots that replace _VALUES and _DIFFERENCES.  They are larger, because the compliance ε leads
-# to a linear system with the condition number 1/ε.
+# For standing robots, these errors replace _VALUES and _DIFFERENCES.  They are larger, because the condition number
+# of the linear system is about 1/ε, where ε is the compliance of the supports.
 _ON_FEET = 1e-7, 1e-6
 
 
 @dataclass(frozen=True)
 class VerificationRow:
-    """Comparison of one quantity from one source with Pinocchio.
+    """Comparison of one quantity from one source with the value from Pinocchio.
 
     Attributes:
-        source: Name of the source.
+        source: ``CasADi``, ``compiled C``, ``finite differences`` or ``MuJoCo``.
         quantity: Name of the quantity: ``H``, ``G``, ``Λ_c``, ``∇H``, ``M`` or ``J``; empty if the whole source is
             skipped or fails.
         verdict: ``pass``, ``fail``, or ``skipped`` if the source is not available on this machine.
-        error: Largest relative error over all samples; ``None`` if the error is unknown or not finite.
+        error: Largest relative error over all samples; ``None`` if it is not finite or was not computed.
         tolerance: Largest relative error that passes; ``None`` without a comparison.
         sample: Number of the sample with the largest error, starting at 0; ``None`` without a comparison.
         entry: Entry of the quantity with the largest error; empty for a scalar.
@@ -75,7 +74,7 @@ class VerificationReport:
     """Comparison of all sources with Pinocchio.
 
     Attributes:
-        rows: Comparisons, sorted by source.
+        rows: One row for each source and quantity, sorted by source.
         samples: Random samples at which the sources were compared.
         seed: Seed of the samples.
     """
@@ -112,7 +111,7 @@ def verify(
     seed: ZeroOrMore = 0,
     progress: Callable[[int, int], None] | None = None,
 ) -> VerificationReport:
-    """Compare ``H``, ``G``, ``Λ_c`` and ``∇H`` from every source with the reference values from Pinocchio.
+    """Compare ``H``, ``G``, ``Λ_c`` and ``∇H`` from four sources with the reference values from Pinocchio.
 
     The sources are the CasADi interpreter, the C export if there is a compiler, finite differences, and MuJoCo if it
     is installed.  The finite differences approximate ``∇H`` from the ``H`` of Pinocchio.  MuJoCo computes ``M`` and
@@ -120,11 +119,11 @@ def verify(
     ``H``, and ``∇H`` by finite differences.
 
     The error of a quantity is relative to its largest entry.  ``H``, ``G`` and ``∇H`` are zero if the contact cannot
-    move along the normal.  So their errors are relative to at least a thousandth of the largest entry of ``Λ_c``
-    (``JM⁻¹Jᵀ`` for ``G``).
+    move along the normal.  So the denominator of their errors is at least a thousandth of the largest entry of
+    ``Λ_c`` (for ``G``: of ``JM⁻¹Jᵀ``).
 
     Args:
-        objective: Objective that defines robot, contact, metric and supports.
+        objective: Objective with the robot, contact, metric and supports.
         samples: Number of random postures and normals.  The first normal is the normal of the contact.
         seed: Seed of the samples.
         progress: Callback with the number of finished comparisons and the number of all comparisons.
@@ -167,7 +166,7 @@ def verify(
 
 
 def _mujoco(objective: WorstCaseObjective) -> Source | VerificationRow:
-    """Return the MuJoCo source, or a row with the reason why this source is not available."""
+    """Return the source ``MuJoCo``, or a row with the reason why it is not available."""
     try:
         import_mujoco()
     except InputError as error:
