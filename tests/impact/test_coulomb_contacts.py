@@ -11,7 +11,8 @@ from hypothesis import given
 from hypothesis import strategies as st
 
 from impact_posture.dynamics.mjcf import build_mjcf, import_mujoco
-from impact_posture.impact.evaluation.coulomb_jump import contact_impulses, coulomb_jump, coulomb_jumps
+from impact_posture.impact.evaluation.coulomb_jump import coulomb_jump, coulomb_jumps
+from impact_posture.impact.friction.contact_impulses import contact_impulses
 from impact_posture.impact.friction.coulomb_impact import coulomb_impact
 from impact_posture.impact.impact_contact import ImpactContact, point_on
 from impact_posture.impact.metric import Metric
@@ -44,7 +45,7 @@ def test_the_laws_hold_at_every_contact(seed: int, count: int) -> None:
     normals = np.array([unit(generator) for _ in range(count)])
     friction = generator.uniform(0, 1, count)
     B = A @ A.T / (3 * count)
-    p = contact_impulses(B, normals, friction)
+    p = contact_impulses(B, -normals, normals, friction)
     assert p is not None
     assert_laws(B, normals, friction, p, 1e-7)
 
@@ -57,10 +58,10 @@ def test_contacts_that_do_not_feel_each_other_are_single_contacts() -> None:
         B[3 * i : 3 * i + 3, 3 * i : 3 * i + 3] = block
     normals = np.array([unit(generator) for _ in range(3)])
     friction = np.array([0.0, 0.2, 5.0])
-    together = contact_impulses(B, normals, friction)
+    together = contact_impulses(B, -normals, normals, friction)
     assert together is not None
     for i, block in enumerate(blocks):
-        alone = contact_impulses(block, normals[i : i + 1], friction[i : i + 1])
+        alone = contact_impulses(block, -normals[i : i + 1], normals[i : i + 1], friction[i : i + 1])
         assert alone is not None
         assert_close(together[i], alone[0], 1e-8, f"contact {i}")
 
@@ -74,7 +75,7 @@ def test_one_contact_is_the_single_solution(friction: float) -> None:
         objective = WorstCaseObjective(loaded, contact, kind="coulomb")
         for q in random_configurations(loaded.model, 3, name, friction):
             impact, o = coulomb_impact(objective.oracle, q), objective.oracle.quantities(q)
-            p = contact_impulses(o.mobility, o.normal[None, :], np.array([friction]))
+            p = contact_impulses(o.mobility, -o.normal[None, :], o.normal[None, :], np.array([friction]))
             assert p is not None
             assert_close(p[0], impact.impulse, 1e-7, name)
             jump = coulomb_jump(objective, q, 2.0)

@@ -1,10 +1,4 @@
-"""Velocity jumps with Coulomb friction, at one contact or at several contacts at once.
-
-If several contacts are hit at once, each obeys ``0 ≤ p_n ⊥ u_n ≥ 0``, ``‖p_t‖ ≤ μ p_n``, ``u_t = −κ p_t`` and ``0 ≤ κ
-⊥ μ p_n − ‖p_t‖ ≥ 0``, with the impulses ``p`` and the velocities ``u = u⁻ + Bp`` after the impact.  A block
-Gauss–Seidel method solves the fixed-point equations ``p_i = P(p_i − ρ(u_i + μ‖u_t‖n_i))``, where ``P`` projects onto
-the friction cone.
-"""
+"""Velocity jumps with Coulomb friction, at one contact or at several contacts at once."""
 
 from __future__ import annotations
 
@@ -14,14 +8,13 @@ import numpy as np
 
 from impact_posture.errors import MetricError
 from impact_posture.impact.evaluation.velocity_jump import Jump, weighed_jump
+from impact_posture.impact.friction.contact_impulses import contact_impulses
 from impact_posture.impact.friction.coulomb_impact import coulomb_impact
 from impact_posture.impact.worst_case_objective import WorstCaseObjective
 from impact_posture.system.arrays import Array
 
-# Most sweeps over the contacts; steps per contact in each sweep; relative change of impulses that ends the iteration.
-_SWEEPS, _STEPS, _TOLERANCE = 5000, 20, 1e-11
-# A slip velocity below this share of the approach speed is a rounding error, so the point sticks.
-_SLIP = 1e-9
+# If the slip velocity is below this share of the approach speed, the point sticks.
+_SLIP = 1e-6
 
 
 @dataclass(frozen=True, eq=False)
@@ -76,7 +69,7 @@ def coulomb_jumps(objective: WorstCaseObjective, q: Array, speed: float) -> tupl
     friction = np.array([oracle.contact.friction for oracle in oracles])
     responses = objective.oracle.at(q).solve(J.T)
     B = J @ responses
-    p = contact_impulses((B + B.T) / 2, normals, friction)
+    p = contact_impulses((B + B.T) / 2, -normals, normals, friction)
     if p is None:
         return None
     after = (B @ p.ravel()).reshape(p.shape) - normals
@@ -84,35 +77,3 @@ def coulomb_jumps(objective: WorstCaseObjective, q: Array, speed: float) -> tupl
     jump = weighed_jump(objective, speed * (responses @ p.ravel()), speed * p[0])
     each = zip(speed * p, friction, slips, strict=True)
     return tuple(CoulombJump.of(jump, impulse, float(mu), slip) for impulse, mu, slip in each)
-
-
-def contact_impulses(B: Array, normals: Array, friction: Array) -> Array | None:
-    """Return the impulses per unit approach speed, world axes, shape (m, 3); ``None`` if they do not converge.
-
-    ``B`` has shape (3m, 3m), the unit ``normals`` in world axes have shape (m, 3), and ``friction`` has shape (m,).
-    """
-    count = len(normals)
-    blocks, p = B.reshape(count, 3, count, 3), np.zeros((count, 3))
-    for _ in range(_SWEEPS):
-        before = p.copy()
-        for i, (n, mu) in enumerate(zip(normals, friction, strict=True)):
-            B_ii = blocks[i, :, i]
-            others = np.einsum("ajb,jb->a", blocks[i], p) - B_ii @ p[i] - n
-            for _ in range(_STEPS):
-                u = B_ii @ p[i] + others
-                slip = np.linalg.norm(u - (n @ u) * n)
-                p[i] = _on_cone(p[i] - (u + mu * slip * n) / max(np.linalg.norm(B_ii), 1e-300), n, mu)
-        if np.abs(p - before).max() <= _TOLERANCE * np.abs(p).max():
-            return p
-    return None
-
-
-def _on_cone(p: Array, n: Array, mu: float) -> Array:
-    """Project an impulse onto the friction cone ``‖p_t‖ ≤ μ p_n`` about the normal ``n``."""
-    along = float(n @ p)
-    across = p - along * n
-    size = float(np.linalg.norm(across))
-    if along < 0 or size > mu * along:
-        along = max(along + mu * size, 0.0) / (1 + mu**2)
-        across = across * (mu * along / max(size, 1e-300))
-    return np.asarray(along * n + across)

@@ -1,0 +1,159 @@
+"""The impact of a standing robot whose feet can lift and slide.
+
+The metric assumes that the ground can also pull the feet.  Here the ground only pushes, within the friction cone.
+Over the compression time T, the ground also carries the weight: a foot that stood with the force ``f`` lifts only if
+the impact pulls it with more than ``fT``.  Let ``P`` be the whole impulse of the ground, and ``p`` the impulse of the
+impact at the hit contact.  The motor torques do not change, so
+
+    ``M Δν = Jᵀp + J_sᵀ(P − fT)``,
+
+and :mod:`~impact_posture.impact.friction.contact_impulses` states the conditions for ``p`` and ``P``.  The forces
+``f`` are computed for locked joints: they are the forces on a statue that stands on the same feet.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from dataclasses import dataclass
+
+import numpy as np
+import pinocchio as pin
+
+from impact_posture.dynamics.numeric import hold_locked
+from impact_posture.impact.friction.contact_impulses import contact_impulses
+from impact_posture.impact.quantities.impact_oracle import ImpactOracle
+from impact_posture.robot.robot_spec import Support
+from impact_posture.system.arrays import Array
+
+# A foot moves if its velocity after the impact is above this share of the approach speed.
+_MOVES = 1e-4
+# A singular value below this share of the largest one is a rounding error.
+_RANK = 1e-9
+
+
+@dataclass(frozen=True, eq=False)
+class UnilateralImpact:
+    """The impact of a standing robot whose feet can lift and slide.
+
+    Attributes:
+        jump: Velocity jump Δν, shape (nv,).
+        impulses: Impulses of the hit surfaces on the robot, world axes, N·s, shape (contacts, 3).
+        lifts: Frames of the feet that leave the ground, or whose sole tips about an edge.
+        slides: Frames of the feet that slide without lifting.
+    """
+
+    jump: Array
+    impulses: Array
+    lifts: tuple[str, ...]
+    slides: tuple[str, ...]
+
+
+class StandingFeet:
+    """The contact points of the feet at one posture: their Jacobian, and the forces that carry the weight.
+
+    A point foot has one contact point.  A sole of known size has its four corners.  A sole of unknown size has one
+    point and does not turn.
+
+    Attributes:
+        frames: Frame of the foot for each contact point.
+        jacobian: Linear Jacobian of the contact points, world axes, shape (3k, nv).
+        forces: Forces that carry the weight, world axes, N, shape (k, 3); ``None`` if the robot would tip or slide
+            even with locked joints.
+    """
+
+    def __init__(self, oracle: ImpactOracle, supports: Sequence[Support], q: Array, friction: float) -> None:
+        oracle.at(q)
+        self._oracle, self.friction = oracle, friction
+        self.frames: list[str] = []
+        rows, turns = [], []
+        for foot, support in zip(oracle.feet, supports, strict=True):
+            J, R = oracle.numeric.jacobian(foot.point), oracle.numeric.placement(foot.point).rotation
+            X, Y = support.size if support.has_sole else (0.0, 0.0)
+            corners = [R @ (x, y, 0.0) for x in (-X, X) for y in (-Y, Y)] if support.has_sole else [np.zeros(3)]
+            rows += [J[:3] - pin.skew(corner) @ J[3:] for corner in corners]
+            turns += [J[3:]] if support.kind == "surface" and not support.has_sole else []
+            self.frames += [support.frame] * len(corners)
+        self.normals = np.tile([0.0, 0.0, 1.0], (len(self.frames), 1))
+        nv = oracle.robot.nv
+        turning = np.vstack(turns) if turns else np.zeros((0, nv))
+        self.M, self.jacobian, self._turning = hold_locked(
+            oracle.numeric.locked, oracle.numeric.mass_matrix(), np.vstack(rows), turning
+        )
+        self.forces = self._carried()
+
+    def respond(self, J: Array) -> Array:
+        """Return ``M⁻¹Jᵀ``, where soles of unknown size do not turn; shape (nv, rows of ``J``)."""
+        free = np.linalg.solve(self.M, J.T)
+        if not len(self._turning):
+            return np.asarray(free)
+        fixed = np.linalg.solve(self.M, self._turning.T)
+        inverse = np.linalg.pinv(self._turning @ fixed, rcond=_RANK, hermitian=True)
+        return np.asarray(free - fixed @ inverse @ (self._turning @ free))
+
+    def _carried(self) -> Array | None:
+        """Return the forces under the weight if the robot is a rigid body: they stop its fall of one second."""
+        model = self._oracle.robot.model
+        base, gravity = self.jacobian[:, :6], np.tile(np.array(model.gravity.linear), len(self.frames))
+        B = base @ np.linalg.solve(self._oracle.numeric.mass_matrix()[:6, :6], base.T)
+        forces = contact_impulses(B, gravity.reshape(-1, 3), self.normals, np.full(len(self.frames), self.friction))
+        if forces is None:
+            return None
+        moves = np.abs(gravity + B @ forces.ravel()).max() > _MOVES * np.linalg.norm(model.gravity.linear)
+        return None if moves else forces
+
+
+def unilateral_impact(
+    feet: StandingFeet, hit: Sequence[ImpactOracle], speed: float, time: float = 0.0
+) -> UnilateralImpact | None:
+    """Compute the impact with feet that can lift and slide.
+
+    ``hit`` are the oracles of the hit contacts at the posture of ``feet``.  ``speed`` is ``(1 + e) v_n``, m/s, and
+    ``time`` the compression time T, s.  Return ``None`` if no impulses fulfill the conditions, or if the weight is
+    counted and the robot cannot stand in this posture.
+    """
+    if time > 0 and feet.forces is None:
+        return None
+    count = len(hit)
+    J = np.vstack([*(oracle.J for oracle in hit), feet.jacobian])
+    normals = np.vstack([*(oracle.n for oracle in hit), feet.normals])
+    friction = np.array([*(oracle.contact.friction for oracle in hit), *[feet.friction] * len(feet.frames)])
+    responses = feet.respond(J)
+    B = J @ responses
+    before, weight = np.zeros(normals.shape), np.zeros(normals.shape)
+    before[:count] = -speed * normals[:count]
+    if feet.forces is not None:
+        weight[count:] = time * feet.forces
+    start = before - (B @ weight.ravel()).reshape(before.shape)
+    P = contact_impulses((B + B.T) / 2, start, normals, friction)
+    if P is None:
+        return None
+    after = (start + (B @ P.ravel()).reshape(start.shape))[count:]
+    up = {frame: 0.0 for frame in feet.frames}
+    across = dict(up)
+    for frame, velocity in zip(feet.frames, after, strict=True):
+        up[frame] = max(up[frame], float(velocity[2]))
+        across[frame] = max(across[frame], float(np.linalg.norm(velocity[:2])))
+    lifts = tuple(frame for frame in up if up[frame] > _MOVES * speed)
+    slides = tuple(frame for frame in up if across[frame] > _MOVES * speed and frame not in lifts)
+    return UnilateralImpact(responses @ (P - weight).ravel(), P[:count].copy(), lifts, slides)
+
+
+def longest_lifting_time(feet: StandingFeet, hit: Sequence[ImpactOracle], speed: float, most: float = 1.0) -> float:
+    """Return the compression time, s, above which no foot lifts or slides; infinite if above ``most``.
+
+    The weight that a foot carries grows with the time, so bisection finds this time up to 1 %.
+    """
+
+    def moves(time: float) -> bool:
+        impact = unilateral_impact(feet, hit, speed, time)
+        return impact is None or bool(impact.lifts or impact.slides)
+
+    if moves(most):
+        return np.inf
+    low, high = most * 1e-4, most
+    if not moves(low):
+        return 0.0 if not moves(0.0) else low
+    while high > 1.01 * low:
+        middle = float(np.sqrt(low * high))
+        low, high = (middle, high) if moves(middle) else (low, middle)
+    return high
