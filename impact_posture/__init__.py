@@ -1,7 +1,7 @@
 """Impact-robust posture optimization for kinematically redundant robots.
 
 The velocity jump of a rigid impact is ``Δν = M⁻¹(q) Jᵀ n λ``.  This package computes the jump, and
-optimizes the posture so that the jump is small under the constraints of a task.  It also exports C code::
+optimizes the posture so that the jump is small under the constraints of a task::
 
     import impact_posture as ip
 
@@ -10,7 +10,7 @@ optimizes the posture so that the jump is small under the constraints of a task.
     result = ip.optimize(ip.PostureProblem(objective, base="level"))
     result.save("out")
 
-Each name is imported at its first use, so that the online part (``ip.tsid``) never loads CasADi.
+Each name is imported at its first use.  Therefore the online controller ``ip.tsid`` never loads CasADi.
 """
 
 from __future__ import annotations

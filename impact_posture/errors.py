@@ -1,4 +1,4 @@
-"""Errors that a user can correct.  All derive from one class, and contain data and a hint.
+"""Errors that a user can correct.  All derive from :class:`ImpactPostureError` and contain a hint.
 
 The command line prints ``what``, ``where`` and ``hint`` as one line and exits with ``exit_code``.
 """
@@ -13,7 +13,7 @@ from typing import ClassVar
 
 # Largest number of characters of a name in a message.  The middle of a longer name is left out.
 _LONGEST_NAME = 200
-# Largest number of characters of one part of a message.  A message may list the 200 joints of a large robot.
+# Largest number of characters of ``what``, ``where`` or ``hint``, enough to list the 200 joints of a large robot.
 _LONGEST_PART = 10_000
 
 
@@ -65,12 +65,12 @@ def shown(value: object) -> str:
         return printable(value, longest=_LONGEST_NAME)
     try:
         return printable(reprlib.repr(value), longest=_LONGEST_NAME)
-    except Exception:  # Python prints no integer of over 4300 digits, and repr may raise any error.
+    except Exception:  # Python does not convert integers of over 4300 digits, and repr may raise any error.
         return type(value).__name__
 
 
 def not_one_of(value: object, choices: Iterable[str]) -> tuple[str, str]:
-    """Return the fault and the hint for a value that is not one of the choices."""
+    """Return ``what`` and ``hint`` of the error for a value that is not one of the choices."""
     names = list(choices)
     folded = {name.casefold(): name for name in names}
     text = shown(value).casefold()
@@ -84,9 +84,9 @@ class ImpactPostureError(Exception):
     """Root of all errors of this package.
 
     Args:
-        what: Fault, without a full stop.
-        where: File, option, joint or frame with the fault.
-        hint: Action by which the user corrects it.
+        what: What is wrong, without a full stop.
+        where: File, option, joint or frame that is wrong.
+        hint: How the user can correct the error.
     """
 
     exit_code: ClassVar[int] = 1
@@ -95,7 +95,7 @@ class ImpactPostureError(Exception):
         self.reword(what, where, hint)
 
     def reword(self, what: str, where: str, hint: str) -> None:
-        """Replace the message, but keep the type and data of the error."""
+        """Replace the message of this error."""
         self.what, self.where, self.hint = (one_line(text) for text in (what, where, hint))
         self.args = (self.line,)
 
@@ -229,7 +229,7 @@ class CompilerError(InputError):
 
 
 class ManifestMismatch(InputError):
-    """A C export was made for another robot; the error contains the key that differs, and both values."""
+    """A C export was made for another robot; the error names the key of the manifest that differs."""
 
     def __init__(self, key: str, exported: object, found: object, *, where: str = "manifest", hint: str = "") -> None:
         self.key, self.exported, self.found = key, exported, found
@@ -268,7 +268,7 @@ class Infeasible(ImpactPostureError):
 
 
 class SolverFailed(ImpactPostureError):
-    """The solver did not converge from any start, or its solution failed the certificate."""
+    """The solver did not converge from any start, or no solution passed the optimality check (certificate)."""
 
     exit_code = 4
 

@@ -26,21 +26,23 @@ from impact_posture.robot.model_variant import ModelVariant, Payload, build_mode
 from impact_posture.robot.robot import Robot
 from impact_posture.robot.robot_spec import Support
 
-# Functions that need the C export import it, because this import takes longer than solving a small problem.
+# Only functions that use the C export import it, because the import takes longer than solving a small problem.
 if TYPE_CHECKING:
     from impact_posture.codegen.export import Export
 
 
 @checked
 class ImpactObjective(WorstCaseObjective):
-    """The objective of one or several impacts, by default with the supports of the robot.
+    """Objective of one impact, or of several simultaneous impacts, of a robot.
 
     Args:
         robot: The robot.
-        contact: Contact of the impact, or several simultaneous contacts.  A contact at the contact frame of
-            robot.toml gets the offset of robot.toml if it has no offset.
-        metric: ``euclidean``, ``kinetic`` or ``weighted``, or a :class:`~impact_posture.impact.metric.Metric`.
-        kind: ``impulse`` (λ̄²H), ``speed`` (V), ``sticking`` (S), ``coulomb`` (C) or ``energy`` (E).
+        contact: Contact of the impact, or several simultaneous contacts.  A contact without an offset gets the
+            offset of robot.toml if robot.toml has the same contact frame.
+        metric: Norm of the velocity jump: ``euclidean``, ``kinetic`` or ``weighted``, or a
+            :class:`~impact_posture.impact.metric.Metric`.
+        kind: Minimized quantity: ``impulse`` (λ̄²H), ``speed`` (V), ``sticking`` (S), ``coulomb`` (C) or ``energy``
+            (E), as in ``docs/notation.md``.
         supports: Feet that stay in place during the impact, as ``FRAME[:point|surface]``; ``None`` selects the feet
             of robot.toml, ``()`` selects no feet.
         compliance: Compliance ε of the supports, 1/kg; 0 selects 1e-4 divided by the mass of the robot.
@@ -50,9 +52,8 @@ class ImpactObjective(WorstCaseObjective):
         bilateral: Whether several contacts can pull as well as push.
         model_variants: Robot models, the nominal model first.  The objective is the worst value over the models.
         weights: Weights of the weighted metric: nv numbers, a TOML file, or ``velocity-limits``.
-        armature_range: Lowest and highest factor on the armature.  The objective is the worst value over both.
-        payloads: Payloads that the robot may carry, one at a time: frame and mass in kg.  The objective is the worst
-            value over the payloads.
+        armature_range: Lowest and highest factor on the armature, for ``model_variants``.
+        payloads: Payloads that the robot may carry, one at a time, for ``model_variants``: frame and mass in kg.
         joint_model: Model of the inertia at the joints: ``reflected``, ``link`` or ``locked``
             (:func:`~impact_posture.robot.joint_model.with_joint_model`); ``None`` selects the model of the robot.
 
@@ -98,19 +99,19 @@ class ImpactObjective(WorstCaseObjective):
         super().__init__(
             robot, leading, metric, kind, feet, compliance, normal_cone_deg, tuple(more), bilateral, variants
         )
-        # A missing support is a hint, not an error, because an impact can be evaluated without supports.
+        # A missing support is not an error, because an impact can be evaluated without supports.
         object.__setattr__(self, "_missing", missing_support(robot) if supports is None and not feet else "")
 
     @checked
     def evaluate(self, q: ArrayLike, speed: float = SPEED, restitution: float = RESTITUTION) -> Evaluation:
-        """Compute H, G, V, S, E, the ellipsoid and the predicted jump at ``q``; see :func:`evaluate`."""
+        """Compute H, G, V, S, E, the impact ellipsoid and the predicted velocity jump at ``q``."""
         return evaluate(self, self.robot.check_posture(np.asarray(q, dtype=float), limits=False), speed, restitution)
 
     @checked
     def export(self, out: str | Path, *, build: bool = True, **options: Any) -> Export:
         """Write C code for H, its gradient and this objective into a folder, and build the library.
 
-        If the folder already contains this code, as ``c/`` of a result does, the code is not written again.
+        If the folder already contains this code, the code is not written again.
 
         Args:
             out: The folder.
@@ -125,7 +126,6 @@ class ImpactObjective(WorstCaseObjective):
 
 
 def _with_offset(robot: Robot, contact: ImpactContact) -> ImpactContact:
-    """Give a contact the offset of robot.toml if it is at the frame of robot.toml and has no offset."""
     default = robot.spec.contact
     missing = contact.frame == default.frame and not any(contact.offset) and any(default.offset)
     return replace(contact, offset=default.offset) if missing else contact

@@ -22,7 +22,7 @@ from impact_posture.posture.program.constrained_problem import ConstrainedProble
 from impact_posture.robot.posture_files import read_posture
 from impact_posture.system.arrays import Array
 
-# Settings that the objective and its robot define, so that PostureProblem must not redefine them.
+# Settings that ImpactObjective defines.  PostureProblem rejects them.
 _OF_THE_OBJECTIVE = {field.name for field in fields(ImpactSettings)} - {"contact_stiffness", "contact_duration"}
 
 
@@ -83,7 +83,7 @@ class PostureProblem:
 
     @classmethod
     def of(cls, prepared: Prepared) -> PostureProblem:
-        """Return the problem that settings from a file or a command line describe."""
+        """Return the problem for settings that were read from a file or a command line."""
         problem = cls.__new__(cls)
         problem.prepared, problem.problem = prepared, prepared.problem
         return problem

@@ -32,7 +32,7 @@ from impact_posture.robot.posture_files import write_posture
 from impact_posture.system.arrays import Array
 from impact_posture.system.output_folder import whole_folder, write_json
 
-# Functions that need the C export or the figures import them, because these imports take longer than a small problem.
+# Only functions that use these modules import them, because the imports take longer than solving a small problem.
 if TYPE_CHECKING:
     from impact_posture.codegen.export import Export
     from impact_posture.path.posture_path import PosturePath
@@ -46,8 +46,7 @@ class PostureResult:
         problem: The solved problem.
         solution: Result of the search.
         robustness: Comparison with the optima of the model variants; ``None`` if there are no model variants.
-        tradeoff: Best objective within each of several distances from the start; ``None`` before a call of
-            :meth:`trade_off`.
+        tradeoff: Best objectives under different bounds; ``None`` before a call of :meth:`trade_off`.
         motion: Timed path from the start to the optimum; ``None`` before a call of :meth:`path`.
         global_search: Result of the search ``global``; ``None`` if another search was used.
     """
@@ -112,7 +111,7 @@ class PostureResult:
         compile: CompileMode = "auto",
         progress: Progress | None = None,
     ) -> PostureResult:
-        """Return this result with a trade-off: the best objective under each of ``points`` bounds on ``against``.
+        """Return this result with the best objectives under ``points`` different bounds on ``against``.
 
         Args:
             points: Number of bounds.
@@ -138,14 +137,14 @@ class PostureResult:
     def path(self, *, seed: ZeroOrMore = 0) -> PostureResult:
         """Return this result with a path from the start to the optimum, timed within the robot's limits.
 
-        See :func:`~impact_posture.path.posture_path.posture_path`.  If there is no path to the best optimum, the
-        other optima are tried.  For a large program, all optima are known only after a search with ``finish_all``.
+        See :func:`~impact_posture.path.posture_path.posture_path`.  If no path leads to the
+        best optimum, paths to the other optima are tried.  A search without ``finish_all`` may not find all optima.
 
         Args:
             seed: Seed of the sampling planner.
 
         Raises:
-            InputError: The package of the extra ``path`` is not installed.
+            InputError: The package TOPP-RA (``impact-posture[path]``) is not installed.
         """
         from impact_posture.path.posture_path import posture_path
 
@@ -164,7 +163,7 @@ class PostureResult:
         jobs: OneOrMore = 2,
         progress: Progress | None = None,
     ) -> Written:
-        """Write the complete result folder or nothing: result.json, problem.toml, posture.json, pictures and C code.
+        """Write a folder with result.json, problem.toml, posture.json, pictures and C code, or write nothing.
 
         Args:
             out: The folder.
@@ -172,14 +171,12 @@ class PostureResult:
             codegen: Whether to export, build and check the C code as well.
             formats: File formats of the pictures: ``png``, ``svg``, ``pdf``.
             report: Whether to write ``report.html``, a page with the result and the robot in 3-D.
-            meshes: Whether ``report.html`` may contain the meshes of the user's own URDF. Everyone who gets the page
-                gets these meshes.
+            meshes: Whether to copy the meshes of the user's own URDF into ``report.html``, for everyone who opens it.
             jobs: Number of parallel processes that draw and compile.
-            progress: Function that is called after each figure, the C code and the report.  Its arguments are the
-                number of finished files and the number of all files.
+            progress: Function that is called with the numbers of finished and of all files after each file.
 
         Returns:
-            The folder, the export inside the folder, and the reason if its C code could not be built.
+            The folder, the C export in the folder, and the reason if the C code could not be built.
 
         Raises:
             OutputError: The folder exists and ``force`` is false, or the folder cannot be written.
@@ -212,7 +209,7 @@ class PostureResult:
 
     @checked
     def export(self, out: str | Path, *, build: bool = True, **options: Any) -> Export:
-        """Write the C code as :meth:`ImpactObjective.export` does, with the optimal posture as a constant."""
+        """Write C code like :meth:`ImpactObjective.export`, with the optimal posture as a constant."""
         from impact_posture.codegen.export import write_export
 
         objective = self.problem.problem.impact
@@ -231,7 +228,7 @@ def optimize(
     progress: Progress | None = None,
     finish_all: bool = False,
 ) -> PostureResult:
-    """Search from many starts for the posture with the smallest objective, and certify this posture.
+    """Search from many starts for the posture with the smallest objective, and check its optimality.
 
     Args:
         problem: The problem.
@@ -247,7 +244,7 @@ def optimize(
     Raises:
         InputError: An argument is not valid, or the search ``global`` cannot solve the problem.
         Infeasible: No posture satisfies the constraints; the error names the conflicting constraints.
-        SolverFailed: No run ended at a certified posture.
+        SolverFailed: No run ended at a posture whose optimality is certified.
     """
     if search == "global":
         check_searchable(problem.problem)

@@ -20,7 +20,7 @@ from impact_posture.system.output_folder import write_whole
 
 _Value = TypeVar("_Value", bound=Hashable)
 
-# Largest cache file that is read, bytes: three times the largest file of a catalogue robot.
+# Largest cache file that is read, bytes: three times the largest file for the robots of this package.
 _LONGEST = 10_000_000
 
 
@@ -38,7 +38,7 @@ StoredArray = Annotated[NDArray[Any], PlainValidator(_unpacked), PlainSerializer
 
 
 def read_stored(kind: str, key: str, cls: type[_Value]) -> _Value | None:
-    """Return the dataclass stored under a kind and key, or ``None`` if there is no valid file."""
+    """Return the dataclass in the file ``<kind>/<key>.json`` of the cache, or ``None`` without a valid file."""
     with suppress(OSError, OutputError, TypeError, ValueError):
         path = _path(kind, key)
         check_private(path)
@@ -51,7 +51,7 @@ def read_stored(kind: str, key: str, cls: type[_Value]) -> _Value | None:
 
 
 def write_stored(kind: str, key: str, value: Hashable) -> None:
-    """Store a dataclass under a kind and key, if the cache can be written."""
+    """Store a dataclass in the file ``<kind>/<key>.json`` of the cache; do nothing if this is impossible."""
     text = adapter(type(value)).dump_json(value).decode()
     with suppress(OSError, OutputError):
         write_whole(_path(kind, key), f"{_seal(text)}\n{text}")

@@ -27,9 +27,8 @@ _WORDS = {int: "a whole number", float: "a number", str: "text", bool: "True or 
 def checked(target: _Target) -> _Target:
     """Make a function, or the constructor of a class, reject arguments that contradict their annotations.
 
-    Each argument must have the annotated type and meet each :class:`Demand` of its annotation.  NumPy numbers and
-    arrays are accepted as numbers and sequences.  If the check does not understand an annotation, it accepts every
-    value.
+    An argument must have the annotated type and satisfy every :class:`Demand` in the annotation.  NumPy numbers and
+    arrays are accepted as numbers and sequences.  Annotations that this module does not know accept every value.
 
     Raises:
         InputError: An argument contradicts its annotation; the error names the parameter.
@@ -57,7 +56,7 @@ def checked(target: _Target) -> _Target:
 
 
 class _Named:
-    """Base of stand-ins for classes that only type checkers import.  Instances are recognized by the class name."""
+    """Base of stand-ins for classes imported under ``TYPE_CHECKING``.  A value matches by the name of its class."""
 
 
 class _Names(dict[str, Any]):
@@ -72,7 +71,7 @@ def _annotations(target: Callable[..., object]) -> dict[str, Any]:
     """Return the annotations of the parameters of a function or constructor, without ``**options``."""
     function: Callable[..., object] = target.__init__ if isinstance(target, type) else target  # type: ignore[misc]
     names = {p.name for p in inspect.signature(function).parameters.values() if p.kind is not p.VAR_KEYWORD}
-    # A dataclass inherits fields.  Their annotations contain names of the module that defines the base.
+    # The annotations of inherited fields contain names of the module that defines the base class.
     is_dataclass = isinstance(target, type) and "__dataclass_params__" in vars(target)
     annotations: dict[str, Any] = {}
     for owner in reversed(target.__mro__) if is_dataclass else [function]:  # type: ignore[attr-defined]
@@ -92,12 +91,12 @@ def _refusal(value: object, annotation: Any, name: str, hint: str) -> InputError
 
 
 def hint_for(value: object, annotation: Any) -> str:
-    """Return a hint that says which values are valid; empty if ``value`` is valid."""
+    """Return a hint on valid values for an error message; empty if ``value`` is valid."""
     if get_origin(annotation) in (Union, UnionType):
         parts = _alternatives(get_args(annotation))
         if any(_fits(value, part) for part in parts):
             return ""
-        # If the value has the type of an alternative, the demand of this alternative gives the hint.
+        # If the value has the type of an alternative, the Demand of this alternative gives the hint.
         close = [part for part in parts if get_origin(part) is Annotated and _fits(value, get_args(part)[0])]
         return hint_for(value, close[0]) if close else f"give {_words(annotation)}"
     base, *demands = get_args(annotation) if get_origin(annotation) is Annotated else (annotation,)
@@ -113,7 +112,7 @@ def hint_for(value: object, annotation: Any) -> str:
 
 
 def _fits(value: object, annotation: Any) -> bool:
-    """Return whether a value has an annotated type; true for annotations that the check does not understand."""
+    """Return whether a value has an annotated type; true for annotations that this module does not know."""
     import numpy as np
     from numpy.typing import ArrayLike
 
@@ -158,7 +157,7 @@ def _fits(value: object, annotation: Any) -> bool:
 
 
 def _alternatives(parts: tuple[Any, ...]) -> tuple[Any, ...]:
-    """Return the alternatives of a union, with ``ArrayLike``, which Python splits into many alternatives, as one."""
+    """Return the alternatives of a union.  Python splits ``ArrayLike`` into many alternatives; merge them again."""
     from numpy.typing import ArrayLike
 
     numeric = get_args(ArrayLike)

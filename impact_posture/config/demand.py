@@ -1,7 +1,7 @@
-"""Annotated types with a demand on the value, such as :data:`Positive`, for files, options and Python arguments.
+"""Annotated types that restrict values, such as :data:`Positive`, for files, options and Python arguments.
 
-Pydantic checks the demand in files, :func:`~impact_posture.config.checked.checked` in Python calls and on the command
-line.  This module imports no slow package, because ``--help`` loads it.
+Pydantic checks values from files.  :func:`~impact_posture.config.checked.checked` checks arguments of Python calls
+and the command line.  This module imports no slow package, because ``--help`` loads it.
 """
 
 from __future__ import annotations
@@ -15,8 +15,8 @@ from impact_posture.config.text_parsers import parse_contact
 from impact_posture.errors import ImpactPostureError, not_one_of
 
 _INFINITE = float("inf")
-# Largest length (m) and largest mass (kg).  For a greater length, the solver does not return; for a greater mass, the
-# mass matrix is singular in double precision.
+# Largest length (m) and largest mass (kg).  With a greater length, the solver does not return.  With a greater mass,
+# the mass matrix is singular in double precision.
 _FARTHEST, _HEAVIEST = 1e100, 1e12
 # Smallest tilt, degrees.  The cosine of a smaller tilt is not accurate enough for the tolerance of the certificate.
 _LEAST_TILT = 0.1
@@ -61,7 +61,7 @@ def between(low: float, high: float, unit: str = "", names: Sequence[str] = ()) 
 
 
 def kind_or_tilt(kinds: Sequence[str], tilted: str) -> Demand:
-    """Return the demand that a text is a kind or ``tilted:DEG``; the error for a misspelt kind has a suggestion."""
+    """Return the demand that a text is one of ``kinds`` or, for ``tilted="level"``, a text such as ``level:10``."""
 
     def holds(value: str) -> bool:
         if value in kinds or value.startswith(f"{tilted}:"):
@@ -85,7 +85,7 @@ def _finite(values: Iterable[float]) -> bool:
 
 
 def _has_direction(vector: Iterable[float]) -> bool:
-    # A vector is treated as zero if all its entries are smaller than this bound on rounding errors.
+    # Entries below 1e-9 may be rounding errors, so that a vector of such entries has no direction.
     return _finite(vector) and max(abs(value) for value in vector) >= 1e-9
 
 

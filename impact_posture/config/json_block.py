@@ -7,7 +7,7 @@ from typing import Any
 
 
 def json_block(value: Any) -> dict[str, Any]:
-    """Return the fields of a dataclass as JSON content: arrays as lists, parts as the result of their ``to_dict``."""
+    """Return the fields of a dataclass as JSON content: arrays as lists, nested objects by their ``to_dict``."""
     return {field.name: _json(getattr(value, field.name)) for field in fields(value)}
 
 

@@ -1,4 +1,4 @@
-"""Setting of an obstacle; :mod:`impact_posture.collision.swept_hull` builds the collision shape."""
+"""Obstacle of a ``problem.toml``; :mod:`impact_posture.collision.swept_hull` builds its collision shape."""
 
 from __future__ import annotations
 
@@ -43,7 +43,6 @@ class Obstacle(StrictTable):
     quaternion: UnitQuaternion = (0.0, 0.0, 0.0, 1.0)
 
     def __post_init__(self) -> None:
-        """Raise an error if the obstacle is not exactly one shape."""
         if (self.box is None) == (self.sphere is None):
             what = "neither edge lengths nor a radius" if self.box is None else "edge lengths and a radius"
             where = f"obstacle '{self.name}'"

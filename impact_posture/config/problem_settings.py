@@ -54,12 +54,12 @@ TransmissionKind = Literal["rigid", "elastic", "locked"]
 # Gere lists 0.0007 to 0.004 GPa.
 MATERIALS = {"steel": (200e9, 0.28), "wood": (11.5e9, 0.3), "rubber": (0.03e9, 0.48), "ground": (24e9, 0.15)}
 
-# Smallest distance (m) between links that must not touch; edge length (m) of the surface if the robot stands behind
-# it.
+# Default distance (m) between links that must not touch.  Default edge length (m) of a square surface: the robot may
+# stand behind its plane.
 CLEARANCE, PATCH = 0.001, 0.3
 # Default friction coefficient (Coulomb).
 FRICTION = 0.7
-# Default number of starts, and number of distances if --tradeoff is given without a number.
+# Default number of starts; number of bounds if --tradeoff is given without a number.
 STARTS, TRADEOFF_POINTS = 16, 16
 # Default approach speed (m/s) and coefficient of restitution of predicted jumps.
 SPEED, RESTITUTION = 1.0, 0.0
@@ -77,8 +77,8 @@ class LoadOptions(StrictTable):
             ``None`` selects the values of robot.toml, or else the rotor data of the SRDF, or else zero.
         config: Path of a robot.toml that is read instead of the robot.toml beside the URDF.
         srdf: SRDF file: a path, or ``example-robot-data:<path below robots/>``.
-        package_dir: Folders in which ``package://`` paths are searched.  Dynamics do not need these folders, but
-            pictures may.
+        package_dir: Folders in which ``package://`` paths are searched.  Only the meshes of
+            collision shapes and pictures need these folders.
         mounting: Displacement of each named joint from its place in the URDF, m, in the axes of the parent joint.
     """
 
@@ -233,7 +233,7 @@ class ProblemSettings(ImpactSettings):
         CLEARANCE, "Least distance between links that must not touch, m.", LIMITS
     )
     surface: Annotated[str | float, between(1e-3, 1e3, "m", ("plane", "none"))] | None = setting(
-        None, "Surface at the contact: an endless plane, none, or a square of this edge length, m.", LIMITS,
+        None, "Surface at the contact: an endless plane, none, or a square of edge length M, m.", LIMITS,
         "plane|none|M", f"the plane, or {PATCH:g} where the robot stands behind it", parse=parse_number_or_name,
     )  # fmt: skip
     obstacles: tuple[Obstacle, ...] = ()

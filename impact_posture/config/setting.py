@@ -18,7 +18,7 @@ class Setting:
         help: Meaning in one line.
         panel: Panel of ``--help`` that lists the option.
         takes: Placeholder of the value in ``--help``.
-        words: Description of the default, if the robot determines the default.
+        words: Description of the default value, if the default is not a constant.
         option: Spelling of the option, if it differs from the name of the field.
         parse: Function that converts all texts given for the option to the value.
         repeatable: Whether the option may be given several times.
@@ -34,5 +34,5 @@ class Setting:
 
 
 def setting(default: Any, *description: Any, **more: Any) -> Any:
-    """Return a dataclass field with a default and the arguments of :class:`Setting`."""
+    """Return a dataclass field with a default and a :class:`Setting` as metadata."""
     return field(default=default, metadata={"setting": Setting(*description, **more)})

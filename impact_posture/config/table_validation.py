@@ -26,9 +26,9 @@ def validate(cls: type[_Table], data: object, where: str) -> _Table:
     """Convert a table to a dataclass.  The error describes the first fault in one line.
 
     Args:
-        cls: Dataclass, whose fields may be dataclasses; its ``__pydantic_config__`` defines how strict the check is.
-        data: Table from :func:`read_toml`; its key ``schema`` is stored in a field ``schema_``.
-        where: File that errors name.
+        cls: Dataclass, possibly with nested dataclasses.  Its ``__pydantic_config__`` may forbid unknown keys.
+        data: Table, for example from :func:`read_toml`.
+        where: Name of the file, for error messages.
 
     Raises:
         SpecError: A key is unknown or missing, or a value is not valid.
@@ -38,16 +38,16 @@ def validate(cls: type[_Table], data: object, where: str) -> _Table:
     try:
         # Pass the table as JSON, because strict dataclasses do not accept Python dictionaries.
         text = json.dumps(data, default=_plain)
-    except ValueError as error:  # An integer with more digits than Python converts.
+    except ValueError as error:  # An integer has more digits than Python converts.
         raise SpecError(f"cannot be read ({error})", where=where, hint="correct the value") from None
     try:
         table: _Table = adapter(cls).validate_json(text)  # type: ignore[arg-type]
         return table
     except ValidationError as error:
-        # Report a misspelt key before missing keys, because the correct key is then missing as well.
+        # Report a misspelt key first, because the correctly spelt key is reported as missing, too.
         faults = error.errors()
         fault = next((f for f in faults if f["type"] in _UNKNOWN), faults[0])
-    # Leave out the alternative of a union, which Pydantic adds to the location.
+    # Pydantic adds the type of the union member to the location.  Leave this type out.
     location = tuple(p for p in fault["loc"] if not (isinstance(p, str) and ("[" in p or p in ("str", "float"))))
     path = ".".join(str(part) for part in location)
     what, hint = f"key '{path}': {fault['msg']}", "correct the value"
@@ -71,14 +71,14 @@ _UNKNOWN = ("extra_forbidden", "unexpected_keyword_argument")
 
 @cache
 def adapter(cls: type) -> Any:
-    """Return the ``TypeAdapter`` of a dataclass, which is built once and cached."""
+    """Return the Pydantic ``TypeAdapter`` of a dataclass."""
     from pydantic import TypeAdapter
 
     return TypeAdapter(cls)
 
 
 def _keys_at(cls: type, location: tuple[int | str, ...]) -> list[str]:
-    """Return the keys of the table at a location inside the table of ``cls``."""
+    """Return the valid keys of a nested table; ``location`` lists the keys that lead to the table."""
     for part in location:
         hint = get_type_hints(cls).get(str(part))
         inner = [c for c in (hint, *getattr(hint, "__args__", ())) if isinstance(c, type) and is_dataclass(c)]
@@ -100,5 +100,5 @@ def read_toml(path: Path) -> dict[str, object]:
         raise SpecError(f"cannot be read ({error})", where=str(path), hint="check the file") from None
     except RecursionError:
         raise SpecError("is nested too deeply", where=str(path), hint="correct the syntax") from None
-    except ValueError as error:  # A TOMLDecodeError, or a number with more digits than Python converts.
+    except ValueError as error:  # TOMLDecodeError, or a number has more digits than Python converts.
         raise SpecError(f"is not valid TOML ({error})", where=str(path), hint="correct the syntax") from None

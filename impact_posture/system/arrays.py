@@ -10,16 +10,16 @@ def null_space(rows: Array, tolerance: float) -> Array:
     """Return an orthonormal basis of the null space of a matrix of shape (k, n), as columns, shape (n, r).
 
     Singular values up to ``tolerance`` times the largest are treated as zero.  SciPy has the same function, but
-    importing SciPy takes longer than solving many problems.
+    importing SciPy takes longer than solving a typical problem.
     """
     _, values, axes = np.linalg.svd(rows)
     return np.asarray(axes[int((values > tolerance * values.max(initial=0.0)).sum()) :].T)
 
 
 def independent_rows(rows: Array, tolerance: float) -> list[int]:
-    """Return the indices of independent rows that span all rows, shape (k, n), by pivoted Gram-Schmidt.
+    """Return the indices of a row basis of a matrix, shape (k, n), by pivoted Gram-Schmidt.
 
-    A row is dependent if its remainder after projection is at most ``tolerance``.
+    A row is dependent if its distance from the span of the chosen rows is at most ``tolerance``.
     """
     left, chosen = np.array(rows, dtype=float), list[int]()
     for _ in range(len(left)):

@@ -1,6 +1,6 @@
 """Escape names of robots, joints, frames and files for output languages.
 
-A name must never act as code in an output file.  For each output language, one function escapes every name.
+A name must never act as code in an output file.  This module has one function for each output language.
 """
 
 from __future__ import annotations
@@ -42,8 +42,8 @@ def toml(value: object) -> str:
     """Return a value as TOML on one line.
 
     Raises:
-        UnicodeEncodeError: A text contains half of a surrogate pair, as paths that are not UTF-8 do.  TOML forbids
-            surrogates.
+        UnicodeEncodeError: A text contains a lone surrogate, which TOML forbids.  Python reads paths that are not
+            UTF-8 as such texts.
     """
     if is_dataclass(value) and not isinstance(value, type):
         value = {key: item for key, item in asdict(value).items() if item is not None}
@@ -60,13 +60,13 @@ def toml(value: object) -> str:
 
 
 def xml_name(text: str) -> str:
-    """Return a name that is valid in XML and that MuJoCo can look up, also if ``text`` is empty."""
+    """Return a name that is valid in XML, and not empty because MuJoCo cannot look up empty names."""
     return printable(text) or "(empty)"
 
 
 def markdown(text: str) -> str:
     """Escape text so that Markdown shows the text unchanged, also in a table cell."""
-    # A single bracket and an underscore between letters need no escape: they make no link and no emphasis.
+    # A single bracket makes no link, and an underscore between letters makes no emphasis, so they need no escape.
     return re.sub(r"[\\`*<>|&$~#!]|\](?=[\[(:]|$)|_+", _escape_markdown, printable(text))
 
 

@@ -1,8 +1,8 @@
 """Build, load and cache shared libraries.
 
-Loading a library runs its code, and loading a truncated library can end the process.  Therefore this module stores
-the SHA-256 of each library that it builds in a file beside the library.  Before loading, :func:`load_library`
-compares this hash with the library.  Only the user can write to the cache.
+Loading a library runs its code, and loading a truncated library can end the process.  Therefore this module writes
+a SHA-256 file beside each library that it builds.  :func:`load_library` refuses a library with another SHA-256.  Only
+the user can write to the cache.
 """
 
 from __future__ import annotations
@@ -87,8 +87,8 @@ def build_parts(folder: Path, library: Path, parts: Mapping[str, Sequence[str]])
 def building(library: Path) -> Iterator[Path]:
     """Yield a temporary folder.  After the block, the library that was built in this folder replaces ``library``.
 
-    The SHA-256 of the library is written beside it.  An interruption leaves either the old library, or the new
-    library without a hash.
+    A SHA-256 file is written beside the library.  An interruption leaves either the old library, or the new library
+    without a SHA-256 file.
 
     Raises:
         OutputError: The library cannot be written, for example because the disk is full.
@@ -136,14 +136,14 @@ def load_library(library: Path) -> ctypes.CDLL:
     Raises:
         SpecError: The library differs from the SHA-256 beside it, is truncated, or cannot be loaded.
     """
-    hint = "delete it: it is built again"
+    hint = "delete this file, so that it is built again"
     try:
         unchanged = has_its_hash(library)
         if unchanged is False:
             fault = "is not the library that was built here (another SHA-256)"
             hint += f"; if you built it yourself, delete {hash_path(library).name}"
         elif unchanged is None and _is_truncated(library):
-            fault = "is truncated: shorter than its ELF header says"
+            fault = "is truncated (shorter than its ELF header states)"
         else:
             return ctypes.CDLL(str(library.absolute()))
     except OSError as error:
@@ -167,7 +167,7 @@ def _is_truncated(library: Path) -> bool:
 
 
 def cache_path() -> Path:
-    """Return the folder of compiled code: ``$IMPACT_POSTURE_CACHE``, else a folder in the user's cache folder."""
+    """Return the path of the cache: ``$IMPACT_POSTURE_CACHE``, or else a folder in the user's cache folder."""
     if chosen := os.environ.get("IMPACT_POSTURE_CACHE"):
         return Path(chosen).absolute()
     # The XDG specification says to ignore a relative path.
@@ -199,8 +199,8 @@ def cache_folder(*parts: str) -> Path:
 def source_key(content: Iterable[str], *packages: str) -> str:
     """Return a short hash of everything that compiled code depends on.
 
-    The hash includes the texts ``content`` and the source code of the packages below ``impact_posture`` that generate
-    the code.
+    The hash includes the texts ``content``, and the source code of ``packages`` below ``impact_posture``, which
+    generate the code.
     """
     text = "\n".join([__version__, *content, *map(_source_hash, packages)])
     return hashlib.sha256(text.encode()).hexdigest()[:32]
@@ -208,7 +208,7 @@ def source_key(content: Iterable[str], *packages: str) -> str:
 
 @cache
 def _source_hash(package: str) -> str:
-    """Return a hash of the source code of a package.  Later changes on the disk do not change the hash."""
+    """Return a hash of the source code of a package, read once per process."""
     digest = hashlib.sha256()
     for path in sorted((Path(__file__).parents[1] / package).glob("**/*")):
         if path.suffix in (".py", ".jinja", ".c", ".h"):
@@ -217,7 +217,7 @@ def _source_hash(package: str) -> str:
 
 
 def check_private(path: Path) -> None:
-    """Raise an error if another user controls a path, because this user could choose the code that runs.
+    """Raise an error if another user controls a path, because the other user could choose the code that runs.
 
     Raises:
         OutputError: Another user owns the path or may write to it.

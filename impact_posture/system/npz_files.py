@@ -1,4 +1,4 @@
-"""Read NPZ files of users with limited memory."""
+"""Read NPZ files from users, with a limit on memory."""
 
 from __future__ import annotations
 
@@ -19,9 +19,9 @@ def read_arrays(path: Path) -> dict[str, NDArray[Any]]:
 
     Raises:
         OSError: The file cannot be read, or its arrays are larger than :data:`MOST_BYTES`.
-        ValueError: The file is not an NPZ, is damaged, or its header states more numbers than the file contains.
+        ValueError: The file is not an NPZ file, is damaged, or contains fewer numbers than its header states.
     """
-    # These modules are imported here, because the help page does not need them.
+    # Import these modules here, because they slow down ``--help``.
     import zlib
     from zipfile import BadZipFile
 
@@ -36,7 +36,7 @@ def read_arrays(path: Path) -> dict[str, NDArray[Any]]:
                 raise OSError(errno.EFBIG, os.strerror(errno.EFBIG), str(path))
             arrays = {name: file[name] for name in file.files}
     except MemoryError:
-        # Compare the sizes, because the header of a small file may state any size.
+        # The header of a small file may state any size.
         raise ValueError(f"{path.name} states more numbers than it has") from None
     except (BadZipFile, EOFError, RuntimeError, zlib.error) as error:
         # A RuntimeError means that the file has another compression or a password.

@@ -1,7 +1,7 @@
-"""Write each output folder completely or not at all, and never overwrite foreign files.
+"""Write output folders completely or not at all, and never overwrite foreign files.
 
-Each output folder has a record, ``.impact-posture.json``, of the files that were written into it.  ``--force``
-replaces a folder only if the record lists every file in the folder.
+The file ``.impact-posture.json`` in an output folder, called the record, lists the files that were written into the
+folder.  Other files are called foreign.  ``--force`` replaces a folder only if it contains no foreign files.
 """
 
 from __future__ import annotations
@@ -28,7 +28,7 @@ Kind = Literal["result", "export", "run", "comparison", "reproduction", "sweep",
 
 
 def check_output(out: Path, *, force: bool, kind: Kind) -> None:
-    """Raise an error before the work begins if the output folder cannot be used; ``force`` allows an earlier result.
+    """Raise an error if an output folder cannot be used.  ``force`` allows a folder with an earlier result.
 
     Raises:
         OutputError: The path is not a folder, the folder exists and ``force`` is false, the folder has foreign files,
@@ -72,8 +72,7 @@ def check_name(out: Path) -> None:
 def whole_folder(out: Path, *, force: bool, kind: Kind, products: Sequence[str] = ()) -> Iterator[Path]:
     """Yield a temporary folder, which replaces ``out`` after the block and is removed after an error.
 
-    ``products`` are files that may be built later in the folder, such as libraries.  These files are not treated as
-    foreign.
+    ``products`` are files that may be built later in the folder, such as libraries.  They are not foreign.
 
     Raises:
         OutputError: ``out`` cannot be used (:func:`check_output`), or the disk is full or not writable.
@@ -101,7 +100,7 @@ def whole_folder(out: Path, *, force: bool, kind: Kind, products: Sequence[str] 
 
 
 def write_record(folder: Path, kind: Kind, products: Sequence[str] = ()) -> None:
-    """Write the record of a folder: all its files, and ``products``, which may be built in the folder later.
+    """Write the record of a folder: all its files, and ``products``, which may be built later.
 
     Raises:
         OSError: The record cannot be written.
@@ -120,13 +119,13 @@ def typed_command(folder: Path) -> str:
 
 
 def is_ours(folder: Path, kind: Kind) -> bool:
-    """Return whether a folder has a record of this kind.  The folder may also contain foreign files."""
+    """Return whether ``kind`` is in the record of a folder.  The folder may also contain foreign files."""
     content = _read_record(folder)
     return content is not None and content["kind"] == kind
 
 
 def own_files(folder: Path, kind: Kind) -> list[str]:
-    """Return the files that the record of a folder lists, without the record; empty without this kind of record."""
+    """Return the files in the record of a folder, without the record itself; empty for a record of another kind."""
     content = _read_record(folder)
     return [] if content is None or content["kind"] != kind else [name for name in content["files"] if name != RECORD]
 
@@ -146,12 +145,12 @@ def add_to_record(folder: Path, paths: Iterable[Path]) -> None:
 
 
 def write_json(path: Path, document: object) -> None:
-    """Write a document as JSON.  A NaN raises an error here, before another program reads the file."""
+    """Write a document as JSON.  A NaN raises a ``ValueError``, because JSON has no NaN."""
     path.write_text(json.dumps(document, indent=1, allow_nan=False) + "\n", encoding="utf-8")
 
 
 def write_whole(path: Path, content: str | bytes) -> None:
-    """Write a file so that it appears completely or not at all.
+    """Write a file completely or not at all.
 
     Raises:
         OutputError: The file cannot be written.
@@ -165,7 +164,7 @@ def write_whole(path: Path, content: str | bytes) -> None:
     try:
         with undone(remove):
             beside.unlink(missing_ok=True)
-            # Mode x does not follow a symbolic link of another user.
+            # Mode x never opens an existing file, such as a symbolic link of another user.
             with beside.open("xb") as file:
                 file.write(content.encode() if isinstance(content, str) else content)
             os.replace(beside, path)
@@ -226,8 +225,8 @@ def _replace(beside: Path, out: Path, force: bool, kind: Kind) -> None:
                 raise OutputError("exists", where=str(out), hint=_EXISTS) from None
             raise
         return
-    # A folder of this name is never swept.  If the process is killed between the two renames, the folder contains the
-    # old result.
+    # scratch_folder does not remove a folder of this name.  If the process is killed between the two renames, the old
+    # result remains there.
     old = out.with_name(f"{out.name}.old-{secrets.token_hex(4)}")
     os.rename(out, old)
     try:

@@ -16,7 +16,7 @@ from impact_posture.errors import WorkerDied
 
 _Result = TypeVar("_Result")
 
-# Signals by which a user or a system ends a process.  A closed terminal sends SIGHUP.
+# Signals by which a user or the system ends a process.  A closed terminal sends SIGHUP.
 ENDING = (signal.SIGINT, signal.SIGTERM, signal.SIGHUP)
 
 # Forked workers read the function here, because its objects (a CasADi solver) cannot be sent to another process.
@@ -26,7 +26,7 @@ _WORK: dict[str, Callable[[int], Any]] = {}
 # inherits the list.
 _UNFINISHED: list[tuple[int, Callable[[], None]]] = []
 
-# Number of active blocks that delay signals, and the exit functions that signals have requested in these blocks.
+# Number of active :func:`signals_held` blocks, and the ``leave`` functions of signals that arrived in these blocks.
 _HELD = [0]
 _LATER: list[Callable[[], None]] = []
 
@@ -35,9 +35,9 @@ _PR_SET_PDEATHSIG = 1
 
 @contextmanager
 def undone(undo: Callable[[], None]) -> Iterator[None]:
-    """Call ``undo`` at the end of the block, also if a signal ends the process inside the block (:func:`end_early`).
+    """Call ``undo`` at the end of the block, also if a signal ends the process (:func:`end_early`).
 
-    A signal may arrive while ``undo`` runs, so it must be safe to call ``undo`` twice.
+    It must be safe to call ``undo`` twice, because a signal may arrive while ``undo`` runs.
     """
     entry = (os.getpid(), undo)
     _UNFINISHED.append(entry)
@@ -50,9 +50,9 @@ def undone(undo: Callable[[], None]) -> Iterator[None]:
 
 @contextmanager
 def signals_held() -> Iterator[None]:
-    """Delay signals that would end the process until the end of the block."""
-    # Processes that are forked in the block inherit the signal mask.  This process also needs the number of blocks,
-    # because another of its threads may get the signal.
+    """Delay the signals :data:`ENDING` until the end of the block."""
+    # The signal mask holds for this thread, and for processes that are forked in the block.  The count in _HELD also
+    # delays a signal that another thread of this process gets.
     before = signal.pthread_sigmask(signal.SIG_BLOCK, ENDING)
     _HELD[0] += 1
     try:
@@ -130,8 +130,8 @@ def _finished(futures: list[Future[tuple[int, _Result]]]) -> Iterator[tuple[int,
 def fork_call(function: Callable[[], _Result]) -> Iterator[Callable[[], _Result]]:
     """Start ``function()`` in a copy of this process and yield a function that waits for its result.
 
-    The copy includes state that cannot be copied in another way (physics, solvers).  Exceptions of the copy are
-    raised in this process.  The copy ends with the block.
+    Only a fork can copy the state of physics engines and solvers.  Exceptions in the copy are raised in this process.
+    The copy ends with the block.
 
     Raises:
         OSError: The system cannot fork.
@@ -158,7 +158,7 @@ def fork_call(function: Callable[[], _Result]) -> Iterator[Callable[[], _Result]
         try:
             error, result = receiver.recv()
         except (EOFError, ConnectionResetError):
-            raise OSError("a process that was forked has died") from None
+            raise OSError("a forked process has died") from None
         if error is not None:
             raise error
         return cast(_Result, result)
@@ -168,7 +168,7 @@ def fork_call(function: Callable[[], _Result]) -> Iterator[Callable[[], _Result]
 
 
 def _send_result(function: Callable[[], Any], sender: Any) -> NoReturn:
-    """Send the error and the result from the copy; end the copy without the clean-up of the original process."""
+    """Send the result or the error of ``function`` to the parent process, and end the process without clean-up."""
     try:
         try:
             sender.send((None, function()))
@@ -179,7 +179,7 @@ def _send_result(function: Callable[[], Any], sender: Any) -> NoReturn:
 
 
 def depend(parent: int) -> None:
-    """Ignore signals except SIGTERM, by which a pool ends its workers; end when the parent ends."""
+    """Make a forked process ignore signals, except SIGTERM, by which pools end workers, and end with its parent."""
     for number in ENDING:
         signal.signal(number, signal.SIG_DFL if number == signal.SIGTERM else signal.SIG_IGN)
     signal.pthread_sigmask(signal.SIG_UNBLOCK, ENDING)

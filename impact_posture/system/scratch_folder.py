@@ -1,7 +1,7 @@
-"""Temporary folders that are also removed after their process was killed.
+"""Temporary folders that are removed even if the process that made them was killed.
 
-A temporary folder has a record, ``.impact-posture.json``, which the process that works in it locks.  If the record is
-not locked, the process was killed.  The next process that works in the same parent folder removes the folder.
+A process locks the file ``.impact-posture.json``, called the record, in its temporary folder.  An unlocked record
+means that the process was killed.  The next process that makes a temporary folder beside it removes the folder.
 """
 
 from __future__ import annotations
@@ -50,15 +50,15 @@ def scratch_folder(parent: Path | None = None, mode: int = 0o700) -> Iterator[Pa
         raise OutputError("no temporary folder can be written", where="TMPDIR", hint="set it to a folder") from None
     _sweep(parent)
     folder = parent / f"{SCRATCH}{secrets.token_hex(4)}"
-    # Make the folder inside this block, so that a signal cannot leave the folder behind.
+    # Make the folder inside this block, so that a signal removes the folder.
     with undone(lambda: remove_scratch(folder)):
         folder.mkdir(mode)
         record = os.open(folder / RECORD, os.O_RDWR | os.O_CREAT | os.O_EXCL, 0o666)
         try:
-            # If files cannot be locked, old folders are not swept.
+            # On file systems without locks, the folders of killed processes are not removed.
             with suppress(OSError):
                 fcntl.flock(record, fcntl.LOCK_EX)
-            # Write the record after locking it, because other processes ignore an empty record without a lock.
+            # Lock the record before writing it.  Until then, the record is empty, and other processes ignore it.
             content = {"schema": SCHEMA, "host": os.uname().nodename, **made_by()}
             os.write(record, json.dumps(content).encode())
             yield folder
@@ -67,7 +67,7 @@ def scratch_folder(parent: Path | None = None, mode: int = 0o700) -> Iterator[Pa
 
 
 def _sweep(parent: Path) -> None:
-    """Remove the temporary folders of killed processes of this package."""
+    """Remove the temporary folders of killed processes in ``parent``."""
     with suppress(OSError):
         for folder in parent.glob(f"{SCRATCH}*"):
             if not folder.is_symlink() and folder.stat().st_uid == os.geteuid():
@@ -82,8 +82,8 @@ def _remove_unlocked(folder: Path) -> None:
         # Locking fails while the process that uses the folder runs.
         fcntl.flock(record, fcntl.LOCK_EX | fcntl.LOCK_NB)
         content = json.loads(os.read(record, 1 << 24))
-        # Compare the machines, because locks may not work across machines.  The record of a finished folder names no
-        # machine.
+        # Keep the folders of other machines, because locks may not work across machines.  The record of a finished
+        # output folder names no machine.
         if content["schema"] == SCHEMA and content.get("host", os.uname().nodename) == os.uname().nodename:
             remove_scratch(folder)
     finally:
@@ -91,10 +91,7 @@ def _remove_unlocked(folder: Path) -> None:
 
 
 def remove_scratch(folder: Path) -> None:
-    """Remove a temporary folder.
-
-    The record is removed last, so that the next sweep recognizes an interrupted removal.
-    """
+    """Remove a temporary folder, its record last, so that an interrupted removal can be continued later."""
     with suppress(OSError):
         for entry in os.scandir(folder):
             if entry.is_dir(follow_symlinks=False):

@@ -6,8 +6,8 @@ import errno
 import os
 from pathlib import Path
 
-# Largest number of characters in a file.  The largest file of this package, the result of a long search, has about a
-# million characters.
+# Largest number of characters in a file.  The result of a long search, the largest file that this package writes, has
+# about a million characters.
 MOST_CHARACTERS = 1 << 26
 
 

@@ -16,8 +16,8 @@ from impact_posture.system.processes import undone
 
 GET_ONE = "install gcc or clang, or set CC"
 
-# A compiler starts other processes.  The shell reads a pipe from standard input.  When this process closes the pipe
-# or is killed, the shell kills its whole process group.
+# Shell script that runs a compiler.  When this Python process ends or closes the pipe, the script kills the compiler
+# and all processes that the compiler has started.
 _GUARD = (
     "exec 3<&0 </dev/null; { read -r _ <&3; kill -KILL 0; } >/dev/null 2>&1 & "
     '"$@" 3<&-; code=$?; kill -KILL $!; exit $code'
@@ -25,7 +25,7 @@ _GUARD = (
 
 
 def find_compiler() -> list[str] | None:
-    """Return the first words of a compiler command: ``$CC`` with its options, cc, gcc, clang, or else ``None``.
+    """Return the first installed compiler of ``$CC`` (with options), cc, gcc and clang, or else ``None``.
 
     Raises:
         CompilerError: ``$CC`` has an open quote.
@@ -37,7 +37,7 @@ def find_compiler() -> list[str] | None:
 
 
 def require_compiler(where: str) -> list[str]:
-    """Return the compiler from :func:`find_compiler`; ``where`` names, for errors, the work that needs a compiler.
+    """Return the compiler from :func:`find_compiler`.  Errors name ``where``, the work that needs a compiler.
 
     Raises:
         CompilerError: No compiler is installed, or ``$CC`` has an open quote.
@@ -68,7 +68,7 @@ def run_compiler(command: list[str], folder: Path) -> None:
 
 
 def run_compilers(commands: Sequence[list[str]], folder: Path) -> None:
-    """Run compiler commands in ``folder``, started in this order, as many in parallel as there are cores.
+    """Run compiler commands in ``folder`` in parallel, at most one per core.
 
     Raises:
         CompilerError: A command failed; the error contains the first error line of the first failure.
@@ -77,7 +77,6 @@ def run_compilers(commands: Sequence[list[str]], folder: Path) -> None:
     reader, writer = os.pipe()
 
     def stop() -> None:
-        """Kill all compilers and the processes that they have started."""
         for _, process in running:
             with suppress(ProcessLookupError):
                 os.killpg(process.pid, signal.SIGKILL)
@@ -101,8 +100,7 @@ def run_compilers(commands: Sequence[list[str]], folder: Path) -> None:
 
 def _start(command: list[str], folder: Path, guard: int) -> subprocess.Popen[str]:
     pipe = subprocess.PIPE
-    # Put temporary files into the folder of the result.  A killed compiler leaves its temporary files, but they are
-    # removed together with this folder.
+    # A killed compiler leaves temporary files behind.  Put them into the folder of the output, which is also removed.
     temporary = (folder / command[command.index("-o") + 1]).absolute().parent
     try:
         return subprocess.Popen(
