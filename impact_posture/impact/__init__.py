@@ -1,1 +1,1 @@
-"""The impact: contacts, metric, quantities H, G, V, S, E, objectives and worst cases."""
+"""Rigid impacts: contacts, metrics, the quantities H, G, V, S and E, objectives and worst cases."""

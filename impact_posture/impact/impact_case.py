@@ -15,11 +15,11 @@ from impact_posture.robot.robot_spec import Support
 
 @dataclass(frozen=True)
 class ImpactCase:
-    """Inputs of the velocity jump of a single impact, except the posture.
+    """Data that determine the velocity jump of a single impact, except the posture.
 
     Attributes:
         contact: Point and normal of the impact.
-        metric: Weight ``W`` of the squared norm of the jump.
+        metric: Weight matrix ``W`` in the squared norm ``ΔνᵀWΔν`` of the velocity jump.
         supports: Feet that stay on the ground; empty for a robot that flies or is bolted down.
         compliance: Compliance ε of the supports, 1/kg.  Zero selects the
             :func:`~impact_posture.impact.support_compliance.default_compliance`.

@@ -15,9 +15,9 @@ from impact_posture.errors import ContactError
 from impact_posture.robot.robot import Robot
 from impact_posture.robot.robot_spec import Support as Support
 
-# A normal is a unit vector up to rounding if its length differs from 1 by at most this.
+# A normal counts as a unit vector if its length differs from 1 by at most this value.
 _UNIT = 1e-15
-# Largest impulse and speed.  The products of their squares and the quantities of a robot must not overflow a double.
+# Largest allowed impulse (N·s) and speed (m/s).  The square of a larger value, multiplied by H or V, could overflow.
 LARGEST = 1e100
 
 
@@ -72,7 +72,7 @@ class ImpactContact:
 
 
 def point_on(robot: Robot, frame: str, offset: Vector3 = (0.0, 0.0, 0.0)) -> PointOnLink:
-    """Return the point on a link at ``offset``, m, in the coordinates of ``frame``.
+    """Return the point at ``offset`` (m, coordinates of ``frame``), attached to the link that carries ``frame``.
 
     Raises:
         FrameNotFound: The robot has no such frame.

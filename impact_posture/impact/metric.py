@@ -22,10 +22,10 @@ from impact_posture.system.arrays import Array
 @checked
 @dataclass(frozen=True)
 class Metric:
-    """The weight ``W`` of ``‖Δν‖²_W``.
+    """Weight matrix ``W`` in the squared norm ``‖Δν‖²_W = ΔνᵀWΔν`` of a velocity jump.
 
     Attributes:
-        kind: ``euclidean`` (W = I), ``kinetic`` (W = M) or ``weighted`` (diagonal).
+        kind: ``euclidean`` (W = I), ``kinetic`` (W = M) or ``weighted`` (``W`` diagonal).
         weights: Diagonal of ``W`` for the kind ``weighted``, shape (nv,); ``None`` for the other kinds.
         source: Text that states where the weights come from.
 
@@ -52,13 +52,13 @@ class Metric:
 
 
 def build_metric(robot: Robot, kind: MetricKind, weights: str | tuple[float, ...] | None = None) -> Metric:
-    """Build a metric of a given kind.
+    """Build a ``euclidean``, ``kinetic`` or ``weighted`` metric.
 
     The weighted metric needs ``weights``: nv numbers, the text ``velocity-limits``, or the path of a TOML file.  The
     file has lines ``joint = weight``, and ``base = [6 numbers]`` for a floating base.
 
     Raises:
-        MetricError: Weights are missing, wrong in number, not above zero, or given for another kind.
+        MetricError: Weights are missing, wrong in number, not above zero, or given for another metric.
     """
     if kind != "weighted":
         if weights is not None and kind in get_args(MetricKind):
@@ -84,7 +84,7 @@ def build_metric(robot: Robot, kind: MetricKind, weights: str | tuple[float, ...
 
 
 def check_weights(robot: Robot, weights: Sequence[float] | None) -> None:
-    """Raise MetricError if ``weights`` does not have one number for each of the nv velocity entries."""
+    """Raise MetricError if ``weights`` does not have nv entries."""
     if weights is not None and np.shape(weights) != (robot.nv,):
         hint = f"give {robot.nv} numbers above zero"
         raise MetricError(f"has {np.size(weights)} entries", where="weights", hint=hint)
@@ -93,7 +93,7 @@ def check_weights(robot: Robot, weights: Sequence[float] | None) -> None:
 def _from_limits(robot: Robot) -> Array:
     limits = robot.velocity_limits
     base = 6 if robot.floating else 0
-    # A floating base has no velocity limits.  With limits of 1 m/s and 1 rad/s, the norm includes the base velocity.
+    # A floating base has no velocity limits.  1 m/s and 1 rad/s are used to include the base velocity in the norm.
     limits[:base] = 1.0
     for name, limit in zip(robot.tangent_names[base:], limits[base:], strict=True):
         if not limit < 1e6:

@@ -1,4 +1,4 @@
-"""The :class:`Objective` protocol, through which the program and its solver use an objective."""
+"""The :class:`Objective` protocol: interface between an objective and the nonlinear program that minimizes it."""
 
 from __future__ import annotations
 
@@ -20,11 +20,11 @@ from impact_posture.system.arrays import Array
 
 @dataclass(frozen=True, eq=False)
 class Subgradients:
-    """Gradients whose convex hull is the subdifferential of an objective.
+    """Gradients whose convex hull is the subdifferential of an objective ``f = max_i f_i``.
 
     Attributes:
-        gradients: Tangent gradients of the members of the maximum, one per row, shape (k, nv).
-        gaps: Value of the objective minus the value of each member, ≥ 0, shape (k,).
+        gradients: Tangent gradients of the functions ``f_i`` that are near the maximum, one per row, shape (k, nv).
+        gaps: Difference ``f − f_i ≥ 0`` for each row, shape (k,).
     """
 
     gradients: Array
@@ -32,7 +32,7 @@ class Subgradients:
 
     @property
     def first(self) -> Array:
-        """The gradient of the leading member, shape (nv,)."""
+        """Gradient of the largest ``f_i``, shape (nv,)."""
         return np.asarray(self.gradients[0])
 
 
@@ -44,7 +44,7 @@ class Minimized(Protocol):
         """Number of different initial guesses that :meth:`guess` offers."""
 
     def guess(self, q: Array, scale: float, attempt: int = 0) -> Guess:
-        """Return initial values at ``q`` for the auxiliaries of the lifted form, and their bounds."""
+        """Return initial values at ``q``, with bounds, for the unknowns that :meth:`lift` adds."""
 
     def value(self, q: Array) -> float:
         """Return the value at ``q``, > 0, computed with Pinocchio.
@@ -56,29 +56,29 @@ class Minimized(Protocol):
     def subgradients(self, q: Array, within: float = 0.0) -> Subgradients:
         """Return gradients that span the subdifferential at ``q``, computed with Pinocchio.
 
-        If the value is smooth at ``q``, the result is one gradient.  If the value is a maximum, the result includes
-        the gradient of every member that is at most ``within`` below the maximum, the leading member first.
+        If the value is smooth at ``q``, the result is one gradient.  If the value is a maximum of functions, the
+        result has the gradient of every function that is at most ``within`` below the maximum, the largest first.
         """
 
     def lift(self, tree: Tree, parameters: ca.SX, scale: ca.SX) -> Lifted:
-        """Return the value at ``tree.q`` as an expression of auxiliary unknowns, with the equations that define them.
+        """Return the value at ``tree.q`` as an expression of additional unknowns, with equations for them.
 
         ``scale`` is a typical size of the value.
         """
 
 
 class WorstCase(Minimized, Protocol):
-    """The largest value that an uncertain impact can have at one posture.
+    """Largest value over all normals, impulses or robot models that an uncertain impact allows.
 
-    The argument ``parameters`` of :meth:`lift` is the normal of the leading contact.
+    The argument ``parameters`` of :meth:`lift` is the normal of the first contact.
     """
 
     @property
     def oracle(self) -> ImpactOracle:
-        """The oracle of the leading contact for the robot as modeled."""
+        """Numeric impact quantities of the first contact for the nominal robot model."""
 
     def expressions(self, k: ImpactKernel) -> tuple[ca.SX, ca.SX]:
-        """Return value and tangent gradient (nv) of the worst member, in the symbols of the kernel ``k``."""
+        """Return the largest value and its tangent gradient, shape (nv,), in the symbols of the kernel ``k``."""
 
 
 class Objective(Minimized, Protocol):
@@ -86,11 +86,11 @@ class Objective(Minimized, Protocol):
 
     @property
     def robot(self) -> Robot:
-        """The robot."""
+        """Robot that receives the impact."""
 
     @property
     def name(self) -> str:
-        """Name in outputs."""
+        """Name of the objective in outputs."""
 
     @property
     def contacts(self) -> tuple[ImpactContact, ...]:
@@ -102,14 +102,14 @@ class Objective(Minimized, Protocol):
 
     @property
     def structure(self) -> str:
-        """Text that, with the robot, identifies the expressions; it is part of the key of the compile cache."""
+        """Text that identifies the expressions for a given robot, as part of the key of the compile cache."""
 
     @property
     def parameters(self) -> Array:
         """Parameters of the lifted form, shape (k,), which can change without rebuilding the program."""
 
     def movable(self, q: Array) -> bool:
-        """Return whether the contact can move at ``q``; if not, the value consists of rounding errors."""
+        """Return whether the contact can move at ``q``; if it cannot, the value is only a rounding error."""
 
     def blind_motions(self) -> Array:
         """Return base twists that do not change the value, world axes, linear first, shape (k, 6)."""

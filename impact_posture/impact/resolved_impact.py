@@ -64,7 +64,7 @@ def resolve(settings: ImpactSettings, robot: Robot | None = None) -> ResolvedImp
 
 
 def _choose(settings: ImpactSettings, *, several: bool) -> tuple[ObjectiveKind, str]:
-    """Return the kind of objective, and the reason for it if the setting is ``auto`` (otherwise empty)."""
+    """Return the objective type, and the reason for this choice if the setting is ``auto`` (otherwise empty)."""
     if settings.objective != "auto":
         return settings.objective, ""
     if several:
@@ -87,11 +87,11 @@ def _contacts(settings: ImpactSettings, robot: Robot) -> list[ImpactContact]:
             raise ContactError("is missing", where="normal", hint="give the direction out of the surface")
         return [_contact(settings, robot, settings.frame or _default_frame(robot), settings.normal, None)]
     if settings.frame is not None or settings.normal is not None:
-        what, hint = "is used instead of `frame` and `normal`", "give either `contact`, or `frame` and `normal`"
+        what, hint = "cannot be combined with `frame` and `normal`", "give either `contact`, or `frame` and `normal`"
         raise ContactError(what, where="contact", hint=hint)
     if len(texts) > 1 and settings.offset is not None:
         hint = "omit the offset, or add frames to the URDF"
-        raise ContactError("one offset for several contacts", where="offset", hint=hint)
+        raise ContactError("one offset for several contacts is ambiguous", where="offset", hint=hint)
     return [_contact(settings, robot, *parse_contact(text)) for text in texts]
 
 
@@ -114,12 +114,12 @@ class ResolvedImpact:
     """An impact whose settings have been checked for its robot.
 
     Attributes:
-        objective: Robot, contact, metric, kind, supports and compliance.
+        objective: Objective with robot, contacts, metric, supports and compliance.
         q: The posture that the settings name, shape (nq,).
         posture: Name or file of the posture ``q``.
         speed: Approach speed, m/s.
         restitution: Coefficient of restitution.
-        missing_support: Hint how to state supports, for a floating robot for which none are stated; otherwise empty.
+        missing_support: Hint how to give supports if the robot floats and no supports are given; otherwise empty.
         contact_stiffness: Elasticity of the contact; ``None`` if not known.
         choice: Reason why ``auto`` chose this objective; empty if the settings name the objective.
     """
@@ -140,7 +140,7 @@ class ResolvedImpact:
 
     @property
     def contact(self) -> ImpactContact:
-        """The leading contact."""
+        """The first contact."""
         return self.objective.contact
 
     @property
@@ -167,9 +167,9 @@ class ResolvedImpact:
         return (*warnings, f"{self.robot.name} is assumed to be floating freely, {FLOATS}; {self.missing_support}")
 
     def to_dict(self, q: Array | None = None) -> dict[str, object]:
-        """Return the blocks of ``result.json`` that state the impact: robot, contacts, supports, metric.
+        """Return the blocks of ``result.json`` that describe the impact: robot, contacts, supports, metric.
 
-        Normals are stated in world axes for the posture ``q``; by default, for :attr:`q`.
+        Normals are in world axes at the posture ``q``, by default :attr:`q`.
         """
         q = self.q if q is None else q
         return {
@@ -199,7 +199,7 @@ def robot_block(robot: Robot) -> dict[str, object]:
 
 
 def missing_support(robot: Robot) -> str:
-    """Return a hint how to state supports if a floating robot has data for neither feet nor rotors; else empty."""
+    """Return a hint how to give supports if a floating robot has data for neither feet nor rotors; else empty."""
     spec = robot.spec
     known = spec.propulsion is not None or spec.kind == "aerial" or spec.constraints.level_base
     if not robot.floating or known:
@@ -208,7 +208,7 @@ def missing_support(robot: Robot) -> str:
     named = " ".join(f"`support` {frame}" for frame in guessed)
     stand = f"{named} (its feet by name or geometry)" if guessed else "`support` FRAME for each foot"
     draft = "(inspect --write-robot-toml drafts one)"
-    return f"give {stand}, no `support` if it floats indeed, `base`, or a robot.toml {draft}"
+    return f"give {stand}, no `support` if the robot really floats, `base`, or a robot.toml {draft}"
 
 
 def _default_frame(robot: Robot) -> str:

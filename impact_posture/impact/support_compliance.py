@@ -19,9 +19,9 @@ def default_compliance(robot: Robot) -> float:
     """Return the default support compliance ε, 1/kg, for which a foot acts as if it had the mass of 10⁴ robots.
 
     The solution of ``M a − J_sᵀ f = Jᵀ n, J_s a + ε f = 0`` is smooth in ``q`` for any ε > 0.  Compared with rigid
-    feet, the effect of the feet on the jump is smaller by a share of at most ``ε/(σ + ε)``, where σ is the least
-    eigenvalue of ``J_sM⁻¹J_sᵀ`` above zero.  If the effective mass at the feet is the mass of the robot, this share
-    is 1e-4.  If ``J_s`` nearly loses rank, the share is larger.
+    feet, the effect of the feet on the velocity jump is reduced by at most the fraction ``ε/(σ + ε)``, where σ is the
+    least eigenvalue of ``J_sM⁻¹J_sᵀ`` above zero.  The fraction is 1e-4 if the effective mass at the feet is the mass
+    of the robot, and larger if ``J_s`` nearly loses rank.
     """
     return _DEFAULT_COMPLIANCE / robot.mass
 
@@ -39,17 +39,17 @@ def check_compliance(robot: Robot, compliance: float) -> None:
     """Raise InputError for a support compliance ε, 1/kg, that is below :func:`least_compliance` or not finite."""
     least = least_compliance(robot)
     if not (np.isfinite(compliance) and compliance >= least):
-        hint = f"give at least {least:.3g}, which is 1e-6 over the mass; stiffer feet are lost in rounding errors"
+        hint = f"give at least {least:.3g}, which is 1e-6 over the mass; rounding errors hide stiffer feet"
         raise InputError(f"the compliance is {compliance:g} 1/kg", where="support_compliance", hint=hint)
 
 
 def heavy_feet_rounding(robot: Robot, compliance: float) -> float:
-    """Return how many times larger the rounding error of ``M + J_sᵀJ_s/ε`` is than with the default ε, at least 1."""
+    """Return the rounding error of ``M + J_sᵀJ_s/ε`` divided by the rounding error for the default ε, at least 1."""
     return max(1.0, default_compliance(robot) / compliance)
 
 
 def support_inertia(robot: Robot, supports: tuple[Support, ...], compliance: float) -> dict[int, Array]:
-    """Return the inertias, shape (6, 6), by joint index, that represent the supports: their sum is ``J_sᵀJ_s/ε``.
+    """Return inertias by joint index, shape (6, 6), that add ``J_sᵀJ_s/ε`` to the mass matrix.
 
     Each support is a point mass ``1/ε``.  A surface support also has the rotational inertia ``1/ε``.
     """

@@ -34,25 +34,24 @@ from impact_posture.system.arrays import Array
 @checked
 @dataclass(frozen=True)
 class WorstCaseObjective:
-    """The worst case of impulse ``λ̄²H``, speed ``V``, sticking ``S``, coulomb ``C`` or energy ``E`` of an impact.
+    """Worst case of ``λ̄²H`` (impulse), ``V`` (speed), ``S`` (sticking), ``C`` (coulomb) or ``E`` (energy).
 
-    The class implements the :class:`~impact_posture.impact.objective.Objective` protocol for every combination of a
-    kind (:mod:`impact_posture.impact.kinds.kinds_by_name`), a metric, supports, contacts, a cone of normals and model
-    variants.  Each type of maximum is a class in :mod:`impact_posture.impact.worst_case`.
+    The class implements the :class:`~impact_posture.impact.objective.Objective` protocol for every combination of an
+    objective type (:mod:`impact_posture.impact.kinds.kinds_by_name`), a metric, supports, contacts, a cone of normals
+    and model variants.  :mod:`impact_posture.impact.worst_case` has a class for each type of maximum.
 
     Attributes:
         robot: The robot.
-        contact: Point and normal of the leading contact.
-        metric: Weight ``W`` of the squared norm of the jump.
-        kind: ``impulse``, ``speed``, ``sticking``, ``coulomb`` or ``energy``.
+        contact: Point and normal of the first contact.
+        metric: Weight matrix ``W`` in the squared norm of the velocity jump.
+        kind: Objective type: ``impulse``, ``speed``, ``sticking``, ``coulomb`` or ``energy``.
         supports: Feet that stay on the ground.
         compliance: Compliance ε of the supports, 1/kg; zero selects the default.
         normal_cone_deg: Half angle of the cone of possible normals, degrees; 0 if only the normal of the contact is
             possible.
-        others: Contacts that are hit at the same time as the leading contact, each with a bound on its impulse.
+        others: Contacts that are hit at the same time as the first contact, each with a bound on its impulse.
         bilateral: Whether several contacts can pull as well as push.
-        model_variants: Possible robot models, the robot as modeled first; empty if only the robot as modeled is
-            possible.
+        model_variants: Possible robot models, the nominal model first; empty if only the nominal model is possible.
     """
 
     robot: Robot
@@ -75,12 +74,12 @@ class WorstCaseObjective:
 
     @cached_property
     def impact_kind(self) -> ImpactKind:
-        """Formulas of the kind for the leading contact and the robot as modeled."""
+        """The objective type, evaluated at the first contact with the nominal robot model."""
         return KINDS[self.kind](self.oracle)
 
     @property
     def name(self) -> str:
-        """Kind of the objective."""
+        """Name of the objective type."""
         return self.kind
 
     @property
@@ -95,7 +94,7 @@ class WorstCaseObjective:
 
     @property
     def structure(self) -> str:
-        """Text that identifies the expressions; the normal of the leading contact is a parameter, so not included."""
+        """Text that identifies the expressions, without the normal of the first contact, which is a parameter."""
         contact = self.contact
         return repr(
             (
@@ -109,15 +108,15 @@ class WorstCaseObjective:
 
     @property
     def parameters(self) -> Array:
-        """Normal of the leading contact, shape (3,)."""
+        """Normal of the first contact, shape (3,)."""
         return np.array(self.contact.normal)
 
     @property
     def warnings(self) -> tuple[str, ...]:
-        """Warnings about combinations of metric and kind with a degenerate meaning."""
+        """Warnings about metrics with which the objective has a degenerate meaning."""
         if self.metric.kind != "kinetic":
             return ()
-        # With supports, aᵀMa = G − ε‖f‖² for their impulses f.  Without supports, aᵀMa = G.
+        # With support impulses f, aᵀMa = G − ε‖f‖².  Without supports, aᵀMa = G.
         rest = ", up to the compliance of the feet" if self.supports else ""
         meanings = {
             "speed": f"is 1/G{rest}: the exact opposite of 'impulse' (G) and twice 'energy'",
@@ -127,17 +126,17 @@ class WorstCaseObjective:
 
     @property
     def contacts(self) -> tuple[ImpactContact, ...]:
-        """All contacts, the leading contact first."""
+        """All contacts, starting with :attr:`contact`."""
         return (self.contact, *self.others)
 
     @cached_property
     def case(self) -> ImpactCase:
-        """The impact at the leading contact for the robot as modeled."""
+        """The impact at the first contact for the nominal robot model."""
         return ImpactCase(self.robot, self.contact, self.metric, self.supports, self.compliance)
 
     @cached_property
     def singles(self) -> tuple[WorstCaseObjective, ...]:
-        """A separate objective for each contact, for the robot as modeled."""
+        """A separate objective for each contact, for the nominal robot model."""
         if not self.others and not self.model_variants:
             return (self,)
         return tuple(
@@ -162,7 +161,7 @@ class WorstCaseObjective:
 
     @cached_property
     def normal_cone(self) -> NormalCone | None:
-        """Worst case over the cone around the normal of the leading contact; ``None`` if there is no cone."""
+        """Worst case over the cone around the normal of the first contact; ``None`` if there is no cone."""
         kind = self.impact_kind
         if not self.normal_cone_deg or not isinstance(kind, QuadraticKind):
             return None
@@ -170,7 +169,7 @@ class WorstCaseObjective:
 
     @property
     def is_multiple_of_H(self) -> bool:
-        """Whether the objective equals ``λ̄²H`` of the leading contact, without a maximum."""
+        """Whether the objective equals ``λ̄²H`` of the first contact, without a maximum."""
         return self.impact_kind.symbol == "H" and isinstance(self.worst_case, ImpactKind)
 
     @cached_property
@@ -187,8 +186,8 @@ class WorstCaseObjective:
     def gradient_fun(self) -> ca.Function:
         """Return the function ``(q, n) → value, gradient`` with a tangent gradient, shape (nv,).
 
-        ``n`` is the normal of the leading contact in its ``normal_frame``; with a cone of normals, it is the axis of
-        the cone.  If members of the maximum tie, the gradient is a subgradient.
+        ``n`` is the normal of the first contact in its ``normal_frame``; with a cone of normals, it is the axis of
+        the cone.  If several normals, impulses or models attain the maximum, the gradient is a subgradient.
         """
         k = self.kernel
         value, gradient = self.worst_case.expressions(k)
@@ -201,32 +200,32 @@ class WorstCaseObjective:
 
     @property
     def attempts(self) -> int:
-        """Number of different initial guesses; one if the equations are linear in the auxiliaries."""
+        """Number of different initial guesses; one if the equations are linear in the unknowns of :meth:`lift`."""
         return self.worst_case.attempts
 
     def guess(self, q: Array, scale: float, attempt: int = 0) -> Guess:
-        """Return values of the auxiliaries that solve the equations of :meth:`lift` at ``q``."""
+        """Return values of the unknowns that solve the equations of :meth:`lift` at ``q``."""
         return self.worst_case.guess(q, scale, attempt)
 
     @cached_property
     def oracle(self) -> ImpactOracle:
-        """The oracle of the leading contact for the robot as modeled."""
+        """Numeric impact quantities of the first contact for the nominal robot model."""
         return ImpactOracle(self.case)
 
     def value(self, q: Array) -> float:
         """Return the objective at ``q``, computed with Pinocchio.
 
         Raises:
-            MetricError: The kind is ``sticking`` or ``coulomb`` and has no value at ``q``.
+            MetricError: The objective type is ``sticking`` or ``coulomb`` and has no value at ``q``.
         """
         return self.worst_case.value(q)
 
     def gradient(self, q: Array) -> Array:
-        """Return the tangent gradient at ``q``, computed with Pinocchio, shape (nv,); a subgradient at a tie."""
+        """Return the tangent gradient at ``q``, computed with Pinocchio, shape (nv,), or a subgradient."""
         return self.subgradients(q).first
 
     def subgradients(self, q: Array, within: float = 0.0) -> Subgradients:
-        """Return the gradients of all members of the maximum whose value ties or is at most ``within`` below it."""
+        """Return the gradients for all normals, impulses and models at most ``within`` below the maximum."""
         return self.worst_case.subgradients(q, within)
 
     def movable(self, q: Array) -> bool:

@@ -1,1 +1,1 @@
-"""The kinds of objective: impulse, speed, sticking, coulomb and energy."""
+"""The objective types ``impulse``, ``speed``, ``sticking``, ``coulomb`` and ``energy``, one class each."""

@@ -1,4 +1,4 @@
-"""The kind ``coulomb``: the squared jump at a given approach speed with friction; the contact sticks or slides."""
+"""The objective type ``coulomb``: squared velocity jump per squared approach speed, with Coulomb friction."""
 
 from __future__ import annotations
 
@@ -21,16 +21,17 @@ from impact_posture.impact.quantities.impact_kernel import ImpactKernel
 from impact_posture.impact.quantities.lifted_form import Guess, Lifted, UnknownJump, impact_at, in_world, unknown_jump
 from impact_posture.system.arrays import Array
 
-# Upper bound of the product κo.  In theory the product is zero, but the interior-point method needs a positive bound.
+# Upper bound of κo, a product of two unknowns of :meth:`CoulombKind.unknowns`.  The exact product is zero, but the
+# interior-point method needs a positive bound.
 _CORNER = 1e-10
 
 
 class CoulombKind(ImpactKind):
-    """``C = ‖M⁻¹Jᵀp‖²_W/v²``: the squared jump at a given approach speed with the friction ``μ`` of the contact.
+    """``C = ‖M⁻¹Jᵀp‖²_W/v²``: squared velocity jump per squared approach speed ``v``, with friction ``μ``.
 
     :mod:`impact_posture.impact.friction.coulomb_impact` computes the impulse ``p``.  ``C`` equals ``S`` if the
-    contact point sticks, and equals ``V`` if there is no friction.  ``C`` is continuous in the posture.  At postures
-    where the contact point begins to slip, the gradient of ``C`` is discontinuous (a kink).
+    contact point sticks, and equals ``V`` if there is no friction.  ``C`` is continuous in the posture, but its
+    gradient is discontinuous (a kink) at postures where the contact point begins to slip.
     """
 
     name, symbol = "coulomb", "C"
@@ -43,11 +44,11 @@ class CoulombKind(ImpactKind):
         return float(jump @ self.oracle.weigh(jump))
 
     def subgradients(self, q: Array, within: float = 0.0) -> Subgradients:
-        """Return the gradient, and the gradient of the other branch (stick or slide) if its value is close.
+        """Return the gradient of the actual branch (stick or slide), and of the other branch if it is relevant.
 
-        The other branch is included if its value is at most ``within`` below the value at ``q``.  At the kink, the
-        gradient of sticking is first.  If the other branch has the larger value, it is not included, because then the
-        kink cannot be a minimum.
+        The other branch is relevant if its value is at most ``within`` below ``C``.  A branch with a larger value is
+        irrelevant: ``C`` is then the smaller of two smooth functions, so the kink cannot be a minimum.  At the kink,
+        the gradient of sticking comes first.
         """
         oracle, sides = self.oracle, [coulomb_impact(self.oracle, q)]
         if within > 0:
@@ -59,9 +60,9 @@ class CoulombKind(ImpactKind):
         return Subgradients(np.array([coulomb_gradient(oracle, q, sides[k]) for k in near]), gaps[near])
 
     def expressions(self, k: ImpactKernel) -> tuple[ca.SX, ca.SX]:
-        """Return value and tangent gradient (nv) in the symbols of a kernel.
+        """Return ``C`` and its tangent gradient, shape (nv,), in the symbols of a kernel.
 
-        At the kink, the gradient is the gradient of sticking.
+        At the kink, the gradient of sticking is returned.
         """
         case, n = self.case, k.n
         if case.contact.friction <= NO_FRICTION:
@@ -75,9 +76,10 @@ class CoulombKind(ImpactKind):
         return value, k.size_gradient(x, impact_at(case, r))
 
     def unknowns(self, tree: Tree, n: ca.SX, label: str = "") -> UnknownJump:
-        """Return the unknown jump under the impulse ``λ(n − μd)``, with the slip velocity ``κd``.
+        """Return the unknown velocity jump ``a`` under the impulse ``λ(n − μd)``, with the slip velocity ``κd``.
 
-        The last unknowns are ``λ``, ``d``, ``κ`` and ``o = 1 − ‖d‖²``.  The equations are ``M a − J_sᵀf − λJᵀ(n − μd)
+        The last unknowns are the normal impulse ``λ``, the slip direction ``d`` (``‖d‖ ≤ 1``, and 1 if the
+        contact slides), the slip speed ``κ``, and ``o = 1 − ‖d‖²``.  The equations are ``M a − J_sᵀf − λJᵀ(n − μd)
         = 0``, ``J_s a + εf = 0``, ``nᵀJa = 1``, ``(Ja)_t = κd``.
         """
         case, size, d = self.case, ca.SX.sym(f"lam{label}"), ca.SX.sym(f"d{label}", 3)
@@ -97,7 +99,7 @@ class CoulombKind(ImpactKind):
         return Lifted.of([jump], self.lifted_value(jump), inequalities=[slip * inside - _CORNER])
 
     def jump(self, q: Array) -> tuple[Array, Array]:
-        """Return the jump with friction, and the values of ``λ``, ``d``, ``κ`` and ``o``."""
+        """Return the velocity jump with friction, and the unknowns ``λ``, ``d``, ``κ`` and ``o``."""
         oracle, friction = self.oracle, self.oracle.contact.friction
         impact = coulomb_impact(oracle, q)
         n, p = oracle.n, impact.impulse

@@ -1,4 +1,4 @@
-"""The kind ``energy``: the energy that the contact dissipates at a given approach speed."""
+"""The objective type ``energy``: energy that the contact dissipates per squared approach speed."""
 
 from __future__ import annotations
 
@@ -15,17 +15,16 @@ from impact_posture.system.arrays import Array
 
 
 class EnergyKind(FrictionlessKind, QuadraticKind):
-    """``E = 1/(2G)``: the energy that the contact dissipates at a given approach speed.
+    """``E = 1/(2G)``: energy that the contact dissipates per squared approach speed.
 
-    The quadratic form of the normal has the matrix ``K = −JM⁻¹Jᵀ``.  Its value is ``−G``, so it is largest for the
-    normal with the least ``G``.
+    The quadratic form ``nᵀKn`` of :class:`QuadraticKind` has ``K = −JM⁻¹Jᵀ``.  The form equals ``−G``.
     """
 
     name, symbol = "energy", "E"
     units = "J per (m/s)² of approach"
 
     def lifted_value(self, jump: UnknownJump) -> ca.SX:
-        """Return ``λ/2``."""
+        """Return ``E = λ/2``, because the last unknown is ``λ = 1/G``."""
         return jump.variables[-1] / 2
 
     def form(self, mobility: Array, world: Array, jumps: Array) -> Array:
@@ -38,7 +37,7 @@ class EnergyKind(FrictionlessKind, QuadraticKind):
         return -k.mobility
 
     def of_form(self, form: Array) -> Array:
-        """Return ``−1/(2K)``; infinite if ``K`` is zero, because then the contact cannot move along the normal."""
+        """Return ``E`` for each ``form = −G``; infinite if ``G = 0`` (immovable contact)."""
         return np.asarray(np.where(form < 0, -1 / (2 * np.where(form < 0, form, -1.0)), np.inf))
 
     def of_form_slope(self, form: Array) -> Array:

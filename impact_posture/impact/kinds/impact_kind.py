@@ -1,4 +1,4 @@
-"""Abstract base classes of the kinds of objective; each kind minimizes one scalar of an impact."""
+"""Abstract base classes of the objective types; each type defines one scalar of an impact that is minimized."""
 
 from __future__ import annotations
 
@@ -29,21 +29,21 @@ from impact_posture.system.arrays import Array
 
 @dataclass(frozen=True)
 class ImpactKind(ABC):
-    """A multiple of H, G, V, S or E of one impact along one normal.
+    """Objective type: a multiple of H, V, S, C or E for a single impact along a given normal.
 
-    A kind implements :class:`~impact_posture.impact.objective.WorstCase`.  No maximum is computed, because the worst
-    impulse is the bound ``λ̄``.  Value, gradient and expressions are read from the attributes of the oracle and the
-    kernel that :attr:`symbol` names.  Each kind adds the equations of its lifted form.
+    The class implements :class:`~impact_posture.impact.objective.WorstCase` without computing a maximum: the
+    largest impulse ``λ̄`` is the worst, or the approach speed determines the impulse.  :attr:`symbol` names the
+    attributes of :class:`ImpactOracle` and :class:`ImpactKernel` that provide value and gradient.  Subclasses define
+    the equations of the lifted form (:class:`Lifted`).
 
     Attributes:
         name: Name in options, files and outputs.
-        symbol: Name of the scalar: H, G, V, S or E.
-        units: Units as text.
-        adds_up: Whether the kind prescribes the impulse of each contact, so that the jumps of several contacts can be
-            added.
+        symbol: Symbol of the scalar: H, V, S, C or E.
+        units: Units of the value, as text.
+        adds_up: Whether the impulse of each contact is given, so that the velocity jumps of several contacts add up.
         kink: Text that states where the gradient is discontinuous, and which gradient is returned there; empty if
             the value is smooth.
-        no_cone: Reason why the kind has no exact worst case over a cone of normals.
+        no_cone: Reason why the worst case over a cone of normals cannot be computed exactly.
         attempts: Number of different initial guesses that :meth:`guess` offers.
     """
 
@@ -63,72 +63,65 @@ class ImpactKind(ABC):
 
     @property
     def factor(self) -> float:
-        """Ratio of the value to the scalar :attr:`symbol`."""
+        """Factor between the scalar :attr:`symbol` and the value."""
         return 1.0
 
     def value(self, q: Array) -> float:
-        """Return the value, computed with Pinocchio.
-
-        Raises:
-            MetricError: The value does not exist at ``q``.
-        """
         value = getattr(self.oracle.quantities(q), self.symbol)
         if value is None:
             raise no_sticking()
         return self.factor * float(value)
 
     def subgradients(self, q: Array, within: float = 0.0) -> Subgradients:
-        """Return the tangent gradient, computed with Pinocchio; it is the only subgradient of a smooth value."""
+        """Return the tangent gradient, which is the only subgradient because the value is smooth."""
         gradient = self.factor * getattr(self.oracle, f"gradient_{self.symbol}")(q)
         return Subgradients(gradient[None, :], np.zeros(1))
 
     def expressions(self, k: ImpactKernel) -> tuple[ca.SX, ca.SX]:
-        """Return value and tangent gradient (nv) in the symbols of a kernel."""
         return self.factor * getattr(k, self.symbol), self.factor * getattr(k, f"grad_{self.symbol}")
 
     @abstractmethod
     def unknowns(self, tree: Tree, n: ca.SX, label: str = "") -> UnknownJump:
-        """Return the unknown jump for an impact at ``tree.q`` along the normal ``n``, with its equations."""
+        """Return the velocity jump of an impact along ``n`` at ``tree.q``, as unknowns with equations."""
 
     @abstractmethod
     def jump(self, q: Array) -> tuple[Array, Array]:
-        """Solve the equations of :meth:`unknowns` at ``q``; return the jump, shape (nv,), and the other unknowns."""
+        """Solve the equations of :meth:`unknowns` at ``q``; return the velocity jump (nv) and the other unknowns."""
 
     def lifted_value(self, jump: UnknownJump) -> ca.SX:
-        """Return the value as an expression of the unknown jump: ``aᵀWa`` times :attr:`factor`."""
+        """Return the value for the unknown velocity jump ``a``: ``aᵀWa`` times :attr:`factor`."""
         return self.factor * weighed(self.case.metric, jump, jump)
 
     def lift(self, tree: Tree, parameters: ca.SX, scale: ca.SX) -> Lifted:
-        """Return the lifted form at the posture ``tree.q``; ``parameters`` is the normal."""
+        """Return the lifted form at ``tree.q``; ``parameters`` is the contact normal."""
         jump = self.unknowns(tree, parameters)
         return Lifted.of([jump], self.lifted_value(jump))
 
     def guess(self, q: Array, scale: float, attempt: int = 0) -> Guess:
-        """Return the values of the unknowns that solve the equations of :meth:`lift` at ``q``."""
         a, others = self.jump(q)
         return Guess.unbounded(np.concatenate([self.oracle.with_support_impulses(a), others]))
 
 
 class FrictionlessKind(ImpactKind):
-    """A kind for an approach speed of 1 m/s without friction; the impulse ``λ`` is an unknown."""
+    """Objective type for an approach speed of 1 m/s without friction; the impulse ``λ`` is unknown."""
 
     def unknowns(self, tree: Tree, n: ca.SX, label: str = "") -> UnknownJump:
-        """Return the jump with ``M a − J_sᵀf − λJᵀn = 0``, ``J_s a + εf = 0``, ``nᵀJa = 1``.
+        """Return the velocity jump with ``M a − J_sᵀf − λJᵀn = 0``, ``J_s a + εf = 0``, ``nᵀJa = 1``.
 
-        ``λ`` is the last unknown.
+        The last unknown is ``λ``.
         """
         impulse = ca.SX.sym(f"lam{label}")
         jump = unknown_jump(self.case, tree, impact_at(self.case, n * impulse), label)
         return jump.with_impulse(impulse, ca.dot(in_world(self.case, tree, n), jump.contact_velocity) - 1)
 
     def jump(self, q: Array) -> tuple[Array, Array]:
-        """Return the frictionless jump ``a/G`` and the impulse ``λ = 1/G``."""
+        """Return the frictionless velocity jump and the impulse ``λ = 1/G``."""
         quantities = self.oracle.quantities(q)
         return quantities.jump / quantities.G, np.array([1 / quantities.G])
 
 
 class QuadraticKind(ImpactKind):
-    """A kind whose value is an increasing function of one quadratic form ``nᵀK(q)n`` of the normal.
+    """Objective type whose value increases with a quadratic form ``nᵀK(q)n`` of the normal ``n``.
 
     The largest value of a quadratic form over a cone of normals can be computed exactly.  By default ``K = Λ_c``.
 
@@ -139,12 +132,12 @@ class QuadraticKind(ImpactKind):
     unknown_impulse: ClassVar[bool] = False
 
     def directions(self, mobility: Array, world: Array) -> Array:
-        """Return the impulses whose jumps :meth:`form` needs, one column per world direction, shape (3, 3).
+        """Return three impulses as columns, shape (3, 3); :meth:`form` needs the velocity jumps that they cause.
 
-        ``mobility`` is ``JM⁻¹Jᵀ``, shape (3, 3).
+        Each impulse belongs to one column of ``world``, shape (3, 3).  ``mobility`` is ``JM⁻¹Jᵀ``, shape (3, 3).
 
         Raises:
-            MetricError: The kind needs the inverse of ``mobility``, which is singular.
+            MetricError: The inverse of ``mobility`` is needed, but ``mobility`` is singular.
         """
         return world
 
@@ -164,25 +157,25 @@ class QuadraticKind(ImpactKind):
         """Return ``K`` in world axes, shape (3, 3)."""
 
     def of_form(self, form: Array) -> Array:
-        """Return the objective for each value of the quadratic form."""
+        """Return the objective for each value ``form = nᵀKn``."""
         return self.factor * form
 
     def of_form_slope(self, form: Array) -> Array:
-        """Return the derivative of the objective with respect to the value of the form."""
+        """Return the derivative of the objective with respect to ``form = nᵀKn``."""
         return np.full_like(form, self.factor)
 
     def of_form_expression(self, form: ca.SX) -> ca.SX:
-        """Return the objective as an expression of the value of the form."""
+        """Return the objective as an expression of ``form = nᵀKn``."""
         return self.factor * form
 
     def lift_direction(self, tree: Tree, n: ca.SX, label: str) -> UnknownJump:
-        """Return the unknown jump for a direction ``n``, shape (3,), in the axes in which the normal is stated."""
+        """Return the unknown velocity jump for an impact along ``n``, in the axes ``normal_frame`` of the contact."""
         return self.unknowns(tree, n, label)
 
     def lift_entry(self, world: ca.SX, first: UnknownJump, second: UnknownJump) -> ca.SX:
-        """Return the entry of ``K`` for two directions from their jumps; ``world`` is the first direction."""
+        """Return the entry of ``K`` for two velocity jumps; ``world`` is the world direction of the first impact."""
         return weighed(self.case.metric, first, second)
 
     def form_unit(self, value: Any) -> Any:
-        """Return the absolute value of the form for which the objective equals ``value`` (number or expression)."""
+        """Return ``|nᵀKn|`` for which the objective equals ``value``, a number or an expression."""
         return value / self.factor

@@ -1,4 +1,4 @@
-"""The kind ``impulse``: the squared jump under the largest impulse."""
+"""The objective type ``impulse``: squared velocity jump under the largest impulse."""
 
 from __future__ import annotations
 
@@ -13,7 +13,7 @@ from impact_posture.system.arrays import Array
 
 
 class ImpulseKind(QuadraticKind):
-    """``λ̄²H`` with ``H = nᵀΛ_c n``: the squared jump under the largest impulse ``λ̄``, with ``K = Λ_c``."""
+    """``λ̄²H`` with ``H = nᵀKn`` and ``K = Λ_c``: squared velocity jump under the largest impulse ``λ̄``."""
 
     name, symbol = "impulse", "H"
     units = "(N·s)² × jump² per impulse²"
@@ -24,7 +24,7 @@ class ImpulseKind(QuadraticKind):
         return self.case.contact.impulse**2
 
     def unknowns(self, tree: Tree, n: ca.SX, label: str = "") -> UnknownJump:
-        """Return the jump with the equations ``M a − J_sᵀf − Jᵀn = 0``, ``J_s a + εf = 0``."""
+        """Return the velocity jump ``a`` with the equations ``M a − J_sᵀf − Jᵀn = 0``, ``J_s a + εf = 0``."""
         return unknown_jump(self.case, tree, impact_at(self.case, n), label)
 
     def jump(self, q: Array) -> tuple[Array, Array]:

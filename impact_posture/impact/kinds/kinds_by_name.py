@@ -1,4 +1,4 @@
-"""Table of the kinds of objective: name → class."""
+"""The class of each objective type, by name."""
 
 from __future__ import annotations
 

@@ -1,4 +1,4 @@
-"""The kind ``speed``: the squared jump at a given approach speed without friction."""
+"""The objective type ``speed``: squared velocity jump per squared approach speed, without friction."""
 
 from __future__ import annotations
 
@@ -6,7 +6,7 @@ from impact_posture.impact.kinds.impact_kind import FrictionlessKind
 
 
 class SpeedKind(FrictionlessKind):
-    """``V = H/G²``: the squared jump at a given approach speed without friction."""
+    """``V = H/G²``: squared velocity jump per squared approach speed, without friction."""
 
     name, symbol = "speed", "V"
     units = "jump² per (m/s)² of approach, frictionless"

@@ -1,4 +1,4 @@
-"""The kind ``sticking``: the squared jump at a given approach speed if the contact point sticks."""
+"""The objective type ``sticking``: squared velocity jump per squared approach speed if the contact point sticks."""
 
 from __future__ import annotations
 
@@ -14,9 +14,9 @@ from impact_posture.system.arrays import Array
 
 
 class StickingKind(QuadraticKind):
-    """``S = ‖M⁻¹Jᵀ(JM⁻¹Jᵀ)⁻¹n‖²_W``: the squared jump at a given approach speed if the contact point sticks.
+    """``S = nᵀKn`` with ``K = B⁻¹Λ_cB⁻¹`` and ``B = JM⁻¹Jᵀ``.
 
-    The matrix of the quadratic form is ``K = B⁻¹Λ_cB⁻¹`` with ``B = JM⁻¹Jᵀ``.
+    ``S`` is the squared velocity jump per squared approach speed if the contact point sticks.
     """
 
     name, symbol = "sticking", "S"
@@ -24,16 +24,16 @@ class StickingKind(QuadraticKind):
     unknown_impulse = True
 
     def unknowns(self, tree: Tree, n: ca.SX, label: str = "") -> UnknownJump:
-        """Return the jump with ``M a − J_sᵀf − Jᵀs = 0``, ``J_s a + εf = 0``, ``J a = n``.
+        """Return the velocity jump ``a`` with ``M a − J_sᵀf − Jᵀs = 0``, ``J_s a + εf = 0``, ``J a = n``.
 
-        ``s`` is the impulse on the contact point; its entries are the last unknowns.
+        The last three unknowns are the impulse ``s`` on the contact point.
         """
         impulse = ca.SX.sym(f"s{label}", 3)
         jump = unknown_jump(self.case, tree, Wrench(self.case.point, impulse, ca.SX.zeros(3)), label)
         return jump.with_impulse(impulse, jump.contact_velocity - in_world(self.case, tree, n))
 
     def jump(self, q: Array) -> tuple[Array, Array]:
-        """Return the jump and the impulse ``s``; if ``S`` does not exist, the frictionless jump and impulse."""
+        """Return the velocity jump and the impulse ``s``, or their frictionless values if ``S`` does not exist."""
         quantities = self.oracle.quantities(q)
         if quantities.sticking_jump is None or quantities.sticking_impulse is None:
             return quantities.jump / quantities.G, quantities.normal / quantities.G

@@ -1,8 +1,8 @@
-"""The impact quantities and their tangent gradients as expressions; the theory page derives the adjoints.
+"""The impact quantities and their tangent gradients as CasADi expressions, derived in ``docs/theory.md``.
 
 If supports with compliance ε keep the feet in place, ``M + J_sᵀJ_s/ε`` replaces ``M`` in every formula below.  This
-is the mass matrix of a robot with an additional point mass 1/ε at each foot.  The same code therefore computes the
-quantities with and without supports.
+sum is the mass matrix of a robot with an additional point mass 1/ε at each foot.  The same code therefore handles
+robots with and without supports.
 """
 
 from __future__ import annotations
@@ -23,15 +23,15 @@ from impact_posture.impact.support_compliance import support_inertia
 from impact_posture.robot.robot import Robot
 from impact_posture.system.arrays import Array, null_space
 
-# A singular value of the stacked Jacobians below this share of the largest one is a rounding error.
+# Singular values of the stacked Jacobians are treated as zero below this fraction of the largest singular value.
 _FROZEN = 1e-9
 
 
 class ImpactKernel:
     """Symbolic ``H, G, V, S, E, Λ_c`` and gradients of one impact.
 
-    The symbol ``q`` has shape (nq, 1).  The symbol ``n`` is the normal in the axes in which the contact states it,
-    shape (3, 1).  With ``limbs``, the expressions of repeated limbs differ only in parameters.
+    The symbol ``q`` has shape (nq, 1).  The symbol ``n``, shape (3, 1), is the normal in the axes ``normal_frame`` of
+    the contact.  With ``limbs``, the expressions of repeated limbs differ only in parameters.
     """
 
     def __init__(self, case: ImpactCase, q: ca.SX, n: ca.SX, limbs: RepeatedLimbs | None = None) -> None:
@@ -57,9 +57,9 @@ class ImpactKernel:
         return self.respond([self.impact])
 
     def _on_all_limbs(self, wrench: Wrench) -> list[Wrench]:
-        """Return the wrench, for a repeated limb as wrenches on all corresponding limbs.
+        """Return the wrench, or one wrench per repeated limb (:class:`RepeatedLimbs`) if it acts on such a limb.
 
-        A parameter is one for the limb of the wrench and zero for the others, so all limbs have the same operations.
+        An indicator sets the wrenches on the other limbs to zero, so all limbs have the same operations.
         """
         limbs, joint = self.tree.limbs, wrench.point.joint
         if limbs is None or joint not in limbs.places:
@@ -95,14 +95,14 @@ class ImpactKernel:
         return self.tree.respond(wrenches=[part for impact in impacts for part in self._on_all_limbs(impact)])
 
     def product(self, first: Response, second: Response) -> ca.SX:
-        """Return ``a₁ᵀWa₂`` of two responses."""
+        """Return ``a₁ᵀWa₂`` for the velocity jumps of two responses."""
         return ca.dot(first.a, self._weigh(second.a, second.velocities))
 
     def size_gradient(self, jump: Response, r: Wrench | None = None) -> ca.SX:
-        """Return the tangent gradient of ``aᵀWa`` of a response, shape (nv,).
+        """Return the tangent gradient of ``aᵀWa`` for the velocity jump ``a`` of a response, shape (nv,).
 
-        If ``r`` is ``None``, the impulses of the response do not depend on ``q``.  Otherwise the response has one
-        impulse ``p``, which depends on ``q`` such that ``∂pᵀJM⁻¹Wa = rᵀ∂B p`` with ``B = JM⁻¹Jᵀ``.
+        If ``r`` is ``None``, the impulses that cause the jump are constant.  Otherwise a single impulse ``p(q)``
+        causes it, and ``∂pᵀJM⁻¹Wa = rᵀ∂B p`` with ``B = JM⁻¹Jᵀ``.
         """
         if self.metric.kind == "kinetic" and not self._supported and r is None:
             return self.tree.pair_gradient(jump, jump)
@@ -113,7 +113,7 @@ class ImpactKernel:
         return gradient
 
     def adjoint_velocity(self, x: Response) -> ca.SX:
-        """Return ``JM⁻¹Wa`` of a response, in world axes, shape (3,)."""
+        """Return ``JM⁻¹Wa`` for the velocity jump ``a`` of a response, world axes, shape (3,)."""
         free = self.tree.respond(tau=self._weigh(x.a, x.velocities))
         return self.tree.point_velocity(self.point, free.velocities)[:3]
 
@@ -161,13 +161,13 @@ class ImpactKernel:
 
     @cached_property
     def _mobility_inverse(self) -> ca.SX:
-        """``(JM⁻¹Jᵀ)⁻¹``, or its pseudo-inverse for a planar robot."""
+        """``(JM⁻¹Jᵀ)⁻¹``, or the pseudo-inverse of ``JM⁻¹Jᵀ`` for a planar robot."""
         frozen = frozen_directions(self.case.robot, self.point)
         return _inverse3(self.mobility + frozen if frozen.any() else self.mobility)
 
     @cached_property
     def sticking_form(self) -> ca.SX:
-        """Matrix ``(JM⁻¹Jᵀ)⁻¹Λ_c(JM⁻¹Jᵀ)⁻¹``, shape (3, 3), whose quadratic form of the world normal is ``S``."""
+        """Matrix ``K = (JM⁻¹Jᵀ)⁻¹Λ_c(JM⁻¹Jᵀ)⁻¹``, shape (3, 3), with ``S = nᵀKn`` for the world normal ``n``."""
         return self._mobility_inverse.T @ self.ellipsoid @ self._mobility_inverse
 
     @cached_property
@@ -184,7 +184,8 @@ class ImpactKernel:
     def grad_S(self) -> ca.SX:
         """Tangent gradient of S, ``2 ∂_q[sᵀJb + rᵀJa − bᵀMa]``, shape (nv,).
 
-        If the normal turns with the robot, ``−2 ∂_q rᵀn(q)`` is added.
+        ``b`` and ``r`` are the adjoint variables of the velocity jump ``a`` and of the impulse ``s``.  If the normal
+        turns with the robot, ``−2 ∂_q rᵀn(q)`` is added.
         """
         x = self._sticking
         r = -self._mobility_inverse @ self.adjoint_velocity(x)

@@ -1,4 +1,4 @@
-"""The impact quantities by dense linear algebra on matrices from Pinocchio, independent of the symbolic kernel.
+"""Compute impact quantities by dense linear algebra with Pinocchio, independently of the symbolic kernel.
 
 The symbolic kernel adds masses to the feet; this module instead solves the KKT system ``[M, −J_sᵀ; J_s, εI]``.  The
 support impulses ``f`` are unknowns of this system.  Computing them as ``−J_s a/ε`` would amplify rounding errors by
@@ -19,13 +19,13 @@ from impact_posture.impact.quantities.impact_quantities import ImpactQuantities
 from impact_posture.impact.quantities.sticking_point import ImpulseResponse, StickingPoint, no_sticking
 from impact_posture.system.arrays import Array
 
-# Number of postures whose matrices are kept, because a search evaluates its starts again.
+# Number of postures whose matrices are stored, because a search evaluates its initial postures repeatedly.
 _KEPT = 32
 
 
 @dataclass(eq=False)
 class _Factorized:
-    """Matrices at one posture, and the impact quantities after they have been computed."""
+    """Matrices at one posture; ``quantities`` is ``None`` until the impact quantities are computed."""
 
     M: Array
     J: Array
@@ -52,7 +52,7 @@ class ImpactOracle:
         self._known: dict[bytes, _Factorized] = {}
 
     def at(self, q: Array) -> ImpactOracle:
-        """Set the posture to ``q``.  The matrices of recent postures are kept and used again."""
+        """Set the posture to ``q``; the matrices of recent postures are stored and reused."""
         q = np.array(q, dtype=float)
         if (key := q.tobytes()) != self._key:
             self.numeric.at(q)
@@ -77,7 +77,7 @@ class ImpactOracle:
     def respond(self, tau: Array, slip: Array | None = None) -> ImpulseResponse:
         """Solve ``M a − J_sᵀf = τ, J_s a + εf = slip`` for ``a`` and ``f``.
 
-        ``tau`` is a vector or a matrix whose columns are solved together.  ``slip`` is zero by default.
+        ``tau`` is a vector, or a matrix with one right-hand side per column.  ``slip`` is zero by default.
         """
         rhs: Array = np.zeros((len(self._kkt), *tau.shape[1:]))
         rhs[: self._nv] = (tau.T * ~self.numeric.locked).T
@@ -97,7 +97,7 @@ class ImpactOracle:
         return np.asarray((self.metric.diagonal(self._nv) * a.T).T)
 
     def quantities(self, q: Array) -> ImpactQuantities:
-        """Return all impact quantities at ``q``.  Recent postures are not computed again."""
+        """Return all impact quantities at ``q``; results for recent postures are stored and reused."""
         known = self.at(q)._known[self._key]
         if known.quantities is not None:
             return known.quantities
@@ -130,7 +130,7 @@ class ImpactOracle:
         return known.quantities
 
     def with_support_impulses(self, a: Array) -> Array:
-        """Return ``a``, followed by the support impulses ``−J_s a/ε`` in the axes of the feet at the last posture."""
+        """Return ``a``, followed by the support impulses ``−J_s a/ε`` in foot axes, at the last posture."""
         f = -self.Js @ a / self.compliance
         parts, start = [a], 0
         for foot in self.feet:
@@ -142,7 +142,7 @@ class ImpactOracle:
     def gradient_H(self, q: Array, normal: Array | None = None) -> Array:
         """Return the tangent gradient of H, shape (nv,).
 
-        ``normal``, shape (3,), replaces the normal of the contact and is stated in the same axes.
+        If given, ``normal``, shape (3,), replaces the normal of the contact; its axes are the same.
         """
         self.at(q)
         normal, n = self._normals(normal)
@@ -190,11 +190,11 @@ class ImpactOracle:
 
     @property
     def axes(self) -> Array:
-        """Axes in which the contact states its normal, as columns in the world at the last posture, shape (3, 3)."""
+        """Axes ``normal_frame`` of the contact at the last posture, as columns in world axes, shape (3, 3)."""
         return np.asarray(self.numeric.placement(self.point).rotation) if self.case.in_contact_frame else np.eye(3)
 
     def _normals(self, normal: Array | None) -> tuple[Array, Array]:
-        """Return ``normal`` (by default the normal of the contact) as stated, and the same normal in world axes."""
+        """Return ``normal``, by default the contact normal, in the axes ``normal_frame`` and in world axes."""
         normal = np.array(self.contact.normal) if normal is None else normal
         return normal, self.axes @ normal if self.case.in_contact_frame else normal
 
@@ -224,9 +224,9 @@ class ImpactOracle:
         return np.array(rows).reshape(-1, self._nv)
 
     def coupling(self, direction: Array, v: Array, in_frame: bool) -> Array:
-        """Return the tangent gradient of ``directionᵀJ(q) v``, shape (nv,).
+        """Return the tangent gradient of ``directionᵀJ(q) v`` for a constant ``v``, shape (nv,).
 
-        The direction is constant in the contact frame if ``in_frame``, else in the world.
+        The direction is constant in the contact frame if ``in_frame`` is true, and otherwise in the world.
         """
         wrench = np.concatenate([direction, np.zeros(3)])
         return self.numeric.coupling_gradient(self.point, wrench, v, in_frame=in_frame)

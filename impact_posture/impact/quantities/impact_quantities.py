@@ -1,4 +1,4 @@
-"""The numbers of one impact at one posture: H, G, V, S, E, the jumps and the effective mass ``1/G``."""
+"""Numeric impact quantities at one posture: H, G, V, S, E, velocity jumps and effective mass ``1/G``."""
 
 from __future__ import annotations
 
@@ -8,7 +8,7 @@ import numpy as np
 
 from impact_posture.system.arrays import Array
 
-# The contact cannot move along the normal if 1/m_eff is below this share of the largest mobility of any direction.
+# The contact is treated as immovable along the normal if G is below this fraction of the largest mobility.
 _BLOCKED = 1e-12
 
 
@@ -29,7 +29,7 @@ class ImpactQuantities:
         ellipsoid: Dynamic impact ellipsoid ``Λ_c``, world axes, shape (3, 3).
         mobility: ``JM⁻¹Jᵀ``, world axes, shape (3, 3), 1/kg.
         normal: World unit normal, shape (3,).
-        support_impulse: Support impulses ``f`` per unit impulse of the impact; the rows of all supports, stacked.
+        support_impulse: Impulses ``f`` of all supports per unit impulse on the contact, shape (rows,).
     """
 
     H: float

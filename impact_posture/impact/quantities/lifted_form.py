@@ -1,4 +1,4 @@
-"""The lifted form of an objective: solutions of linear systems become unknowns and equations of the program."""
+"""The lifted form of an objective, in which the nonlinear program solves the linear systems of the impact."""
 
 from __future__ import annotations
 
@@ -16,21 +16,21 @@ from impact_posture.impact.impact_contact import point_on
 from impact_posture.impact.metric import Metric
 from impact_posture.system.arrays import Array
 
-# Initial distance of t above its lower bounds in each attempt, in units of the scale.  The interior-point method
-# needs a start that satisfies the inequalities strictly.
+# Initial distance of the unknown t of :func:`worst_of` above its lower bounds, for each attempt, in units of the
+# scale.  The interior-point method needs a start that satisfies the inequalities strictly.
 ABOVE = (0.01, 1.0, 0.1)
 
 
 @dataclass(frozen=True)
 class Lifted:
-    """An objective in lifted form: its linear systems are equations of the program.
+    """An objective whose linear systems are equations of the nonlinear program.
 
     Attributes:
-        variables: Auxiliary unknowns, shape (k, 1).
+        variables: Unknowns that the objective adds to the program, shape (k, 1).
         residual: Left sides of the equations ``residual = 0`` that determine the unknowns, shape (r, 1).
         value: The objective as an expression of the configuration and the unknowns.
         inequalities: Expressions that must be ``≤ 0``; they bound the value from below, shape (i, 1).
-        jumps: Unknown jumps whose derivatives are available in closed form.
+        jumps: Unknown velocity jumps whose derivatives are available in closed form.
     """
 
     variables: ca.SX
@@ -48,9 +48,9 @@ class Lifted:
         equations: Sequence[ca.SX] = (),
         inequalities: Sequence[ca.SX] = (),
     ) -> Lifted:
-        """Return a form with the unknowns, equations and inequalities of all parts.
+        """Return a lifted form with the unknowns, equations and inequalities of all ``parts``.
 
-        Further unknowns ``others``, and further ``equations`` and ``inequalities``, come after the parts.
+        The additional unknowns ``others``, the ``equations`` and the ``inequalities`` come last.
         """
         row, column, placed = 0, 0, list[PlacedJump]()
         for part in parts:
@@ -67,7 +67,7 @@ class Lifted:
 
     @property
     def rest(self) -> ca.SX:
-        """The residual without the terms whose derivatives are available in closed form, shape (r, 1)."""
+        """The residual without the terms that have derivatives in closed form, shape (r, 1)."""
         rest = ca.SX(self.residual)
         for jump, row, _ in self.jumps:
             rest[row : row + jump.rest.numel()] = jump.rest
@@ -90,7 +90,7 @@ class Guess:
 
     @staticmethod
     def unbounded(values: Array) -> Guess:
-        """Return a guess with these values and without bounds."""
+        """Return a guess without bounds."""
         return Guess(values, np.full(values.size, -np.inf))
 
     @property
@@ -100,7 +100,7 @@ class Guess:
 
     @staticmethod
     def joined(parts: Sequence[Guess]) -> Guess:
-        """Return one guess with the unknowns of all parts, one part after the other."""
+        """Concatenate guesses."""
         keys = ("values", "lower", "above")
         return Guess(*(np.concatenate([np.zeros(0), *[getattr(part, key) for part in parts]]) for key in keys))
 
@@ -115,9 +115,9 @@ class UnknownJump:
         variables: All unknowns: ``a``, ``f``, and the impulse of the impact if it is unknown.
         residual: ``M a − J_sᵀf − (generalized impulse of the impact)``, then ``J_s a + εf``, then equations that
             determine the impulse of the impact if it is unknown.
-        rest: The terms of the residual that :attr:`derivatives` do not include: the impulse of the impact, and the
-            rows of locked joints.
-        derivatives: Derivatives in closed form of the other terms.
+        rest: The terms of the residual without derivatives in closed form: the impulse of the impact, and the rows
+            of locked joints.
+        derivatives: Derivatives of ``residual − rest`` in closed form.
         compliance: Compliance ε of the supports, 1/kg.
         tree: The kinematic tree.  Each locked joint k has the equation ``a_k = 0``.
         contact_velocity: Velocity jump ``J a`` of the contact point, world axes, shape (3,).
@@ -135,16 +135,16 @@ class UnknownJump:
 
     @property
     def jumps(self) -> tuple[PlacedJump, ...]:
-        """This jump as the first part of a :class:`Lifted`; empty if the jump has no derivatives in closed form."""
+        """The jump as the first part of a :class:`Lifted`; empty if no derivatives exist in closed form."""
         return (PlacedJump(self, 0, 0),) if self.derivatives.exist else ()
 
     def with_impulse(self, impulse: ca.SX, fixing: ca.SX) -> UnknownJump:
-        """Return this jump with the unknown ``impulse`` of the impact and the equations ``fixing = 0`` for it."""
+        """Return a copy with the additional unknowns ``impulse``, which the equations ``fixing = 0`` determine."""
         residual, rest = (ca.vertcat(rows, fixing) for rows in (self.residual, self.rest))
         return replace(self, variables=ca.vertcat(self.variables, impulse), residual=residual, rest=rest)
 
     def known_derivatives(self, multipliers: ca.SX) -> tuple[ca.SX, ca.SX]:
-        """Return Jacobian and Hessian of ``residual − rest`` with respect to chart coordinates, ``a`` and ``f``."""
+        """Return Jacobian and Hessian of ``residual − rest`` for the unknowns (chart coordinates, ``a``, ``f``)."""
         count, locked = self.a.numel(), list(self.tree.locked)
         moving = ca.SX.ones(count)
         moving[locked] = 0
@@ -155,7 +155,7 @@ class UnknownJump:
 
 
 class PlacedJump(NamedTuple):
-    """An unknown jump, with the indices of its first row and its first unknown in a lifted form."""
+    """An unknown velocity jump, with its first row and its first column in the Jacobian of a lifted form."""
 
     jump: UnknownJump
     row: int
@@ -163,7 +163,7 @@ class PlacedJump(NamedTuple):
 
 
 def unknown_jump(case: ImpactCase, tree: Tree, impact: Wrench, label: str = "") -> UnknownJump:
-    """Return the unknowns and equations of the velocity jump that one impulse causes."""
+    """Return the unknowns and equations of the velocity jump that the impulse ``impact`` causes at ``tree.q``."""
     a = ca.SX.sym(f"a{label}", tree.nv)
     velocities = tree.velocities(a)
     feet = [Foot(point_on(case.robot, s.frame, s.offset), s.rows) for s in case.supports]
@@ -192,33 +192,32 @@ def unknown_jump(case: ImpactCase, tree: Tree, impact: Wrench, label: str = "") 
 
 
 def impact_at(case: ImpactCase, impulse: ca.SX) -> Wrench:
-    """Return an impulse at the contact point; ``impulse`` is in the axes in which the contact states its normal."""
+    """Return ``impulse``, in the axes ``normal_frame`` of the contact, as a wrench at the contact point."""
     return Wrench(case.point, impulse, ca.SX.zeros(3), in_frame=case.in_contact_frame)
 
 
 def in_world(case: ImpactCase, tree: Tree, directions: ca.SX) -> ca.SX:
-    """Turn directions (columns) from the axes in which the contact states its normal to world axes."""
+    """Turn directions (columns) from the axes ``normal_frame`` of the contact to world axes."""
     return tree.rotation(case.point) @ directions if case.in_contact_frame else directions
 
 
 def weighed(metric: Metric, first: UnknownJump, second: UnknownJump) -> ca.SX:
-    """Return ``a₁ᵀWa₂``."""
+    """Return ``a₁ᵀWa₂`` for two unknown velocity jumps."""
     if metric.kind == "kinetic":
-        # At a solution of the equations, sᵀJa − ε|f|² has the same value, but with stiff feet, this difference loses
-        # digits by cancellation.
+        # The equations imply a₁ᵀMa₂ = sᵀJa₂ − εf₁ᵀf₂, but with stiff feet this difference loses digits.
         return ca.dot(first.a, second.tree.mass_times(second.a))
     return ca.dot(first.a, ca.SX(metric.diagonal(first.a.numel())) * second.a)
 
 
 def worst_of(parts: Sequence[Lifted | UnknownJump], values: Sequence[ca.SX], scale: ca.SX) -> Lifted:
-    """Return the form with the value ``t · scale`` and ``values[k] ≤ t · scale`` for all k.
+    """Return the lifted form of the maximum of ``values``: ``t · scale`` with ``values[k] ≤ t · scale`` for all k.
 
-    The form has the unknowns and equations of all parts, and the unknown ``t``.
+    The unknowns are ``t`` and the unknowns of all ``parts``.
     """
     t = ca.SX.sym("t")
     return Lifted.of(parts, t * scale, others=[t], inequalities=[v / scale - t for v in values])
 
 
 def worst_of_guesses(parts: Sequence[Guess], largest: float, attempt: int) -> Guess:
-    """Return the guess for :func:`worst_of`, with ``t`` above ``largest``, the maximum in units of the scale."""
+    """Return the guess for :func:`worst_of`; ``largest`` is the maximum in units of the scale."""
     return Guess.joined([*parts, Guess.unbounded(np.array([largest + ABOVE[attempt]]))])

@@ -1,4 +1,4 @@
-"""The jump and the impulse of a contact point that sticks."""
+"""Velocity jump and impulse of a contact point that sticks."""
 
 from __future__ import annotations
 
@@ -10,13 +10,13 @@ from numpy.typing import NDArray
 from impact_posture.errors import MetricError
 from impact_posture.system.arrays import Array
 
-# An eigenvalue of JM⁻¹Jᵀ below this share of the largest eigenvalue is regarded as zero.
+# Eigenvalues of JM⁻¹Jᵀ are treated as zero below this fraction of the largest eigenvalue.
 SINGULAR = 1e-9
 
 
 @dataclass(frozen=True, eq=False)
 class ImpulseResponse:
-    """Velocity jump and support impulses for one generalized impulse ``τ``, or for k of them as columns.
+    """Velocity jump and support impulses for a generalized impulse ``τ``, or for k impulses as columns.
 
     Attributes:
         a: Velocity jump ``(M + J_sᵀJ_s/ε)⁻¹ τ``, shape (nv,) or (nv, k).
@@ -32,7 +32,7 @@ class StickingPoint:
     """A contact point whose velocity is prescribed in the directions in which it can move.
 
     The system ``M a − J_sᵀf − Jᵀs = τ, J_s a + εf = 0, J a = v`` is solved as a whole.  A solution with
-    ``(JM⁻¹Jᵀ)⁻¹`` would be less accurate: in the adjoint of ∇S, the condition number of ``JM⁻¹Jᵀ`` would be squared.
+    ``(JM⁻¹Jᵀ)⁻¹`` would be less accurate, because its condition number would enter the gradient of S squared.
     """
 
     system: Array
@@ -61,9 +61,9 @@ class StickingPoint:
         return bool(np.linalg.norm(self.outside.T @ n) <= np.sqrt(SINGULAR))
 
     def respond(self, *, tau: Array | None = None, velocity: Array | None = None) -> tuple[ImpulseResponse, Array]:
-        """Return the jump and the impulse ``s`` on the point for the impulse ``tau`` and the point velocity ``v``.
+        """Return the velocity jump with support impulses, and the impulse ``s`` on the point.
 
-        Both ``tau`` and ``velocity`` are zero by default.
+        The generalized impulse ``tau`` and the point velocity ``velocity`` are zero by default.
         """
         right, nv = np.zeros(len(self.system)), len(self.mobile)
         size = len(right) - self.axes.shape[1]

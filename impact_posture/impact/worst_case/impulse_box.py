@@ -1,9 +1,10 @@
-"""Several contacts at once: the largest jump if each impulse is within its bounds, which form a box.
+"""Worst case of several simultaneous contacts, each with its own bound on the impulse (a box of impulses).
 
 The squared jump ``‖Σ λ_i a_i‖²_W`` with ``a_i = M⁻¹J_iᵀn_i`` is a convex quadratic function ``λᵀKλ`` of the impulses,
 ``K_ij = a_iᵀWa_j``.  Its maximum over ``0 ≤ λ_i ≤ λ̄_i`` is therefore at a corner of the box.  The origin is not a
-candidate, so ``2^m − 1`` corners remain.  If contacts can pull, the bounds are ``|λ_i| ≤ λ̄_i``.  Opposite corners
-then have the same value, so ``2^(m−1)`` corners suffice.  The program is ``min t`` with ``t ≥ λᵀKλ`` at every corner.
+candidate, so ``2^m − 1`` corners remain for m contacts.  If contacts can pull, the bounds are ``|λ_i| ≤ λ̄_i``.
+Opposite corners then have the same value, so ``2^(m−1)`` corners suffice.  The program is ``min t`` with ``t ≥ λᵀKλ``
+at every corner.
 """
 
 from __future__ import annotations
@@ -47,7 +48,7 @@ class WorstImpulses:
     Attributes:
         value: Value of the objective: ``λᵀKλ`` at the corner.
         impulses: Impulse λ of each contact at the corner, N·s, shape (m,).
-        tied: All corners with the same value, as rows, N·s, shape (k, m); the first row is ``impulses``.
+        tied: All corners that attain ``value``, as rows, N·s, shape (k, m); the first row is ``impulses``.
         jump: Velocity jump ``Δν`` at the corner, shape (nv,).
     """
 
@@ -72,7 +73,7 @@ def check_contacts(contacts: Sequence[ImpactContact], kind: type[ImpactKind], *,
     Raises:
         ContactError: There are too many contacts, two contacts have the same point and normal, or a single contact is
             bilateral.
-        MetricError: There are several contacts, and the kind is per approach speed or there is a cone of normals.
+        MetricError: There are several contacts, and the objective is per approach speed or has a cone of normals.
     """
     if len(contacts) == 1:
         if bilateral:
@@ -101,7 +102,7 @@ def corners(count: int, bilateral: bool) -> Array:
     """
     if bilateral:
         return np.array([[1.0, *rest] for rest in product((1.0, -1.0), repeat=count - 1)])
-    # The corner at which all contacts have their largest impulse is first, so that it is shown if corners tie.
+    # The corner with all impulses at their bounds comes first, so it is reported if several corners are worst.
     rows = sorted(product((1.0, 0.0), repeat=count), key=lambda corner: -sum(corner))
     return np.array(rows[:-1])
 
@@ -111,7 +112,7 @@ class ImpulseBox:
     """Worst case over the corners of the box ``0 ≤ λ_i ≤ λ̄_i``, or ``|λ_i| ≤ λ̄_i`` for bilateral contacts.
 
     Attributes:
-        oracles: The oracle of each contact, the leading contact first.
+        oracles: Numeric impact quantities of each contact, the first contact first.
         bilateral: Whether the contacts can pull as well as push.
         attempts: Number of different initial guesses that :meth:`guess` offers.
     """
@@ -183,7 +184,7 @@ class ImpulseBox:
         return worst_of_guesses(parts, self.value(q) / scale, attempt)
 
     def _impacts(self, n: ca.SX) -> list[Wrench]:
-        """Return the unit impulses of all contacts; ``n`` is the normal of the leading contact."""
+        """Return the unit impulses of all contacts; ``n`` is the normal of the first contact."""
         leading, *others = [oracle.case for oracle in self.oracles]
         return [impact_at(leading, n), *[impact_at(c, ca.SX(np.array(c.contact.normal))) for c in others]]
 

@@ -16,7 +16,7 @@ from impact_posture.impact.quantities.impact_oracle import ImpactOracle
 from impact_posture.impact.quantities.lifted_form import ABOVE, Guess, Lifted, worst_of, worst_of_guesses
 from impact_posture.system.arrays import Array
 
-# A value is regarded as tied with the largest value if it is at most this share below it.
+# A value is treated as equal to the largest value if it is at most this fraction smaller.
 ACTIVE = 1e-6
 
 
@@ -27,7 +27,7 @@ class ModelSet:
     Let ``f_k`` be the objective for the k-th model.  The problem ``min_q max_k f_k(q)`` becomes ``min t`` with ``t ≥
     f_k(q)`` for all k.  Models between the variants are not included;
     :mod:`impact_posture.posture.analysis.robustness` samples them.  ``members`` contains the worst case for each
-    model; the first member is for the robot as modeled.
+    model, first for the nominal model.
     """
 
     members: tuple[WorstCase, ...]
@@ -49,7 +49,7 @@ class ModelSet:
 
     def subgradients(self, q: Array, within: float = 0.0) -> Subgradients:
         tied, gaps = finite_maximum(self.values(q), within)
-        # A member is already ``gap`` below the maximum, so its own members may be ``within − gap`` lower.
+        # The objective for this model is already ``gap`` below the maximum, so only ``within − gap`` remains.
         parts = [self.members[k].subgradients(q, max(within - gap, 0.0)) for k, gap in zip(tied, gaps, strict=True)]
         return Subgradients(
             np.vstack([part.gradients for part in parts]),
@@ -59,8 +59,7 @@ class ModelSet:
     def expressions(self, k: ImpactKernel) -> tuple[ca.SX, ca.SX]:
         pairs = []
         for member in self.members:
-            # A kernel is used only for the model it was built for: with a payload on one limb, other limbs are
-            # repeated.
+            # A model with a payload on one limb has other repeated limbs, so it needs its own kernel.
             case = member.oracle.case
             pairs.append(member.expressions(k if case.robot is k.case.robot else ImpactKernel(case, k.q, k.n)))
         return first_of_largest([value for value, _ in pairs], [gradient for _, gradient in pairs])
@@ -78,21 +77,21 @@ class ModelSet:
 
 
 def finite_maximum(values: Array, within: float = 0.0) -> tuple[NDArray[np.int_], Array]:
-    """Return the indices of the values that tie with the largest value, and their distances below it (gaps).
+    """Return the indices of the largest values, and the gap between each of them and the largest value.
 
-    The index of the leading value is first.  A value ties if it is at most ``within``, or the share :data:`ACTIVE`,
-    below the largest value.
+    A value is included if it is at most ``within``, or the fraction :data:`ACTIVE`, below the largest value.  The
+    index of the largest value comes first.
     """
     largest = float(values.max())
     near = np.flatnonzero(values >= largest - max(ACTIVE * abs(largest), within))
-    # Rounding errors must not determine the leading index, so it is the first of all values equal up to rounding.
+    # Rounding errors must not determine the order, so values that differ only by rounding count as equal here.
     leading = int(np.flatnonzero(values >= largest - 1e-12 * abs(largest))[0])
     order = np.concatenate([[leading], near[near != leading]])
     return order, np.asarray(largest - values[order])
 
 
 def first_of_largest(values: Sequence[ca.SX], choices: Sequence[ca.SX]) -> tuple[ca.SX, ca.SX]:
-    """Return the largest of ``values`` and the entry of ``choices`` with the same index; at a tie, the first."""
+    """Return the first largest entry of ``values``, and the entry of ``choices`` with the same index."""
     largest, choice = values[0], choices[0]
     for value, other in zip(values[1:], choices[1:], strict=True):
         larger = value > largest

@@ -1,9 +1,9 @@
 """The worst normal within a cone: value, gradients, expressions and lifted form.
 
-The kinds ``impulse``, ``sticking`` and ``energy`` depend on the normal through one quadratic form ``nᵀK(q)n``
+The objective types ``impulse``, ``sticking`` and ``energy`` increase with a quadratic form ``nᵀK(q)n``
 (:class:`~impact_posture.impact.kinds.impact_kind.QuadraticKind`).  The largest value of this form over a cone can be
-computed exactly (:mod:`impact_posture.impact.worst_case.worst_normal`).  ``speed`` is not a quadratic form and has no
-such dual.
+computed exactly (:mod:`impact_posture.impact.worst_case.worst_normal`).  ``speed`` is not such a
+function, and its exact worst normal is not known.
 
 In the program, the dual problem replaces the maximum over the normals.  In the axes of the cone (half angle α), let
 ``P(q) = [a, bᵀ; b, C]`` be the matrix of the form, divided by the value of the form at the start.  With ``c = cos α``
@@ -11,9 +11,9 @@ and ``s = sin α``, the program is::
 
     min t,   t = a + sτ,   Z = [τ − ρ, −bᵀ; −b, (st + ρc²) I − sC] = L²,   ρ ≥ 0
 
-``Z`` equals ``D(tI − P − μ(n₀n₀ᵀ − c²I))D`` with ``D = diag(s^-½, s^½, s^½)`` and ``μ = ρ/s``; its entries are
-bounded as α tends to zero.  At mirror-symmetric postures, two eigenvalues of ``Z`` are zero.  At these postures the
-gradient of ``det Z`` vanishes, but the gradient of the equations with the symmetric root ``L`` does not.
+``Z`` equals ``D(tI − P − μ(n₀n₀ᵀ − c²I))D`` with ``D = diag(s^-½, s^½, s^½)`` and ``μ = ρ/s``.  The entries of
+``Z`` stay bounded as α tends to zero.  At mirror-symmetric postures, two eigenvalues of ``Z`` are zero.  At these
+postures the gradient of ``det Z`` vanishes, but the gradient of the equations with the symmetric root ``L`` does not.
 """
 
 from __future__ import annotations
@@ -34,16 +34,16 @@ from impact_posture.impact.worst_case.worst_normal import WorstNormal, cone_axes
 from impact_posture.impact.worst_case.worst_normal_symbolic import cone_axes_symbolic, worst_normal_symbolic
 from impact_posture.system.arrays import Array
 
-# The gradient at a normal belongs to the subdifferential if its value is at most this share below the largest value.
+# A normal contributes a subgradient if its value is less than this fraction of |K| below the largest value.
 _ACTIVE = 1e-7
-# Initial values of τ and ρ minus their solution at the first posture, for each attempt.  Without this distance, L
-# would start with a zero eigenvalue, which is a saddle point for Newton's method.
+# Offsets of the initial τ and ρ from their optimal values, for each attempt.  Without offsets, L would start with a
+# zero eigenvalue, which is a saddle point for Newton's method.
 _INSIDE = ((0.03, 0.01), (0.3, 0.1), (0.003, 0.001))
 _UPPER = ((0, 0), (0, 1), (0, 2), (1, 1), (1, 2), (2, 2))
 
 
 def check_cone(kind: type[ImpactKind], degrees: float) -> None:
-    """Raise MetricError for a kind that is not a quadratic form of the normal, if there is a cone."""
+    """Raise MetricError if ``degrees`` > 0 and the objective type is not a :class:`QuadraticKind`."""
     if degrees and not issubclass(kind, QuadraticKind):
         hint = "choose `objective` impulse, sticking or energy, or `normal_cone` 0"
         raise MetricError(kind.no_cone, where="normal_cone", hint=hint)
@@ -67,27 +67,27 @@ class NormalCone:
         return np.array(self.oracle.contact.normal)
 
     def worst(self, q: Array) -> WorstNormal:
-        """Return the worst normal at ``q``, in the axes in which the contact states its normal.
+        """Return the worst normal at ``q``, in the axes ``normal_frame`` of the contact.
 
-        The attribute ``value`` of the result is the value of the form ``nᵀKn``, not the objective.
+        The attribute ``value`` of the result is ``nᵀKn``, not the objective.
 
         Raises:
-            MetricError: The kind is ``sticking``, and there is a direction in which the contact point cannot move.
+            MetricError: The objective type is ``sticking``, and the contact point cannot move in some direction.
         """
         return worst_normal(self._form(q)[0], self.axis, self.degrees)
 
     def worst_in_world(self, q: Array) -> WorstNormal:
-        """Return :meth:`worst` with its normals in world axes."""
+        """Return :meth:`worst` with normals in world axes."""
         return self.worst(q).turned(self.oracle.at(q).axes)
 
     def value(self, q: Array) -> float:
         return float(self.kind.of_form(np.array(self.worst(q).value)))
 
     def subgradients(self, q: Array, within: float = 0.0) -> Subgradients:
-        """Return one gradient for each worst normal, the leading normal first.
+        """Return one gradient for each worst normal.
 
-        Each gradient is computed for a fixed normal (Danskin).  A normal is included if its objective is at most
-        ``within`` below the maximum.  If an arc or a circle of normals is included, it is sampled densely.
+        Each gradient is computed for a fixed normal (Danskin's theorem).  A normal is included if its objective is at
+        most ``within`` below the maximum.  If an arc or a circle of normals is included, it is sampled densely.
         """
         kind, axis = self.kind, self.axis
         form = self._form(q)[0]
@@ -104,7 +104,7 @@ class NormalCone:
         return Subgradients(slopes[:, None] * gradients, gaps)
 
     def expressions(self, k: ImpactKernel) -> tuple[ca.SX, ca.SX]:
-        """Return value and gradient for the worst normal, which is fixed in the gradient (Danskin)."""
+        """Return value and gradient; the gradient treats the worst normal as constant (Danskin's theorem)."""
         R = in_world(k.case, k.tree, ca.SX.eye(3))
         K = R.T @ self.kind.form_expression(k) @ R
         n = worst_normal_symbolic((K + K.T) / 2, k.n, self.degrees)
@@ -163,11 +163,10 @@ class NormalCone:
         return float(np.cos(alpha)), float(np.sin(alpha))
 
     def _form(self, q: Array, directions: Array | None = None) -> tuple[Array, Array, Array]:
-        """Return ``K`` in the axes of three directions, with the three jumps and the impulses that cause them.
+        """Return ``K`` in the axes ``directions``, three velocity jumps, and the impulses that cause these jumps.
 
-        The directions are columns in the axes in which the normal is stated; by default, they are these axes.  ``K``
-        has shape (3, 3).  The jumps are columns, shape (nv, 3).  The impulses are columns in world axes, shape (3,
-        3).
+        ``directions`` are columns in the axes ``normal_frame`` of the contact, by default the identity.  ``K`` has
+        shape (3, 3).  The jumps are columns, shape (nv, 3).  The impulses are columns in world axes, shape (3, 3).
         """
         world = self.oracle.at(q).axes
         if directions is not None:

@@ -14,11 +14,11 @@ import numpy as np
 
 from impact_posture.system.arrays import Array
 
-# Two values tie if their difference is below this share of |A| sin α, the range of the values in the cone.
+# Two values are treated as equal if they differ by less than this fraction of |A| sin α, the range in the cone.
 TIED = 1e-6
-# Two worst normals are regarded as the same if their distance is below this share of sin α.
+# Two worst normals are treated as the same if their distance is below this fraction of sin α.
 _APART = 1e-2
-# Two values are equal up to rounding if their difference is below this share of |A|.
+# Two values differ only by rounding if their difference is below this fraction of |A|.
 _EQUAL = 1e-14
 _SMALL = float(np.finfo(float).tiny)
 _POLISH = 20
@@ -87,7 +87,8 @@ def worst_normal(A: Array, axis: Array, cone_deg: float) -> WorstNormal:
     candidates = np.vstack([_inside(P, c, s * size), _on_edge(P, c, s, size)])
     values = np.einsum("ki,ij,kj->k", candidates, P, candidates)
     best = float(values.max())
-    # Rounding errors must not determine the leading normal.  Candidates with equal values are sorted by coordinates.
+    # Rounding errors must not determine which normal comes first.  Candidates with equal values are sorted by
+    # coordinates.
     near = [k for k in range(len(candidates)) if values[k] >= best - TIED * s * size]
     near.sort(key=lambda k: (round((best - values[k]) / (_EQUAL * size)), *(-candidates[k])))
     apart: list[Array] = []
@@ -111,7 +112,7 @@ def tied_normals(A: Array, axis: Array, cone_deg: float, worst: WorstNormal, tol
     """Return the normals whose value is at most ``tolerance · |A|`` below the largest value, shape (k, 3).
 
     The worst normal is the first.  If these normals form an arc, a circle or a cap, enough samples are returned to
-    represent its convex hull.
+    represent the convex hull.
     """
     alpha = np.deg2rad(cone_deg)
     size = float(np.abs(A).max())
@@ -119,8 +120,8 @@ def tied_normals(A: Array, axis: Array, cone_deg: float, worst: WorstNormal, tol
     circle = np.stack([np.cos(_GRID), np.sin(_GRID)])
     values, vectors = np.linalg.eigh(A)
     top = vectors[:, values >= values[-1] - tolerance * size]
-    # If two eigenvalues are the largest, their plane cuts the cap in an arc of tied normals.  If all three are equal,
-    # all normals of the cap tie.
+    # If the largest eigenvalue is double, the plane of its eigenvectors cuts the cap in an arc of worst normals.  If
+    # it is triple, all normals of the cap are worst normals.
     tilts = alpha * (np.linspace(0, 1, 9) if top.shape[1] == 3 else np.ones(1))
     rings = [np.vstack([np.full_like(_GRID, np.cos(tilt)), np.sin(tilt) * circle]) for tilt in tilts]
     planes = [top[:, [i, j]] @ circle for i in range(top.shape[1]) for j in range(i)]
@@ -154,7 +155,7 @@ def _inside(P: Array, c: float, size: float) -> Array:
 
 
 def _on_edge(P: Array, c: float, s: float, size: float) -> Array:
-    """Return the maxima of the form on the edge ``n = (c, s cos φ, s sin φ)`` of the cap, one per row.
+    """Return the normals ``(c, s cos φ, s sin φ)`` on the edge of the cap with a local maximum of the form, as rows.
 
     If the form is constant on the edge, three points are added.
     """

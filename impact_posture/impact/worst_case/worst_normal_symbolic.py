@@ -35,7 +35,7 @@ def worst_normal_symbolic(A: ca.SX, axis: ca.SX, cone_deg: float) -> ca.SX:
     """Return the normal, shape (3,), that maximizes ``nᵀAn`` within ``cone_deg`` degrees of ``axis``.
 
     If several normals attain the maximum, one of them is returned.  Do not differentiate this expression: the
-    gradient of the maximum is the gradient of ``nᵀA(q)n`` for a fixed ``n`` (Danskin).
+    gradient of the maximum is the gradient of ``nᵀA(q)n`` for a fixed ``n`` (Danskin's theorem).
     """
     alpha = np.deg2rad(cone_deg)
     c, s = float(np.cos(alpha)), float(np.sin(alpha))
