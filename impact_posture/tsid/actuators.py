@@ -10,13 +10,12 @@ from impact_posture.system.arrays import Array
 
 
 class Actuators:
-    """Decomposition of the actuation matrix ``G``: forces that ``G`` can produce, forces that it cannot, null space.
+    """Actuation matrix ``G = blkdiag(G_b, I)``, with pseudo-inverse, null space and control limits.
 
-    ``G = blkdiag(G_b, I)``.  ``G_b`` (6 × rotors) is constant, because generalized forces are dual to ν.  For a
-    generalized force ``p = Mν̇ + h − …``:
-
-    - ``blindᵀ p_b = 0`` is the unactuated part (6 rows for a legged robot, none for six independent rotors);
-    - ``u = [G_b⁺ p_b + spare w; p_joints]``, where ``w`` chooses among the thrusts of redundant rotors.
+    ``G_b`` (6 × rotors) maps rotor thrusts to the wrench on the base, in base axes.  A generalized force
+    ``p = [p_b; p_joints]`` can be produced only if ``blindᵀ p_b = 0`` (6 equations for a legged robot, none for six
+    independent rotors).  The controls are then ``u = [G_b⁺ p_b + spare w; p_joints]``.  With redundant rotors, ``w``
+    selects one of the possible thrust vectors.
 
     Attributes:
         rotors: Number of rotors.
@@ -27,7 +26,7 @@ class Actuators:
         spare: Orthonormal basis of the null space of ``G_b``, shape (rotors, rotors − rank).
         rank: Rank of ``G_b``.
         lower: Lower limits of rotor thrusts (N), then of joint torques (N·m), shape (controls,).
-        upper: Upper limits in the same order; infinite if the model has no effort limit or the limit zero.
+        upper: Upper limits in the same order; infinite for joints whose effort limit is missing or zero.
         names: Names of the controls.
     """
 
@@ -58,7 +57,8 @@ class Actuators:
     def solve(self, force: Array, spare: Array) -> Array:
         """Return the controls ``u``, shape (controls,), in a new array.
 
-        ``force`` is the generalized force ``p``, shape (nv,).  ``spare`` is ``w``, the choice among redundant rotors.
+        ``force`` is the generalized force ``p``, shape (nv,).  ``spare`` is ``w``, the coordinates of the thrusts in
+        the null space of ``G_b``.
         """
         return np.concatenate([self.inverse @ force[: self.base] + self.spare @ spare, force[self.base :]])
 

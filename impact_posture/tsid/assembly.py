@@ -15,36 +15,36 @@ from impact_posture.tsid.support_contact import ContactStack
 from impact_posture.tsid.task_formulation import TaskFormulation
 from impact_posture.tsid.tasks.task import TaskStack
 
-# Weight of an acceleration without a task, so that the cost has a minimum.
+# Least weight of each acceleration in the cost, so that the minimum is unique.
 _IDLE = 1e-8
-# Weight of a moment (N·m), relative to a force (N).
+# Weight of a squared moment, (N·m)², relative to a squared force, N².
 _MOMENT = 100.0
-# If the singular value of a direction is below this share of the largest, the tasks leave the direction free.
+# The tasks leave a direction free if its singular value is below this share of the largest singular value.
 _REDUNDANT = 1e-6
 
 
 class Assembly:
-    """Buffers of the QP of a formulation, which are filled at each tick.
+    """QP of a formulation, in buffers that each tick fills again.
 
-    The variables are ``z = [ν̇; w; f]``: the accelerations, the choice among redundant rotors, and the contact forces
-    in world axes.  Controls are not variables, because ``u`` follows from ``p = Mν̇ + h − Jᵀf − J_eᵀF̂``
-    (:class:`Actuators`).  The QP has these rows, in this order:
+    The variables are ``z = [ν̇; w; f]``: the accelerations, the thrusts ``w`` in the null space of redundant rotors,
+    and the contact forces in world axes.  Controls are not variables, because ``u`` follows from
+    ``p = Mν̇ + h − Jᵀf − J_eᵀF̂`` (:class:`Actuators`).  The QP has these rows, in this order:
 
     - ``blind``: ``blindᵀ p_base = 0``, the unactuated part of the dynamics;
     - ``contacts``: ``J ν̇ = a`` of the hard contacts;
     - ``levels``: ``J ν̇ = a`` of each strict level;
     - ``controls``: ``u_min ≤ u(z) ≤ u_max``;
     - ``cones``: friction cones;
-    - ``limits``: the row limits of the formulation.
+    - ``limits``: limits of expected impacts (``TaskFormulation.row_limits``).
 
-    The variables ``ν̇`` have the acceleration bounds of the joint limits as bounds.
+    The bounds on ``ν̇`` keep the joints within their limits (:class:`AccelerationBounds`).
 
     Attributes:
         qp: The QP of the last :meth:`build_qp`.
-        rank: The independent rows of the levels, and the QP without the dependent rows.
+        rank: Finds dependent rows of the strict levels, and contains the QP without them.
         levels: Names and rows of the strict levels, the most important first.  If there are hard contacts, the first
             entry is ``contacts``.
-        limits: Indices of the entries of ``[z; A z]`` with bounds from joint limits and row limits.
+        limits: Indices of the entries of ``[z; A z]`` that joint limits or limits of expected impacts bound.
         names: Name of each entry of ``[z; A z]``.
     """
 
@@ -69,8 +69,8 @@ class Assembly:
         self._place_cost(robot)
         self.levels = self._name_levels(hard, levels)
         self.limits = np.concatenate([np.arange(nv), np.arange(qp.n + cones.stop, qp.n + m)])
-        # The unit of forces is the mass times an acceleration of 1.  With a unit of 1 N, least squares would reduce
-        # the contact forces by lifting the robot.
+        # The unit of forces is the mass of the robot times 1 m/s².  With the unit 1 N, a least-squares relaxation
+        # would lift the robot to reduce the contact forces.
         units = np.ones(qp.n)
         units[self._f] = robot.mass
         self.rank = LevelRank(qp, blind.stop, [rows for _, rows in self.levels], nv, units)
@@ -92,7 +92,7 @@ class Assembly:
         self._free = np.zeros(nv)
 
     def reset(self, state: State) -> None:
-        """Read gains and weights again, and make the present places of the contacts their targets."""
+        """Read gains and weights again, and set the targets of the contacts to their present poses."""
         self.strict.refresh(state)
         self.weighted.refresh(state)
         self.contacts.reset(state)
@@ -157,7 +157,7 @@ class Assembly:
         return np.ascontiguousarray(Z if Z.shape[1] else null_space(np.vstack(rows[:2]), _REDUNDANT))
 
     def _at(self, rows: slice) -> slice:
-        """Return the indices that rows of ``A`` have in the bounds."""
+        """Return the slice of ``qp.lower`` and ``qp.upper`` that belongs to rows of ``A``."""
         return slice(self.qp.n + rows.start, self.qp.n + rows.stop)
 
     def _equate(self, rows: slice, value: Array) -> None:
@@ -175,8 +175,8 @@ class Assembly:
         qp.A[thrusts, self._w] = actuators.spare
         self._A_hard, self._A_controls = qp.A[hard, :nv], qp.A[controls]
         self._free_blind, self._known = np.zeros(actuators.blind.shape[1]), np.zeros(actuators.controls)
-        # For each block of the dynamics: its rows, the buffer of its constants, its entries of a generalized force,
-        # and the matrix that maps these entries to the rows (``None`` for the identity).
+        # Each block of the dynamics has four parts: rows of A, a buffer for the constants, entries of a generalized
+        # force, and the matrix that maps these entries to the rows (``None`` for the identity).
         base, joints = slice(actuators.base), slice(actuators.base, nv)
         parts: list[tuple[slice, Array, slice, Array | None]] = [
             (blind, self._free_blind, base, np.ascontiguousarray(actuators.blind.T) if actuators.rotors else None),

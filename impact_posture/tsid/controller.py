@@ -25,15 +25,15 @@ from impact_posture.tsid.task_formulation import TaskFormulation
 from impact_posture.tsid.tasks.impact_robust import ImpactRobustPosture
 from impact_posture.tsid.tasks.task import Task
 
-# Limit on the time step of ramps, in periods, for a tick after a long pause.
+# Largest time step of ramps, in periods of the controller.  A tick after a long pause would otherwise end a ramp.
 _LONGEST = 10
-# From this nv on, LAPACK transforms a dense cost (:class:`WhitenedSolver`).  With smaller nv, LAPACK saves no time.
+# Least nv for which LAPACK factorizes the cost (:class:`WhitenedSolver`).  For smaller robots, this saves no time.
 _LARGE = 20
-# Largest sum of squares of a valid measurement (1e8 m, rad/s or N).
+# A measurement is invalid if the sum of its squares is larger (numbers of about 1e8 m, rad/s or N).
 _ABSURD = 1e16
 # Largest violation of a control limit, relative to the largest limit.
 _EXCESS = 1e-6
-# Damping of a held command, divided by the inertia of each joint, 1/s.
+# Joint damping that is added to a repeated command, divided by the inertia of the joint, 1/s.
 _HOLD = 10.0
 
 
@@ -43,11 +43,11 @@ class Status(Enum):
     SOLVED = "solved"
     """All constraints hold, and strict levels hold as far as their rank permits (``Report.deficient``)."""
     RELAXED = "relaxed"
-    """A strict level gave way to limits (``Report.relaxed``)."""
+    """A strict level does not hold, because limits prevent it (``Report.relaxed``)."""
     INFEASIBLE = "infeasible"
     """No acceleration satisfies the hard constraints.  The previous command is repeated, with damping."""
     UNSOLVED = "unsolved"
-    """The solver gave up, or its answer violates a control limit.  The previous command is repeated, with damping."""
+    """The solver failed, or its answer violates a control limit.  The previous command is repeated, with damping."""
     NON_FINITE = "non-finite"
     """A measurement is not finite, exceeds 1e8, or is not a rotation.
 
@@ -82,10 +82,9 @@ class Report:
 
     Attributes:
         status: Result of the tick.
-        relaxed: Levels and limits that gave way, the most important first.
-        deficient: Levels that do not hold because of their rank and not because of limits.  Levels above determine
-            their motion, their rows contradict each other, or they are damped near a singularity
-            (:class:`LevelRank`).
+        relaxed: Strict levels and limits that more important constraints violate, the most important first.
+        deficient: Strict levels that do not hold because their rows are dependent.  More important levels determine
+            the same motion, rows contradict each other, or the posture is nearly singular (:class:`LevelRank`).
         residuals: Task name → ``ÿ − ÿ*``; the name ``contacts`` stands for all contacts.
         active: Pairs of the name of an active bound and ``lower`` or ``upper``.
         dynamics: Error of the equations of motion, ``‖Mν̇ + h − Gu − Jᵀf − J_eᵀF̂‖_∞``.
@@ -121,7 +120,7 @@ class Controller:
     def __init__(self, robot: Robot, formulation: TaskFormulation, *, period: Positive = 1e-3) -> None:
         """Size all buffers.
 
-        ``period``, s, is the first time step.  Later time steps are at most a fixed multiple of ``period``.
+        ``period``, s, is the first time step of ramps.  Later time steps are at most ten times ``period``.
 
         Raises:
             FrameNotFound: The frame of a task does not exist.
@@ -138,12 +137,12 @@ class Controller:
         # Call ``advance`` only for tasks that define it, because most tasks keep no memory.
         self._advancing = [task for task in self._tasks if type(task).advance is not Task.advance]
         self._ready = False
-        # Square of the largest violation of a control limit that is within the tolerance of the solver.
+        # Square of the largest violation of a control limit that the tolerance of the solver allows.
         limits = np.abs([self.actuators.lower, self.actuators.upper])
         self._excess = (_EXCESS * max(1.0, float(np.max(limits, where=np.isfinite(limits), initial=0.0)))) ** 2
 
     def reset(self, q: ArrayLike, v: ArrayLike) -> Command:
-        """Start again at ``(q, ν)``: set the missing targets of tasks, and clear ramps and warm starts.
+        """Start again at ``(q, ν)``: set task targets that are not set yet, and clear ramps and warm starts.
 
         Returns:
             The first command.  If the first tick fails, the tick returns this command with damping.

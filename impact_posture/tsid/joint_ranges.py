@@ -13,7 +13,7 @@ class JointRanges:
     Attributes:
         lower: Lower position limits, rad or m, shape (nv,).
         upper: Upper position limits, rad or m, shape (nv,).
-        velocity: Velocity limits, rad/s or m/s, shape (nv,); infinite if the model has no limit or the limit zero.
+        velocity: Velocity limits, rad/s or m/s, shape (nv,); infinite if the limit is missing or zero.
         index: Index in ``q`` of each entry of ν with position limits, shape (nv,); arbitrary for the other entries.
     """
 

@@ -1,4 +1,4 @@
-"""Solution of the QP of a tick.  If not all strict levels can hold, the least important level gives way first."""
+"""Solution of the QP of a tick.  If not all strict levels can hold, the least important level is relaxed first."""
 
 from __future__ import annotations
 
@@ -13,11 +13,11 @@ from impact_posture.tsid.qp.daqp_solver import SOLVED, DaqpSolver
 from impact_posture.tsid.qp.hierarchy import Level, lexicographic
 from impact_posture.tsid.qp.quadratic_program import EQUALITY, QP, Solved
 
-# A row whose error is below this share of its terms counts as satisfied.
+# A row counts as satisfied if its error is below this share of the sum of its absolute terms.
 _OFF = 1e-6
-# A row keeps its value if it misses its bounds by more than this, relative to its length times the size of the point.
+# A row that violates a bound by more keeps its value.  Relative to the norm of the row times the norm of z.
 _MISSES = 1e-9
-# Largest violation of a bound that a result may have, in the unit of ``_MISSES``.
+# Largest violation of a bound by a result, relative as for ``_MISSES``.
 _ROUNDING = 1e-13
 # Bound that DAQP treats as infinite, and the settings of DAQP for the scaled program of the cost.
 _FAR, _SETTINGS = 1e30, {"primal_tol": 1e-11, "sing_tol": 1e-13, "iter_limit": 1000}
@@ -29,7 +29,7 @@ _FLAT = 1e-6
 
 @dataclass(frozen=True)
 class Relaxed:
-    """Level or limit that gave way in a tick.
+    """Strict level or limit that did not hold in a tick.
 
     Attributes:
         level: Name of the level, or ``joint limits``.
@@ -46,7 +46,7 @@ class Outcome:
 
     Attributes:
         solved: Solution; ``None`` if not even the relaxed QPs have a solution.
-        relaxed: Levels and limits that gave way, the most important first.
+        relaxed: Strict levels and limits that do not hold, the most important first.
     """
 
     solved: Solved | None
@@ -67,12 +67,12 @@ def solve(assembly: Assembly, solver: DaqpSolver) -> Outcome:
         solver.reset()
     solved = solver.solve(qp)
     if solved is None and not solver.infeasible:
-        # The solver gave up from its warm start, so try a cold start.
+        # The solver failed from the active set of the last tick, so start without an active set.
         solver.reset()
         solved = solver.solve(qp)
     if solved is None and qp.finite:
-        # DAQP can call nearly dependent rows infeasible, so proximal steps decide.  Proximal steps would start from
-        # the last answer in the solver's workspace, so a new solver is used.
+        # DAQP can report nearly dependent rows as infeasible, so solve again with proximal iterations.  Use a new
+        # solver, because proximal iterations would start from the last answer in the old workspace.
         solved = DaqpSolver(qp.n, qp.m, proximal=_FLAT).solve(qp)
     if solved is not None or not qp.finite:
         return Outcome(solved)
@@ -84,11 +84,11 @@ def solve(assembly: Assembly, solver: DaqpSolver) -> Outcome:
 
 
 def _cheapest(qp: QP, units: Array, nearest: Array) -> Solved:
-    """Minimize the cost in the directions that the lexicographic answer ``nearest`` leaves free.
+    """Minimize the cost without a change of the errors of the lexicographic answer ``nearest``.
 
-    Equations, and rows that miss their bounds, keep their values.  The cost is therefore minimized in the null space
-    of these rows: ``z = nearest + W y``.  In the basis ``W``, the cost is a sum of squares.  All other bounds hold.
-    If the free motion is within rounding errors, return ``nearest``.
+    Equations, and rows that violate their bounds, keep their values.  The cost is therefore minimized in the null
+    space of these rows: ``z = nearest + W y``.  In the basis ``W``, the cost is a sum of squares.  All other bounds
+    hold.  Return ``nearest`` if there is no free direction or the solver failed.
     """
     values, rows = qp.values(nearest), np.vstack([np.eye(qp.n), qp.A]) * units
     size, lengths = max(1.0, float(np.max(np.abs(nearest / units)))), np.linalg.norm(rows, axis=1)
@@ -103,7 +103,7 @@ def _cheapest(qp: QP, units: Array, nearest: Array) -> Solved:
     curvatures, axes = np.linalg.eigh((free.T * units) @ qp.H @ (units[:, None] * free))
     largest = float(curvatures[-1])
     W = free @ (axes / np.sqrt(np.maximum(curvatures / largest, _FLATTEST)))
-    # A row that the free directions change only by rounding errors depends on the held rows, so it needs no bound.
+    # Leave out the bounds of rows that change only by rounding errors along the free directions.
     sees = np.linalg.norm(rows @ free, axis=1) > _MISSES
     bound = np.flatnonzero(~held & sees & (np.isfinite(lower) | np.isfinite(upper)))
     seen, g = rows[bound] @ W, W.T @ (units * (qp.H @ nearest + qp.g)) / (size * largest)
@@ -126,10 +126,7 @@ def _cheapest(qp: QP, units: Array, nearest: Array) -> Solved:
 
 
 def missed(assembly: Assembly, z: Array, *, equations: bool) -> tuple[Relaxed, ...]:
-    """Return the strict levels that have errors.
-
-    If ``equations`` is true, compare the rows that are equations; otherwise, compare the rows that lack rank.
-    """
+    """Return the strict levels with errors at ``z``: in their equations, or else in their dependent rows."""
     levels = []
     for name, level in assembly.levels:
         rows = assembly.rank.rows(level, equations)

@@ -131,8 +131,7 @@ class State:
     def center_of_mass(self) -> tuple[Array, Array, Array]:
         """Return position (3,), Jacobian (3, nv) and drift ``J̇ν`` (3,) of the center of mass in the world.
 
-        The first three rows of the dynamics are the linear momentum in base axes.  Hence ``m J_com = R M[:3]`` and
-        ``m J̇_com ν = R h[:3] + m g``.
+        ``M[:3] ν`` is the linear momentum in base axes.  Hence ``m J_com = R M[:3]``, ``m J̇_com ν = R h[:3] + m g``.
 
         Raises:
             InputError: The base is fixed.

@@ -122,7 +122,7 @@ class ContactStack:
         self.cone, self.least = np.zeros((count, self.size)), np.zeros(count)
 
     def reset(self, state: State) -> None:
-        """Make the present places of the contacts their targets."""
+        """Set the targets of the contacts to their present poses."""
         for k, (contact, rows, cone_rows) in enumerate(zip(self.contacts, self.rows, self.cone_rows, strict=True)):
             here = state.at(contact.point)
             self._home[k] = here.position.copy(), here.rotation.copy()
@@ -160,8 +160,8 @@ def point_cone(friction: float) -> Array:
 def surface_cone(friction: float, half_x: float, half_y: float) -> Array:
     """Return the matrix of the contact wrench cone of a rectangular sole, shape (17, 6).
 
-    The cone contains the wrenches at the sole's center that forces in friction pyramids at its four corners can
-    produce (Caron, Pham, Nakamura 2015, "Stability of surface contacts for humanoid robots", eq. 16 to 20).  The
+    The cone contains the wrenches at the center of the sole that friction forces at the four corners can produce
+    (Caron, Pham, Nakamura 2015, "Stability of surface contacts for humanoid robots", eq. 16 to 20).  The
     first row is ``f_z ≥ 0``.  Four rows limit friction, and four rows keep the center of pressure on the sole.  Eight
     rows limit the yaw moment:
     ``−μ(X+Y)f_z + |Y f_x − μ τ_x| + |X f_y − μ τ_y| ≤ τ_z ≤ μ(X+Y)f_z − |Y f_x + μ τ_x| − |X f_y + μ τ_y|``.
@@ -179,7 +179,7 @@ def surface_cone(friction: float, half_x: float, half_y: float) -> Array:
 
 
 def to_world(cone: Array, normal: Array, heading: Array) -> Array:
-    """Return a cone of forces (and moments) in world axes, with z along ``normal`` and x along ``heading``.
+    """Rotate a friction cone to world axes from contact axes, with z along ``normal`` and x along ``heading``.
 
     Raises:
         ContactError: The ``heading`` of a sole is parallel to the normal.

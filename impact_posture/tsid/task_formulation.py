@@ -141,9 +141,7 @@ def legged_formulation(
     force_point: Point | None = None,
     law: LimitLaw | None = LimitLaw(),
 ) -> TaskFormulation:
-    """Return the task stack of Afifi et al. 2026 for a standing robot.
-
-    The tasks, which the contacts constrain, are: center of mass, base orientation, posture.
+    """Return the tasks of Afifi et al. 2026 for a standing robot: center of mass, base orientation and posture.
 
     Args:
         robot: The robot, which stands on the supports of its ``robot.toml``.
@@ -176,10 +174,7 @@ def _manipulator(
     order: Order,
     law: LimitLaw | None,
 ) -> TaskFormulation:
-    """Return the stack of the tasks ``above``, the end effector and the posture.
-
-    If the order is strict, each task is a level of its own.
-    """
+    """Return the stack of the tasks ``above``, the end effector and the posture; one level for each strict task."""
     frame = robot.spec.contact.frame
     if end_effector is None:
         if frame is None:

@@ -18,21 +18,20 @@ from impact_posture.tsid.qp.daqp_solver import DaqpSolver
 from impact_posture.tsid.qp.quadratic_program import QP
 from impact_posture.tsid.state import State
 
-# A smaller ``H/H₀`` is replaced by this value in the square root.
+# Least value of ``H/H₀`` under the square root.
 _LEAST = 1e-8
 # If the sine of the tilt is smaller, the slope of the tilt is set to zero, because the tilt axis is undefined.
 _LEVEL = 1e-6
 # Largest violation of a limit during braking, rad (m) for joints, and a share of the range for static controls.
 _NEAR = 1e-3
-# Largest violation at which the flow may still move along a limit.  It is below ``_NEAR``, because the flow would
-# otherwise slowly cross the limit.
+# Up to this violation, the flow may still move along a limit.  With ``_NEAR``, it would slowly cross the limit.
 _SPENT = 9.9e-4
 # Distance that the flow keeps from the joint limits, rad (m).
 _AIM = 2e-3
-# Distance that the flow keeps from the limits of the static controls, as a share of the range.  The distance is
-# larger, because the slope of the static controls is only estimated.
+# Distance that the flow keeps from the limits of the static controls, as a share of the range.  Their slope is only
+# estimated, so this distance is larger than ``_AIM``.
 _RESERVE = 8e-3
-# Squared length of a row, projected on the constraints, below which the row cannot be corrected.
+# If the squared length of a row in the free directions is smaller, no motion along these directions corrects the row.
 _FLAT = 1e-6
 _PositiveShare = Annotated[float, Demand(lambda value: 0 < value <= 1, "a number above zero, up to 1")]
 
@@ -46,7 +45,7 @@ class FlowOptions:
         speed: Largest speed ``v`` of an entry of ``q_r``, rad/s (m/s).
         acceleration: Largest acceleration ``a``, rad/s² (m/s²).  Two fifths of ``a`` suffice to stop the flow within
             its step.
-        rho: ρ, weight of the squared distance from the start in ``Φ``, per rad², relative to ``H₀``.
+        rho: ρ, weight of the squared distance from the start in ``Φ`` (:class:`FlowDirection`), 1/rad².
         mu: μ, lower bound on the curvature that the flow uses, per rad², relative to ``H₀``.
         epsilon: ε, relative to ``H₀``.  The flow rests if the predicted decrease is below ε and resumes above 4 ε.
         duration: Longest time that the flow moves after each start, s.  Time on a path or at rest is not included.
@@ -54,8 +53,8 @@ class FlowOptions:
         com_margin: Distance of the center of mass from the edges of the support polygon, m.
         tilt: Largest angle between the vertical and :attr:`~impact_posture.robot.robot.Robot.upright`, rad.
         share: Share of the actuators' limits that the static controls at ``q_r`` may use.
-        haste: Share of the remaining actuators' limits that accelerations may use.  Braking before a limit may also
-            use half of the rest.
+        haste: Share that accelerations may use of the control range that the static controls leave.  Braking before a
+            limit may use the share ``(1 + haste)/2``.
         tracking: If the joints of the robot lag behind ``q_r`` by this error, rad (m), the flow stops and waits.
     """
 
@@ -89,7 +88,7 @@ class FlowDirection:
     Attributes:
         B: Estimated curvature of ``H/H₀`` on the constraints, shape (nv, nv).
         T: Estimated slope of the static controls (:class:`StaticControls`), shape (controls, nv).
-        gain: Predicted decrease of ``H/H₀`` by the last step; limited to the first-order prediction.
+        gain: Predicted decrease of ``H/H₀`` by the last step; at most the first-order prediction.
         failures: Number of steps for which the solver failed; each of these steps is zero.
     """
 
@@ -135,8 +134,8 @@ class FlowDirection:
         """Set the rows of the limits at a state with ``ν = 0``.
 
         ``rooms`` are the distances from the center of mass to the edges of the polygon, minus the margin, m, shape
-        (k,).  ``shares`` are the static controls, shape (controls,).  ``coasting`` is the displacement during which
-        the present flow brakes, shape (nv,).  The limits are tightened by this displacement.
+        (k,).  ``shares`` are the static controls, shape (controls,).  ``coasting`` is the displacement of the flow
+        while it brakes, shape (nv,).  The limits are tightened by this displacement.
         """
         upper, lower = self._qp.upper[self._qp.n :], self._qp.lower[self._qp.n :]
         count, k = self._joints.size, self._edges.shape[0]
@@ -180,7 +179,7 @@ class FlowDirection:
         values, vectors = np.linalg.eigh(curvature)
         axes = Z @ (vectors / np.sqrt(np.maximum(np.abs(values), self._mu)))
         step = self._solve(axes, axes.T @ (Z @ slope))
-        # Only a decrease of H is a gain; a decrease in the pull or in the springs is not.
+        # The step also decreases the energies of pull and springs, but only the decrease of H is the gain.
         self.gain = min(self.gain * root, -float(gradient @ step))
         return step
 
@@ -244,7 +243,7 @@ class FlowDirection:
         qp.A[:, :r] = self._rows @ axes
         qp.A[:, r:] = 0.0
         qp.g[:r], qp.g[r:] = slope, 0.0
-        # Start without an active set, because a row that was zero in the last step would otherwise stay inactive.
+        # Clear the active set.  With a warm start, a row that was zero in the last step would stay inactive.
         self._solver.reset()
         solved = self._solver.solve(qp)
         if solved is None:

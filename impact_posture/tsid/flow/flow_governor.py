@@ -11,10 +11,10 @@ from impact_posture.tsid.flow.flow_direction import FlowDirection, FlowOptions
 from impact_posture.tsid.flow.redundancy import Redundancy
 from impact_posture.tsid.flow.zero_moment_point import ZeroMomentPoint
 
-# Number of attempts per candidate: first unchanged, then twice without the part that crosses limits.
+# Attempts per candidate of :meth:`FlowGovernor.change`: first unchanged, then twice without the part that crosses
+# limits.
 _ATTEMPTS = 3
-# Least share of the acceleration that is assumed to be available for braking.  One change can increase the assumed
-# share by at most the same value.
+# Least share of the acceleration that the flow assumes for braking, and largest increase of this share per change.
 _ABLE = 0.1
 # Safety factor of the braking time, because the slopes of the limits change during braking.
 _CAUTION = 1.5
@@ -63,12 +63,16 @@ class FlowGovernor:
     ) -> tuple[Array, bool]:
         """Return the change of the velocity towards a step, shape (nv,), and whether the change only brakes.
 
-        There are three candidates.  In the first, each joint uses its full acceleration, and the change is projected
-        on the constraints.  In the second, all joints change in proportion.  In the third, all joints brake in
-        proportion.  The first two candidates have three attempts each; the last two attempts leave out the part that
-        crosses limits.  The first candidate also leaves out the part that moves the zero moment point too far, unless
-        the change slows the flow down.  The result is the first attempt after which the flow can stop within the
-        limits, with the deceleration that the actuators permitted lately.
+        The function tries three candidates:
+
+        1. Each joint uses its full acceleration, and the change is projected on the constraints.  Unless the change
+           slows the flow down, the part is left out that moves the zero moment point too far.
+        2. The velocity changes straight towards the wanted velocity.
+        3. The velocity decreases without a change of direction.
+
+        Candidates 1 and 2 have three attempts; the last two attempts leave out the part that crosses limits.  The
+        result is the first attempt after which the flow can stop within the limits.  The assumed deceleration is the
+        one that the actuators permitted in the last changes.
 
         ``step`` is ``δ``, shape (nv,).  ``fastest`` is the largest speed of an entry, rad/s (m/s).  The change takes
         ``period`` seconds.  If ``slope`` is ``∇H/H₀``, shape (nv,), the change must not increase ``H``; ``None``
@@ -116,7 +120,7 @@ class FlowGovernor:
         return limited(after, fastest) - self.flow if np.abs(after).max(initial=0.0) > fastest else change
 
     def _braking(self, change: Array, period: float) -> float:
-        """Return the time at constant velocity that equals the motion of one change and the braking after it, s."""
+        """Return the time, s, in which the new velocity covers the way of one change and of the braking after it."""
         return _CAUTION * self.stopping(self.flow + change) / 2 / self._able + period
 
 

@@ -11,17 +11,16 @@ from impact_posture.tsid.flow.redundancy import Redundancy
 
 # Least squared length of a direction, which prevents a division by zero.
 _EMPTY = 1e-24
-# If the part of a direction that is orthogonal to the earlier ones is shorter, the direction is orthogonalized twice,
-# because rounding would otherwise leave the direction inexact.
+# If a direction is shorter after its orthogonalization, rounding errors are large, so it is orthogonalized twice.
 _NEW = 0.1
 
 
 class ProbeDirections:
-    """Unit vectors on the constraints.  A round of r vectors is orthogonal and spans all r free directions.
+    """Unit vectors along the r free directions of the constraints.  Each round of r vectors is orthogonal.
 
     The vectors are projections of fixed directions, because the columns of the basis ``Z`` are not unique.  The
-    entries of the fixed directions are the fractional parts of ``k² φ``, where φ is the golden ratio in 32 bits.
-    These entries are spread like random numbers and are equal, bit for bit, on every machine.
+    entries of the fixed directions are the fractional parts of ``k² φ`` minus 1/2, where φ is the golden ratio in 32
+    bits.  These entries are spread like random numbers and are equal, bit for bit, on every machine.
 
     Attributes:
         count: Number of directions in which the flow has measured.

@@ -14,7 +14,7 @@ from impact_posture.system.arrays import Array
 _SOFT = 2e-2
 # Stiffness of the springs relative to ``H₀``, 1/m²: the energy at an error of 6 mm is about half of ``H₀``.
 _STIFFNESS = 3e4
-# Small regularization for base motions that leave the joints at rest.
+# Added to the diagonal of equations that are singular if the base can move while the joints are at rest.
 _IDLE = 1e-9
 
 
@@ -52,7 +52,7 @@ class Redundancy:
         return cls(Z, (Vt[:rank].T / s[:rank]) @ U[:, :rank].T, springs, stiffness)
 
     def project(self, vector: Array) -> Array:
-        """Return the part of a vector, shape (nv,), that stays on the constraints."""
+        """Return the projection of a vector, shape (nv,), on the free directions."""
         return np.asarray(self.basis @ (self.basis.T @ vector))
 
     def back(self, rate: Array, base: int) -> Array:

@@ -1,7 +1,4 @@
-"""Flow of a reference posture to lower impacts, with limited speed and acceleration.
-
-Contacts and tasks constrain the flow.
-"""
+"""Flow of a reference posture to lower impacts, with limited speed, while contacts and tasks hold."""
 
 from __future__ import annotations
 
@@ -38,9 +35,9 @@ _MOVED = 1e-6
 _REACHED = 0.02
 # Speed below which a flow that is off is set to rest, rad/s (m/s).
 _STILL = 1e-5
-# If the velocity vector is shorter, the flow does not probe its stopping point, which is then too near.
+# At a lower speed, rad/s (m/s), the point where the flow would stop is too near for finite differences.
 _SLOW = 1e-3
-# Number of ticks over which one update is spread.
+# Number of ticks of one update.
 UPDATE_TICKS = 14
 # Tick of the first change of the motion in an update; number of ticks from the second change to the next evaluation.
 _UNTIL, _SINCE = 4, 3
@@ -67,7 +64,7 @@ class ReferenceFlow:
         value: ``H(q_r)`` at the last update.
         start: ``H₀``, the absolute value of ``H`` at the reset.
         on: Whether the flow may move.
-        resting: Whether the flow rests, because the predicted decrease is below ε or its time is over.
+        resting: Whether the flow rests, because the predicted decrease of ``H`` is too small or the time is over.
         failed: Whether the last evaluation raised an exception or was not finite; the flow then brakes.
         led: Tasks that follow the flow.
         error: Errors of contacts and tasks at the last update, m and rad, then zeros for held joints.
@@ -183,7 +180,7 @@ class ReferenceFlow:
         return self.on or bool(self.velocity.any())
 
     def _look(self) -> None:
-        """Evaluate objective, constraints and limits at ``q_r`` as predicted for the next change of the motion.
+        """Evaluate objective, constraints and limits at the predicted ``q_r`` of the next change of the motion.
 
         Update the curvature estimates from the differences to the last evaluation.
         """
@@ -265,7 +262,7 @@ class ReferenceFlow:
             self._wanted[:] = 0.0
 
     def _govern(self, measured: Array) -> None:
-        """Set the acceleration of the flow: limited, and with the return to contacts and tasks."""
+        """Set the acceleration of the flow, which includes the return to contacts and tasks, within all limits."""
         options = self.options
         period, self._elapsed = self._elapsed, 0.0
         if not period > 0:

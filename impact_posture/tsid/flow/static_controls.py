@@ -14,11 +14,11 @@ from impact_posture.tsid.actuators import Actuators
 from impact_posture.tsid.state import State
 from impact_posture.tsid.support_contact import SupportContact
 
-# Weight of a moment (N·m), relative to a force (N), in the choice of contact wrenches.
+# Weight of a moment (N·m), relative to a force (N), in the norm of contact wrenches.
 _MOMENT = 100.0
 # Accelerations may always use at least this share of the half range of a control.
 _LEFT = 0.1
-# Share of the weight of which each sole carries an equal part.
+# Each of n soles carries at least this share of the weight, divided by n.
 _EVEN = 0.6
 # If the direction of an edge is within this angle of −π, rad, the edge is sorted as if its direction were +π.
 _START = 1e-8
@@ -31,7 +31,7 @@ class StaticControls:
     """Static controls ``u = G⁺(h − Jᵀf)``, measured from the middle of the control ranges.
 
     At ±1, a control reaches the permitted share of its limits.  Of all contact wrenches ``f`` that carry the base,
-    the result uses those with the least weighted norm.  Redundant rotors share the load evenly.
+    the result uses the wrenches with the least weighted norm.  Redundant rotors share the load evenly.
 
     Attributes:
         limited: Controls that have limits, shape (m,).
@@ -43,12 +43,12 @@ class StaticControls:
         self.limited = np.flatnonzero(np.isfinite(actuators.upper) & np.isfinite(actuators.lower))
         lower, upper = actuators.lower[self.limited], actuators.upper[self.limited]
         self._middle, self._half = (upper + lower) / 2, share * (upper - lower) / 2
-        # The full limits, and the least range for accelerations if the start needs more than its share.
+        # Full range, and least range that accelerations may use; both in units of the permitted half range.
         self._whole, self._least = 1.0 / share, _LEFT / share
         wrench = np.array([1.0] * 3 + [_MOMENT] * 3)
         self._ease = 1.0 / np.concatenate([np.zeros(0), *(wrench[: c.size] for c in contacts)])
         self._count, self._base = self._ease.size, base
-        # u = inverse · force, where the contact forces are already subtracted from the force.
+        # Maps a generalized force, without the part that contacts produce, to the controls.
         self._inverse = np.linalg.pinv(actuators.G, rcond=1e-9)[self.limited] / self._half[:, None]
         # Generalized forces of the contacts per unit wrench on the base, shape (nv, base).
         self._carried = np.zeros((actuators.G.shape[0], base))
@@ -100,11 +100,11 @@ class StaticControls:
 def support_edges(state: State, contacts: Sequence[SupportContact]) -> tuple[Array, Array]:
     """Return ``n`` (k, 2) and ``b`` (k,) of the polygon ``n·c + b ≤ 0`` of the feet on level ground, m.
 
-    If the center of mass ``c`` is in the polygon, each sole carries at least its equal part of 60 % of the weight.
-    A sole without load would leave the ground at the smallest push.  For this, each corner of a sole is moved towards
-    the mean of the same corners of all soles.  Point feet are not moved, because three of four feet can carry a
-    robot.  If the feet do not span an area, the center of mass must not move.  The result is then four edges with
-    infinite ``b``.
+    If the center of mass ``c`` is in the polygon, each of n soles carries at least 60 %/n of the weight, because a
+    sole without load would leave the ground at the smallest push.  To achieve this, each corner of a sole is moved
+    towards the mean of the same corners of all soles.  Point feet are not moved, because three of four feet can carry
+    a robot.  If the feet do not span an area, the result is four edges with infinite ``b``, which prevent any motion
+    of the center of mass.
 
     Raises:
         InputError: There are contacts, but the base is fixed and carries weight, too.
@@ -126,8 +126,7 @@ def support_edges(state: State, contacts: Sequence[SupportContact]) -> tuple[Arr
     if edges is None:
         return np.vstack([np.eye(2), -np.eye(2)]), np.full(4, np.inf)
     normals, offsets = edges
-    # The order is the same as in the C code, which begins at the leftmost corner, because the result depends on the
-    # order of the edges.
+    # Sort the edges from the leftmost corner, as the C code does, because the motion depends on their order.
     turn = np.arctan2(normals[:, 1], normals[:, 0])
     order = np.argsort(np.where(turn < _START - np.pi, np.pi, turn))
     return normals[order], -offsets[order]

@@ -13,9 +13,9 @@ from impact_posture.tsid.support_contact import SupportContact
 
 # Share of the distance from the center of mass to an edge that accelerations may use.
 _SHARE = 0.8
-# A smaller distance from the center of mass to an edge is replaced by this distance, m.
+# Least distance from the center of mass to an edge in the bounds, m.
 _LEAST = 0.01
-# Squared length of a row, projected on the constraints, below which the row cannot be corrected.
+# If the squared length of a row in the free directions is smaller, no motion along these directions corrects the row.
 _TINY = 1e-12
 
 
@@ -24,7 +24,8 @@ class ZeroMomentPoint:
 
     The ground forces equal the first six rows of ``h + M ν̇``: a force ``f`` and a moment ``τ`` about the base
     origin ``p``.  With the ``height`` of ``p`` above the ground, the moments about horizontal axes vanish at
-    ``z = (p_x − (τ_y + height f_x)/f_z, p_y + (τ_x − height f_y)/f_z)``.  Hence ``f_z (n·z + b)`` is linear in ``ν̇``.
+    ``z = (p_x − (τ_y + height f_x)/f_z, p_y + (τ_x − height f_y)/f_z)``.  Hence ``f_z (n·z + b)`` is linear in
+    ``ν̇``.
     """
 
     def __init__(self, edges: Array, offsets: Array, state: State, contacts: Sequence[SupportContact]) -> None:

@@ -13,8 +13,8 @@ from impact_posture.tsid.qp.quadratic_program import EQUALITY, INEQUALITY
 
 # Bounds are scaled so that none exceeds this value, because the tolerances of DAQP are absolute.
 _LARGEST = 1e4
-# Tolerances within which a row is at its bound, relative to the length of the row times the size of the point.  The
-# refinement uses the first tolerance that does not make the answer worse.
+# Within this tolerance, a row counts as being at its bound, relative to the norm of the row times the norm of z.  The
+# refinement uses the first of these values that does not make the answer worse.
 _AT = (1e-9, 1e-8, 1e-7, 1e-6, 1e-5, 1e-4)
 # Singular values of rows below this value, relative to the spectral norm, are treated as zero.
 _RANK = 1e-9
@@ -38,7 +38,7 @@ def lexicographic(levels: Sequence[Level], units: Array | float = 1.0) -> Array 
     The violation of a level is the norm of the violations of its rows.  DAQP determines which rows are violated and
     which bounds are reached.  A refinement then treats these rows as equations and gives full precision.
 
-    ``units`` are typical sizes of the variables, shape (n,).  Return ``None`` if the solver gave up.
+    ``units`` are typical sizes of the variables, shape (n,).  Return ``None`` if the solver failed.
     """
     levels = [level for level in levels if level.lower.size]
     z = _nearest(levels)
@@ -52,7 +52,7 @@ def lexicographic(levels: Sequence[Level], units: Array | float = 1.0) -> Array 
     if missed:
         whole = _stacked(scaled[: missed + 1])
         if _holds(whole, _onto(whole, y)):
-            # DAQP violated a level that can hold, so solve again with this level joined to the first level.
+            # DAQP violated a level that can hold.  Join all levels down to this level, and solve again.
             return lexicographic([_stacked(levels[: missed + 1]), *levels[missed + 1 :]], units)
     return np.asarray(units * y)
 
@@ -128,7 +128,7 @@ def _onto(level: Level, y: Array) -> Array:
 
 
 def _nearest(levels: Sequence[Level]) -> Array | None:
-    """Return the solution of the hierarchical programs of DAQP, with about six digits; ``None`` if DAQP gave up.
+    """Return the solution of the hierarchical programs of DAQP, with about six digits; ``None`` if DAQP failed.
 
     DAQP divides each violation by the length of its row.  Therefore, a rotation (:func:`balanced`) first gives all
     equations of a level the same length.  The rotation does not change the sum of squares.

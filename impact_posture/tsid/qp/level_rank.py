@@ -14,8 +14,8 @@ from impact_posture.tsid.smooth_step import smooth
 # A direction is damped if its singular value, divided by the length of the level's longest row, is smaller than this.
 # In their home postures, all robots of the package are above 0.03.
 SINGULAR = 2e-2
-# Directions below this share of SINGULAR are removed.  The share is far above rounding errors, but too small for a
-# visible effect.
+# Directions whose singular value is below this share of SINGULAR are removed.  The share is far above rounding
+# errors, but too small for a visible effect.
 _NOTHING = 1e-9
 # Least 1 − α, which bounds the weight of a damped row for the solver.
 _LEAST = 1e-8
@@ -39,8 +39,8 @@ class LevelRank:
       The levels below can use the direction with the factor ``√(1 − α)``.
 
     The result depends only on the present rows and on their lengths at reset.  While all rows are independent, the QP
-    does not change.  A singular value changes at most by the change of the matrix (Weyl 1912), so most ticks detect
-    independent rows without a decomposition.
+    does not change.  A singular value changes at most by the norm of the change of the matrix (Weyl 1912), so most
+    ticks detect independent rows without a decomposition.
 
     Attributes:
         qp: The QP to solve.

@@ -19,7 +19,7 @@ class Phase(Enum):
     RELEASE = "release"
 
 
-# Phases that may follow each phase by a call of ``enter``.  RELEASE changes to FREE without a call.
+# Phase → phases that a call of ``enter`` may start next.  RELEASE changes to FREE without a call.
 _FOLLOWS = {
     Phase.FREE: (Phase.BRACE,),
     Phase.BRACE: (Phase.CONTACT, Phase.RELEASE),

@@ -109,7 +109,7 @@ class CenterOfMass(TargetTask[Array]):
 
 
 class BodyTaskLead:
-    """Moves the targets of center of mass and base orientation along a reference motion."""
+    """Move the targets of center of mass and base orientation along a reference motion."""
 
     def __init__(self, model: pin.Model) -> None:
         self._model, self._data = model, model.createData()

@@ -27,7 +27,7 @@ Spring = Literal["keep", "release", "follow"]
 
 # Step of the central differences of the gradient, rad.
 _STEP = 1e-5
-# Lower bound on the curvature scale, per rad², as a share of H.
+# Lower bound on the curvature scale ``λ``, as a share of H, per rad².
 _FLAT = 1e-3
 
 
@@ -51,7 +51,7 @@ def gradient_of(export: ImpactGradient, normal: ArrayLike | None = None) -> Grad
 
 
 def fitting_gradient(robot: Robot, gradient: Gradient | ImpactGradient) -> Gradient:
-    """Return the gradient as a function.
+    """Return a gradient function, or the gradient function of a compiled export (:func:`gradient_of`).
 
     Raises:
         ManifestMismatch: The export belongs to another robot.
