@@ -82,7 +82,7 @@ class Report:
 
     Attributes:
         status: Result of the tick.
-        relaxed: Strict levels and limits that more important constraints violate, the most important first.
+        relaxed: Strict levels and limits that more important constraints prevent, the most important first.
         deficient: Strict levels that do not hold because their rows are dependent.  More important levels determine
             the same motion, rows contradict each other, or the posture is nearly singular (:class:`LevelRank`).
         residuals: Task name → ``ÿ − ÿ*``; the name ``contacts`` stands for all contacts.

@@ -11,8 +11,7 @@ from impact_posture.tsid.flow.flow_direction import FlowDirection, FlowOptions
 from impact_posture.tsid.flow.redundancy import Redundancy
 from impact_posture.tsid.flow.zero_moment_point import ZeroMomentPoint
 
-# Attempts per candidate of :meth:`FlowGovernor.change`: first unchanged, then twice without the part that crosses
-# limits.
+# Attempts per candidate of `change`: first unchanged, then twice without the part that crosses limits.
 _ATTEMPTS = 3
 # Least share of the acceleration that the flow assumes for braking, and largest increase of this share per change.
 _ABLE = 0.1
@@ -120,7 +119,7 @@ class FlowGovernor:
         return limited(after, fastest) - self.flow if np.abs(after).max(initial=0.0) > fastest else change
 
     def _braking(self, change: Array, period: float) -> float:
-        """Return the time, s, in which the new velocity covers the way of one change and of the braking after it."""
+        """Return the time, s, in which the new velocity covers the distance of one change and the braking after it."""
         return _CAUTION * self.stopping(self.flow + change) / 2 / self._able + period
 
 

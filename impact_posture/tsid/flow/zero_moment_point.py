@@ -24,8 +24,7 @@ class ZeroMomentPoint:
 
     The ground forces equal the first six rows of ``h + M ν̇``: a force ``f`` and a moment ``τ`` about the base
     origin ``p``.  With the ``height`` of ``p`` above the ground, the moments about horizontal axes vanish at
-    ``z = (p_x − (τ_y + height f_x)/f_z, p_y + (τ_x − height f_y)/f_z)``.  Hence ``f_z (n·z + b)`` is linear in
-    ``ν̇``.
+    ``z = (p_x − (τ_y + height f_x)/f_z, p_y + (τ_x − height f_y)/f_z)``.  Hence ``f_z (n·z + b)`` is linear in ``ν̇``.
     """
 
     def __init__(self, edges: Array, offsets: Array, state: State, contacts: Sequence[SupportContact]) -> None:

@@ -14,7 +14,7 @@ from impact_posture.tsid.smooth_step import smooth
 # A direction is damped if its singular value, divided by the length of the level's longest row, is smaller than this.
 # In their home postures, all robots of the package are above 0.03.
 SINGULAR = 2e-2
-# Directions whose singular value is below this share of SINGULAR are removed.  The share is far above rounding
+# Directions are removed if their singular value is below this share of SINGULAR.  The share is far above rounding
 # errors, but too small for a visible effect.
 _NOTHING = 1e-9
 # Least 1 − α, which bounds the weight of a damped row for the solver.
