@@ -119,7 +119,7 @@ class FlowGovernor:
         return limited(after, fastest) - self.flow if np.abs(after).max(initial=0.0) > fastest else change
 
     def _braking(self, change: Array, period: float) -> float:
-        """Return the time, s, in which the new velocity covers the distance of one change and the braking after it."""
+        """Return the time, s, in which the new velocity covers the distance of the change and of the braking."""
         return _CAUTION * self.stopping(self.flow + change) / 2 / self._able + period
 
 
