@@ -1,4 +1,4 @@
-"""Divide a graph into blocks.  Each block becomes a C function, and the exported functions call the blocks."""
+"""Divide a graph of operations into blocks.  Each block becomes a C function that the exported functions call."""
 
 from __future__ import annotations
 
@@ -30,13 +30,13 @@ class Block:
 
 @dataclass(frozen=True)
 class Layout:
-    """Blocks of a graph, and places for the values that later blocks use.
+    """Blocks of a graph, and array indices for the values that later blocks use.
 
     Attributes:
         graph: The graph.
         blocks: The blocks in the order in which they are called.
-        inlined: Nodes without a statement of their own, computed as part of the statement of their only user.
-        slots: Node that a later block uses → index of its value in the work array for its width.
+        inlined: Nodes that are computed inside the statement of the only operation that uses them.
+        slots: Node that a later block uses → index of its value in the work array.  Each width has a work array.
         sizes: Width → length of the work array for values of this width.
         angles: Input nodes whose sine and cosine are computed, in the order of the arrays of sines and cosines.
         trig: Sine or cosine node → index of its first value in the array of sines or cosines.
@@ -62,7 +62,7 @@ def lay_out(graph: Graph, functions: Sequence[Sequence[str]], block: int = _BLOC
     angles, trig = _trig(graph, order)
     leaves = frozenset(k for k in order if graph.nodes[k].op in ("const", "in", "lane") or k in trig)
     needed = _needed(graph, functions, leaves)
-    # Drop nodes that are needed only for the arrays of sines and cosines; no statement computes them.
+    # Remove nodes that only the arrays of sines and cosines need, because no statement computes them.
     order = [k for k in order if k in needed]
     users: dict[int, list[int]] = {}
     for k in order:
@@ -95,8 +95,8 @@ def lay_out(graph: Graph, functions: Sequence[Sequence[str]], block: int = _BLOC
 def _slots(graph: Graph, blocks: Sequence[Block], last: Mapping[int, int]) -> tuple[dict[int, int], dict[int, int]]:
     """Return indices in the work arrays for values that later blocks use, and the lengths of the arrays.
 
-    All functions call blocks in the same order.  Therefore an index can be used again after the ``last`` block that
-    uses its value.
+    All functions call blocks in the same order.  Therefore an index can store another value after the ``last`` block
+    that uses the first value.
     """
     slots: dict[int, int] = {}
     sizes: dict[int, int] = {}
@@ -128,10 +128,9 @@ def _sources(graph: Graph, leaves: Set[int], k: int) -> list[int]:
 
 
 def _depth_first(graph: Graph, roots: Sequence[int]) -> list[int]:
-    """Return the nodes that the roots need, in an order in which operands come shortly before their users.
+    """Return the nodes that the roots need.  Each operand comes shortly before the operation that uses the operand.
 
-    The operand with the longest chain of operations is the last operand in this order, so that its result is used
-    immediately.
+    The operand with the longest chain of operations comes last, so that its result is used immediately.
     """
     depth: list[int] = []
     for node in graph.nodes:
@@ -153,10 +152,7 @@ def _depth_first(graph: Graph, roots: Sequence[int]) -> list[int]:
 
 
 def _trig(graph: Graph, order: Sequence[int]) -> tuple[tuple[int, ...], dict[int, int]]:
-    """Return ``angles`` and ``trig`` of :class:`Layout`.
-
-    Vectors come first, so that each vector starts at a multiple of its width.
-    """
+    """Return ``angles`` and ``trig`` of :class:`Layout`; vectors come first, which aligns them."""
     trigonometric = [k for k in order if graph.nodes[k].op in (SINE, COSINE)]
     starts: dict[int, int] = {}
     angles: list[int] = []
@@ -192,11 +188,7 @@ def _inlined(
     outputs: set[int],
     needed: Mapping[int, frozenset[int]],
 ) -> set[int]:
-    """Return the nodes that can be part of the statement of another node.
-
-    Such a node is an arithmetic operation that is used only once, by another arithmetic operation of the same
-    functions.
-    """
+    """Return the arithmetic operations that only one other arithmetic operation of the same functions uses."""
     size: dict[int, int] = {}
     inlined: set[int] = set()
     for k in order:

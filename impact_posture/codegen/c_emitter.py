@@ -1,8 +1,8 @@
 """Write C99 code for a layout.
 
 A block is a function without branches.  Its values are local variables, or entries of work arrays if later blocks use
-them.  Names are short, because the code of a humanoid has ten thousand operations.  Vectors use an extension of GCC
-and Clang, in which arithmetic operators also apply to vectors.
+the values.  Names are short, because the code of a humanoid has ten thousand operations.  Vectors use an extension of
+GCC and Clang, in which arithmetic operators also apply to vectors.
 """
 
 from __future__ import annotations
@@ -15,15 +15,15 @@ from impact_posture.codegen.block_layout import Block, Layout
 from impact_posture.codegen.c_literals import Real
 from impact_posture.codegen.expression_graph import COSINE, Node
 
-# Length of a reference to a constant in a table, such as K[1234].  Literals that are shorter are written directly.
+# Length of a reference to a constant in a table, such as K[1234].  Shorter literals are written directly.
 _PLACE = 7
 SHORT_NAMES = ("APART", "K", "K2", "K4", "V2", "V2u", "V4", "V4u", "VN")
 """Names of the macros that the generated C file defines, and undefines at its end."""
 
 # Arrays that can be parameters of a block in addition to the inputs: sines, cosines, and work arrays by width.
 _SHARED = ("s", "c", "w", "w2", "w4")
-# A compiler splits vectors that are wider than the vectors of the processor.  Without optimization, it stores both
-# the parts and the whole vector, which takes twice the stack.
+# A compiler splits vectors that are wider than the vectors of the processor.  Without optimization, the compiler
+# stores the whole vector and its parts, which takes twice the stack.
 _HALVES = 2
 
 
@@ -46,7 +46,7 @@ class BlockText:
 
 
 class Constants:
-    """Tables of the constants in the blocks of a library; a reference to a table is shorter than the number."""
+    """C tables of the constants of a library, because a reference to a table is shorter than the number."""
 
     def __init__(self, prefix: str, real: Real) -> None:
         self._prefix, self._real = prefix, real
@@ -115,7 +115,7 @@ class Emitter:
         self.blocks = [self._block(number, block) for number, block in enumerate(layout.blocks)]
 
     def output(self, k: int, work: str = "m.") -> str:
-        """Return a C expression for the value of node ``k``, which is valid after the blocks have been called."""
+        """Return a C expression for the value of node ``k``, valid after the calls of the blocks."""
         node = self._graph.nodes[k]
         if node.op == "const":
             return self._real.literal(node.value[0])
@@ -167,7 +167,7 @@ class Emitter:
         )
 
     def _vector_bytes(self, block: Block) -> int:
-        """Return the total size, bytes, of all vectors that a block computes, including vectors within statements."""
+        """Return the total size of all vectors that a block computes, including vectors within statements, bytes."""
         total, waiting = 0, list(block.nodes)
         while waiting:
             node = self._graph.nodes[waiting.pop()]
@@ -178,8 +178,7 @@ class Emitter:
     def _expression(self, k: int, number: int, names: dict[int, str], lines: list[str], *, top: bool = False) -> str:
         """Return a C expression for node ``k``: a variable, an array element, or the operation itself.
 
-        An operation is in parentheses unless ``top``, that is, unless the expression is the right side of a
-        statement.
+        An operation is in parentheses, except as the right side of a statement (``top``).
         """
         node = self._graph.nodes[k]
         if not top and k in names:

@@ -1,4 +1,4 @@
-"""Write numbers as C text: the number type of an export, literals, and initializers of arrays."""
+"""Write numbers as C text: floating-point type of an export, literals, and initializers of arrays."""
 
 from __future__ import annotations
 
@@ -21,7 +21,7 @@ class Real:
     Attributes:
         name: C name of the type, ``double`` or ``float``.
         size: Size of a number, bytes.
-        unit_tolerance: Largest permitted difference between the norm of a quaternion (or cosine-sine pair) and one.
+        unit_tolerance: Largest permitted difference from 1 of the norm of a quaternion or cosine-sine pair.
     """
 
     name: str
@@ -70,7 +70,7 @@ REALS = {real.name: real for real in (DOUBLE, FLOAT)}
 
 
 def c_double(value: float) -> str:
-    """Return a C literal with exactly this value as a double; a negative literal is in parentheses."""
+    """Return the C literal of a double, without rounding; a negative literal is in parentheses."""
     if math.isnan(value):
         return "NAN"
     text = "INFINITY" if math.isinf(value) else repr(abs(value))

@@ -1,4 +1,4 @@
-"""C identifiers of an export, and names of the files that building an export creates."""
+"""C identifiers of an export, and names of the files that a build of an export creates."""
 
 from __future__ import annotations
 
@@ -8,7 +8,7 @@ from impact_posture.errors import InputError
 from impact_posture.system.escape import identifier
 
 _IDENTIFIER = re.compile(r"[A-Za-z][A-Za-z0-9_]*")
-# Names of headers of the C library.  A file <prefix>.h with the same name would hide the header.
+# Names of headers of the C library.  A file <prefix>.h with one of these names would hide the header.
 _C_HEADERS = frozenset(
     "assert complex ctype errno fenv float inttypes iso646 limits locale math setjmp signal stdarg stdbool stddef"
     " stdint stdio stdlib string tgmath time wchar wctype".split()
@@ -22,7 +22,7 @@ def products(prefix: str) -> tuple[str, ...]:
 
 
 def c_identifier(robot: str, frame: str) -> str:
-    """Return robot and frame name as one C identifier; underscores replace characters that C does not allow."""
+    """Return robot name and frame name as one C identifier; underscores replace characters that C does not allow."""
     text = identifier(f"{robot}_{frame}")
     return text if _IDENTIFIER.fullmatch(text) else f"robot_{text}".rstrip("_")
 

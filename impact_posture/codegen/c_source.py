@@ -19,7 +19,7 @@ from impact_posture.config.cached_values import read_stored, write_stored
 from impact_posture.system.libraries import source_key
 
 LARGEST_VECTOR = 64
-"""Size of the widest vectors, bytes.  Groups of narrower vectors in a batch have at most this size in total."""
+"""Size of the widest vectors, bytes.  A batch computes narrower vectors in groups of at most this total size."""
 
 # Stack bytes for return addresses, saved registers, alignment and the variables of the small functions.  The macro
 # APART prevents the compiler from inlining blocks, so the stack contains the variables of only one block at a time.
@@ -28,8 +28,8 @@ _FRAMES = 2048
 # vectors, which takes up to this many times the stack.
 _SPILL = 2
 
-# Largest number of statements in a block of a batch.  A block of this length stays in the first-level cache while the
-# groups are computed one after the other.
+# Largest number of statements in a block of a batch.  The instructions of such a block stay in the first-level cache
+# while the block computes one group of configurations after the other.
 _BATCH_BLOCK = 60
 
 
@@ -44,14 +44,13 @@ class CSource:
         angles: Index in ``q`` of each angle whose sine and cosine are computed.
         room: Length of the arrays of sines and cosines.
         work: C type, name and length of each work array.
-        functions: One entry for each function of a single configuration.  Keys: ``stem``, ``name``, ``normal`` (the
-            constant normal; ``None`` if the normal is a parameter), ``calls`` (statements that call the blocks),
+        functions: Template variables of each function that computes one configuration: ``stem``, ``name``, ``normal``
+            (the constant normal; ``None`` if the normal is a parameter), ``calls`` (statements that call the blocks),
             ``outputs`` (target, value, whether the value is constant), and ``finite`` (name and length of each
             result).
-        batches: One entry for each objective of one contact.  Keys: ``stem``, ``normal``, ``scale`` (C literal of the
-            ratio of the objective to ``H``; empty if the objective is not a multiple of ``H``), ``blocks``, and, if
-            there are blocks, ``angles``, ``room``, ``work`` and ``outputs``.  If ``blocks`` is empty, the batch is a
-            loop over single calls.
+        batches: Template variables of each batch function: ``stem``, ``normal``, ``scale`` (C literal of the ratio of
+            the objective to ``H``; empty if the ratio is not constant), and ``blocks``.  With blocks also ``angles``,
+            ``room``, ``work`` and ``outputs``.  Without blocks, the batch is a loop over single calls.
         stack_bytes: Upper bound on the stack that a call uses, in bytes, without the functions of the C library.
     """
 
@@ -67,7 +66,7 @@ class CSource:
 
 
 def build_c_source(exported: Sequence[NamedObjective], prefix: str, real: Real, *, portable: bool = False) -> CSource:
-    """Generate the C code of the objectives of one robot, or read it from the cache of the user.
+    """Generate the C code of the objectives of one robot, or read the code from the cache of the user.
 
     ``portable`` code does not use vectors, so compilers other than GCC and Clang can compile it.
     """
@@ -92,13 +91,12 @@ def _generate(
     contacts = {v.stem: v.objective.contact for v in single}
     robot = single[0].objective.robot
     scalars = library.graph()
-    # In a single call, the processor waits for the results of operations, so the order of sums matters.  In a batch,
-    # it computes other configurations meanwhile, so the batch uses the original order.
+    # In a single call, the processor waits for the results of operations, so a good order of sums saves time.  In a
+    # batch, the processor computes other configurations meanwhile, so the batch uses the original order.
     graph = reorder_sums(scalars if portable else library.vector_graph())
     layout = lay_out(graph, [f.outputs for f in library.functions])
     constants = Constants(prefix, real)
-    # The names of types occur thousands of times, so they are short macros, which are undefined at the end of the
-    # file.
+    # The names of types occur thousands of times, so they are short macros.
     types = {1: real.name, 2: "V2", 4: "V4"}
     emitter = Emitter(layout, prefix, real, types, constants)
     angles = _angles(layout)
@@ -143,7 +141,7 @@ def _generate(
 
 
 def _lanes(function: Exported, scalars: Graph, real: Real, constants: Constants) -> dict[str, Any]:
-    """Return the keys of a batch that computes vectors of configurations; empty if an operation has no such form."""
+    """Return the variables of a batch that computes vectors of configurations; empty if C has no vector operation."""
     layout = lay_out(scalars, [function.outputs], _BATCH_BLOCK)
     computed = {k for block in layout.blocks for k in block.nodes} | layout.inlined
     if not all(k in layout.trig or scalars.nodes[k].op in ARITHMETIC for k in computed):
@@ -165,7 +163,7 @@ def _angles(layout: Layout) -> tuple[int, ...]:
 
 
 def _outputs(function: Exported, emitter: Emitter, work: str) -> Iterator[dict[str, Any]]:
-    """Yield the assignments of the results of a function; ``work`` begins the names of the work arrays."""
+    """Yield the assignments of the results of a function; names of work arrays begin with ``work``."""
     graph, arrays = emitter.layout.graph, lengths(0, 0)
     for name, output in zip(SIGNATURES[function.name][1], function.outputs, strict=True):
         for k, node in enumerate(graph.outputs[output]):

@@ -37,14 +37,15 @@ from impact_posture.system.libraries import (
 from impact_posture.system.scratch_folder import scratch_folder
 from impact_posture.system.toolchain import find_compiler, words_of
 
-# Relative tolerance for the comparison with the oracle.  The oracle factorizes another matrix, whose condition number
-# is about 1/ε if the robot has supports with compliance ε.
+# Relative tolerance for the comparison with :class:`ImpactOracle`.  With supports of compliance ε, the condition
+# number of the matrix in this class is about 1/ε.
 _ORACLE_TOLERANCE = 1e-5
 # Number of random pairs of posture and normal in a comparison.
 _SAMPLES = 20
 # Largest number of libraries in the cache; if there are more, the oldest are deleted.
 _CACHED = 16
-# The error of a gradient is relative to its largest entry, or to the share _SHARE of the value if this is larger.
+# Gradient → value.  The error of the gradient is relative to its largest entry, or to _SHARE times the value if
+# larger.
 _LEAST = {"grad": "H", "objective_grad": "objective"}
 _SHARE = 1e-3
 
@@ -70,8 +71,7 @@ def compile_and_check(
         library = load_library(built)
         for v in named_objectives(objectives, prefix):
             objective = v.objective
-            # If ``several`` is set, ImpactGradient uses the objective of all contacts instead of the objective of the
-            # frame.
+            # Remove ``several``, because ImpactGradient would use the objective of all contacts for each frame.
             block = manifest if v.joint else manifest | {"several": None}
             gradient = ImpactGradient(library, block, objective.contact.frame, free=v.free)
             tolerance = self_test_tolerance(objective, real)

@@ -15,15 +15,16 @@ from impact_posture.system.libraries import library_path
 from impact_posture.system.output_folder import own_files
 from impact_posture.system.toolchain import find_compiler
 
-# Keys of a manifest whose values do not follow from the objective alone.
+# Keys of a manifest whose values depend on more than the objective.
 _OTHERS = ("posture", "compression", "stack_bytes")
 
 
 def existing_export(objective: WorstCaseObjective, out: Path, *, build: bool) -> Export | None:
-    """Return the export of an objective that ``out``, such as ``c/`` of a result, contains; ``None`` if it has none.
+    """Return the export of an objective in the folder ``out``; return ``None`` if the folder has no such export.
 
     The manifest can state any posture and compression of the impact.  All other content must equal the manifest that
-    :func:`~impact_posture.codegen.export.export` would write.  If ``build``, the library is built and checked.
+    :func:`~impact_posture.codegen.export.export` would write.  If ``build`` is true, the library is built and
+    checked.
 
     Raises:
         CompilerError: The compiler failed, or the results of the compiled code are wrong.
@@ -37,8 +38,7 @@ def existing_export(objective: WorstCaseObjective, out: Path, *, build: bool) ->
         content = _comparable(manifest)
     except (OSError, LookupError, ValueError, TypeError, AttributeError, RecursionError):
         return None
-    # Convert the new manifest to JSON and back: like the manifest from the file, it then has lists in place of
-    # tuples.
+    # Convert the new manifest to JSON and back, because the manifest in the file has lists instead of tuples.
     if content != _comparable(json.loads(json.dumps(build_manifest([objective], prefix, None, None)))):
         return None
     existing = Export(out, objective.robot, tuple(out / name for name in files), manifest, requested=build)

@@ -75,7 +75,7 @@ class Export(WrittenCode):
         return self.agreement is not None
 
     def load(self, **options: Any) -> ImpactGradient:
-        """Load the library, which runs its code; the options are as for :meth:`ImpactGradient.load`."""
+        """Load the library, which runs its code.  The options are arguments of :meth:`ImpactGradient.load`."""
         return ImpactGradient.load(self.out, robot=self.robot, **options)
 
     @property
@@ -132,7 +132,7 @@ def export(
         out: The existing folder.
         prefix: Text with which all C names begin, a C identifier; by default, names of robot and frame.
         posture: Configuration that the code contains as a constant, shape (nq,); ``None`` for no constant.
-        compression: Compression time, peak force and x of the impact, which are written to manifest and header.
+        compression: Duration and peak force of the impact (:class:`Compression`), for the manifest and the header.
         real: Floating-point type of the code.
         portable: Write plain C99 without vectors, for compilers other than GCC and Clang.
         force: Replace existing files.
@@ -156,8 +156,8 @@ def export(
     if posture is not None:
         stated = np.array(posture, dtype=float)
         posture = robot.check_posture(stated, limits=False)
-        # Normalization can change the last digits even if the posture is normalized.  In this case keep the given
-        # digits, so that the code contains the same numbers as result.json.
+        # Normalization can change the last digits of a normalized posture.  Keep the given digits, so that the code
+        # contains the same numbers as result.json.
         posture = stated if np.allclose(stated, posture, rtol=0, atol=1e-9) else posture
     exported, code = cached_code(tuple(objectives), prefix, real, portable)
     manifest = build_manifest(objectives, prefix, posture, compression, real, code.stack_bytes, portable=portable)
@@ -178,10 +178,7 @@ def export(
 def cached_code(
     objectives: tuple[WorstCaseObjective, ...], prefix: str, real: Real, portable: bool
 ) -> tuple[tuple[NamedObjective, ...], CSource]:
-    """Return the objectives and the C code of an export; they do not depend on the posture.
-
-    Generating the code takes most of the time of :func:`export`, so the last result is cached.
-    """
+    """Return the named objectives and the C code of an export, cached because generating the code is slow."""
     exported = named_objectives(objectives, prefix)
     return exported, build_c_source(exported, prefix, real, portable=portable)
 
@@ -199,16 +196,16 @@ def write_export(
     build: bool = False,
     force: bool = False,
 ) -> Export:
-    """Write an export into a new folder, completely or not at all, and build its library if ``build``.
+    """Write an export into a new folder, completely or not at all.
 
-    The folder ``out`` is ``./<prefix>-c`` by default.  If ``single``, the code computes in ``float``.  ``build``
-    creates ``lib<prefix>.so`` in the folder; if there is no compiler, the library is omitted without an error.
-    ``force`` replaces an earlier export.  The other arguments are as in :func:`export`.
+    The folder ``out`` is ``./<prefix>-c`` by default.  With ``single``, the code computes in ``float``.  ``build``
+    creates ``lib<prefix>.so`` in the folder; without a compiler, the library is omitted without an error.
+    ``force`` replaces an earlier export.  The other arguments are the same as in :func:`export`.
 
     Raises:
         OutputError: The folder exists and ``force`` is False, it is not an export, or it is not writable.
         CompilerError: The compiler failed, or the results of the compiled code are wrong.  Nothing is written.
-        ImpactPostureError: :func:`export` raises an error.
+        ImpactPostureError: As in :func:`export`.
     """
     prefix = default_prefix(objectives) if prefix is None else check_prefix(prefix)
     out = Path(f"{prefix}-c") if out is None else out

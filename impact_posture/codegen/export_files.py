@@ -177,7 +177,7 @@ def _frame(v: NamedObjective, test: dict[str, Any], alone: bool) -> dict[str, An
 
 
 def _worst_note(objective: WorstCaseObjective) -> str:
-    """Return a note for the header about model variants, the gradient if normals or models tie, and friction."""
+    """Return a note for the header about model variants, non-unique gradients, and friction."""
     note = ""
     if objective.model_variants:
         note = "; the worst of " + "; ".join(model.name for model in objective.model_variants)

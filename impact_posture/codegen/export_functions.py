@@ -27,9 +27,9 @@ def lengths(nq: int, nv: int) -> dict[str, int]:
 
 
 def stems(prefix: str, frames: Sequence[str]) -> tuple[str, ...]:
-    """Return for each frame the text with which its function names begin (stem).
+    """Return the stem of each frame, which is the text with which its function names begin.
 
-    For one frame, the stem is the prefix.  For several frames, the stem is prefix and frame name.
+    For one frame, the stem is the prefix.  For several frames, the stem consists of prefix and frame name.
 
     Raises:
         InputError: A frame is given twice, or two frames have the same C identifier.

@@ -24,8 +24,8 @@ class NamedObjective:
     Attributes:
         objective: The objective.
         stem: Text with which the C names of the objective begin.
-        free: Whether this objective is for a standing robot without its supports.
-        joint: Whether this objective is for several contacts at once; ``H`` is then not exported.
+        free: Whether this objective ignores the supports of a standing robot.
+        joint: Whether this objective is for several simultaneous contacts; ``H`` is then not exported.
     """
 
     objective: WorstCaseObjective
@@ -37,8 +37,8 @@ class NamedObjective:
 def named_objectives(objectives: Sequence[WorstCaseObjective], prefix: str) -> tuple[NamedObjective, ...]:
     """Return the objectives to export, with their stems.
 
-    If the robot has supports, each objective is followed by ``<stem>_free``, the objective without supports.  An
-    objective of several contacts becomes one objective per contact; the objective of all contacts is last.
+    If the robot has supports, the objective without supports follows each objective, with the stem ``<stem>_free``.
+    An objective of several contacts becomes one objective per contact; the objective of all contacts is last.
 
     Raises:
         InputError: An objective of several contacts is exported together with other objectives.
@@ -69,7 +69,7 @@ class Exported:
     Attributes:
         stem: Text with which the C name of the function begins.
         name: Name of the function in :data:`~impact_posture.codegen.export_functions.SIGNATURES`.
-        outputs: Names of the results of the function among the outputs of :attr:`ExportLibrary.function`.
+        outputs: Outputs of :attr:`ExportLibrary.function` that are the results of this C function.
     """
 
     stem: str
@@ -83,8 +83,8 @@ class ExportLibrary:
 
     Attributes:
         function: CasADi function ``(q, n, constants)`` → all outputs.
-        constants: Values of the input ``constants``: the constants in which repeated limbs differ.
-        seeds: (input name, index) → place of the input in repeated limbs.
+        constants: Values of the input ``constants``, which contains the constants in which repeated limbs differ.
+        seeds: (input name, index) → limb to which the input belongs.
         functions: The C functions.
     """
 
@@ -101,7 +101,7 @@ class ExportLibrary:
         return graph_of(ca.Function("numbers", inputs, values, *names, {"cse": True}))
 
     def vector_graph(self) -> Graph:
-        """Return the graph of operations, in which vector operations replace equal operations of repeated limbs."""
+        """Return the graph in which one vector operation replaces the equal operations of repeated limbs."""
         if not self.seeds:
             return self.graph()
         return pack_lanes(graph_of(self.function), self.seeds, {"constants": self.constants})
@@ -110,8 +110,8 @@ class ExportLibrary:
 def export_library(exported: Sequence[NamedObjective]) -> ExportLibrary:
     """Return the expressions of the objectives of one robot.
 
-    The C code computes two results from others, so they have no expression here: ``V`` from ``H`` and ``G``, and an
-    ``objective`` that is a multiple of ``H``.
+    Two results have no expression, because the C code computes ``V`` from ``H`` and ``G``, and an ``objective`` that
+    is a multiple of ``H`` from ``H``.
     """
     model = exported[0].objective.robot.model
     q, n, limbs = ca.SX.sym("q", model.nq), ca.SX.sym("n", 3), RepeatedLimbs(model)

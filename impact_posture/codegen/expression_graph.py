@@ -11,11 +11,11 @@ import casadi as ca
 
 from impact_posture.errors import CompilerError
 
-# Operations that C can apply to vectors.  A division becomes a product with a reciprocal ("inv"), because several
-# divisions by the same number can share the reciprocal.
+# Operations that C can apply to vectors.  Divisions become products with a reciprocal ("inv"), because several
+# divisions by the same number need the reciprocal only once.
 ARITHMETIC = frozenset({"+", "-", "*", "neg", "inv"})
 _COMMUTE = frozenset({"+", "*"})
-# Functions that have the same name in C and in CasADi: with one argument, and with two arguments.
+# Functions with the same name in C and in CasADi.  The first tuple lists functions of one argument.
 _OF_ONE = ("exp", "log", "sqrt", "sin", "cos", "tan", "asin", "acos", "atan", "tanh", "fabs")
 _OF_TWO = ("pow", "atan2", "hypot", "fmin", "fmax")
 # CasADi operation → C expression, for all other operations.  Every operand is a name or is in parentheses.
@@ -45,8 +45,8 @@ class Node(NamedTuple):
     Attributes:
         op: ``const`` (constant), ``in`` (entry of an input), ``lane`` (entry of a vector), ``gather`` (vector from
             single numbers), an operation of :data:`ARITHMETIC`, or a C expression of :data:`CALLS`.
-        args: Numbers of the nodes that are operands.  For ``in``: number of the input, and index in the input.  For
-            ``lane``: number of the vector node, and index in the vector.
+        args: Numbers of the operand nodes.  For ``in``: number of the input, and index in the input.  For ``lane``:
+            number of the vector node, and index in the vector.
         width: Number of lanes of a vector; 1 for a single number.
         value: For ``const``, one value per lane, or one value for all lanes.
     """

@@ -23,8 +23,8 @@ if TYPE_CHECKING:
 Array = NDArray[Any]
 
 _TYPES: dict[str, Any] = {"double": ctypes.c_double, "float": ctypes.c_float}
-# Relative tolerance for the reference values of the manifest, which allows for rounding.  In float, few of the seven
-# digits are correct if the robot has supports with compliance ε (condition number about 1/ε).
+# Relative tolerance for rounding errors in the comparison with the reference values of the manifest.  In float, few
+# of the seven digits are correct if the robot has supports with compliance ε (condition number about 1/ε).
 _SELF_TEST = {"double": 1e-7, "float": 0.1}
 
 
@@ -46,7 +46,7 @@ class ImpactGradient:
     Attributes:
         manifest: The content of ``<prefix>.json``.
         frame: Name of the contact frame of this object.
-        free: Whether this object computes the robot without its supports.
+        free: Whether this object ignores the supports of the robot.
         nq: Length of a configuration.
         nv: Length of a gradient.
         dtype: NumPy type of the numbers in the library.
@@ -87,15 +87,15 @@ class ImpactGradient:
         """Load an export.  **Loading runs the code of the export**, so load an export only if you trust its origin.
 
         The library is ``lib<prefix>.so`` in the folder of the manifest.  If the library is missing, this method
-        **builds it in this folder** with the compiler of the user (``$CC``, cc, gcc or clang).  If the folder has a
-        file with the SHA-256 of the library, the hash must agree.  The library must also identify this manifest, and
-        reproduce the reference values of the manifest.
+        **builds the library in this folder** with the compiler of the user (``$CC``, cc, gcc or clang).  If the
+        folder has a file with the SHA-256 of the library, the hash must agree.  The library must contain the hash of
+        this manifest, and must reproduce the reference values of the manifest.
 
         Args:
             path: The folder of the export, or its ``<prefix>.json``.
             robot: If given, the export must be for this robot model.
             frame: The contact frame; by default, the first frame of the export.
-            free: Compute the robot without its supports; no effect if the export has no supports.
+            free: Ignore the supports of the robot; no effect if the export has no supports.
 
         Raises:
             SpecError: The export does not exist or is damaged.
@@ -163,7 +163,7 @@ class ImpactGradient:
         return function(), results
 
     def _results(self, name: str, q: ArrayLike, n: ArrayLike | None = None) -> tuple[Array, ...]:
-        """Call a C function and return views of its results; raise an error if its code is not zero."""
+        """Call a C function and return views of its results; raise an error if the C function reports one."""
         code, results = self.call(name, q, n)
         if code:
             raise _failure(code)
@@ -229,7 +229,7 @@ class ImpactGradient:
         H, grad = self.value_and_gradient(test["q"], test["n"])
         values, expected = np.array([H, *grad]), np.array([test["H"], *test["grad"]])
         difference = float(np.abs(values - expected).max() / np.abs(expected).max())
-        # The condition "difference > tolerance" would be False for NaN, and accept it.
+        # The condition "difference > tolerance" would be False for NaN, so NaN would be accepted.
         if not difference <= _SELF_TEST[self.manifest["real"]]:
             hint = "delete the library, so that it is built again"
             raise ManifestMismatch("reference value of H", test["H"], H, where=where, hint=hint)

@@ -25,7 +25,7 @@ Numbers = tuple[Annotated[float, Field(allow_inf_nan=False)], ...]
 
 
 class Loose(BaseModel):
-    """A block of JSON with required keys; other keys are allowed and ignored."""
+    """JSON object with required keys; other keys are ignored."""
 
     model_config = ConfigDict(strict=True)
 
@@ -183,7 +183,7 @@ def check_robot(manifest: Mapping[str, Any], robot: Robot, *, where: str = "mani
 
 
 def frame_block(manifest: Mapping[str, Any], frame: str | None) -> Mapping[str, Any]:
-    """Return the manifest block of a frame; for ``None``, of the first frame.
+    """Return the entry of a frame in a manifest; with ``None``, return the first entry.
 
     Raises:
         FrameNotFound: The export has no such frame; the error lists its frames.

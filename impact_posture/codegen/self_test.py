@@ -62,12 +62,12 @@ def oracle_reference(objective: WorstCaseObjective) -> Reference:
 
 
 def oracle_along(objective: WorstCaseObjective, normal: Array) -> ImpactOracle:
-    """Return an oracle for the leading contact with another normal, shape (3,), stated in the same axes."""
+    """Return the oracle of the first contact with another normal, shape (3,), in the axes of the old normal."""
     x, y, z = (float(v) for v in normal)
     return ImpactOracle(replace(objective.case, contact=replace(objective.contact, normal=(x, y, z))))
 
 
-# A unit vector that is not parallel to an axis; with such a normal, entries of the gradient are not zero.
+# Unit vector that is not parallel to an axis, because many entries of the gradient would otherwise be zero.
 _NORMAL = (0.48, -0.6, 0.64)
 _SCALARS = frozenset({"H", "objective", "G", "V"})
 

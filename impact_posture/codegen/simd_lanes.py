@@ -1,7 +1,7 @@
 """Replace equal operations of repeated limbs by one vector operation, with one SIMD lane for each limb.
 
-Two operations are equal if they have the same key.  The key of an operation consists of its kind and the keys of its
-operands.  The key of an angle or constant of a limb is its place in the limb.  If all limbs of a group have an
+Two operations are equal if they have the same key.  The key of an operation consists of its operator and the keys of
+its operands.  The key of a joint angle or constant is its name within the limb.  If all limbs of a group have an
 operation with the same key, these operations become one vector operation.
 """
 
@@ -12,13 +12,13 @@ from dataclasses import dataclass
 
 from impact_posture.codegen.expression_graph import ARITHMETIC, COSINE, SINE, Graph, Node
 
-# Key by which equal operations of several limbs are identified.
+# Equal operations of several limbs have equal keys.
 Key = tuple[object, ...]
 
 
 @dataclass(frozen=True)
 class LimbInput:
-    """Place of an input (an angle or a constant) in repeated limbs.
+    """Limb to which an input (a joint angle or a constant) belongs.
 
     Attributes:
         group: Number of the group of repeated limbs to which the input belongs.
@@ -36,8 +36,8 @@ def pack_lanes(
 ) -> Graph:
     """Return a graph with the same results, in which vector operations replace equal operations of repeated limbs.
 
-    ``seeds`` maps (input name, index) to the place of the input in repeated limbs.  ``values`` maps the name of an
-    input to its values if these are constant.
+    ``seeds`` maps (input name, index) to the limb of the input.  ``values`` maps the name of each constant input to
+    its values.
     """
     widths: dict[int, int] = {}
     for seed in seeds.values():
@@ -52,7 +52,7 @@ def pack_lanes(
 
 
 def _levels(graph: Graph) -> list[list[int]]:
-    """Return lists of nodes.  List k has the nodes whose longest path from an input or a constant has length k."""
+    """Return lists of nodes.  List k contains the nodes whose longest path from an input or constant has length k."""
     depth: list[int] = []
     levels: list[list[int]] = []
     for k, node in enumerate(graph.nodes):
@@ -68,12 +68,12 @@ def _bundles(
 ) -> dict[int, tuple[int, ...]]:
     """Return node → all nodes of the vector to which the node belongs.
 
-    Operations with the same key are in the same level, so the bundles of a level are complete before the next level
-    is processed.  If a limb has no operation with a key, or has several, the operations with this key stay single.
+    Operations with the same key are in the same list of ``levels``, so the vectors of a list are complete before the
+    next list is processed.  Operations stay single unless each limb has exactly one operation with their key.
     """
     bundles: dict[int, tuple[int, ...]] = {}
     lanes: dict[int, tuple[int, int]] = {}
-    # Number that represents a node in keys: the first node of its bundle, or the node itself if it has no bundle.
+    # Node → number that represents it in keys: the first node of its vector, or the node itself without a vector.
     short = list(range(len(graph.nodes)))
     for level in levels:
         by_key: dict[Key, dict[int, list[int]]] = {}
@@ -98,8 +98,8 @@ def _place(
 ) -> tuple[Key, tuple[int, int]] | None:
     """Return the key of a node, and its group and lane.
 
-    Return ``None`` if the node cannot be in a vector: its operands are in no lane or in several lanes, or the
-    operation has no vector form.
+    Return ``None`` if the node cannot be in a vector, because its operands are in no lane or in several lanes, or
+    because C cannot apply the operation to vectors.
     """
     node = graph.nodes[k]
     if k in places:
@@ -120,13 +120,13 @@ def _merge(
     bundles: Mapping[int, tuple[int, ...]],
     values: Mapping[str, Sequence[float]],
 ) -> Graph:
-    """Return a graph in which one vector operation replaces the operations of each bundle."""
+    """Return a graph in which one vector operation replaces the nodes of each tuple in ``bundles``."""
     merged = Graph(graph.inputs)
     singles: dict[int, int] = {}
     vectors: dict[tuple[int, ...], int] = {}
 
     def number(k: int) -> int:
-        """Return the number in the new graph of the node whose number in the old graph is ``k``."""
+        """Return the number in the new graph of the old node ``k``."""
         if k not in singles:
             bundle = bundles[k]
             singles[k] = merged.element(vectors[bundle], bundle.index(k))
@@ -150,7 +150,7 @@ def _merge(
             if all(merged.nodes[p].op == "const" for p in parts):
                 return merged.constant(*[merged.nodes[p].value[0] for p in parts])
             return merged.add(Node("gather", tuple(parts), len(parts)))
-        # An operand is either one number that all lanes share, or a vector with its lanes in the same order.
+        # An operand is a single number that all lanes use, or a vector with the same order of lanes.
         slots = [list(operands) for operands in zip(*[node.operands for node in members], strict=True)]
         if members[0].op in "+*":
             _align(slots, bundles)
@@ -160,7 +160,7 @@ def _merge(
         ]
         return merged.add(Node(members[0].op, tuple(operands), max(merged.nodes[o].width for o in operands)))
 
-    # All nodes of a bundle are in the same level, and all their operands are in earlier levels.
+    # All nodes of a vector are in the same list of ``levels``, and all their operands are in earlier lists.
     for k in (k for level in levels for k in level):
         if k not in bundles:
             singles[k] = single(graph.nodes[k])
@@ -171,7 +171,7 @@ def _merge(
 
 
 def _align(slots: list[list[int]], bundles: Mapping[int, tuple[int, ...]]) -> None:
-    """Exchange the operands of a sum or product in a lane if they are not in the order of the first lane."""
+    """Exchange the operands of a sum or product in each lane whose order differs from the first lane."""
     first, second = slots
     for lane in range(1, len(first)):
         pairs = ((first[0], first[lane]), (second[0], second[lane]))

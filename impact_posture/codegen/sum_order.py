@@ -1,4 +1,4 @@
-"""Reorder sums so that the terms that are available first are added first; only the last term then causes a delay."""
+"""Reorder sums: terms that are available first are added first, so that only the last term causes a delay."""
 
 from __future__ import annotations
 
@@ -7,11 +7,11 @@ from collections.abc import Callable
 
 from impact_posture.codegen.expression_graph import Graph, Node
 
-# Approximate latency of operations on current processors, in cycles; _TRIG is for a sine, cosine or other function.
+# Approximate latency of operations on current processors, cycles.  _TRIG is the latency of functions, such as sine.
 _LATENCY = {"+": 4, "-": 4, "*": 4, "inv": 15, "neg": 1, "lane": 2, "const": 0, "in": 0, "gather": 1}
 _TRIG = 40
-# Two terms are added separately only if this saves at least this number of cycles.  A separate addition cannot be
-# part of a fused multiply-add, so it takes extra time.
+# Two terms are added to each other first only if this saves at least this number of cycles.  A separate addition
+# takes extra time, because it cannot be part of a fused multiply-add.
 _WORTH = 8
 
 
@@ -44,7 +44,7 @@ def reorder_sums(graph: Graph) -> Graph:
 
 
 def _inner(graph: Graph) -> set[int]:
-    """Return the sums that are used only once, namely as a term of another sum of the same width."""
+    """Return the sums whose only use is as a term of another sum of the same width."""
     users: dict[int, set[int]] = {}
     times: Counter[int] = Counter()
     for k, node in enumerate(graph.nodes):
@@ -79,7 +79,7 @@ def _terms(graph: Graph, root: int, inner: set[int]) -> list[tuple[int, int]]:
 
 
 def _sum(graph: Graph, add: Callable[[Node], int], ready: list[int], terms: list[tuple[int, int]]) -> int:
-    """Add the terms (pairs of sign and node number), the term that is available last at the end; return the node."""
+    """Return the sum of terms (pairs of sign and node number); the term that is available last is added last."""
     queue = sorted(terms, key=lambda term: (ready[term[1]], term[1]))
 
     def plus(first: tuple[int, int], second: tuple[int, int]) -> tuple[int, int]:
@@ -94,7 +94,7 @@ def _sum(graph: Graph, add: Callable[[Node], int], ready: list[int], terms: list
     while queue:
         term = queue.pop(0)
         if queue and ready[total[1]] >= ready[queue[0][1]] + _WORTH:
-            # The next two terms are both available long before the sum so far: add them to each other first.
+            # The next two terms are available long before the present sum, so add them to each other first.
             term = plus(term, queue.pop(0))
         total = plus(total, term)
     return total[1] if total[0] > 0 else add(Node("neg", (total[1],), graph.nodes[total[1]].width))
