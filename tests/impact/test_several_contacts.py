@@ -360,7 +360,7 @@ def test_a_resolved_problem_gives_the_same_again(tmp_path: Path) -> None:
         ({"objective": "speed"}, MetricError, "approach speed of one contact"),
         ({"normal_cone": 5.0}, MetricError, "exact for one contact only"),
         ({"offset": (0.0, 0.0, 0.1)}, ContactError, "one offset for several contacts"),
-        ({"frame": "panda_hand_tcp"}, ContactError, "instead of `frame`"),
+        ({"frame": "panda_hand_tcp"}, ContactError, "cannot be combined with `frame`"),
         ({"contact": ("panda_hand:1,0,0", "panda_hand:2,0,0")}, ContactError, "given twice"),
         ({"contact": tuple(f"panda_link{k}:0,0,1" for k in range(1, 8))}, ContactError, "7 contacts"),
         ({"contact": ("panda_hand_tcp:0,0,1",), "bilateral": True}, ContactError, "one contact"),
